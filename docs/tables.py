@@ -28,7 +28,7 @@ from perchctl.log.fields import EVENT_FIELDS, FIELDS  # noqa: E402
 from perchctl.mission import FLYING_PHASES, Phase, table  # noqa: E402
 from perchctl.mission.lander import MANOEUVRES, Evidence, Reach, Stage  # noqa: E402
 from perchctl.profile import Profile, SimulationConfig  # noqa: E402
-from perchctl.profile.keys import UNITS, allowed, keys  # noqa: E402
+from perchctl.profile.keys import UNITS, keys  # noqa: E402
 from perchctl.profile.simulation import WORLDS  # noqa: E402
 
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -48,7 +48,7 @@ def profile_keys() -> str:
     for key in keys(Profile()):
         name = key.path.removeprefix(f"{key.section}.")
         meaning = key.meaning + (f" ({SEE[key.path]})" if key.path in SEE else "")
-        cells = (f"`{name}`", key.unit, _shown(key.default), allowed(key.field), meaning)
+        cells = (f"`{name}`", key.unit, _shown(key.default), key.allowed, meaning)
         sections.setdefault(key.section, []).append(f"| {' | '.join(cells)} |")
     head = ["", "| key | unit | default | allowed | meaning |", "|---|---|---|---|---|"]
     lines: list[str] = []

@@ -50,6 +50,8 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     (
         "perchctl.geometry",
         "perchctl.files",
+        "perchctl.places",
+        "perchctl.plain_yaml",
         "perchctl.vehicle",
         "perchctl.values",
         "perchctl.children",
@@ -96,7 +98,7 @@ MOST_NAMES = {
     "mission": 60,
     "perception": 15,
     "positioning": 15,
-    "profile": 55,
+    "profile": 38,
     "replay": 15,
     "report": 15,
     "sim": 29,

@@ -75,7 +75,7 @@ def test_help_loads_nothing_heavy() -> None:
 
 
 def test_the_help_lists_the_commands_in_the_order_of_use() -> None:
-    commands = ["make-target", "calibrate", "new-profile", "profile"]
+    commands = ["make-target", "calibrate", "profile"]
     commands += ["fit-weights", "track", "fly", "simulate"]
     assert re.findall(rf"^\W*({'|'.join(commands)}) ", run("--help").stdout, re.M) == commands
 

@@ -29,7 +29,6 @@ from tests.helpers.flights import ROOT
 COMMANDS = (
     "make-target",
     "calibrate",
-    "new-profile",
     "profile",
     "fit-weights",
     "track",

@@ -96,7 +96,7 @@ def cheap(line: str) -> list[str]:
             words.append("--help")
         case ["perchctl", "check"]:  # its verdict is this computer's; tests/check has it
             words.append("--help")
-        case ["perchctl", "new-profile"]:  # without a dialogue, over what is there
+        case ["perchctl", "profile"] if words[2] == "new":  # without a dialogue, over what is there
             words += ["--defaults", "--force"]
         case ["perchctl", "simulate"] if words.count("--sweep") > 1:
             words.append("--help")  # many flights

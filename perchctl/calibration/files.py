@@ -14,7 +14,8 @@ import numpy as np
 
 from perchctl.errors import InvalidValue, Note, NotFound
 from perchctl.geometry import Array
-from perchctl.profile import CameraConfig, find_calibration, parse_yaml
+from perchctl.plain_yaml import parse_yaml
+from perchctl.profile import CameraConfig, find_calibration
 from perchctl.vision import CameraModel
 
 KALIBR_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}

@@ -1,4 +1,4 @@
-from .compared import comparison_rows as comparison_rows
+from .capture import comparison_rows as comparison_rows
 from .profile import profile_rows as profile_rows
 from .profile import warnings_before_flight as warnings_before_flight
 from .row import Row as Row

@@ -1,44 +1,74 @@
-"""The motion capture that a vehicle would be told its position by: answers, body, rate, noise.
+"""The motion capture that gives a vehicle its position: answers, body, rate, noise, axes.
 
-`listen` hears vehicle and capture for a while; `rows` judges, pure. Nothing is sent.
+`listen` hears vehicle and capture for a while; `capture_rows` judges that at rest, and
+`hand_finding` what a hand that lifts, turns and tilts the vehicle shows. Pure, and nothing is sent.
+
+The vehicle's own attitude knows how it is turned, and which way is up; the capture says the same
+in its own axes. With R_own and R_seen the attitudes that both have of it, and A the capture's
+world, B the rigid body's axes, where they should be none:
+
+    R_seen = A R_own B
+
+A turn between two moments, as a vector, is ``A w`` in the capture's world where the vehicle has
+``w``, and ``B^T v`` in the body's axes where it has ``v``: two rotations between sets of vectors,
+each solved by least squares (Kabsch, by the singular value decomposition). A's turn about the
+vertical is the capture's own affair, since the vehicle's heading is set by it; its tilt is
+another axis up. B is a body whose axes were not defined along the vehicle's.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from perchctl.check.row import Row, by_limits, failed, passed, skipped, worse
+from perchctl.check.row import (
+    Finding,
+    Row,
+    Verdict,
+    ask_all,
+    by_limits,
+    failed,
+    passed,
+    skip_all,
+    skipped,
+    warned,
+    worst,
+)
 from perchctl.flight import (
     external_height_problem,
     millimetres_problem,
     motion_problem,
+    nearest_axis,
     tilt_problem,
     world_problem,
 )
-from perchctl.geometry import Array
-from perchctl.positioning import CaptureFrame, CaptureSource, Placed
+from perchctl.geometry import Array, rotation_from_rpy, rpy_from_rotation
+from perchctl.link import vehicle_uri
+from perchctl.perception import History, attitude_at
+from perchctl.positioning import (
+    CaptureFrame,
+    CaptureSource,
+    Comparison,
+    ComparisonRecord,
+    Placed,
+    load_comparison,
+    save_comparison,
+)
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vehicle import Telemetry
 
-LISTEN_S = 2.0
+CAPTURE_S = 2.0
 POLL_S = 0.005
-RATE_WARN_HZ, RATE_FAIL_HZ = 50.0, 20.0
-"""Between two at 20 Hz a vehicle falls by 12 mm before it is told."""
-AGE_WARN_S, AGE_FAIL_S = 0.03, 0.1
 NOISE_FAIL = 4.0
 """Times `positioning.position_sigma_m`: so much more than the vehicle takes it for."""
 WILD_M = 0.1
 """No capture is so noisy."""
-
-NAMES = ("capture", "body", "body rate", "body age", "body noise", "body place")
-"""The rows of a capture, in their order."""
-
-Wait = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -61,135 +91,392 @@ class Listened:
 
 
 def listen(
-    heard: Callable[[], list[Telemetry]],
+    take: Callable[[], list[Telemetry]],
     source: CaptureSource,
     clock: Callable[[], float],
-    wait: Wait,
-    for_s: float = LISTEN_S,
-    enough: Callable[[Listened], bool] = lambda so_far: False,
+    wait: Callable[[float], None],
+    for_s: float = CAPTURE_S,
+    is_enough: Callable[[Listened], bool] = lambda so_far: False,
 ) -> Listened:
     """For so long, or until it is enough; that is asked every half second."""
-    began_s, asked_s = clock(), clock()
+    began_s = asked_s = clock()
     telemetry: list[Telemetry] = []
     frames: list[tuple[CaptureFrame, float]] = []
     source.poll(began_s)  # what came before is old
-    heard()
+    take()
     while (now_s := clock()) - began_s < for_s:
-        telemetry.extend(heard())
+        telemetry.extend(take())
         frame = source.poll(now_s)
         if frame is not None:
             frames.append((frame, now_s - frame.t_s))
         if now_s - asked_s > 0.5:
             asked_s = now_s
-            if enough(Listened(now_s - began_s, tuple(telemetry), tuple(frames))):
+            if is_enough(Listened(now_s - began_s, tuple(telemetry), tuple(frames))):
                 break
         wait(POLL_S)
     now_s = clock()
     return Listened(now_s - began_s, tuple(telemetry), tuple(frames), source.problem(now_s))
 
 
-def refused(why: str, config: PositioningConfig) -> list[Row]:
-    """It could not be opened."""
+# --- At rest ------------------------------------------------------------------------------------
+
+
+def refused_rows(why: str, config: PositioningConfig) -> list[Row]:
+    """The rows of a capture that could not be opened, or sends nothing."""
     advice = "does it stream, is positioning.host right, does a firewall stop it?"
-    return [
-        failed("capture", why, advice),
-        *(skipped(name, f"no {config.label}") for name in NAMES[1:]),
-    ]
+    names = ("body", *CAPTURE)
+    return [Row("capture", *failed(why, advice)), *skip_all(names, f"no {config.label}")]
 
 
-def rows(heard: Listened, profile: Profile) -> list[Row]:
+def capture_rows(heard: Listened, profile: Profile) -> list[Row]:
     config = profile.positioning
     if not heard.frames:
-        return refused(heard.problem or f"{config.label} sends no frame", config)
-    first = passed("capture", f"{config.label} sends")
+        return refused_rows(heard.problem or f"{config.label} sends no frame", config)
+    first = Row("capture", *passed(f"{config.label} sends"))
     places = heard.places(config)
     if not places:
         others = sorted({name for frame, _ in heard.frames for name in frame.bodies})
         found = f"no rigid body {config.body!r}; it sees {', '.join(others) or 'none'}"
-        return [
-            first, failed("body", found, "correct positioning.body, or show it to the cameras"),
-            *(skipped(name, "the rigid body is not seen") for name in NAMES[2:]),
-        ]  # fmt: skip
-    return [
-        first,
-        _seen(heard, places, config),
-        _rate(places, config),
-        _age(heard),
-        _noise(places, config),
-        _place(heard, places, profile),
-    ]
-
-
-def _seen(heard: Listened, places: list[Placed], config: PositioningConfig) -> Row:
-    """`Capture.poll` prefers frames with the body, so a frame without is one more unseen."""
+        body = failed(found, "correct positioning.body, or show it to the cameras")
+        return [first, Row("body", *body), *skip_all(CAPTURE, "the rigid body is not seen")]
+    # `Capture.poll` prefers frames with the body, so a frame without is one more unseen.
     share = 1.0 - len(places) / len(heard.frames)
     found = f"{config.body!r} seen in {100.0 * (1.0 - share):.0f} % of the frames"
     advice = "it is hidden at times, or has too few markers: look at it in the capture"
-    return by_limits("body", share, 0.02, 0.2, found, advice)
+    body = by_limits(share, 0.02, 0.2, found, advice)
+    return [first, Row("body", *body), *ask_all(CAPTURE, heard, places, profile)]
 
 
-def _rate(places: list[Placed], config: PositioningConfig) -> Row:
+def _rate(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
+    """Between two at 20 Hz a vehicle falls by 12 mm before it gets the next."""
     times = [place.t_s for place in places]
     span_s = times[-1] - times[0]
     rate_hz = (len(times) - 1) / span_s if span_s > 0.0 else 0.0
     gap_s = max((b - a for a, b in itertools.pairwise(times)), default=math.inf)
     found = f"{rate_hz:.0f} Hz, the longest gap {1e3 * gap_s:.0f} ms"
     advice = "raise the capture's rate, use a cable, close what loads this computer"
-    by_rate = by_limits("body rate", -rate_hz, -RATE_WARN_HZ, -RATE_FAIL_HZ, found, advice)
-    by_gap = by_limits("body rate", gap_s, config.hold_s / 2.0, config.hold_s, found, advice)
-    return worse(by_rate, by_gap)
+    hold_s = profile.positioning.hold_s
+    return worst(
+        by_limits(-rate_hz, -50.0, -20.0, found, advice),
+        by_limits(gap_s, hold_s / 2.0, hold_s, found, advice),
+    )
 
 
-def _age(heard: Listened) -> Row:
+def _age(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
     """From its arrival to its reading; what passes before, from the exposure on, no clock of
     this computer's tells."""
     ages = sorted(age_s for _, age_s in heard.frames)
     age_s = ages[int(0.95 * (len(ages) - 1))]
     found = f"95 % read within {1e3 * max(0.0, age_s):.0f} ms of their arrival"
-    return by_limits(
-        "body age", age_s, AGE_WARN_S, AGE_FAIL_S, found, "close what loads this computer"
-    )
+    return by_limits(age_s, 0.03, 0.1, found, "close what loads this computer")
 
 
-def _noise(places: list[Placed], config: PositioningConfig) -> Row:
-    """Of a vehicle at rest."""
+def _noise(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
+    """Of a vehicle at rest: of the worst axis, about the middle; a few wild ones do not make it."""
     at = np.array([place.position_m for place in places])
     if len(at) > 2 and not np.ptp(at, axis=0).any():
-        return failed(
-            "body noise", "frozen: all of its numbers repeat",
-            "a measured pose has noise: is the capture paused, or the body hidden?",
-        )  # fmt: skip
-    sigma_m = _sigma_m(at)
+        advice = "a measured pose has noise: is the capture paused, or the body hidden?"
+        return failed("frozen: all of its numbers repeat", advice)
+    sigma_m = float(np.max(1.4826 * np.median(np.abs(at - np.median(at, axis=0)), axis=0)))
     found = f"{1e3 * sigma_m:.1f} mm (one sigma)"
     advice = (
         "let it stand still; calibrate the capture, or raise positioning.position_sigma_m"
         if sigma_m < WILD_M
         else "these look like millimetres: set the unit of its stream to metres"
     )
-    limit_m = config.position_sigma_m
-    return by_limits("body noise", sigma_m, limit_m, NOISE_FAIL * limit_m, found, advice)
+    limit_m = profile.positioning.position_sigma_m
+    return by_limits(sigma_m, limit_m, NOISE_FAIL * limit_m, found, advice)
 
 
-def _sigma_m(at: Array) -> float:
-    """Of the worst axis, about the middle; a few wild ones do not make it."""
-    middle = np.median(at, axis=0)
-    return float(np.max(1.4826 * np.median(np.abs(at - middle), axis=0)))
-
-
-def _place(heard: Listened, places: list[Placed], profile: Profile) -> Row:
+def _place(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
     """By what `fly` asks of it."""
     newest = heard.telemetry[-1] if heard.telemetry else None
     place = places[-1].external(pose=True)
     if newest is None:
         problem = millimetres_problem(place, profile) or external_height_problem(place, profile)
     elif tilt_problem(newest, profile) or motion_problem(newest):
-        return skipped("body place", "the vehicle does not stand level and still")
+        return skipped("the vehicle does not stand level and still")
     else:
         problem = world_problem(place, newest, profile)
     if problem is not None:
-        return failed("body place", problem.found, problem.advice)
+        return failed(problem.found, problem.advice)
     x, y, z = place.position_m
     found = f"x {x:.2f}, y {y:.2f}, z {z:.2f} m"
     if newest is None:
-        return skipped("body place", f"{found}; its attitude is not compared: no telemetry")
-    return passed("body place", found)
+        return skipped(f"{found}; its attitude is not compared: no telemetry")
+    return passed(found)
+
+
+CAPTURE: dict[str, Callable[[Listened, list[Placed], Profile], Finding]] = {
+    "body rate": _rate,
+    "body age": _age,
+    "body noise": _noise,
+    "body place": _place,
+}
+"""The rows of a body that is seen, in their order."""
+
+
+# --- In a hand ----------------------------------------------------------------------------------
+
+HOW_TO_TURN = (
+    "lift it straight up by 30 cm, turn it by 90 deg, tilt it forward and aside, put it back"
+)
+EVERY_S = 0.1
+LEAST_STEP_RAD, MOST_STEP_RAD = math.radians(12.0), math.radians(120.0)
+"""Turns between two moments: smaller ones are noise, larger ones have no certain axis."""
+MOVED_RAD, MOVED_M, MOVED_G = math.radians(12.0), 0.06, 0.05
+STILL_RAD, STILL_M = math.radians(4.0), 0.03
+MANY_SHARE = 0.9
+"""All turns are about one axis where so many of them leave it by less than `LEAST_STEP_RAD`. A
+spread over all of them would say so of who turns far and tilts little, or lets it stand long."""
+UPRIGHT_DEG, BODY_WARN_DEG, BODY_FAIL_DEG = 25.0, 5.0, 15.0
+LIFTED_M = 0.12
+REACH_M = 5.0
+"""A hand lifts no farther: what moved farther is given in another unit."""
+STRANGER = 0.4
+"""Of a turn: what A and B leave unexplained, on the average."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """Pairs of one moment each: n attitudes as the vehicle and as the capture have them, the
+    capture's places (n, 3), and the accelerometer's largest difference from 1 g."""
+
+    own: Rotation
+    seen: Rotation
+    place_m: Array
+    moved_g: float
+
+    @property
+    def ways_m(self) -> Array:
+        """Of the places from the first, (n, 3)."""
+        return np.asarray(self.place_m - self.place_m[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Turns:
+    """What the turns say.
+
+    Attributes:
+        up: the vertical in the capture's world, (3,), None where all turns were about one other
+            axis.
+        body: the rigid body's axes in the vehicle's, None where all turns were about one axis.
+        unexplained: of a turn, on the average, 0 to 1 and more.
+    """
+
+    up: Array | None
+    body: Rotation | None
+    unexplained: float
+
+
+def paired(telemetry: Sequence[Telemetry], places: Sequence[Placed]) -> Moved | None:
+    """The attitude of each place's moment, every `EVERY_S`; None of less than three."""
+    if len(telemetry) < 2:
+        return None
+    history = History(tuple(telemetry))
+    own, seen, place_m, last_s = [], [], [], -math.inf
+    for placed in places:
+        inside = telemetry[0].t_s <= placed.t_s <= telemetry[-1].t_s
+        if not inside or placed.t_s < last_s + EVERY_S:
+            continue
+        attitude = attitude_at(history, placed.t_s)
+        if attitude is None:
+            continue
+        own.append(rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad))
+        seen.append(placed.R)
+        place_m.append(placed.position_m)
+        last_s = placed.t_s
+    if len(own) < 3:
+        return None
+    moved_g = max(abs(t.acc_z_g - 1.0) for t in telemetry)
+    return Moved(
+        Rotation.from_matrix(np.array(own)),
+        Rotation.from_matrix(np.array(seen)),
+        np.array(place_m),
+        moved_g,
+    )
+
+
+def turns_of(moved: Moved) -> Turns | None:
+    """A and B by all pairs of moments between which it was turned; None of no such pair."""
+    i, j = np.triu_indices(len(moved.own), 1)
+    size = (moved.own[j] * moved.own[i].inv()).magnitude()
+    kept = (size >= LEAST_STEP_RAD) & (size <= MOST_STEP_RAD)
+    if kept.sum() < 3:
+        return None
+    i, j, size = i[kept], j[kept], size[kept]
+    world_own, world_seen = ((R[j] * R[i].inv()).as_rotvec() for R in (moved.own, moved.seen))
+    body_own, body_seen = ((R[i].inv() * R[j]).as_rotvec() for R in (moved.own, moved.seen))
+    A, many, axis = _rotation_between(world_own, world_seen)
+    B_T, many_body, _ = _rotation_between(body_own, body_seen)
+    unexplained = float(np.mean(np.linalg.norm(world_seen - world_own @ A.T, axis=1) / size))
+    about_z = abs(float(axis[2])) > math.cos(math.radians(UPRIGHT_DEG))
+    up = A[:, 2] if many else A @ axis * math.copysign(1.0, axis[2]) if about_z else None
+    return Turns(up, Rotation.from_matrix(B_T.T) if many_body else None, unexplained)
+
+
+def _rotation_between(before: Array, after: Array) -> tuple[Array, bool, Array]:
+    """The rotation that takes (n, 3) to (n, 3), whether the vectors span more than one axis,
+    and the axis that they have most of."""
+    u, _, vt = np.linalg.svd(after.T @ before)
+    sign = np.sign(np.linalg.det(u @ vt))
+    axis = np.linalg.eigh(before.T @ before)[1][:, 2]  # the largest comes last
+    aside_rad = np.linalg.norm(before - np.outer(before @ axis, axis), axis=1)
+    many = bool(np.quantile(aside_rad, MANY_SHARE) > LEAST_STEP_RAD)
+    return u @ np.diag([1.0, 1.0, sign]) @ vt, many, axis
+
+
+def is_enough(moved: Moved | None) -> bool:
+    """Lifted, turned and tilted, and put back: more would tell no more."""
+    turns = None if moved is None else turns_of(moved)
+    if moved is None or turns is None or turns.up is None or turns.body is None:
+        return False
+    far_m = np.linalg.norm(moved.ways_m, axis=1)
+    is_back = far_m[-1] < STILL_M and _turned_rad(moved.own)[-1] < MOVED_RAD
+    return bool(is_back) and float(far_m.max()) > 2.0 * LIFTED_M
+
+
+def _turned_rad(attitudes: Rotation) -> Array:
+    """Each attitude's turn from the first, (n,)."""
+    return np.asarray((attitudes[0].inv() * attitudes).magnitude())
+
+
+def hand_finding(moved: Moved | None, config: PositioningConfig) -> Finding:
+    """The comparison of vehicle and capture: the gravest that was found."""
+    if moved is None:
+        return skipped("no moments at which both vehicle and capture said something", HOW_TO_TURN)
+    own_rad, seen_rad = (float(_turned_rad(R).max()) for R in (moved.own, moved.seen))
+    way_m = float(np.linalg.norm(moved.ways_m, axis=1).max())
+    body = f"rigid body {config.body!r}"
+    others = "it is another body's: correct positioning.body"
+    moves = own_rad > MOVED_RAD or moved.moved_g > MOVED_G
+    follows = seen_rad > STILL_RAD or way_m > STILL_M
+    if moves and not follows:
+        return failed(f"the vehicle moves, and the {body} stands still", others)
+    if not moves and (way_m > MOVED_M or seen_rad > MOVED_RAD):
+        return failed(f"the {body} moves, and the vehicle stands still", others)
+    if not moves:
+        return skipped("it was not moved", HOW_TO_TURN)
+    if way_m > REACH_M:
+        found = f"the {body} moved by {way_m:.0f} m: these look like millimetres"
+        return failed(found, "set the unit of the capture's stream to metres")
+    turns = turns_of(moved)
+    if turns is not None and turns.unexplained > STRANGER:
+        advice = (
+            "it is another body's, or its markers are too few or too symmetric to tell its turns"
+        )
+        return failed(f"the {body} does not turn as the vehicle does", advice)
+    up = None if turns is None else turns.up
+    risen = _rise(moved.ways_m, up)
+    wrong = (None if up is None else _wrong_up(up, risen)) or _sideways(risen)
+    if wrong is not None:
+        return wrong
+    if turns is None or turns.up is None or turns.body is None:
+        turned_deg = math.degrees(own_rad)
+        found = f"turned by {turned_deg:.0f} deg, about too few axes to tell all"
+        return warned(found, HOW_TO_TURN)
+    return _body_finding(turns.body, risen, config)
+
+
+def _rise(ways_m: Array, up: Array | None) -> Array | None:
+    """The place at its farthest, (3,) from the first; where the vertical is known, at its
+    farthest along that. None where it was not lifted."""
+    far_m = np.linalg.norm(ways_m, axis=1)
+    far = ways_m[int(np.argmax(far_m if up is None else np.abs(ways_m @ up)))]
+    if float(np.linalg.norm(far)) < LIFTED_M:
+        far = ways_m[int(np.argmax(far_m))]
+    return far if float(np.linalg.norm(far)) >= LIFTED_M else None
+
+
+def _wrong_up(up: Array, risen: Array | None) -> Finding | None:
+    """Of the vertical in the capture's world, (3,)."""
+    off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
+    axis = nearest_axis(up)
+    if off_deg > UPRIGHT_DEG and axis is None:
+        found = f"the capture's world is tilted by {off_deg:.0f} deg: up is {_xyz(up)}"
+        return failed(found, "calibrate its volume anew, with z up")
+    if off_deg > UPRIGHT_DEG:
+        advice = "set its world to z up, and define the rigid body anew with the vehicle level"
+        return failed(f"swapped axes: up is {axis} in the motion capture", advice)
+    if risen is not None and risen[2] < 0.0 and abs(risen[2]) == max(abs(risen)):
+        advice = "its axes are left-handed: calibrate its volume anew, with z up"
+        return failed("mirrored: lifted, the body goes down in the capture", advice)
+    return None
+
+
+def _xyz(vector: Array) -> str:
+    return " ".join(f"{float(v):.2f}" for v in vector)
+
+
+def _sideways(risen: Array | None) -> Finding | None:
+    """Of a body that rose along another axis than z."""
+    axis = "z" if risen is None else nearest_axis(risen / np.linalg.norm(risen))
+    if risen is None or axis == "z":
+        return None
+    along = f"along its {axis}" if axis else f"by x {risen[0]:.2f}, y {risen[1]:.2f} m"
+    return failed(
+        f"swapped axes: lifted, the body goes {along} in the motion capture",
+        "set its world to z up; if you carried it aside, once more, straight up",
+    )
+
+
+def _body_finding(body: Rotation, risen: Array | None, config: PositioningConfig) -> Finding:
+    """`body`: what is left of the body's turn, beyond the profile's."""
+    off_deg = math.degrees(float(body.magnitude()))
+    if off_deg > BODY_WARN_DEG:
+        profiled = rotation_from_rpy(*(math.radians(a) for a in config.body_rpy_deg))
+        rpy = rpy_from_rotation(body.as_matrix() @ profiled)
+        wanted = ", ".join(f"{math.degrees(angle):.0f}" for angle in rpy)
+        verdict = failed if off_deg > BODY_FAIL_DEG else warned
+        return verdict(
+            f"the rigid body's axes are turned by {off_deg:.0f} deg against the vehicle's",
+            f"set positioning.body_rpy_deg: [{wanted}], or define the body anew with the vehicle "
+            f"along x",
+        )
+    found = f"turns as the vehicle does, within {off_deg:.0f} deg"
+    if risen is None:
+        return warned(f"{found}; it was not lifted", HOW_TO_TURN)
+    return passed(f"{found}; rose by {risen[2]:.2f} m")
+
+
+# --- What the hand found, written down for `fly` ------------------------------------------------
+
+COMPARED = "compared"
+
+
+def comparison_rows(
+    config: PositioningConfig, uri: str, now: datetime, *, simulated: bool
+) -> list[Row]:
+    """Whether `fly` finds a comparison by hand of this motion capture: one row, none with decks,
+    nor for the simulator's own vehicle, whose room is right as it is built."""
+    if config.by != "mocap" or simulated:
+        return []
+    return [_record_row(load_comparison(config, vehicle_uri(uri)), now)]
+
+
+def save_row(lifted: Finding, config: PositioningConfig, uri: str, now: datetime) -> Row:
+    """Write down what the hand found, and the row of it. A lift that showed nothing is none."""
+    vehicle = vehicle_uri(uri)
+    if lifted.verdict is Verdict.SKIPPED:
+        return _record_row(load_comparison(config, vehicle), now)
+    record = Comparison(now, lifted.verdict is Verdict.PASS, lifted.found)
+    why = save_comparison(config, vehicle, record)
+    if why is None:
+        return _record_row(record, now)
+    standing = load_comparison(config, vehicle)
+    if not record.passed and standing.objection(now) is None:
+        found = f"what was found could not be written, and fly goes by an older pass: {why}"
+        advice = "free some space, or give back the right to write there; do not fly before"
+        return Row(COMPARED, *failed(found, advice))
+    return Row(
+        COMPARED, *warned(f"not written, so fly does not know of it: {why}", "then once more")
+    )
+
+
+def _record_row(record: ComparisonRecord, now: datetime) -> Row:
+    objection = record.objection(now)
+    if objection is None:
+        assert isinstance(record, Comparison)
+        return Row(COMPARED, *passed(record.text(now)))
+    found, advice = objection
+    return Row(COMPARED, *warned(f"{found}; fly refuses", advice))

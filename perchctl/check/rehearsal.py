@@ -1,63 +1,34 @@
 """The flight loop's senses on live pictures for a few seconds: what they see, how long it takes.
 
-The vehicle stays as it is: nothing is sent.
+The vehicle stays as it is: a rehearsal has only the telemetry of a link, and can send nothing.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
 
 from perchctl.camera import FrameSource, WrappedSource
 from perchctl.flight import Clock, FlightInputs
-from perchctl.link import Guard, SentCallback, ignore_sent
 from perchctl.profile import Profile
 from perchctl.target import PrintCheck, PrintVerdict
-from perchctl.values import replace
-from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
-from perchctl.vision import Detections, Frame, Pipeline, TargetEstimate
+from perchctl.vehicle import Telemetry
+from perchctl.vision import MARKERS, Detections, Frame, Pipeline, TargetEstimate, refine_lines
 
 REHEARSED_S = 3.0
 WARM_FRAMES = 3
 """The first frames load libraries: how long they took says nothing."""
 KEPT_FRAMES = 12
 
-
-class Silent:
-    """A link to nothing, where there is no vehicle."""
-
-    def connect(self) -> None:
-        return None
-
-    def measured_by(self) -> MeasuredBy:
-        return MeasuredBy()
-
-    def telemetry(self) -> list[Telemetry]:
-        return []
-
-    def send(self, command: Command) -> None:
-        return None
-
-    def external(self, place: ExternalPosition) -> bool:
-        return False
-
-    def problem(self, now_s: float) -> str | None:
-        return None
-
-    def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
-        return None
-
-    def close(self) -> None:
-        return None
-
-
-class Listened(Protocol):
-    """What of a link is heard here."""
-
-    def telemetry(self) -> list[Telemetry]: ...
+TakeTelemetry = Callable[[], list[Telemetry]]
+"""Gives what came since the last time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +39,25 @@ class Looked:
     detections: Detections
 
 
+@dataclass(frozen=True)
+class Light:
+    """Mean grey level, 0 to 255, and the share of pixels that are clipped white."""
+
+    mean: float
+    white: float
+
+
+@dataclass(frozen=True)
+class Blur:
+    """Sigma of the edges of the target's markers, px: of the sharpest and the softest side."""
+
+    least_px: float
+    most_px: float
+
+
 @dataclass(eq=False)
 class Rehearsal:
-    """What came of it.
+    """Result of a rehearsal.
 
     Attributes:
         arrivals: index and time of arrival of each picture that was taken up.
@@ -81,6 +68,8 @@ class Rehearsal:
         looked: the newest few; found: of how many pictures there was a target, and mirrored ones.
         silent_s: since the last picture, at the end.
         target: where it was at the end; None where it was not seen then.
+        light, noise, blur: what the pictures are like, noise as a sigma in grey levels; None
+            where it could not be measured.
     """
 
     live: bool
@@ -100,6 +89,17 @@ class Rehearsal:
     target: TargetEstimate | None = None
     height_m: float | None = None
     print_verdict: PrintVerdict | None = None
+    light: Light | None = None
+    noise: float | None = None
+    blur: Blur | None = None
+
+    @property
+    def frame_period_s(self) -> float | None:
+        """Between two pictures; None of too few, or of a recording."""
+        if not self.live or len(self.arrivals) < 2:
+            return None
+        (first, begin_s), (last, end_s) = self.arrivals[0], self.arrivals[-1]
+        return (end_s - begin_s) / (last - first) if last > first else None
 
 
 class _Noted(WrappedSource):
@@ -112,8 +112,29 @@ class _Noted(WrappedSource):
         return self.newest
 
 
+@dataclass(frozen=True)
+class _TelemetryOnly:
+    """All that the senses get of the link. With `feet_m` the vehicle stands there: one that gets
+    no position has an estimate that runs away."""
+
+    take: TakeTelemetry
+    feet_m: tuple[float, float, float] | None
+
+    def telemetry(self) -> list[Telemetry]:
+        samples, feet_m = self.take(), self.feet_m
+        if feet_m is None:
+            return samples
+        return [replace(t, position_m=feet_m, velocity_mps=(0.0, 0.0, 0.0)) for t in samples]
+
+
+def telemetry_for(take: TakeTelemetry, profile: Profile) -> _TelemetryOnly:
+    """The link's telemetry as a rehearsal uses it."""
+    by_target = profile.positioning.by == "target"
+    return _TelemetryOnly(take, (0.0, 0.0, profile.safety.ground_z_m) if by_target else None)
+
+
 def rehearse(
-    link: Listened,
+    take: TakeTelemetry,
     source: FrameSource,
     pipeline: Pipeline,
     profile: Profile,
@@ -127,7 +148,7 @@ def rehearse(
     move.
     """
     noted = _Noted(source)
-    senses = FlightInputs(_only_heard(link, profile), noted, pipeline, profile)
+    senses = FlightInputs(telemetry_for(take, profile), noted, pipeline, profile)
     done = Rehearsal(source.live)
     prints = PrintCheck(pipeline.camera, profile.target)
     period_s = 1.0 / profile.link.loop_hz
@@ -152,6 +173,8 @@ def rehearse(
     newest = senses.history.newest
     done.height_m = None if newest is None else newest.position_m[2] - profile.safety.ground_z_m
     done.print_verdict = prints.verdict() if prints.judged else None
+    done.light, done.noise = _light(done.looked), _noise(done.looked)
+    done.blur = _blur(done.looked, pipeline)
     return done
 
 
@@ -183,30 +206,47 @@ def _note(
     done.looked = [*done.looked[1 - KEPT_FRAMES :], Looked(frame, seen)]
 
 
-class _OnlyHeard(Silent):
-    def __init__(self, link: Listened) -> None:
-        self._link = link
+# --- What the pictures are like -----------------------------------------------------------------
 
-    def telemetry(self) -> list[Telemetry]:
-        return self._link.telemetry()
+_CALM = 0.98  # of the differences: edges that moved are no noise
+_MEAN_OF_NORMAL = 0.7979  # of |x|, standard normal
 
 
-class _Stands(_OnlyHeard):
-    """A vehicle that nobody tells its position here: its estimate runs away, and it stands."""
-
-    def __init__(self, link: Listened, ground_z_m: float) -> None:
-        super().__init__(link)
-        self._feet_m = (0.0, 0.0, ground_z_m)
-
-    def telemetry(self) -> list[Telemetry]:
-        return [
-            replace(sample, position_m=self._feet_m, velocity_mps=(0.0, 0.0, 0.0))
-            for sample in super().telemetry()
-        ]
+def _light(looked: Sequence[Looked]) -> Light | None:
+    """Of the newest picture."""
+    if not looked:
+        return None
+    image = looked[-1].frame.image[::2, ::2]
+    return Light(float(image.mean()), float(np.mean(image >= 250)))
 
 
-def _only_heard(link: Listened, profile: Profile) -> Silent:
-    """So that nothing here can send."""
-    if profile.positioning.by == "target":
-        return _Stands(link, profile.safety.ground_z_m)
-    return _OnlyHeard(link)
+def _noise(looked: Sequence[Looked]) -> float | None:
+    """Sigma in grey levels, from what differs between neighbouring pictures at rest; None of
+    fewer than two."""
+    pairs = [(a.frame.image, b.frame.image) for a, b in pairwise(looked)]
+    sigmas = [_noise_between(a, b) for a, b in pairs if a.shape == b.shape]
+    return float(np.median(sigmas)) if sigmas else None
+
+
+def _noise_between(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
+    difference = np.abs(one[::2, ::2].astype(np.int16) - other[::2, ::2])
+    calm = np.sort(difference.ravel())[: max(1, int(_CALM * difference.size))]
+    return float(calm.mean()) / _MEAN_OF_NORMAL / math.sqrt(2.0)
+
+
+def _blur(looked: Sequence[Looked], pipeline: Pipeline) -> Blur | None:
+    """By the target's own edges; None where it was not seen."""
+    least, most = [], []
+    for each in looked:
+        for name in MARKERS:
+            seen = each.detections.get(name)
+            if seen is None:
+                continue
+            rim = pipeline.detector.patterns[name].rim
+            corners = seen.corners_px.reshape(1, 4, 2)
+            (refined,) = refine_lines(each.frame.image, corners, [rim], pipeline.camera)
+            if refined is not None:
+                least.append(refined.least_blur_px)
+                most.append(refined.blur_px)
+                break  # the large one, where there is one
+    return Blur(float(np.median(least)), float(np.median(most))) if least else None

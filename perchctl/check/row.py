@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple, ParamSpec
+
+from perchctl.flight import Problem
 
 
 class Verdict(StrEnum):
@@ -16,12 +20,6 @@ class Verdict(StrEnum):
     """Do not fly like this."""
     SKIPPED = "skipped"
     """Could not be known; `found` says why. Never taken for a pass."""
-
-    def worse_than(self, other: Verdict) -> bool:
-        return _ORDER.index(self) > _ORDER.index(other)
-
-
-_ORDER = (Verdict.PASS, Verdict.SKIPPED, Verdict.WARN, Verdict.FAIL)
 
 
 @dataclass(frozen=True)
@@ -36,30 +34,76 @@ class Row:
     """What to do; empty on a pass."""
 
 
-def passed(name: str, found: str) -> Row:
-    return Row(name, Verdict.PASS, found)
+class Finding(NamedTuple):
+    """The answer to a question whose name is known elsewhere: a `Row` without it."""
+
+    verdict: Verdict
+    found: str
+    advice: str = ""
 
 
-def warned(name: str, found: str, advice: str) -> Row:
-    return Row(name, Verdict.WARN, found, advice)
+class Unknown(Exception):
+    """A question could not be answered; `finding` is the skipped one."""
+
+    def __init__(self, why: str, advice: str = "") -> None:
+        super().__init__(why)
+        self.finding = skipped(why, advice)
 
 
-def failed(name: str, found: str, advice: str) -> Row:
-    return Row(name, Verdict.FAIL, found, advice)
+P = ParamSpec("P")
 
 
-def skipped(name: str, why: str, advice: str = "") -> Row:
-    return Row(name, Verdict.SKIPPED, why, advice)
+def ask(name: str, judge: Callable[P, Finding], *args: P.args, **kwargs: P.kwargs) -> Row:
+    """The row of that name: what `judge` finds, skipped where it raises `Unknown`."""
+    try:
+        return Row(name, *judge(*args, **kwargs))
+    except Unknown as unknown:
+        return Row(name, *unknown.finding)
 
 
-def worse(one: Row, other: Row) -> Row:
-    return one if one.verdict.worse_than(other.verdict) else other
+def ask_all(
+    judges: Mapping[str, Callable[P, Finding]], *args: P.args, **kwargs: P.kwargs
+) -> list[Row]:
+    """A row for each judge, by its name, in the mapping's order."""
+    return [ask(name, judge, *args, **kwargs) for name, judge in judges.items()]
+
+
+def skip_all(names: Iterable[str], why: str, advice: str = "") -> list[Row]:
+    """A skipped row for each name, all for one reason."""
+    return [Row(name, *skipped(why, advice)) for name in names]
+
+
+def passed(found: str) -> Finding:
+    return Finding(Verdict.PASS, found)
+
+
+def warned(found: str, advice: str) -> Finding:
+    return Finding(Verdict.WARN, found, advice)
+
+
+def failed(found: str, advice: str) -> Finding:
+    return Finding(Verdict.FAIL, found, advice)
+
+
+def skipped(why: str, advice: str = "") -> Finding:
+    return Finding(Verdict.SKIPPED, why, advice)
+
+
+def by_problem(problem: Problem | None, found: str) -> Finding:
+    """By a criterion that `fly` has, too: fails with its problem, or passes with `found`."""
+    return passed(found) if problem is None else failed(problem.found, problem.advice)
 
 
 def by_limits(
-    name: str, value: float, warn_above: float, fail_above: float, found: str, advice: str
-) -> Row:
-    """A figure that is the better the smaller it is; one that is no number fails."""
+    value: float, warn_above: float, fail_above: float, found: str, advice: str
+) -> Finding:
+    """By a figure that is the better the smaller it is; one that is no number fails."""
     if value <= warn_above:
-        return passed(name, found)
-    return (warned if value <= fail_above else failed)(name, found, advice)
+        return passed(found)
+    return (warned if value <= fail_above else failed)(found, advice)
+
+
+def worst(*findings: Finding) -> Finding:
+    """The gravest of them, the first of several."""
+    order = (Verdict.PASS, Verdict.SKIPPED, Verdict.WARN, Verdict.FAIL)
+    return max(findings, key=lambda finding: order.index(finding.verdict))

@@ -9,23 +9,11 @@ from dataclasses import dataclass
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import FrameSource, device_listing, open_source, without_password
-from perchctl.check import (
-    camera,
-    capture,
-    compared,
-    computer,
-    gone,
-    hand,
-    health,
-    lift,
-    link,
-    scan,
-    sight,
-)
-from perchctl.check.lift import WITHIN_S as LIFT_S
+from perchctl.check import camera, capture, vehicle
+from perchctl.check.computer import log_folder_finding, loop_finding
 from perchctl.check.profile import quick_rows
-from perchctl.check.rehearsal import REHEARSED_S, Listened, Rehearsal, Silent, rehearse
-from perchctl.check.row import Row, failed, passed, skipped
+from perchctl.check.rehearsal import REHEARSED_S, Rehearsal, TakeTelemetry, rehearse
+from perchctl.check.row import Finding, Row, ask, failed, passed, skip_all, skipped
 from perchctl.errors import ConnectionFailed, PerchError, UsageError
 from perchctl.flight import (
     FlyOptions,
@@ -35,14 +23,11 @@ from perchctl.flight import (
     simulated_vehicle,
     wall_date,
 )
-from perchctl.link import ProbeLink, ScanResult, address_of, check_uri
-from perchctl.link import find_vehicles as scan_for
+from perchctl.link import ProbeLink, ScanResult, address_of, check_uri, find_vehicles
 from perchctl.positioning import CaptureSource, open_capture
 from perchctl.profile import PositioningConfig, Profile
-from perchctl.vehicle import Telemetry
 from perchctl.vision import Pipeline, make_pipeline
 
-NO_VEHICLE = "the vehicle does not answer"
 AFTERWARDS = "the motor test ends by itself within 15 s: keep clear of the propellers"
 
 
@@ -57,97 +42,70 @@ class CheckScope:
 
     may_turn_motors: Callable[[], bool] | None = None
     lift: bool = False
-    listen_s: float = link.LISTEN_S
+    listen_s: float = vehicle.LISTEN_S
     rehearse_s: float = REHEARSED_S
-    lift_s: float = LIFT_S
+    lift_s: float = vehicle.LIFT_S
     health_s: float | None = None
     tell: Callable[[str], None] = lambda text: None
     open_capture: Callable[[PositioningConfig], CaptureSource] = open_capture
-    capture_s: float = capture.LISTEN_S
-    other_vehicles: Callable[[str], ScanResult] = lambda uri: scan_for([address_of(uri)])
-
-
-def check(options: FlyOptions, wanted: CheckScope) -> Iterator[Row]:
-    """Rows as they are found. Errors, before anything is opened: InvalidValue, NotFound (the
-    profile's files), UsageError (a library that is missing, or does not load)."""
-    check_options(options)
-    profile = options.profile
-    calibrated = profile_camera(profile.camera)
-    pipeline = make_pipeline(profile, calibrated)
-    rehearsal: Rehearsal | None = None
-    with contextlib.ExitStack() as stack:
-        uri, spec = options.uri, options.source
-        if options.simulated:
-            wanted.tell("starting the simulated vehicle")
-            simulated = stack.enter_context(simulated_vehicle(options, calibrated))
-            uri = simulated.uri
-            spec = simulated.stream_url if spec.startswith("sim:") else spec
-            profile = _with_capture_at(profile, simulated.capture)
-        room = _opened_capture(profile.positioning, wanted, stack)
-        probe = ProbeLink(uri, profile.link, time.monotonic)
-        stack.callback(probe.close)
-        heard: Listened = Silent()
-        wanted.tell(f"connecting to {options.uri}")
-        try:
-            probe.connect()
-        except ConnectionFailed as error:
-            yield from _no_vehicle(options, error, wanted)
-            yield from _room(room, lambda: [], profile, wanted)
-            yield from _compared(options.uri, profile)
-        else:
-            heard = probe
-            yield passed("address", f"{options.uri} answers")
-            yield from _vehicle(probe, options.uri, profile, room, wanted)
-        shown, remarks = without_password(options.source), list[str]()
-        wanted.tell(f"opening the camera {shown}")
-        try:
-            source = _source(spec, options, stack, remarks)
-        except PerchError as error:
-            yield from camera.refused(error, device_listing())
-            yield from sight.unseen("no picture comes", profile)
-        else:
-            yield camera.opened_row(shown, device_listing(), remarks)
-            rehearsal = yield from _camera(heard, source, pipeline, options, wanted)
-    yield computer.loop_row(rehearsal, profile)
-    yield computer.log_folder_row(options.log_dir)
-    yield from quick_rows(options)
+    capture_s: float = capture.CAPTURE_S
+    other_vehicles: Callable[[str], ScanResult] = lambda uri: find_vehicles([address_of(uri)])
 
 
 def scan_rows(uri: str | None) -> list[Row]:
     """`--scan`: what answers, at the usual address and at that of `uri`. Errors: InvalidValue."""
     if uri is not None:
         check_uri(uri)
-    return scan.rows(scan_for([address_of(uri or "")]))
+    return vehicle.answering_rows(find_vehicles([address_of(uri or "")]))
 
 
-def _no_vehicle(options: FlyOptions, error: ConnectionFailed, wanted: CheckScope) -> Iterator[Row]:
-    found, _, help_text = str(error).partition("\n")
-    advice = help_text
-    if not help_text:
-        wanted.tell("nothing answers there: looking who else does")
-        advice = scan.others(options.uri, wanted.other_vehicles(options.uri))
-    yield failed("address", found, advice)
-    for name in (*link.NAMES, lift.NAME, *health.NAMES):
-        yield skipped(name, NO_VEHICLE)
+def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
+    """Rows as they are found. Errors, before anything is opened: InvalidValue, NotFound (the
+    profile's files), UsageError (a library that is missing, or does not load)."""
+    check_options(options)
+    calibrated = profile_camera(options.profile.camera)
+    pipeline = make_pipeline(options.profile, calibrated)
+    with contextlib.ExitStack() as stack:
+        uri, spec, profile = options.uri, options.source, options.profile
+        if options.simulated:
+            scope.tell("starting the simulated vehicle")
+            simulated = stack.enter_context(simulated_vehicle(options, calibrated))
+            uri = simulated.uri
+            spec = simulated.stream_url if spec.startswith("sim:") else spec
+            positioning = capture_for_vehicle(profile.positioning, simulated.capture)
+            profile = profile.model_copy(update={"positioning": positioning})
+        room = _open_room(profile, scope, stack)
+        probe = ProbeLink(uri, profile.link, time.monotonic)
+        stack.callback(probe.close)
+        session = VehicleSession(probe, options.uri, profile, room, scope)
+        take = yield from session.rows()
+        shown, remarks = without_password(options.source), list[str]()
+        scope.tell(f"opening the camera {shown}")
+        rehearsal: Rehearsal | None = None
+        try:
+            source = _open_camera(spec, options, remarks)
+        except PerchError as error:
+            yield from camera.refused_rows(error, device_listing(), options.profile)
+        else:
+            stack.callback(source.close)
+            yield Row("camera", *camera.opened_finding(shown, device_listing(), remarks))
+            rehearsal = yield from _camera_rows(take, source, pipeline, options.profile, scope)
+    yield ask("loop", loop_finding, rehearsal, options.profile)
+    yield ask("log folder", log_folder_finding, options.log_dir)
+    yield from quick_rows(options)
 
 
 Room = CaptureSource | str | None
 """An open motion capture, or why it could not be opened; None where decks do it."""
 
 
-def _with_capture_at(profile: Profile, simulated: tuple[str, str] | None) -> Profile:
-    positioning = capture_for_vehicle(profile.positioning, simulated)
-    return profile.model_copy(update={"positioning": positioning})
-
-
-def _opened_capture(
-    config: PositioningConfig, wanted: CheckScope, stack: contextlib.ExitStack
-) -> Room:
+def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) -> Room:
+    config = profile.positioning
     if config.by != "mocap":
         return None
-    wanted.tell(f"connecting to {config.label}")
+    scope.tell(f"connecting to {config.label}")
     try:
-        opened = wanted.open_capture(config)
+        opened = scope.open_capture(config)
     except UsageError:
         raise  # a library that does not load is the computer's fault, here as in `fly`
     except PerchError as error:
@@ -156,125 +114,156 @@ def _opened_capture(
     return opened
 
 
-def _room(
-    room: Room, heard: Callable[[], list[Telemetry]], profile: Profile, wanted: CheckScope
-) -> Iterator[Row]:
-    """The rows of the motion capture; none with decks."""
-    if room is None:
-        return
-    if isinstance(room, str):
-        yield from capture.refused(room, profile.positioning)
-        return
-    wanted.tell(f"listening to {profile.positioning.label} for {wanted.capture_s:g} s")
-    seen = capture.listen(heard, room, time.monotonic, time.sleep, wanted.capture_s)
-    yield from capture.rows(seen, profile)
+@dataclass(frozen=True)
+class VehicleSession:
+    """The rows of a vehicle and of its motion capture. `uri` is as it was given; the probe's may
+    be that of a simulated one."""
 
+    probe: ProbeLink
+    uri: str
+    profile: Profile
+    room: Room
+    scope: CheckScope
 
-def _lifted(probe: ProbeLink, room: Room, profile: Profile, wanted: CheckScope) -> Row:
-    """By its own position, or by a motion capture against its attitude."""
-    if profile.positioning.by == "target":
-        return skipped(lift.NAME, "only in flight it is told its position, by the target")
-    if room is None:
-        wanted.tell(f"now, within {wanted.lift_s:g} s: {lift.HOW}")
-        return lift.row(lift.lift_of(lift.watch(probe, time.sleep, wanted.lift_s)))
-    if isinstance(room, str):
-        return skipped(lift.NAME, f"no {profile.positioning.label}")
-    config = profile.positioning
-    wanted.tell(f"now, within {wanted.lift_s:g} s: {hand.HOW}")
-
-    def enough(so_far: capture.Listened) -> bool:
-        moved = hand.paired(so_far.telemetry, so_far.places(config))
-        return moved is not None and hand.is_enough(moved)
-
-    seen = capture.listen(probe.telemetry, room, time.monotonic, time.sleep, wanted.lift_s, enough)
-    return hand.row(hand.paired(seen.telemetry, seen.places(config)), config)
-
-
-def _compared(uri: str, profile: Profile) -> list[Row]:
-    return compared.comparison_rows(
-        profile.positioning, uri, wall_date(), simulated=uri.startswith("sim://")
-    )
-
-
-def _vehicle(
-    probe: ProbeLink, uri: str, profile: Profile, room: Room, wanted: CheckScope
-) -> Iterator[Row]:
-    wanted.tell(f"listening to the vehicle for {wanted.listen_s:g} s")
-    seen = link.look(probe, uri, wanted.listen_s)
-    if lost := probe.lost():
-        yield failed("packets", f"the link was lost: {lost}", "see address; restart the vehicle")
-        for name in (*link.NAMES[1:], lift.NAME, *health.NAMES):
-            yield skipped(name, NO_VEHICLE)
-        yield from _compared(uri, profile)
-        return
-    yield from link.rows(seen, profile)
-    yield from _room(room, probe.telemetry, profile, wanted)
-    yield from _with_a_hand(probe, uri, room, profile, wanted)
-    yield from gone.rows(probe)
-
-
-def _with_a_hand(
-    probe: ProbeLink, uri: str, room: Room, profile: Profile, wanted: CheckScope
-) -> Iterator[Row]:
-    """What somebody has to lift it for, or to keep clear of; it may end with a dead vehicle."""
-    if wanted.lift:
-        lifted = _lifted(probe, room, profile, wanted)
-        yield lifted
-        rows = _compared(uri, profile)
-        yield from [compared.kept(lifted, profile.positioning, uri, wall_date())] if rows else []
-    else:
-        yield lift.unasked()
-        yield from _compared(uri, profile)
-    if wanted.may_turn_motors is None:
-        yield from health.unasked()
-        return
-    if why := health.hindrance(probe.newest(), probe.age_s(), profile):
-        yield from health.unasked(f"not begun: {why}")
-    elif not wanted.may_turn_motors():
-        yield from health.unasked("not confirmed")
-    else:
-        wanted.tell("turning each propeller for a moment: keep clear")
+    def rows(self) -> Generator[Row, None, TakeTelemetry]:
+        """Yields the rows; returns where telemetry comes from, if only from nowhere."""
+        self.scope.tell(f"connecting to {self.uri}")
         try:
-            yield from health.run(probe, profile, time.sleep, wanted.health_s)
+            self.probe.connect()
+        except ConnectionFailed as error:
+            yield from self._silent_rows(error)
+            return list
+        yield Row("address", *passed(f"{self.uri} answers"))
+        yield from self.answering_rows()
+        return self.probe.telemetry
+
+    def _silent_rows(self, error: ConnectionFailed) -> Iterator[Row]:
+        found, _, advice = str(error).partition("\n")
+        if not advice:
+            self.scope.tell("nothing answers there: looking who else does")
+            advice = vehicle.advice_for_silent(self.uri, self.scope.other_vehicles(self.uri))
+        yield Row("address", *failed(found, advice))
+        yield from _not_answering([*vehicle.VEHICLE, vehicle.LIFTED, *vehicle.MOTORS])
+        yield from self._room_rows(list)
+        yield from self._compared_rows()
+
+    def answering_rows(self) -> Iterator[Row]:
+        """Of a vehicle that is connected."""
+        self.scope.tell(f"listening to the vehicle for {self.scope.listen_s:g} s")
+        seen = vehicle.look(self.probe, self.uri, self.scope.listen_s)
+        if lost := self.probe.lost():
+            first, *rest = vehicle.VEHICLE
+            advice = "see address; restart the vehicle"
+            yield Row(first, *failed(f"the link was lost: {lost}", advice))
+            yield from _not_answering([*rest, vehicle.LIFTED, *vehicle.MOTORS])
+            yield from self._compared_rows()
+            return
+        for name, judge in vehicle.VEHICLE.items():
+            yield ask(name, judge, seen, self.profile)
+        yield from self._room_rows(self.probe.telemetry)
+        yield from self._lift_rows()
+        yield from self._motor_rows()
+        yield from vehicle.gone_rows(self.probe)
+
+    def _room_rows(self, take: TakeTelemetry) -> list[Row]:
+        """Of the motion capture; none with decks."""
+        config = self.profile.positioning
+        if self.room is None:
+            return []
+        if isinstance(self.room, str):
+            return capture.refused_rows(self.room, config)
+        seconds = self.scope.capture_s
+        self.scope.tell(f"listening to {config.label} for {seconds:g} s")
+        seen = capture.listen(take, self.room, time.monotonic, time.sleep, seconds)
+        return capture.capture_rows(seen, self.profile)
+
+    def _compared_rows(self) -> list[Row]:
+        simulated = self.uri.startswith("sim://")
+        return capture.comparison_rows(
+            self.profile.positioning, self.uri, wall_date(), simulated=simulated
+        )
+
+    def _lift_rows(self) -> Iterator[Row]:
+        """What somebody has to lift the vehicle for."""
+        compared = self._compared_rows()
+        if self.scope.lift:
+            lifted = self._lift_finding()
+            yield Row(vehicle.LIFTED, *lifted)
+            if compared:
+                config = self.profile.positioning
+                compared = [capture.save_row(lifted, config, self.uri, wall_date())]
+        else:
+            advice = "add --lift, and lift it by hand when told"
+            yield from skip_all([vehicle.LIFTED], "not asked for", advice)
+        yield from compared
+
+    def _lift_finding(self) -> Finding:
+        """By the vehicle's own position, or by a motion capture against its attitude."""
+        config, room, within_s = self.profile.positioning, self.room, self.scope.lift_s
+        if config.by == "target":
+            return skipped("only in flight it gets its position, by the target")
+        if room is None:
+            self.scope.tell(f"now, within {within_s:g} s: {vehicle.HOW_TO_LIFT}")
+            return vehicle.lift_finding(vehicle.watch_lift(self.probe, time.sleep, within_s))
+        if isinstance(room, str):
+            return skipped(f"no {config.label}")
+        self.scope.tell(f"now, within {within_s:g} s: {capture.HOW_TO_TURN}")
+
+        def moved(so_far: capture.Listened) -> capture.Moved | None:
+            return capture.paired(so_far.telemetry, so_far.places(config))
+
+        seen = capture.listen(
+            self.probe.telemetry, room, time.monotonic, time.sleep, within_s,
+            lambda so_far: capture.is_enough(moved(so_far)),
+        )  # fmt: skip
+        return capture.hand_finding(moved(seen), config)
+
+    def _motor_rows(self) -> list[Row]:
+        """What somebody has to keep clear of; it may end with a dead vehicle."""
+        probe, scope = self.probe, self.scope
+        if scope.may_turn_motors is None:
+            return skip_all(vehicle.MOTORS, "not asked for", "add --prop-test")
+        if why := vehicle.hindrance(probe.newest(), probe.age_s(), self.profile):
+            return skip_all(vehicle.MOTORS, f"not begun: {why}")
+        if not scope.may_turn_motors():
+            return skip_all(vehicle.MOTORS, "not confirmed")
+        scope.tell("turning each propeller for a moment: keep clear")
+        try:
+            return vehicle.motor_rows(probe, self.profile, time.sleep, scope.health_s)
         except KeyboardInterrupt:
-            wanted.tell(AFTERWARDS)
+            scope.tell(AFTERWARDS)
             raise
 
 
-def _source(
-    spec: str, options: FlyOptions, stack: contextlib.ExitStack, remarks: list[str]
-) -> FrameSource:
+def _not_answering(names: list[str]) -> list[Row]:
+    return skip_all(names, "the vehicle does not answer")
+
+
+def _open_camera(spec: str, options: FlyOptions, remarks: list[str]) -> FrameSource:
     config = options.profile.camera
     size_px = profile_camera(config).size_px
-    source = open_source(
+    return open_source(
         spec, config.start_latency_s, size_px, time.monotonic, config.start_timeout_s,
         config=config, tell=remarks.append,
     )  # fmt: skip
-    stack.callback(source.close)
-    return source
 
 
-def _camera(
-    heard: Listened,
+def _camera_rows(
+    take: TakeTelemetry,
     source: FrameSource,
     pipeline: Pipeline,
-    options: FlyOptions,
-    wanted: CheckScope,
+    profile: Profile,
+    scope: CheckScope,
 ) -> Generator[Row, None, Rehearsal | None]:
     """Yields the rows; returns the rehearsal, None where there could be none."""
-    size = camera.size_row(source.size_px, pipeline.camera.size_px)
+    size = camera.size_finding(source.size_px, pipeline.camera.size_px)
+    yield Row("size", *size)
     if size.verdict != "pass":
         why = "pictures of another size cannot be looked at"
-        yield from camera.unseen(why, size)
-        yield from sight.unseen(why, options.profile)
+        yield from skip_all(camera.names_of(profile), why)
         return None
-    yield size
-    wanted.tell(f"rehearsing on live pictures for {wanted.rehearse_s:g} s")
-    profile = options.profile
-    done = rehearse(heard, source, pipeline, profile, WallClock(), wanted.rehearse_s)
-    optical = camera.optical_of(done, pipeline)
-    design = camera.design_of(done, optical, pipeline, profile)
-    yield from camera.rows(done, optical, design, profile)
-    measured = optical.blur is not None
-    yield from sight.rows(done, design, measured, profile, pipeline.camera)
+    scope.tell(f"rehearsing on live pictures for {scope.rehearse_s:g} s")
+    done = rehearse(take, source, pipeline, profile, WallClock(), scope.rehearse_s)
+    design = camera.design_of(done, pipeline, profile)
+    yield from camera.picture_rows(done, design, profile, pipeline.camera)
     return done

@@ -1,17 +1,29 @@
-"""The work behind `perchctl check`: options in, a table or JSON and an exit code out."""
+"""`perchctl check`: everything that can be known on the ground, as a table or JSON."""
 
 from __future__ import annotations
 
 import json
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from perchctl.camera import CameraControl, ConnectedCamera, find_cameras
-from perchctl.check import CheckScope, Row, Verdict, check, scan_rows
+from perchctl.check import CheckScope, Row, Verdict, scan_rows
+from perchctl.check import check as check_rows
+from perchctl.commands.command_line import (
+    Command,
+    ProfileOption,
+    SourceOption,
+    UriOption,
+    examples,
+    new_app,
+    reporting,
+)
 from perchctl.commands.fly import resolve
 from perchctl.commands.interrupt import interruptible, unheeded
 from perchctl.commands.output import confirmed, say
@@ -30,88 +42,119 @@ SHOWN = {Verdict.PASS: "pass", Verdict.WARN: "warn", Verdict.FAIL: "FAIL", Verdi
 EXIT_CODE_OF = {"address": ConnectionFailed.exit_code, "camera": NotFound.exit_code}
 """Of a failing row; `SafetyAbort`'s of all others."""
 
-
-@dataclass(frozen=True)
-class CheckRequest:
-    """The command line as it was given; None is not given."""
-
-    profile: str = "sim"
-    uri: str | None = None
-    source: str | None = None
-    seed: int | None = None
-    log_dir: Path | None = None
-    scan: bool = False
-    cameras: bool = False
-    lift: bool = False
-    prop_test: bool = False
-    yes: bool = False
-    as_json: bool = False
+app = new_app()
 
 
-def run(request: CheckRequest, wanted: CheckScope | None = None) -> int:
-    """Look, print what was found, also so far as Ctrl-C let it come; returns the exit code.
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl check -p my_vehicle.yaml",
+        "perchctl check -p my_vehicle.yaml --lift",
+        "perchctl check --scan",
+    ),
+)
+@reporting
+def check(
+    profile: ProfileOption = "sim",
+    uri: UriOption = None,
+    source: SourceOption = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", help="Seed of the simulated scenario; 11 by default.")
+    ] = None,
+    log_dir: Annotated[
+        Path | None, typer.Option("--log-dir", help="Folder that the flight log will go to.")
+    ] = None,
+    scan: Annotated[
+        bool,
+        typer.Option("--scan", help="Only show which vehicles answer, on any channel and rate."),
+    ] = False,
+    cameras: Annotated[
+        bool,
+        typer.Option(
+            "--cameras",
+            help="Only list this computer's cameras: number, name, path, modes, controls.",
+        ),
+    ] = False,
+    lift: Annotated[
+        bool,
+        typer.Option("--lift", help="Also watch the position while you lift the vehicle by hand."),
+    ] = False,
+    prop_test: Annotated[
+        bool,
+        typer.Option(
+            "--prop-test", help="Also turn each propeller for a moment, and load the battery; asks."
+        ),
+    ] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Do not ask before --prop-test.")
+    ] = False,
+    as_json: Annotated[
+        bool,
+        typer.Option("--json", help="A list of name, verdict, found and advice on stdout."),
+    ] = False,
+) -> int:
+    """Look at vehicle, camera, computer and profile on the ground, and say what is not fit to fly.
 
-    `wanted` takes the place of what the request wants. Errors: those of the request and of the
-    profile's files.
+    A row passes, warns, fails, or is skipped where it could not be known. Nothing is armed, and
+    no motor turns but with --prop-test, which asks first. Exits with 0 when nothing fails, with
+    10 when the vehicle does not answer, 20 when the camera gives no picture, 52 for any other
+    failing row.
     """
-    _refuse_ignored(request)
-    if request.cameras:
-        return list_cameras(request.as_json)
-    if request.prop_test and not request.yes and not sys.stdin.isatty():
+    beyond = {"--source": source, "--seed": seed, "--log-dir": log_dir, "--lift": lift,
+              "--prop-test": prop_test}  # fmt: skip
+    given = any(value not in (None, False) for value in beyond.values())
+    if yes and not prop_test:
+        raise UsageError("--yes answers --prop-test: add that, or leave --yes out")
+    if scan and given:
+        raise UsageError("--scan only shows which vehicles answer: give it -u and --json at most")
+    if cameras and (given or scan or uri is not None):
+        raise UsageError("--cameras only lists this computer's cameras: give it --json at most")
+    if cameras:
+        return list_cameras(as_json)
+    if scan:
+        say("scanning all channels and rates")
+        return report(_scanned(uri), as_json)
+    if prop_test and not yes and not sys.stdin.isatty():
         raise UsageError("--prop-test turns the motors, and there is nobody to ask: add --yes")
-    rows: list[Row] = []
+    may_turn_motors = (lambda: yes or confirm_motors()) if prop_test else None
+    options = resolve(profile, uri, source, seed=seed, log_dir=log_dir)
+    scope = CheckScope(may_turn_motors=may_turn_motors, lift=lift, tell=say)
+    return report(check_rows(options, scope), as_json)
+
+
+def confirm_motors() -> bool:
+    """Whether somebody at the terminal allows the motors' test, now."""
+    return confirmed("About to turn each propeller. Is it free, the vehicle held by nobody?")
+
+
+def _scanned(uri: str | None) -> Iterator[Row]:
+    """The scan as an iterator, so that Ctrl-C may end it."""
+    yield from scan_rows(uri)
+
+
+def report(rows: Iterable[Row], as_json: bool) -> int:
+    """Print the rows, also so far as Ctrl-C or an error let them come; returns the exit code."""
+    found: list[Row] = []
     interrupted = False
     try:
         with interruptible():
-            for row in _rows(request, wanted or _wanted(request)):
-                rows.append(row)
+            for row in rows:
+                found.append(row)
     except KeyboardInterrupt:
         interrupted = True
     except PerchError:
-        if rows and not request.as_json:
-            print(table(rows, finished=False))
+        if found and not as_json:
+            print(table(found, finished=False))
         raise
     with unheeded():
-        if request.as_json:
-            print(json.dumps([asdict(row) for row in rows]))
-        elif rows:
-            print(table(rows, finished=not interrupted))
+        if as_json:
+            print(json.dumps([asdict(row) for row in found]))
+        elif found:
+            print(table(found, finished=not interrupted))
     if interrupted:
         say("Ctrl-C: this is what was found until then")
         return Interrupted.exit_code
-    return exit_code(rows)
-
-
-def _refuse_ignored(request: CheckRequest) -> None:
-    """Raises UsageError for options that would say nothing."""
-    if request.yes and not request.prop_test:
-        raise UsageError("--yes answers --prop-test: add that, or leave --yes out")
-    others = (request.source, request.seed, request.log_dir, request.lift, request.prop_test)
-    if request.scan and any(other not in (None, False) for other in others):
-        raise UsageError("--scan only shows which vehicles answer: give it -u and --json at most")
-    beside = (*others, request.scan, request.uri)
-    if request.cameras and any(other not in (None, False) for other in beside):
-        raise UsageError("--cameras only lists this computer's cameras: give it --json at most")
-
-
-def _rows(request: CheckRequest, wanted: CheckScope) -> Iterator[Row]:
-    if request.scan:
-        say("scanning all channels and rates")
-        yield from scan_rows(request.uri)
-        return
-    options = resolve(
-        request.profile, request.uri, request.source, seed=request.seed, log_dir=request.log_dir
-    )
-    yield from check(options, wanted)
-
-
-def _wanted(request: CheckRequest) -> CheckScope:
-    may_turn = (lambda: request.yes or _confirmed()) if request.prop_test else None
-    return CheckScope(may_turn_motors=may_turn, lift=request.lift, tell=say)
-
-
-def _confirmed() -> bool:
-    return confirmed("About to turn each propeller. Is it free, the vehicle held by nobody?")
+    return exit_code(found)
 
 
 def exit_code(rows: Sequence[Row]) -> int:
@@ -125,7 +168,8 @@ def exit_code(rows: Sequence[Row]) -> int:
 def table(rows: Sequence[Row], finished: bool = True) -> str:
     """At 80 columns: verdict, name, what was found, and below it what to do.
 
-    Rows that were skipped for one and the same reason share a line.
+    Rows that were skipped for one and the same reason share a line. Of a check that did not come
+    to its end nothing good is said.
     """
     lines: list[str] = []
     skipped: dict[tuple[str, str], list[str]] = {}
@@ -135,42 +179,30 @@ def table(rows: Sequence[Row], finished: bool = True) -> str:
         else:
             lines += _lines(SHOWN[row.verdict], row.name, row.found, row.advice)
     for (why, advice), names in skipped.items():
-        if len(names) == 1:
-            lines += _lines(SHOWN[Verdict.SKIPPED], names[0], why, advice)
-        else:
-            lines += _lines(SHOWN[Verdict.SKIPPED], "", f"{', '.join(names)}: {why}", advice)
-    return "\n".join([*lines, summary(rows, finished)])
-
-
-def _lines(verdict: str, name: str, found: str, advice: str) -> list[str]:
-    head = f"{verdict}  {name:<{NAME_WIDTH}}"
-    room = WIDTH - len(head)
-    text = textwrap.wrap(found, room, break_on_hyphens=False) or [""]
-    lines = [head + text[0]] + [" " * len(head) + more for more in text[1:]]
-    for part in advice.splitlines():
-        wrapped = textwrap.wrap(part, room - 3, break_on_hyphens=False) or [""]
-        if len(advice.splitlines()) > 1:
-            wrapped = [part]  # lines to be copied stay as they are
-        lines += (
-            [
-                " " * len(head) + ("-> " if n == 0 else "   ") + more
-                for n, more in enumerate(wrapped)
-            ]
-            if len(advice.splitlines()) == 1
-            else [f"  {more}" for more in wrapped]
-        )
-    return [line.rstrip() for line in lines]
-
-
-def summary(rows: Sequence[Row], finished: bool = True) -> str:
-    """The last line. Of a check that did not come to its end nothing good is said."""
+        name, found = (names[0], why) if len(names) == 1 else ("", f"{', '.join(names)}: {why}")
+        lines += _lines(SHOWN[Verdict.SKIPPED], name, found, advice)
     counts = {v: sum(row.verdict is v for row in rows) for v in Verdict}
-    told = ", ".join(f"{n} {SHOWN[v]}" for v, n in counts.items() if n)
+    counted = ", ".join(f"{n} {SHOWN[v]}" for v, n in counts.items() if n)
     failing = [row.name for row in rows if row.verdict is Verdict.FAIL]
     ends = [f"not fit to fly: {', '.join(failing)}"] if failing else []
     if not finished:
         ends.append("not finished, the rest is not known")
-    return f"{told}: {'; '.join(ends) or 'nothing fails'}"
+    return "\n".join([*lines, f"{counted}: {'; '.join(ends) or 'nothing fails'}"])
+
+
+def _lines(verdict: str, name: str, found: str, advice: str) -> list[str]:
+    head = f"{verdict}  {name:<{NAME_WIDTH}}"
+    margin = " " * len(head)
+    lines = _wrapped(found, head, margin) or [head.rstrip()]
+    if "\n" in advice:  # lines to be copied stay as they are
+        return lines + [f"  {line}" for line in advice.splitlines()]
+    return lines + _wrapped(advice, f"{margin}-> ", f"{margin}   ")
+
+
+def _wrapped(text: str, first: str, others: str) -> list[str]:
+    return textwrap.wrap(
+        text, WIDTH, initial_indent=first, subsequent_indent=others, break_on_hyphens=False
+    )
 
 
 # --- `perchctl check --cameras`: what this computer's cameras are called, and what they can ----

@@ -49,13 +49,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "calibrate",
         "Calibrate the camera, and report what its error means in mm at the target.",
     ),
-    "new-profile": (
-        "cli.new_profile",
-        "Write a profile of your vehicle, every key commented, in a short dialogue.",
-    ),
     "profile": (
-        "cli.profile",
-        "Show a profile as it is flown: every key with its value, unit, bounds and meaning.",
+        "profile",
+        "Show a profile as it is flown, every key explained, or write one of your vehicle (new).",
     ),
     "fit-weights": (
         "fit_weights",
@@ -66,7 +62,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Find the target in a camera, video or pictures, without a vehicle.",
     ),
     "check": (
-        "cli.check",
+        "check",
         "Look at vehicle, camera, computer and profile on the ground, and say what is not fit to "
         "fly.",
     ),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from perchctl.camera import IMAGE_SUFFIXES, camera_numbers
 from perchctl.commands.positioning import POSITIONINGS
-from perchctl.profile import file_names
+from perchctl.places import file_names
 
 _DEVICES = Path("/dev")
 _SCHEMES = ("video:", "images:", "http://", "rtsp://", "aideck://", "sim:")

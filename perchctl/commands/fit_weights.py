@@ -36,7 +36,8 @@ from perchctl.errors import (
     no_simulator,
 )
 from perchctl.files import check_output, same_file, write_files
-from perchctl.profile import Profile, data_folder, find_weights, load_profile, user_config_folder
+from perchctl.places import data_folder, user_config_folder
+from perchctl.profile import Profile, find_weights, load_profile
 from perchctl.vision import CameraModel
 from perchctl.weights import (
     FITTED,

@@ -34,6 +34,7 @@ from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
 from perchctl.commands.output import confirmed, print_record, say, tell
 from perchctl.commands.page import page_port
+from perchctl.commands.picture_edges import picture_edges
 from perchctl.commands.positioning import positioned
 from perchctl.display import (
     DisplayWatcher,
@@ -72,7 +73,6 @@ from perchctl.profile import (
     find_profile,
     find_weights,
     load_profile,
-    picture_edges,
     read_weights,
 )
 from perchctl.target import mm_text, overhead_view

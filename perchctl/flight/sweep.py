@@ -21,14 +21,8 @@ from perchctl.flight.compared import (
     variants_record,
 )
 from perchctl.flight.results import FlightResult, align_columns, rate_record, rate_text
-from perchctl.profile import (
-    Profile,
-    changed_profile,
-    clip_text,
-    profile_value,
-    scalar_text,
-    split_values,
-)
+from perchctl.plain_yaml import clip_text, split_values
+from perchctl.profile import Profile, changed_profile, profile_value, scalar_text
 
 MOST_KEYS = 2
 

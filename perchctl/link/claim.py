@@ -15,7 +15,7 @@ from pathlib import Path
 
 from perchctl.camera import without_password
 from perchctl.errors import ConnectionFailed
-from perchctl.profile import user_runtime_folder
+from perchctl.places import user_runtime_folder
 
 _USUAL = ("2", "2M", "E7E7E7E7E7")  # channel, rate and address of a radio's URI that names none
 _LOCKED_BYTE = 1 << 30  # beyond the text, which others read (Windows)

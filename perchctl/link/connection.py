@@ -16,7 +16,7 @@ from perchctl.errors import ConnectionFailed
 from perchctl.files import cannot_be_written
 from perchctl.link.claim import Claim, claim
 from perchctl.link.uri import UDEV_HELP
-from perchctl.profile import user_cache_folder
+from perchctl.places import user_cache_folder
 from perchctl.sim import Packet
 
 CONNECT_TRIES = 2

@@ -43,7 +43,7 @@ from perchctl.mission.release import (
     stop_motors,
 )
 from perchctl.mission.state import Condition, Observation, Phase, PlannerState, Severity
-from perchctl.profile import OVERDUE_SHARE, LandingConfig, Profile
+from perchctl.profile import LandingConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import (
     FULL_THRUST,
@@ -653,7 +653,7 @@ def _setpoints(c: Context) -> Acted:
         return state, away
     c = Context(state, c.obs, c.profile)
     # When its time is over nothing is sent any more: by then it must be landing by itself.
-    overdue = c.in_phase_s > OVERDUE_SHARE * c.profile.planner.landing.timeout_s
+    overdue = c.in_phase_s > c.profile.planner.landing.overdue_s
     if overdue or c.height_m <= c.profile.planner.landing.handover_m:
         return _own_landing(c)
     return _by_setpoints(c)

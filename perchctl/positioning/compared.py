@@ -19,7 +19,8 @@ from pathlib import Path
 
 from perchctl.errors import InvalidValue
 from perchctl.files import write_files
-from perchctl.profile import PositioningConfig, user_state_folder
+from perchctl.places import user_state_folder
+from perchctl.profile import PositioningConfig
 
 VALID_S = 24 * 3600.0
 AHEAD_S = 60.0

@@ -1,12 +1,11 @@
 """Profiles: one YAML file says everything a flight depends on.
 
-schema: the models, each key with its bounds (vision, merge, mission, positioning and simulation
-hold the larger sections). worlds: the named sets of the simulation's keys.
-load: reading, `extends`, the files a profile names. plain_yaml: what of YAML is read.
-old_keys: what earlier versions called them. places: where shipped and the user's files are.
-limits: keys that must fit each other. keys: each with its unit, bounds and meaning.
-written: as a commented file, and as a schema for editors.
-dictionaries: ArUco's ids.
+schema: the whole; vision, mission, positioning and simulation hold the sections, each key with
+its bounds, and the named worlds of the simulation. limits: keys that must fit each other.
+load: reading, `extends`, the weights file. named_files: calibration and mask. old_keys: what
+earlier versions called them. edit: changes, in memory and in the file. keys: each with its unit,
+bounds and meaning, as a commented file, and as a schema for editors.
+dictionaries: ArUco's.
 """
 
 import lazy_loader

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import ValuesView
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -22,14 +22,25 @@ _OnBody = Annotated[float, Field(ge=-FARTHEST_ON_BODY_M, le=FARTHEST_ON_BODY_M)]
 BodyVector3 = tuple[_OnBody, _OnBody, _OnBody]
 
 
-def ordered(pair: tuple[float, float]) -> tuple[float, float]:
+def key(default: Any, meaning: str, **constraints: Any) -> Any:
+    """A key of a section: pydantic's `Field`, with the meaning that people read about it. The
+    default ... means that the key must be given."""
+    return Field(default, description=meaning, **constraints)
+
+
+def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
     """The pair, lowest first. Raises ValueError where it is not."""
     if pair[0] > pair[1]:
         raise ValueError(f"the lower bound {pair[0]} is above the upper bound {pair[1]}")
     return pair
 
 
-Range = Annotated[tuple[float, float], AfterValidator(ordered)]
+Number = TypeVar("Number")
+Ordered = Annotated[
+    tuple[Number, Number], AfterValidator(_ordered), Field(json_schema_extra={"ordered": True})
+]
+"""Two numbers, the lowest first."""
+Range = Ordered[float]
 
 
 class Section(BaseModel):
@@ -57,3 +68,44 @@ def _holds_truth(value: Any) -> bool:
     if isinstance(parts, (list, tuple, ValuesView)):
         return any(map(_holds_truth, parts))
     return isinstance(value, bool)
+
+
+# --- Units ---------------------------------------------------------------------------------------
+
+UNITS = {
+    "acc_g": "g",
+    "deg": "deg",
+    "dps": "deg/s",
+    "g": "g",
+    "hz": "Hz",
+    "kg": "kg",
+    "m": "m",
+    "mah": "mAh",
+    "m2": "m^2",
+    "mb": "MB",
+    "mps": "m/s",
+    "mps2": "m/s^2",
+    "n": "N",
+    "ohm": "ohm",
+    "per_m": "1/m",
+    "per_s": "1/s",
+    "px": "px",
+    "rad": "rad",
+    "radps": "rad/s",
+    "radps2": "rad/s^2",
+    "s": "s",
+    "v": "V",
+}
+"""A name's last word, and the unit that it stands for."""
+UNITS_OF = {
+    "k1": "cm^2, deg^2",
+    "k2": "cm^2, deg^2",
+    "camera_noise_sigma": "grey levels",
+}
+
+
+def key_unit(path: str) -> str:
+    """By the last of a key's words; empty where it has no unit."""
+    name = path.rpartition(".")[2]
+    endings = (name.split("_", n)[-1] for n in range(1, name.count("_") + 1))
+    return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")

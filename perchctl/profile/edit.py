@@ -1,23 +1,98 @@
-"""Numbers written into a profile's file, and nothing else of it touched: comments, order and
-layout stay as they are."""
+"""Changes of a profile: some keys of a loaded one, and numbers written into its file.
+
+In the file nothing else is touched: comments, order and layout stay as they are.
+"""
 
 from __future__ import annotations
 
 import copy
 import itertools
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import ValidationError
 
-from perchctl.errors import InvalidValue, PerchError
+from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_place, mode_of, write_files
-from perchctl.profile.load import check_profile, find_profile
+from perchctl.places import data_folder
+from perchctl.plain_yaml import clip_text, parse_yaml
+from perchctl.profile.load import check_profile, find_profile, first_invalid_key
 from perchctl.profile.old_keys import RENAMED, with_present_keys
-from perchctl.profile.places import data_folder
-from perchctl.profile.plain_yaml import parse_yaml
+from perchctl.profile.schema import Profile
+from perchctl.profile.simulation import in_world
+
+# --- Keys of a loaded profile -------------------------------------------------------------------
+
+WORLD = "simulation.set"
+
+
+def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
+    """The profile with each ``key=value``, such as ``planner.align.xy_m=0.03``; the value as in a
+    profile's file. `option` is where they were given.
+
+    Raises:
+        UsageError: a setting has another form.
+        InvalidValue: an unknown key, or a value that it may not have.
+    """
+    values = profile.model_dump(mode="json")
+    pairs = [_parsed(setting, option) for setting in settings]
+    for key, text in sorted(pairs, key=lambda pair: pair[0] != WORLD):  # keys win over a world
+        try:
+            _put(values, key, parse_yaml(text))
+            if key == WORLD:
+                world = in_world(profile.simulation, str(parse_yaml(text)))
+                values["simulation"] = world.model_dump(mode="json")
+        except ValidationError as error:
+            setting = clip_text(f"{key}={text}")
+            raise InvalidValue(f"{option} {setting}: {first_invalid_key(error)[1]}") from None
+        except ValueError as error:
+            raise InvalidValue(f"{option} {clip_text(f'{key}={text}')}: {error}") from None
+    try:
+        _, notes = with_present_keys(values, Profile)
+        if notes:
+            raise InvalidValue(f"{option}: {notes[0]}")
+        return Profile.model_validate(values)
+    except ValidationError as error:
+        key, why = first_invalid_key(error)
+        raise InvalidValue(f"{option}: {key or 'profile'}: {why}") from None
+
+
+def _parsed(setting: str, option: str) -> tuple[str, str]:
+    """Key and value."""
+    key, equals, text = setting.partition("=")
+    if not equals or not key.strip():
+        raise UsageError(
+            f"{option} {clip_text(setting)} must be KEY=VALUE with a key of the profile, as in "
+            f"{option} planner.align.xy_m=0.03"
+        )
+    return key.strip(), text
+
+
+def profile_value(profile: Profile, dotted: str) -> Any:
+    """What the profile has at that key, in JSON's types; None where it has none."""
+    value: Any = profile.model_dump(mode="json")
+    for name in dotted.split("."):
+        value = value.get(name) if isinstance(value, dict) else None
+    return value
+
+
+def _put(values: dict[str, Any], dotted: str, value: Any) -> None:
+    """The key has to be there; below a mapping that a profile may fill, such as
+    `link.parameters`, any key is. What is unknown there, the schema says."""
+    *sections, key = dotted.split(".")
+    for section in sections:
+        inner = values.get(section)
+        if not isinstance(inner, dict):
+            what = "unknown" if section not in values else "no section"
+            raise ValueError(f"{section} is {what}; allowed here are {', '.join(values)}")
+        values = inner
+    values[key] = value
+
+
+# --- Numbers in a profile's file ----------------------------------------------------------------
 
 Value = float | int | str | tuple[float, ...]
 
@@ -55,7 +130,8 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
         InvalidValue: the layout does not allow it, the profile would not load with them, or the
         file cannot be written; nothing is changed then.
     """
-    by_hand = f"write them yourself: {_listed(values)}"
+    listed = ", ".join(f"{dotted}: {_flow(value)}" for dotted, value in values.items())
+    by_hand = f"write them yourself: {listed}"
     try:
         old, mode = path.read_bytes().decode(), mode_of(path)
         new = with_values(old, values)
@@ -68,7 +144,9 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
             f"with these numbers the profile would not load, and it is left as it was: {error}; "
             f"mend what does not fit, then {by_hand}"
         ) from None
-    aside = _free_name(path)
+    numbers = itertools.chain([""], map(str, itertools.count(2)))
+    names = (path.with_name(f"{path.name}.bak{number}") for number in numbers)
+    aside = next(name for name in names if not name.exists())
     write_files({aside: old.encode(), path: new.encode()}, mode)
     return aside
 
@@ -82,23 +160,28 @@ def with_values(text: str, values: Mapping[str, Value]) -> str:
     Raises:
         ValueError: the layout does not allow it without a change of something else.
     """
-    new = text
-    for dotted, value in values.items():
-        new = _with_value(new, dotted.split("."), value)
-    wanted = copy.deepcopy(_values_of(text))
+    new, wanted = text, copy.deepcopy(_values_of(text))
     for dotted, value in values.items():
         *sections, key = dotted.split(".")
+        new = _with_value(new, [*sections, key], value)
         place = wanted
         for section in sections:
             place = place.setdefault(section, {})
-        place[key] = list(value) if isinstance(value, tuple) else value
+        place[key] = yaml.safe_load(_flow(value))
     try:
         written = _values_of(new)
     except ValueError:
         written = {}
-    if _rounded(written) != _rounded(wanted):
+    if written != wanted:
         raise ValueError("the numbers do not fit into this file's layout")
     return new
+
+
+def _values_of(text: str) -> dict[str, Any]:
+    values = parse_yaml(text)
+    if not isinstance(values, dict):
+        raise ValueError("holds no keys and values")
+    return with_present_keys(values, Profile)[0]
 
 
 def _with_value(text: str, keys: list[str], value: Value) -> str:
@@ -132,19 +215,14 @@ def _child(
 
 
 def _replaced(text: str, node: yaml.Node, value: Value) -> str:
-    if (
-        isinstance(node, yaml.SequenceNode)
-        and isinstance(value, tuple)
-        and len(node.value) == len(value)
-    ):
-        for part, number in reversed(list(zip(node.value, value, strict=True))):
-            text = _put(text, part, _number(number))
-        return text
-    return _put(text, node, _flow(value))
-
-
-def _put(text: str, node: yaml.Node, new: str) -> str:
-    return text[: node.start_mark.index] + new + text[node.end_mark.index :]
+    numbers = value if isinstance(value, tuple) else ()
+    if isinstance(node, yaml.SequenceNode) and len(node.value) == len(numbers):
+        parts = list(zip(node.value, map(_flow, numbers), strict=True))
+    else:
+        parts = [(node, _flow(value))]
+    for part, number in reversed(parts):
+        text = text[: part.start_mark.index] + number + text[part.end_mark.index :]
+    return text
 
 
 def _inserted(
@@ -170,37 +248,10 @@ def _inserted(
 
 
 def _flow(value: Value) -> str:
+    """In YAML: with a point and without an exponent, which would be read as text."""
     if isinstance(value, tuple):
-        return f"[{', '.join(map(_number, value))}]"
-    return _number(value) if isinstance(value, float) else str(value)
-
-
-def _number(value: float) -> str:
-    """With a point and without an exponent, which YAML would read as text."""
+        return f"[{', '.join(map(_flow, value))}]"
+    if not isinstance(value, float):
+        return str(value)
     whole, _, part = f"{round(value, _DECIMALS) + 0.0:.{_DECIMALS}f}".partition(".")
     return f"{whole}.{part.rstrip('0') or '0'}"
-
-
-def _values_of(text: str) -> dict[str, Any]:
-    values = parse_yaml(text)
-    if not isinstance(values, dict):
-        raise ValueError("holds no keys and values")
-    return with_present_keys(values)[0]
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _rounded(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_rounded(inner) for inner in value]
-    return round(value, _DECIMALS) if isinstance(value, float) else value
-
-
-def _listed(values: Mapping[str, Value]) -> str:
-    return ", ".join(f"{dotted}: {_flow(value)}" for dotted, value in values.items())
-
-
-def _free_name(path: Path) -> Path:
-    numbers = itertools.chain([""], map(str, itertools.count(2)))
-    names = (path.with_name(f"{path.name}.bak{number}") for number in numbers)
-    return next(name for name in names if not name.exists())

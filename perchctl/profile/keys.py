@@ -1,57 +1,31 @@
-"""The profile's keys one by one: path, unit, default, what is allowed, what it means.
+"""What people read about a profile's keys: path, unit, default, what is allowed, what it means.
 
-What people read about a key comes from here: the table of docs/profiles.md, the comments of a
-profile that perchctl writes, the schema for editors.
+From here are the table of docs/profiles.md, a profile as a commented YAML file, and the schema by
+which an editor completes one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import textwrap
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from functools import cache
+from typing import Any
 
+import yaml
 from pydantic import BaseModel
 
-BOUNDS = ("ge", "gt", "le", "lt")
-UNITS = {
-    "acc_g": "g",
-    "deg": "deg",
-    "dps": "deg/s",
-    "g": "g",
-    "hz": "Hz",
-    "kg": "kg",
-    "m": "m",
-    "mah": "mAh",
-    "m2": "m^2",
-    "mb": "MB",
-    "mps": "m/s",
-    "mps2": "m/s^2",
-    "n": "N",
-    "ohm": "ohm",
-    "per_m": "1/m",
-    "per_s": "1/s",
-    "px": "px",
-    "rad": "rad",
-    "radps": "rad/s",
-    "radps2": "rad/s^2",
-    "s": "s",
-    "v": "V",
-}
-"""A name's last word, and the unit that it stands for."""
-UNITS_OF = {
-    "k1": "cm^2, deg^2",
-    "k2": "cm^2, deg^2",
-    "camera_noise_sigma": "grey levels",
-}
+from perchctl.profile.base import UNITS as UNITS
+from perchctl.profile.base import key_unit
+from perchctl.profile.schema import Profile
 
 
 @dataclass(frozen=True)
 class Key:
-    """One leaf of the profile's schema."""
+    """One leaf of the profile's schema; `schema` is its part of the JSON schema."""
 
     path: str
-    field: Any
+    schema: dict[str, Any]
     default: Any
 
     @property
@@ -68,70 +42,133 @@ class Key:
     @property
     def meaning(self) -> str:
         """The schema's own description; backticks around what is typed as it stands."""
-        return str(self.field.description or "")
+        return str(self.schema.get("description", ""))
 
-
-def key_unit(path: str) -> str:
-    """By the last of a key's words; empty where it has no unit."""
-    name = path.rpartition(".")[2]
-    endings = (name.split("_", n)[-1] for n in range(1, name.count("_") + 1))
-    return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")
+    @property
+    def allowed(self) -> str:
+        """Bounds or choices, in words."""
+        return _allowed(self.schema)
 
 
 def keys(section: BaseModel, prefix: str = "") -> Iterator[Key]:
-    """Every leaf below a section of the default profile, in the schema's order."""
-    for name, field in type(section).model_fields.items():
+    """Every leaf below a section of a profile with its value there, in the schema's order."""
+    properties = _schema(type(section))["properties"]
+    for name in type(section).model_fields:
         value = getattr(section, name)
         if isinstance(value, BaseModel):
             yield from keys(value, f"{prefix}{name}.")
         else:
-            yield Key(prefix + name, field, value)
+            yield Key(prefix + name, properties[name], value)
 
 
-def allowed(field: Any) -> str:
-    """The bounds or choices of a field, in words."""
-    kinds = _alternatives(field.annotation)
-    texts = [_allowed_of(kind, field.metadata) for kind in kinds if kind is not type(None)]
-    return ", or ".join([*texts, *(["none"] if type(None) in kinds else [])])
+@cache
+def _schema(model: type[BaseModel]) -> dict[str, Any]:
+    return model.model_json_schema()
 
 
-def _alternatives(kind: Any) -> tuple[Any, ...]:
-    return get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+def _allowed(schema: dict[str, Any]) -> str:
+    kinds = schema.get("anyOf", [schema])
+    texts = [_allowed_of(kind) for kind in kinds if kind.get("type") != "null"]
+    return ", or ".join([*texts, *(["none"] if len(texts) < len(kinds) else [])])
 
 
-def _allowed_of(kind: Any, metadata: Iterable[Any]) -> str:
-    """Of one of a field's kinds; `metadata` is of the field, or of the kind alone."""
-    if get_origin(kind) is Annotated:
-        inner, *notes = get_args(kind)
-        each = (m for note in notes for m in getattr(note, "metadata", (note,)))
-        return _allowed_of(inner, tuple(each))
-    if get_origin(kind) is Literal:
-        return ", ".join(f"`{choice}`" for choice in get_args(kind))
-    if bounds := _bounds(metadata):
-        return _span(bounds)
-    if get_origin(kind) is tuple and Ellipsis in get_args(kind):
-        return f"any number, each of {_allowed_of(get_args(kind)[0], ())}"
-    if get_origin(kind) is tuple:
-        ordered = any(type(m).__name__ == "AfterValidator" for m in metadata)
-        text = "lowest, highest" if ordered else f"{len(get_args(kind))} numbers"
-        for each in getattr(get_args(kind)[0], "__metadata__", ()):
-            text += f", each {_span(_bounds(each.metadata))}"
-        return text
-    if get_origin(kind) is dict:
-        return "name: number"
-    return {"bool": "true, false", "str": "text", "date": "YYYY-MM-DD"}.get(kind.__name__, "")
+def _allowed_of(kind: dict[str, Any]) -> str:
+    """Of one of a key's kinds."""
+    choices = kind.get("enum", [kind["const"]] if "const" in kind else [])
+    if choices:
+        return ", ".join(f"`{choice}`" for choice in choices)
+    match kind.get("type"):
+        case "array" if "prefixItems" in kind:
+            parts = kind["prefixItems"]
+            text = "lowest, highest" if kind.get("ordered") else f"{len(parts)} numbers"
+            span = _span(parts[0])
+            return f"{text}, each {span}" if span else text
+        case "array":
+            return f"any number, each of {_allowed_of(kind['items'])}"
+        case "object":
+            return "name: number"
+        case "boolean":
+            return "true, false"
+        case "string":
+            return "YYYY-MM-DD" if kind.get("format") == "date" else "text"
+    return _span(kind)
 
 
-def _bounds(metadata: Iterable[Any]) -> dict[str, float]:
-    """``ge``, ``gt``, ``le`` and ``lt``, as far as they are given."""
-    found = ((name, getattr(m, name, None)) for m in metadata for name in BOUNDS)
-    return {name: value for name, value in found if value is not None}
+def _span(number: dict[str, Any]) -> str:
+    """The bounds of a number; empty without any."""
+    above, below = number.get("exclusiveMinimum"), number.get("exclusiveMaximum")
+    least, most = number.get("minimum"), number.get("maximum")
+    if least is None and above is None:
+        return ""
+    low = f"{least:g}" if least is not None else f"above {above:g}"
+    if most is not None:
+        return f"{low} to {most:g}"
+    if below is not None:
+        return f"{low}, below {below:g}"
+    return low if least is None else f"at least {low}"
 
 
-def _span(bounds: dict[str, float]) -> str:
-    low = f"{bounds['ge']:g}" if "ge" in bounds else f"above {bounds['gt']:g}"
-    if "le" in bounds:
-        return f"{low} to {bounds['le']:g}"
-    if "lt" in bounds:
-        return f"{low}, below {bounds['lt']:g}"
-    return low if "gt" in bounds else f"at least {low}"
+# --- A profile as a commented file --------------------------------------------------------------
+
+_WIDTH = 80
+
+
+def profile_text(profile: Profile, paths: Collection[str] | None = None) -> str:
+    """Keys of a profile, each under a comment with its meaning, unit and what is allowed.
+
+    Read back, the keys have the same values. `paths` are the dotted paths of the keys that are
+    written, by default all.
+    """
+    lines: list[str] = []
+    before: list[str] = []
+    for key in keys(profile):
+        if paths is not None and key.path not in paths:
+            continue
+        *sections, name = key.path.split(".")
+        same = next(
+            (n for n, pair in enumerate(zip(sections, before, strict=False)) if pair[0] != pair[1]),
+            min(len(sections), len(before)),
+        )
+        for depth in range(same, len(sections)):
+            if depth == 0 and lines:
+                lines.append("")
+            lines.append(f"{'  ' * depth}{sections[depth]}:")
+        before = sections
+        margin = "  " * len(sections)
+        lines += textwrap.wrap(
+            _comment(key), _WIDTH, initial_indent=f"{margin}# ", subsequent_indent=f"{margin}# ",
+            break_long_words=False, break_on_hyphens=False,
+        )  # fmt: skip
+        lines.append(f"{margin}{name}: {scalar_text(key.default)}")
+    return "\n".join(lines) + "\n"
+
+
+def _comment(key: Key) -> str:
+    choices = key.allowed.replace("`", "")
+    limits = ", ".join(part for part in (key.unit, choices) if part not in ("", "text"))
+    meaning = key.meaning.replace("`", "")
+    return f"{meaning} ({limits})" if limits else meaning
+
+
+def scalar_text(value: Any) -> str:
+    """The value in YAML, on one line."""
+    plain = list(value) if isinstance(value, tuple) else value
+    text: str = yaml.safe_dump([plain], default_flow_style=True, width=10**9, allow_unicode=True)
+    return text.strip()[1:-1]
+
+
+def editor_schema() -> dict[str, Any]:
+    """The JSON schema of a profile's file: types, bounds, defaults, meanings and units."""
+    schema = Profile.model_json_schema()
+    for section in (schema, *schema["$defs"].values()):
+        section.pop("title", None)
+        section.pop("required", None)  # a profile that extends another gives some keys only
+        for name, field in section["properties"].items():
+            field.pop("title", None)
+            field.pop("ordered", None)
+            unit = key_unit(name)
+            if unit and "description" in field:
+                field["description"] += f" ({unit})"
+    extends = {"type": "string", "description": "name or path of the profile that has the rest"}
+    schema["properties"] = {"extends": extends, **schema["properties"]}
+    return {"title": "perchctl profile", **schema}

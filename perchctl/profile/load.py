@@ -10,14 +10,14 @@ import warnings
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from perchctl.errors import InvalidValue, NotFound, ProfileNote
-from perchctl.profile.merge import FittedWeights
+from perchctl.places import data_file, file_names
+from perchctl.plain_yaml import clip_text, parse_yaml
 from perchctl.profile.old_keys import with_present_keys
-from perchctl.profile.places import data_file, data_folder, file_names
-from perchctl.profile.plain_yaml import clip_text, parse_yaml
 from perchctl.profile.schema import Profile
+from perchctl.profile.vision import WeightsConfig
 
 _NAMED_FILES = (
     ("merge", "weights_file", "weights"),
@@ -77,6 +77,39 @@ def _checked(path: Path, own: dict[str, Any]) -> Profile:
         raise InvalidValue(_one_sentence(path, error)) from None
 
 
+# --- The weights file ---------------------------------------------------------------------------
+
+
+class FittedData(BaseModel):
+    """The data that weights were fitted to."""
+
+    file: str = ""
+    sha256: str = ""
+    rows: int = 0
+    positions: int = 0
+
+
+class FittedWeights(BaseModel):
+    """A weights file, as far as a flight needs it (`perchctl.weights` writes more)."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+    date: str = ""
+    method: str = ""
+    weights: WeightsConfig
+    data: FittedData = FittedData()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _all_axes(cls, values: dict[str, Any]) -> dict[str, Any]:
+        given = values.get("weights")
+        if isinstance(given, dict):
+            missing = [axis for axis in WeightsConfig.model_fields if axis not in given]
+            if missing:
+                raise ValueError(f"weights.{missing[0]} is missing; needed are x, y, z and yaw")
+        return values
+
+
 def find_weights(name: str) -> Path:
     """The weights file that a loaded profile names: a whole path, or a name in the user's
     folder."""
@@ -99,19 +132,7 @@ def read_weights(path: Path) -> FittedWeights:
         raise InvalidValue(_one_sentence(path, error, FittedWeights)) from None
 
 
-def find_calibration(name: str) -> Path:
-    """A calibration file by path, or by name from `calib/`. (A loaded profile names its own by
-    the whole path.)"""
-    given = Path(name).expanduser()
-    if given.is_file():
-        return given
-    found = data_file("calib", name)
-    if found is None:
-        raise NotFound(
-            f"calibration file {name} not found; give a path, or one of "
-            + (", ".join(file_names("calib")) or f"none ({data_folder('calib')} is empty)")
-        )
-    return found
+# --- Reading ------------------------------------------------------------------------------------
 
 
 def _choices() -> str:
@@ -146,7 +167,7 @@ def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[s
 
 def _with_present_keys(values: dict[str, Any], path: Path) -> dict[str, Any]:
     try:
-        values, notes = with_present_keys(values)
+        values, notes = with_present_keys(values, Profile)
     except ValueError as error:
         raise InvalidValue(f"{path}: {error}") from None
     for note in notes:

@@ -2,47 +2,44 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
-from pydantic import Field
-
-from perchctl.profile.base import Section
+from perchctl.profile.base import Section, key
 
 
 class SearchConfig(Section):
     """Phase 2. Waits `wait_s`, climbs `step_m`, tries again; never above `max_height_m`."""
 
-    attempts: int = Field(6, ge=1, le=100, description="times to wait, before it lands")
-    wait_s: float = Field(1.5, gt=0, le=60, description="at each height")
-    step_m: float = Field(0.12, ge=0, le=1, description="higher each time")
-    max_height_m: float = Field(
-        1.3, gt=0, le=20, description="never above it to look for the target"
+    attempts: int = key(6, "times to wait, before it lands", ge=1, le=100)
+    wait_s: float = key(1.5, "at each height", gt=0, le=60)
+    step_m: float = key(0.12, "higher each time", ge=0, le=1)
+    max_height_m: float = key(1.3, "never above it to look for the target", gt=0, le=20)
+    yaw_step_deg: float = key(
+        60.0, "turned each time: the picture is wider than high", ge=0, le=180
     )
-    yaw_step_deg: float = Field(
-        60.0, ge=0, le=180, description="turned each time: the picture is wider than high"
-    )
-    confirm_frames: int = Field(3, ge=1, le=100, description="in a row with the target")
+    confirm_frames: ClassVar[int] = 3
+    """In a row with the target."""
 
 
 class EstimateConfig(Section):
     """Phase 3. The pose must stay within `spread_m` for `dwell_s`."""
 
-    dwell_s: float = Field(0.4, ge=0, le=10, description="for which the pose must be steady")
-    spread_m: float = Field(0.05, gt=0, le=1, description="within which it must stay")
-    timeout_s: float = Field(4.0, gt=0, le=60, description="then back to search")
+    dwell_s: float = key(0.4, "for which the pose must be steady", ge=0, le=10)
+    spread_m: ClassVar[float] = 0.05
+    """Within which it must stay."""
+    timeout_s: float = key(4.0, "then back to search", gt=0, le=60)
 
 
 class AlignConfig(Section):
     """Phase 4. Errors must stay within tolerance for `dwell_s`."""
 
-    xy_m: float = Field(
-        0.04, gt=0, le=1, description="aligned: the gear's distance from the target's axis"
-    )
-    yaw_deg: float = Field(5.0, gt=0, le=180, description="aligned: heading")
-    dwell_s: float = Field(0.4, ge=0, le=10, description="for which both must hold")
-    timeout_s: float = Field(20.0, gt=0, le=120, description="then the attempt counts as failed")
-    speed_mps: float = Field(0.4, gt=0, le=2, description="of the setpoint, sideways")
-    yaw_rate_dps: float = Field(60.0, gt=0, le=360, description="of the setpoint")
+    xy_m: float = key(0.04, "aligned: the gear's distance from the target's axis", gt=0, le=1)
+    yaw_deg: float = key(5.0, "aligned: heading", gt=0, le=180)
+    dwell_s: float = key(0.4, "for which both must hold", ge=0, le=10)
+    timeout_s: float = key(20.0, "then the attempt counts as failed", gt=0, le=120)
+    speed_mps: float = key(0.4, "of the setpoint, sideways", gt=0, le=2)
+    yaw_rate_dps: ClassVar[float] = 60.0
+    """Of the setpoint."""
 
 
 class AscendConfig(Section):
@@ -54,55 +51,52 @@ class AscendConfig(Section):
     the stand-off.
     """
 
-    speed_mps: float = Field(0.25, gt=0, le=1, description="climb, far below")
-    near_speed_mps: float = Field(0.12, gt=0, le=1, description="climb, nearer than `near_m`")
-    near_m: float = Field(0.35, gt=0, le=2, description="from here on it climbs slowly")
-    cone_base_m: float = Field(0.05, gt=0, le=1, description="the cone's radius at the target")
-    cone_slope: float = Field(
-        0.2, ge=0, le=2, description="the cone's radius grows by it a metre below"
+    speed_mps: float = key(0.25, "climb, far below", gt=0, le=1)
+    near_speed_mps: float = key(0.12, "climb, nearer than 0.35 m", gt=0, le=1)
+    near_m: ClassVar[float] = 0.35
+    """From here on it climbs slowly."""
+    cone_base_m: ClassVar[float] = 0.05
+    """The cone's radius at the target."""
+    cone_slope: ClassVar[float] = 0.2
+    """The cone's radius grows by it a metre below."""
+    standoff_m: float = key(0.08, "between gear and target where it settles", gt=0.01, le=0.5)
+    settle_xy_m: float = key(0.004, "settled: distance from the axis", gt=0, le=0.1)
+    settle_z_m: float = key(0.02, "settled: at most so far below the stand-off", gt=0, le=0.1)
+    settle_yaw_deg: ClassVar[float] = 3.0
+    """Settled: heading."""
+    settle_speed_mps: ClassVar[float] = 0.04
+    """Settled: speed."""
+    settle_dwell_s: float = key(0.3, "for which all must hold", ge=0, le=10)
+    settle_timeout_s: float = key(10.0, "at the stand-off", gt=0, le=60)
+    fresh_s: float = key(
+        0.25, "a target older than this, beyond the latency, is not fresh", gt=0, le=2
     )
-    standoff_m: float = Field(
-        0.08, gt=0.01, le=0.5, description="between gear and target where it settles"
-    )
-    settle_xy_m: float = Field(0.004, gt=0, le=0.1, description="settled: distance from the axis")
-    settle_z_m: float = Field(
-        0.02, gt=0, le=0.1, description="settled: at most so far below the stand-off"
-    )
-    settle_yaw_deg: float = Field(3.0, gt=0, le=90, description="settled: heading")
-    settle_speed_mps: float = Field(0.04, gt=0, le=1, description="settled: speed")
-    settle_dwell_s: float = Field(0.3, ge=0, le=10, description="for which all must hold")
-    settle_timeout_s: float = Field(10.0, gt=0, le=60, description="at the stand-off")
-    fresh_s: float = Field(
-        0.25, gt=0, le=2, description="a target older than this, beyond the latency, is not fresh"
-    )
-    timeout_s: float = Field(40.0, gt=0, le=300, description="for the whole ascent")
+    timeout_s: float = key(40.0, "for the whole ascent", gt=0, le=300)
 
 
 class PerchConfig(Section):
     """Phase 6. `position` presses with a setpoint `press_m` above the contact;
     `raw` raises the thrust with stabilised position control off, as the paper does."""
 
-    mode: Literal["position", "raw"] = Field(
-        "position", description="press by a setpoint above the contact, or by raw thrust"
+    mode: Literal["position", "raw"] = key(
+        "position", "press by a setpoint above the contact, or by raw thrust"
     )
-    thrust: int = Field(60000, ge=1000, le=65535, description="of the raw mode")
-    press_m: float = Field(0.25, gt=0, le=1, description="the setpoint above the contact")
-    climb_mps: float = Field(0.2, gt=0, le=1, description="of the setpoint")
-    contact_dwell_s: float = Field(0.25, gt=0, le=5, description="for which contact must hold")
-    contact_z_m: float = Field(
-        0.05, gt=0, le=0.3, description="contact: the gear's distance from the target"
+    thrust: int = key(60000, "of the raw mode", ge=1000, le=65535)
+    press_m: float = key(0.25, "the setpoint above the contact", gt=0, le=1)
+    climb_mps: float = key(0.2, "of the setpoint", gt=0, le=1)
+    contact_dwell_s: float = key(0.25, "for which contact must hold", gt=0, le=5)
+    contact_z_m: float = key(0.05, "contact: the gear's distance from the target", gt=0, le=0.3)
+    contact_xy_m: float = key(
+        0.025, "contact: its distance from the axis, the magnet's radius", gt=0, le=0.5
     )
-    contact_xy_m: float = Field(
-        0.025, gt=0, le=0.5, description="contact: its distance from the axis, the magnet's radius"
+    contact_speed_mps: float = key(0.06, "contact: vertical speed", gt=0, le=1)
+    contact_acc_g: float = key(
+        0.12, "contact: acceleration differs from 1 g by at most this", gt=0, le=1
     )
-    contact_speed_mps: float = Field(0.06, gt=0, le=1, description="contact: vertical speed")
-    contact_acc_g: float = Field(
-        0.12, gt=0, le=1, description="contact: acceleration differs from 1 g by at most this"
+    contact_thrust_ratio: float = key(
+        1.03, "contact: thrust over hover thrust, where there is more", gt=1, le=2
     )
-    contact_thrust_ratio: float = Field(
-        1.03, gt=1, le=2, description="contact: thrust over hover thrust, where there is more"
-    )
-    timeout_s: float = Field(3.0, gt=0, le=20, description="without contact")
+    timeout_s: float = key(3.0, "without contact", gt=0, le=20)
 
 
 class CompleteConfig(Section):
@@ -114,49 +108,43 @@ class CompleteConfig(Section):
     the stream alive: the whole weight must hang for `hang_s`. `watch_s` after the stop.
     """
 
-    steps: int = Field(5, ge=1, le=50, description="of the release")
-    release_s: float = Field(0.8, gt=0, le=10, description="over which the thrust is released")
-    release_drop_m: float = Field(
-        0.25, gt=0, le=1, description="the setpoint's last step lies below the contact"
+    steps: int = key(5, "of the release", ge=1, le=50)
+    release_s: ClassVar[float] = 0.8
+    """Over which the thrust is released."""
+    release_drop_m: ClassVar[float] = 0.25
+    """The setpoint's last step lies below the contact."""
+    hold_ratio: float = key(0.6, "thrust over the hover thrust that proves the magnet", gt=0, lt=1)
+    hold_dwell_s: float = key(0.3, "for which it must prove it", ge=0, le=5)
+    ramp_s: float = key(
+        0.5, "of raw thrust, from the least of position mode to still motors", gt=0, le=10
     )
-    hold_ratio: float = Field(
-        0.6, gt=0, lt=1, description="thrust over the hover thrust that proves the magnet"
+    hang_s: float = key(
+        1.0, "that the whole weight must hang before the motors stop", ge=0.3, le=10
     )
-    hold_dwell_s: float = Field(0.3, ge=0, le=5, description="for which it must prove it")
-    ramp_s: float = Field(
-        0.5,
-        gt=0,
-        le=10,
-        description="of raw thrust, from the least of position mode to still motors",
+    release_timeout_s: float = key(8.0, "then the attempt counts as failed", gt=0, le=30)
+    slip_m: float = key(0.03, "hanging: at most so far below the contact", gt=0, le=0.3)
+    slip_mps: float = key(0.12, "a slip: sinking faster", gt=0, le=1)
+    slip_dwell_s: float = key(
+        0.03, "a slip: for so long; a free fall is answered at once", ge=0, le=0.5
     )
-    hang_s: float = Field(
-        1.0, ge=0.3, le=10, description="that the whole weight must hang before the motors stop"
+    slip_acc_g: float = key(
+        0.5, "a free fall, or a slip wherever the estimate is: less", gt=0, lt=1
     )
-    release_timeout_s: float = Field(
-        8.0, gt=0, le=30, description="then the attempt counts as failed"
-    )
-    slip_m: float = Field(
-        0.03, gt=0, le=0.3, description="hanging: at most so far below the contact"
-    )
-    slip_mps: float = Field(0.12, gt=0, le=1, description="a slip: sinking faster")
-    slip_dwell_s: float = Field(
-        0.03, ge=0, le=0.5, description="a slip: for so long; a free fall is answered at once"
-    )
-    slip_acc_g: float = Field(
-        0.5, gt=0, lt=1, description="a free fall, or a slip wherever the estimate is: less"
-    )
-    watch_s: float = Field(
-        1.5, gt=0, le=60, description="after the motor stop, before it counts as perched"
-    )
+    watch_s: float = key(1.5, "after the motor stop, before it counts as perched", gt=0, le=60)
 
 
 class RecoverConfig(Section):
     """After a miss or a slip: descend, steady, back to phase 3."""
 
-    descend_m: float = Field(0.10, gt=0, le=1, description="below where the attempt ended")
-    dwell_s: float = Field(0.5, ge=0, le=10, description="for which it must be steady")
-    steady_mps: float = Field(0.1, gt=0, le=1, description="steady: speed")
-    timeout_s: float = Field(6.0, gt=0, le=60, description="then it lands")
+    descend_m: float = key(0.10, "below where the attempt ended", gt=0, le=1)
+    dwell_s: float = key(0.5, "for which it must be steady", ge=0, le=10)
+    steady_mps: ClassVar[float] = 0.1
+    """Steady: speed."""
+    timeout_s: float = key(6.0, "then it lands", gt=0, le=60)
+
+
+OVERDUE_SHARE = 0.5
+"""Of the landing's time: so long it goes by setpoints, and then by the vehicle's own landing."""
 
 
 class LandingConfig(Section):
@@ -164,30 +152,27 @@ class LandingConfig(Section):
     own landing, which goes to `undershoot_m` below the ground of the estimate, and by
     `drift_mps` of the flight's time lower, so that a drifted height still ends on the floor."""
 
-    speed_mps: float = Field(0.3, gt=0, le=1, description="of the landing")
-    handover_m: float = Field(
-        0.3, ge=0.1, le=2, description="above the ground: from here the vehicle lands by itself"
+    speed_mps: float = key(0.3, "of the landing", gt=0, le=1)
+    handover_m: float = key(
+        0.3, "above the ground: from here the vehicle lands by itself", ge=0.1, le=2
     )
-    undershoot_m: float = Field(
-        0.05, ge=0, le=1, description="the landing aims so far below the ground"
-    )
-    drift_mps: float = Field(
-        0.012, ge=0, le=0.1, description="of the estimate's height: the aim sinks so fast"
-    )
-    timeout_s: float = Field(30.0, gt=0, le=120, description="for which a landing is waited for")
+    undershoot_m: float = key(0.05, "the landing aims so far below the ground", ge=0, le=1)
+    drift_mps: float = key(0.012, "of the estimate's height: the aim sinks so fast", ge=0, le=0.1)
+    timeout_s: float = key(30.0, "for which a landing is waited for", gt=0, le=120)
+
+    @property
+    def overdue_s(self) -> float:
+        """For so long the landing goes by setpoints; then the vehicle lands by itself."""
+        return OVERDUE_SHARE * self.timeout_s
 
 
 class PlannerConfig(Section):
-    takeoff_height_m: float = Field(
-        0.5, ge=0.2, le=5, description="of the take-off, above the ground"
+    takeoff_height_m: float = key(0.5, "of the take-off, above the ground", ge=0.2, le=5)
+    takeoff_speed_mps: float = key(0.3, "of the setpoint, from the ground up", gt=0, le=1)
+    approach_xy_m: tuple[float, float] | None = key(
+        None, "fly here after take-off, in the estimate's world"
     )
-    takeoff_speed_mps: float = Field(
-        0.3, gt=0, le=1, description="of the setpoint, from the ground up"
-    )
-    approach_xy_m: tuple[float, float] | None = Field(
-        None, description="fly here after take-off, in the estimate's world"
-    )
-    approach_timeout_s: float = Field(15.0, gt=0, le=120, description="for take-off and way")
+    approach_timeout_s: float = key(15.0, "for take-off and way", gt=0, le=120)
     search: SearchConfig = SearchConfig()
     estimate: EstimateConfig = EstimateConfig()
     align: AlignConfig = AlignConfig()
@@ -196,88 +181,65 @@ class PlannerConfig(Section):
     complete: CompleteConfig = CompleteConfig()
     recover: RecoverConfig = RecoverConfig()
     landing: LandingConfig = LandingConfig()
-    attempts: int = Field(5, ge=1, le=50, description="perching attempts in all")
-    perching_time_s: float = Field(120.0, gt=0, le=1200, description="then it lands")
-    integral_per_s: float = Field(
-        0.4, ge=0, le=5, description="gain of the integral of the horizontal error"
-    )
-    integral_limit_m: float = Field(0.08, ge=0, le=0.5, description="of that integral")
+    attempts: int = key(5, "perching attempts in all", ge=1, le=50)
+    perching_time_s: float = key(120.0, "then it lands", gt=0, le=1200)
+    integral_per_s: float = key(0.4, "gain of the integral of the horizontal error", ge=0, le=5)
+    integral_limit_m: ClassVar[float] = 0.08
+    """Of that integral."""
 
 
 class SafetyConfig(Section):
     """Limits and reaction times; `*_hold_s` stays where it is, `*_land_s` lands."""
 
-    min_rest_v: float = Field(3.8, ge=0, le=5, description="no flight begins below it")
-    min_load_v: float = Field(3.0, ge=0, le=5, description="in flight, under load: lands below it")
-    battery_debounce_s: float = Field(
-        1.5, ge=0, le=30, description="below `min_load_v` before it lands"
+    min_rest_v: float = key(3.8, "no flight begins below it", ge=0, le=5)
+    min_load_v: float = key(3.0, "in flight, under load: lands below it", ge=0, le=5)
+    battery_debounce_s: float = key(1.5, "below `min_load_v` before it lands", ge=0, le=30)
+    energy_gate: bool = key(True, "no attempt begins that the battery has not enough for: it lands")
+    energy_reserve_s: float = key(
+        4.0, "of hovering, left after an attempt and a landing", ge=0, le=120
     )
-    energy_gate: bool = Field(
-        True, description="no attempt begins that the battery has not enough for: it lands"
+    battery_stale_s: float = key(90.0, "grace for a reading that stands still", gt=0, le=600)
+    telemetry_hold_s: float = key(0.3, "age of telemetry: held", gt=0, le=5)
+    telemetry_land_s: float = key(1.0, "age of telemetry: landed", gt=0, le=10)
+    proof_age_s: float = key(
+        0.1, "older telemetry proves nothing: no contact, no landing, no stop", gt=0, le=0.5
     )
-    energy_reserve_s: float = Field(
-        4.0, ge=0, le=120, description="of hovering, left after an attempt and a landing"
+    camera_hold_s: float = key(0.5, "since the last good picture: held", gt=0, le=10)
+    camera_land_s: float = key(3.0, "since the last good picture: landed", gt=0, le=60)
+    max_frame_age_s: float = key(0.4, "an older picture is no measurement", gt=0, le=5)
+    jump_m: float = key(0.25, "a step of the estimate beyond its speed: a jump", gt=0, le=5)
+    jump_z_m: float = key(0.15, "a step of its height", gt=0, le=5)
+    jump_deg: float = key(15.0, "a step of its heading", gt=0, le=180)
+    heading_lost_deg: float = key(
+        40.0, "step of the heading: down at once, level, by raw thrust", gt=0, le=180
     )
-    battery_stale_s: float = Field(
-        90.0, gt=0, le=600, description="grace for a reading that stands still"
+    jump_mps: float = key(1.0, "a step of its velocity", gt=0, le=10)
+    flight_variance_m2: float = key(0.05, "of the position in flight: above it, held", gt=0, le=10)
+    variance_land_s: float = key(1.0, "above it for so long: landed", ge=0, le=30)
+    jump_hold_s: float = key(0.5, "held, then landed", ge=0, le=0.5)
+    max_height_m: float = key(3.0, "above the ground: lands when higher", gt=0, le=20)
+    fence_radius_m: float = key(
+        2.0, "of the fence around the place of take-off: lands outside", gt=0, le=50
     )
-    telemetry_hold_s: float = Field(0.3, gt=0, le=5, description="age of telemetry: held")
-    telemetry_land_s: float = Field(1.0, gt=0, le=10, description="age of telemetry: landed")
-    proof_age_s: float = Field(
-        0.1,
-        gt=0,
-        le=0.5,
-        description="older telemetry proves nothing: no contact, no landing, no stop",
+    max_tilt_deg: float = key(55.0, "beyond it the motors are cut", gt=0, le=180)
+    tilt_debounce_s: float = key(0.2, "for which it must be tilted", ge=0, le=2)
+    loop_late_hold_s: float = key(0.25, "a turn so late: held", gt=0, le=5)
+    loop_late_land_s: float = key(1.0, "a turn so late: landed", gt=0, le=10)
+    estimator_wait_s: float = key(10.0, "on the ground", gt=0, le=60)
+    estimator_variance_m2: float = key(
+        0.01, "of the position, at most, before take-off", gt=0, le=10
     )
-    camera_hold_s: float = Field(0.5, gt=0, le=10, description="since the last good picture: held")
-    camera_land_s: float = Field(
-        3.0, gt=0, le=60, description="since the last good picture: landed"
+    ground_z_m: float = key(
+        0.0, "height at which the estimate places the ground, where it takes off", ge=-10, le=10
     )
-    max_frame_age_s: float = Field(
-        0.4, gt=0, le=5, description="an older picture is no measurement"
+    ground_tolerance_m: float = key(
+        0.15, "farther from it the vehicle hangs, or is held: no take-off", gt=0, le=10
     )
-    jump_m: float = Field(
-        0.25, gt=0, le=5, description="a step of the estimate beyond its speed: a jump"
+    start_tilt_deg: float = key(10.0, "roll and pitch, at most, before take-off", gt=0, le=45)
+    blocked_s: float = key(
+        0.7, "pressed against something and not moving: back off down", gt=0, le=5
     )
-    jump_z_m: float = Field(0.15, gt=0, le=5, description="a step of its height")
-    jump_deg: float = Field(15.0, gt=0, le=180, description="a step of its heading")
-    heading_lost_deg: float = Field(
-        40.0, gt=0, le=180, description="step of the heading: down at once, level, by raw thrust"
+    blocked_thrust_ratio: float = key(
+        1.1, "of the hover thrust: from here on it is pressed", gt=1, le=2
     )
-    jump_mps: float = Field(1.0, gt=0, le=10, description="a step of its velocity")
-    flight_variance_m2: float = Field(
-        0.05, gt=0, le=10, description="of the position in flight: above it, held"
-    )
-    variance_land_s: float = Field(1.0, ge=0, le=30, description="above it for so long: landed")
-    jump_hold_s: float = Field(0.5, ge=0, le=0.5, description="held, then landed")
-    max_height_m: float = Field(3.0, gt=0, le=20, description="above the ground: lands when higher")
-    fence_radius_m: float = Field(
-        2.0, gt=0, le=50, description="of the fence around the place of take-off: lands outside"
-    )
-    max_tilt_deg: float = Field(55.0, gt=0, le=180, description="beyond it the motors are cut")
-    tilt_debounce_s: float = Field(0.2, ge=0, le=2, description="for which it must be tilted")
-    loop_late_hold_s: float = Field(0.25, gt=0, le=5, description="a turn so late: held")
-    loop_late_land_s: float = Field(1.0, gt=0, le=10, description="a turn so late: landed")
-    estimator_wait_s: float = Field(10.0, gt=0, le=60, description="on the ground")
-    estimator_variance_m2: float = Field(
-        0.01, gt=0, le=10, description="of the position, at most, before take-off"
-    )
-    ground_z_m: float = Field(
-        0.0,
-        ge=-10,
-        le=10,
-        description="height at which the estimate places the ground, where it takes off",
-    )
-    ground_tolerance_m: float = Field(
-        0.15, gt=0, le=10, description="farther from it the vehicle hangs, or is held: no take-off"
-    )
-    start_tilt_deg: float = Field(
-        10.0, gt=0, le=45, description="roll and pitch, at most, before take-off"
-    )
-    blocked_s: float = Field(
-        0.7, gt=0, le=5, description="pressed against something and not moving: back off down"
-    )
-    blocked_thrust_ratio: float = Field(
-        1.1, gt=1, le=2, description="of the hover thrust: from here on it is pressed"
-    )
-    land_on_log_error: bool = Field(False, description="land when the log cannot be written")
+    land_on_log_error: bool = key(False, "land when the log cannot be written")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 from typing import Any
 
+from pydantic import BaseModel
+
 RENAMED: dict[str, str] = {
     "camera.T_body_cam": "mount",
     "planner.trim_per_s": "integral_per_s",
@@ -19,8 +21,13 @@ UNUSED: tuple[str, ...] = (
 """Nothing depends on them any more: left out."""
 
 
-def with_present_keys(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """The values under their present keys, and a note for each old one.
+def with_present_keys(
+    values: dict[str, Any], model: type[BaseModel]
+) -> tuple[dict[str, Any], list[str]]:
+    """The values of a profile under their present keys, and a note for each old one.
+
+    A key that has become a constant of its section (a class variable of `model`, or of a model
+    within it) is left out.
 
     Raises ValueError where a key stands under both of its names.
     """
@@ -38,7 +45,22 @@ def with_present_keys(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]
         section, old = _section_of(result, dotted)
         if section is not None and section.pop(old, None) is not None:
             notes.append(f"{dotted} is no longer used: remove it")
-    return result, notes
+    return result, notes + _without_constants(result, model)
+
+
+def _without_constants(values: dict[str, Any], model: type[BaseModel], path: str = "") -> list[str]:
+    """Removes the keys that are constants from the values; returns a note for each."""
+    notes: list[str] = []
+    for key in list(values):
+        field, value = model.model_fields.get(key), values[key]
+        kind = field.annotation if field is not None else None
+        if key in model.__class_vars__:
+            del values[key]
+            constant = f"{getattr(model, key)} for every profile"
+            notes.append(f"{path}{key} is no longer a key: it is {constant}; remove it")
+        elif isinstance(value, dict) and isinstance(kind, type) and issubclass(kind, BaseModel):
+            notes += _without_constants(value, kind, f"{path}{key}.")
+    return notes
 
 
 def _section_of(values: dict[str, Any], dotted: str) -> tuple[dict[str, Any] | None, str]:

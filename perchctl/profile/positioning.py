@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from typing import Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import field_validator, model_validator
 
-from perchctl.profile.base import BodyVector3, Section, Vector3
+from perchctl.profile.base import BodyVector3, Section, Vector3, key
 
 SPARE_S = 0.02
 """Frames do not come to the millisecond."""
@@ -41,44 +41,35 @@ class PositioningConfig(Section):
     `body_position_m`, both in the vehicle's body axes.
     """
 
-    by: Literal["deck", "mocap", "target"] = Field("deck", description="what measures the position")
-    system: Literal["vicon", "optitrack", "qualisys", "vrpn"] = Field(
-        "vicon", description="kind of motion capture"
+    by: Literal["deck", "mocap", "target"] = key("deck", "what measures the position")
+    system: Literal["vicon", "optitrack", "qualisys", "vrpn"] = key(
+        "vicon", "kind of motion capture"
     )
-    host: str = Field("", description="its computer, or `NAME:PORT`")
-    body: str = Field("crazyflie", min_length=1, description="the vehicle's rigid body there")
-    body_rpy_deg: Vector3 = Field(
-        (0.0, 0.0, 0.0), description="the rigid body's axes in the vehicle's: roll, pitch, yaw"
+    host: str = key("", "its computer, or `NAME:PORT`")
+    body: str = key("crazyflie", "the vehicle's rigid body there", min_length=1)
+    body_rpy_deg: Vector3 = key(
+        (0.0, 0.0, 0.0), "the rigid body's axes in the vehicle's: roll, pitch, yaw"
     )
-    body_position_m: BodyVector3 = Field(
-        (0.0, 0.0, 0.0), description="the rigid body's origin in the vehicle's axes"
+    body_position_m: BodyVector3 = key(
+        (0.0, 0.0, 0.0), "the rigid body's origin in the vehicle's axes"
     )
-    send: Literal["position", "pose"] = Field(
-        "position", description="position alone, or position and attitude"
+    send: Literal["position", "pose"] = key("position", "position alone, or position and attitude")
+    rate_hz: float = key(100.0, "at most so many are sent a second", ge=10, le=100)
+    latency_s: float = key(
+        0.01, "from the cameras' exposure to arrival, as far as known", ge=0, le=MOST_LATENCY_S
     )
-    rate_hz: float = Field(100.0, ge=10, le=100, description="at most so many are sent a second")
-    latency_s: float = Field(
-        0.01,
-        ge=0,
-        le=MOST_LATENCY_S,
-        description="from the cameras' exposure to arrival, as far as known",
+    position_sigma_m: float = key(
+        0.005, "what the vehicle takes it for: `locSrv.extPosStdDev`", gt=0, le=0.2
     )
-    position_sigma_m: float = Field(
-        0.005, gt=0, le=0.2, description="what the vehicle takes it for: `locSrv.extPosStdDev`"
+    attitude_sigma_rad: float = key(
+        0.05, "what the vehicle takes it for: `locSrv.extQuatStdDev`", gt=0, le=1
     )
-    attitude_sigma_rad: float = Field(
-        0.05, gt=0, le=1, description="what the vehicle takes it for: `locSrv.extQuatStdDev`"
-    )
-    hold_s: float = Field(
-        0.15, gt=0, le=0.5, description="without a fresh position it is held in place"
-    )
-    land_s: float = Field(0.7, gt=0, le=2, description="without a fresh position it is landed")
-    connect_timeout_s: float = Field(5.0, gt=0, le=60, description="for the first frame")
+    hold_s: float = key(0.15, "without a fresh position it is held in place", gt=0, le=0.5)
+    land_s: float = key(0.7, "without a fresh position it is landed", gt=0, le=2)
+    connect_timeout_s: float = key(5.0, "for the first frame", gt=0, le=60)
 
-    decks: tuple[str, ...] = Field(
-        (),
-        description="further decks that give a position, of drivers of your own: names as `check` "
-        "has them",
+    decks: tuple[str, ...] = key(
+        (), "further decks that give a position, of drivers of your own: names as `check` has them"
     )
 
     @property

@@ -8,17 +8,13 @@ larger sections.
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import reduce
 from typing import Any
 
 from pydantic import Field, model_validator
 
-from perchctl.profile.base import Section
+from perchctl.profile.base import Section, key
 from perchctl.profile.dictionaries import check_marker_id
-from perchctl.profile.keys import key_unit
-from perchctl.profile.merge import MergeConfig
+from perchctl.profile.limits import IMPOSSIBLE
 from perchctl.profile.mission import PlannerConfig, SafetyConfig
 from perchctl.profile.old_keys import with_present_keys
 from perchctl.profile.positioning import PositioningConfig
@@ -27,6 +23,7 @@ from perchctl.profile.vision import (
     CameraConfig,
     DetectorConfig,
     KalmanConfig,
+    MergeConfig,
     PoseConfig,
     TargetConfig,
     VehicleConfig,
@@ -36,31 +33,29 @@ from perchctl.profile.vision import (
 class LinkConfig(Section):
     """The profile's `link`: URI, telemetry and firmware parameters."""
 
-    uri: str = Field("sim://", description="`sim://`, `radio://...`, `usb://0`, `udp://HOST:PORT`")
-    connect_timeout_s: float = Field(15.0, gt=0, le=120, description="for both tries together")
+    uri: str = key("sim://", "`sim://`, `radio://...`, `usb://0`, `udp://HOST:PORT`")
+    connect_timeout_s: float = key(15.0, "for both tries together", gt=0, le=120)
     parameters: dict[str, int | float] = Field(
         default_factory=dict, description="firmware parameters, set and read back before the flight"
     )
-    telemetry_period_s: float = Field(0.01, ge=0.01, le=0.1, description="of position and attitude")
-    loop_hz: float = Field(50.0, ge=5, le=200, description="turns of the flight loop")
+    telemetry_period_s: float = key(0.01, "of position and attitude", ge=0.01, le=0.1)
+    loop_hz: float = key(50.0, "turns of the flight loop", ge=5, le=200)
 
 
 class LogConfig(Section):
-    directory: str = Field("perchctl-logs", description="for the log and its plot")
-    plot: bool = Field(True, description="draw the flight after it")
-    max_mb: float = Field(
-        2000.0, gt=0, le=1e6, description="no more pictures are recorded into a larger recording"
+    directory: str = key("perchctl-logs", "for the log and its plot")
+    plot: bool = key(True, "draw the flight after it")
+    max_mb: float = key(
+        2000.0, "no more pictures are recorded into a larger recording", gt=0, le=1e6
     )
 
 
 class Profile(Section):
     """One flight's resolved configuration."""
 
-    name: str = Field("unnamed", description="of the profile; else its file's")
-    description: str = Field("", description="one sentence for people")
-    date: datetime.date | None = Field(
-        None, description="of the measurements in it; printed on the target"
-    )
+    name: str = key("unnamed", "of the profile; else its file's")
+    description: str = key("", "one sentence for people")
+    date: datetime.date | None = key(None, "of the measurements in it; printed on the target")
     camera: CameraConfig = CameraConfig()
     vehicle: VehicleConfig = VehicleConfig()
     target: TargetConfig = TargetConfig()
@@ -79,7 +74,7 @@ class Profile(Section):
     @classmethod
     def _present_keys(cls, values: Any) -> Any:
         """Logs of earlier versions hold profiles with old keys."""
-        return with_present_keys(values)[0] if isinstance(values, dict) else values
+        return with_present_keys(values, cls)[0] if isinstance(values, dict) else values
 
     @model_validator(mode="after")
     def _neighbours_can_be_printed(self) -> Profile:
@@ -99,149 +94,3 @@ class Profile(Section):
             if not limit.holds(self):
                 raise ValueError(limit.sentence(self))
         return self
-
-
-# --- Keys that must fit each other: what no flight could end well with is refused at load ------
-# `Limit` says that one side stays below the other; `IMPOSSIBLE` is the list that a profile is held
-# to. What is only doubtful is told by `perchctl.check.profile`.
-
-
-REACHED_SHARE = 0.8
-"""Of the take-off height: from here on it counts as reached (`Condition.AT_TAKEOFF_HEIGHT`)."""
-OVERDUE_SHARE = 0.5
-"""Of the landing's time: so long it goes by setpoints, and then by the vehicle's own landing."""
-
-
-def _sum(*parts: float) -> float:
-    return sum(parts)
-
-
-@dataclass(frozen=True)
-class Limit:
-    """`of` the values of `left`, their sum, must be below the value of `right`.
-
-    Attributes:
-        left, right: a key's dotted path, or a number that stands for itself.
-        because: what happens otherwise.
-        words: of what is no sum, what it is: {0}, {1}, ... stand for the parts of `left`.
-        equal: both sides may be equal.
-    """
-
-    left: tuple[str | float, ...]
-    right: str | float
-    because: str
-    of: Callable[..., float] = _sum
-    words: str = ""
-    equal: bool = False
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        return tuple(side for side in (*self.left, self.right) if isinstance(side, str))
-
-    def holds(self, profile: Any) -> bool:
-        """Also where a key has no number to compare."""
-        values = self._values(profile)
-        if values is None:
-            return True
-        left, right = values
-        return left < right or (self.equal and left <= right)
-
-    def sentence(self, profile: Any) -> str:
-        """What is found, and what must hold."""
-        relation = "must not exceed" if self.equal else "must be less than"
-        found, right = self._found(profile), _named(profile, self.right, units=bool(self.words))
-        return f"{found} {relation} {right}: {self.because}"
-
-    def _found(self, profile: Any) -> str:
-        """The left side, and what it comes to where it has parts."""
-        values = self._values(profile)
-        names = [_named(profile, side, units=bool(self.words)) for side in self.left]
-        named = self.words.format(*names) if self.words else " + ".join(names)
-        if values is None or len(names) == 1:
-            return named
-        if not self.words:
-            return f"{named}, together {values[0]:.3g},"
-        unit = key_unit(self.right) if isinstance(self.right, str) else ""
-        return f"{named} is {f'{values[0]:.3g} {unit}'.strip()}, and"
-
-    def _values(self, profile: Any) -> tuple[float, float] | None:
-        values = [_value(profile, side) for side in (*self.left, self.right)]
-        if not all(isinstance(value, (int, float)) for value in values):
-            return None
-        return self.of(*values[:-1]), values[-1]
-
-
-def _value(profile: Any, side: str | float) -> Any:
-    if side == "camera.latency_s":
-        return profile.camera.start_latency_s
-    return reduce(getattr, side.split("."), profile) if isinstance(side, str) else side
-
-
-def _named(profile: Any, side: str | float, units: bool = False) -> str:
-    if not isinstance(side, str):
-        return f"{side:g}"
-    unit = key_unit(side) if units else ""
-    return f"{side} ({f'{_value(profile, side):g} {unit}'.strip()})"
-
-
-IMPOSSIBLE: tuple[Limit, ...] = (
-    Limit(
-        ("planner.search.max_height_m",), "safety.max_height_m",
-        "the search would climb to where it has to land", equal=True,
-    ),
-    Limit(
-        ("planner.takeoff_height_m",), "planner.search.max_height_m",
-        "the take-off would end above where the search ends", equal=True,
-    ),
-    Limit(
-        ("planner.takeoff_height_m", "planner.takeoff_speed_mps"), "planner.approach_timeout_s",
-        "the take-off takes longer than it is waited for",
-        of=lambda height_m, speed_mps: REACHED_SHARE * height_m / speed_mps,
-        words=f"the climb to {REACHED_SHARE:g} of {{0}} at {{1}}",
-    ),
-    Limit(
-        ("camera.latency_s",), "safety.max_frame_age_s",
-        "every picture would be too old to measure by",
-    ),
-    Limit(
-        ("link.telemetry_period_s",), "safety.proof_age_s",
-        "telemetry would be too old to prove a contact or a landing",
-    ),
-    Limit(
-        ("link.telemetry_period_s",), "safety.telemetry_hold_s",
-        "telemetry would always be old, and the vehicle held",
-    ),
-    Limit(
-        ("link.telemetry_period_s",), "safety.telemetry_land_s",
-        "telemetry would always be old, and the vehicle landed",
-    ),
-    Limit(
-        ("planner.estimate.dwell_s",), "planner.estimate.timeout_s",
-        "no pose could be steady in time",
-    ),
-    Limit(
-        ("planner.align.dwell_s",), "planner.align.timeout_s", "nothing could be aligned in time"
-    ),
-    Limit(
-        ("planner.ascend.settle_dwell_s",), "planner.ascend.settle_timeout_s",
-        "it could not settle in time",
-    ),
-    Limit(
-        ("planner.ascend.settle_dwell_s",), "planner.ascend.timeout_s",
-        "it could not settle in time",
-    ),
-    Limit(
-        ("planner.perch.contact_dwell_s",), "planner.perch.timeout_s",
-        "no contact could be proven in time",
-    ),
-    Limit(
-        (
-            "planner.complete.hold_dwell_s", "planner.complete.ramp_s", "planner.complete.hang_s",
-        ), "planner.complete.release_timeout_s", "the thrust could not be released in time",
-    ),
-    Limit(
-        ("planner.recover.dwell_s",), "planner.recover.timeout_s",
-        "after a miss it could not become steady in time",
-    ),
-)  # fmt: skip
-"""Every flight with such a profile comes to nothing."""

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from perchctl.profile.base import Range, Section, Vector3, ordered
+from perchctl.profile.base import Ordered, Range, Section, Vector3, key
 
 MarkerId = Annotated[int, Field(ge=0)]
-_Positive = Annotated[float, Field(ge=0)]
-_Share = Annotated[float, Field(ge=0, le=1)]
-_Tilt = Annotated[float, Field(ge=0, le=20)]
-_Ohm = Annotated[float, Field(ge=0, le=1)]
-_Charge = Annotated[float, Field(ge=0.05, le=1)]
-_Knee = Annotated[float, Field(ge=0.01, le=0.9)]
-_Loss = Annotated[float, Field(ge=0, le=0.5)]
-_Burst = Annotated[float, Field(ge=0.01, le=10)]
-Amounts = Annotated[tuple[_Positive, _Positive], AfterValidator(ordered)]
-Shares = Annotated[tuple[_Share, _Share], AfterValidator(ordered)]
-Tilts = Annotated[tuple[_Tilt, _Tilt], AfterValidator(ordered)]
-Ohms = Annotated[tuple[_Ohm, _Ohm], AfterValidator(ordered)]
-Charges = Annotated[tuple[_Charge, _Charge], AfterValidator(ordered)]
-Knees = Annotated[tuple[_Knee, _Knee], AfterValidator(ordered)]
-Losses = Annotated[tuple[_Loss, _Loss], AfterValidator(ordered)]
-Bursts = Annotated[tuple[_Burst, _Burst], AfterValidator(ordered)]
+Amounts = Ordered[Annotated[float, Field(ge=0)]]
+Shares = Ordered[Annotated[float, Field(ge=0, le=1)]]
+Tilts = Ordered[Annotated[float, Field(ge=0, le=20)]]
+Ohms = Ordered[Annotated[float, Field(ge=0, le=1)]]
+Charges = Ordered[Annotated[float, Field(ge=0.05, le=1)]]
+Knees = Ordered[Annotated[float, Field(ge=0.01, le=0.9)]]
+Losses = Ordered[Annotated[float, Field(ge=0, le=0.5)]]
+Bursts = Ordered[Annotated[float, Field(ge=0.01, le=10)]]
 
 
 class SimulationConfig(Section):
@@ -33,163 +25,140 @@ class SimulationConfig(Section):
     `set` gives the defaults (`perchctl.profile.simulation`); keys that are written win over it.
     """
 
-    set: Literal["nominal", "rough", "extreme"] = Field(
-        "nominal", description="the world whose values stand where a key is not written"
+    set: Literal["nominal", "rough", "extreme"] = key(
+        "nominal", "the world whose values stand where a key is not written"
     )
-    start_offset_m: float = Field(
-        0.5, ge=0, le=5, description="start under the target, at most so far aside in x and in y"
+    start_offset_m: float = key(
+        0.5, "start under the target, at most so far aside in x and in y", ge=0, le=5
     )
-    target_yaw_deg: Range = Field((-180.0, 180.0), description="the target's heading")
-    ceiling_z_m: Range = Field((1.8, 2.6), description="over the floor")
-    mass_kg: Range = Field((0.038, 0.042), description="all-up")
-    battery_rest_v: Range = Field((3.85, 4.2), description="at the start")
-    camera_latency_s: Range = Field((0.03, 0.12), description="the true one")
-    camera_jitter_s: float = Field(0.008, ge=0, le=0.2, description="of the latency, one sigma")
-    camera_rate_hz: float = Field(30.0, gt=0, le=200, description="frames")
-    camera_drop_rate: float = Field(0.1, ge=0, lt=1, description="share of frames lost")
-    camera_burst_frames: tuple[int, int] | None = Field(
-        (8, 20), description="frames lost in one go, once a flight"
+    target_yaw_deg: Range = key((-180.0, 180.0), "the target's heading")
+    ceiling_z_m: Range = key((1.8, 2.6), "over the floor")
+    mass_kg: Range = key((0.038, 0.042), "all-up")
+    battery_rest_v: Range = key((3.85, 4.2), "at the start")
+    camera_latency_s: Range = key((0.03, 0.12), "the true one")
+    camera_jitter_s: float = key(0.008, "of the latency, one sigma", ge=0, le=0.2)
+    camera_rate_hz: float = key(30.0, "frames", gt=0, le=200)
+    camera_drop_rate: float = key(0.1, "share of frames lost", ge=0, lt=1)
+    camera_burst_frames: tuple[int, int] | None = key(
+        (8, 20), "frames lost in one go, once a flight"
     )
-    camera_noise_sigma: Range = Field((4.0, 8.0), description="of 255")
-    camera_exposure_s: float = Field(0.008, ge=0, le=0.05, description="motion blur")
-    camera_defocus_px: float = Field(0.6, ge=0, le=10, description="sigma of the lens's blur")
-    camera_fields: Literal["progressive", "top", "bottom"] = Field(
-        "progressive", description="interlaced: which row's field comes first"
+    camera_noise_sigma: Range = key((4.0, 8.0), "of 255")
+    camera_exposure_s: float = key(0.008, "motion blur", ge=0, le=0.05)
+    camera_defocus_px: float = key(0.6, "sigma of the lens's blur", ge=0, le=10)
+    camera_fields: Literal["progressive", "top", "bottom"] = key(
+        "progressive", "interlaced: which row's field comes first"
     )
-    camera_blended: bool = Field(
-        False, description="the two fields averaged, as some converters do"
+    camera_blended: bool = key(False, "the two fields averaged, as some converters do")
+    camera_readout_s: float = key(
+        0.0, "rolling shutter: from the first row to the last", ge=0, le=0.05
     )
-    camera_readout_s: float = Field(
-        0.0, ge=0, le=0.05, description="rolling shutter: from the first row to the last"
+    camera_flicker: float = key(
+        0.0, "share of the light that comes and goes 100 times a second", ge=0, le=1
     )
-    camera_flicker: float = Field(
-        0.0, ge=0, le=1, description="share of the light that comes and goes 100 times a second"
+    camera_pumping: float = key(
+        0.0, "share by which an exposure control that hunts is off", ge=0, le=0.9
     )
-    camera_pumping: float = Field(
-        0.0, ge=0, le=0.9, description="share by which an exposure control that hunts is off"
+    camera_analogue: float = key(
+        0.0, "trembling, torn and lost lines; 1 is about to be lost", ge=0, le=1
     )
-    camera_analogue: float = Field(
-        0.0, ge=0, le=1, description="trembling, torn and lost lines; 1 is about to be lost"
-    )
-    camera_receiver_hz: float | None = Field(
+    camera_receiver_hz: float | None = key(
         None,
+        "the receiver's own rate, at which it gives out its newest picture again; "
+        "none: each once, as it comes",
         gt=0,
         le=200,
-        description="the receiver's own rate, at which it gives out its newest picture again; "
-        "none: each once, as it comes",
     )
-    camera_receiver_noise: float = Field(
-        0.0, ge=0, le=50, description="that the receiver adds each time; of 255, one sigma"
+    camera_receiver_noise: float = key(
+        0.0, "that the receiver adds each time; of 255, one sigma", ge=0, le=50
     )
-    camera_blank_rate: float = Field(
-        0.0, ge=0, lt=1, description="share of pictures in whose place the screen is blue"
+    camera_blank_rate: float = key(
+        0.0, "share of pictures in whose place the screen is blue", ge=0, lt=1
     )
-    mount_error_deg: float = Field(
-        1.0, ge=0, le=20, description="what the profile's mount is wrong by, at most"
+    mount_error_deg: float = key(1.0, "what the profile's mount is wrong by, at most", ge=0, le=20)
+    mount_error_m: float = key(
+        0.001, "what the profile's mount is wrong by, at most", ge=0, le=0.05
     )
-    mount_error_m: float = Field(
-        0.001, ge=0, le=0.05, description="what the profile's mount is wrong by, at most"
+    estimate_noise_m: float = key(0.002, "of the state estimate", ge=0, le=0.2)
+    estimate_tilt_bias_deg: float = key(0.3, "of the state estimate, at most", ge=0, le=10)
+    drift_mps: float = key(0.01, "of the state estimate", ge=0, le=0.2)
+    gyro_bias_dps: float = key(
+        0.0, "of the gyroscope, without a deck; each axis, at most", ge=0, le=5
     )
-    estimate_noise_m: float = Field(0.002, ge=0, le=0.2, description="of the state estimate")
-    estimate_tilt_bias_deg: float = Field(
-        0.3, ge=0, le=10, description="of the state estimate, at most"
+    acc_bias_g: float = key(
+        0.0, "of the accelerometer, without a deck; each level axis, at most", ge=0, le=0.2
     )
-    drift_mps: float = Field(0.01, ge=0, le=0.2, description="of the state estimate")
-    gyro_bias_dps: float = Field(
-        0.0, ge=0, le=5, description="of the gyroscope, without a deck; each axis, at most"
+    draught_mps: Range = key((0.0, 0.3), "wind, with gusts")
+    magnet_force_n: float = key(1.2, "that the magnet holds", ge=0, le=20)
+    first_contact_fails: float = key(
+        0.1, "share of flights in which the first contact does not hold", ge=0, le=1
     )
-    acc_bias_g: float = Field(
-        0.0,
-        ge=0,
-        le=0.2,
-        description="of the accelerometer, without a deck; each level axis, at most",
+    no_target: bool = key(False, "a bare ceiling")
+    capture_delay_s: float = key(0.01, "motion capture: from exposure to arrival", ge=0, le=1)
+    capture_noise_m: float = key(0.001, "motion capture: of a position, one sigma", gt=0, le=0.1)
+    neighbours: tuple[tuple[float, float, float], ...] = key(
+        (), "other targets beside the own one: x and y (m) in its axes, heading (deg)", max_length=8
     )
-    draught_mps: Range = Field((0.0, 0.3), description="wind, with gusts")
-    magnet_force_n: float = Field(1.2, ge=0, le=20, description="that the magnet holds")
-    first_contact_fails: float = Field(
-        0.1, ge=0, le=1, description="share of flights in which the first contact does not hold"
+    neighbour_ids: tuple[MarkerId, MarkerId] | None = key(
+        None, "of their large and small markers; none: the own target's"
     )
-    no_target: bool = Field(False, description="a bare ceiling")
-    capture_delay_s: float = Field(
-        0.01, ge=0, le=1, description="motion capture: from exposure to arrival"
+    target_xy_m: tuple[float, float] | None = key(
+        None, "the target's centre, instead of what `start_offset_m` draws"
     )
-    capture_noise_m: float = Field(
-        0.001, gt=0, le=0.1, description="motion capture: of a position, one sigma"
+    camera_burst_start_s: Range = key((4.0, 22.0), "of the frames lost in one go")
+    mount_error_rpy_deg: Vector3 | None = key(
+        None, "what the mount is turned by, instead of what `mount_error_deg` draws"
     )
-    neighbours: tuple[tuple[float, float, float], ...] = Field(
-        (),
-        max_length=8,
-        description="other targets beside the own one: x and y (m) in its axes, heading (deg)",
+    mount_error_xyz_m: Vector3 | None = key(
+        None, "what the mount is shifted by, instead of what `mount_error_m` draws"
     )
-    neighbour_ids: tuple[MarkerId, MarkerId] | None = Field(
-        None, description="of their large and small markers; none: the own target's"
+    drift_xyz_mps: Vector3 | None = key(None, "the drift, instead of what `drift_mps` draws")
+    draught_towards_deg: Range = key((-180.0, 180.0), "counted from the world's x")
+    estimate_tilt_bias_xy_deg: tuple[float, float] | None = key(
+        None, "of roll and pitch, instead of what `estimate_tilt_bias_deg` draws"
     )
-    target_xy_m: tuple[float, float] | None = Field(
-        None, description="the target's centre, instead of what `start_offset_m` draws"
+    first_contact_share: ClassVar[tuple[float, float]] = (0.0, 0.6)
+    """Of the weight, that a first contact carries which does not hold."""
+    gust_mps: Amounts = key((0.0, 0.0), "peak of single gusts beside the draught")
+    gust_every_s: ClassVar[float] = 8.0
+    """On average."""
+    ceiling_suction: Shares = key(
+        (0.1, 0.1), "share of thrust gained with the rotors at the ceiling"
     )
-    camera_burst_start_s: Range = Field((4.0, 22.0), description="of the frames lost in one go")
-    mount_error_rpy_deg: Vector3 | None = Field(
-        None, description="what the mount is turned by, instead of what `mount_error_deg` draws"
+    cell_resistance_ohm: Ohms | None = key(None, "none: a good one's, 0.143")
+    cell_slow_ohm: Ohms = key((0.0, 0.0), "more of it, that an old or cold cell shows within 15 s")
+    cell_charge: Charges = key((1.0, 1.0), "share of a new one's that it holds")
+    cell_knee: Knees = key((0.1, 0.1), "share of its charge where the steep end begins")
+    target_tilt_deg: Tilts = key((0.0, 0.0), "of the target out of the horizontal")
+    target_tilt_towards_deg: Range = key(
+        (-180.0, 180.0), "which of its sides is lifted, from the world's x"
     )
-    mount_error_xyz_m: Vector3 | None = Field(
-        None, description="what the mount is shifted by, instead of what `mount_error_m` draws"
+    gloss: Amounts = key(
+        (0.0, 0.0), "brightest of the lamp's reflection in the print, in paper whites"
     )
-    drift_xyz_mps: Vector3 | None = Field(
-        None, description="the drift, instead of what `drift_mps` draws"
+    lamp_aside_m: ClassVar[tuple[float, float]] = (0.1, 0.6)
+    """Of the lamp, from under the target."""
+    lamp_z_m: ClassVar[tuple[float, float]] = (0.0, 1.2)
+    """Of the lamp, over the floor."""
+    flow_noise_radps: Amounts = key(
+        (0.0, 0.0), "of each reading of the flow sensor; times the height it is a speed"
     )
-    draught_towards_deg: Range = Field((-180.0, 180.0), description="counted from the world's x")
-    estimate_tilt_bias_xy_deg: tuple[float, float] | None = Field(
-        None, description="of roll and pitch, instead of what `estimate_tilt_bias_deg` draws"
+    flow_bias_dps: Amounts = key(
+        (0.0, 0.0), "of the gyroscope, that is taken for flow: drift grows with height"
     )
-    first_contact_share: Shares = Field(
-        (0.0, 0.6), description="of the weight, that a first contact carries which does not hold"
+    flow_reach_m: float | None = key(
+        None, "above this the flow sensor sees nothing; none: it always does", gt=0, le=20
     )
-    gust_mps: Amounts = Field((0.0, 0.0), description="peak of single gusts beside the draught")
-    gust_every_s: float = Field(8.0, gt=0, le=1000, description="on average")
-    ceiling_suction: Shares = Field(
-        (0.1, 0.1), description="share of thrust gained with the rotors at the ceiling"
+    bare_floor_m: Amounts = key(
+        (0.0, 0.0), "radius of a patch of floor without texture, where flow is blind"
     )
-    cell_resistance_ohm: Ohms | None = Field(None, description="none: a good one's, 0.143")
-    cell_slow_ohm: Ohms = Field(
-        (0.0, 0.0), description="more of it, that an old or cold cell shows within 15 s"
+    bare_floor_aside_m: ClassVar[tuple[float, float]] = (0.0, 0.6)
+    """Of it, from under the target."""
+    radio_loss: Losses = key((0.0, 0.0), "share of the time in which no packet passes")
+    radio_burst_s: Bursts = key((0.1, 0.1), "mean length of such a time")
+    capture_hole_s: Amounts = key(
+        (0.0, 0.0), "motion capture: for so long it does not see the vehicle"
     )
-    cell_charge: Charges = Field((1.0, 1.0), description="share of a new one's that it holds")
-    cell_knee: Knees = Field(
-        (0.1, 0.1), description="share of its charge where the steep end begins"
-    )
-    target_tilt_deg: Tilts = Field((0.0, 0.0), description="of the target out of the horizontal")
-    target_tilt_towards_deg: Range = Field(
-        (-180.0, 180.0), description="which of its sides is lifted, from the world's x"
-    )
-    gloss: Amounts = Field(
-        (0.0, 0.0), description="brightest of the lamp's reflection in the print, in paper whites"
-    )
-    lamp_aside_m: Amounts = Field((0.1, 0.6), description="of the lamp, from under the target")
-    lamp_z_m: Amounts = Field((0.0, 1.2), description="of the lamp, over the floor")
-    flow_noise_radps: Amounts = Field(
-        (0.0, 0.0), description="of each reading of the flow sensor; times the height it is a speed"
-    )
-    flow_bias_dps: Amounts = Field(
-        (0.0, 0.0), description="of the gyroscope, that is taken for flow: drift grows with height"
-    )
-    flow_reach_m: float | None = Field(
-        None,
-        gt=0,
-        le=20,
-        description="above this the flow sensor sees nothing; none: it always does",
-    )
-    bare_floor_m: Amounts = Field(
-        (0.0, 0.0), description="radius of a patch of floor without texture, where flow is blind"
-    )
-    bare_floor_aside_m: Amounts = Field((0.0, 0.6), description="of it, from under the target")
-    radio_loss: Losses = Field(
-        (0.0, 0.0), description="share of the time in which no packet passes"
-    )
-    radio_burst_s: Bursts = Field((0.1, 0.1), description="mean length of such a time")
-    capture_hole_s: Amounts = Field(
-        (0.0, 0.0), description="motion capture: for so long it does not see the vehicle"
-    )
-    capture_hole_every_s: float = Field(15.0, gt=0, le=1000, description="on average")
+    capture_hole_every_s: float = key(15.0, "on average", gt=0, le=1000)
 
     @model_validator(mode="before")
     @classmethod

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from perchctl.geometry import Array, make_T, rotation_from_rpy
-from perchctl.profile.base import BodyVector3, Section, Vector3
+from perchctl.plain_yaml import clip_text
+from perchctl.profile.base import BodyVector3, Section, Vector3, key
 from perchctl.profile.dictionaries import check_marker_id, is_one_pattern
-from perchctl.profile.plain_yaml import clip_text
 
 _FORMAT = "^[A-Z0-9]{3,4}$"
 
@@ -27,12 +27,9 @@ class Mounting(Section):
     image's right to the vehicle's left.
     """
 
-    position_m: BodyVector3 = Field(
-        (0.0, 0.0, 0.01), description="the camera in body axes: forward, left, up"
-    )
-    rpy_deg: Vector3 = Field(
-        (0.0, 0.0, 0.0),
-        description="its turn; at 0 0 0 the picture's right is forward, its bottom left",
+    position_m: BodyVector3 = key((0.0, 0.0, 0.01), "the camera in body axes: forward, left, up")
+    rpy_deg: Vector3 = key(
+        (0.0, 0.0, 0.0), "its turn; at 0 0 0 the picture's right is forward, its bottom left"
     )
 
     @field_validator("rpy_deg")
@@ -73,42 +70,36 @@ picture is so late that the target is not to be steered by."""
 class CameraConfig(Section):
     """The profile's `camera`: source, calibration, latency, mounting."""
 
-    source: str = Field(
+    source: str = key(
         "sim:",
-        description="`camera:N` or its name, `rtsp://...`, `http://...`, `aideck://HOST`, "
+        "`camera:N` or its name, `rtsp://...`, `http://...`, `aideck://HOST`, "
         "`gst:PIPELINE`, `video:FILE`, `images:DIR`, `sim:`",
     )
-    calibration: str = Field(
-        "example_640x480.yaml", description="file beside the profile, in `calib/`, or a whole path"
+    calibration: str = key(
+        "example_640x480.yaml", "file beside the profile, in `calib/`, or a whole path"
     )
-    cam: str | None = Field(
-        None, description="which camera of a Kalibr file of several: `cam0`, `cam1`, ..."
-    )
-    latency_s: Annotated[float, Field(ge=0, le=MOST_LATENCY_S)] | Literal["measured"] = Field(
-        START_LATENCY_S, description="from exposure to arrival; `measured`: by each flight"
+    cam: str | None = key(None, "which camera of a Kalibr file of several: `cam0`, `cam1`, ...")
+    latency_s: Annotated[float, Field(ge=0, le=MOST_LATENCY_S)] | Literal["measured"] = key(
+        START_LATENCY_S, "from exposure to arrival; `measured`: by each flight"
     )
     mount: Mounting = Mounting()
-    start_timeout_s: float = Field(8.0, gt=0, le=60, description="wait for the first good picture")
-    mirrored: bool = Field(False, description="flip each picture before use")
-    mask: str | None = Field(None, description="picture of what the vehicle itself covers, white")
-    fields: Literal["auto", "top", "bottom", "progressive"] = Field(
-        "auto",
-        description="interlaced pictures: found by measure, or which field is earlier, or never",
+    start_timeout_s: float = key(8.0, "wait for the first good picture", gt=0, le=60)
+    mirrored: bool = key(False, "flip each picture before use")
+    mask: str | None = key(None, "picture of what the vehicle itself covers, white")
+    fields: Literal["auto", "top", "bottom", "progressive"] = key(
+        "auto", "interlaced pictures: found by measure, or which field is earlier, or never"
     )
-    readout_s: float | None = Field(
-        0.0,
-        ge=0,
-        le=0.05,
-        description="rolling shutter: from the first row to the last; none: not known",
+    readout_s: float | None = key(
+        0.0, "rolling shutter: from the first row to the last; none: not known", ge=0, le=0.05
     )
 
-    format: str | None = Field(
+    format: str | None = key(
         None,
+        "asked of `camera:` sources: `MJPG`, `YUYV`, ...; none: the driver's own",
         pattern=_FORMAT,
-        description="asked of `camera:` sources: `MJPG`, `YUYV`, ...; none: the driver's own",
     )
-    rate_hz: float | None = Field(
-        None, gt=0, le=500, description="asked of `camera:` sources; none: the driver's own"
+    rate_hz: float | None = key(
+        None, "asked of `camera:` sources; none: the driver's own", gt=0, le=500
     )
     controls: dict[str, int | str] = Field(
         default_factory=dict,
@@ -166,23 +157,19 @@ class CameraConfig(Section):
 
 
 class VehicleConfig(Section):
-    gear_body_m: BodyVector3 = Field(
-        (0.0, 0.0, 0.03), description="tip of the magnet gear in body axes: forward, left, up"
+    gear_body_m: BodyVector3 = key(
+        (0.0, 0.0, 0.03), "tip of the magnet gear in body axes: forward, left, up"
     )
-    battery_mah: float = Field(
-        250.0, ge=50, le=5000, description="charge of the full battery, as printed on it"
-    )
+    battery_mah: float = key(250.0, "charge of the full battery, as printed on it", ge=50, le=5000)
 
 
 class MarkerConfig(Section):
     """One marker of the profile's `target`: dictionary, id and side."""
 
-    dictionary: str = Field(description="an OpenCV dictionary")
-    id: int = Field(ge=0, description="within the dictionary")
-    side_m: float = Field(
-        ge=0.004,
-        le=2.0,
-        description="of the black square, as printed; small: less than half of large",
+    dictionary: str = key(..., "an OpenCV dictionary")
+    id: int = key(..., "within the dictionary", ge=0)
+    side_m: float = key(
+        ..., "of the black square, as printed; small: less than half of large", ge=0.004, le=2.0
     )
 
     @model_validator(mode="after")
@@ -206,25 +193,21 @@ class TargetConfig(Section):
 
     large: MarkerConfig = MarkerConfig(dictionary="DICT_4X4_1000", id=997, side_m=0.150)
     small: MarkerConfig = MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=5, side_m=0.025)
-    size_sigma: float = Field(
-        0.005,
-        ge=0,
-        le=0.1,
-        description="share by which all printed sizes may be off; less once measured",
+    size_sigma: float = key(
+        0.005, "share by which all printed sizes may be off; less once measured", ge=0, le=0.1
     )
-    curl_per_m: float = Field(
+    curl_per_m: float = key(
         0.03,
+        "so much times r^2 a place r from the sheet's centre may be off its plane",
         ge=0,
         le=10,
-        description="so much times r^2 a place r from the sheet's centre may be off its plane",
     )
 
-    expected_xy_m: tuple[_InARoom, _InARoom] | None = Field(
-        None,
-        description="where it hangs, in the estimate's world: of several alike the nearest counts",
+    expected_xy_m: tuple[_InARoom, _InARoom] | None = key(
+        None, "where it hangs, in the estimate's world: of several alike the nearest counts"
     )
-    expected_within_m: float = Field(
-        0.3, gt=0, le=20, description="one farther from `expected_xy_m` is another vehicle's"
+    expected_within_m: float = key(
+        0.3, "one farther from `expected_xy_m` is another vehicle's", gt=0, le=20
     )
 
     @model_validator(mode="after")
@@ -261,36 +244,31 @@ class TargetConfig(Section):
 class DetectorConfig(Section):
     """The profile's `detector`: how markers are searched and measured."""
 
-    refinement: Literal["none", "subpix", "line"] = Field(
-        "line", description="of corners: lines fitted to the sides, OpenCV's sub-pixel, or none"
+    refinement: Literal["none", "subpix", "line"] = key(
+        "line", "of corners: lines fitted to the sides, OpenCV's sub-pixel, or none"
     )
-    window: bool = Field(True, description="look around the last pose first")
-    blurred: bool = Field(True, description="look once more where blur may hide the target")
-    blurred_every: int = Field(
-        4,
-        ge=1,
-        le=100,
-        description="... so in every Nth picture of a stream without it, not for a sharp one",
+    window: bool = key(True, "look around the last pose first")
+    blurred: ClassVar[bool] = True
+    """Look once more where blur may hide the target."""
+    blurred_every: int = key(
+        4, "... so in every Nth picture of a stream without it, not for a sharp one", ge=1, le=100
     )
-    cut: bool = Field(
-        True,
-        description="measure by what is left of the drawing where the picture cuts both markers",
+    cut: bool = key(
+        True, "measure by what is left of the drawing where the picture cuts both markers"
     )
-    correction_bits_large: int = Field(0, ge=0, le=3, description="wrong cells that are corrected")
-    correction_bits_small: int = Field(1, ge=0, le=3, description="wrong cells that are corrected")
+    correction_bits_large: int = key(0, "wrong cells that are corrected", ge=0, le=3)
+    correction_bits_small: int = key(1, "wrong cells that are corrected", ge=0, le=3)
 
 
 class PoseConfig(Section):
     """The profile's `pose`: how a pose is solved from corners."""
 
-    solver: Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"] = Field(
-        "sqpnp", description="OpenCV's solver for the first guess"
+    solver: Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"] = key(
+        "sqpnp", "OpenCV's solver for the first guess"
     )
-    refine: bool = Field(True, description="least squares on the corners after it")
-    max_reprojection_px: float = Field(3.0, gt=0, description="no pose above this RMS")
-    each_marker: bool = Field(
-        False, description="beside the joint pose also each marker's own, for the log"
-    )
+    refine: bool = key(True, "least squares on the corners after it")
+    max_reprojection_px: float = key(3.0, "no pose above this RMS", gt=0)
+    each_marker: bool = key(False, "beside the joint pose also each marker's own, for the log")
 
 
 class KalmanConfig(Section):
@@ -307,47 +285,62 @@ class KalmanConfig(Section):
     of the state estimate by that estimate's drift only, at most so fast.
     """
 
-    k1: float = Field(
-        0.04, gt=0, description="measurement noise, the paper's R = k1 I, with `noise: fixed`"
+    k1: float = key(0.04, "measurement noise, the paper's R = k1 I, with `noise: fixed`", gt=0)
+    k2: float = key(
+        0.004, "process noise of a frame, the paper's Q = k2 I, with `noise: fixed`", gt=0
     )
-    k2: float = Field(
-        0.004,
-        gt=0,
-        description="process noise of a frame, the paper's Q = k2 I, with `noise: fixed`",
+    alpha: float = key(
+        0.85, "a coasting track's speeds are multiplied by it each frame", gt=0, le=1
     )
-    alpha: float = Field(
-        0.85, gt=0, le=1, description="a coasting track's speeds are multiplied by it each frame"
+    n_max: int = key(8, "frames for which a track coasts", ge=0, le=100)
+    frame: Literal["level", "world"] = key(
+        "world", "where tracks live: `level` as the paper, or `world`"
     )
-    n_max: int = Field(8, ge=0, le=100, description="frames for which a track coasts")
-    frame: Literal["level", "world"] = Field(
-        "world", description="where tracks live: `level` as the paper, or `world`"
+    noise: Literal["fixed", "measured"] = key(
+        "measured", "k1 and k2 for every frame, or each pose's own covariance and accelerations"
     )
-    noise: Literal["fixed", "measured"] = Field(
-        "measured",
-        description="k1 and k2 for every frame, or each pose's own covariance and accelerations",
+    acceleration_mps2: ClassVar[float] = 3.0
+    """Of camera or target in the level frame, with `noise: measured`."""
+    turn_radps2: ClassVar[float] = 3.0
+    """Of the camera's attitude and heading, likewise."""
+    drift_mps2: float = key(
+        0.1, "of the state estimate's drift, for tracks in the world, likewise", gt=0, le=100
     )
-    acceleration_mps2: float = Field(
-        3.0,
-        gt=0,
-        le=100,
-        description="of camera or target in the level frame, with `noise: measured`",
+    attitude_sigma_deg: float = key(0.3, "constant error of roll and pitch, likewise", ge=0, le=10)
+    drift_mps: float = key(
+        0.05, "an unmeasured target moves in the estimate's world at most so fast", ge=0, le=1
     )
-    turn_radps2: float = Field(
-        3.0, gt=0, le=1000, description="of the camera's attitude and heading, likewise"
+    gate: bool = key(True, "a pose that contradicts the target's track is not taken")
+
+
+class WeightsConfig(Section):
+    """The paper's weights: the large marker's share in each axis and in yaw."""
+
+    x: float = key(0.275, "the large marker's share; the small one has the rest", ge=0, le=1)
+    y: float = key(0.306, "as x", ge=0, le=1)
+    z: float = key(0.728, "as x", ge=0, le=1)
+    yaw: float = key(0.469, "as x", ge=0, le=1)
+
+
+class MergeConfig(Section):
+    """The profile's `merge`: how the two markers become one estimate."""
+
+    method: Literal["weights", "joint"] = key(
+        "joint", "the paper's weights, or both markers solved as one"
     )
-    drift_mps2: float = Field(
-        0.1,
-        gt=0,
-        le=100,
-        description="of the state estimate's drift, for tracks in the world, likewise",
+    weights: WeightsConfig = WeightsConfig()
+    weights_file: str | None = key(None, "of `perchctl fit-weights`; replaces `weights`")
+    stages: Literal["seen", "range"] = key(
+        "seen", "merge what is seen, or by distance as equations 4, 6, 11"
     )
-    attitude_sigma_deg: float = Field(
-        0.3, ge=0, le=10, description="constant error of roll and pitch, likewise"
-    )
-    drift_mps: float = Field(
-        0.05,
-        ge=0,
-        le=1,
-        description="an unmeasured target moves in the estimate's world at most so fast",
-    )
-    gate: bool = Field(True, description="a pose that contradicts the target's track is not taken")
+    z2_m: float = key(0.25, "farthest range of the small marker", gt=0)
+    z3_m: float = key(0.12, "nearest range of the whole large marker", gt=0)
+    disagreement_m: ClassVar[float] = 0.03
+    """Farther apart than this the markers contradict."""
+    disagreement_frames: int = key(15, "so many in a row, and it lands", ge=1)
+
+    @model_validator(mode="after")
+    def _ranges_in_order(self) -> MergeConfig:
+        if not self.z3_m < self.z2_m:
+            raise ValueError("z3_m < z2_m must hold (metres)")
+        return self

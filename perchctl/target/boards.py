@@ -30,7 +30,8 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_valid
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
-from perchctl.profile import MarkerConfig, aruco_dictionary, dictionary_size, parse_yaml
+from perchctl.plain_yaml import parse_yaml
+from perchctl.profile import MarkerConfig, aruco_dictionary, dictionary_size
 from perchctl.target.drawing import (
     Rectangle,
     marker_cells,

@@ -19,17 +19,16 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration import profile_camera
 from perchctl.camera import VERDICT_TEXTS, mirrored_note
 from perchctl.check import Row, Verdict, camera, computer
-from perchctl.check.camera import Optical
-from perchctl.check.pictures import Blur, Light
-from perchctl.check.rehearsal import Rehearsal, Silent, rehearse
+from perchctl.check.rehearsal import Blur, Light, Rehearsal, rehearse
+from perchctl.check.row import ask
 from perchctl.errors import NotFound
 from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.effects import FOR_EVER, CameraFault
 from perchctl.flight.lockstep import LockstepClock, LockstepSource
 from perchctl.link import MockLink
-from perchctl.profile import load_profile
+from perchctl.profile import Profile, load_profile
 from perchctl.sim import Scenario, SimulatedVehicle
-from perchctl.target import Optics, make_design
+from perchctl.target import Optics, TargetDesign, make_design
 from perchctl.target.design import GearRanges, Ranges
 from perchctl.target.sight import Blind, Mounted
 from perchctl.vision import make_pipeline
@@ -82,14 +81,16 @@ def rehearsed(
     if fault is not None:
         source.begin(fault, 0.4)
     clock = LockstepClock(link)
-    return rehearse(link, source, PIPELINE, PROFILE, clock, duration_s, Stopwatch(0.005))
+    return rehearse(link.telemetry, source, PIPELINE, PROFILE, clock, duration_s, Stopwatch(0.005))
 
 
-def rows_of(done: Rehearsal, optical: Optical | None = None) -> dict[str, Row]:
-    optical = optical or camera.optical_of(done, PIPELINE)
-    found = camera.rows(done, optical, DESIGN, PROFILE)
-    assert [row.name for row in found] == list(camera.PICTURE_NAMES)
-    return {row.name: row for row in [*found, computer.loop_row(done, PROFILE)]}
+def rows_of(
+    done: Rehearsal, profile: Profile = PROFILE, design: TargetDesign = DESIGN
+) -> dict[str, Row]:
+    found = camera.picture_rows(done, design, profile, CAMERA)
+    assert [row.name for row in found] == list(camera.names_of(profile))
+    loop = ask("loop", computer.loop_finding, done, profile)
+    return {row.name: row for row in [*found, loop]}
 
 
 FAULTS: dict[str, dict[str, Any]] = {
@@ -122,11 +123,9 @@ def good() -> tuple[Rehearsal, dict[str, Row]]:
 def test_the_advice_for_a_mirrored_picture_goes_by_the_profile(is_set: bool) -> None:
     done, _ = shown("mirrored")
     config = PROFILE.camera.model_copy(update={"mirrored": is_set})
-    profile = PROFILE.model_copy(update={"camera": config})
     note = mirrored_note(config)
     noted = replace(done, problems=Counter({note: done.pictures}))
-    found = camera.rows(noted, camera.optical_of(done, PIPELINE), DESIGN, profile)
-    rows = {row.name: row for row in found}
+    rows = rows_of(noted, PROFILE.model_copy(update={"camera": config}))
     assert rows["mirrored"].advice == note.partition(": ")[2]
     assert rows["pictures"].advice == "see mirrored"
 
@@ -209,6 +208,14 @@ def gaps(*gaps_s: float) -> list[tuple[int, float]]:
     ("lost frames", "pass", {"arrivals": gaps(*[0.033, 0.05, 0.033, 0.05, 0.033] * 4),
                              "repeats": 30}),
     ("lost frames", "warn", {"arrivals": gaps(*[0.033, 0.05, 0.033, 0.14] * 5), "repeats": 30}),
+    ("light", "warn", {"light": Light(200.0, 0.5)}),
+    ("light", "warn", {"light": Light(30.0, 0.0)}),
+    ("light", "skipped", {"light": None}),
+    ("noise", "fail", {"noise": 40.0}),
+    ("noise", "skipped", {"noise": None}),
+    ("focus", "warn", {"blur": Blur(2.0, 2.0)}),
+    ("focus", "warn", {"blur": Blur(0.8, 2.5)}),
+    ("ranges", "skipped", {"blur": None}),
     ("target", "warn", {"found": 3, "target": None}),
     ("target", "fail", {"target": target_at(1.0, (0.0, 0.0, 0.23), (0.0, 0.0, 0.0))}),
     ("loop", "warn", {"work_s": [0.028] * 20}),
@@ -220,7 +227,7 @@ def gaps(*gaps_s: float) -> list[tuple[int, float]]:
 ])  # fmt: skip
 def test_figures_make_their_row(name: str, verdict: str, changes: dict[str, Any]) -> None:
     done = altered(**changes)
-    assert rows_of(done, Optical())[name].verdict == verdict
+    assert rows_of(done)[name].verdict == verdict
 
 
 def test_what_a_receiver_gives_out_again_is_counted_once() -> None:
@@ -238,36 +245,22 @@ def test_a_rate_below_the_wanted_one_warns() -> None:
     slow = PROFILE.model_copy(
         update={"camera": PROFILE.camera.model_copy(update={"rate_hz": 60.0})}
     )
-    rows = {row.name: row for row in camera.rows(good()[0], Optical(), DESIGN, slow)}
+    rows = rows_of(good()[0], slow)
     assert rows["frame rate"].verdict is Verdict.WARN
     assert "asked for 60" in rows["frame rate"].found
 
 
 def test_what_the_camera_does_not_do_as_asked_is_told() -> None:
-    row = camera.opened_row("camera:0", ["camera:0 (USB Video)"], ["it gives YUYV"])
+    row = camera.opened_finding("camera:0", ["camera:0 (USB Video)"], ["it gives YUYV"])
     assert (row.verdict, "YUYV" in row.found) == (Verdict.WARN, True)
-    assert camera.opened_row("camera:0", []).verdict is Verdict.PASS
-
-
-@pytest.mark.parametrize(("name", "verdict", "optical"), [
-    ("light", "warn", Optical(light=Light(200.0, 0.5, 0.0))),
-    ("light", "warn", Optical(light=Light(30.0, 0.0, 0.2))),
-    ("light", "skipped", Optical()),
-    ("noise", "fail", Optical(noise=40.0)),
-    ("noise", "skipped", Optical()),
-    ("focus", "warn", Optical(blur=Blur(2.0, 2.0))),
-    ("focus", "warn", Optical(blur=Blur(0.8, 2.5))),
-    ("ranges", "skipped", Optical()),
-])  # fmt: skip
-def test_what_a_picture_is_like_makes_its_row(name: str, verdict: str, optical: Optical) -> None:
-    assert rows_of(good()[0], optical)[name].verdict == verdict
+    assert camera.opened_finding("camera:0", []).verdict is Verdict.PASS
 
 
 def test_a_gap_in_the_target_s_ranges_is_told() -> None:
     blind = Mounted(Blind(None, None))
     gap = replace(DESIGN, warnings=("gap between the markers",), gear=GearRanges(None, None),
                   mount=blind)  # fmt: skip
-    rows = {r.name: r for r in camera.rows(good()[0], Optical(blur=Blur(1.0, 1.0)), gap, PROFILE)}
+    rows = rows_of(good()[0], design=gap)
     assert rows["ranges"].verdict is Verdict.WARN
     assert "gap between the markers" in rows["ranges"].found
 
@@ -278,7 +271,7 @@ def test_the_better_turn_of_the_camera_is_told() -> None:
         "mount": PROFILE.camera.mount.model_copy(update={
             "position_m": (0.0, 0.03, 0.03), "rpy_deg": (0.0, 0.0, 0.0)})})})  # fmt: skip
     design = make_design(profile.target, CAMERA, Optics(), profile, ranges=RANGES)
-    (row,) = (r for r in camera.rows(good()[0], Optical(), design, profile) if r.name == "blind")
+    row = rows_of(good()[0], profile, design)["blind"]
     assert row.verdict is Verdict.WARN
     assert "camera.mount.rpy_deg" in row.advice
 
@@ -291,9 +284,9 @@ def test_the_ranges_are_those_of_these_pictures(monkeypatch: pytest.MonkeyPatch)
         return RANGES
 
     monkeypatch.setattr("perchctl.target.design.design_ranges", ranges)
-    done = altered(target=target_at(1.0, (0.0, 0.0, 2.2), (0.0, 0.0, 0.0)), height_m=0.0)
-    optical = Optical(noise=9.3, blur=Blur(1.4, 1.6))
-    design = camera.design_of(done, optical, PIPELINE, PROFILE)
+    high = target_at(1.0, (0.0, 0.0, 2.2), (0.0, 0.0, 0.0))
+    done = altered(target=high, height_m=0.0, noise=9.3, blur=Blur(1.4, 1.6))
+    design = camera.design_of(done, PIPELINE, PROFILE)
     assert asked == [Optics(1.5, 9.0)]
     assert design.search_range_m == pytest.approx(2.2 - 1.3 - 0.005, abs=0.01)
 
@@ -301,67 +294,57 @@ def test_the_ranges_are_those_of_these_pictures(monkeypatch: pytest.MonkeyPatch)
 def test_an_unknown_height_says_nothing_of_the_ceiling(monkeypatch: pytest.MonkeyPatch) -> None:
     """Seen from 1 m, and without telemetry: that is no ceiling at 1 m."""
     monkeypatch.setattr("perchctl.target.design.design_ranges", lambda *_: RANGES)
-    near = target_at(1.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
-    optical = Optical(noise=4.0, blur=Blur(1.0, 1.0))
-    design = camera.design_of(altered(target=near, height_m=None), optical, PIPELINE, PROFILE)
+    near = {"target": target_at(1.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)), "noise": 4.0}
+    design = camera.design_of(altered(**near, height_m=None), PIPELINE, PROFILE)
     assert design.search_range_m is None
     assert design.warnings == DESIGN.warnings  # those of no ceiling
-    on_the_floor = camera.design_of(altered(target=near, height_m=0.0), optical, PIPELINE, PROFILE)
+    on_the_floor = camera.design_of(altered(**near, height_m=0.0), PIPELINE, PROFILE)
     assert len(on_the_floor.warnings) > len(design.warnings)
 
 
 def test_pictures_of_another_size_are_not_looked_at() -> None:
-    row = camera.size_row((320, 240), (640, 480))
-    assert row.verdict is Verdict.FAIL
-    assert "320x240" in row.found
-    assert camera.size_row((640, 480), (640, 480)).verdict is Verdict.PASS
-    assert camera.size_row(None, (640, 480)).verdict is Verdict.SKIPPED
-    rest = camera.unseen("of another size", row)
-    assert [r.name for r in rest] == ["size", *camera.PICTURE_NAMES]
-    assert {r.verdict for r in rest[1:]} == {Verdict.SKIPPED}
+    finding = camera.size_finding((320, 240), (640, 480))
+    assert finding.verdict is Verdict.FAIL
+    assert "320x240" in finding.found
+    assert camera.size_finding((640, 480), (640, 480)).verdict is Verdict.PASS
+    assert camera.size_finding(None, (640, 480)).verdict is Verdict.SKIPPED
 
 
 def test_a_missing_camera_names_those_that_are_there() -> None:
     error = NotFound("camera:7 was not found; there are camera:0; plug in the camera")
-    first, *rest = camera.refused(error, ["camera:0"])
+    first, *rest = camera.refused_rows(error, ["camera:0"], PROFILE)
     assert (first.name, first.verdict) == ("camera", Verdict.FAIL)
     assert "camera:0" in first.found
     assert first.advice == "plug in the camera"
     assert {r.verdict for r in rest} == {Verdict.SKIPPED}
-    told = camera.refused(NotFound("http://x: no answer"), ["camera:2"])[0]
+    told = camera.refused_rows(NotFound("http://x: no answer"), ["camera:2"], PROFILE)[0]
     assert "camera:2" in told.advice
 
 
 # --- The rehearsal itself, and the computer ---------------------------------------------
 
 
-class Shouting(Silent):
-    """A link that may only be listened to."""
-
-    def send(self, command: Any) -> None:
-        raise AssertionError("nothing is sent in a rehearsal")
-
-
-def test_a_rehearsal_sends_nothing_and_needs_no_vehicle() -> None:
+def test_a_rehearsal_needs_no_vehicle() -> None:
+    """Nor can it send anything: telemetry is all that it gets of one."""
     vehicle = SimulatedVehicle(Scenario(), CAMERA, PROFILE.target)
     clock = LockstepClock(MockLink(vehicle))
     assert vehicle.camera is not None
     source = LockstepSource(vehicle.camera, 0.07)
-    done = rehearse(Shouting(), source, PIPELINE, PROFILE, clock, 0.3, time.perf_counter)
+    done = rehearse(list, source, PIPELINE, PROFILE, clock, 0.3, time.perf_counter)
     assert done.pictures > 3
     assert done.height_m is None
 
 
 def test_the_log_s_folder_is_not_made(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "b"
-    assert computer.log_folder_row(folder).verdict is Verdict.PASS
-    assert computer.disk_row(folder).verdict is not Verdict.SKIPPED
+    assert computer.log_folder_finding(folder).verdict is Verdict.PASS
+    assert computer.disk_finding(folder).verdict is not Verdict.SKIPPED
     assert not (tmp_path / "a").exists()
 
 
 def test_a_log_folder_that_is_a_file_fails(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")
-    row = computer.log_folder_row(tmp_path / "taken")
+    row = computer.log_folder_finding(tmp_path / "taken")
     assert row.verdict is Verdict.FAIL
     assert "is a file" in row.found
 
@@ -374,4 +357,4 @@ def test_a_full_disk_is_told(
 ) -> None:
     usage = type("Usage", (), {"free": free, "total": 10**12})
     monkeypatch.setattr(computer.shutil, "disk_usage", lambda path: usage)
-    assert computer.disk_row(tmp_path).verdict == verdict
+    assert computer.disk_finding(tmp_path).verdict == verdict

@@ -65,8 +65,8 @@ def rows_of(it: Scripted, sample: Telemetry | None = None) -> dict[str, Row]:
         return [replace(rest, t_s=it.now_s)]
 
     seen = capture.listen(heard, it, it.clock, it.wait)
-    found = capture.rows(seen, PROFILE)
-    assert [row.name for row in found] == list(capture.NAMES)
+    found = capture.capture_rows(seen, PROFILE)
+    assert [row.name for row in found] == ["capture", "body", *capture.CAPTURE]
     return {row.name: row for row in found}
 
 
@@ -141,16 +141,18 @@ def test_a_tilted_vehicle_is_not_judged() -> None:
 def test_without_a_vehicle_the_attitude_is_not_compared() -> None:
     it = Scripted()
     seen = capture.listen(lambda: [], it, it.clock, it.wait)
-    rows = {row.name: row for row in capture.rows(seen, PROFILE)}
+    rows = {row.name: row for row in capture.capture_rows(seen, PROFILE)}
     assert rows["body place"].verdict is Verdict.SKIPPED
     assert "no telemetry" in rows["body place"].found
     mm = Scripted(lambda t_s, p: moved(p, 1000.0))
     seen = capture.listen(lambda: [], mm, mm.clock, mm.wait)
-    assert {r.name: r for r in capture.rows(seen, PROFILE)}["body place"].verdict is Verdict.FAIL
+    assert {r.name: r for r in capture.capture_rows(seen, PROFILE)}[
+        "body place"
+    ].verdict is Verdict.FAIL
 
 
 def test_one_that_does_not_open_skips_the_rest() -> None:
-    rows = capture.refused("no motion capture vicon:lab: no answer within 5 s", CONFIG)
-    assert [row.name for row in rows] == list(capture.NAMES)
+    rows = capture.refused_rows("no motion capture vicon:lab: no answer within 5 s", CONFIG)
+    assert [row.name for row in rows] == ["capture", "body", *capture.CAPTURE]
     assert rows[0].verdict is Verdict.FAIL
     assert {row.verdict for row in rows[1:]} == {Verdict.SKIPPED}

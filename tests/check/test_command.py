@@ -12,14 +12,14 @@ from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import CheckScope, Row, Verdict, camera, compared, gone, session
-from perchctl.check.row import failed, passed, skipped, warned
+from perchctl.check import CheckScope, Row, Verdict, camera, check, session
+from perchctl.check.capture import CAPTURE, COMPARED
+from perchctl.check.vehicle import GONE
 from perchctl.commands import app
 from perchctl.commands import check as command
-from perchctl.commands.check import CheckRequest, exit_code, run, table
-from perchctl.errors import UsageError
+from perchctl.commands.check import confirm_motors, exit_code, report, table
 from perchctl.sim import SimProcess
-from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed
+from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options
 from tests.helpers.flights import ROOT
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -34,7 +34,7 @@ def invoke(*words: str) -> Any:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "_wanted", lambda request: CheckScope(**QUICK))
+    monkeypatch.setattr(command, "CheckScope", lambda **_: CheckScope(**QUICK))
 
 
 def test_json_is_a_list_of_rows(quick: None) -> None:
@@ -92,18 +92,14 @@ def test_ctrl_c_ends_with_what_was_found(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(session, "simulated_vehicle", lambda *_: Borrowed(sim))
-    code = run(CheckRequest(), CheckScope(**QUICK, tell=tell))
+    rows = check(options("sim://", "sim:"), CheckScope(**QUICK, tell=tell))
+    code = report(rows, as_json=False)
     printed = capsys.readouterr()
     assert code == 130
     assert "Ctrl-C" in printed.err
     assert ("supervisor" in printed.out) is (stage == "opening")
     assert not printed.out or "not finished" in printed.out
     assert "nothing fails" not in printed.out
-
-
-def test_a_motor_test_needs_somebody_to_ask() -> None:
-    with pytest.raises(UsageError, match="add --yes"):
-        run(CheckRequest(prop_test=True))
 
 
 @pytest.mark.parametrize(("answer", "leave"), [("y", True), ("yes", True), ("", False),
@@ -117,17 +113,22 @@ def test_only_yes_is_a_yes(
         return answer
 
     monkeypatch.setattr("builtins.input", typed)
-    assert command._confirmed() is leave
+    assert confirm_motors() is leave
 
 
 ROWS = [
-    passed("address", "sim:// answers"),
-    warned("lost frames", "22 %, longest gap 111 ms " + "and more " * 12, "bring it nearer " * 8),
-    failed("battery", "the battery rests at 3.50 V", "charge it"),
-    skipped("print", "both markers must be in view", "hold it nearer"),
-    skipped("radio", "none in sim://"),
-    skipped("signal", "the vehicle does not answer"),
-    skipped("packets", "the vehicle does not answer"),
+    Row("address", Verdict.PASS, "sim:// answers"),
+    Row(
+        "lost frames",
+        Verdict.WARN,
+        "22 %, longest gap 111 ms " + "and more " * 12,
+        "bring it nearer " * 8,
+    ),
+    Row("battery", Verdict.FAIL, "the battery rests at 3.50 V", "charge it"),
+    Row("print", Verdict.SKIPPED, "both markers must be in view", "hold it nearer"),
+    Row("radio", Verdict.SKIPPED, "none in sim://"),
+    Row("signal", Verdict.SKIPPED, "the vehicle does not answer"),
+    Row("packets", Verdict.SKIPPED, "the vehicle does not answer"),
 ]
 
 
@@ -145,9 +146,9 @@ def test_the_table_fits_80_columns_and_says_what_to_do() -> None:
 @pytest.mark.parametrize(("rows", "code"), [
     (ROWS[:2], 0),
     (ROWS, 52),
-    ([failed("address", "", "")], 10),
-    ([failed("camera", "", ""), failed("battery", "", "")], 20),
-    ([skipped("address", "")], 0),
+    ([Row("address", Verdict.FAIL, "")], 10),
+    ([Row("camera", Verdict.FAIL, ""), Row("battery", Verdict.FAIL, "")], 20),
+    ([Row("address", Verdict.SKIPPED, "")], 0),
 ])  # fmt: skip
 def test_the_exit_code_is_the_first_failing_row_s(rows: list[Row], code: int) -> None:
     assert exit_code(rows) == code
@@ -181,5 +182,20 @@ def test_a_flight_says_what_its_profile_makes_doubtful(tmp_path: Path) -> None:
 
 def test_every_row_is_on_its_page() -> None:
     page = (ROOT / "docs" / "check.md").read_text(encoding="utf-8")
-    for name in (*VEHICLE, compared.NAME, gone.NAME, *camera.NAMES, "loop", "disk", "log folder"):
+    for name in (
+        *VEHICLE,
+        *CAPTURE,
+        COMPARED,
+        GONE,
+        *camera.PICTURES,
+        *camera.DESIGN,
+        *camera.SIGHT,
+        "capture",
+        "body",
+        "camera",
+        "size",
+        "loop",
+        "disk",
+        "log folder",
+    ):
         assert f"`{name}`" in page, name

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from perchctl.check import Verdict, compared
+from perchctl.check import Verdict
+from perchctl.check.capture import save_row
 from perchctl.commands import app
 from perchctl.flight import wall_date
 from perchctl.profile import PositioningConfig
@@ -54,7 +55,7 @@ def test_what_the_hand_finds_is_what_fly_refuses(
 
     turn = axes_matrix(axes)
     lifted = recorded(world=turn, body=turn.T, config=config)
-    row = compared.kept(lifted, config, NOWHERE, wall_date())
+    row = save_row(lifted, config, NOWHERE, wall_date())
     code, said = fly()
     if words is None:
         assert (lifted.verdict, row.verdict) == (Verdict.PASS, Verdict.PASS)

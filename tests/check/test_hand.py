@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from perchctl.check import Row, Verdict, hand
+from perchctl.check import Verdict, capture
+from perchctl.check.row import Finding
 from perchctl.geometry import Array, rot_z, rotation_from_rpy
 from perchctl.positioning import BodyPose, Placed
 from perchctl.profile import PositioningConfig
@@ -53,8 +55,8 @@ def recorded(
     seen: tuple[float, float, float] | None = None,
     mirror: Array = I3,
     config: PositioningConfig = CONFIG,
-) -> Row:
-    """The row of what a capture says that has the vehicle as ``world R body``, and of what the
+) -> Finding:
+    """The finding on what a capture says that has the vehicle as ``world R body``, and of what the
     vehicle says itself, from a heading of its own: both with noise, the capture late."""
     from perchctl.geometry import quaternion_from_rotation
     from perchctl.positioning import Placed
@@ -79,7 +81,7 @@ def recorded(
         place = scale * (mirror @ world @ (origin + place + rng.normal(0.0, 0.001, 3)))
         pose = BodyPose(tuple(place), quaternion_from_rotation(R_seen))
         places.append(Placed.of(pose, config, float(t_s)))
-    return hand.row(hand.paired(samples, places), config)
+    return capture.hand_finding(capture.paired(samples, places), config)
 
 
 def _rpy(R: Array) -> tuple[float, float, float]:
@@ -182,7 +184,7 @@ def test_what_too_small_a_motion_cannot_tell_is_no_pass(
     row = recorded(7, own=own)
     assert row.verdict == verdict, row
     assert words in row.found
-    assert row.advice == hand.HOW
+    assert row.advice == capture.HOW_TO_TURN
 
 
 @pytest.mark.parametrize("own", [(1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
@@ -206,11 +208,11 @@ def test_what_is_asked_for_is_enough_however_long_it_stands(
         replace(stop, rpy_rad=(share * stop.rpy_rad[0], share * stop.rpy_rad[1], stop.rpy_rad[2]))
         for stop in lifted_and_turned(home)
     ])  # fmt: skip
-    moments = [way.at(float(t_s)) for t_s in np.arange(-before_s, 7.5 + after_s, hand.EVERY_S)]
-    R = np.array([moment.R for moment in moments])
-    moved = hand.Moved(R, R, np.array([moment.position_m for moment in moments]), 0.2)
-    assert hand.is_enough(moved)
-    assert hand.row(moved, CONFIG).verdict is Verdict.PASS
+    moments = [way.at(float(t_s)) for t_s in np.arange(-before_s, 7.5 + after_s, capture.EVERY_S)]
+    R = Rotation.from_matrix([moment.R for moment in moments])
+    moved = capture.Moved(R, R, np.array([moment.position_m for moment in moments]), 0.2)
+    assert capture.is_enough(moved)
+    assert capture.hand_finding(moved, CONFIG).verdict is Verdict.PASS
 
 
 @given(wobble_deg=st.floats(0.0, 5.0), stands_s=st.floats(0.2, 20.0))
@@ -221,15 +223,15 @@ def test_a_hand_that_wobbles_has_tilted_nothing(wobble_deg: float, stands_s: flo
         Stop(1.0, up), Stop(0.8, up, (wobble, -wobble, turn / 2.0)),
         Stop(0.8, up, (-wobble, wobble, turn)), Stop(1.5, up), Stop(1.0, (0.0, 0.0, 0.0)),
     ])  # fmt: skip
-    moments = [way.at(float(t_s)) for t_s in np.arange(-0.5, 5.1 + stands_s, hand.EVERY_S)]
-    R = np.array([moment.R for moment in moments])
-    moved = hand.Moved(R, R, np.array([moment.position_m for moment in moments]), 0.2)
-    assert not hand.is_enough(moved)
-    assert "too few axes" in hand.row(moved, CONFIG).found
+    moments = [way.at(float(t_s)) for t_s in np.arange(-0.5, 5.1 + stands_s, capture.EVERY_S)]
+    R = Rotation.from_matrix([moment.R for moment in moments])
+    moved = capture.Moved(R, R, np.array([moment.position_m for moment in moments]), 0.2)
+    assert not capture.is_enough(moved)
+    assert "too few axes" in capture.hand_finding(moved, CONFIG).found
 
 
 def test_without_moments_of_both_nothing_is_said() -> None:
-    assert hand.row(None, CONFIG).verdict is Verdict.SKIPPED
+    assert capture.hand_finding(None, CONFIG).verdict is Verdict.SKIPPED
     sample = telemetry(0.0)
-    assert hand.paired([sample, replace(sample, t_s=1.0)], []) is None
-    assert hand.paired([], []) is None
+    assert capture.paired([sample, replace(sample, t_s=1.0)], []) is None
+    assert capture.paired([], []) is None

@@ -16,7 +16,9 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("motioncapture", reason="motion capture needs the extra [mocap]")
 
-from perchctl.check import CheckScope, Row, Verdict, check, compared, hand
+from perchctl.check import CheckScope, Row, Verdict, check
+from perchctl.check.capture import COMPARED, HOW_TO_TURN
+from perchctl.check.vehicle import LIFTED
 from perchctl.errors import SafetyAbort
 from perchctl.flight import require_comparison
 from perchctl.profile import Profile
@@ -62,7 +64,7 @@ class Lab:
             lasted_s = time.monotonic() - began_s
             behind_s = lasted_s - (self.sim.truth()["t_s"] - began_t_s)
             least_s = min(least_s, behind_s)
-            if rows[hand.NAME].verdict is expected or behind_s < SLOW_S:
+            if rows[LIFTED].verdict is expected or behind_s < SLOW_S:
                 return rows
         if least_s > STARVED_S:
             pytest.skip(f"no real time on this computer: {least_s:.1f} s lost at each try")
@@ -72,7 +74,7 @@ class Lab:
         """The hand takes it when the command says so."""
 
         def tell(text: str) -> None:
-            if hand.HOW in text:
+            if HOW_TO_TURN in text:
                 self.sim.carry(lifted_and_turned(HOME))
 
         self._put_down()
@@ -112,11 +114,11 @@ def test_a_capture_that_is_set_up_right_passes_and_may_be_flown_by(sim: SimProce
     with pytest.raises(SafetyAbort, match="never compared"):
         it.may_fly()
     rows = it.lift(UNTIL_BACK_S, Verdict.PASS)
-    lifted = rows[hand.NAME]
+    lifted = rows[LIFTED]
     assert lifted.verdict is Verdict.PASS, lifted
     assert "turns as the vehicle does" in lifted.found
     assert rows["body place"].verdict is Verdict.PASS
-    assert rows[compared.NAME].verdict is Verdict.PASS
+    assert rows[COMPARED].verdict is Verdict.PASS
     it.may_fly()
 
 
@@ -136,7 +138,7 @@ def test_what_is_set_up_wrong_is_named_and_not_flown_by(
         rows = it.lift(within_s, Verdict.FAIL)
     finally:
         sim.capture_fault(None)
-    assert rows[hand.NAME].verdict is Verdict.FAIL, rows[hand.NAME]
-    assert re.search(words, rows[hand.NAME].found)
+    assert rows[LIFTED].verdict is Verdict.FAIL, rows[LIFTED]
+    assert re.search(words, rows[LIFTED].found)
     with pytest.raises(SafetyAbort, match="found by check --lift on"):
         it.may_fly()

@@ -14,8 +14,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import CheckScope, Row, Verdict, gone, health, lift, session
-from perchctl.check.link import Vehicle
+from perchctl.check import CheckScope, Row, Verdict, session, vehicle
+from perchctl.check.row import Finding
+from perchctl.check.vehicle import Vehicle
 from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.vehicle import FLYING, LOCKED, Telemetry
 from tests.helpers.checks import AT_REST, NOWHERE, PROFILE, said
@@ -66,8 +67,8 @@ class Lockstep:
 
 
 def motors(rig: Lockstep) -> dict[str, Row]:
-    rows = health.run(rig, PROFILE, rig.wait)  # type: ignore[arg-type]
-    assert [row.name for row in rows] == list(health.NAMES)
+    rows = vehicle.motor_rows(rig, PROFILE, rig.wait)  # type: ignore[arg-type]
+    assert [row.name for row in rows] == list(vehicle.MOTORS)
     return {row.name: row for row in rows}
 
 
@@ -90,10 +91,9 @@ def test_the_motor_test_finds_what_is_wrong(
 
 
 def test_the_firmware_s_own_threshold_counts() -> None:
-    seen = health.Propellers((1.0, 1.0, 1.0, 1.0), (True, True, False, True))
-    assert health.propeller_row(seen).verdict is Verdict.FAIL
-    even = health.propeller_row(health.Propellers((1.0, 1.0, 1.0, 1.0), (True,) * 4))
-    assert even.verdict is Verdict.PASS
+    even = (1.0, 1.0, 1.0, 1.0)
+    assert vehicle.propellers_finding(even, {2}).verdict is Verdict.FAIL
+    assert vehicle.propellers_finding(even, set()).verdict is Verdict.PASS
 
 
 @pytest.mark.parametrize(("change", "age_s", "words"), [
@@ -106,9 +106,9 @@ def test_the_firmware_s_own_threshold_counts() -> None:
     ({"position_variance_m2": 1.0}, 0.0, "variance"),
 ])  # fmt: skip
 def test_no_motor_turns_but_on_the_ground(change: dict[str, Any], age_s: float, words: str) -> None:
-    assert words in health.hindrance(said(**change), age_s, PROFILE)
-    assert health.hindrance(AT_REST, 0.0, PROFILE) == ""
-    assert health.hindrance(None, 0.0, PROFILE)
+    assert words in vehicle.hindrance(said(**change), age_s, PROFILE)
+    assert vehicle.hindrance(AT_REST, 0.0, PROFILE) == ""
+    assert vehicle.hindrance(None, 0.0, PROFILE)
 
 
 def test_a_vehicle_that_is_picked_up_between_the_tests_is_left_alone() -> None:
@@ -122,7 +122,7 @@ def test_a_vehicle_that_is_picked_up_between_the_tests_is_left_alone() -> None:
         rig.vehicle.world.set_pose((0.0, 0.0, 0.5), hold=True)
 
     rig.start_health_test = picked_up  # type: ignore[method-assign]
-    rows = health.run(rig, PROFILE, rig.wait)  # type: ignore[arg-type]
+    rows = vehicle.motor_rows(rig, PROFILE, rig.wait)  # type: ignore[arg-type]
     assert rows[1].verdict is Verdict.SKIPPED
     assert "not begun" in rows[1].found
     assert rig.vehicle.firmware.log_value("health.batterySag") == 0.0
@@ -149,7 +149,7 @@ def test_a_sag_that_came_once_is_judged_though_the_next_answer_is_lost() -> None
     ask = rig.variables
 
     def once(names: Any) -> dict[str, float]:
-        if list(names) != [health.SAG]:
+        if list(names) != [vehicle.SAG]:
             return ask(names)
         if changed:
             return {}
@@ -163,18 +163,18 @@ def test_a_sag_that_came_once_is_judged_though_the_next_answer_is_lost() -> None
     assert row.found.startswith(f"{changed[0]:.2f} V")
 
 
-@pytest.mark.parametrize("without", [set(health.VARIANCES[6:]), {health.PASS}])
+@pytest.mark.parametrize("without", [set(vehicle.VARIANCES[6:]), {vehicle.PASS}])
 def test_a_result_that_comes_in_part_is_no_broken_motor(without: set[str]) -> None:
     rig = Lockstep()
-    rig.parameters = lambda: {health.THRESHOLD: 9.0}  # type: ignore[method-assign]
-    unheard(rig, {*health.VARIANCES, health.PASS}, without)
+    rig.parameters = lambda: {vehicle.THRESHOLD: 9.0}  # type: ignore[method-assign]
+    unheard(rig, {*vehicle.VARIANCES, vehicle.PASS}, without)
     row = motors(rig)["propellers"]
     assert row.verdict is Verdict.WARN
     assert "did not come whole" in row.found
 
 
 @pytest.mark.parametrize(("name", "asked"), [
-    ("propellers", health.COUNT), ("battery sag", health.SAG),
+    ("propellers", vehicle.COUNT), ("battery sag", vehicle.SAG),
 ])  # fmt: skip
 def test_a_first_question_without_an_answer_is_not_a_firmware_without_the_test(
     name: str, asked: str
@@ -193,9 +193,16 @@ def test_an_earlier_test_s_result_is_not_taken_for_this_one_s() -> None:
     """Though the count that tells them apart be lost once."""
     rig = Lockstep()
     motors(rig)
-    unheard(rig, {health.PASS, health.COUNT}, {health.COUNT})
+    unheard(rig, {vehicle.PASS, vehicle.COUNT}, {vehicle.COUNT})
     rig.start_health_test = lambda test: None  # type: ignore[method-assign]
-    assert motors(rig)["propellers"].found == health.NO_RESULT
+    assert motors(rig)["propellers"].found == vehicle.NO_RESULT
+
+
+def test_a_result_counts_only_once_the_test_has_finished() -> None:
+    rig = Lockstep()
+    read = rig.variables
+    rig.variables = lambda names: read(names) | {vehicle.PASS: 0.0}  # type: ignore[method-assign]
+    assert motors(rig)["propellers"].found == vehicle.NO_RESULT
 
 
 def test_after_a_test_without_a_result_no_other_begins() -> None:
@@ -208,7 +215,7 @@ def test_after_a_test_without_a_result_no_other_begins() -> None:
     assert rows["propellers"].verdict is Verdict.WARN
     assert "keep clear" in rows["propellers"].advice
     assert rows["battery sag"].found.startswith("not begun: the test before")
-    assert health.hindrance(rig.newest(), rig.age_s(), PROFILE) == ""
+    assert vehicle.hindrance(rig.newest(), rig.age_s(), PROFILE) == ""
 
 
 def dying(rig: Lockstep, told: bool) -> None:
@@ -236,33 +243,33 @@ def by_hand(rig: Lockstep, moment: str, told: bool, patch: pytest.MonkeyPatch) -
         return True
 
     rig.start_health_test = start  # type: ignore[method-assign]
-    patch.setattr(session.link, "look", lambda *_: Vehicle(NOWHERE, telemetry=AT_REST))
+    patch.setattr(vehicle, "look", lambda *_: Vehicle(NOWHERE, telemetry=AT_REST))
     patch.setattr(session, "time", SimpleNamespace(sleep=rig.wait))
     wanted = CheckScope(yes, lift=True, lift_s=0.5, tell=at)
-    rows = session._vehicle(rig, NOWHERE, PROFILE, None, wanted)  # type: ignore[arg-type]
-    return {row.name: row for row in rows}
+    it = session.VehicleSession(rig, NOWHERE, PROFILE, None, wanted)  # type: ignore[arg-type]
+    return {row.name: row for row in it.answering_rows()}
 
 
 @pytest.mark.parametrize("told", [True, False])
 @pytest.mark.parametrize(("moment", "propellers"), [
-    (f"now, within 0.5 s: {lift.HOW}", "not begun"),
+    (f"now, within 0.5 s: {vehicle.HOW_TO_LIFT}", "not begun"),
     ("question", "not begun"),
-    ("startPropTest", health.NO_RESULT),
+    ("startPropTest", vehicle.NO_RESULT),
     ("startBatTest", "shake"),
 ])  # fmt: skip
 def test_a_vehicle_that_dies_by_the_hand_or_the_motors_fails_a_row(
     moment: str, propellers: str, told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = by_hand(Lockstep(), moment, told, monkeypatch)
-    assert rows[gone.NAME].verdict is Verdict.FAIL
-    assert ("switched off" if told else "no telemetry came for 1.6 s") in rows[gone.NAME].found
+    assert rows[vehicle.GONE].verdict is Verdict.FAIL
+    assert ("switched off" if told else "no telemetry came for 1.6 s") in rows[vehicle.GONE].found
     assert rows["propellers"].found.startswith(propellers)
 
 
 def test_a_vehicle_that_lives_has_no_row_of_its_death(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = by_hand(Lockstep(), "never", True, monkeypatch)
     assert rows["battery sag"].verdict is Verdict.PASS
-    assert gone.NAME not in rows
+    assert vehicle.GONE not in rows
 
 
 def test_a_vehicle_that_dies_in_the_motor_test_is_not_waited_for() -> None:
@@ -273,7 +280,7 @@ def test_a_vehicle_that_dies_in_the_motor_test_is_not_waited_for() -> None:
     assert rig.vehicle.t_s - start_s < 1.0
 
 
-def a_hand(rig: Lockstep, to_m: float, moves_g: float = 0.0) -> Row:
+def a_hand(rig: Lockstep, to_m: float, moves_g: float = 0.0) -> Finding:
     """Lifts it after a second, and puts it back."""
     before = rig.wait
     at = [0.0]
@@ -284,9 +291,9 @@ def a_hand(rig: Lockstep, to_m: float, moves_g: float = 0.0) -> Row:
         rig.vehicle.world.set_pose((0.0, 0.0, z_m), hold=True)
         before(seconds)
 
-    seen = lift.watch(rig, wait, 3.0)  # type: ignore[arg-type]
+    seen = vehicle.watch_lift(rig, wait, 3.0)  # type: ignore[arg-type]
     seen[len(seen) // 2] = replace(seen[len(seen) // 2], acc_z_g=1.0 + moves_g)
-    return lift.row(lift.lift_of(seen))
+    return vehicle.lift_finding(seen)
 
 
 def test_a_lift_by_hand_shows_in_the_position() -> None:
@@ -304,5 +311,7 @@ def test_a_position_that_stays_where_it_is_fails() -> None:
 
 
 def test_a_position_that_does_not_come_back_is_told() -> None:
-    assert lift.row(lift.Lift(0.4, 0.25, 0.2)).verdict is Verdict.WARN
-    assert lift.row(None).verdict is Verdict.SKIPPED
+    heights_m = (0.0, 0.4, 0.25)
+    seen = [said(position_m=(0.0, 0.0, z_m), acc_z_g=1.0 + z_m) for z_m in heights_m]
+    assert vehicle.lift_finding(seen).verdict is Verdict.WARN
+    assert vehicle.lift_finding([]).verdict is Verdict.SKIPPED

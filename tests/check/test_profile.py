@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from perchctl.check import Row, Verdict, profile_rows
-from perchctl.check.profile import DOUBTFUL
-from perchctl.profile import Profile, data_folder, load_profile
+from perchctl.places import data_folder
+from perchctl.profile import DOUBTFUL, Profile, load_profile
 from tests.helpers.flights import short_profile
 
 CASES: tuple[tuple[str, Mapping[str, Any], str], ...] = (

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import CheckScope, Row, Verdict, camera, check, health, session
+from perchctl.check import CheckScope, Row, Verdict, camera, check, session, vehicle
 from perchctl.commands.check import exit_code
 from perchctl.errors import UsageError, broken_motion_capture
 from perchctl.link import ScanResult, address_of, find_vehicles
@@ -59,7 +59,16 @@ def test_nothing_arms_flies_or_turns_without_a_yes(sim: SimProcess, relay: Relay
     by_name = {row.name: row for row in rows}
     assert by_name["address"].verdict is Verdict.PASS
     assert [row.name for row in rows][: len(VEHICLE)] == VEHICLE
-    assert set(camera.NAMES) | {"loop", "disk", "log folder", "markers"} <= set(by_name)
+    assert {
+        *camera.PICTURES,
+        *camera.DESIGN,
+        "camera",
+        "size",
+        "loop",
+        "disk",
+        "log folder",
+        "markers",
+    } <= set(by_name)
     assert asked == ["?"]
     assert by_name["propellers"].found == "not confirmed"
     assert len(relay.up) > 100
@@ -152,7 +161,7 @@ def test_ctrl_c_in_the_motor_test_says_that_it_goes_on(
     def interrupted(*_: object) -> list[Row]:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(health, "run", interrupted)
+    monkeypatch.setattr(vehicle, "motor_rows", interrupted)
     wait_for(sim, 1.5)
     rows = check(options(sim.uri), CheckScope(lambda: True, **QUICK, tell=said.append))
     with pytest.raises(KeyboardInterrupt):

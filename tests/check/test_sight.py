@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.check import Row, Verdict, link, profile_rows, sight
-from perchctl.check.rehearsal import Looked, Rehearsal, _only_heard
+from perchctl.check import Row, Verdict, profile_rows
+from perchctl.check.camera import SIGHT, names_of, picture_rows
+from perchctl.check.rehearsal import Blur, Looked, Rehearsal, telemetry_for
+from perchctl.check.row import ask_all
+from perchctl.check.vehicle import BY_FLY, VEHICLE, Vehicle
 from perchctl.profile import Profile, load_profile
 from perchctl.target import Optics, make_design
 from perchctl.target.design import GearRanges, Ranges
@@ -39,22 +42,21 @@ def rehearsed(x: float = 0.1, y: float = 0.0, z: float = 2.0, **changes: Any) ->
     """Under a target that is there from where the vehicle stands."""
     target = target_at(1.0, (x, y, z), (0.0, 0.0, 0.0))
     made = Rehearsal(live=True, pictures=60, found=60, target=target, height_m=0.0)
-    made.looked = [shown(300.0)]
+    made.looked, made.blur = [shown(300.0)], Blur(0.6, 0.6)
     return replace(made, **changes)
 
 
-def rows_of(
-    done: Rehearsal, profile: Profile = TARGET, measured: bool = True, **ranges: Any
-) -> dict[str, Row]:
+def rows_of(done: Rehearsal, profile: Profile = TARGET, **ranges: Any) -> dict[str, Row]:
     given = replace(RANGES, **ranges)
     design = make_design(profile.target, CAMERA, Optics(), profile, ranges=given)
     assert isinstance(design.gear, GearRanges)
-    return {row.name: row for row in sight.rows(done, design, measured, profile, CAMERA)}
+    found = picture_rows(done, design, profile, CAMERA)
+    return {row.name: row for row in found if row.name in SIGHT}
 
 
 def test_under_the_target_both_rows_pass_and_say_from_how_far() -> None:
     rows = rows_of(rehearsed())
-    assert list(rows) == list(sight.NAMES)
+    assert list(rows) == list(SIGHT)
     assert {row.verdict for row in rows.values()} == {Verdict.PASS}
     assert "at most 3.0 m above the camera" in rows["sight range"].found
     assert "0.07 m aside of the camera's axis 2.00 m above it" in rows["in view"].found
@@ -84,7 +86,7 @@ def test_where_to_put_it_is_told() -> None:
 
 
 def test_a_range_by_a_guessed_blur_is_no_pass() -> None:
-    row = rows_of(rehearsed(), measured=False)["sight range"]
+    row = rows_of(rehearsed(blur=None))["sight range"]
     assert row.verdict is Verdict.SKIPPED
     assert "at most 3.2 m" in row.found
     blind = rows_of(rehearsed(), large_px=None, z1_m=None)["sight range"]
@@ -93,8 +95,7 @@ def test_a_range_by_a_guessed_blur_is_no_pass() -> None:
 
 def test_what_measures_otherwise_has_no_such_rows() -> None:
     assert rows_of(rehearsed(), PROFILE) == {}
-    assert sight.unseen("no picture comes", PROFILE) == []
-    assert [row.name for row in sight.unseen("no picture comes", TARGET)] == list(sight.NAMES)
+    assert set(names_of(TARGET)) - set(names_of(PROFILE)) == set(SIGHT)
     names = {row.name for row in profile_rows(PROFILE)}
     assert {row.name for row in profile_rows(TARGET)} - names == {"latency", "marker size"}
 
@@ -120,25 +121,23 @@ def test_a_simulated_ceiling_out_of_sight_is_doubted() -> None:
 def test_decks_and_an_estimate_are_not_asked_for() -> None:
     """Its estimate runs away while nothing is sent, and says nothing against it."""
     away = replace(AT_REST, position_m=(3.0, -2.0, 9.0), position_variance_m2=50.0)
-    vehicle = link.Vehicle("radio://0/80/2M", telemetry=away, external=False)
-    rows = {row.name: row for row in link.rows(vehicle, TARGET)}
+    vehicle = Vehicle("radio://0/80/2M", telemetry=away, external=False)
+    rows = {row.name: row for row in ask_all(VEHICLE, vehicle, TARGET)}
     assert rows["decks"].verdict is Verdict.PASS
     assert rows["positioning"].found == "by the target, see sight range and in view"
     assert rows["estimator"].verdict is rows["ground"].verdict is Verdict.SKIPPED
-    assert rows["estimator"].found == link.BY_FLY
+    assert rows["estimator"].found == BY_FLY
 
 
-class Runaway:
-    """A link to a vehicle at rest whose estimate has left."""
-
-    def telemetry(self) -> list[Telemetry]:
-        return [replace(AT_REST, position_m=(3.0, -2.0, 9.0), velocity_mps=(1.0, 2.0, 3.0))]
+def runaway() -> list[Telemetry]:
+    """Of a vehicle at rest whose estimate has left."""
+    return [replace(AT_REST, position_m=(3.0, -2.0, 9.0), velocity_mps=(1.0, 2.0, 3.0))]
 
 
 def test_pictures_are_rehearsed_on_a_vehicle_that_stands() -> None:
-    (sample,) = _only_heard(Runaway(), TARGET).telemetry()
+    (sample,) = telemetry_for(runaway, TARGET).telemetry()
     assert sample.position_m == (0.0, 0.0, TARGET.safety.ground_z_m)
     assert sample.velocity_mps == (0.0, 0.0, 0.0)
     assert sample.acc_z_g == AT_REST.acc_z_g
-    (sample,) = _only_heard(Runaway(), PROFILE).telemetry()
+    (sample,) = telemetry_for(runaway, PROFILE).telemetry()
     assert sample.position_m == (3.0, -2.0, 9.0)

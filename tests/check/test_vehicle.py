@@ -13,8 +13,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import Row, Verdict, link
-from perchctl.check.link import Vehicle
+from perchctl.check import Row, Verdict
+from perchctl.check.row import ask_all
+from perchctl.check.vehicle import VEHICLE, Vehicle, look, moved_m
 from perchctl.link import Echoes, ProbeLink
 from perchctl.profile import LinkConfig, Profile
 from perchctl.sim import Scenario, SimProcess
@@ -49,20 +50,22 @@ BAD = Scenario(
 OLD = LinkOptions(protocol_version=11, missing_log_variables=("acc.z", "radio.rssi"))
 
 
+def rows_of(vehicle: Vehicle, profile: Profile = PROFILE) -> dict[str, Row]:
+    return {row.name: row for row in ask_all(VEHICLE, vehicle, profile)}
+
+
 def looked_at(sim: SimProcess, silent_s: float = 0.0) -> dict[str, Row]:
     """`silent_s`: for so long, of its echoes, the link carries nothing."""
     probe = ProbeLink(sim.uri, LinkConfig(connect_timeout_s=30.0), time.monotonic)
     probe.connect()
     try:
-        seen = link.look(probe, sim.uri, LISTEN_S)
+        seen = look(probe, sim.uri, LISTEN_S)
         if silent_s:
             sim.silence(silent_s)
             seen = replace(seen, echoes=probe.echoes(LISTEN_S))
     finally:
         probe.close()
-    found = link.rows(seen, PROFILE)
-    assert [row.name for row in found] == list(link.NAMES)
-    return {row.name: row for row in found}
+    return rows_of(seen)
 
 
 @pytest.fixture(scope="module")
@@ -207,9 +210,8 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
 def test_a_fault_alone_makes_its_row_and_no_other(
     name: str, verdict: str, changes: dict[str, Any]
 ) -> None:
-    before = {row.name: row.verdict for row in link.rows(GOOD, PROFILE)}
-    assert set(before.values()) == {Verdict.PASS}
-    after = {row.name: row for row in link.rows(replace(GOOD, **changes), PROFILE)}
+    assert {row.verdict for row in rows_of(GOOD).values()} == {Verdict.PASS}
+    after = rows_of(replace(GOOD, **changes))
     assert after[name].verdict == verdict
     others = {n for n, row in after.items() if row.verdict in ("warn", "fail")} - {name}
     assert others == set()
@@ -218,22 +220,21 @@ def test_a_fault_alone_makes_its_row_and_no_other(
 def test_a_deck_of_one_s_own_is_believed_where_it_is_named() -> None:
     vehicle = replace(GOOD, parameters=parameters(deck__labUwb=1, deck__bcFlow2=0), external=None)
     known = Profile.model_validate({"positioning": {"decks": ["labUwb"]}})
-    rows = {row.name: row for row in link.rows(vehicle, known)}
-    assert rows["positioning"].found == "by labUwb"
-    before = next(row for row in link.rows(vehicle, PROFILE) if row.name == "positioning")
+    assert rows_of(vehicle, known)["positioning"].found == "by labUwb"
+    before = rows_of(vehicle)["positioning"]
     assert before.verdict is Verdict.FAIL
     assert "positioning.decks" in before.advice
 
 
 def test_a_position_that_slides_at_rest_is_seen() -> None:
     slid = [said(t_s=0.01 * k, position_m=(0.001 * k, 0.0, 0.0)) for k in range(200)]
-    assert link._moved_m(slid) == pytest.approx(0.18, abs=0.001)
-    assert link._moved_m([]) == 0.0
+    assert moved_m(slid) == pytest.approx(0.18, abs=0.001)
+    assert moved_m([]) == 0.0
 
 
 def test_an_old_profile_s_limit_is_the_flight_s() -> None:
     """One home for each criterion: what `check` allows, `fly` takes off with."""
     strict = Profile.model_validate({"safety": {"min_rest_v": 4.1, "start_tilt_deg": 1.0}})
     vehicle = replace(GOOD, telemetry=said(battery_v=4.0, roll_rad=math.radians(2.0)))
-    rows = {row.name: row.verdict for row in link.rows(vehicle, strict)}
-    assert rows["battery"] is rows["level"] is Verdict.FAIL
+    rows = rows_of(vehicle, strict)
+    assert rows["battery"].verdict is rows["level"].verdict is Verdict.FAIL

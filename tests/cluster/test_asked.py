@@ -25,7 +25,8 @@ from perchctl.cluster.wanted import Answer, Wanted, answer_to, source_sha256, wa
 from perchctl.cluster.worker import fly_order
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.flight import flight_order
-from perchctl.profile import Profile, data_file, load_profile
+from perchctl.places import data_file
+from perchctl.profile import Profile, load_profile
 from tests.helpers.seeds import Ended, ends_at_once
 
 ADDRESS = "tcp://10.0.0.5:4001"

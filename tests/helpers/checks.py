@@ -6,7 +6,8 @@ import time
 from dataclasses import replace
 from typing import Any
 
-from perchctl.check import health, lift, link
+from perchctl.check.vehicle import LIFTED, MOTORS
+from perchctl.check.vehicle import VEHICLE as ANSWERING
 from perchctl.flight import FlyOptions
 from perchctl.link import ScanResult
 from perchctl.profile import Profile, find_profile, load_profile
@@ -21,7 +22,7 @@ QUICK: dict[str, Any] = {
     "listen_s": 0.1, "rehearse_s": 0.2, "lift_s": 0.2, "health_s": 0.2,
     "other_vehicles": lambda uri: ScanResult((), "no Crazyradio is plugged in"),
 }  # fmt: skip
-VEHICLE = ["address", *link.NAMES, lift.NAME, *health.NAMES]
+VEHICLE = ["address", *ANSWERING, LIFTED, *MOTORS]
 AT_REST = telemetry(
     1.0, 0.0, thrust=0.0, supervisor=READY, battery_v=4.1, position_variance_m2=1e-4
 )

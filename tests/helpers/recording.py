@@ -19,7 +19,8 @@ from perchctl.geometry import (
     rot_z,
     rotation_from_rpy,
 )
-from perchctl.profile import TargetConfig, data_folder
+from perchctl.places import data_folder
+from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
 from perchctl.vision import CameraModel
 

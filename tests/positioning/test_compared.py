@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
 from perchctl.check import Verdict
-from perchctl.check import compared as check_compared
+from perchctl.check.capture import comparison_rows, save_row
 from perchctl.check.row import failed, passed, skipped, warned
 from perchctl.commands import app
 from perchctl.errors import SafetyAbort
@@ -176,30 +176,30 @@ def test_a_damaged_record_refuses_in_one_sentence(how: str) -> None:
 
 
 @pytest.mark.parametrize("lifted", [
-    failed("lifted", SWAPPED, ""), warned("lifted", "about too few axes to tell all", ""),
+    failed(SWAPPED, ""), warned("about too few axes to tell all", ""),
 ])  # fmt: skip
 def test_what_did_not_pass_ends_an_older_pass(lifted: Any) -> None:
     was_compared(CONFIG, URI)
-    row = check_compared.kept(lifted, CONFIG, URI, session.wall_date())
+    row = save_row(lifted, CONFIG, URI, session.wall_date())
     assert row.verdict is Verdict.WARN
     with pytest.raises(SafetyAbort, match=lifted.found):
         session.require_comparison(CONFIG, URI, simulated=False)
-    again = check_compared.kept(passed("lifted", "fine"), CONFIG, URI, session.wall_date())
+    again = save_row(passed("fine"), CONFIG, URI, session.wall_date())
     assert again.verdict is Verdict.PASS
     session.require_comparison(CONFIG, URI, simulated=False)
 
 
 def test_a_lift_that_told_nothing_leaves_the_record_as_it_is() -> None:
-    row = check_compared.kept(skipped("lifted", "not moved"), CONFIG, URI, session.wall_date())
+    row = save_row(skipped("not moved"), CONFIG, URI, session.wall_date())
     assert "was never compared" in row.found
     was_compared(CONFIG, URI)
-    row = check_compared.kept(skipped("lifted", "not moved"), CONFIG, URI, session.wall_date())
+    row = save_row(skipped("not moved"), CONFIG, URI, session.wall_date())
     assert row.verdict is Verdict.PASS
 
 
 def test_a_record_that_cannot_be_written_warns(folder: Path) -> None:
     folder.write_text("in the way", encoding="utf-8")
-    row = check_compared.kept(passed("lifted", "fine"), CONFIG, URI, session.wall_date())
+    row = save_row(passed("fine"), CONFIG, URI, session.wall_date())
     assert row.verdict is Verdict.WARN
     assert "not written" in row.found
     with pytest.raises(SafetyAbort):
@@ -217,7 +217,7 @@ def test_an_unwritten_finding_leaves_no_older_pass_unsaid(
     monkeypatch.setattr(compared, "write_files", full)
     if not removable:
         monkeypatch.setattr(Path, "unlink", full)
-    row = check_compared.kept(failed("lifted", SWAPPED, ""), CONFIG, URI, session.wall_date())
+    row = save_row(failed(SWAPPED, ""), CONFIG, URI, session.wall_date())
     assert row.verdict is (Verdict.WARN if removable else Verdict.FAIL)
     assert "No space left" in row.found
     if removable:
@@ -229,7 +229,7 @@ def test_decks_and_the_simulator_s_own_room_ask_for_none() -> None:
     deck = CONFIG.model_copy(update={"by": "deck"})
     for config, simulated in ((deck, False), (CONFIG, True)):
         session.require_comparison(config, URI, simulated=simulated)
-        assert check_compared.comparison_rows(config, URI, NOW, simulated=simulated) == []
+        assert comparison_rows(config, URI, NOW, simulated=simulated) == []
 
 
 # --- `fly` -------------------------------------------------------------------------------

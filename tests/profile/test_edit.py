@@ -9,7 +9,8 @@ import yaml
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.files import mode_of
-from perchctl.profile import data_folder, load_profile, writable_profile, write_profile_values
+from perchctl.places import data_folder
+from perchctl.profile import load_profile, writable_profile, write_profile_values
 from perchctl.profile.edit import with_values
 
 MEASURED = {

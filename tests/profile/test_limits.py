@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from perchctl.check.profile import DOUBTFUL
-from perchctl.profile import Limit, Profile
-from perchctl.profile.schema import IMPOSSIBLE
+from perchctl.profile import DOUBTFUL, Profile
+from perchctl.profile.limits import IMPOSSIBLE, Limit
 from tests.helpers.flights import short_profile
 
 BROKEN: tuple[Mapping[str, Any], ...] = (
@@ -73,7 +72,7 @@ def test_a_measured_latency_counts_as_where_the_flight_begins() -> None:
 
 @pytest.mark.parametrize(
     "limit",
-    [limit for limits in (IMPOSSIBLE, *DOUBTFUL.values()) for limit in limits if limit.left[1:]],
+    [limit for limits in (IMPOSSIBLE, *DOUBTFUL.values()) for limit in limits if limit.keys[2:]],
     ids=lambda limit: limit.because,
 )
 def test_only_a_sum_is_told_as_one(limit: Limit) -> None:
@@ -90,8 +89,6 @@ def test_only_a_sum_is_told_as_one(limit: Limit) -> None:
 def test_a_landing_that_takes_too_long_is_told_as_one() -> None:
     high = short_profile({"safety.max_height_m": 9.4}, base="sim")
     (limit,) = (limit for limit in DOUBTFUL["time limits"] if not limit.holds(high))
-    assert limit.sentence(high).startswith(
-        "twice the time that landing from safety.max_height_m (9.4 m) takes at "
-        "planner.landing.speed_mps (0.3 m/s) is 62.7 s, and must be less than "
-        "planner.landing.timeout_s (30 s)"
-    )
+    said = limit.sentence(high)
+    for words in ("twice the time", "max_height_m (9.4 m)", "is 62.7 s, and must", "(30 s)"):
+        assert words in said

@@ -12,20 +12,15 @@ from pydantic import BaseModel, ValidationError
 
 import perchctl
 from perchctl.calibration import load_calibration
-from perchctl.commands.profile import run
 from perchctl.errors import InvalidValue, NotFound, PerchError, ProfileNote
-from perchctl.profile import Profile, file_names, find_calibration, load_profile
+from perchctl.places import file_names
+from perchctl.profile import Profile, changed_profile, find_calibration, load_profile
 
 
-@pytest.mark.parametrize("name", ["sim", "paper", "crazyflie", "fpv", "aideck", "rough", "extreme"])
-def test_shipped_profiles_load(name: str) -> None:
-    assert load_profile(name).name == name
-
-
-def test_the_shipped_profiles_are_all_listed() -> None:
-    assert {"sim", "paper", "crazyflie", "fpv", "aideck", "rough", "extreme"} <= set(
-        file_names("profiles")
-    )
+def test_shipped_profiles_are_listed_and_load() -> None:
+    names = file_names("profiles")
+    assert {"sim", "paper", "crazyflie", "fpv", "aideck", "rough", "extreme"} <= set(names)
+    assert [load_profile(name).name for name in names] == names
 
 
 def test_paper_constants() -> None:
@@ -216,7 +211,7 @@ def test_a_profile_round_trips_through_its_own_dump() -> None:
 OLD = """
 extends: sim
 camera: {T_body_cam: {position_m: [0.01, 0.02, 0.03]}}
-planner: {trim_per_s: 0.3, recover: {speed_mps: 0.2}}
+planner: {trim_per_s: 0.3, recover: {speed_mps: 0.2}, ascend: {near_m: 0.5}}
 merge: {z1_m: 1.2}
 """
 
@@ -234,13 +229,19 @@ def test_old_keys_are_read_and_said(tmp_path: Path) -> None:
         profile = load_profile(str(path))
     assert profile.camera.mount.position_m == (0.01, 0.02, 0.03)
     assert profile.planner.integral_per_s == 0.3
-    said = sorted(str(note.message) for note in notes)
-    assert said == [
-        f"{path}: camera.T_body_cam was read as mount, its present name: rename it",
-        f"{path}: merge.z1_m is no longer used: remove it",
-        f"{path}: planner.recover.speed_mps is no longer used: remove it",
-        f"{path}: planner.trim_per_s was read as integral_per_s, its present name: rename it",
-    ]
+    said = sorted(str(note.message).removeprefix(f"{path}: ") for note in notes)
+    assert [words.partition(" was ")[0].partition(" is no ")[0] for words in said] == [
+        "camera.T_body_cam", "merge.z1_m", "planner.ascend.near_m", "planner.recover.speed_mps",
+        "planner.trim_per_s",
+    ]  # fmt: skip
+    assert profile.planner.ascend.near_m == 0.35
+    assert "it is 0.35" in said[2]
+
+
+@pytest.mark.parametrize("setting", ["planner.ascend.near_m=0.5", "merge.z1_m=1.0"])
+def test_an_old_key_is_not_set_without_effect(setting: str) -> None:
+    with pytest.raises(InvalidValue, match=f"--set: {setting.partition('=')[0]} is no longer"):
+        changed_profile(load_profile("sim"), [setting])
 
 
 def test_a_key_under_both_names_is_refused(tmp_path: Path) -> None:
@@ -252,6 +253,7 @@ def test_a_profile_in_an_old_log_is_read() -> None:
     values = load_profile("sim").model_dump(mode="json")
     values["camera"]["T_body_cam"] = values["camera"].pop("mount")
     values["merge"]["z1_m"] = 1.15
+    values["planner"]["ascend"]["near_m"] = 0.35
     assert Profile.model_validate(values) == load_profile("sim")
 
 
@@ -359,17 +361,3 @@ def test_bad_calibrations_are_refused(tmp_path: Path, text: str, expected: str) 
     path.write_text(text)
     with pytest.raises(InvalidValue, match=expected):
         load_calibration(path)
-
-
-@pytest.mark.parametrize("as_json", [True, False])
-def test_the_command_shows_no_password(
-    as_json: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "own.yaml"
-    path.write_text(
-        'description: "at http://me:secret@h/s"\ncamera: {source: "http://me:secret@h/s"}\n'
-    )
-    assert run(str(path), False, as_json) == 0
-    shown = capsys.readouterr()
-    assert "http://h/s" in shown.out
-    assert "secret" not in shown.out + shown.err

@@ -9,17 +9,13 @@ import numpy as np
 import pytest
 import yaml
 
-from perchctl.profile import (
+from perchctl.commands.picture_edges import (
     PICTURE_EDGES,
-    Mounting,
-    Profile,
     edges_beside,
-    editor_schema,
-    load_profile,
     mount_from_edges,
     picture_edges,
-    profile_text,
 )
+from perchctl.profile import Mounting, Profile, editor_schema, load_profile, profile_text
 from perchctl.profile.keys import keys
 from tests.helpers.flights import short_profile
 

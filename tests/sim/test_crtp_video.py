@@ -12,7 +12,7 @@ import pytest
 
 from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, NotFound
-from perchctl.profile import data_file
+from perchctl.places import data_file
 from perchctl.sim import Scenario, SimProcess
 from perchctl.sim.process.host import MjpegServer
 from perchctl.vision import CameraModel

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from perchctl.calibration import load_calibration
 from perchctl.errors import PerchError
-from perchctl.profile import data_file
+from perchctl.places import data_file
 from perchctl.sim.capture import COMMAND_PORT, CaptureSettings
 from perchctl.sim.process.child import Runner
 from perchctl.sim.process.handle import HostSetup

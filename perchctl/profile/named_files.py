@@ -1,4 +1,4 @@
-"""The profile's picture of what the vehicle's own gear covers (`camera.mask`)."""
+"""The files that a profile names: the camera's calibration and mask."""
 
 from __future__ import annotations
 
@@ -9,6 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue, NotFound, distinct_figures
+from perchctl.places import data_file, data_folder, file_names
+
+
+def find_calibration(name: str) -> Path:
+    """A calibration file by path, or by name from `calib/`. (A loaded profile names its own by
+    the whole path.)"""
+    given = Path(name).expanduser()
+    if given.is_file():
+        return given
+    found = data_file("calib", name)
+    if found is None:
+        raise NotFound(
+            f"calibration file {name} not found; give a path, or one of "
+            + (", ".join(file_names("calib")) or f"none ({data_folder('calib')} is empty)")
+        )
+    return found
+
 
 MOST_COVERED = 0.75
 """Of the picture; with more of it covered there is no room for a target."""

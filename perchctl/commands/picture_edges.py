@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from perchctl.geometry import Array
-from perchctl.profile.vision import Mounting
+from perchctl.profile import Mounting
 
 PICTURE_EDGES: dict[str, tuple[int, int]] = {
     "top": (0, -1),

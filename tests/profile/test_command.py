@@ -1,8 +1,7 @@
-"""`perchctl new-profile` and `perchctl profile`: the file equals the answers."""
+"""`perchctl profile`: shown, its schema, and a new one, whose file equals the answers."""
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import re
@@ -18,17 +17,11 @@ from typer.testing import CliRunner
 
 from perchctl.check import Verdict, profile_rows
 from perchctl.commands import app
-from perchctl.commands.new_profile import NewProfileRequest, run
-from perchctl.commands.new_profile_answers import QUESTIONS, WRITTEN
+from perchctl.commands.picture_edges import PICTURE_EDGES, edges_beside, picture_edges
+from perchctl.commands.profile import QUESTIONS, completed, profile_keys, write_new_profile
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.files import mode_of
-from perchctl.profile import (
-    PICTURE_EDGES,
-    edges_beside,
-    find_calibration,
-    load_profile,
-    picture_edges,
-)
+from perchctl.profile import find_calibration, load_profile
 from perchctl.profile.keys import keys
 from tests.profile.test_written import uncommented
 
@@ -63,7 +56,7 @@ def answers(draw: st.DrawFn) -> dict[str, str]:
 def test_the_file_loads_and_equals_what_was_answered(said: dict[str, str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "mine.yaml"
-        assert run(NewProfileRequest(output, said)) == 0
+        write_new_profile(output, said)
         text = output.read_text(encoding="utf-8")
         mine = load_profile(str(output))
     assert uncommented(text) == []
@@ -84,11 +77,9 @@ def test_the_file_loads_and_equals_what_was_answered(said: dict[str, str]) -> No
     assert mine.safety.max_height_m == pytest.approx(ceiling_m + 0.4, abs=0.01)
     assert mine.planner.search.max_height_m <= ceiling_m - 0.49
     assert mine.safety.fence_radius_m == float(said["fence"])
-    other = {key.path for key in keys(mine)} - WRITTEN - {"name"}
-    default = {key.path: key.default for key in keys(type(mine)())}
-    assert {key.path: key.default for key in keys(mine) if key.path in other} == {
-        path: default[path] for path in other
-    }
+    found, default = ({key.path: key.default for key in keys(p)} for p in (mine, type(mine)()))
+    other = default.keys() - profile_keys(completed(said), output).keys() - {"name"}
+    assert {path: found[path] for path in other} == {path: default[path] for path in other}
 
 
 def typed(*lines: str, end: type[BaseException] = EOFError) -> Callable[[str], str]:
@@ -105,8 +96,8 @@ def typed(*lines: str, end: type[BaseException] = EOFError) -> Callable[[str], s
 
 def test_enter_takes_every_default(tmp_path: Path) -> None:
     asked, silent = tmp_path / "asked.yaml", tmp_path / "silent.yaml"
-    run(NewProfileRequest(asked), ask=typed(*[""] * len(QUESTIONS)))
-    run(NewProfileRequest(silent, defaults=True))
+    write_new_profile(asked, {}, typed(*[""] * len(QUESTIONS)))
+    write_new_profile(silent, {})
     one, other = (load_profile(str(path)) for path in (asked, silent))
     assert one.model_copy(update={"name": ""}) == other.model_copy(update={"name": ""})
     assert one.link.uri.startswith("radio://")
@@ -124,7 +115,7 @@ def test_a_mirrored_picture_is_asked_about_and_named(
         return ""
 
     given = {question.name: question.default({}) for question in QUESTIONS[:1]}
-    run(NewProfileRequest(tmp_path / "asked.yaml", given | {"front": front}), ask=ask)
+    write_new_profile(tmp_path / "asked.yaml", given | {"front": front}, ask)
     (question,) = [text for text in asked if "left side" in text]
     assert plain in question
     assert mirrored in question
@@ -132,9 +123,7 @@ def test_a_mirrored_picture_is_asked_about_and_named(
     assert "camera.mirrored" not in capsys.readouterr().err
 
     for left in (mirrored, mirrored[0]):
-        answers = {"front": front, "left": left}
-        request = NewProfileRequest(tmp_path / f"{left}.yaml", answers, defaults=True)
-        assert run(request) == 0
+        write_new_profile(tmp_path / f"{left}.yaml", {"front": front, "left": left})
         said = capsys.readouterr().err
         assert "camera.mirrored: true" in said
         assert front in said
@@ -145,7 +134,7 @@ def test_a_password_is_in_the_source_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output, source = tmp_path / "mine.yaml", "rtsp://me:secret@cam/s"
-    assert run(NewProfileRequest(output, {"source": source}, defaults=True)) == 0
+    write_new_profile(output, {"source": source})
     assert load_profile(str(output)).camera.source == source
     assert load_profile(str(output)).description.endswith("rtsp://cam/s")
     shown = capsys.readouterr()
@@ -172,7 +161,7 @@ def test_a_wrong_answer_is_asked_again_with_what_is_allowed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lines = [line for question in QUESTIONS for line in (WRONG[question.name][0], "")]
-    run(NewProfileRequest(tmp_path / "mine.yaml"), ask=typed(*lines))
+    write_new_profile(tmp_path / "mine.yaml", {}, typed(*lines))
     said = capsys.readouterr().err
     assert max(map(len, said.splitlines()[1:3])) <= 80
     told = re.findall(r"^  \S.*$", re.sub(r"\n    (?=\S)", " ", said), re.MULTILINE)
@@ -186,9 +175,8 @@ def test_a_wrong_answer_is_asked_again_with_what_is_allowed(
 def test_a_wrong_option_is_one_sentence_with_its_name(name: str, tmp_path: Path) -> None:
     (question,) = (question for question in QUESTIONS if question.name == name)
     given = {"front": "top"} if name == "left" else {}
-    request = NewProfileRequest(tmp_path / "m.yaml", {**given, name: WRONG[name][0]}, defaults=True)
     with pytest.raises(PerchError, match=f"^{question.option}: ") as caught:
-        run(request)
+        write_new_profile(tmp_path / "m.yaml", {**given, name: WRONG[name][0]})
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 
@@ -211,18 +199,18 @@ def test_a_wrong_option_says_what_was_meant(
     given: dict[str, str], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(InvalidValue, match=said):
-        run(NewProfileRequest(tmp_path / "m.yaml", given, defaults=True))
+        write_new_profile(tmp_path / "m.yaml", given)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("given", [{"latency": "0"}, {"latency": "1"}, {"camera": "0 0 0"}])
 def test_small_and_nothing_are_taken(given: dict[str, str], tmp_path: Path) -> None:
-    assert run(NewProfileRequest(tmp_path / "m.yaml", given, defaults=True)) == 0
+    write_new_profile(tmp_path / "m.yaml", given)
 
 
 @pytest.mark.parametrize("ceiling_m", ["1", "2.4", "4.1", "6", "9", "10"])
 def test_a_landing_from_under_any_ceiling_has_the_time(ceiling_m: str, tmp_path: Path) -> None:
-    run(NewProfileRequest(tmp_path / "m.yaml", {"ceiling": ceiling_m}, defaults=True))
+    write_new_profile(tmp_path / "m.yaml", {"ceiling": ceiling_m})
     mine = load_profile(str(tmp_path / "m.yaml"))
     (row,) = (row for row in profile_rows(mine) if row.name == "time limits")
     assert row.verdict is Verdict.PASS, row.found
@@ -235,7 +223,7 @@ def test_without_a_calibration_it_says_once_which_was_written(
     uri: str, what_to_do: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = {"uri": uri, "calibration": "none"}
-    run(NewProfileRequest(tmp_path / "m.yaml", said, defaults=True))
+    write_new_profile(tmp_path / "m.yaml", said)
     (line,) = (line for line in capsys.readouterr().err.splitlines() if "calibration" in line)
     assert "none yet: wrote example_640x480.yaml" in line
     assert what_to_do in line
@@ -249,14 +237,11 @@ def test_a_dialogue_that_is_left_says_how_to_go_on(
 ) -> None:
     output = tmp_path / "my own.yaml"
     with pytest.raises(kind) as caught:
-        run(
-            NewProfileRequest(output, {"gear": "0 0 31"}),
-            ask=typed("usb://0", "", "", "", "left", end=end),
-        )
+        write_new_profile(output, {"gear": "0 0 31"}, typed("usb://0", "", "", "", "left", end=end))
     assert caught.value.exit_code == code
     assert not output.exists()
     words = shlex.split(str(caught.value).partition("go on from here: ")[2])
-    assert words[:2] == ["perchctl", "new-profile"]
+    assert words[:3] == ["perchctl", "profile", "new"]
     done = CliRunner().invoke(app, [*words[1:], "--defaults"])
     assert done.exit_code == 0, done.output
     mine = load_profile(str(output))
@@ -265,20 +250,18 @@ def test_a_dialogue_that_is_left_says_how_to_go_on(
 
 
 def test_nobody_to_ask_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.stdin", io.StringIO("usb://0\n"))
-    given = {q.name: q.default({}) for q in QUESTIONS[:1]}
-    with pytest.raises(
-        UsageError, match=r"nobody to ask .*--source.*--fence.*--defaults"
-    ) as caught:
-        run(NewProfileRequest(tmp_path / "m.yaml", given))
-    assert "--uri" not in str(caught.value)
+    monkeypatch.chdir(tmp_path)
+    refused = CliRunner().invoke(app, ["profile", "new", "-o", "m.yaml", "--uri", "usb://0"])
+    assert refused.exit_code == UsageError.exit_code
+    assert re.search(r"nobody to ask .*--source.*--fence.*--defaults", refused.stderr)
+    assert "--uri" not in refused.stderr
 
 
 @pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o002, 0o664), (0o077, 0o600)])
 def test_who_may_read_it_is_up_to_the_umask(umask: int, mode: int, tmp_path: Path) -> None:
     before = os.umask(umask)
     try:
-        run(NewProfileRequest(tmp_path / "mine.yaml", defaults=True))
+        write_new_profile(tmp_path / "mine.yaml", {})
     finally:
         os.umask(before)
     assert mode_of(tmp_path / "mine.yaml") == mode
@@ -288,12 +271,12 @@ def test_a_file_that_exists_is_kept_without_force(tmp_path: Path) -> None:
     path = tmp_path / "m.yaml"
     path.write_text("mine")
     with pytest.raises(InvalidValue, match="--force"):
-        run(NewProfileRequest(path), ask=typed())  # before anything is asked
+        write_new_profile(path, {}, typed())  # before anything is asked
     assert path.read_text() == "mine"
-    run(NewProfileRequest(path, defaults=True, force=True))
+    write_new_profile(path, {}, force=True)
     assert load_profile(str(path)).name == "m"
     with pytest.raises(InvalidValue, match=r"\.yaml or \.yml"):
-        run(NewProfileRequest(tmp_path / "m.txt", defaults=True))
+        write_new_profile(tmp_path / "m.txt", {})
 
 
 def test_a_calibration_is_named_from_where_the_profile_is(tmp_path: Path) -> None:
@@ -303,7 +286,7 @@ def test_a_calibration_is_named_from_where_the_profile_is(tmp_path: Path) -> Non
     (tmp_path / "elsewhere").mkdir()
     for place, named in (("m.yaml", "calib/mine.yaml"), ("elsewhere/m.yaml", str(tmp_path))):
         said = {"calibration": str(tmp_path / "calib" / "mine.yaml")}
-        run(NewProfileRequest(tmp_path / place, said, defaults=True))
+        write_new_profile(tmp_path / place, said)
         mine = load_profile(str(tmp_path / place))
         assert Path(mine.camera.calibration).samefile(tmp_path / "calib" / "mine.yaml")
         assert f"calibration: {named}" in (tmp_path / place).read_text(encoding="utf-8")
@@ -325,18 +308,27 @@ def test_profile_prints_what_is_flown(tmp_path: Path) -> None:
 
 
 def test_profile_prints_a_schema_for_editors() -> None:
-    schema = json.loads(CliRunner().invoke(app, ["profile", "--schema"]).stdout)
+    schema = json.loads(CliRunner().invoke(app, ["profile", "schema"]).stdout)
     assert set(schema["properties"]) == {"extends", *type(load_profile("sim")).model_fields}
-    refused = CliRunner().invoke(app, ["profile", "--schema", "-p", "sim"])
-    assert refused.exit_code == 2
-    assert "leave it out" in refused.stderr
+
+
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_the_command_shows_no_password(options: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text(
+        'description: "at http://me:secret@h/s"\ncamera: {source: "http://me:secret@h/s"}\n'
+    )
+    shown = CliRunner().invoke(app, ["profile", "-p", str(path), *options])
+    assert shown.exit_code == 0
+    assert "http://h/s" in shown.stdout
+    assert "secret" not in shown.output
 
 
 def test_an_aideck_gets_its_size_and_what_late_pictures_need(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = {"uri": "usb://0", "source": "aideck://192.168.4.1", "calibration": "none"}
-    run(NewProfileRequest(tmp_path / "m.yaml", said, defaults=True))
+    write_new_profile(tmp_path / "m.yaml", said)
     assert "none yet: wrote example_aideck_324x244.yaml" in capsys.readouterr().err
     mine, shipped = load_profile(str(tmp_path / "m.yaml")), load_profile("aideck")
     assert mine.camera.calibration == shipped.camera.calibration
@@ -347,4 +339,4 @@ def test_an_aideck_gets_its_size_and_what_late_pictures_need(
 def test_an_aideck_without_a_host_is_refused(tmp_path: Path) -> None:
     said = {"uri": "usb://0", "source": "aideck://"}
     with pytest.raises(PerchError, match="aideck://192"):
-        run(NewProfileRequest(tmp_path / "m.yaml", said, defaults=True))
+        write_new_profile(tmp_path / "m.yaml", said)
