@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import gzip
 import json
+import math
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from io import BufferedReader
@@ -96,6 +97,40 @@ class FlightLog:
         except (TypeError, ValueError):
             raise InvalidValue(f"{self.path}: {key} is not a number in every record") from None
         return np.array(values, dtype=np.float64)
+
+    def texts(self, key: str) -> list[str]:
+        """A field over the ticks as text, empty where it is missing."""
+        return [str(record.get(key) or "") for record in self.records]
+
+    @property
+    def t_s(self) -> Array:
+        """Times of the ticks since the flight's first turn, shape (n,)."""
+        return self.since(self.column("t_s"))
+
+    @property
+    def end_s(self) -> float:
+        """Time of the last tick since the flight's first turn; 0 without any."""
+        return self.since(float(self.records[-1]["t_s"])) if self.records else 0.0
+
+    def setting(self, key: str) -> Any:
+        """The flown profile's value of a dotted key, as JSON has it; None where there is none."""
+        value = self.header.get("profile")
+        for name in key.split("."):
+            value = value.get(name) if isinstance(value, Mapping) else None
+        return value
+
+    def number(self, key: str) -> float | None:
+        """The flown profile's value of a dotted key; None where that is no finite number."""
+        value = self.setting(key)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            return None
+        return float(value) if math.isfinite(value) else None
+
+    @property
+    def profile_name(self) -> str | None:
+        """The flown profile's name; None where the header holds none."""
+        name = self.setting("name")
+        return None if name is None else str(name)
 
     @property
     def start_s(self) -> float:

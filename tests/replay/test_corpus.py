@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
+from perchctl.analysis import replay
+from perchctl.analysis.replay_text import difference_text
+from perchctl.analysis.replayer import Replay
 from perchctl.log import FlightLog, computer_differences, read_log
 from perchctl.log.write import SCHEMA_VERSION
 from perchctl.mission import Phase
-from perchctl.replay import replay
-from perchctl.replay.run import Replay
-from perchctl.replay.told import difference_text
 from tests.helpers.flights import ROOT
 
 FOLDER = ROOT / "tests" / "data" / "flights"

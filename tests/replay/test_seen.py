@@ -21,10 +21,10 @@ from typing import Any
 
 import pytest
 
+from perchctl.analysis import replay
+from perchctl.analysis.replay_text import difference_text
+from perchctl.analysis.replayer import Replay
 from perchctl.log import computer_differences, recorded_pictures, to_exact
-from perchctl.replay import replay
-from perchctl.replay.run import Replay
-from perchctl.replay.told import difference_text
 from perchctl.vision import filter as the_filter
 from perchctl.vision import solve
 from perchctl.vision.markers import lines
