@@ -25,13 +25,13 @@ HOMES: dict[str, tuple[str, ...]] = {
     "matplotlib": ("*.plot", "perchctl.analysis.figures"),
     "jinja2": ("perchctl.analysis.report",),
     "motioncapture": ("perchctl.positioning",),
-    "mcap": ("perchctl.log.recording",),
-    "mcap_protobuf": ("perchctl.log.recording",),
-    "foxglove_schemas_protobuf": ("perchctl.log.recording",),
-    "google": ("perchctl.log.recording",),
+    "mcap": ("perchctl.log.recording_file", "perchctl.log.recorded"),
+    "mcap_protobuf": ("perchctl.log.recording_file", "perchctl.log.recorded"),
+    "foxglove_schemas_protobuf": ("perchctl.log.recording_file", "perchctl.log.recorded"),
+    "google": ("perchctl.log.recording_file", "perchctl.log.recorded"),
     "distributed": ("perchctl.cluster",),
     "dask": ("perchctl.cluster",),
-    "pyarrow": ("perchctl.log.export.as_parquet",),
+    "pyarrow": ("perchctl.log.table",),
     "av": ("perchctl.track.outputs", "perchctl.camera.rtsp"),
 }
 

@@ -7,7 +7,7 @@ import gzip
 import json
 import math
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from io import BufferedReader
@@ -19,17 +19,17 @@ import numpy as np
 from perchctl import __version__
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
-from perchctl.log.fields import FIELDS
-from perchctl.log.jsonl import decode_line
-from perchctl.log.place import path_beside
-from perchctl.log.sent import Takeover, sent_of, takeovers_of
-from perchctl.log.turn import turn_of
-from perchctl.log.write import FORMAT, SCHEMA_VERSION
-from perchctl.mission import SentCommand, Turn
+from perchctl.log.exact import decode_line, from_exact
+from perchctl.log.fields import (
+    FIELDS,
+    FORMAT,
+    READABLE_VERSIONS,
+    SCHEMA_VERSION,
+    command_values,
+)
+from perchctl.log.write import path_beside
+from perchctl.mission import SentBy, SentCommand, Turn
 
-READABLE_VERSIONS = (1, 2, 3, SCHEMA_VERSION)
-"""1 knew no `tracked` and no events of several fields; its missing values read None. 2 knew no
-turns; 3 neither why a turn was decided so, nor what was sent in the loop's place."""
 Times = TypeVar("Times", float, Array)
 MOST_LOG_BYTES = 300_000_000
 """Of a log, unpacked: three quarters of an hour of flight at 0.115 MB/s. What a packed file of a
@@ -290,6 +290,90 @@ def _checked(record: dict[str, Any]) -> dict[str, Any]:
 
 def _without_kind(record: dict[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in record.items() if k != "kind"}
+
+
+# --- turns, and what was sent in the loop's place --------------------------------------------
+
+APART_S = 2.0
+"""What is farther apart is told by itself."""
+_TELLS = {
+    "position": "position setpoints",
+    "thrust": "raw thrust",
+    "land": "landing ordered",
+    "stop": "motors stopped",
+    "emergency": "motors cut",
+}
+
+
+def turn_of(record: dict[str, Any]) -> Turn:
+    """Back to the same bits. Errors: InvalidValue."""
+    try:
+        return from_exact(Turn, {k: v for k, v in _with_telemetry(record).items() if k != "kind"})
+    except ValueError as error:
+        raise InvalidValue(
+            f"the log's turn {record.get('number', '?')} cannot be read ({error}): the log is "
+            f"damaged, or another version of perchctl wrote it"
+        ) from None
+
+
+def _with_telemetry(record: dict[str, Any]) -> dict[str, Any]:
+    """The observation's is the newest of the turn, where it has none of its own."""
+    obs, taken = record.get("observation"), record.get("taken")
+    if not isinstance(obs, dict) or "telemetry" in obs or not isinstance(taken, dict):
+        return record
+    samples = taken.get("late") or taken.get("samples")
+    if not isinstance(samples, list) or not samples:
+        return record
+    return record | {"observation": obs | {"telemetry": samples[-1]}}
+
+
+def sent_of(record: Mapping[str, Any]) -> SentCommand:
+    """Back to the same bits. Errors: InvalidValue."""
+    try:
+        return from_exact(SentCommand, {k: v for k, v in record.items() if k != "kind"})
+    except ValueError as error:
+        raise InvalidValue(
+            f"the log's record of what was sent at {record.get('t_s', '?')} s cannot be read "
+            f"({error}): the log is damaged, or another version of perchctl wrote it"
+        ) from None
+
+
+def sent_values(sent: SentCommand) -> dict[str, Any]:
+    """By the names of a tick's fields (`perchctl.log.fields.FIELDS`), and ``by``."""
+    return {"t_s": sent.t_s, "by": sent.by, **command_values(sent.command)}
+
+
+@dataclass(frozen=True)
+class Takeover:
+    """What one sender sent in one go. Times on the loop's clock; `sent`: commands by their name
+    in a tick's `cmd`, in the order of their first, and how many of each."""
+
+    by: SentBy
+    start_s: float
+    end_s: float
+    sent: tuple[tuple[str, int], ...]
+
+    @property
+    def text(self) -> str:
+        """``position setpoints (14), landing ordered (2)``"""
+        return ", ".join(f"{_TELLS[name]} ({count})" for name, count in self.sent)
+
+
+def takeovers_of(sent: Sequence[SentCommand]) -> tuple[Takeover, ...]:
+    """In order."""
+    goes: list[list[SentCommand]] = []
+    for each in sorted(sent, key=lambda one: one.t_s):
+        last = goes[-1][-1] if goes else None
+        if last is None or last.by != each.by or each.t_s - last.t_s > APART_S:
+            goes.append([])
+        goes[-1].append(each)
+    return tuple(_takeover(go) for go in goes)
+
+
+def _takeover(go: Sequence[SentCommand]) -> Takeover:
+    names = [str(command_values(each.command)["cmd"]) for each in go]
+    counted = tuple((name, names.count(name)) for name in dict.fromkeys(names))
+    return Takeover(go[0].by, go[0].t_s, go[-1].t_s, counted)
 
 
 # --- What a file is that is no flight log, or no whole one, in words ---------------------------

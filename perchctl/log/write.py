@@ -13,30 +13,22 @@ from __future__ import annotations
 import errno
 import math
 import os
+import re
 import threading
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
-import perchctl
-from perchctl.camera import profile_record, without_password
 from perchctl.errors import InvalidValue
-from perchctl.log.behind import Behind
-from perchctl.log.exact import to_exact
-from perchctl.log.fields import EVENT_FIELDS, FIELDS, event_record
-from perchctl.log.jsonl import encode, json_line
-from perchctl.log.place import cannot_start, make_log_folder, new_file
-from perchctl.log.sent import SENT_NOTE, sent_line
-from perchctl.log.setup import camera_record, computer_record
-from perchctl.log.turn import TURN_NOTE, turn_line
+from perchctl.log.exact import encode, json_line, to_exact
+from perchctl.log.fields import event_record
 from perchctl.mission import Event, SentCommand, Turn
-from perchctl.profile import Profile
 
-FORMAT = "perchctl-flight-log"
-SCHEMA_VERSION = 4
 FSYNC_PERIOD_S = 1.0
 RETRY_PERIOD_S = 1.0
 CLOSE_TIMEOUT_S, RECOVERED_S = 3.0, 0.2
@@ -48,39 +40,6 @@ TURNS_SHARE = 0.8
 DEFAULT_LOOP_HZ = 50.0
 NO_ANSWER = "the disk does not answer: the flight log lacks its end"
 _Record = Mapping[str, Any] | Turn | SentCommand
-
-
-def make_header(
-    profile: Profile,
-    *,
-    uri: str,
-    source: str,
-    seed: int | None = None,
-    lockstep: bool = False,
-    started: datetime | None = None,
-    t0_s: float = 0.0,
-) -> dict[str, Any]:
-    """The first record. Without `started` it depends on nothing but its arguments and the files
-    that the profile names. `t0_s`: the loop's clock when the log began, or at `started`."""
-    return {
-        "kind": "header",
-        "format": FORMAT,
-        "version": SCHEMA_VERSION,
-        "perchctl": perchctl.__version__,
-        "uri": uri,
-        "source": without_password(source),
-        "seed": seed,
-        "lockstep": lockstep,
-        "started_utc": started.astimezone(UTC).isoformat(timespec="seconds") if started else None,
-        "t0_s": t0_s,
-        "profile": profile_record(profile),
-        **camera_record(profile),
-        **computer_record(),
-        "fields": FIELDS,
-        "event_fields": EVENT_FIELDS,
-        "turns": TURN_NOTE,
-        "sent": SENT_NOTE,
-    }
 
 
 class FlightLogWriter:
@@ -160,11 +119,11 @@ class FlightLogWriter:
         self._put({"kind": "tick", **record}, _time_of(record))
 
     def turn(self, turn: Turn) -> None:
-        """Append a whole turn, exactly (`perchctl.log.turn`). Never raises."""
+        """Append a whole turn, exactly (`turn_line`). Never raises."""
         self._put(turn, turn.t_s)
 
     def sent(self, sent: SentCommand) -> None:
-        """Append what was sent in the loop's place, exactly (`perchctl.log.sent`); from any
+        """Append what was sent in the loop's place, exactly; from any
         thread. Never raises."""
         self._put(sent, sent.t_s)
 
@@ -314,9 +273,18 @@ def _line_of(record: _Record) -> bytes:
         case Turn():
             return turn_line(record)
         case SentCommand():
-            return sent_line(record)
+            return json_line({"kind": "sent", **to_exact(record)})
         case _:
             return encode(record)
+
+
+def turn_line(turn: Turn) -> bytes:
+    """A turn as one line of the log, whole and exact: the fields of `perchctl.mission.Turn`."""
+    record = {"kind": "turn", **to_exact(turn)}
+    obs, samples = turn.observation, turn.taken.late or turn.taken.samples
+    if obs is not None and samples and obs.telemetry is samples[-1]:
+        del record["observation"]["telemetry"]  # it stands in the same line already
+    return json_line(record)
 
 
 def _time_of(record: Mapping[str, Any]) -> float | None:
@@ -330,3 +298,134 @@ def _explain(error: OSError) -> str:
 
 def _formless(error: Exception) -> str:
     return f"a record has no form in the flight log: {str(error) or type(error).__name__}"
+
+
+# --- a thread for what may hang -------------------------------------------------------------
+
+Job = Callable[[], None]
+
+
+class Behind:
+    """A bounded queue of jobs and the thread that does them, in order.
+
+    What a job raises is dropped: it has to remember itself what failed."""
+
+    def __init__(self, most: int, name: str) -> None:
+        self._most = most
+        self._jobs: deque[Job] = deque()
+        self._changed = threading.Condition()
+        self._last = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, job: Job, share: float = 1.0) -> bool:
+        """False when that share of the queue is full: the job is not done."""
+        with self._changed:
+            if len(self._jobs) >= share * self._most or self._last:
+                return False
+            self._jobs.append(job)
+            self._changed.notify()
+        return True
+
+    def wait(self, job: Job, timeout_s: float) -> bool:
+        """One more, however many there are; whether it was done by then. Later it may be, too."""
+        done = threading.Event()
+
+        def run() -> None:
+            try:
+                job()
+            finally:
+                done.set()
+
+        with self._changed:
+            self._jobs.append(run)
+            self._changed.notify()
+        return done.wait(timeout_s)
+
+    def finish(self, job: Job, timeout_s: float, late: Job) -> int:
+        """One last job; waits for it. How many jobs were not done by then: 0 is all done.
+
+        `late` is done instead of them should the thread ever get on: it frees what they held."""
+        with self._changed:
+            self._jobs.append(job)
+            self._last = True
+            self._changed.notify()
+        self._thread.join(timeout_s)
+        with self._changed:
+            alive = self._thread.is_alive()
+            left = len(self._jobs) + int(alive)
+            self._jobs.clear()  # what comes too late is not done at all
+            if alive:
+                self._jobs.append(late)
+        return left
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._jobs:
+                    if self._last:
+                        return
+                    self._changed.wait()
+                job = self._jobs.popleft()
+            with suppress(Exception):  # the next one is done all the same
+                job()
+
+
+# --- where a flight's files lie: the log, and what is beside it by its name ---------------------
+
+PACKED = ".gz"
+_ELSEWHERE = "name another folder with --log-dir, or in the profile (log.directory)"
+
+
+def path_beside(log: Path | str, suffix: str) -> Path:
+    """The file of a log's name with another ending, such as ``.png``; of a packed log, too."""
+    path = Path(log)
+    whole = path.with_suffix("") if path.suffix == PACKED else path
+    return whole.with_name(whole.stem + suffix)
+
+
+def log_path(directory: Path, profile_name: str, started: datetime) -> Path:
+    """``flight_<UTC yyyymmdd_hhmmss>_<profile>.jsonl`` in the directory.
+
+    (A flight in lockstep is named ``flight_seed<seed>.jsonl`` by the campaign.)
+    """
+    safe = re.sub(r"[^A-Za-z0-9._-]+", "-", profile_name).strip("-.") or "profile"
+    return directory / f"flight_{started.astimezone(UTC):%Y%m%d_%H%M%S}_{safe[:60]}.jsonl"
+
+
+def make_log_folder(directory: Path) -> None:
+    """Where it is missing. Errors: InvalidValue."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        why = "it is a file" if directory.is_file() else error.strerror or str(error)
+        raise InvalidValue(f"{directory} cannot hold flight logs ({why}): {_ELSEWHERE}") from None
+
+
+def new_file(path: Path, none_beside: tuple[str, ...] = ()) -> tuple[Path, int]:
+    """A file that did not exist before, open, by `path`'s name or the next free one; `none_beside`:
+    suffixes of files of the same name that must not be there, either. Raises OSError."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_BINARY", 0)
+    for number in count(1):
+        free = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
+        if any(path_beside(free, suffix).exists() for suffix in none_beside):
+            continue
+        with suppress(FileExistsError):
+            return free, os.open(free, flags, 0o644)
+    raise AssertionError("unreachable")
+
+
+def cannot_start(path: Path, error: OSError) -> str:
+    return (
+        f"{path}: the flight log cannot be created ({error.strerror or error}): free the place, "
+        f"or {_ELSEWHERE}"
+    )
+
+
+RECORDING_SUFFIX = ".mcap"
+LAYOUT_SUFFIX = ".foxglove.json"
+
+
+def recording_path(path: Path | str) -> Path:
+    """The recording's place, of a log's path or the recording's own."""
+    return path_beside(path, RECORDING_SUFFIX)

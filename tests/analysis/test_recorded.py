@@ -12,7 +12,7 @@ import pytest
 from perchctl.analysis import FlightAnalysis
 from perchctl.analysis.report import decisions_of, reported_flight
 from perchctl.log import recorded_pictures
-from perchctl.log.recording.recorder import Recorder
+from perchctl.log.recorder import Recorder
 from perchctl.profile import Profile
 from perchctl.vision import Frame
 from tests.helpers import log as synthetic

@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
-from perchctl.log import decode_line, from_exact, to_exact
-from perchctl.log.sent import sent_line, sent_of
-from perchctl.log.turn import turn_line, turn_of
+from perchctl.log import decode_line, from_exact, json_line, to_exact
+from perchctl.log.read import sent_of, turn_of
+from perchctl.log.write import turn_line
 from perchctl.mission import (
     Condition,
     ExternalPositions,
@@ -165,7 +165,7 @@ def test_a_turn_is_one_line_and_comes_back() -> None:
 @pytest.mark.parametrize("command", SENT)
 def test_what_was_sent_is_one_line_and_comes_back(command: Command) -> None:
     sent = SentCommand(0.1 + 0.2, "watchdog", command)
-    line = sent_line(sent)
+    line = json_line({"kind": "sent", **to_exact(sent)})
     assert line.count(b"\n") == 1
     assert bits(sent_of(decode_line(line))) == bits(sent)
     with pytest.raises(InvalidValue, match="sent at soon s cannot be read"):

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.log import decode_line, to_plain
-from perchctl.log.jsonl import encode
+from perchctl.log.exact import encode
 from perchctl.mission import Phase
 
 

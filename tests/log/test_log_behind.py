@@ -17,8 +17,7 @@ from perchctl.commands import fly
 from perchctl.errors import LogIncomplete
 from perchctl.flight import FlyOptions, SessionResult
 from perchctl.log import FlightSummary, LogWatcher, read_log, summary_text, write
-from perchctl.log.behind import Behind
-from perchctl.log.write import FlightLogWriter
+from perchctl.log.write import Behind, FlightLogWriter
 from perchctl.mission import FlightReport, Outcome, Phase, Turn, TurnInputs
 from perchctl.profile import load_profile
 from tests.helpers import log as synthetic

@@ -17,9 +17,9 @@ from perchctl.flight.rescue import rescue
 from perchctl.link.mock import ScriptedLink
 from perchctl.link.sender import Sender
 from perchctl.log import LogWatcher, export_mcap, read_log, write
-from perchctl.log.recording import recorder as recording_module
-from perchctl.log.recording.recorder import Recorder
-from perchctl.log.sent import sent_values, takeovers_of
+from perchctl.log import recorder as recording_module
+from perchctl.log.read import sent_values, takeovers_of
+from perchctl.log.recorder import Recorder
 from perchctl.log.write import FlightLogWriter
 from perchctl.mission import FlightReport, Operator, Outcome, Phase, SentCommand
 from perchctl.profile import load_profile

@@ -15,7 +15,7 @@ from perchctl.analysis import replay
 from perchctl.analysis.replay_text import difference_text
 from perchctl.analysis.replayer import Replay
 from perchctl.log import FlightLog, computer_differences, read_log
-from perchctl.log.write import SCHEMA_VERSION
+from perchctl.log.fields import SCHEMA_VERSION
 from perchctl.mission import Phase
 from tests.helpers.flights import ROOT
 

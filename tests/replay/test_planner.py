@@ -28,7 +28,8 @@ from perchctl.log import (
     read_log,
     to_exact,
 )
-from perchctl.log.write import FlightLogWriter, make_header
+from perchctl.log.header import make_header
+from perchctl.log.write import FlightLogWriter
 from perchctl.mission import conditions, guidance, step_mission
 from perchctl.profile import Profile, changed_profile
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors

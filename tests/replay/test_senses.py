@@ -16,7 +16,8 @@ from perchctl.analysis.sense import Picture
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.flight import fly, senses
 from perchctl.log import FlightLog, LogWatcher, read_log
-from perchctl.log.write import FlightLogWriter, make_header
+from perchctl.log.header import make_header
+from perchctl.log.write import FlightLogWriter
 from perchctl.mission import Operator, Phase, Tick
 from perchctl.profile import changed_profile
 from perchctl.vision import FieldState, Frame, Pipeline

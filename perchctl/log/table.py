@@ -9,19 +9,14 @@ import csv
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from io import StringIO
-from typing import Any, Literal
+from io import BytesIO, StringIO
+from typing import Any
 
-from perchctl.errors import InvalidValue
-from perchctl.log.fields import FIELDS
+from perchctl.errors import InvalidValue, no_parquet
+from perchctl.log.fields import FIELDS, Kind, field_kind
 from perchctl.log.read import FlightLog
 from perchctl.profile import key_unit
 
-Kind = Literal["number", "integer", "flag", "text"]
-
-_TEXTS = ("phase", "stage", "reason", "hold", "pos_note", "lock_note", "cmd")
-_FLAGS = ("measured", "tracked")
-_INTEGERS = ("attempts", "battery_state", "supervisor", "pos_sent", "frame", "unseen")
 _CORNERS = tuple(f"{corner}_{axis}" for corner in ("tl", "tr", "br", "bl") for axis in "xy")
 _TIMES = ("t_s", "frame_t_s")
 """On the loop's clock in the log, from the flight's first turn in the table."""
@@ -65,11 +60,11 @@ def log_columns(log: FlightLog) -> list[Column]:
 
 def _of_field(log: FlightLog, key: str) -> Iterator[Column]:
     values = [record.get(key) for record in log.records]
-    meaning = FIELDS.get(key) or str(_told_fields(log).get(key, ""))
+    meaning = FIELDS.get(key) or str(_header_fields(log).get(key, ""))
     if key in _TIMES:
         meaning = meaning.replace("on the loop's clock", "since the flight's first turn")
         values = [None if v is None else _since(log, key, v) for v in values]
-    if key.endswith("_px") and key in FIELDS and not key.endswith("rms_px"):
+    if key in FIELDS and field_kind(key) == "corners":
         yield from _corners(log, key, meaning, values)
         return
     kind = _kind(key, values)
@@ -117,10 +112,7 @@ def _timings(log: FlightLog) -> Iterator[Column]:
 
 def _kind(key: str, values: list[Any]) -> Kind:
     if key in FIELDS:
-        for kind, keys in (("text", _TEXTS), ("flag", _FLAGS), ("integer", _INTEGERS)):
-            if key in keys:
-                return kind  # type: ignore[return-value]
-        return "number"
+        return field_kind(key)
     known = [value for value in values if value is not None]
     numbers = all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in known)
     return "number" if numbers else "text"
@@ -151,7 +143,7 @@ def _since(log: FlightLog, key: str, value: Any) -> float:
     return round(log.since(number), _DECIMALS) + 0.0
 
 
-def _told_fields(log: FlightLog) -> dict[str, Any]:
+def _header_fields(log: FlightLog) -> dict[str, Any]:
     fields = log.header.get("fields")
     return fields if isinstance(fields, dict) else {}
 
@@ -181,3 +173,45 @@ def _cell(value: Any) -> Any:
     if value is None:
         return ""
     return int(value) if isinstance(value, bool) else value
+
+
+# --- A flight as an Apache Parquet file, which needs the extra ``parquet`` ------------------------
+
+
+def check_parquet() -> None:
+    """Before any long work. Errors: UsageError where the library is not installed."""
+    try:
+        import pyarrow.parquet  # noqa: F401
+    except ImportError:
+        raise no_parquet() from None
+
+
+def parquet_bytes(log: FlightLog, columns: Sequence[Column]) -> bytes:
+    """The table, each column's unit and meaning, and the log's header and summary as JSON under
+    ``perchctl.header`` and ``perchctl.summary``. Errors: UsageError without the library."""
+    check_parquet()
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    types: dict[Kind, pa.DataType] = {
+        "number": pa.float64(),
+        "integer": pa.int64(),
+        "flag": pa.bool_(),
+        "text": pa.string(),
+    }
+    fields = [
+        pa.field(c.name, types[c.kind], metadata={"unit": c.unit, "meaning": c.meaning})
+        for c in columns
+    ]
+    about = {
+        "perchctl.header": json.dumps(log.header),
+        "perchctl.summary": json.dumps(log.summary),
+    }
+    arrays = [
+        pa.array(column.values, type=field.type)
+        for column, field in zip(columns, fields, strict=True)
+    ]
+    table = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=about))
+    content = BytesIO()
+    pq.write_table(table, content, compression="zstd")
+    return content.getvalue()

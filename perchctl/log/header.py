@@ -1,4 +1,4 @@
-"""What a flight was set up with, in its log's header: enough to decide it again elsewhere.
+"""The log's header: what a flight was set up with, enough to decide it again elsewhere.
 
 The profile stands there with every key. The files that it names for the camera may be others
 by the time of a replay, so what was in them stands there, too; and how the computer calculates.
@@ -12,6 +12,7 @@ import math
 import platform
 import zlib
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from functools import cache
 from typing import Any
 
@@ -20,11 +21,59 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+import perchctl
 from perchctl.calibration import profile_camera
+from perchctl.camera import profile_record, without_password
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.log.exact import from_exact, to_exact
+from perchctl.log.fields import EVENT_FIELDS, FIELDS, FORMAT, SCHEMA_VERSION
 from perchctl.profile import Profile, first_invalid_key, read_mask
 from perchctl.vision import CameraModel
+
+TURN_NOTE = (
+    "records of kind turn: all that a turn of the loop took in, knew and decided, not rounded; "
+    "their times are on the loop's clock"
+)
+
+
+SENT_NOTE = (
+    "records of kind sent: a command that went to the vehicle in the loop's place, not rounded: "
+    "the watchdog's (the loop was silent, or the operator's stop), a rescue's after an error, an "
+    "order once more over a link that was lost, and the link's farewell"
+)
+
+
+def make_header(
+    profile: Profile,
+    *,
+    uri: str,
+    source: str,
+    seed: int | None = None,
+    lockstep: bool = False,
+    started: datetime | None = None,
+    t0_s: float = 0.0,
+) -> dict[str, Any]:
+    """The first record. Without `started` it depends on nothing but its arguments and the files
+    that the profile names. `t0_s`: the loop's clock when the log began, or at `started`."""
+    return {
+        "kind": "header",
+        "format": FORMAT,
+        "version": SCHEMA_VERSION,
+        "perchctl": perchctl.__version__,
+        "uri": uri,
+        "source": without_password(source),
+        "seed": seed,
+        "lockstep": lockstep,
+        "started_utc": started.astimezone(UTC).isoformat(timespec="seconds") if started else None,
+        "t0_s": t0_s,
+        "profile": profile_record(profile),
+        **camera_record(profile),
+        **computer_record(),
+        "fields": FIELDS,
+        "event_fields": EVENT_FIELDS,
+        "turns": TURN_NOTE,
+        "sent": SENT_NOTE,
+    }
 
 
 def camera_record(profile: Profile) -> dict[str, Any]:

@@ -15,10 +15,9 @@ from typing import Any
 
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
-from perchctl.log.behind import Behind
-from perchctl.log.recording.container import DiskStream, Stream
-from perchctl.log.recording.end import RecordingEnd
-from perchctl.log.recording.writing import Writing, encoded, told_of
+from perchctl.log.recording_file import DiskStream, RecordingFile, Stream, encoded, frame_record
+from perchctl.log.summary import RecordingEnd
+from perchctl.log.write import Behind
 from perchctl.profile import Profile
 from perchctl.vision import Frame
 
@@ -77,7 +76,7 @@ class Recorder:
         self._handed_bytes = 0
         self._closed = False
         # Of the thread that writes.
-        self._writing = Writing(stream, header, profile, profile_camera(profile.camera))
+        self._file = RecordingFile(stream, header, profile, profile_camera(profile.camera))
         self._over = False
         self._done_bytes = 0
         self._flushed_s: float | None = None
@@ -116,7 +115,7 @@ class Recorder:
             self._turn.events.append(record)
 
     def sent(self, values: Mapping[str, Any]) -> None:
-        """What was sent in the loop's place (`perchctl.log.sent.sent_values`). From any thread:
+        """What was sent in the loop's place (`perchctl.log.read.sent_values`). From any thread:
         the loop hangs, perhaps, and its turn is left alone. Never raises."""
         if self._closed or self._over:
             return
@@ -147,7 +146,7 @@ class Recorder:
             self._closed = True
             if self._behind is None:
                 self._end()
-            elif self._behind.finish(self._end, CLOSE_TIMEOUT_S, self._writing.give_up):
+            elif self._behind.finish(self._end, CLOSE_TIMEOUT_S, self._file.give_up):
                 self._over = True
                 self._remember("the disk does not answer: the recording lacks its end")
         kept = self._flushed_pictures
@@ -184,38 +183,38 @@ class Recorder:
             self._fail(error)
 
     def _written(self, turn: _Turn) -> None:
-        writing = self._writing
+        file = self._file
         if turn.frame is not None:
-            full = writing.size_bytes + turn.picture_bytes > self._most_bytes
+            full = file.size_bytes + turn.picture_bytes > self._most_bytes
             kept = None if full or turn.frame.repeated else encoded(turn.frame)
-            writing.frame(told_of(turn.frame), kept)
+            file.frame(frame_record(turn.frame), kept)
             if full:
                 self._remember(
                     f"the recording is full (log.max_mb in the profile, "
                     f"{self._most_bytes / 1e6:g}): it goes on without pictures"
                 )
         for event in turn.events:
-            writing.event(event)
+            file.event(event)
         if turn.sent is not None:
-            writing.sent(turn.sent)
+            file.sent(turn.sent)
         if turn.tick is not None:
-            writing.tick(turn.tick)
-        now_s = writing.newest_s
+            file.tick(turn.tick)
+        now_s = file.newest_s
         if self._flushed_s is None or now_s - self._flushed_s >= FLUSH_PERIOD_S:
             self._flushed_s = now_s
             self._flush()
 
     def _flush(self) -> None:
-        self._writing.flush()
-        self._flushed_pictures = self._writing.pictures
-        free = self._writing.free_bytes()
+        self._file.flush()
+        self._flushed_pictures = self._file.pictures
+        free = self._file.free_bytes()
         if free < RESERVE_BYTES:
             self._over = True
             self._remember(
                 f"the recording has ended: {free / 1e6:.0f} MB are left on its disk, and "
                 f"{RESERVE_BYTES / 1e6:.0f} are kept for the log; {GOES_ON}"
             )
-            self._writing.finish()
+            self._file.finish()
 
     def _fail(self, error: Exception) -> None:
         self._over = True
@@ -223,14 +222,14 @@ class Recorder:
         if isinstance(error, OSError):
             why = error.strerror or str(error)
         self._remember(f"the recording has ended ({why}): {GOES_ON}")
-        self._writing.give_up()
+        self._file.give_up()
 
     def _end(self) -> None:
         if self._over:
             return
         try:
-            self._writing.finish()
-            self._flushed_pictures = self._writing.pictures
+            self._file.finish()
+            self._flushed_pictures = self._file.pictures
         except Exception as error:
             self._fail(error)
         self._over = True
