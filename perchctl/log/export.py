@@ -13,10 +13,11 @@ from typing import Any, Literal
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.files import PartFile, cannot_be_written, check_output, check_place, write_files
+from perchctl.log.disk import DiskFile
 from perchctl.log.header import flown_camera, flown_profile
 from perchctl.log.read import FlightLog, read_log, sent_values
 from perchctl.log.recorded import recorded_frames
-from perchctl.log.recording_file import DiskStream, RecordingFile
+from perchctl.log.recording_file import RecordingFile
 from perchctl.log.write import LAYOUT_SUFFIX, RECORDING_SUFFIX, recording_path
 from perchctl.profile import Profile
 from perchctl.vision import CameraModel
@@ -56,7 +57,7 @@ def export_mcap(
     profile, camera = _setup(log, notes)
     part = PartFile(out_path)
     try:
-        file = RecordingFile(DiskStream(part.part), log.header, profile, camera)
+        file = RecordingFile(DiskFile.new(part.part), log.header, profile, camera)
         for _, kind, what in heapq.merge(_records(log), _frames(log, notes), key=_time_of):
             match kind:
                 case "tick":

@@ -15,9 +15,9 @@ from typing import Any
 
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
-from perchctl.log.recording_file import DiskStream, RecordingFile, Stream, encoded, frame_record
+from perchctl.log.disk import BackgroundWriter, DiskFile, Stream
+from perchctl.log.recording_file import RecordingFile, encoded, frame_record
 from perchctl.log.summary import RecordingEnd
-from perchctl.log.write import Behind
 from perchctl.profile import Profile
 from perchctl.vision import Frame
 
@@ -70,7 +70,7 @@ class Recorder:
         self._remarks: deque[str] = deque()
         self._problem: str | None = None
         # Of the loop's thread.
-        self._behind = Behind(MOST_BEHIND, "perchctl-recording") if live else None
+        self._writer = BackgroundWriter(MOST_BEHIND, "perchctl-recording", live)
         self._turn = _Turn()
         self._pictures = 0
         self._handed_bytes = 0
@@ -88,7 +88,7 @@ class Recorder:
     ) -> Recorder:
         """A new file beside the log. Errors: NotFound, InvalidValue, before the flight."""
         try:
-            stream = DiskStream(path, sync=live)
+            stream = DiskFile.new(path, sync=live)
         except OSError as error:
             raise _cannot_begin(path, error) from None
         try:
@@ -120,10 +120,8 @@ class Recorder:
         if self._closed or self._over:
             return
         alone = _Turn(sent=values)
-        if self._behind is None:
-            self._write(alone)
-        elif not self._behind.put(partial(self._write, alone)):
-            self._behind_hand("turns are missing in it")
+        if not self._writer.put(partial(self._write, alone)):
+            self._note_lag("turns are missing in it")
 
     def tick(self, record: Mapping[str, Any]) -> None:
         """A tick's record (`perchctl.log.fields.tick_record`). Never raises."""
@@ -144,9 +142,7 @@ class Recorder:
         if not self._closed:
             self._hand_over()
             self._closed = True
-            if self._behind is None:
-                self._end()
-            elif self._behind.finish(self._end, CLOSE_TIMEOUT_S, self._file.give_up):
+            if self._writer.finish(self._end, CLOSE_TIMEOUT_S, self._file.give_up):
                 self._over = True
                 self._remember("the disk does not answer: the recording lacks its end")
         kept = self._flushed_pictures
@@ -154,21 +150,18 @@ class Recorder:
 
     def _hand_over(self) -> None:
         turn, self._turn = self._turn, _Turn()
-        if self._behind is None:
-            self._write(turn)
-            return
-        size = turn.held_bytes
         if self._over:
             return
+        size = turn.held_bytes
         if self._handed_bytes - self._done_bytes + size > MOST_PICTURE_BYTES:
             turn.frame, size = None, 0
-            self._behind_hand("pictures are missing in it")
+            self._note_lag("pictures are missing in it")
         self._handed_bytes += size
-        if not self._behind.put(partial(self._write, turn)):
+        if not self._writer.put(partial(self._write, turn)):
             self._handed_bytes -= size
-            self._behind_hand("turns are missing in it")
+            self._note_lag("turns are missing in it")
 
-    def _behind_hand(self, what: str) -> None:
+    def _note_lag(self, what: str) -> None:
         self._remember(f"the disk does not keep up with the recording: {what}")
 
     # The thread that writes, or lockstep.

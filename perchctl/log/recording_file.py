@@ -9,18 +9,14 @@ state estimate), `body`, `gear`, `camera` (OpenCV's axes, which are Foxglove's) 
 
 from __future__ import annotations
 
-import errno
 import json
 import math
-import os
-import shutil
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -51,6 +47,7 @@ from mcap_protobuf.schema import register_schema
 
 import perchctl
 from perchctl.geometry import quaternion_from_rotation, quaternion_from_rpy
+from perchctl.log.disk import Stream
 from perchctl.log.exact import encode
 from perchctl.log.fields import FIELDS, field_kind
 from perchctl.profile import Profile
@@ -72,68 +69,6 @@ LOOP_TIMES = ("t_s", "frame_t_s")
 PATH_PERIOD_S = 1.0
 """The whole path so far is written so often: who jumps into the middle sees what was flown."""
 PATH_STEP_S = 0.1
-
-
-# --- the disk -------------------------------------------------------------------------------
-
-
-class Stream(Protocol):
-    """What a recording is written to. All but `tell` may raise OSError."""
-
-    def write(self, data: bytes) -> int: ...
-
-    def tell(self) -> int: ...
-
-    def flush(self) -> None: ...
-
-    def free_bytes(self) -> int: ...
-
-    def close(self) -> None: ...
-
-
-class DiskStream:
-    """A file that holds whole records only: a write that fails leaves nothing of itself."""
-
-    def __init__(self, path: Path, sync: bool = True) -> None:
-        """A new file; `sync`: what is flushed is on the disk, not only with the system.
-        Raises OSError, where one is there already, too."""
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
-        self._fd = os.open(path, flags, 0o644)
-        self._path = path
-        self._sync = sync
-        self._good_bytes = 0
-
-    def write(self, data: bytes) -> int:
-        done = 0
-        view = memoryview(data)
-        try:
-            while done < len(data):
-                done += os.write(self._fd, view[done:])
-        except OSError:
-            with suppress(OSError):
-                os.ftruncate(self._fd, self._good_bytes)
-                os.lseek(self._fd, self._good_bytes, os.SEEK_SET)
-            raise
-        self._good_bytes += done
-        return done
-
-    def tell(self) -> int:
-        return self._good_bytes
-
-    def flush(self) -> None:
-        if not self._sync:
-            return
-        try:
-            os.fsync(self._fd)
-        except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a pipe, a special file
-                raise
-
-    def free_bytes(self) -> int:
-        return shutil.disk_usage(self._path).free
-
-    def close(self) -> None:
-        os.close(self._fd)
 
 
 # --- the file -------------------------------------------------------------------------------

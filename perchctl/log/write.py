@@ -10,13 +10,10 @@ in `FlightLogWriter.problem`.
 
 from __future__ import annotations
 
-import errno
 import math
-import os
 import re
 import threading
-from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
@@ -25,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.errors import InvalidValue
+from perchctl.log.disk import BackgroundWriter, DiskFile
 from perchctl.log.exact import encode, json_line, to_exact
 from perchctl.log.fields import event_record
 from perchctl.mission import Event, SentCommand, Turn
@@ -53,18 +51,17 @@ class FlightLogWriter:
         lost_records: how many could not be written.
     """
 
-    def __init__(self, path: Path, fd: int) -> None:
+    def __init__(self, path: Path, file: DiskFile, writer: BackgroundWriter) -> None:
         self.path = path
         self.problem: str | None = None
         self.formless: str | None = None
-        self._fd = fd
-        self._behind: Behind | None = None
+        self._file = file
+        self._writer = writer
         self._closed = self._concluded = self._hung = False
         self._dropped = 0  # by the loop's thread, and by the link's
         self._dropping = threading.Lock()
         # Below: of the thread that writes.
         self._failed = 0
-        self._good_bytes = 0
         self._synced_s: float | None = None
         self._failed_s: float | None = None
 
@@ -97,22 +94,20 @@ class FlightLogWriter:
         """
         make_log_folder(path.parent)
         try:
-            free, fd = new_file(path, none_beside)
+            file, free = new_file(path, none_beside, live)
         except OSError as error:
             raise InvalidValue(cannot_start(path, error)) from None
-        writer = cls(free, fd)
         try:
-            writer._append(_header_line(header))
-            if live:  # last: a thread would be left behind by what fails after it
-                most = math.ceil(BEHIND_S * RECORDS_A_TURN * loop_hz)
-                writer._behind = Behind(most, "perchctl-log")
+            file.write(_header_line(header))
+            most = math.ceil(BEHIND_S * RECORDS_A_TURN * loop_hz)
+            # Last: a thread would be left behind by what fails after it.
+            return cls(free, file, BackgroundWriter(most, "perchctl-log", live))
         except BaseException as error:
-            os.close(fd)
+            file.close()
             free.unlink(missing_ok=True)
             if isinstance(error, OSError):
                 raise InvalidValue(cannot_start(path, error)) from None
             raise
-        return writer
 
     def write(self, record: Mapping[str, Any]) -> None:
         """Append one tick record (`perchctl.log.fields.tick_record`). Never raises."""
@@ -137,11 +132,7 @@ class FlightLogWriter:
         if self._closed or self._concluded:
             return
         self._concluded = True
-        if self._behind is None:
-            self._summarise(summary)
-        else:
-            done = partial(self._summarise, summary)
-            self._hung = not self._behind.wait(done, CLOSE_TIMEOUT_S)
+        self._hung = not self._writer.wait(partial(self._summarise, summary), CLOSE_TIMEOUT_S)
 
     def close(
         self,
@@ -157,11 +148,8 @@ class FlightLogWriter:
             return
         self._closed = True
         end = partial(self._end, summary, recording)
-        if self._behind is None:
-            end()
-            return
         once_more_s = RECOVERED_S if self._hung else CLOSE_TIMEOUT_S
-        left = self._behind.finish(end, once_more_s, self._let_go)
+        left = self._writer.finish(end, once_more_s, self._let_go)
         if left:
             self._drop(left)
             self._remember(NO_ANSWER)
@@ -170,8 +158,7 @@ class FlightLogWriter:
         lost = {"lost_records": self.lost_records, "problem": self.lacks}
         self._failed_s = None  # one last try, whatever happened before
         self._store({"kind": "summary", **summary, **lost}, None)
-        if self._behind is not None:
-            self._sync_to_disk()
+        self._sync_to_disk()
 
     def _end(
         self, summary: Mapping[str, Any] | None, recording: Mapping[str, Any] | None = None
@@ -180,16 +167,12 @@ class FlightLogWriter:
             self._summarise(summary)
         if recording is not None:
             self._store({"kind": "recording", **recording}, None)
-        if self._behind is not None:
-            self._sync_to_disk()
+        self._sync_to_disk()
         self._let_go()
 
     def _let_go(self) -> None:
-        """Once: the number may be another file's by the second time."""
-        fd, self._fd = self._fd, -1
-        if fd >= 0:
-            with suppress(OSError):
-                os.close(fd)
+        with suppress(OSError):
+            self._file.close()
 
     def _drop(self, count: int = 1) -> None:
         with self._dropping:
@@ -198,9 +181,7 @@ class FlightLogWriter:
     def _put(self, record: _Record, t_s: float | None) -> None:
         if self._closed or self._concluded:
             self._drop()
-        elif self._behind is None:
-            self._store(record, t_s)
-        elif not self._behind.put(
+        elif not self._writer.put(
             partial(self._store, record, t_s), TURNS_SHARE if isinstance(record, Turn) else 1.0
         ):
             self._drop()
@@ -211,7 +192,7 @@ class FlightLogWriter:
             self._failed += 1
             return
         try:
-            self._append(_line_of(record))
+            self._file.write(_line_of(record))
         except OSError as error:
             self._failed += 1
             self._failed_s = t_s
@@ -222,7 +203,7 @@ class FlightLogWriter:
             self.formless = self.formless or _formless(error)
             return
         self._failed_s = None
-        if self._behind is not None and t_s is not None:
+        if t_s is not None:
             self._sync_sometimes(t_s)
 
     def _is_waiting(self, t_s: float | None) -> bool:
@@ -230,19 +211,6 @@ class FlightLogWriter:
         if t_s is None or self._failed_s is None:
             return False
         return t_s - self._failed_s < RETRY_PERIOD_S
-
-    def _append(self, line: bytes) -> None:
-        """Write the whole line or, on failure, leave no piece of it behind."""
-        done = 0
-        try:
-            while done < len(line):
-                done += os.write(self._fd, line[done:])
-        except BaseException:
-            if done:
-                with suppress(OSError):
-                    os.ftruncate(self._fd, self._good_bytes)
-            raise
-        self._good_bytes += done
 
     def _sync_sometimes(self, t_s: float) -> None:
         if self._synced_s is None:
@@ -253,10 +221,9 @@ class FlightLogWriter:
 
     def _sync_to_disk(self) -> None:
         try:
-            os.fsync(self._fd)
+            self._file.flush()
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a pipe, a special file
-                self._remember(_explain(error))
+            self._remember(_explain(error))
 
     def _remember(self, problem: str) -> None:
         if self.problem is None:
@@ -300,77 +267,6 @@ def _formless(error: Exception) -> str:
     return f"a record has no form in the flight log: {str(error) or type(error).__name__}"
 
 
-# --- a thread for what may hang -------------------------------------------------------------
-
-Job = Callable[[], None]
-
-
-class Behind:
-    """A bounded queue of jobs and the thread that does them, in order.
-
-    What a job raises is dropped: it has to remember itself what failed."""
-
-    def __init__(self, most: int, name: str) -> None:
-        self._most = most
-        self._jobs: deque[Job] = deque()
-        self._changed = threading.Condition()
-        self._last = False
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
-
-    def put(self, job: Job, share: float = 1.0) -> bool:
-        """False when that share of the queue is full: the job is not done."""
-        with self._changed:
-            if len(self._jobs) >= share * self._most or self._last:
-                return False
-            self._jobs.append(job)
-            self._changed.notify()
-        return True
-
-    def wait(self, job: Job, timeout_s: float) -> bool:
-        """One more, however many there are; whether it was done by then. Later it may be, too."""
-        done = threading.Event()
-
-        def run() -> None:
-            try:
-                job()
-            finally:
-                done.set()
-
-        with self._changed:
-            self._jobs.append(run)
-            self._changed.notify()
-        return done.wait(timeout_s)
-
-    def finish(self, job: Job, timeout_s: float, late: Job) -> int:
-        """One last job; waits for it. How many jobs were not done by then: 0 is all done.
-
-        `late` is done instead of them should the thread ever get on: it frees what they held."""
-        with self._changed:
-            self._jobs.append(job)
-            self._last = True
-            self._changed.notify()
-        self._thread.join(timeout_s)
-        with self._changed:
-            alive = self._thread.is_alive()
-            left = len(self._jobs) + int(alive)
-            self._jobs.clear()  # what comes too late is not done at all
-            if alive:
-                self._jobs.append(late)
-        return left
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                while not self._jobs:
-                    if self._last:
-                        return
-                    self._changed.wait()
-                job = self._jobs.popleft()
-            with suppress(Exception):  # the next one is done all the same
-                job()
-
-
 # --- where a flight's files lie: the log, and what is beside it by its name ---------------------
 
 PACKED = ".gz"
@@ -402,16 +298,15 @@ def make_log_folder(directory: Path) -> None:
         raise InvalidValue(f"{directory} cannot hold flight logs ({why}): {_ELSEWHERE}") from None
 
 
-def new_file(path: Path, none_beside: tuple[str, ...] = ()) -> tuple[Path, int]:
-    """A file that did not exist before, open, by `path`'s name or the next free one; `none_beside`:
+def new_file(path: Path, none_beside: tuple[str, ...], sync: bool) -> tuple[DiskFile, Path]:
+    """A file that did not exist before, by `path`'s name or the next free one; `none_beside`:
     suffixes of files of the same name that must not be there, either. Raises OSError."""
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_BINARY", 0)
     for number in count(1):
         free = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
         if any(path_beside(free, suffix).exists() for suffix in none_beside):
             continue
         with suppress(FileExistsError):
-            return free, os.open(free, flags, 0o644)
+            return DiskFile.new(free, sync), free
     raise AssertionError("unreachable")
 
 

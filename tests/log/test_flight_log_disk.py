@@ -186,7 +186,7 @@ def test_a_log_that_cannot_begin_leaves_nothing(
     close = os.close
     monkeypatch.setattr(os, "close", lambda fd: (closed.append(fd), close(fd)))
     if failing == "thread":
-        monkeypatch.setattr(write, "Behind", no_thread)
+        monkeypatch.setattr(write, "BackgroundWriter", no_thread)
     header = synthetic.header() | ({"odd": object()} if failing == "header" else {})
     with pytest.raises((TypeError, ValueError, RuntimeError)):
         FlightLogWriter.open(tmp_path / "f.jsonl", header, live=True)

@@ -17,7 +17,8 @@ from perchctl.commands import fly
 from perchctl.errors import LogIncomplete
 from perchctl.flight import FlyOptions, SessionResult
 from perchctl.log import FlightSummary, LogWatcher, read_log, summary_text, write
-from perchctl.log.write import Behind, FlightLogWriter
+from perchctl.log.disk import BackgroundWriter
+from perchctl.log.write import FlightLogWriter
 from perchctl.mission import FlightReport, Outcome, Phase, Turn, TurnInputs
 from perchctl.profile import load_profile
 from tests.helpers import log as synthetic
@@ -79,10 +80,10 @@ def test_closing_does_not_wait_for_ever(
     assert writer.problem is not None
     assert "does not answer" in writer.problem
     assert writer.lost_records == 11  # the summary too
-    held = writer._fd
+    held = writer._file._fd
     disk.gate.set()
-    assert writer._behind is not None
-    writer._behind._thread.join(20.0)
+    assert writer._writer._thread is not None
+    writer._writer._thread.join(20.0)
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(held)
 
@@ -128,7 +129,7 @@ def test_a_job_that_raises_does_not_end_the_thread() -> None:
     def fails() -> None:
         raise AttributeError("odd")
 
-    behind = Behind(10, "test")
+    behind = BackgroundWriter(10, "test", live=True)
     for job in (fails, lambda: done.append(1), fails):
         assert behind.put(job)
     assert behind.finish(lambda: done.append(2), 20.0, fails) == 0

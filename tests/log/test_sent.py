@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 import time
 from pathlib import Path
@@ -171,8 +172,8 @@ def hung_recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[LogW
 
 def test_the_guard_waits_for_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     watcher, disk = hung_recorder(tmp_path, monkeypatch)
-    gate, real = threading.Event(), write.os.write
-    monkeypatch.setattr(write.os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
+    gate, real = threading.Event(), os.write
+    monkeypatch.setattr(os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
     spent_s = time.thread_time()
     began_s = time.monotonic()
     for _ in range(50):
@@ -237,16 +238,16 @@ def test_a_log_s_disk_that_hangs_is_waited_for_once(
 ) -> None:
     monkeypatch.setattr(write, "CLOSE_TIMEOUT_S", 0.2)
     watcher, disk = hung_recorder(tmp_path, monkeypatch)
-    gate, real = threading.Event(), write.os.write
-    monkeypatch.setattr(write.os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
+    gate, real = threading.Event(), os.write
+    monkeypatch.setattr(os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
     waits: list[float] = []
-    finish = watcher.writer._behind.finish  # type: ignore[union-attr]
+    finish = watcher.writer._writer.finish
 
     def waited(job: Any, timeout_s: float, late: Any) -> int:
         waits.append(timeout_s)
         return finish(job, timeout_s, late)
 
-    watcher.writer._behind.finish = waited  # type: ignore[union-attr,method-assign]
+    watcher.writer._writer.finish = waited  # type: ignore[method-assign]
     summary = watcher.close(REPORT)
     assert waits == [write.RECOVERED_S]
     assert summary is not None
@@ -259,10 +260,10 @@ def test_a_disk_that_has_recovered_by_the_close_has_lost_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
-    gate, real = threading.Event(), write.os.write
+    gate, real = threading.Event(), os.write
     monkeypatch.setattr(write, "CLOSE_TIMEOUT_S", 0.1)
     monkeypatch.setattr(write, "RECOVERED_S", 20.0)
-    monkeypatch.setattr(write.os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
+    monkeypatch.setattr(os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
     writer.conclude(synthetic.SUMMARY)
     gate.set()
     writer.close(recording={"frames": 3})

@@ -35,8 +35,9 @@ from perchctl.flight import (  # noqa: E402
     lockstep,
 )
 from perchctl.log import LogWatcher  # noqa: E402
+from perchctl.log.disk import DiskFile  # noqa: E402
 from perchctl.log.recorded import recorded_frames  # noqa: E402
-from perchctl.log.recording_file import DiskStream, RecordingFile  # noqa: E402
+from perchctl.log.recording_file import RecordingFile  # noqa: E402
 from perchctl.log.write import recording_path  # noqa: E402
 from perchctl.mission import (  # noqa: E402
     FlightReport,
@@ -145,7 +146,7 @@ def _packed(data: bytes) -> bytes:
 def _keep_pictures(recording: Path, path: Path) -> None:
     """Of a recording, what a replay takes from it."""
     path.unlink(missing_ok=True)
-    kept = RecordingFile(DiskStream(path), {"t0_s": 0.0}, None, None)
+    kept = RecordingFile(DiskFile.new(path), {"t0_s": 0.0}, None, None)
     for frame, picture in islice(recorded_frames(recording), PICTURES):
         kept.frame(frame, None if picture is None else (_packed(picture.data), "png"))
     kept.finish()

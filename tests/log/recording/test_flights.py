@@ -20,7 +20,7 @@ from perchctl.calibration import profile_camera
 from perchctl.flight import lockstep
 from perchctl.flight.campaign import fly_seed
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rotation_from_quaternion
-from perchctl.log import read_log, recorded_pictures, recording_file
+from perchctl.log import read_log, recorded_pictures
 from perchctl.profile import load_profile
 from perchctl.vision import Frame, project, square_corners
 from tests.helpers import recorded
@@ -110,7 +110,7 @@ def test_a_disk_that_fills_up_ends_the_recording_and_not_the_flight(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return real(fd, data)
 
-    monkeypatch.setattr(recording_file.os, "write", write)
+    monkeypatch.setattr(os, "write", write)
     path = tmp_path / "flight.jsonl"
     result = fly_seed(load_profile(SHORT), SEED, path, record=True)
     assert (result.outcome, result.log_problem) == ("perched", None)

@@ -222,7 +222,7 @@ def test_a_queue_that_is_full_drops_turns(
     recorder = onto(hung, live=True)
     hung.gate.clear()
     recorded.fly(recorder, recorded.flown(60))
-    assert len(recorder._behind._jobs) == 20  # type: ignore[union-attr]
+    assert len(recorder._writer._jobs) == 20
     (said,) = recorder.take_remarks()
     assert "turns are missing" in said
 
