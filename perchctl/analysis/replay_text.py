@@ -15,7 +15,6 @@ from perchctl.analysis.decide import Decided, Difference, decide
 from perchctl.analysis.replayer import Replay
 from perchctl.analysis.sense import Sensed
 from perchctl.geometry import Array, wrap_rad
-from perchctl.log import flown_profile
 from perchctl.mission import Condition
 
 CAUTION = (
@@ -205,7 +204,7 @@ def changed_gates(replay: Replay) -> list[Gate]:
     """Those that would have fallen at other times. The other side is decided anew, too, by the
     flown profile: what a log does not hold is compared as well."""
     turns = [each.turn for each in replay.decided]
-    flown = list(decide(turns, flown_profile(replay.log.header)))
+    flown = list(decide(turns, replay.log.flown_profile))
     one, other = _falls(flown, replay.log.start_s), _falls(replay.decided, replay.log.start_s)
     names = [*one, *(name for name in other if name not in one)]
     gates = [Gate(n, tuple(one.get(n, ())), tuple(other.get(n, ()))) for n in names]

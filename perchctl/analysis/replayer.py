@@ -31,7 +31,7 @@ from perchctl.analysis.sense import (
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
 from perchctl.flight import SENSED
-from perchctl.log import FlightLog, computer_differences, flown_camera, flown_mask, flown_profile
+from perchctl.log import FlightLog
 from perchctl.mission import Observation, Turn
 from perchctl.profile import Profile
 from perchctl.vision import Pipeline, make_pipeline
@@ -122,7 +122,7 @@ def replay(
     the same goes for what telemetry and times alone give.
     Errors: InvalidValue, NotFound (a calibration or mask that another profile names).
     """
-    flown = flown_profile(log.header)
+    flown = log.flown_profile
     whole = whole_turns(log)
     turns, used = whole.turns, profile or flown
     changed = changed_keys(flown, used)
@@ -167,10 +167,10 @@ def check_readable(log: FlightLog) -> None:
     """Decode all that a replay takes from the log. Errors: InvalidValue, and those of a value that
     no flight writes."""
     whole_turns(log)
-    flown_profile(log.header)
-    camera = flown_camera(log.header)
+    _ = log.flown_profile
+    camera = log.flown_camera
     if camera is not None:
-        flown_mask(log.header, camera)
+        log.flown_mask(camera)
     if not math.isfinite(log.start_s):
         raise ValueError("the first turn has no time")
 
@@ -193,13 +193,13 @@ def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:
 def pipeline_of(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -> Pipeline:
     """The flown calibration and mask, unless others are named by now. Errors: InvalidValue,
     NotFound."""
-    camera = flown_camera(log.header)
+    camera = log.flown_camera
     if camera is None or {"camera.calibration", "camera.cam"} & {*changed}:
         camera = profile_camera(profile.camera)
     if profile.camera.mask is None or "camera.mask" in changed:
         return make_pipeline(profile, camera)
     try:
-        return make_pipeline(profile, camera, flown_mask(log.header, camera))
+        return make_pipeline(profile, camera, log.flown_mask(camera))
     except ValueError as error:
         raise InvalidValue(f"{log.path}: its mask does not fit its calibration: {error}") from None
 
@@ -305,7 +305,7 @@ def notes_of(
             f"perchctl {made_by} flew it, and this is {perchctl.__version__}: what differs may be "
             f"what has been changed on purpose since"
         )
-    elsewhere = computer_differences(log.header)
+    elsewhere = log.computer_differences
     if elsewhere:
         yield f"it was flown with {elsewhere}: the last bits of a number may differ for that alone"
     if log.truncated:

@@ -12,15 +12,7 @@ from typing import Any
 
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.errors import NotFound, PerchError
-from perchctl.log import (
-    READABLE_VERSIONS,
-    FlightLog,
-    FlightSummary,
-    decode_line,
-    read_log,
-    summarise_flight,
-    summary_text,
-)
+from perchctl.log import FlightLog, FlightSummary, read_ends, summarise_flight, summary_text
 
 COLUMNS = 79
 _HANG = 11
@@ -226,7 +218,6 @@ SUFFIXES = (".jsonl", ".jsonl.gz")
 _BEGIN = b'{"kind":"header","format":"perchctl-flight-log"'
 _NAME = "flight_"
 _PACKED = b"\x1f\x8b"
-_TAIL_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -324,34 +315,12 @@ class LogList:
 def list_log(path: Path) -> Listed:
     """A log's header and end. Never raises for a file that is bad."""
     try:
-        quick = _from_both_ends(path)
-        if quick is not None:
-            return quick
-        log = read_log(path)
+        log = read_ends(path)
         return Listed(path, log.header, summarise_flight(log))
     except PerchError as error:
         return Listed(path, {}, None, str(error).removeprefix(f"{path}: "))
     except (TypeError, ValueError) as error:
         return Listed(path, {}, None, f"it holds what is no flight's ({error})")
-
-
-def _from_both_ends(path: Path) -> Listed | None:
-    """None where the end is not a summary: such a log has to be read whole."""
-    try:
-        with path.open("rb") as stream:
-            first = stream.readline()
-            stream.seek(max(len(first), os.fstat(stream.fileno()).st_size - _TAIL_BYTES))
-            last = stream.read().splitlines()[-2:]
-        header, end = decode_line(first), decode_line(last[-1])
-        if end.get("kind") == "recording":
-            end = decode_line(last[0]) | {k: v for k, v in end.items() if k != "kind"}
-    except (OSError, ValueError, IndexError):
-        return None
-    if end.get("kind") != "summary" or not first.startswith(_BEGIN):
-        return None
-    if header.get("version") not in READABLE_VERSIONS:
-        return None
-    return Listed(path, header, summarise_flight(FlightLog(path, header, [], [], end, False)))
 
 
 def _is_log(path: Path) -> bool:

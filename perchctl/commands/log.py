@@ -42,13 +42,9 @@ from perchctl.errors import InvalidValue, ReplayDiffers, UsageError
 from perchctl.files import check_output, same_file, write_files
 from perchctl.log import (
     FlightLog,
-    check_parquet,
-    csv_text,
     export_mcap,
-    flown_profile,
-    log_columns,
+    log_table,
     log_values,
-    parquet_bytes,
     path_beside,
     read_log,
     recorded_pictures,
@@ -292,12 +288,10 @@ def export(
     if output == STDOUT and (form is not _Form.CSV or as_json):
         beside_it = "--json" if form is _Form.CSV else f"--{form}"
         raise UsageError(f"-o - is CSV on stdout, which {beside_it} does not go with: name a file")
-    if form is _Form.PARQUET:
-        check_parquet()
     path = _log_file(file, profile, log_dir)
     if output == STDOUT:
         with _opened(path) as log:
-            text = csv_text(log_columns(log))
+            text = log_table(log).csv()
         sys.stdout.write(text)
         return 0
     beside = ("_export" if form is _Form.MCAP else "") + form.ending
@@ -335,13 +329,13 @@ def _form(asked: Sequence[_Form], output: Path | None) -> _Form:
 
 def _write_table(path: Path, place: Path, form: _Form) -> dict[str, Any]:
     with _opened(path) as log:
-        columns = log_columns(log)
+        table = log_table(log)
         if form is _Form.CSV:
-            content = csv_text(columns).encode("utf-8", errors="backslashreplace")
+            content = table.csv().encode("utf-8", errors="backslashreplace")
         else:
-            content = parquet_bytes(log, columns)
+            content = table.parquet()
     write_files({place: content})
-    return {"rows": len(columns[0].values), "columns": len(columns)}
+    return {"rows": table.rows, "columns": len(table.columns)}
 
 
 def _write_mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
@@ -412,7 +406,7 @@ def replay(
     with _opened(path) as log:
         wanted = None
         if profile is not None or settings:
-            base = flown_profile(log.header) if profile is None else load_profile(profile)
+            base = log.flown_profile if profile is None else load_profile(profile)
             wanted = changed_profile(base, settings or ())
         check_readable(log)
     is_recorded = pictures and recording_path(path).is_file()

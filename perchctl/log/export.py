@@ -14,7 +14,6 @@ from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.files import PartFile, cannot_be_written, check_output, check_place, write_files
 from perchctl.log.disk import DiskFile
-from perchctl.log.header import flown_camera, flown_profile
 from perchctl.log.read import FlightLog, read_log, sent_values
 from perchctl.log.recorded import recorded_frames
 from perchctl.log.recording_file import RecordingFile
@@ -81,12 +80,12 @@ def export_mcap(
 def _setup(log: FlightLog, notes: list[str]) -> tuple[Profile | None, CameraModel | None]:
     """The profile and the calibration that were flown, as far as they are known."""
     try:
-        profile = flown_profile(log.header)
+        profile = log.flown_profile
     except InvalidValue as error:
         notes.append(f"without the camera's mounting, the vehicle and the target: {error}")
         return None, None
     with contextlib.suppress(PerchError):
-        return profile, flown_camera(log.header) or profile_camera(profile.camera)
+        return profile, log.flown_camera or profile_camera(profile.camera)
     notes.append(
         f"without the camera's calibration: the log does not hold it, and "
         f"{profile.camera.calibration} is not here"

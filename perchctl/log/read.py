@@ -6,6 +6,7 @@ import contextlib
 import gzip
 import json
 import math
+import os
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perchctl import __version__
 from perchctl.errors import InvalidValue, NotFound
@@ -27,15 +29,23 @@ from perchctl.log.fields import (
     SCHEMA_VERSION,
     command_values,
 )
+from perchctl.log.header import (
+    computer_differences,
+    flown_camera,
+    flown_mask,
+    flown_profile,
+)
 from perchctl.log.write import path_beside
 from perchctl.mission import SentBy, SentCommand, Turn
+from perchctl.profile import Profile
+from perchctl.vision import CameraModel
 
 Times = TypeVar("Times", float, Array)
 MOST_LOG_BYTES = 300_000_000
 """Of a log, unpacked: three quarters of an hour of flight at 0.115 MB/s. What a packed file of a
 megabyte unfolds to may otherwise fill the memory."""
 _GZIP = b"\x1f\x8b"
-_BEGIN_BYTES = 1 << 16
+_BEGIN_BYTES = _TAIL_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -127,6 +137,27 @@ class FlightLog:
         return float(value) if math.isfinite(value) else None
 
     @property
+    def flown_profile(self) -> Profile:
+        """The profile that was flown, but for passwords. Errors: InvalidValue."""
+        return flown_profile(self.header)
+
+    @property
+    def flown_camera(self) -> CameraModel | None:
+        """The calibration that was flown; None in a log that has none. Errors: InvalidValue."""
+        return flown_camera(self.header)
+
+    def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
+        """(height, width), True where the gear covers; None without a mask. Errors:
+        InvalidValue."""
+        return flown_mask(self.header, camera)
+
+    @property
+    def computer_differences(self) -> str:
+        """In what the flight's computer differed from this one, in words; empty where it did not,
+        or where the log does not say."""
+        return computer_differences(self.header)
+
+    @property
     def profile_name(self) -> str | None:
         """The flown profile's name; None where the header holds none."""
         name = self.setting("name")
@@ -199,6 +230,28 @@ def read_log(path: Path | str) -> FlightLog:
         turn_records=[r for r in good if r["kind"] == "turn"],
         sent_records=[r for r in good if r["kind"] == "sent"],
     )
+
+
+def read_ends(path: Path) -> FlightLog:
+    """A log's header and summary alone, without reading it whole, where it ends with its summary;
+    else the whole log.
+
+    Raises NotFound and InvalidValue, as `read_log`.
+    """
+    try:
+        with path.open("rb") as stream:
+            first = stream.readline()
+            stream.seek(max(len(first), os.fstat(stream.fileno()).st_size - _TAIL_BYTES))
+            last = stream.read().splitlines()[-2:]
+        header, end = decode_line(first), decode_line(last[-1])
+        if end.get("kind") == "recording":
+            end = decode_line(last[0]) | _without_kind(end)
+    except (OSError, ValueError, IndexError):
+        return read_log(path)
+    is_whole = end.get("kind") == "summary" and header.get("format") == FORMAT
+    if not is_whole or header.get("version") not in READABLE_VERSIONS:
+        return read_log(path)
+    return FlightLog(path, header, [], [], end, truncated=False)
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO, StringIO
 from typing import Any
@@ -44,7 +44,69 @@ class Column:
         return key_unit(self.name)
 
 
-def log_columns(log: FlightLog) -> list[Column]:
+@dataclass(frozen=True)
+class LogTable:
+    """A flight as a table; all columns are of one length."""
+
+    log: FlightLog
+    columns: list[Column]
+
+    @property
+    def rows(self) -> int:
+        """How many turns it has."""
+        return len(self.columns[0].values)
+
+    def csv(self) -> str:
+        """A line of names, then a line each row; a missing value is empty, a flag 0 or 1."""
+        text = StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([column.name for column in self.columns])
+        cells = ([_cell(value) for value in column.values] for column in self.columns)
+        writer.writerows(zip(*cells, strict=True))
+        return text.getvalue()
+
+    def parquet(self) -> bytes:
+        """An Apache Parquet file: the table, each column's unit and meaning, and the log's header
+        and summary as JSON under ``perchctl.header`` and ``perchctl.summary``.
+
+        Errors: UsageError without the library, which comes with the extra ``parquet``.
+        """
+        try:
+            import pyarrow as pa
+            import pyarrow.parquet as pq
+        except ImportError:
+            raise no_parquet() from None
+        types: dict[Kind, pa.DataType] = {
+            "number": pa.float64(),
+            "integer": pa.int64(),
+            "flag": pa.bool_(),
+            "text": pa.string(),
+        }
+        fields = [
+            pa.field(c.name, types[c.kind], metadata={"unit": c.unit, "meaning": c.meaning})
+            for c in self.columns
+        ]
+        about = {
+            "perchctl.header": json.dumps(self.log.header),
+            "perchctl.summary": json.dumps(self.log.summary),
+        }
+        arrays = [
+            pa.array(column.values, type=field.type)
+            for column, field in zip(self.columns, fields, strict=True)
+        ]
+        table = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=about))
+        content = BytesIO()
+        pq.write_table(table, content, compression="zstd")
+        return content.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    if value is None:
+        return ""
+    return int(value) if isinstance(value, bool) else value
+
+
+def log_table(log: FlightLog) -> LogTable:
     """`t_s` first, from 0; then the log's fields in their order, with lists flattened, what
     happened in words, and how long the parts of the turn took.
 
@@ -55,7 +117,7 @@ def log_columns(log: FlightLog) -> list[Column]:
     found: list[Column] = []
     for key in dict.fromkeys((*FIELDS, *(key for record in log.records for key in record))):
         found += _of_field(log, key)
-    return [*found, _events(log), *_timings(log)]
+    return LogTable(log, [*found, _events(log), *_timings(log)])
 
 
 def _of_field(log: FlightLog, key: str) -> Iterator[Column]:
@@ -155,63 +217,3 @@ def _wrong(log: FlightLog, key: str, value: Any, allowed: str) -> InvalidValue:
         f"{log.path}: {key} must be {allowed}, found {shown}: the file is damaged, take the "
         f"original"
     )
-
-
-# --- A flight as comma-separated values --------------------------------------------------------
-
-
-def csv_text(columns: Sequence[Column]) -> str:
-    """A line of names, then a line each row; a missing value is empty, a flag 0 or 1."""
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([column.name for column in columns])
-    writer.writerows(zip(*([_cell(v) for v in column.values] for column in columns), strict=True))
-    return text.getvalue()
-
-
-def _cell(value: Any) -> Any:
-    if value is None:
-        return ""
-    return int(value) if isinstance(value, bool) else value
-
-
-# --- A flight as an Apache Parquet file, which needs the extra ``parquet`` ------------------------
-
-
-def check_parquet() -> None:
-    """Before any long work. Errors: UsageError where the library is not installed."""
-    try:
-        import pyarrow.parquet  # noqa: F401
-    except ImportError:
-        raise no_parquet() from None
-
-
-def parquet_bytes(log: FlightLog, columns: Sequence[Column]) -> bytes:
-    """The table, each column's unit and meaning, and the log's header and summary as JSON under
-    ``perchctl.header`` and ``perchctl.summary``. Errors: UsageError without the library."""
-    check_parquet()
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    types: dict[Kind, pa.DataType] = {
-        "number": pa.float64(),
-        "integer": pa.int64(),
-        "flag": pa.bool_(),
-        "text": pa.string(),
-    }
-    fields = [
-        pa.field(c.name, types[c.kind], metadata={"unit": c.unit, "meaning": c.meaning})
-        for c in columns
-    ]
-    about = {
-        "perchctl.header": json.dumps(log.header),
-        "perchctl.summary": json.dumps(log.summary),
-    }
-    arrays = [
-        pa.array(column.values, type=field.type)
-        for column, field in zip(columns, fields, strict=True)
-    ]
-    table = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=about))
-    content = BytesIO()
-    pq.write_table(table, content, compression="zstd")
-    return content.getvalue()

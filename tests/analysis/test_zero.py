@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from perchctl.analysis import FlightAnalysis, replay, show_record, show_text
-from perchctl.log import export_mcap, json_line, log_columns, read_log
+from perchctl.log import export_mcap, json_line, log_table, read_log
 from perchctl.mission import conditions
 from tests.helpers.recorded import messages
 from tests.replay.test_corpus import FOLDER
@@ -43,7 +43,7 @@ def test_all_outputs_of_a_log_have_one_zero(path: Path, monkeypatch: pytest.Monk
     assert log.since(float(log.records[0]["t_s"])) == 0.0
     assert at_s > SOONER_S
 
-    columns = {column.name: column.values for column in log_columns(log)}
+    columns = {column.name: column.values for column in log_table(log).columns}
     export_mcap(path, path.with_suffix(".mcap"))
     ticks = map(json.loads, messages(path.with_suffix(".mcap"))["/tick"])
     monkeypatch.setitem(conditions.CONDITIONS, conditions.Condition.SETTLED, lambda c: False)

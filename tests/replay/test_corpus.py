@@ -14,7 +14,7 @@ import pytest
 from perchctl.analysis import replay
 from perchctl.analysis.replay_text import difference_text
 from perchctl.analysis.replayer import Replay
-from perchctl.log import FlightLog, computer_differences, read_log
+from perchctl.log import FlightLog, read_log
 from perchctl.log.fields import SCHEMA_VERSION
 from perchctl.mission import Phase
 from tests.helpers.flights import ROOT
@@ -40,7 +40,7 @@ def test_the_planner_decides_as_it_did(name: str) -> None:
     if found.first is None:
         assert found.ticks > 50
         return
-    assert computer_differences(found.log.header), f"{difference_text(found.first)}; {ANEW}"
+    assert found.log.computer_differences, f"{difference_text(found.first)}; {ANEW}"
     assert not _beyond_last_bits(found), f"{difference_text(found.first)}; {ANEW}"
 
 

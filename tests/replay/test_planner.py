@@ -19,16 +19,8 @@ from perchctl.analysis.decide import first_differing, same
 from perchctl.analysis.replay_text import CAUTION, Gate, changed_gates, gate_text
 from perchctl.analysis.replayer import changed_keys
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
-from perchctl.log import (
-    FlightLog,
-    flown_camera,
-    flown_mask,
-    flown_profile,
-    json_line,
-    read_log,
-    to_exact,
-)
-from perchctl.log.header import make_header
+from perchctl.log import FlightLog, json_line, read_log, to_exact
+from perchctl.log.header import flown_camera, flown_mask, make_header
 from perchctl.log.write import FlightLogWriter
 from perchctl.mission import conditions, guidance, step_mission
 from perchctl.profile import Profile, changed_profile
@@ -238,7 +230,7 @@ def test_the_header_s_profile_is_the_flown_one_to_the_bit(tmp_path: Path) -> Non
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", make_header(profile, uri="", source=""))
     writer.close()
     log = read_log(writer.path)
-    back = flown_profile(log.header)
+    back = log.flown_profile
     assert changed_keys(profile, back) == ("camera.source",)
     assert back.safety.jump_m == 0.1 + 0.2
     assert b"secret" not in writer.path.read_bytes()
@@ -277,10 +269,8 @@ def test_a_mask_goes_with_the_log(tmp_path: Path) -> None:
 
 def test_what_if_names_tick_gates_and_what_it_cannot_know() -> None:
     log = corpus("perched")
-    dwell_s = flown_profile(log.header).planner.ascend.settle_dwell_s
-    later = changed_profile(
-        flown_profile(log.header), [f"planner.ascend.settle_dwell_s={dwell_s + 0.2}"]
-    )
+    dwell_s = log.flown_profile.planner.ascend.settle_dwell_s
+    later = changed_profile(log.flown_profile, [f"planner.ascend.settle_dwell_s={dwell_s + 0.2}"])
     found = replay(log, None, later)
     assert found.changed == ("planner.ascend.settle_dwell_s",)
     assert found.first is not None
@@ -298,7 +288,7 @@ def test_what_if_names_tick_gates_and_what_it_cannot_know() -> None:
 
 def test_what_if_nothing_would_differ() -> None:
     log = corpus("perched")
-    wider = changed_profile(flown_profile(log.header), ["safety.max_height_m=9"])
+    wider = changed_profile(log.flown_profile, ["safety.max_height_m=9"])
     found = replay(log, None, wider)
     assert found.same
     assert changed_gates(found) == []
@@ -308,7 +298,7 @@ def test_what_if_nothing_would_differ() -> None:
 def test_what_acts_on_pictures_only_is_said() -> None:
     log = corpus("perched")
     found = replay(
-        log, None, changed_profile(flown_profile(log.header), ["kalman.n_max=3", "link.loop_hz=20"])
+        log, None, changed_profile(log.flown_profile, ["kalman.n_max=3", "link.loop_hz=20"])
     )
     assert any(
         n.startswith("kalman.n_max: what it would change in the pictures") for n in found.notes

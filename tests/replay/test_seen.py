@@ -24,7 +24,7 @@ import pytest
 from perchctl.analysis import replay
 from perchctl.analysis.replay_text import difference_text
 from perchctl.analysis.replayer import Replay
-from perchctl.log import computer_differences, recorded_pictures, to_exact
+from perchctl.log import recorded_pictures, to_exact
 from perchctl.vision import filter as the_filter
 from perchctl.vision import solve
 from perchctl.vision.markers import lines
@@ -84,7 +84,7 @@ def test_the_pictures_show_what_they_showed() -> None:
     assert found.seen is not None
     assert (found.seen.frames, found.seen.ended) == (PICTURES, "")
     assert not beyond(found), f"{beyond(found)[:1]}; {ANEW}"
-    if not computer_differences(found.log.header):
+    if not found.log.computer_differences:
         first = found.seen.first
         assert first is None, f"{difference_text(first)}; {ANEW}"
 

@@ -20,7 +20,7 @@ from perchctl.analysis.replayer import Replay
 from perchctl.analysis.sense import shown
 from perchctl.camera import VERDICT_TEXTS
 from perchctl.flight import SENSED, history
-from perchctl.log import FlightLog, flown_profile
+from perchctl.log import FlightLog
 from perchctl.mission import Turn
 from perchctl.profile import PositioningConfig, Profile, SafetyConfig, changed_profile
 from perchctl.vehicle import Telemetry
@@ -33,12 +33,12 @@ JUDGED = ("jumped", "turned_rad", "battery_age_s", "camera_age_s", "new_frame", 
 
 
 def what_if(log: FlightLog, *settings: str) -> Replay:
-    return replay(log, None, changed_profile(flown_profile(log.header), settings))
+    return replay(log, None, changed_profile(log.flown_profile, settings))
 
 
 def flown_by(log: FlightLog, *settings: str) -> FlightLog:
     """The log of a flight by another profile, which was shown what that makes of it."""
-    was = flown_profile(log.header)
+    was = log.flown_profile
     profile = changed_profile(was, settings)
     turns = [
         replace(each.turn, observation=each.observation) for each in shown(log.turns, was, profile)
@@ -79,7 +79,7 @@ def stepped(key: str) -> FlightLog:
         else replace(turn, taken=replace(turn.taken, samples=tuple(map(step, turn.taken.samples))))
         for turn in log.turns
     ]
-    return with_turns(log, turns, flown_profile(log.header))
+    return with_turns(log, turns, log.flown_profile)
 
 
 @pytest.mark.parametrize("key", STEPS)
@@ -210,7 +210,7 @@ def test_with_pictures_it_is_judged_alike(tmp_path: Path, setting: str) -> None:
 def test_another_latency_of_a_capture_makes_positions_older() -> None:
     log = corpus("external-occluded")
     found = what_if(log, "positioning={by: mocap, latency_s: 0.04, host: x}")
-    later_s = 0.04 - flown_profile(log.header).positioning.latency_s
+    later_s = 0.04 - log.flown_profile.positioning.latency_s
     assert found.shown is not None
     assert found.shown.first is not None
     assert found.shown.first.field == "position_age_s"
