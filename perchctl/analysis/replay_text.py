@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.analysis.decide import Decided, Difference, decide
-from perchctl.analysis.replayer import Replay
+from perchctl.analysis.replayer import Replay, Seen
 from perchctl.analysis.sense import Sensed
 from perchctl.geometry import Array, wrap_rad
 from perchctl.mission import Condition
@@ -25,42 +25,42 @@ _MOST_KEYS = 6
 
 
 def replay_record(replay: Replay) -> dict[str, Any]:
-    """`ticks`, `differences` and `first_difference` are the planner's; `pictures` None without
-    any, and else `shown`; `what_if` None where nothing was changed."""
-    seen = replay.seen
+    """The replay as JSON's own types.
+
+    `ticks`, `differences` and `first_difference` are the planner's; `pictures` is None without
+    any, and else `shown`; `what_if` is None where nothing was changed.
+    """
+    seen, shown, what_if = replay.seen, replay.shown, None
+    if replay.changed:
+        what_if = {
+            "changed": list(replay.changed),
+            "gates": [asdict(gate) for gate in changed_gates(replay)],
+            "rms": [asdict(change) for change in pose_changes(replay)],
+            "caution": CAUTION,
+        }
     return {
         "log": str(replay.log.path),
         "same": replay.same,
         "ticks": replay.ticks,
-        "differences": replay.differences,
-        "first_difference": _difference_record(replay.first),
+        **_differences(replay),
         "gap": replay.gap or None,
-        "shown": None
-        if replay.shown is None
-        else {
-            "turns": len(replay.shown.turns),
-            "differences": replay.shown.differences,
-            "first_difference": _difference_record(replay.shown.first),
-        },
+        "shown": None if shown is None else {"turns": len(shown.turns), **_differences(shown)},
         "pictures": None
         if seen is None
         else {
             "frames": seen.frames,
             "frames_flown": seen.frames_flown,
             "ended": seen.ended or None,
-            "differences": seen.differences,
-            "first_difference": _difference_record(seen.first),
+            **_differences(seen),
         },
-        "what_if": None
-        if not replay.changed
-        else {
-            "changed": list(replay.changed),
-            "gates": [asdict(gate) for gate in changed_gates(replay)],
-            "rms": [asdict(change) for change in pose_changes(replay)],
-            "caution": CAUTION,
-        },
+        "what_if": what_if,
         "notes": list(replay.notes),
     }
+
+
+def _differences(found: Replay | Seen) -> dict[str, Any]:
+    first = None if found.first is None else asdict(found.first)
+    return {"differences": found.differences, "first_difference": first}
 
 
 def replay_lines(replay: Replay) -> list[str]:
@@ -141,10 +141,6 @@ def difference_text(first: Difference, what_if: bool = False) -> str:
     return (
         f"tick {first.tick} at {first.t_s:.2f} s: {first.field} was {recorded}, {other} {replayed}"
     )
-
-
-def _difference_record(first: Difference | None) -> dict[str, Any] | None:
-    return None if first is None else asdict(first)
 
 
 def gate_text(gate: Gate) -> str:

@@ -7,13 +7,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import perchctl
+from perchctl.analysis.compare import profile_differences
 from perchctl.analysis.decide import (
     Decided,
     Difference,
     decide,
     first_differing,
     first_of,
-    same,
     whole_turns,
 )
 from perchctl.analysis.sense import (
@@ -39,21 +39,21 @@ from perchctl.vision import Pipeline, make_pipeline
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What came of the pictures.
+    """What the senses made of pictures, telemetry and times; or of the last two alone.
 
     Attributes:
         turns: each, seen again, up to where a picture is missing.
+        differences: turns of which a pose, or what the planner sees, differs; `first` of them.
         frames: pictures that were looked at, of `frames_flown`.
-        differences: turns of which a pose, or what the planner sees, differs.
         ended: why it ends before the flight does, or empty.
         another: it ends at a picture that is not the flown one.
         unreadable: it ends where the recording cannot be read.
     """
 
     turns: Sequence[Sensed]
-    frames: int
     differences: int
     first: Difference | None
+    frames: int = 0
     frames_flown: int = 0
     ended: str = ""
     another: bool = False
@@ -68,23 +68,13 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """What came of telemetry and times, without pictures: `differences` counts the turns in which
-    the planner is shown something else."""
-
-    turns: Sequence[Sensed]
-    differences: int
-    first: Difference | None
-
-
-@dataclass(frozen=True, eq=False)
 class Replay:
     """Attributes:
     decided: each turn of the planner, decided again.
     ticks: how many were flown; `differences`, how many of them were decided otherwise; `first`
         may be of one that was not sent.
-    seen: None without pictures.
-    shown: None where pictures were looked at to the end.
+    seen: by pictures; None without any.
+    shown: by telemetry and times alone; None where pictures were looked at to the end.
     changed: the keys in which the profile is another than the flown one's.
     gap: which turn is the first that the log has lost, or empty.
     notes: what limits the replay, in sentences.
@@ -97,7 +87,7 @@ class Replay:
     differences: int
     first: Difference | None
     seen: Seen | None = None
-    shown: Shown | None = None
+    shown: Seen | None = None
     changed: tuple[str, ...] = ()
     gap: str = ""
     notes: tuple[str, ...] = ()
@@ -136,7 +126,8 @@ def replay(
     by_telemetry = None
     unseen = seen is None or not (seen.frames or seen.another)
     if unseen or (seen is not None and seen.ended):
-        by_telemetry = _shown(log, turns, flown, used)
+        found = list(shown(turns, flown, used))
+        by_telemetry = Seen(found, *_differing(log, turns, found))
     again, ended = by_telemetry if unseen else seen, "" if seen is None else seen.ended
     observations: dict[int, Observation | None] = {}
     if again is not None and changed:
@@ -177,17 +168,8 @@ def check_readable(log: FlightLog) -> None:
 
 def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:
     """The dotted keys in which two profiles differ, but for what only names or describes."""
-
-    def walk(a: object, b: object, name: str) -> Iterator[str]:
-        if isinstance(a, dict) and isinstance(b, dict) and a and b:
-            for key in [*a, *(k for k in b if k not in a)]:
-                yield from walk(a.get(key), b.get(key), f"{name}.{key}" if name else str(key))
-        elif not same(a, b):
-            yield name
-
-    told = ("name", "description", "date")
-    found = walk(one.model_dump(mode="json"), other.model_dump(mode="json"), "")
-    return tuple(key for key in found if key not in told)
+    found = profile_differences(one.model_dump(mode="json"), other.model_dump(mode="json"))
+    return tuple(key for key in found if key not in ("name", "description", "date"))
 
 
 def pipeline_of(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -> Pipeline:
@@ -223,18 +205,13 @@ def _seen(
             missing = error
     return Seen(
         found,
-        _frames_of(each.turn for each in found),
         *_differing(log, turns, found),
+        frames=_frames_of(each.turn for each in found),
         frames_flown=_frames_of(turns),
         ended=f"{missing}: what came after it cannot be seen again" if missing else "",
         another=isinstance(missing, PictureAnother),
         unreadable=isinstance(missing, PicturesUnreadable),
     )
-
-
-def _shown(log: FlightLog, turns: Sequence[Turn], flown: Profile, profile: Profile) -> Shown:
-    found = list(shown(turns, flown, profile))
-    return Shown(found, *_differing(log, turns, found))
 
 
 def _differing(
