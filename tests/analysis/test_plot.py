@@ -25,7 +25,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> FlightLog:
     path = tmp_path_factory.mktemp("log") / "f.jsonl"
     writer = FlightLogWriter.open(path, synthetic.header())
     for record in synthetic.ticks():
-        writer.write(record)
+        writer.write(record | {"true_miss_m": 0.004})
     writer.close(synthetic.SUMMARY)
     return read_log(writer.path)
 
