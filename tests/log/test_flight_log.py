@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.log import read_log, to_plain
+from perchctl.log import read_log, recording_path, to_plain
 from perchctl.log.fields import FIELDS, tick_record
 from perchctl.log.write import FlightLogWriter, log_path
 from perchctl.mission import BatteryOutlook, ExternalPositions, Phase, PlannerState
@@ -135,3 +135,9 @@ def test_every_field_is_filled_by_something() -> None:
         record = tick_record(tick, (0.0, 0.0, 1.0), 0.01)
         seen |= {key for key, value in record.items() if value is not None}
     assert set(FIELDS) - seen == {"var_m2"}  # this vehicle does not report it
+
+
+@pytest.mark.parametrize("name", ["x.jsonl", "x.jsonl.gz", "x.mcap"])
+@pytest.mark.parametrize("kind", [str, Path])
+def test_it_is_found_by_the_log_the_packed_log_and_itself(name: str, kind: type) -> None:
+    assert recording_path(kind(Path("logs.d") / name)) == Path("logs.d") / "x.mcap"
