@@ -91,7 +91,7 @@ MOST_NAMES = {
     "faults": 15,
     "flight": 83,
     "link": 31,
-    "log": 22,
+    "log": 21,
     "mission": 60,
     "positioning": 15,
     "profile": 55,
