@@ -32,7 +32,7 @@ from speed import RATE_HZ, sequence
 
 from perchctl.camera import FrameSource, WrappedSource
 from perchctl.log import LogWatcher
-from perchctl.log.recording.end import RecordingEnd
+from perchctl.log.summary import RecordingEnd
 from perchctl.mission import (
     FrameSeen,
     Observation,

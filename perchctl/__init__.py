@@ -11,9 +11,10 @@ __version__ = "0.2.0"
 TYPE_CHECKING = False  # typing's own takes longer to load than all of this
 
 if TYPE_CHECKING:
+    from perchctl.analysis import plot_flight
     from perchctl.calibration import load_calibration
     from perchctl.flight import fly_lockstep
-    from perchctl.log import plot_flight, read_log
+    from perchctl.log import read_log
     from perchctl.profile import load_profile
     from perchctl.vision import Attitude, Frame, PipelineState, estimate, make_pipeline, step
 
@@ -26,7 +27,7 @@ _HOMES = {
     "load_calibration": "perchctl.calibration.files",
     "load_profile": "perchctl.profile",
     "make_pipeline": "perchctl.vision.pipeline",
-    "plot_flight": "perchctl.log.plot",
+    "plot_flight": "perchctl.analysis.plot",
     "read_log": "perchctl.log.read",
     "step": "perchctl.vision.pipeline",
 }

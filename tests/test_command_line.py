@@ -235,7 +235,7 @@ def test_ctrl_c_in_the_drawing_leaves_the_result(
         assert flown[0].startswith("LANDED: Ctrl-C")
         os.kill(os.getpid(), 2)  # Ctrl-C
 
-    monkeypatch.setattr("perchctl.log.plot_flight", draw)
+    monkeypatch.setattr("perchctl.analysis.plot_flight", draw)
     code = fly_and_report(resolve(), True, None)
     out, err = capsys.readouterr()
     told = json.loads(out)
@@ -247,7 +247,7 @@ def test_ctrl_c_in_the_drawing_leaves_the_result(
 def test_the_object_names_the_plot(
     flown: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("perchctl.log.plot_flight", lambda *_: None)
+    monkeypatch.setattr("perchctl.analysis.plot_flight", lambda *_: None)
     fly_and_report(resolve(), True, None)
     told = json.loads(capsys.readouterr().out)
     assert told["plot"] == told["log"].replace(".jsonl", ".png")
@@ -267,7 +267,7 @@ def test_ctrl_c_behind_the_landing_does_not_replace_the_result(
         return close(self, *arguments)
 
     monkeypatch.setattr(LogWatcher, "close", slow)
-    monkeypatch.setattr("perchctl.log.plot_flight", lambda *_: None)
+    monkeypatch.setattr("perchctl.analysis.plot_flight", lambda *_: None)
     assert fly_and_report(resolve(), True, None) == 130
     assert json.loads(capsys.readouterr().out)["outcome"] == "landed"
 

@@ -91,14 +91,14 @@ def test_programs_are_told_what_an_export_lacks(logs: Path) -> None:
 def test_programs_are_told_where_a_replay_is_drawn(
     logs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("perchctl.replay.plot_replay", lambda _found, _path: None)
+    monkeypatch.setattr("perchctl.analysis.plot_replay", lambda _found, _path: None)
     log = str(FLIGHTS / "stopped.jsonl.gz")
     assert json.loads(run("log", "replay", log, "--json", "-o", "x.png").stdout)["plot"] == "x.png"
 
 
 def test_a_plot_s_name_is_its_form(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Path] = []
-    monkeypatch.setattr("perchctl.log.plot_flight", lambda _log, path: drawn.append(path))
+    monkeypatch.setattr("perchctl.analysis.plot_flight", lambda _log, path: drawn.append(path))
     old = "perchctl-logs/flight_old.jsonl"
     assert run("log", "plot", old).stdout == "plot:      perchctl-logs/flight_old.png\n"
     assert json.loads(run("log", "plot", old, "-o", "x.PDF", "--json").stdout)["plot"] == "x.PDF"

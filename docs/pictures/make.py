@@ -35,6 +35,7 @@ ROOT = Path(__file__).resolve().parents[2]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
+from perchctl.analysis import plot_flight, write_report  # noqa: E402
 from perchctl.calibration import profile_camera  # noqa: E402
 from perchctl.display import (  # noqa: E402
     LivePage,
@@ -47,7 +48,6 @@ from perchctl.flight import PLAIN_SEED  # noqa: E402
 from perchctl.geometry import Array, make_T, rotation_from_rpy  # noqa: E402
 from perchctl.log import (  # noqa: E402
     FlightLog,
-    plot_flight,
     read_log,
 )
 from perchctl.mission import BatteryOutlook  # noqa: E402
@@ -62,7 +62,6 @@ from perchctl.plot import (  # noqa: E402
     save_png,
 )
 from perchctl.profile import Profile, load_profile  # noqa: E402
-from perchctl.report import write_report  # noqa: E402
 from perchctl.sim import (  # noqa: E402
     Renderer,
     draw_scenario,

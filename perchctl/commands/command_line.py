@@ -75,8 +75,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Fly many seeded scenarios in lockstep, faster than real time, and count.",
     ),
     "log": (
-        "cli.log",
-        "After a flight: its log shown, drawn, compared, exported, replayed, told.",
+        "log",
+        "After a flight: show, draw, compare, export, replay or report its log.",
     ),
 }
 """In the order in which one uses them: the file, and the first sentence of its help."""

@@ -13,7 +13,7 @@ def plot_of(log_path: Path, profile: Profile) -> Path | None:
     """Draws it where the profile asks for it; one that fails is a warning, the flight is over."""
     if not profile.log.plot:
         return None
-    from perchctl.log import plot_flight
+    from perchctl.analysis import plot_flight
 
     picture = path_beside(log_path, ".png")
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from perchctl.analysis import profile_differences
 from perchctl.commands.output import print_record
 from perchctl.commands.positioning import positioned
 from perchctl.commands.simulate_request import SimulateRequest, and_problem, fly_each
@@ -14,7 +15,6 @@ from perchctl.flight import (
     variants_text,
     whole_seeds,
 )
-from perchctl.log import profile_differences
 from perchctl.profile import load_profile
 
 _NO_DIFFERENCE = ("name", "description", "date")

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
-from perchctl.mission import BatteryOutlook, Event, ExternalPositions
+from perchctl.mission import Event, ExternalPositions, Tick
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -23,7 +23,13 @@ from perchctl.vehicle import (
     StopMotors,
     Telemetry,
 )
-from perchctl.vision import MARKERS, Consistency, MarkerPose, PipelineOutput, TargetEstimate
+from perchctl.vision import MARKERS, Consistency, PipelineOutput, TargetEstimate
+
+FORMAT = "perchctl-flight-log"
+SCHEMA_VERSION = 4
+READABLE_VERSIONS = (1, 2, 3, SCHEMA_VERSION)
+"""1 knew no `tracked` and no events of several fields; its missing values read None. 2 knew no
+turns; 3 neither why a turn was decided so, nor what was sent in the loop's place."""
 
 _POSE_SOURCES = {"l": "large", "s": "small", "j": "joint"}
 
@@ -136,6 +142,19 @@ FIELDS: dict[str, str] = {
     "true_miss_m": "true horizontal distance of the gear from the target's centre, simulation only",
 }
 
+Kind = Literal["number", "integer", "flag", "text", "corners"]
+_KINDS: dict[Kind, tuple[str, ...]] = {
+    "text": ("phase", "stage", "reason", "hold", "pos_note", "lock_note", "cmd"),
+    "flag": ("measured", "tracked"),
+    "integer": ("attempts", "battery_state", "supervisor", "pos_sent", "frame", "unseen"),
+    "corners": ("large_px", "small_px"),
+}
+
+
+def field_kind(key: str) -> Kind:
+    """What a field of `FIELDS` holds; `corners` are eight numbers."""
+    return next((kind for kind, keys in _KINDS.items() if key in keys), "number")
+
 
 EVENT_FIELDS: dict[str, str] = {
     "t_s": "time on the loop's clock",
@@ -162,57 +181,33 @@ def event_record(event: Event) -> dict[str, Any]:
 
 
 def tick_record(
-    *,
-    t_s: float,
-    telemetry: Telemetry | None,
-    output: PipelineOutput | None,
-    target: TargetEstimate | None,
-    phase: str,
-    reason: str,
-    command: Command | None,
-    stage: str | None = None,
-    hold: str = "",
-    attempts: int = 0,
-    loop_late_s: float = 0.0,
-    camera_age_s: float | None = None,
-    telemetry_age_s: float | None = None,
-    consistency: Consistency | None = None,
-    delay_used_s: float = 0.0,
-    outside: ExternalPositions | None = None,
-    battery: BatteryOutlook | None = None,
+    tick: Tick,
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,
 ) -> dict[str, Any]:
-    """One tick as a flat record with all keys of `FIELDS`, in their order.
-
-    `output` is what this tick's new frame gave, None without a new frame.
-    `stage` defaults to the output's, else to the target's.
-    """
-    if stage is None:
-        seen = output or target
-        stage = seen.stage.value if seen is not None else None
-    if telemetry is not None and telemetry_age_s is None:
-        telemetry_age_s = t_s - telemetry.t_s
+    """One tick as a flat record with all keys of `FIELDS`, in their order; with the truth of a
+    simulation."""
+    seen, battery = tick.output or tick.target, tick.state.battery
     values: dict[str, Any] = {
-        "t_s": t_s,
-        "phase": phase,
-        "stage": stage,
-        "reason": reason,
-        "hold": hold or None,
-        "attempts": attempts,
-        "tel_age_s": telemetry_age_s,
-        "cam_age_s": camera_age_s,
-        "late_s": loop_late_s,
-        "delay_used_s": delay_used_s or None,
+        "t_s": tick.t_s,
+        "phase": tick.state.phase.value,
+        "stage": None if seen is None else seen.stage.value,
+        "reason": tick.state.reason,
+        "hold": tick.state.hold or None,
+        "attempts": tick.state.attempts,
+        "tel_age_s": tick.telemetry_age_s,
+        "cam_age_s": tick.camera_age_s,
+        "late_s": tick.loop_late_s,
+        "delay_used_s": tick.delay_used_s or None,
         "true_miss_m": true_miss_m,
-        **_consistency_values(consistency),
+        **_consistency_values(tick.consistency),
         **_xyz("true_", true_position_m),
-        **_outside_values(outside),
-        **_battery_values(battery),
-        **_telemetry_values(telemetry),
-        **_output_values(output),
-        **_target_values(target),
-        **command_values(command),
+        **_external_values(tick.outside),
+        **({} if battery is None else {f"battery_{k}": v for k, v in vars(battery).items()}),
+        **_telemetry_values(tick.telemetry),
+        **_output_values(tick.output),
+        **_target_values(tick.target),
+        **command_values(tick.command),
     }
     return {key: values.get(key) for key in FIELDS}
 
@@ -228,25 +223,21 @@ def _consistency_values(seen: Consistency | None) -> dict[str, Any]:
     }
 
 
-def _outside_values(outside: ExternalPositions | None) -> dict[str, Any]:
-    if outside is None:
+def _external_values(external: ExternalPositions | None) -> dict[str, Any]:
+    if external is None:
         return {}
     values: dict[str, Any] = {
-        "pos_age_s": outside.age_s if math.isfinite(outside.age_s) else None,
-        "pos_note": outside.problem,
-        "pos_sent": outside.sent,
-        "pos_hz": outside.rate_hz,
+        "pos_age_s": external.age_s if math.isfinite(external.age_s) else None,
+        "pos_note": external.problem,
+        "pos_sent": external.sent,
+        "pos_hz": external.rate_hz,
     }
-    place = outside.place
+    place = external.place
     if place is not None:
         values |= _xyz("pos_", place.position_m)
         if place.quaternion is not None:
             values |= {f"pos_q{c}": q for c, q in zip("wxyz", place.quaternion, strict=True)}
     return values
-
-
-def _battery_values(battery: BatteryOutlook | None) -> dict[str, Any]:
-    return {} if battery is None else {f"battery_{k}": v for k, v in vars(battery).items()}
 
 
 def _xyz(prefix: str, vector: Any, unit: str = "m") -> dict[str, Any]:
@@ -255,9 +246,7 @@ def _xyz(prefix: str, vector: Any, unit: str = "m") -> dict[str, Any]:
     return {f"{prefix}{axis}_{unit}": v for axis, v in zip("xyz", vector, strict=True)}
 
 
-def _telemetry_values(tel: Telemetry | None) -> dict[str, Any]:
-    if tel is None:
-        return {}
+def _telemetry_values(tel: Telemetry) -> dict[str, Any]:
     return {
         **_xyz("", tel.position_m),
         **_xyz("v", tel.velocity_mps, "mps"),
@@ -289,16 +278,10 @@ def _output_values(output: PipelineOutput | None) -> dict[str, Any]:
     for short, name in _POSE_SOURCES.items():
         pose = output.poses.get(name)
         if pose is not None:
-            values |= _pose_values(short, pose)
+            values |= _xyz(short, pose.e_m)
+            values[f"{short}yaw_rad"] = pose.e_yaw_rad
+            values[f"{short}_rms_px"] = pose.reprojection_px
     return values
-
-
-def _pose_values(short: str, pose: MarkerPose) -> dict[str, Any]:
-    return {
-        **_xyz(short, pose.e_m),
-        f"{short}yaw_rad": pose.e_yaw_rad,
-        f"{short}_rms_px": pose.reprojection_px,
-    }
 
 
 def _target_values(target: TargetEstimate | None) -> dict[str, Any]:
@@ -319,11 +302,9 @@ def _target_values(target: TargetEstimate | None) -> dict[str, Any]:
     }
 
 
-def command_values(command: Command | None) -> Mapping[str, Any]:
-    """``cmd`` and what belongs to it; nothing for None."""
+def command_values(command: Command) -> Mapping[str, Any]:
+    """``cmd`` and what belongs to it."""
     match command:
-        case None:
-            return {}
         case Idle():
             return {"cmd": "idle"}
         case PositionSetpoint(x_m, y_m, z_m, yaw_rad):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import gzip
 import json
+import math
+import os
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from io import BufferedReader
@@ -14,27 +16,36 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perchctl import __version__
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
-from perchctl.log.fields import FIELDS
-from perchctl.log.jsonl import decode_line
-from perchctl.log.place import path_beside
-from perchctl.log.sent import Takeover, sent_of, takeovers_of
-from perchctl.log.turn import turn_of
-from perchctl.log.write import FORMAT, SCHEMA_VERSION
-from perchctl.mission import SentCommand, Turn
+from perchctl.log.exact import decode_line, from_exact
+from perchctl.log.fields import (
+    FIELDS,
+    FORMAT,
+    READABLE_VERSIONS,
+    SCHEMA_VERSION,
+    command_values,
+)
+from perchctl.log.header import (
+    computer_differences,
+    flown_camera,
+    flown_mask,
+    flown_profile,
+)
+from perchctl.log.write import path_beside
+from perchctl.mission import SentBy, SentCommand, Turn
+from perchctl.profile import Profile
+from perchctl.vision import CameraModel
 
-READABLE_VERSIONS = (1, 2, 3, SCHEMA_VERSION)
-"""1 knew no `tracked` and no events of several fields; its missing values read None. 2 knew no
-turns; 3 neither why a turn was decided so, nor what was sent in the loop's place."""
 Times = TypeVar("Times", float, Array)
 MOST_LOG_BYTES = 300_000_000
 """Of a log, unpacked: three quarters of an hour of flight at 0.115 MB/s. What a packed file of a
 megabyte unfolds to may otherwise fill the memory."""
 _GZIP = b"\x1f\x8b"
-_BEGIN_BYTES = 1 << 16
+_BEGIN_BYTES = _TAIL_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -96,6 +107,61 @@ class FlightLog:
         except (TypeError, ValueError):
             raise InvalidValue(f"{self.path}: {key} is not a number in every record") from None
         return np.array(values, dtype=np.float64)
+
+    def texts(self, key: str) -> list[str]:
+        """A field over the ticks as text, empty where it is missing."""
+        return [str(record.get(key) or "") for record in self.records]
+
+    @property
+    def t_s(self) -> Array:
+        """Times of the ticks since the flight's first turn, shape (n,)."""
+        return self.since(self.column("t_s"))
+
+    @property
+    def end_s(self) -> float:
+        """Time of the last tick since the flight's first turn; 0 without any."""
+        return self.since(float(self.records[-1]["t_s"])) if self.records else 0.0
+
+    def setting(self, key: str) -> Any:
+        """The flown profile's value of a dotted key, as JSON has it; None where there is none."""
+        value = self.header.get("profile")
+        for name in key.split("."):
+            value = value.get(name) if isinstance(value, Mapping) else None
+        return value
+
+    def number(self, key: str) -> float | None:
+        """The flown profile's value of a dotted key; None where that is no finite number."""
+        value = self.setting(key)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            return None
+        return float(value) if math.isfinite(value) else None
+
+    @property
+    def flown_profile(self) -> Profile:
+        """The profile that was flown, but for passwords. Errors: InvalidValue."""
+        return flown_profile(self.header)
+
+    @property
+    def flown_camera(self) -> CameraModel | None:
+        """The calibration that was flown; None in a log that has none. Errors: InvalidValue."""
+        return flown_camera(self.header)
+
+    def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
+        """(height, width), True where the gear covers; None without a mask. Errors:
+        InvalidValue."""
+        return flown_mask(self.header, camera)
+
+    @property
+    def computer_differences(self) -> str:
+        """In what the flight's computer differed from this one, in words; empty where it did not,
+        or where the log does not say."""
+        return computer_differences(self.header)
+
+    @property
+    def profile_name(self) -> str | None:
+        """The flown profile's name; None where the header holds none."""
+        name = self.setting("name")
+        return None if name is None else str(name)
 
     @property
     def start_s(self) -> float:
@@ -164,6 +230,28 @@ def read_log(path: Path | str) -> FlightLog:
         turn_records=[r for r in good if r["kind"] == "turn"],
         sent_records=[r for r in good if r["kind"] == "sent"],
     )
+
+
+def read_ends(path: Path) -> FlightLog:
+    """A log's header and summary alone, without reading it whole, where it ends with its summary;
+    else the whole log.
+
+    Raises NotFound and InvalidValue, as `read_log`.
+    """
+    try:
+        with path.open("rb") as stream:
+            first = stream.readline()
+            stream.seek(max(len(first), os.fstat(stream.fileno()).st_size - _TAIL_BYTES))
+            last = stream.read().splitlines()[-2:]
+        header, end = decode_line(first), decode_line(last[-1])
+        if end.get("kind") == "recording":
+            end = decode_line(last[0]) | _without_kind(end)
+    except (OSError, ValueError, IndexError):
+        return read_log(path)
+    is_whole = end.get("kind") == "summary" and header.get("format") == FORMAT
+    if not is_whole or header.get("version") not in READABLE_VERSIONS:
+        return read_log(path)
+    return FlightLog(path, header, [], [], end, truncated=False)
 
 
 @contextlib.contextmanager
@@ -255,6 +343,90 @@ def _checked(record: dict[str, Any]) -> dict[str, Any]:
 
 def _without_kind(record: dict[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in record.items() if k != "kind"}
+
+
+# --- turns, and what was sent in the loop's place --------------------------------------------
+
+APART_S = 2.0
+"""What is farther apart is told by itself."""
+_TELLS = {
+    "position": "position setpoints",
+    "thrust": "raw thrust",
+    "land": "landing ordered",
+    "stop": "motors stopped",
+    "emergency": "motors cut",
+}
+
+
+def turn_of(record: dict[str, Any]) -> Turn:
+    """Back to the same bits. Errors: InvalidValue."""
+    try:
+        return from_exact(Turn, {k: v for k, v in _with_telemetry(record).items() if k != "kind"})
+    except ValueError as error:
+        raise InvalidValue(
+            f"the log's turn {record.get('number', '?')} cannot be read ({error}): the log is "
+            f"damaged, or another version of perchctl wrote it"
+        ) from None
+
+
+def _with_telemetry(record: dict[str, Any]) -> dict[str, Any]:
+    """The observation's is the newest of the turn, where it has none of its own."""
+    obs, taken = record.get("observation"), record.get("taken")
+    if not isinstance(obs, dict) or "telemetry" in obs or not isinstance(taken, dict):
+        return record
+    samples = taken.get("late") or taken.get("samples")
+    if not isinstance(samples, list) or not samples:
+        return record
+    return record | {"observation": obs | {"telemetry": samples[-1]}}
+
+
+def sent_of(record: Mapping[str, Any]) -> SentCommand:
+    """Back to the same bits. Errors: InvalidValue."""
+    try:
+        return from_exact(SentCommand, {k: v for k, v in record.items() if k != "kind"})
+    except ValueError as error:
+        raise InvalidValue(
+            f"the log's record of what was sent at {record.get('t_s', '?')} s cannot be read "
+            f"({error}): the log is damaged, or another version of perchctl wrote it"
+        ) from None
+
+
+def sent_values(sent: SentCommand) -> dict[str, Any]:
+    """By the names of a tick's fields (`perchctl.log.fields.FIELDS`), and ``by``."""
+    return {"t_s": sent.t_s, "by": sent.by, **command_values(sent.command)}
+
+
+@dataclass(frozen=True)
+class Takeover:
+    """What one sender sent in one go. Times on the loop's clock; `sent`: commands by their name
+    in a tick's `cmd`, in the order of their first, and how many of each."""
+
+    by: SentBy
+    start_s: float
+    end_s: float
+    sent: tuple[tuple[str, int], ...]
+
+    @property
+    def text(self) -> str:
+        """``position setpoints (14), landing ordered (2)``"""
+        return ", ".join(f"{_TELLS[name]} ({count})" for name, count in self.sent)
+
+
+def takeovers_of(sent: Sequence[SentCommand]) -> tuple[Takeover, ...]:
+    """In order."""
+    goes: list[list[SentCommand]] = []
+    for each in sorted(sent, key=lambda one: one.t_s):
+        last = goes[-1][-1] if goes else None
+        if last is None or last.by != each.by or each.t_s - last.t_s > APART_S:
+            goes.append([])
+        goes[-1].append(each)
+    return tuple(_takeover(go) for go in goes)
+
+
+def _takeover(go: Sequence[SentCommand]) -> Takeover:
+    names = [str(command_values(each.command)["cmd"]) for each in go]
+    counted = tuple((name, names.count(name)) for name in dict.fromkeys(names))
+    return Takeover(go[0].by, go[0].t_s, go[-1].t_s, counted)
 
 
 # --- What a file is that is no flight log, or no whole one, in words ---------------------------

@@ -10,9 +10,30 @@ from typing import Any
 import numpy as np
 
 from perchctl.log.read import FlightLog, PhaseSpan
-from perchctl.log.recording.end import RecordingEnd
 from perchctl.mission import ContactError, Findings, Touchdown, latency_text, turn_text
 from perchctl.vehicle import NO_BATTERY_READING_V
+
+
+@dataclass(frozen=True)
+class RecordingEnd:
+    """What became of a recording.
+
+    Attributes:
+        pictures: how many are in it; `missing`: how many are not, and `problem`: the first
+            reason why.
+    """
+
+    path: Path
+    pictures: int
+    missing: int = 0
+    problem: str | None = None
+
+    @property
+    def text(self) -> str:
+        told = f"{self.pictures} pictures in {self.path}"
+        if self.missing:
+            told += f", {self.missing} missing"
+        return f"{told} ({self.problem})" if self.problem else told
 
 
 @dataclass(frozen=True)

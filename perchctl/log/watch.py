@@ -11,18 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 from perchctl.camera import FrameSource, WatchedSource
 from perchctl.log.fields import event_record, tick_record
-from perchctl.log.place import SUFFIX, log_path, recording_path
-from perchctl.log.read import PhaseSpan
-from perchctl.log.sent import sent_values
-from perchctl.log.summary import FlightSummary, recording_values
-from perchctl.log.write import FlightLogWriter, make_header
+from perchctl.log.header import make_header
+from perchctl.log.read import PhaseSpan, sent_values
+from perchctl.log.summary import FlightSummary, RecordingEnd, recording_values
+from perchctl.log.write import RECORDING_SUFFIX, FlightLogWriter, log_path, recording_path
 from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
 from perchctl.profile import Profile
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 if TYPE_CHECKING:
-    from perchctl.log.recording.end import RecordingEnd
-    from perchctl.log.recording.recorder import Recorder
+    from perchctl.log.recorder import Recorder
 
 Truth = tuple[tuple[float, float, float], float]
 """The body's true position (world, m) and the gear's true miss (m)."""
@@ -72,11 +70,11 @@ class LogWatcher:
     def _opened(
         cls, path: Path, header: Mapping[str, Any], profile: Profile, record: bool, live: bool
     ) -> LogWatcher:
-        taken = (SUFFIX,) if record else ()
+        taken = (RECORDING_SUFFIX,) if record else ()
         writer = FlightLogWriter.open(path, header, live, taken, profile.link.loop_hz)
         if not record:
             return cls(writer)
-        from perchctl.log.recording.recorder import Recorder
+        from perchctl.log.recorder import Recorder
 
         try:
             return cls(writer, Recorder.open(recording_path(writer.path), header, profile, live))
@@ -112,7 +110,7 @@ class LogWatcher:
         if battery_v >= NO_BATTERY_READING_V:
             self._battery_min_v = min(battery_v, self._battery_min_v or battery_v)
         position_m, miss_m = (None, None) if self.truth is None else self.truth()
-        record = flight_record(tick, position_m, miss_m)
+        record = tick_record(tick, position_m, miss_m)
         self.writer.write(record)
         if tick.turn is not None:
             self.writer.turn(tick.turn)
@@ -191,32 +189,4 @@ def spans_of(report: FlightReport) -> tuple[PhaseSpan, ...]:
     return tuple(
         PhaseSpan(event.phase.value if event.phase else "", event.t_s, end_s, event.reason)
         for event, end_s in zip(starts, ends, strict=True)
-    )
-
-
-def flight_record(
-    tick: Tick,
-    true_position_m: tuple[float, float, float] | None = None,
-    true_miss_m: float | None = None,
-) -> dict[str, Any]:
-    """The tick as a record; with the truth of a simulation."""
-    return tick_record(
-        t_s=tick.t_s,
-        telemetry=tick.telemetry,
-        output=tick.output,
-        target=tick.target,
-        phase=tick.state.phase.value,
-        reason=tick.state.reason,
-        command=tick.command,
-        hold=tick.state.hold,
-        attempts=tick.state.attempts,
-        loop_late_s=tick.loop_late_s,
-        camera_age_s=tick.camera_age_s,
-        telemetry_age_s=tick.telemetry_age_s,
-        consistency=tick.consistency,
-        delay_used_s=tick.delay_used_s,
-        outside=tick.outside,
-        battery=tick.state.battery,
-        true_position_m=true_position_m,
-        true_miss_m=true_miss_m,
     )

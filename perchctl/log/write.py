@@ -10,33 +10,23 @@ in `FlightLogWriter.problem`.
 
 from __future__ import annotations
 
-import errno
 import math
-import os
+import re
 import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
-import perchctl
-from perchctl.camera import profile_record, without_password
 from perchctl.errors import InvalidValue
-from perchctl.log.behind import Behind
-from perchctl.log.exact import to_exact
-from perchctl.log.fields import EVENT_FIELDS, FIELDS, event_record
-from perchctl.log.jsonl import encode, json_line
-from perchctl.log.place import cannot_start, make_log_folder, new_file
-from perchctl.log.sent import SENT_NOTE, sent_line
-from perchctl.log.setup import camera_record, computer_record
-from perchctl.log.turn import TURN_NOTE, turn_line
+from perchctl.log.disk import BackgroundWriter, DiskFile
+from perchctl.log.exact import encode, json_line, to_exact
+from perchctl.log.fields import event_record
 from perchctl.mission import Event, SentCommand, Turn
-from perchctl.profile import Profile
 
-FORMAT = "perchctl-flight-log"
-SCHEMA_VERSION = 4
 FSYNC_PERIOD_S = 1.0
 RETRY_PERIOD_S = 1.0
 CLOSE_TIMEOUT_S, RECOVERED_S = 3.0, 0.2
@@ -50,39 +40,6 @@ NO_ANSWER = "the disk does not answer: the flight log lacks its end"
 _Record = Mapping[str, Any] | Turn | SentCommand
 
 
-def make_header(
-    profile: Profile,
-    *,
-    uri: str,
-    source: str,
-    seed: int | None = None,
-    lockstep: bool = False,
-    started: datetime | None = None,
-    t0_s: float = 0.0,
-) -> dict[str, Any]:
-    """The first record. Without `started` it depends on nothing but its arguments and the files
-    that the profile names. `t0_s`: the loop's clock when the log began, or at `started`."""
-    return {
-        "kind": "header",
-        "format": FORMAT,
-        "version": SCHEMA_VERSION,
-        "perchctl": perchctl.__version__,
-        "uri": uri,
-        "source": without_password(source),
-        "seed": seed,
-        "lockstep": lockstep,
-        "started_utc": started.astimezone(UTC).isoformat(timespec="seconds") if started else None,
-        "t0_s": t0_s,
-        "profile": profile_record(profile),
-        **camera_record(profile),
-        **computer_record(),
-        "fields": FIELDS,
-        "event_fields": EVENT_FIELDS,
-        "turns": TURN_NOTE,
-        "sent": SENT_NOTE,
-    }
-
-
 class FlightLogWriter:
     """Writes one flight. Only `open` raises; afterwards look at `problem`.
 
@@ -94,18 +51,17 @@ class FlightLogWriter:
         lost_records: how many could not be written.
     """
 
-    def __init__(self, path: Path, fd: int) -> None:
+    def __init__(self, path: Path, file: DiskFile, writer: BackgroundWriter) -> None:
         self.path = path
         self.problem: str | None = None
         self.formless: str | None = None
-        self._fd = fd
-        self._behind: Behind | None = None
+        self._file = file
+        self._writer = writer
         self._closed = self._concluded = self._hung = False
         self._dropped = 0  # by the loop's thread, and by the link's
         self._dropping = threading.Lock()
         # Below: of the thread that writes.
         self._failed = 0
-        self._good_bytes = 0
         self._synced_s: float | None = None
         self._failed_s: float | None = None
 
@@ -138,33 +94,31 @@ class FlightLogWriter:
         """
         make_log_folder(path.parent)
         try:
-            free, fd = new_file(path, none_beside)
+            file, free = new_file(path, none_beside, live)
         except OSError as error:
             raise InvalidValue(cannot_start(path, error)) from None
-        writer = cls(free, fd)
         try:
-            writer._append(_header_line(header))
-            if live:  # last: a thread would be left behind by what fails after it
-                most = math.ceil(BEHIND_S * RECORDS_A_TURN * loop_hz)
-                writer._behind = Behind(most, "perchctl-log")
+            file.write(_header_line(header))
+            most = math.ceil(BEHIND_S * RECORDS_A_TURN * loop_hz)
+            # Last: a thread would be left behind by what fails after it.
+            return cls(free, file, BackgroundWriter(most, "perchctl-log", live))
         except BaseException as error:
-            os.close(fd)
+            file.close()
             free.unlink(missing_ok=True)
             if isinstance(error, OSError):
                 raise InvalidValue(cannot_start(path, error)) from None
             raise
-        return writer
 
     def write(self, record: Mapping[str, Any]) -> None:
         """Append one tick record (`perchctl.log.fields.tick_record`). Never raises."""
         self._put({"kind": "tick", **record}, _time_of(record))
 
     def turn(self, turn: Turn) -> None:
-        """Append a whole turn, exactly (`perchctl.log.turn`). Never raises."""
+        """Append a whole turn, exactly (`turn_line`). Never raises."""
         self._put(turn, turn.t_s)
 
     def sent(self, sent: SentCommand) -> None:
-        """Append what was sent in the loop's place, exactly (`perchctl.log.sent`); from any
+        """Append what was sent in the loop's place, exactly; from any
         thread. Never raises."""
         self._put(sent, sent.t_s)
 
@@ -178,11 +132,7 @@ class FlightLogWriter:
         if self._closed or self._concluded:
             return
         self._concluded = True
-        if self._behind is None:
-            self._summarise(summary)
-        else:
-            done = partial(self._summarise, summary)
-            self._hung = not self._behind.wait(done, CLOSE_TIMEOUT_S)
+        self._hung = not self._writer.wait(partial(self._summarise, summary), CLOSE_TIMEOUT_S)
 
     def close(
         self,
@@ -198,11 +148,8 @@ class FlightLogWriter:
             return
         self._closed = True
         end = partial(self._end, summary, recording)
-        if self._behind is None:
-            end()
-            return
         once_more_s = RECOVERED_S if self._hung else CLOSE_TIMEOUT_S
-        left = self._behind.finish(end, once_more_s, self._let_go)
+        left = self._writer.finish(end, once_more_s, self._let_go)
         if left:
             self._drop(left)
             self._remember(NO_ANSWER)
@@ -211,8 +158,7 @@ class FlightLogWriter:
         lost = {"lost_records": self.lost_records, "problem": self.lacks}
         self._failed_s = None  # one last try, whatever happened before
         self._store({"kind": "summary", **summary, **lost}, None)
-        if self._behind is not None:
-            self._sync_to_disk()
+        self._sync_to_disk()
 
     def _end(
         self, summary: Mapping[str, Any] | None, recording: Mapping[str, Any] | None = None
@@ -221,16 +167,12 @@ class FlightLogWriter:
             self._summarise(summary)
         if recording is not None:
             self._store({"kind": "recording", **recording}, None)
-        if self._behind is not None:
-            self._sync_to_disk()
+        self._sync_to_disk()
         self._let_go()
 
     def _let_go(self) -> None:
-        """Once: the number may be another file's by the second time."""
-        fd, self._fd = self._fd, -1
-        if fd >= 0:
-            with suppress(OSError):
-                os.close(fd)
+        with suppress(OSError):
+            self._file.close()
 
     def _drop(self, count: int = 1) -> None:
         with self._dropping:
@@ -239,9 +181,7 @@ class FlightLogWriter:
     def _put(self, record: _Record, t_s: float | None) -> None:
         if self._closed or self._concluded:
             self._drop()
-        elif self._behind is None:
-            self._store(record, t_s)
-        elif not self._behind.put(
+        elif not self._writer.put(
             partial(self._store, record, t_s), TURNS_SHARE if isinstance(record, Turn) else 1.0
         ):
             self._drop()
@@ -252,7 +192,7 @@ class FlightLogWriter:
             self._failed += 1
             return
         try:
-            self._append(_line_of(record))
+            self._file.write(_line_of(record))
         except OSError as error:
             self._failed += 1
             self._failed_s = t_s
@@ -263,7 +203,7 @@ class FlightLogWriter:
             self.formless = self.formless or _formless(error)
             return
         self._failed_s = None
-        if self._behind is not None and t_s is not None:
+        if t_s is not None:
             self._sync_sometimes(t_s)
 
     def _is_waiting(self, t_s: float | None) -> bool:
@@ -271,19 +211,6 @@ class FlightLogWriter:
         if t_s is None or self._failed_s is None:
             return False
         return t_s - self._failed_s < RETRY_PERIOD_S
-
-    def _append(self, line: bytes) -> None:
-        """Write the whole line or, on failure, leave no piece of it behind."""
-        done = 0
-        try:
-            while done < len(line):
-                done += os.write(self._fd, line[done:])
-        except BaseException:
-            if done:
-                with suppress(OSError):
-                    os.ftruncate(self._fd, self._good_bytes)
-            raise
-        self._good_bytes += done
 
     def _sync_sometimes(self, t_s: float) -> None:
         if self._synced_s is None:
@@ -294,10 +221,9 @@ class FlightLogWriter:
 
     def _sync_to_disk(self) -> None:
         try:
-            os.fsync(self._fd)
+            self._file.flush()
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a pipe, a special file
-                self._remember(_explain(error))
+            self._remember(_explain(error))
 
     def _remember(self, problem: str) -> None:
         if self.problem is None:
@@ -314,9 +240,18 @@ def _line_of(record: _Record) -> bytes:
         case Turn():
             return turn_line(record)
         case SentCommand():
-            return sent_line(record)
+            return json_line({"kind": "sent", **to_exact(record)})
         case _:
             return encode(record)
+
+
+def turn_line(turn: Turn) -> bytes:
+    """A turn as one line of the log, whole and exact: the fields of `perchctl.mission.Turn`."""
+    record = {"kind": "turn", **to_exact(turn)}
+    obs, samples = turn.observation, turn.taken.late or turn.taken.samples
+    if obs is not None and samples and obs.telemetry is samples[-1]:
+        del record["observation"]["telemetry"]  # it stands in the same line already
+    return json_line(record)
 
 
 def _time_of(record: Mapping[str, Any]) -> float | None:
@@ -330,3 +265,62 @@ def _explain(error: OSError) -> str:
 
 def _formless(error: Exception) -> str:
     return f"a record has no form in the flight log: {str(error) or type(error).__name__}"
+
+
+# --- where a flight's files lie: the log, and what is beside it by its name ---------------------
+
+PACKED = ".gz"
+_ELSEWHERE = "name another folder with --log-dir, or in the profile (log.directory)"
+
+
+def path_beside(log: Path | str, suffix: str) -> Path:
+    """The file of a log's name with another ending, such as ``.png``; of a packed log, too."""
+    path = Path(log)
+    whole = path.with_suffix("") if path.suffix == PACKED else path
+    return whole.with_name(whole.stem + suffix)
+
+
+def log_path(directory: Path, profile_name: str, started: datetime) -> Path:
+    """``flight_<UTC yyyymmdd_hhmmss>_<profile>.jsonl`` in the directory.
+
+    (A flight in lockstep is named ``flight_seed<seed>.jsonl`` by the campaign.)
+    """
+    safe = re.sub(r"[^A-Za-z0-9._-]+", "-", profile_name).strip("-.") or "profile"
+    return directory / f"flight_{started.astimezone(UTC):%Y%m%d_%H%M%S}_{safe[:60]}.jsonl"
+
+
+def make_log_folder(directory: Path) -> None:
+    """Where it is missing. Errors: InvalidValue."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        why = "it is a file" if directory.is_file() else error.strerror or str(error)
+        raise InvalidValue(f"{directory} cannot hold flight logs ({why}): {_ELSEWHERE}") from None
+
+
+def new_file(path: Path, none_beside: tuple[str, ...], sync: bool) -> tuple[DiskFile, Path]:
+    """A file that did not exist before, by `path`'s name or the next free one; `none_beside`:
+    suffixes of files of the same name that must not be there, either. Raises OSError."""
+    for number in count(1):
+        free = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
+        if any(path_beside(free, suffix).exists() for suffix in none_beside):
+            continue
+        with suppress(FileExistsError):
+            return DiskFile.new(free, sync), free
+    raise AssertionError("unreachable")
+
+
+def cannot_start(path: Path, error: OSError) -> str:
+    return (
+        f"{path}: the flight log cannot be created ({error.strerror or error}): free the place, "
+        f"or {_ELSEWHERE}"
+    )
+
+
+RECORDING_SUFFIX = ".mcap"
+LAYOUT_SUFFIX = ".foxglove.json"
+
+
+def recording_path(path: Path | str) -> Path:
+    """The recording's place, of a log's path or the recording's own."""
+    return path_beside(path, RECORDING_SUFFIX)

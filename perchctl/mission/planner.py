@@ -3,7 +3,7 @@
 `step_mission(state, observation, profile) -> (state, command)`.
 
 Pure: no clock, no input but its arguments, so a log replays to the same commands
-(`perchctl.replay.decide`, and `tests/replay/test_corpus.py` demands it).
+(`perchctl.analysis.decide`, and `tests/replay/test_corpus.py` demands it).
 One tick: remember what was observed, look up the table, act for the phase.
 """
 

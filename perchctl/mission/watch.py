@@ -156,7 +156,7 @@ class SentCommand:
 
 
 # --- One turn of the loop, whole: what its edges gave, what was known, and what was decided ----
-# From a flight's turns it can be decided again (`perchctl.replay`).
+# From a flight's turns it can be decided again (`perchctl.analysis`).
 
 
 TurnRole = Literal["waiting", "redone", "flown", "failed"]

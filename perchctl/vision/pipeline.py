@@ -1,7 +1,7 @@
 """THE pipeline: one frame through detection, pose, filter and merge.
 
 `step` is the only way from a picture to a pose; flying, weight fitting, tracking and
-replaying (`perchctl.replay.sense`) all call it. `estimate` carries its result to any later
+replaying (`perchctl.analysis.sense`) all call it. `estimate` carries its result to any later
 moment. Neither keeps a memory of its own: what must be remembered is in `PipelineState`, which
 goes in and comes out.
 """

@@ -30,7 +30,7 @@ from perchctl.camera import (
 from perchctl.camera.source import to_grey
 from perchctl.commands.calibrate import Source, sized
 from perchctl.errors import InvalidValue, NotFound, UsageError
-from perchctl.log.write import make_header
+from perchctl.log.header import make_header
 from perchctl.profile import Profile
 from perchctl.vision import CameraModel, Frame
 

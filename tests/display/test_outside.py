@@ -9,7 +9,7 @@ import pytest
 
 from perchctl.display.status import status_rows
 from perchctl.display.watch import WIDTH, status_of
-from perchctl.log.watch import flight_record
+from perchctl.log.fields import tick_record
 from perchctl.mission import ExternalPositions
 from perchctl.vehicle import ExternalPosition
 from tests.display.test_panel import STATUS, tick
@@ -33,12 +33,12 @@ def test_what_is_wrong_takes_the_line(age_s: float) -> None:
 
 
 def test_the_log_has_what_was_sent() -> None:
-    record = flight_record(tick(outside=WELL))
+    record = tick_record(tick(outside=WELL))
     assert [record[f"pos_{key}"] for key in ("age_s", "sent", "hz", "x_m", "z_m")] == [
         0.012, 300, 99.6, 0.1, 0.3,
     ]  # fmt: skip
     assert record["pos_qw"] is None  # a position alone was sent
-    never = flight_record(tick(outside=ExternalPositions(math.inf, "none has come", 0, 0.0, None)))
+    never = tick_record(tick(outside=ExternalPositions(math.inf, "none has come", 0, 0.0, None)))
     assert never["pos_age_s"] is None
     assert never["pos_note"] == "none has come"
-    assert flight_record(tick())["pos_sent"] is None
+    assert tick_record(tick())["pos_sent"] is None

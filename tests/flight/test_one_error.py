@@ -15,7 +15,8 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.display.watch import status_of
 from perchctl.flight import fly_lockstep
 from perchctl.geometry import Array, rot_z, wrap_rad
-from perchctl.log.watch import Truth, flight_record
+from perchctl.log.fields import tick_record
+from perchctl.log.watch import Truth
 from perchctl.mission import Context, Phase, Tick, planner
 from perchctl.perception import perception
 from perchctl.sim import draw_scenario
@@ -79,7 +80,7 @@ def flight() -> Iterator[tuple[list[tuple[Tick, Truth]], Counted]]:
         flown = fly_lockstep(PROFILE, log=looker, scenario=SCENARIO)
         assert flown.report.phase is Phase.PERCHED
         for tick, _ in looker.ticks:  # whatever looks at a tick solves nothing
-            flight_record(tick)
+            tick_record(tick)
             status_of(tick)
         yield looker.ticks, counted
 
@@ -91,7 +92,7 @@ def test_the_log_and_the_panel_hold_the_planner_s_error(
     assert len(ticks) == len(counted.contexts)
     seen = 0
     for (tick, _), context in zip(ticks, counted.contexts, strict=True):
-        record, status = flight_record(tick), status_of(tick)
+        record, status = tick_record(tick), status_of(tick)
         target = context.obs.target
         if target is None:
             assert (record["ex_m"], status.e_m) == (None, None)

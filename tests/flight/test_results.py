@@ -17,7 +17,8 @@ from rich.progress import Task, TaskID
 from perchctl.commands.progress import TimeLeft, progress_bar
 from perchctl.flight import FlightResult, campaign_summary, campaign_table
 from perchctl.flight.results import ENDS, worst_first
-from perchctl.log import FlightSummary, PhaseSpan, read_log, summarise_flight, summary_text
+from perchctl.log import FlightSummary, read_log, summarise_flight, summary_text
+from perchctl.log.read import PhaseSpan
 from perchctl.log.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers.results import aborted, landed, perched

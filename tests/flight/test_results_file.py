@@ -21,7 +21,7 @@ from perchctl.flight import (
     profile_sha256,
 )
 from perchctl.flight.results_file import CampaignHeader
-from perchctl.log.place import recording_path
+from perchctl.log.write import recording_path
 from perchctl.profile import load_profile
 from tests.helpers.results import perched
 

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from perchctl.analysis import FlightAnalysis, show_record, show_text
+from perchctl.analysis.report import ReportedFlight, page_of
 from perchctl.display import summary_card
 from perchctl.log import (
     FlightSummary,
     read_log,
-    show_record,
-    show_text,
     summarise_flight,
     summary_text,
 )
@@ -35,8 +35,6 @@ from perchctl.mission import (
 from perchctl.mission.ending import HARD_MPS
 from perchctl.mission.imu import BLOW_MPS, Blow, Reckoning, reckoned
 from perchctl.profile import load_profile
-from perchctl.report.sections import headline
-from perchctl.report.told import tell
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
 from tests.flight.test_silent_loop import Guarded, hanging_camera
 from tests.helpers import log
@@ -264,12 +262,13 @@ def test_log_show_and_log_report_tell_both(tmp_path: Path) -> None:
         "perched", "r", contact=ContactError(1.8e-3, 0.6e-3), touchdown=HARD
     ).as_record() | {"outcome": "landed", "attempts": 1}  # fmt: skip
     flown = read_log(log.write(tmp_path / "f.jsonl", summary=end))
-    record, text, whole = show_record(flown), show_text(flown), tell(flown)
+    flight = FlightAnalysis(flown)
+    record, text, whole = show_record(flight), show_text(flight), ReportedFlight(flight)
     assert "contact:   1.8 +- 0.6 mm off centre" in text
     assert f"vehicle:   {SENTENCE}" in text
     assert (record["contact_aside_m"], record["contact_sigma_m"]) == (1.8e-3, 0.6e-3)
     assert (record["touchdown_mps"], record["touchdown_g"]) == (0.9, 3.1)
-    page = unescape(str(headline(whole))).replace("\xa0", " ")
+    page = unescape(page_of([whole])).replace("\xa0", " ")
     assert "1.8 +- 0.6 mm off centre" in page, page
     assert f"It {SENTENCE}" in [sentence.text for sentence in whole.story]
     card = summary_card(summarise_flight(flown), flown.path)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from perchctl.analysis.decide import decide, first_of
 from perchctl.flight import SENSED, WallClock, fly
 from perchctl.flight.turns import Turns
 from perchctl.mission import (
@@ -20,7 +21,6 @@ from perchctl.mission import (
     step_mission,
 )
 from perchctl.profile import Profile
-from perchctl.replay.decide import decide, first_of
 from perchctl.vehicle import Command, Land
 from tests.helpers.hangs import hang_in_the_planner, plan_by
 from tests.helpers.loop_rig import Rig, Vehicle
@@ -102,7 +102,7 @@ def test_a_planner_that_fails_on_the_first_turn_fails_again(
     def fails(obs: Observation) -> PlannerState:
         raise ValueError("by the test")
 
-    for module in ("perchctl.flight.loop", "perchctl.replay.decide"):
+    for module in ("perchctl.flight.loop", "perchctl.analysis.decide"):
         monkeypatch.setattr(f"{module}.start_mission", fails)
     told, rig = Told(), Rig()
     with pytest.raises(ValueError, match="by the test"):

@@ -16,7 +16,7 @@ from perchctl.vision import Frame
 
 def plan_by(monkeypatch: pytest.MonkeyPatch, step: Callable[..., Any]) -> None:
     """In the flight loop and in a replay of it."""
-    for module in ("perchctl.flight.loop", "perchctl.replay.decide"):
+    for module in ("perchctl.flight.loop", "perchctl.analysis.decide"):
         monkeypatch.setattr(f"{module}.step_mission", step)
 
 

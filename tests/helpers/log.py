@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from perchctl.log.fields import tick_record
-from perchctl.log.write import FlightLogWriter, make_header
-from perchctl.mission import Event
+from perchctl.log.header import make_header
+from perchctl.log.write import FlightLogWriter
+from perchctl.mission import Event, Phase, PlannerState, Tick
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     Command,
@@ -131,17 +132,30 @@ def ticks(seed: int = 7) -> Iterator[dict[str, Any]]:
             if pose is not None and not gone and n % 2 == 0:
                 frame = output(n // 2, pose, rng)
             yield tick_record(
-                t_s=t_s,
-                telemetry=telemetry(t_s - 0.012, z_m),
-                output=frame,
-                target=pose,
-                phase=phase,
-                reason=reason,
-                command=_command(phase, z_m),
-                camera_age_s=0.03,
+                tick(
+                    t_s,
+                    telemetry(t_s - 0.012, z_m),
+                    _command(phase, z_m),
+                    PlannerState(Phase(phase), reason=reason),
+                    output=frame,
+                    target=pose,
+                )
             )
             n += 1
             t_s += PERIOD_S
+
+
+def tick(
+    t_s: float,
+    sample: Telemetry,
+    command: Command,
+    state: PlannerState,
+    output: PipelineOutput | None = None,
+    target: TargetEstimate | None = None,
+    **more: Any,
+) -> Tick:
+    age_s = t_s - sample.t_s
+    return Tick(t_s, sample, output, target, state, command, 0.0, 0.03, age_s, **more)
 
 
 def _command(phase: str, z_m: float) -> Command:

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from perchctl.log.fields import event_record
-from perchctl.log.recording.recorder import Recorder
+from perchctl.log.recorder import Recorder
 from perchctl.mission import Event, EventKind, Phase, Severity
 from perchctl.profile import Profile
 from perchctl.vision import Frame

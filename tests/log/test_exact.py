@@ -1,10 +1,11 @@
-"""The exact codec: what comes back is what was written, to the bit."""
+"""Values as JSON: exact, what comes back is what was written, to the bit; rounded, one line."""
 
 from __future__ import annotations
 
 import json
 import math
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
-from perchctl.log import decode_line, from_exact, to_exact
-from perchctl.log.sent import sent_line, sent_of
-from perchctl.log.turn import turn_line, turn_of
+from perchctl.log import decode_line, from_exact, json_line, to_exact, to_plain
+from perchctl.log.exact import encode
+from perchctl.log.read import sent_of, turn_of
+from perchctl.log.write import turn_line
 from perchctl.mission import (
     Condition,
     ExternalPositions,
@@ -165,7 +167,7 @@ def test_a_turn_is_one_line_and_comes_back() -> None:
 @pytest.mark.parametrize("command", SENT)
 def test_what_was_sent_is_one_line_and_comes_back(command: Command) -> None:
     sent = SentCommand(0.1 + 0.2, "watchdog", command)
-    line = sent_line(sent)
+    line = json_line({"kind": "sent", **to_exact(sent)})
     assert line.count(b"\n") == 1
     assert bits(sent_of(decode_line(line))) == bits(sent)
     with pytest.raises(InvalidValue, match="sent at soon s cannot be read"):
@@ -218,3 +220,46 @@ def test_what_has_no_exact_form_is_refused() -> None:
     for value in (object(), {1, 2}, np.array([object()])):
         with pytest.raises(TypeError, match="no exact form"):
             to_exact(Odd(value))
+
+
+# --- rounded, one line a record ---------------------------------------------------------
+
+
+def test_plain_values() -> None:
+    values = {
+        "np": np.float32(0.5),
+        "int": np.int64(3),
+        "bool": np.bool_(True),
+        "nan": [math.nan, math.inf, -math.inf],
+        "array": np.array([[1.23456789, -0.0]]),
+        "enum": Phase.ALIGN,
+        "path": Path("a/b"),
+        "text": "°€\ud800",
+        "none": None,
+    }
+    line = encode(values)
+    assert line.endswith(b"\n")
+    assert line.count(b"\n") == 1
+    back = decode_line(line)
+    assert back["nan"] == [None, None, None]
+    assert back["array"] == [[1.234568, 0.0]]
+    assert "-0.0" not in line.decode()
+    assert (back["np"], back["int"], back["bool"]) == (0.5, 3, True)
+    assert (back["enum"], back["path"], back["text"]) == ("ALIGN", "a/b", "°€\ud800")
+    assert "none" not in back
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner),
+    max_leaves=10,
+)
+
+
+@given(st.dictionaries(st.text(max_size=8), json_values))
+def test_encoding_is_one_line_and_stable(record: dict[str, Any]) -> None:
+    line = encode(record)
+    assert line.count(b"\n") == 1
+    back = decode_line(line)
+    assert back == {k: v for k, v in to_plain(record).items() if v is not None}
+    assert encode(back) == line

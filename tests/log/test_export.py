@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from perchctl.errors import InvalidValue, UsageError
-from perchctl.log import FlightLog, csv_text, log_columns, parquet_bytes, read_log
+from perchctl.log import FlightLog, log_table, read_log
 from perchctl.log.fields import FIELDS
 from tests.helpers import log as synthetic
 from tests.helpers.mission import held, note
@@ -25,7 +25,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> FlightLog:
 
 
 def test_a_table_begins_with_the_time_from_0_and_holds_every_field(log: FlightLog) -> None:
-    columns = {column.name: column for column in log_columns(log)}
+    columns = {column.name: column for column in log_table(log).columns}
     assert next(iter(columns)) == "t_s"
     assert columns["t_s"].values[:3] == [0.0, 0.02, 0.04]
     assert columns["vx_mps"].unit == "m/s"
@@ -34,7 +34,7 @@ def test_a_table_begins_with_the_time_from_0_and_holds_every_field(log: FlightLo
 
 
 def test_corners_become_columns(log: FlightLog) -> None:
-    columns = {column.name: column.values for column in log_columns(log)}
+    columns = {column.name: column.values for column in log_table(log).columns}
     (row,) = [i for i, r in enumerate(log.records) if r["large_px"]][:1]
     corners = [f"large_{c}_{axis}_px" for c in ("tl", "tr", "br", "bl") for axis in "xy"]
     assert [columns[name][row] for name in corners] == log.records[row]["large_px"]
@@ -43,7 +43,7 @@ def test_corners_become_columns(log: FlightLog) -> None:
 
 
 def test_frames_count_from_the_same_0(log: FlightLog) -> None:
-    columns = {column.name: column.values for column in log_columns(log)}
+    columns = {column.name: column.values for column in log_table(log).columns}
     for row, record in enumerate(log.records):
         if record["frame_t_s"] is not None:
             late_s = columns["t_s"][row] - columns["frame_t_s"][row]
@@ -51,7 +51,7 @@ def test_frames_count_from_the_same_0(log: FlightLog) -> None:
 
 
 def test_what_happened_stands_in_the_turn_behind_it(log: FlightLog) -> None:
-    (events,) = [c.values for c in log_columns(log) if c.name == "event"]
+    (events,) = [c.values for c in log_table(log).columns if c.name == "event"]
     assert events[1] == "note: a note, with a comma | hold: no picture"
     assert not any(events[2:])
 
@@ -60,13 +60,13 @@ def test_the_parts_of_a_turn_are_beside_it(log: FlightLog) -> None:
     timing = {"pipeline_s": 0.004, "planner_s": 0.001, "send_s": 0.0, "turn_s": 0.006}
     t_s = log.records[3]["t_s"]
     timed = replace(log, turn_records=[{"t_s": t_s + 3e-7, "timing": timing}])
-    columns = {column.name: column.values for column in log_columns(timed)}
+    columns = {column.name: column.values for column in log_table(timed).columns}
     assert columns["turn_s"][3] == 0.006
     assert columns["turn_s"][4] is None
 
 
 def test_csv_comes_back_as_it_was(log: FlightLog) -> None:
-    rows = list(csv.DictReader(StringIO(csv_text(log_columns(log)))))
+    rows = list(csv.DictReader(StringIO(log_table(log).csv())))
     assert len(rows) == len(log.records)
     for row, record in zip(rows, log.records, strict=True):
         assert float(row["z_m"]) == record["z_m"]
@@ -77,7 +77,7 @@ def test_csv_comes_back_as_it_was(log: FlightLog) -> None:
 
 def test_parquet_has_types_units_and_the_header(log: FlightLog) -> None:
     pq = pytest.importorskip("pyarrow.parquet", reason="Parquet needs the extra [parquet]")
-    table = pq.read_table(BytesIO(parquet_bytes(log, log_columns(log))))
+    table = pq.read_table(BytesIO(log_table(log).parquet()))
     kinds = {name: str(table.schema.field(name).type) for name in table.column_names}
     assert (kinds["t_s"], kinds["measured"], kinds["attempts"], kinds["phase"]) == (
         "double", "bool", "int64", "string",
@@ -91,8 +91,8 @@ def test_parquet_has_types_units_and_the_header(log: FlightLog) -> None:
 def test_all_logs_have_the_same_columns_and_types(log: FlightLog, tmp_path: Path) -> None:
     """Tables of several flights can be put under each other."""
     bare = replace(log, records=[dict.fromkeys(FIELDS) | {"t_s": 0.0}], events=[])
-    full = [(c.name, c.kind) for c in log_columns(log)]
-    assert [(c.name, c.kind) for c in log_columns(bare)] == full
+    full = [(c.name, c.kind) for c in log_table(log).columns]
+    assert [(c.name, c.kind) for c in log_table(bare).columns] == full
 
 
 def test_without_the_library_it_is_one_sentence(
@@ -100,7 +100,7 @@ def test_without_the_library_it_is_one_sentence(
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(UsageError, match=r"needs the library pyarrow.*perchctl\[parquet\]"):
-        parquet_bytes(log, log_columns(log))
+        log_table(log).parquet()
 
 
 @pytest.mark.parametrize(
@@ -117,10 +117,10 @@ def test_a_value_of_another_kind_is_named(
 ) -> None:
     wrong = replace(log, records=[log.records[0] | {key: value}])
     with pytest.raises(InvalidValue, match="take the original") as refused:
-        log_columns(wrong)
+        log_table(wrong)
     assert said in str(refused.value)
 
 
 def test_nothing_to_export_is_said(log: FlightLog) -> None:
     with pytest.raises(InvalidValue, match="holds no ticks"):
-        log_columns(replace(log, records=[]))
+        log_table(replace(log, records=[]))

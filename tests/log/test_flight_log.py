@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.log import read_log, to_plain
+from perchctl.log import read_log, recording_path, to_plain
 from perchctl.log.fields import FIELDS, tick_record
-from perchctl.log.place import log_path
-from perchctl.log.write import FlightLogWriter
-from perchctl.mission import BatteryOutlook, ExternalPositions
+from perchctl.log.write import FlightLogWriter, log_path
+from perchctl.mission import BatteryOutlook, ExternalPositions, Phase, PlannerState
 from perchctl.vehicle import (
     EmergencyStop,
     ExternalPosition,
@@ -96,22 +95,15 @@ def test_names_and_no_overwriting(tmp_path: Path) -> None:
 
 def test_commands_and_telemetry_in_a_record() -> None:
     def of(command: Any) -> dict[str, Any]:
-        return tick_record(
-            t_s=1.0,
-            telemetry=synthetic.telemetry(0.99, 0.8),
-            output=None,
-            target=None,
-            phase="PERCH",
-            reason="settled",
-            command=command,
-        )
+        state = PlannerState(Phase.PERCH, reason="settled")
+        return tick_record(synthetic.tick(1.0, synthetic.telemetry(0.99, 0.8), command, state))
 
     assert of(PositionSetpoint(1.0, 2.0, 3.0, 0.5))["cmd_z_m"] == 3.0
     assert of(RawThrust(60000))["cmd_thrust"] == 60000
     assert of(Land(-0.05, 2.5))["cmd_duration_s"] == 2.5
     assert of(Land(-0.05, 2.0))["cmd_z_m"] == -0.05
-    names = [of(c)["cmd"] for c in (Idle(), StopMotors(), EmergencyStop(), None)]
-    assert names == ["idle", "stop", "emergency", None]
+    names = [of(c)["cmd"] for c in (Idle(), StopMotors(), EmergencyStop())]
+    assert names == ["idle", "stop", "emergency"]
     record = of(Idle())
     assert set(record) == set(FIELDS)
     assert record["tel_age_s"] == pytest.approx(0.01)
@@ -120,36 +112,32 @@ def test_commands_and_telemetry_in_a_record() -> None:
 
 def test_every_field_is_filled_by_something() -> None:
     """No documented key that nothing writes."""
-    rng = np.random.default_rng(1)
     pose = synthetic.target(1.0, 1.6)
-    seen: set[str] = set()
-    frame = synthetic.output(3, pose, rng)
+    frame = synthetic.output(3, pose, np.random.default_rng(1))
     frame.poses["joint"] = frame.poses["large"]
     frame = replace(frame, lock_note="not the tracked target")
-    commands = (Land(-0.05, 2.0), PositionSetpoint(0.0, 0.0, 1.0, 0.1), RawThrust(1))
-    for command in commands:
-        record = tick_record(
-            t_s=1.0,
-            telemetry=synthetic.telemetry(),
+    battery = BatteryOutlook(60.0, 3, 12.5, 3.9)
+    state = PlannerState(Phase.ALIGN, reason="steady", hold="no picture", battery=battery)
+    place = ExternalPosition((1.0, 2.0, 0.5), (1.0, 0.0, 0.0, 0.0))
+    seen: set[str] = set()
+    for command in (Land(-0.05, 2.0), PositionSetpoint(0.0, 0.0, 1.0, 0.1), RawThrust(1)):
+        tick = synthetic.tick(
+            1.0,
+            synthetic.telemetry(),
+            command,
+            state,
             output=frame,
             target=pose,
-            phase="ALIGN",
-            reason="steady",
-            hold="no picture",
-            command=command,
-            camera_age_s=0.1,
             consistency=Consistency(0.01, 0.004, (0.01, 0.02, 0.03), (0.01, 0.01, 0.02)),
             delay_used_s=0.005,
-            outside=ExternalPositions(
-                0.012,
-                "hidden",
-                7,
-                99.0,
-                ExternalPosition((1.0, 2.0, 0.5), (1.0, 0.0, 0.0, 0.0)),
-            ),
-            battery=BatteryOutlook(60.0, 3, 12.5, 3.9),
-            true_position_m=(0.0, 0.0, 1.0),
-            true_miss_m=0.01,
+            outside=ExternalPositions(0.012, "hidden", 7, 99.0, place),
         )
+        record = tick_record(tick, (0.0, 0.0, 1.0), 0.01)
         seen |= {key for key, value in record.items() if value is not None}
     assert set(FIELDS) - seen == {"var_m2"}  # this vehicle does not report it
+
+
+@pytest.mark.parametrize("name", ["x.jsonl", "x.jsonl.gz", "x.mcap"])
+@pytest.mark.parametrize("kind", [str, Path])
+def test_it_is_found_by_the_log_the_packed_log_and_itself(name: str, kind: type) -> None:
+    assert recording_path(kind(Path("logs.d") / name)) == Path("logs.d") / "x.mcap"

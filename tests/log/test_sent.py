@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 import time
 from pathlib import Path
@@ -10,20 +11,20 @@ from typing import Any
 
 import pytest
 
+from perchctl.analysis import FlightAnalysis, show_record, show_text
+from perchctl.analysis.story import story_of
 from perchctl.flight import fly
 from perchctl.flight.rescue import rescue
 from perchctl.link.mock import ScriptedLink
 from perchctl.link.sender import Sender
-from perchctl.log import LogWatcher, export_mcap, read_log, show_record, show_text, write
-from perchctl.log.recording import recorder as recording_module
-from perchctl.log.recording.recorder import Recorder
-from perchctl.log.sent import sent_values, takeovers_of
+from perchctl.log import LogWatcher, export_mcap, read_log, write
+from perchctl.log import recorder as recording_module
+from perchctl.log.read import sent_values, takeovers_of
+from perchctl.log.recorder import Recorder
 from perchctl.log.write import FlightLogWriter
 from perchctl.mission import FlightReport, Operator, Outcome, Phase, SentCommand
 from perchctl.perception import History
 from perchctl.profile import load_profile
-from perchctl.report.story import story_of
-from perchctl.report.track import Track
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.flight.test_silent_loop import HANG_AT_S, hung_rig
 from tests.helpers import log as synthetic
@@ -65,7 +66,7 @@ def test_it_comes_back_to_the_bit(log: Path) -> None:
 def test_a_log_of_before_has_none(tmp_path: Path) -> None:
     path = synthetic.write(tmp_path / "f.jsonl", synthetic.header(), synthetic.SUMMARY, most=5)
     assert read_log(path).takeovers == ()
-    assert "loop's place" not in show_text(read_log(path))
+    assert "loop's place" not in show_text(FlightAnalysis(read_log(path)))
 
 
 def test_recording_and_export_say_it_alike(log: Path, tmp_path: Path) -> None:
@@ -93,10 +94,10 @@ def test_what_one_sends_in_one_go_is_told_together() -> None:
 
 def test_show_and_story_tell_who_took_over(log: Path) -> None:
     read = read_log(log)
-    text = show_text(read)
+    text = show_text(FlightAnalysis(read))
     assert "watchdog   position setpoints (2), landing ordered (1)" in text
-    assert show_record(read)["sent"][0]["commands"] == {"position": 2, "land": 1}
-    told = [s for s in story_of(Track(read)) if "took over" in s.text]
+    assert show_record(FlightAnalysis(read))["sent"][0]["commands"] == {"position": 2, "land": 1}
+    told = [s for s in story_of(FlightAnalysis(read)) if "took over" in s.text]
     assert [s.t_s for s in told] == pytest.approx([4.0 - read.start_s, 9.0 - read.start_s])
     assert told[0].text.endswith("for 0.7 s: it gave it a place to hold and it ordered a landing")
     assert told[1].grade == "bad"
@@ -172,8 +173,8 @@ def hung_recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[LogW
 
 def test_the_guard_waits_for_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     watcher, disk = hung_recorder(tmp_path, monkeypatch)
-    gate, real = threading.Event(), write.os.write
-    monkeypatch.setattr(write.os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
+    gate, real = threading.Event(), os.write
+    monkeypatch.setattr(os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
     spent_s = time.thread_time()
     began_s = time.monotonic()
     for _ in range(50):
@@ -238,16 +239,16 @@ def test_a_log_s_disk_that_hangs_is_waited_for_once(
 ) -> None:
     monkeypatch.setattr(write, "CLOSE_TIMEOUT_S", 0.2)
     watcher, disk = hung_recorder(tmp_path, monkeypatch)
-    gate, real = threading.Event(), write.os.write
-    monkeypatch.setattr(write.os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
+    gate, real = threading.Event(), os.write
+    monkeypatch.setattr(os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
     waits: list[float] = []
-    finish = watcher.writer._behind.finish  # type: ignore[union-attr]
+    finish = watcher.writer._writer.finish
 
     def waited(job: Any, timeout_s: float, late: Any) -> int:
         waits.append(timeout_s)
         return finish(job, timeout_s, late)
 
-    watcher.writer._behind.finish = waited  # type: ignore[union-attr,method-assign]
+    watcher.writer._writer.finish = waited  # type: ignore[method-assign]
     summary = watcher.close(REPORT)
     assert waits == [write.RECOVERED_S]
     assert summary is not None
@@ -260,10 +261,10 @@ def test_a_disk_that_has_recovered_by_the_close_has_lost_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
-    gate, real = threading.Event(), write.os.write
+    gate, real = threading.Event(), os.write
     monkeypatch.setattr(write, "CLOSE_TIMEOUT_S", 0.1)
     monkeypatch.setattr(write, "RECOVERED_S", 20.0)
-    monkeypatch.setattr(write.os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
+    monkeypatch.setattr(os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
     writer.conclude(synthetic.SUMMARY)
     gate.set()
     writer.close(recording={"frames": 3})

@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from perchctl.log import FlightLog, computer_differences, read_log
-from perchctl.log.write import SCHEMA_VERSION
+from perchctl.analysis import replay
+from perchctl.analysis.replay_text import difference_text
+from perchctl.analysis.replayer import Replay
+from perchctl.log import FlightLog, read_log
+from perchctl.log.fields import SCHEMA_VERSION
 from perchctl.mission import Phase
-from perchctl.replay import replay
-from perchctl.replay.run import Replay
-from perchctl.replay.told import difference_text
 from tests.helpers.flights import ROOT
 
 FOLDER = ROOT / "tests" / "data" / "flights"
@@ -40,7 +40,7 @@ def test_the_planner_decides_as_it_did(name: str) -> None:
     if found.first is None:
         assert found.ticks > 50
         return
-    assert computer_differences(found.log.header), f"{difference_text(found.first)}; {ANEW}"
+    assert found.log.computer_differences, f"{difference_text(found.first)}; {ANEW}"
     assert not _beyond_last_bits(found), f"{difference_text(found.first)}; {ANEW}"
 
 

@@ -14,24 +14,16 @@ from typing import Any
 import pytest
 
 import perchctl
-from perchctl.commands import log_plot, log_replay
+from perchctl.analysis import replay, replay_lines, replay_record
+from perchctl.analysis.decide import first_differing, same
+from perchctl.analysis.replay_text import CAUTION, Gate, changed_gates, gate_text
+from perchctl.analysis.replayer import changed_keys
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
-from perchctl.log import (
-    FlightLog,
-    flown_camera,
-    flown_mask,
-    flown_profile,
-    json_line,
-    read_log,
-    to_exact,
-)
-from perchctl.log.write import FlightLogWriter, make_header
+from perchctl.log import FlightLog, json_line, read_log, to_exact
+from perchctl.log.header import flown_camera, flown_mask, make_header
+from perchctl.log.write import FlightLogWriter
 from perchctl.mission import conditions, guidance, step_mission
 from perchctl.profile import Profile, changed_profile
-from perchctl.replay import changed_gates, replay, replay_lines, replay_record
-from perchctl.replay.compare import first_differing, same
-from perchctl.replay.run import changed_keys
-from perchctl.replay.whatif import CAUTION, Gate
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.commands import run
 from tests.helpers.hangs import plan_by
@@ -73,7 +65,7 @@ def test_a_changed_constant_is_named_by_tick_and_field(monkeypatch: pytest.Monke
     assert at.turn.command.z_m == found.first.recorded
     assert 0 < found.differences <= found.ticks
     assert all(not each.differs for each in found.decided if each.tick < at.tick)
-    assert any("command.z_m was" in line for line in replay_lines(found, [], []))
+    assert any("command.z_m was" in line for line in replay_lines(found))
 
 
 def test_a_gate_that_falls_later_is_a_difference_of_the_phase(
@@ -104,7 +96,7 @@ def test_a_changed_word_of_the_planner_is_named_by_tick_and_field(
     assert found.first is not None
     assert (found.first.tick, found.first.field) == (first, "reason")
     assert "hanging" in found.first.replayed
-    assert any("reason was" in line for line in replay_lines(found, [], []))
+    assert any("reason was" in line for line in replay_lines(found))
     assert old.header["version"] == 3
     assert replay(old).same
 
@@ -195,7 +187,7 @@ def test_a_turn_that_was_not_sent_is_no_tick_of_either_count() -> None:
     assert found.first.field == "attempts"
     assert (found.ticks, found.differences) == (replay(corpus("stopped")).ticks, 0)
     assert not found.same
-    assert any("what was not sent" in line for line in replay_lines(found, [], []))
+    assert any("what was not sent" in line for line in replay_lines(found))
 
 
 def test_a_lost_record_ends_the_replay(tmp_path: Path) -> None:
@@ -205,8 +197,8 @@ def test_a_lost_record_ends_the_replay(tmp_path: Path) -> None:
     assert found.same
     assert found.ticks < 200
     assert any("is not in the log" in note for note in found.notes)
-    assert "is not in the log" in replay_record(found, [], [])["gap"]
-    assert any("up to where the log has lost" in line for line in replay_lines(found, [], []))
+    assert "is not in the log" in replay_record(found)["gap"]
+    assert any("up to where the log has lost" in line for line in replay_lines(found))
 
 
 def test_a_log_of_before_has_no_turns(tmp_path: Path) -> None:
@@ -238,7 +230,7 @@ def test_the_header_s_profile_is_the_flown_one_to_the_bit(tmp_path: Path) -> Non
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", make_header(profile, uri="", source=""))
     writer.close()
     log = read_log(writer.path)
-    back = flown_profile(log.header)
+    back = log.flown_profile
     assert changed_keys(profile, back) == ("camera.source",)
     assert back.safety.jump_m == 0.1 + 0.2
     assert b"secret" not in writer.path.read_bytes()
@@ -277,20 +269,18 @@ def test_a_mask_goes_with_the_log(tmp_path: Path) -> None:
 
 def test_what_if_names_tick_gates_and_what_it_cannot_know() -> None:
     log = corpus("perched")
-    dwell_s = flown_profile(log.header).planner.ascend.settle_dwell_s
-    later = changed_profile(
-        flown_profile(log.header), [f"planner.ascend.settle_dwell_s={dwell_s + 0.2}"]
-    )
+    dwell_s = log.flown_profile.planner.ascend.settle_dwell_s
+    later = changed_profile(log.flown_profile, [f"planner.ascend.settle_dwell_s={dwell_s + 0.2}"])
     found = replay(log, None, later)
     assert found.changed == ("planner.ascend.settle_dwell_s",)
     assert found.first is not None
     assert (found.first.recorded, found.first.replayed) == ("PERCH", "ASCEND")
     gate = next(g for g in changed_gates(found) if g.name == "row settled")
     assert gate.flown_s == (found.first.t_s,)
-    text = "\n".join(replay_lines(found, changed_gates(found), []))
+    text = "\n".join(replay_lines(found))
     assert "gate:      row settled: at " in text
     assert CAUTION in text
-    record = replay_record(found, changed_gates(found), [])
+    record = replay_record(found)
     assert record["what_if"]["changed"] == ["planner.ascend.settle_dwell_s"]
     assert record["first_difference"]["field"] == "phase"
     json.dumps(record, allow_nan=False)
@@ -298,17 +288,17 @@ def test_what_if_names_tick_gates_and_what_it_cannot_know() -> None:
 
 def test_what_if_nothing_would_differ() -> None:
     log = corpus("perched")
-    wider = changed_profile(flown_profile(log.header), ["safety.max_height_m=9"])
+    wider = changed_profile(log.flown_profile, ["safety.max_height_m=9"])
     found = replay(log, None, wider)
     assert found.same
     assert changed_gates(found) == []
-    assert any("no command would have been another" in s for s in replay_lines(found, [], []))
+    assert any("no command would have been another" in s for s in replay_lines(found))
 
 
 def test_what_acts_on_pictures_only_is_said() -> None:
     log = corpus("perched")
     found = replay(
-        log, None, changed_profile(flown_profile(log.header), ["kalman.n_max=3", "link.loop_hz=20"])
+        log, None, changed_profile(log.flown_profile, ["kalman.n_max=3", "link.loop_hz=20"])
     )
     assert any(
         n.startswith("kalman.n_max: what it would change in the pictures") for n in found.notes
@@ -321,9 +311,7 @@ def test_what_acts_on_pictures_only_is_said() -> None:
     [((1.0,), "at 1.00 s as"), ((1.0, 2.0), "once more as"), ((1.0, 2.0, 3.0), "2 times more as")],
 )
 def test_gates_are_counted_in_words(times_s: tuple[float, ...], text: str) -> None:
-    found = replay(corpus("stopped"))
-    changed_too = replace(found, changed=("x",))
-    assert any(text in s for s in replay_lines(changed_too, [Gate("g", times_s, ())], []))
+    assert text in gate_text(Gate("g", times_s, ()))
 
 
 @pytest.mark.parametrize(
@@ -401,7 +389,7 @@ def test_both_are_drawn(tmp_path: Path) -> None:
 
 
 def test_a_fault_of_the_planner_is_not_the_file_s(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is a difference by itself, and the end: what came after it cannot be decided."""
 
@@ -410,15 +398,14 @@ def test_a_fault_of_the_planner_is_not_the_file_s(
 
     path = log_of(tmp_path, lines_of()[:120])
     plan_by(monkeypatch, fails)
-    code = log_replay.run(path, as_json=True)
-    found = json.loads(capsys.readouterr().out)
-    assert code == 61
+    said = run("log", "replay", str(path), "--json")
+    found = json.loads(said.stdout)
+    assert said.code == 61
     assert found["first_difference"]["field"] == "error"
     assert found["first_difference"]["replayed"] == "ValueError"
     assert (found["ticks"], found["differences"]) == (1, 1)
-    monkeypatch.setattr("perchctl.log.plot_flight", fails)
-    with pytest.raises(ValueError, match="by the test"):
-        log_plot.run(path)
+    monkeypatch.setattr("perchctl.analysis.plot_flight", fails)
+    assert "unforeseen ValueError: by the test" in run("log", "plot", str(path)).complaint
 
 
 def test_a_damaged_turn_is_the_file_s(tmp_path: Path) -> None:

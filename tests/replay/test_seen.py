@@ -2,7 +2,7 @@
 
 Which kernels numpy's BLAS, OpenCV and the C library choose is the processor's, and their sums
 differ in the last bits, which a fit of edges to pictures makes larger. So bits are demanded of a
-computer with the flight's libraries and arithmetic (`perchctl.log.setup`), and closeness of
+computer with the flight's libraries and arithmetic (`perchctl.log.header`), and closeness of
 any other. Emulated by their own switches (`ELSEWHERE` and others), processors without FMA, AVX2,
 AVX, SSE4 differed by at most 5e-8 m and 4e-7 rad, and in what the filter claims by 7e-10 m and
 3e-9 rad. A constant that is off by 1e-3 shows in that claim, if it weighs anything. A threshold
@@ -21,10 +21,10 @@ from typing import Any
 
 import pytest
 
-from perchctl.log import computer_differences, recorded_pictures, to_exact
-from perchctl.replay import replay
-from perchctl.replay.run import Replay
-from perchctl.replay.told import difference_text
+from perchctl.analysis import replay
+from perchctl.analysis.replay_text import difference_text
+from perchctl.analysis.replayer import Replay
+from perchctl.log import recorded_pictures, to_exact
 from perchctl.vision import filter as the_filter
 from perchctl.vision import pose
 from perchctl.vision.markers import edge_fit
@@ -84,7 +84,7 @@ def test_the_pictures_show_what_they_showed() -> None:
     assert found.seen is not None
     assert (found.seen.frames, found.seen.ended) == (PICTURES, "")
     assert not beyond(found), f"{beyond(found)[:1]}; {ANEW}"
-    if not computer_differences(found.log.header):
+    if not found.log.computer_differences:
         first = found.seen.first
         assert first is None, f"{difference_text(first)}; {ANEW}"
 
@@ -122,7 +122,7 @@ def test_a_changed_constant_of_the_pipeline_is_noticed(
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the switches are that processor's")
 def test_on_another_processor_it_is_near() -> None:
     """Its arithmetic is another, which is noticed."""
-    asked = "from perchctl.log.setup import arithmetic_fingerprint; print(arithmetic_fingerprint())"
+    asked = "from perchctl.log import arithmetic_fingerprint; print(arithmetic_fingerprint())"
     assert _elsewhere({}, asked) != _elsewhere(ELSEWHERE, asked)
     _elsewhere(
         ELSEWHERE,

@@ -14,15 +14,16 @@ from pathlib import Path
 import pytest
 
 import perchctl.mission
+from perchctl.analysis import replay, replay_lines, replay_record
+from perchctl.analysis.decide import first_differing, same
+from perchctl.analysis.replayer import Replay
+from perchctl.analysis.sense import shown
 from perchctl.camera import VERDICT_TEXTS
 from perchctl.flight import SENSED
-from perchctl.log import FlightLog, flown_profile
+from perchctl.log import FlightLog
 from perchctl.mission import Turn
 from perchctl.perception import history
 from perchctl.profile import PositioningConfig, Profile, SafetyConfig, changed_profile
-from perchctl.replay import replay, replay_lines, replay_record
-from perchctl.replay.compare import first_differing, same
-from perchctl.replay.run import Replay, shown
 from perchctl.vehicle import Telemetry
 from perchctl.vision import Frame
 from tests.helpers.loop_rig import PROFILE, Camera, Rig
@@ -33,12 +34,12 @@ JUDGED = ("jumped", "turned_rad", "battery_age_s", "camera_age_s", "new_frame", 
 
 
 def what_if(log: FlightLog, *settings: str) -> Replay:
-    return replay(log, None, changed_profile(flown_profile(log.header), settings))
+    return replay(log, None, changed_profile(log.flown_profile, settings))
 
 
 def flown_by(log: FlightLog, *settings: str) -> FlightLog:
     """The log of a flight by another profile, which was shown what that makes of it."""
-    was = flown_profile(log.header)
+    was = log.flown_profile
     profile = changed_profile(was, settings)
     turns = [
         replace(each.turn, observation=each.observation) for each in shown(log.turns, was, profile)
@@ -79,7 +80,7 @@ def stepped(key: str) -> FlightLog:
         else replace(turn, taken=replace(turn.taken, samples=tuple(map(step, turn.taken.samples))))
         for turn in log.turns
     ]
-    return with_turns(log, turns, flown_profile(log.header))
+    return with_turns(log, turns, log.flown_profile)
 
 
 @pytest.mark.parametrize("key", STEPS)
@@ -99,10 +100,10 @@ def test_a_jump_is_judged_anew(key: str) -> None:
         assert (first.tick, first.field) == (30, "jumped")
         assert (first.recorded, first.replayed) == (flown_with == narrow, flown_with == wide)
         assert found.decided[30].observation.jumped == (flown_with == wide)
-        text = "\n".join(replay_lines(found, [], []))
+        text = "\n".join(replay_lines(found))
         assert re.search(r"telemetry: \d+ turns would show the planner something else", text)
         assert "first:     tick 30 at" in text
-        assert replay_record(found, [], [])["shown"]["first_difference"]["field"] == "jumped"
+        assert replay_record(found)["shown"]["first_difference"]["field"] == "jumped"
         if flown_with == wide:
             assert found.first is not None  # the planner's, which then holds
             assert found.first.tick == 30
@@ -120,7 +121,7 @@ def test_a_changed_constant_of_the_history_is_noticed(monkeypatch: pytest.Monkey
     assert found.shown.first is not None
     assert found.shown.first.field == "turned_rad"
     assert not found.same
-    text = "\n".join(replay_lines(found, [], []))
+    text = "\n".join(replay_lines(found))
     assert "telemetry: 1 turns show the planner something else" in text
 
 
@@ -210,7 +211,7 @@ def test_with_pictures_it_is_judged_alike(tmp_path: Path, setting: str) -> None:
 def test_another_latency_of_a_capture_makes_positions_older() -> None:
     log = corpus("external-occluded")
     found = what_if(log, "positioning={by: mocap, latency_s: 0.04, host: x}")
-    later_s = 0.04 - flown_profile(log.header).positioning.latency_s
+    later_s = 0.04 - log.flown_profile.positioning.latency_s
     assert found.shown is not None
     assert found.shown.first is not None
     assert found.shown.first.field == "position_age_s"
@@ -248,7 +249,7 @@ def test_each_key_is_judged_or_said() -> None:
 
 
 def said_of(log: FlightLog, key: str) -> bool:
-    from perchctl.replay.run import notes_of
+    from perchctl.analysis.replayer import notes_of
 
     notes = notes_of(log, "", "", [key], pictures=False)
     return any(note.startswith(f"{key}: ") for note in notes)
@@ -257,7 +258,7 @@ def said_of(log: FlightLog, key: str) -> bool:
 def test_what_was_asked_before_take_off_is_said() -> None:
     found = what_if(corpus("stopped"), "safety.min_rest_v=3.9")
     assert any("before take-off only" in note for note in found.notes)
-    lines = replay_lines(found, [], [])
+    lines = replay_lines(found)
     assert any("no command would have been another" in line for line in lines)
 
 

@@ -27,7 +27,6 @@ sys.path.insert(0, str(HERE.parents[2]))
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage  # noqa: E402
 
 from perchctl.faults.flight import fly_fault_seed  # noqa: E402
 from perchctl.flight import (  # noqa: E402
@@ -36,10 +35,10 @@ from perchctl.flight import (  # noqa: E402
     lockstep,
 )
 from perchctl.log import LogWatcher  # noqa: E402
-from perchctl.log.place import recording_path  # noqa: E402
-from perchctl.log.recording.container import Container, DiskStream  # noqa: E402
-from perchctl.log.recording.messages import FRAME, IMAGE  # noqa: E402
-from perchctl.log.recording.walk import walk  # noqa: E402
+from perchctl.log.disk import DiskFile  # noqa: E402
+from perchctl.log.recorded import recorded_frames  # noqa: E402
+from perchctl.log.recording_file import RecordingFile  # noqa: E402
+from perchctl.log.write import recording_path  # noqa: E402
 from perchctl.mission import (  # noqa: E402
     FlightReport,
     Operator,
@@ -133,29 +132,23 @@ def _end_of(lines: list[bytes]) -> int:
     return len(lines)
 
 
-def _packed(data: bytes) -> CompressedImage:
+def _packed(data: bytes) -> bytes:
     """The same pixels in fewer bytes: noise is best left to Huffman alone."""
-    picture = CompressedImage.FromString(data)
-    pixels = np.frombuffer(picture.data, np.uint8)
-    image = cv2.imdecode(pixels, cv2.IMREAD_GRAYSCALE)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert image is not None
     how = [
         cv2.IMWRITE_PNG_COMPRESSION, 9,
         cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
     ]  # fmt: skip
-    picture.data = cv2.imencode(".png", image, how)[1].tobytes()
-    return picture
+    return cv2.imencode(".png", image, how)[1].tobytes()
 
 
 def _keep_pictures(recording: Path, path: Path) -> None:
     """Of a recording, what a replay takes from it."""
     path.unlink(missing_ok=True)
-    kept = Container(DiskStream(path))
-    for each in islice(walk(recording, (IMAGE, FRAME)), 2 * PICTURES):
-        if each.topic == IMAGE:
-            kept.say(IMAGE, each.log_ns, _packed(each.data), each.sequence)
-        else:
-            kept.say_json(FRAME, each.log_ns, each.data, each.sequence)
+    kept = RecordingFile(DiskFile.new(path), {"t0_s": 0.0}, None, None)
+    for frame, picture in islice(recorded_frames(recording), PICTURES):
+        kept.frame(frame, None if picture is None else (_packed(picture.data), "png"))
     kept.finish()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +34,8 @@ from perchctl.geometry import (
     rotation_from_rpy,
 )
 from perchctl.log import recorded_pictures
-from perchctl.log.recording.export import layout
-from perchctl.log.recording.messages import calibration_message
-from perchctl.log.recording.shapes import SCHEMAS
-from perchctl.log.sent import sent_values
+from perchctl.log.read import sent_values
+from perchctl.log.recording_file import SCHEMAS, calibration_message
 from perchctl.mission import SentCommand
 from perchctl.vehicle import Land
 from perchctl.vision import CameraModel
@@ -158,9 +157,9 @@ def test_the_schemas_are_foxgloves_own(recording: Path) -> None:
     for topic, official in OFFICIAL.items():
         schema = found[topic]
         assert (schema.encoding, schema.name) == ("protobuf", official.DESCRIPTOR.full_name)
-        files = FileDescriptorSet.FromString(schema.data)
+        described = FileDescriptorSet.FromString(schema.data)
         pool = DescriptorPool()
-        for file in files.file:
+        for file in described.file:
             pool.Add(file)
         assert _shape(pool.FindMessageTypeByName(schema.name)) == _shape(official.DESCRIPTOR)
         assert schema.name.startswith("foxglove.")
@@ -337,7 +336,7 @@ def test_the_header_goes_along(recording: Path) -> None:
 
 
 def test_the_layout_shows_what_is_there(found: dict[str, list[Any]]) -> None:
-    shown = layout()
+    shown = json.loads(files("perchctl.log").joinpath("foxglove.json").read_bytes())
     topics = set(found)
     text = json.dumps(shown)
     named = {word for word in text.replace(".", '"').split('"') if word.startswith("/")}

@@ -21,7 +21,6 @@ from perchctl.flight import lockstep
 from perchctl.flight.campaign import fly_seed
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rotation_from_quaternion
 from perchctl.log import read_log, recorded_pictures
-from perchctl.log.recording import container
 from perchctl.profile import load_profile
 from perchctl.vision import Frame, project, square_corners
 from tests.helpers import recorded
@@ -111,7 +110,7 @@ def test_a_disk_that_fills_up_ends_the_recording_and_not_the_flight(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return real(fd, data)
 
-    monkeypatch.setattr(container.os, "write", write)
+    monkeypatch.setattr(os, "write", write)
     path = tmp_path / "flight.jsonl"
     result = fly_seed(load_profile(SHORT), SEED, path, record=True)
     assert (result.outcome, result.log_problem) == ("perched", None)

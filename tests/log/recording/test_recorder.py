@@ -22,10 +22,17 @@ from mcap.records import Attachment, Channel, Chunk, Header, Message, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from perchctl.errors import InvalidValue
-from perchctl.log import LogWatcher, read_log, recorded_pictures, summarise_flight, summary_text
-from perchctl.log.recording import container, walk
-from perchctl.log.recording import recorder as recording_module
-from perchctl.log.recording.recorder import Recorder
+from perchctl.log import (
+    LogWatcher,
+    read_log,
+    recorded_pictures,
+    recording_file,
+    summarise_flight,
+    summary_text,
+)
+from perchctl.log import recorded as reading
+from perchctl.log import recorder as recording_module
+from perchctl.log.recorder import Recorder
 from perchctl.log.write import FlightLogWriter
 from perchctl.mission import FlightReport, Outcome, Phase
 from perchctl.profile import Profile
@@ -172,7 +179,7 @@ def test_a_disk_that_hangs_holds_up_nobody(
     """The queue's place for pictures is used up, and then its place for turns."""
     held_bytes = recording_module._Turn(recorded.frame(0, 1.0, as_jpeg=True)).held_bytes
     monkeypatch.setattr(recording_module, "MOST_PICTURE_BYTES", 10 * held_bytes)
-    monkeypatch.setattr(container, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(recording_file, "CHUNK_BYTES", 1)
     recorder, flight = onto(hung, live=True), recorded.flown(120)
     hung.gate.clear()
     began_s = time.monotonic()
@@ -215,7 +222,7 @@ def test_a_queue_that_is_full_drops_turns(
     recorder = onto(hung, live=True)
     hung.gate.clear()
     recorded.fly(recorder, recorded.flown(60))
-    assert len(recorder._behind._jobs) == 20  # type: ignore[union-attr]
+    assert len(recorder._writer._jobs) == 20
     (said,) = recorder.take_remarks()
     assert "turns are missing" in said
 
@@ -328,7 +335,7 @@ def test_a_chunk_that_unfolds_without_bound_is_refused(
     packed = lz4.frame.compress(bomb) if compression == "lz4" else zstandard.compress(bomb)
     path = tmp_path / "bomb.mcap"
     path.write_bytes(with_chunk(compression, bomb, packed))
-    monkeypatch.setattr(walk, "MOST_CHUNK_BYTES", 1_000_000)
+    monkeypatch.setattr(reading, "MOST_CHUNK_BYTES", 1_000_000)
     tracemalloc.start()
     with pytest.raises(InvalidValue, match="more than 1 MB"):
         list(recorded_pictures(path))
@@ -347,15 +354,16 @@ def test_a_chunk_of_each_compression_is_read(compression: str, tmp_path: Path) -
     packed = {"": plain, "lz4": lz4.frame.compress(plain), "zstd": zstandard.compress(plain)}
     path = tmp_path / "one.mcap"
     path.write_bytes(with_chunk(compression, plain, packed[compression]))
-    assert list(walk.walk(path, ("/tick",))) == [walk.Walked("/tick", 7, 5, b"{}")]
+    ((topic, message),) = reading.recording_messages(path, ("/tick",))
+    assert (topic, message.sequence, message.log_time, message.data) == ("/tick", 7, 5, b"{}")
     path.write_bytes(with_chunk(compression, plain, packed[compression][: len(plain) // 2]))
-    assert list(walk.walk(path, ("/tick",))) == [], "torn"
+    assert list(reading.recording_messages(path, ("/tick",))) == [], "torn"
 
 
 def test_a_record_too_large_is_refused_and_one_behind_the_end_is_torn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(walk, "MOST_CHUNK_BYTES", 1_000)
+    monkeypatch.setattr(reading, "MOST_CHUNK_BYTES", 1_000)
     path = tmp_path / "x.mcap"
     builder = RecordBuilder()
     Header(profile="", library="").write(builder)
@@ -363,9 +371,9 @@ def test_a_record_too_large_is_refused_and_one_behind_the_end_is_torn(
     whole = bytes(MCAP0_MAGIC + builder.end())
     path.write_bytes(whole)
     with pytest.raises(InvalidValue, match="more than"):
-        list(walk.walk(path, ("/tick",)))
+        list(reading.recording_messages(path, ("/tick",)))
     path.write_bytes(whole[:-1])
-    assert list(walk.walk(path, ("/tick",))) == []
+    assert list(reading.recording_messages(path, ("/tick",))) == []
 
 
 def test_a_killed_program_leaves_what_is_older_than_a_second(tmp_path: Path) -> None:

@@ -1,0 +1,264 @@
+"""What to change for the next flight: each sentence with the figure that it rests on, and none
+where the log shows nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from perchctl.analysis.flight import FlightAnalysis
+from perchctl.analysis.sight import percentile
+from perchctl.analysis.words import count, length, milliseconds, share, times
+from perchctl.geometry import Array
+
+SWING_M, LEAST_SWINGS = 0.03, 4
+"""Farther than that to both sides of the target, one after the other."""
+WAITED_S = 4.0
+LEAST_PAIRS, SCALE_OFF = 20, 0.03
+RMS_PX = 1.0
+UNSEEN_SHARE, LEAST_UNSEEN, BLURRED_PX = 0.1, 10, 2.5
+IN_VIEW = 0.5
+"""Aside by less than half of the height: a camera that looks up has the target in view."""
+GAP_S = 0.3
+SPARE_V, WORN_SAG_V, WORN_HUNGER, LEAST_USED = 0.15, 0.95, 1.8, 0.15
+APART_M = 0.05
+
+
+@dataclass(frozen=True)
+class Advice:
+    """`about`: one word; `evidence`: the figures, in a sentence without its end."""
+
+    about: str
+    text: str
+    evidence: str
+
+
+def advice_of(flight: FlightAnalysis) -> tuple[Advice, ...]:
+    """All advice in the order in which to heed it."""
+    found = [
+        *_latency_and_mounting(flight),
+        *_computer(flight),  # what it delays looks like a video that fails
+        *_print(flight),
+        *_light(flight),
+        *_video(flight),
+        *_gains(flight),
+        *_settling(flight),
+        *_link(flight),
+        *_battery(flight),
+        *_external(flight),
+    ]
+    return tuple(found)
+
+
+def _latency_and_mounting(flight: FlightAnalysis) -> Iterator[Advice]:
+    for sentence in () if flight.findings is None else flight.findings.advice:
+        about = "latency" if sentence.startswith("latency") else "mounting"
+        yield Advice(about, sentence, "fitted to the whole flight, with its 95 % interval")
+
+
+def _print(flight: FlightAnalysis) -> Iterator[Advice]:
+    large, small = flight.log.column("lz_m"), flight.log.column("sz_m")
+    ratio = large / np.where(small > 0.05, small, np.nan) - 1.0
+    known = ratio[np.isfinite(ratio)]
+    if known.size >= LEAST_PAIRS and abs(off := float(np.median(known))) > SCALE_OFF:
+        farther = "farther away" if off > 0 else "nearer"
+        yield Advice(
+            "print",
+            "measure both markers on the sheet, and write their sides into target.large.side_m "
+            "and target.small.side_m",
+            f"the large marker seems {share(abs(off))} {farther} than the small one, median of "
+            f"{known.size} frames with both",
+        )
+    if flight.vision_led.misfit_px > RMS_PX:
+        yield Advice(
+            "print",
+            "look whether the sheet is flat, and check the camera's calibration",
+            f"the corners miss the pose by {flight.vision_led.misfit_px:.1f} px, median over "
+            f"{count(flight.vision_led.with_target, 'frame')}",
+        )
+
+
+def _light(flight: FlightAnalysis) -> Iterator[Advice]:
+    unseen, frames = _unseen_in_view(flight)
+    if len(unseen) < LEAST_UNSEEN or len(unseen) < UNSEEN_SHARE * frames:
+        return
+    blur = flight.motion.blur_px[unseen]
+    told = f"{len(unseen)} of {frames} frames did not show the target, though it was in view"
+    blurred = int(np.count_nonzero(blur > BLURRED_PX))
+    if blurred > len(unseen) / 2:
+        yield Advice(
+            "light",
+            "more light and a shorter exposure (camera.controls), or a slower flight",
+            f"{told}; {blurred} of them were blurred by more than {BLURRED_PX:g} px",
+        )
+    elif np.isfinite(blur).any():
+        yield Advice(
+            "light",
+            "look for what darkens, dazzles or hides the target: it was not the motion",
+            f"{told}; their median blur was {percentile(blur, 50):.1f} px",
+        )
+    else:
+        flow = percentile(flight.motion.flow_pxps[unseen], 50)
+        moved = f"; it moved at {flow:.0f} px/s" if math.isfinite(flow) else ""
+        yield Advice("light", "more light, so that the exposure can be shorter", f"{told}{moved}")
+
+
+def _unseen_in_view(flight: FlightAnalysis) -> tuple[list[int], int]:
+    """Ticks whose frame lacks a target that was overhead; and all frames with it overhead."""
+    overhead = np.hypot(flight.log.column("ex_m"), flight.log.column("ey_m")) < (
+        IN_VIEW * flight.log.column("ez_m")
+    )
+    phases = flight.log.texts("phase")
+    looked = [
+        (i, seen)
+        for i, seen in zip(flight.frames.ticks, flight.frames.seen, strict=True)
+        if overhead[i] and phases[i] in ("ESTIMATE", "ALIGN", "ASCEND")
+    ]
+    return [int(i) for i, seen in looked if not seen], len(looked)
+
+
+def _video(flight: FlightAnalysis) -> Iterator[Advice]:
+    long = [b - a for a, b in flight.frames.gaps_s if b - a > GAP_S]
+    if long:
+        yield Advice(
+            "video",
+            "look at the video's way: channel, antennas, receiver, cable",
+            f"{times(len(long))} no picture came for more than {GAP_S:g} s, at most "
+            f"{max(long):.1f} s",
+        )
+
+
+def _gains(flight: FlightAnalysis) -> Iterator[Advice]:
+    for phase, key in (("ALIGN", "align"), ("ASCEND", "ascend")):
+        swings, widest_m, over_s = _swings(flight, phase)
+        if swings < LEAST_SWINGS:
+            continue
+        speed = flight.log.setting(f"planner.{key}.speed_mps")
+        integral = flight.log.setting("planner.integral_per_s")
+        text = f"lower planner.{key}.speed_mps"
+        text += f" (flown with {speed})" if speed is not None else ""
+        text += ", or planner.integral_per_s"
+        text += f" ({integral})" if integral is not None else ""
+        if any(a.about == "latency" for a in _latency_and_mounting(flight)):
+            text = f"put the latency right first; if it still swings, {text}"
+        yield Advice(
+            "gains",
+            text,
+            f"in {phase} it swung {swings} times across the target, by up to {length(widest_m)} "
+            f"in {over_s:.1f} s",
+        )
+
+
+def _swings(flight: FlightAnalysis, phase: str) -> tuple[int, float, float]:
+    """The most changes of side in one stay, how wide, in how long."""
+    best = (0, 0.0, 0.0)
+    for stay in flight.stays:
+        if stay.phase != phase:
+            continue
+        ticks = flight.within(stay.start_s, stay.end_s)
+        for axis in "xy":
+            swings, widest_m = swings_of(flight.log.column(f"e{axis}_m")[ticks])
+            best = max(best, (swings, widest_m, stay.duration_s))
+    return best
+
+
+def swings_of(e_m: Array) -> tuple[int, float]:
+    """How often an error went from beyond `SWING_M` on one side to beyond it on the other, and
+    how far it went after the first time."""
+    sides = np.sign(e_m[np.abs(e_m) > SWING_M])
+    changes = int(np.count_nonzero(np.diff(sides)))
+    if not changes:
+        return 0, 0.0
+    beyond = np.abs(e_m[np.abs(e_m) > SWING_M])
+    return changes, float(beyond[int(np.flatnonzero(np.diff(sides))[0]) + 1 :].max())
+
+
+def _settling(flight: FlightAnalysis) -> Iterator[Advice]:
+    standoff_m, settle_z_m, settle_xy_m = (
+        flight.log.number(f"planner.ascend.{key}")
+        for key in ("standoff_m", "settle_z_m", "settle_xy_m")
+    )
+    if standoff_m is None or settle_z_m is None or settle_xy_m is None:
+        return
+    near = (flight.log.column("ez_m") <= standoff_m + settle_z_m) & np.array(
+        [phase == "ASCEND" for phase in flight.log.texts("phase")], dtype=bool
+    )
+    spent_s = float(np.diff(flight.t_s, append=flight.end_s)[near].sum())
+    if spent_s < WAITED_S:
+        return
+    aside = np.hypot(flight.log.column("ex_m"), flight.log.column("ey_m"))[near]
+    yield Advice(
+        "gains",
+        "look for a draught or a weak position estimate; where the target forgives more, "
+        "planner.ascend.settle_xy_m can be larger",
+        f"it waited {spent_s:.1f} s at the stand-off, and was within "
+        f"{length(settle_xy_m)} of the axis for {share(float(np.mean(aside <= settle_xy_m)))} "
+        f"of that time (median {length(percentile(aside, 50))})",
+    )
+
+
+def _link(flight: FlightAnalysis) -> Iterator[Advice]:
+    hold_s = flight.log.number("safety.telemetry_hold_s") or GAP_S
+    long = [gap for gap in flight.link.old if gap[2] > hold_s]
+    if long:
+        yield Advice(
+            "link",
+            "another radio channel, or an antenna with a free view",
+            f"telemetry was older than {milliseconds(hold_s)} {times(len(long))}, at "
+            f"most {milliseconds(max(gap[2] for gap in long))}",
+        )
+
+
+def _computer(flight: FlightAnalysis) -> Iterator[Advice]:
+    period_s = 1.0 / (flight.log.number("link.loop_hz") or 50.0)
+    most_s = percentile(flight.log.column("late_s"), 99)
+    if most_s > period_s / 2:
+        yield Advice(
+            "computer",
+            "close other programs on the computer, or lower the camera's resolution",
+            f"1 turn in 100 began {milliseconds(most_s)} late or more, of a period of "
+            f"{milliseconds(period_s)}",
+        )
+
+
+def _battery(flight: FlightAnalysis) -> Iterator[Advice]:
+    least_v, battery = flight.log.number("safety.min_load_v"), flight.battery
+    if least_v is not None and battery.lowest_v < least_v + SPARE_V:
+        yield Advice(
+            "battery",
+            "start with a full battery",
+            f"it came down to {battery.lowest_v:.2f} V, and at {least_v:.2f} V a flight is ended",
+        )
+    fit = battery.fit
+    is_used = battery.used_mah > LEAST_USED * battery.battery_mah  # or its hunger is a guess
+    if fit is not None and (fit.sag_v > WORN_SAG_V or (is_used and fit.hunger > WORN_HUNGER)):
+        yield Advice(
+            "battery",
+            "take another battery: this one is worn, or its contacts are",
+            f"it falls by {fit.sag_v:.2f} V under full thrust, and empties {fit.hunger:.1f} times "
+            f"as fast as one of {battery.battery_mah:.0f} mAh should",
+        )
+
+
+def _external(flight: FlightAnalysis) -> Iterator[Advice]:
+    external = flight.external
+    if external is None:
+        return
+    if external.stops:
+        longest = max(external.stops, key=lambda stop: stop[1] - stop[0])
+        yield Advice(
+            "positioning",
+            "look where the markers are hidden from the cameras",
+            f"{times(len(external.stops))} no position was sent, at most for "
+            f"{longest[1] - longest[0]:.1f} s: {longest[2]}",
+        )
+    if external.apart_most_m > APART_M:
+        yield Advice(
+            "positioning",
+            "compare both by hand (`perchctl check --lift`)",
+            f"the vehicle's estimate was {length(external.apart_most_m)} from the positions from "
+            f"outside in 1 turn of 20",
+        )

@@ -1,0 +1,159 @@
+"""What differs between two flights: their numbers, their phases, their profiles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+from typing import Any
+
+from perchctl.analysis.flight import FlightAnalysis, Measures
+from perchctl.analysis.show import hung, plain
+
+_NAME, _CELL = 32, 14
+_NOT_THERE = "not there"
+
+
+@dataclass(frozen=True)
+class PhaseTimes:
+    """How long, and how often, each of two flights was in a phase."""
+
+    phase: str
+    stays_s: tuple[float, float]
+    visits: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two flights side by side, A and B."""
+
+    flights: tuple[FlightAnalysis, FlightAnalysis]
+
+    @cached_property
+    def phases(self) -> tuple[PhaseTimes, ...]:
+        """Each phase that one of them flew through."""
+        names = dict.fromkeys(stay.phase for flight in self.flights for stay in flight.stays)
+        found = []
+        for name in names:
+            a, b = (
+                [stay.duration_s for stay in flight.stays if stay.phase == name]
+                for flight in self.flights
+            )
+            found.append(PhaseTimes(name, (sum(a), sum(b)), (len(a), len(b))))
+        return tuple(found)
+
+    @cached_property
+    def profile(self) -> dict[str, tuple[Any, Any]]:
+        """The profile keys with different values, each with both."""
+        a, b = (flight.log.header.get("profile") for flight in self.flights)
+        return profile_differences(a, b)
+
+    @cached_property
+    def differences(self) -> dict[str, Any]:
+        """By the names of `Measures`: B's value less A's; None where one is not known."""
+        a, b = (asdict(flight.measures) for flight in self.flights)
+        return {
+            name: None if a[name] is None or b[name] is None else b[name] - a[name] for name in a
+        }
+
+    def record(self) -> dict[str, Any]:
+        """The comparison for programs: SI; a difference is B's value less A's."""
+        a, b = (_flight_record(flight) for flight in self.flights)
+        return {
+            "a": a,
+            "b": b,
+            "differences": self.differences,
+            "phases": [
+                {
+                    "phase": each.phase,
+                    "a_s": round(each.stays_s[0], 6),
+                    "b_s": round(each.stays_s[1], 6),
+                    "difference_s": round(each.stays_s[1] - each.stays_s[0], 6),
+                    "a_visits": each.visits[0],
+                    "b_visits": each.visits[1],
+                }
+                for each in self.phases
+            ],
+            "profile": {key: {"a": a, "b": b} for key, (a, b) in self.profile.items()},
+        }
+
+    def text(self) -> str:
+        """The comparison as a table, for people."""
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        for name, flight in zip("AB", self.flights, strict=True):
+            log, end = flight.log, flight.summary
+            seed = log.header.get("seed")
+            which = f"profile {log.profile_name or '?'}" + (
+                "" if seed is None else f", seed {seed}"
+            )
+            yield from hung(f"{name}:  ", f"{log.path} ({which})")
+            yield from hung("    ", f"{end.outcome.upper()}: {end.reason}".rstrip(": "))
+        yield ""
+        yield _row("", "A", "B", "B - A")
+        yield from self._measure_rows()
+        if self.phases:
+            yield ""
+            yield "time in each phase [s]"
+        for each in self.phases:
+            often = "" if each.visits == (1, 1) else f" ({each.visits[0]}x, {each.visits[1]}x)"
+            a_s, b_s = each.stays_s
+            name = f"  {plain(each.phase)}{often}"
+            yield _row(name, f"{a_s:.2f}", f"{b_s:.2f}", f"{b_s - a_s:+.2f}")
+        yield ""
+        yield "profile keys that differ, A and B" if self.profile else "their profiles are the same"
+        for key, (a, b) in self.profile.items():
+            yield from hung(f"  {plain(key):<{_NAME - 2}}  ", f"{_value(a)}  {_value(b)}")
+
+    def _measure_rows(self) -> Iterator[str]:
+        a, b = (flight.measures for flight in self.flights)
+        for f in fields(Measures):
+            if getattr(a, f.name) is None and getattr(b, f.name) is None:
+                continue
+            meta, difference = f.metadata, self.differences[f.name]
+            label = meta["label"] + (f" [{meta['unit']}]" if meta["unit"] else "")
+            less = "" if difference is None else f"{difference * meta['scale']:+.{meta['digits']}f}"
+            yield _row(label, a.text(f.name), b.text(f.name), less)
+
+
+def _flight_record(flight: FlightAnalysis) -> dict[str, Any]:
+    return {
+        "log": str(flight.log.path),
+        "profile": flight.log.profile_name,
+        "seed": flight.log.header.get("seed"),
+        "outcome": flight.summary.outcome,
+        "reason": flight.summary.reason,
+        **asdict(flight.measures),
+    }
+
+
+def _row(name: str, a: str, b: str, difference: str) -> str:
+    return f"{name:<{_NAME}}{a:>{_CELL}}{b:>{_CELL}}{difference:>{_CELL}}".rstrip()
+
+
+def _value(value: Any) -> str:
+    return "none" if value is None else str(value)
+
+
+def profile_differences(one: Any, other: Any) -> dict[str, tuple[Any, Any]]:
+    """The dotted keys of two profiles, as JSON has them, that have different values."""
+    a, b = _flat(one), _flat(other)
+    return {
+        key: (a.get(key, _NOT_THERE), b.get(key, _NOT_THERE))
+        for key in dict.fromkeys((*a, *b))
+        if a.get(key, _NOT_THERE) != b.get(key, _NOT_THERE)
+    }
+
+
+def _flat(values: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested keys as dotted paths; an empty mapping is a value."""
+    if not isinstance(values, Mapping):
+        return {}
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            found |= _flat(value, f"{prefix}{key}.")
+        else:
+            found[f"{prefix}{key}"] = value
+    return found

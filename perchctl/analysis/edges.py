@@ -1,0 +1,265 @@
+"""A flight's edges, read off its log: telemetry, setpoints, external positions, battery, timing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from perchctl.analysis.sight import percentile
+from perchctl.geometry import Array
+from perchctl.log import FlightLog
+from perchctl.mission import (
+    BatteryFit,
+    EnergyState,
+    charge_at,
+    fit_battery,
+    update_energy,
+    used_mah,
+)
+from perchctl.vehicle import NO_BATTERY_READING_V
+
+OLD_TELEMETRY_S = 0.1
+"""Telemetry older than that is reported."""
+
+
+def runs_of(log: FlightLog, key: str) -> list[tuple[float, float, str]]:
+    """Stretches over which a text stayed the same, without those that have none: from, to, text."""
+    found: list[tuple[float, float, str]] = []
+    began_s, text = 0.0, ""
+    for t_s, now in zip((*log.t_s, log.end_s), (*log.texts(key), None), strict=True):
+        if now == text:
+            continue
+        if text:
+            found.append((began_s, float(t_s), text))
+        began_s, text = float(t_s), now or ""
+    return found
+
+
+# --- the link -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LinkHealth:
+    """Telemetry as the turns had it, and what was sent. Rates in 1/s, NaN where unknown.
+
+    Attributes:
+        fresh_hz: samples that were new in their turn; not above the loop's own rate.
+        samples_hz: all that came, NaN where the log does not hold them (before version 3).
+        age_s, age_most_s, age_worst_s: of the newest sample: median, 99 of 100 below, all below.
+        old: stretches in which the newest sample was older than `OLD_TELEMETRY_S`: from, to,
+            worst age.
+        sent: commands by kind, how many turns each.
+        setpoints_hz: position setpoints and raw thrusts, while they were sent.
+    """
+
+    turns_hz: float
+    fresh_hz: float
+    samples_hz: float
+    age_s: float
+    age_most_s: float
+    age_worst_s: float
+    old: tuple[tuple[float, float, float], ...]
+    sent: tuple[tuple[str, int], ...]
+    setpoints_hz: float
+
+
+def link_of(log: FlightLog) -> LinkHealth:
+    """The link over the whole flight."""
+    t_s, age = log.t_s, log.column("tel_age_s")
+    spent_s = max(log.end_s, 1e-9) if t_s.size > 1 else math.nan
+    sampled = np.round(t_s - age, 4)
+    fresh = np.count_nonzero(np.diff(sampled[np.isfinite(sampled)]) > 0)
+    kinds = [kind for kind in log.texts("cmd") if kind]
+    flying = np.array([kind in ("position", "thrust") for kind in log.texts("cmd")], dtype=bool)
+    between = np.diff(t_s)[flying[1:] & flying[:-1]]
+    return LinkHealth(
+        turns_hz=(t_s.size - 1) / spent_s,
+        fresh_hz=fresh / spent_s,
+        samples_hz=_samples_hz(log),
+        age_s=percentile(age, 50),
+        age_most_s=percentile(age, 99),
+        age_worst_s=percentile(age, 100),
+        old=_old_telemetry(t_s, age),
+        sent=tuple((kind, kinds.count(kind)) for kind in dict.fromkeys(kinds)),
+        setpoints_hz=1.0 / float(np.mean(between)) if between.size else math.nan,
+    )
+
+
+def _samples_hz(log: FlightLog) -> float:
+    """By the samples' own times, so that what came late in one go counts as it was taken."""
+    taken = [t for r in log.turn_records if isinstance(t := r.get("taken"), dict)]
+    at_s = [
+        sample["t_s"]
+        for each in taken
+        for sample in (*(each.get("samples") or ()), *(each.get("late") or ()))
+    ]
+    spent_s = max(at_s) - min(at_s) if at_s else 0.0
+    return (len(at_s) - 1) / spent_s if spent_s > 0 else math.nan
+
+
+def _old_telemetry(times_s: Array, ages_s: Array) -> tuple[tuple[float, float, float], ...]:
+    found: list[tuple[float, float, float]] = []
+    inside = False
+    for t_s, age_s in zip(times_s, ages_s, strict=True):
+        if not age_s > OLD_TELEMETRY_S:
+            inside = False
+        elif inside:
+            start_s, _, worst_s = found[-1]
+            found[-1] = (start_s, float(t_s), max(worst_s, float(age_s)))
+        else:
+            found.append((float(t_s), float(t_s), float(age_s)))
+            inside = True
+    return tuple(found)
+
+
+# --- external positions ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ExternalHealth:
+    """External positions as they were sent to the vehicle.
+
+    Attributes:
+        sent: how many; `rate_hz`: while they were sent.
+        age_s, age_most_s: since their exposure: median, 99 of 100 below.
+        apart_m, apart_most_m: between the newest one and the vehicle's own estimate: median,
+            95 of 100 below.
+        stops: stretches in which none was sent: from, to, why.
+    """
+
+    sent: int
+    rate_hz: float
+    age_s: float
+    age_most_s: float
+    apart_m: float
+    apart_most_m: float
+    stops: tuple[tuple[float, float, str], ...]
+
+
+def external_of(log: FlightLog) -> ExternalHealth | None:
+    """None where the vehicle's decks measured its position."""
+    sent = log.column("pos_sent")
+    if not np.isfinite(sent).any():
+        return None
+    offsets = [log.column(f"pos_{axis}_m") - log.column(f"{axis}_m") for axis in "xyz"]
+    stopped = np.array([bool(text) for text in log.texts("pos_note")])
+    apart = np.where(stopped, np.nan, np.linalg.norm(np.stack(offsets, 1), axis=1))
+    age = log.column("pos_age_s")
+    return ExternalHealth(
+        int(np.nanmax(sent)),
+        percentile(np.where(stopped, np.nan, log.column("pos_hz")), 50),
+        percentile(age, 50),
+        percentile(age, 99),
+        percentile(apart, 50),
+        percentile(apart, 95),
+        tuple(runs_of(log, "pos_note")),
+    )
+
+
+# --- the battery ----------------------------------------------------------------------------
+
+USUAL_MAH = 250.0
+"""Of the battery that a Crazyflie comes with, where a log's profile does not say."""
+LONGEST_STEP_S = 1.0
+"""A longer gap between two ticks is the log's, and not counted as flown."""
+
+
+@dataclass(frozen=True)
+class PhaseEnergy:
+    """Of all stays in a phase together. `lowest_v` is NaN without a reading."""
+
+    phase: str
+    duration_s: float
+    used_mah: float
+    mean_thrust: float
+    lowest_v: float
+
+
+@dataclass(frozen=True, eq=False)
+class BatteryUse:
+    """Voltages as they were read, charge by the count of the thrust.
+
+    Attributes:
+        battery_mah: what the charge is counted against; `assumed` where no profile says it.
+        rest_v: (n,) the estimated resting voltage over the ticks, NaN where there is none.
+        start_v, end_v, lowest_v: first, last and lowest reading; NaN without any.
+        fit: how much the voltage falls under full thrust, and how much faster than assumed the
+            battery empties; None where it was never under load.
+        left: estimated share of the charge at the end; None where it is unknown.
+    """
+
+    battery_mah: float
+    assumed: bool
+    phases: tuple[PhaseEnergy, ...]
+    rest_v: Array
+    start_v: float
+    end_v: float
+    lowest_v: float
+    fit: BatteryFit | None
+    left: float | None
+
+    @property
+    def used_mah(self) -> float:
+        return sum(phase.used_mah for phase in self.phases)
+
+
+def battery_of(log: FlightLog) -> BatteryUse:
+    """Fits the battery model to the whole flight; a log without ticks has no phases."""
+    written = log.number("vehicle.battery_mah") or 0.0
+    battery_mah = written if written > 0 else USUAL_MAH
+    t_s, volts = log.column("t_s"), log.column("battery_v")
+    thrust = np.nan_to_num(log.column("thrust"))
+    step_s = np.clip(np.diff(t_s, append=t_s[-1:]), 0.0, LONGEST_STEP_S)
+    state = EnergyState()
+    count_mah, rest_v = np.zeros(t_s.shape), np.full(t_s.shape, np.nan)
+    for i in range(t_s.size):
+        state = update_energy(
+            state, float(step_s[i]), float(volts[i]), float(thrust[i]), battery_mah
+        )
+        count_mah[i] = used_mah(state, battery_mah)
+        rest_v[i] = math.nan if state.rest_v is None else state.rest_v
+    step_mah = np.diff(count_mah, prepend=0.0)
+    phases = np.array(log.texts("phase"))
+    known = volts[volts >= NO_BATTERY_READING_V]
+    is_loaded = state.loaded_s > 0
+    return BatteryUse(
+        battery_mah,
+        written <= 0,
+        tuple(
+            PhaseEnergy(
+                name,
+                float(step_s[phases == name].sum()),
+                float(step_mah[phases == name].sum()),
+                float(thrust[phases == name].mean()),
+                _lowest_v(volts[phases == name]),
+            )
+            for name in dict.fromkeys(log.texts("phase"))
+        ),
+        rest_v,
+        float(known[0]) if known.size else math.nan,
+        float(known[-1]) if known.size else math.nan,
+        _lowest_v(volts),
+        fit_battery(state) if is_loaded else None,
+        charge_at(state.rest_v) if is_loaded and state.rest_v is not None else None,
+    )
+
+
+def _lowest_v(volts: Array) -> float:
+    known = volts[volts >= NO_BATTERY_READING_V]
+    return float(known.min()) if known.size else math.nan
+
+
+# --- the loop -------------------------------------------------------------------------------
+
+
+def timings_of(log: FlightLog) -> dict[str, Array]:
+    """What each turn took, s, by name: how late it began, and what the log has of its parts; a
+    flight in lockstep has none of them."""
+    late = log.column("late_s")
+    found = {"late": late[np.isfinite(late)]}
+    timings = [t for r in log.turn_records if isinstance(t := r.get("timing"), dict)]
+    for key in dict.fromkeys(key for timing in timings for key in timing):
+        found[key.removesuffix("_s")] = np.array([t.get(key, math.nan) for t in timings], float)
+    return found

@@ -1,0 +1,357 @@
+"""What a flight was: one value under `log show`, `compare`, `plot` and `report`."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from perchctl.analysis.edges import (
+    BatteryUse,
+    ExternalHealth,
+    LinkHealth,
+    battery_of,
+    external_of,
+    link_of,
+)
+from perchctl.analysis.sight import (
+    LED_BY_CAMERA,
+    SAME_S,
+    Frames,
+    Loss,
+    Motion,
+    Stay,
+    Vision,
+    frames_of,
+    losses_of,
+    motion_of,
+    percentile,
+    vision_of,
+    within,
+)
+from perchctl.geometry import Array
+from perchctl.log import FlightLog, FlightSummary, summarise_flight
+from perchctl.mission import Findings, flight_findings
+from perchctl.profile import CameraConfig
+from perchctl.vision import Consistency
+
+SETTLED_S = 1.0
+"""So long before the contact begins is looked at for how well the vehicle has settled."""
+WHOLE_FLIGHT = "whole flight"
+LED_PHASES = "in these phases"
+_NUMBER = re.compile(r"[0-9.]+")
+
+
+@dataclass(frozen=True)
+class Hold:
+    """The vehicle was held in place; times since the flight's first turn."""
+
+    start_s: float
+    end_s: float
+    phase: str
+    reason: str
+
+    @property
+    def duration_s(self) -> float:
+        return self.end_s - self.start_s
+
+
+def _number(label: str, unit: str = "", scale: float = 1.0, digits: int = 0) -> Any:
+    """A number that may be unknown, and how people read it: `label`, and so many `digits` of
+    `scale` times it in `unit`."""
+    shown = {"label": label, "unit": unit, "scale": scale, "digits": digits}
+    return field(default=None, metadata=shown)
+
+
+@dataclass(frozen=True)
+class Measures:
+    """The numbers by which flights are compared; None is not known.
+
+    The settled errors are the RMS over the last `SETTLED_S` of the ascent from which the last
+    contact was begun: horizontal distance of gear and target, and heading.
+    """
+
+    duration_s: float | None = _number("flight", "s", digits=1)
+    attempts: int | None = _number("attempts")
+    miss_m: float | None = _number("miss", "mm", 1e3, 1)
+    settled_xy_rms_m: float | None = _number("settled, aside, RMS", "mm", 1e3, 1)
+    settled_yaw_rms_rad: float | None = _number("settled, heading, RMS", "deg", 180 / np.pi, 2)
+    latency_s: float | None = _number("latency found", "ms", 1e3, 0)
+    latency_sigma_s: float | None = _number("latency, SD", "ms", 1e3, 1)
+    battery_start_v: float | None = _number("battery, first", "V", digits=2)
+    battery_min_v: float | None = _number("battery, lowest", "V", digits=2)
+    battery_end_v: float | None = _number("battery, last", "V", digits=2)
+    frames: int | None = _number("frames")
+    frames_unseen: int | None = _number("frames without target")
+    frame_rate_hz: float | None = _number("frames, median rate", "Hz", digits=1)
+    frame_age_s: float | None = _number("frames, median age", "ms", 1e3, 0)
+    frame_gaps: int | None = _number("gaps without a frame")
+    frame_gaps_s: float | None = _number("time in such gaps", "s", digits=2)
+    corner_rms_px: float | None = _number("corners' misfit, median", "px", digits=2)
+    turns: int | None = _number("turns of the loop")
+    late_p99_s: float | None = _number("turn late, 99 %", "ms", 1e3, 1)
+    telemetry_age_p99_s: float | None = _number("telemetry's age, 99 %", "ms", 1e3, 0)
+
+    def text(self, name: str) -> str:
+        """A number as people read it, without its unit; ``-`` where it is not known."""
+        (of,) = [f for f in fields(self) if f.name == name]
+        value = getattr(self, name)
+        if value is None:
+            return "-"
+        return f"{value * of.metadata['scale']:.{of.metadata['digits']}f}"
+
+
+class FlightAnalysis:
+    """What one flight was, worked out from its log; each part once, when it is first used.
+
+    Times count from the flight's first turn. Where a part needs a value that no flight writes it
+    raises InvalidValue, TypeError, ValueError, LookupError or AttributeError: `open_log` makes one
+    error of them.
+    """
+
+    def __init__(self, log: FlightLog) -> None:
+        self.log = log
+
+    @cached_property
+    def summary(self) -> FlightSummary:
+        """How it ended."""
+        return summarise_flight(self.log)
+
+    @cached_property
+    def t_s(self) -> Array:
+        """Times of the ticks, (n,)."""
+        return self.log.t_s
+
+    @property
+    def end_s(self) -> float:
+        """Time of the last tick."""
+        return self.log.end_s
+
+    # --- phases and holds
+
+    @cached_property
+    def stays(self) -> tuple[Stay, ...]:
+        """The phases in the order in which they were entered, with the rows that led there where
+        the log has its events; also an end that no tick followed."""
+        since, events = self.log.since, [e for e in self.log.events if e.get("event") == "phase"]
+        entered = [(span.phase, since(span.start_s), since(span.end_s), span.reason)
+                   for span in self.log.phases]  # fmt: skip
+        known = {round(start_s, 2) for _, start_s, _, _ in entered}
+        for event in events:
+            at_s = since(float(event["t_s"]))
+            if entered and at_s > entered[-1][2] - SAME_S and round(at_s, 2) not in known:
+                entered.append((str(event.get("phase") or ""), at_s, at_s, ""))
+        return tuple(_stay(*each, events, since) for each in entered)
+
+    @cached_property
+    def holds(self) -> tuple[Hold, ...]:
+        """Each stretch of turns in one phase that were held for one and the same reason, whatever
+        its numbers, which are the last ones'."""
+        found: list[Hold] = []
+        before: tuple[str, str] | None = None
+        phases, reasons = self.log.texts("phase"), self.log.texts("hold")
+        for t_s, phase, reason in zip(map(float, self.t_s), phases, reasons, strict=True):
+            this = (phase, _NUMBER.sub("", reason)) if reason else None
+            if before is not None:
+                last = found[-1]
+                found[-1] = replace(
+                    last, end_s=t_s, reason=reason if this == before else last.reason
+                )
+            if this is not None and this != before:
+                found.append(Hold(t_s, t_s, phase, reason))
+            before = this
+        return tuple(found)
+
+    @property
+    def notes(self) -> list[tuple[float, str]]:
+        """The log's notes, each with its time."""
+        return [
+            (self.log.since(float(event["t_s"])), str(event.get("reason") or ""))
+            for event in self.log.events
+            if event.get("event") == "note"
+        ]
+
+    # --- sight and edges
+
+    @cached_property
+    def frames(self) -> Frames:
+        """The camera frames that the pipeline was given."""
+        return frames_of(self.log)
+
+    @cached_property
+    def motion(self) -> Motion:
+        """Speed and blur at each tick."""
+        return motion_of(self.log)
+
+    @cached_property
+    def losses(self) -> tuple[Loss, ...]:
+        """When the target was out of sight while it was needed."""
+        return losses_of(self.log, self.frames, self.motion, self.stays)
+
+    @cached_property
+    def vision(self) -> Vision:
+        """How well the camera saw over the whole flight."""
+        return vision_of(self.log, self.frames, self.motion, WHOLE_FLIGHT)
+
+    @cached_property
+    def vision_led(self) -> Vision:
+        """How well it saw in all phases together in which the camera leads."""
+        return vision_of(self.log, self.frames, self.motion, LED_PHASES, LED_BY_CAMERA)
+
+    @cached_property
+    def vision_by_phase(self) -> tuple[Vision, ...]:
+        """How well it saw in each of these phases that had a frame."""
+        each = [
+            vision_of(self.log, self.frames, self.motion, phase, (phase,))
+            for phase in LED_BY_CAMERA
+        ]
+        return tuple(vision for vision in each if vision.frames)
+
+    @cached_property
+    def link(self) -> LinkHealth:
+        """Telemetry and setpoints."""
+        return link_of(self.log)
+
+    @cached_property
+    def external(self) -> ExternalHealth | None:
+        """External positions; None where the vehicle's decks measured its position."""
+        return external_of(self.log)
+
+    @cached_property
+    def battery(self) -> BatteryUse:
+        """Voltages, charge and load."""
+        return battery_of(self.log)
+
+    @cached_property
+    def findings(self) -> Findings | None:
+        """Latency and mounting as the flight showed them: the summary's, or in a log without its
+        end what the last ticks had worked out. None where neither is there."""
+        return self.summary.findings if self.log.summary is not None else _last_findings(self.log)
+
+    @cached_property
+    def measures(self) -> Measures:
+        """The numbers by which flights are compared."""
+        end, log, vision, battery = self.summary, self.log, self.vision, self.battery
+        xy_m, yaw_rad = self._settled()
+        return Measures(
+            duration_s=end.duration_s if log.records or end.duration_s else None,
+            attempts=end.attempts,
+            miss_m=end.miss_m,
+            settled_xy_rms_m=xy_m,
+            settled_yaw_rms_rad=yaw_rad,
+            latency_s=None if end.findings is None else end.findings.latency_s,
+            latency_sigma_s=None if end.findings is None else end.findings.latency_sigma_s,
+            battery_start_v=_known(battery.start_v),
+            battery_min_v=end.battery_min_v,
+            battery_end_v=_known(battery.end_v),
+            frames=vision.frames,
+            frames_unseen=vision.frames - vision.with_target,
+            frame_rate_hz=_known(vision.rate_hz),
+            frame_age_s=_known(vision.age_s),
+            frame_gaps=len(self.frames.gaps_s),
+            frame_gaps_s=float(np.sum(np.diff(self.frames.gaps_s, axis=1))),
+            corner_rms_px=_known(vision.misfit_px),
+            turns=len(log.records),
+            late_p99_s=_known(percentile(log.column("late_s"), 99)),
+            telemetry_age_p99_s=_known(self.link.age_most_s),
+        )
+
+    def _settled(self) -> tuple[float | None, float | None]:
+        """Horizontal and heading error before the last contact."""
+        ascent = last_ascent(self.stays)
+        if ascent is None:
+            return None, None
+        start_s = max(ascent.start_s, ascent.end_s - SETTLED_S) - SAME_S / 2
+        inside = (self.t_s >= start_s) & (self.t_s < ascent.end_s - SAME_S / 2)
+        x_m, y_m, yaw_rad = (self.log.column(k)[inside] for k in ("ex_m", "ey_m", "eyaw_rad"))
+        known = np.isfinite(x_m + y_m + yaw_rad)
+        if not known.any():
+            return None, None
+        return (
+            float(np.sqrt(np.mean(x_m[known] ** 2 + y_m[known] ** 2))),
+            float(np.sqrt(np.mean(yaw_rad[known] ** 2))),
+        )
+
+    # --- single ticks
+
+    def tracked(self, key: str) -> Array:
+        """A field over the ticks, (n,), NaN where the target is only remembered."""
+        remembered = [record.get("tracked") is False for record in self.log.records]
+        return np.where(remembered, np.nan, self.log.column(key))
+
+    def index_at(self, t_s: float) -> int:
+        """Index of the newest tick at that time."""
+        return max(0, int(np.searchsorted(self.t_s, t_s + SAME_S / 2, side="right")) - 1)
+
+    def at(self, t_s: float, key: str) -> float:
+        """A field at that time; NaN where it is missing or no number."""
+        value = self.log.records[self.index_at(t_s)].get(key) if self.log.records else None
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            return math.nan
+        return float(value)
+
+    def height_m(self, t_s: float) -> float:
+        """Height above the place of the first tick."""
+        return self.at(t_s, "z_m") - self.at(0.0, "z_m")
+
+    def within(self, start_s: float, end_s: float) -> slice:
+        """The ticks from one time to another."""
+        return within(self.t_s, start_s, end_s)
+
+
+def last_ascent(stays: Sequence[Stay]) -> Stay | None:
+    """The ascent from which the last contact was begun; None without a contact."""
+    ascents = [a for a, b in pairwise(stays) if (a.phase, b.phase) == ("ASCEND", "PERCH")]
+    return ascents[-1] if ascents else None
+
+
+def _stay(
+    phase: str, start_s: float, end_s: float, reason: str, events: Sequence[Any], since: Any
+) -> Stay:
+    event: Any = next(
+        (
+            event
+            for event in events
+            if event.get("phase") == phase and abs(since(float(event["t_s"])) - start_s) < SAME_S
+        ),
+        {},
+    )
+    words = [str(event.get(key) or "") for key in ("reason", "row", "severity", "simulated")]
+    return Stay(phase, start_s, end_s, reason or words[0], *words[1:])
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+WORKED_OUT = (
+    "delay_s",
+    "delay_sigma_s",
+    *(f"turn_{axis}{part}_rad" for axis in "xyz" for part in ("", "_sigma")),
+)
+
+
+def _last_findings(log: FlightLog) -> Findings | None:
+    newest = next(
+        (r for r in reversed(log.records) if all(r.get(k) is not None for k in WORKED_OUT)), None
+    )
+    if newest is None:
+        return None
+    try:
+        camera = CameraConfig.model_validate(log.setting("camera"))
+    except ValidationError:  # of an older perchctl
+        return None
+    seen = Consistency(
+        delay_s=newest["delay_s"],
+        delay_sigma_s=newest["delay_sigma_s"],
+        turn_rad=tuple(newest[f"turn_{axis}_rad"] for axis in "xyz"),
+        turn_sigma_rad=tuple(newest[f"turn_{axis}_sigma_rad"] for axis in "xyz"),
+    )
+    return flight_findings(seen, camera)

@@ -1,0 +1,319 @@
+"""One log replayed: as it was flown, or with another profile."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import perchctl
+from perchctl.analysis.compare import profile_differences
+from perchctl.analysis.decide import (
+    Decided,
+    Difference,
+    decide,
+    first_differing,
+    first_of,
+    whole_turns,
+)
+from perchctl.analysis.sense import (
+    Picture,
+    PictureAnother,
+    PictureMissing,
+    PicturesUnreadable,
+    Sensed,
+    older,
+    one_thread,
+    placed_later_s,
+    sense,
+    shown,
+)
+from perchctl.calibration import profile_camera
+from perchctl.errors import InvalidValue
+from perchctl.flight import SENSED
+from perchctl.log import FlightLog
+from perchctl.mission import Observation, Turn
+from perchctl.profile import Profile
+from perchctl.vision import Pipeline, make_pipeline
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What the senses made of pictures, telemetry and times; or of the last two alone.
+
+    Attributes:
+        turns: each, seen again, up to where a picture is missing.
+        differences: turns of which a pose, or what the planner sees, differs; `first` of them.
+        frames: pictures that were looked at, of `frames_flown`.
+        ended: why it ends before the flight does, or empty.
+        another: it ends at a picture that is not the flown one.
+        unreadable: it ends where the recording cannot be read.
+    """
+
+    turns: Sequence[Sensed]
+    differences: int
+    first: Difference | None
+    frames: int = 0
+    frames_flown: int = 0
+    ended: str = ""
+    another: bool = False
+    unreadable: bool = False
+
+    @property
+    def same(self) -> bool:
+        """Of pictures none of which was looked at that is not known; of those that cannot be
+        read, nothing is."""
+        unseen = bool(self.ended) and not self.frames and not self.unreadable
+        return not (self.differences or self.another or unseen)
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """Attributes:
+    decided: each turn of the planner, decided again.
+    ticks: how many were flown; `differences`, how many of them were decided otherwise; `first`
+        may be of one that was not sent.
+    seen: by pictures; None without any.
+    shown: by telemetry and times alone; None where pictures were looked at to the end.
+    changed: the keys in which the profile is another than the flown one's.
+    gap: which turn is the first that the log has lost, or empty.
+    notes: what limits the replay, in sentences.
+    """
+
+    log: FlightLog
+    profile: Profile
+    decided: Sequence[Decided]
+    ticks: int
+    differences: int
+    first: Difference | None
+    seen: Seen | None = None
+    shown: Seen | None = None
+    changed: tuple[str, ...] = ()
+    gap: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def same(self) -> bool:
+        shown = self.shown is None or self.shown.first is None
+        return self.first is None and shown and (self.seen is None or self.seen.same)
+
+
+def replay(
+    log: FlightLog,
+    pictures: Iterable[Picture] | None = None,
+    profile: Profile | None = None,
+    pipeline: Pipeline | None = None,
+) -> Replay:
+    """The flight again, by its own profile; or, with `profile`, what that would have changed.
+
+    As it was flown the planner is given the recorded observations, and the pictures are compared
+    for themselves; with another profile it is given what that sees in the pictures. `pipeline`
+    looks at them; by default the profile's, with the flown calibration and mask. Without pictures
+    the same goes for what telemetry and times alone give.
+    Errors: InvalidValue, NotFound (a calibration or mask that another profile names).
+    """
+    flown = log.flown_profile
+    whole = whole_turns(log)
+    turns, used = whole.turns, profile or flown
+    changed = changed_keys(flown, used)
+    seen = None
+    if pictures is not None:
+        pipeline = pipeline or pipeline_of(log, used, changed)
+        # A source takes the latency off the time at which a picture came.
+        later_s = flown.camera.start_latency_s - used.camera.start_latency_s
+        placed_s = placed_later_s(turns, flown, used)
+        seen = _seen(log, turns, used, pictures, pipeline, later_s, placed_s)
+    by_telemetry = None
+    unseen = seen is None or not (seen.frames or seen.another)
+    if unseen or (seen is not None and seen.ended):
+        found = list(shown(turns, flown, used))
+        by_telemetry = Seen(found, *_differing(log, turns, found))
+    again, ended = by_telemetry if unseen else seen, "" if seen is None else seen.ended
+    observations: dict[int, Observation | None] = {}
+    if again is not None and changed:
+        observations = {each.turn.number: each.observation for each in again.turns}
+        turns = turns[: len(again.turns)]
+    decided = list(
+        decide(turns, used, lambda turn: observations.get(turn.number, turn.observation))
+    )
+    return Replay(
+        log=log,
+        profile=used,
+        decided=decided,
+        ticks=sum(each.turn.role == "flown" for each in decided),
+        differences=sum(each.differs for each in decided if each.turn.role == "flown"),
+        first=first_of(decided, log.start_s),
+        seen=seen,
+        shown=by_telemetry,
+        changed=changed,
+        gap=whole.gap,
+        notes=(
+            *notes_of(log, whole.gap, ended, changed, pictures=not unseen),
+            *_failures(decided),
+        ),
+    )
+
+
+def check_readable(log: FlightLog) -> None:
+    """Decode all that a replay takes from the log. Errors: InvalidValue, and those of a value that
+    no flight writes."""
+    whole_turns(log)
+    _ = log.flown_profile
+    camera = log.flown_camera
+    if camera is not None:
+        log.flown_mask(camera)
+    if not math.isfinite(log.start_s):
+        raise ValueError("the first turn has no time")
+
+
+def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:
+    """The dotted keys in which two profiles differ, but for what only names or describes."""
+    found = profile_differences(one.model_dump(mode="json"), other.model_dump(mode="json"))
+    return tuple(key for key in found if key not in ("name", "description", "date"))
+
+
+def pipeline_of(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -> Pipeline:
+    """The flown calibration and mask, unless others are named by now. Errors: InvalidValue,
+    NotFound."""
+    camera = log.flown_camera
+    if camera is None or {"camera.calibration", "camera.cam"} & {*changed}:
+        camera = profile_camera(profile.camera)
+    if profile.camera.mask is None or "camera.mask" in changed:
+        return make_pipeline(profile, camera)
+    try:
+        return make_pipeline(profile, camera, log.flown_mask(camera))
+    except ValueError as error:
+        raise InvalidValue(f"{log.path}: its mask does not fit its calibration: {error}") from None
+
+
+def _seen(
+    log: FlightLog,
+    turns: Sequence[Turn],
+    profile: Profile,
+    pictures: Iterable[Picture],
+    pipeline: Pipeline,
+    later_s: float,
+    placed_later_s: float,
+) -> Seen:
+    found: list[Sensed] = []
+    missing: PictureMissing | None = None
+    with one_thread():
+        try:
+            for each in sense(turns, profile, pipeline, pictures, later_s):
+                found.append(older(each, placed_later_s))
+        except PictureMissing as error:
+            missing = error
+    return Seen(
+        found,
+        *_differing(log, turns, found),
+        frames=_frames_of(each.turn for each in found),
+        frames_flown=_frames_of(turns),
+        ended=f"{missing}: what came after it cannot be seen again" if missing else "",
+        another=isinstance(missing, PictureAnother),
+        unreadable=isinstance(missing, PicturesUnreadable),
+    )
+
+
+def _differing(
+    log: FlightLog, turns: Sequence[Turn], found: Iterable[Sensed]
+) -> tuple[int, Difference | None]:
+    """In how many turns it is not what was seen, and the first."""
+    start = next((t.number for t in turns if t.role != "waiting"), len(turns))
+    differing = [(each.turn, d) for each in found if (d := _unlike(each)) is not None]
+    if not differing:
+        return 0, None
+    turn, difference = differing[0]
+    first = Difference(_tick_of(turn, turns, start), turn.t_s - log.start_s, *difference)
+    return len(differing), first
+
+
+def _failures(decided: Sequence[Decided]) -> Iterator[str]:
+    for each in decided:
+        if each.error is not None:
+            as_flown = ", as in flight" if each.error == each.turn.error else ""
+            yield f"the planner breaks down on turn {each.turn.number}{as_flown}: {each.error}"
+
+
+def _frames_of(turns: Iterable[Turn]) -> int:
+    return sum(turn.taken.frame is not None and turn.taken.look for turn in turns)
+
+
+def _tick_of(turn: Turn, turns: Sequence[Turn], start: int) -> int:
+    if turn.number < start:
+        return turn.number - start
+    return sum(t.role == "flown" for t in turns[start : turn.number])
+
+
+def _unlike(sensed: Sensed) -> tuple[str, object, object] | None:
+    """The first field in which what is seen is not what was seen."""
+    turn, seen = sensed.turn, sensed.observation
+    found = first_differing("poses", turn.poses, sensed.poses)
+    if found is not None or turn.observation is None or seen is None:
+        return found
+    for name in (*SENSED, "position_age_s"):
+        found = first_differing(name, getattr(turn.observation, name), getattr(seen, name))
+        if found is not None:
+            return found
+    return None
+
+
+# --- What limits a replay, in sentences --------------------------------------------------------
+
+
+ON_PICTURES = ("camera", "detector", "pose", "kalman", "merge", "target", "vehicle")
+ON_NEITHER = ("link", "simulation", "log")
+BEFORE_TAKEOFF = (
+    "safety.min_rest_v", "safety.estimator_wait_s", "safety.estimator_variance_m2",
+    "safety.ground_z_m", "safety.ground_tolerance_m", "safety.start_tilt_deg",
+    "positioning.connect_timeout_s",
+)  # fmt: skip
+ON_AGES = ("positioning.hold_s", "positioning.land_s", "positioning.latency_s")
+"""Of `positioning` these act on the positions' ages, which are recorded; the others on which
+positions the vehicle is given."""
+
+
+def notes_of(
+    log: FlightLog, gap: str, ended: str, changed: Sequence[str], *, pictures: bool
+) -> Iterator[str]:
+    """`ended`: why the pictures do so before the flight; `pictures`: some were looked at."""
+    made_by = log.header.get("perchctl")
+    if made_by != perchctl.__version__:
+        yield (
+            f"perchctl {made_by} flew it, and this is {perchctl.__version__}: what differs may be "
+            f"what has been changed on purpose since"
+        )
+    elsewhere = log.computer_differences
+    if elsewhere:
+        yield f"it was flown with {elsewhere}: the last bits of a number may differ for that alone"
+    if log.truncated:
+        yield "the log ends in the flight, without its summary: replayed is what is there"
+    yield from (note for note in (gap, ended) if note)
+    yield from _on_keys(changed, pictures)
+
+
+def _on_keys(changed: Sequence[str], pictures: bool) -> Iterator[str]:
+    def those(*sections: str) -> list[str]:
+        return [key for key in changed if key.split(".")[0] in sections]
+
+    told = (
+        (
+            [] if pictures else those(*ON_PICTURES),
+            "what it would change in the pictures cannot be shown, as there are none to look at",
+        ),
+        (
+            [] if pictures else [key for key in changed if key == "safety.max_frame_age_s"],
+            "another picture that is let pass or refused changes the camera's age; what it would "
+            "change in the target's estimate cannot be shown, as there are no pictures to look at",
+        ),
+        (
+            [key for key in those("positioning") if key not in (*ON_AGES, *BEFORE_TAKEOFF)],
+            "which positions the vehicle would have been given, and where it would have taken "
+            "itself to be, cannot be shown: a log has only those that it was given",
+        ),
+        (
+            [key for key in changed if key in BEFORE_TAKEOFF],
+            "it is asked before take-off only, and a replay begins with the flight",
+        ),
+        (those(*ON_NEITHER), "a replay has nothing that it acts on"),
+    )
+    yield from (f"{', '.join(keys)}: {text}" for keys, text in told if keys)

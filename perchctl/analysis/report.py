@@ -1,0 +1,457 @@
+"""A page that reports one flight, or a session of several, and needs no other file."""
+
+from __future__ import annotations
+
+import base64
+import math
+import os
+import re
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jinja2
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+import perchctl
+from perchctl.analysis.advice import Advice, advice_of
+from perchctl.analysis.edges import timings_of
+from perchctl.analysis.figures import battery_figure, flight_figures, histogram, trend
+from perchctl.analysis.flight import FlightAnalysis
+from perchctl.analysis.show import utc_text
+from perchctl.analysis.sight import percentile
+from perchctl.analysis.story import SEVEN, Sentence, story_of
+from perchctl.analysis.words import count, kept_together, length, milliseconds, share
+from perchctl.errors import PerchError
+from perchctl.files import write_files
+from perchctl.geometry import Array
+from perchctl.log import log_values, read_log, recorded_pictures, recording_path
+from perchctl.mission import latency_text, turn_text
+
+UNFINISHED = "unfinished"
+TITLES = {
+    "perched": "Perched",
+    "landed": "Landed",
+    "aborted": "Broken off",
+    "failed": "Failed",
+    UNFINISHED: "Unfinished: the log has no end",
+}
+GRADES = {"perched": "good", "landed": "warn"}
+MOST_STRETCHES, MOST_STOPS = 4, 6
+
+
+def write_report(log_paths: Sequence[Path], output: Path) -> Report:
+    """Writes the page, whole or not at all; returns what is on it.
+
+    Raises NotFound and InvalidValue, as `read_log` and `write_files`.
+    """
+    report = Report(tuple(reported_flight(path) for path in log_paths))
+    write_files({output: page_of(report.flights).encode("utf-8")})
+    return report
+
+
+@dataclass(frozen=True)
+class Report:
+    """The flights on a page, at least one."""
+
+    flights: tuple[ReportedFlight, ...]
+
+    @property
+    def counts_text(self) -> str:
+        """``one flight: perched``, ``4 flights: 3 perched, 1 landed``."""
+        outcomes = [told.outcome for told in self.flights]
+        if len(outcomes) == 1:
+            return f"one flight: {outcomes[0]}"
+        each = ", ".join(f"{outcomes.count(name)} {name}" for name in dict.fromkeys(outcomes))
+        return f"{len(outcomes)} flights: {each}"
+
+    def record(self) -> list[dict[str, Any]]:
+        """The flights as JSON's own types."""
+        return [
+            {
+                "log": str(told.flight.log.path),
+                "outcome": told.outcome,
+                "miss_m": told.flight.summary.miss_m,
+                "used_mah": round(told.flight.battery.used_mah, 1),
+                "pictures": None if told.pictures is None else len(told.pictures),
+                "advice": [f"{a.about}: {a.text} ({a.evidence})" for a in told.advice],
+            }
+            for told in self.flights
+        ]
+
+
+def reported_flight(log_path: Path) -> ReportedFlight:
+    """One flight, with what was recorded beside its log. A recording that cannot be read costs
+    the pictures only.
+
+    Raises NotFound and InvalidValue for the log, as `read_log`.
+    """
+    flight, recording = FlightAnalysis(read_log(log_path)), recording_path(log_path)
+    if not recording.is_file():
+        return ReportedFlight(flight)
+    with log_values(log_path):
+        return with_pictures(
+            flight, lambda numbers: recorded_pictures(recording, exact=False, numbers=numbers)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ReportedFlight:
+    """One flight as the page has it. `pictures` is None where no recording was made;
+    `picture_problem` says why some could not be read."""
+
+    flight: FlightAnalysis
+    pictures: tuple[Shown, ...] | None = None
+    picture_problem: str = ""
+
+    @cached_property
+    def story(self) -> tuple[Sentence, ...]:
+        """What happened."""
+        return story_of(self.flight)
+
+    @cached_property
+    def advice(self) -> tuple[Advice, ...]:
+        """What to change for the next flight."""
+        return advice_of(self.flight)
+
+    @property
+    def outcome(self) -> str:
+        """`UNFINISHED` for a log without its end."""
+        return UNFINISHED if self.flight.log.summary is None else self.flight.summary.outcome
+
+    @property
+    def grade(self) -> str:
+        """How good that is: good, warn or bad."""
+        return GRADES.get(self.outcome, "bad")
+
+    @property
+    def title(self) -> str:
+        """How it ended, and by how much it missed the target's centre."""
+        miss_m = self.flight.summary.miss_m
+        title = TITLES.get(self.outcome, self.outcome)
+        return title if miss_m is None else f"{title}, {length(miss_m)} off centre"
+
+    @property
+    def name(self) -> str:
+        """The log's, without its folder: a page that is sent on does not tell of a computer."""
+        return self.flight.log.path.name
+
+    @property
+    def profile(self) -> str:
+        """The profile's name."""
+        return self.flight.log.profile_name or "?"
+
+    @property
+    def when(self) -> str:
+        """In UTC; a simulated flight in lockstep has no date."""
+        header = self.flight.log.header
+        if header.get("started_utc"):
+            return utc_text(header["started_utc"])
+        return "simulated, without a date" if header.get("lockstep") else "not known"
+
+    @property
+    def align_s(self) -> float:
+        """In ALIGN altogether, NaN where it never came to that."""
+        stays = [stay.duration_s for stay in self.flight.stays if stay.phase == "ALIGN"]
+        return sum(stays) if stays else math.nan
+
+    @property
+    def faults(self) -> list[str]:
+        """What the log lacks, a sentence each."""
+        end, log = self.flight.summary, self.flight.log
+        found = []
+        if not log.records:
+            found.append("The log holds no turn of a flight: there is nothing to tell.")
+        if log.summary is None:
+            found.append(
+                "The log ends without its summary: the program was killed, or lost its disk or its "
+                "power. What is told here ends with its last record."
+            )
+        if log.ignored_bytes:
+            found.append(f"Its last {log.ignored_bytes} bytes could not be read and are left out.")
+        if end.lost_records:
+            why = end.log_problem or "no reason is known"
+            found.append(f"The log lacks {count(end.lost_records, 'record')}: {why}.")
+        elif end.log_problem:
+            found.append(f"The log may lack its last records: {end.log_problem}.")
+        return found
+
+    @property
+    def vision_rows(self) -> list[tuple[str, ...]]:
+        """Of each phase in which the camera leads, and of all of them together."""
+        return [
+            (
+                vision.phase,
+                str(vision.frames),
+                share(vision.share),
+                _known(f"{vision.rate_hz:.1f} /s"),
+                milliseconds(vision.age_s),
+                milliseconds(vision.age_most_s),
+                _known(f"{vision.misfit_px:.2f} px"),
+                _known(f"{vision.blur_px:.1f}, {vision.blur_most_px:.1f} px"),
+            )
+            for vision in (*self.flight.vision_by_phase, self.flight.vision_led)
+        ]
+
+    @property
+    def longest_gap_s(self) -> float:
+        """The longest time without a picture; 0 without any gap."""
+        return max((float(b - a) for a, b in self.flight.frames.gaps_s), default=0.0)
+
+    @property
+    def old_telemetry(self) -> str:
+        """When telemetry was old; empty where it never was."""
+        old = self.flight.link.old
+        shown = [f"at {start:.1f} s up to {milliseconds(worst)}" for start, _, worst in old]
+        first = ", ".join(shown[:MOST_STRETCHES])
+        rest = len(old) - MOST_STRETCHES
+        return first if rest <= 0 else f"{first}, and {rest} more"
+
+    @property
+    def commands(self) -> str:
+        """How many turns sent each kind of command."""
+        return ", ".join(f"{kind} {number}" for kind, number in self.flight.link.sent)
+
+    @property
+    def stops(self) -> str:
+        """When and why no external position was sent."""
+        stops = () if self.flight.external is None else self.flight.external.stops
+        return "; ".join(
+            f"at {a:.1f} s for {b - a:.1f} s: {why}" for a, b, why in stops[:MOST_STOPS]
+        )
+
+    @property
+    def battery_rows(self) -> list[tuple[str, ...]]:
+        """Of each phase."""
+        return [
+            (
+                phase.phase,
+                f"{phase.duration_s:.1f} s",
+                f"{phase.used_mah:.1f} mAh",
+                f"{phase.mean_thrust / 655.35:.0f} %",
+                _known(f"{phase.lowest_v:.2f} V"),
+            )
+            for phase in self.flight.battery.phases
+            if phase.duration_s > 0
+        ]
+
+    @cached_property
+    def timings(self) -> dict[str, Array]:
+        """What each turn took, s, by name."""
+        return timings_of(self.flight.log)
+
+    @property
+    def timing_rows(self) -> list[tuple[str, ...]]:
+        """Median, 99 of 100 below, and the longest."""
+        return [
+            (name, *(milliseconds(percentile(values, percent)) for percent in (50, 99, 100)))
+            for name, values in self.timings.items()
+        ]
+
+
+def _known(text: str) -> str:
+    return "-" if "nan" in text else text
+
+
+# --- the page ---------------------------------------------------------------------------
+
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+"""No script, nothing from elsewhere: the browser holds the page to it."""
+SESSION = "flights"
+
+
+def page_of(flights: Sequence[ReportedFlight]) -> str:
+    """HTML that needs nothing else. `flights` has at least one. Raises InvalidValue for a value
+    that no flight writes."""
+    is_session = len(flights) > 1
+    articles = [
+        _article(told, number, SESSION if is_session else "")
+        for number, told in enumerate(flights, start=1)
+    ]
+    return _render(
+        "page.html",
+        flights=flights,
+        articles=articles,
+        session=_session(flights) if is_session else "",
+        counts=Report(tuple(flights)).counts_text,
+        policy=POLICY,
+        version=perchctl.__version__,
+    )
+
+
+def _article(told: ReportedFlight, number: int, back: str) -> Markup:
+    with log_values(told.flight.log.path):
+        html = _render(
+            "flight.html",
+            told=told,
+            flight=told.flight,
+            number=number,
+            back=back,
+            seven_phases=SEVEN,
+            latency_text=latency_text,
+            turn_text=turn_text,
+            flight_figures=flight_figures,
+            battery_figure=battery_figure,
+            histogram=histogram,
+        )
+    return _with_own_ids(html, f"f{number}-")
+
+
+def _session(flights: Sequence[ReportedFlight]) -> Markup:
+    each = [told.flight for told in flights]
+    misses_mm = [math.nan if f.summary.miss_m is None else 1e3 * f.summary.miss_m for f in each]
+    trends = [
+        trend("miss [mm]", misses_mm),
+        trend("aligning [s]", [told.align_s for told in flights]),
+        trend("lowest battery [V]", [flight.battery.lowest_v for flight in each]),
+        trend("used [mAh]", [flight.battery.used_mah for flight in each]),
+    ]
+    html = _render("session.html", flights=flights, session=SESSION, trends=trends)
+    return _with_own_ids(html, "session-")
+
+
+def _with_own_ids(html: str, prefix: str) -> Markup:
+    """The figures' names are this flight's: another's may be the same."""
+    own = re.sub(r'(<(?:path|clipPath|g|rect) id=")', rf"\g<1>{prefix}", html)
+    return Markup(re.sub(r'(<use href="#|url\(#)', rf"\g<1>{prefix}", own))
+
+
+def _render(name: str, **values: Any) -> str:
+    return _templates().get_template(name).render(values)
+
+
+@cache
+def _templates() -> jinja2.Environment:
+    """Text is escaped, always; only what the templates and the figures hold is not."""
+    templates = jinja2.Environment(
+        loader=jinja2.PackageLoader("perchctl.analysis"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    templates.filters.update(
+        together=kept_together,
+        length_text=length,
+        milliseconds=milliseconds,
+        share=share,
+        count=count,
+    )
+    templates.tests["finite"] = math.isfinite
+    return templates
+
+
+# --- What the camera saw when the mission decided: out of the recording beside the log ---------
+
+
+Recorded = Callable[[Collection[int]], Iterable[tuple[int, float, NDArray[np.uint8]]]]
+"""Gives the frames of some numbers: number, time, and the picture as the pipeline had it. Raises
+PerchError where the recording cannot be read."""
+
+DECIDED = {"ESTIMATE": "found", "ASCEND": "aligned", "PERCH": "settled", "COMPLETE": "contact"}
+OLD_S = 0.2
+"""An older picture shows another moment, and its caption says which."""
+MOST = 16
+"""Of a flight with many attempts the first and the last ones."""
+WIDEST_PX, JPEG_QUALITY = 480, 80
+LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A moment worth a picture; `frame`: the number of the newest frame then, which the loop
+    had at `seen_s`."""
+
+    t_s: float
+    name: str
+    frame: int
+    record: dict[str, Any]
+    seen_s: float
+
+    @property
+    def caption(self) -> str:
+        text = f"{self.name}, {self.t_s:.1f} s"
+        if self.t_s - self.seen_s > OLD_S:  # the last centimetres are flown without a picture
+            text += f"; the picture is from {self.seen_s:.1f} s"
+        up_m = self.record.get("ez_m")
+        return text if up_m is None else f"{text}, {length(float(up_m))} below"
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A decision with its picture as a JPEG, the markers drawn as they were found."""
+
+    decision: Decision
+    jpeg: bytes
+
+    @property
+    def address(self) -> str:
+        return "data:image/jpeg;base64," + base64.b64encode(self.jpeg).decode("ascii")
+
+
+def with_pictures(flight: FlightAnalysis, recorded: Recorded) -> ReportedFlight:
+    """The flight with the pictures of its decisions, as far as the recording can be read."""
+    shown, problem = shown_of(decisions_of(flight), recorded)
+    return ReportedFlight(flight, shown, problem.replace(f"{flight.log.path.parent}{os.sep}", ""))
+
+
+def decisions_of(flight: FlightAnalysis) -> tuple[Decision, ...]:
+    """In order: where the mission went on because of what was seen, and where sight was lost."""
+    moments = [(s.start_s, DECIDED[s.phase]) for s in flight.stays if s.phase in DECIDED]
+    for loss in flight.losses:
+        moments.append((loss.start_s + min(loss.duration_s, 0.5), "lost"))
+    found = []
+    for t_s, name in sorted(moments):
+        record = _frame_before(flight, t_s)
+        if record is not None:
+            seen_s = flight.log.since(float(record["t_s"]))
+            found.append(Decision(t_s, name, int(record["frame"]), record, seen_s))
+    if len(found) > MOST:
+        found = found[: MOST // 2] + found[-MOST // 2 :]
+    return tuple(found)
+
+
+def _frame_before(flight: FlightAnalysis, t_s: float) -> dict[str, Any] | None:
+    for record in flight.log.records[flight.index_at(t_s) :: -1]:
+        if record.get("frame") is not None:
+            return record
+    return None
+
+
+def shown_of(decisions: Iterable[Decision], recorded: Recorded) -> tuple[tuple[Shown, ...], str]:
+    """Those whose picture is in the recording, and why others could not be read, or nothing."""
+    wanted: dict[int, list[Decision]] = {}
+    for decision in decisions:
+        wanted.setdefault(decision.frame, []).append(decision)
+    found: list[Shown] = []
+    problem = ""
+    try:
+        for number, _t_s, image in recorded(wanted.keys()) if wanted else ():
+            for decision in wanted.pop(number, ()):
+                found.append(Shown(decision, _jpeg(decision, image)))
+            if not wanted:
+                break
+    except PerchError as error:
+        problem = str(error)
+    return tuple(sorted(found, key=lambda shown: shown.decision.t_s)), problem
+
+
+def _jpeg(decision: Decision, image: NDArray[np.uint8]) -> bytes:
+    drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
+    scale = min(1.0, WIDEST_PX / drawn.shape[1])
+    if scale < 1.0:
+        drawn = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    for key, colour in (("large_px", LARGE_BGR), ("small_px", SMALL_BGR)):
+        corners = decision.record.get(key)
+        if corners and len(corners) == 8:
+            # A pixel's centre is a whole number; shrunk, too.
+            points = (np.array(corners, dtype=np.float64).reshape(4, 2) + 0.5) * scale - 0.5
+            fixed = np.round(points * 16).astype(np.int32)
+            cv2.polylines(drawn, [fixed], True, colour, 2, cv2.LINE_AA, 4)
+    _, data = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return bytes(data)

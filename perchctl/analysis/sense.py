@@ -1,0 +1,313 @@
+"""A flight seen again: the recorded telemetry and pictures through the loop's own inputs.
+
+The same pictures, samples and times have to give the same poses, to the bit, on one thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import zlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.errors import InvalidValue, NotFound
+from perchctl.flight import ENDED_TEXT, SENSED, FlightInputs, lateness_text
+from perchctl.mission import FrameSeen, Observation, PoseSeen, Turn, TurnInputs
+from perchctl.perception import History, add_late_samples, add_samples, battery_age_s
+from perchctl.profile import Profile
+from perchctl.vehicle import Telemetry
+from perchctl.vision import Frame, Pipeline, TargetEstimate
+
+Picture = tuple[int, float, NDArray[np.uint8]]
+"""Of a frame: its number, its time as the source gave it, and the picture that was looked at."""
+
+
+class PictureMissing(Exception):
+    """The replay of pictures ends here; the message says why."""
+
+
+class PictureAnother(PictureMissing):
+    """It is there, and not the one that was flown by."""
+
+
+class PicturesUnreadable(PictureMissing):
+    """What should hold them is damaged, or is no recording."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sensed:
+    """One turn, seen again: `observation` with what the replay sees in the place of what was
+    seen, None before there is any telemetry."""
+
+    turn: Turn
+    poses: dict[str, PoseSeen]
+    observation: Observation | None
+
+
+class _Given:
+    """The recorded edges of one turn after another, as the inputs ask for them."""
+
+    def __init__(
+        self, pictures: Iterable[Picture], size_px: tuple[int, int], later_s: float
+    ) -> None:
+        self.size_px: tuple[int, int] | None = size_px
+        self._later_s = later_s
+        self._pictures = _readable(pictures)
+        self._name = "the recording"
+        self._shown: tuple[int | None, NDArray[np.uint8]] | None = None
+        self._taken = TurnInputs()
+        self._samples: list[tuple[Telemetry, ...]] = []
+
+    def turn(self, turn: Turn) -> None:
+        taken, obs = turn.taken, turn.observation
+        self._taken, self._samples = taken, [taken.samples, taken.late]
+        told = None if obs is None else obs.camera_problem
+        if taken.ended and told is not None and told.endswith(ENDED_TEXT):
+            self._name = told.removesuffix(ENDED_TEXT)  # no other record has the flown source's
+
+    # As a link.
+
+    def telemetry(self) -> list[Telemetry]:
+        return list(self._samples.pop(0))
+
+    # As a source of frames.
+
+    @property
+    def live(self) -> bool:
+        return self._taken.live
+
+    @property
+    def finished(self) -> bool:
+        return self._taken.ended
+
+    def poll(self, now_s: float) -> Frame | None:
+        seen = self._taken.frame
+        if seen is None:
+            return None
+        image = self._picture_of(seen)
+        t_s = seen.t_s + self._later_s if self._taken.live else seen.t_s
+        return Frame(seen.index, t_s, image, seen.t_arrival_s, seen.fields, seen.repeated)
+
+    def problem(self, now_s: float) -> str | None:
+        return self._taken.problem
+
+    def describe(self) -> str:
+        return self._name
+
+    def close(self) -> None:
+        return None
+
+    def _picture_of(self, seen: FrameSeen) -> NDArray[np.uint8]:
+        if self._taken.problem is not None:  # nobody looked at it
+            return np.zeros((1, 1), np.uint8)
+        image = self._again(seen) if seen.repeated else self._recorded(seen)
+        self._shown = (seen.checksum, image)
+        return image
+
+    def _again(self, seen: FrameSeen) -> NDArray[np.uint8]:
+        """One that the source repeated, which is not recorded: nothing is measured in it, but
+        whether its bytes are the same tells a frozen picture."""
+        if self._shown is None:
+            raise PictureMissing(f"the picture that frame {seen.index} repeats was not recorded")
+        checksum, image = self._shown
+        if seen.checksum != checksum:
+            image = image.copy()
+            image.flat[0] ^= 1
+        return image
+
+    def _recorded(self, seen: FrameSeen) -> NDArray[np.uint8]:
+        for index, t_s, image in self._pictures:
+            if (index, t_s) == (seen.index, seen.t_s):
+                if seen.checksum not in (None, zlib.crc32(image.tobytes())):
+                    raise PictureAnother(f"the picture of frame {seen.index} is another one")
+                return image
+            if index > seen.index:
+                break
+            # Otherwise of a frame that no turn took.
+        raise PictureMissing(f"the picture of frame {seen.index} was not recorded")
+
+
+def sense(
+    turns: Iterable[Turn],
+    profile: Profile,
+    pipeline: Pipeline,
+    pictures: Iterable[Picture],
+    later_s: float = 0.0,
+) -> Iterator[Sensed]:
+    """Each turn, in order, from the first before take-off on. `later_s` is added to the time at
+    which a live source's pictures were taken.
+
+    Raises PictureMissing where a frame was taken whose picture is not there, is another one or
+    cannot be read: from then on the pipeline would remember another flight.
+    """
+    given = _Given(pictures, pipeline.camera.size_px, later_s)
+    inputs = FlightInputs(given, given, pipeline, profile, recorded=True)
+    with one_thread():
+        for turn in turns:
+            given.turn(turn)
+            inputs.take_in(turn.began_s, look=turn.taken.look)
+            if turn.t_s != turn.began_s:
+                inputs.present(turn.began_s, turn.t_s)
+            yield Sensed(turn, inputs.poses, _observed(turn, inputs))
+
+
+def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
+    """A recording that cannot be read costs the planner's replay nothing."""
+    try:
+        yield from pictures
+    except (InvalidValue, NotFound) as error:
+        raise PicturesUnreadable(str(error)) from error
+
+
+def _observed(turn: Turn, inputs: FlightInputs) -> Observation | None:
+    if turn.observation is None or inputs.history.newest is None:
+        return None
+    seen = inputs.observation(turn.t_s)
+    return replace(turn.observation, **{name: getattr(seen, name) for name in SENSED})
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """OpenCV's sums then have one order."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
+
+
+# --- What the planner would be shown, from a log alone ------------------------------------------
+# The part of the inputs that needs no picture.
+# Telemetry and the frames' times are recorded, so whether the estimate jumped, how old battery and
+# camera are, and which picture came too late can be judged anew. What a picture showed cannot: the
+# target stays where it was estimated in the flight.
+
+
+@dataclass
+class _Camera:
+    """What a replay remembers of the camera from one turn to the next.
+
+    `told` is the trouble as it was recorded, `problem` as the replay has it; `alive`: the filter's
+    own word on whether it tracks, which a stale or unwatched picture hides.
+    """
+
+    young_s: list[float] = field(default_factory=list)  # turns before take-off with such a picture
+    before: Observation | None = None
+    good_s: float = -math.inf
+    problem: str | None = None
+    alive: bool = False
+
+
+def shown(turns: Sequence[Turn], flown: Profile, profile: Profile) -> Iterator[Sensed]:
+    """Each turn, in order, from the first before take-off on: `flown` is the profile that it was
+    flown by, `profile` the one whose `safety` and `positioning` count. With the same one twice
+    the observations are the recorded ones, to the bit."""
+    history, camera = History(), _Camera()
+    later_s = placed_later_s(turns, flown, profile)
+    for turn in turns:
+        history = add_samples(history, list(turn.taken.samples), profile.safety)
+        if turn.t_s != turn.began_s:
+            history = add_late_samples(history, list(turn.taken.late), profile.safety)
+        obs, newest = turn.observation, history.newest
+        if obs is None or newest is None:
+            if _is_judged(turn) and _late(turn, 0.0, profile) is None:
+                camera.young_s.append(turn.began_s)
+            yield Sensed(turn, turn.poses, None)
+            continue
+        again = replace(
+            _pictured(turn, obs, camera, flown, profile),
+            telemetry=newest,
+            battery_age_s=battery_age_s(history, turn.t_s),
+            jumped=history.jumped,
+            turned_rad=history.turned_rad,
+        )
+        yield older(Sensed(turn, turn.poses, again), later_s)
+
+
+def placed_later_s(turns: Sequence[Turn], flown: Profile, profile: Profile) -> float:
+    """How much older positions from outside are by the other profile; 0 of a flight by decks."""
+    if not any(turn.outside is not None for turn in turns):
+        return 0.0
+    return profile.positioning.latency_s - flown.positioning.latency_s
+
+
+def older(sensed: Sensed, later_s: float) -> Sensed:
+    """With positions that are so much older."""
+    obs = sensed.observation
+    if obs is None or not later_s:
+        return sensed
+    aged = replace(obs, position_age_s=obs.position_age_s + later_s)
+    return replace(sensed, observation=aged)
+
+
+def _pictured(
+    turn: Turn, obs: Observation, camera: _Camera, flown: Profile, profile: Profile
+) -> Observation:
+    """The observation with another `max_frame_age_s` and `camera_hold_s`.
+
+    A good picture makes the camera's age 0, and nothing else does.
+    """
+    before = camera.before
+    if before is None:
+        camera.good_s = _good_before(obs, camera.young_s)
+    good = was_good = obs.camera_age_s == 0.0
+    used_s = obs.delay_s if before is None else before.delay_s
+    was_late, late = _late(turn, used_s, flown), _late(turn, used_s, profile)
+    was_late = None if was_good or obs.camera_problem != was_late else was_late
+    if late is not None and (was_good or was_late is not None):
+        good, camera.problem = False, late
+    elif was_late is not None:
+        good, camera.problem = True, None
+    elif was_good or before is None or obs.camera_problem != before.camera_problem:
+        camera.problem = obs.camera_problem
+    if good:
+        camera.good_s = turn.t_s
+    camera.before = obs
+    return replace(
+        obs,
+        target=_target(turn, obs, camera, flown, profile),
+        new_frame=obs.new_frame and good,
+        camera_age_s=turn.t_s - camera.good_s,
+        camera_problem=camera.problem,
+    )
+
+
+def _target(
+    turn: Turn, obs: Observation, camera: _Camera, flown: Profile, profile: Profile
+) -> TargetEstimate | None:
+    """As it was estimated, and tracked while pictures are fresh and looked at."""
+    target = obs.target
+    if target is None:
+        return None
+    if turn.taken.look and obs.camera_age_s <= flown.safety.camera_hold_s:
+        camera.alive = target.tracked
+    fresh = turn.t_s - camera.good_s <= profile.safety.camera_hold_s
+    tracked = camera.alive and turn.taken.look and fresh
+    return target if tracked == target.tracked else replace(target, tracked=tracked)
+
+
+def _is_judged(turn: Turn) -> bool:
+    """It has a frame that is no old one once more."""
+    taken = turn.taken
+    return taken.frame is not None and not taken.frame.repeated and taken.problem is None
+
+
+def _late(turn: Turn, used_s: float, profile: Profile) -> str | None:
+    """What is said of its frame, where that is too old; `used_s` was taken off its time."""
+    frame = turn.taken.frame
+    if frame is None or not (_is_judged(turn) and turn.taken.live):
+        return None
+    return lateness_text(turn.began_s - (frame.t_s - used_s), profile.safety)
+
+
+def _good_before(obs: Observation, young_s: Iterable[float]) -> float:
+    """When the last good picture came before take-off: one that is young enough, and no newer
+    than the one from which the recorded age counts."""
+    good_s = (t_s for t_s in young_s if obs.t_s - t_s >= obs.camera_age_s)
+    return max(good_s, default=-math.inf)

@@ -1,0 +1,342 @@
+"""A flight as `perchctl log show` prints it: lines of at most `COLUMNS` columns, or one record; and
+the logs of a folder, a line each."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from textwrap import wrap
+from typing import Any
+
+from perchctl.analysis.flight import FlightAnalysis
+from perchctl.errors import NotFound, PerchError
+from perchctl.log import FlightLog, FlightSummary, read_ends, summarise_flight, summary_text
+
+COLUMNS = 79
+_HANG = 11
+"""Where the text of a line begins, behind its name."""
+_MOST_ROWS = 12
+_END_KEYS = (
+    "outcome", "cause", "reason", "locked", "fell", "contact_aside_m", "contact_sigma_m",
+    "touchdown_mps", "touchdown_g", "mount_turn_deg", "mount_turn_sigma_deg",
+)  # fmt: skip
+
+
+def show_record(flight: FlightAnalysis) -> dict[str, Any]:
+    """All that `show_text` shows, for programs: SI, times from the flight's first turn."""
+    log, end, header = flight.log, flight.summary, flight.log.header
+    ended = end.as_record()
+    return {
+        "log": str(log.path),
+        **{key: header.get(key) for key in ("version", "perchctl", "started_utc", "uri", "source")},
+        "profile": log.profile_name,
+        "seed": header.get("seed"),
+        "whole": not log.truncated,
+        "ignored_bytes": log.ignored_bytes,
+        **{key: ended.get(key) for key in _END_KEYS},
+        "advice": ended.get("advice") or [],
+        "lost_records": end.lost_records,
+        "log_problem": end.log_problem,
+        **asdict(flight.measures),
+        "phases": [
+            {
+                "phase": stay.phase,
+                "start_s": _rounded(stay.start_s),
+                "duration_s": _rounded(stay.duration_s),
+                "reason": stay.reason,
+                "row": stay.row or None,
+            }
+            for stay in flight.stays
+        ],
+        "holds": [
+            {
+                "start_s": _rounded(hold.start_s),
+                "duration_s": _rounded(hold.duration_s),
+                "phase": hold.phase,
+                "reason": hold.reason,
+            }
+            for hold in flight.holds
+        ],
+        "sent": [
+            {
+                "by": go.by,
+                "start_s": _rounded(log.since(go.start_s)),
+                "end_s": _rounded(log.since(go.end_s)),
+                "commands": dict(go.sent),
+            }
+            for go in log.takeovers
+        ],
+        "notes": [{"t_s": _rounded(t_s), "note": note} for t_s, note in flight.notes],
+    }
+
+
+def show_text(flight: FlightAnalysis) -> str:
+    """How it ended, its phases, what held it, and what is known of vision, link and battery."""
+    log = flight.log
+    lines = [*_end_lines(flight), *_named("record", _origin(log)), *_measure_lines(flight)]
+    if flight.stays:
+        lines += ["", "  at [s]  for [s]  phase     why"]
+    for stay in flight.stays:
+        why = stay.reason + (f" ({stay.row})" if stay.row else "")
+        lines += hung(f"{_span(stay.start_s, stay.duration_s)}{plain(stay.phase):<9} ", why)
+    lines += _table(
+        "  at [s]  for [s]  held in   because",
+        [
+            (f"{_span(hold.start_s, hold.duration_s)}{plain(hold.phase):<9} ", hold.reason)
+            for hold in flight.holds
+        ],
+    )
+    lines += _table(
+        "  at [s]  for [s]  sent by    in the loop's place",
+        [
+            (f"{_span(log.since(go.start_s), go.end_s - go.start_s)}{go.by:<10} ", go.text)
+            for go in log.takeovers
+        ],
+    )
+    lines += _table("  at [s]  note", [(f"{_rounded(at):8.2f}  ", n) for at, n in flight.notes])
+    return "\n".join(lines)
+
+
+def _table(head: str, rows: Sequence[tuple[str, str]]) -> Iterator[str]:
+    """The first rows, each with its begin and its text; nothing where there is none."""
+    if not rows:
+        return
+    yield ""
+    yield head
+    for begin, text in rows[:_MOST_ROWS]:
+        yield from hung(begin, text)
+    if len(rows) > _MOST_ROWS:
+        yield " " * len(rows[0][0]) + f"and {len(rows) - _MOST_ROWS} more: --json has all"
+
+
+def _span(start_s: float, duration_s: float) -> str:
+    return f"{_rounded(start_s):8.2f} {duration_s:8.2f}  "
+
+
+def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
+    """The lines that `fly` ends with, but for the phases, which come as a table."""
+    log = flight.log
+    end = replace(flight.summary, phases=(), battery_min_v=None)
+    first, *others = summary_text(end).splitlines()
+    yield from wrap(plain(first), COLUMNS, subsequent_indent="  ")
+    for line in others:
+        name, _, text = line.partition(":")
+        yield from _named(name, text.strip())
+    if log.summary is None:
+        yield from _named("log lost", "its end: the program was killed, or the disk failed")
+    if log.turn_records and not log.records:
+        yield from _named(
+            "ticks",
+            f"left out of this log; its {len(log.turn_records)} turns are whole: perchctl log "
+            f"replay decides them again",
+        )
+    if log.ignored_bytes:
+        yield from _named("log lost", f"its tail, {log.ignored_bytes} unreadable bytes")
+
+
+def _origin(log: FlightLog) -> str:
+    header = log.header
+    started, seed = header.get("started_utc"), header.get("seed")
+    parts = [
+        f"profile {log.profile_name or '?'}",
+        "" if seed is None else f"seed {seed}",
+        f"{header.get('uri', '?')} with {header.get('source', '?')}",
+        "" if not started else f"begun {utc_text(started)}",
+        f"perchctl {header.get('perchctl', '?')}, version {header.get('version')}",
+    ]
+    return ", ".join(part for part in parts if part)
+
+
+def utc_text(started_utc: Any) -> str:
+    """A header's `started_utc` as people read it."""
+    return str(started_utc).replace("T", " ").replace("+00:00", " UTC")
+
+
+def _measure_lines(flight: FlightAnalysis) -> Iterator[str]:
+    m, of = flight.measures, flight.measures.text
+    if m.settled_xy_rms_m is not None:
+        yield from _named(
+            "settled",
+            f"{of('settled_xy_rms_m')} mm aside and {of('settled_yaw_rms_rad')} deg RMS in the "
+            f"last second before the contact",
+        )
+    if m.frames:
+        gaps = "no gap"
+        if m.frame_gaps:
+            gaps = "1 gap of" if m.frame_gaps == 1 else f"{of('frame_gaps')} gaps of"
+            gaps += f" {of('frame_gaps_s')} s" + (" together" if m.frame_gaps > 1 else "")
+        yield from _named(
+            "frames",
+            f"{of('frames')}, {of('frames_unseen')} without the target; {of('frame_rate_hz')} Hz, "
+            f"{of('frame_age_s')} ms old; {gaps}; corners' misfit {of('corner_rms_px')} px",
+        )
+    if m.battery_min_v is not None:
+        ends = ""
+        if m.battery_start_v is not None:
+            ends = f"; {of('battery_start_v')} V at the start, {of('battery_end_v')} V at the end"
+        yield from _named("battery", f"{of('battery_min_v')} V at its lowest{ends}")
+    if m.turns:
+        yield from _named(
+            "loop",
+            f"{of('turns')} turns, late by {of('late_p99_s')} ms, telemetry "
+            f"{of('telemetry_age_p99_s')} ms old (99 % at most)",
+        )
+
+
+def plain(text: str) -> str:
+    """Without what a terminal would obey."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def _rounded(seconds: float) -> float:
+    return round(seconds, 6) + 0.0
+
+
+def _named(name: str, text: str) -> list[str]:
+    return list(hung(f"{name + ':':<{_HANG}}", text))
+
+
+def hung(begin: str, text: str) -> Iterator[str]:
+    """The text behind its begin, its further lines below it."""
+    room = " " * len(begin)
+    lines = wrap(
+        plain(text), COLUMNS, initial_indent=begin, subsequent_indent=room, break_on_hyphens=False
+    )
+    yield from lines or [begin.rstrip()]
+
+
+def _cut(text: str, room: int) -> str:
+    return text if len(text) <= room else f"{text[: room - 3]}..."
+
+
+# --- Which logs a folder holds, the newest first, and how each ended: without reading them whole
+
+
+SUFFIXES = (".jsonl", ".jsonl.gz")
+_BEGIN = b'{"kind":"header","format":"perchctl-flight-log"'
+_NAME = "flight_"
+_PACKED = b"\x1f\x8b"
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One log of a folder. Of a file that cannot be read `problem` says why, and the rest is
+    empty."""
+
+    path: Path
+    header: dict[str, Any]
+    summary: FlightSummary | None
+    problem: str | None = None
+
+    @property
+    def how(self) -> str:
+        """How it ended, or why it cannot be read."""
+        end = self.summary
+        if end is None:
+            return self.problem or ""
+        if end.outcome == "perched":
+            return "perched" if end.miss_m is None else f"perched, {end.miss_m * 1e3:.1f} mm"
+        return f"{end.outcome}: {end.reason}".rstrip(": ")
+
+    def record(self) -> dict[str, Any]:
+        """The same as JSON's own types."""
+        keys = ("outcome", "reason", "duration_s", "miss_m")
+        profile = self.header.get("profile")
+        return {
+            "log": str(self.path),
+            "started_utc": self.header.get("started_utc"),
+            "profile": profile.get("name") if isinstance(profile, dict) else None,
+            "seed": self.header.get("seed"),
+            **{key: getattr(self.summary, key, None) for key in keys},
+            "problem": self.problem,
+        }
+
+
+def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
+    """The folder's flight logs by the time of their last record, the newest first.
+
+    What only ends like one is not among them. Errors: NotFound.
+    """
+    try:
+        names = [name for name in os.listdir(folder) if name.endswith(SUFFIXES)]
+    except FileNotFoundError:
+        raise NotFound(
+            f"there is no folder {folder} with flight logs: name a log, or the folder with "
+            f"--log-dir"
+        ) from None
+    except NotADirectoryError:
+        raise NotFound(f"{folder} is a file, not a folder: name it as FILE") from None
+    except OSError as error:
+        raise NotFound(f"the folder {folder} cannot be read: {error.strerror}") from None
+    aged = [(_changed_ns(folder / name), name) for name in names]
+    logs: list[Path] = []
+    for _, name in sorted(aged, reverse=True):
+        if most is not None and len(logs) >= most:
+            break
+        if _is_log(folder / name):
+            logs.append(folder / name)
+    if not logs:
+        raise NotFound(
+            f"the folder {folder} holds no flight log: name a log, or another folder with --log-dir"
+        )
+    return logs
+
+
+@dataclass(frozen=True)
+class LogList:
+    """The newest logs of a folder, and how each ended."""
+
+    folder: Path
+    logs: tuple[Listed, ...]
+
+    @classmethod
+    def of(cls, folder: Path, most: int | None = None) -> LogList:
+        """As `newest_logs`. Errors: NotFound."""
+        return cls(folder, tuple(list_log(path) for path in newest_logs(folder, most)))
+
+    def record(self) -> dict[str, Any]:
+        """The list as JSON's own types."""
+        return {"folder": str(self.folder), "logs": [each.record() for each in self.logs]}
+
+    def text(self) -> str:
+        """A line each log, as wide as a terminal of 80 columns."""
+        width = min(44, max([3, *(len(plain(each.path.name)) for each in self.logs)]))
+        room = COLUMNS - width - 10
+        lines = [f"{'log':<{width}}  {'s':>6}  how it ended"]
+        for each in self.logs:
+            name = _cut(plain(each.path.name), width)
+            seconds = "-" if each.summary is None else f"{each.summary.duration_s:.1f}"
+            lines.append(f"{name:<{width}}  {seconds:>6}  {_cut(plain(each.how), room)}".rstrip())
+        return "\n".join(lines)
+
+
+def list_log(path: Path) -> Listed:
+    """A log's header and end. Never raises for a file that is bad."""
+    try:
+        log = read_ends(path)
+        return Listed(path, log.header, summarise_flight(log))
+    except PerchError as error:
+        return Listed(path, {}, None, str(error).removeprefix(f"{path}: "))
+    except (TypeError, ValueError) as error:
+        return Listed(path, {}, None, f"it holds what is no flight's ({error})")
+
+
+def _is_log(path: Path) -> bool:
+    """By its begin; by its name where that is lost, as a flight that left nothing is one, too."""
+    if path.name.startswith(_NAME):
+        return True
+    try:
+        with path.open("rb") as stream:
+            begin = stream.read(len(_BEGIN))
+    except OSError:
+        return False
+    return begin == _BEGIN or begin.startswith(_PACKED)
+
+
+def _changed_ns(path: Path) -> int:
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0

@@ -1,0 +1,314 @@
+"""A flight in sentences, each at its time, made of the log's events and ticks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from perchctl.analysis.edges import runs_of
+from perchctl.analysis.flight import FlightAnalysis
+from perchctl.analysis.sight import Loss, Stay
+from perchctl.analysis.words import count, length
+from perchctl.mission import FLYING_PHASES, SEVEN_PHASES
+from perchctl.vehicle import NO_BATTERY_READING_V
+
+HELD_LEAST_S = 0.1
+BACKED_OFF_M = 0.01
+FLYING = frozenset(phase.value for phase in FLYING_PHASES)
+TOOK_OVER = {
+    "watchdog": "The watchdog took over",
+    "rescue": "The rescue took over, after an error",
+    "reconnect": "The link was opened once more",
+}
+ACTS = {
+    "position": "it gave it a place to hold",
+    "thrust": "it kept the thrust",
+    "land": "it ordered a landing",
+    "stop": "it stopped the motors",
+    "emergency": "it cut the motors",
+}
+SEVEN = tuple(phase.value for phase in SEVEN_PHASES)
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """What happened at a time, s from the first tick; `grade`: step, good, warn or bad."""
+
+    t_s: float
+    text: str
+    grade: str = "step"
+
+
+def story_of(flight: FlightAnalysis) -> tuple[Sentence, ...]:
+    """The whole flight, in order; empty for a log without ticks."""
+    if not flight.log.records:
+        return ()
+    told = [
+        *_steps(flight),
+        *(_told_loss(flight, loss) for loss in flight.losses),
+        *_holds(flight),
+        *_taken_over(flight),
+        *_notes(flight),
+        *_motors(flight),
+        *_end(flight),
+    ]
+    return tuple(sorted(told, key=lambda sentence: sentence.t_s))
+
+
+# --- the phases -----------------------------------------------------------------------
+
+
+def _steps(flight: FlightAnalysis) -> Iterator[Sentence]:
+    for i, stay in enumerate(flight.stays):
+        text = TELLS.get(stay.phase, _plain)(flight, stay)
+        if stay.simulated:
+            text += f" (the simulation: {stay.simulated})"
+        if i == 0 and stay.phase == "APPROACH":
+            text += _battery(flight)
+        yield Sentence(stay.start_s, text, _grade(stay))
+
+
+def _grade(stay: Stay) -> str:
+    if stay.phase in ("PERCHED", "COMPLETE"):
+        return "good"
+    if stay.phase == "ABORTED" or stay.severity == "stop":
+        return "bad"
+    if stay.phase == "RECOVER" or stay.severity in ("back off", "hold"):
+        return "warn"
+    return "warn" if stay.phase == "LANDING" else "step"
+
+
+def _plain(flight: FlightAnalysis, stay: Stay) -> str:
+    return f"{stay.phase}: {stay.reason}" if stay.reason else stay.phase
+
+
+def _approach(flight: FlightAnalysis, stay: Stay) -> str:
+    return "Took off"
+
+
+def _search(flight: FlightAnalysis, stay: Stay) -> str:
+    at = f"at {length(flight.height_m(stay.start_s))}"
+    if stay.row == "approached" or stay.reason == "hovering in the perching area":
+        return f"It hovered {at}, and looked for the target"
+    return f"{_upper(stay.reason)}: it looked for the target again, {at}"
+
+
+def _estimate(flight: FlightAnalysis, stay: Stay) -> str:
+    where = _where(flight, stay.start_s)
+    if stay.row == "recovered" or "again" in stay.reason or "once more" in stay.reason:
+        return f"{_upper(stay.reason)}:{where}" if where else _upper(stay.reason)
+    return f"Found the target{where}"
+
+
+def _align(flight: FlightAnalysis, stay: Stay) -> str:
+    if stay.severity == "hold" or "cone" in stay.reason:
+        return f"{_upper(stay.reason)}{_beside(flight, stay.start_s)}: it aligned again"
+    return f"Its pose was steady{_spread(flight, stay.start_s)}: it went under the target"
+
+
+def _ascend(flight: FlightAnalysis, stay: Stay) -> str:
+    took_s = _time_before(flight, stay, "ALIGN")
+    turned = flight.at(stay.start_s, "eyaw_rad")
+    text = f"Aligned{_beside(flight, stay.start_s)}"
+    if math.isfinite(turned):
+        text += f" and {abs(math.degrees(turned)):.1f} deg off"
+    if took_s:
+        text += f", after {took_s:.1f} s"
+    return f"{text}: it climbed"
+
+
+def _perch(flight: FlightAnalysis, stay: Stay) -> str:
+    below_m = flight.at(stay.start_s, "ez_m")
+    below = f" {length(below_m)} below the target" if math.isfinite(below_m) else ""
+    text = f"Settled at the stand-off{below}{_beside(flight, stay.start_s)}"
+    took_s = _time_before(flight, stay, "ASCEND")
+    return f"{text}, after {took_s:.1f} s of ascent: it pressed" if took_s else f"{text}"
+
+
+def _complete(flight: FlightAnalysis, stay: Stay) -> str:
+    speed = flight.at(stay.start_s, "vz_mps")
+    thrust = flight.at(stay.start_s, "thrust") / 655.35
+    text = _upper(stay.reason)
+    if math.isfinite(thrust) and math.isfinite(speed):
+        text += f", at {thrust:.0f} % thrust"
+    return f"{text}: the thrust was taken away"
+
+
+def _recover(flight: FlightAnalysis, stay: Stay) -> str:
+    heights = flight.log.column("z_m")[flight.within(stay.start_s, stay.end_s)]
+    heights = heights[np.isfinite(heights)]
+    down_m = float(heights[0] - np.min(heights)) if heights.size else 0.0
+    attempts = flight.at(stay.start_s, "attempts")
+    nth = f" (failed attempt {attempts:.0f})" if attempts >= 1 else ""
+    away = f"backed off {length(down_m)}" if down_m >= BACKED_OFF_M else "it stayed where it was"
+    return f"{_upper(stay.reason)}: {away}{nth}"
+
+
+def _landing(flight: FlightAnalysis, stay: Stay) -> str:
+    height_m = flight.height_m(stay.start_s)
+    at = f", from {length(height_m)}" if math.isfinite(height_m) else ""
+    return f"{_upper(stay.reason)}: it landed{at}"
+
+
+def _perched(flight: FlightAnalysis, stay: Stay) -> str:
+    return f"Perched: {stay.reason}"
+
+
+def _landed(flight: FlightAnalysis, stay: Stay) -> str:
+    return f"Down: {stay.reason}"
+
+
+def _aborted(flight: FlightAnalysis, stay: Stay) -> str:
+    return f"The flight was broken off: {stay.reason}"
+
+
+TELLS: dict[str, Callable[[FlightAnalysis, Stay], str]] = {
+    "APPROACH": _approach,
+    "SEARCH": _search,
+    "ESTIMATE": _estimate,
+    "ALIGN": _align,
+    "ASCEND": _ascend,
+    "PERCH": _perch,
+    "COMPLETE": _complete,
+    "RECOVER": _recover,
+    "LANDING": _landing,
+    "PERCHED": _perched,
+    "LANDED": _landed,
+    "ABORTED": _aborted,
+}
+
+
+def _battery(flight: FlightAnalysis) -> str:
+    volts = flight.at(0.0, "battery_v")
+    return f" with the battery at {volts:.2f} V" if volts >= NO_BATTERY_READING_V else ""
+
+
+def _where(flight: FlightAnalysis, t_s: float) -> str:
+    up_m, aside_m = flight.at(t_s, "ez_m"), _aside_m(flight, t_s)
+    if not math.isfinite(up_m + aside_m):
+        return ""
+    return f" {length(up_m)} above, {length(aside_m)} to the side"
+
+
+def _beside(flight: FlightAnalysis, t_s: float) -> str:
+    aside_m = _aside_m(flight, t_s)
+    return f", {length(aside_m)} off centre" if math.isfinite(aside_m) else ""
+
+
+def _aside_m(flight: FlightAnalysis, t_s: float) -> float:
+    return math.hypot(flight.at(t_s, "ex_m"), flight.at(t_s, "ey_m"))
+
+
+def _spread(flight: FlightAnalysis, t_s: float) -> str:
+    sigma_m = math.hypot(flight.at(t_s, "esx_m"), flight.at(t_s, "esy_m"))
+    return f" to {length(sigma_m)}" if math.isfinite(sigma_m) else ""
+
+
+def _time_before(flight: FlightAnalysis, stay: Stay, phase: str) -> float:
+    """How long the phase before lasted, 0 where another one was before."""
+    at = flight.stays.index(stay)
+    before = flight.stays[at - 1] if at else None
+    return before.duration_s if before and before.phase == phase else 0.0
+
+
+# --- between them ---------------------------------------------------------------------
+
+
+def _told_loss(flight: FlightAnalysis, loss: Loss) -> Sentence:
+    for_s = f"for {loss.duration_s:.1f} s" if loss.regained else "and not seen again"
+    if loss.frames:
+        text = f"The target was lost {for_s}: {count(loss.frames, 'frame')} without it"
+        text += _motion(loss)
+    else:
+        text = f"No picture that could be used came {for_s if loss.regained else 'any more'}"
+    return Sentence(loss.start_s, f"{text}{_then(flight, loss)}", "warn")
+
+
+def _motion(loss: Loss) -> str:
+    if math.isfinite(loss.blur_px):
+        fastest = f", blur {loss.blur_px:.1f} px"
+    elif math.isfinite(loss.flow_pxps):
+        fastest = f", moving at {loss.flow_pxps:.0f} px/s in the picture"
+    else:
+        fastest = ","
+    return f"{fastest} at {loss.speed_mps:.1f} m/s" if math.isfinite(loss.speed_mps) else ""
+
+
+def _then(flight: FlightAnalysis, loss: Loss) -> str:
+    """What the mission made of it while it lasted."""
+    for stay in flight.stays:
+        if not loss.start_s < stay.start_s <= loss.end_s:
+            continue
+        if stay.phase == "RECOVER":
+            return f"; {_recover(flight, stay).rpartition(': ')[2].partition(' (')[0]}"
+        if stay.phase == "LANDING":
+            return "; landed"
+        return f"; {stay.phase} again" if stay.phase in ("SEARCH", "ALIGN") else ""
+    return ""
+
+
+def _holds(flight: FlightAnalysis) -> Iterator[Sentence]:
+    for hold in flight.holds:
+        if hold.duration_s >= HELD_LEAST_S:
+            text = f"Held in place for {hold.duration_s:.1f} s: {hold.reason}"
+            yield Sentence(hold.start_s, text, "warn")
+
+
+def _taken_over(flight: FlightAnalysis) -> Iterator[Sentence]:
+    """What came from elsewhere than the loop. The farewell, to a vehicle that is down, is none of
+    the flight's."""
+    for go in flight.log.takeovers:
+        who = TOOK_OVER.get(go.by)
+        if who is None:
+            continue
+        acts = [ACTS[name] for name, _ in go.sent]
+        for_s = go.end_s - go.start_s
+        lasted = f" for {for_s:.1f} s" if for_s >= HELD_LEAST_S else ""
+        steered = all(name in ("position", "thrust") for name, _ in go.sent)
+        t_s = max(0.0, flight.log.since(go.start_s))
+        text = f"{who}{lasted}: {' and '.join(acts)}"
+        yield Sentence(t_s, text, "warn" if steered else "bad")
+
+
+def _notes(flight: FlightAnalysis) -> Iterator[Sentence]:
+    for t_s, note in flight.notes:
+        if note:
+            yield Sentence(max(0.0, t_s), _upper(note))
+
+
+def _motors(flight: FlightAnalysis) -> Iterator[Sentence]:
+    """Each kind once: a stop may be repeated, and an emergency cut may come long after it."""
+    tells = {"stop": "The motors were stopped", "emergency": "The motors were cut and locked"}
+    for start_s, _end_s, command in runs_of(flight.log, "cmd"):
+        text = tells.pop(command, None)
+        if text is not None:
+            yield Sentence(start_s, text, "step" if command == "stop" else "bad")
+
+
+def _end(flight: FlightAnalysis) -> Iterator[Sentence]:
+    """Where a log stops without saying how the flight ended."""
+    if flight.log.summary is not None:
+        end = flight.summary
+        if end.locked:
+            text = "The supervisor locked the vehicle: inspect and restart it"
+            yield Sentence(flight.end_s, text, "bad")
+        if end.touchdown is not None and end.touchdown.is_hard:
+            yield Sentence(flight.end_s, f"It {end.touchdown.text}", "bad")
+        if end.fell:
+            yield Sentence(flight.end_s, "The vehicle fell", "bad")
+        return
+    phase = flight.stays[-1].phase if flight.stays else "?"
+    text = f"The log ends here, in {phase}"
+    height_m = flight.height_m(flight.end_s)
+    if phase in FLYING | {"LANDING"} and math.isfinite(height_m):
+        text += f" at {length(height_m)}"
+    yield Sentence(
+        flight.end_s, f"{text}: how the flight ended is not known, its program was ended", "bad"
+    )
+
+
+def _upper(sentence: str) -> str:
+    return sentence[:1].upper() + sentence[1:]

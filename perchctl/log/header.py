@@ -1,0 +1,221 @@
+"""The log's header: what a flight was set up with, enough to decide it again elsewhere.
+
+The profile stands there with every key. The files that it names for the camera may be others
+by the time of a replay, so what was in them stands there, too; and how the computer calculates.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import math
+import platform
+import zlib
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+import perchctl
+from perchctl.calibration import profile_camera
+from perchctl.camera import profile_record, without_password
+from perchctl.errors import InvalidValue, PerchError
+from perchctl.log.exact import from_exact, to_exact
+from perchctl.log.fields import EVENT_FIELDS, FIELDS, FORMAT, SCHEMA_VERSION
+from perchctl.profile import Profile, first_invalid_key, read_mask
+from perchctl.vision import CameraModel
+
+TURN_NOTE = (
+    "records of kind turn: all that a turn of the loop took in, knew and decided, not rounded; "
+    "their times are on the loop's clock"
+)
+
+
+SENT_NOTE = (
+    "records of kind sent: a command that went to the vehicle in the loop's place, not rounded: "
+    "the watchdog's (the loop was silent, or the operator's stop), a rescue's after an error, an "
+    "order once more over a link that was lost, and the link's farewell"
+)
+
+
+def make_header(
+    profile: Profile,
+    *,
+    uri: str,
+    source: str,
+    seed: int | None = None,
+    lockstep: bool = False,
+    started: datetime | None = None,
+    t0_s: float = 0.0,
+) -> dict[str, Any]:
+    """The first record. Without `started` it depends on nothing but its arguments and the files
+    that the profile names. `t0_s`: the loop's clock when the log began, or at `started`."""
+    return {
+        "kind": "header",
+        "format": FORMAT,
+        "version": SCHEMA_VERSION,
+        "perchctl": perchctl.__version__,
+        "uri": uri,
+        "source": without_password(source),
+        "seed": seed,
+        "lockstep": lockstep,
+        "started_utc": started.astimezone(UTC).isoformat(timespec="seconds") if started else None,
+        "t0_s": t0_s,
+        "profile": profile_record(profile),
+        **camera_record(profile),
+        **computer_record(),
+        "fields": FIELDS,
+        "event_fields": EVENT_FIELDS,
+        "turns": TURN_NOTE,
+        "sent": SENT_NOTE,
+    }
+
+
+def camera_record(profile: Profile) -> dict[str, Any]:
+    """``camera``, the calibration, and ``mask``, what the gear covers in it; of a file that
+    cannot be read, nothing: that is the flight's to say."""
+    with contextlib.suppress(PerchError):
+        camera = profile_camera(profile.camera)
+        record = {"camera": to_exact(camera)}
+        if profile.camera.mask is not None:
+            record["mask"] = _packed(read_mask(profile.camera.mask, camera.size_px))
+        return record
+    return {}
+
+
+def computer_record() -> dict[str, Any]:
+    """``computer``: what the last bits of a sum may depend on."""
+    return {
+        "computer": {
+            "system": platform.system(),
+            "machine": platform.machine(),
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "opencv": cv2.__version__,
+            "arithmetic": arithmetic_fingerprint(),
+        }
+    }
+
+
+def computer_differences(header: Mapping[str, Any]) -> str:
+    """In what the flight's differed from this one, in words; empty where it did not, or where
+    the log does not say."""
+    was, here = header.get("computer"), computer_record()["computer"]
+    if not isinstance(was, dict):
+        return ""
+    return ", ".join(
+        f"{key} {was[key]} there and {here[key]} here"
+        for key in here
+        if key in was and was[key] != here[key]
+    )
+
+
+def flown_profile(header: Mapping[str, Any]) -> Profile:
+    """The profile that was flown, but for passwords. Errors: InvalidValue."""
+    try:
+        return Profile.model_validate(header.get("profile"))
+    except ValidationError as error:
+        key, text = first_invalid_key(error)
+        raise InvalidValue(
+            f"the log's profile cannot be used by this version of perchctl: {key or 'profile'}: "
+            f"{text}"
+        ) from None
+
+
+def flown_camera(header: Mapping[str, Any]) -> CameraModel | None:
+    """The calibration that was flown; None in a log that has none. Errors: InvalidValue."""
+    if header.get("camera") is None:
+        return None
+    try:
+        return from_exact(CameraModel, header["camera"])
+    except ValueError as error:
+        raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
+
+
+def flown_mask(header: Mapping[str, Any], camera: CameraModel) -> NDArray[np.bool_] | None:
+    """(height, width), True where the gear covers; None without a mask. Errors: InvalidValue."""
+    text = header.get("mask")
+    if text is None:
+        return None
+    width, height = camera.size_px
+    try:
+        # No more than the mask: what a damaged text unfolds to has no bound.
+        packed = zlib.decompressobj().decompress(base64.b64decode(text), width * height // 8 + 1)
+        bits = np.frombuffer(packed, dtype=np.uint8)
+        return np.unpackbits(bits)[: width * height].reshape(height, width).astype(bool)
+    except (ValueError, TypeError, zlib.error) as error:
+        raise InvalidValue(f"the log's header holds no mask: mask: {error}") from None
+
+
+def _packed(mask: NDArray[np.bool_]) -> str:
+    return base64.b64encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode("ascii")
+
+
+# --- A fingerprint of how this computer calculates ---------------------------------------------
+# Libraries choose their kernels by the processor: numpy's BLAS and vector functions, OpenCV's
+# filters, the sine of the C library. They sum in another order, or round once where others round
+# twice, so that the last bits of a pose are a processor's own.
+
+
+_SIDES = (2, 3, 4, 6, 8, 12)
+
+
+@cache
+def arithmetic_fingerprint() -> str:
+    """Eight hexadecimal digits. Where they are the same, with the same libraries, single-threaded
+    results are the same to the bit: they stand for the kernels that may be chosen, and for what
+    came of some small calculations."""
+    bits = zlib.crc32(repr((_kernels(), cv2.getCPUFeaturesLine())).encode())
+    for part in (_of_libm(), *_of_numpy(), *_of_opencv()):
+        bits = zlib.crc32(np.ascontiguousarray(part).tobytes(), bits)
+    return f"{bits:08x}"
+
+
+def _kernels() -> Any:
+    config: Any = np.show_config(mode="dicts")
+    return config.get("SIMD Extensions", {}) if isinstance(config, dict) else {}
+
+
+def _grid() -> Any:
+    return np.arange(1, 257) * (math.pi / 97.0)
+
+
+def _of_libm() -> Any:
+    functions = (math.sin, math.cos, math.atan, math.exp, math.log, math.sqrt)
+    values = [f(x) for x in _grid().tolist() for f in functions]
+    return np.array(values + [math.hypot(x, 1.0 / x, 0.3) for x in _grid().tolist()])
+
+
+def _of_numpy() -> list[Any]:
+    x = _grid()
+    found = [np.sin(x), np.cos(x), np.exp(-x), np.arctan2(x, 2.0), x.sum(), np.dot(x, x)]
+    for n in _SIDES:
+        A = np.sin(x[: n * n]).reshape(n, n)
+        S = A.dot(A.T) + n * np.eye(n)
+        found += [S, np.linalg.solve(S, A), np.linalg.inv(S), *np.linalg.eigh(S)]
+        found += [np.linalg.svd(A)[1], A.dot(A[0]), np.einsum("ij,jk->ik", A, S)]
+    return found
+
+
+def _of_opencv() -> list[Any]:
+    y, x = np.mgrid[0:64, 0:96]
+    image = np.asarray(128 + 90 * np.sign((x - 40) * (y - 30)) + (7 * x + 13 * y) % 29, np.uint8)
+    corners = np.array([[[40.3, 30.4]]], np.float32)
+    way = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 1e-4)
+    K = np.array([[300.0, 0.0, 48.0], [0.0, 300.0, 32.0], [0.0, 0.0, 1.0]])
+    points = np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    turned, moved = np.array([0.1, -0.2, 0.3]), np.array([0.1, 0.2, 9.0])
+    seen, by_place = cv2.projectPoints(points, turned, moved, K, np.array([0.1, -0.05, 0.0, 0.0]))
+    _, r, t = cv2.solvePnP(points, seen, K, None, flags=cv2.SOLVEPNP_IPPE)
+    return [
+        cv2.GaussianBlur(image.astype(np.float32), (5, 5), 1.1),
+        cv2.Sobel(image, cv2.CV_32F, 1, 0),
+        cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), way),
+        cv2.warpPerspective(image, K / 300.0 + 0.001, (48, 48)),
+        cv2.Rodrigues(turned)[0], seen, by_place, r, t,
+    ]  # fmt: skip

@@ -1,0 +1,591 @@
+"""A flight's recording as an MCAP file: what is written into it, and how.
+
+Every message is made from the records that the log holds, so that a recording made in flight and
+one made of its log say the same. The messages are Foxglove's protobuf ones, with the definitions of
+Foxglove's own package: a picture stays the bytes that it came as, which the JSON variant of the
+same schemas would make a third longer. What is perchctl's own is JSON. Frames: `world` (of the
+state estimate), `body`, `gear`, `camera` (OpenCV's axes, which are Foxglove's) and `target`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import cv2
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.Point2_pb2 import Point2
+from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.message import Message
+from google.protobuf.timestamp_pb2 import Timestamp
+from mcap.data_stream import RecordBuilder
+from mcap.records import DataEnd, Footer
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap_protobuf.schema import register_schema
+
+import perchctl
+from perchctl.geometry import quaternion_from_rotation, quaternion_from_rpy
+from perchctl.log.disk import Stream
+from perchctl.log.exact import encode
+from perchctl.log.fields import FIELDS, field_kind
+from perchctl.profile import Profile
+from perchctl.vision import CameraModel, Frame
+
+WORLD, BODY, GEAR, CAMERA, TARGET = "world", "body", "gear", "camera", "target"
+
+IMAGE, FRAME, CALIBRATION = "/camera/image", "/camera/frame", "/camera/calibration"
+CORNERS = "/camera/corners"
+TF, VEHICLE, PATH, TARGET_POSE = "/tf", "/vehicle/pose", "/vehicle/path", "/target/pose"
+SETPOINT, SCENE, LOG, TICK, SENT = "/setpoint", "/scene", "/log", "/tick", "/sent"
+
+HEADER_NAME = "header.json"
+CHUNK_BYTES = 4_000_000
+PNG_LEVEL = 1
+"""Fast; the next levels cost twice the time for a twentieth of the size."""
+LOOP_TIMES = ("t_s", "frame_t_s")
+"""Of a tick's record: in the recording they count from the first flown turn."""
+PATH_PERIOD_S = 1.0
+"""The whole path so far is written so often: who jumps into the middle sees what was flown."""
+PATH_STEP_S = 0.1
+
+
+# --- the file -------------------------------------------------------------------------------
+
+
+class RecordingFile:
+    """A recording that grows, in the order in which a flight gives it; one thread's. Every method
+    but `give_up` may raise OSError.
+
+    Attributes:
+        pictures: how many were written; `newest_s`: the loop's time of what was written last.
+    """
+
+    def __init__(
+        self,
+        stream: Stream,
+        header: Mapping[str, Any],
+        profile: Profile | None,
+        camera: CameraModel | None,
+    ) -> None:
+        """Without a profile or camera it lacks what follows from them."""
+        self.pictures = 0
+        self.newest_s = 0.0
+        self._header = header
+        self._profile = profile
+        self._camera = camera
+        self._epoch: Epoch | None = None
+        self._first_s: float | None = None
+        self._space = SpaceMessages(Epoch(0, 0.0))
+        self._stream = stream
+        self._writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)  # type: ignore[arg-type]
+        self._channels: dict[str, int] = {}
+        self._pending_bytes = 0
+        self._closed = False
+        self._writer.start(library=f"perchctl {perchctl.__version__}")
+
+    @property
+    def size_bytes(self) -> int:
+        """On the disk, with what waits for it, as far as it is known."""
+        return self._stream.tell() + self._pending_bytes
+
+    def frame(self, about: Mapping[str, Any], picture: tuple[bytes, str] | None) -> None:
+        """A frame as its source gave it (`frame_record`), and its picture with its format
+        (`encoded`) where it is to be kept."""
+        ns = self._at(about["t_arrival_s"])
+        number = about["number"] & 0xFFFFFFFF
+        if picture is not None:
+            taken_ns = self._epoch_at(about["t_s"]).ns(about["t_s"])
+            data, form = picture
+            self._add(IMAGE, ns, CompressedImage(timestamp=stamp(taken_ns), frame_id=CAMERA,
+                                                 data=data, format=form), number)  # fmt: skip
+            self.pictures += 1
+        # With all digits: a replay needs the very times.
+        self._add(FRAME, ns, json.dumps(about).encode(), number)
+
+    def tick(self, record: Mapping[str, Any]) -> None:
+        """A tick's record (`perchctl.log.fields.FIELDS`)."""
+        ns = self._at(float(record["t_s"]))
+        if self._first_s is None:
+            self._first_s = float(record["t_s"])
+        for topic, message in self._space.of(record):
+            self._add(topic, ns, message)
+        self._add(TICK, ns, encode(self._since_first(record))[:-1])
+
+    def sent(self, values: Mapping[str, Any]) -> None:
+        """What was sent in the loop's place (`perchctl.log.read.sent_values`)."""
+        ns = self._at(float(values["t_s"]))
+        self._add(SENT, ns, encode(self._since_first(values))[:-1])
+
+    def event(self, record: Mapping[str, Any]) -> None:
+        """An event's record (`perchctl.log.fields.event_record`)."""
+        ns = self._at(float(record["t_s"]))
+        self._add(LOG, ns, log_message(ns, record))
+
+    def flush(self) -> None:
+        """What was added so far is on the disk when this returns."""
+        self._writer.flush()
+        self._pending_bytes = 0
+
+    def free_bytes(self) -> int:
+        """Left on its disk."""
+        return self._stream.free_bytes()
+
+    def finish(self) -> None:
+        """End it with its index; nothing can be added any more."""
+        self._writer.finish()
+        self._stream.flush()
+        self._closed = True
+        self._stream.close()
+
+    def give_up(self) -> None:
+        """End the file where its last whole record ends, without an index: the disk failed.
+        One that was ended stays as it is. Never raises."""
+        if self._closed:
+            return
+        self._closed = True
+        end = RecordBuilder()
+        DataEnd(0).write(end)
+        Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(end)
+        with suppress(OSError):
+            self._stream.write(end.end() + MCAP0_MAGIC)
+            self._stream.flush()
+        with suppress(OSError):
+            self._stream.close()
+
+    def _since_first(self, record: Mapping[str, Any]) -> dict[str, Any]:
+        """With its times as every output counts them, from the first flown turn; before that
+        without them."""
+        first_s = self._first_s
+        times = [key for key in LOOP_TIMES if record.get(key) is not None]
+        return {
+            **record,
+            **{key: None if first_s is None else record[key] - first_s for key in times},
+        }
+
+    def _at(self, t_s: float) -> int:
+        self.newest_s = t_s
+        return self._epoch_at(t_s).ns(t_s)
+
+    def _epoch_at(self, t_s: float) -> Epoch:
+        """The start's, which is known by the first record at the latest; with it goes what is
+        written once."""
+        if self._epoch is None:
+            self._epoch = epoch = epoch_of(self._header, t_s)
+            ns = epoch.ns(epoch.t0_s)
+            mounts = [] if self._profile is None else mounts_of(self._profile)
+            self._space = SpaceMessages(epoch, mounts)
+            text = json.dumps(self._header).encode()
+            self._writer.add_attachment(ns, ns, HEADER_NAME, "application/json", text)
+            if self._camera is not None:
+                self._add(CALIBRATION, ns, calibration_message(ns, self._camera))
+            if self._profile is not None:
+                self._add(SCENE, ns, scene_message(ns, self._profile))
+        return self._epoch
+
+    def _add(self, topic: str, ns: int, message: Message | bytes, sequence: int = 0) -> None:
+        """A message of Foxglove's, or the JSON of one of `SCHEMAS`."""
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._channels[topic] = self._new_channel(topic, message)
+        data = message if isinstance(message, bytes) else message.SerializeToString()
+        before = self._stream.tell()
+        self._writer.add_message(channel, ns, data, ns, sequence)
+        self._pending_bytes += len(data)
+        if self._stream.tell() != before:  # a chunk was full
+            self._pending_bytes = 0
+
+    def _new_channel(self, topic: str, message: Message | bytes) -> int:
+        if isinstance(message, bytes):
+            name, schema = SCHEMAS[topic]
+            text = json.dumps(schema).encode()
+            number = self._writer.register_schema(name, SchemaEncoding.JSONSchema, text)
+            return self._writer.register_channel(topic, MessageEncoding.JSON, number)
+        number = register_schema(self._writer, type(message))
+        return self._writer.register_channel(topic, MessageEncoding.Protobuf, number)
+
+
+def frame_record(frame: Frame) -> dict[str, Any]:
+    """The frame without its picture, but with the checksum by which one is known to be it."""
+    return {
+        "number": frame.index,
+        "t_s": frame.t_s,
+        "t_arrival_s": frame.t_arrival_s,
+        "repeated": frame.repeated,
+        "crc32": zlib.crc32(np.ascontiguousarray(frame.image).data),
+    }
+
+
+def encoded(frame: Frame) -> tuple[bytes, str]:
+    """The picture's bytes and their format: as they came, or without loss."""
+    if frame.encoded is not None:
+        return frame.encoded, "jpeg"
+    ok, data = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
+    if not ok:
+        raise ValueError(f"a picture of shape {frame.image.shape} cannot be encoded")
+    return data.tobytes(), "png"
+
+
+# --- perchctl's own messages, for which Foxglove has no schema: JSON ------------------------------
+
+FRAME_FIELDS = {
+    "number": ("integer", "number of the frame, as the message's sequence number and the log's"),
+    "t_s": ("number", "exposure on the loop's clock, as the source gave it"),
+    "t_arrival_s": ("number", "arrival on the loop's clock"),
+    "repeated": ("boolean", "the source gave out the picture before once more: it is not kept"),
+    "crc32": ("integer", "of the grey pixels that the pipeline saw"),
+}
+
+
+_JSON_TYPES: dict[str, dict[str, Any]] = {
+    "number": {"type": "number"},
+    "integer": {"type": "number"},
+    "flag": {"type": "boolean"},
+    "text": {"type": "string"},
+    "corners": {"type": "array", "items": {"type": "number"}},
+}
+
+
+def _property(key: str) -> dict[str, Any]:
+    return {**_JSON_TYPES[field_kind(key)], "description": FIELDS[key]}
+
+
+SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
+    TICK: (
+        "perchctl.Tick",
+        {
+            "type": "object",
+            "title": "One turn of the flight loop, as the flight log has it",
+            "properties": {key: _property(key) for key in FIELDS},
+        },
+    ),
+    SENT: (
+        "perchctl.Sent",
+        {
+            "type": "object",
+            "title": "What was sent to the vehicle in the flight loop's place",
+            "properties": {
+                "t_s": _property("t_s"),
+                "by": {"type": "string", "description": "watchdog, rescue, reconnect or farewell"},
+                **{key: _property(key) for key in FIELDS if key.split("_")[0] == "cmd"},
+            },
+        },
+    ),
+    FRAME: (
+        "perchctl.Frame",
+        {
+            "type": "object",
+            "title": "A frame that the camera gave",
+            "properties": {
+                key: {"type": kind, "description": text}
+                for key, (kind, text) in FRAME_FIELDS.items()
+            },
+        },
+    ),
+}
+"""By topic: name and JSON schema."""
+
+
+# --- Foxglove's messages ----------------------------------------------------------------------
+
+_MODELS = {"fisheye": "kannala_brandt"}
+"""Foxglove's name of OpenCV's fisheye; the others are called alike."""
+_LEVELS = {"hold": Log.WARNING, "back off": Log.WARNING, "land": Log.ERROR, "stop": Log.FATAL}
+_OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)
+
+
+def stamp(ns: int) -> Timestamp:
+    return Timestamp(seconds=ns // NS, nanos=ns % NS)
+
+
+def calibration_message(ns: int, camera: CameraModel) -> CameraCalibration:
+    """With its distortion. One camera needs no rectification: R is 1 and P holds K."""
+    width, height = camera.size_px
+    P = np.hstack([camera.K, np.zeros((3, 1))])
+    return CameraCalibration(
+        timestamp=stamp(ns),
+        frame_id=CAMERA,
+        width=width,
+        height=height,
+        distortion_model=_MODELS.get(camera.model, camera.model),
+        D=[float(v) for v in np.ravel(camera.dist)],
+        K=[float(v) for v in np.ravel(camera.K)],
+        R=[float(v) for v in np.eye(3).ravel()],
+        P=[float(v) for v in P.ravel()],
+    )
+
+
+def log_message(ns: int, record: Mapping[str, Any]) -> Log:
+    """An event's record. What goes on is an info, a landing an error, a stop fatal."""
+    level = _LEVELS.get(str(record.get("severity")), Log.INFO)
+    what, phase = record.get("event"), record.get("phase")
+    text = str(record.get("reason") or "")
+    if what == "phase":
+        text = f"{phase}: {text}".rstrip(": ")
+    elif what == "hold":
+        text = f"held: {text}"
+    if record.get("simulated"):
+        text = f"{text} (simulated: {record['simulated']})"
+    return Log(
+        timestamp=stamp(ns),
+        level=level,
+        message=text,
+        name="perchctl",
+        file=record.get("row") or "",
+    )
+
+
+def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
+    """The markers' outlines in the frame of a tick's record; none of one without the target,
+    so that no old one stays in the picture."""
+    return ImageAnnotations(
+        timestamp=stamp(ns),
+        points=[
+            PointsAnnotation(
+                timestamp=stamp(ns),
+                type=PointsAnnotation.LINE_LOOP,
+                points=[Point2(x=x, y=y) for x, y in zip(px[::2], px[1::2], strict=True)],
+                outline_color=_OUTLINE,
+                thickness=2.0,
+            )
+            for px in (record.get("large_px"), record.get("small_px"))
+            if px is not None
+        ],
+    )
+
+
+def mounts_of(profile: Profile) -> list[FrameTransform]:
+    """What does not move against the body."""
+    T_body_cam = profile.camera.mount.T_body_cam
+    q = quaternion_from_rotation(T_body_cam[:3, :3])
+    gear_m = profile.vehicle.gear_body_m
+    return [
+        _transform(0, BODY, CAMERA, T_body_cam[:3, 3], q),
+        _transform(0, BODY, GEAR, gear_m, (1.0, 0.0, 0.0, 0.0)),
+    ]
+
+
+class SpaceMessages:
+    """The messages of each tick for the 3-D panel, and the path that grows with them.
+
+    What stands still is written with every tick: who jumps into the middle of a flight gets the
+    newest message of each topic, and no older one.
+    """
+
+    def __init__(self, epoch: Epoch, mounts: Sequence[FrameTransform] = ()) -> None:
+        self._epoch = epoch
+        self._mounts = mounts
+        self._target: FrameTransform | None = None  # where it was last
+        self._path = PosesInFrame(frame_id=WORLD)
+        self._path_s = self._point_s = -math.inf
+
+    def of(self, record: Mapping[str, Any]) -> Iterator[tuple[str, Message]]:
+        """Of a tick's record (`perchctl.log.fields.FIELDS`)."""
+        t_s = float(record["t_s"])
+        ns = self._epoch.ns(t_s)
+        now = stamp(ns)
+        for mount in self._mounts:
+            mount.timestamp.CopyFrom(now)
+        transforms = list(self._mounts)
+        body = _body_of(record)
+        if body is not None:
+            sampled_ns = self._epoch.ns(t_s - (_number(record, "tel_age_s") or 0.0))
+            transforms.append(_transform(sampled_ns, WORLD, BODY, *body))
+            pose = _pose(*body)
+            yield VEHICLE, PoseInFrame(timestamp=stamp(sampled_ns), frame_id=WORLD, pose=pose)
+            yield from self._path_with(pose, t_s, ns)
+        target = _turned(record, "tx_m", "ty_m", "tz_m", "tyaw_rad")
+        if target is not None:
+            self._target = _transform(ns, WORLD, TARGET, *target)
+            yield TARGET_POSE, _pose_in_world(ns, target)
+        elif self._target is not None:
+            self._target.timestamp.CopyFrom(now)
+        if self._target is not None:
+            transforms.append(self._target)
+        yield TF, FrameTransforms(transforms=transforms)
+        setpoint = _turned(record, "cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
+        if setpoint is not None:
+            yield SETPOINT, _pose_in_world(ns, setpoint)
+        if record.get("frame_t_s") is not None:
+            yield CORNERS, corners_message(self._epoch.ns(float(record["frame_t_s"])), record)
+
+    def _path_with(self, pose: Pose, t_s: float, ns: int) -> Iterator[tuple[str, Message]]:
+        if t_s - self._point_s >= PATH_STEP_S:
+            self._point_s = t_s
+            self._path.poses.append(pose)
+        if t_s - self._path_s >= PATH_PERIOD_S:
+            self._path_s = t_s
+            self._path.timestamp.CopyFrom(stamp(ns))
+            yield PATH, self._path
+
+
+Placed = tuple[Any, tuple[float, float, float, float]]
+"""A position (3,), m, and a quaternion (w, x, y, z)."""
+
+
+def _body_of(record: Mapping[str, Any]) -> Placed | None:
+    keys = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
+    values = [_number(record, key) for key in keys]
+    if any(value is None for value in values):
+        return None
+    x, y, z, roll, pitch, yaw = (float(v) for v in values if v is not None)
+    return (x, y, z), quaternion_from_rpy(roll, pitch, yaw)
+
+
+def _turned(record: Mapping[str, Any], *keys: str) -> Placed | None:
+    """Three keys of a position and one of a heading."""
+    values = [_number(record, key) for key in keys]
+    if any(value is None for value in values):
+        return None
+    x, y, z, yaw = (float(v) for v in values if v is not None)
+    return (x, y, z), quaternion_from_rpy(0.0, 0.0, yaw)
+
+
+def _number(record: Mapping[str, Any], key: str) -> float | None:
+    """None for what is missing or not finite: a view of it would fail."""
+    value = record.get(key)
+    return float(value) if value is not None and math.isfinite(value) else None
+
+
+def _transform(
+    ns: int, parent: str, child: str, t_m: Any, q: tuple[float, float, float, float]
+) -> FrameTransform:
+    return FrameTransform(
+        timestamp=stamp(ns),
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=_vector(t_m),
+        rotation=_quaternion(q),
+    )
+
+
+def _pose(t_m: Any, q: tuple[float, float, float, float]) -> Pose:
+    return Pose(position=_vector(t_m), orientation=_quaternion(q))
+
+
+def _pose_in_world(ns: int, placed: Placed) -> PoseInFrame:
+    return PoseInFrame(timestamp=stamp(ns), frame_id=WORLD, pose=_pose(*placed))
+
+
+def _vector(t_m: Any) -> Vector3:
+    x, y, z = t_m
+    return Vector3(x=x, y=y, z=z)
+
+
+def _quaternion(q: tuple[float, float, float, float]) -> Quaternion:
+    w, x, y, z = q
+    return Quaternion(w=w, x=x, y=y, z=z)
+
+
+# --- What the 3-D panel draws besides the frames: a vehicle, and the target's two markers ------
+
+Size = tuple[float, float, float]
+
+ARM_M, FLAT_M = (0.092, 0.012, 0.006), (0.03, 0.03, 0.02)
+THIN_M = 0.001
+_VEHICLE, _BLACK, _WHITE = (0.2, 0.5, 0.9, 1.0), (0.1, 0.1, 0.1, 1.0), (0.95, 0.95, 0.95, 1.0)
+_EIGHTH = (0.9238795, 0.3826834)
+"""Cosine and sine of an eighth of a turn, halved: the arms lie across the body's axes."""
+
+
+def scene_message(ns: int, profile: Profile) -> SceneUpdate:
+    """Both stay where their frames go, and until the file's end."""
+    cos, sin = _EIGHTH
+    vehicle = [
+        _cube(ARM_M, _VEHICLE, turn=(cos, sin)),
+        _cube(ARM_M, _VEHICLE, turn=(cos, -sin)),
+        _cube(FLAT_M, _VEHICLE),
+    ]
+    large_m, small_m = profile.target.large.side_m, profile.target.small.side_m
+    target = [  # each sheet a little nearer to the vehicle than the one behind it
+        _cube((1.25 * large_m, 1.25 * large_m, THIN_M), _WHITE),
+        _cube((large_m, large_m, THIN_M), _BLACK, z_m=-THIN_M),
+        _cube((1.5 * small_m, 1.5 * small_m, THIN_M), _WHITE, z_m=-2.0 * THIN_M),
+        _cube((small_m, small_m, THIN_M), _BLACK, z_m=-3.0 * THIN_M),
+    ]
+    return SceneUpdate(
+        entities=[_entity(ns, "vehicle", BODY, vehicle), _entity(ns, "target", TARGET, target)]
+    )
+
+
+def _entity(ns: int, name: str, frame: str, cubes: list[CubePrimitive]) -> SceneEntity:
+    return SceneEntity(timestamp=stamp(ns), frame_id=frame, id=name, frame_locked=True, cubes=cubes)
+
+
+def _cube(
+    size_m: Size,
+    colour: tuple[float, float, float, float],
+    *,
+    z_m: float = 0.0,
+    turn: tuple[float, float] = (1.0, 0.0),
+) -> CubePrimitive:
+    r, g, b, a = colour
+    x, y, z = size_m
+    return CubePrimitive(
+        pose=Pose(
+            position=Vector3(x=0.0, y=0.0, z=z_m),
+            orientation=Quaternion(w=turn[0], x=0.0, y=0.0, z=turn[1]),
+        ),
+        size=Vector3(x=x, y=y, z=z),
+        color=Color(r=r, g=g, b=b, a=a),
+    )
+
+
+# --- The loop's clock on the wall's, in which a recording has its times ------------------------
+
+NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """`started_ns` of the wall's clock, since 1970, is `t0_s` of the loop's.
+
+    A flight in lockstep has no wall clock: its recording begins in 1970, at 0.
+    """
+
+    started_ns: int
+    t0_s: float
+
+    def ns(self, t_s: float) -> int:
+        """Nanoseconds since 1970; what was before that is at 0, which MCAP begins at."""
+        return max(0, self.started_ns + round((t_s - self.t0_s) * NS))
+
+
+def epoch_of(header: Mapping[str, Any], first_s: float) -> Epoch:
+    """By a log's header; `first_s` is the loop's time of the first record, which counts as the
+    start where the header does not say more."""
+    t0_s = header.get("t0_s")
+    if not isinstance(t0_s, (int, float)) or not math.isfinite(t0_s):
+        t0_s = first_s
+    return Epoch(_started_ns(header.get("started_utc")), float(t0_s))
+
+
+def _started_ns(text: Any) -> int:
+    try:
+        started = datetime.fromisoformat(str(text))
+    except ValueError:
+        return 0
+    aware = started if started.tzinfo else started.replace(tzinfo=UTC)
+    since = aware - datetime(1970, 1, 1, tzinfo=UTC)
+    return (since.days * 86400 + since.seconds) * NS + since.microseconds * 1000

@@ -1,0 +1,141 @@
+"""The numbers of a flight, and how they are told."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from perchctl.analysis import FlightAnalysis, LogList, newest_logs, show_record, show_text
+from perchctl.analysis.flight import last_ascent
+from perchctl.analysis.show import COLUMNS, list_log
+from perchctl.log import FlightLog, read_log
+from perchctl.mission import Event
+from tests.helpers import log as synthetic
+from tests.helpers.mission import note
+
+
+def log_of(records: list[dict[str, object]]) -> FlightLog:
+    return FlightLog(Path("f.jsonl"), {}, records, [], None, True)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def flown(tmp_path: Path) -> FlightLog:
+    path = synthetic.write(
+        tmp_path / "f.jsonl", summary=synthetic.SUMMARY, events=[note(1.2, "a \x1b[31mnote")]
+    )
+    return read_log(path)
+
+
+def test_settled_is_the_last_second_before_the_last_contact() -> None:
+    def tick(t_s: float, phase: str, e_m: float) -> dict[str, object]:
+        return {"t_s": t_s, "phase": phase, "ex_m": e_m, "ey_m": e_m, "eyaw_rad": 2 * e_m}
+
+    records = [
+        *(tick(0.1 * i, "ASCEND", 9.0) for i in range(30)),
+        tick(3.0, "PERCH", 9.0),
+        tick(3.1, "RECOVER", 9.0),
+        *(tick(4.0 + 0.1 * i, "ASCEND", 9.0 if i < 10 else 0.003) for i in range(20)),
+        tick(6.0, "PERCH", 9.0),
+    ]
+    log = log_of(records)
+    contact = last_ascent(FlightAnalysis(log).stays)
+    assert contact is not None
+    assert contact.start_s == 4.0
+    found = FlightAnalysis(log).measures
+    assert found.settled_xy_rms_m == pytest.approx(0.003 * math.sqrt(2))
+    assert found.settled_yaw_rms_rad == pytest.approx(0.006)
+    assert found.text("settled_xy_rms_m") == "4.2"
+    assert found.text("miss_m") == "-"
+
+
+def test_no_contact_is_nothing_settled() -> None:
+    found = FlightAnalysis(log_of([{"t_s": 0.0, "phase": "ASCEND", "ex_m": 0.1}])).measures
+    assert found.settled_xy_rms_m is None
+
+
+def test_a_hold_whose_numbers_grow_is_one() -> None:
+    def tick(t_s: float, hold: str | None, phase: str = "ALIGN") -> dict[str, object]:
+        return {"t_s": t_s, "phase": phase, "hold": hold}
+
+    log = log_of(
+        [
+            tick(0.0, None),
+            tick(0.1, "no picture for 0.5 s"),
+            tick(0.2, "no picture for 0.6 s"),
+            tick(0.3, "telemetry is old"),
+            tick(0.4, None),
+            tick(0.5, "telemetry is old"),
+            tick(0.6, "telemetry is old", "ASCEND"),
+            tick(0.7, None, "ASCEND"),
+        ]
+    )
+    found = [(h.start_s, h.end_s, h.phase, h.reason) for h in FlightAnalysis(log).holds]
+    assert found == [
+        (0.1, 0.3, "ALIGN", "no picture for 0.6 s"),
+        (0.3, 0.4, "ALIGN", "telemetry is old"),
+        (0.5, 0.6, "ALIGN", "telemetry is old"),
+        (0.6, 0.7, "ASCEND", "telemetry is old"),
+    ]
+
+
+def test_the_text_fits_a_terminal_and_obeys_nothing(flown: FlightLog) -> None:
+    text = show_text(FlightAnalysis(flown))
+    assert text.startswith("PERCHED: hanging still with the motors off\nmiss:      3.1 mm\n")
+    assert max(map(len, text.splitlines())) <= COLUMNS
+    assert "a ?[31mnote" in text
+    assert "\x1b" not in text
+    record = show_record(FlightAnalysis(flown))
+    assert [p["phase"] for p in record["phases"]] == [phase for phase, _, _ in synthetic.PLAN]
+    assert record["phases"][0]["start_s"] == 0.0
+    assert record["notes"] == [{"t_s": 0.1, "note": "a \x1b[31mnote"}]
+    assert record["whole"]
+
+
+def test_a_killed_flight_says_what_is_lost(tmp_path: Path) -> None:
+    path = synthetic.write(tmp_path / "f.jsonl", most=300)
+    path.write_bytes(path.read_bytes()[:-40])
+    text = show_text(FlightAnalysis(read_log(path)))
+    assert text.startswith("UNKNOWN: the log ends in ALIGN\n")
+    assert "its end: the program was killed" in text
+    assert "its tail, " in text
+
+
+def test_the_rows_that_were_taken_are_told(tmp_path: Path) -> None:
+    from perchctl.mission import EventKind, Phase
+
+    entered = Event(4.1, EventKind.PHASE, "hovering in the perching area", Phase.SEARCH,
+                    row="approached")  # fmt: skip
+    log = read_log(synthetic.write(tmp_path / "f.jsonl", most=200, events=[entered]))
+    assert "hovering in the perching area (approached)" in show_text(FlightAnalysis(log))
+
+
+# --- a folder of logs ------------------------------------------------------------------
+
+
+def test_the_newest_is_by_its_last_record_and_bad_ones_are_named(tmp_path: Path) -> None:
+    import os
+
+    old = synthetic.write(tmp_path / "flight_old.jsonl", summary=synthetic.SUMMARY, most=5)
+    killed = synthetic.write(tmp_path / "killed.jsonl", most=80)
+    empty = tmp_path / "flight_empty.jsonl"
+    empty.write_bytes(b"")
+    (tmp_path / "hand.jsonl").write_text('{"part": "carry"}\n')
+    for age, path in enumerate((empty, killed, old)):
+        os.utime(path, (1000 - age, 1000 - age))
+    assert newest_logs(tmp_path) == [empty, killed, old]
+    assert newest_logs(tmp_path, 1) == [empty]
+    lines = LogList.of(tmp_path).text().splitlines()
+    assert [line.split()[0] for line in lines] == [
+        "log", "flight_empty.jsonl", "killed.jsonl", "flight_old.jsonl",
+    ]  # fmt: skip
+    assert "the file is empty" in lines[1]
+    assert "unknown: the log ends in APPROACH" in lines[2]
+    assert lines[3].endswith("18.6  perched, 3.1 mm")
+    assert max(map(len, lines)) <= COLUMNS
+
+
+def test_the_end_of_a_log_of_another_version_is_not_believed(tmp_path: Path) -> None:
+    path = synthetic.write(tmp_path / "f.jsonl", {"version": 99}, synthetic.SUMMARY, most=5)
+    assert "schema version 99" in (list_log(path).problem or "")

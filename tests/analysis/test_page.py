@@ -1,0 +1,340 @@
+"""The page: whole, closed in itself, and true for every kind of log."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from perchctl.analysis import FlightAnalysis
+from perchctl.analysis.figures import flight_figures
+from perchctl.analysis.report import ReportedFlight, page_of, with_pictures
+from perchctl.errors import InvalidValue
+from tests.helpers.commands import elsewhere, run  # noqa: F401 - a fixture
+from tests.helpers.told import Change, flown_s, made, written
+
+MOST_BYTES = 3_000_000
+VOID = {"meta", "img", "br"}
+LOADS = {"src", "href", "xlink:href", "action", "data", "srcset"}
+
+
+class Page(HTMLParser):
+    """Every element is closed in its turn; what is loaded, linked and named is kept."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.loads: list[str] = []
+        self.ids: list[str] = []
+        self.text: list[str] = []
+        self.feed(html)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.loads += [value or "" for key, value in attrs if key in LOADS]
+        self.ids += [value or "" for key, value in attrs if key == "id"]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+    @property
+    def words(self) -> str:
+        return " ".join(" ".join(self.text).replace("\N{NO-BREAK SPACE}", " ").split())
+
+
+def told(change: Change = lambda record: None, **more: Any) -> ReportedFlight:
+    return ReportedFlight(FlightAnalysis(made(change, **more)))
+
+
+@pytest.fixture(scope="module")
+def perched() -> str:
+    return page_of([told()])
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the flight's plots, which take most of a page's time."""
+    monkeypatch.setattr("perchctl.analysis.report.flight_figures", lambda flight: [])
+    monkeypatch.setattr("perchctl.analysis.report.battery_figure", lambda flight: None)
+    monkeypatch.setattr("perchctl.analysis.report.trend", lambda label, values: None)
+
+
+words_only = pytest.mark.usefixtures("undrawn")
+
+
+KINDS: dict[str, dict[str, Any]] = {
+    "perched": {},
+    "killed": {"summary": None},
+    "first version": {"version": 1},
+    "without a profile": {"profile": None},
+    "odd profile": {"profile": {"name": "x", "camera": 3, "planner": []}},
+}
+
+
+def assert_closed(html: str) -> Page:
+    page = Page(html)
+    assert len(html.encode()) < MOST_BYTES
+    assert "http:" not in html
+    assert "https:" not in html
+    assert not {"script", "link", "iframe", "object"} & set(page.tags)
+    assert all(address.startswith(("#", "data:")) for address in page.loads)
+    assert len(set(page.ids)) == len(page.ids)
+    assert set(re.findall(r"url\(#([\w-]+)\)", html)) <= set(page.ids)
+    assert "url(" not in re.sub(r"url\(#[\w-]+\)", "", html)
+    assert {a[1:] for a in page.loads if a.startswith("#")} <= set(page.ids)
+    return page
+
+
+def test_a_page_is_whole_and_asks_for_nothing(perched: str) -> None:
+    assert assert_closed(perched).tags.count("svg") == 6
+
+
+@words_only
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_log_has_its_page(kind: str) -> None:
+    words = assert_closed(page_of([told(**KINDS[kind])])).words
+    assert "What happened" in words
+
+
+@pytest.mark.long
+def test_every_log_has_its_plots() -> None:
+    page = assert_closed(page_of([told(**more) for more in KINDS.values()]))
+    assert page.tags.count("svg") == 6 * len(KINDS) + 4
+
+
+def test_its_sections_say_what_the_flight_was(perched: str) -> None:
+    words = Page(perched).words
+    for part in (
+        "Perched, 3.1 mm off centre",
+        "What happened",
+        "ASCEND 6.0 s",
+        "no recording was made beside this log",
+        "The last 5 s with the target, in millimetres",
+        "gaps without a picture",
+        "samples of telemetry",
+        "mAh by the count of the thrust",
+        "Each turn began at its time",
+    ):
+        assert part in words, part
+    assert "External positions" not in words
+
+
+@words_only
+def test_the_sum_of_the_frames_says_what_it_counts() -> None:
+    """Frames of the other phases are not in it: `log show` counts those, too."""
+
+    def change(record: dict[str, Any]) -> None:
+        if record["phase"] == "APPROACH":
+            record["frame_t_s"] = record["t_s"]
+
+    flight = told(change).flight
+    assert flight.vision_led.phase == "in these phases"
+    assert flight.vision_led.frames == sum(each.frames for each in flight.vision_by_phase)
+    assert flight.vision_led.frames < flight.vision.frames == flight.measures.frames
+
+
+def test_a_log_without_a_tick_says_so() -> None:
+    log = made(summary=None)
+    log.records.clear()
+    words = Page(page_of([ReportedFlight(FlightAnalysis(log))])).words
+    assert "The log holds no turn of a flight" in words
+    assert "Unfinished: the log has no end" in words
+
+
+@words_only
+def test_what_the_log_lacks_is_told() -> None:
+    end = {"outcome": "landed", "reason": "x", "lost_records": 7, "problem": "the disk is full"}
+    words = Page(page_of([told(summary=end)])).words
+    assert "The log lacks 7 records: the disk is full." in words
+    assert "ends without its summary" in Page(page_of([told(summary=None)])).words
+
+
+@words_only
+def test_what_is_text_stays_text() -> None:
+    evil = "<script>alert(1)</script>\"'&"
+
+    def change(record: dict[str, Any]) -> None:
+        record |= {"reason": evil, "hold": evil, "cmd": evil}
+        if record["phase"] == "SEARCH":
+            record["phase"] = evil
+
+    end = {"outcome": evil, "reason": evil, "cause": evil, "advice": [evil]}
+    log = made(change, end, uri=evil, source=evil, started_utc=evil, perchctl=evil)
+    log.header["profile"]["name"] = evil
+    html = page_of([ReportedFlight(FlightAnalysis(log)), ReportedFlight(FlightAnalysis(log))])
+    page = Page(html)
+    assert "script" not in page.tags
+    assert "<script" not in html
+    assert "alert(1)" in page.words
+
+
+@words_only
+def test_no_folder_of_the_computer_is_on_the_page(tmp_path: Path) -> None:
+    from perchctl.analysis import write_report
+
+    log = written(tmp_path / "deep" / "flight.jsonl")
+    write_report([log], tmp_path / "page.html")
+    html = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert str(tmp_path) not in html
+    assert "deep" not in html
+
+
+@words_only
+def test_times_of_turns_have_their_histogram() -> None:
+    def change(record: dict[str, Any]) -> None:
+        record["late_s"] = 0.004 if record["t_s"] < 5 else 0.0005
+
+    log = made(change)
+    log.turn_records.extend({"timing": {"pipeline_s": 0.011, "turn_s": 0.012}} for _ in range(50))
+    words = Page(page_of([ReportedFlight(FlightAnalysis(log))])).words
+    assert "late 0.5 ms 4.0 ms 4.0 ms" in words
+    assert "pipeline 11 ms 11 ms 11 ms" in words
+
+
+@words_only
+def test_positions_from_outside_are_told_where_they_were_sent() -> None:
+    def change(record: dict[str, Any]) -> None:
+        record |= {"pos_sent": 100, "pos_hz": 100.0, "pos_age_s": 0.012}
+        record |= {f"pos_{a}_m": record[f"{a}_m"] + 0.003 for a in "xyz"}
+        if 6.0 < record["t_s"] < 7.0:
+            record["pos_note"] = "the body is hidden"
+
+    words = Page(page_of([told(change)])).words
+    assert "External positions" in words
+    assert "5.2 mm, 95 % below 5.2 mm" in words
+    assert "at 4.9 s for 1.0 s: the body is hidden" in words
+
+
+@words_only
+def test_several_flights_have_a_table_that_leads_to_each() -> None:
+    flights = [told(), told(summary=None), told(summary={"outcome": "landed", "reason": "r"})]
+    page = Page(page_of(flights))
+    assert "3 flights: 1 perched, 1 unfinished, 1 landed" in page.words
+    assert {f"#flight-{n}" for n in (1, 2, 3)} <= set(page.loads)
+    assert {f"flight-{n}" for n in (1, 2, 3)} <= set(page.ids)
+    assert len(set(page.ids)) == len(page.ids)
+
+
+# --- pictures -------------------------------------------------------------------------
+
+
+def grey(number: int) -> np.ndarray:
+    return np.full((480, 640), 40 + number % 100, np.uint8)
+
+
+@words_only
+def test_each_decision_has_the_picture_of_its_frame() -> None:
+    asked: list[int] = []
+
+    def recorded(numbers: Any) -> Any:
+        asked.extend(numbers)
+        return ((n, 0.0, grey(n)) for n in range(2000))
+
+    flight = with_pictures(FlightAnalysis(made()), recorded)
+    assert flight.pictures is not None
+    names = [shown.decision.name for shown in flight.pictures]
+    assert names == ["found", "aligned", "settled", "contact"] or "lost" in names
+    for shown in flight.pictures:
+        assert shown.decision.frame in asked
+        assert shown.decision.frame == pytest.approx(shown.decision.t_s / 0.04, abs=13)
+        image = cv2.imdecode(np.frombuffer(shown.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert abs(int(image[-3, -3]) - int(grey(shown.decision.frame)[0, 0])) <= 2
+    assert Page(page_of([flight])).tags.count("img") == len(flight.pictures)
+
+
+@words_only
+def test_a_recording_that_breaks_off_costs_the_pictures_only() -> None:
+    def recorded(numbers: Any) -> Any:
+        yield min(numbers), 0.0, grey(1)
+        raise InvalidValue("the recording is cut")
+
+    flight = with_pictures(FlightAnalysis(made()), recorded)
+    assert flight.pictures is not None
+    assert len(flight.pictures) == 1
+    words = Page(page_of([flight])).words
+    assert "the recording is cut." in words
+    assert "Perched" in words
+
+
+# --- the command ----------------------------------------------------------------------
+
+
+@words_only
+def test_the_command_writes_beside_the_log_and_replaces_nothing(tmp_path: Path) -> None:
+    log = written(tmp_path / "flight.jsonl")
+    said = run("log", "report", str(log))
+    assert (said.code, said.stdout.strip()) == (0, str(log.with_suffix(".html")))
+    assert "already" in run("log", "report", str(log)).complaint
+    other = written(tmp_path / "other.jsonl")
+    said = run("log", "report", str(log), str(other), "-o", "both.html", "--json")
+    answer = json.loads(said.stdout)
+    assert answer["report"] == "both.html"
+    assert [flight["outcome"] for flight in answer["flights"]] == ["perched", "perched"]
+
+
+@words_only
+@pytest.mark.parametrize(
+    ("words", "code", "sentence"),
+    [
+        (("nowhere.jsonl",), 20, "does not exist"),
+        (("flight.jsonl", "-o", "flight.jsonl", "--force"), 2, "one of the logs"),
+        (("flight.jsonl", "-o", "page.pdf"), 30, "must end in .html"),
+    ],
+)
+def test_the_command_refuses(
+    tmp_path: Path, words: tuple[str, ...], code: int, sentence: str
+) -> None:
+    written(tmp_path / "flight.jsonl")
+    said = run("log", "report", *words)
+    assert said.code == code
+    assert sentence in said.complaint
+
+
+@words_only
+def test_no_figure_is_parted_from_its_unit() -> None:
+    html = page_of([told()])
+    for parted in (r"\d (?:s|ms|mm|cm|V|mAh|px|deg)\b", r"\d %", r"\+- \d"):
+        inside = re.findall(rf"<(?:dd|span|figcaption)>[^<]*?({parted})", html)
+        assert not inside, inside
+
+
+def test_the_last_seconds_of_a_short_flight_begin_with_it() -> None:
+    """A flight that was killed soon has no time before its first turn to draw."""
+    flight = made(summary=None)
+    del flight.records[200:]
+    (figure,) = [
+        svg for title, svg in flight_figures(FlightAnalysis(flight)) if "millimetres" in title
+    ]
+    times_s = re.findall(r"text-anchor: middle[^>]*>([^<]+)<", figure)
+    assert times_s
+    assert not any(text.startswith("\N{MINUS SIGN}") for text in times_s)
+
+
+def test_what_the_marks_at_the_bottom_mean_is_said() -> None:
+    def unseen(record: dict[str, Any]) -> None:
+        if 6.0 < flown_s(record) < 7.0:
+            record.update({key: None for key in record if re.match(r"[jls]x_m", key)})
+
+    figures = dict(flight_figures(FlightAnalysis(made(unseen))))
+    figure = figures["The target relative to the gear"]
+    assert "no target" in figure
+    assert "no picture" in figure
