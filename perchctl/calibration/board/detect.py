@@ -228,12 +228,10 @@ _MIN_WIDTH_PX, _MAX_WIDTH_SHARE = 0.25, 1.2
 
 @dataclass(frozen=True, eq=False)
 class Saddles:
-    """corners_px (n, 2); ok (n,): the fit holds; sigma_px (n,): its own spread from the
-    grey residuals; width_px (n,): the wider edge's spread."""
+    """corners_px (n, 2); ok (n,): the fit holds; width_px (n,): the wider edge's spread."""
 
     corners_px: Array
     ok: NDArray[np.bool_]
-    sigma_px: Array
     width_px: Array
 
 
@@ -268,10 +266,7 @@ def fit_saddles(
             the picture shows them, (n, 2) each.
         room: how far the picture is of use around a corner.
     """
-    n = len(corners_px)
-    start = np.asarray(corners_px, dtype=np.float64).reshape(-1, 2)
-    if n == 0:
-        return Saddles(start, np.zeros(0, dtype=np.bool_), np.zeros(0), np.zeros(0))
+    start = np.asarray(corners_px, dtype=np.float64)
     axes = np.stack([along_px, down_px], axis=2)  # (n, 2, 2): board units -> px
     size_px = _thickness_px(axes)
     reach = np.clip(
@@ -307,12 +302,7 @@ def _sample(
 ) -> tuple[Array, NDArray[np.bool_]]:
     places = centre[:, None] + offsets
     h, w = image.shape
-    inside = (
-        (places[..., 0] >= 0)
-        & (places[..., 0] <= w - 1)
-        & (places[..., 1] >= 0)
-        & (places[..., 1] <= h - 1)
-    )
+    inside = np.asarray(((places >= 0) & (places <= (w - 1, h - 1))).all(axis=2))
     xy = places.astype(np.float32)
     grey = cv2.remap(image.astype(np.float32), xy[..., 0], xy[..., 1], cv2.INTER_LINEAR)
     return np.asarray(grey, dtype=np.float64), inside
@@ -454,4 +444,4 @@ def _judged(
         & (sigma < 0.5)
     )
     corners = np.where(ok[:, None], start + state[:, :2], start)
-    return Saddles(corners, ok, sigma, np.exp(state[:, 4:]).max(axis=1))
+    return Saddles(corners, ok, np.exp(state[:, 4:]).max(axis=1))
