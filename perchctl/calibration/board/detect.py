@@ -302,10 +302,10 @@ def _sample(
 ) -> tuple[Array, NDArray[np.bool_]]:
     places = centre[:, None] + offsets
     h, w = image.shape
-    inside = np.all((places >= 0) & (places <= (w - 1, h - 1)), axis=2)
+    inside = np.asarray(((places >= 0) & (places <= (w - 1, h - 1))).all(axis=2))
     xy = places.astype(np.float32)
     grey = cv2.remap(image.astype(np.float32), xy[..., 0], xy[..., 1], cv2.INTER_LINEAR)
-    return np.asarray(grey, dtype=np.float64), np.asarray(inside)
+    return np.asarray(grey, dtype=np.float64), inside
 
 
 def _white_quadrants(grey: Array, uv: Array) -> NDArray[np.bool_]:
