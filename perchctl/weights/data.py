@@ -13,6 +13,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import math
+import operator
 import os
 from array import array
 from collections.abc import Sequence
@@ -141,16 +142,20 @@ def refuse_repeated(parts: Sequence[Measurements], test: Measurements | None = N
 
     Without times, rows of one position may well be equal: rounded, of a camera at rest.
     """
+    files = [*parts, *([] if test is None else [test])]
     first: dict[bytes, tuple[Measurements, int]] = {}
-    for part in (*parts, *([] if test is None else [test])):
+    for part in files:
         timeless = float(np.ptp(part.t_s)) == 0.0
         poses = [np.nan_to_num(getattr(part, source)) for source in SOURCES]
         values = np.column_stack([part.t_s, *poses]) + 0.0  # no zero with a minus
-        for row, content in enumerate(values):
-            before, old_row = first.setdefault(content.tobytes(), (part, row))
-            if before is part and (
-                old_row == row or (timeless and part.position[row] == part.position[old_row])
-            ):
+        content, size = values.tobytes(), values.itemsize * values.shape[1]
+        for row in range(len(part)):
+            key = content[row * size : (row + 1) * size]
+            if key not in first:
+                first[key] = (part, row)
+                continue
+            before, old_row = first[key]
+            if before is part and timeless and part.position[row] == part.position[old_row]:
                 continue
             why = (
                 "--test judges by other data than was fitted to"
@@ -197,6 +202,7 @@ def _parsed(path: Path, sha256: str, reader: Any, ended: bool) -> Measurements:
     if not all(name in columns for name in JOINT):
         names = list(NEEDED)
     wanted = [columns.index(name) for name in names]
+    pick = operator.itemgetter(*wanted)
     numbers, lines = array("d"), array("q")
     for cells in reader:
         if len(cells) < 2 and not "".join(cells).strip():
@@ -211,10 +217,11 @@ def _parsed(path: Path, sha256: str, reader: Any, ended: bool) -> Measurements:
                 )
             raise fault(line, f"{len(cells)} cells where the header has {len(columns)} columns")
         try:
-            row = [float(cells[k] or "nan") for k in wanted]
+            row = list(map(float, pick(cells)))
+            plain = math.isfinite(sum(row))
         except ValueError:
-            row = [math.nan]
-        if not math.isfinite(sum(row)):  # a marker that was not seen, or a fault
+            plain = False
+        if not plain:  # a marker that was not seen, or a fault
             row = [
                 _number(cells[k], name, line, fault) for k, name in zip(wanted, names, strict=True)
             ]
