@@ -10,13 +10,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from perchctl.calibration import profile_camera
+from perchctl.campaign import fly_all, fly_measured, seed_log_path
 from perchctl.errors import PerchError
 from perchctl.faults.bounds import DescentBound, PlaceBound, UnfeltDrift
 from perchctl.faults.camera import FaultyCamera
-from perchctl.faults.catalogue import FROM_THE_START, Case, draw_case
+from perchctl.faults.catalogue import BY_NAME, FROM_THE_START, Case, draw_case
 from perchctl.faults.claims import REFUSAL_CLAIMS, claims_of, claims_of_rescue, last_row
 from perchctl.faults.effects import (
     CameraFault,
@@ -40,11 +39,7 @@ from perchctl.flight import (
     OperatorSwitch,
     feed_lockstep,
     fly,
-    fly_all,
-    give_back_memory,
     lockstep_source,
-    peak_memory_mb,
-    seed_log_path,
     with_positioning,
 )
 from perchctl.geometry import GRAVITY_MPS2
@@ -52,7 +47,7 @@ from perchctl.link import FAST_BLOCKS, MockLink, simulated_radio
 from perchctl.log import LogWatcher, to_exact
 from perchctl.mission import Event, FlightReport, Phase, Tick, Watcher
 from perchctl.profile import Profile
-from perchctl.sim import Packet, Port, Scenario, draw_capture, draw_scenario
+from perchctl.sim import Packet, Port, Scenario, draw_capture
 from perchctl.vision import make_pipeline
 
 AFTER_S, AFTER_IN_THE_AIR_S = 6.0, 10.0
@@ -297,16 +292,12 @@ def fly_fault_seed(
     record: bool = False,
 ) -> FaultResult:
     """The seed's scenario with the seed's fault out of those named."""
-    from perchctl.faults.catalogue import BY_NAME
 
-    cv2.setNumThreads(1)  # a job is one core
-    cpu_began_s = time.process_time()
-    scenario = draw_scenario(profile, seed)
-    case = draw_case(seed, scenario, [BY_NAME[name] for name in faults])
-    result = fly_with_fault(profile, case, scenario, log, record)
-    cpu_s = time.process_time() - cpu_began_s
-    give_back_memory()
-    return replace(result, cpu_s=cpu_s, peak_memory_mb=peak_memory_mb(), scenario=scenario)
+    def fly_drawn(scenario: Scenario) -> FaultResult:
+        case = draw_case(seed, scenario, [BY_NAME[name] for name in faults])
+        return fly_with_fault(profile, case, scenario, log, record)
+
+    return fly_measured(profile, seed, fly_drawn)
 
 
 def _scenario_of(case: Case, scenario: Scenario) -> Scenario:
@@ -364,7 +355,7 @@ def run_fault_campaign(
     log_dir: Path | None = None,
     record: bool = False,
 ) -> list[FaultResult]:
-    """Fly all seeds, as `perchctl.flight.campaign.run_campaign` does."""
+    """Fly all seeds, as `perchctl.campaign.run_campaign` does."""
     return fly_all(
         partial(_fly_logged, profile, faults, log_dir, record), seeds, executor, on_result
     )

@@ -30,7 +30,7 @@ class FaultResult:
         touchdown_mps, touchdown_aside_mps: the hardest touchdown, downwards and sideways.
         astray_m: in the air, the farthest from where it should have been.
         log, log_problem: the flight's log, and what it lacks; None without.
-        cpu_s, peak_memory_mb, scenario: as a `perchctl.flight.results.FlightResult` has them.
+        cpu_s, peak_memory_mb, scenario: as `perchctl.campaign.FlightResult` has them.
     """
 
     seed: int

@@ -7,12 +7,12 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal, get_args
 
+from perchctl.campaign import align_columns, peak_mb, rate_record, rate_text
 from perchctl.faults.catalogue import AIR, FAULTS
 from perchctl.faults.claims import NOT_KNOWN, UNCONFIRMED
 from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES
 from perchctl.faults.oracle import FLAGS
 from perchctl.faults.result import End, FaultResult
-from perchctl.flight import align_columns, peak_mb, rate_record, rate_text
 
 ENDS: tuple[End, ...] = get_args(End)
 WORST = 20

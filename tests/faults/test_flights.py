@@ -19,6 +19,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 import cv2
 from typer.testing import CliRunner
 
+from perchctl.campaign.results_file import flown_record
 from perchctl.commands import app
 from perchctl.commands.positioning import POSITIONINGS, positioned
 from perchctl.errors import SafetyAbort
@@ -33,7 +34,6 @@ from perchctl.faults.program import PlantedError
 from perchctl.faults.promises import PROMISE_OF, PROMISES
 from perchctl.faults.summary import worst_first
 from perchctl.flight import loop
-from perchctl.flight.record import flown_record
 from perchctl.mission import Phase
 from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile, load_profile

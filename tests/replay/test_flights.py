@@ -8,9 +8,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl.campaign.flights import fly_seed
 from perchctl.faults import FAULTS
 from perchctl.faults.flight import fly_fault_seed
-from perchctl.flight.campaign import fly_seed
 from perchctl.log import read_log, recorded_pictures
 from perchctl.profile import changed_profile
 from perchctl.replay import pose_changes, replay

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
@@ -15,18 +15,18 @@ from typing import Any, TypeVar
 
 import cv2
 
+from perchctl.campaign.pool import defer_interrupts, give_back_memory, peak_memory_mb
+from perchctl.campaign.results import FlightEnd, FlightResult
 from perchctl.errors import PerchError, SafetyAbort, TimedOut
-from perchctl.flight.hands import defer_interrupts
-from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
-from perchctl.flight.results import FlightEnd, FlightResult, give_back_memory, peak_memory_mb
+from perchctl.flight import LockstepFlight, fly_lockstep
 from perchctl.log import FlightSummary, LogWatcher
 from perchctl.mission import Event, EventKeeper, Phase, Watcher
 from perchctl.profile import Profile
-from perchctl.sim import draw_scenario
+from perchctl.sim import Scenario, draw_scenario
 
 R = TypeVar("R")
 K = TypeVar("K", bound=Hashable)
-"""A seed, or what else names a flight of many; its text names it to people."""
+"""A seed, or another key of one flight among many; its text names the flight to people."""
 
 OUTCOMES: dict[Phase, FlightEnd] = {
     Phase.PERCHED: "perched",
@@ -34,12 +34,12 @@ OUTCOMES: dict[Phase, FlightEnd] = {
     Phase.ABORTED: "aborted",
 }
 FLOWN_AGAIN = 2
-"""Times that a flight may be lost with who flew it, and is flown again."""
+"""Times that a flight may be lost with the process that flew it, and is flown again."""
 
 
 @dataclass(frozen=True)
 class LoggedFlight:
-    """All that is told of one flight; `events` are what happened, in order."""
+    """One flight with its summary, its log, and its events in order."""
 
     seed: int
     outcome: FlightEnd
@@ -56,34 +56,40 @@ class LoggedFlight:
         return (self.outcome != "perched",)
 
 
+def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R:
+    """The result of `fly`, a dataclass, called with the seed's scenario on one core; completed by
+    the time of a core that it took, the peak of the memory and the scenario. What the flight held
+    is freed."""
+    cv2.setNumThreads(1)  # a job is one core, so that the rates are rates a core
+    cpu_began_s = time.process_time()
+    scenario = draw_scenario(profile, seed)
+    result: Any = fly(scenario)
+    cpu_s = time.process_time() - cpu_began_s
+    give_back_memory()
+    flown: R = replace(result, cpu_s=cpu_s, peak_memory_mb=peak_memory_mb(), scenario=scenario)
+    return flown
+
+
 def fly_seed(
     profile: Profile, seed: int, log_path: Path | None = None, record: bool = False
 ) -> FlightResult:
-    """Fly one seed of the profile's scenario; a function of its own so that any
-    executor can carry it to another process or machine. `record`: with the pictures beside
-    the log. What is refused before take-off is a result, too, and leaves no log."""
-    began_s, cpu_began_s = time.perf_counter(), time.process_time()
+    """Fly one seed of the profile's scenario. It is a function of its own so that any executor can
+    carry it to another process or machine. `record`: with the pictures beside the log. A flight
+    that is refused before take-off is a result, too, and leaves no log.
+    Errors: NotFound, InvalidValue (calibration, log)."""
+    return fly_measured(profile, seed, lambda _: _fly(profile, seed, log_path, record))
+
+
+def _fly(profile: Profile, seed: int, log_path: Path | None, record: bool) -> FlightResult:
+    began_s = time.perf_counter()
     log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
     try:
         flight, summary = _flown(profile, seed, log)
     except (SafetyAbort, TimedOut) as error:
         if log is not None:
             log.abandon(str(error))
-        return FlightResult(
-            seed=seed,
-            outcome="refused",
-            reason=str(error),
-            miss_m=None,
-            time_s=0.0,
-            attempts=0,
-            locked=False,
-            fell=False,
-            realtime_factor=0.0,
-            cpu_s=time.process_time() - cpu_began_s,
-            peak_memory_mb=peak_memory_mb(),
-            scenario=draw_scenario(profile, seed),
-        )
-    result = FlightResult(
+        return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False, 0.0)
+    return FlightResult(
         seed=seed,
         outcome=_outcome(flight),
         reason=flight.report.reason,
@@ -95,17 +101,12 @@ def fly_seed(
         realtime_factor=flight.simulated_s / (time.perf_counter() - began_s),
         log=None if log is None else log.path,
         log_problem=None if summary is None else summary.log_problem,
-        cpu_s=time.process_time() - cpu_began_s,
-        peak_memory_mb=peak_memory_mb(),
-        scenario=flight.scenario,
     )
-    del flight
-    give_back_memory()
-    return result
 
 
 def fly_logged(profile: Profile, folder: Path, seed: int, record: bool = False) -> LoggedFlight:
     """Fly one seed to look at it closely. Errors: NotFound, InvalidValue (calibration, log)."""
+    cv2.setNumThreads(1)
     log = LogWatcher.lockstep(seed_log_path(seed, folder), profile, seed, record)
     events = EventKeeper()
     flight, summary = _flown(profile, seed, log, events)
@@ -116,7 +117,6 @@ def fly_logged(profile: Profile, folder: Path, seed: int, record: bool = False) 
 def _flown(
     profile: Profile, seed: int, log: LogWatcher | None, *watchers: Watcher
 ) -> tuple[LockstepFlight, FlightSummary | None]:
-    cv2.setNumThreads(1)  # a job is one core, so that the rates are rates a core
     flight = fly_lockstep(profile, seed, log, watchers=watchers)
     if log is None:
         return flight, None
@@ -135,15 +135,13 @@ def run_campaign(
     log_dir: Path | None = None,
     record: bool = False,
 ) -> list[FlightResult]:
-    """Fly all seeds; results in the order of the seeds. With an executor (any of
-    `concurrent.futures`' kind) the flights are handed to it, otherwise flown here."""
-    return fly_all(partial(_fly_logged, profile, log_dir, record), seeds, executor, on_result)
+    """Fly all seeds, as `fly_all` does; results in the order of the seeds."""
+    return fly_all(partial(_fly_in_folder, profile, log_dir, record), seeds, executor, on_result)
 
 
-def _fly_logged(profile: Profile, log_dir: Path | None, record: bool, seed: int) -> FlightResult:
-    return fly_seed(
-        profile, seed, None if log_dir is None else seed_log_path(seed, log_dir), record
-    )
+def _fly_in_folder(profile: Profile, log_dir: Path | None, record: bool, seed: int) -> FlightResult:
+    log_path = None if log_dir is None else seed_log_path(seed, log_dir)
+    return fly_seed(profile, seed, log_path, record)
 
 
 def seed_log_path(seed: int, log_dir: Path) -> Path:
@@ -160,8 +158,9 @@ def fly_all(
     """`fly` of each seed, each once, in the order of the seeds; `on_result` as they are done.
 
     `executor` is anything with ``submit(fly, seed)`` that returns a future of
-    `concurrent.futures`' kind; one that fails with `BrokenExecutor` was lost with who flew it,
-    and is flown again, `FLOWN_AGAIN` times at most. Errors: PerchError.
+    `concurrent.futures`' kind, or None to fly here. A flight whose future fails with
+    `BrokenExecutor` was lost with the process that flew it, and is flown again, `FLOWN_AGAIN`
+    times at most. Errors: PerchError.
     """
     seeds = list(dict.fromkeys(seeds))
     by_seed: dict[K, R] = {}

@@ -1,9 +1,10 @@
-"""Figures of a campaign and the words after a flight."""
+"""Figures of a campaign and their intervals, and the words after a flight."""
 
 from __future__ import annotations
 
 import io
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +15,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.progress import Task, TaskID
 
+from perchctl.campaign import (
+    FlightResult,
+    campaign_summary,
+    campaign_table,
+    none_took_off,
+    rate_record,
+    rate_text,
+    run_campaign,
+    seed_log_path,
+)
+from perchctl.campaign.compare import FIGURES
+from perchctl.campaign.results import ENDS, rate_interval, worst_first
+from perchctl.campaign.results_file import flown_record, result_from, result_record
+from perchctl.errors import SafetyAbort
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
 from perchctl.commands.progress import TimeLeft, progress_bar
-from perchctl.flight import FlightResult, campaign_summary, campaign_table
-from perchctl.flight.results import ENDS, worst_first
 from perchctl.log import FlightSummary, PhaseSpan, read_log, summarise_flight, summary_text
 from perchctl.log.write import FlightLogWriter
 from tests.helpers import log as synthetic
+from tests.helpers.commands import elsewhere, run  # noqa: F401
+from tests.helpers.flights import SHORT, short_profile
 from tests.helpers.results import aborted, landed, perched
 
 PERCHED, ABORTED = perched(1, miss_m=0.004), aborted(3)
@@ -44,7 +62,7 @@ results_lists = st.lists(
 
 
 def test_a_campaign_of_three() -> None:
-    figures = campaign_summary([PERCHED, LANDED, ABORTED], wall_s=12.0)
+    figures = campaign_summary([PERCHED, LANDED, ABORTED])
     assert figures == {
         "flights": 3,
         "perched": 1,
@@ -58,12 +76,10 @@ def test_a_campaign_of_three() -> None:
         "locked": 1,
         "fell": 1,
         "miss_m": {"median": 0.004, "p95": 0.004, "max": 0.004},
-        "realtime_factor": 5.0,
+        "realtime_factor": pytest.approx(60.0 / (4.0 + 6.0 + 4.0), abs=1e-6),
         "peak_memory_mb": 5e6,
         "worst_seeds": [3, 2],
     }
-    without_wall = campaign_summary([PERCHED, LANDED, ABORTED])
-    assert without_wall["realtime_factor"] == pytest.approx(60.0 / (4.0 + 6.0 + 4.0))
 
 
 def test_no_flights() -> None:
@@ -112,7 +128,7 @@ def test_more_bad_flights_than_are_shown_are_counted() -> None:
 
 
 def test_table_says_what_happened() -> None:
-    lines = campaign_table([PERCHED, LANDED, ABORTED], wall_s=12.0).splitlines()
+    lines = campaign_table([PERCHED, LANDED, ABORTED]).splitlines()
     said = {line.split("  ")[0]: line for line in lines if line}
     assert said["perched"].endswith("1 of 3 (0.8 to 90.6 %)")
     assert said["miss [mm]"].endswith("median 4.0, p95 4.0, max 4.0 (seed 1)")
@@ -234,3 +250,100 @@ def test_the_time_left_is_known_from_the_first_flight_on() -> None:
 def test_rounding_keeps_a_micrometre() -> None:
     figures = campaign_summary([replace(PERCHED, miss_m=float(np.float64(0.0012345678)))])
     assert figures["miss_m"]["max"] == 0.001235
+
+
+# --- refused before take-off: a result of the campaign, not its end ---------------------------
+
+REFUSED = FlightResult(4, "refused", "the battery is flat", None, 0.0, 0, False, False, 0.0)
+
+
+def test_a_flat_battery_is_a_result_and_leaves_no_log(tmp_path: Path) -> None:
+    flat = short_profile({"simulation.battery_rest_v": [3.2, 3.3]})
+    results = run_campaign(flat, [5, 6], log_dir=tmp_path)
+    assert [r.outcome for r in results] == ["refused", "refused"]
+    assert "charge it" in results[0].reason
+    for result in results:
+        assert result.scenario is not None
+        assert 3.2 <= result.scenario.battery_rest_v <= 3.3
+        assert result.log is None
+        assert not seed_log_path(result.seed, tmp_path).exists()
+        assert flown_record(result_from(result_record(result))) == flown_record(result)
+
+
+def test_it_counts_as_bad_but_did_no_harm() -> None:
+    results = [REFUSED, PERCHED, ABORTED, LANDED]
+    assert [r.seed for r in worst_first(results)] == [3, 2, 4]
+    assert PERCHED.badness < REFUSED.badness < LANDED.badness < ABORTED.badness
+    figures = campaign_summary(results)
+    assert (figures["flights"], figures["perched"], figures["refused"]) == (4, 1, 1)
+    assert figures["realtime_factor"] == pytest.approx(60.0 / (4.0 + 6.0 + 4.0))
+
+
+def test_the_table_has_a_line_for_them_where_there_are_any() -> None:
+    assert "refused" in campaign_table([PERCHED, REFUSED])
+    assert "refused" not in campaign_table([PERCHED, LANDED])
+    assert "flight time [s]   median 20.0, max 20.0" in campaign_table([PERCHED, REFUSED])
+
+
+def test_it_has_no_time_and_no_attempts_to_compare() -> None:
+    assert [figure.of(REFUSED) for figure in FIGURES] == [None, None, None]
+    assert [figure.of(LANDED) for figure in FIGURES] == [None, 30.0, 0.0]
+
+
+def test_where_none_took_off_it_is_not_the_seeds() -> None:
+    assert none_took_off([]) is None
+    assert none_took_off([REFUSED, LANDED]) is None
+    problem = none_took_off([REFUSED, REFUSED])
+    assert isinstance(problem, SafetyAbort)
+    assert "every flight was refused before take-off: the battery is flat" in str(problem)
+
+
+@pytest.mark.long
+def test_the_command_says_so_after_its_table(tmp_path: Path) -> None:
+    flat = tmp_path / "flat.yaml"
+    flat.write_text(f"extends: {SHORT}\nsimulation:\n  battery_rest_v: [3.2, 3.3]\n")
+    said = run("simulate", "-p", str(flat), "-n", "2", "--jobs", "1", "--json")
+    assert said.code == SafetyAbort.exit_code
+    assert json.loads(said.stdout)["refused"] == 2
+    assert said.complaint.startswith("every flight was refused before take-off: the battery rests")
+
+
+# --- a rate's interval against the binomial law that it stands for -----------------------------
+
+
+def _at_most(k: int, n: int, p: float) -> float:
+    """The chance of at most k of n."""
+    return sum(math.comb(n, i) * p**i * (1.0 - p) ** (n - i) for i in range(k + 1))
+
+
+@given(st.integers(0, 60), st.integers(1, 60), st.sampled_from([0.5, 0.9, 0.95, 0.99]))
+def test_beyond_a_bound_what_was_seen_has_half_of_the_rest(k: int, n: int, level: float) -> None:
+    k = min(k, n)
+    low, high = rate_interval(k, n, level)
+    assert 0.0 <= low <= k / n <= high <= 1.0
+    side = 0.5 * (1.0 - level)
+    if k:
+        assert 1.0 - _at_most(k - 1, n, low) == pytest.approx(side, abs=1e-9)
+    if k < n:
+        assert _at_most(k, n, high) == pytest.approx(side, abs=1e-9)
+    mirrored = rate_interval(n - k, n, level)
+    assert mirrored == pytest.approx((1.0 - high, 1.0 - low), abs=1e-12)
+
+
+def test_words() -> None:
+    assert rate_text(100, 100) == "100 of 100 (>= 96.4 %)"
+    assert rate_text(0, 100) == "0 of 100 (<= 3.6 %)"
+    assert rate_text(97, 100) == "97 of 100 (91.5 to 99.4 %)"
+    assert rate_text(0, 0) == "0 of 0"
+
+
+def test_a_record() -> None:
+    assert rate_record(0, 0) == {}
+    assert rate_record(100, 100) == {"rate": 1.0, "interval": [0.963783, 1.0]}
+
+
+def test_what_is_no_rate_is_refused() -> None:
+    for k, n, level in ((3, 2, 0.95), (-1, 2, 0.95), (1, 2, 1.0)):
+        with pytest.raises(ValueError, match=r"is no rate|a level is between"):
+            rate_interval(k, n, level)
+    assert rate_interval(0, 0) == (0.0, 1.0)

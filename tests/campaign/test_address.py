@@ -5,15 +5,13 @@ from __future__ import annotations
 import importlib.util
 import socket
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.cluster import parse_address
-from perchctl.cluster.hands import Place
-from perchctl.commands.simulate_request import SimulateRequest
+
+from perchctl.campaign.pool import ClusterAddress, parse_address
 from perchctl.errors import UsageError
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.flights import SHORT
@@ -22,14 +20,14 @@ from tests.helpers.flights import SHORT
 @pytest.mark.parametrize(
     ("text", "place"),
     [
-        ("local:1", Place(None, 1)),
-        ("local:64", Place(None, 64)),
-        ("tcp://10.0.0.5:8786", Place("tcp://10.0.0.5:8786")),
-        ("node7.lab:8786", Place("tcp://node7.lab:8786")),
-        ("tls://[::1]:8786", Place("tls://[::1]:8786")),
+        ("local:1", ClusterAddress(None, 1)),
+        ("local:64", ClusterAddress(None, 64)),
+        ("tcp://10.0.0.5:8786", ClusterAddress("tcp://10.0.0.5:8786")),
+        ("node7.lab:8786", ClusterAddress("tcp://node7.lab:8786")),
+        ("tls://[::1]:8786", ClusterAddress("tls://[::1]:8786")),
     ],
 )
-def test_an_address_is_read(text: str, place: Place) -> None:
+def test_an_address_is_read(text: str, place: ClusterAddress) -> None:
     assert parse_address(text) == place
     assert parse_address(str(place)) == place
 
@@ -48,17 +46,18 @@ def test_what_is_none_is_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("words", "named"),
     [
-        ({"jobs": 2}, "--jobs 2 does not apply"),
-        ({"only": 3}, "--cluster local:2 does not apply; leave it out, or --only"),
-        ({"faults": "list"}, "--cluster local:2 does not apply"),
-        ({"sweep": ("a.b=1",), "jobs": 1}, "--jobs 1 does not apply"),
+        (("--jobs", "2"), "--jobs 2 does not apply"),
+        (("--only", "3"), "--cluster local:2 does not apply; leave it out, or --only"),
+        (("--faults", "list"), "--cluster local:2 does not apply"),
+        (("sweep", "planner.attempts=1", "--jobs", "1"), "--jobs 1 does not apply"),
     ],
 )
-def test_what_does_not_go_with_it_is_refused(options: dict[str, Any], words: str) -> None:
-    with pytest.raises(UsageError, match=words):
-        SimulateRequest(cluster="local:2", **options).check()
+def test_what_does_not_go_with_it_is_refused(words: tuple[str, ...], named: str) -> None:
+    said = run("simulate", *words, "--cluster", "local:2")
+    assert said.code == UsageError.exit_code
+    assert named in said.stderr
 
 
 def test_without_the_library_one_sentence_says_what_to_install(
@@ -66,7 +65,7 @@ def test_without_the_library_one_sentence_says_what_to_install(
 ) -> None:
     there = importlib.util.find_spec
     hide = lambda name, *rest: None if name == "distributed" else there(name, *rest)  # noqa: E731
-    monkeypatch.setattr("perchctl.commands.simulate_hands.find_spec", hide)
+    monkeypatch.setattr("perchctl.commands.simulate.find_spec", hide)
     said = run("simulate", "-p", SHORT, "-n", "2", "--cluster", "local:2")
     assert said.code == 2
     assert said.complaint.startswith("--cluster needs the library distributed (it is missing)")
@@ -77,7 +76,7 @@ def test_an_address_that_nobody_answers_is_told_in_time(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
-    monkeypatch.setattr("perchctl.cluster.hands.ANSWER_S", 0.3)
+    monkeypatch.setattr("perchctl.campaign.cluster.ANSWER_S", 0.3)
     with socket.socket() as deaf:  # is bound, and takes no call
         deaf.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{deaf.getsockname()[1]}"

@@ -1,7 +1,8 @@
 """The workers of a dask cluster as an executor: flights in, futures of `concurrent.futures` out.
 
-All that is dask's runs in one event loop, in a thread that never sees a signal. A worker is handed
-one flight at a time; the rest wait here, where they cost the scheduler nothing.
+Everything of dask's runs in one event loop, in a thread that never sees a signal. A worker gets
+one flight at a time; the rest wait here, where they cost the scheduler nothing. A flight that
+waits at a worker would be lost with it, too, which is why dask's own executor does not do.
 """
 
 from __future__ import annotations
@@ -11,13 +12,11 @@ import contextlib
 import logging
 import os
 import pickle
-import re
 import threading
 import warnings
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,12 +24,18 @@ from typing import Any, TypeVar
 from distributed import Client, KilledWorker
 from distributed.versions import VersionMismatchWarning
 
-from perchctl.cluster.asking import ask_all, ask_scheduler, cannot_load
-from perchctl.cluster.local import LocalWorkers, local_scheduler
-from perchctl.cluster.wanted import Wanted, wanted
-from perchctl.cluster.worker import fly_order
-from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
-from perchctl.flight import defer_interrupts, flight_order
+from perchctl.campaign.local_workers import LocalWorkers, local_scheduler
+from perchctl.campaign.pool import ClusterAddress, defer_interrupts
+from perchctl.campaign.workers import (
+    WorkerRequirements,
+    cannot_load,
+    flight_order,
+    fly_order,
+    verify_scheduler,
+    verify_workers,
+    worker_requirements,
+)
+from perchctl.errors import ConnectionFailed, InvalidValue, PerchError
 from perchctl.profile import Profile
 
 R = TypeVar("R")
@@ -45,25 +50,26 @@ NOBODY_S = 120.0
 """For so long a campaign waits without any worker."""
 LOCAL_S = 600.0
 """For so long it waits for one here, which has to load all libraries; one that cannot is seen."""
-_LOOK_S = 0.25
+_POLL_S = 0.25
 _CLOSE_S = 0.5
 _END_S = 1.0
 _QUIET = ("distributed", "tornado", "asyncio")
 
 
-class ClusterHands(Executor):
-    """`width`: workers at the start. `notes`: what is worth saying, a sentence each."""
+class ClusterPool(Executor):
+    """`notes`: what is worth saying once it has started, a sentence each. `local`: the workers of
+    this computer, None where the cluster is another's."""
 
-    def __init__(self, place: Place, asked: Wanted) -> None:
-        self.width, self.notes = place.workers, list[str]()
-        self.local = None if place.address else LocalWorkers(place.workers)
-        self._place, self._asked = place, asked
+    def __init__(self, address: ClusterAddress, required: WorkerRequirements) -> None:
+        self.notes: list[str] = []
+        self.local = None if address.scheduler else LocalWorkers(address.workers)
+        self._cluster, self._required = address, required
         self._orders: deque[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]]] = deque()
         self._flying: set[asyncio.Task[None]] = set()
         self._lock = threading.Lock()
         self._broken: PerchError | None = None
         self._ended = False
-        self._address = place.address or ""
+        self._address = address.scheduler or ""
         self._workers = self._number = 0
         self._nobody_s = 0.0
         self._ready: Future[None] = Future()
@@ -71,15 +77,15 @@ class ClusterHands(Executor):
         self._thread = threading.Thread(target=self._live, name="perchctl-cluster", daemon=True)
 
     def start(self) -> None:
-        """Returns as flights can be handed over. Errors: PerchError."""
+        """Return as soon as flights can be handed over. Errors: PerchError."""
         resource_tracker.ensure_running()  # it lifts the mask of the thread that starts it
-        with defer_interrupts():  # threads and processes have the mask of who starts them
+        with defer_interrupts():  # threads and processes inherit the mask of who starts them
             self._thread.start()
         self._ready.result()
 
     def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
-        """The future fails with `BrokenExecutor` where the worker that flew was lost, and with
-        PerchError where it must not fly, or none is left that could."""
+        """The future fails with `BrokenExecutor` if the worker that flew was lost, and with
+        PerchError if the worker must not fly, or no worker is left."""
         if kwargs:
             raise TypeError("a flight has no arguments by name")
         if self._ended:
@@ -94,7 +100,7 @@ class ClusterHands(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Leaves the cluster; what it is flying is dropped."""
+        """Leave the cluster; the flights that it is flying are dropped."""
         self._ended = True
         self._call(self._leave)
         if wait and self._thread.ident is not None:
@@ -103,12 +109,13 @@ class ClusterHands(Executor):
             self.local.kill()
 
     def _call(self, what: Callable[[], object]) -> None:
+        """Call `what` in the event loop."""
         if self._task is not None:
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 self._task.get_loop().call_soon_threadsafe(what)
 
     def _live(self) -> None:
-        """The thread's life."""
+        """Run the event loop; this is the life of the thread."""
         try:
             asyncio.run(self._work())
         except asyncio.CancelledError:
@@ -119,7 +126,7 @@ class ClusterHands(Executor):
             self._fail(self._unforeseen(error))
 
     def _fail(self, why: PerchError) -> None:
-        """All flights fail that were handed over and are not flown."""
+        """Let all flights fail that were handed over and are not flown."""
         with self._lock:
             self._broken = why
             orders = list(self._orders)
@@ -140,21 +147,20 @@ class ClusterHands(Executor):
         if self._ended:
             return
         async with contextlib.AsyncExitStack() as stack:
-            if self._place.address is None:
+            if self._cluster.scheduler is None:
                 self._address = await stack.enter_async_context(self._started())
             self._client = await stack.enter_async_context(_connected(self._address))
-            await ask_scheduler(self._client, self._address)
+            await verify_scheduler(self._client, self._address)
             await self._first_worker()
-            self.notes = await ask_all(self._client, self._asked)
-            self.width = self._place.workers or self._workers
+            self.notes = await verify_workers(self._client, self._required)
             self._ready.set_result(None)
             while True:
-                await self._look(NOBODY_S if self.local is None else LOCAL_S)
+                await self._poll(NOBODY_S if self.local is None else LOCAL_S)
                 self._hand_over()
 
     @contextlib.asynccontextmanager
     async def _started(self) -> AsyncIterator[str]:
-        """The scheduler and the workers of this computer; yields the address."""
+        """Start a scheduler and the workers of this computer; yields the scheduler's address."""
         assert self.local is not None
         async with local_scheduler(self.local.folder) as scheduler:
             try:
@@ -166,12 +172,12 @@ class ClusterHands(Executor):
 
     async def _first_worker(self) -> None:
         while not self._workers:
-            await self._look(WORKERS_S if self.local is None else LOCAL_S)
+            await self._poll(WORKERS_S if self.local is None else LOCAL_S)
 
-    async def _look(self, nobody_s: float) -> None:
-        """Who is there, a moment from now. Errors: ConnectionFailed, where the scheduler is not,
-        or for `nobody_s` no worker; PerchError."""
-        await asyncio.sleep(_LOOK_S)
+    async def _poll(self, nobody_s: float) -> None:
+        """Count the workers, a moment from now. Errors: ConnectionFailed if the scheduler is gone,
+        or there has been no worker for `nobody_s`; PerchError."""
+        await asyncio.sleep(_POLL_S)
         try:
             if self._client.status != "running":
                 raise OSError(self._client.status)
@@ -187,7 +193,7 @@ class ClusterHands(Executor):
         elif now_s - self._nobody_s >= nobody_s:
             if self.local is not None:
                 raise ConnectionFailed(
-                    f"no worker of --cluster {self._place} has come up within {nobody_s:.0f} s: "
+                    f"no worker of --cluster {self._cluster} has come up within {nobody_s:.0f} s: "
                     f"end what keeps this computer busy, or start fewer"
                 )
             raise ConnectionFailed(
@@ -196,7 +202,7 @@ class ClusterHands(Executor):
             )
 
     def _hand_over(self) -> None:
-        """One flight a worker."""
+        """Send waiting flights, one a worker."""
         while self._orders and len(self._flying) < max(1, self._workers):
             with self._lock:
                 order = self._orders.popleft()
@@ -215,13 +221,13 @@ class ClusterHands(Executor):
     ) -> None:
         try:
             order = flight_order(fn, args)
-        except Exception as error:  # nothing that can be sent
+        except Exception as error:  # it cannot be sent
             future.set_exception(error)
             return
         self._number += 1
-        key = f"{self._asked.campaign}-{self._number}"
+        key = f"{self._required.campaign}-{self._number}"
         try:
-            flight = self._client.submit(fly_order, order, self._asked, key=key, pure=False)
+            flight = self._client.submit(fly_order, order, self._required, key=key, pure=False)
             good, answer = pickle.loads(await flight.result())
         except KilledWorker:
             future.set_exception(BrokenExecutor("the worker that flew was lost"))
@@ -237,7 +243,7 @@ class ClusterHands(Executor):
 
     def _scheduler_lost(self) -> ConnectionFailed:
         return ConnectionFailed(
-            f"the scheduler of --cluster {self._place} does not answer any more: start it again, "
+            f"the scheduler of --cluster {self._cluster} does not answer any more: start it again, "
             f"and go on with what was written to --out by --resume"
         )
 
@@ -245,15 +251,15 @@ class ClusterHands(Executor):
         if os.environ.get("PERCHCTL_DEBUG"):
             logging.getLogger("perchctl").exception("the cluster failed")
         return ConnectionFailed(
-            f"--cluster {self._place} failed ({type(error).__name__}: {error}): look at what its "
+            f"--cluster {self._cluster} failed ({type(error).__name__}: {error}): look at what its "
             f"scheduler says (PERCHCTL_DEBUG=1 shows more)"
         )
 
 
 @contextlib.asynccontextmanager
 async def _connected(address: str) -> AsyncIterator[Any]:
-    """Errors: ConnectionFailed."""
-    # Versions that matter are asked for.
+    """A client of the scheduler. Errors: ConnectionFailed."""
+    # `verify_scheduler` compares the versions that matter.
     warnings.filterwarnings("ignore", category=VersionMismatchWarning)
     client = Client(address, asynchronous=True, set_as_default=False, timeout=ANSWER_S)
     try:
@@ -271,56 +277,20 @@ async def _connected(address: str) -> AsyncIterator[Any]:
 
 
 @contextlib.contextmanager
-def cluster_hands(
-    place: Place, profiles: Sequence[Profile], folder: Path | None = None
-) -> Iterator[ClusterHands]:
-    """The workers there, which have this computer's program and data for these profiles, and where
-    it is given, its `folder`. Errors: ConnectionFailed, InvalidValue, PerchError."""
+def cluster_pool(
+    address: ClusterAddress, profiles: Sequence[Profile], folder: Path | None = None
+) -> Iterator[ClusterPool]:
+    """Yield an executor of the cluster's workers, which have this computer's program, its data for
+    these `profiles`, and its `folder` if one is given.
+    Errors: ConnectionFailed, InvalidValue, PerchError."""
     if not os.environ.get("PERCHCTL_DEBUG"):
         for name in (*_QUIET, *logging.root.manager.loggerDict):
             if name.startswith(_QUIET):
                 logging.getLogger(name).setLevel(logging.CRITICAL)
-    with wanted(profiles, folder) as asked:
-        hands = ClusterHands(place, asked)
+    with worker_requirements(profiles, folder) as required:
+        pool = ClusterPool(address, required)
         try:
-            hands.start()
-            yield hands
+            pool.start()
+            yield pool
         finally:
-            hands.shutdown()
-
-
-# --- Where the flights of a campaign go: the ADDRESS of `--cluster` ----------------------------
-
-
-MOST_LOCAL = 1024
-_FORM = re.compile(r"(tcp|tls|ws|wss)://([^\s/:]+|\[[0-9a-fA-F:.]+\]):([0-9]{1,5})")
-
-
-@dataclass(frozen=True)
-class Place:
-    """`address`: of a scheduler that runs; None where `workers` are started here with one."""
-
-    address: str | None
-    workers: int = 0
-
-    def __str__(self) -> str:
-        return self.address or f"local:{self.workers}"
-
-
-def parse_address(text: str) -> Place:
-    """Of ``local:N``, ``HOST:PORT`` or ``tcp://HOST:PORT``. Errors: UsageError."""
-    kind, _, number = text.partition(":")
-    if kind == "local":
-        if number.isascii() and number.isdigit() and 1 <= int(number[:9]) <= MOST_LOCAL:
-            return Place(None, int(number))
-        raise UsageError(
-            f"--cluster {text} must be local:N with N from 1 to {MOST_LOCAL} workers, as in "
-            f"--cluster local:4"
-        )
-    found = _FORM.fullmatch(text if "://" in text else f"tcp://{text}")
-    if found is None or not 1 <= int(found[3]) <= 65535:
-        raise UsageError(
-            f"--cluster {text} must be the address of a dask scheduler, as in "
-            f"--cluster tcp://10.0.0.5:8786, or local:N"
-        )
-    return Place(found[0])
+            pool.shutdown()

@@ -9,17 +9,10 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl.campaign import FlightResult, VariantResult, sweep_grid
+from perchctl.campaign.compare import whole_seeds
+from perchctl.campaign.sweep import sweep_results
 from perchctl.errors import InvalidValue, UsageError
-from perchctl.flight import (
-    FlightResult,
-    VariantResult,
-    sweep_grid,
-    sweep_record,
-    sweep_results,
-    sweep_text,
-    whole_seeds,
-)
-from perchctl.flight.variants import Variant
 from perchctl.profile import load_profile
 from tests.helpers.results import landed, perched
 
@@ -62,7 +55,7 @@ def test_two_keys_are_each_with_each_and_values_may_be_lists() -> None:
         (["nothing.xx=1"], InvalidValue, "nothing is unknown"),
         ([f"{KEY}=0.1,0.10"], UsageError, "0.1 and 0.10 are the same"),
         ([f"{KEY}=0.1", f"{KEY}=0.2"], UsageError, "given twice"),
-        ([f"{KEY}=0.1", f"{OTHER}=raw", "planner.attempts=1"], UsageError, "3 times"),
+        ([f"{KEY}=0.1", f"{OTHER}=raw", "planner.attempts=1"], UsageError, "3 keys"),
     ],
 )
 def test_what_cannot_be_swept_is_refused(
@@ -85,18 +78,18 @@ def test_the_best_is_proven_or_not() -> None:
     found = sweep_results(grid, flights(40, 0.001, 0.003, None))
     assert (found.best, found.figures[0].flights, found.figures[2].good) == (0, 40, 0)
     assert found.figures[0].median_m == pytest.approx(0.0013)
-    text = sweep_text(found)
+    text = found.text()
     assert f"best:  {KEY}=0.02" in text
     assert f"own:   {KEY}=0.04" in text
     assert "counting that it was picked out of 3: miss, B is better by 2.00 mm" in text
-    assert json.loads(json.dumps(sweep_record(found)))["best"] == {KEY: 0.02}
+    assert json.loads(json.dumps(found.record()))["best"] == {KEY: 0.02}
 
 
 def test_a_best_cell_of_few_seeds_is_not_proven() -> None:
     grid = sweep_grid(SIM, [f"{KEY}=0.02,0.04"])
     found = sweep_results(grid, flights(4, 0.001, 0.003))
     assert found.best == 0
-    assert "no difference proven" in sweep_text(found)
+    assert "no difference proven" in found.text()
 
 
 def test_of_equal_cells_the_profiles_own_is_the_best() -> None:
@@ -104,7 +97,7 @@ def test_of_equal_cells_the_profiles_own_is_the_best() -> None:
     found = sweep_results(grid, flights(20, 0.002, 0.002))
     assert found.best == grid.own
     assert found.against_own is None
-    assert sweep_text(found).endswith("the profile's own values are the best")
+    assert found.text().endswith("the profile's own values are the best")
 
 
 def test_chance_among_many_cells_is_no_proof() -> None:
@@ -118,16 +111,16 @@ def test_chance_among_many_cells_is_no_proof() -> None:
     found = sweep_results(grid, rows)
     assert found.figures[grid.own].good == 4
     assert found.best != grid.own
-    assert "no difference proven" in sweep_text(found)
+    assert "no difference proven" in found.text()
 
 
 def test_seeds_count_that_every_cell_has_flown() -> None:
     results = [
-        VariantResult(Variant(seed, number), replace(perched(seed), attempts=number))
+        VariantResult(number, replace(perched(seed), attempts=number))
         for seed in (4, 3)
         for number in (1, 0)
     ]
-    seeds = whole_seeds([*results, VariantResult(Variant(5, 0), perched(5))], 2)
+    seeds = whole_seeds([*results, VariantResult(0, perched(5))], 2)
     assert [(row[0].seed, row[0].attempts, row[1].attempts) for row in seeds] == [
         (3, 0, 1), (4, 0, 1),
     ]  # fmt: skip

@@ -16,15 +16,22 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
 
+
 import perchctl
 from perchctl.calibration import profile_camera
-from perchctl.cluster import asking, worker
-from perchctl.cluster import wanted as asked_of
-from perchctl.cluster.asking import ask_all
-from perchctl.cluster.wanted import Answer, Wanted, answer_to, source_sha256, wanted
-from perchctl.cluster.worker import fly_order
+from perchctl.campaign import workers
+from perchctl.campaign.workers import (
+    WorkerReport,
+    WorkerRequirements,
+    fitness,
+    flight_order,
+    fly_order,
+    source_sha256,
+    verify_scheduler,
+    verify_workers,
+    worker_requirements,
+)
 from perchctl.errors import ConnectionFailed, InvalidValue
-from perchctl.flight import flight_order
 from perchctl.profile import Profile, data_file, load_profile
 from tests.helpers.seeds import Ended, ends_at_once
 
@@ -32,8 +39,8 @@ ADDRESS = "tcp://10.0.0.5:4001"
 
 
 @pytest.fixture
-def asked() -> Wanted:
-    with wanted([], None) as found:
+def required() -> WorkerRequirements:
+    with worker_requirements([], None) as found:
         return found
 
 
@@ -41,16 +48,16 @@ def asked() -> Wanted:
 
 
 def test_a_worker_like_this_computer_may_fly(tmp_path: Path) -> None:
-    with wanted([load_profile("sim"), load_profile("rough")], tmp_path) as found:
+    with worker_requirements([load_profile("sim"), load_profile("rough")], tmp_path) as found:
         assert len(list(tmp_path.iterdir())) == 1
-        answer = answer_to(found, 1)
+        answer = fitness(found, 1)
         assert answer.problem is None
         assert len(answer.arithmetic) == 8
     assert list(tmp_path.iterdir()) == []
 
 
 def test_another_source_is_seen_whatever_the_version(
-    asked: Wanted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    required: WorkerRequirements, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = tmp_path / "perchctl"
     (copy / "flight").mkdir(parents=True)
@@ -64,9 +71,9 @@ def test_another_source_is_seen_whatever_the_version(
     (copy / "flight/loop.py").write_bytes(text + b"# another\n")
     there = source_sha256(copy)
     assert there != here
-    monkeypatch.setattr(asked_of, "SOURCE", there)
-    assert answer_to(replace(asked, source=there), 1).problem is None
-    problem = answer_to(replace(asked, source=here, program="perchctl 0.2.0 (abc)"), 1).problem
+    monkeypatch.setattr(workers, "SOURCE", there)
+    assert fitness(replace(required, source=there), 1).problem is None
+    problem = fitness(replace(required, source=here, program="perchctl 0.2.0 (abc)"), 1).problem
     assert problem is not None
     assert problem.startswith(f"has perchctl {perchctl.__version__}")
     assert problem.endswith(
@@ -75,19 +82,21 @@ def test_another_source_is_seen_whatever_the_version(
     )
 
 
-def test_other_libraries_are_named_with_both_versions(asked: Wanted) -> None:
-    own = dict(asked.libraries)
+def test_other_libraries_are_named_with_both_versions(required: WorkerRequirements) -> None:
+    own = dict(required.libraries)
     assert set(own) == {"python", "opencv", "numpy", "mujoco", "filterpy", "distributed"}
     assert "none" not in own.values()
-    other = replace(asked, libraries=(*asked.libraries[:2], ("numpy", "1.0"), ("newest", "7")))
-    assert answer_to(other, 1).problem == (
+    other = replace(
+        required, libraries=(*required.libraries[:2], ("numpy", "1.0"), ("newest", "7"))
+    )
+    assert fitness(other, 1).problem == (
         f"has numpy {own['numpy']} and newest none, and here it is numpy 1.0 and newest 7: install "
         f"the same there, and start its workers again"
     )
 
 
-def test_two_flights_in_one_process_are_refused(asked: Wanted) -> None:
-    problem = answer_to(asked, 16).problem
+def test_two_flights_in_one_process_are_refused(required: WorkerRequirements) -> None:
+    problem = fitness(required, 16).problem
     assert problem is not None
     assert problem.endswith("start it as dask worker --nthreads 1 --nworkers 16")
 
@@ -99,25 +108,25 @@ def test_another_calibration_or_none_is_seen(tmp_path: Path) -> None:
     file = tmp_path / "camera.yaml"
     shutil.copyfile(shipped, file)
     (tmp_path / "mine.yaml").write_text("extends: sim\ncamera: {calibration: camera.yaml}\n")
-    with wanted([load_profile(str(tmp_path / "mine.yaml"))], None) as found:
-        assert answer_to(found, 1).problem is None
+    with worker_requirements([load_profile(str(tmp_path / "mine.yaml"))], None) as found:
+        assert fitness(found, 1).problem is None
         text = file.read_text()
         focal = str(profile_camera(found.profiles[0][0].camera).K[0, 0])
         assert focal in text
         file.write_text(text.replace(focal, f"{float(focal) + 1.0}"))
-        problem = answer_to(found, 1).problem
+        problem = fitness(found, 1).problem
         assert problem == (
             f"has another {file} for mine than there is here: bring this computer's there"
         )
         file.unlink()
-        problem = answer_to(found, 1).problem
+        problem = fitness(found, 1).problem
         assert problem is not None
         assert problem.startswith(f"cannot fly mine: calibration file {file} not found")
 
 
 def test_of_profiles_with_the_same_files_one_is_sent_to_be_checked() -> None:
     sim, rough = load_profile("sim"), load_profile("rough")
-    with wanted([sim, rough], None) as found:
+    with worker_requirements([sim, rough], None) as found:
         assert len(found.profiles) == 1
 
 
@@ -126,15 +135,15 @@ def test_a_folder_that_is_not_shared_is_refused(tmp_path: Path) -> None:
     ours, theirs = tmp_path / "ours", tmp_path / "theirs"
     ours.mkdir()
     theirs.mkdir()
-    with wanted([], ours) as found:
+    with worker_requirements([], ours) as found:
         there = replace(found, folder=theirs)
-        wanted_words = "to {}: name one in --log-dir that all computers have at this path"
-        unseen = "does not see what this computer writes " + wanted_words
-        assert answer_to(there, 1).problem == unseen.format(theirs)
+        words = "to {}: name one in --log-dir that all computers have at this path"
+        unseen = "does not see what this computer writes " + words
+        assert fitness(there, 1).problem == unseen.format(theirs)
         shutil.copyfile(found.mark, there.mark)
-        assert answer_to(there, 1).problem is None
+        assert fitness(there, 1).problem is None
         there.mark.write_text("of another campaign")
-        assert answer_to(there, 1).problem == unseen.format(theirs)
+        assert fitness(there, 1).problem == unseen.format(theirs)
         assert [path.name for path in theirs.iterdir()] == [there.mark.name]
 
 
@@ -144,15 +153,18 @@ def test_a_folder_that_a_worker_cannot_write_to_is_refused(
     def full(_path: Path, *_args: object, **_named: object) -> None:
         raise OSError(28, "No space left on device")
 
-    with wanted([], tmp_path) as found:
+    with worker_requirements([], tmp_path) as found:
         monkeypatch.setattr(Path, "write_text", full)
-        problem = answer_to(found, 1).problem
+        problem = fitness(found, 1).problem
     assert problem is not None
     assert problem.startswith(f"cannot write to {tmp_path} (No space left on device): name one in")
 
 
 def test_a_folder_that_nothing_can_be_written_to_here_is_told(tmp_path: Path) -> None:
-    with pytest.raises(InvalidValue, match="cannot be written"), wanted([], tmp_path / "none"):
+    with (
+        pytest.raises(InvalidValue, match="cannot be written"),
+        worker_requirements([], tmp_path / "none"),
+    ):
         raise AssertionError
 
 
@@ -163,21 +175,21 @@ def test_a_folder_that_nothing_can_be_written_to_here_is_told(tmp_path: Path) ->
 def on_a_worker(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     def on(threads: int) -> None:
         there = SimpleNamespace(address=ADDRESS, state=SimpleNamespace(nthreads=threads))
-        monkeypatch.setattr(worker, "get_worker", lambda: there)
+        monkeypatch.setattr(workers, "get_worker", lambda: there)
 
     return on
 
 
 def test_one_that_came_later_is_asked_with_its_first_flight(
-    asked: Wanted, on_a_worker: Callable[[int], None], tmp_path: Path
+    required: WorkerRequirements, on_a_worker: Callable[[int], None], tmp_path: Path
 ) -> None:
     on_a_worker(2)
-    good, error = pickle.loads(fly_order(flight_order(ends_at_once, (1,)), asked))
+    good, error = pickle.loads(fly_order(flight_order(ends_at_once, (1,)), required))
     assert not good
     assert isinstance(error, InvalidValue)
     assert str(error).startswith(f"worker {ADDRESS} on ")
     assert "flies 2 flights in one process" in str(error)
-    with wanted([], tmp_path) as other:
+    with worker_requirements([], tmp_path) as other:
         on_a_worker(1)
         good, ended = pickle.loads(fly_order(flight_order(ends_at_once, (1,)), other))
         assert good
@@ -194,13 +206,15 @@ class Client:
     def __init__(self, answers: dict[str, Any]) -> None:
         self.answers = answers
 
-    async def run(self, _fn: object, _asked: Wanted, on_error: str) -> dict[str, Any]:
+    async def run(
+        self, _fn: object, _required: WorkerRequirements, on_error: str
+    ) -> dict[str, Any]:
         assert on_error == "return"
         return self.answers
 
 
-def asked_all(asked: Wanted, **answers: Any) -> list[str]:
-    return asyncio.run(ask_all(Client(answers), asked))
+def verified(required: WorkerRequirements, **answers: Any) -> list[str]:
+    return asyncio.run(verify_workers(Client(answers), required))
 
 
 def test_a_scheduler_of_another_version_is_told() -> None:
@@ -211,59 +225,63 @@ def test_a_scheduler_of_another_version_is_told() -> None:
 
     client = SimpleNamespace(scheduler=SimpleNamespace(versions=versions))
     with pytest.raises(InvalidValue, match=r"at here has distributed 1\.0, and here it is "):
-        asyncio.run(asking.ask_scheduler(client, "here"))
+        asyncio.run(verify_scheduler(client, "here"))
 
 
-def test_the_first_that_must_not_fly_is_told_and_how_many_more(asked: Wanted) -> None:
-    bad = Answer("node7", "has numpy 1: install the same there")
+def test_the_first_that_must_not_fly_is_told_and_how_many_more(
+    required: WorkerRequirements,
+) -> None:
+    bad = WorkerReport("node7", "has numpy 1: install the same there")
     with pytest.raises(InvalidValue) as told:
-        asked_all(asked, c=bad, b=bad, a=Answer("node1", None, "x"))
+        verified(required, c=bad, b=bad, a=WorkerReport("node1", None, "x"))
     assert str(told.value) == ("worker b on node7 has numpy 1: install the same there (and 1 more)")
 
 
-def test_one_without_this_perchctl_is_told(asked: Wanted) -> None:
+def test_one_without_this_perchctl_is_told(required: WorkerRequirements) -> None:
     with pytest.raises(InvalidValue) as told:
-        asked_all(asked, a=ModuleNotFoundError("No module named 'perchctl'"))
+        verified(required, a=ModuleNotFoundError("No module named 'perchctl'"))
     assert str(told.value) == (
         "worker a cannot load what flies (ModuleNotFoundError: No module named 'perchctl'): "
         "install this computer's perchctl there, with the extras sim and cluster"
     )
 
 
-def test_one_that_has_gone_meanwhile_stops_nothing(asked: Wanted) -> None:
-    own = answer_to(asked, 1)
-    assert asked_all(asked, a=own, b=ConnectionResetError()) == []
+def test_one_that_has_gone_meanwhile_stops_nothing(required: WorkerRequirements) -> None:
+    own = fitness(required, 1)
+    assert verified(required, a=own, b=ConnectionResetError()) == []
 
 
-def test_another_processor_is_worth_a_note(asked: Wanted) -> None:
-    own = answer_to(asked, 1)
-    (note,) = asked_all(asked, a=own, b=replace(own, arithmetic="00000000"))
+def test_another_processor_is_worth_a_note(required: WorkerRequirements) -> None:
+    own = fitness(required, 1)
+    (note,) = verified(required, a=own, b=replace(own, arithmetic="00000000"))
     assert note.startswith("1 of 2 workers have another processor")
 
 
-def test_workers_that_hang_are_told(asked: Wanted, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_that_hang_are_told(
+    required: WorkerRequirements, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Hanging(Client):
         async def run(self, *_args: Any, **_named: Any) -> dict[str, Any]:
             await asyncio.Event().wait()
             return {}
 
-    monkeypatch.setattr(asking, "ANSWERS_S", 0.01)
+    monkeypatch.setattr(workers, "ANSWERS_S", 0.01)
     with pytest.raises(ConnectionFailed, match="not all workers answer within"):
-        asyncio.run(ask_all(Hanging({}), asked))
+        asyncio.run(verify_workers(Hanging({}), required))
 
 
 def test_what_a_worker_writes_has_to_be_seen_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And is taken away."""
-    with wanted([], tmp_path) as found:
-        own = replace(answer_to(found, 1), left=".left")
+    with worker_requirements([], tmp_path) as found:
+        own = replace(fitness(found, 1), file=".left")
         (tmp_path / ".left").write_text(found.token)
-        assert asked_all(found, a=own) == []
+        assert verified(found, a=own) == []
         assert not (tmp_path / ".left").exists()
-        monkeypatch.setattr(asking, "SEEN_S", 0.0)
+        monkeypatch.setattr(workers, "SEEN_S", 0.0)
         with pytest.raises(InvalidValue) as told:
-            asked_all(found, a=own)
+            verified(found, a=own)
         assert str(told.value) == (
             f"what worker a on {own.host} writes to {tmp_path} is not seen here: name a folder in "
             f"--log-dir that all computers share"
@@ -272,5 +290,5 @@ def test_what_a_worker_writes_has_to_be_seen_here(
 
 def test_a_profile_is_sent_small() -> None:
     """It goes with each flight."""
-    with wanted([Profile()], None) as found:
+    with worker_requirements([Profile()], None) as found:
         assert len(pickle.dumps(found)) < 20_000

@@ -12,9 +12,15 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
 
-from perchctl.cluster import cluster_hands, parse_address
-from perchctl.flight import FlightResult, flight_processes, fly_all, run_campaign
-from perchctl.flight.record import flown_record
+from perchctl.campaign import (
+    FlightResult,
+    cluster_pool,
+    flight_processes,
+    fly_all,
+    parse_address,
+    run_campaign,
+)
+from perchctl.campaign.results_file import flown_record
 from perchctl.profile import load_profile
 from tests.helpers.cluster import dies_in_flight
 
@@ -38,8 +44,8 @@ def test_forty_seeds_in_one_process_in_two_and_on_a_cluster(tmp_path: Path) -> N
         assert flown(two) == alone
     told: list[FlightResult] = []
     fly = partial(dies_in_flight, profile, tmp_path, DEADLY)
-    with cluster_hands(parse_address("local:2"), [profile]) as hands:
-        results = fly_all(fly, SEEDS, hands, told.append)
+    with cluster_pool(parse_address("local:2"), [profile]) as pool:
+        results = fly_all(fly, SEEDS, pool, told.append)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(map(str, DEADLY))
     assert [flown_record(result) for result in results] == alone
     assert sorted(result.seed for result in told) == list(SEEDS)

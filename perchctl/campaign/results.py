@@ -1,13 +1,7 @@
-"""How flights ended: one flight's result, the figures of a campaign of them, its rates with their
-intervals, and the memory that it takes."""
+"""How flights ended: one flight's result, the figures of a campaign, and rates with intervals."""
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import gc
-import resource
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,16 +10,19 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 from scipy.special import betaincinv
 
+from perchctl.campaign.pool import peak_memory_mb
 from perchctl.errors import SafetyAbort
 from perchctl.sim import Scenario
 
 FlightEnd = Literal["perched", "landed", "aborted", "refused"]
 ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
+WORST = 5
+"""So many of the bad flights are named."""
 _SEVERITY: tuple[FlightEnd, ...] = ("perched", "refused", "landed", "aborted")
 
 
-class Measured(Protocol):
-    """A flight's result, of whatever campaign."""
+class HasPeak(Protocol):
+    """The result of a flight in any kind of campaign."""
 
     @property
     def peak_memory_mb(self) -> float: ...
@@ -77,21 +74,17 @@ class FlightResult:
         return self.is_bad, _SEVERITY.index(self.outcome), harmed, self.miss_m or 0.0
 
 
-def campaign_summary(
-    results: Sequence[FlightResult], wall_s: float | None = None, worst: int = 5
-) -> dict[str, Any]:
+def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
     """A campaign's figures, ready for JSON.
 
-    `rates` has each end's share with its interval. `miss_m` is taken over the
-    perched flights (None without any; p95 by linear interpolation).
-    `realtime_factor` is flight time over `wall_s`, or over the sum of the
-    flights' own wall times without it. `worst_seeds` names at most `worst`
-    flights, all of them bad.
+    `rates` has each end's share with its interval. `miss_m` is taken over the perched flights
+    (None without any; p95 by linear interpolation). `realtime_factor` is the flight time over
+    the sum of the flights' own wall times. `worst_seeds` names at most `WORST` flights, all of
+    them bad.
     """
     misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
     flown_s = sum(r.time_s for r in results)
-    if wall_s is None:
-        wall_s = sum(r.time_s / r.realtime_factor for r in results if r.realtime_factor > 0)
+    wall_s = sum(r.time_s / r.realtime_factor for r in results if r.realtime_factor > 0)
     return {
         "flights": len(results),
         **{end: sum(r.outcome == end for r in results) for end in ENDS},
@@ -107,13 +100,13 @@ def campaign_summary(
         },
         "realtime_factor": _rounded(flown_s / wall_s) if wall_s > 0 else None,
         "peak_memory_mb": peak_mb(results),
-        "worst_seeds": [r.seed for r in worst_first(results)[:worst]],
+        "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
     }
 
 
-def peak_mb(results: Iterable[Measured]) -> float:
-    """The most that any process of the campaign ever held (1e6 bytes): this one, and those that
-    flew."""
+def peak_mb(results: Iterable[HasPeak]) -> float:
+    """The most memory that any process of the campaign ever held (1e6 bytes): this one, and those
+    that flew."""
     return round(max([peak_memory_mb(), *(r.peak_memory_mb for r in results)]), 1)
 
 
@@ -124,7 +117,8 @@ def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
 
 
 def none_took_off(results: Sequence[FlightResult]) -> SafetyAbort | None:
-    """What a campaign says of which every flight was refused: that is no seed's doing."""
+    """The error of a campaign whose flights were all refused, which no seed brings about; None
+    for any other."""
     if not results or any(r.outcome != "refused" for r in results):
         return None
     first = min(results, key=lambda r: r.seed)
@@ -139,19 +133,17 @@ def _rounded(value: Any) -> float:
     return round(float(value), 6)
 
 
-def campaign_table(
-    results: Sequence[FlightResult], wall_s: float | None = None, worst: int = 5
-) -> str:
+def campaign_table(results: Sequence[FlightResult]) -> str:
     """The campaign's figures and its worst flights as plain text."""
-    figures = campaign_summary(results, wall_s, worst)
-    lines = [f"{name:<18}{text}" for name, text in campaign_rows(figures, results)]
+    figures = campaign_summary(results)
+    lines = [f"{name:<18}{text}" for name, text in _rows(figures, results)]
     bad = worst_first(results)
     if bad:
-        shown = "" if len(bad) <= worst else f", {worst} of {len(bad)}"
+        shown = "" if len(bad) <= WORST else f", {WORST} of {len(bad)}"
         lines += ["", f"worst flights{shown}"]
         lines += align_columns(
             [("seed", "outcome", "miss [mm]", "time [s]", "attempts", "reason")]
-            + [_cells(r) for r in bad[:worst]]
+            + [_cells(r) for r in bad[:WORST]]
         )
     elif results:
         lines += ["", "worst flights: none is bad, all perched, none locked or fell"]
@@ -174,9 +166,7 @@ def _cells(r: FlightResult) -> tuple[str, ...]:
     return str(r.seed), outcome, miss, f"{r.time_s:.1f}", str(r.attempts), r.reason
 
 
-def campaign_rows(
-    figures: Mapping[str, Any], results: Sequence[FlightResult]
-) -> list[tuple[str, str]]:
+def _rows(figures: Mapping[str, Any], results: Sequence[FlightResult]) -> list[tuple[str, str]]:
     """Name and text of each figure of `campaign_summary`."""
     flights = figures["flights"]
     rows = [("flights", str(flights))]
@@ -221,11 +211,11 @@ def rate_interval(k: int, n: int, level: float = LEVEL) -> tuple[float, float]:
     return low, high
 
 
-def rate_text(k: int, n: int, level: float = LEVEL) -> str:
+def rate_text(k: int, n: int) -> str:
     """``97 of 100 (91.5 to 99.4 %)``, ``100 of 100 (>= 96.4 %)``, ``0 of 100 (<= 3.6 %)``."""
     if n == 0:
         return "0 of 0"
-    low, high = (100.0 * bound for bound in rate_interval(k, n, level))
+    low, high = (100.0 * bound for bound in rate_interval(k, n))
     if k == n:
         return f"{k} of {n} (>= {low:.1f} %)"
     if k == 0:
@@ -233,41 +223,8 @@ def rate_text(k: int, n: int, level: float = LEVEL) -> str:
     return f"{k} of {n} ({low:.1f} to {high:.1f} %)"
 
 
-def rate_record(k: int, n: int, level: float = LEVEL) -> dict[str, float | list[float]]:
+def rate_record(k: int, n: int) -> dict[str, float | list[float]]:
     """For JSON: `rate` and its `interval`; empty where nothing was seen."""
     if n == 0:
         return {}
-    return {"rate": round(k / n, 6), "interval": [round(b, 6) for b in rate_interval(k, n, level)]}
-
-
-# --- How much memory a campaign takes ----------------------------------------------------------
-
-
-_STATUS = Path("/proc/self/status")
-_RSS_UNIT = 1 if sys.platform == "darwin" else 1024  # getrusage's, bytes
-
-
-def give_back_memory() -> None:
-    """What a flight leaves behind. Its objects know of each other, so Python frees them when it
-    next looks through everything, which may be many flights later; and the C library keeps what
-    it is given back in pieces."""
-    gc.collect()
-    if not gc.get_freeze_count():
-        # What is left are the program's own modules and what it keeps for all flights: nothing
-        # to look through again and again, which takes as long as 30 pictures.
-        gc.freeze()
-    with contextlib.suppress(AttributeError, OSError):  # glibc has it, others do not
-        ctypes.CDLL(None).malloc_trim(0)
-
-
-def peak_memory_mb() -> float:
-    """The most that this process, or any that it has waited for, ever held (1e6 bytes)."""
-    own, ended = (
-        resource.getrusage(who).ru_maxrss * _RSS_UNIT * 1e-6
-        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    )
-    # Linux hands a program the peak of the one that started it; its own is told elsewhere.
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        lines = _STATUS.read_text().splitlines()
-        own = next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) * 1024e-6
-    return max(own, ended)
+    return {"rate": round(k / n, 6), "interval": [round(b, 6) for b in rate_interval(k, n)]}

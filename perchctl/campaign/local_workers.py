@@ -1,7 +1,8 @@
-"""Workers on this computer.
+"""Workers of a cluster on this computer.
 
-dask's own local cluster gives each worker a nanny, which ends late and starts again what cannot
-start. These are plain processes that end with this one, killed or not, and leave nothing behind.
+dask's own `LocalCluster` gives each worker a nanny: with flights in the air it takes four seconds
+to close, it starts again and again what cannot start, and its folder stays where the program is
+killed. These are plain processes that end with this one, killed or not, and leave nothing behind.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _CONTEXT = multiprocessing.get_context("spawn")
 
 @asynccontextmanager
 async def local_scheduler(folder: str) -> AsyncIterator[Any]:
-    """In this event loop, on loopback. `folder`: for what it must write."""
+    """Yield a scheduler in this event loop, on loopback. `folder`: for what it must write."""
     import dask
     from distributed import Scheduler
 
@@ -53,8 +54,8 @@ async def local_scheduler(folder: str) -> AsyncIterator[Any]:
 
 
 class LocalWorkers:
-    """`count` of them, each started again where it is lost. They have the signals' mask of the
-    thread that starts them. `folder`: of their own, until they are killed."""
+    """`count` worker processes, each started again if it is lost. They inherit the signals' mask of
+    the thread that starts them. `folder`: their own, until they are killed."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -65,14 +66,14 @@ class LocalWorkers:
         self._processes: dict[int, Any] = {}
 
     async def start(self, address: str) -> None:
-        """At the scheduler of this address."""
+        """Start them at the scheduler of this address."""
         for number in range(self._count):
             self._start(address, number)
             await asyncio.sleep(0)
 
     def look_after(self, address: str, there: Container[str]) -> None:
-        """Starts those again that are gone. `there`: names of those that the scheduler knows.
-        Errors: PerchError, where one cannot start."""
+        """Start those again that are gone. `there`: names of those that the scheduler knows.
+        Errors: PerchError if one cannot start."""
         for number, process in list(self._processes.items()):
             if str(number) in there:
                 self._failed[number] = 0
@@ -88,7 +89,7 @@ class LocalWorkers:
             self._start(address, number)
 
     def kill(self) -> None:
-        """Ends them where they are, for good; from any thread."""
+        """End them where they are, for good; from any thread."""
         with self._lock:
             self._ended = True
             for process in self._processes.values():
@@ -114,7 +115,7 @@ class LocalWorkers:
 
 
 def serve(address: str, folder: str, number: int) -> None:
-    """A worker's life."""
+    """Run a worker; this is the life of its process."""
     tidy = partial(shutil.rmtree, folder, ignore_errors=True)
     end_with_parent(tidy)
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))  # before numpy is loaded

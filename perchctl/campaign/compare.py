@@ -1,23 +1,98 @@
-"""Two sets of flights over the same seeds: what differs, and whether that is proven.
+"""The same seeds flown by several profiles: what differs between two, and whether it is proven.
 
 Each seed is its own pair, so what differs from seed to seed takes no part. A figure's difference
-is the mean over the pairs, with a bootstrap's interval (BCa, Efron 1987); success is told by the
-pairs in which only one of both succeeded (McNemar's test, the exact one). All questions that are
-asked together err together in one comparison of twenty at most: each gets its part of the 5 %.
+is the mean over the pairs, with a bootstrap's interval (BCa, Efron 1987); success is compared by
+the pairs in which only one of both succeeded (McNemar's test, the exact one). All questions that
+are asked together err together in one comparison of twenty at most: each gets its part of the 5 %.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest, bootstrap
 
-from perchctl.flight.results import LEVEL, FlightResult, align_columns, rate_record, rate_text
+from perchctl.campaign.flights import fly_all, fly_seed
+from perchctl.campaign.results import LEVEL, FlightResult, align_columns, rate_record, rate_text
+from perchctl.profile import Profile
+
+
+@dataclass(frozen=True)
+class VariantResult:
+    """The flight of a seed by the profile of that `number`."""
+
+    number: int
+    result: FlightResult
+
+    @property
+    def seed(self) -> int:
+        return self.result.seed
+
+    @property
+    def outcome(self) -> str:
+        return self.result.outcome
+
+    @property
+    def badness(self) -> tuple[Any, ...]:
+        return self.result.badness
+
+    @property
+    def log(self) -> Path | None:
+        return self.result.log
+
+    @property
+    def log_problem(self) -> str | None:
+        return self.result.log_problem
+
+
+@dataclass(frozen=True)
+class _Variant:
+    """One flight that is to be flown: of a seed, by the profile of that number."""
+
+    seed: int
+    number: int
+
+    def __str__(self) -> str:
+        return f"{self.seed} (profile {self.number + 1})"
+
+
+def fly_variants(
+    profiles: Sequence[Profile],
+    seeds: Iterable[int],
+    executor: Executor | None = None,
+    on_result: Callable[[VariantResult], None] = lambda result: None,
+) -> list[VariantResult]:
+    """Fly each seed by all profiles before the next seed, as `fly_all` does."""
+    variants = [_Variant(seed, number) for seed in seeds for number in range(len(profiles))]
+    return fly_all(partial(_fly, tuple(profiles)), variants, executor, on_result)
+
+
+def _fly(profiles: tuple[Profile, ...], variant: _Variant) -> VariantResult:
+    return VariantResult(variant.number, fly_seed(profiles[variant.number], variant.seed))
+
+
+def whole_seeds(results: Iterable[VariantResult], profiles: int) -> list[tuple[FlightResult, ...]]:
+    """The seeds that were flown by all profiles, in order: of each seed one result a profile."""
+    by_seed: dict[int, dict[int, FlightResult]] = {}
+    for each in results:
+        by_seed.setdefault(each.seed, {})[each.number] = each.result
+    return [
+        tuple(flown[number] for number in range(profiles))
+        for _, flown in sorted(by_seed.items())
+        if len(flown) == profiles
+    ]
+
+
+# --- What is compared --------------------------------------------------------------------------
+
 
 FEWEST_PAIRS = 20
 """An interval of fewer would promise too much: of 8 pairs a bootstrap's is wrong five times as
@@ -33,8 +108,8 @@ NOT_PROVEN = "no difference proven"
 
 @dataclass(frozen=True)
 class Figure:
-    """What of a flight is compared; less of it is better. `of` gives SI, None where it has none;
-    `scale` makes it `unit`."""
+    """A figure of a flight of which less is better. `of` gives it in SI, None where a flight has
+    none; `scale` makes it `unit`."""
 
     name: str
     key: str
@@ -65,7 +140,7 @@ FIGURES = (
 
 @dataclass(frozen=True)
 class Difference:
-    """Of a figure, B's less A's, in SI.
+    """The difference of a figure, B's less A's, in SI.
 
     Attributes:
         pairs: the seeds of which both have the figure.
@@ -84,7 +159,7 @@ class Difference:
 
     @property
     def better(self) -> int | None:
-        """Which of both is proven to be, 0 or 1."""
+        """Which of both is proven to be better, 0 or 1; None where neither is."""
         if self.interval is None or self.interval[0] <= 0.0 <= self.interval[1]:
             return None
         return int(self.interval[1] < 0.0)
@@ -136,14 +211,42 @@ class Comparison:
         found = {self.success.better, *(each.better for each in self.differences)}
         return {which for which in found if which is not None}
 
+    def text(self) -> str:
+        """The comparison as a table, for people."""
+        return "\n".join(_lines(self))
 
-def compare_variants(
+    def record(self) -> dict[str, Any]:
+        """For programs: SI; a difference is B's less A's, `better` "A", "B" or None."""
+        success = self.success
+        return {
+            "flights": self.flights,
+            "identical": self.identical,
+            "success": {
+                **{
+                    name: {"good": k, **rate_record(k, success.flights)}
+                    for name, k in zip("AB", success.good, strict=True)
+                },
+                "only_a": success.alone[0],
+                "only_b": success.alone[1],
+                "p": round(success.p, 9),
+                "better": _letter(success.better),
+            },
+            **{each.figure.key: _difference_record(each) for each in self.differences},
+        }
+
+
+def compare_profiles(names: tuple[str, str], results: Iterable[VariantResult]) -> Comparison:
+    """The comparison of two profiles, by the seeds that both have flown."""
+    return compare_pairs(names, [(a, b) for a, b in whole_seeds(results, len(names))])
+
+
+def compare_pairs(
     names: tuple[str, str],
     pairs: Sequence[tuple[FlightResult, FlightResult]],
     figures: Sequence[Figure] = FIGURES,
     times_asked: int = 1,
 ) -> Comparison:
-    """Of two flights a seed. `times_asked`: comparisons that are made together."""
+    """The comparison of two flights a seed. `times_asked`: comparisons that are made together."""
     questions = times_asked * (1 + len(figures))
     level = 1.0 - (1.0 - LEVEL) / questions
     return Comparison(
@@ -198,11 +301,6 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, floa
 
 def _ending(r: FlightResult) -> tuple[Any, ...]:
     return r.outcome, r.reason, r.miss_m, r.time_s, r.attempts, r.locked, r.fell
-
-
-def variants_text(found: Comparison) -> str:
-    """The comparison of two profiles as a table, for people."""
-    return "\n".join(_lines(found))
 
 
 def _lines(found: Comparison) -> Iterator[str]:
@@ -263,26 +361,6 @@ def difference_verdict(each: Difference) -> str:
         return NOT_PROVEN
     unit = f" {each.figure.unit}" if each.figure.unit else ""
     return f"{'AB'[each.better]} is better by {each.figure.scale * abs(each.mean):.2f}{unit}"
-
-
-def variants_record(found: Comparison) -> dict[str, Any]:
-    """For programs: SI; a difference is B's less A's, `better` "A", "B" or None."""
-    success = found.success
-    return {
-        "flights": found.flights,
-        "identical": found.identical,
-        "success": {
-            **{
-                name: {"good": k, **rate_record(k, success.flights)}
-                for name, k in zip("AB", success.good, strict=True)
-            },
-            "only_a": success.alone[0],
-            "only_b": success.alone[1],
-            "p": round(success.p, 9),
-            "better": _letter(success.better),
-        },
-        **{each.figure.key: _difference_record(each) for each in found.differences},
-    }
 
 
 def _difference_record(each: Difference) -> dict[str, Any]:

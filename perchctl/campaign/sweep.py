@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from perchctl.errors import InvalidValue, UsageError
-from perchctl.flight.compared import (
+from perchctl.campaign.compare import (
     MISS,
     NOT_PROVEN,
     Comparison,
-    compare_variants,
+    VariantResult,
+    compare_pairs,
     difference_verdict,
     success_verdict,
-    variants_record,
+    whole_seeds,
 )
-from perchctl.flight.results import FlightResult, align_columns, rate_record, rate_text
+from perchctl.campaign.results import FlightResult, align_columns, rate_record, rate_text
+from perchctl.errors import InvalidValue, UsageError
 from perchctl.profile import (
     Profile,
     changed_profile,
@@ -44,11 +45,10 @@ class Cell:
 
 @dataclass(frozen=True)
 class Grid:
-    """`texts`: each key's values in their order. `cells`: each with each, and the profile's own
-    values at the end where they are none of these."""
+    """`cells`: each value of one key with each of the other, and the profile's own values at the
+    end where they are none of these."""
 
     keys: tuple[str, ...]
-    texts: tuple[tuple[str, ...], ...]
     cells: tuple[Cell, ...]
 
     @property
@@ -59,30 +59,33 @@ class Grid:
         texts = zip(self.keys, self.cells[number].texts, strict=True)
         return ", ".join(f"{key}={text}" for key, text in texts)
 
+    def compared(self, results: Iterable[VariantResult]) -> Swept:
+        """The figures of all cells, by the seeds that were flown in every cell."""
+        return sweep_results(self, whole_seeds(results, len(self.cells)))
+
 
 def sweep_grid(profile: Profile, sweeps: Sequence[str]) -> Grid:
-    """Of each ``key=value,value``; the values as in a profile's file. Errors: UsageError,
+    """The grid of each ``key=value,value``; the values as in a profile's file. Errors: UsageError,
     InvalidValue."""
     if len(sweeps) > MOST_KEYS:
         raise UsageError(
-            f"--sweep is given {len(sweeps)} times: one key makes a table, two a heat map, more "
-            f"are not swept together"
+            f"{len(sweeps)} keys are given: a sweep takes one or two, each value with each"
         )
     keys, texts = zip(*map(_split, sweeps), strict=True)
     if len(set(keys)) < len(keys):
-        raise UsageError(f"--sweep {keys[0]} is given twice: give all its values at once")
+        raise UsageError(f"{keys[0]} is given twice: give all its values at once")
     cells = []
     for row in itertools.product(*texts):
         settings = [f"{key}={text}" for key, text in zip(keys, row, strict=True)]
-        swept = changed_profile(profile, settings, "--sweep")
+        swept = changed_profile(profile, settings, "sweep")
         cells.append(Cell(row, swept, swept == changed_profile(profile, ())))
     if not any(cell.own for cell in cells):
         own = tuple(scalar_text(profile_value(profile, key)) for key in keys)
         cells.append(Cell(own, profile, True))
     for one, other in itertools.combinations(cells, 2):
         if one.profile == other.profile:
-            raise UsageError(f"--sweep: {_row(one)} and {_row(other)} are the same: keep one")
-    return Grid(keys, texts, tuple(cells))
+            raise UsageError(f"sweep: {_row(one)} and {_row(other)} are the same: keep one")
+    return Grid(keys, tuple(cells))
 
 
 def _split(sweep: str) -> tuple[str, tuple[str, ...]]:
@@ -90,11 +93,11 @@ def _split(sweep: str) -> tuple[str, tuple[str, ...]]:
     try:
         parts = split_values(text)
     except ValueError as error:
-        raise InvalidValue(f"--sweep {clip_text(sweep)}: {error}") from None
+        raise InvalidValue(f"sweep {clip_text(sweep)}: {error}") from None
     if not equals or not key.strip() or not parts:
         raise UsageError(
-            f"--sweep {clip_text(sweep)} must be KEY=VALUE,VALUE with a key of the profile, as in "
-            f"--sweep planner.align.xy_m=0.02,0.04"
+            f"{clip_text(sweep)} must be KEY=VALUE,VALUE with a key of the profile, as in "
+            f"planner.align.xy_m=0.02,0.04"
         )
     return key.strip(), tuple(parts)
 
@@ -105,7 +108,7 @@ def _row(cell: Cell) -> str:
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one cell's flights; misses are those of the perched ones, None without any."""
+    """Figures of one cell's flights; misses are those of the perched ones, None without any."""
 
     flights: int
     good: int
@@ -124,9 +127,29 @@ class Swept:
     best: int
     against_own: Comparison | None
 
+    def text(self) -> str:
+        """The table of a sweep, and the best of its values, for people."""
+        return "\n".join(_lines(self))
+
+    def record(self) -> dict[str, Any]:
+        """For programs: SI; `values` as the profile has them."""
+        cells = [
+            {
+                "values": {key: profile_value(cell.profile, key) for key in self.grid.keys},
+                "own": cell.own,
+                "flights": figures.flights,
+                "good": figures.good,
+                **rate_record(figures.good, figures.flights),
+                "miss_m": {"median": _rounded(figures.median_m), "p95": _rounded(figures.p95_m)},
+            }
+            for cell, figures in zip(self.grid.cells, self.figures, strict=True)
+        ]
+        against = None if self.against_own is None else self.against_own.record()
+        return {"cells": cells, "best": cells[self.best]["values"], "best_against_own": against}
+
 
 def sweep_results(grid: Grid, seeds: Sequence[tuple[FlightResult, ...]]) -> Swept:
-    """Of each seed's flights, one a cell."""
+    """The sweep's figures from each seed's flights, one a cell."""
     by_cell = list(zip(*seeds, strict=True)) or [()] * len(grid.cells)
     figures = tuple(map(_figures, by_cell))
     best = min(range(len(figures)), key=lambda n: (*_rank(figures[n]), n != grid.own, n))
@@ -134,7 +157,7 @@ def sweep_results(grid: Grid, seeds: Sequence[tuple[FlightResult, ...]]) -> Swep
     if best != grid.own:
         pairs = list(zip(by_cell[grid.own], by_cell[best], strict=True))
         names = (grid.name(grid.own), grid.name(best))
-        against = compare_variants(names, pairs, (MISS,), times_asked=len(figures) - 1)
+        against = compare_pairs(names, pairs, (MISS,), times_asked=len(figures) - 1)
     return Swept(grid, figures, best, against)
 
 
@@ -149,11 +172,6 @@ def _figures(results: Sequence[FlightResult]) -> Figures:
 
 def _rank(figures: Figures) -> tuple[float, float]:
     return -figures.good, math.inf if figures.median_m is None else figures.median_m
-
-
-def sweep_text(found: Swept) -> str:
-    """The table of a sweep, and the best of its values, for people."""
-    return "\n".join(_lines(found))
 
 
 def _lines(found: Swept) -> Iterator[str]:
@@ -204,24 +222,6 @@ def _verdict(found: Swept) -> str:
 
 def _mm(value_m: float | None) -> str:
     return "-" if value_m is None else f"{1e3 * value_m:.1f}"
-
-
-def sweep_record(found: Swept) -> dict[str, Any]:
-    """For programs: SI; `values` as the profile has them."""
-    grid = found.grid
-    cells = [
-        {
-            "values": {key: profile_value(cell.profile, key) for key in grid.keys},
-            "own": cell.own,
-            "flights": figures.flights,
-            "good": figures.good,
-            **rate_record(figures.good, figures.flights),
-            "miss_m": {"median": _rounded(figures.median_m), "p95": _rounded(figures.p95_m)},
-        }
-        for cell, figures in zip(grid.cells, found.figures, strict=True)
-    ]
-    against = None if found.against_own is None else variants_record(found.against_own)
-    return {"cells": cells, "best": cells[found.best]["values"], "best_against_own": against}
 
 
 def _rounded(value: float | None) -> float | None:

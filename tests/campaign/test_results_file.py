@@ -10,19 +10,28 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.errors import InvalidValue, UsageError
-from perchctl.flight import (
-    CampaignResults,
-    FlightResult,
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.campaign import CampaignResults, FlightResult
+from perchctl.campaign.results_file import (
+    CampaignHeader,
     campaign_header,
     commit_of,
+    flown_record,
     log_keeper,
     open_results,
     profile_sha256,
+    result_from,
+    result_record,
 )
-from perchctl.flight.results_file import CampaignHeader
+from perchctl.errors import InvalidValue, UsageError
+from perchctl.faults import FAULTS, FaultResult
+from perchctl.faults.catalogue import draw_case
+from perchctl.faults.flight import _parameters
 from perchctl.log.place import recording_path
 from perchctl.profile import load_profile
+from perchctl.sim import draw_scenario
+from tests.helpers.flights import SHORT
 from tests.helpers.results import perched
 
 HEADER = CampaignHeader("1.0", "abc", "sim", "0123456789", None)
@@ -224,25 +233,29 @@ def test_other_words_are_refused(keep: str) -> None:
 def test_a_campaign_that_goes_on_judges_the_logs_of_its_own_folder(tmp_path: Path) -> None:
     """Those in another folder may be another campaign's by now."""
     own, other = tmp_path / "own", tmp_path / "other"
-    earlier = {}
+    path = tmp_path / "out.jsonl"
+    results = open_results(path, HEADER, FlightResult)
     for seed, folder in enumerate((own, own, other)):
         folder.mkdir(exist_ok=True)
         log = folder / f"flight_seed{seed}.jsonl"
         log.touch()
-        earlier[seed] = replace(perched(seed, miss_m=0.001 * (seed + 1)), log=log)
-    kept = CampaignResults(range(4), earlier, log_keeper("worst:1"), folder=own)
+        results.append(replace(perched(seed, miss_m=0.001 * (seed + 1)), log=log))
+    results.close()
+    results = open_results(path, HEADER, FlightResult, resume=True)
+    kept = CampaignResults(range(4), results, log_keeper("worst:1"), own)
+    results.close()
     assert kept.left == [3]
-    left = {path.name for path in tmp_path.rglob("*.jsonl")}
+    left = {log.name for log in tmp_path.rglob("flight_*.jsonl")}
     assert left == {"flight_seed1.jsonl", "flight_seed2.jsonl"}
 
 
 def test_the_logs_of_flights_that_were_broken_off_go(tmp_path: Path) -> None:
     logs = [tmp_path / f"flight_seed{seed}.jsonl" for seed in range(3)]
     logs[0].touch()  # another campaign's
-    kept: CampaignResults[FlightResult] = CampaignResults(range(3), {}, log_keeper("failed"))
+    kept: CampaignResults[FlightResult] = CampaignResults(range(3), keep_log=log_keeper("failed"))
 
     def stopped() -> None:
-        with kept.without_torn(logs):
+        with kept.torn_logs_removed(logs):
             for log in logs[1:]:
                 log.touch()
                 recording_path(log).touch()
@@ -252,3 +265,65 @@ def test_the_logs_of_flights_that_were_broken_off_go(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         stopped()
     assert set(tmp_path.iterdir()) == {logs[0], logs[1], recording_path(logs[1])}
+
+
+# --- one result as a record --------------------------------------------------------------------
+
+SCENARIO = draw_scenario(load_profile("sim"), 17)
+WHOLE = FlightResult(
+    17, "perched", "hanging still", 0.1 / 3, 20.0, 1, False, False, 5.0 / 3,
+    Path("logs/a.jsonl"), None, 4.0, 200.0, SCENARIO,
+)  # fmt: skip
+FAULTY = FaultResult(
+    3, "killed", "SEARCH", 0.3, None, {"Kill": {"at": [1.0, "a"]}}, "gone", "", "killed",
+    {"fell": 1.25, "lied": 2.0}, ("lied",), None, 12.0, None, 0.1, way=("SEARCH", "ALIGN"),
+)  # fmt: skip
+
+
+def _read_back(record: dict[str, object]) -> dict[str, object]:
+    read = json.loads(json.dumps(record, allow_nan=False))
+    assert isinstance(read, dict)
+    return read
+
+
+@pytest.mark.parametrize("result", [WHOLE, replace(WHOLE, miss_m=None, log=None, scenario=None)])
+def test_a_flight_comes_back(result: FlightResult) -> None:
+    record = _read_back(result_record(result))
+    assert result_from(record) == result
+    assert record["seed"] == 17
+    assert record["timings"] == {
+        "realtime_factor": 5.0 / 3, "cpu_s": 4.0, "peak_memory_mb": 200.0,
+    }  # fmt: skip
+
+
+def test_a_flight_with_a_fault_comes_back() -> None:
+    assert result_from(_read_back(result_record(FAULTY)), FaultResult) == FAULTY
+
+
+def test_each_fault_has_parameters_with_a_form() -> None:
+    scenario = draw_scenario(load_profile(SHORT), 1)
+    for fault in FAULTS:
+        for seed in range(4):
+            parameters = _parameters(draw_case(seed, scenario, [fault]))
+            result = replace(FAULTY, parameters=parameters)
+            assert result_from(_read_back(result_record(result)), FaultResult) == result
+
+
+def test_what_a_computer_measured_is_not_the_flight() -> None:
+    elsewhere = replace(WHOLE, realtime_factor=9.0, cpu_s=1.0, peak_memory_mb=9.0, log=None)
+    assert flown_record(elsewhere) == flown_record(WHOLE)
+    assert flown_record(replace(WHOLE, miss_m=0.1)) != flown_record(WHOLE)
+    moved = replace(SCENARIO, mass_kg=0.05)
+    assert flown_record(replace(WHOLE, scenario=moved)) != flown_record(WHOLE)
+
+
+def test_what_is_no_result_is_refused() -> None:
+    record = result_record(WHOLE)
+    for wrong in (
+        {},
+        {**record, "outcome": "lost"},
+        {**record, "more": 1},
+        {**record, "timings": 1},
+    ):
+        with pytest.raises(ValueError, match=r"needed|none of|no field|missing"):
+            result_from(wrong)

@@ -10,8 +10,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.flight import flight_processes, fly_all, peak_memory_mb
-from perchctl.flight.campaign import fly_seed
+from perchctl.campaign import flight_processes, fly_all
+from perchctl.campaign.flights import fly_seed
+from perchctl.campaign.pool import peak_memory_mb
 from perchctl.profile import Profile
 from tests.helpers.flights import SEED, short_profile
 
@@ -41,7 +42,7 @@ def test_a_peak_stays() -> None:
 @pytest.mark.skipif(not STATM.exists(), reason="only Linux tells what is held now")
 def test_a_process_that_flies_on_does_not_grow() -> None:
     profile = short_profile({"planner.perching_time_s": 0.3})
-    with flight_processes(1) as hands:
-        held = fly_all(partial(held_mb, profile), range(SEED, SEED + FLIGHTS), hands)
+    with flight_processes(1) as pool:
+        held = fly_all(partial(held_mb, profile), range(SEED, SEED + FLIGHTS), pool)
     assert held[-1] - held[FROM - 1] < MORE_MB, held
     assert max(held) < 250.0, held
