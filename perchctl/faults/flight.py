@@ -14,9 +14,15 @@ from perchctl.calibration import profile_camera
 from perchctl.campaign import fly_all, fly_measured, seed_log_path
 from perchctl.errors import PerchError
 from perchctl.faults.bounds import DescentBound, PlaceBound, UnfeltDrift
-from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.catalogue import BY_NAME, FROM_THE_START, Case, draw_case
 from perchctl.faults.claims import REFUSAL_CLAIMS, claims_of, claims_of_rescue, last_row
+from perchctl.faults.edges import (
+    FaultyCamera,
+    FaultyClock,
+    FaultyRadio,
+    PlantedError,
+    ProgramKilled,
+)
 from perchctl.faults.effects import (
     CameraFault,
     DeckSilent,
@@ -27,13 +33,10 @@ from perchctl.faults.effects import (
 )
 from perchctl.faults.effects import Operator as Presses
 from perchctl.faults.expected_outcomes import unexpected
-from perchctl.faults.facts import FactsRecorder
 from perchctl.faults.inject import Disk, Edges, Injector, changed_scenario
 from perchctl.faults.oracle import Limits, Oracle, Sample
-from perchctl.faults.program import FaultyClock, PlantedError, ProgramKilled
-from perchctl.faults.radio import FaultyRadio
-from perchctl.faults.result import End, FaultResult
-from perchctl.faults.truth import WatchedVehicle, sample_of
+from perchctl.faults.results import End, FaultResult
+from perchctl.faults.truth import FactsRecorder, WatchedVehicle, sample_of
 from perchctl.flight import (
     FlightParts,
     OperatorSwitch,
@@ -119,7 +122,7 @@ class FaultyFlight:
             case.effects, scenario, by_target=profile.positioning.by == "target"
         )
         self._descent_bound = DescentBound(case.effects, profile)
-        self._recorder = FactsRecorder(vehicle, profile)
+        self._recorder = FactsRecorder(vehicle, profile, case.effects)
         self._touched = False  # the ceiling, since the fault began
 
     def fly(self) -> FaultResult:
@@ -226,8 +229,7 @@ class FaultyFlight:
     def _result(self, ended: _Ended, end_s: float, wall_s: float) -> FaultResult:
         case, report = self._case, ended.report
         verdict = self._oracle.verdict()
-        facts = self._recorder.facts(
-            case.effects,
+        facts = self._recorder.complete(
             begin_s=self._injector.begin_s,
             killed_s=self._clock.killed_s,
             stop_s=self._oracle.stop_s,

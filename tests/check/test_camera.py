@@ -23,7 +23,7 @@ from perchctl.check.camera import Optical
 from perchctl.check.pictures import Blur, Light
 from perchctl.check.rehearsal import Rehearsal, Silent, rehearse
 from perchctl.errors import NotFound
-from perchctl.faults.camera import FaultyCamera
+from perchctl.faults.edges import FaultyCamera
 from perchctl.faults.effects import FOR_EVER, CameraFault
 from perchctl.flight.lockstep import LockstepClock, LockstepSource
 from perchctl.link import MockLink

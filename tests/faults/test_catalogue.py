@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import asdict
 from pathlib import Path
@@ -42,6 +43,16 @@ def test_a_fault_is_well_formed(fault: Fault) -> None:
             for effect in case.effects:
                 assert getattr(effect, "for_s", 1.0) > 0.0
                 assert all(v is None or isinstance(v, object) for v in asdict(effect).values())
+
+
+def test_the_same_seeds_draw_the_same_cases_for_ever() -> None:
+    """Campaigns of before are repeated by their seeds."""
+    drawn = hashlib.sha256()
+    for seed in range(1000):
+        case = draw_case(seed, SCENARIO)
+        drawn.update(repr((case.fault.name, case.phase, case.moment_s, case.effects)).encode())
+        drawn.update(repr((case.landed_from, case.landed_after_s, case.first_hold)).encode())
+    assert drawn.hexdigest()[:16] == "266117f3df5f357f"
 
 
 def test_names_are_given_once() -> None:
