@@ -102,10 +102,6 @@ ClusterOption = Annotated[
         "with N workers.",
     ),
 ]
-ComparedProfile = Annotated[
-    str, typer.Argument(metavar="PROFILE", autocompletion=complete_profile, help="By name or path.")
-]
-
 app = new_app(Group)
 
 
@@ -247,8 +243,18 @@ def run(
 )
 @reporting
 def compare(
-    profile_a: ComparedProfile,
-    profile_b: ComparedProfile,
+    profile_a: Annotated[
+        str,
+        typer.Argument(
+            metavar="PROFILE_A", help="A, by name or path.", autocompletion=complete_profile
+        ),
+    ],
+    profile_b: Annotated[
+        str,
+        typer.Argument(
+            metavar="PROFILE_B", help="B, by name or path.", autocompletion=complete_profile
+        ),
+    ],
     flights: FlightsOption = None,
     seed: SeedOption = None,
     jobs: JobsOption = None,
