@@ -1,8 +1,8 @@
 """The workers of a dask cluster as an executor: flights in, futures of `concurrent.futures` out.
 
 Everything of dask's runs in one event loop, in a thread that never sees a signal. A worker gets
-one flight at a time; the rest wait here, where they cost the scheduler nothing. A flight that
-waits at a worker would be lost with it, too, which is why dask's own executor does not do.
+one flight at a time; the rest wait here, where they cost the scheduler nothing. dask's own
+executor would let them wait at the workers, where they are lost with the flight before them.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import multiprocessing
 import os
 import pickle
+import tempfile
 import threading
 import warnings
 from collections import deque
@@ -21,10 +23,10 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
 
-from distributed import Client, KilledWorker
+import dask
+from distributed import Client, KilledWorker, LocalCluster
 from distributed.versions import VersionMismatchWarning
 
-from perchctl.campaign.local_workers import LocalWorkers, local_scheduler
 from perchctl.campaign.pool import ClusterAddress, defer_interrupts
 from perchctl.campaign.workers import (
     WorkerRequirements,
@@ -48,21 +50,19 @@ WORKERS_S = 20.0
 """It may take so long until it has a worker."""
 NOBODY_S = 120.0
 """For so long a campaign waits without any worker."""
-LOCAL_S = 600.0
-"""For so long it waits for one here, which has to load all libraries; one that cannot is seen."""
 _POLL_S = 0.25
 _CLOSE_S = 0.5
 _END_S = 1.0
+_NO_PAGES = "127.0.0.1:0"
+"""dask opens a port for its web pages in any case: on loopback, any that is free, and no page."""
 _QUIET = ("distributed", "tornado", "asyncio")
 
 
 class ClusterPool(Executor):
-    """`notes`: what is worth saying once it has started, a sentence each. `local`: the workers of
-    this computer, None where the cluster is another's."""
+    """`notes`: what is worth saying once it has started, a sentence each."""
 
     def __init__(self, address: ClusterAddress, required: WorkerRequirements) -> None:
         self.notes: list[str] = []
-        self.local = None if address.scheduler else LocalWorkers(address.workers)
         self._cluster, self._required = address, required
         self._orders: deque[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]]] = deque()
         self._flying: set[asyncio.Task[None]] = set()
@@ -105,8 +105,10 @@ class ClusterPool(Executor):
         self._call(self._leave)
         if wait and self._thread.ident is not None:
             self._thread.join(_END_S)
-        if self.local is not None:
-            self.local.kill()
+            if self._thread.is_alive() and self._cluster.scheduler is None:
+                for worker in multiprocessing.active_children():  # they fly on
+                    worker.kill()
+                self._thread.join(_END_S)
 
     def _call(self, what: Callable[[], object]) -> None:
         """Call `what` in the event loop."""
@@ -148,31 +150,16 @@ class ClusterPool(Executor):
             return
         async with contextlib.AsyncExitStack() as stack:
             if self._cluster.scheduler is None:
-                self._address = await stack.enter_async_context(self._started())
+                self._address = await stack.enter_async_context(_local(self._cluster.workers))
             self._client = await stack.enter_async_context(_connected(self._address))
             await verify_scheduler(self._client, self._address)
-            await self._first_worker()
+            while not self._workers:
+                await self._poll(WORKERS_S)
             self.notes = await verify_workers(self._client, self._required)
             self._ready.set_result(None)
             while True:
-                await self._poll(NOBODY_S if self.local is None else LOCAL_S)
+                await self._poll(NOBODY_S)
                 self._hand_over()
-
-    @contextlib.asynccontextmanager
-    async def _started(self) -> AsyncIterator[str]:
-        """Start a scheduler and the workers of this computer; yields the scheduler's address."""
-        assert self.local is not None
-        async with local_scheduler(self.local.folder) as scheduler:
-            try:
-                self._scheduler = scheduler
-                await self.local.start(scheduler.address)
-                yield str(scheduler.address)
-            finally:
-                self.local.kill()
-
-    async def _first_worker(self) -> None:
-        while not self._workers:
-            await self._poll(WORKERS_S if self.local is None else LOCAL_S)
 
     async def _poll(self, nobody_s: float) -> None:
         """Count the workers, a moment from now. Errors: ConnectionFailed if the scheduler is gone,
@@ -184,18 +171,10 @@ class ClusterPool(Executor):
             self._workers = len(await asyncio.wait_for(self._client.nthreads(), HANGS_S))
         except (OSError, TimeoutError) as error:
             raise self._scheduler_lost() from error
-        if self.local is not None:
-            there = {worker.name for worker in self._scheduler.workers.values()}
-            self.local.look_after(self._address, there)
         now_s = asyncio.get_running_loop().time()
         if self._workers or not self._nobody_s:
             self._nobody_s = now_s
         elif now_s - self._nobody_s >= nobody_s:
-            if self.local is not None:
-                raise ConnectionFailed(
-                    f"no worker of --cluster {self._cluster} has come up within {nobody_s:.0f} s: "
-                    f"end what keeps this computer busy, or start fewer"
-                )
             raise ConnectionFailed(
                 f"the scheduler at {self._address} has had no worker for {nobody_s:.0f} s: start "
                 f"some with dask worker {self._address} --nthreads 1"
@@ -254,6 +233,29 @@ class ClusterPool(Executor):
             f"--cluster {self._cluster} failed ({type(error).__name__}: {error}): look at what its "
             f"scheduler says (PERCHCTL_DEBUG=1 shows more)"
         )
+
+
+@contextlib.asynccontextmanager
+async def _local(workers: int) -> AsyncIterator[str]:
+    """Start a scheduler and workers on this computer; yields the scheduler's address. They end
+    with this program, killed or not."""
+    with tempfile.TemporaryDirectory(
+        prefix="perchctl-cluster-", ignore_cleanup_errors=True
+    ) as folder:
+        settings = {
+            "distributed.scheduler.allowed-failures": 0,  # `fly_all` flies a lost flight again
+            "distributed.scheduler.http.routes": [],
+            "distributed.worker.http.routes": [],
+            "distributed.worker.profile.enabled": False,
+            "temporary-directory": folder,
+        }
+        with dask.config.set(settings):
+            async with LocalCluster(
+                n_workers=workers, threads_per_worker=1, asynchronous=True, memory_limit=0,
+                dashboard_address=None, scheduler_kwargs={"dashboard_address": _NO_PAGES},
+                silence_logs=logging.CRITICAL,
+            ) as cluster:  # fmt: skip
+                yield cluster.scheduler_address
 
 
 @contextlib.asynccontextmanager
