@@ -23,8 +23,8 @@ from common import Picture, camera_pose, in_view, renderer, rms, setup_with, tab
 
 from perchctl.calibration import load_calibration
 from perchctl.camera.aideck import without_mosaic
-from perchctl.flight import FlightResult
-from perchctl.flight.campaign import fly_seed
+from perchctl.campaign import FlightResult
+from perchctl.campaign.flights import fly_seed
 from perchctl.geometry import Array
 from perchctl.profile import Profile, load_profile
 from perchctl.vision import MARKERS, Frame

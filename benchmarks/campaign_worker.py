@@ -103,15 +103,22 @@ class Stopwatch:
         return before
 
 
+def fly_seed() -> Any:
+    """The function that flies a seed, wherever this checkout has it."""
+    try:
+        from perchctl.campaign.flights import fly_seed
+    except ModuleNotFoundError:
+        from perchctl.flight.campaign import fly_seed
+    return fly_seed
+
+
 def flown(profile: Any, seed: int, by_parts: bool) -> dict[str, Any]:
     """One flight, its times and what came of it."""
-    from perchctl.flight.campaign import fly_seed
-
     watch = Stopwatch()
     before = watch.watch() if by_parts else []
     wall_s, cpu_s = time.perf_counter(), time.process_time()
     try:
-        result = fly_seed(profile, seed)
+        result = fly_seed()(profile, seed)
         watch._go_on()
     finally:
         for owner, name, function in before:
@@ -138,9 +145,9 @@ def _peak_mb() -> float:
 
 def main() -> None:
     import perchctl
-    from perchctl.flight.campaign import fly_seed  # noqa: F401 - what a process loads first
     from perchctl.profile import load_profile
 
+    fly_seed()  # what a process loads first
     profile = load_profile(sys.argv[1])
     home = str(Path(perchctl.__file__).resolve().parents[1])
     hello = {"home": home, "start_s": time.perf_counter() - STARTED_S}

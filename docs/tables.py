@@ -138,7 +138,7 @@ def expected_outcomes() -> str:
 
 
 def promises() -> str:
-    rows = [f"| {promise.what} | {promise.happens} |" for promise in PROMISES]
+    rows = [f"| {promise.what} | {promise.happens} |" for promise in PROMISES.values()]
     return "\n".join(["| what | what happens |", "|---|---|", *rows])
 
 

@@ -60,8 +60,6 @@ def test_a_note_stands_before_the_sentence_of_a_failure(
         ("--resume", ["--resume", "--out"]),
         ("--keep failed", ["--keep", "--log-dir"]),
         ("--keep best --log-dir x", ["--keep best", "all, failed and worst:N"]),
-        ("--compare sim --sweep a.b=1", ["--compare and --sweep do not go together"]),
-        ("--compare sim --log-dir x", ["--log-dir does not apply", "leave it out"]),
     ],
 )
 def test_options_that_do_not_apply_are_refused(arguments: str, words: list[str]) -> None:

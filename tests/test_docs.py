@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration, write_recordings
-from perchctl.cluster import parse_address
+from perchctl.campaign import parse_address
 from perchctl.commands import app
 from perchctl.flight import fly_lockstep
 from perchctl.log import decode_line
@@ -98,16 +98,17 @@ def cheap(line: str) -> list[str]:
             words.append("--help")
         case ["perchctl", "profile"] if words[2] == "new":  # without a dialogue, over what is there
             words += ["--defaults", "--force"]
-        case ["perchctl", "simulate"] if words.count("--sweep") > 1:
+        case ["perchctl", "simulate"] if sum("=" in word for word in words) > 1:
             words.append("--help")  # many flights
         case ["perchctl", "simulate"]:
             if "--cluster" in words:  # the form is looked at; a cluster of one is this computer's
                 at = words.index("--cluster")
                 place = parse_address(words[at + 1])
-                words[at : at + 2] = [] if place.address else ["--cluster", "local:1"]
-            if "--compare" in words:
-                words[words.index("--compare") + 1] = "quick.yaml"
-            words += ["-p", "quick.yaml"]
+                words[at : at + 2] = [] if place.scheduler else ["--cluster", "local:1"]
+            if words[2] == "compare":
+                words[3:5] = ["quick.yaml", "quick.yaml"]
+            else:
+                words += ["-p", "quick.yaml"]
             for option in ("-n", "--only"):
                 if option in words:
                     words[words.index(option) + 1] = "1"

@@ -1,4 +1,4 @@
-"""`perchctl simulate --compare` and `--sweep`: what they print, of flights that are none, and in
+"""`perchctl simulate compare` and `sweep`: what they print, of flights that are none, and in
 campaigns of true ones."""
 
 from __future__ import annotations
@@ -13,9 +13,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands import simulate_compare, simulate_sweep
-from perchctl.flight import FlightResult, VariantResult
-from perchctl.flight.variants import Variant
+from perchctl.campaign import FlightResult, VariantResult
 from perchctl.profile import Profile, load_profile
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.flights import ROOT
@@ -23,6 +21,7 @@ from tests.helpers.results import landed, perched
 
 SIM = load_profile("sim")
 KEY = "planner.integral_per_s"
+FLY_VARIANTS = "perchctl.commands.simulate.fly_variants"
 Note = Callable[[Any], None]
 
 
@@ -43,10 +42,9 @@ def no_flights(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
     ) -> None:
         for seed in seeds:
             for number, profile in enumerate(profiles):
-                note(VariantResult(Variant(seed, number), fly(profile, seed)))
+                note(VariantResult(number, fly(profile, seed)))
 
-    monkeypatch.setattr(simulate_compare, "fly_variants", variants)
-    monkeypatch.setattr(simulate_sweep, "fly_variants", variants)
+    monkeypatch.setattr(FLY_VARIANTS, variants)
 
 
 def write(name: str, text: str) -> str:
@@ -56,7 +54,7 @@ def write(name: str, text: str) -> str:
 
 def test_a_difference_is_told_with_the_keys_that_differ() -> None:
     without = write("without.yaml", "planner: {integral_per_s: 0}\n")
-    said = run("simulate", "--compare", without, "-n", "60")
+    said = run("simulate", "compare", "sim", without, "-n", "60")
     assert said.code == 0
     lines = said.stdout.splitlines()
     [miss] = [line for line in lines if line.startswith("miss")]
@@ -64,14 +62,15 @@ def test_a_difference_is_told_with_the_keys_that_differ() -> None:
     assert miss.endswith("A is better by 3.00 mm")
     assert "57 of 60 (86.1 to 99.0 %)" in lines[1]
     assert f"differs: {KEY} is 0.4 in A, 0.0 in B" in lines
-    record = json.loads(run("simulate", "--compare", without, "-n", "60", "--json").stdout)
+    record = json.loads(run("simulate", "compare", "sim", without, "-n", "60", "--json").stdout)
     assert (record["a"], record["b"], record["miss_m"]["better"]) == ("sim", without, "A")
     assert record["success"]["better"] is None
     assert record["profile"] == {KEY: {"a": 0.4, "b": 0.0}}
 
 
 def test_a_copy_is_the_same_in_all_flights() -> None:
-    said = run("simulate", "--compare", write("copy.yaml", "description: a copy\n"), "-n", "60")
+    copy = write("copy.yaml", "description: a copy\n")
+    said = run("simulate", "compare", "sim", copy, "-n", "60")
     assert "identical in all 60 flights\nthe profiles do not differ\n" in said.stdout
     assert "better" not in said.stdout
 
@@ -79,18 +78,18 @@ def test_a_copy_is_the_same_in_all_flights() -> None:
 def test_ctrl_c_leaves_the_seeds_that_both_have_flown(monkeypatch: pytest.MonkeyPatch) -> None:
     def variants(_profiles: object, _seeds: object, _executor: object, note: Note) -> None:
         for seed, number in ((0, 0), (0, 1), (1, 0)):
-            note(VariantResult(Variant(seed, number), perched(seed)))
+            note(VariantResult(number, perched(seed)))
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(simulate_compare, "fly_variants", variants)
-    said = run("simulate", "--compare", "sim", "--json")
+    monkeypatch.setattr(FLY_VARIANTS, variants)
+    said = run("simulate", "compare", "sim", "sim", "--json")
     record = json.loads(said.stdout)
     assert (said.code, record["flights"], record["exit_code"]) == (130, 1, 130)
     assert record["error"] == "stopped: 3 of 20 flights were flown"
 
 
 def test_a_sweep_names_the_best_and_proves_it() -> None:
-    said = run("simulate", "--sweep", f"{KEY}=0,0.2,0.4", "-n", "40")
+    said = run("simulate", "sweep", f"{KEY}=0,0.2,0.4", "-n", "40")
     assert said.code == 0
     assert said.complaint == "3 cells of 40 seeds are 120 flights"
     lines = said.stdout.splitlines()
@@ -98,9 +97,9 @@ def test_a_sweep_names_the_best_and_proves_it() -> None:
     assert lines[3].endswith("best, own")
     assert lines[-1] == "the profile's own values are the best"
     base = write("zero.yaml", "planner: {integral_per_s: 0}\n")
-    worse = run("simulate", "-p", base, "--sweep", f"{KEY}=0.2", "-n", "40").stdout
+    worse = run("simulate", "sweep", f"{KEY}=0.2", "-p", base, "-n", "40").stdout
     assert "miss, B is better by 3.00 mm" in worse
-    record = json.loads(run("simulate", "--sweep", f"{KEY}=0,0.2", "-n", "9", "--json").stdout)
+    record = json.loads(run("simulate", "sweep", f"{KEY}=0,0.2", "-n", "9", "--json").stdout)
     assert [cell["own"] for cell in record["cells"]] == [False, False, True]
     assert record["cells"][0]["values"] == {KEY: 0.0}
     assert record["best"] == {KEY: 0.4}
@@ -117,7 +116,7 @@ def test_sixty_pairs_find_an_integral_that_is_off_and_nothing_between_a_profile_
     Path("drifting.yaml").write_text(f"extends: {short}\nsimulation: {{drift_mps: 0.02}}\n")
     Path("without.yaml").write_text("extends: drifting.yaml\nplanner: {integral_per_s: 0}\n")
     Path("copy.yaml").write_text("extends: drifting.yaml\ndescription: the same again\n")
-    flown = ("simulate", "-p", "drifting.yaml", "-n", "60", "--jobs", "2", "--compare")
+    flown = ("simulate", "compare", "-n", "60", "--jobs", "2", "drifting.yaml")
     record = json.loads(run(*flown, "without.yaml", "--json").stdout)
     assert record["flights"] == 60
     assert record["profile"] == {KEY: {"a": 0.4, "b": 0.0}}

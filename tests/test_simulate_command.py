@@ -15,7 +15,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.flight.record import flown_record, result_from
+from perchctl.campaign.results_file import flown_record, result_from
 from perchctl.log import read_log
 from tests.helpers.commands import Said, elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT, SEED, SHORT

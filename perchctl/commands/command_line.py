@@ -71,7 +71,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Fly the seven phases: find the target, align, ascend, perch, stop the motors.",
     ),
     "simulate": (
-        "cli.simulate",
+        "simulate",
         "Fly many seeded scenarios in lockstep, faster than real time, and count.",
     ),
     "log": (

@@ -1,98 +1,578 @@
-"""The work behind `perchctl simulate`: seeds in, a table or one JSON object out."""
+"""`perchctl simulate`: seeded flights in lockstep, counted; two profiles compared; a sweep."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+import contextlib
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
+from dataclasses import asdict
+from functools import partial
 from importlib.util import find_spec
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, TypeVar
 
+import typer
+
+from perchctl.analysis import profile_differences
+from perchctl.commands.command_line import (
+    Command,
+    ForceOption,
+    Group,
+    JsonOption,
+    PositioningOption,
+    ProfileOption,
+    complete_profile,
+    examples,
+    new_app,
+    reporting,
+)
+from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.interrupt import signals_to
-from perchctl.commands.output import print_record
-from perchctl.commands.simulate_request import (
-    SimulateRequest,
-    and_problem,
-    fly_each,
-    stop_once,
-    tell_logs,
+from perchctl.commands.output import print_record, say
+from perchctl.commands.positioning import positioned
+from perchctl.commands.progress import progress_bar
+from perchctl.display import timed_event_text
+from perchctl.errors import (
+    Interrupted,
+    InvalidValue,
+    PerchError,
+    UsageError,
+    no_cluster,
+    no_simulator,
 )
-from perchctl.errors import PerchError, no_simulator
-from perchctl.flight import (
-    FlightResult,
-    campaign_summary,
-    campaign_table,
-    defer_interrupts,
-    none_took_off,
+from perchctl.log import make_log_folder, summary_text, to_plain
+from perchctl.profile import Profile, load_profile
+
+try:
+    from perchctl.campaign import (
+        CampaignFlight,
+        CampaignResults,
+        FlightResult,
+        LoggedFlight,
+        VariantResult,
+        align_columns,
+        campaign_results,
+        campaign_summary,
+        campaign_table,
+        compare_profiles,
+        defer_interrupts,
+        flight_processes,
+        fly_all,
+        fly_logged,
+        fly_variants,
+        none_took_off,
+        parse_address,
+        run_campaign,
+        sweep_grid,
+    )
+    from perchctl.faults import (
+        FAULTS,
+        FaultResult,
+        fault_summary,
+        fault_table,
+        run_fault_campaign,
+        select_faults,
+    )
+except ModuleNotFoundError as error:
+    raise no_simulator(error.name) from None
+
+R = TypeVar("R", bound=CampaignFlight)
+AGAIN_S = 0.5
+"""A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
+_NO_DIFFERENCE = ("name", "description", "date")
+
+FlightsOption = Annotated[
+    int | None, typer.Option("-n", "--flights", min=1, help="How many; 10 by default.")
+]
+SeedOption = Annotated[
+    int | None, typer.Option("--seed", min=0, help="Of the first flight; 0 by default.")
+]
+JobsOption = Annotated[
+    int | None, typer.Option("--jobs", "-j", min=1, help="Flights at a time; 1 by default.")
+]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="ADDRESS|local:N",
+        help="Fly on the workers of this dask scheduler, as tcp://10.0.0.5:8786, or of one here "
+        "with N workers.",
+    ),
+]
+app = new_app(Group)
+
+
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl simulate -n 100 --jobs 4",
+        "perchctl simulate --only 17 --log-dir logs",
+        "perchctl simulate --faults all -n 1000 --jobs 4 --out flown.jsonl",
+    ),
 )
-from perchctl.log import make_log_folder
-from perchctl.startup import leave_at_ctrl_c, loaded
-
-__all__ = ["SimulateRequest", "run"]
-
-
-def run(request: SimulateRequest) -> int:
-    """Fly the seeds and print; progress goes to stderr, the result to stdout.
-
-    Errors: NotFound, InvalidValue, UsageError.
-    """
-    request.check()
-    if find_spec("mujoco") is None:
-        raise no_simulator()
-    # A library that is half loaded fails with words of its own; nothing is open, nothing is lost.
-    leave_at_ctrl_c()
-    try:
-        from perchctl.commands.simulate_faults import run_faults
-        from perchctl.commands.simulate_only import run_only
-    finally:
-        loaded()
-    if request.log_dir is not None:
-        make_log_folder(request.log_dir)
-        if request.cluster is not None:  # whose workers are started in other folders
-            request = replace(request, log_dir=request.log_dir.absolute())
+@reporting
+def run(
+    flights: FlightsOption = None,
+    seed: SeedOption = None,
+    jobs: JobsOption = None,
+    profile: ProfileOption = "sim",
+    only: Annotated[
+        int | None,
+        typer.Option("--only", min=0, help="One flight, of this seed, told in full and logged."),
+    ] = None,
+    faults: Annotated[
+        str | None,
+        typer.Option(
+            "--faults",
+            metavar="all|list|NAME,NAME",
+            help="Lay a fault into each flight, and judge by the world's truth.",
+        ),
+    ] = None,
+    positioning: PositioningOption = None,
+    as_json: JsonOption = False,
+    cluster: ClusterOption = None,
+    log_dir: Annotated[
+        Path | None,
+        typer.Option(
+            "--log-dir", help="Log the flights, into this folder.", rich_help_panel="Files"
+        ),
+    ] = None,
+    record: Annotated[
+        bool,
+        typer.Option(
+            "--record",
+            help="Keep the pictures, in an MCAP file beside each log.",
+            rich_help_panel="Files",
+        ),
+    ] = False,
+    keep: Annotated[
+        str | None,
+        typer.Option(
+            "--keep",
+            metavar="all|failed|worst:N",
+            help="Of the logs in --log-dir; all by default.",
+            rich_help_panel="Files",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", help="JSONL file; each flight's result, as it ends.", rich_help_panel="Files"
+        ),
+    ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Go on with --out: fly the seeds that it lacks.",
+            rich_help_panel="Files",
+        ),
+    ] = False,
+    force: ForceOption = False,
+) -> int:
+    """Fly many seeded scenarios in lockstep, faster than real time, and count."""
+    many = {"-n": flights, "--seed": seed, "--jobs": jobs, "--cluster": cluster, "--out": out}
+    if faults == "list":
+        others = {**many, "--only": only, "--log-dir": log_dir}
+        _refuse_options("--faults list flies nothing", others, "")
+        return _list_faults(as_json)
+    if only is not None:
+        one = f"--only {only} repeats the one flight of seed {only}"
+        _refuse_options(one, {**many, "--keep": keep}, ", or --only")
+    if log_dir is None and (record or keep is not None) and only is None:
+        raise UsageError(
+            f"{'--record' if record else '--keep'} concerns the logs of the flights: name their "
+            f"folder with --log-dir"
+        )
+    if resume and out is None:
+        raise UsageError("--resume goes on with a file of results: name it with --out")
+    if out is not None and out.suffix != ".jsonl":
+        raise InvalidValue(f"{out} must end in .jsonl: a result is one line of JSON")
+    flown = positioned(load_profile(profile), positioning)
+    if only is not None and log_dir is not None:
+        make_log_folder(log_dir)
+    if cluster is not None and log_dir is not None:
+        log_dir = log_dir.absolute()  # workers are started in other folders
+    seeds = _seeds(flights, seed)
+    executor = executor_of(jobs, cluster, [flown], log_dir)
+    files: dict[str, Any] = {
+        "out": out, "resume": resume, "force": force, "keep": keep, "log_dir": log_dir,
+    }  # fmt: skip
     with signals_to(stop_once()):
-        if request.faults is not None:
-            return run_faults(request)
-        if request.only is not None:
-            return run_only(request)
-        answer = _answer(request)
-        if answer is not None:
-            return answer(request)
-        return _campaign(request)
+        if faults is not None:
+            names = tuple(fault.name for fault in select_faults(faults))
+            if only is not None:
+                folder = log_dir or Path(flown.log.directory)
+                return _fly_fault(flown, only, names, folder, record, as_json)
+            with campaign_results(flown, seeds, FaultResult, faults=names, **files) as faulty:
+                return fly_each(
+                    lambda executor, note: run_fault_campaign(
+                        flown, faulty.left, names, executor, note, log_dir, record
+                    ),
+                    partial(_report, fault_summary, fault_table, as_json, log_dir, keep),
+                    len(seeds),
+                    executor,
+                    faulty,
+                )
+        if only is not None:
+            folder = log_dir or Path(flown.log.directory)
+            return _fly_only(flown, only, folder, record, as_json)
+        with campaign_results(flown, seeds, FlightResult, **files) as kept:
+            return fly_each(
+                lambda executor, note: run_campaign(
+                    flown, kept.left, executor, note, log_dir, record
+                ),
+                partial(_report, campaign_summary, campaign_table, as_json, log_dir, keep),
+                len(seeds),
+                executor,
+                kept,
+                none_took_off,
+            )
 
 
-def _answer(request: SimulateRequest) -> Callable[[SimulateRequest], int] | None:
-    """What answers the question that was asked; None: it is a plain campaign."""
-    with defer_interrupts():
-        if request.compare is not None:
-            from perchctl.commands.simulate_compare import run_compare
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl simulate compare sim paper -n 60 --jobs 4",
+        "perchctl simulate compare crazyflie.yaml changed.yaml -n 200 --cluster local:4",
+        "perchctl simulate compare sim rough --positioning mocap --json",
+    ),
+)
+@reporting
+def compare(
+    profile_a: Annotated[
+        str,
+        typer.Argument(
+            metavar="PROFILE_A", help="A, by name or path.", autocompletion=complete_profile
+        ),
+    ],
+    profile_b: Annotated[
+        str,
+        typer.Argument(
+            metavar="PROFILE_B", help="B, by name or path.", autocompletion=complete_profile
+        ),
+    ],
+    flights: FlightsOption = None,
+    seed: SeedOption = None,
+    jobs: JobsOption = None,
+    cluster: ClusterOption = None,
+    positioning: PositioningOption = None,
+    as_json: JsonOption = False,
+) -> int:
+    """Fly each seed by two profiles: what differs, and what of it is proven."""
+    names = (profile_a, profile_b)
+    profiles = [positioned(load_profile(name), positioning) for name in names]
+    keys = profile_differences(*(p.model_dump(mode="json") for p in profiles))
+    keys = {key: values for key, values in keys.items() if key not in _NO_DIFFERENCE}
 
-            return run_compare
-        if request.sweep:
-            from perchctl.commands.simulate_sweep import run_sweep
+    def report(results: list[VariantResult], problem: PerchError | None) -> None:
+        found = compare_profiles(names, results)
+        if as_json:
+            differences = {key: {"a": a, "b": b} for key, (a, b) in keys.items()}
+            record = {"a": profile_a, "b": profile_b, **found.record(), "profile": differences}
+            print_record(with_problem(record, problem))
+            return
+        print(found.text())
+        for key, (a, b) in keys.items():
+            print(f"differs: {key} is {a} in A, {b} in B")
+        if not keys:
+            print("the profiles do not differ")
 
-            return run_sweep
+    return _fly_by_each(profiles, _seeds(flights, seed), jobs, cluster, report)
+
+
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl simulate sweep planner.align.xy_m=0.02,0.04,0.08 -n 30",
+        "perchctl simulate sweep planner.integral_per_s=0,0.4 planner.align.xy_m=0.02,0.04 -n 30",
+        "perchctl simulate sweep 'simulation.mass_kg=[0.038,0.038],[0.046,0.046]' --json",
+    ),
+)
+@reporting
+def sweep(
+    values: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="KEY=VALUE,VALUE...",
+            help="A key of the profile with its values; two keys: each value with each.",
+        ),
+    ],
+    profile: ProfileOption = "sim",
+    flights: FlightsOption = None,
+    seed: SeedOption = None,
+    jobs: JobsOption = None,
+    cluster: ClusterOption = None,
+    positioning: PositioningOption = None,
+    as_json: JsonOption = False,
+) -> int:
+    """Fly the same seeds with several values of a profile's keys: which is the best."""
+    grid = sweep_grid(positioned(load_profile(profile), positioning), values)
+    profiles = [cell.profile for cell in grid.cells]
+    seeds = _seeds(flights, seed)
+    say(f"{len(profiles)} cells of {len(seeds)} seeds are {len(profiles) * len(seeds)} flights")
+
+    def report(results: list[VariantResult], problem: PerchError | None) -> None:
+        found = grid.compared(results)
+        if as_json:
+            print_record(with_problem(found.record(), problem))
+        else:
+            print(found.text(), flush=True)
+
+    return _fly_by_each(profiles, seeds, jobs, cluster, report)
+
+
+def _fly_by_each(
+    profiles: Sequence[Profile],
+    seeds: Sequence[int],
+    jobs: int | None,
+    cluster: str | None,
+    report: Callable[[list[VariantResult], PerchError | None], None],
+) -> int:
+    with signals_to(stop_once()):
+        return fly_each(
+            lambda executor, note: fly_variants(profiles, seeds, executor, note),
+            report,
+            len(profiles) * len(seeds),
+            executor_of(jobs, cluster, profiles),
+        )
+
+
+def _seeds(flights: int | None, first: int | None) -> list[int]:
+    return list(range(first or 0, (first or 0) + (flights or 10)))
+
+
+def _refuse_options(reason: str, options: Mapping[str, object], instead: str) -> None:
+    given = [f"{name} {value}" for name, value in options.items() if value is not None]
+    if given:
+        does, it = ("does", "it") if len(given) == 1 else ("do", "them")
+        raise UsageError(
+            f"{reason}: {' and '.join(given)} {does} not apply; leave {it} out{instead}"
+        )
+
+
+# --- Who flies, and how it may end -------------------------------------------------------------
+
+
+ExecutorOf = Callable[[int], AbstractContextManager[Executor]]
+"""Who flies so many flights."""
+
+
+def executor_of(
+    jobs: int | None, cluster: str | None, profiles: Sequence[Profile], log_dir: Path | None = None
+) -> ExecutorOf:
+    """Processes of this computer, or the workers of a cluster. `profiles`: with the files that
+    flights read; `log_dir`: where they write. Errors: UsageError."""
+    if cluster is None:
+        return lambda flights: flight_processes(max(1, min(jobs or 1, flights)))
+    if jobs is not None:
+        raise UsageError(
+            f"--cluster {cluster} flies as many at a time as it has workers: --jobs {jobs} does "
+            f"not apply; leave it out, or --cluster"
+        )
+    address = parse_address(cluster)
+    if find_spec("distributed") is None:
+        raise no_cluster()
+
+    @contextlib.contextmanager
+    def workers(flights: int) -> Iterator[Executor]:
+        if not flights:
+            with flight_processes(1) as processes:
+                yield processes
+            return
+        try:
+            with defer_interrupts():
+                from perchctl.campaign import cluster_pool
+        except ImportError as error:
+            raise no_cluster(str(error)) from error
+        with cluster_pool(address, profiles, log_dir) as pool:
+            for note in pool.notes:
+                say(note)
+            yield pool
+
+    return workers
+
+
+def fly_each(
+    campaign: Callable[[Executor, Callable[[R], None]], object],
+    report: Callable[[list[R], PerchError | None], None],
+    total: int,
+    executor_of: ExecutorOf,
+    kept: CampaignResults[R] | None = None,
+    objection: Callable[[list[R]], PerchError | None] = lambda results: None,
+) -> int:
+    """Fly a campaign of `total` flights, and report those that were flown, however it ends: also
+    by Ctrl-C, or when a flight fails. Returns the exit code.
+
+    `campaign` gets who flies, and the function to call with each result; `report` gets the
+    results, and why not all were flown. `kept`: those that were flown before, which count, too,
+    and where each goes. `objection`: what all of them together amount to. Errors: PerchError if
+    none was flown.
+    """
+    results: list[R] = [] if kept is None else list(kept.earlier)
+    problem: PerchError | None = None
+    begun = False
+    try:
+        with (
+            contextlib.suppress(KeyboardInterrupt),
+            executor_of(total - len(results)) as executor,
+            progress_bar(total, earlier=list(results)) as advance,
+        ):
+            begun = True
+
+            def note(result: R) -> None:
+                with defer_interrupts():
+                    results.append(result)
+                    if kept is not None:
+                        kept.note(result)
+                    advance(result)
+
+            campaign(executor, note)
+    except PerchError as error:
+        if not begun:
+            raise
+        problem = error
+    flown = f"{len(results)} of {total} flights were flown"
+    if problem is None and len(results) < total:
+        problem = Interrupted(f"stopped: {flown}")
+    elif problem is not None:
+        problem.args = (f"{problem}; {flown}",)
+    if problem is not None and not results:
+        raise problem
+    problem = problem or objection(results)
+    report(sorted(results, key=lambda result: result.seed), problem)
+    if problem is None:
+        return 0
+    say(str(problem))
+    return problem.exit_code
+
+
+def stop_once(
+    clock: Callable[[], float] = time.monotonic, leave: Callable[[int], object] = os._exit
+) -> Callable[[int, FrameType | None], None]:
+    """A handler: the first signal raises KeyboardInterrupt, a further one ends the program
+    where it is."""
+    first_s: list[float] = []
+
+    def press(_number: int, _frame: FrameType | None) -> None:
+        if not first_s:
+            first_s.append(clock())
+            raise KeyboardInterrupt
+        if clock() - first_s[0] >= AGAIN_S:
+            leave(Interrupted.exit_code)
+
+    return press
+
+
+# --- What is printed ---------------------------------------------------------------------------
+
+
+def with_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[str, Any]:
+    """The one object of `--json`, with why not all were flown."""
+    if problem is None:
+        return dict(record)
+    return {**record, "error": str(problem), "exit_code": problem.exit_code}
+
+
+def _report(
+    summary: Callable[[list[R]], Mapping[str, Any]],
+    table: Callable[[list[R]], str],
+    as_json: bool,
+    log_dir: Path | None,
+    keep: str | None,
+    results: list[R],
+    problem: PerchError | None,
+) -> None:
+    if as_json:
+        print_record(with_problem(summary(results), problem))
+    else:
+        print(table(results), flush=True)
+    say_where_logs_are(results, log_dir, keep)
+
+
+def say_where_logs_are(
+    results: Sequence[CampaignFlight], log_dir: Path | None, keep: str | None = None
+) -> None:
+    """Where the logs are, and what they lack, on stderr."""
+    if log_dir is None or not results:
+        return
+    kept = "the logs that are kept" if keep else "the flights' logs"
+    say(f"{kept} are in {log_dir}")
+    problems = [result.log_problem for result in results if result.log_problem is not None]
+    if problems:
+        say(f"{len(problems)} of {len(results)} logs are incomplete: {problems[0]}")
+
+
+def _fly_only(profile: Profile, seed: int, folder: Path, record: bool, as_json: bool) -> int:
+    """Fly one seed, and tell it as `perchctl fly` tells a flight."""
+
+    def report(flights: list[LoggedFlight], _problem: PerchError | None) -> None:
+        (flight,) = flights
+        if not as_json:
+            start_s = flight.events[0].t_s
+            for event in flight.events:
+                print(timed_event_text(event, start_s))
+            print(summary_text(flight.summary, flight.log), flush=True)
+        plot = _plot(flight.log, profile)
+        if as_json:
+            lacks = {
+                "lost_records": flight.summary.lost_records,
+                "log_problem": flight.summary.log_problem,
+            }
+            files = {"log": str(flight.log), "plot": None if plot is None else str(plot)}
+            print_record({"seed": flight.seed} | flight.summary.as_record() | lacks | files)
+        elif plot is not None:
+            print(f"plot:      {plot}")
+
+    fly = partial(fly_logged, profile, folder, record=record)
+    return fly_each(
+        lambda executor, note: fly_all(fly, [seed], executor, note),
+        report,
+        1,
+        executor_of(None, None, [profile]),
+    )
+
+
+def _fly_fault(
+    profile: Profile, seed: int, faults: tuple[str, ...], folder: Path, record: bool, as_json: bool
+) -> int:
+    """Fly one seed with its fault, and print all that is known of the flight."""
+
+    def report(results: list[FaultResult], _problem: PerchError | None) -> None:
+        (result,) = results
+        known = asdict(result)
+        if not as_json:
+            print("\n".join(f"{name:<18} {value}" for name, value in known.items()), flush=True)
+        assert result.log is not None
+        plot = _plot(result.log, profile)
+        if as_json:
+            print_record(to_plain({**known, "plot": plot}))
+        elif plot is not None:
+            print(f"{'plot':<18} {plot}")
+
+    return fly_each(
+        lambda executor, note: run_fault_campaign(
+            profile, [seed], faults, executor, note, folder, record
+        ),
+        report,
+        1,
+        executor_of(None, None, [profile]),
+    )
+
+
+def _plot(log: Path, profile: Profile) -> Path | None:
+    with contextlib.suppress(KeyboardInterrupt):  # the flight is flown, and is told all the same
+        return plot_of(log, profile)
     return None
 
 
-def _campaign(request: SimulateRequest) -> int:
-    from perchctl.flight import run_campaign
-
-    profile = request.loaded()
-
-    def report(results: list[FlightResult], problem: PerchError | None) -> None:
-        if request.as_json:
-            print_record(and_problem(campaign_summary(results), problem))
-        else:
-            print(campaign_table(results), flush=True)
-        tell_logs(results, request.log_dir, request.keep)
-
-    with request.results(profile, FlightResult) as kept:
-        return fly_each(
-            lambda executor, note: run_campaign(
-                profile, kept.left, executor, note, request.log_dir, request.record
-            ),
-            request,
-            report,
-            kept,
-            profiles=[profile],
-            objection=none_took_off,
-        )
+def _list_faults(as_json: bool) -> int:
+    if as_json:
+        print_record({"faults": {fault.name: fault.what for fault in FAULTS}})
+    else:
+        print("\n".join(align_columns([(fault.name, fault.what) for fault in FAULTS])))
+    return 0

@@ -1,6 +1,6 @@
 from .catalogue import FAULTS as FAULTS
 from .catalogue import select_faults as select_faults
 from .flight import run_fault_campaign as run_fault_campaign
-from .result import FaultResult as FaultResult
-from .summary import fault_summary as fault_summary
-from .summary import fault_table as fault_table
+from .results import FaultResult as FaultResult
+from .results import fault_summary as fault_summary
+from .results import fault_table as fault_table

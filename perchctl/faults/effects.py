@@ -21,7 +21,7 @@ class Silence:
 
 @dataclass(frozen=True)
 class PacketLost:
-    """The next `count` packets of an order are lost (`ORDERS` of `perchctl.faults.radio`)."""
+    """The next `count` packets of an order are lost (`ORDERS` of `perchctl.faults.edges`)."""
 
     order: str
     count: int

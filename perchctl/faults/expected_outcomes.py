@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from perchctl.faults.effects import Killed, Push
-from perchctl.faults.facts import Facts
 from perchctl.faults.oracle import Flag
+from perchctl.faults.truth import Facts
 from perchctl.mission import CATCHABLE_M
 
 NOTICED_S, DOWN_MPS = 1.5, 0.4

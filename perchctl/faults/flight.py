@@ -10,14 +10,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from perchctl.calibration import profile_camera
+from perchctl.campaign import fly_all, fly_measured, seed_log_path
 from perchctl.errors import PerchError
 from perchctl.faults.bounds import DescentBound, PlaceBound, UnfeltDrift
-from perchctl.faults.camera import FaultyCamera
-from perchctl.faults.catalogue import FROM_THE_START, Case, draw_case
+from perchctl.faults.catalogue import BY_NAME, FROM_THE_START, Case, draw_case
 from perchctl.faults.claims import REFUSAL_CLAIMS, claims_of, claims_of_rescue, last_row
+from perchctl.faults.edges import (
+    FaultyCamera,
+    FaultyClock,
+    FaultyRadio,
+    PlantedError,
+    ProgramKilled,
+)
 from perchctl.faults.effects import (
     CameraFault,
     DeckSilent,
@@ -28,23 +33,16 @@ from perchctl.faults.effects import (
 )
 from perchctl.faults.effects import Operator as Presses
 from perchctl.faults.expected_outcomes import unexpected
-from perchctl.faults.facts import FactsRecorder
 from perchctl.faults.inject import Disk, Edges, Injector, changed_scenario
 from perchctl.faults.oracle import Limits, Oracle, Sample
-from perchctl.faults.program import FaultyClock, PlantedError, ProgramKilled
-from perchctl.faults.radio import FaultyRadio
-from perchctl.faults.result import End, FaultResult
-from perchctl.faults.truth import WatchedVehicle, sample_of
+from perchctl.faults.results import End, FaultResult
+from perchctl.faults.truth import FactsRecorder, WatchedVehicle, sample_of
 from perchctl.flight import (
     FlightParts,
     OperatorSwitch,
     feed_lockstep,
     fly,
-    fly_all,
-    give_back_memory,
     lockstep_source,
-    peak_memory_mb,
-    seed_log_path,
     with_positioning,
 )
 from perchctl.geometry import GRAVITY_MPS2
@@ -52,7 +50,7 @@ from perchctl.link import FAST_BLOCKS, MockLink, simulated_radio
 from perchctl.log import LogWatcher, to_exact
 from perchctl.mission import Event, FlightReport, Phase, Tick, Watcher
 from perchctl.profile import Profile
-from perchctl.sim import Packet, Port, Scenario, draw_capture, draw_scenario
+from perchctl.sim import Packet, Port, Scenario, draw_capture
 from perchctl.vision import make_pipeline
 
 AFTER_S, AFTER_IN_THE_AIR_S = 6.0, 10.0
@@ -124,7 +122,7 @@ class FaultyFlight:
             case.effects, scenario, by_target=profile.positioning.by == "target"
         )
         self._descent_bound = DescentBound(case.effects, profile)
-        self._recorder = FactsRecorder(vehicle, profile)
+        self._recorder = FactsRecorder(vehicle, profile, case.effects)
         self._touched = False  # the ceiling, since the fault began
 
     def fly(self) -> FaultResult:
@@ -231,8 +229,7 @@ class FaultyFlight:
     def _result(self, ended: _Ended, end_s: float, wall_s: float) -> FaultResult:
         case, report = self._case, ended.report
         verdict = self._oracle.verdict()
-        facts = self._recorder.facts(
-            case.effects,
+        facts = self._recorder.complete(
             begin_s=self._injector.begin_s,
             killed_s=self._clock.killed_s,
             stop_s=self._oracle.stop_s,
@@ -297,16 +294,12 @@ def fly_fault_seed(
     record: bool = False,
 ) -> FaultResult:
     """The seed's scenario with the seed's fault out of those named."""
-    from perchctl.faults.catalogue import BY_NAME
 
-    cv2.setNumThreads(1)  # a job is one core
-    cpu_began_s = time.process_time()
-    scenario = draw_scenario(profile, seed)
-    case = draw_case(seed, scenario, [BY_NAME[name] for name in faults])
-    result = fly_with_fault(profile, case, scenario, log, record)
-    cpu_s = time.process_time() - cpu_began_s
-    give_back_memory()
-    return replace(result, cpu_s=cpu_s, peak_memory_mb=peak_memory_mb(), scenario=scenario)
+    def fly_drawn(scenario: Scenario) -> FaultResult:
+        case = draw_case(seed, scenario, [BY_NAME[name] for name in faults])
+        return fly_with_fault(profile, case, scenario, log, record)
+
+    return fly_measured(profile, seed, fly_drawn)
 
 
 def _scenario_of(case: Case, scenario: Scenario) -> Scenario:
@@ -364,7 +357,7 @@ def run_fault_campaign(
     log_dir: Path | None = None,
     record: bool = False,
 ) -> list[FaultResult]:
-    """Fly all seeds, as `perchctl.flight.campaign.run_campaign` does."""
+    """Fly all seeds, as `perchctl.campaign.run_campaign` does."""
     return fly_all(
         partial(_fly_logged, profile, faults, log_dir, record), seeds, executor, on_result
     )

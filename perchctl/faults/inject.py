@@ -11,7 +11,7 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from perchctl.faults.camera import FaultyCamera
+from perchctl.faults.edges import FaultyCamera, FaultyClock, FaultyRadio
 from perchctl.faults.effects import (
     BatterySags,
     BlockDead,
@@ -41,8 +41,6 @@ from perchctl.faults.effects import (
     TelemetryDelayed,
     ThrustChanged,
 )
-from perchctl.faults.program import FaultyClock
-from perchctl.faults.radio import FaultyRadio
 from perchctl.faults.truth import SAMPLE_S, WatchedVehicle
 from perchctl.geometry import GRAVITY_MPS2, rot_z
 from perchctl.mission import Event, Phase, Tick

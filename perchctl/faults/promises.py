@@ -1,6 +1,6 @@
 """What the README promises for when something goes wrong, and whether a flight keeps it.
 
-The README's table is drawn from `PROMISES`; each fault of the catalogue stands under one.
+The README's table is drawn from `PROMISES`; each fault of the catalogue names the key of one.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from perchctl.faults.claims import HELD_ELSEWHERE, UNCONFIRMED
-from perchctl.faults.result import End, FaultResult
+from perchctl.faults.results import End, FaultResult
 
 DOWN: frozenset[End] = frozenset({"perched", "landed"})
 CUT: frozenset[End] = frozenset({"perched", "landed", "aborted"})
@@ -16,14 +16,12 @@ CUT: frozenset[End] = frozenset({"perched", "landed", "aborted"})
 
 @dataclass(frozen=True)
 class Promise:
-    """`ends`: how a flight with one of the `faults` may end; `unseen`: also aborted, where the
+    """`ends`: how a flight with a fault of this promise may end; `unseen`: also aborted, where the
     landing was ordered and nobody saw it, or it is held where its estimate, which may have moved,
-    has no target; `names`: its last sentence says so,
-    unless it perched."""
+    has no target; `names`: its last sentence says so, unless it perched."""
 
     what: str
     happens: str
-    faults: tuple[str, ...]
     ends: frozenset[End] = DOWN
     unseen: bool = False
     names: str = ""
@@ -41,124 +39,104 @@ class Promise:
         return result.unavoidable is not None or result.end in self.ends
 
 
-PROMISES = (
-    Promise(
+PROMISES: dict[str, Promise] = {
+    "camera": Promise(
         "camera silent, frozen, snowing, dark, late, lossy; target covered",
         "held after 0.5 s, landed after 3 s; in the ascent it backs off down; landed "
         "where the latency changes by 0.1 s, and named",
-        ("camera-silent", "camera-frozen", "camera-snow", "camera-dark", "camera-late",
-         "latency-falls", "camera-out-of-order", "camera-lossy", "target-covered",
-         "covered-and-kick", "covered-and-gust"),
     ),
-    Promise(
+    "mirrored": Promise(
         "picture mirrored",
         "not flown by; landed after the search, and `camera.mirrored` named",
-        ("camera-mirrored",), names="camera.mirrored",
+        names="camera.mirrored",
     ),
-    Promise(
+    "turned": Promise(
         "camera mounted 90 or 180 deg off",
         "stopped and landed within 0.3 m (0.6 m by the target alone), as soon as the target moves "
         "with the vehicle, and the turn that fits named",
-        ("camera-turned",), names="camera.mount",
+        names="camera.mount",
     ),
-    Promise(
+    "telemetry": Promise(
         "telemetry old or standing still, or a part of it; loop late or hanging",
         "held after 0.3 s (a late loop after 0.25 s), landed after 1 s; nothing old proves a "
         "contact or a landing",
-        ("downlink-silent", "state-block-dead", "attitude-block-dead", "telemetry-delayed",
-         "position-frozen", "attitude-frozen", "acceleration-frozen", "thrust-frozen",
-         "supervisor-frozen", "slow", "hung", "hung-and-packet-lost"),
         unseen=True,
     ),
-    Promise(
+    "link": Promise(
         "link lost, or the vehicle starts again",
         "a landing is ordered, for which the link is opened once more; a silent vehicle levels "
         "out at 0.5 s and cuts at 2 s by itself, except in its own landing",
-        ("uplink-silent", "link-silent", "weak-magnet-uplink", "brown-out"), CUT,
+        CUT,
     ),
-    Promise(
+    "packet": Promise(
         "a packet lost or sent twice, at any order",
         "nothing: what must arrive is sent again until it shows",
-        ("landing-lost", "notify-lost", "stop-lost", "stop-notify-lost", "packet-twice"),
     ),
-    Promise(
+    "battery": Promise(
         "battery low under load for 1.5 s, its reading frozen",
         "no new attempt, landing; without a reading no attempt begins, and it lands after 90 s",
-        ("battery-low", "battery-sags", "battery-reading-frozen", "battery-block-dead"),
     ),
-    Promise(
+    "estimate": Promise(
         "state estimate jumps, drifts, is no number",
         "held for 0.5 s, then landed where it is; what the magnet holds goes on",
-        ("estimate-jumps", "height-jumps", "estimate-drifts", "estimate-nan",
-         "variance-block-dead"),
         unseen=True,
     ),
-    Promise(
+    "positions": Promise(
         "motion capture hides the body, freezes, ends, takes another body for it, is late; a deck "
         "measures no more",
         "what cannot be true is not sent; held after 0.15 s, landed after 0.7 s without a "
         "position, within 1 s without a deck's",
-        ("external-position", "external-occluded", "external-swapped", "external-scaled",
-         "external-mirrored", "external-late", "deck-silent"),
         unseen=True,
     ),
-    Promise(
+    "heading": Promise(
         "heading jumps by more than 40 deg",
         "down at once, level, by thrust alone",
-        ("heading-jumps",),
     ),
-    Promise(
+    "pushed": Promise(
         "a blow, a gust, a weak motor, another hover thrust",
         "flown out; back to the alignment when it is beside the target",
-        ("kick", "gust", "motor-weak", "thrust-changed"),
     ),
-    Promise(
+    "magnet": Promise(
         "no magnet, a weak one, a slip",
         "caught, one attempt less; the motors stop only after a second of the whole weight",
-        ("no-magnet", "weak-magnet", "magnet-lets-go"),
     ),
-    Promise(
+    "ceiling": Promise(
         "pressed against something for 0.7 s, ceiling bare or elsewhere",
         "backs off down, or lands when it was the take-off; lands when nothing is found",
-        ("low-bare-ceiling", "bare-ceiling", "ceiling-unusual"),
     ),
-    Promise(
+    "beside": Promise(
         "magnet 2 to 20 cm above or below the printed target",
         "perched within the contact's tolerance; what holds it farther away is left holding it "
         "with the motors off, and said so",
-        ("ceiling-beside-its-plane",), CUT,
+        CUT,
     ),
-    Promise(
+    "moved": Promise(
         "target moved, a second one",
         "followed, or landed after the attempts",
-        ("target-moves", "second-target"),
     ),
-    Promise(
+    "operator": Promise(
         "Ctrl-C once, held, terminal closed",
         "landed; where the magnet holds on, left hanging and said so",
-        ("operator-once", "operator-held", "covered-and-operator", "hang-up"),
     ),
-    Promise(
+    "stop": Promise(
         "Ctrl-C twice, or hammered for 2 s",
         "motors cut and locked, repeated until it shows",
-        ("operator-twice", "operator-hammers", "emergency-stop-lost"), CUT,
+        CUT,
     ),
-    Promise(
+    "disk": Promise(
         "disk full, or hanging",
         "flies on, says so, and exits with 60 where all else went well",
-        ("disk-full",),
     ),
-    Promise(
+    "killed": Promise(
         "perchctl suspended, killed",
         "in the air the firmware cuts after 2 s and locks, but finishes its own landing; the log "
         "reads up to its last record",
-        ("suspended", "killed"), CUT | {"gone"},
+        CUT | {"gone"},
     ),
-    Promise(
-        "perchctl itself fails", "the vehicle is landed first, whatever was raised",
-        ("exception",), DOWN | {"failed"},
+    "exception": Promise(
+        "perchctl itself fails",
+        "the vehicle is landed first, whatever was raised",
+        DOWN | {"failed"},
     ),
-    Promise("tumbled, crashed, locked", "stop; the message says to inspect and restart", ()),
-)  # fmt: skip
-
-PROMISE_OF = {fault: promise for promise in PROMISES for fault in promise.faults}
+    "ended": Promise("tumbled, crashed, locked", "stop; the message says to inspect and restart"),
+}

@@ -1,4 +1,4 @@
-"""One flight, real or in lockstep, and campaigns of simulated flights."""
+"""One flight, real or in lockstep."""
 
 import lazy_loader
 

@@ -22,7 +22,7 @@ from perchctl.check import Row, Verdict, camera, computer
 from perchctl.check.rehearsal import Blur, Light, Rehearsal, rehearse
 from perchctl.check.row import ask
 from perchctl.errors import NotFound
-from perchctl.faults.camera import FaultyCamera
+from perchctl.faults.edges import FaultyCamera
 from perchctl.faults.effects import FOR_EVER, CameraFault
 from perchctl.flight.lockstep import LockstepClock, LockstepSource
 from perchctl.link import MockLink

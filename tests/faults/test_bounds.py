@@ -197,59 +197,78 @@ def test_what_touches_the_ceiling_is_not_overdue() -> None:
     assert overdue_s(e.Silence(EVER, False, True), SIM, P.ALIGN, touching=True) == math.inf
 
 
-def test_what_hears_nothing_is_overdue_once_it_hears_again() -> None:
+class Lost:
+    """A vehicle at 1.5 m in the alignment that the effect befalls at 0 s."""
+
+    def __init__(self, effect: e.Effect) -> None:
+        self._bound = DescentBound((effect,), SIM)
+        self._bound.begin(0.0, P.ALIGN)
+
+    def is_overdue(
+        self,
+        t_s: float,
+        height_m: float = 1.5,
+        vz_mps: float = 0.0,
+        touching: bool = False,
+        uplink: bool = True,
+        lands: bool = False,
+    ) -> bool:
+        return self._bound.is_overdue(
+            t_s, height_m, vz_mps, touching=touching, uplink=uplink, lands=lands
+        )
+
+
+@pytest.mark.parametrize("effect", [e.Suspended(1.9), e.Silence(1.9, True, True)])
+def test_what_hears_nothing_is_overdue_once_it_hears_again(effect: e.Effect) -> None:
     """As a program that was suspended for 1.9 s is, or a link that was silent for so long."""
-    for effect in (e.Suspended(1.9), e.Silence(1.9, True, True)):
-        made = DescentBound((effect,), SIM)
-        made.begin(0.0, P.ALIGN)
-        assert not made.is_overdue(1.9, 1.5, 0.0, touching=False, uplink=False)
-        assert not made.is_overdue(1.9 + REACTION_S + 0.01, 1.5, 0.0, touching=False, uplink=True)
-        late_s = 1.9 + REACTION_S + WATCHED_S + 0.02
-        assert not made.is_overdue(late_s - 0.1, 1.5, 0.0, touching=False, uplink=True)
-        assert made.is_overdue(late_s, 1.5, 0.0, touching=False, uplink=True)
+    vehicle = Lost(effect)
+    assert not vehicle.is_overdue(1.9, uplink=False)
+    assert not vehicle.is_overdue(1.9 + REACTION_S + 0.01)
+    late_s = 1.9 + REACTION_S + WATCHED_S + 0.02
+    assert not vehicle.is_overdue(late_s - 0.1)
+    assert vehicle.is_overdue(late_s)
 
 
 def test_a_silence_on_the_way_down_begins_it_anew() -> None:
-    made = DescentBound((e.Hung(EVER),), SIM)
-    made.begin(0.0, P.ALIGN)
-    assert not made.is_overdue(2.1, 1.5, 0.0, touching=False, uplink=True)
-    assert not made.is_overdue(3.0, 1.5, 0.0, touching=False, uplink=False)
-    assert not made.is_overdue(4.2, 1.5, 0.0, touching=False, uplink=True)
-    assert made.is_overdue(6.3, 1.5, 0.0, touching=False, uplink=True)
+    vehicle = Lost(e.Hung(EVER))
+    assert not vehicle.is_overdue(2.1)
+    assert not vehicle.is_overdue(3.0, uplink=False)
+    assert not vehicle.is_overdue(4.2)
+    assert vehicle.is_overdue(6.3)
 
 
 def test_what_rises_to_the_ceiling_instead_is_overdue() -> None:
-    made = DescentBound((e.Hung(EVER),), SIM)
-    made.begin(0.0, P.ALIGN)
-    assert not made.is_overdue(2.01, 1.5, 0.0, touching=False, uplink=True)
-    assert not made.is_overdue(3.0, 2.0, 0.0, touching=True, uplink=True)
-    assert made.is_overdue(4.1, 2.0, 0.0, touching=True, uplink=True)
+    vehicle = Lost(e.Hung(EVER))
+    assert not vehicle.is_overdue(2.01)
+    assert not vehicle.is_overdue(3.0, 2.0, touching=True)
+    assert vehicle.is_overdue(4.1, 2.0, touching=True)
 
 
-def test_what_is_on_its_way_down_is_not_overdue() -> None:
-    for sunk_m, late in ((SUNK_M + 0.01, False), (SUNK_M - 0.01, True)):
-        made = DescentBound((e.Hung(EVER),), SIM)
-        made.begin(0.0, P.ALIGN)
-        assert not made.is_overdue(2.0 + 1e-6, 1.5, 0.0, touching=False, uplink=True)
-        found = made.is_overdue(4.1, 1.5 - sunk_m, 0.0, touching=False, uplink=True)
-        assert found is late
-    low = DescentBound((e.Hung(EVER),), SIM)
-    low.begin(0.0, P.ALIGN)
-    assert not low.is_overdue(4.1, LOW_M, 0.0, touching=False, uplink=True)
-    assert not low.is_overdue(9.0, LOW_M, 0.0, touching=False, uplink=True)
+@pytest.mark.parametrize(
+    ("height_m", "vz_mps", "late"),
+    [
+        (1.5 - SUNK_M - 0.01, 0.0, False),
+        (1.5 - SUNK_M + 0.01, 0.0, True),
+        (1.45, -SINKING_MPS - 0.01, False),
+        (1.45, -SINKING_MPS + 0.01, True),
+    ],
+)
+def test_what_is_on_its_way_down_is_not_overdue(height_m: float, vz_mps: float, late: bool) -> None:
+    vehicle = Lost(e.Hung(EVER))
+    assert not vehicle.is_overdue(2.0 + 1e-6)
+    assert vehicle.is_overdue(4.1, height_m, vz_mps) is late
 
 
-def test_a_landing_of_its_own_that_begins_slowly_is_not_overdue() -> None:
-    """Its curve starts from rest."""
-    for lands in (True, False):
-        made = DescentBound((e.Hung(EVER),), SIM)
-        made.begin(0.0, P.ALIGN)
-        assert not made.is_overdue(2.0 + 1e-6, 1.5, 0.0, touching=False, uplink=True)
-        late = made.is_overdue(4.1, 1.5, 0.0, touching=False, uplink=True, lands=lands)
-        assert late is not lands
-        assert made.is_overdue(4.1, 1.8, 0.2, touching=False, uplink=True, lands=lands)  # it climbs
-    for sinking_mps, late in ((SINKING_MPS + 0.01, False), (SINKING_MPS - 0.01, True)):
-        made = DescentBound((e.Hung(EVER),), SIM)
-        made.begin(0.0, P.ALIGN)
-        assert not made.is_overdue(2.0 + 1e-6, 1.5, 0.0, touching=False, uplink=True)
-        assert made.is_overdue(4.1, 1.45, -sinking_mps, touching=False, uplink=True) is late
+def test_what_is_low_is_not_overdue() -> None:
+    vehicle = Lost(e.Hung(EVER))
+    assert not vehicle.is_overdue(4.1, LOW_M)
+    assert not vehicle.is_overdue(9.0, LOW_M)
+
+
+@pytest.mark.parametrize("lands", [True, False])
+def test_a_landing_of_its_own_that_begins_slowly_is_not_overdue(lands: bool) -> None:
+    """Its curve starts from rest; one that climbs is none."""
+    vehicle = Lost(e.Hung(EVER))
+    assert not vehicle.is_overdue(2.0 + 1e-6)
+    assert vehicle.is_overdue(4.1, lands=lands) is not lands
+    assert vehicle.is_overdue(4.1, 1.8, 0.2, lands=lands)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -32,28 +32,28 @@ def test_a_fault_is_well_formed(fault: Fault) -> None:
     for seed in range(20):
         for phase in fault.phases:
             case = case_of(fault, phase, np.random.default_rng(seed), SCENARIO)
-            assert case == case_of(fault, phase, np.random.default_rng(seed), SCENARIO) or (
-                "nan" in repr(case)
-            )
             assert 0.0 <= case.moment_s <= USUAL_S[phase]
             assert case.effects
             assert (case.landed_from is not None) == (phase is Phase.LANDING)
             assert (case.first_hold is not None) == (phase is Phase.RECOVER)
-            for effect in case.effects:
-                assert getattr(effect, "for_s", 1.0) > 0.0
-                assert all(v is None or isinstance(v, object) for v in asdict(effect).values())
+            assert all(getattr(effect, "for_s", 1.0) > 0.0 for effect in case.effects)
 
 
-def test_names_are_given_once() -> None:
-    assert len({fault.name for fault in FAULTS}) == len(FAULTS)
+def test_the_same_seeds_draw_the_same_cases_for_ever() -> None:
+    """Campaigns of before are repeated by their seeds."""
+    drawn = hashlib.sha256()
+    for seed in range(1000):
+        case = draw_case(seed, SCENARIO)
+        drawn.update(repr((case.fault.name, case.phase, case.moment_s, case.effects)).encode())
+        drawn.update(repr((case.landed_from, case.landed_after_s, case.first_hold)).encode())
+    assert drawn.hexdigest()[:16] == "266117f3df5f357f"
 
 
-def test_a_seed_draws_the_same_fault_again_and_others_draw_others() -> None:
-    drawn = [repr(draw_case(seed, SCENARIO)) for seed in range(200)]
-    assert drawn == [repr(draw_case(seed, SCENARIO)) for seed in range(200)]
+def test_many_seeds_draw_all_faults_and_phases() -> None:
     cases = [draw_case(seed, SCENARIO) for seed in range(200)]
     assert len({case.fault.name for case in cases}) > 0.9 * len(FAULTS)
     assert {case.phase for case in cases} == set(AIR)
+    assert len(BY_NAME) == len(FAULTS)
 
 
 @pytest.mark.parametrize(("name", "stops"), [("operator-held", False), ("operator-hammers", True)])

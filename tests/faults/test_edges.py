@@ -9,9 +9,15 @@ import pytest
 
 from perchctl.camera.health import HealthLimits, content
 from perchctl.faults import effects as e
-from perchctl.faults.camera import FaultyCamera
-from perchctl.faults.program import LONGEST_S, FaultyClock, ProgramKilled
-from perchctl.faults.radio import ORDERS, FaultyRadio, order_of
+from perchctl.faults.edges import (
+    LONGEST_S,
+    ORDERS,
+    FaultyCamera,
+    FaultyClock,
+    FaultyRadio,
+    ProgramKilled,
+    order_of,
+)
 from perchctl.link import BLOCKS_DELETED_AFTER_S
 from perchctl.link.encode import UNLOCK_THRUST, encode
 from perchctl.link.mock import TELEMETRY_DELAY_S

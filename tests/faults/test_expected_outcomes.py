@@ -24,8 +24,8 @@ from perchctl.faults.expected_outcomes import (
     ExpectedOutcome,
     unexpected,
 )
-from perchctl.faults.facts import LEAST_LIFT, Facts
 from perchctl.faults.oracle import FLAGS
+from perchctl.faults.truth import LEAST_LIFT, Facts
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import Phase
 from perchctl.profile import Profile, load_profile

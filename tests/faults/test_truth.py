@@ -12,10 +12,9 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration
-from perchctl.faults.effects import Reboots
-from perchctl.faults.facts import CUT_S, FactsRecorder
+from perchctl.faults.effects import Effect, Reboots
 from perchctl.faults.oracle import Sample
-from perchctl.faults.truth import WatchedVehicle, sample_of
+from perchctl.faults.truth import CUT_S, FactsRecorder, WatchedVehicle, sample_of
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.sim import Scenario
 
@@ -68,7 +67,7 @@ HOVER = HANGING._replace(hanging=False, motors_on=True)
 class Recorded:
     """A recorder beside a vehicle of which only the script is true."""
 
-    def __init__(self, rest_v: float = 4.1) -> None:
+    def __init__(self, rest_v: float = 4.1, effects: tuple[Effect, ...] = ()) -> None:
         self.magnet = SimpleNamespace(let_go=False)
         self.planner = SimpleNamespace(active=False)
         self.supervisor = SimpleNamespace(emergency=False)
@@ -83,7 +82,8 @@ class Recorded:
             firmware=SimpleNamespace(planner=self.planner, supervisor=self.supervisor),
             scenario=SimpleNamespace(mass_kg=0.04),
         )
-        self.recorder = FactsRecorder(vehicle, PROFILE)
+        self.recorder = FactsRecorder(vehicle, PROFILE, effects)
+        self.facts = self.recorder.facts
         self.t_s = 0.0
 
     def show(self, sample: Sample, for_s: float, *, begun: bool = True, **changes: Any) -> Recorded:
@@ -103,17 +103,17 @@ def test_the_magnet_is_watched_by_the_world_not_by_the_report(
     it.show(HANGING, complete.hang_s + complete.watch_s - short_s)
     it.magnet.let_go = True
     it.show(HANGING, DT_S)
-    assert it.recorder.let_go_s == pytest.approx(it.t_s - DT_S)
-    assert it.recorder.watched is watched
+    assert it.facts.let_go_s == pytest.approx(it.t_s - DT_S)
+    assert it.facts.watched is watched
 
 
 def test_silence_that_ends_in_a_cut() -> None:
     """By the vehicle's lock, not by how long nothing came."""
     it = Recorded().show(HOVER, 1.0).show(HOVER, CUT_S + 0.05, uplink=False).show(HOVER, 1.0)
-    assert it.recorder.cut_s is None
+    assert it.facts.cut_s is None
     it.show(HOVER, 2.0, uplink=False).show(HOVER, 1.0, uplink=False, locked=True)
-    assert it.recorder.cut_s == pytest.approx(4.0 + CUT_S + 0.05)
-    assert not it.recorder.own_landing
+    assert it.facts.cut_s == pytest.approx(4.0 + CUT_S + 0.05)
+    assert not it.facts.own_landing
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_silence_that_ends_in_a_cut() -> None:
 def test_a_lock_that_no_silence_brought_is_no_cut(before: dict[str, Any]) -> None:
     it = Recorded().show(HOVER, 1.0, locked=before["locked"])
     it.show(HOVER, before["silent_s"], uplink=False, locked=before["locked"])
-    assert it.show(HOVER, 1.0, uplink=False, locked=True).recorder.cut_s is None
+    assert it.show(HOVER, 1.0, uplink=False, locked=True).facts.cut_s is None
 
 
 @pytest.mark.parametrize(
@@ -140,40 +140,40 @@ def test_a_cut_shows_only_after_the_silence_that_brought_it(
     it = Recorded().show(HOVER, 1.0).show(HOVER, silent_s, uplink=False).show(HOVER, heard_s)
     it.supervisor.emergency = emergency
     it.show(HOVER, 1.0, locked=True)
-    assert (it.recorder.cut_s is not None) is cut
+    assert (it.facts.cut_s is not None) is cut
 
 
 def test_a_landing_of_the_vehicle_s_own_is_kept_that_began_before_the_silence() -> None:
     it = Recorded().show(HOVER, 1.0)
     it.planner.active = True
     it.show(HOVER, CUT_S - 0.1, uplink=False)
-    assert not it.recorder.own_landing
-    assert it.show(HOVER, 0.2, uplink=False).recorder.own_landing
+    assert not it.facts.own_landing
+    assert it.show(HOVER, 0.2, uplink=False).facts.own_landing
 
 
 @pytest.mark.parametrize(("before", "flew"), [(HOVER, True), (HANGING, False)])
 def test_what_hangs_or_stands_loses_nothing_by_starting_again(before: Sample, flew: bool) -> None:
-    it = Recorded()
+    it = Recorded(effects=(Reboots(1.0),))
     it.show(before, 1.0, begun=False).show(HANGING, 1.0)
-    facts = it.recorder.facts((Reboots(1.0),), begin_s=1.0, killed_s=None, stop_s=None)
+    facts = it.recorder.complete(begin_s=1.0, killed_s=None, stop_s=None)
     assert facts.rebooted_s == (1.0 if flew else None)
 
 
 def test_a_slip_from_still_motors_is_kept_with_its_height() -> None:
     it = Recorded().show(HANGING, 1.0, motors_on=True).show(HOVER, 0.5)
-    assert it.recorder.slipped_s is None
+    assert it.facts.slipped_s is None
     it.show(HANGING, 1.0, height_m=0.9).show(HOVER, 0.1, motors_on=False, height_m=0.89)
-    assert it.recorder.slipped_s == pytest.approx(2.5)
-    assert it.recorder.slipped_m == 0.89
+    assert it.facts.slipped_s == pytest.approx(2.5)
+    assert it.facts.slipped_m == 0.89
 
 
 def test_when_nothing_lifts_it_any_more() -> None:
     it = Recorded().show(HOVER, 0.5)
-    assert (it.recorder.weak_s, it.recorder.low_s) == (None, None)
+    assert (it.facts.weak_s, it.facts.low_s) == (None, None)
     it.world.battery_rest_v, it.world.battery_v = 3.3, 2.9
     it.show(HOVER, 0.5, height_m=1.2)
-    assert it.recorder.weak_s == pytest.approx(0.5)
-    assert (it.recorder.low_s, it.recorder.low_m) == (pytest.approx(0.5), 1.2)
+    assert it.facts.weak_s == pytest.approx(0.5)
+    assert (it.facts.low_s, it.facts.low_m) == (pytest.approx(0.5), 1.2)
 
 
 def test_a_sample_tells_how_far_the_gear_is_from_the_target() -> None:

@@ -11,10 +11,11 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl.campaign import FlightResult, campaign_summary, run_campaign
+from perchctl.campaign.flights import fly_seed
 from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.errors import EXIT_CODES
-from perchctl.flight import PLAIN_SEED, FlightResult, campaign_summary, fly_lockstep, run_campaign
-from perchctl.flight.campaign import fly_seed
+from perchctl.flight import PLAIN_SEED, fly_lockstep
 from perchctl.geometry import rot_z
 from perchctl.log import FlightLog, read_log
 from perchctl.mission import SEVEN_PHASES, Event, EventKeeper, Operator, Outcome, Phase, Tick

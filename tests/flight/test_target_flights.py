@@ -9,11 +9,11 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl.campaign.flights import fly_seed
 from perchctl.faults import FAULTS
 from perchctl.faults.catalogue import draw_case
 from perchctl.faults.flight import FaultyFlight
 from perchctl.flight import fly_lockstep
-from perchctl.flight.campaign import fly_seed
 from perchctl.mission import Event, Phase, Tick
 from perchctl.sim import draw_scenario
 from tests.helpers.sights import TARGET_ONLY

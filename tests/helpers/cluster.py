@@ -12,8 +12,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from perchctl.flight import FlightResult, fly_lockstep
-from perchctl.flight.campaign import fly_seed
+from perchctl.campaign import FlightResult
+from perchctl.campaign.flights import fly_seed
+from perchctl.flight import fly_lockstep
 from perchctl.mission import Event, Phase, Tick
 from perchctl.profile import Profile
 from tests.helpers.flights import ROOT

@@ -5,32 +5,36 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from concurrent.futures import Executor
 from functools import partial
 
-from perchctl.commands.interrupt import signals_to
-from perchctl.commands.simulate_request import SimulateRequest, fly_each, stop_once
 from perchctl.errors import PerchError
-from perchctl.flight import fly_all
 from tests.helpers.seeds import Ended, ends_first_only
 
 
 def campaign(
     fly: Callable[[int], Ended],
-    request: SimulateRequest,
+    flights: int,
     report: Callable[[list[Ended], PerchError | None], None],
     on_result: Callable[[Ended], None] = lambda result: None,
+    jobs: int | None = None,
+    cluster: str | None = None,
 ) -> int:
     """As `perchctl simulate` has it."""
+    # Not at the top: each process that flies loads this module.
+    from perchctl.campaign import fly_all
+    from perchctl.commands.interrupt import signals_to
+    from perchctl.commands.simulate import executor_of, fly_each, stop_once
 
-    def flown(executor: object, note: Callable[[Ended], None]) -> None:
+    def flown(executor: Executor, note: Callable[[Ended], None]) -> None:
         def noted(result: Ended) -> None:
             note(result)
             on_result(result)
 
-        fly_all(fly, request.seeds, executor, noted)  # type: ignore[arg-type]
+        fly_all(fly, range(flights), executor, noted)
 
     with signals_to(stop_once()):
-        return fly_each(flown, request, report)
+        return fly_each(flown, report, flights, executor_of(jobs, cluster, []))
 
 
 if __name__ == "__main__":
@@ -39,8 +43,10 @@ if __name__ == "__main__":
     sys.exit(
         campaign(
             ends_first_only,
-            SimulateRequest(flights=6, jobs=None if WHERE else 2, cluster=WHERE),
+            6,
             lambda flown, problem: say("report", len(flown), problem),
             lambda result: say(result.pid),
+            jobs=None if WHERE else 2,
+            cluster=WHERE,
         )
     )

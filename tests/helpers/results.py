@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from perchctl.flight import FlightResult
+from perchctl.campaign import FlightResult
 
 PERCHED = FlightResult(0, "perched", "hanging still", 0.002, 20.0, 1, False, False, 5.0)
 LANDED = replace(PERCHED, outcome="landed", reason="battery at 2.9 V", miss_m=None, time_s=30.0)

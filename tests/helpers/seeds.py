@@ -62,8 +62,3 @@ def is_killed_later(seed: int) -> Ended:
     if seed:
         os.kill(os.getpid(), signal.SIGKILL)
     return ends_at_once(seed)
-
-
-def ends_badly(*_anything: object) -> None:
-    """In a worker's place."""
-    os._exit(3)

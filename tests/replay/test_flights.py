@@ -11,9 +11,9 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.analysis import replay
 from perchctl.analysis.replay_text import pose_changes
 from perchctl.analysis.replayer import Replay
+from perchctl.campaign.flights import fly_seed
 from perchctl.faults import FAULTS
 from perchctl.faults.flight import fly_fault_seed
-from perchctl.flight.campaign import fly_seed
 from perchctl.log import read_log, recorded_pictures
 from perchctl.profile import changed_profile
 from tests.helpers.flights import short_profile

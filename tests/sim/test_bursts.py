@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.faults.radio import FaultyRadio
+from perchctl.faults.edges import FaultyRadio
 from perchctl.link import Radio, simulated_radio
 from perchctl.link.mock import TELEMETRY_DELAY_S, BurstyRadio
 from perchctl.sim import Bursts, Packet, Scenario

@@ -17,8 +17,8 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from mcap.reader import make_reader
 
 from perchctl.calibration import profile_camera
+from perchctl.campaign.flights import fly_seed
 from perchctl.flight import lockstep
-from perchctl.flight.campaign import fly_seed
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rotation_from_quaternion
 from perchctl.log import read_log, recorded_pictures
 from perchctl.profile import load_profile

@@ -1,0 +1,225 @@
+"""Seeded flights over randomised scenarios, one lockstep flight a seed."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any, TypeVar
+
+import cv2
+
+from perchctl.campaign.pool import defer_interrupts, give_back_memory, peak_memory_mb
+from perchctl.campaign.results import FlightEnd, FlightResult
+from perchctl.errors import PerchError, SafetyAbort, TimedOut
+from perchctl.flight import LockstepFlight, fly_lockstep
+from perchctl.log import FlightSummary, LogWatcher
+from perchctl.mission import Event, EventKeeper, Phase, Watcher
+from perchctl.profile import Profile
+from perchctl.sim import Scenario, draw_scenario
+
+R = TypeVar("R")
+K = TypeVar("K", bound=Hashable)
+"""A seed, or another key of one flight among many; its text names the flight to people."""
+
+OUTCOMES: dict[Phase, FlightEnd] = {
+    Phase.PERCHED: "perched",
+    Phase.LANDED: "landed",
+    Phase.ABORTED: "aborted",
+}
+FLOWN_AGAIN = 2
+"""Times that a flight may be lost with the process that flew it, and is flown again."""
+
+
+@dataclass(frozen=True)
+class LoggedFlight:
+    """One flight with its summary, its log, and its events in order."""
+
+    seed: int
+    outcome: FlightEnd
+    summary: FlightSummary
+    log: Path
+    events: tuple[Event, ...]
+
+    @property
+    def log_problem(self) -> str | None:
+        return self.summary.log_problem
+
+    @property
+    def badness(self) -> tuple[bool]:
+        return (self.outcome != "perched",)
+
+
+def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R:
+    """The result of `fly`, a dataclass, called with the seed's scenario on one core; completed by
+    the time of a core that it took, the peak of the memory and the scenario. What the flight held
+    is freed."""
+    cv2.setNumThreads(1)  # a job is one core, so that the rates are rates a core
+    cpu_began_s = time.process_time()
+    scenario = draw_scenario(profile, seed)
+    result: Any = fly(scenario)
+    cpu_s = time.process_time() - cpu_began_s
+    give_back_memory()
+    flown: R = replace(result, cpu_s=cpu_s, peak_memory_mb=peak_memory_mb(), scenario=scenario)
+    return flown
+
+
+def fly_seed(
+    profile: Profile, seed: int, log_path: Path | None = None, record: bool = False
+) -> FlightResult:
+    """Fly one seed of the profile's scenario. It is a function of its own so that any executor can
+    carry it to another process or machine. `record`: with the pictures beside the log. A flight
+    that is refused before take-off is a result, too, and leaves no log.
+    Errors: NotFound, InvalidValue (calibration, log)."""
+    return fly_measured(profile, seed, lambda _: _fly(profile, seed, log_path, record))
+
+
+def _fly(profile: Profile, seed: int, log_path: Path | None, record: bool) -> FlightResult:
+    began_s = time.perf_counter()
+    log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
+    try:
+        flight, summary = _flown(profile, seed, log)
+    except (SafetyAbort, TimedOut) as error:
+        if log is not None:
+            log.abandon(str(error))
+        return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False, 0.0)
+    return FlightResult(
+        seed=seed,
+        outcome=_outcome(flight),
+        reason=flight.report.reason,
+        miss_m=flight.perched_miss_m,
+        time_s=flight.report.duration_s,
+        attempts=flight.report.attempts,
+        locked=flight.locked,
+        fell=flight.fell,
+        realtime_factor=flight.simulated_s / (time.perf_counter() - began_s),
+        log=None if log is None else log.path,
+        log_problem=None if summary is None else summary.log_problem,
+    )
+
+
+def fly_logged(profile: Profile, folder: Path, seed: int, record: bool = False) -> LoggedFlight:
+    """Fly one seed to look at it closely. Errors: NotFound, InvalidValue (calibration, log)."""
+    cv2.setNumThreads(1)
+    log = LogWatcher.lockstep(seed_log_path(seed, folder), profile, seed, record)
+    events = EventKeeper()
+    flight, summary = _flown(profile, seed, log, events)
+    assert summary is not None
+    return LoggedFlight(seed, _outcome(flight), summary, log.path, tuple(events.seen))
+
+
+def _flown(
+    profile: Profile, seed: int, log: LogWatcher | None, *watchers: Watcher
+) -> tuple[LockstepFlight, FlightSummary | None]:
+    flight = fly_lockstep(profile, seed, log, watchers=watchers)
+    if log is None:
+        return flight, None
+    return flight, log.close(flight.report, flight.perched_miss_m, flight.fell)
+
+
+def _outcome(flight: LockstepFlight) -> FlightEnd:
+    return OUTCOMES[flight.report.phase] if not flight.fell else "aborted"
+
+
+def run_campaign(
+    profile: Profile,
+    seeds: Iterable[int],
+    executor: Executor | None = None,
+    on_result: Callable[[FlightResult], None] = lambda result: None,
+    log_dir: Path | None = None,
+    record: bool = False,
+) -> list[FlightResult]:
+    """Fly all seeds, as `fly_all` does; results in the order of the seeds."""
+    return fly_all(partial(_fly_in_folder, profile, log_dir, record), seeds, executor, on_result)
+
+
+def _fly_in_folder(profile: Profile, log_dir: Path | None, record: bool, seed: int) -> FlightResult:
+    log_path = None if log_dir is None else seed_log_path(seed, log_dir)
+    return fly_seed(profile, seed, log_path, record)
+
+
+def seed_log_path(seed: int, log_dir: Path) -> Path:
+    """The file for a seed's log."""
+    return log_dir / f"flight_seed{seed}.jsonl"
+
+
+def fly_all(
+    fly: Callable[[K], R],
+    seeds: Iterable[K],
+    executor: Executor | None = None,
+    on_result: Callable[[R], None] = lambda result: None,
+) -> list[R]:
+    """`fly` of each seed, each once, in the order of the seeds; `on_result` as they are done.
+
+    `executor` is anything with ``submit(fly, seed)`` that returns a future of
+    `concurrent.futures`' kind, or None to fly here. A flight whose future fails with
+    `BrokenExecutor` was lost with the process that flew it, and is flown again, `FLOWN_AGAIN`
+    times at most. Errors: PerchError.
+    """
+    seeds = list(dict.fromkeys(seeds))
+    by_seed: dict[K, R] = {}
+    if executor is None:
+        for seed in seeds:
+            by_seed[seed] = fly(seed)
+            on_result(by_seed[seed])
+        return list(by_seed.values())
+    ended: SimpleQueue[tuple[K, Future[R]]] = SimpleQueue()
+
+    def hand_over(*some: K) -> None:
+        with defer_interrupts():  # the executor may start processes as flights are handed to it
+            for seed in some:
+                _submitted(executor, fly, seed).add_done_callback(partial(_put, ended, seed))
+
+    hand_over(*seeds)
+    lost: Counter[K] = Counter()
+    while len(by_seed) < len(seeds):
+        seed, future = ended.get()
+        if _was_lost(future) and lost[seed] < FLOWN_AGAIN:
+            lost[seed] += 1
+            hand_over(seed)
+        else:
+            by_seed[seed] = result = _result(future, seed)
+            on_result(result)
+    return [by_seed[seed] for seed in seeds]
+
+
+def _submitted(executor: Executor, fly: Callable[[K], R], seed: K) -> Future[R]:
+    try:
+        return executor.submit(fly, seed)
+    except BrokenExecutor as error:  # nobody is left who could fly it
+        future: Future[R] = Future()
+        future.set_exception(error)
+        return future
+
+
+def _put(ended: SimpleQueue[tuple[K, Future[R]]], seed: K, future: Future[R]) -> None:
+    ended.put((seed, future))
+
+
+def _was_lost(future: Future[Any]) -> bool:
+    return future.cancelled() or isinstance(future.exception(), BrokenExecutor)
+
+
+def _result(future: Future[R], seed: K) -> R:
+    try:
+        return future.result()
+    except (BrokenExecutor, CancelledError):
+        raise PerchError(
+            f"the process that flew seed {seed} was ended from outside, {1 + FLOWN_AGAIN} times "
+            f"in all (where memory is short, fly fewer at a time: --jobs)"
+        ) from None
+    except PerchError:
+        raise
+    except Exception as error:
+        if os.environ.get("PERCHCTL_DEBUG"):
+            raise
+        raise PerchError(
+            f"unforeseen {type(error).__name__} in the flight of seed {seed}: {error} "
+            f"(PERCHCTL_DEBUG=1 shows where; please report it)"
+        ) from error

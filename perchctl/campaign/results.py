@@ -1,0 +1,230 @@
+"""How flights ended: one flight's result, the figures of a campaign, and rates with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol, get_args
+
+import numpy as np
+from scipy.special import betaincinv
+
+from perchctl.campaign.pool import peak_memory_mb
+from perchctl.errors import SafetyAbort
+from perchctl.sim import Scenario
+
+FlightEnd = Literal["perched", "landed", "aborted", "refused"]
+ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
+WORST = 5
+"""So many of the bad flights are named."""
+_SEVERITY: tuple[FlightEnd, ...] = ("perched", "refused", "landed", "aborted")
+
+
+class HasPeak(Protocol):
+    """The result of a flight in any kind of campaign."""
+
+    @property
+    def peak_memory_mb(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class FlightResult:
+    """One simulated flight.
+
+    Attributes:
+        outcome: the terminal phase, in small letters, or refused: it never took off.
+        miss_m: horizontal distance of the gear from the target's centre in the
+            simulation's truth; None when it did not perch.
+        time_s: duration of the flight in the loop's time.
+        attempts: perching attempts, the successful one included.
+        locked: the supervisor had locked the vehicle at the end.
+        fell: it hit the floor other than by landing.
+        realtime_factor: loop time over wall time.
+        cpu_s: what it took of a core.
+        peak_memory_mb: the most that the process that flew it had ever held by its end (1e6
+            bytes).
+        scenario: what the seed drew.
+        log, log_problem: the flight's log, and what it lacks; None without.
+    """
+
+    seed: int
+    outcome: FlightEnd
+    reason: str
+    miss_m: float | None
+    time_s: float
+    attempts: int
+    locked: bool
+    fell: bool
+    realtime_factor: float
+    log: Path | None = None
+    log_problem: str | None = None
+    cpu_s: float = 0.0
+    peak_memory_mb: float = 0.0
+    scenario: Scenario | None = None
+
+    @property
+    def is_bad(self) -> bool:
+        return self.outcome != "perched" or self.locked or self.fell
+
+    @property
+    def badness(self) -> tuple[bool, int, bool, float]:
+        """The larger the worse: bad ones by their end, then the misses."""
+        harmed = self.locked or self.fell
+        return self.is_bad, _SEVERITY.index(self.outcome), harmed, self.miss_m or 0.0
+
+
+def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
+    """A campaign's figures, ready for JSON.
+
+    `rates` has each end's share with its interval. `miss_m` is taken over the perched flights
+    (None without any; p95 by linear interpolation). `realtime_factor` is the flight time over
+    the sum of the flights' own wall times. `worst_seeds` names at most `WORST` flights, all of
+    them bad.
+    """
+    misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
+    flown_s = sum(r.time_s for r in results)
+    wall_s = sum(r.time_s / r.realtime_factor for r in results if r.realtime_factor > 0)
+    return {
+        "flights": len(results),
+        **{end: sum(r.outcome == end for r in results) for end in ENDS},
+        "rates": {
+            end: rate_record(sum(r.outcome == end for r in results), len(results)) for end in ENDS
+        },
+        "locked": sum(r.locked for r in results),
+        "fell": sum(r.fell for r in results),
+        "miss_m": {
+            "median": _rounded(np.median(misses)) if misses else None,
+            "p95": _rounded(np.percentile(misses, 95)) if misses else None,
+            "max": _rounded(max(misses)) if misses else None,
+        },
+        "realtime_factor": _rounded(flown_s / wall_s) if wall_s > 0 else None,
+        "peak_memory_mb": peak_mb(results),
+        "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
+    }
+
+
+def peak_mb(results: Iterable[HasPeak]) -> float:
+    """The most memory that any process of the campaign ever held (1e6 bytes): this one, and those
+    that flew."""
+    return round(max([peak_memory_mb(), *(r.peak_memory_mb for r in results)]), 1)
+
+
+def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
+    """The bad flights: aborted before landed before refused before perched, then by seed."""
+    bad = [r for r in results if r.is_bad]
+    return sorted(bad, key=lambda r: (-_SEVERITY.index(r.outcome), r.seed))
+
+
+def none_took_off(results: Sequence[FlightResult]) -> SafetyAbort | None:
+    """The error of a campaign whose flights were all refused, which no seed brings about; None
+    for any other."""
+    if not results or any(r.outcome != "refused" for r in results):
+        return None
+    first = min(results, key=lambda r: r.seed)
+    return SafetyAbort(f"every flight was refused before take-off: {first.reason}")
+
+
+def _miss_m(result: FlightResult) -> float:
+    return result.miss_m or 0.0
+
+
+def _rounded(value: Any) -> float:
+    return round(float(value), 6)
+
+
+def campaign_table(results: Sequence[FlightResult]) -> str:
+    """The campaign's figures and its worst flights as plain text."""
+    figures = campaign_summary(results)
+    lines = [f"{name:<18}{text}" for name, text in _rows(figures, results)]
+    bad = worst_first(results)
+    if bad:
+        shown = "" if len(bad) <= WORST else f", {WORST} of {len(bad)}"
+        lines += ["", f"worst flights{shown}"]
+        lines += align_columns(
+            [("seed", "outcome", "miss [mm]", "time [s]", "attempts", "reason")]
+            + [_cells(r) for r in bad[:WORST]]
+        )
+    elif results:
+        lines += ["", "worst flights: none is bad, all perched, none locked or fell"]
+    return "\n".join(lines)
+
+
+def align_columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """Rows of cells as lines of columns; the first row is the head."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return [
+        "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def _cells(r: FlightResult) -> tuple[str, ...]:
+    flags = [word for word, on in (("locked", r.locked), ("fell", r.fell)) if on]
+    outcome = ", ".join([r.outcome, *flags])
+    miss = "-" if r.miss_m is None else f"{r.miss_m * 1e3:.1f}"
+    return str(r.seed), outcome, miss, f"{r.time_s:.1f}", str(r.attempts), r.reason
+
+
+def _rows(figures: Mapping[str, Any], results: Sequence[FlightResult]) -> list[tuple[str, str]]:
+    """Name and text of each figure of `campaign_summary`."""
+    flights = figures["flights"]
+    rows = [("flights", str(flights))]
+    for end in ENDS:
+        if end != "refused" or figures[end]:
+            rows.append((end, rate_text(figures[end], flights)))
+    rows += [("locked", str(figures["locked"])), ("fell", str(figures["fell"]))]
+    miss = figures["miss_m"]
+    if miss["max"] is not None:
+        text = ", ".join(f"{k} {miss[k] * 1e3:.1f}" for k in ("median", "p95", "max"))
+        farthest = max((r for r in results if r.outcome == "perched"), key=_miss_m)
+        rows.append(("miss [mm]", f"{text} (seed {farthest.seed})"))
+    flown = [r for r in results if r.outcome != "refused"]
+    if flown:
+        times = [r.time_s for r in flown]
+        attempts = [r.attempts for r in flown]
+        rows.append(("flight time [s]", f"median {np.median(times):.1f}, max {max(times):.1f}"))
+        rows.append(("attempts", f"mean {np.mean(attempts):.2f}, max {max(attempts)}"))
+    if figures["realtime_factor"] is not None:
+        rows.append(("real-time factor", f"{figures['realtime_factor']:.1f}"))
+    rows.append(("peak memory [MB]", f"{figures['peak_memory_mb']:.0f}"))
+    return rows
+
+
+# --- Rates as what is known of them: k of n, and the interval that the true rate is in ---------
+
+
+LEVEL = 0.95
+
+
+def rate_interval(k: int, n: int, level: float = LEVEL) -> tuple[float, float]:
+    """Where the true rate is after `k` of `n`: the exact interval of Clopper and Pearson (1934),
+    which holds it in at least `level` of all campaigns; half of the rest is on either side.
+    Nothing seen is (0, 1). Raises ValueError where `k` of `n` cannot be."""
+    if not 0 <= k <= n:
+        raise ValueError(f"{k} of {n} is no rate")
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"a level is between 0 and 1, found {level}")
+    side = 0.5 * (1.0 - level)
+    low = float(betaincinv(k, n - k + 1, side)) if k else 0.0
+    high = float(betaincinv(k + 1, n - k, 1.0 - side)) if k < n else 1.0
+    return low, high
+
+
+def rate_text(k: int, n: int) -> str:
+    """``97 of 100 (91.5 to 99.4 %)``, ``100 of 100 (>= 96.4 %)``, ``0 of 100 (<= 3.6 %)``."""
+    if n == 0:
+        return "0 of 0"
+    low, high = (100.0 * bound for bound in rate_interval(k, n))
+    if k == n:
+        return f"{k} of {n} (>= {low:.1f} %)"
+    if k == 0:
+        return f"{k} of {n} (<= {high:.1f} %)"
+    return f"{k} of {n} ({low:.1f} to {high:.1f} %)"
+
+
+def rate_record(k: int, n: int) -> dict[str, float | list[float]]:
+    """For JSON: `rate` and its `interval`; empty where nothing was seen."""
+    if n == 0:
+        return {}
+    return {"rate": round(k / n, 6), "interval": [round(b, 6) for b in rate_interval(k, n)]}

@@ -1,0 +1,238 @@
+"""The processes of a campaign: Ctrl-C is the parent's alone, and ends them at once."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor, Future
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.campaign import defer_interrupts, flight_processes, fly_all
+from perchctl.campaign.flights import FLOWN_AGAIN
+from perchctl.commands.interrupt import signals_to
+from perchctl.commands.simulate import (
+    AGAIN_S,
+    executor_of,
+    fly_each,
+    say_where_logs_are,
+    stop_once,
+    with_problem,
+)
+from perchctl.errors import Interrupted, PerchError
+from tests.helpers.ended import ended
+from tests.helpers.jobs import campaign
+from tests.helpers.seeds import (
+    Ended,
+    ends_at_once,
+    ends_first_only,
+    fails_later,
+    is_killed_later,
+    is_lost,
+    no_form,
+)
+
+pytestmark = pytest.mark.long
+
+AT_ONCE_S = 20.0
+"""Beside the time for which the flights would go on; on a busy machine, too."""
+
+
+class Reported:
+    """What a campaign said, and why not all were flown."""
+
+    def __init__(self) -> None:
+        self.flights: list[Ended] = []
+        self.problem: PerchError | None = None
+
+    def __call__(self, flights: list[Ended], problem: PerchError | None) -> None:
+        self.flights, self.problem = flights, problem
+
+
+def test_what_is_flown_never_sees_a_signal(capsys: pytest.CaptureFixture[str]) -> None:
+    reported = Reported()
+    assert campaign(ends_at_once, 2, reported) == 0
+    assert [(flight.seed, flight.deaf) for flight in reported.flights] == [(0, True), (1, True)]
+    assert reported.flights[0].pid != os.getpid()
+    assert reported.problem is None
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    assert capsys.readouterr().err == ""
+
+
+def test_a_signal_waits_for_what_must_not_be_left_halfway() -> None:
+    done: list[str] = []
+
+    def load() -> None:
+        with defer_interrupts():
+            signal.raise_signal(signal.SIGINT)
+            done.append("loaded")
+
+    with pytest.raises(KeyboardInterrupt):
+        load()
+    assert done == ["loaded"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_flights_where_they_are(
+    number: signal.Signals, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What was flown by then is reported; a key that is held down is one press."""
+    reported = Reported()
+    pressed_s: list[float] = []
+
+    def press(_result: Ended) -> None:
+        pressed_s.append(time.monotonic())
+        try:
+            signal.raise_signal(number)
+        finally:
+            signal.raise_signal(number)
+
+    assert campaign(ends_first_only, 6, reported, press, jobs=2) == 130
+    assert time.monotonic() - pressed_s[0] < AT_ONCE_S
+    assert [flight.seed for flight in reported.flights] == [0]
+    assert multiprocessing.active_children() == []
+    assert capsys.readouterr().err == "perchctl: stopped: 1 of 6 flights were flown\n"
+
+
+def test_a_signal_that_another_thread_takes_waits_too() -> None:
+    """A library's own: its mask is its own, and Python's handler runs in the main thread."""
+    done: list[bytes] = []
+    over = threading.Event()
+    other = threading.Thread(target=over.wait, daemon=True)
+    taken, tell = socket.socketpair()
+    tell.setblocking(False)
+    taken.settimeout(AT_ONCE_S)
+
+    def load() -> None:
+        with defer_interrupts():
+            signal.pthread_kill(other.ident or 0, signal.SIGINT)
+            done.append(taken.recv(1))
+            done.append(b"loaded")
+
+    before = signal.set_wakeup_fd(tell.fileno())
+    other.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            load()
+    finally:
+        signal.set_wakeup_fd(before)
+        over.set()
+        taken.close()
+        tell.close()
+    assert done == [bytes([signal.SIGINT]), b"loaded"]
+
+
+def test_with_nothing_flown_there_is_nothing_to_report() -> None:
+    def flown(_executor: object, _note: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    with signals_to(stop_once()), pytest.raises(Interrupted, match="0 of 10 flights were flown"):
+        fly_each(flown, Reported(), 10, executor_of(None, None, []))
+
+
+def test_a_second_press_ends_the_program_at_once() -> None:
+    now_s = [0.0]
+    left: list[int] = []
+    press = stop_once(lambda: now_s[0], left.append)
+    with pytest.raises(KeyboardInterrupt):
+        press(signal.SIGINT, None)
+    now_s[0] = 0.5 * AGAIN_S
+    press(signal.SIGINT, None)
+    assert left == []
+    now_s[0] = AGAIN_S
+    press(signal.SIGINT, None)
+    assert left == [130]
+
+
+@pytest.mark.parametrize(
+    ("fly", "words"),
+    [
+        (fails_later, "unforeseen ZeroDivisionError in the flight of seed 1: no such luck"),
+        (is_killed_later, "ended from outside"),
+    ],
+)
+def test_a_flight_that_fails_loses_none_of_the_others(
+    fly: Callable[[int], Ended], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reported = Reported()
+    assert campaign(fly, 3, reported) == 1
+    assert [flight.seed for flight in reported.flights] == [0]
+    assert reported.problem is not None
+    assert with_problem({"flights": 1}, reported.problem) == {
+        "flights": 1, "error": str(reported.problem), "exit_code": 1,
+    }  # fmt: skip
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.endswith("; 1 of 3 flights were flown\n")
+
+
+@pytest.mark.parametrize("times", [1, FLOWN_AGAIN])
+def test_a_lost_flight_is_flown_again_and_counted_once(times: int, tmp_path: Path) -> None:
+    """And those that others were flying meanwhile are flown once."""
+    fly = partial(is_lost, folder=tmp_path, times=times)
+    told: list[int] = []
+    with flight_processes(2) as pool:
+        results = fly_all(fly, [0, 1, 2, 1, 3], pool, lambda result: told.append(result.seed))
+    assert [result.seed for result in results] == [0, 1, 2, 3]
+    assert sorted(told) == [0, 1, 2, 3]
+    flown = Counter(path.name[0] for path in tmp_path.iterdir())
+    assert flown == {"0": 1, "1": 1 + times, "2": 1, "3": 1}
+
+
+def test_a_flight_that_is_lost_always_is_told(tmp_path: Path) -> None:
+    fly = partial(is_lost, folder=tmp_path, times=FLOWN_AGAIN + 1)
+    with (
+        pytest.raises(PerchError, match="flew seed 1 was ended from outside, 3 times in all"),
+        flight_processes(1) as pool,
+    ):
+        fly_all(fly, [1], pool)
+    assert len(list(tmp_path.iterdir())) == FLOWN_AGAIN + 1
+
+
+def test_any_executor_that_breaks_for_good_is_told() -> None:
+    class Broken(Executor):
+        def submit(self, fn: object, /, *args: object, **kwargs: object) -> Future[Ended]:  # type: ignore[override]
+            raise BrokenExecutor
+
+    with pytest.raises(PerchError, match="flew seed 5 was ended from outside"):
+        fly_all(ends_at_once, [5], Broken())
+
+
+def test_what_has_no_form_is_told_and_ends_no_process() -> None:
+    with flight_processes(1) as pool:
+        assert pool.submit(no_form).exception() is not None
+        assert pool.submit(len, (1, 2)).result() == 2
+        assert pool.submit(lambda: None).exception() is not None
+        assert pool.submit(len, ()).result() == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_program_that_is_ended_leaves_nothing_behind(number: signal.Signals) -> None:
+    """No process that flies on, and, where it could, no warning of semaphores; a terminal
+    sends its signals to the children, too."""
+    it = ended(number, AT_ONCE_S)
+    assert it.child
+    if number == signal.SIGTERM:
+        assert it.code == 130
+        assert it.out == "report 1 stopped: 1 of 6 flights were flown\n"
+        assert it.err.endswith("perchctl: stopped: 1 of 6 flights were flown\n")
+
+
+def test_logs_that_lack_something_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    say_where_logs_are([Ended(0), Ended(1, log_problem="no space left")], tmp_path)
+    assert capsys.readouterr().err.splitlines() == [
+        f"perchctl: the flights' logs are in {tmp_path}",
+        "perchctl: 1 of 2 logs are incomplete: no space left",
+    ]

@@ -1,0 +1,350 @@
+"""Figures of a campaign and their intervals, and the words after a flight."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.progress import Task, TaskID
+
+from perchctl.campaign import (
+    FlightResult,
+    campaign_summary,
+    campaign_table,
+    none_took_off,
+    rate_record,
+    rate_text,
+    run_campaign,
+    seed_log_path,
+)
+from perchctl.campaign.compare import FIGURES
+from perchctl.campaign.results import ENDS, rate_interval, worst_first
+from perchctl.campaign.results_file import flown_record, result_from, result_record
+from perchctl.errors import SafetyAbort
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.commands.progress import TimeLeft, progress_bar
+from perchctl.log import FlightSummary, read_log, summarise_flight, summary_text
+from perchctl.log.read import PhaseSpan
+from perchctl.log.write import FlightLogWriter
+from tests.helpers import log as synthetic
+from tests.helpers.commands import elsewhere, run  # noqa: F401
+from tests.helpers.flights import SHORT, short_profile
+from tests.helpers.results import aborted, landed, perched
+
+PERCHED, ABORTED = perched(1, miss_m=0.004), aborted(3)
+LANDED = replace(landed(2), attempts=0, reason="target not found")
+
+
+results_lists = st.lists(
+    st.builds(
+        FlightResult,
+        seed=st.integers(0, 10_000),
+        outcome=st.sampled_from(ENDS),
+        reason=st.just("why"),
+        miss_m=st.none() | st.floats(0.0, 0.1),
+        time_s=st.floats(0.0, 120.0),
+        attempts=st.integers(0, 5),
+        locked=st.booleans(),
+        fell=st.booleans(),
+        realtime_factor=st.floats(0.1, 50.0),
+    ),
+    max_size=30,
+)
+
+
+def test_a_campaign_of_three() -> None:
+    figures = campaign_summary([PERCHED, LANDED, ABORTED])
+    assert figures == {
+        "flights": 3,
+        "perched": 1,
+        "landed": 1,
+        "aborted": 1,
+        "refused": 0,
+        "rates": {
+            **{end: {"rate": 0.333333, "interval": [0.008404, 0.905701]} for end in ENDS},
+            "refused": {"rate": 0.0, "interval": [0.0, 0.707598]},
+        },
+        "locked": 1,
+        "fell": 1,
+        "miss_m": {"median": 0.004, "p95": 0.004, "max": 0.004},
+        "realtime_factor": pytest.approx(60.0 / (4.0 + 6.0 + 4.0), abs=1e-6),
+        "peak_memory_mb": 5e6,
+        "worst_seeds": [3, 2],
+    }
+
+
+def test_no_flights() -> None:
+    figures = campaign_summary([])
+    assert figures["miss_m"] == {"median": None, "p95": None, "max": None}
+    assert (figures["flights"], figures["realtime_factor"], figures["worst_seeds"]) == (0, None, [])
+    assert "flights" in campaign_table([])
+
+
+@given(results_lists)
+def test_figures_of_any_campaign(results: list[FlightResult]) -> None:
+    figures = campaign_summary(results)
+    assert sum(figures[end] for end in ENDS) == figures["flights"] == len(results)
+    misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
+    miss = figures["miss_m"]
+    if misses:
+        assert miss["max"] == pytest.approx(max(misses), abs=1e-6)
+        assert miss["median"] <= miss["p95"] + 1e-6 <= miss["max"] + 2e-6
+    else:
+        assert miss["max"] is None
+    assert json.loads(json.dumps(figures)) == figures
+    order = worst_first(results)
+    severity = ("perched", "refused", "landed", "aborted")
+    ends = [severity.index(r.outcome) for r in order]
+    assert ends == sorted(ends, reverse=True)
+    assert all(r.outcome != "perched" or r.locked or r.fell for r in order)
+    assert len(order) == sum(r.outcome != "perched" or r.locked or r.fell for r in results)
+    assert figures["worst_seeds"] == [r.seed for r in order[:5]]
+    text = campaign_table(results)
+    assert all(len(line) == len(line.rstrip()) for line in text.splitlines())
+
+
+def test_good_flights_are_no_worst_ones_but_the_largest_miss_has_its_seed() -> None:
+    misses = [0.003, 0.009, 0.001, 0.007]
+    results = [replace(PERCHED, seed=i, miss_m=m) for i, m in enumerate(misses)]
+    assert campaign_summary(results)["worst_seeds"] == []
+    text = campaign_table(results)
+    assert text.endswith("worst flights: none is bad, all perched, none locked or fell")
+    assert "max 9.0 (seed 1)\n" in text
+
+
+def test_more_bad_flights_than_are_shown_are_counted() -> None:
+    lines = campaign_table([replace(LANDED, seed=i) for i in range(7)]).splitlines()
+    assert "worst flights, 5 of 7" in lines
+    assert [line.split()[0] for line in lines[-5:]] == list("01234")
+
+
+def test_table_says_what_happened() -> None:
+    lines = campaign_table([PERCHED, LANDED, ABORTED]).splitlines()
+    said = {line.split("  ")[0]: line for line in lines if line}
+    assert said["perched"].endswith("1 of 3 (0.8 to 90.6 %)")
+    assert said["miss [mm]"].endswith("median 4.0, p95 4.0, max 4.0 (seed 1)")
+    assert said["flight time [s]"].endswith("median 20.0, max 30.0")
+    assert said["attempts"].endswith("mean 0.67, max 1")
+    assert [line.split()[0] for line in lines[-2:]] == ["3", "2"]
+    assert "aborted, locked, fell" in said["3"]
+
+
+def test_words_after_a_flight(tmp_path: Path) -> None:
+    flight = FlightSummary(
+        outcome="landed",
+        reason="target not found in the allowed attempts",
+        cause="target not found",
+        duration_s=21.44,
+        attempts=1,
+        miss_m=None,
+        battery_min_v=3.521,
+        locked=True,
+        fell=True,
+        phases=(PhaseSpan("APPROACH", 0.0, 3.0), PhaseSpan("LANDED", 3.0, 3.0)),
+    )
+    text = summary_text(flight, tmp_path / "f.jsonl")
+    assert text.splitlines() == [
+        "LANDED: target not found in the allowed attempts [target not found]",
+        "flight:    21.4 s, 1 attempt",
+        "phases:    APPROACH 3.0 s > LANDED",
+        "battery:   3.52 V at its lowest",
+        "vehicle:   locked by its supervisor: inspect and restart it",
+        "vehicle:   fell",
+        f"log:       {tmp_path / 'f.jsonl'}",
+    ]
+
+
+def test_words_from_a_log(tmp_path: Path) -> None:
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
+    records = list(synthetic.ticks())
+    for record in records:
+        writer.write(record)
+    cut = read_log(writer.path)
+    writer.close(synthetic.SUMMARY)
+    text = summary_text(read_log(writer.path))
+    assert text.startswith("PERCHED: hanging still with the motors off\nmiss:      3.1 mm\n")
+    assert "SEARCH 0.5 s > ESTIMATE 0.5 s" in text
+    unfinished = summarise_flight(cut)
+    assert (unfinished.outcome, unfinished.reason) == ("unknown", "the log ends in PERCHED")
+    assert unfinished.duration_s == pytest.approx(18.6, abs=0.05)
+    assert unfinished.battery_min_v == pytest.approx(min(r["battery_v"] for r in records))
+    with writer.path.open("ab") as stream:
+        stream.write(b'{"kind":"ti')
+    assert "log lost:  its tail, 11 unreadable bytes" in summary_text(read_log(writer.path))
+
+
+def test_a_battery_that_is_not_measured_has_no_minimum(tmp_path: Path) -> None:
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
+    writer.write({"t_s": 0.0, "phase": "APPROACH", "battery_v": 0.0})
+    writer.close()
+    assert summarise_flight(read_log(writer.path)).battery_min_v is None
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "100")
+    plain, terminal = io.StringIO(), Terminal()
+    for stream in (plain, terminal):
+        with progress_bar(2, stream) as advance:
+            advance(PERCHED)
+            advance(LANDED)
+    assert plain.getvalue() == ""
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
+    assert re.search(r"flights .* 2/2 .*/min .* left 1 perched 1 landed", text)
+
+
+def test_progress_is_one_line_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "80")
+    terminal = Terminal()
+    earlier = [LANDED] * 12 + [ABORTED] * 3 + [PERCHED] * 900
+    now_s = [0.0]
+    with progress_bar(1000, terminal, earlier, lambda: now_s[0]) as advance:
+        now_s[0] = 60.0
+        for _ in range(10):
+            advance(PERCHED)
+    lines = re.split(r"[\r\n]+", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue()))
+    assert lines[-2].endswith("925/1000 10.0/min 0:07:30 left 12 landed 3 aborted 910 perched")
+    assert len(lines[-2]) <= 80
+
+
+def test_progress_elsewhere_is_a_line_now_and_then() -> None:
+    now_s = [0.0]
+    plain = io.StringIO()
+    with progress_bar(100, plain, [LANDED], lambda: now_s[0]) as advance:
+        for _ in range(12):
+            now_s[0] += 2.0
+            advance(PERCHED)
+    assert plain.getvalue().splitlines() == [
+        "perchctl: flown 6 of 100 30.0/min 0:03:08 left 1 landed 5 perched",
+        "perchctl: flown 11 of 100 30.0/min 0:02:58 left 1 landed 10 perched",
+    ]
+
+
+def test_the_time_left_is_known_from_the_first_flight_on() -> None:
+    now_s = [0.0]
+    task = Task(TaskID(0), "", 20, 0, _get_time=lambda: now_s[0])
+    task.start_time = 0.0
+    now_s[0] = 90.0
+    assert TimeLeft().render(task).plain == ""
+    task.completed = 1
+    assert TimeLeft().render(task).plain == "0:28:30 left"
+    task.completed = 20
+    assert TimeLeft().render(task).plain == "0:00:00 left"
+
+
+def test_rounding_keeps_a_micrometre() -> None:
+    figures = campaign_summary([replace(PERCHED, miss_m=float(np.float64(0.0012345678)))])
+    assert figures["miss_m"]["max"] == 0.001235
+
+
+# --- refused before take-off: a result of the campaign, not its end ---------------------------
+
+REFUSED = FlightResult(4, "refused", "the battery is flat", None, 0.0, 0, False, False, 0.0)
+
+
+def test_a_flat_battery_is_a_result_and_leaves_no_log(tmp_path: Path) -> None:
+    flat = short_profile({"simulation.battery_rest_v": [3.2, 3.3]})
+    results = run_campaign(flat, [5, 6], log_dir=tmp_path)
+    assert [r.outcome for r in results] == ["refused", "refused"]
+    assert "charge it" in results[0].reason
+    for result in results:
+        assert result.scenario is not None
+        assert 3.2 <= result.scenario.battery_rest_v <= 3.3
+        assert result.log is None
+        assert not seed_log_path(result.seed, tmp_path).exists()
+        assert flown_record(result_from(result_record(result))) == flown_record(result)
+
+
+def test_it_counts_as_bad_but_did_no_harm() -> None:
+    results = [REFUSED, PERCHED, ABORTED, LANDED]
+    assert [r.seed for r in worst_first(results)] == [3, 2, 4]
+    assert PERCHED.badness < REFUSED.badness < LANDED.badness < ABORTED.badness
+    figures = campaign_summary(results)
+    assert (figures["flights"], figures["perched"], figures["refused"]) == (4, 1, 1)
+    assert figures["realtime_factor"] == pytest.approx(60.0 / (4.0 + 6.0 + 4.0))
+
+
+def test_the_table_has_a_line_for_them_where_there_are_any() -> None:
+    assert "refused" in campaign_table([PERCHED, REFUSED])
+    assert "refused" not in campaign_table([PERCHED, LANDED])
+    assert "flight time [s]   median 20.0, max 20.0" in campaign_table([PERCHED, REFUSED])
+
+
+def test_it_has_no_time_and_no_attempts_to_compare() -> None:
+    assert [figure.of(REFUSED) for figure in FIGURES] == [None, None, None]
+    assert [figure.of(LANDED) for figure in FIGURES] == [None, 30.0, 0.0]
+
+
+def test_where_none_took_off_it_is_not_the_seeds() -> None:
+    assert none_took_off([]) is None
+    assert none_took_off([REFUSED, LANDED]) is None
+    problem = none_took_off([REFUSED, REFUSED])
+    assert isinstance(problem, SafetyAbort)
+    assert "every flight was refused before take-off: the battery is flat" in str(problem)
+
+
+@pytest.mark.long
+def test_the_command_says_so_after_its_table(tmp_path: Path) -> None:
+    flat = tmp_path / "flat.yaml"
+    flat.write_text(f"extends: {SHORT}\nsimulation:\n  battery_rest_v: [3.2, 3.3]\n")
+    said = run("simulate", "-p", str(flat), "-n", "2", "--jobs", "1", "--json")
+    assert said.code == SafetyAbort.exit_code
+    assert json.loads(said.stdout)["refused"] == 2
+    assert said.complaint.startswith("every flight was refused before take-off: the battery rests")
+
+
+# --- a rate's interval against the binomial law that it stands for -----------------------------
+
+
+def _at_most(k: int, n: int, p: float) -> float:
+    """The chance of at most k of n."""
+    return sum(math.comb(n, i) * p**i * (1.0 - p) ** (n - i) for i in range(k + 1))
+
+
+@given(st.integers(0, 60), st.integers(1, 60), st.sampled_from([0.5, 0.9, 0.95, 0.99]))
+def test_beyond_a_bound_what_was_seen_has_half_of_the_rest(k: int, n: int, level: float) -> None:
+    k = min(k, n)
+    low, high = rate_interval(k, n, level)
+    assert 0.0 <= low <= k / n <= high <= 1.0
+    side = 0.5 * (1.0 - level)
+    if k:
+        assert 1.0 - _at_most(k - 1, n, low) == pytest.approx(side, abs=1e-9)
+    if k < n:
+        assert _at_most(k, n, high) == pytest.approx(side, abs=1e-9)
+    mirrored = rate_interval(n - k, n, level)
+    assert mirrored == pytest.approx((1.0 - high, 1.0 - low), abs=1e-12)
+
+
+def test_words() -> None:
+    assert rate_text(100, 100) == "100 of 100 (>= 96.4 %)"
+    assert rate_text(0, 100) == "0 of 100 (<= 3.6 %)"
+    assert rate_text(97, 100) == "97 of 100 (91.5 to 99.4 %)"
+    assert rate_text(0, 0) == "0 of 0"
+
+
+def test_a_record() -> None:
+    assert rate_record(0, 0) == {}
+    assert rate_record(100, 100) == {"rate": 1.0, "interval": [0.963783, 1.0]}
+
+
+def test_what_is_no_rate_is_refused() -> None:
+    for k, n, level in ((3, 2, 0.95), (-1, 2, 0.95), (1, 2, 1.0)):
+        with pytest.raises(ValueError, match=r"is no rate|a level is between"):
+            rate_interval(k, n, level)
+    assert rate_interval(0, 0) == (0.0, 1.0)
