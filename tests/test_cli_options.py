@@ -70,22 +70,12 @@ def test_options_that_do_not_apply_are_refused(arguments: str, words: list[str])
     assert list(Path().iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ("pictures --view", ["pictures is no live camera", "--view does not apply"]),
-        ("pictures --check c.yaml -o d.yaml", ["--check", "--output does not apply"]),
-        ("pictures --check c.yaml --model fisheye", ["--check", "--model does not apply"]),
-        ("--convert c.yaml -o d.yaml --model fisheye", ["--convert", "--model does not apply"]),
-        ("--convert c.yaml -o d.yaml --view", ["--convert", "--view does not apply"]),
-    ],
-)
-def test_calibrate_refuses_what_it_would_not_heed(arguments: str, words: list[str]) -> None:
+def test_calibrate_refuses_what_it_would_not_heed() -> None:
     Path("pictures").mkdir()
-    said = run("calibrate", *arguments.split())
+    said = run("calibrate", "pictures", "--view")
     assert said.code == 2
-    for word in words:
-        assert word in said.complaint
+    assert "pictures is no live camera" in said.complaint
+    assert "--view does not apply" in said.complaint
 
 
 def test_a_seed_for_a_real_vehicle_is_said_to_change_nothing() -> None:

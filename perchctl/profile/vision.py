@@ -248,8 +248,7 @@ class DetectorConfig(Section):
         "line", "of corners: lines fitted to the sides, OpenCV's sub-pixel, or none"
     )
     window: bool = key(True, "look around the last pose first")
-    blurred: ClassVar[bool] = True
-    """Look once more where blur may hide the target."""
+    blurred: bool = key(True, "look once more where blur may hide the target")
     blurred_every: int = key(
         4, "... so in every Nth picture of a stream without it, not for a sharp one", ge=1, le=100
     )
