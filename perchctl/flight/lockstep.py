@@ -12,7 +12,7 @@ from perchctl.camera import FrameSource, NewestSlot, mirrored_as_profiled
 from perchctl.errors import ConnectionFailed
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.geometry import yaw_of
-from perchctl.link import RESET_PARAMETER, MockLink, estimator_parameters, simulated_radio
+from perchctl.link import RESET_PARAMETER, MockLink, Radio, estimator_parameters
 from perchctl.log import LogWatcher
 from perchctl.mission import Event, FlightReport, Operator, Phase, Tick, Watcher
 from perchctl.positioning import FeedThread, PositionFeed
@@ -28,6 +28,7 @@ from perchctl.sim import (
     SimulatedVehicle,
     draw_capture,
     draw_scenario,
+    radio_bursts,
 )
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
@@ -187,7 +188,7 @@ def fly_lockstep(
     camera = profile_camera(profile.camera)
     capture = capture or draw_capture(profile, scenario.seed)
     vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
-    link = MockLink(vehicle, profile.link.telemetry_period_s, simulated_radio(scenario))
+    link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(radio_bursts(scenario)))
     positions = feed_lockstep(link, profile)
     source = lockstep_source(vehicle, profile)
     truth = Truth(vehicle)

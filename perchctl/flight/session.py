@@ -123,9 +123,11 @@ def fly_session(
     with contextlib.ExitStack() as stack:
         uri, spec, simulated = options.uri, options.source, None
         clock: WallClock | SimulatedClock = WallClock()
+        tell: Callable[[Event], str] = _tell_nothing
         if options.simulated:
             simulated = stack.enter_context(simulated_vehicle(options, camera))
-            clock, uri = SimulatedClock(simulated.shared_time), simulated.uri
+            clock, tell = _simulated_clock(options, simulated)
+            uri = simulated.uri
             spec = simulated.stream_url if spec.startswith("sim:") else spec
         config = profile.camera
         source = open_source(
@@ -147,7 +149,7 @@ def fly_session(
             switch.listening = True
             parts = FlightParts(
                 link, source, clock, profile, pipeline, watchers, switch.read,
-                _teller(options, clock), positions, remarks,
+                tell, positions, remarks,
             )  # fmt: skip
             if isinstance(clock, WallClock):
                 report = fly(parts)
@@ -159,16 +161,6 @@ def fly_session(
             switch.listening = True  # while closing, Ctrl-C must not cut the wait short
             link.close()
         return SessionResult(report, miss_m=_true_miss_m(simulated))
-
-
-def _teller(options: FlyOptions, clock: Clock) -> Callable[[Event], str]:
-    """What the simulated scenario did, by the time at which the simulation was then."""
-    if not isinstance(clock, SimulatedClock):
-        return lambda event: ""
-    from perchctl.sim import EventExplainer, draw_scenario
-
-    tell = EventExplainer(draw_scenario(options.profile, options.seed))
-    return lambda event: tell(event, event.t_s - clock.zero_s)
 
 
 def _true_miss_m(simulated: SimProcess | None) -> float | None:
@@ -192,6 +184,22 @@ def simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
         target=options.profile.target,
         capture=draw_capture(options.profile, options.seed),
     )
+
+
+def _tell_nothing(event: Event) -> str:
+    """A real flight has no scenario."""
+    return ""
+
+
+def _simulated_clock(
+    options: FlyOptions, simulated: SimProcess
+) -> tuple[SimulatedClock, Callable[[Event], str]]:
+    """The simulated vehicle's time, and what its scenario did at the time of an event."""
+    from perchctl.sim import CLOCK_MARGIN_S, EventExplainer, draw_scenario
+
+    clock = SimulatedClock(simulated.shared_time, CLOCK_MARGIN_S)
+    tell = EventExplainer(draw_scenario(options.profile, options.seed))
+    return clock, lambda event: tell(event, event.t_s - clock.zero_s)
 
 
 # --- The operator's commands: Ctrl-C, the other signals, and the live page's STOP button -------

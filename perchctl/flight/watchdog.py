@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from perchctl.flight.history import History, add_samples
-from perchctl.link import is_cut, knows_its_position
 from perchctl.mission import Observation, Operator, Phase, PlannerState, step_landing
 from perchctl.profile import Profile
 from perchctl.values import replace
@@ -25,6 +24,8 @@ from perchctl.vehicle import (
     PositionSetpoint,
     RawThrust,
     Telemetry,
+    is_cut,
+    knows_its_position,
 )
 
 REPEAT_AFTER_S = 0.3

@@ -2,14 +2,12 @@ from .assemble import FAST_BLOCKS as FAST_BLOCKS
 from .cflib_link import CflibLink as CflibLink
 from .cflib_link import EstimateLink as EstimateLink
 from .claim import vehicle_uri as vehicle_uri
-from .evidence import FRESH_S as FRESH_S
-from .evidence import is_cut as is_cut
-from .evidence import knows_its_position as knows_its_position
+from .crtp import Packet as Packet
+from .crtp import Port as Port
 from .log_blocks import BLOCKS_DELETED_AFTER_S as BLOCKS_DELETED_AFTER_S
 from .log_blocks import RESUME_PERIOD_S as RESUME_PERIOD_S
 from .mock import MockLink as MockLink
 from .mock import Radio as Radio
-from .mock import simulated_radio as simulated_radio
 from .motion import MotionLink as MotionLink
 from .outside import RESET_PARAMETER as RESET_PARAMETER
 from .outside import check_estimator_parameters as check_estimator_parameters

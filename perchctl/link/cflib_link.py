@@ -15,15 +15,15 @@ from collections.abc import Callable
 
 from perchctl.errors import ConnectionFailed
 from perchctl.link.connection import Connection, open_connection, send_packets
-from perchctl.link.encode import (
+from perchctl.link.crtp import (
     ARM,
     UNLOCK_PERIOD_S,
     UNLOCK_THRUST,
     UNLOCK_TIMES,
+    Packet,
     encode,
     encode_external,
 )
-from perchctl.link.evidence import is_known, may_fly
 from perchctl.link.log_blocks import LogBlocks
 from perchctl.link.outside import Feed, Settling, estimator_parameters
 from perchctl.link.prepare import check_firmware, set_parameters
@@ -33,7 +33,6 @@ from perchctl.link.uri import check_uri
 from perchctl.link.variables import measured_by
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig, PositioningConfig
-from perchctl.sim import Packet
 from perchctl.vehicle import (
     ARMED,
     FLYING,
@@ -43,6 +42,8 @@ from perchctl.vehicle import (
     MeasuredBy,
     RawThrust,
     Telemetry,
+    is_known,
+    may_fly,
 )
 
 SILENCE_S = 1.5

@@ -15,9 +15,9 @@ from typing import Any
 from perchctl.errors import ConnectionFailed
 from perchctl.files import cannot_be_written
 from perchctl.link.claim import Claim, claim
+from perchctl.link.crtp import Packet
 from perchctl.link.uri import UDEV_HELP
 from perchctl.profile import user_cache_folder
-from perchctl.sim import Packet
 
 CONNECT_TRIES = 2
 CLOSE_TIMEOUT_S = 3.0

@@ -11,8 +11,8 @@ from typing import Any
 
 from perchctl.errors import NotFound, TimedOut
 from perchctl.link.assemble import BLOCKS, FAST_BLOCKS, SLOW_PERIOD_S, Assembler
+from perchctl.link.crtp import Packet, Port
 from perchctl.link.timebase import Timebase
-from perchctl.sim import Packet, Port
 from perchctl.vehicle import Telemetry
 
 FIRST_SAMPLE_TIMEOUT_S = 3.0

@@ -17,10 +17,10 @@ from typing import Any, Literal
 from perchctl.errors import NotFound, TimedOut
 from perchctl.link.cflib_link import EstimateLink
 from perchctl.link.connection import Connection, send_packets
+from perchctl.link.crtp import Packet, Port
 from perchctl.link.prepare import missing_variables
 from perchctl.link.variables import has_variable, parameters, variables
 from perchctl.profile import LinkConfig
-from perchctl.sim import Packet, Port
 from perchctl.vehicle import Telemetry
 
 ANSWER_S = 0.5

@@ -7,8 +7,6 @@ from .capture.settings import MILLIMETRES_PER_M as MILLIMETRES_PER_M
 from .capture.settings import CaptureFault as CaptureFault
 from .capture.settings import CaptureSettings as CaptureSettings
 from .capture.system import LockstepCapture as LockstepCapture
-from .crtp.codec import Packet as Packet
-from .crtp.codec import Port as Port
 from .crtp.commands import CommandService as CommandService
 from .crtp.server import PROTOCOL_VERSION as PROTOCOL_VERSION
 from .draw import draw_capture as draw_capture

@@ -12,10 +12,9 @@ from perchctl.faults import effects as e
 from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.program import LONGEST_S, FaultyClock, ProgramKilled
 from perchctl.faults.radio import ORDERS, FaultyRadio, order_of
-from perchctl.link import BLOCKS_DELETED_AFTER_S
-from perchctl.link.encode import UNLOCK_THRUST, encode
+from perchctl.link import BLOCKS_DELETED_AFTER_S, Packet
+from perchctl.link.crtp import UNLOCK_THRUST, encode
 from perchctl.link.mock import TELEMETRY_DELAY_S
-from perchctl.sim import Packet
 from perchctl.vehicle import EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from perchctl.vision import Frame
 

@@ -23,7 +23,7 @@ from perchctl.link import (
     estimator_parameters,
 )
 from perchctl.link.connection import Connection, send_packets
-from perchctl.link.encode import encode_external
+from perchctl.link.crtp import encode_external
 from perchctl.link.outside import AGREE_WITHIN_S, RESETS, Settling
 from perchctl.positioning import FeedStatus, Placed
 from perchctl.profile import LinkConfig, PositioningConfig

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from perchctl.link import MockLink, Radio
-from perchctl.link.encode import UNLOCK_TIMES
-from perchctl.sim import Packet, Scenario, SimulatedVehicle
+from perchctl.link import MockLink, Packet, Radio
+from perchctl.link.crtp import UNLOCK_TIMES
+from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.vehicle import RawThrust
 
 
@@ -14,6 +14,7 @@ class LosesTheFirst(Radio):
     """So many of the packets sent up are lost at the beginning."""
 
     def __init__(self, count: int) -> None:
+        super().__init__()
         self.left = count
 
     def up(self, packet: Packet, now_s: float) -> bool:

@@ -12,7 +12,6 @@ import pytest
 
 from perchctl.flight import History, fly
 from perchctl.flight.rescue import rescue
-from perchctl.link.mock import ScriptedLink
 from perchctl.link.sender import Sender
 from perchctl.log import LogWatcher, export_mcap, read_log, show_record, show_text, write
 from perchctl.log.recording import recorder as recording_module
@@ -30,6 +29,7 @@ from tests.helpers import recorded
 from tests.helpers.loop_rig import PROFILE, Clock
 from tests.helpers.mission import telemetry
 from tests.helpers.recorded import MemoryDisk
+from tests.helpers.scripted_link import ScriptedLink
 
 HOLD, LAND = PositionSetpoint(0.1, 0.2, 1.0 / 3.0, 0.0), Land(-0.05, 2.0)
 TOLD = (
