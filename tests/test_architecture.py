@@ -31,7 +31,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "distributed": ("perchctl.cluster",),
     "dask": ("perchctl.cluster",),
     "pyarrow": ("perchctl.log.export.as_parquet",),
-    "av": ("perchctl.track.outputs", "perchctl.camera.rtsp"),
+    "av": ("perchctl.track.outputs", "perchctl.camera.network"),
 }
 
 # Time is an argument here.
@@ -82,7 +82,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # many names it has at most.
 MOST_NAMES = {
     "calibration": 49,
-    "camera": 40,
+    "camera": 30,
     "check": 15,
     "cluster": 15,
     "commands": 15,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import FrameSource, device_listing, open_source, without_password
+from perchctl.camera import FrameSource, find_cameras, open_camera, without_password
 from perchctl.check import (
     camera,
     capture,
@@ -103,10 +103,10 @@ def check(options: FlyOptions, wanted: CheckScope) -> Iterator[Row]:
         try:
             source = _source(spec, options, stack, remarks)
         except PerchError as error:
-            yield from camera.refused(error, device_listing())
+            yield from camera.refused(error, list(map(str, find_cameras())))
             yield from sight.unseen("no picture comes", profile)
         else:
-            yield camera.opened_row(shown, device_listing(), remarks)
+            yield camera.opened_row(shown, list(map(str, find_cameras())), remarks)
             rehearsal = yield from _camera(heard, source, pipeline, options, wanted)
     yield computer.loop_row(rehearsal, profile)
     yield computer.log_folder_row(options.log_dir)
@@ -246,10 +246,7 @@ def _source(
 ) -> FrameSource:
     config = options.profile.camera
     size_px = profile_camera(config).size_px
-    source = open_source(
-        spec, config.start_latency_s, size_px, time.monotonic, config.start_timeout_s,
-        config=config, tell=remarks.append,
-    )  # fmt: skip
+    source = open_camera(spec, time.monotonic, config, size_px=size_px, tell=remarks.append)
     stack.callback(source.close)
     return source
 

@@ -33,7 +33,7 @@ from perchctl.calibration import (
     views_of_images,
     views_of_video,
 )
-from perchctl.camera import FrameSource, check_size, is_live
+from perchctl.camera import FrameSource, check_size, parse_source
 from perchctl.commands.calibrate_live import captured_views
 from perchctl.commands.calibrate_mount_request import MountRequest
 from perchctl.commands.calibrate_source import Source, sized, source_of
@@ -118,7 +118,7 @@ def run(request: CalibrateRequest) -> int:
             "a SOURCE is needed: images:DIR (or a pattern), video:FILE, camera:N, http://... or aideck://HOST"
         )
     source = sized(source_of(request.sources), request.size)
-    if not is_live(source.spec):
+    if not parse_source(source.spec).live:
         _refuse_beside(f"{source} is no live camera", request, "--view")
     if request.check is not None:
         _refuse_beside("--check judges a calibration as it is", request, "--model", "--output")

@@ -30,7 +30,7 @@ from perchctl.calibration import (
     pose_basis,
     write_recordings,
 )
-from perchctl.camera import FrameSource, check_size, open_source
+from perchctl.camera import FrameSource, check_size, open_camera
 from perchctl.commands.interrupt import Stopper, unheeded
 from perchctl.commands.output import say
 from perchctl.commands.page import live_page
@@ -72,7 +72,7 @@ def recorded(setup: LiveSetup) -> tuple[MountingRecording, ...]:
 
     Raises:
         Interrupted: Ctrl-C. SafetyAbort: the motors turn.
-        Those of `open_source`, `MotionLink.connect` and `capture`.
+        Those of `open_camera`, `MotionLink.connect` and `capture`.
     """
     start_s = time.monotonic()
 
@@ -82,9 +82,8 @@ def recorded(setup: LiveSetup) -> tuple[MountingRecording, ...]:
     tapes: list[MountingTape] = []
     with contextlib.ExitStack() as stack:
         # Its pictures keep the camera's own time: what is taken off it is what is measured.
-        config = setup.profile.camera
-        size_px, timeout_s = setup.camera.size_px, config.start_timeout_s
-        source = open_source(setup.source, 0.0, size_px, now, timeout_s, config=config)
+        config, size_px = setup.profile.camera, setup.camera.size_px
+        source = open_camera(setup.source, now, config, size_px=size_px, latency_s=0.0)
         stack.callback(source.close)
         check_size(source.size_px, setup.camera, source.describe())
         sensors = _vehicle(setup, now, stack)

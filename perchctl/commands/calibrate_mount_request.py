@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from perchctl.calibration import MountingPart, profile_camera
-from perchctl.camera import is_live, source_spec, without_password
+from perchctl.camera import parse_source, without_password
 from perchctl.errors import InvalidValue, UsageError
 from perchctl.files import check_output, check_place
 from perchctl.link import check_uri
@@ -150,13 +150,14 @@ def _live(
         raise UsageError(
             f"camera {given} {_SIMULATED} with --source (camera:N, http://..., aideck://HOST)"
         )
-    source = source_spec(given)
+    name = parse_source(given, files=True)
+    source = name.spec
     named = request.uri if request.uri is not None else os.environ.get("CFLIB_URI")
     if "carry" not in parts and request.uri is None:
         return source, None
-    if not is_live(source):
+    if not name.live:
         raise UsageError(
-            f"{without_password(source)} is a recording, and has not the vehicle's clock: the "
+            f"{name} is a recording, and has not the vehicle's clock: the "
             f"carry needs a live camera; --part pivot needs no vehicle"
         )
     uri = profile.link.uri if named is None else named

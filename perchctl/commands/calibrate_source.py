@@ -11,10 +11,9 @@ from pathlib import Path
 from perchctl.camera import (
     IMAGE_SUFFIXES,
     FrameSource,
-    ImagesSource,
     image_files,
-    open_source,
-    source_spec,
+    open_camera,
+    parse_source,
     without_password,
 )
 from perchctl.errors import InvalidValue, NotFound, UsageError
@@ -22,7 +21,7 @@ from perchctl.errors import InvalidValue, NotFound, UsageError
 
 @dataclass(frozen=True)
 class Source:
-    """A source as `open_source` takes it, or the picture files that were named one by one."""
+    """A source as `open_camera` takes it, or the picture files that were named one by one."""
 
     spec: str
     files: tuple[Path, ...] = ()
@@ -49,10 +48,8 @@ class Source:
         return image_files(self.files or self.place)
 
     def open(self) -> FrameSource:
-        """Its frames, of a live source too. Errors: those of `open_source`."""
-        if self.files:
-            return ImagesSource(self.files)
-        return open_source(self.spec, 0.0, self.size_px, time.monotonic)
+        """Its frames, of a live source too. Errors: those of `open_camera`."""
+        return open_camera(self.files or self.spec, time.monotonic, size_px=self.size_px)
 
 
 def sized(source: Source, text: str | None) -> Source:
@@ -74,7 +71,7 @@ def source_of(words: Sequence[str]) -> Source:
     Raises NotFound, UsageError.
     """
     if len(words) == 1:
-        return Source(source_spec(words[0]))
+        return Source(parse_source(words[0], files=True).spec)
     files = tuple(Path(word) for word in words)
     for file in files:
         if not file.exists():

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import open_source
+from perchctl.camera import open_camera
 from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
@@ -95,14 +95,10 @@ def _collect_with_person(
             "the simulator has the truth itself: add --truth sim, or name a real camera "
             "with --source (camera:N, http://..., aideck://HOST)"
         )
-    config = profile.camera
     with ExitStack() as stack:
         truth = _truth(request, profile, now)
         stack.callback(truth.close)
-        source = open_source(
-            spec, config.start_latency_s, camera.size_px, now, config.start_timeout_s,
-            config=config,
-        )  # fmt: skip
+        source = open_camera(spec, now, profile.camera, size_px=camera.size_px)
         stack.callback(source.close)
         experiment = Experiment(
             _open_session(path, request.frames),

@@ -14,14 +14,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from perchctl.calibration import load_calibration
-from perchctl.camera import (
-    ALLOWED_SOURCES,
-    SCHEMES,
-    aideck_address,
-    is_live,
-    scheme_of,
-    without_password,
-)
+from perchctl.camera import parse_source, without_password
 from perchctl.errors import InvalidValue
 from perchctl.link import check_uri
 from perchctl.profile import (
@@ -64,13 +57,12 @@ def _simulated(answers: Texts) -> bool:
 
 
 def _source(text: str, answers: Texts) -> str:
-    if scheme_of(text) not in SCHEMES or re.fullmatch(r"camera:\W*(-\d*)?", text):
-        raise InvalidValue(f"{text!r} is no camera; allowed are {ALLOWED_SOURCES}")
-    if scheme_of(text) == "aideck":
-        aideck_address(text)
-    if not _simulated(answers) and (text.startswith("sim:") or not is_live(text)):
+    source = parse_source(text)
+    if source.scheme == "camera" and re.fullmatch(r"\W*(-\d*)?", source.place):
+        raise InvalidValue(f"{text!r} names no camera; write camera:N or camera:NAME")
+    if not _simulated(answers) and (source.scheme == "sim" or not source.live):
         raise InvalidValue(
-            f"{without_password(text)} is no camera that flies with {answers['uri']}; allowed are "
+            f"{source} is no camera that flies with {answers['uri']}; allowed are "
             f"camera:N, camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH, "
             f"aideck://HOST, gst:PIPELINE"
         )
@@ -272,7 +264,7 @@ def made(texts: Texts, output: Path) -> Profile:
         "safety": heights["safety"] | {"fence_radius_m": answer["fence"]},
         "link": {"uri": uri, "parameters": {"stabilizer.estimator": 2}},
     }
-    if scheme_of(texts["source"]) == "aideck":
+    if texts["source"].lower().startswith("aideck:"):
         shipped = load_profile("aideck")
         values["kalman"] = shipped.kalman
         values["planner"]["ascend"] = shipped.planner.ascend
@@ -316,12 +308,12 @@ def _heights(ceiling_m: float) -> dict[str, dict[str, Any]]:
 
 def written_for(source: str) -> frozenset[str]:
     """The keys of the new file of a vehicle with that camera."""
-    return WRITTEN | OF_AN_AIDECK if scheme_of(source) == "aideck" else WRITTEN
+    return WRITTEN | OF_AN_AIDECK if source.lower().startswith("aideck:") else WRITTEN
 
 
 def example_of(source: str) -> str:
     """The shipped calibration that stands in for one's own: of the size that the source has."""
-    return AIDECKS_EXAMPLE if scheme_of(source) == "aideck" else EXAMPLE
+    return AIDECKS_EXAMPLE if source.lower().startswith("aideck:") else EXAMPLE
 
 
 def _named(calibration: object, output: Path, source: str) -> str:

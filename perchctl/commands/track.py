@@ -6,7 +6,7 @@ import contextlib
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,15 +14,12 @@ from typing import TextIO
 
 from perchctl.calibration import assumed_size_warning, load_calibration, load_sized
 from perchctl.camera import (
-    DEFAULT_RATE_HZ,
     FrameSource,
-    ImagesSource,
     Recording,
-    UnmirroredSource,
+    WrappedSource,
     check_size,
-    is_pictures,
-    open_source,
-    source_spec,
+    open_camera,
+    parse_source,
     without_password,
 )
 from perchctl.commands.interrupt import Stopper
@@ -74,7 +71,7 @@ class TrackRequest:
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """The command line on top of the profile, checked. `source` as `open_source` takes it;
+    """The command line on top of the profile, checked. `source` as `open_camera` takes it;
     `stills`: each of its pictures for itself."""
 
     source: str
@@ -96,7 +93,7 @@ def resolve(request: TrackRequest) -> TrackOptions:
     """What can be refused before anything is opened. Errors: NotFound, InvalidValue,
     UsageError."""
     profile = load_profile(request.profile)
-    source = source_spec(request.source)
+    source = parse_source(request.source, files=True).spec
     stills = _are_stills(request, source)
     for path, suffix in ((request.csv, ".csv"), (request.overlay, ".mp4")):
         if path is not None:
@@ -124,11 +121,11 @@ def _are_stills(request: TrackRequest, source: str) -> bool:
     """Files of pictures need not belong together, unless the user says so."""
     if request.video and request.stills:
         raise UsageError("--stills and --video contradict each other: give one of them")
-    if request.video and not is_pictures(source):
+    if request.video and not source.startswith("images:"):
         raise UsageError(
             f"--video is for files of pictures, and {source} gives a video anyway: leave it out"
         )
-    return request.stills or (is_pictures(source) and not request.video)
+    return request.stills or (source.startswith("images:") and not request.video)
 
 
 def track(
@@ -192,7 +189,7 @@ class _Input:
     number of frames."""
 
     source: FrameSource
-    paths: list[Path] | None
+    paths: Sequence[Path]
     rate_hz: float | None
     count: int | None
 
@@ -209,16 +206,12 @@ def _open(
     options: TrackOptions, size_px: tuple[int, int] | None, now: Callable[[], float]
 ) -> _Input:
     config = options.profile.camera
-    pictures_hz = STILLS_HZ if options.stills else DEFAULT_RATE_HZ
-    latency_s = config.start_latency_s
-    source = open_source(
-        options.source, latency_s, size_px, now, pictures_hz=pictures_hz, config=config
-    )
-    raw = source.inner if isinstance(source, UnmirroredSource) else source
-    paths = raw.paths if isinstance(raw, ImagesSource) else None
+    pictures_hz = STILLS_HZ if options.stills else None
+    source = open_camera(options.source, now, config, size_px=size_px, pictures_hz=pictures_hz)
+    raw = source.inner if isinstance(source, WrappedSource) else source
     if isinstance(raw, Recording):
-        return _Input(source, paths, raw.rate_hz, raw.count)
-    return _Input(source, paths, None, None)
+        return _Input(source, raw.paths, raw.rate_hz, raw.count)
+    return _Input(source, (), None, None)
 
 
 class _Run:

@@ -10,15 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import (
-    ALLOWED_SOURCES,
-    SCHEMES,
-    FrameSource,
-    is_live,
-    open_source,
-    scheme_of,
-    without_password,
-)
+from perchctl.camera import FrameSource, open_camera, parse_source
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError, no_simulator
 from perchctl.flight.clock import Clock, SimulatedClock, WallClock
 from perchctl.flight.loop import FlightParts, fly
@@ -84,17 +76,15 @@ def check_options(options: FlyOptions) -> None:
     """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
     check_positioning(options.profile, simulated=options.simulated)
-    shown = without_password(options.source)
-    if scheme_of(options.source) not in SCHEMES:
-        raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED_SOURCES}")
-    if options.source.startswith("sim:") and not options.simulated:
+    source = parse_source(options.source)
+    if source.scheme == "sim" and not options.simulated:
         raise UsageError(
-            f"source {shown} belongs to the simulated vehicle, but the URI is "
+            f"source {source} belongs to the simulated vehicle, but the URI is "
             f"{options.uri}; name the camera with --source (camera:N, http://..., aideck://HOST)"
         )
-    if not is_live(options.source) and not options.simulated:
+    if not source.live and not options.simulated:
         raise UsageError(
-            f"source {shown} is a recording, and {options.uri} a real vehicle: it would "
+            f"source {source} is a recording, and {options.uri} a real vehicle: it would "
             f"be steered by pictures of another flight; fly sim://, or name a camera with --source"
         )
     if options.seed < 0:
@@ -129,11 +119,7 @@ def fly_session(
             clock, tell = _simulated_clock(options, simulated)
             uri = simulated.uri
             spec = simulated.stream_url if spec.startswith("sim:") else spec
-        config = profile.camera
-        source = open_source(
-            spec, config.start_latency_s, camera.size_px, clock.now, config.start_timeout_s,
-            config=config,
-        )  # fmt: skip
+        source = open_camera(spec, clock.now, profile.camera, size_px=camera.size_px)
         stack.callback(source.close)
         source = watch_source(source)
         positioning = capture_for_vehicle(

@@ -13,10 +13,16 @@ import pytest
 
 from perchctl.calibration import load_calibration
 from perchctl.camera import aideck as aideck_module
-from perchctl.camera import aideck_address, check_size, open_source
-from perchctl.camera.aideck import NO_PICTURE_S, AiDeckAddress, AiDeckSource, decoded
-from perchctl.camera.cpx import CpxPicture
-from perchctl.camera.stream import MAX_FAILED_CONNECTIONS
+from perchctl.camera import check_size, open_camera
+from perchctl.camera.aideck import (
+    NO_PICTURE_S,
+    AiDeckAddress,
+    AiDeckSource,
+    CpxPicture,
+    aideck_address,
+    decoded,
+)
+from perchctl.camera.network import MAX_FAILED_CONNECTIONS
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
@@ -199,7 +205,7 @@ def test_a_raw_picture_and_one_without_its_mosaic_are_no_jpeg(
 
 def test_another_size_than_the_calibrations_is_refused(deck: AiDeck) -> None:
     deck.forever = [raw(picture(90, (162, 122)))]
-    source = open_source(deck.url, 0.0, CAMERA.size_px, Clock(), timeout_s=WAIT_S)
+    source = open_camera(deck.url, Clock(), timeout_s=WAIT_S)
     try:
         with pytest.raises(InvalidValue, match="162x122 px, but the calibration was made at 324x"):
             check_size(source.size_px, CAMERA, source.describe())
@@ -210,7 +216,7 @@ def test_another_size_than_the_calibrations_is_refused(deck: AiDeck) -> None:
 def test_nobody_listens(deck: AiDeck) -> None:
     deck.close()
     with pytest.raises(TimedOut, match="5 attempts: connection refused"):
-        open_source(deck.url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(deck.url, Clock(), timeout_s=WAIT_S)
 
 
 def test_closing_does_not_wait_for_a_stalled_deck(deck: AiDeck) -> None:
@@ -252,7 +258,7 @@ def test_a_wrong_address_is_one_sentence(spec: str) -> None:
         assert aideck_address(spec).host == "a"
         return
     with pytest.raises(InvalidValue, match=r"write aideck://HOST\[:5000\], as in aideck://192"):
-        open_source(spec, 0.0, None, Clock())
+        open_camera(spec, Clock())
 
 
 # -- the commands ------------------------------------------------------------

@@ -14,8 +14,16 @@ import pytest
 from typer.testing import CliRunner
 
 from perchctl.camera import find_cameras
-from perchctl.camera.computer import camera_number, finder_of
-from perchctl.camera.device import Asked, DeviceSource, asked_of, differences, set_controls, set_up
+from perchctl.camera.device import (
+    Asked,
+    DeviceSource,
+    asked_of,
+    camera_number,
+    differences,
+    finder_of,
+    set_controls,
+    set_up,
+)
 from perchctl.camera.v4l2 import (
     Call,
     Delivered,

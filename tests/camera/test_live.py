@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.camera import UnmirroredSource, mjpeg, open_source
+from perchctl.camera import network, open_camera
 from perchctl.camera.device import (
     LOST_AFTER_FAILURES,
     Asked,
@@ -23,9 +23,8 @@ from perchctl.camera.device import (
     DeviceSource,
     open_capture,
 )
-from perchctl.camera.mjpeg import MjpegSource
-from perchctl.camera.source import SILENT_AFTER_S, LiveSource
-from perchctl.camera.stream import MAX_FAILED_CONNECTIONS, StreamSource
+from perchctl.camera.network import MAX_FAILED_CONNECTIONS, MjpegSource, StreamSource
+from perchctl.camera.source import SILENT_AFTER_S, LiveSource, UnmirroredSource
 from perchctl.errors import NotFound, TimedOut
 from tests.helpers.live import WAIT_S, Clock, level, next_frame, wait_for
 
@@ -217,7 +216,7 @@ def test_a_picture_above_the_largest_size_is_not_decoded_and_the_problem_says_so
     server: Server, opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried: list[bytes] = []
-    monkeypatch.setattr(mjpeg, "grey_pixels", tried.append)
+    monkeypatch.setattr(network, "grey_pixels", tried.append)
     server.scripts.put([part(resized(jpeg(60), 4097, 4096)), threading.Event()])
     source = stream(server, Clock(), opened)
     wait_for(lambda: source.damaged == 1)
@@ -334,7 +333,7 @@ def test_silence_is_a_problem_and_ends_with_the_next_frame(
 def test_a_path_the_server_does_not_have_is_not_found(server: Server) -> None:
     server.status = 404
     with pytest.raises(NotFound, match="404"):
-        open_source(server.url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(server.url, Clock(), timeout_s=WAIT_S)
     assert len(server.paths) == 1
 
 
@@ -360,13 +359,13 @@ def test_no_first_frame_in_time(server: Server) -> None:
     quiet = threading.Event()
     server.scripts.put([b"--frame\r\n", quiet])
     with pytest.raises(TimedOut, match=r"no first frame within 0\.05 s"):
-        open_source(server.url, 0.0, None, Clock(), timeout_s=0.05)
+        open_camera(server.url, Clock(), timeout_s=0.05)
     quiet.set()
 
 
-def test_open_source_waits_for_the_first_frame(server: Server) -> None:
+def test_opening_waits_for_the_first_frame(server: Server) -> None:
     server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = open_source(server.url, 0.0, None, Clock(), timeout_s=WAIT_S)
+    source = open_camera(server.url, Clock(), timeout_s=WAIT_S)
     assert source.live
     assert source.size_px == (64, 48)
     assert source.describe() == f"{server.url} (64x48 px)"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.camera import open_source
-from perchctl.camera.mjpeg import MjpegSource, redirected
+from perchctl.camera import open_camera
+from perchctl.camera.network import MjpegSource, redirected
 from perchctl.camera.source import LiveSource
 from perchctl.errors import NotFound
 from tests.camera.test_live import Server, jpeg, part, stream
@@ -30,7 +30,7 @@ def test_a_certificate_that_nobody_vouches_for(
     server.encrypt(pem)
     url = server.url.replace("http://", "https://me:secret@")
     with pytest.raises(NotFound, match=r"is not trusted \(self.signed.*SSL_CERT_FILE") as caught:
-        open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(url, Clock(), timeout_s=WAIT_S)
     assert "secret" not in str(caught.value)
     monkeypatch.setenv("SSL_CERT_FILE", str(pem))
     server.scripts.put([part(jpeg(60)), threading.Event()])
@@ -108,9 +108,7 @@ def test_a_camera_that_forbids_the_nameless_without_asking_gets_the_name(
 def test_one_that_forbids_it_for_good_is_told_at_once(server: Server, who: str) -> None:
     server.status = 403
     with pytest.raises(NotFound, match="403"):
-        open_source(
-            server.url.replace("http://", f"http://{who}"), 0.0, None, Clock(), timeout_s=WAIT_S
-        )
+        open_camera(server.url.replace("http://", f"http://{who}"), Clock(), timeout_s=WAIT_S)
     assert len(server.authorization) == (2 if who else 1)
 
 
@@ -125,7 +123,7 @@ def test_who_may_not_see_it_is_told_at_once(
     server.challenges, server.nonce = challenges, "none of mine"
     url = server.url.replace("http://", f"http://{who}")
     with pytest.raises(NotFound, match=f"401.*{sentence}") as caught:
-        open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(url, Clock(), timeout_s=WAIT_S)
     assert "wrong" not in str(caught.value)
     assert len(server.authorization) <= 3
 
@@ -168,7 +166,7 @@ def test_a_redirect_from_https_to_http_is_not_followed(
         server.redirect_first = plain.url
         url = server.url.replace("http://", f"https://{WHO}")
         with pytest.raises(NotFound, match=r"https.*encrypted") as caught:
-            open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+            open_camera(url, Clock(), timeout_s=WAIT_S)
         assert plain.paths == [], "nobody can answer there in the camera's place"
         assert plain.url in str(caught.value)
         assert "secret" not in str(caught.value)
@@ -179,7 +177,7 @@ def test_a_redirect_from_https_to_http_is_not_followed(
 def test_a_redirect_to_another_protocol_is_not_followed(server: Server) -> None:
     server.redirect_first = "rtsp://127.0.0.1/live"
     with pytest.raises(NotFound, match=r"rtsp://127\.0\.0\.1/live"):
-        open_source(server.url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(server.url, Clock(), timeout_s=WAIT_S)
 
 
 def test_name_and_password_do_not_go_to_another_host(

@@ -14,11 +14,16 @@ import av.error
 import numpy as np
 import pytest
 
-from perchctl.camera import open_source, rtsp
+from perchctl.camera import network, open_camera
 from perchctl.camera.jpeg import MOST_STREAM_PX
-from perchctl.camera.rtsp import WINDOW_S, RtspSource, Waiting, unresolved
+from perchctl.camera.network import (
+    MAX_FAILED_CONNECTIONS,
+    WINDOW_S,
+    RtspSource,
+    Waiting,
+    unresolved,
+)
 from perchctl.camera.source import LiveSource
-from perchctl.camera.stream import MAX_FAILED_CONNECTIONS
 from perchctl.errors import NotFound, TimedOut
 from perchctl.profile import CameraConfig
 from tests.camera.test_live import WAIT_S, Clock, level, next_frame, wait_for
@@ -86,7 +91,7 @@ def test_the_resolver_is_asked_only_before_the_first_picture(
 ) -> None:
     """It may take half a minute, which in flight is one without pictures."""
     asked: list[str] = []
-    monkeypatch.setattr(rtsp, "unresolved", lambda url: asked.append(url) or "")
+    monkeypatch.setattr(network, "unresolved", lambda url: asked.append(url) or "")
     never = threading.Event()
     server.scripts.put([*seconds(20, 60, 80), never])  # it stalls: an error in time
     server.scripts.put([*seconds(20, 160, 180), never])
@@ -176,7 +181,7 @@ def test_what_trying_again_would_not_mend_is_told_at_once(
     server.who = ("me", "secret")
     url = server.url(who).replace("/live", path)
     with pytest.raises(NotFound) as caught:
-        open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(url, Clock(), timeout_s=WAIT_S)
     assert sentence in str(caught.value)
     assert "hush" not in str(caught.value)
     assert "secret" not in str(caught.value)
@@ -191,7 +196,7 @@ def test_name_and_password_do_not_go_where_the_server_redirects(
     server.who = ("me", "secret") if asks_first else None
     try:
         with pytest.raises(NotFound, match=r"redirects to rtsp://127") as caught:
-            open_source(server.url("me:secret@"), 0.0, None, Clock(), timeout_s=WAIT_S)
+            open_camera(server.url("me:secret@"), Clock(), timeout_s=WAIT_S)
         assert other.asked == []
         assert "secret" not in str(caught.value)
     finally:
@@ -214,13 +219,13 @@ def test_a_redirect_of_a_url_without_a_password_is_followed(
 def test_nobody_listens(server: RtspServer) -> None:
     server.close()
     with pytest.raises(TimedOut, match=r"gave no picture in 5 attempts: connection refused"):
-        open_source(server.url("me:secret@"), 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(server.url("me:secret@"), Clock(), timeout_s=WAIT_S)
 
 
 def test_a_host_that_is_not_known_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """FFmpeg has an input/output error of it."""
     with pytest.raises(TimedOut, match=r"the host name 'a\.\.b' cannot be resolved") as caught:
-        open_source("rtsp://me:secret@a..b/x", 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera("rtsp://me:secret@a..b/x", Clock(), timeout_s=WAIT_S)
     assert "secret" not in str(caught.value)
 
     def unknown(*_: object) -> None:
@@ -242,9 +247,9 @@ def test_what_only_a_driver_can_do_is_said_of_a_stream(server: RtspServer) -> No
     for asked, words in wishes:
         server.scripts.put([*seconds(5, 60, 100), never])
         told: list[str] = []
-        source = open_source(
-            server.url("me:secret@"), 0.0, None, Clock(), timeout_s=WAIT_S,
-            config=CameraConfig(**asked), tell=told.append,
+        source = open_camera(
+            server.url("me:secret@"), Clock(), CameraConfig(**asked), timeout_s=WAIT_S,
+            tell=told.append,
         )  # fmt: skip
         source.close()
         assert [words in sentence for sentence in told] == ([] if words is None else [True])

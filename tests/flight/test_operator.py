@@ -286,7 +286,7 @@ def test_it_is_asked_once_the_vehicle_has_answered(monkeypatch: pytest.MonkeyPat
 
     camera = SimpleNamespace(close=lambda: order.append("camera closed"))
     monkeypatch.setattr(session, "CflibLink", Link)
-    monkeypatch.setattr(session, "open_source", lambda *args, **options: camera)
+    monkeypatch.setattr(session, "open_camera", lambda *args, **options: camera)
     monkeypatch.setattr(session, "fly", lambda parts: order.append("flew"))
     options = session.FlyOptions(
         load_profile("crazyflie"), Path("crazyflie.yaml"), "radio://0/80/2M", "http://cam/"

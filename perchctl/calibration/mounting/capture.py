@@ -15,7 +15,8 @@ from perchctl.calibration.mounting.recording import (
     SeenPose,
 )
 from perchctl.calibration.mounting.solve import MIRRORED, missing
-from perchctl.camera import FrameSource, Grey
+from perchctl.calibration.types import Grey
+from perchctl.camera import FrameSource
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import Array
 
