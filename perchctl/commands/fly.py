@@ -21,11 +21,10 @@ from perchctl.commands.output import confirmed, print_record, say, tell
 from perchctl.commands.page import page_port
 from perchctl.commands.positioning import positioned
 from perchctl.display import (
-    DisplayWatcher,
     FlightPage,
     failed_card,
     flight_page,
-    make_reporter,
+    open_panel,
     summary_card,
 )
 from perchctl.errors import (
@@ -145,7 +144,7 @@ def fly(options: FlyOptions, as_json: bool, port: int | None, asks: bool = False
         options.log_dir, options.profile, options.uri, options.source, simulated_seed,
         options.record,
     )  # fmt: skip
-    reporter = make_reporter(stream=sys.stderr)
+    panel = open_panel(stream=sys.stderr)
     merges = ""
     if options.profile.merge.method == "weights":
         merges = f"; merges with {weights_text(options)}"
@@ -156,7 +155,7 @@ def fly(options: FlyOptions, as_json: bool, port: int | None, asks: bool = False
     with unheeded(), contextlib.ExitStack() as stack:
         try:
             page = stack.enter_context(live_page(options, port, switch))
-            result = _session(options, log, DisplayWatcher(reporter), switch, page, asks)
+            result = _session(options, log, panel, switch, page, asks)
         except BaseException as error:
             # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
             if page is not None:
@@ -164,7 +163,7 @@ def fly(options: FlyOptions, as_json: bool, port: int | None, asks: bool = False
             log.abandon(str(error) or type(error).__name__)
             raise
         finally:
-            reporter.close()
+            panel.close()
         perched = result.report.phase is Phase.PERCHED
         summary = log.close(result.report, result.miss_m if perched else None)
         assert summary is not None

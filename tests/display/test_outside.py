@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from perchctl.display.status import status_rows
-from perchctl.display.watch import WIDTH, status_of
+from perchctl.display.panel import WIDTH, status_of, status_rows
 from perchctl.log.watch import flight_record
 from perchctl.mission import ExternalPositions
 from perchctl.vehicle import ExternalPosition

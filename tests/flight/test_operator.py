@@ -252,11 +252,11 @@ def test_a_terminal_that_is_gone_is_no_failure() -> None:
     code = (
         "import os, sys\n"
         "from perchctl.commands.output import say, tell\n"
-        "from perchctl.display.watch import make_reporter\n"
+        "from perchctl.display import open_panel\n"
         "from perchctl.mission.watch import Event, EventKind\n"
-        "say('one'); reporter = make_reporter(stream=sys.stderr)\n"
-        "reporter.event(Event(0.0, EventKind.NOTE, 'two'))\n"
-        "reporter.close(); tell('three')\n"
+        "say('one'); panel = open_panel(stream=sys.stderr)\n"
+        "panel.event(Event(0.0, EventKind.NOTE, 'two'))\n"
+        "panel.close(); tell('three')\n"
         "sys.exit(7)\n"
     )
     read, write = os.pipe()
