@@ -24,13 +24,12 @@ from perchctl.link.crtp import (
     encode,
     encode_external,
 )
-from perchctl.link.log_blocks import LogBlocks
-from perchctl.link.outside import Feed, Settling, estimator_parameters
-from perchctl.link.prepare import check_firmware, set_parameters
+from perchctl.link.external_position import Feed, Settling, estimator_parameters
+from perchctl.link.firmware import check_firmware, measured_by, set_parameters
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
+from perchctl.link.telemetry import LogBlocks
 from perchctl.link.uri import check_uri
-from perchctl.link.variables import measured_by
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig, PositioningConfig
 from perchctl.vehicle import (
@@ -110,8 +109,8 @@ class CflibLink:
             return False
 
     def settle(self, feed: Feed) -> None:
-        """Start the estimator where the capture that `feed` is of sees the vehicle. On the
-        ground, after `connect`; bounded. Errors: those of `perchctl.link.outside.Settling`."""
+        """Start the estimator where `feed` says that the vehicle is. On the ground, after
+        `connect`; bounded. Errors: ConnectionFailed, NotFound, InvalidValue, TimedOut."""
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
         Settling(

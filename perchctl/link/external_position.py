@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
 from perchctl.geometry import wrap_rad, yaw_of
-from perchctl.link.prepare import order_parameter, set_parameters
+from perchctl.link.firmware import order_parameter, set_parameters
 from perchctl.positioning import FeedStatus, Placed
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import Telemetry, knows_its_position, may_fly

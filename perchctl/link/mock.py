@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
-from perchctl.link.assemble import BLOCKS, FAST_BLOCKS, SLOW_PERIOD_S, Assembler
 from perchctl.link.crtp import (
     UNLOCK_PERIOD_S,
     UNLOCK_THRUST,
@@ -17,8 +16,9 @@ from perchctl.link.crtp import (
     encode,
     encode_external,
 )
+from perchctl.link.firmware import EXTERNAL_POSITION_TICK, LISTEN_S, decks_found
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
-from perchctl.link.variables import EXTERNAL_POSITION_TICK, LISTEN_S, decks_found
+from perchctl.link.telemetry import BLOCKS, FAST_BLOCKS, SLOW_PERIOD_S, Assembler
 from perchctl.mission import SentCommand
 from perchctl.values import replace
 from perchctl.vehicle import FLYING, Command, ExternalPosition, MeasuredBy, Telemetry

@@ -33,7 +33,7 @@ AGAIN = "run perchctl check --lift, lift the vehicle and turn it by hand"
 @dataclass(frozen=True)
 class SetUp:
     """What a comparison is true of: another vehicle, capture, body or turn of its axes is another
-    one. `vehicle`: as `perchctl.link.claim.vehicle_uri` has it."""
+    one. `vehicle`: as `perchctl.link.vehicle_uri` has it."""
 
     vehicle: str
     system: str

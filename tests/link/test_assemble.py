@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.link.assemble import BLOCKS, MOST_CARRIED_S, Assembler
+from perchctl.link.telemetry import BLOCKS, MOST_CARRIED_S, Assembler
 from perchctl.mission import Condition, Context, Observation, Phase, PlannerState
 from perchctl.mission.conditions import BY_PLACE, PROOFS, conditions_since
 from perchctl.profile import Profile

@@ -24,7 +24,7 @@ from perchctl.link import (
 )
 from perchctl.link.connection import Connection, send_packets
 from perchctl.link.crtp import encode_external
-from perchctl.link.outside import AGREE_WITHIN_S, RESETS, Settling
+from perchctl.link.external_position import AGREE_WITHIN_S, RESETS, Settling
 from perchctl.positioning import FeedStatus, Placed
 from perchctl.profile import LinkConfig, PositioningConfig
 from perchctl.vehicle import FLYING, ExternalPosition, Telemetry

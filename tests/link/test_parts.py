@@ -11,15 +11,16 @@ from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
 from perchctl.link import UDEV_HELP, check_uri
-from perchctl.link import scan as scan_room
+from perchctl.link import probe as scan_room
 from perchctl.link.telemetry import (
     ATTITUDE_BLOCK,
     BATTERY_BLOCK,
     NEEDED,
     STATE_BLOCK,
+    WRAP_MS,
+    Timebase,
     telemetry_from,
 )
-from perchctl.link.timebase import WRAP_MS, Timebase
 
 SIZES = {"float": 4, "FP16": 2, "uint16_t": 2, "int8_t": 1}
 
