@@ -15,7 +15,6 @@ from .health import VERDICT_TEXTS as VERDICT_TEXTS
 from .health import HealthState as HealthState
 from .health import HealthVerdict as HealthVerdict
 from .health import assess_frame as assess_frame
-from .open import SourceName as SourceName
 from .open import open_camera as open_camera
 from .open import parse_source as parse_source
 from .source import MIRRORED_TEXT as MIRRORED_TEXT

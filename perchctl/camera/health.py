@@ -28,27 +28,17 @@ VERDICT_TEXTS: dict[Kind, str] = {
 }
 
 
-@dataclass(frozen=True)
-class HealthLimits:
-    """Grey levels of 0..255.
-
-    Attributes:
-        frozen_after_s: time without a change after which repeated is frozen.
-        uniform_sigma: spread below which a picture shows nothing; a blank video
-            screen has below 1, the noise of a camera alone more than 2.
-        dark_level: mean plus two spreads below which a picture is dark.
-        snow_sigma, snow_roughness: snow has a spread above the first, and lines
-            two rows apart that are as unlike as if unrelated (1 = unrelated).
-        snow_grain: the same for columns two apart, lower because a receiver's
-            bandwidth smooths along lines.
-    """
-
-    frozen_after_s: float = 0.4
-    uniform_sigma: float = 1.5
-    dark_level: float = 30.0
-    snow_sigma: float = 35.0
-    snow_roughness: float = 0.7
-    snow_grain: float = 0.3
+# Grey levels are of 0..255.
+FROZEN_AFTER_S = 0.4
+"""Time without a change after which repeated is frozen."""
+UNIFORM_SIGMA = 1.5
+"""Spread below which a picture shows nothing; a blank video screen has below 1, the noise of a
+camera alone more than 2."""
+DARK_LEVEL = 30.0
+"""Mean plus two spreads below which a picture is dark."""
+SNOW_SIGMA, SNOW_ROUGHNESS, SNOW_GRAIN = 35.0, 0.7, 0.3
+"""Snow has a spread above the first, and lines two rows apart that are as unlike as if unrelated
+(1 = unrelated); columns less so, because a receiver's bandwidth smooths along lines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +69,7 @@ class HealthVerdict:
 
 
 def assess_frame(
-    state: HealthState, frame: Frame, live: bool = True, limits: HealthLimits | None = None
+    state: HealthState, frame: Frame, live: bool = True
 ) -> tuple[HealthState, HealthVerdict]:
     """Judge one frame.
 
@@ -88,34 +78,33 @@ def assess_frame(
     has found to be one (`Frame.repeated`), which is never frozen for that alone. In
     recordings (`live` false) equal pictures are taken as they are.
     """
-    limits = limits or HealthLimits()
     image = frame.image
     if live and state.picture is not None and same_bytes(state.picture, image):
         state = HealthState(state.picture, state.changed_at_s, state.repeats + 1)
         unchanged_s = frame.t_s - state.changed_at_s
-        frozen = unchanged_s >= limits.frozen_after_s
+        frozen = unchanged_s >= FROZEN_AFTER_S
         return state, HealthVerdict("frozen" if frozen else "repeated", state.repeats, unchanged_s)
     if live and frame.repeated:
         repeats = state.repeats + 1
         return HealthState(image, state.changed_at_s, repeats), HealthVerdict("repeated", repeats)
-    return HealthState(image, frame.t_s, 0), HealthVerdict(content(image, limits))
+    return HealthState(image, frame.t_s, 0), HealthVerdict(content(image))
 
 
-def content(image: NDArray[np.uint8], limits: HealthLimits) -> Kind:
+def content(image: NDArray[np.uint8]) -> Kind:
     """What the picture shows, from every eighth line (and the second after it)."""
     height = image.shape[0]
     first = image[: max(height - 2, 1) : 8]
     mean, sigma = (float(each[0, 0]) for each in cv2.meanStdDev(first))
-    if mean + 2.0 * sigma < limits.dark_level:
+    if mean + 2.0 * sigma < DARK_LEVEL:
         return "dark"
-    if sigma < limits.uniform_sigma:
+    if sigma < UNIFORM_SIGMA:
         return "uniform"
-    if sigma > limits.snow_sigma and height > 2:
+    if sigma > SNOW_SIGMA and height > 2:
         below = image[2::8][: len(first)]
         unrelated = 2.0 * sigma**2  # mean square difference of unrelated pixels
         roughness = _mean_square(below, first) / unrelated
         grain = _mean_square(first[:, 2:], first[:, :-2]) / unrelated
-        if roughness > limits.snow_roughness and grain > limits.snow_grain:
+        if roughness > SNOW_ROUGHNESS and grain > SNOW_GRAIN:
             return "snow"
     return "ok"
 

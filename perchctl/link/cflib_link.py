@@ -113,13 +113,11 @@ class CflibLink:
         `connect`; bounded. Errors: ConnectionFailed, NotFound, InvalidValue, TimedOut."""
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
-        Settling(
-            self.connection.cf,
-            self._uri,
-            self._positioning,
-            lambda: self._blocks.newest,
+        settling = Settling(
+            self.connection.cf, self._uri, self._positioning, lambda: self._blocks.newest,
             self._clock,
-        ).settle(feed)
+        )  # fmt: skip
+        settling.settle(feed)
 
     def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
         self._guard, self._told = guard, told
@@ -175,7 +173,7 @@ class CflibLink:
             lambda sent: self._told(sent),
             pieces=encode,
             tend=self._tend,
-            spare=self._resume_logging,
+            spare=lambda: self._blocks.resume(self._hand_over),
         )
 
     def _start_logging(self, connection: Connection) -> None:
@@ -210,10 +208,6 @@ class CflibLink:
     def _hand_over(self, packet: Packet) -> bool:
         """In the sender's thread."""
         return self.connection is not None and self.connection.send(packet)
-
-    def _resume_logging(self) -> bool:
-        """In the sender's thread."""
-        return self._blocks.resume(self._hand_over)
 
     def _tend(self, stuck_s: float, hangs: bool) -> None:
         """See to the link, in the thread of the sender's that never touches cflib."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, TimedOut
-from perchctl.link.telemetry import NEEDED
+from perchctl.link.telemetry import NEEDED, start_block
 from perchctl.values import replace
 from perchctl.vehicle import MeasuredBy
 
@@ -150,23 +150,16 @@ def variables(cf: Any, names: Iterable[str]) -> dict[str, float]:
 
 
 def _read(cf: Any, names: list[str]) -> dict[str, float]:
-    from cflib.crazyflie.log import LogConfig
-
     arrived = threading.Event()
     values: dict[str, float] = {}
 
-    def on_data(_stamp: int, data: dict[str, float], _block: Any) -> None:
+    def on_data(_stamp: int, data: Mapping[str, float], _block: Any) -> None:
         values.update(data)
         arrived.set()
 
-    block = LogConfig(name="perch_probe", period_in_ms=50)
-    for name in names:
-        block.add_variable(name)
-    block.data_received_cb.add_callback(on_data)
     try:
-        cf.log.add_config(block)
-        block.start()
-    except (KeyError, AttributeError):  # cflib's ways to say that the link is gone
+        block = start_block(cf.log, "it", "probe", dict.fromkeys(names), 0.05, on_data)
+    except (NotFound, KeyError, AttributeError):  # cflib's ways to say that the link is gone
         return {}
     arrived.wait(ANSWER_S)
     block.stop()

@@ -303,12 +303,16 @@ def start_block(
     log: Any,
     uri: str,
     name: str,
-    variables: dict[str, str],
+    variables: Mapping[str, str | None],
     period_s: float,
     on_data: Callable[[int, dict[str, float], Any], None],
 ) -> Any:
-    """Start a block in cflib's `log` and return it. `period_s` is rounded to 10 ms; `on_data` gets
-    the stamp in ms, the values by name and the block. Raises NotFound for a refused one."""
+    """Start a block in cflib's `log` and return it.
+
+    `variables`: their types by name, None: as the firmware has it. `period_s` is rounded to 10 ms.
+    `on_data` gets the stamp in ms, the values by name and the block. Raises NotFound for a refused
+    block.
+    """
     from cflib.crazyflie.log import LogConfig
 
     period_ms = max(10, 10 * round(period_s * 100))
