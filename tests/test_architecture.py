@@ -89,7 +89,7 @@ MOST_NAMES = {
     "display": 15,
     "faults": 15,
     "flight": 83,
-    "link": 29,
+    "link": 26,
     "log": 42,
     "mission": 60,
     "positioning": 15,

@@ -48,7 +48,7 @@ from perchctl.flight import (
     with_positioning,
 )
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.link import FAST_BLOCKS, MockLink, Packet, Port, Radio
+from perchctl.link import MockLink, Packet, Port, Radio
 from perchctl.log import LogWatcher, to_exact
 from perchctl.mission import Event, FlightReport, Phase, Tick, Watcher
 from perchctl.profile import Profile
@@ -207,7 +207,7 @@ class FaultyFlight:
             uplink=uplink,
             lands=self._vehicle.firmware.planner.active,
         )
-        heard = all(self._is_heard(block, t_s) for block in FAST_BLOCKS)
+        heard = all(self._is_heard(block, t_s) for block in MockLink.FAST_BLOCKS)
         return sample._replace(astray_m=astray_m, overdue=overdue, uplink=uplink, heard=heard)
 
     def _is_heard(self, block: str, t_s: float) -> bool:

@@ -2,9 +2,7 @@ from .cflib_link import CflibLink as CflibLink
 from .cflib_link import EstimateLink as EstimateLink
 from .crtp import Packet as Packet
 from .crtp import Port as Port
-from .external_position import RESET_PARAMETER as RESET_PARAMETER
 from .external_position import check_estimator_parameters as check_estimator_parameters
-from .external_position import estimator_parameters as estimator_parameters
 from .firmware import EXTERNAL_POSITION_TICK as EXTERNAL_POSITION_TICK
 from .firmware import NEEDED_PROTOCOL as NEEDED_PROTOCOL
 from .firmware import decks_found as decks_found
@@ -22,7 +20,6 @@ from .protocol import Link as Link
 from .protocol import SentCallback as SentCallback
 from .protocol import ignore_sent as ignore_sent
 from .telemetry import BLOCKS_DELETED_AFTER_S as BLOCKS_DELETED_AFTER_S
-from .telemetry import FAST_BLOCKS as FAST_BLOCKS
 from .telemetry import RESUME_PERIOD_S as RESUME_PERIOD_S
 from .uri import UDEV_HELP as UDEV_HELP
 from .uri import check_uri as check_uri

@@ -24,7 +24,7 @@ from perchctl.link.crtp import (
     encode,
     encode_external,
 )
-from perchctl.link.external_position import Feed, Settling, estimator_parameters
+from perchctl.link.external_position import NEEDED_BY, Feed, Settling, estimator_parameters
 from perchctl.link.firmware import check_firmware, measured_by, set_parameters
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
@@ -164,7 +164,7 @@ class CflibLink:
             connection.cf,
             self._uri,
             estimator_parameters(self._positioning),
-            needed_by="positioning from outside",
+            needed_by=NEEDED_BY,
         )
         self._sender = Sender(
             self._hand_over,

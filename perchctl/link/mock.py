@@ -16,10 +16,17 @@ from perchctl.link.crtp import (
     encode,
     encode_external,
 )
+from perchctl.link.external_position import (
+    RESET_PARAMETER,
+    estimator_parameters,
+    start_parameters,
+)
 from perchctl.link.firmware import EXTERNAL_POSITION_TICK, LISTEN_S, decks_found
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
 from perchctl.link.telemetry import BLOCKS, FAST_BLOCKS, SLOW_PERIOD_S, Assembler
 from perchctl.mission import SentCommand
+from perchctl.positioning import Placed
+from perchctl.profile import PositioningConfig
 from perchctl.values import replace
 from perchctl.vehicle import FLYING, Command, ExternalPosition, MeasuredBy, Telemetry
 
@@ -76,6 +83,8 @@ class MockLink:
     Commands reach it as bytes, through the decoder of the simulated link's server, and its
     telemetry comes in the same log blocks, through the same assembler, as by radio.
     """
+
+    FAST_BLOCKS = FAST_BLOCKS
 
     def __init__(
         self,
@@ -171,6 +180,14 @@ class MockLink:
     def external(self, place: ExternalPosition) -> bool:
         self._hand_over((encode_external(place),))
         return True
+
+    def settle(self, config: PositioningConfig, start: Placed) -> None:
+        """Set the estimator to positions from outside, and start it there."""
+        firmware = self.vehicle.firmware
+        parameters = estimator_parameters(config) | start_parameters(start)
+        for name, value in (parameters | {RESET_PARAMETER: 1}).items():
+            firmware.set_parameter(name, value)
+        firmware.set_parameter(RESET_PARAMETER, 0)
 
     def problem(self, now_s: float) -> str | None:
         return None
