@@ -18,19 +18,12 @@ from numpy.typing import NDArray
 
 from perchctl.camera.credentials import without_password
 from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_end, size_in
-from perchctl.camera.network import (
-    CONNECT_TIMEOUT_S,
-    READ_TIMEOUT_S,
-    RECONNECT_WAIT_S,
-    StreamSource,
-)
+from perchctl.camera.network import StreamSource
 from perchctl.camera.source import Clock
 from perchctl.errors import InvalidValue
 
 PORT = 5000
 FORM = "aideck://HOST[:5000]"
-NO_PICTURE_S = 5.0
-"""Bytes that come for so long without a whole picture end the connection."""
 
 # What waits unread would be taken for new: the kernel holds back the deck instead.
 _RECEIVE_BYTES = 131072
@@ -85,33 +78,25 @@ class AiDeckSource(StreamSource):
     hangs on the air. Its age of arrival is the last byte's.
     """
 
-    def __init__(
-        self,
-        address: AiDeckAddress,
-        latency_s: float,
-        clock: Clock,
-        read_timeout_s: float = READ_TIMEOUT_S,
-        reconnect_wait_s: float = RECONNECT_WAIT_S,
-        no_picture_s: float = NO_PICTURE_S,
-    ) -> None:
-        name = f"aideck://{address.host}:{address.port}"
-        super().__init__(name, latency_s, clock, read_timeout_s, reconnect_wait_s)
+    no_picture_s = 5.0
+    """Bytes that come for so long without a whole picture end the connection."""
+
+    def __init__(self, address: AiDeckAddress, latency_s: float, clock: Clock) -> None:
+        super().__init__(f"aideck://{address.host}:{address.port}", latency_s, clock)
         self._address = address
-        self._no_picture_s = no_picture_s
         self.bytes_seen = 0
         self._grey = MosaicFilter(address.colour)
-        self._start(self._run)
 
     def _connection(self) -> str:
         with socket.socket(_family(self._address.host), socket.SOCK_STREAM) as connection:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
-            connection.settimeout(CONNECT_TIMEOUT_S)
+            connection.settimeout(self.connect_timeout_s)
             connection.connect((self._address.host, self._address.port))
             self._socket = connection
             try:
                 if self._stop.is_set():
                     return "closed"
-                connection.settimeout(self._read_timeout_s)
+                connection.settimeout(self.read_timeout_s)
                 return self._read(connection)
             finally:
                 self._socket = None
@@ -137,7 +122,7 @@ class AiDeckSource(StreamSource):
                     break
                 splitter.damaged += 1
             self.damaged = earlier + splitter.damaged
-            if now_s - last_s > self._no_picture_s:
+            if now_s - last_s > self.no_picture_s:
                 return _nothing(splitter)
         return "closed"
 
@@ -234,7 +219,7 @@ _HEADER = struct.Struct("<BHHBBI")
 _MAGIC, _RAW, _JPEG = 0xBC, 0, 1
 _HOST, _SENDERS, _APP = 3, (1, 2, 4), 5
 _FUNCTIONS = (1, 2, 3, 4, _APP, 14, 15)
-_NOT_RESERVED, _LAST_BIT = 0x7F, 0x40
+_NOT_RESERVED = 0x7F
 _START_BYTES = _PACKET.size + _HEADER.size
 _START = re.compile(
     re.escape(struct.pack("<H", 2 + _HEADER.size)) + rb"[\x00-\x7f]\x05\xbc", re.DOTALL

@@ -28,11 +28,8 @@ from perchctl.camera.health import Grey
 from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, grey_pixels, size_in
 from perchctl.camera.source import Clock, LiveSource, one_line
 
-CONNECT_TIMEOUT_S = 3.0
-READ_TIMEOUT_S = 2.0
 MAX_FAILED_CONNECTIONS = 5
 """Connections in a row that bring no picture before the source gives up."""
-RECONNECT_WAIT_S = 0.3
 
 
 class StreamSource(LiveSource):
@@ -40,25 +37,25 @@ class StreamSource(LiveSource):
     `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when the server
     answers that there is no such stream before the first picture came (`not_found`).
 
-    A subclass has `_connection`, sets `_socket` in it, and calls `_start(self._run)` when it
-    is ready. `damaged` counts the pictures that were dropped.
+    It connects from `begin` until `close`. A subclass has `_connection`, and sets `_socket` in it.
+    `damaged` counts the pictures that were dropped.
     """
 
-    def __init__(
-        self,
-        name: str,
-        latency_s: float,
-        clock: Clock,
-        read_timeout_s: float = READ_TIMEOUT_S,
-        reconnect_wait_s: float = RECONNECT_WAIT_S,
-    ) -> None:
-        super().__init__(name, latency_s, clock)
-        self._read_timeout_s = read_timeout_s
-        self._reconnect_wait_s = reconnect_wait_s
+    connect_timeout_s = 3.0
+    read_timeout_s = 2.0
+    reconnect_wait_s = 0.3
+
+    def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
+        super().__init__(without_password(url), latency_s, clock)
+        self._url = url
         self._socket: socket.socket | None = None
         self.not_found = False
         self.connections = 0
         self.damaged = 0
+
+    def begin(self) -> None:
+        """Connect, and read in a thread."""
+        self._start(self._run)
 
     def close(self) -> None:
         self._stop.set()
@@ -93,7 +90,7 @@ class StreamSource(LiveSource):
             if failed >= MAX_FAILED_CONNECTIONS:
                 self._fail(f"{self._name} gave no picture in {failed} attempts: {reason}")
                 return
-            self._stop.wait(self._reconnect_wait_s)
+            self._stop.wait(self.reconnect_wait_s)
 
 
 def _reason(error: Exception) -> str:
@@ -125,18 +122,7 @@ class MjpegSource(StreamSource):
     a proxy for the internet is not for it.
     """
 
-    def __init__(
-        self,
-        url: str,
-        latency_s: float,
-        clock: Clock,
-        read_timeout_s: float = READ_TIMEOUT_S,
-        reconnect_wait_s: float = RECONNECT_WAIT_S,
-    ) -> None:
-        super().__init__(without_password(url), latency_s, clock, read_timeout_s, reconnect_wait_s)
-        self._url = url
-        self._challenge: Challenge | None = None
-        self._start(self._run)
+    _challenge: Challenge | None = None
 
     def _connection(self) -> str:
         try:
@@ -151,7 +137,7 @@ class MjpegSource(StreamSource):
         kind = (
             http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
         )
-        timeout_s = self._read_timeout_s if self._count else CONNECT_TIMEOUT_S
+        timeout_s = self.read_timeout_s if self._count else self.connect_timeout_s
         connection = kind(parts.hostname or "", parts.port, timeout=timeout_s)
         try:
             connection.connect()
@@ -171,7 +157,7 @@ class MjpegSource(StreamSource):
                 self.not_found = gone and self._count == 0
                 hint = _hint(response, parts)
                 return f"the server answers {response.status} {response.reason}{hint}"
-            self._socket.settimeout(self._read_timeout_s)
+            self._socket.settimeout(self.read_timeout_s)
             self._read(response)
             return "the stream ended"
         finally:
@@ -288,7 +274,6 @@ def _untrusted(error: ssl.SSLCertVerificationError) -> str:
 # FFmpeg says neither.
 
 
-RTSP_CONNECT_TIMEOUT_S = 5.0
 RTSP_PORT = 554
 MOST_ANSWER_BYTES = 65536
 MAX_DAMAGED = 100
@@ -346,33 +331,22 @@ class RtspSource(StreamSource):
     Given up at once, too, where the camera wants another name and password.
     """
 
-    def __init__(
-        self,
-        url: str,
-        latency_s: float,
-        clock: Clock,
-        connect_timeout_s: float = RTSP_CONNECT_TIMEOUT_S,
-        read_timeout_s: float = READ_TIMEOUT_S,
-        reconnect_wait_s: float = RECONNECT_WAIT_S,
-    ) -> None:
-        super().__init__(without_password(url), latency_s, clock, read_timeout_s, reconnect_wait_s)
-        self._url = url
-        self._timeouts_s = (connect_timeout_s, read_timeout_s)
-        self._start(self._run)
+    connect_timeout_s = 5.0
 
     def _connection(self) -> str:
         import av  # late: most flights have another camera
         import av.error
 
         # Before the first picture is before the flight: later it would cost pictures.
-        if self._count == 0 and (target := redirect_of(self._url, self._timeouts_s[0])):
+        if self._count == 0 and (target := redirect_of(self._url, self.connect_timeout_s)):
             self.not_found = True
             return (
                 f"the server redirects to {without_password(target)}, which would get the name "
                 f"and password; name that address in camera.source"
             )
         try:
-            with av.open(self._url, options=_OPTIONS, timeout=self._timeouts_s) as stream:
+            timeouts_s = (self.connect_timeout_s, self.read_timeout_s)
+            with av.open(self._url, options=_OPTIONS, timeout=timeouts_s) as stream:
                 return self._read(stream)
         except (av.error.FFmpegError, OSError, ValueError) as error:
             self.not_found = self._count == 0 and isinstance(error, _gone(av.error))

@@ -153,12 +153,16 @@ def _live(
         pipeline = CaptureSource(str(name), latency_s, clock, lambda: open_pipeline(name.place))
         pipeline.begin()
         return pipeline
+    stream: StreamSource | None = None
     if name.scheme == "aideck":
-        return AiDeckSource(aideck_address(name.spec), latency_s, clock)
-    if name.scheme in _USUAL_PORT and name.place.strip("/"):
+        stream = AiDeckSource(aideck_address(name.spec), latency_s, clock)
+    elif name.scheme in _USUAL_PORT and name.place.strip("/"):
         _check_address(name)
-        stream = RtspSource if name.scheme == "rtsp" else MjpegSource
-        return stream(name.spec, latency_s, clock)
+        kind = RtspSource if name.scheme == "rtsp" else MjpegSource
+        stream = kind(name.spec, latency_s, clock)
+    if stream is not None:
+        stream.begin()
+        return stream
     if name.spec == "sim:":
         raise InvalidValue(
             "camera source sim: is the simulated vehicle's camera and needs a link of sim://; "

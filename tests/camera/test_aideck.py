@@ -15,7 +15,6 @@ from perchctl.calibration import load_calibration
 from perchctl.camera import aideck as aideck_module
 from perchctl.camera import check_size, open_camera
 from perchctl.camera.aideck import (
-    NO_PICTURE_S,
     AiDeckAddress,
     AiDeckSource,
     CpxPicture,
@@ -44,7 +43,7 @@ from tests.helpers.aideck import (
 )
 from tests.helpers.boards import CHARUCO, BoardRenderer, draw_poses
 from tests.helpers.commands import run
-from tests.helpers.live import WAIT_S, Clock, level, next_frame, wait_for
+from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame, wait_for
 
 CAMERA = load_calibration("example_aideck_324x244.yaml")
 
@@ -60,10 +59,8 @@ def opened() -> Iterator[Callable[..., AiDeckSource]]:
     sources: list[AiDeckSource] = []
 
     def make(deck: AiDeck, clock: Clock | None = None, **options: float) -> AiDeckSource:
-        source = AiDeckSource(
-            aideck_address(deck.url), 0.06, clock or Clock(), reconnect_wait_s=0.0, **options
-        )
-        sources.append(source)
+        source = AiDeckSource(aideck_address(deck.url), 0.06, clock or Clock())
+        sources.append(begun(source, reconnect_wait_s=0.0, **options))
         return source
 
     yield make
@@ -77,15 +74,15 @@ Opened = Callable[..., AiDeckSource]
 def test_a_frame_is_of_its_first_byte_and_arrives_with_its_last(
     deck: AiDeck, opened: Opened
 ) -> None:
-    clock, begun, go = Clock(), threading.Event(), threading.Event()
+    clock, come, go = Clock(), threading.Event(), threading.Event()
     whole = raw(picture(160))
-    deck.scripts.put([jpeg(picture(60)), begun, whole[:3000], go, whole[3000:], threading.Event()])
+    deck.scripts.put([jpeg(picture(60)), come, whole[:3000], go, whole[3000:], threading.Event()])
     source = opened(deck, clock)
     first = next_frame(source)
     assert (first.index, level(first), first.t_arrival_s) == (0, 60, 100.0)
     assert source.size_px == (324, 244)
     before, clock.t_s = source.bytes_seen, 100.1
-    begun.set()
+    come.set()
     wait_for(lambda: source.bytes_seen > before)
     clock.t_s = 100.3
     go.set()
@@ -174,7 +171,7 @@ def test_bytes_without_pictures_end_the_connection(deck: AiDeck, opened: Opened)
     deck.scripts.put([raw(picture(160)), never])
     source = opened(deck, clock, read_timeout_s=1000.0)
     next_frame(source)
-    clock.t_s += NO_PICTURE_S + 0.1
+    clock.t_s += AiDeckSource.no_picture_s + 0.1
     said.set()
     assert level(next_frame(source)) == 160
     assert source.connections == 2
@@ -222,7 +219,8 @@ def test_nobody_listens(deck: AiDeck) -> None:
 def test_closing_does_not_wait_for_a_stalled_deck(deck: AiDeck) -> None:
     end = threading.Event()
     deck.scripts.put([raw(picture(60)), end])
-    source = AiDeckSource(aideck_address(deck.url), 0.0, Clock(), read_timeout_s=1000.0)
+    source = AiDeckSource(aideck_address(deck.url), 0.0, Clock())
+    begun(source, read_timeout_s=1000.0)
     next_frame(source)
     source.close()
     assert source._thread is not None

@@ -26,7 +26,7 @@ from perchctl.camera.device import (
 from perchctl.camera.network import MAX_FAILED_CONNECTIONS, MjpegSource, StreamSource
 from perchctl.camera.source import SILENT_AFTER_S, LiveSource, UnmirroredSource
 from perchctl.errors import NotFound, TimedOut
-from tests.helpers.live import WAIT_S, Clock, level, next_frame, wait_for
+from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame, wait_for
 
 
 def jpeg(level: int, size: tuple[int, int] = (48, 64), **options: int) -> bytes:
@@ -133,9 +133,8 @@ def server() -> Iterator[Server]:
 
 
 def stream(server: Server, clock: Clock, opened: list[LiveSource], **options: float) -> MjpegSource:
-    source = MjpegSource(server.url, 0.07, clock, reconnect_wait_s=0.0, **options)
-    opened.append(source)
-    return source
+    source = MjpegSource(server.url, 0.07, clock)
+    return begun(source, opened, reconnect_wait_s=0.0, **options)
 
 
 def test_frames_are_stamped_at_arrival_less_the_latency(
@@ -228,9 +227,9 @@ class Broken(StreamSource):
     """Its connection raises what nobody has foreseen."""
 
     def __init__(self, error: Exception, attempts: int) -> None:
-        super().__init__("http://me:secret@camera/x", 0.0, Clock(), reconnect_wait_s=0.0)
+        super().__init__("http://me:secret@camera/x", 0.0, Clock())
         self.errors = [error] * attempts
-        self._start(self._run)
+        begun(self, reconnect_wait_s=0.0)
 
     def _connection(self) -> str:
         if self.errors:
@@ -340,15 +339,14 @@ def test_a_path_the_server_does_not_have_is_not_found(server: Server) -> None:
 def test_nobody_listens(server: Server, opened: list[LiveSource]) -> None:
     url = server.url
     server.close()
-    source = MjpegSource(url, 0.0, Clock(), reconnect_wait_s=0.0)
-    opened.append(source)
+    source = begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.0)
     assert not source.wait_first(WAIT_S)
     assert "connection refused" in str(source.problem(100.0))
 
 
 def test_closing_does_not_wait_for_a_stalled_stream(server: Server) -> None:
     server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = MjpegSource(server.url, 0.0, Clock(), read_timeout_s=1000.0)
+    source = begun(MjpegSource(server.url, 0.0, Clock()), read_timeout_s=1000.0)
     next_frame(source)
     source.close()
     assert source._thread is not None

@@ -13,7 +13,7 @@ from perchctl.camera.network import MjpegSource, redirected
 from perchctl.camera.source import LiveSource
 from perchctl.errors import NotFound
 from tests.camera.test_live import Server, jpeg, part, stream
-from tests.helpers.live import WAIT_S, Clock, level, next_frame, wait_for
+from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame, wait_for
 
 
 @pytest.fixture
@@ -34,8 +34,7 @@ def test_a_certificate_that_nobody_vouches_for(
     assert "secret" not in str(caught.value)
     monkeypatch.setenv("SSL_CERT_FILE", str(pem))
     server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = MjpegSource(url, 0.0, Clock())
-    opened.append(source)
+    source = begun(MjpegSource(url, 0.0, Clock()), opened)
     assert level(next_frame(source)) == 60
 
 
@@ -51,8 +50,7 @@ def test_user_and_password_of_the_url_are_sent(server: Server, opened: list[Live
     server.scripts.put([part(jpeg(60)), threading.Event()])
     url = server.url.replace("http://", "http://me:p%40ss@")
     server.challenges = ['Basic realm="camera"']
-    source = MjpegSource(url, 0.0, Clock())
-    opened.append(source)
+    source = begun(MjpegSource(url, 0.0, Clock()), opened)
     next_frame(source)
     assert server.authorization == [None, "Basic bWU6cEBzcw=="], "once it is asked for"
     assert "p%40ss" not in source.describe()
@@ -68,8 +66,7 @@ def test_digest_is_preferred_and_kept_for_the_next_connection(
     server.scripts.put([part(jpeg(60))])
     server.scripts.put([part(jpeg(100)), threading.Event()])
     url = server.url.replace("http://", "http://me:secret@")
-    source = MjpegSource(url, 0.0, Clock(), reconnect_wait_s=0.0)
-    opened.append(source)
+    begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.0)
     wait_for(lambda: len(server.authorization) == 3)
     assert server.authorization[0] is None
     kept = [str(each) for each in server.authorization[1:]]
@@ -82,10 +79,8 @@ def test_a_nonce_that_is_too_old_is_changed(server: Server, opened: list[LiveSou
     server.challenges = DIGEST
     server.scripts.put([part(jpeg(60))])
     server.scripts.put([part(jpeg(100)), threading.Event()])
-    source = MjpegSource(
-        server.url.replace("http://", "http://me:secret@"), 0.0, Clock(), reconnect_wait_s=0.05
-    )
-    opened.append(source)
+    url = server.url.replace("http://", "http://me:secret@")
+    source = begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.05)
     wait_for(lambda: len(server.authorization) == 2)
     server.challenges = ['Digest realm="camera", nonce="n2", stale=true, qop="auth"']
     server.nonce = "n2"
@@ -98,8 +93,8 @@ def test_a_camera_that_forbids_the_nameless_without_asking_gets_the_name(
 ) -> None:
     server.refusal = 403
     server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = MjpegSource(server.url.replace("http://", "http://me:p%40ss@"), 0.0, Clock())
-    opened.append(source)
+    url = server.url.replace("http://", "http://me:p%40ss@")
+    source = begun(MjpegSource(url, 0.0, Clock()), opened)
     assert level(next_frame(source)) == 60
     assert server.authorization == [None, "Basic bWU6cEBzcw=="]
 
@@ -188,8 +183,7 @@ def test_name_and_password_do_not_go_to_another_host(
         other.challenges = ['Basic realm="camera"']
         server.redirect_first = other.url
         url = server.url.replace("http://", "http://me:secret@")
-        source = MjpegSource(url, 0.0, Clock(), reconnect_wait_s=0.0)
-        opened.append(source)
+        source = begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.0)
         wait_for(lambda: source.problem(100.0) is not None)
         assert other.authorization == [None]
         assert "401" in str(source.problem(100.0))

@@ -26,7 +26,7 @@ from perchctl.camera.network import (
 from perchctl.camera.source import LiveSource
 from perchctl.errors import NotFound, TimedOut
 from perchctl.profile import CameraConfig
-from tests.camera.test_live import WAIT_S, Clock, level, next_frame, wait_for
+from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame, wait_for
 from tests.helpers.rtsp import RtspServer, Step
 
 
@@ -38,12 +38,8 @@ def server() -> Iterator[RtspServer]:
 
 
 def started(server: RtspServer, opened: list[LiveSource], who: str = "") -> RtspSource:
-    source = RtspSource(
-        server.url(who), 0.07, Clock(), connect_timeout_s=2.0, read_timeout_s=0.3,
-        reconnect_wait_s=0.0,
-    )  # fmt: skip
-    opened.append(source)
-    return source
+    times_s = {"connect_timeout_s": 2.0, "read_timeout_s": 0.3, "reconnect_wait_s": 0.0}
+    return begun(RtspSource(server.url(who), 0.07, Clock()), opened, **times_s)
 
 
 def seconds(count: int, *levels: int) -> list[Step]:
@@ -144,8 +140,7 @@ def test_a_packet_that_cannot_be_decoded_costs_no_connection(
 ) -> None:
     stream = Packets(60, error, 160)
     monkeypatch.setattr(av, "open", lambda *_, **__: stream)
-    source = RtspSource("rtsp://camera/x", 0.0, Clock(), reconnect_wait_s=WAIT_S)
-    opened.append(source)
+    source = begun(RtspSource("rtsp://camera/x", 0.0, Clock()), opened, reconnect_wait_s=WAIT_S)
     wait_for(lambda: source._count == 2)
     assert (source.connections, source.damaged) == (1, 1)
     assert int(stream.context.options["max_pixels"]) == MOST_STREAM_PX
@@ -259,7 +254,7 @@ def test_what_only_a_driver_can_do_is_said_of_a_stream(server: RtspServer) -> No
 def test_closing_does_not_wait_for_a_stalled_stream(server: RtspServer) -> None:
     never = threading.Event()
     server.scripts.put([*seconds(20, 60, 80), never])
-    source = RtspSource(server.url(), 0.0, Clock(), read_timeout_s=1.0)
+    source = begun(RtspSource(server.url(), 0.0, Clock()), read_timeout_s=1.0)
     assert source.wait_first(WAIT_S)
     source.close()
     assert source._thread is not None

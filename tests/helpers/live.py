@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from typing import TypeVar
 
+from perchctl.camera.network import StreamSource
 from perchctl.camera.source import LiveSource
 from perchctl.vision import Frame
 
 WAIT_S = 10.0  # bound of every wait; reached only when a test fails
+
+
+S = TypeVar("S", bound=StreamSource)
 
 
 class Clock:
@@ -17,6 +22,17 @@ class Clock:
 
     def __call__(self) -> float:
         return self.t_s
+
+
+def begun(source: S, opened: list[LiveSource] | None = None, **timing: float) -> S:
+    """The stream connecting, with other times than its own."""
+    for name, seconds in timing.items():
+        assert hasattr(source, name)
+        setattr(source, name, seconds)
+    source.begin()
+    if opened is not None:
+        opened.append(source)
+    return source
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
