@@ -29,7 +29,7 @@ from perchctl.camera.source import to_grey
 from perchctl.commands.calibrate_source import Source, sized
 from perchctl.errors import InvalidValue, NotFound, UsageError
 from perchctl.log.write import make_header
-from perchctl.profile import Profile
+from perchctl.profile import CameraConfig, Profile
 from perchctl.vision import CameraModel, Frame
 
 
@@ -66,6 +66,17 @@ def test_images_come_all_and_in_natural_order(tmp_path: Path) -> None:
     assert frames[3].t_s == pytest.approx(0.1)
     assert frames[3].t_arrival_s == pytest.approx(0.17)
     assert source.problem(1e6) is None
+
+
+@pytest.mark.parametrize(("given_s", "counts_s"), [(None, 0.05), (0.0, 0.0), (0.2, 0.2)])
+def test_the_profile_s_latency_counts_unless_another_is_given(
+    tmp_path: Path, given_s: float | None, counts_s: float
+) -> None:
+    write_images(tmp_path, 1)
+    config = CameraConfig(latency_s=0.05)
+    frame = open_camera(f"images:{tmp_path}", clock, config, latency_s=given_s).poll(0.0)
+    assert frame is not None
+    assert frame.t_arrival_s - frame.t_s == pytest.approx(counts_s)
 
 
 def test_images_by_pattern_and_single(tmp_path: Path) -> None:

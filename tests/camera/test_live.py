@@ -26,6 +26,7 @@ from perchctl.camera.device import (
 from perchctl.camera.network import MAX_FAILED_CONNECTIONS, MjpegSource, StreamSource
 from perchctl.camera.source import SILENT_AFTER_S, LiveSource, UnmirroredSource
 from perchctl.errors import NotFound, TimedOut
+from perchctl.profile import CameraConfig
 from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame, wait_for
 
 
@@ -357,7 +358,7 @@ def test_no_first_frame_in_time(server: Server) -> None:
     quiet = threading.Event()
     server.scripts.put([b"--frame\r\n", quiet])
     with pytest.raises(TimedOut, match=r"no first frame within 0\.05 s"):
-        open_camera(server.url, Clock(), timeout_s=0.05)
+        open_camera(server.url, Clock(), CameraConfig(start_timeout_s=0.05))
     quiet.set()
 
 
