@@ -43,7 +43,8 @@ from tests.helpers.aideck import (
 )
 from tests.helpers.boards import CHARUCO, BoardRenderer, draw_poses
 from tests.helpers.commands import run
-from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame, wait_for
+from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
+from tests.helpers.waiting import until
 
 CAMERA = load_calibration("example_aideck_324x244.yaml")
 
@@ -83,7 +84,7 @@ def test_a_frame_is_of_its_first_byte_and_arrives_with_its_last(
     assert source.size_px == (324, 244)
     before, clock.t_s = source.bytes_seen, 100.1
     come.set()
-    wait_for(lambda: source.bytes_seen > before)
+    until(lambda: source.bytes_seen > before)
     clock.t_s = 100.3
     go.set()
     second = next_frame(source)
@@ -153,14 +154,14 @@ def test_reconnects_are_bounded_and_the_reason_is_said(deck: AiDeck, opened: Ope
     for _ in range(MAX_FAILED_CONNECTIONS):
         deck.scripts.put([b"HTTP/1.1 400 Bad Request\r\n\r\n"])
     source = opened(deck)
-    wait_for(lambda: "gave no picture" in (source.problem(100.0) or ""))
+    until(lambda: "gave no picture" in (source.problem(100.0) or ""))
     assert "in 5 attempts: 28 bytes came, and no whole picture" in str(source.problem(100.0))
     assert deck.connections == MAX_FAILED_CONNECTIONS
 
 
 def test_a_deck_that_takes_the_connection_and_sends_nothing(deck: AiDeck, opened: Opened) -> None:
     source = opened(deck)
-    wait_for(lambda: "gave no picture" in (source.problem(100.0) or ""))
+    until(lambda: "gave no picture" in (source.problem(100.0) or ""))
     assert "sent nothing; switch the Crazyflie off and on" in str(source.problem(100.0))
 
 

@@ -13,7 +13,8 @@ from perchctl.camera.network import MjpegSource, redirected
 from perchctl.camera.source import LiveSource
 from perchctl.errors import NotFound
 from tests.camera.test_live import Server, jpeg, part, stream
-from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame, wait_for
+from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
+from tests.helpers.waiting import until
 
 
 @pytest.fixture
@@ -67,7 +68,7 @@ def test_digest_is_preferred_and_kept_for_the_next_connection(
     server.scripts.put([part(jpeg(100)), threading.Event()])
     url = server.url.replace("http://", "http://me:secret@")
     begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.0)
-    wait_for(lambda: len(server.authorization) == 3)
+    until(lambda: len(server.authorization) == 3)
     assert server.authorization[0] is None
     kept = [str(each) for each in server.authorization[1:]]
     assert all(each.startswith('Digest username="me", realm="camera"') for each in kept)
@@ -81,10 +82,10 @@ def test_a_nonce_that_is_too_old_is_changed(server: Server, opened: list[LiveSou
     server.scripts.put([part(jpeg(100)), threading.Event()])
     url = server.url.replace("http://", "http://me:secret@")
     source = begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.05)
-    wait_for(lambda: len(server.authorization) == 2)
+    until(lambda: len(server.authorization) == 2)
     server.challenges = ['Digest realm="camera", nonce="n2", stale=true, qop="auth"']
     server.nonce = "n2"
-    wait_for(lambda: source._count == 2)
+    until(lambda: source._count == 2)
     assert 'nonce="n2"' in str(server.authorization[-1])
 
 
@@ -184,7 +185,7 @@ def test_name_and_password_do_not_go_to_another_host(
         server.redirect_first = other.url
         url = server.url.replace("http://", "http://me:secret@")
         source = begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.0)
-        wait_for(lambda: source.problem(100.0) is not None)
+        until(lambda: source.problem(100.0) is not None)
         assert other.authorization == [None]
         assert "401" in str(source.problem(100.0))
     finally:

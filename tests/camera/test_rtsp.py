@@ -26,8 +26,9 @@ from perchctl.camera.network import (
 from perchctl.camera.source import LiveSource
 from perchctl.errors import NotFound, TimedOut
 from perchctl.profile import CameraConfig
-from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame, wait_for
+from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
 from tests.helpers.rtsp import RtspServer, Step
+from tests.helpers.waiting import until
 
 
 @pytest.fixture
@@ -59,7 +60,7 @@ def test_pictures_come_and_the_newest_wins(server: RtspServer, opened: list[Live
             seen.append(frame)
         return bool(seen) and level(seen[-1]) == 160
 
-    wait_for(last_came)
+    until(last_came)
     assert seen[-1].image.shape == (48, 64)
     assert seen[-1].t_arrival_s == 100.0
     assert seen[-1].t_s == pytest.approx(99.93, abs=1e-6) or seen[-1].t_s < 99.93
@@ -75,7 +76,7 @@ def test_it_connects_anew_where_the_stream_is_cut_or_stalls(
     server.scripts.put([*seconds(20, 60, 80), *([] if cut else [never])])
     server.scripts.put([*seconds(20, 160, 180), never])
     source = started(server, opened)
-    wait_for(lambda: server.plays == 2)
+    until(lambda: server.plays == 2)
     frame = next_frame(source)
     while level(frame) < 150:
         frame = next_frame(source)
@@ -92,7 +93,7 @@ def test_the_resolver_is_asked_only_before_the_first_picture(
     server.scripts.put([*seconds(20, 60, 80), never])  # it stalls: an error in time
     server.scripts.put([*seconds(20, 160, 180), never])
     source = started(server, opened)
-    wait_for(lambda: server.plays == 2)
+    until(lambda: server.plays == 2)
     assert source._count > 0
     assert asked == []
     never.set()
@@ -141,7 +142,7 @@ def test_a_packet_that_cannot_be_decoded_costs_no_connection(
     stream = Packets(60, error, 160)
     monkeypatch.setattr(av, "open", lambda *_, **__: stream)
     source = begun(RtspSource("rtsp://camera/x", 0.0, Clock()), opened, reconnect_wait_s=WAIT_S)
-    wait_for(lambda: source._count == 2)
+    until(lambda: source._count == 2)
     assert (source.connections, source.damaged) == (1, 1)
     assert int(stream.context.options["max_pixels"]) == MOST_STREAM_PX
 
@@ -149,7 +150,7 @@ def test_a_packet_that_cannot_be_decoded_costs_no_connection(
 def test_connections_are_bounded(server: RtspServer, opened: list[LiveSource]) -> None:
     server.status = "500 Internal Server Error"
     source = started(server, opened)
-    wait_for(lambda: "gave no picture in 5 attempts" in (source.problem(100.0) or ""))
+    until(lambda: "gave no picture in 5 attempts" in (source.problem(100.0) or ""))
     assert source.connections == MAX_FAILED_CONNECTIONS
 
 
