@@ -10,8 +10,8 @@ from perchctl.faults.effects import (
     Silence,
     TelemetryDelayed,
 )
-from perchctl.link import BLOCKS_DELETED_AFTER_S, RESUME_PERIOD_S, Radio
-from perchctl.sim import PROTOCOL_VERSION, CommandService, Firmware, Packet, Port
+from perchctl.link import BLOCKS_DELETED_AFTER_S, RESUME_PERIOD_S, Packet, Port, Radio
+from perchctl.sim import PROTOCOL_VERSION, CommandService, Firmware
 
 ORDERS = ("setpoint", "raw", "land", "notify", "stop", "emergency-stop")
 """The packets that faults can name."""
