@@ -289,7 +289,7 @@ def test_the_page_of_a_flight_ends_with_its_card(
         return SessionResult(report)
 
     monkeypatch.setattr(fly, "_session", session)
-    assert fly.fly(options_in(tmp_path), as_json=False, port=0) == 50
+    assert fly.fly_and_report(options_in(tmp_path), as_json=False, port=0) == 50
     card = last_state["card"]
     assert (card["outcome"], card["reason"]) == ("LANDED", "target not found")
     (log,) = tmp_path.glob("*.jsonl")
@@ -309,7 +309,7 @@ def test_the_page_of_a_flight_that_failed_says_so(
     monkeypatch.setattr(LogWatcher, "abandon", lambda *a: (ended.append("log"), abandon(*a)))
     monkeypatch.setattr(fly, "_session", session)
     with pytest.raises(Interrupted):
-        fly.fly(options_in(tmp_path), as_json=False, port=0)
+        fly.fly_and_report(options_in(tmp_path), as_json=False, port=0)
     assert last_state["card"]["outcome"] == "FAILED"
     assert "nothing was started" in last_state["card"]["reason"]
     assert last_state["card"]["rows"] == []  # no tick, no log
