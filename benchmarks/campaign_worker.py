@@ -34,7 +34,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     ),
     "judging pictures": (
         "perchctl.perception.perception:assess_frame",
-        "perchctl.camera.slot:repeated",
+        "perchctl.camera.source:repeated",
     ),
     "physics, firmware": ("perchctl.sim.vehicle:SimulatedVehicle.advance_to",),
     "link": (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -47,6 +48,39 @@ class Telemetry:
 
     def has(self, bit: int) -> bool:
         return bool(self.supervisor & bit)
+
+
+# --- What a vehicle may be doing, by its newest telemetry: what is old is unknown, and what is
+# unknown counts as flying. By it a link is left, and a rescue and the watchdog land.
+
+
+FRESH_S = 0.3
+"""Telemetry that is older says nothing of the motors."""
+
+
+def is_known(newest: Telemetry | None, now_s: float) -> bool:
+    """True if there is telemetry, and it is fresh."""
+    return newest is not None and now_s - newest.t_s <= FRESH_S
+
+
+def knows_its_position(newest: Telemetry | None, now_s: float) -> bool:
+    """True if position and velocity are known too: they come by a packet of their own."""
+    if newest is None or now_s - newest.t_s + newest.behind_s > FRESH_S:
+        return False
+    return all(math.isfinite(v) for v in (*newest.position_m, *newest.velocity_mps))
+
+
+def may_fly(newest: Telemetry | None, now_s: float) -> bool:
+    """True if a zero setpoint could drop the vehicle, or lock it: the flying bit outlives the
+    motors by 2 s (docs/firmware.md, "When setpoints stop")."""
+    return newest is None or not is_known(newest, now_s) or newest.has(FLYING)
+
+
+def is_cut(newest: Telemetry | None, now_s: float) -> bool:
+    """True if an emergency stop has come to be: locked, with the motors off."""
+    if newest is None or not is_known(newest, now_s):
+        return False
+    return newest.has(LOCKED) and newest.thrust < 1
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "distributed": ("perchctl.campaign",),
     "dask": ("perchctl.campaign",),
     "pyarrow": ("perchctl.log.table",),
-    "av": ("perchctl.track.outputs", "perchctl.camera.rtsp"),
+    "av": ("perchctl.track.outputs", "perchctl.camera.network"),
 }
 
 # Time is an argument here.
@@ -65,8 +65,8 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.camera", "perchctl.positioning"),
     ("perchctl.perception",),
     ("perchctl.calibration",),
-    ("perchctl.sim",),
-    ("perchctl.link", "perchctl.log"),
+    ("perchctl.link",),
+    ("perchctl.sim", "perchctl.log"),
     ("perchctl.flight",),
     ("perchctl.campaign",),
     (
@@ -87,20 +87,20 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 MOST_NAMES = {
     "analysis": 15,
     "calibration": 31,
-    "camera": 40,
+    "camera": 30,
     "campaign": 25,
     "check": 15,
     "commands": 15,
     "display": 15,
     "faults": 15,
     "flight": 42,
-    "link": 31,
+    "link": 26,
     "log": 21,
     "mission": 60,
     "perception": 15,
     "positioning": 15,
     "profile": 38,
-    "sim": 29,
+    "sim": 27,
     "target": 29,
     "track": 15,
     "vision": 50,
@@ -320,7 +320,8 @@ BROKEN = {
     ),
     "perchctl.vision.merge": ("from perchctl.mission import state\n", uphill, "mission.state"),
     "perchctl.geometry": ("from .profile import Profile\n", uphill, "profile"),
-    "perchctl.log.watch": ("from perchctl.link import uri\n", uphill, "link.uri"),
+    "perchctl.sim.world": ("from perchctl.log import read\n", uphill, "log.read"),
+    "perchctl.link.mock": ("from perchctl.sim import world\n", uphill, "sim.world"),
     "perchctl.vision.pipeline": (
         "import typing\nif typing.TYPE_CHECKING:\n    from perchctl.link.mock import X\n",
         uphill,

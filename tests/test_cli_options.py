@@ -70,12 +70,30 @@ def test_options_that_do_not_apply_are_refused(arguments: str, words: list[str])
     assert list(Path().iterdir()) == []
 
 
-def test_calibrate_refuses_what_it_would_not_heed() -> None:
+def test_calibrate_refuses_a_page_without_a_live_camera() -> None:
     Path("pictures").mkdir()
     said = run("calibrate", "pictures", "--view")
     assert said.code == 2
-    assert "pictures is no live camera" in said.complaint
-    assert "--view does not apply" in said.complaint
+    for word in ("pictures is no live camera", "--view does not apply"):
+        assert word in said.complaint
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        ("check c.yaml pictures -o d.yaml", "-o"),
+        ("check c.yaml pictures --output d.yaml", "--output"),
+        ("check c.yaml pictures --model fisheye", "--model"),
+        ("convert c.yaml -o d.yaml --model fisheye", "--model"),
+        ("convert c.yaml -o d.yaml --view", "--view"),
+    ],
+)
+def test_calibrate_knows_no_option_that_it_would_not_heed(arguments: str, option: str) -> None:
+    Path("pictures").mkdir()
+    said = run("calibrate", "pictures", "--view")
+    assert said.code == 2
+    assert f"No such option: {option}" in said.stderr
+    assert not Path("d.yaml").exists()
 
 
 def test_a_seed_for_a_real_vehicle_is_said_to_change_nothing() -> None:

@@ -42,8 +42,11 @@ from perchctl.display import (  # noqa: E402
     Sketch,
     draw_sketch,
 )
-from perchctl.display.status import FlightStatus, status_rows  # noqa: E402
-from perchctl.display.watch import panel  # noqa: E402
+from perchctl.display.panel import (  # noqa: E402
+    FlightStatus,
+    panel,
+    status_rows,
+)
 from perchctl.flight import PLAIN_SEED  # noqa: E402
 from perchctl.geometry import Array, make_T, rotation_from_rpy  # noqa: E402
 from perchctl.log import (  # noqa: E402

@@ -26,10 +26,12 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".
 class Recording:
     """What the two recordings share; `_read` gives the next picture and its time, or None.
 
-    `rate_hz` is the frames' nominal rate, `count` their number, None where it is unknown.
+    `rate_hz` is the frames' nominal rate, `count` their number, None where it is unknown. `paths`:
+    the files of pictures, in the order of their frames' indices; empty of a video.
     """
 
     live = False
+    paths: Sequence[Path] = ()
 
     def __init__(self, name: str, latency_s: float, rate_hz: float, count: int | None) -> None:
         self.rate_hz, self.count = rate_hz, count
@@ -124,22 +126,17 @@ class ImagesSource(Recording):
         latency_s: float = 0.0,
         rate_hz: float = DEFAULT_RATE_HZ,
     ) -> None:
-        self._paths = image_files(where)
+        self.paths = image_files(where)
         self._next = 0
-        named = where if isinstance(where, str) else self._paths[0]
+        named = where if isinstance(where, str) else self.paths[0]
         super().__init__(
-            f"images:{without_password(str(named))}", latency_s, rate_hz, len(self._paths)
+            f"images:{without_password(str(named))}", latency_s, rate_hz, len(self.paths)
         )
 
-    @property
-    def paths(self) -> list[Path]:
-        """All files, in the order of their frames' indices."""
-        return self._paths
-
     def _read(self) -> tuple[NDArray[np.uint8], float] | None:
-        if self._next >= len(self._paths):
+        if self._next >= len(self.paths):
             return None
-        path, t_s = self._paths[self._next], self._next / self.rate_hz
+        path, t_s = self.paths[self._next], self._next / self.rate_hz
         self._next += 1
         return read_grey(path), t_s
 

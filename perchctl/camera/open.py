@@ -1,9 +1,10 @@
-"""From the profile's `camera.source` to an open frame source."""
+"""From a source's text, as a profile or a command names it, to an open frame source."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -12,14 +13,11 @@ import cv2
 from cv2 import videoio_registry
 
 from perchctl.camera.aideck import FORM, AiDeckSource, aideck_address
-from perchctl.camera.computer import camera_number, finder_of
 from perchctl.camera.credentials import without_password
-from perchctl.camera.device import CaptureSource, DeviceSource, asked_of
+from perchctl.camera.device import CaptureSource, DeviceSource, asked_of, camera_number, finder_of
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
-from perchctl.camera.mjpeg import MjpegSource
-from perchctl.camera.rtsp import RtspSource
+from perchctl.camera.network import MjpegSource, RtspSource, StreamSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource, mirrored_as_profiled
-from perchctl.camera.stream import StreamSource
 from perchctl.errors import CameraNote, InvalidValue, NotFound, TimedOut
 from perchctl.profile import CameraConfig
 
@@ -27,47 +25,59 @@ REAL = (
     "camera:N, camera:NAME, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, "
     f"rtsp://HOST/PATH, {FORM}, gst:PIPELINE"
 )
-ALLOWED_SOURCES = f"{REAL}, sim:"
-
-FIRST_FRAME_WITHIN_S = 8.0
+ALLOWED = f"{REAL}, sim:"
 SCHEMES = ("camera", "video", "images", "http", "https", "rtsp", "aideck", "gst", "sim")
-RECORDED = ("video", "images")
+FIRST_FRAME_WITHIN_S = 8.0
 
 
-def source_spec(source: str) -> str:
-    """The source as `open_source` takes it; a bare path names a video, picture or folder.
+@dataclass(frozen=True)
+class SourceName:
+    """What a source's text names. `scheme`: one of `SCHEMES`; `place`: what stands behind the
+    colon. As a text it shows no password."""
 
-    Errors: NotFound for a path that is not there.
+    scheme: str
+    place: str
+
+    @property
+    def spec(self) -> str:
+        """The text that `open_camera` takes, with its password."""
+        return f"{self.scheme}:{self.place}"
+
+    @property
+    def live(self) -> bool:
+        """True for cameras and streams, which run in real time; False for recordings."""
+        return self.scheme not in ("video", "images")
+
+    def __str__(self) -> str:
+        return without_password(self.spec)
+
+
+def parse_source(text: str, *, files: bool = False) -> SourceName:
+    """The source that a text names: a scheme, in small or capital letters, and what is behind it.
+
+    `files`: a bare path names a video, a picture, a pattern or a folder of pictures. Nothing is
+    opened. Errors: InvalidValue for an unknown scheme or an AI-deck's address that is none;
+    NotFound for a bare path that does not exist.
     """
-    if scheme_of(source) in SCHEMES:
-        return source
-    path = Path(source).expanduser()
-    if path.is_dir() or any(c in source for c in "*?["):
-        return f"images:{source}"
-    if path.is_file():
-        return f"{'images' if path.suffix.lower() in IMAGE_SUFFIXES else 'video'}:{source}"
-    if "://" in source or (scheme_of(source) and not path.suffix and "/" not in source):
-        return source  # `open_source` names what is allowed
-    raise NotFound(
-        f"{without_password(source)} does not exist; a source is a video, picture or folder of "
-        f"pictures, or one of {REAL}"
-    )
-
-
-def scheme_of(spec: str) -> str:
-    """What stands before the colon, in small letters; the empty string where there is none."""
-    scheme, colon, _ = spec.partition(":")
-    return scheme.lower() if colon else ""
-
-
-def is_live(spec: str) -> bool:
-    """Whether the source runs in real time (cameras and streams), else it is a recording."""
-    return scheme_of(spec) not in RECORDED
-
-
-def is_pictures(spec: str) -> bool:
-    """Whether the source is files of pictures, which may or may not belong together."""
-    return scheme_of(spec) == "images"
+    scheme, colon, place = text.partition(":")
+    scheme = scheme.lower() if colon else ""
+    if scheme == "aideck":
+        aideck_address(f"{scheme}:{place}")
+    if scheme in SCHEMES:
+        return SourceName(scheme, place)  # FFmpeg knows rtsp:// and not RTSP://
+    path = Path(text).expanduser()
+    is_path = "://" not in text and not (scheme and not path.suffix and "/" not in text)
+    if files and (path.is_dir() or any(c in text for c in "*?[")):
+        return SourceName("images", text)
+    if files and path.is_file():
+        return SourceName("images" if path.suffix.lower() in IMAGE_SUFFIXES else "video", text)
+    shown = without_password(text)
+    if files and is_path:
+        raise NotFound(
+            f"{shown} does not exist; a source is a video, picture or folder of pictures, or one "
+            f"of {REAL}"
+        )
+    raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED}")
 
 
 def note(sentence: str) -> None:
@@ -75,28 +85,29 @@ def note(sentence: str) -> None:
     warnings.warn(sentence, CameraNote, stacklevel=3)
 
 
-def open_source(
-    spec: str,
-    latency_s: float,
-    size_px: tuple[int, int] | None,
+def open_camera(
+    source: str | Sequence[Path],
     clock: Clock,
-    timeout_s: float = FIRST_FRAME_WITHIN_S,
-    pictures_hz: float = DEFAULT_RATE_HZ,
     config: CameraConfig | None = None,
+    *,
+    size_px: tuple[int, int] | None = None,
+    latency_s: float | None = None,
+    pictures_hz: float | None = None,
+    timeout_s: float | None = None,
     tell: Callable[[str], None] = note,
 ) -> FrameSource:
-    """Open the source and wait for its first frame.
+    """Open any source and wait for its first frame.
 
     Args:
-        spec: one of `ALLOWED_SOURCES`; ``sim:`` belongs to the simulated vehicle, which
-            resolves it to its own stream before this function is called.
-        latency_s: time from exposure to arrival, taken off live frames' times.
-        size_px: wanted width and height (requested of ``camera:N`` only).
+        source: a text that `parse_source` takes, or picture files one by one. ``sim:`` belongs
+            to the simulated vehicle, whose stream's address the caller gives instead.
         clock: the loop's clock, s.
-        timeout_s: how long the first frame of a live source may take.
-        pictures_hz: as if taken at this rate (``images:`` only).
-        config: whose format, rate and controls are asked of ``camera:``; if it says that the
-            pictures are mirrored, each is turned right.
+        config: the profile's camera. Its latency is taken off live frames' times, its format,
+            rate and controls are asked of ``camera:``, and mirrored pictures are turned right.
+        size_px: wanted width and height (requested of ``camera:`` only).
+        latency_s: from exposure to arrival, instead of the profile's (0 without one).
+        pictures_hz: pictures count as taken at this rate (``images:`` only; 30 by default).
+        timeout_s: how long the first frame of a live source may take, instead of the profile's.
         tell: gets a sentence for each thing that the camera does not do as asked.
 
     Raises:
@@ -104,101 +115,102 @@ def open_source(
         unreadable content, a control or format that the camera lacks. TimedOut: no
         first frame in time.
     """
-    source = _opened(spec, latency_s, size_px, clock, timeout_s, pictures_hz, config, tell)
-    return source if config is None else mirrored_as_profiled(source, config)
+    if latency_s is None:
+        latency_s = 0.0 if config is None else config.start_latency_s
+    if timeout_s is None:
+        timeout_s = FIRST_FRAME_WITHIN_S if config is None else config.start_timeout_s
+    pictures_hz = DEFAULT_RATE_HZ if pictures_hz is None else pictures_hz
+    opened: FrameSource
+    if not isinstance(source, str):
+        opened = ImagesSource(source, latency_s, pictures_hz)
+    else:
+        name = parse_source(source, files=True)
+        if name.scheme == "video" and name.place:
+            opened = VideoSource(Path(name.place).expanduser(), latency_s)
+        elif name.scheme == "images" and name.place:
+            opened = ImagesSource(str(Path(name.place).expanduser()), latency_s, pictures_hz)
+        else:
+            live = _live(name, latency_s, size_px, clock, config)
+            opened = _started(live, timeout_s, tell)
+            if isinstance(live, StreamSource):
+                _tell_unasked(name, config, tell)
+    return opened if config is None else mirrored_as_profiled(opened, config)
 
 
-def _opened(
-    spec: str,
+def _live(
+    name: SourceName,
     latency_s: float,
     size_px: tuple[int, int] | None,
     clock: Clock,
-    timeout_s: float,
-    pictures_hz: float,
     config: CameraConfig | None,
-    tell: Callable[[str], None],
-) -> FrameSource:
-    scheme, rest = scheme_of(spec), spec.partition(":")[2]
-    if scheme in SCHEMES:
-        spec = f"{scheme}:{rest}"  # FFmpeg knows rtsp:// and not RTSP://
-    if scheme == "video" and rest:
-        return VideoSource(Path(rest).expanduser(), latency_s)
-    if scheme == "images" and rest:
-        return ImagesSource(str(Path(rest).expanduser()), latency_s, pictures_hz)
-    if scheme == "camera":
-        number = camera_number(rest)
-        device = DeviceSource(
-            number, latency_s, asked_of(config, size_px), clock, find=finder_of(number)
-        )
-        return _started(device, timeout_s, tell)
-    if scheme == "gst" and rest.strip():
-        name = without_password(spec)
-        pipeline = CaptureSource(name, latency_s, clock, lambda: open_pipeline(rest))
+) -> LiveSource:
+    """A camera or stream whose first frame is still to come."""
+    if name.scheme == "camera":
+        number = camera_number(name.place)
+        asked = asked_of(config, size_px)
+        return DeviceSource(number, latency_s, asked, clock, find=finder_of(number))
+    if name.scheme == "gst" and name.place.strip():
+        pipeline = CaptureSource(str(name), latency_s, clock, lambda: open_pipeline(name.place))
         pipeline.begin()
-        return _started(pipeline, timeout_s, tell)
-    if (stream := _stream(spec, scheme, rest, latency_s, clock)) is not None:
-        try:
-            started = _started(stream, timeout_s, tell)
-            _tell_unasked(spec, config, tell)
-            return started
-        except TimedOut as error:
-            if stream.not_found:
-                raise NotFound(str(error)) from None
-            raise
-    if spec == "sim:":
+        return pipeline
+    stream: StreamSource | None = None
+    if name.scheme == "aideck":
+        stream = AiDeckSource(aideck_address(name.spec), latency_s, clock)
+    elif name.scheme in _USUAL_PORT and name.place.strip("/"):
+        _check_address(name)
+        kind = RtspSource if name.scheme == "rtsp" else MjpegSource
+        stream = kind(name.spec, latency_s, clock)
+    if stream is not None:
+        stream.begin()
+        return stream
+    if name.spec == "sim:":
         raise InvalidValue(
             "camera source sim: is the simulated vehicle's camera and needs a link of sim://; "
             f"other sources are {REAL}"
         )
-    shown = without_password(spec)
-    raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED_SOURCES}")
-
-
-def _stream(
-    spec: str, scheme: str, rest: str, latency_s: float, clock: Clock
-) -> StreamSource | None:
-    if scheme == "aideck":
-        return AiDeckSource(aideck_address(spec), latency_s, clock)
-    kinds: dict[str, Callable[[str, float, Clock], StreamSource]]
-    kinds = {"http": MjpegSource, "https": MjpegSource, "rtsp": RtspSource}
-    if scheme not in kinds or not rest.strip("/"):
-        return None
-    port: int | str | None = None
-    try:
-        parts = urlsplit(spec)
-        host = parts.hostname if rest.startswith("//") else None
-        try:
-            port = parts.port
-        except ValueError:
-            port = parts.netloc.rpartition(":")[2]
-            host = None if "@" in spec else host  # part of a password, it may be
-    except ValueError:
-        host = None
-    if not host:
-        raise InvalidValue(
-            f"camera source {without_password(spec)!r} lacks a host that can be read, as in "
-            f"{scheme}://192.168.1.20/stream; in a name or password @ is %40, : is %3A, / is %2F"
-        )
-    if port == 0 or isinstance(port, str):
-        raise InvalidValue(
-            f"camera source {without_password(spec)!r} has port {port}; allowed are 1 to 65535, "
-            f"as in {scheme}://{host}:{_USUAL_PORT[scheme]}/stream, or none for the usual one"
-        )
-    return kinds[scheme](spec, latency_s, clock)
+    raise InvalidValue(f"camera source {str(name)!r} is unknown; allowed are {ALLOWED}")
 
 
 _USUAL_PORT = {"http": 80, "https": 443, "rtsp": 554}
 
 
-def _tell_unasked(spec: str, config: CameraConfig | None, tell: Callable[[str], None]) -> None:
+def _check_address(name: SourceName) -> None:
+    """Raises InvalidValue where a stream's URL has no host or no port that can be."""
+    port: int | str | None = None
+    try:
+        parts = urlsplit(name.spec)
+        host = parts.hostname if name.place.startswith("//") else None
+        try:
+            port = parts.port
+        except ValueError:
+            port = parts.netloc.rpartition(":")[2]
+            host = None if "@" in name.spec else host  # part of a password, it may be
+    except ValueError:
+        host = None
+    if not host:
+        raise InvalidValue(
+            f"camera source {str(name)!r} lacks a host that can be read, as in "
+            f"{name.scheme}://192.168.1.20/stream; in a name or password @ is %40, : is %3A, "
+            f"/ is %2F"
+        )
+    if port == 0 or isinstance(port, str):
+        raise InvalidValue(
+            f"camera source {str(name)!r} has port {port}; allowed are 1 to 65535, as in "
+            f"{name.scheme}://{host}:{_USUAL_PORT[name.scheme]}/stream, or none for the usual one"
+        )
+
+
+def _tell_unasked(
+    name: SourceName, config: CameraConfig | None, tell: Callable[[str], None]
+) -> None:
     """What the profile asks of a driver, and no network camera has."""
     keys = {} if config is None else {"format": config.format, "controls": config.controls}
     given = [f"camera.{key}" for key, value in keys.items() if value]
     if given:
         verb = "is" if len(given) == 1 else "are"
         tell(
-            f"{' and '.join(given)} {verb} not used with {without_password(spec)}: only camera: "
-            f"sources have a driver to ask; set that in the camera itself"
+            f"{' and '.join(given)} {verb} not used with {name}: only camera: sources have a "
+            f"driver to ask; set that in the camera itself"
         )
 
 
@@ -210,6 +222,8 @@ def _started(source: LiveSource, timeout_s: float, tell: Callable[[str], None]) 
     problem = source.problem(float("-inf"))
     described = source.describe()
     source.close()
+    if isinstance(source, StreamSource) and source.not_found:
+        raise NotFound(f"no first frame: {problem}")
     if problem is not None:
         raise TimedOut(f"no first frame: {problem}")
     raise TimedOut(

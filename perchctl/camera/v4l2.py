@@ -28,7 +28,7 @@ _CAPTURE = 1  # V4L2_CAP_VIDEO_CAPTURE, and the type of its buffer
 _HAS_DEVICE_CAPS = 0x80000000
 _NEXT_CONTROL = 0x80000000
 _DISABLED, _READ_ONLY, _INACTIVE, _WRITE_ONLY = 0x01, 0x04, 0x10, 0x40
-_MENU, _BUTTON, _INTEGER_MENU = 3, 4, 9
+_MENU, _INTEGER_MENU = 3, 9
 _VALUED = {1: "integer", 2: "boolean", _MENU: "menu", 8: "bitmask", _INTEGER_MENU: "menu"}
 _DISCRETE = 1
 _FORMAT_BYTES = 204 if struct.calcsize("P") == 4 else 208  # its union holds pointers

@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import FrameSource, device_listing, open_source, without_password
+from perchctl.camera import FrameSource, find_cameras, open_camera, without_password
 from perchctl.check import camera, capture, vehicle
 from perchctl.check.computer import log_folder_finding, loop_finding
 from perchctl.check.profile import quick_rows
@@ -85,10 +85,12 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
         try:
             source = _open_camera(spec, options, remarks)
         except PerchError as error:
-            yield from camera.refused_rows(error, device_listing(), options.profile)
+            yield from camera.refused_rows(error, list(map(str, find_cameras())), options.profile)
         else:
             stack.callback(source.close)
-            yield Row("camera", *camera.opened_finding(shown, device_listing(), remarks))
+            yield Row(
+                "camera", *camera.opened_finding(shown, list(map(str, find_cameras())), remarks)
+            )
             rehearsal = yield from _camera_rows(take, source, pipeline, options.profile, scope)
     yield ask("loop", loop_finding, rehearsal, options.profile)
     yield ask("log folder", log_folder_finding, options.log_dir)
@@ -242,10 +244,7 @@ def _not_answering(names: list[str]) -> list[Row]:
 def _open_camera(spec: str, options: FlyOptions, remarks: list[str]) -> FrameSource:
     config = options.profile.camera
     size_px = profile_camera(config).size_px
-    return open_source(
-        spec, config.start_latency_s, size_px, time.monotonic, config.start_timeout_s,
-        config=config, tell=remarks.append,
-    )  # fmt: skip
+    return open_camera(spec, time.monotonic, config, size_px=size_px, tell=remarks.append)
 
 
 def _camera_rows(

@@ -38,12 +38,10 @@ from perchctl.camera import (
     IMAGE_SUFFIXES,
     FrameSource,
     Grey,
-    ImagesSource,
     check_size,
     image_files,
-    is_live,
-    open_source,
-    source_spec,
+    open_camera,
+    parse_source,
     without_password,
 )
 from perchctl.commands.calibrate_mount import mount
@@ -405,7 +403,7 @@ def _draw(result: Calibration, picture: Path) -> Path:
 
 @dataclass(frozen=True)
 class Source:
-    """A source as `open_source` takes it, or the picture files that were named one by one."""
+    """A source as `open_camera` takes it, or the picture files that were named one by one."""
 
     spec: str
     files: tuple[Path, ...] = ()
@@ -428,23 +426,21 @@ class Source:
         return str(Path(self.spec.partition(":")[2]).expanduser())
 
     def open(self) -> FrameSource:
-        """Its frames, of a live source too. Errors: those of `open_source`."""
-        if self.files:
-            return ImagesSource(self.files)
-        return open_source(self.spec, 0.0, self.size_px, time.monotonic)
+        """Its frames, of a live source too. Errors: those of `open_camera`."""
+        return open_camera(self.files or self.spec, time.monotonic, size_px=self.size_px)
 
 
 def _source(words: Sequence[str], size: str | None, view: bool = False) -> Source:
     """The source that the command line names; several words are picture files, which is what
     a shell makes of ``left*.jpg``. Raises NotFound, InvalidValue, UsageError."""
     if len(words) == 1:
-        source = Source(source_spec(words[0]))
+        source = Source(parse_source(words[0], files=True).spec)
     else:
         files = tuple(Path(word) for word in words)
         for file in files:
             _check_picture(file)
         source = Source("images:", files)
-    if view and not is_live(source.spec):
+    if view and not parse_source(source.spec).live:
         raise UsageError(f"{source} is no live camera: --view does not apply; leave it out")
     return sized(source, size)
 

@@ -37,9 +37,8 @@ from perchctl.calibration import (
 from perchctl.camera import (
     FrameSource,
     check_size,
-    is_live,
-    open_source,
-    source_spec,
+    open_camera,
+    parse_source,
     without_password,
 )
 from perchctl.commands.command_line import (
@@ -255,18 +254,18 @@ def _live_sources(
         raise UsageError(
             f"camera {given} {_SIMULATED} with --source (camera:N, http://..., aideck://HOST)"
         )
-    spec = source_spec(given)
+    name = parse_source(given, files=True)
     if "carry" not in parts and uri is None:
-        return spec, None
-    if not is_live(spec):
+        return name.spec, None
+    if not name.live:
         raise UsageError(
-            f"{without_password(spec)} is a recording, and has not the vehicle's clock: the "
+            f"{name} is a recording, and has not the vehicle's clock: the "
             f"carry needs a live camera; --part pivot needs no vehicle"
         )
     link_uri = uri if uri is not None else os.environ.get("CFLIB_URI", profile.link.uri)
     if check_uri(link_uri) == "sim":
         raise UsageError(f"vehicle {link_uri} {_SIMULATED} with -u; --part pivot needs none")
-    return spec, link_uri
+    return name.spec, link_uri
 
 
 def _places(output: Path | None, name: str, force: bool, live: bool) -> tuple[Path, Path]:
@@ -367,7 +366,7 @@ def _recorded(
 
     Raises:
         Interrupted: Ctrl-C. SafetyAbort: the motors turn.
-        Those of `open_source`, `MotionLink.connect` and `capture`.
+        Those of `open_camera`, `MotionLink.connect` and `capture`.
     """
     start_s = time.monotonic()
 
@@ -377,8 +376,7 @@ def _recorded(
     tapes: list[MountingTape] = []
     with contextlib.ExitStack() as stack:
         # Its pictures keep the camera's own time: what is taken off it is what is measured.
-        timeout_s = profile.camera.start_timeout_s
-        frames = open_source(source, 0.0, camera.size_px, now, timeout_s, config=profile.camera)
+        frames = open_camera(source, now, profile.camera, size_px=camera.size_px, latency_s=0.0)
         stack.callback(frames.close)
         check_size(frames.size_px, camera, frames.describe())
         sensors = VehicleSensors()

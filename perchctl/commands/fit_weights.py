@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import open_source
+from perchctl.camera import open_camera
 from perchctl.commands.command_line import (
     Command,
     ForceOption,
@@ -325,8 +325,7 @@ def _collect_with_person(
     def now() -> float:
         return time.monotonic() - start_s
 
-    config = profile.camera
-    spec = config.source if source is None else source
+    spec = profile.camera.source if source is None else source
     if spec.startswith("sim:"):
         raise UsageError(
             "the simulator has the truth itself: add --truth sim, or name a real camera "
@@ -335,10 +334,7 @@ def _collect_with_person(
     with ExitStack() as stack:
         poses = _open_truth(truth, profile, **given)
         stack.callback(poses.close)
-        frame_source = open_source(
-            spec, config.start_latency_s, camera.size_px, now, config.start_timeout_s,
-            config=config,
-        )  # fmt: skip
+        frame_source = open_camera(spec, now, profile.camera, size_px=camera.size_px)
         stack.callback(frame_source.close)
         experiment = Experiment(
             _open_session(path, frames), frame_source, profile, camera, poses,

@@ -37,11 +37,10 @@ from perchctl.commands.page import page_port
 from perchctl.commands.picture_edges import picture_edges
 from perchctl.commands.positioning import positioned
 from perchctl.display import (
-    DisplayWatcher,
     FlightPage,
     failed_card,
     flight_page,
-    make_reporter,
+    open_panel,
     summary_card,
 )
 from perchctl.errors import (
@@ -192,7 +191,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
         options.log_dir, options.profile, options.uri, options.source, simulated_seed,
         options.record,
     )  # fmt: skip
-    reporter = make_reporter(stream=sys.stderr)
+    panel = open_panel(stream=sys.stderr)
     merges = ""
     if options.profile.merge.method == "weights":
         merges = f"; merges with {weights_text(options)}"
@@ -203,7 +202,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
     with unheeded(), contextlib.ExitStack() as stack:
         try:
             page = stack.enter_context(live_page(options, port, switch))
-            result = _session(options, log, DisplayWatcher(reporter), switch, page, asks)
+            result = _session(options, log, panel, switch, page, asks)
         except BaseException as error:
             # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
             if page is not None:
@@ -211,7 +210,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
             log.abandon(str(error) or type(error).__name__)
             raise
         finally:
-            reporter.close()
+            panel.close()
         perched = result.report.phase is Phase.PERCHED
         summary = log.close(result.report, result.miss_m if perched else None)
         assert summary is not None

@@ -20,12 +20,8 @@ from pydantic import ValidationError
 
 from perchctl.calibration import load_calibration
 from perchctl.camera import (
-    ALLOWED_SOURCES,
-    SCHEMES,
-    aideck_address,
-    is_live,
+    parse_source,
     profile_record,
-    scheme_of,
     without_password,
     without_passwords,
 )
@@ -382,17 +378,20 @@ def _simulated(answers: Texts) -> bool:
 
 
 def _source(text: str, answers: Texts) -> str:
-    if scheme_of(text) not in SCHEMES or re.fullmatch(r"camera:\W*(-\d*)?", text):
-        raise InvalidValue(f"{text!r} is no camera; allowed are {ALLOWED_SOURCES}")
-    if scheme_of(text) == "aideck":
-        aideck_address(text)
-    if not _simulated(answers) and (text.startswith("sim:") or not is_live(text)):
+    source = parse_source(text)
+    if source.scheme == "camera" and re.fullmatch(r"\W*(-\d*)?", source.place):
+        raise InvalidValue(f"{text!r} names no camera; write camera:N or camera:NAME")
+    if not _simulated(answers) and (source.scheme == "sim" or not source.live):
         raise InvalidValue(
-            f"{without_password(text)} is no camera that flies with {answers['uri']}; allowed are "
+            f"{source} is no camera that flies with {answers['uri']}; allowed are "
             f"camera:N, camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH, "
             f"aideck://HOST, gst:PIPELINE"
         )
     return text
+
+
+def _is_aideck(source: str) -> bool:
+    return source.lower().startswith("aideck:")
 
 
 def _calibration(text: str, _answers: Texts) -> Path | None:
@@ -590,7 +589,7 @@ def profile_keys(texts: Texts, output: Path) -> dict[str, Any]:
         "link.uri": uri,
         "link.parameters": {"stabilizer.estimator": 2},
     }
-    if scheme_of(source) == "aideck":
+    if _is_aideck(source):
         shipped = load_profile("aideck")
         keys |= {path: profile_value(shipped, path) for path in AIDECK_KEYS}
     return keys
@@ -614,7 +613,7 @@ def _validated(keys: Mapping[str, Any], output: Path) -> Profile:
 
 def _example(source: str) -> str:
     """The shipped calibration that stands in for one's own: of the size that the source has."""
-    return AIDECKS_EXAMPLE if scheme_of(source) == "aideck" else EXAMPLE
+    return AIDECKS_EXAMPLE if _is_aideck(source) else EXAMPLE
 
 
 def _calibration_name(calibration: Path | None, output: Path, source: str) -> str:

@@ -6,7 +6,7 @@ import contextlib
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,15 +16,12 @@ import typer
 
 from perchctl.calibration import SizeMissing, load_calibration
 from perchctl.camera import (
-    DEFAULT_RATE_HZ,
     FrameSource,
-    ImagesSource,
     Recording,
-    UnmirroredSource,
+    WrappedSource,
     check_size,
-    is_pictures,
-    open_source,
-    source_spec,
+    open_camera,
+    parse_source,
     without_password,
 )
 from perchctl.commands.command_line import (
@@ -73,7 +70,7 @@ app = new_app()
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """The command line on top of the profile, checked. `source` as `open_source` takes it;
+    """The command line on top of the profile, checked. `source` as `open_camera` takes it;
     `stills`: each of its pictures for itself."""
 
     source: str
@@ -165,7 +162,7 @@ def resolve(
     """What can be refused before anything is opened; None is not given. Errors: NotFound,
     InvalidValue, UsageError."""
     profile = load_profile(profile_name)
-    source = source_spec(source)
+    source = parse_source(source, files=True).spec
     stills = _are_stills(source, stills, video)
     for path, suffix in ((csv, ".csv"), (overlay, ".mp4")):
         if path is not None:
@@ -187,11 +184,11 @@ def _are_stills(source: str, stills: bool, video: bool) -> bool:
     """Files of pictures need not belong together, unless the user says so."""
     if video and stills:
         raise UsageError("--stills and --video contradict each other: give one of them")
-    if video and not is_pictures(source):
+    if video and not source.startswith("images:"):
         raise UsageError(
             f"--video is for files of pictures, and {source} gives a video anyway: leave it out"
         )
-    return stills or (is_pictures(source) and not video)
+    return stills or (source.startswith("images:") and not video)
 
 
 def track_source(
@@ -255,7 +252,7 @@ class _Input:
     number of frames."""
 
     source: FrameSource
-    paths: list[Path] | None
+    paths: Sequence[Path]
     rate_hz: float | None
     count: int | None
 
@@ -272,16 +269,12 @@ def _open(
     options: TrackOptions, size_px: tuple[int, int] | None, now: Callable[[], float]
 ) -> _Input:
     config = options.profile.camera
-    pictures_hz = STILLS_HZ if options.stills else DEFAULT_RATE_HZ
-    latency_s = config.start_latency_s
-    source = open_source(
-        options.source, latency_s, size_px, now, pictures_hz=pictures_hz, config=config
-    )
-    raw = source.inner if isinstance(source, UnmirroredSource) else source
-    paths = raw.paths if isinstance(raw, ImagesSource) else None
+    pictures_hz = STILLS_HZ if options.stills else None
+    source = open_camera(options.source, now, config, size_px=size_px, pictures_hz=pictures_hz)
+    raw = source.inner if isinstance(source, WrappedSource) else source
     if isinstance(raw, Recording):
-        return _Input(source, paths, raw.rate_hz, raw.count)
-    return _Input(source, paths, None, None)
+        return _Input(source, raw.paths, raw.rate_hz, raw.count)
+    return _Input(source, (), None, None)
 
 
 class _Run:

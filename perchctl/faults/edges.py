@@ -25,8 +25,15 @@ from perchctl.faults.effects import (
     Suspended,
     TelemetryDelayed,
 )
-from perchctl.link import BLOCKS_DELETED_AFTER_S, RESUME_PERIOD_S, MockLink, Radio
-from perchctl.sim import PROTOCOL_VERSION, CommandService, Firmware, Packet, Port
+from perchctl.link import (
+    BLOCKS_DELETED_AFTER_S,
+    RESUME_PERIOD_S,
+    MockLink,
+    Packet,
+    Port,
+    Radio,
+)
+from perchctl.sim import PROTOCOL_VERSION, CommandService, Firmware
 from perchctl.vision import Frame
 
 # --- The radio: what arrives, what does not, and what comes late -------------------------------

@@ -46,11 +46,11 @@ from perchctl.flight import (
     with_positioning,
 )
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.link import FAST_BLOCKS, MockLink, simulated_radio
+from perchctl.link import MockLink, Packet, Port, Radio
 from perchctl.log import LogWatcher, to_exact
 from perchctl.mission import Event, FlightReport, Phase, Tick, Watcher
 from perchctl.profile import Profile
-from perchctl.sim import Packet, Port, Scenario, draw_capture
+from perchctl.sim import Scenario, draw_capture, radio_bursts
 from perchctl.vision import make_pipeline
 
 AFTER_S, AFTER_IN_THE_AIR_S = 6.0, 10.0
@@ -89,7 +89,7 @@ class FaultyFlight:
         camera = profile_camera(profile.camera)
         capture = draw_capture(profile, scenario.seed)
         self._vehicle = vehicle = WatchedVehicle(scenario, camera, profile.target, capture)
-        self._radio = radio = FaultyRadio(simulated_radio(scenario))
+        self._radio = radio = FaultyRadio(Radio(radio_bursts(scenario)))
         radio.serves(vehicle.firmware)
         self._link = MockLink(vehicle, profile.link.telemetry_period_s, radio)
         source = FaultyCamera(lockstep_source(vehicle, profile), scenario.seed)
@@ -205,7 +205,7 @@ class FaultyFlight:
             uplink=uplink,
             lands=self._vehicle.firmware.planner.active,
         )
-        heard = all(self._is_heard(block, t_s) for block in FAST_BLOCKS)
+        heard = all(self._is_heard(block, t_s) for block in MockLink.FAST_BLOCKS)
         return sample._replace(astray_m=astray_m, overdue=overdue, uplink=uplink, heard=heard)
 
     def _is_heard(self, block: str, t_s: float) -> bool:

@@ -8,9 +8,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from datetime import datetime
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from perchctl.sim import CLOCK_MARGIN_S, SharedTime
+if TYPE_CHECKING:
+    from perchctl.sim import SharedTime
 
 SIM_PATIENCE_S = 5.0
 """The clock waits so long, on the wall's clock, for a simulator that does not go on: longer than
@@ -51,6 +52,7 @@ class SimulatedClock:
 
     The simulator advances it with the wall's clock. On a busy computer it stands still until the
     slower of the two has caught up, so no age grows by that. `now` may be called from any thread.
+    `margin_s`: by how much the simulator may run past the moment that the loop waits for.
     `zero_s` is its reading at the simulator's start, such that it first agrees with
     `time.monotonic`.
     """
@@ -58,10 +60,12 @@ class SimulatedClock:
     def __init__(
         self,
         shared: SharedTime,
+        margin_s: float,
         wall: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._shared, self._wall, self._sleep = shared, wall, sleep
+        self._shared, self._margin_s = shared, margin_s
+        self._wall, self._sleep = wall, sleep
         self._lock = threading.Lock()
         self._reached_s, self._moved_s = shared.reached_s, wall()
         self._now_s = self._moved_s
@@ -82,14 +86,14 @@ class SimulatedClock:
 
     def wait_until(self, t_s: float) -> None:
         if self._began_s is not None:
-            self._shared.limit_s = t_s - self.zero_s + CLOCK_MARGIN_S
+            self._shared.limit_s = t_s - self.zero_s + self._margin_s
         while (left_s := t_s - self.now()) > 0:
             self._sleep(max(left_s, _POLL_S))
 
     @contextlib.contextmanager
     def waiting_for_loop(self) -> Iterator[None]:
         """Within it each `wait_until` is the loop's sign of life, and without one simulated time
-        goes on for `CLOCK_MARGIN_S` only."""
+        goes on for `margin_s` only."""
         self._began_s = self._wall(), self.now()
         try:
             yield

@@ -7,16 +7,17 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from perchctl.calibration import profile_camera
 from perchctl.camera import FrameSource, NewestSlot, mirrored_as_profiled
 from perchctl.errors import ConnectionFailed
 from perchctl.flight.loop import FlightParts, fly
-from perchctl.geometry import yaw_of
-from perchctl.link import RESET_PARAMETER, MockLink, estimator_parameters, simulated_radio
+from perchctl.link import MockLink, Radio
 from perchctl.log import LogWatcher
 from perchctl.mission import Event, FlightReport, Operator, Phase, Tick, Watcher
-from perchctl.positioning import FeedThread, PositionFeed
-from perchctl.profile import PositioningConfig, Profile
+from perchctl.positioning import FeedThread, Placed, PositionFeed
+from perchctl.profile import Profile
 from perchctl.sim import (
     CaptureSettings,
     DeliveredFrame,
@@ -26,6 +27,7 @@ from perchctl.sim import (
     SimulatedVehicle,
     draw_capture,
     draw_scenario,
+    radio_bursts,
 )
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
@@ -185,7 +187,7 @@ def fly_lockstep(
     camera = profile_camera(profile.camera)
     capture = capture or draw_capture(profile, scenario.seed)
     vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
-    link = MockLink(vehicle, profile.link.telemetry_period_s, simulated_radio(scenario))
+    link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(radio_bursts(scenario)))
     positions = feed_lockstep(link, profile)
     source = lockstep_source(vehicle, profile)
     truth = Truth(vehicle)
@@ -288,7 +290,8 @@ def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
     """
     capture, config = link.vehicle.capture, profile.positioning
     if config.by == "target":
-        _start_at(link, config, 0.0, 0.0, profile.safety.ground_z_m, 0.0)
+        origin_m = np.array([0.0, 0.0, profile.safety.ground_z_m])
+        link.settle(config, Placed(link.now_s, origin_m, np.eye(3)))
         return None
     if capture is None or config.by != "mocap":
         return None
@@ -301,16 +304,5 @@ def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
             why = feed.status(link.now_s).problem or f"nothing comes from {config.label}"
             raise ConnectionFailed(f"no position within {FIRST_FRAME_S:g} s: {why}")
         link.advance_to(link.now_s + FeedThread.PERIOD_S)
-    x, y, z = (float(part) for part in place.position_m)
-    _start_at(link, config, x, y, z, yaw_of(place.R))
+    link.settle(config, place)
     return feed
-
-
-def _start_at(
-    link: MockLink, config: PositioningConfig, x_m: float, y_m: float, z_m: float, yaw_rad: float
-) -> None:
-    start = {"X": x_m, "Y": y_m, "Z": z_m, "Yaw": yaw_rad}
-    initial = {f"kalman.initial{name}": value for name, value in start.items()}
-    for name, value in (estimator_parameters(config) | initial | {RESET_PARAMETER: 1}).items():
-        link.vehicle.firmware.set_parameter(name, value)
-    link.vehicle.firmware.set_parameter(RESET_PARAMETER, 0)

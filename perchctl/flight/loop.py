@@ -26,7 +26,7 @@ from perchctl.flight.preflight import (
 from perchctl.flight.rescue import Rescued, rescue
 from perchctl.flight.turns import Turns
 from perchctl.flight.watchdog import Watchdog
-from perchctl.link import FRESH_S, Link
+from perchctl.link import Link
 from perchctl.mission import (
     FLYING_PHASES,
     RESCUE,
@@ -58,7 +58,7 @@ from perchctl.mission import (
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vehicle import LOCKED, Command, Idle, is_battery_reading
+from perchctl.vehicle import FRESH_S, LOCKED, Command, Idle, is_battery_reading
 from perchctl.vision import Consistency, Pipeline
 
 HUNG_S = 0.25

@@ -10,15 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import (
-    ALLOWED_SOURCES,
-    SCHEMES,
-    FrameSource,
-    is_live,
-    open_source,
-    scheme_of,
-    without_password,
-)
+from perchctl.camera import FrameSource, open_camera, parse_source
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError, no_simulator
 from perchctl.flight.clock import Clock, SimulatedClock, WallClock
 from perchctl.flight.loop import FlightParts, fly
@@ -84,17 +76,15 @@ def check_options(options: FlyOptions) -> None:
     """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
     check_positioning(options.profile, simulated=options.simulated)
-    shown = without_password(options.source)
-    if scheme_of(options.source) not in SCHEMES:
-        raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED_SOURCES}")
-    if options.source.startswith("sim:") and not options.simulated:
+    source = parse_source(options.source)
+    if source.scheme == "sim" and not options.simulated:
         raise UsageError(
-            f"source {shown} belongs to the simulated vehicle, but the URI is "
+            f"source {source} belongs to the simulated vehicle, but the URI is "
             f"{options.uri}; name the camera with --source (camera:N, http://..., aideck://HOST)"
         )
-    if not is_live(options.source) and not options.simulated:
+    if not source.live and not options.simulated:
         raise UsageError(
-            f"source {shown} is a recording, and {options.uri} a real vehicle: it would "
+            f"source {source} is a recording, and {options.uri} a real vehicle: it would "
             f"be steered by pictures of another flight; fly sim://, or name a camera with --source"
         )
     if options.seed < 0:
@@ -123,15 +113,13 @@ def fly_session(
     with contextlib.ExitStack() as stack:
         uri, spec, simulated = options.uri, options.source, None
         clock: WallClock | SimulatedClock = WallClock()
+        tell: Callable[[Event], str] = _tell_nothing
         if options.simulated:
             simulated = stack.enter_context(simulated_vehicle(options, camera))
-            clock, uri = SimulatedClock(simulated.shared_time), simulated.uri
+            clock, tell = _simulated_clock(options, simulated)
+            uri = simulated.uri
             spec = simulated.stream_url if spec.startswith("sim:") else spec
-        config = profile.camera
-        source = open_source(
-            spec, config.start_latency_s, camera.size_px, clock.now, config.start_timeout_s,
-            config=config,
-        )  # fmt: skip
+        source = open_camera(spec, clock.now, profile.camera, size_px=camera.size_px)
         stack.callback(source.close)
         source = watch_source(source)
         positioning = capture_for_vehicle(
@@ -147,7 +135,7 @@ def fly_session(
             switch.listening = True
             parts = FlightParts(
                 link, source, clock, profile, pipeline, watchers, switch.read,
-                _teller(options, clock), positions, remarks,
+                tell, positions, remarks,
             )  # fmt: skip
             if isinstance(clock, WallClock):
                 report = fly(parts)
@@ -159,16 +147,6 @@ def fly_session(
             switch.listening = True  # while closing, Ctrl-C must not cut the wait short
             link.close()
         return SessionResult(report, miss_m=_true_miss_m(simulated))
-
-
-def _teller(options: FlyOptions, clock: Clock) -> Callable[[Event], str]:
-    """What the simulated scenario did, by the time at which the simulation was then."""
-    if not isinstance(clock, SimulatedClock):
-        return lambda event: ""
-    from perchctl.sim import EventExplainer, draw_scenario
-
-    tell = EventExplainer(draw_scenario(options.profile, options.seed))
-    return lambda event: tell(event, event.t_s - clock.zero_s)
 
 
 def _true_miss_m(simulated: SimProcess | None) -> float | None:
@@ -192,6 +170,22 @@ def simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
         target=options.profile.target,
         capture=draw_capture(options.profile, options.seed),
     )
+
+
+def _tell_nothing(event: Event) -> str:
+    """A real flight has no scenario."""
+    return ""
+
+
+def _simulated_clock(
+    options: FlyOptions, simulated: SimProcess
+) -> tuple[SimulatedClock, Callable[[Event], str]]:
+    """The simulated vehicle's time, and what its scenario did at the time of an event."""
+    from perchctl.sim import CLOCK_MARGIN_S, EventExplainer, draw_scenario
+
+    clock = SimulatedClock(simulated.shared_time, CLOCK_MARGIN_S)
+    tell = EventExplainer(draw_scenario(options.profile, options.seed))
+    return clock, lambda event: tell(event, event.t_s - clock.zero_s)
 
 
 # --- The operator's commands: Ctrl-C, the other signals, and the live page's STOP button -------

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from perchctl.link import is_cut, knows_its_position
 from perchctl.mission import Observation, Operator, Phase, PlannerState, step_landing
 from perchctl.perception import History, add_samples
 from perchctl.profile import Profile
@@ -25,6 +24,8 @@ from perchctl.vehicle import (
     PositionSetpoint,
     RawThrust,
     Telemetry,
+    is_cut,
+    knows_its_position,
 )
 
 REPEAT_AFTER_S = 0.3

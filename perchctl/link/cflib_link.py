@@ -15,25 +15,23 @@ from collections.abc import Callable
 
 from perchctl.errors import ConnectionFailed
 from perchctl.link.connection import Connection, open_connection, send_packets
-from perchctl.link.encode import (
+from perchctl.link.crtp import (
     ARM,
     UNLOCK_PERIOD_S,
     UNLOCK_THRUST,
     UNLOCK_TIMES,
+    Packet,
     encode,
     encode_external,
 )
-from perchctl.link.evidence import is_known, may_fly
-from perchctl.link.log_blocks import LogBlocks
-from perchctl.link.outside import Feed, Settling, estimator_parameters
-from perchctl.link.prepare import check_firmware, set_parameters
+from perchctl.link.external_position import NEEDED_BY, Feed, Settling, estimator_parameters
+from perchctl.link.firmware import check_firmware, measured_by, set_parameters
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
+from perchctl.link.telemetry import LogBlocks
 from perchctl.link.uri import check_uri
-from perchctl.link.variables import measured_by
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig, PositioningConfig
-from perchctl.sim import Packet
 from perchctl.vehicle import (
     ARMED,
     FLYING,
@@ -43,6 +41,8 @@ from perchctl.vehicle import (
     MeasuredBy,
     RawThrust,
     Telemetry,
+    is_known,
+    may_fly,
 )
 
 SILENCE_S = 1.5
@@ -109,17 +109,15 @@ class CflibLink:
             return False
 
     def settle(self, feed: Feed) -> None:
-        """Start the estimator where the capture that `feed` is of sees the vehicle. On the
-        ground, after `connect`; bounded. Errors: those of `perchctl.link.outside.Settling`."""
+        """Start the estimator where `feed` says that the vehicle is. On the ground, after
+        `connect`; bounded. Errors: ConnectionFailed, NotFound, InvalidValue, TimedOut."""
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
-        Settling(
-            self.connection.cf,
-            self._uri,
-            self._positioning,
-            lambda: self._blocks.newest,
+        settling = Settling(
+            self.connection.cf, self._uri, self._positioning, lambda: self._blocks.newest,
             self._clock,
-        ).settle(feed)
+        )  # fmt: skip
+        settling.settle(feed)
 
     def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
         self._guard, self._told = guard, told
@@ -166,7 +164,7 @@ class CflibLink:
             connection.cf,
             self._uri,
             estimator_parameters(self._positioning),
-            needed_by="positioning from outside",
+            needed_by=NEEDED_BY,
         )
         self._sender = Sender(
             self._hand_over,
@@ -175,7 +173,7 @@ class CflibLink:
             lambda sent: self._told(sent),
             pieces=encode,
             tend=self._tend,
-            spare=self._resume_logging,
+            spare=lambda: self._blocks.resume(self._hand_over),
         )
 
     def _start_logging(self, connection: Connection) -> None:
@@ -210,10 +208,6 @@ class CflibLink:
     def _hand_over(self, packet: Packet) -> bool:
         """In the sender's thread."""
         return self.connection is not None and self.connection.send(packet)
-
-    def _resume_logging(self) -> bool:
-        """In the sender's thread."""
-        return self._blocks.resume(self._hand_over)
 
     def _tend(self, stuck_s: float, hangs: bool) -> None:
         """See to the link, in the thread of the sender's that never touches cflib."""

@@ -1,53 +1,80 @@
-"""The lockstep sibling of the cflib link: same protocol, same packets, no wall clock.
-
-`MockLink` flies a `SimulatedVehicle`; `ScriptedLink` plays back a list of
-telemetry and records the commands.
-"""
+"""The lockstep sibling of the cflib link: same protocol, same packets, no wall clock."""
 
 from __future__ import annotations
 
 import heapq
 import itertools
 import math
-from collections import deque
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
-from perchctl.errors import ConnectionFailed
-from perchctl.link.assemble import BLOCKS, FAST_BLOCKS, SLOW_PERIOD_S, Assembler
-from perchctl.link.encode import (
+from perchctl.link.crtp import (
     UNLOCK_PERIOD_S,
     UNLOCK_THRUST,
     UNLOCK_TIMES,
+    Packet,
     encode,
     encode_external,
 )
+from perchctl.link.external_position import (
+    RESET_PARAMETER,
+    estimator_parameters,
+    start_parameters,
+)
+from perchctl.link.firmware import EXTERNAL_POSITION_TICK, LISTEN_S, decks_found
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
-from perchctl.link.variables import EXTERNAL_POSITION_TICK, LISTEN_S, decks_found
+from perchctl.link.telemetry import BLOCKS, FAST_BLOCKS, SLOW_PERIOD_S, Assembler
 from perchctl.mission import SentCommand
-from perchctl.sim import PROTOCOL_VERSION, CommandService, Packet
+from perchctl.positioning import Placed
+from perchctl.profile import PositioningConfig
 from perchctl.values import replace
 from perchctl.vehicle import FLYING, Command, ExternalPosition, MeasuredBy, Telemetry
-
-if TYPE_CHECKING:
-    from perchctl.sim import SimulatedVehicle
-from perchctl.sim import Bursts, Scenario, radio_bursts
 
 TELEMETRY_DELAY_S = 0.01
 SETTLE_S = 1.0
 WATCH_PERIOD_S = 0.05
 
 
+class Bursts(Protocol):
+    """When a radio loses what is sent."""
+
+    def lost(self, t_s: float) -> bool:
+        """True if a packet of that time is lost. The times never go back."""
+
+
 class Radio:
-    """What becomes of the packets of both directions; this one loses none."""
+    """What becomes of the packets of both directions; loses those of `bursts`, or none."""
+
+    def __init__(self, bursts: Bursts | None = None) -> None:
+        self._bursts = bursts
 
     def up(self, packet: Packet, now_s: float) -> bool:
-        """Whether it arrives at the vehicle."""
-        return True
+        """True if the packet arrives at the vehicle."""
+        return self._bursts is None or not self._bursts.lost(now_s)
 
     def down(self, block: str, now_s: float) -> float | None:
         """After how many seconds a log block's packet arrives; None when it is lost."""
-        return TELEMETRY_DELAY_S
+        lost = self._bursts is not None and self._bursts.lost(now_s)
+        return None if lost else TELEMETRY_DELAY_S
+
+
+class MockVehicle(Protocol):
+    """A vehicle on simulated time: packets in, log variables out (`perchctl.sim`)."""
+
+    firmware: Any
+    """Its model: log variables and parameters by name."""
+    capture: Any
+    """Its motion capture, None without one."""
+
+    @property
+    def t_s(self) -> float:
+        """Simulated time since the start."""
+
+    def advance_to(self, t_s: float) -> None:
+        """Let the time pass until then."""
+
+    def receive(self, packet: Packet) -> None:
+        """Take a packet as it comes from the radio."""
 
 
 class MockLink:
@@ -57,15 +84,16 @@ class MockLink:
     telemetry comes in the same log blocks, through the same assembler, as by radio.
     """
 
+    FAST_BLOCKS = FAST_BLOCKS
+
     def __init__(
         self,
-        vehicle: SimulatedVehicle,
+        vehicle: MockVehicle,
         telemetry_period_s: float = 0.01,
         radio: Radio | None = None,
     ) -> None:
         self.vehicle = vehicle
         self.radio = radio or Radio()
-        self._service = CommandService(vehicle.firmware, PROTOCOL_VERSION)
         self._assembler = Assembler()
         self._periods_s = {
             name: telemetry_period_s if name in FAST_BLOCKS else SLOW_PERIOD_S for name in BLOCKS
@@ -153,6 +181,14 @@ class MockLink:
         self._hand_over((encode_external(place),))
         return True
 
+    def settle(self, config: PositioningConfig, start: Placed) -> None:
+        """Set the estimator to positions from outside, and start it there."""
+        firmware = self.vehicle.firmware
+        parameters = estimator_parameters(config) | start_parameters(start)
+        for name, value in (parameters | {RESET_PARAMETER: 1}).items():
+            firmware.set_parameter(name, value)
+        firmware.set_parameter(RESET_PARAMETER, 0)
+
     def problem(self, now_s: float) -> str | None:
         return None
 
@@ -165,7 +201,7 @@ class MockLink:
     def _hand_over(self, packets: Iterable[Packet]) -> None:
         for packet in packets:
             if self.radio.up(packet, self.now_s):
-                self._service.handle(packet)
+                self.vehicle.receive(packet)
 
     def _send_down(self, block: str) -> None:
         firmware = self.vehicle.firmware
@@ -178,72 +214,3 @@ class MockLink:
             arrives_s, number = self.now_s + delay_s, next(self._count)
             packet = (arrives_s, number, block, self.now_s, values, self._start)
             heapq.heappush(self._under_way, packet)
-
-
-class ScriptedLink:
-    """Plays telemetry by time and records commands: for tests of the flight loop."""
-
-    def __init__(
-        self, telemetry: Iterable[Telemetry], *, refuse: str = "", dies_at_s: float = math.inf
-    ) -> None:
-        self._script = deque(telemetry)
-        self._refuse = refuse
-        self._dies_at_s = dies_at_s
-        self.now_s = 0.0
-        self.sent: list[tuple[float, Command]] = []
-        self.places: list[tuple[float, ExternalPosition]] = []
-        self.closed = False
-
-    def advance_to(self, t_s: float) -> None:
-        self.now_s = t_s
-
-    def connect(self) -> None:
-        if self._refuse:
-            raise ConnectionFailed(self._refuse)
-
-    def measured_by(self) -> MeasuredBy:
-        return MeasuredBy(("bcFlow2",))
-
-    def telemetry(self) -> list[Telemetry]:
-        arrived = []
-        while self._script and self._script[0].t_s <= self.now_s:
-            arrived.append(self._script.popleft())
-        return arrived
-
-    def send(self, command: Command) -> None:
-        self.sent.append((self.now_s, command))
-
-    def problem(self, now_s: float) -> str | None:
-        return "the script ended the link" if now_s >= self._dies_at_s else None
-
-    def external(self, place: ExternalPosition) -> bool:
-        self.places.append((self.now_s, place))
-        return True
-
-    def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
-        self.watchdog, self.told = guard, told
-
-    def close(self) -> None:
-        self.closed = True
-
-
-# --- The lockstep's radio in a scenario that loses packets by bursts, both ways ----------------
-
-
-class BurstyRadio(Radio):
-    """Loses what is sent while a burst lasts."""
-
-    def __init__(self, bursts: Bursts) -> None:
-        self._bursts = bursts
-
-    def up(self, packet: Packet, now_s: float) -> bool:
-        return not self._bursts.lost(now_s) and super().up(packet, now_s)
-
-    def down(self, block: str, now_s: float) -> float | None:
-        return None if self._bursts.lost(now_s) else super().down(block, now_s)
-
-
-def simulated_radio(scenario: Scenario) -> Radio:
-    """As the scenario has it."""
-    bursts = radio_bursts(scenario)
-    return Radio() if bursts is None else BurstyRadio(bursts)

@@ -18,10 +18,8 @@ from perchctl.errors import NotFound, TimedOut
 from perchctl.geometry import Array
 from perchctl.link.cflib_link import SILENCE_S, EstimateLink
 from perchctl.link.connection import Connection
-from perchctl.link.log_blocks import FIRST_SAMPLE_TIMEOUT_S, start_block
-from perchctl.link.prepare import check_firmware
-from perchctl.link.telemetry import VARIANCE_BLOCK
-from perchctl.link.timebase import Timebase
+from perchctl.link.firmware import check_firmware
+from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S, VARIANCE_BLOCK, Timebase, start_block
 from perchctl.profile import LinkConfig
 from perchctl.vehicle import FLYING
 

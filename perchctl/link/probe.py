@@ -1,4 +1,4 @@
-"""A vehicle's link, looked at: what it answers, what it holds, how good the radio is.
+"""A vehicle's link, looked at: which vehicles answer, what one holds, how good the radio is.
 
 Nothing that is sent here flies, arms or turns a motor, but `start_health_test`.
 """
@@ -16,11 +16,11 @@ from typing import Any, Literal
 
 from perchctl.errors import NotFound, TimedOut
 from perchctl.link.cflib_link import EstimateLink
-from perchctl.link.connection import Connection, send_packets
-from perchctl.link.prepare import missing_variables
-from perchctl.link.variables import has_variable, parameters, variables
+from perchctl.link.connection import Connection, plain_cause, ready_cflib, send_packets
+from perchctl.link.crtp import Packet, Port
+from perchctl.link.firmware import has_variable, missing_variables, parameters, variables
+from perchctl.link.uri import FORMS, with_whole_address
 from perchctl.profile import LinkConfig
-from perchctl.sim import Packet, Port
 from perchctl.vehicle import Telemetry
 
 ANSWER_S = 0.5
@@ -168,3 +168,67 @@ class ProbeLink(EstimateLink):
 
 
 _ECHO = struct.Struct("<BQ")  # as long as cflib's own, which it takes all of them for
+
+
+# --- Which vehicles answer: channels, rates and addresses of the radio, USB, and UDP -----------
+
+
+SCAN_TIMEOUT_S = 20.0
+USUAL_ADDRESS = 0xE7E7E7E7E7
+
+
+@dataclass(frozen=True)
+class ScanResult:
+    """The URIs that answered; `radio` is why no radio was asked, empty where one was."""
+
+    uris: tuple[str, ...]
+    radio: str = ""
+
+
+def address_of(uri: str) -> int | None:
+    """A radio's address, of five bytes; None of another URI, or where it is the usual one."""
+    parts = uri.partition("?")[0].split("/")
+    if not uri.startswith("radio://") or len(parts) < 6:
+        return None
+    address = int(parts[5], 16)
+    return None if address == USUAL_ADDRESS else address
+
+
+def find_vehicles(
+    addresses: Iterable[int | None] = (), timeout_s: float = SCAN_TIMEOUT_S
+) -> ScanResult:
+    """What answers now at the usual address and at these; sends null packets only.
+
+    A radio's driver may hang: it gets a thread, and what came by then counts.
+    """
+    asked = list(dict.fromkeys((None, *addresses)))
+    found: list[str] = []
+    why: list[str] = ["the radio did not answer in time"]
+
+    def run() -> None:
+        from cflib import crtp
+
+        ready_cflib()
+        with contextlib.suppress(Exception):  # whatever the driver raises
+            why[0] = _radio_problem()
+        for driver in crtp.CLASSES:
+            for address in asked:
+                with contextlib.suppress(Exception):
+                    found.extend(uri for uri, _ in driver().scan_interface(address))
+
+    worker = threading.Thread(target=run, name="perchctl-scan", daemon=True)
+    worker.start()
+    worker.join(timeout_s)
+    uris = (uri for uri in dict.fromkeys(found) if uri.partition("://")[0] in FORMS)
+    return ScanResult(tuple(map(with_whole_address, uris)), why[0])
+
+
+def _radio_problem() -> str:
+    from cflib.drivers.crazyradio import Crazyradio
+
+    try:
+        Crazyradio().close()
+    except Exception as error:
+        cause = plain_cause(str(error) or "Cannot find a Crazyradio Dongle")
+        return cause.partition("\n")[0].rstrip(".")
+    return ""

@@ -1,4 +1,4 @@
-"""A Crazyflie's log variables, and their one conversion into `Telemetry`.
+"""Telemetry by cflib's log blocks: their variables, and the samples that their packets make.
 
 Here, and only here, degrees become radians and the Crazyflie's nose-up pitch
 becomes the right-handed nose-down one (docs/firmware.md, "Signs and units").
@@ -7,8 +7,14 @@ becomes the right-handed nose-down one (docs/firmware.md, "Signs and units").
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import struct
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
 
+from perchctl.errors import NotFound, TimedOut
+from perchctl.link.crtp import Packet, Port
 from perchctl.vehicle import Telemetry
 
 STATE_BLOCK: dict[str, str] = {
@@ -79,3 +85,259 @@ def telemetry_from(
         acc_y_g=values["acc.y"],
         start=start,
     )
+
+
+# --- The vehicle's milliseconds on the loop's clock --------------------------------------------
+
+
+WRAP_MS = 1 << 24
+"""Log time stamps have three bytes (docs/firmware.md, "Link")."""
+CLOCK_SKEW = 1e-4
+"""How fast the two clocks may run apart: far above a crystal's, far below a fault's."""
+REBOOTED_MS = 1000
+"""Stamps that fall back by more are those of another start; packets overtake by far less."""
+
+
+class Timebase:
+    """Maps log time stamps to the loop's clock by the fastest delivery seen so far.
+
+    The smallest difference between arrival and stamp belongs to the packet that
+    waited least; it may grow slowly, so that a drifting clock is followed. A vehicle that has
+    started again is followed from its first stamp on; `start` counts how often it has.
+    """
+
+    def __init__(self) -> None:
+        self.start = 0
+        self._last_ms: int | None = None
+        self._unwrapped_ms = 0
+        self._offset_s: float | None = None
+        self._last_arrival_s = 0.0
+
+    def to_loop_s(self, stamp_ms: int, arrival_s: float) -> float:
+        if self._last_ms is None:
+            self._unwrapped_ms = stamp_ms
+        else:
+            step = (stamp_ms - self._last_ms) % WRAP_MS
+            step = step - WRAP_MS if step > WRAP_MS // 2 else step
+            self._unwrapped_ms += step
+            if step < -REBOOTED_MS:
+                self._offset_s = None
+                self.start += 1
+        self._last_ms = stamp_ms
+        offset_s = arrival_s - self._unwrapped_ms / 1000.0
+        if self._offset_s is None:
+            self._offset_s = offset_s
+        else:
+            allowed = self._offset_s + CLOCK_SKEW * max(0.0, arrival_s - self._last_arrival_s)
+            self._offset_s = min(offset_s, allowed)
+        self._last_arrival_s = arrival_s
+        return self._unwrapped_ms / 1000.0 + self._offset_s
+
+
+# --- From the packets of the log blocks to samples: for the radio's and for the simulated ones --
+
+
+BLOCKS: dict[str, dict[str, str]] = {
+    "battery": BATTERY_BLOCK,
+    "variance": VARIANCE_BLOCK,
+    "state": STATE_BLOCK,
+    "attitude": ATTITUDE_BLOCK,
+}
+"""In the order in which those of one time are sent, what completes a sample last."""
+FAST_BLOCKS = ("state", "attitude")
+"""A sample needs these; the others come ten times a second, where the firmware has them."""
+SLOW_PERIOD_S = 0.1
+MOST_CARRIED_S = 0.05
+
+
+class Assembler:
+    """Puts the newest values of all blocks together.
+
+    A block that stops coming leaves its values behind. The attitude's block makes the sample,
+    so its end is the end of the samples; what the position's block lacks in age is written
+    into the sample (`Telemetry.behind_s`), since frozen numbers look like a vehicle at rest.
+    """
+
+    def __init__(self) -> None:
+        self._values: dict[str, float] = {}
+        self._state_s: float | None = None
+        self._start = 0
+
+    def accept(
+        self, block: str, values: Mapping[str, float], t_s: float, start: int = 0
+    ) -> Telemetry | None:
+        """One packet of a block, its stamp on the loop's clock and the vehicle's start that it is
+        from; the sample that it completes. What a vehicle told before it started anew is over."""
+        if start < self._start:
+            return None
+        if start > self._start:
+            self._start, self._state_s = start, None
+        self._values.update(values)
+        if block == "state":
+            self._state_s = t_s
+        if block != "attitude" or self._state_s is None or self.missing():
+            return None
+        behind_s = t_s - self._state_s
+        return telemetry_from(_carried(self._values, behind_s), t_s, max(0.0, behind_s), start)
+
+    def missing(self) -> list[str]:
+        """The needed variables of which nothing has come yet."""
+        return [name for name in NEEDED if name not in self._values]
+
+
+def _carried(values: Mapping[str, float], ahead_s: float) -> dict[str, float]:
+    """The position block carried on to the attitude block's time by its velocity."""
+    carried = dict(values)
+    step_s = max(-MOST_CARRIED_S, min(MOST_CARRIED_S, ahead_s))
+    for axis in "xyz":
+        carried[f"stateEstimate.{axis}"] += values[f"stateEstimate.v{axis}"] * step_s
+    return carried
+
+
+# --- cflib's log blocks: started, collected by cflib's thread, and started again after a silence
+# in which the vehicle has forgotten them.
+
+
+FIRST_SAMPLE_TIMEOUT_S = 3.0
+AWAIT_SLOW_S = 1.0
+"""The first sample waits that long for the slow blocks."""
+BLOCKS_DELETED_AFTER_S = 1.0
+"""A vehicle that hears no radio for so long deletes its log blocks (docs/firmware.md, "Radio
+silence")."""
+RESUME_PERIOD_S = 0.25
+"""Longer than the slowest block's period: one that was started shows by then."""
+MOST_SAMPLES = 2000
+_SETTINGS, _CREATE, _START = 1, 6, 3  # channel of the log port, and commands
+_PREFIX = "perch_"
+
+
+class LogBlocks:
+    """Samples on the loop's clock.
+
+    The callbacks run in cflib's thread; they take the values and return. `newest` is the
+    last sample, None before the first; `last_arrival_s` is when data last came.
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._timebase = Timebase()
+        self._assembler = Assembler()
+        self._samples: deque[Telemetry] = deque(maxlen=MOST_SAMPLES)
+        self._first_sample = threading.Event()
+        self._awaited: set[str] = set()  # slow blocks without data so far
+        self._started_s = 0.0
+        self._starting: dict[str, list[Packet]] = {}  # what starts each block
+        self._arrived_s: dict[str, float] = {}  # of each block
+        self._resuming: deque[Packet] = deque()  # what has still to go out
+        self._resumed_s = 0.0
+        self.last_arrival_s = 0.0
+        self.newest: Telemetry | None = None
+
+    def start(self, log: Any, uri: str, period_s: float) -> None:
+        """Start the blocks in cflib's `log` and wait for the first sample.
+
+        Raises NotFound for a refused block, TimedOut.
+        """
+        self._started_s = self._clock()
+        for name, variables in BLOCKS.items():
+            if name in FAST_BLOCKS:
+                block = start_block(log, uri, name, variables, period_s, self._on_data)
+            elif all(log.toc.get_element_by_complete_name(n) is not None for n in variables):
+                self._awaited.add(name)
+                block = start_block(log, uri, name, variables, SLOW_PERIOD_S, self._on_data)
+            else:
+                continue
+            self._starting[name] = _starting(log, block)
+        if not self._first_sample.wait(FIRST_SAMPLE_TIMEOUT_S):
+            missing = self._assembler.missing()
+            raise TimedOut(
+                f"{uri} is connected but sends no telemetry "
+                f"(missing: {', '.join(missing) or 'none'})"
+            )
+
+    def take(self) -> list[Telemetry]:
+        """Samples that arrived since the last call, oldest first."""
+        arrived = []
+        while self._samples:
+            arrived.append(self._samples.popleft())
+        return arrived
+
+    @property
+    def waiting(self) -> list[Telemetry]:
+        """Samples that the next `take` gives, from any thread."""
+        return list(self._samples.copy())
+
+    def resume(self, send: Callable[[Packet], bool]) -> bool:
+        """Start the blocks again that come no more: one packet, whether it went out.
+
+        To be called whenever there is room for one, from one thread. `send` must not wait. A
+        vehicle that still has a block answers that it exists, and starts it again all the same.
+        """
+        now_s = self._clock()
+        if not self._resuming and now_s - self._resumed_s > RESUME_PERIOD_S:
+            for name, packets in self._starting.items():
+                if now_s - self._arrived_s.get(name, self._started_s) > BLOCKS_DELETED_AFTER_S:
+                    self._resuming.extend(packets)
+        if not self._resuming or not send(self._resuming[0]):
+            return False
+        self._resuming.popleft()
+        self._resumed_s = now_s
+        return True
+
+    def _on_data(self, stamp: int, data: dict[str, float], block: Any) -> None:
+        now_s = self._clock()
+        self.last_arrival_s = now_s
+        name = block.name.removeprefix(_PREFIX)
+        self._awaited.discard(name)
+        self._arrived_s[name] = now_s
+        sent_s = self._timebase.to_loop_s(stamp, now_s)
+        sample = self._assembler.accept(name, data, sent_s, self._timebase.start)
+        if sample is None or (self._awaited and now_s < self._started_s + AWAIT_SLOW_S):
+            return  # the first sample is to contain the battery too
+        self.newest = sample
+        self._samples.append(sample)
+        self._first_sample.set()
+
+
+def start_block(
+    log: Any,
+    uri: str,
+    name: str,
+    variables: Mapping[str, str | None],
+    period_s: float,
+    on_data: Callable[[int, dict[str, float], Any], None],
+) -> Any:
+    """Start a block in cflib's `log` and return it.
+
+    `variables`: their types by name, None: as the firmware has it. `period_s` is rounded to 10 ms.
+    `on_data` gets the stamp in ms, the values by name and the block. Raises NotFound for a refused
+    block.
+    """
+    from cflib.crazyflie.log import LogConfig
+
+    period_ms = max(10, 10 * round(period_s * 100))
+    block = LogConfig(name=_PREFIX + name, period_in_ms=period_ms)
+    for variable, ctype in variables.items():
+        block.add_variable(variable, ctype)
+    try:
+        log.add_config(block)
+    except (KeyError, AttributeError) as error:
+        raise NotFound(f"log block {name} is refused by {uri}: {error}") from None
+    block.data_received_cb.add_callback(on_data)
+    block.start()
+    return block
+
+
+def _starting(log: Any, block: Any) -> list[Packet]:
+    """The packets by which cflib has a new block created and started (docs/firmware.md, "Log
+    blocks"): one each, since none of perchctl's has more than nine variables."""
+    variables = b"".join(
+        struct.pack(
+            "<BH", variable.get_storage_and_fetch_byte(), log.toc.get_element_id(variable.name)
+        )
+        for variable in block.variables
+    )
+    return [
+        Packet(Port.LOG, _SETTINGS, bytes((_CREATE, block.id)) + variables),
+        Packet(Port.LOG, _SETTINGS, bytes((_START, block.id, block.period))),
+    ]

@@ -16,6 +16,7 @@ FORMS = {
 }
 MOST_CHANNEL, RATES = 125, ("250K", "1M", "2M")
 ADDRESS_DIGITS = 10
+_USUAL = ("2", "2M", "E7E7E7E7E7")  # channel, rate and address of a radio's URI that names none
 EXAMPLES = "sim://, radio://0/80/2M/E7E7E7E7E7, usb://0, udp://127.0.0.1:19850"
 
 UDEV_HELP = """\
@@ -70,3 +71,16 @@ def with_whole_address(uri: str) -> str:
         lambda found: found[1] + found[2].zfill(ADDRESS_DIGITS),
         uri,
     )
+
+
+def vehicle_uri(uri: str) -> str:
+    """The URI without what does not tell vehicles apart: a radio's dongle, case, options."""
+    scheme, _, rest = uri.partition("?")[0].partition("://")
+    scheme = scheme.lower()
+    if scheme == "radio":
+        given = [part for part in rest.split("/")[1:4] if part]
+        channel, rate, address = (*given, *_USUAL[len(given) :])
+        return f"radio/{int(channel)}/{rate.upper()}/{address.upper().zfill(len(_USUAL[2]))}"
+    if scheme != "serial":  # whose place is a file, and its case tells
+        rest = rest.lower()
+    return f"{scheme}/{re.sub('^localhost(?=:|$)', '127.0.0.1', rest)}"

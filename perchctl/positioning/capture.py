@@ -38,7 +38,7 @@ from perchctl.errors import (
     broken_motion_capture,
     no_motion_capture,
 )
-from perchctl.positioning.types import BodyPose, CaptureFrame
+from perchctl.positioning.feed import BodyPose, CaptureFrame
 from perchctl.profile import CAPTURE_SYSTEMS, PositioningConfig, host_fault
 
 SILENT_S = 0.3
@@ -102,7 +102,7 @@ def open_capture(
 
 
 class MotionCapture:
-    """`perchctl.positioning.types.CaptureSource`; its process ends with it."""
+    """`perchctl.positioning.feed.CaptureSource`; its process ends with it."""
 
     def __init__(
         self,

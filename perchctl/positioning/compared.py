@@ -13,9 +13,11 @@ import contextlib
 import hashlib
 import itertools
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict, ValidationError
 
 from perchctl.errors import InvalidValue
 from perchctl.files import write_files
@@ -31,10 +33,11 @@ MOST_OTHERS = 200
 AGAIN = "run perchctl check --lift, lift the vehicle and turn it by hand"
 
 
-@dataclass(frozen=True)
-class SetUp:
+class SetUp(BaseModel):
     """What a comparison is true of: another vehicle, capture, body or turn of its axes is another
-    one. `vehicle`: as `perchctl.link.claim.vehicle_uri` has it."""
+    one. `vehicle`: as `perchctl.link.vehicle_uri` has it."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     vehicle: str
     system: str
@@ -55,38 +58,23 @@ class ComparisonRecord:
 
 
 @dataclass(frozen=True)
-class NeverCompared(ComparisonRecord):
-    """There is no record."""
+class NoComparison(ComparisonRecord):
+    """There is no record, or none that can be read: what was found, and what to do."""
+
+    found: str
+    advice: str
 
     def objection(self, now: datetime) -> tuple[str, str] | None:
-        return "the motion capture was never compared with this vehicle", f"{AGAIN}, once"
+        return self.found, self.advice
 
 
-@dataclass(frozen=True)
-class OthersCompared(ComparisonRecord):
-    """Records there are of this very capture and body, and of other vehicles only."""
-
-    vehicle: str
-    others: tuple[str, ...]
-
-    def objection(self, now: datetime) -> tuple[str, str] | None:
-        found = (
-            f"the motion capture was compared with another vehicle ({', '.join(self.others)}), "
-            f"and never with this one ({self.vehicle})"
-        )
-        return found, f"{AGAIN}, once"
+NEVER = NoComparison("the motion capture was never compared with this vehicle", f"{AGAIN}, once")
 
 
-@dataclass(frozen=True)
-class Unreadable(ComparisonRecord):
+def unreadable(path: Path, why: str) -> NoComparison:
     """There is a record, and nobody knows what it says."""
-
-    path: Path
-    why: str
-
-    def objection(self, now: datetime) -> tuple[str, str] | None:
-        found = f"whether the motion capture was compared is not known: {self.path} {self.why}"
-        return found, f"remove that file, then {AGAIN}"
+    found = f"whether the motion capture was compared is not known: {path} {why}"
+    return NoComparison(found, f"remove that file, then {AGAIN}")
 
 
 @dataclass(frozen=True)
@@ -119,7 +107,10 @@ class Comparison(ComparisonRecord):
 
 def set_up_of(config: PositioningConfig, vehicle: str) -> SetUp:
     rpy, place = (tuple(map(float, v)) for v in (config.body_rpy_deg, config.body_position_m))
-    return SetUp(vehicle, config.system, config.host, config.body, rpy, place)
+    return SetUp(
+        vehicle=vehicle, system=config.system, host=config.host, body=config.body,
+        body_rpy_deg=rpy, body_position_m=place,
+    )  # fmt: skip
 
 
 def _told(at: datetime, now: datetime) -> str:
@@ -132,9 +123,21 @@ def _told(at: datetime, now: datetime) -> str:
 _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 
 
+class _File(BaseModel):
+    """What the file of a comparison holds."""
+
+    model_config = ConfigDict(strict=True)
+
+    set_up: SetUp
+    at: AwareDatetime
+    passed: bool
+    found: str
+
+
 def encoded(set_up: SetUp, record: Comparison) -> bytes:
+    """The bytes of a comparison's file."""
     values = {
-        "set_up": asdict(set_up),
+        "set_up": set_up.model_dump(),
         "at": record.at.astimezone(UTC).isoformat(),
         "passed": record.passed,
         "found": _one_line(record.found),
@@ -145,18 +148,14 @@ def encoded(set_up: SetUp, record: Comparison) -> bytes:
 def decoded(data: bytes, set_up: SetUp) -> Comparison:
     """Errors: ValueError, with what is wrong of it, for what is none or is of another set-up."""
     try:
-        values = json.loads(data)
-        at = datetime.fromisoformat(values["at"])
-        passed, found, of = values["passed"], values["found"], values["set_up"]
-    except (ValueError, KeyError, TypeError, RecursionError):
+        file = _File.model_validate_json(data)
+    except ValidationError:
         raise ValueError("is damaged") from None
-    if not (isinstance(passed, bool) and isinstance(found, str)) or at.tzinfo is None:
+    if not timedelta(0) < file.at - _LONG_AGO < _LONG:  # else no time zone could tell it
         raise ValueError("is damaged")
-    if not timedelta(0) < at - _LONG_AGO < _LONG:  # else no time zone could tell it
-        raise ValueError("is damaged")
-    if of != json.loads(json.dumps(asdict(set_up))):
+    if file.set_up != set_up:
         raise ValueError("is of another set-up")
-    return Comparison(at, passed, _one_line(found))
+    return Comparison(file.at, file.passed, _one_line(file.found))
 
 
 _LONG_AGO, _LONG = datetime(2000, 1, 1, tzinfo=UTC), timedelta(days=365_000)
@@ -171,7 +170,7 @@ def _one_line(text: str) -> str:
 
 
 def path_of(set_up: SetUp) -> Path:
-    name = hashlib.sha256(json.dumps(asdict(set_up)).encode()).hexdigest()[:16]
+    name = hashlib.sha256(json.dumps(set_up.model_dump()).encode()).hexdigest()[:16]
     return user_state_folder() / "compared" / f"{name}.json"
 
 
@@ -180,48 +179,50 @@ def load_comparison(config: PositioningConfig, vehicle: str) -> ComparisonRecord
     set_up = set_up_of(config, vehicle)
     path = path_of(set_up)
     data = _read(path)
+    if isinstance(data, NoComparison):
+        return data
     if data is None:
         others = _others(set_up)
-        return OthersCompared(vehicle, others) if others else NeverCompared()
-    if isinstance(data, Unreadable):
-        return data
+        if not others:
+            return NEVER
+        found = (
+            f"the motion capture was compared with another vehicle ({', '.join(others)}), and "
+            f"never with this one ({vehicle})"
+        )
+        return NoComparison(found, f"{AGAIN}, once")
     try:
         return decoded(data, set_up)
     except ValueError as error:
-        return Unreadable(path, str(error))
+        return unreadable(path, str(error))
 
 
-def _read(path: Path) -> bytes | Unreadable | None:
+def _read(path: Path) -> bytes | NoComparison | None:
     """None where there is no file."""
     try:
         if not path.exists():
             return None
         if not path.is_file():  # one that is a pipe would be waited for
-            return Unreadable(path, "is no file")
+            return unreadable(path, "is no file")
         with path.open("rb") as stream:
             data = stream.read(MOST_BYTES + 1)
     except FileNotFoundError:
         return None
     except OSError as error:
-        return Unreadable(path, f"cannot be read ({error.strerror or error})")
-    return Unreadable(path, "is damaged") if len(data) > MOST_BYTES else data
+        return unreadable(path, f"cannot be read ({error.strerror or error})")
+    return unreadable(path, "is damaged") if len(data) > MOST_BYTES else data
 
 
 def _others(set_up: SetUp) -> tuple[str, ...]:
     """The other vehicles of which there is a record in this set-up; only for a sentence."""
-    wanted = json.loads(json.dumps(asdict(set_up)))
     found = set()
     for path in itertools.islice(sorted(path_of(set_up).parent.glob("*.json")), MOST_OTHERS):
         data = _read(path)
         if not isinstance(data, bytes):
             continue
-        try:
-            of = json.loads(data)["set_up"]
-            vehicle = of["vehicle"]
-        except (ValueError, KeyError, TypeError, RecursionError):
-            continue
-        if isinstance(vehicle, str) and of == wanted | {"vehicle": vehicle}:
-            found.add(_one_line(vehicle))
+        with contextlib.suppress(ValidationError):
+            of = _File.model_validate_json(data).set_up
+            if of == set_up.model_copy(update={"vehicle": of.vehicle}):
+                found.add(_one_line(of.vehicle))
     return tuple(sorted(found - {set_up.vehicle}))
 
 

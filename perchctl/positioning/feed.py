@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -23,9 +23,40 @@ from perchctl.geometry import (
     rotation_from_quaternion,
     rotation_from_rpy,
 )
-from perchctl.positioning.types import BodyPose, CaptureFrame, CaptureSource
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import ExternalPosition, SendPosition
+
+Quaternion = tuple[float, float, float, float]  # w, x, y, z
+
+
+@dataclass(frozen=True)
+class BodyPose:
+    """A rigid body in the capture's world: its origin, and the turn from its axes to the
+    world's. SI; as the system says it, before the profile's turn and offset."""
+
+    position_m: tuple[float, float, float]
+    quaternion: Quaternion
+
+
+@dataclass(frozen=True)
+class CaptureFrame:
+    """`t_s`: its arrival, on the loop's clock. A body that is occluded is not in it."""
+
+    t_s: float
+    bodies: Mapping[str, BodyPose] = field(default_factory=dict)
+
+
+class CaptureSource(Protocol):
+    """A motion-capture system, real or simulated; nothing in it blocks."""
+
+    def poll(self, now_s: float) -> CaptureFrame | None:
+        """The newest frame that has arrived by `now_s`, None if none since the last call."""
+
+    def problem(self, now_s: float) -> str | None:
+        """None while it works; otherwise one sentence with the cause."""
+
+    def close(self) -> None: ...
+
 
 QUIET_S = 0.1
 """Without a position for so long, or for two periods, it is said why. One frame that is missing
@@ -62,6 +93,37 @@ class FeedStatus:
         return self.problem == UNSEEN
 
 
+class SendingRate:
+    """When the next position may be sent, and how many were."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self.period_s = 1.0 / rate_hz
+        self.count = 0
+        self._due_s = -math.inf
+        self._times_s: deque[float] = deque()  # of the last `RATE_OVER_S`, and the newest
+
+    def is_due(self, now_s: float) -> bool:
+        """True if a position may be sent now."""
+        return now_s >= self._due_s - 1e-6
+
+    def sent(self, now_s: float) -> None:
+        """One was sent. A turn that comes late must not slow the next ones down, and none makes
+        up for it."""
+        self._due_s = max(self._due_s + self.period_s, now_s)
+        self.count += 1
+        self._times_s.append(now_s)
+        while now_s - self._times_s[0] > RATE_OVER_S:
+            self._times_s.popleft()
+
+    def silent_s(self, now_s: float) -> float:
+        """Seconds since the newest was sent; infinite before the first."""
+        return now_s - self._times_s[-1] if self._times_s else math.inf
+
+    def hz(self, now_s: float) -> float:
+        """How many were sent in the last second."""
+        return sum(now_s - t_s < RATE_OVER_S for t_s in self._times_s) / RATE_OVER_S
+
+
 class PositionFeed:
     """No thread and no clock: `turn` is called about 100 times a second, by a `FeedThread` or
     in lockstep; `status` from any thread."""
@@ -71,17 +133,14 @@ class PositionFeed:
     ) -> None:
         self._source, self._send, self._config = source, send, config
         self._judge = Judge(config)
-        self._period_s = 1.0 / config.rate_hz
-        self._quiet_s = max(QUIET_S, 2.0 * self._period_s)
-        self._due_s = -math.inf
+        self._rate = SendingRate(config.rate_hz)
+        self._quiet_s = max(QUIET_S, 2.0 * self._rate.period_s)
         self._lock = threading.Lock()
         self._turned_s: float | None = None
         self._framed_s = -math.inf
         self._exposed_s = -math.inf
         self._placed: Placed | None = None
         self._pose: ExternalPosition | None = None
-        self._count = 0
-        self._times_s: deque[float] = deque()
         self._problem: str | None = None
         self._stopped = False
 
@@ -106,14 +165,13 @@ class PositionFeed:
 
     def status(self, now_s: float) -> FeedStatus:
         with self._lock:
-            times = list(self._times_s)
-            quiet = not times or now_s - times[-1] > self._quiet_s
+            quiet = self._rate.silent_s(now_s) > self._quiet_s
             return FeedStatus(
                 age_s=now_s - self._exposed_s,
                 problem=self._why(now_s) if quiet else None,
-                sent=self._count,
+                sent=self._rate.count,
                 pose=self._pose,
-                rate_hz=sum(now_s - t_s < RATE_OVER_S for t_s in times) / RATE_OVER_S,
+                rate_hz=self._rate.hz(now_s),
                 measured=None if self._placed is None else self._placed.external(pose=True),
             )
 
@@ -125,19 +183,14 @@ class PositionFeed:
             return trouble or (None if silent else self._judge.problem)
         self._framed_s = now_s
         placed = self._judge.judge(frame, now_s)
-        if placed is None or now_s < self._due_s - 1e-6:
+        if placed is None or not self._rate.is_due(now_s):
             return trouble or self._judge.problem
         place = placed.external(pose=self._config.send == "pose")
         if self._send(place) is False:
             return BUSY
-        # A turn that comes late must not slow the next ones down, and none makes up for it.
-        self._due_s = max(self._due_s + self._period_s, now_s)
         with self._lock:
             self._placed, self._exposed_s, self._pose = placed, placed.t_s, place
-            self._count += 1
-            self._times_s.append(now_s)
-            while now_s - self._times_s[0] > RATE_OVER_S:
-                self._times_s.popleft()
+            self._rate.sent(now_s)
         return None
 
     def _why(self, now_s: float) -> str:

@@ -15,12 +15,11 @@ planner holds, sinks and comes down by it.
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import numpy as np
 
 from perchctl.geometry import Place, quaternion_from_rpy, rot_z, wrap_rad
-from perchctl.positioning.feed import RATE_OVER_S, UNSEEN, FeedStatus
+from perchctl.positioning.feed import UNSEEN, FeedStatus, SendingRate
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import ExternalPosition, SendPosition
@@ -71,16 +70,13 @@ class SightFeed:
     def __init__(self, send: SendPosition, profile: Profile, setup: PoseSetup) -> None:
         self._send, self._config, self._setup = send, profile.positioning, setup
         self._origin_m = (0.0, 0.0, profile.safety.ground_z_m)
-        self._period_s = 1.0 / self._config.rate_hz
+        self._rate = SendingRate(self._config.rate_hz)
         self.target: Place | None = None
         self.off = NOWHERE
         self._on_ground: list[Place] = []
         self._seen_s = -math.inf
         self._placed_s = -math.inf
-        self._due_s = -math.inf
         self._pose: ExternalPosition | None = None
-        self._count = 0
-        self._times_s: deque[float] = deque()
         self._refusal = ""
 
     def stand(self, now_s: float) -> None:
@@ -149,9 +145,9 @@ class SightFeed:
         return FeedStatus(
             age_s=age_s,
             problem=problem,
-            sent=self._count,
+            sent=self._rate.count,
             pose=self._pose,
-            rate_hz=sum(now_s - t_s < RATE_OVER_S for t_s in self._times_s) / RATE_OVER_S,
+            rate_hz=self._rate.hz(now_s),
             measured=self._pose,
         )
 
@@ -192,11 +188,6 @@ class SightFeed:
     def _hand_over(self, place: ExternalPosition, placed_s: float, now_s: float) -> None:
         """`placed_s`: when the body was there. What comes too soon waits for nothing: the next
         one is newer."""
-        if now_s < self._due_s - 1e-6 or self._send(place) is False:
-            return
-        self._due_s = max(self._due_s + self._period_s, now_s)
-        self._placed_s, self._pose = placed_s, place
-        self._count += 1
-        self._times_s.append(now_s)
-        while now_s - self._times_s[0] > RATE_OVER_S:
-            self._times_s.popleft()
+        if self._rate.is_due(now_s) and self._send(place) is not False:
+            self._rate.sent(now_s)
+            self._placed_s, self._pose = placed_s, place

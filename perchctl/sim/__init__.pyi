@@ -5,8 +5,6 @@ from .camera import SimCamera as SimCamera
 from .capture import MILLIMETRES_PER_M as MILLIMETRES_PER_M
 from .capture import CaptureFault as CaptureFault
 from .capture import CaptureSettings as CaptureSettings
-from .crtp.codec import Packet as Packet
-from .crtp.codec import Port as Port
 from .crtp.commands import CommandService as CommandService
 from .crtp.server import PROTOCOL_VERSION as PROTOCOL_VERSION
 from .draw import draw_capture as draw_capture

@@ -6,9 +6,12 @@ from __future__ import annotations
 from collections import deque
 
 from perchctl.geometry import Array, make_T, rotation_from_quaternion
+from perchctl.link import Packet
 from perchctl.profile import TargetConfig
 from perchctl.sim.camera import SimCamera
 from perchctl.sim.capture import CaptureSettings, SimCapture
+from perchctl.sim.crtp.commands import CommandService
+from perchctl.sim.crtp.server import PROTOCOL_VERSION
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
@@ -59,6 +62,7 @@ class SimulatedVehicle:
         self.scenario = scenario
         self.world = World(scenario)
         self.firmware = Firmware(self.world, scenario)
+        self._commands = CommandService(self.firmware, PROTOCOL_VERSION)
         self.camera: SimCamera | None = None
         if camera is not None:
             renderer = Renderer(scenario, camera, target or TargetConfig(), scenario.seed)
@@ -91,6 +95,10 @@ class SimulatedVehicle:
                     self.camera.advance(t_s, self._past)
                     due_s = self.camera.next_s - _TICK_S
         self.camera.advance(t_s, self._past)
+
+    def receive(self, packet: Packet) -> None:
+        """Take a packet as it comes from the radio."""
+        self._commands.handle(packet)
 
     def step(self) -> None:
         """One control period, and the exposures that fall into it."""

@@ -13,10 +13,15 @@ import pytest
 
 from perchctl.calibration import load_calibration
 from perchctl.camera import aideck as aideck_module
-from perchctl.camera import aideck_address, check_size, open_source
-from perchctl.camera.aideck import NO_PICTURE_S, AiDeckAddress, AiDeckSource, decoded
-from perchctl.camera.cpx import CpxPicture
-from perchctl.camera.stream import MAX_FAILED_CONNECTIONS
+from perchctl.camera import check_size, open_camera
+from perchctl.camera.aideck import (
+    AiDeckAddress,
+    AiDeckSource,
+    CpxPicture,
+    aideck_address,
+    decoded,
+)
+from perchctl.camera.network import MAX_FAILED_CONNECTIONS
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
@@ -38,7 +43,8 @@ from tests.helpers.aideck import (
 )
 from tests.helpers.boards import CHARUCO, BoardRenderer, draw_poses
 from tests.helpers.commands import run
-from tests.helpers.live import WAIT_S, Clock, level, next_frame, wait_for
+from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
+from tests.helpers.waiting import until
 
 CAMERA = load_calibration("example_aideck_324x244.yaml")
 
@@ -54,10 +60,8 @@ def opened() -> Iterator[Callable[..., AiDeckSource]]:
     sources: list[AiDeckSource] = []
 
     def make(deck: AiDeck, clock: Clock | None = None, **options: float) -> AiDeckSource:
-        source = AiDeckSource(
-            aideck_address(deck.url), 0.06, clock or Clock(), reconnect_wait_s=0.0, **options
-        )
-        sources.append(source)
+        source = AiDeckSource(aideck_address(deck.url), 0.06, clock or Clock())
+        sources.append(begun(source, reconnect_wait_s=0.0, **options))
         return source
 
     yield make
@@ -71,16 +75,16 @@ Opened = Callable[..., AiDeckSource]
 def test_a_frame_is_of_its_first_byte_and_arrives_with_its_last(
     deck: AiDeck, opened: Opened
 ) -> None:
-    clock, begun, go = Clock(), threading.Event(), threading.Event()
+    clock, come, go = Clock(), threading.Event(), threading.Event()
     whole = raw(picture(160))
-    deck.scripts.put([jpeg(picture(60)), begun, whole[:3000], go, whole[3000:], threading.Event()])
+    deck.scripts.put([jpeg(picture(60)), come, whole[:3000], go, whole[3000:], threading.Event()])
     source = opened(deck, clock)
     first = next_frame(source)
     assert (first.index, level(first), first.t_arrival_s) == (0, 60, 100.0)
     assert source.size_px == (324, 244)
     before, clock.t_s = source.bytes_seen, 100.1
-    begun.set()
-    wait_for(lambda: source.bytes_seen > before)
+    come.set()
+    until(lambda: source.bytes_seen > before)
     clock.t_s = 100.3
     go.set()
     second = next_frame(source)
@@ -150,14 +154,14 @@ def test_reconnects_are_bounded_and_the_reason_is_said(deck: AiDeck, opened: Ope
     for _ in range(MAX_FAILED_CONNECTIONS):
         deck.scripts.put([b"HTTP/1.1 400 Bad Request\r\n\r\n"])
     source = opened(deck)
-    wait_for(lambda: "gave no picture" in (source.problem(100.0) or ""))
+    until(lambda: "gave no picture" in (source.problem(100.0) or ""))
     assert "in 5 attempts: 28 bytes came, and no whole picture" in str(source.problem(100.0))
     assert deck.connections == MAX_FAILED_CONNECTIONS
 
 
 def test_a_deck_that_takes_the_connection_and_sends_nothing(deck: AiDeck, opened: Opened) -> None:
     source = opened(deck)
-    wait_for(lambda: "gave no picture" in (source.problem(100.0) or ""))
+    until(lambda: "gave no picture" in (source.problem(100.0) or ""))
     assert "sent nothing; switch the Crazyflie off and on" in str(source.problem(100.0))
 
 
@@ -168,7 +172,7 @@ def test_bytes_without_pictures_end_the_connection(deck: AiDeck, opened: Opened)
     deck.scripts.put([raw(picture(160)), never])
     source = opened(deck, clock, read_timeout_s=1000.0)
     next_frame(source)
-    clock.t_s += NO_PICTURE_S + 0.1
+    clock.t_s += AiDeckSource.no_picture_s + 0.1
     said.set()
     assert level(next_frame(source)) == 160
     assert source.connections == 2
@@ -199,7 +203,7 @@ def test_a_raw_picture_and_one_without_its_mosaic_are_no_jpeg(
 
 def test_another_size_than_the_calibrations_is_refused(deck: AiDeck) -> None:
     deck.forever = [raw(picture(90, (162, 122)))]
-    source = open_source(deck.url, 0.0, CAMERA.size_px, Clock(), timeout_s=WAIT_S)
+    source = open_camera(deck.url, Clock(), timeout_s=WAIT_S)
     try:
         with pytest.raises(InvalidValue, match="162x122 px, but the calibration was made at 324x"):
             check_size(source.size_px, CAMERA, source.describe())
@@ -210,13 +214,14 @@ def test_another_size_than_the_calibrations_is_refused(deck: AiDeck) -> None:
 def test_nobody_listens(deck: AiDeck) -> None:
     deck.close()
     with pytest.raises(TimedOut, match="5 attempts: connection refused"):
-        open_source(deck.url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(deck.url, Clock(), timeout_s=WAIT_S)
 
 
 def test_closing_does_not_wait_for_a_stalled_deck(deck: AiDeck) -> None:
     end = threading.Event()
     deck.scripts.put([raw(picture(60)), end])
-    source = AiDeckSource(aideck_address(deck.url), 0.0, Clock(), read_timeout_s=1000.0)
+    source = AiDeckSource(aideck_address(deck.url), 0.0, Clock())
+    begun(source, read_timeout_s=1000.0)
     next_frame(source)
     source.close()
     assert source._thread is not None
@@ -252,7 +257,7 @@ def test_a_wrong_address_is_one_sentence(spec: str) -> None:
         assert aideck_address(spec).host == "a"
         return
     with pytest.raises(InvalidValue, match=r"write aideck://HOST\[:5000\], as in aideck://192"):
-        open_source(spec, 0.0, None, Clock())
+        open_camera(spec, Clock())
 
 
 # -- the commands ------------------------------------------------------------

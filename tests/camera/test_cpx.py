@@ -10,8 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.camera.aideck import MosaicFilter, has_mosaic, without_mosaic
-from perchctl.camera.cpx import STALLED_S, CpxPicture, CpxSplitter
+from perchctl.camera.aideck import (
+    STALLED_S,
+    CpxPicture,
+    CpxSplitter,
+    MosaicFilter,
+    has_mosaic,
+    without_mosaic,
+)
 from tests.helpers.aideck import (
     APP,
     CHUNK_BYTES,

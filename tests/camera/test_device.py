@@ -14,8 +14,16 @@ import pytest
 from typer.testing import CliRunner
 
 from perchctl.camera import find_cameras
-from perchctl.camera.computer import camera_number, finder_of
-from perchctl.camera.device import Asked, DeviceSource, asked_of, differences, set_controls, set_up
+from perchctl.camera.device import (
+    Asked,
+    DeviceSource,
+    asked_of,
+    camera_number,
+    differences,
+    finder_of,
+    set_controls,
+    set_up,
+)
 from perchctl.camera.v4l2 import (
     Call,
     Delivered,
@@ -29,8 +37,8 @@ from perchctl.commands import app, check
 from perchctl.commands.check import camera_lines, list_cameras
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
-from tests.helpers.live import wait_for
 from tests.helpers.v4l2 import READ_ONLY, FakeControl, FakeDevice
+from tests.helpers.waiting import until
 
 WAIT_S = 10.0
 FIXED = {
@@ -271,10 +279,10 @@ def test_controls_are_set_again_when_a_camera_comes_back() -> None:
         device.controls, device.resets = fresh.controls, fresh.resets
         assert values(device)["auto_exposure"] == 3
         device.unplugged = True
-        wait_for(lambda: device.released)
+        until(lambda: device.released)
         device.unplugged = False
-        wait_for(lambda: not source._reopened and device.log[-1] == "read")
-        wait_for(lambda: {name: values(device)[name] for name in FIXED} == {
+        until(lambda: not source._reopened and device.log[-1] == "read")
+        until(lambda: {name: values(device)[name] for name in FIXED} == {
             "exposure_time_absolute": 80, "auto_exposure": 1, "white_balance_automatic": 0,
         })  # fmt: skip
     finally:

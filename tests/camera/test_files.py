@@ -14,24 +14,22 @@ import pytest
 from perchctl.camera import (
     BrokenPicture,
     FrameSource,
-    ImagesSource,
     Recording,
     VideoSource,
     check_size,
     files,
-    is_live,
-    open_source,
+    open_camera,
+    parse_source,
     profile_record,
     read_grey,
-    scheme_of,
-    source_spec,
     without_password,
 )
+from perchctl.camera.files import ImagesSource
 from perchctl.camera.source import to_grey
 from perchctl.commands.calibrate import Source, sized
 from perchctl.errors import InvalidValue, NotFound, UsageError
 from perchctl.log.header import make_header
-from perchctl.profile import Profile
+from perchctl.profile import CameraConfig, Profile
 from perchctl.vision import CameraModel, Frame
 
 
@@ -57,7 +55,7 @@ def write_images(folder: Path, count: int, suffix: str = ".png") -> None:
 def test_images_come_all_and_in_natural_order(tmp_path: Path) -> None:
     write_images(tmp_path, 12)
     (tmp_path / "notes.txt").write_text("no picture")
-    source = open_source(f"images:{tmp_path}", 0.07, None, clock)
+    source = open_camera(f"images:{tmp_path}", clock, latency_s=0.07)
     assert isinstance(source, Recording)
     assert (source.rate_hz, source.count) == (30.0, 12)
     assert source.size_px == (32, 24)
@@ -70,17 +68,28 @@ def test_images_come_all_and_in_natural_order(tmp_path: Path) -> None:
     assert source.problem(1e6) is None
 
 
+@pytest.mark.parametrize(("given_s", "counts_s"), [(None, 0.05), (0.0, 0.0), (0.2, 0.2)])
+def test_the_profile_s_latency_counts_unless_another_is_given(
+    tmp_path: Path, given_s: float | None, counts_s: float
+) -> None:
+    write_images(tmp_path, 1)
+    config = CameraConfig(latency_s=0.05)
+    frame = open_camera(f"images:{tmp_path}", clock, config, latency_s=given_s).poll(0.0)
+    assert frame is not None
+    assert frame.t_arrival_s - frame.t_s == pytest.approx(counts_s)
+
+
 def test_images_by_pattern_and_single(tmp_path: Path) -> None:
     write_images(tmp_path, 12)
-    assert len(drain(open_source(f"images:{tmp_path}/shot_1*.png", 0.0, None, clock))) == 3
+    assert len(drain(open_camera(f"images:{tmp_path}/shot_1*.png", clock))) == 3
     assert len(drain(ImagesSource(str(tmp_path / "shot_5.png")))) == 1
 
 
 def test_images_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(NotFound, match="neither a folder nor a pattern"):
-        open_source(f"images:{tmp_path}/nowhere", 0.0, None, clock)
+        open_camera(f"images:{tmp_path}/nowhere", clock)
     with pytest.raises(NotFound, match="holds no pictures"):
-        open_source(f"images:{tmp_path}", 0.0, None, clock)
+        open_camera(f"images:{tmp_path}", clock)
 
 
 def test_a_broken_image_is_named(tmp_path: Path) -> None:
@@ -102,7 +111,7 @@ def write_video(path: Path, count: int, rate_hz: float) -> None:
 
 def test_a_video_gives_every_frame_with_its_time(tmp_path: Path) -> None:
     write_video(tmp_path / "flight.avi", 20, 25.0)
-    source = open_source(f"video:{tmp_path}/flight.avi", 0.0, None, clock)
+    source = open_camera(f"video:{tmp_path}/flight.avi", clock)
     assert isinstance(source, Recording)
     assert (source.rate_hz, source.count) == (25.0, 20)
     assert source.size_px == (64, 48)
@@ -115,19 +124,23 @@ def test_a_video_gives_every_frame_with_its_time(tmp_path: Path) -> None:
     assert source.finished
 
 
+def spec_of(text: str) -> str:
+    return parse_source(text, files=True).spec
+
+
 def test_a_bare_path_becomes_a_source(tmp_path: Path) -> None:
     write_images(tmp_path, 1)
     video, picture = tmp_path / "flight.avi", tmp_path / "shot_0.png"
     video.write_bytes(b"")
-    assert source_spec(str(tmp_path)) == f"images:{tmp_path}"
-    assert source_spec(f"{tmp_path}/*.png") == f"images:{tmp_path}/*.png"
-    assert source_spec(str(picture)) == f"images:{picture}"
-    assert source_spec(str(video)) == f"video:{video}"
-    for spec in ("camera:0", "http://host/stream", "webcam:0"):
-        assert source_spec(spec) == spec
+    assert spec_of(str(tmp_path)) == f"images:{tmp_path}"
+    assert spec_of(f"{tmp_path}/*.png") == f"images:{tmp_path}/*.png"
+    assert spec_of(str(picture)) == f"images:{picture}"
+    assert spec_of(str(video)) == f"video:{video}"
+    for spec in ("camera:0", "http://host/stream"):
+        assert spec_of(spec) == spec
     for path in ("none.mp4", "none"):
         with pytest.raises(NotFound, match=f"^{path} does not exist"):
-            source_spec(path)
+            spec_of(path)
 
 
 @pytest.mark.parametrize("text", [
@@ -161,10 +174,10 @@ def test_no_message_and_no_record_shows_a_password(tmp_path: Path) -> None:
     for spec in (f"ftp{at}", f"video:rtsp{at}s", f"images:http{at}*", f"aideck{at}",
                  "http:me:secret@host", "RTSP:/me:secret@host"):  # fmt: skip
         with pytest.raises((InvalidValue, NotFound)) as caught:
-            open_source(source_spec(spec), 0.0, None, clock)
+            open_camera(spec, clock)
         assert "secret" not in str(caught.value)
     with pytest.raises(NotFound) as missing:
-        source_spec("me:secret/http:x:secret@host.mp4")
+        spec_of("me:secret/http:x:secret@host.mp4")
     assert "x:secret" not in str(missing.value)
     profile = Profile.model_validate({
         "description": "at http://me:secret@h/s", "camera": {"source": "RTSP://me:secret@h/s"},
@@ -175,12 +188,13 @@ def test_no_message_and_no_record_shows_a_password(tmp_path: Path) -> None:
 def test_an_unknown_scheme_is_told_from_a_missing_file_and_known_ones_in_any_case() -> None:
     for spec in ("rtmp://host/live", "ftp://host/a.mp4"):
         with pytest.raises(InvalidValue, match=r"is unknown; allowed are .*gst:PIPELINE"):
-            open_source(source_spec(spec), 0.0, None, clock)
+            open_camera(spec, clock)
     for spec in ("RTSP://host/s", "Http://host/s", "AIDECK://192.168.4.1", "Camera:0"):
-        assert source_spec(spec) == spec
-        assert scheme_of(spec) == spec.partition(":")[0].lower()
-        assert is_live(spec)
-    assert not is_live("VIDEO:x.mp4")
+        source = parse_source(spec)
+        assert source.scheme == spec.partition(":")[0].lower()
+        assert source.spec == f"{source.scheme}:{spec.partition(':')[2]}"
+        assert source.live
+    assert not parse_source("VIDEO:x.mp4").live
 
 
 def test_a_password_is_not_shown() -> None:
@@ -198,26 +212,26 @@ def test_videos_that_are_none(tmp_path: Path) -> None:
         VideoSource(tmp_path / "flight.avi")
 
 
-@pytest.mark.parametrize("spec", ["webcam", "ftp://x", "video:", "images:", "http://", "gst:", ""])
+@pytest.mark.parametrize("spec", ["webcam:0", "ftp://x", "video:", "images:", "http://", "gst:"])
 def test_unknown_schemes_say_what_is_allowed(spec: str) -> None:
     with pytest.raises(InvalidValue, match=r"allowed are camera:N, .*video:FILE, images:DIR"):
-        open_source(spec, 0.0, None, clock)
+        open_camera(spec, clock)
 
 
 @pytest.mark.parametrize("spec", ["camera:", 'camera:""', "camera:-1"])
 def test_a_camera_needs_a_number(spec: str) -> None:
     with pytest.raises(InvalidValue, match="camera:0"):
-        open_source(spec, 0.0, None, clock)
+        open_camera(spec, clock)
 
 
 def test_the_simulated_camera_belongs_to_the_simulated_vehicle() -> None:
     with pytest.raises(InvalidValue, match="sim://"):
-        open_source("sim:", 0.0, None, clock)
+        open_camera("sim:", clock)
 
 
 def test_which_sources_are_live() -> None:
     live = ("camera:0", "http://a/b", "sim:", "video:x", "images:x")
-    assert [is_live(s) for s in live] == [True, True, True, False, False]
+    assert [parse_source(s).live for s in live] == [True, True, True, False, False]
 
 
 def test_the_wrong_size_names_both() -> None:
@@ -296,7 +310,7 @@ def test_what_is_no_picture_is_named(tmp_path: Path, data: bytes | None) -> None
 @pytest.mark.parametrize("url", ["rtsp://me:sec/ret@host/a", "http://:80/a", "rtsp:host/a"])
 def test_a_url_without_a_host_is_refused_and_its_password_not_shown(url: str) -> None:
     with pytest.raises(InvalidValue, match=r"lacks a host .*(rtsp|http)://192") as e:
-        open_source(url, 0.0, None, clock)
+        open_camera(url, clock)
     assert "sec" not in str(e.value)
 
 
@@ -306,16 +320,16 @@ def test_a_url_without_a_host_is_refused_and_its_password_not_shown(url: str) ->
 ])  # fmt: skip
 def test_a_port_that_is_none_is_named(url: str, found: str) -> None:
     with pytest.raises(InvalidValue, match=rf"has port {found}; allowed are 1 to 65535, as in"):
-        open_source(url, 0.0, None, clock)
+        open_camera(url, clock)
 
 
 def test_gst_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("perchctl.camera.open.has_gstreamer", lambda: False)
     with pytest.raises(InvalidValue, match=r"^gst: needs an OpenCV .* GStreamer.*rtsp://"):
-        open_source("gst:videotestsrc ! appsink", 0.0, None, clock)
+        open_camera("gst:videotestsrc ! appsink", clock)
     monkeypatch.setattr("perchctl.camera.open.has_gstreamer", lambda: True)
     with pytest.raises(NotFound, match="does not run; try it with gst-launch"):
-        open_source("gst:nonsense", 0.0, None, clock)
+        open_camera("gst:nonsense", clock)
 
 
 def test_gst_reads_where_opencv_can(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -327,7 +341,7 @@ def test_gst_reads_where_opencv_can(monkeypatch: pytest.MonkeyPatch) -> None:
             return None
 
     monkeypatch.setattr("perchctl.camera.open.open_pipeline", lambda text: Capture())
-    source = open_source("gst:videotestsrc ! appsink", 0.0, None, clock)
+    source = open_camera("gst:videotestsrc ! appsink", clock)
     assert source.size_px == (64, 48)
     assert source.describe().startswith("gst:videotestsrc")
     source.close()

@@ -10,13 +10,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from perchctl.camera import HealthState, HealthVerdict, assess_frame
-from perchctl.camera.health import HealthLimits, content
+from perchctl.camera.health import content
 from perchctl.geometry import make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
 from perchctl.vision import CameraModel, Frame
 
-LIMITS = HealthLimits()
 SHAPE = (480, 640)
 
 
@@ -59,7 +58,7 @@ def renderers() -> list[Renderer]:
 def test_pictures_of_the_ceiling_are_usable(renderers: list[Renderer], below_m: float) -> None:
     for renderer in renderers:
         pose = make_T(rotation_from_rpy(0.1, -0.05, 0.7), (0.02, 0.01, 2.2 - below_m))
-        assert content(renderer.render([pose]), LIMITS) == "ok"
+        assert content(renderer.render([pose])) == "ok"
 
 
 @pytest.mark.parametrize("band_px", [0.0, 0.5, 0.8])
@@ -69,23 +68,23 @@ def test_snow(band_px: float, quality: int | None) -> None:
     if quality is not None:
         packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
         image = np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), np.uint8)
-    assert content(image, LIMITS) == "snow"
+    assert content(image) == "snow"
 
 
 @pytest.mark.parametrize(("level", "kind"), [(0, "dark"), (24, "dark"), (41, "uniform")])
 def test_blank_screens(level: int, kind: str) -> None:
-    assert content(np.full(SHAPE, level, np.uint8), LIMITS) == kind
-    assert content(noisy(level, 0.6), LIMITS) == kind
+    assert content(np.full(SHAPE, level, np.uint8)) == kind
+    assert content(noisy(level, 0.6)) == kind
 
 
 def test_a_covered_lens_is_dark() -> None:
-    assert content(noisy(8, 6.0), LIMITS) == "dark"
+    assert content(noisy(8, 6.0)) == "dark"
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(st.integers(0, 2**31), st.floats(2.0, 20.0), st.floats(60.0, 200.0))
 def test_sensor_noise_alone_is_not_snow(seed: int, sigma: float, level: float) -> None:
-    assert content(noisy(level, sigma, seed), LIMITS) == "ok"
+    assert content(noisy(level, sigma, seed)) == "ok"
 
 
 def judge(images: list[NDArray[np.uint8]], live: bool = True) -> list[HealthVerdict]:

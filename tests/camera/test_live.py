@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.camera import UnmirroredSource, mjpeg, open_source
+from perchctl.camera import network, open_camera
 from perchctl.camera.device import (
     LOST_AFTER_FAILURES,
     Asked,
@@ -23,11 +23,12 @@ from perchctl.camera.device import (
     DeviceSource,
     open_capture,
 )
-from perchctl.camera.mjpeg import MjpegSource
-from perchctl.camera.source import SILENT_AFTER_S, LiveSource
-from perchctl.camera.stream import MAX_FAILED_CONNECTIONS, StreamSource
+from perchctl.camera.network import MAX_FAILED_CONNECTIONS, MjpegSource, StreamSource
+from perchctl.camera.source import SILENT_AFTER_S, LiveSource, UnmirroredSource
 from perchctl.errors import NotFound, TimedOut
-from tests.helpers.live import WAIT_S, Clock, level, next_frame, wait_for
+from perchctl.profile import CameraConfig
+from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
+from tests.helpers.waiting import until
 
 
 def jpeg(level: int, size: tuple[int, int] = (48, 64), **options: int) -> bytes:
@@ -134,9 +135,8 @@ def server() -> Iterator[Server]:
 
 
 def stream(server: Server, clock: Clock, opened: list[LiveSource], **options: float) -> MjpegSource:
-    source = MjpegSource(server.url, 0.07, clock, reconnect_wait_s=0.0, **options)
-    opened.append(source)
-    return source
+    source = MjpegSource(server.url, 0.07, clock)
+    return begun(source, opened, reconnect_wait_s=0.0, **options)
 
 
 def test_frames_are_stamped_at_arrival_less_the_latency(
@@ -185,7 +185,7 @@ def test_the_newest_frame_wins(server: Server, opened: list[LiveSource]) -> None
             seen.append(level(frame))
         return 160 in seen
 
-    wait_for(last_came)
+    until(last_came)
     assert seen == sorted(seen)
     assert source.poll(0.0) is None
 
@@ -196,7 +196,7 @@ def test_a_truncated_picture_is_skipped(server: Server, opened: list[LiveSource]
     server.scripts.put([part(torn), whole, whole, threading.Event()])
     source = stream(server, Clock(), opened)
     assert level(next_frame(source)) == 160
-    wait_for(lambda: source.damaged >= 1)
+    until(lambda: source.damaged >= 1)
 
 
 @pytest.mark.parametrize("size", [(40_000, 40_000), (32_000, 32_000), (0, 64)])
@@ -206,7 +206,7 @@ def test_damaged_size_bytes_cost_their_own_picture_alone(
     go = threading.Event()
     server.scripts.put([part(resized(jpeg(60), *size)), go, part(jpeg(160)), threading.Event()])
     source = stream(server, Clock(), opened)
-    wait_for(lambda: source.damaged == 1)
+    until(lambda: source.damaged == 1)
     go.set()
     assert level(next_frame(source)) == 160
     assert source.connections == 1
@@ -217,10 +217,10 @@ def test_a_picture_above_the_largest_size_is_not_decoded_and_the_problem_says_so
     server: Server, opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried: list[bytes] = []
-    monkeypatch.setattr(mjpeg, "grey_pixels", tried.append)
+    monkeypatch.setattr(network, "grey_pixels", tried.append)
     server.scripts.put([part(resized(jpeg(60), 4097, 4096)), threading.Event()])
     source = stream(server, Clock(), opened)
-    wait_for(lambda: source.damaged == 1)
+    until(lambda: source.damaged == 1)
     assert tried == []
     assert "4097x4096 px" in str(source.problem(102.0))
 
@@ -229,9 +229,9 @@ class Broken(StreamSource):
     """Its connection raises what nobody has foreseen."""
 
     def __init__(self, error: Exception, attempts: int) -> None:
-        super().__init__("http://me:secret@camera/x", 0.0, Clock(), reconnect_wait_s=0.0)
+        super().__init__("http://me:secret@camera/x", 0.0, Clock())
         self.errors = [error] * attempts
-        self._start(self._run)
+        begun(self, reconnect_wait_s=0.0)
 
     def _connection(self) -> str:
         if self.errors:
@@ -249,7 +249,7 @@ def test_an_unforeseen_error_in_a_stream_is_followed_by_another_connection(
     next_frame(source)
     assert source.problem(100.0) is None
     opened.append(source := Broken(error, MAX_FAILED_CONNECTIONS))
-    wait_for(lambda: source.problem(100.0) is not None)
+    until(lambda: source.problem(100.0) is not None)
     assert type(error).__name__ in str(source.problem(100.0))
 
 
@@ -292,15 +292,15 @@ def test_it_reconnects_when_the_stream_stalls(server: Server, opened: list[LiveS
     server.scripts.put([part(jpeg(60)), never])
     server.scripts.put([part(jpeg(160)), never])
     source = stream(server, Clock(), opened, read_timeout_s=0.1)
-    wait_for(lambda: source.connections >= 2)
-    wait_for(lambda: source.size_px is not None)
+    until(lambda: source.connections >= 2)
+    until(lambda: source.size_px is not None)
     never.set()
 
 
 def test_reconnects_are_bounded(server: Server, opened: list[LiveSource]) -> None:
     server.scripts.put([part(jpeg(60))])
     source = stream(server, Clock(), opened)
-    wait_for(lambda: "gave no picture" in (source.problem(100.0) or ""))
+    until(lambda: "gave no picture" in (source.problem(100.0) or ""))
     assert source.connections == 1 + MAX_FAILED_CONNECTIONS
     assert "5 attempts: the stream ended" in str(source.problem(100.0))
 
@@ -312,7 +312,7 @@ def test_a_server_of_one_picture_a_connection_is_kept_though_they_are_equal(
         server.scripts.put([part(jpeg(60))])
     server.scripts.put([part(jpeg(60)), threading.Event()])
     source = stream(server, Clock(), opened)
-    wait_for(lambda: source._arrived == 1 + 2 * MAX_FAILED_CONNECTIONS)
+    until(lambda: source._arrived == 1 + 2 * MAX_FAILED_CONNECTIONS)
     assert source.problem(100.0) is None
 
 
@@ -334,22 +334,21 @@ def test_silence_is_a_problem_and_ends_with_the_next_frame(
 def test_a_path_the_server_does_not_have_is_not_found(server: Server) -> None:
     server.status = 404
     with pytest.raises(NotFound, match="404"):
-        open_source(server.url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(server.url, Clock(), timeout_s=WAIT_S)
     assert len(server.paths) == 1
 
 
 def test_nobody_listens(server: Server, opened: list[LiveSource]) -> None:
     url = server.url
     server.close()
-    source = MjpegSource(url, 0.0, Clock(), reconnect_wait_s=0.0)
-    opened.append(source)
+    source = begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.0)
     assert not source.wait_first(WAIT_S)
     assert "connection refused" in str(source.problem(100.0))
 
 
 def test_closing_does_not_wait_for_a_stalled_stream(server: Server) -> None:
     server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = MjpegSource(server.url, 0.0, Clock(), read_timeout_s=1000.0)
+    source = begun(MjpegSource(server.url, 0.0, Clock()), read_timeout_s=1000.0)
     next_frame(source)
     source.close()
     assert source._thread is not None
@@ -360,13 +359,13 @@ def test_no_first_frame_in_time(server: Server) -> None:
     quiet = threading.Event()
     server.scripts.put([b"--frame\r\n", quiet])
     with pytest.raises(TimedOut, match=r"no first frame within 0\.05 s"):
-        open_source(server.url, 0.0, None, Clock(), timeout_s=0.05)
+        open_camera(server.url, Clock(), CameraConfig(start_timeout_s=0.05))
     quiet.set()
 
 
-def test_open_source_waits_for_the_first_frame(server: Server) -> None:
+def test_opening_waits_for_the_first_frame(server: Server) -> None:
     server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = open_source(server.url, 0.0, None, Clock(), timeout_s=WAIT_S)
+    source = open_camera(server.url, Clock(), timeout_s=WAIT_S)
     assert source.live
     assert source.size_px == (64, 48)
     assert source.describe() == f"{server.url} (64x48 px)"
@@ -430,7 +429,7 @@ def test_a_device_s_damaged_picture_is_dropped(opened: list[LiveSource]) -> None
         capture.pictures.put(each)
     source = DeviceSource(0, 0.0, Asked(), Clock(), lambda n, asked: capture, retry_s=0.0)
     opened.append(source)
-    wait_for(lambda: source._count == 2)
+    until(lambda: source._count == 2)
     assert not capture.released.is_set()
     assert source.problem(100.0) is None
 
@@ -472,7 +471,7 @@ def test_a_device_that_comes_back_is_opened_again_under_its_new_number(
     opened.append(source)
     assert level(next_frame(source)) == 60
     bus.capture, first.unplugged = None, True
-    wait_for(lambda: len(bus.numbers) > 3)
+    until(lambda: len(bus.numbers) > 3)
     assert first.released.is_set()
     clock.t_s = 102.0
     assert "camera:3 was not found" in str(source.problem(102.0))
@@ -526,8 +525,8 @@ def test_a_device_that_flaps_is_never_given_up(opened: list[LiveSource]) -> None
 
     source = DeviceSource(0, 0.0, Asked(), Clock(), one_picture, retry_s=0.0, reopen_every_s=0.0)
     opened.append(source)
-    wait_for(lambda: len(captures) > 3)
-    wait_for(lambda: source._count > 3)
+    until(lambda: len(captures) > 3)
+    until(lambda: source._count > 3)
     assert all(each.released.is_set() for each in captures[:-2])
 
 

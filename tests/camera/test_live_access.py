@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.camera import open_source
-from perchctl.camera.mjpeg import MjpegSource, redirected
+from perchctl.camera import open_camera
+from perchctl.camera.network import MjpegSource, redirected
 from perchctl.camera.source import LiveSource
 from perchctl.errors import NotFound
 from tests.camera.test_live import Server, jpeg, part, stream
-from tests.helpers.live import WAIT_S, Clock, level, next_frame, wait_for
+from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
+from tests.helpers.waiting import until
 
 
 @pytest.fixture
@@ -30,12 +31,11 @@ def test_a_certificate_that_nobody_vouches_for(
     server.encrypt(pem)
     url = server.url.replace("http://", "https://me:secret@")
     with pytest.raises(NotFound, match=r"is not trusted \(self.signed.*SSL_CERT_FILE") as caught:
-        open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(url, Clock(), timeout_s=WAIT_S)
     assert "secret" not in str(caught.value)
     monkeypatch.setenv("SSL_CERT_FILE", str(pem))
     server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = MjpegSource(url, 0.0, Clock())
-    opened.append(source)
+    source = begun(MjpegSource(url, 0.0, Clock()), opened)
     assert level(next_frame(source)) == 60
 
 
@@ -51,8 +51,7 @@ def test_user_and_password_of_the_url_are_sent(server: Server, opened: list[Live
     server.scripts.put([part(jpeg(60)), threading.Event()])
     url = server.url.replace("http://", "http://me:p%40ss@")
     server.challenges = ['Basic realm="camera"']
-    source = MjpegSource(url, 0.0, Clock())
-    opened.append(source)
+    source = begun(MjpegSource(url, 0.0, Clock()), opened)
     next_frame(source)
     assert server.authorization == [None, "Basic bWU6cEBzcw=="], "once it is asked for"
     assert "p%40ss" not in source.describe()
@@ -68,9 +67,8 @@ def test_digest_is_preferred_and_kept_for_the_next_connection(
     server.scripts.put([part(jpeg(60))])
     server.scripts.put([part(jpeg(100)), threading.Event()])
     url = server.url.replace("http://", "http://me:secret@")
-    source = MjpegSource(url, 0.0, Clock(), reconnect_wait_s=0.0)
-    opened.append(source)
-    wait_for(lambda: len(server.authorization) == 3)
+    begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.0)
+    until(lambda: len(server.authorization) == 3)
     assert server.authorization[0] is None
     kept = [str(each) for each in server.authorization[1:]]
     assert all(each.startswith('Digest username="me", realm="camera"') for each in kept)
@@ -82,14 +80,12 @@ def test_a_nonce_that_is_too_old_is_changed(server: Server, opened: list[LiveSou
     server.challenges = DIGEST
     server.scripts.put([part(jpeg(60))])
     server.scripts.put([part(jpeg(100)), threading.Event()])
-    source = MjpegSource(
-        server.url.replace("http://", "http://me:secret@"), 0.0, Clock(), reconnect_wait_s=0.05
-    )
-    opened.append(source)
-    wait_for(lambda: len(server.authorization) == 2)
+    url = server.url.replace("http://", "http://me:secret@")
+    source = begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.05)
+    until(lambda: len(server.authorization) == 2)
     server.challenges = ['Digest realm="camera", nonce="n2", stale=true, qop="auth"']
     server.nonce = "n2"
-    wait_for(lambda: source._count == 2)
+    until(lambda: source._count == 2)
     assert 'nonce="n2"' in str(server.authorization[-1])
 
 
@@ -98,8 +94,8 @@ def test_a_camera_that_forbids_the_nameless_without_asking_gets_the_name(
 ) -> None:
     server.refusal = 403
     server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = MjpegSource(server.url.replace("http://", "http://me:p%40ss@"), 0.0, Clock())
-    opened.append(source)
+    url = server.url.replace("http://", "http://me:p%40ss@")
+    source = begun(MjpegSource(url, 0.0, Clock()), opened)
     assert level(next_frame(source)) == 60
     assert server.authorization == [None, "Basic bWU6cEBzcw=="]
 
@@ -108,9 +104,7 @@ def test_a_camera_that_forbids_the_nameless_without_asking_gets_the_name(
 def test_one_that_forbids_it_for_good_is_told_at_once(server: Server, who: str) -> None:
     server.status = 403
     with pytest.raises(NotFound, match="403"):
-        open_source(
-            server.url.replace("http://", f"http://{who}"), 0.0, None, Clock(), timeout_s=WAIT_S
-        )
+        open_camera(server.url.replace("http://", f"http://{who}"), Clock(), timeout_s=WAIT_S)
     assert len(server.authorization) == (2 if who else 1)
 
 
@@ -125,7 +119,7 @@ def test_who_may_not_see_it_is_told_at_once(
     server.challenges, server.nonce = challenges, "none of mine"
     url = server.url.replace("http://", f"http://{who}")
     with pytest.raises(NotFound, match=f"401.*{sentence}") as caught:
-        open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(url, Clock(), timeout_s=WAIT_S)
     assert "wrong" not in str(caught.value)
     assert len(server.authorization) <= 3
 
@@ -168,7 +162,7 @@ def test_a_redirect_from_https_to_http_is_not_followed(
         server.redirect_first = plain.url
         url = server.url.replace("http://", f"https://{WHO}")
         with pytest.raises(NotFound, match=r"https.*encrypted") as caught:
-            open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+            open_camera(url, Clock(), timeout_s=WAIT_S)
         assert plain.paths == [], "nobody can answer there in the camera's place"
         assert plain.url in str(caught.value)
         assert "secret" not in str(caught.value)
@@ -179,7 +173,7 @@ def test_a_redirect_from_https_to_http_is_not_followed(
 def test_a_redirect_to_another_protocol_is_not_followed(server: Server) -> None:
     server.redirect_first = "rtsp://127.0.0.1/live"
     with pytest.raises(NotFound, match=r"rtsp://127\.0\.0\.1/live"):
-        open_source(server.url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(server.url, Clock(), timeout_s=WAIT_S)
 
 
 def test_name_and_password_do_not_go_to_another_host(
@@ -190,9 +184,8 @@ def test_name_and_password_do_not_go_to_another_host(
         other.challenges = ['Basic realm="camera"']
         server.redirect_first = other.url
         url = server.url.replace("http://", "http://me:secret@")
-        source = MjpegSource(url, 0.0, Clock(), reconnect_wait_s=0.0)
-        opened.append(source)
-        wait_for(lambda: source.problem(100.0) is not None)
+        source = begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.0)
+        until(lambda: source.problem(100.0) is not None)
         assert other.authorization == [None]
         assert "401" in str(source.problem(100.0))
     finally:

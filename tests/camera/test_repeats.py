@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from perchctl.camera import HealthState, NewestSlot, assess_frame
 from perchctl.camera.aideck import AiDeckSource
 from perchctl.camera.device import DeviceSource
-from perchctl.camera.mjpeg import MjpegSource
-from perchctl.camera.repeats import MOST_AGAIN, RepeatState, repeated
-from perchctl.camera.rtsp import RtspSource
+from perchctl.camera.health import MOST_AGAIN, RepeatState, repeated
+from perchctl.camera.network import MjpegSource, RtspSource
 from perchctl.sim.camera import BLUE_GREY
 from perchctl.vision import Frame
 from tests.helpers.interlaced import Pass

@@ -14,15 +14,21 @@ import av.error
 import numpy as np
 import pytest
 
-from perchctl.camera import open_source, rtsp
+from perchctl.camera import network, open_camera
 from perchctl.camera.jpeg import MOST_STREAM_PX
-from perchctl.camera.rtsp import WINDOW_S, RtspSource, Waiting, unresolved
+from perchctl.camera.network import (
+    MAX_FAILED_CONNECTIONS,
+    WINDOW_S,
+    RtspSource,
+    Waiting,
+    unresolved,
+)
 from perchctl.camera.source import LiveSource
-from perchctl.camera.stream import MAX_FAILED_CONNECTIONS
 from perchctl.errors import NotFound, TimedOut
 from perchctl.profile import CameraConfig
-from tests.camera.test_live import WAIT_S, Clock, level, next_frame, wait_for
+from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
 from tests.helpers.rtsp import RtspServer, Step
+from tests.helpers.waiting import until
 
 
 @pytest.fixture
@@ -33,12 +39,8 @@ def server() -> Iterator[RtspServer]:
 
 
 def started(server: RtspServer, opened: list[LiveSource], who: str = "") -> RtspSource:
-    source = RtspSource(
-        server.url(who), 0.07, Clock(), connect_timeout_s=2.0, read_timeout_s=0.3,
-        reconnect_wait_s=0.0,
-    )  # fmt: skip
-    opened.append(source)
-    return source
+    times_s = {"connect_timeout_s": 2.0, "read_timeout_s": 0.3, "reconnect_wait_s": 0.0}
+    return begun(RtspSource(server.url(who), 0.07, Clock()), opened, **times_s)
 
 
 def seconds(count: int, *levels: int) -> list[Step]:
@@ -58,7 +60,7 @@ def test_pictures_come_and_the_newest_wins(server: RtspServer, opened: list[Live
             seen.append(frame)
         return bool(seen) and level(seen[-1]) == 160
 
-    wait_for(last_came)
+    until(last_came)
     assert seen[-1].image.shape == (48, 64)
     assert seen[-1].t_arrival_s == 100.0
     assert seen[-1].t_s == pytest.approx(99.93, abs=1e-6) or seen[-1].t_s < 99.93
@@ -74,7 +76,7 @@ def test_it_connects_anew_where_the_stream_is_cut_or_stalls(
     server.scripts.put([*seconds(20, 60, 80), *([] if cut else [never])])
     server.scripts.put([*seconds(20, 160, 180), never])
     source = started(server, opened)
-    wait_for(lambda: server.plays == 2)
+    until(lambda: server.plays == 2)
     frame = next_frame(source)
     while level(frame) < 150:
         frame = next_frame(source)
@@ -86,12 +88,12 @@ def test_the_resolver_is_asked_only_before_the_first_picture(
 ) -> None:
     """It may take half a minute, which in flight is one without pictures."""
     asked: list[str] = []
-    monkeypatch.setattr(rtsp, "unresolved", lambda url: asked.append(url) or "")
+    monkeypatch.setattr(network, "unresolved", lambda url: asked.append(url) or "")
     never = threading.Event()
     server.scripts.put([*seconds(20, 60, 80), never])  # it stalls: an error in time
     server.scripts.put([*seconds(20, 160, 180), never])
     source = started(server, opened)
-    wait_for(lambda: server.plays == 2)
+    until(lambda: server.plays == 2)
     assert source._count > 0
     assert asked == []
     never.set()
@@ -139,9 +141,8 @@ def test_a_packet_that_cannot_be_decoded_costs_no_connection(
 ) -> None:
     stream = Packets(60, error, 160)
     monkeypatch.setattr(av, "open", lambda *_, **__: stream)
-    source = RtspSource("rtsp://camera/x", 0.0, Clock(), reconnect_wait_s=WAIT_S)
-    opened.append(source)
-    wait_for(lambda: source._count == 2)
+    source = begun(RtspSource("rtsp://camera/x", 0.0, Clock()), opened, reconnect_wait_s=WAIT_S)
+    until(lambda: source._count == 2)
     assert (source.connections, source.damaged) == (1, 1)
     assert int(stream.context.options["max_pixels"]) == MOST_STREAM_PX
 
@@ -149,7 +150,7 @@ def test_a_packet_that_cannot_be_decoded_costs_no_connection(
 def test_connections_are_bounded(server: RtspServer, opened: list[LiveSource]) -> None:
     server.status = "500 Internal Server Error"
     source = started(server, opened)
-    wait_for(lambda: "gave no picture in 5 attempts" in (source.problem(100.0) or ""))
+    until(lambda: "gave no picture in 5 attempts" in (source.problem(100.0) or ""))
     assert source.connections == MAX_FAILED_CONNECTIONS
 
 
@@ -176,7 +177,7 @@ def test_what_trying_again_would_not_mend_is_told_at_once(
     server.who = ("me", "secret")
     url = server.url(who).replace("/live", path)
     with pytest.raises(NotFound) as caught:
-        open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(url, Clock(), timeout_s=WAIT_S)
     assert sentence in str(caught.value)
     assert "hush" not in str(caught.value)
     assert "secret" not in str(caught.value)
@@ -191,7 +192,7 @@ def test_name_and_password_do_not_go_where_the_server_redirects(
     server.who = ("me", "secret") if asks_first else None
     try:
         with pytest.raises(NotFound, match=r"redirects to rtsp://127") as caught:
-            open_source(server.url("me:secret@"), 0.0, None, Clock(), timeout_s=WAIT_S)
+            open_camera(server.url("me:secret@"), Clock(), timeout_s=WAIT_S)
         assert other.asked == []
         assert "secret" not in str(caught.value)
     finally:
@@ -214,13 +215,13 @@ def test_a_redirect_of_a_url_without_a_password_is_followed(
 def test_nobody_listens(server: RtspServer) -> None:
     server.close()
     with pytest.raises(TimedOut, match=r"gave no picture in 5 attempts: connection refused"):
-        open_source(server.url("me:secret@"), 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera(server.url("me:secret@"), Clock(), timeout_s=WAIT_S)
 
 
 def test_a_host_that_is_not_known_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """FFmpeg has an input/output error of it."""
     with pytest.raises(TimedOut, match=r"the host name 'a\.\.b' cannot be resolved") as caught:
-        open_source("rtsp://me:secret@a..b/x", 0.0, None, Clock(), timeout_s=WAIT_S)
+        open_camera("rtsp://me:secret@a..b/x", Clock(), timeout_s=WAIT_S)
     assert "secret" not in str(caught.value)
 
     def unknown(*_: object) -> None:
@@ -242,9 +243,9 @@ def test_what_only_a_driver_can_do_is_said_of_a_stream(server: RtspServer) -> No
     for asked, words in wishes:
         server.scripts.put([*seconds(5, 60, 100), never])
         told: list[str] = []
-        source = open_source(
-            server.url("me:secret@"), 0.0, None, Clock(), timeout_s=WAIT_S,
-            config=CameraConfig(**asked), tell=told.append,
+        source = open_camera(
+            server.url("me:secret@"), Clock(), CameraConfig(**asked), timeout_s=WAIT_S,
+            tell=told.append,
         )  # fmt: skip
         source.close()
         assert [words in sentence for sentence in told] == ([] if words is None else [True])
@@ -254,7 +255,7 @@ def test_what_only_a_driver_can_do_is_said_of_a_stream(server: RtspServer) -> No
 def test_closing_does_not_wait_for_a_stalled_stream(server: RtspServer) -> None:
     never = threading.Event()
     server.scripts.put([*seconds(20, 60, 80), never])
-    source = RtspSource(server.url(), 0.0, Clock(), read_timeout_s=1.0)
+    source = begun(RtspSource(server.url(), 0.0, Clock()), read_timeout_s=1.0)
     assert source.wait_first(WAIT_S)
     source.close()
     assert source._thread is not None

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from perchctl.display import LivePage, Sketch
-from perchctl.display.page.live import MAX_STREAMS
+from perchctl.display.live import MAX_STREAMS
 from perchctl.errors import InvalidValue
 from tests.helpers.live_page import CORNERS, ask
 from tests.helpers.recording import camera

@@ -8,7 +8,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from perchctl.display import LivePage
-from perchctl.display.page.live import TOKEN_HEADER, is_loopback
+from perchctl.display.live import TOKEN_HEADER, is_loopback
 from tests.helpers.live_page import Stops, ask, stop
 from tests.helpers.recording import camera
 

@@ -15,7 +15,7 @@ import pytest
 
 from perchctl.commands import fly
 from perchctl.display import FlightPage, LivePage, failed_card, summary_card
-from perchctl.display.page.flight import answered
+from perchctl.display.page import answered
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch, SessionResult
 from perchctl.log import FlightSummary, LogWatcher

@@ -14,13 +14,20 @@ import pytest
 from rich.console import Console
 from rich.text import Text
 
-from perchctl.display import DisplayWatcher, make_reporter
-from perchctl.display.status import FlightStatus, status_rows
-from perchctl.display.watch import Reporter, panel, status_of
+from perchctl.display import open_panel
+from perchctl.display.panel import WIDTH, FlightPanel, FlightStatus, panel, status_of, status_rows
 from perchctl.log import LogWatcher, read_log
+from perchctl.log.fields import tick_record
 from perchctl.log.write import FlightLogWriter
-from perchctl.mission import BatteryOutlook, Observation, Phase, Tick, start_mission
-from perchctl.vehicle import PositionSetpoint
+from perchctl.mission import (
+    BatteryOutlook,
+    ExternalPositions,
+    Observation,
+    Phase,
+    Tick,
+    start_mission,
+)
+from perchctl.vehicle import ExternalPosition, PositionSetpoint
 from tests.helpers import log as synthetic
 from tests.helpers.mission import entered, held, note
 
@@ -69,7 +76,7 @@ class Recorder:
 
 def test_one_line_an_event_where_there_is_no_terminal() -> None:
     stream = io.StringIO()
-    reporter = make_reporter(stream=stream)
+    reporter = open_panel(stream=stream)
     reporter.event(entered(100.0, Phase.SEARCH, "hovering in the perching area"))
     for i in range(50):
         reporter.update(replace(STATUS, t_s=100.0 + 0.02 * i, phase="SEARCH"))
@@ -85,7 +92,7 @@ def test_one_line_an_event_where_there_is_no_terminal() -> None:
 
 def test_no_more_than_ten_pictures_a_second() -> None:
     surface = Recorder()
-    reporter = Reporter(surface)
+    reporter = FlightPanel(surface)
     for i in range(500):  # ten seconds of the loop
         reporter.update(replace(STATUS, t_s=100.0 + 0.02 * i))
     reporter.close()
@@ -98,7 +105,7 @@ def test_no_more_than_ten_pictures_a_second() -> None:
 def test_the_panel_ends_with_the_flight_s_last_moment(last: str) -> None:
     """The loop tells the event first, and then the tick, which may be the last one."""
     surface = Recorder()
-    reporter = Reporter(surface)
+    reporter = FlightPanel(surface)
     reporter.update(replace(STATUS, t_s=100.0, phase="ASCEND"))
     reporter.event(entered(100.02, Phase(last), "over"))
     reporter.update(replace(STATUS, t_s=100.02, phase=last))
@@ -115,7 +122,7 @@ def test_a_new_phase_is_shown_without_waiting() -> None:
             if status.phase == "ABORTED":
                 shown.set()
 
-    reporter = Reporter(Watched())
+    reporter = FlightPanel(Watched())
     reporter.update(replace(STATUS, t_s=100.0, phase="ASCEND"))
     reporter.event(entered(100.02, Phase.ABORTED, "Ctrl-C twice"))
     reporter.update(replace(STATUS, t_s=100.02, phase="ABORTED"))
@@ -128,11 +135,11 @@ def test_the_panel_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setenv("COLUMNS", "80")
     stream = Terminal()
-    reporter = make_reporter(stream=stream)
+    reporter = open_panel(stream=stream)
     reporter.event(note(100.0, "link: radio://0/80/2M/E7E7E7E7E7 [ok] https://a.b"))
     reporter.update(replace(STATUS, phase="LANDING"))
     reporter.close()
-    assert reporter.problem is None
+    assert reporter.failure is None
     text = ESCAPE.sub("", stream.getvalue())
     assert "link: radio://0/80/2M/E7E7E7E7E7 [ok] https://a.b" in text
     assert "x -12.3  y +4.5  z +123.4 cm   yaw -166.2 deg" in text
@@ -145,7 +152,7 @@ def test_no_color(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NO_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm-256color")
     stream = Terminal()
-    reporter = make_reporter(True, stream)
+    reporter = open_panel(True, stream)
     reporter.update(replace(STATUS, phase="ABORTED", hold="no picture"))
     reporter.close()
     assert "ABORTED" in stream.getvalue()
@@ -155,7 +162,7 @@ def test_no_color(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_dumb_terminal_gets_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "dumb")
     stream = Terminal()
-    reporter = make_reporter(stream=stream)
+    reporter = open_panel(stream=stream)
     reporter.update(STATUS)
     reporter.close()
     assert stream.getvalue() == "[   0.00 s] ALIGN: pose is steady\n"
@@ -189,10 +196,10 @@ def test_a_display_that_fails_falls_silent_once() -> None:
             raise BrokenPipeError("gone")
 
     surface = Failing()
-    reporter = Reporter(surface)
+    reporter = FlightPanel(surface)
     reporter.event(entered(0.0, Phase.SEARCH, "x"))
     reporter.close()
-    assert reporter.problem == "the display fell silent: BrokenPipeError: gone"
+    assert reporter.failure == "the display fell silent: BrokenPipeError: gone"
     reporter.event(entered(1.0, Phase.ALIGN, "y"))
     reporter.update(STATUS)
     reporter.close()
@@ -209,7 +216,7 @@ def test_a_terminal_that_stands_still_does_not_stop_the_loop() -> None:
             super().line(text)
 
     surface = Stuck()
-    reporter = Reporter(surface)
+    reporter = FlightPanel(surface)
     for i in range(5000):
         reporter.event(note(0.02 * i, f"event {i}"))
         reporter.update(replace(STATUS, t_s=0.02 * i))
@@ -240,14 +247,14 @@ def tick(**changes: Any) -> Tick:
 def test_what_the_loop_knows_reaches_log_and_display(tmp_path: Path) -> None:
     log = LogWatcher(FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header()))
     surface = Recorder()
-    display = DisplayWatcher(Reporter(surface))
+    display = FlightPanel(surface)
     for watcher in (log, display):
         watcher.event(entered(100.0, Phase.APPROACH, "start"))
         watcher.tick(tick())
         watcher.event(held(100.1, "no picture"))
     assert (log.problem, display.problem) == (None, None)
     log.close()
-    display.reporter.close()
+    display.close()
     back = read_log(log.path)
     assert back.truncated
     assert [e["event"] for e in back.events] == ["phase", "hold"]
@@ -299,3 +306,36 @@ def test_what_the_battery_is_enough_for(
     rows = dict(status_rows(replace(STATUS, battery_v=volts, battery=battery)))
     assert rows["height"] == f"0.82 m   battery {text}"
     assert len(rows["height"]) < 70
+
+
+# --- Positions from outside, on the panel and in the log ---------------------------------------
+
+
+PLACE = ExternalPosition((0.1, -0.2, 0.3))
+WELL = ExternalPositions(0.012, None, 300, 99.6, PLACE)
+
+
+def test_positions_from_outside_have_their_line() -> None:
+    assert "outside" not in dict(status_rows(STATUS))
+    assert status_of(tick()).outside is None
+    rows = dict(status_rows(status_of(tick(outside=WELL))))
+    assert rows["outside"] == "position 100 Hz   12 ms"
+
+
+@pytest.mark.parametrize("age_s", [0.4, math.inf])
+def test_what_is_wrong_takes_the_line(age_s: float) -> None:
+    outside = replace(WELL, age_s=age_s, problem="the rigid body 'cf2' is not seen")
+    assert dict(status_rows(replace(STATUS, outside=outside)))["outside"] == outside.problem
+    assert WIDTH <= 80
+
+
+def test_the_log_has_what_was_sent() -> None:
+    record = tick_record(tick(outside=WELL))
+    assert [record[f"pos_{key}"] for key in ("age_s", "sent", "hz", "x_m", "z_m")] == [
+        0.012, 300, 99.6, 0.1, 0.3,
+    ]  # fmt: skip
+    assert record["pos_qw"] is None  # a position alone was sent
+    never = tick_record(tick(outside=ExternalPositions(math.inf, "none has come", 0, 0.0, None)))
+    assert never["pos_age_s"] is None
+    assert never["pos_note"] == "none has come"
+    assert tick_record(tick())["pos_sent"] is None

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.camera.health import HealthLimits, content
+from perchctl.camera.health import content
 from perchctl.faults import effects as e
 from perchctl.faults.edges import (
     LONGEST_S,
@@ -18,10 +18,9 @@ from perchctl.faults.edges import (
     ProgramKilled,
     order_of,
 )
-from perchctl.link import BLOCKS_DELETED_AFTER_S
-from perchctl.link.encode import UNLOCK_THRUST, encode
+from perchctl.link import BLOCKS_DELETED_AFTER_S, Packet
+from perchctl.link.crtp import UNLOCK_THRUST, encode
 from perchctl.link.mock import TELEMETRY_DELAY_S
-from perchctl.sim import Packet
 from perchctl.vehicle import EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from perchctl.vision import Frame
 
@@ -205,8 +204,8 @@ def test_what_each_camera_fault_does() -> None:
     assert len(frozen) > 15
     assert all(np.array_equal(f.image, frozen[0].image) for f in frozen)
     assert len({f.t_s for f in frozen}) == len(frozen)
-    assert {content(f.image, HealthLimits()) for f in during(looked("snow"))} == {"snow"}
-    assert {content(f.image, HealthLimits()) for f in during(looked("dark"))} == {"dark"}
+    assert {content(f.image) for f in during(looked("snow"))} == {"snow"}
+    assert {content(f.image) for f in during(looked("dark"))} == {"dark"}
     mirrored = during(looked("mirrored"))[0].image
     assert np.array_equal(mirrored[:, -1], np.full(48, 180))
 

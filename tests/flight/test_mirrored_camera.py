@@ -15,7 +15,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from numpy.typing import NDArray
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import FrameSource, mirrored_note, open_source
+from perchctl.camera import FrameSource, mirrored_note, open_camera
 from perchctl.faults.catalogue import BY_NAME, draw_case
 from perchctl.faults.effects import FOR_EVER, CameraFault
 from perchctl.faults.flight import FaultyFlight
@@ -96,9 +96,8 @@ def test_each_source_that_is_opened_by_a_profile_is_turned_right(tmp_path: Path)
     image = np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
     cv2.imwrite(f"{tmp_path}/a.png", image)
     for mirrored in (False, True):
-        source = open_source(
-            f"images:{tmp_path}", 0.0, None, lambda: 0.0, config=CameraConfig(mirrored=mirrored)
-        )
+        config = CameraConfig(mirrored=mirrored)
+        source = open_camera(f"images:{tmp_path}", lambda: 0.0, config)
         frame = source.poll(0.0)
         assert frame is not None
         np.testing.assert_array_equal(frame.image, image[:, ::-1] if mirrored else image)

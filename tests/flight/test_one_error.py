@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.display.watch import status_of
+from perchctl.display.panel import status_of
 from perchctl.flight import fly_lockstep
 from perchctl.geometry import Array, rot_z, wrap_rad
 from perchctl.log.fields import tick_record

@@ -252,11 +252,11 @@ def test_a_terminal_that_is_gone_is_no_failure() -> None:
     code = (
         "import os, sys\n"
         "from perchctl.commands.output import say, tell\n"
-        "from perchctl.display.watch import make_reporter\n"
+        "from perchctl.display import open_panel\n"
         "from perchctl.mission.watch import Event, EventKind\n"
-        "say('one'); reporter = make_reporter(stream=sys.stderr)\n"
-        "reporter.event(Event(0.0, EventKind.NOTE, 'two'))\n"
-        "reporter.close(); tell('three')\n"
+        "say('one'); panel = open_panel(stream=sys.stderr)\n"
+        "panel.event(Event(0.0, EventKind.NOTE, 'two'))\n"
+        "panel.close(); tell('three')\n"
         "sys.exit(7)\n"
     )
     read, write = os.pipe()
@@ -286,7 +286,7 @@ def test_it_is_asked_once_the_vehicle_has_answered(monkeypatch: pytest.MonkeyPat
 
     camera = SimpleNamespace(close=lambda: order.append("camera closed"))
     monkeypatch.setattr(session, "CflibLink", Link)
-    monkeypatch.setattr(session, "open_source", lambda *args, **options: camera)
+    monkeypatch.setattr(session, "open_camera", lambda *args, **options: camera)
     monkeypatch.setattr(session, "fly", lambda parts: order.append("flew"))
     options = session.FlyOptions(
         load_profile("crazyflie"), Path("crazyflie.yaml"), "radio://0/80/2M", "http://cam/"

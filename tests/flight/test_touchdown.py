@@ -51,13 +51,13 @@ SENTENCE = "touched down hard: 0.9 m/s, 3.1 g"
 def dropped(seed: int, share: float, blind: bool) -> tuple[float, float, Touchdown | None]:
     """The vehicle comes down on a share of the thrust that it hovers on. Returns its true speed
     at the floor, its largest true specific force, g, and what was felt."""
-    from perchctl.link import MockLink, simulated_radio
-    from perchctl.sim import SimulatedVehicle, draw_scenario
+    from perchctl.link import MockLink, Radio
+    from perchctl.sim import SimulatedVehicle, draw_scenario, radio_bursts
 
     profile = load_profile("sim")
     scenario = draw_scenario(profile, seed)
     vehicle = SimulatedVehicle(scenario)
-    link = MockLink(vehicle, profile.link.telemetry_period_s, simulated_radio(scenario))
+    link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(radio_bursts(scenario)))
     link.connect()
     motion, carried, last = ImuMotion(), Reckoning(), None
     t_s, dropped_s, hit_s, speed_mps, sink_mps = 1.0, math.inf, math.inf, 0.0, 0.0

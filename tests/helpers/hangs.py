@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from perchctl.link import MockLink
-from perchctl.link.mock import ScriptedLink
 from perchctl.mission import Observation, PlannerState, step_mission
 from perchctl.vision import Frame
+from tests.helpers.scripted_link import ScriptedLink
 
 
 def plan_by(monkeypatch: pytest.MonkeyPatch, step: Callable[..., Any]) -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
+from typing import TypeVar
 
+from perchctl.camera.network import StreamSource
 from perchctl.camera.source import LiveSource
 from perchctl.vision import Frame
+from tests.helpers.waiting import until
 
 WAIT_S = 10.0  # bound of every wait; reached only when a test fails
+
+
+S = TypeVar("S", bound=StreamSource)
 
 
 class Clock:
@@ -19,14 +23,15 @@ class Clock:
         return self.t_s
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    """Poll on an event with a bound; no fixed pauses."""
-    tick = threading.Event()
-    for _ in range(int(WAIT_S / 0.002)):
-        if condition():
-            return
-        tick.wait(0.002)
-    raise AssertionError("waited in vain")
+def begun(source: S, opened: list[LiveSource] | None = None, **timing: float) -> S:
+    """The stream connecting, with other times than its own."""
+    for name, seconds in timing.items():
+        assert hasattr(source, name)
+        setattr(source, name, seconds)
+    source.begin()
+    if opened is not None:
+        opened.append(source)
+    return source
 
 
 def next_frame(source: LiveSource) -> Frame:
@@ -38,7 +43,7 @@ def next_frame(source: LiveSource) -> Frame:
             found.append(frame)
         return bool(found)
 
-    wait_for(ready)
+    until(ready)
     return found[0]
 
 

@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from perchctl.display.page.live import TOKEN_HEADER
+from perchctl.display.live import TOKEN_HEADER
 
 CORNERS = np.array([[200.0, 150.0], [400.0, 150.0], [400.0, 350.0], [200.0, 350.0]])
 

@@ -13,7 +13,6 @@ import pytest
 from perchctl.flight import FlightParts, fly
 from perchctl.flight.loop import Positions
 from perchctl.flight.rescue import Rescued, rescue
-from perchctl.link.mock import ScriptedLink
 from perchctl.mission import Event, FlightReport, Observation, Operator, Phase, Tick, planner
 from perchctl.perception import History
 from perchctl.profile import Profile
@@ -28,6 +27,7 @@ from perchctl.vehicle import (
 )
 from perchctl.vision import CameraModel, Frame, Pipeline, make_pipeline
 from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, telemetry
+from tests.helpers.scripted_link import ScriptedLink
 
 SIZE_PX = (64, 48)
 

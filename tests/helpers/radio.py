@@ -22,7 +22,8 @@ from cflib.crtp.crtpdriver import CRTPDriver
 from cflib.crtp.exceptions import WrongUriType
 from cflib.drivers.crazyradio import Crazyradio, _radio_ack
 
-from perchctl.sim import Packet, Port, Scenario, SimulatedVehicle
+from perchctl.link import Packet, Port
+from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.sim.crtp.server import CrtpServer
 
 URI = "radio://0/80/2M/E7E7E7E7E7"

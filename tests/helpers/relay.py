@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-from perchctl.sim import Packet, Port
+from perchctl.link import Packet, Port
 
 COMMANDS = (Port.COMMANDER, Port.LOCALIZATION, Port.COMMANDER_GENERIC, Port.HIGH_LEVEL)
 PARAMETER_WRITE, PLATFORM_COMMAND, SUPERVISOR_COMMAND = 2, 0, 1  # channels

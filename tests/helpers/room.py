@@ -13,8 +13,9 @@ import numpy as np
 
 from perchctl.flight import fly_lockstep
 from perchctl.geometry import Array, invert_T, make_T, rot_z, yaw_of
+from perchctl.link import Packet, Port
 from perchctl.profile import Profile
-from perchctl.sim import Neighbour, Packet, Port, Scenario, draw_scenario
+from perchctl.sim import Neighbour, Scenario, draw_scenario
 
 COMMANDS = (Port.COMMANDER, Port.COMMANDER_GENERIC, Port.HIGH_LEVEL, Port.SUPERVISOR)
 _POSITION = 7  # type of a setpoint

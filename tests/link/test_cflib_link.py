@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+from tests.helpers.waiting import until
+
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
@@ -41,15 +43,6 @@ WAIT_S = 20.0
 PAUSE = threading.Event()
 PITCH_PORT = 3  # raw setpoints: attitude and thrust
 COMMAND_PORTS = (PITCH_PORT, 7, 8, 9)
-
-
-def until(true: Callable[[], Any], limit_s: float = WAIT_S) -> Any:
-    """Wait, bounded, until something becomes true."""
-    end_s = time.monotonic() + limit_s
-    while not (value := true()):
-        assert time.monotonic() < end_s
-        PAUSE.wait(0.01)
-    return value
 
 
 def let_pass(sim: SimProcess, dt_s: float, meanwhile: Callable[[], None] = lambda: None) -> None:

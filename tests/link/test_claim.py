@@ -13,13 +13,12 @@ import pytest
 
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.link import connection, vehicle_uri
-from perchctl.link.claim import claim
-from perchctl.link.connection import open_connection, plain_cause
+from perchctl.link.connection import claim, open_connection, plain_cause
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
 _HOLDS = """
 import sys
-from perchctl.link.claim import claim
+from perchctl.link.connection import claim
 held = claim(sys.argv[1])
 print("held", flush=True)
 sys.stdin.read()

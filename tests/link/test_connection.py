@@ -5,6 +5,8 @@ Time is the test's own: the clock that `perchctl.link.connection` reads.
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import dataclass
@@ -16,9 +18,9 @@ import cflib.crtp
 import pytest
 from cflib.crtp import radiodriver
 
+from perchctl.link import Packet, Port
 from perchctl.link import connection as room
 from perchctl.link.connection import DEAD_S, Connection
-from perchctl.sim import Packet, Port
 
 PACKET = Packet(Port.SUPERVISOR, 1, b"\x03")
 STEP_S = 0.05
@@ -178,3 +180,18 @@ def await_open(connection: Connection) -> None:
             return
         pause.wait(0.01)
     raise AssertionError(connection.lost)
+
+
+def test_a_real_flight_loads_nothing_of_the_simulator() -> None:
+    """Neither does its link: the mock takes a simulated vehicle as an argument."""
+    program = (
+        "import sys, time\n"
+        "import perchctl.flight.session\n"
+        "from perchctl.link import CflibLink, MockLink, Packet, ProbeLink\n"
+        "from perchctl.profile import LinkConfig\n"
+        "CflibLink('radio://0/80/2M', LinkConfig(), time.monotonic)\n"
+        "print(*[name for name in sys.modules if name.startswith('perchctl.sim')])\n"
+    )
+    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert shown.returncode == 0, shown.stderr
+    assert shown.stdout.split() == []

@@ -11,10 +11,10 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed
-from perchctl.link import CflibLink, EstimateLink, MockLink, evidence
+from perchctl.link import CflibLink, EstimateLink, MockLink
 from perchctl.link.connection import Connection
 from perchctl.sim import SimProcess, SimulatedVehicle
-from perchctl.vehicle import FLYING, HL_ACTIVE, LOCKED, EmergencyStop, Land
+from perchctl.vehicle import FLYING, FRESH_S, LOCKED, EmergencyStop, Land, is_cut, may_fly
 from tests.helpers.mission import AIRBORNE, READY, telemetry
 from tests.link.test_cflib_link import (
     CONFIG,
@@ -40,26 +40,23 @@ def sim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimProcess]:
 
 # --- evidence --------------------------------------------------------------------------------
 
-OLD_S = evidence.FRESH_S + 0.01
+OLD_S = FRESH_S + 0.01
 
 
 def test_what_is_unknown_flies() -> None:
     standing = telemetry(10.0, 0.0, supervisor=READY, thrust=0.0)
-    for predicate in (evidence.may_fly, evidence.motors_may_run):
-        assert predicate(None, 10.0)
-        assert predicate(standing, 10.0 + OLD_S)
-        assert not predicate(standing, 10.1)
-    assert not evidence.is_cut(None, 10.0)
+    assert may_fly(None, 10.0)
+    assert may_fly(standing, 10.0 + OLD_S)
+    assert not may_fly(standing, 10.1)
+    assert not is_cut(None, 10.0)
     locked = telemetry(10.0, supervisor=LOCKED, thrust=0.0)
-    assert evidence.is_cut(locked, 10.1)
-    assert not evidence.is_cut(locked, 10.0 + OLD_S)
+    assert is_cut(locked, 10.1)
+    assert not is_cut(locked, 10.0 + OLD_S)
 
 
 def test_motors_off_for_less_than_two_seconds_is_no_flight_but_no_farewell_either() -> None:
     hanging = telemetry(10.0, 2.0, supervisor=AIRBORNE, thrust=0.0)
-    assert evidence.may_fly(hanging, 10.0)
-    assert not evidence.motors_may_run(hanging, 10.0)
-    assert evidence.motors_may_run(telemetry(10.0, supervisor=READY | HL_ACTIVE, thrust=0.0), 10.0)
+    assert may_fly(hanging, 10.0)
 
 
 # --- leaving ---------------------------------------------------------------------------------

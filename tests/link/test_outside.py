@@ -16,15 +16,16 @@ import pytest
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, PerchError, TimedOut
 from perchctl.geometry import rot_z
-from perchctl.link import (
+from perchctl.link import CflibLink, check_estimator_parameters
+from perchctl.link.connection import Connection, send_packets
+from perchctl.link.crtp import encode_external
+from perchctl.link.external_position import (
+    AGREE_WITHIN_S,
     RESET_PARAMETER,
-    CflibLink,
-    check_estimator_parameters,
+    RESETS,
+    Settling,
     estimator_parameters,
 )
-from perchctl.link.connection import Connection, send_packets
-from perchctl.link.encode import encode_external
-from perchctl.link.outside import AGREE_WITHIN_S, RESETS, Settling
 from perchctl.positioning import FeedStatus, Placed
 from perchctl.profile import LinkConfig, PositioningConfig
 from perchctl.vehicle import FLYING, ExternalPosition, Telemetry

@@ -20,12 +20,12 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from cflib.crtp import radiodriver
 from cflib.crtp.crtpstack import CRTPPacket
 
-from perchctl.link import CflibLink
+from perchctl.link import CflibLink, Packet, Port
 from perchctl.link import connection as connection_room
-from perchctl.link.encode import encode
+from perchctl.link.crtp import encode
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
-from perchctl.sim import Packet, Port, Scenario
+from perchctl.sim import Scenario
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, Telemetry
 from tests.helpers.radio import FORGETS_LOGS_S, URI, Air, OpaqueRadio, plug_in
 

@@ -15,19 +15,11 @@ import pytest
 from perchctl.link.sender import GUARD_PERIOD_S, HANGS_S, STALE_S, Sender
 from perchctl.mission import SentCommand
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, StopMotors
+from tests.helpers.waiting import until
 
 LIMIT_S = 5.0
 LAND, STOP = Land(-0.05, 2.0), EmergencyStop()
 PLACES = [PositionSetpoint(float(i), 0.0, 1.0, 0.0) for i in range(4)]
-PAUSE = threading.Event()
-
-
-def until(true: Callable[[], Any]) -> None:
-    for _ in range(int(LIMIT_S / 0.005)):
-        if true():
-            return
-        PAUSE.wait(0.005)
-    raise AssertionError("it did not happen")
 
 
 class Library:

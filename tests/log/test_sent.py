@@ -15,7 +15,6 @@ from perchctl.analysis import FlightAnalysis, show_record, show_text
 from perchctl.analysis.story import story_of
 from perchctl.flight import fly
 from perchctl.flight.rescue import rescue
-from perchctl.link.mock import ScriptedLink
 from perchctl.link.sender import Sender
 from perchctl.log import LogWatcher, export_mcap, read_log, write
 from perchctl.log import recorder as recording_module
@@ -32,6 +31,7 @@ from tests.helpers import recorded
 from tests.helpers.loop_rig import PROFILE, Clock
 from tests.helpers.mission import telemetry
 from tests.helpers.recorded import MemoryDisk
+from tests.helpers.scripted_link import ScriptedLink
 
 HOLD, LAND = PositionSetpoint(0.1, 0.2, 1.0 / 3.0, 0.0), Land(-0.05, 2.0)
 TOLD = (

@@ -20,12 +20,13 @@ from perchctl.errors import SafetyAbort
 from perchctl.flight import session
 from perchctl.positioning import compared
 from perchctl.positioning.compared import (
+    NEVER,
     Comparison,
     ComparisonRecord,
-    NeverCompared,
-    Unreadable,
+    NoComparison,
     decoded,
     encoded,
+    unreadable,
 )
 from perchctl.profile import PositioningConfig
 from tests.helpers.capture import compared as was_compared
@@ -49,6 +50,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "state"
 
 
+def is_unreadable(record: ComparisonRecord) -> bool:
+    return isinstance(record, NoComparison) and "is not known" in record.found
+
+
 def ago(seconds: float, passes: bool = True, found: str = "fine") -> Comparison:
     return Comparison(NOW - timedelta(seconds=seconds), passes, found)
 
@@ -65,12 +70,12 @@ def test_only_a_pass_of_the_last_day_is_flown_by(seconds: float, passes: bool) -
 
 
 @pytest.mark.parametrize(("record", "words"), [
-    (NeverCompared(), "was never compared with this vehicle: run perchctl check --lift"),
+    (NEVER, "was never compared with this vehicle: run perchctl check --lift"),
     (ago(30 * 3600.0), "last compared 30 h ago, on 21 Nov 09:00 (24 h at most)"),
     (ago(400 * DAY_S), "last compared 400 days ago, on 18 Oct 2025 15:00"),
     (ago(-7200.0), "compared on 22 Nov 17:00, which is yet to come: set this computer's clock"),
     (ago(3000.0, False, SWAPPED), f"{SWAPPED} (found by check --lift on 22 Nov 14:10): mend"),
-    (Unreadable(Path("x.json"), "is damaged"), "is not known: x.json is damaged: remove"),
+    (unreadable(Path("x.json"), "is damaged"), "is not known: x.json is damaged: remove"),
 ])  # fmt: skip
 def test_each_objection_says_what_is_and_what_to_do(record: ComparisonRecord, words: str) -> None:
     said = record.objection(NOW)
@@ -108,11 +113,11 @@ def test_what_is_no_record_is_told_as_such(data: bytes) -> None:
 def test_another_set_up_was_never_compared(change: dict[str, Any], folder: Path) -> None:
     was_compared(CONFIG, URI)
     other = CONFIG.model_copy(update=change)
-    assert compared.load_comparison(other, VEHICLE) == NeverCompared()
+    assert compared.load_comparison(other, VEHICLE) == NEVER
     # Nor by a file that was copied to its place.
     (mine, theirs) = (compared.path_of(compared.set_up_of(c, VEHICLE)) for c in (CONFIG, other))
     theirs.write_bytes(mine.read_bytes())
-    assert isinstance(compared.load_comparison(other, VEHICLE), Unreadable)
+    assert is_unreadable(compared.load_comparison(other, VEHICLE))
 
 
 def test_another_vehicle_s_record_lets_none_fly_and_is_named() -> None:
@@ -127,12 +132,12 @@ def test_another_vehicle_s_record_lets_none_fly_and_is_named() -> None:
     # Nor by a file that was copied to its place; what is damaged beside it is no vehicle.
     (mine, theirs) = (compared.path_of(compared.set_up_of(CONFIG, v)) for v in (VEHICLE, OTHER))
     mine.write_bytes(theirs.read_bytes())
-    assert isinstance(compared.load_comparison(CONFIG, VEHICLE), Unreadable)
+    assert is_unreadable(compared.load_comparison(CONFIG, VEHICLE))
     mine.unlink()
     theirs.write_bytes(b"{")
-    assert compared.load_comparison(CONFIG, VEHICLE) == NeverCompared()
+    assert compared.load_comparison(CONFIG, VEHICLE) == NEVER
     was_compared(CONFIG.model_copy(update={"host": "lab2"}), OTHER_URI)
-    assert compared.load_comparison(CONFIG, VEHICLE) == NeverCompared()
+    assert compared.load_comparison(CONFIG, VEHICLE) == NEVER
 
 
 def test_a_vehicle_found_by_another_dongle_is_the_same() -> None:

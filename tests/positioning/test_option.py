@@ -1,4 +1,4 @@
-"""`--positioning`, its words, and what the plan says of it."""
+"""`--positioning`, its words and limits, and what the plan says of it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from pydantic import ValidationError
 from typer.testing import CliRunner, Result
 
 from perchctl.commands import app
@@ -16,6 +17,7 @@ from perchctl.commands.complete import positionings
 from perchctl.commands.positioning import positioned
 from perchctl.errors import InvalidValue
 from perchctl.profile import PositioningConfig, Profile
+from perchctl.profile.positioning import MOST_LATENCY_S
 from perchctl.startup import failure_record
 from perchctl.weights import open_named
 
@@ -139,3 +141,19 @@ def test_the_library_that_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyP
     assert done.exit_code == 2
     assert "-m pip install 'perchctl[mocap]'" in done.stderr
     assert done.stderr.strip().count("\n") == 0
+
+
+@pytest.mark.parametrize(
+    "late",
+    [{"rate_hz": 10.0, "latency_s": 0.04}, {"latency_s": 0.04, "hold_s": 0.06}, {"hold_s": 0.03}],
+)
+def test_a_hold_that_each_perfect_frame_would_reach_is_refused(late: dict[str, float]) -> None:
+    with pytest.raises(ValidationError, match="a position is stale before the next one comes"):
+        PositioningConfig(by="mocap", host="lab", **late)
+    PositioningConfig(by="mocap", host="lab", **{**late, "hold_s": 0.4})
+
+
+def test_a_capture_that_is_later_than_can_be_flown_by_is_refused() -> None:
+    PositioningConfig(by="mocap", host="lab", latency_s=MOST_LATENCY_S)
+    with pytest.raises(ValidationError, match=r"less than or equal to 0\.04"):
+        PositioningConfig(by="mocap", host="lab", latency_s=0.07)

@@ -9,9 +9,9 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.faults.edges import FaultyRadio
-from perchctl.link import Radio, simulated_radio
-from perchctl.link.mock import TELEMETRY_DELAY_S, BurstyRadio
-from perchctl.sim import Bursts, Packet, Scenario
+from perchctl.link import Packet, Radio
+from perchctl.link.mock import TELEMETRY_DELAY_S
+from perchctl.sim import Bursts, Scenario, radio_bursts
 from perchctl.sim.bursts import CONNECTED_S
 
 STEP_S = 0.005
@@ -58,9 +58,8 @@ def test_nothing_is_lost_before_the_take_off_nor_without_a_share() -> None:
 
 def test_both_directions_are_lost_together() -> None:
     scenario = Scenario(seed=2, radio_loss=0.3, radio_burst_s=0.3)
-    radio, same = simulated_radio(scenario), Bursts(2, 0.3, 0.3)
-    assert isinstance(radio, BurstyRadio)
-    assert type(simulated_radio(Scenario())) is Radio
+    radio, same = Radio(radio_bursts(scenario)), Bursts(2, 0.3, 0.3)
+    assert radio_bursts(Scenario()) is None
     for step in range(4000):
         t_s = step * STEP_S
         lost = same.lost(t_s)
@@ -70,7 +69,8 @@ def test_both_directions_are_lost_together() -> None:
 
 def test_faults_are_laid_over_the_same_radio() -> None:
     scenario = Scenario(seed=2, radio_loss=0.3, radio_burst_s=0.3)
-    plain, faulty = simulated_radio(scenario), FaultyRadio(simulated_radio(scenario))
+    plain = Radio(radio_bursts(scenario))
+    faulty = FaultyRadio(Radio(radio_bursts(scenario)))
     for step in range(2000):
         t_s = step * STEP_S
         assert faulty.up(PACKET, t_s) is plain.up(PACKET, t_s)

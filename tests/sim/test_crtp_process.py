@@ -17,7 +17,8 @@ from pathlib import Path
 import pytest
 
 from perchctl.errors import ConnectionFailed, InvalidValue
-from perchctl.sim import CONTROL_PERIOD_S, Packet, Port, Scenario, SimProcess
+from perchctl.link import Packet, Port
+from perchctl.sim import CONTROL_PERIOD_S, Scenario, SimProcess
 from perchctl.sim.process.child import MAX_LAG_S, Runner
 from tests.helpers.crtp_rig import ROOT, WAIT_S, Client, wired
 

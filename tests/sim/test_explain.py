@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.display.status import event_text
+from perchctl.display.panel import event_text
 from perchctl.flight import fly_lockstep
 from perchctl.log import read_log
 from perchctl.mission import Event, EventKeeper, EventKind, Phase, Severity

@@ -1,8 +1,4 @@
-"""CRTP on the wire: the header byte, the ports and the number types.
-
-One packet is a header ``port << 4 | 0x0C | channel`` and at most 30 bytes
-(docs/firmware.md, "Link").
-"""
+"""CRTP on the wire: what the firmware answers, and its number types."""
 
 from __future__ import annotations
 
@@ -12,25 +8,11 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
+
+from perchctl.link import Packet as Packet
+from perchctl.link import Port as Port
 
 MAX_DATA = 30
-
-
-class Port(IntEnum):
-    """CRTP's ports, by their numbers on the air."""
-
-    CONSOLE = 0
-    PARAM = 2
-    COMMANDER = 3
-    MEM = 4
-    LOG = 5
-    LOCALIZATION = 6
-    COMMANDER_GENERIC = 7
-    HIGH_LEVEL = 8
-    SUPERVISOR = 9
-    PLATFORM = 13
-    LINK = 15
 
 
 class Status(IntEnum):
@@ -43,22 +25,6 @@ class Status(IntEnum):
     ENOMEM = 12
     EACCES = 13
     EEXIST = 17
-
-
-class Packet(NamedTuple):
-    port: int
-    channel: int
-    data: bytes
-
-    def encode(self) -> bytes:
-        return bytes((self.port << 4 | 0x0C | self.channel,)) + self.data
-
-    @staticmethod
-    def decode(datagram: bytes) -> Packet | None:
-        """None for what cannot be a packet: empty or too long."""
-        if not 1 <= len(datagram) <= 1 + MAX_DATA:
-            return None
-        return Packet(datagram[0] >> 4, datagram[0] & 0x03, datagram[1:])
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,10 @@ from typing import Any, Protocol
 
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
 from perchctl.geometry import wrap_rad, yaw_of
-from perchctl.link.evidence import knows_its_position, may_fly
-from perchctl.link.prepare import order_parameter, set_parameters
+from perchctl.link.firmware import order_parameter, set_parameters
 from perchctl.positioning import FeedStatus, Placed
 from perchctl.profile import PositioningConfig
-from perchctl.vehicle import Telemetry
+from perchctl.vehicle import Telemetry, knows_its_position, may_fly
 
 ESTIMATOR = "stabilizer.estimator"
 KALMAN = 2
@@ -33,6 +32,7 @@ AGREE_M, AGREE_RAD = 0.05, math.radians(5.0)
 STILL_M = 0.05
 """From the reset until they agree: who carries the vehicle about has not put it down."""
 _POLL_S = 0.02
+NEEDED_BY = "positioning from outside"
 
 
 class Feed(Protocol):
@@ -52,6 +52,13 @@ def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
         "locSrv.extPosStdDev": config.position_sigma_m,
         "locSrv.extQuatStdDev": config.attitude_sigma_rad,
     }
+
+
+def start_parameters(start: Placed) -> dict[str, float]:
+    """Where a reset of the firmware's estimator starts it."""
+    x, y, z = (float(part) for part in start.position_m)
+    values = {"X": x, "Y": y, "Z": z, "Yaw": yaw_of(start.R)}
+    return {f"kalman.initial{name}": value for name, value in values.items()}
 
 
 def check_estimator_parameters(own: Mapping[str, float], config: PositioningConfig) -> None:
@@ -125,22 +132,11 @@ class Settling:
         return placed
 
     def _reset(self, start: Placed) -> None:
-        x, y, z = (float(part) for part in start.position_m)
-        values = {"X": x, "Y": y, "Z": z, "Yaw": yaw_of(start.R)}
-        set_parameters(
-            self._cf,
-            self._uri,
-            {f"kalman.initial{name}": value for name, value in values.items()},
-            needed_by="positioning from outside",
-        )
+        set_parameters(self._cf, self._uri, start_parameters(start), needed_by=NEEDED_BY)
         # Whether it was heard shows in the estimate: the firmware may clear it by itself.
-        order_parameter(
-            self._cf, self._uri, RESET_PARAMETER, 1, needed_by="positioning from outside"
-        )
+        order_parameter(self._cf, self._uri, RESET_PARAMETER, 1, needed_by=NEEDED_BY)
         self._wait(RESET_PULSE_S)
-        order_parameter(
-            self._cf, self._uri, RESET_PARAMETER, 0, needed_by="positioning from outside"
-        )
+        order_parameter(self._cf, self._uri, RESET_PARAMETER, 0, needed_by=NEEDED_BY)
 
     def _agreement(self, feed: Feed, start: Placed) -> str:
         """Empty once capture and estimate agree over fresh samples of both for a while;

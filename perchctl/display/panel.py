@@ -1,4 +1,4 @@
-"""The panel as a watcher of the loop."""
+"""The live display on a terminal: what it shows of one moment of a flight, and its drawing."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 from collections import deque
+from dataclasses import dataclass
 from typing import Protocol, TextIO
 
 from rich.console import Console
@@ -15,25 +16,53 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from perchctl.display.status import FlightStatus, event_text, status_rows
-from perchctl.mission import BEFORE_CONTACT, Event, EventKind, Tick
+from perchctl.mission import (
+    BEFORE_CONTACT,
+    BatteryOutlook,
+    Event,
+    EventKind,
+    ExternalPositions,
+    Tick,
+)
+from perchctl.vehicle import NO_BATTERY_READING_V
 
 
-class DisplayWatcher:
-    """Shows the flight. A display that fails is no reason to land: no problem, ever."""
+@dataclass(frozen=True)
+class FlightStatus:
+    """SI and radians; the display turns them into centimetres and degrees.
 
-    def __init__(self, reporter: Reporter) -> None:
-        self.reporter = reporter
+    Attributes:
+        t_s: the loop's clock.
+        in_phase_s: time since the phase was entered.
+        e_m, e_yaw_rad: target relative to the gear; None while none was seen.
+        tracked: the target is seen, or was a moment ago; else `e_m` is remembered.
+        stage: markers seen: none, large, both, small.
+        height_m: above the place of take-off.
+        link_age_s, camera_age_s: since the newest telemetry and the last good frame.
+        loop_late_s: how late this tick began.
+        attempts: failed perching attempts so far.
+        battery: what it is enough for; None outside a flight's phases.
+        reason: why the phase was entered; `hold`: why the vehicle is held, or empty.
+        outside: how it goes with positions from outside; None where decks measure them.
+    """
 
-    def tick(self, tick: Tick) -> None:
-        self.reporter.update(status_of(tick))
-
-    def event(self, event: Event) -> None:
-        self.reporter.event(event)
-
-    @property
-    def problem(self) -> str | None:
-        return None
+    t_s: float
+    phase: str
+    in_phase_s: float
+    e_m: tuple[float, float, float] | None
+    e_yaw_rad: float | None
+    tracked: bool
+    stage: str
+    height_m: float
+    battery_v: float
+    link_age_s: float
+    camera_age_s: float
+    loop_late_s: float
+    attempts: int
+    reason: str
+    hold: str = ""
+    outside: ExternalPositions | None = None
+    battery: BatteryOutlook | None = None
 
 
 def status_of(tick: Tick) -> FlightStatus:
@@ -64,6 +93,79 @@ def status_of(tick: Tick) -> FlightStatus:
         outside=tick.outside,
         battery=state.battery if state.phase in BEFORE_CONTACT else None,
     )
+
+
+def status_rows(status: FlightStatus) -> list[tuple[str, str]]:
+    """Name and text of each line of the display, at most 80 columns together."""
+    if status.e_m is None:
+        error = "no target seen yet"
+    else:
+        x, y, z = (f"{100.0 * v:+.1f}" for v in status.e_m)
+        yaw = "-" if status.e_yaw_rad is None else f"{math.degrees(status.e_yaw_rad):+.1f}"
+        error = f"x {x}  y {y}  z {z} cm   yaw {yaw} deg"
+        error += "" if status.tracked else "   (not seen)"
+    ages = (
+        f"link {_age(status.link_age_s)}   camera {_age(status.camera_age_s)}"
+        f"   loop late {_age(status.loop_late_s)}"
+    )
+    return [
+        ("phase", f"{status.phase}  {status.in_phase_s:.1f} s"),
+        ("error", error),
+        ("markers", f"{status.stage}   attempts {status.attempts}"),
+        ("height", f"{status.height_m:.2f} m   battery {battery_text(status)}"),
+        ("ages", ages),
+        *([] if status.outside is None else [("outside", _outside_text(status.outside))]),
+        ("held" if status.hold else "reason", status.hold or status.reason),
+    ]
+
+
+def battery_text(status: FlightStatus) -> str:
+    """Its voltage under load, and what it is enough for."""
+    if not status.battery_v >= NO_BATTERY_READING_V:
+        return "unknown"
+    text, battery = f"{status.battery_v:.2f} V", status.battery
+    if battery is None or battery.left_s is None:
+        return text
+    if battery.attempts is None:
+        return f"{text}, {_whole(battery.left_s)} left"
+    if battery.attempts == 0:
+        return f"{text}, not enough for an attempt"
+    return f"{text}, enough for {battery.attempts} attempt{'s' if battery.attempts > 1 else ''}"
+
+
+def _whole(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} min"
+
+
+def _outside_text(outside: ExternalPositions) -> str:
+    if outside.problem is not None:
+        return outside.problem
+    return f"position {outside.rate_hz:.0f} Hz   {_age(outside.age_s)}"
+
+
+def event_text(event: Event) -> str:
+    """An event as one line."""
+    text = _what_happened(event)
+    return f"{text} (simulated: {event.simulated})" if event.simulated else text
+
+
+def timed_event_text(event: Event, start_s: float) -> str:
+    """The line with the time since the start."""
+    return f"[{event.t_s - start_s:7.2f} s] {event_text(event)}"
+
+
+def _what_happened(event: Event) -> str:
+    match event.kind:
+        case EventKind.PHASE:
+            return f"{event.phase.value if event.phase else '?'}: {event.reason}"
+        case EventKind.HOLD:
+            return f"holding: {event.reason}"
+        case EventKind.NOTE:
+            return event.reason
+
+
+def _age(seconds: float) -> str:
+    return f"{1e3 * seconds:.0f} ms" if seconds < 10.0 else "none" if seconds > 1e6 else ">10 s"
 
 
 # --- The live display: a panel on a terminal, one plain line an event elsewhere ----------------
@@ -130,15 +232,16 @@ class PanelSurface:
         self._live.stop()
 
 
-class Reporter:
-    """The display, as the loop sees it. No method raises or waits, but `close` (bounded).
-
-    Attributes:
-        problem: None, or why the display fell silent.
+class FlightPanel:
+    """The display, as a watcher of the flight loop. No method raises or waits, but `close`
+    (bounded). A display that fails is no reason to land: `problem` is always None, `failure`
+    says why it fell silent.
     """
 
+    problem: str | None = None
+
     def __init__(self, surface: Surface) -> None:
-        self.problem: str | None = None
+        self.failure: str | None = None
         self._surface = surface
         self._wake = threading.Event()
         self._closing = threading.Event()
@@ -146,15 +249,19 @@ class Reporter:
         self._status: FlightStatus | None = None
         self._drawn: FlightStatus | None = None
         self._start_s: float | None = None
-        self._next_s = -float("inf")
-        self._phase = self._shown = ""  # as a line told it, and as the panel has it
+        self._next_s = -math.inf
+        self._phase = self._shown = ""  # as a line has it, and as the panel has it
         self._thread = threading.Thread(target=self._draw, name="display", daemon=True)
         self._thread.start()
+
+    def tick(self, tick: Tick) -> None:
+        """Show this tick of the loop."""
+        self.update(status_of(tick))
 
     def update(self, status: FlightStatus) -> None:
         """Show this moment: at once if the phase is a new one, or 0.1 s after the last one that
         was shown, or as the last one of all."""
-        if self.problem is not None:
+        if self.failure is not None:
             return
         self._status = status
         if status.phase != self._phase:  # a change without an event
@@ -168,7 +275,7 @@ class Reporter:
 
     def event(self, event: Event) -> None:
         """One line, at once."""
-        if self.problem is not None:
+        if self.failure is not None:
             return
         if event.kind is EventKind.PHASE and event.phase is not None:
             self._phase = event.phase.value
@@ -198,7 +305,7 @@ class Reporter:
                 self._closing.wait(PERIOD_S)  # in lockstep the loop's time runs faster
             self._surface.close()
         except Exception as error:
-            self.problem = f"the display fell silent: {error.__class__.__name__}: {error}"
+            self.failure = f"the display fell silent: {error.__class__.__name__}: {error}"
             try:
                 self._surface.close()
             except Exception:
@@ -213,7 +320,7 @@ class Reporter:
             self._surface.show(status)
 
 
-def make_reporter(interactive: bool | None = None, stream: TextIO | None = None) -> Reporter:
+def open_panel(interactive: bool | None = None, stream: TextIO | None = None) -> FlightPanel:
     """A panel when `interactive`, plain lines when not; None: as the stream is.
 
     `stream` defaults to stderr. NO_COLOR takes the colours away.
@@ -222,7 +329,7 @@ def make_reporter(interactive: bool | None = None, stream: TextIO | None = None)
     if interactive is None:
         interactive = stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
     if not interactive:
-        return Reporter(PlainSurface(stream))
+        return FlightPanel(PlainSurface(stream))
     console = Console(
         file=stream,
         force_terminal=True,
@@ -230,7 +337,7 @@ def make_reporter(interactive: bool | None = None, stream: TextIO | None = None)
         markup=False,
         emoji=False,
     )
-    return Reporter(PanelSurface(console))
+    return FlightPanel(PanelSurface(console))
 
 
 def panel(status: FlightStatus) -> Panel:

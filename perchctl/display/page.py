@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.camera import FrameSource, WatchedSource
-from perchctl.display.page.live import LivePage, PageState
-from perchctl.display.page.sketch import Sketch
-from perchctl.display.status import status_rows
-from perchctl.display.watch import status_of
+from perchctl.display.live import LivePage, PageState
+from perchctl.display.panel import status_of, status_rows
+from perchctl.display.sketch import Sketch
 from perchctl.log import FlightSummary
 from perchctl.mission import RESCUE, TERMINALS, Event, EventKind, Phase, Tick, is_mission_over
 from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput

@@ -1,4 +1,4 @@
-"""A command as the CRTP packets that the vehicle receives: the one place that encodes.
+"""CRTP packets, and a command as those that the vehicle receives: the one place that encodes.
 
 `CflibLink` sends these packets, `MockLink` hands the same bytes to the simulated vehicle.
 Layouts are those of cflib 0.1.34 (`commander`, `high_level_commander`, `supervisor`) for
@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 import struct
+from enum import IntEnum
+from typing import NamedTuple
 
 from perchctl.errors import InvalidValue
-from perchctl.sim import Packet, Port
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -23,6 +24,45 @@ from perchctl.vehicle import (
     RawThrust,
     StopMotors,
 )
+
+MAX_DATA = 30
+"""Bytes of a packet behind its header."""
+
+
+class Port(IntEnum):
+    """CRTP's ports, by their numbers on the air."""
+
+    CONSOLE = 0
+    PARAM = 2
+    COMMANDER = 3
+    MEM = 4
+    LOG = 5
+    LOCALIZATION = 6
+    COMMANDER_GENERIC = 7
+    HIGH_LEVEL = 8
+    SUPERVISOR = 9
+    PLATFORM = 13
+    LINK = 15
+
+
+class Packet(NamedTuple):
+    """One packet: a header ``port << 4 | 0x0C | channel`` and at most `MAX_DATA` bytes."""
+
+    port: int
+    channel: int
+    data: bytes
+
+    def encode(self) -> bytes:
+        """The packet's bytes on the air."""
+        return bytes((self.port << 4 | 0x0C | self.channel,)) + self.data
+
+    @staticmethod
+    def decode(datagram: bytes) -> Packet | None:
+        """The packet of these bytes; None for what cannot be one: empty or too long."""
+        if not 1 <= len(datagram) <= 1 + MAX_DATA:
+            return None
+        return Packet(datagram[0] >> 4, datagram[0] & 0x03, datagram[1:])
+
 
 LAND_TIMES = 3
 # Port 7: the channels, then the setpoints' types.

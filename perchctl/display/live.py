@@ -16,12 +16,12 @@ from collections import deque
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urlsplit
 
 import cv2
 
-from perchctl.display.page.sketch import Sketch, draw_sketch
+from perchctl.display.sketch import Sketch, draw_sketch
 from perchctl.errors import InvalidValue
 from perchctl.vision import CameraModel
 
@@ -235,33 +235,12 @@ def is_loopback(host: str | None) -> bool:
         return False
 
 
-class Content(Protocol):
-    """What the server needs of the page that it serves: `perchctl.display.page.live`."""
-
-    opened: threading.Event
-    closed: bool
-
-    def state(self) -> dict[str, Any]: ...
-
-    def was_read(self, state: dict[str, Any]) -> None: ...
-
-    def jpeg_after(self, number: int) -> tuple[int, bytes] | None: ...
-
-    def pause(self, seconds: float) -> bool: ...
-
-    def may_stop(self, token: str) -> bool: ...
-
-    def stop(self) -> None: ...
-
-    def remember(self, error: BaseException) -> None: ...
-
-
 class PageServer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
     allow_reuse_address = True
 
-    def __init__(self, page: Content, port: int) -> None:
+    def __init__(self, page: LivePage, port: int) -> None:
         self.page = page
         self.html = _HTML.read_text(encoding="utf-8")
         self.streams = threading.BoundedSemaphore(MAX_STREAMS)

@@ -1,0 +1,458 @@
+"""Cameras over a network: ``http://`` (Motion-JPEG) and ``rtsp://``, each read by a thread.
+
+They connect, read, and connect again, with a limit; the newest frame wins. PyAV's mpjpeg reader
+is not used for Motion-JPEG: without a length in front of each picture it gives one out with the
+next one's first bytes, a whole period late (41 ms instead of 0.2 ms at 25 Hz).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import math
+import socket
+import ssl
+from collections import deque
+from dataclasses import replace
+from typing import Any
+from urllib.parse import SplitResult, urljoin, urlsplit, urlunsplit
+
+from perchctl.camera.credentials import (
+    Challenge,
+    answer,
+    challenge_of,
+    credentials_of,
+    without_password,
+)
+from perchctl.camera.health import Grey
+from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, grey_pixels, size_in
+from perchctl.camera.source import Clock, LiveSource, one_line
+
+MAX_FAILED_CONNECTIONS = 5
+"""Connections in a row that bring no picture before the source gives up."""
+
+
+class StreamSource(LiveSource):
+    """Reconnects when the stream ends, stalls or breaks; gives up after
+    `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when the server
+    answers that there is no such stream before the first picture came (`not_found`).
+
+    It connects from `begin` until `close`. A subclass has `_connection`, and sets `_socket` in it.
+    `damaged` counts the pictures that were dropped.
+    """
+
+    connect_timeout_s = 3.0
+    read_timeout_s = 2.0
+    reconnect_wait_s = 0.3
+
+    def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
+        super().__init__(without_password(url), latency_s, clock)
+        self._url = url
+        self._socket: socket.socket | None = None
+        self.not_found = False
+        self.connections = 0
+        self.damaged = 0
+
+    def begin(self) -> None:
+        """Connect, and read in a thread."""
+        self._start(self._run)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._wake()
+        super().close()
+
+    def _wake(self) -> None:
+        """End a read that waits for bytes."""
+        current = self._socket
+        if current is not None:
+            with contextlib.suppress(OSError):
+                current.shutdown(socket.SHUT_RDWR)
+
+    def _connection(self) -> str:
+        """Read one connection until it ends; return why it ended. It may raise any Exception."""
+        raise NotImplementedError
+
+    def _run(self) -> None:
+        failed = 0
+        while not self._stop.is_set():
+            before = self._arrived
+            self.connections += 1
+            try:
+                reason = self._connection()
+            except Exception as error:
+                # Whatever damaged bytes do to a library: a new connection may bring whole ones.
+                reason = _reason(error)
+            if self.not_found:
+                self._fail(f"{self._name}: {reason}")
+                return
+            failed = 0 if self._arrived > before else failed + 1
+            if failed >= MAX_FAILED_CONNECTIONS:
+                self._fail(f"{self._name} gave no picture in {failed} attempts: {reason}")
+                return
+            self._stop.wait(self.reconnect_wait_s)
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, TimeoutError):
+        return "no answer in time"
+    if isinstance(error, ConnectionRefusedError):
+        return "connection refused"
+    if isinstance(error, (OSError, http.client.HTTPException, ValueError)):
+        return str(error) or type(error).__name__
+    return one_line(error)
+
+
+# --- Motion-JPEG over HTTP ----------------------------------------------------------------------
+
+
+READ_BYTES = 65536
+MAX_REDIRECTS = 3
+MOST_REQUESTS = 3
+"""One that is answered by what to answer to, once more where that was too old."""
+
+_HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*", "Connection": "close"}
+
+
+class MjpegSource(StreamSource):
+    """A Motion-JPEG stream (multipart/x-mixed-replace, or bare JPEGs one after another).
+
+    Given up at once, too, where the server wants another name and password. They are sent
+    as it asks for them, digest or basic, and to no other host. Goes straight to the camera:
+    a proxy for the internet is not for it.
+    """
+
+    _challenge: Challenge | None = None
+
+    def _connection(self) -> str:
+        try:
+            return self._connect(self._url, MAX_REDIRECTS)
+        except ssl.SSLCertVerificationError as error:
+            self.not_found = self._count == 0
+            return _untrusted(error)
+
+    def _connect(self, url: str, redirects: int) -> str:
+        """One connection until it ends; why it ended."""
+        parts = urlsplit(url)
+        kind = (
+            http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
+        )
+        timeout_s = self.read_timeout_s if self._count else self.connect_timeout_s
+        connection = kind(parts.hostname or "", parts.port, timeout=timeout_s)
+        try:
+            connection.connect()
+            self._socket = connection.sock
+            if self._stop.is_set():
+                return "closed"
+            response = self._answered(connection, parts)
+            location = response.getheader("Location")
+            if response.status in (301, 302, 303, 307, 308) and location and redirects > 0:
+                target = redirected(url, location)
+                if why := _unsafe(url, target):
+                    self.not_found = self._count == 0
+                    return why
+                return self._connect(target, redirects - 1)
+            if response.status != 200:
+                gone = response.status in (401, 403, 404, 410)
+                self.not_found = gone and self._count == 0
+                hint = _hint(response, parts)
+                return f"the server answers {response.status} {response.reason}{hint}"
+            self._socket.settimeout(self.read_timeout_s)
+            self._read(response)
+            return "the stream ended"
+        finally:
+            self._socket = None
+            connection.close()
+
+    def _answered(
+        self, connection: http.client.HTTPConnection, parts: SplitResult
+    ) -> http.client.HTTPResponse:
+        """The response; with name and password once the server has asked for them, or has
+        refused the nameless without asking (403)."""
+        path = urlunsplit(("", "", parts.path or "/", parts.query, ""))
+        who = credentials_of(parts)
+        for _ in range(MOST_REQUESTS):
+            headers = dict(_HEADERS)
+            if who is not None and self._challenge is not None:
+                headers["Authorization"] = answer(self._challenge, who, "GET", path)
+                self._challenge = replace(self._challenge, count=self._challenge.count + 1)
+            connection.request("GET", path, headers=headers)
+            response = connection.getresponse()
+            asked = _challenge(response)
+            # After an answer 403 is the last word: nobody asked for less than a digest then.
+            asks = response.status == 401 or (response.status == 403 and self._challenge is None)
+            if not asks or who is None or asked is None:
+                break
+            # A nonce of an earlier connection may be too old: a new one is answered once more.
+            if self._challenge is not None and asked.asks_the_same(self._challenge):
+                break
+            self._challenge = asked
+            connection.close()
+            connection.connect()
+            self._socket = connection.sock
+        return response
+
+    def _read(self, response: http.client.HTTPResponse) -> None:
+        splitter = JpegSplitter()
+        earlier = self.damaged
+        while not self._stop.is_set():
+            data = response.read1(READ_BYTES)
+            if not data:
+                return
+            # If the network delivered several at once only the newest is worth decoding.
+            for picture in reversed(splitter.feed(data)):
+                image = self._decoded(picture)
+                if image is not None:
+                    self._put(image, encoded=picture)
+                    break
+                splitter.damaged += 1
+            self.damaged = earlier + splitter.damaged
+
+    def _decoded(self, picture: bytes) -> Grey | None:
+        """The JPEG's pixels; None if it is damaged, or says a size above `MOST_STREAM_PX`."""
+        size_px = size_in(picture)
+        if size_px is None:
+            return None
+        width, height = size_px
+        if width * height > MOST_STREAM_PX:
+            self._why_silent = (
+                f"its pictures say {width}x{height} px, and at most {MOST_STREAM_PX:,} pixels are "
+                f"decoded; set the camera to a smaller size"
+            )
+            return None
+        return grey_pixels(picture)
+
+
+def redirected(url: str, location: str) -> str:
+    """Where to go: name and password go along to the same host only, and never from https to
+    another scheme."""
+    before, after = urlsplit(url), urlsplit(urljoin(url, location))
+    same = (before.hostname, before.port) == (after.hostname, after.port)
+    kept = same and after.scheme in (before.scheme, "https")
+    if kept and after.username is None and before.username is not None:
+        after = after._replace(netloc=f"{before.netloc.rpartition('@')[0]}@{after.netloc}")
+    return urlunsplit(after)
+
+
+def _unsafe(url: str, target: str) -> str:
+    """Why a redirect is not followed; an empty string if it is."""
+    scheme, shown = urlsplit(target).scheme, without_password(target)
+    if scheme == "http" and urlsplit(url).scheme == "https":
+        return (
+            f"the server redirects from https to {shown}, where pictures and password are not "
+            f"encrypted; name that address in camera.source if you accept that"
+        )
+    if scheme not in ("http", "https"):
+        return f"the server redirects to {shown}; name that address in camera.source"
+    return ""
+
+
+def _challenge(response: http.client.HTTPResponse) -> Challenge | None:
+    """What the server asks for; one that does not say so gets the simplest."""
+    headers = response.headers.get_all("WWW-Authenticate")
+    return challenge_of(headers) if headers else Challenge(digest=False)
+
+
+def _hint(response: http.client.HTTPResponse, parts: SplitResult) -> str:
+    if response.status != 401:
+        return ""
+    if parts.username is None:
+        return "; it wants a name and a password, as in http://NAME:PASSWORD@HOST/PATH"
+    if _challenge(response) is None:
+        return ", and asks for no basic or digest authentication; others are not known here"
+    return "; check the name and the password in the URL (@ is %40 there, : is %3A)"
+
+
+def _untrusted(error: ssl.SSLCertVerificationError) -> str:
+    return (
+        f"its certificate is not trusted ({error.verify_message or 'not verified'}); name a file "
+        f"with that certificate in the environment variable SSL_CERT_FILE, or use http://"
+    )
+
+
+# --- RTSP, decoded by PyAV: its open and read end in time, and say why they failed; OpenCV's
+# FFmpeg says neither.
+
+
+RTSP_PORT = 554
+MOST_ANSWER_BYTES = 65536
+MAX_DAMAGED = 100
+"""Packets in a row that cannot be decoded before it connects anew."""
+WINDOW_S = 10.0
+CLOCK_SLOW = 0.02
+"""By which a camera's clock may run slow before its pictures look older than they are. Allowing
+for it is safer than a short window: that would forget the fastest amid a heap."""
+
+_OPTIONS = {
+    "rtsp_flags": "prefer_tcp",  # a lost packet costs every picture up to the next whole one
+    "fflags": "nobuffer",
+    "flags": "low_delay",
+    "max_delay": "0",
+    "reorder_queue_size": "0",
+    "analyzeduration": "200000",
+    "probesize": "200000",
+    "fpsprobesize": "0",
+    "allowed_media_types": "video",
+}
+
+
+class Waiting:
+    """How long a picture was under way beyond the fastest of the last ten seconds; pure.
+
+    The camera's own time of a picture tells it. What piles up behind a radio that stalls
+    comes in a heap, and would look as if it had just been taken. Where the camera's time goes
+    backwards, as when its clock is set back, it starts anew, and one set forward makes the next
+    picture the fastest.
+    """
+
+    def __init__(self) -> None:
+        self._camera_s = -math.inf
+        self._ways: deque[tuple[float, float]] = deque()  # arrival, and `way_s`
+
+    def of(self, camera_s: float | None, arrival_s: float) -> float:
+        """s; 0 where the camera gives no time."""
+        if camera_s is None:
+            return 0.0
+        if camera_s < self._camera_s:
+            self._ways.clear()
+        self._camera_s = camera_s
+        way_s = arrival_s * (1.0 - CLOCK_SLOW) - camera_s
+        while self._ways and self._ways[-1][1] >= way_s:
+            self._ways.pop()  # a window's minimum: none of these will be it any more
+        self._ways.append((arrival_s, way_s))
+        while self._ways[0][0] < arrival_s - WINDOW_S:
+            self._ways.popleft()
+        return way_s - self._ways[0][1]
+
+
+class RtspSource(StreamSource):
+    """An RTSP stream of any codec that FFmpeg decodes, over TCP where the camera can.
+
+    Given up at once, too, where the camera wants another name and password.
+    """
+
+    connect_timeout_s = 5.0
+
+    def _connection(self) -> str:
+        import av  # late: most flights have another camera
+        import av.error
+
+        # Before the first picture is before the flight: later it would cost pictures.
+        if self._count == 0 and (target := redirect_of(self._url, self.connect_timeout_s)):
+            self.not_found = True
+            return (
+                f"the server redirects to {without_password(target)}, which would get the name "
+                f"and password; name that address in camera.source"
+            )
+        try:
+            timeouts_s = (self.connect_timeout_s, self.read_timeout_s)
+            with av.open(self._url, options=_OPTIONS, timeout=timeouts_s) as stream:
+                return self._read(stream)
+        except (av.error.FFmpegError, OSError, ValueError) as error:
+            self.not_found = self._count == 0 and isinstance(error, _gone(av.error))
+            # Asking is unbounded: only before the first picture, which is before the flight.
+            return (self._count == 0 and unresolved(self._url)) or _ffmpeg_reason(error)
+
+    def _read(self, stream: Any) -> str:
+        """One connection until it ends; why it ended. Errors: those of PyAV."""
+        import av.error
+
+        if not stream.streams.video:
+            return "the stream has no picture in it"
+        video = stream.streams.video[0]
+        # A thread for each frame would hold back as many frames as there are threads.
+        video.thread_type = "NONE"
+        video.codec_context.options = {"max_pixels": str(MOST_STREAM_PX)}
+        waiting, damaged = Waiting(), 0
+        for packet in stream.demux(video):
+            if self._stop.is_set():
+                return "closed"
+            try:
+                frames = [(f.to_ndarray(format="gray"), f.time) for f in packet.decode()[-1:]]
+            except (av.error.FFmpegError, ValueError):
+                damaged += 1
+                self.damaged += 1
+                if damaged >= MAX_DAMAGED:
+                    return "its pictures cannot be decoded"
+                continue
+            damaged = 0
+            for image, time_s in frames:
+                self._put(image, waited_s=waiting.of(time_s, self._clock()))
+        return "the stream ended"
+
+
+def redirect_of(url: str, timeout_s: float) -> str:
+    """The other host or port to which the server redirects a URL with name and password; an empty
+    string if there is none. FFmpeg would follow, and take name and password along."""
+    parts = urlsplit(url)
+    who = credentials_of(parts)
+    if who is None or parts.hostname is None:
+        return ""
+    asked = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
+    challenge: Challenge | None = None
+    failures = (OSError, ValueError, IndexError, http.client.HTTPException)
+    with (
+        contextlib.suppress(*failures),  # FFmpeg will say why
+        socket.create_connection((parts.hostname, parts.port or RTSP_PORT), timeout_s) as server,
+        server.makefile("rb") as answers,
+    ):
+        # Once more with name and password, if they are asked for.
+        for number, method in enumerate(("OPTIONS", "DESCRIBE", "DESCRIBE"), start=1):
+            request = f"{method} {asked} RTSP/1.0\r\nCSeq: {number}\r\n"
+            if challenge is not None:
+                request += f"Authorization: {answer(challenge, who, method, asked)}\r\n"
+            server.sendall(f"{request}\r\n".encode())
+            status = int(answers.readline(MOST_ANSWER_BYTES).split()[1])
+            headers = http.client.parse_headers(answers)
+            answers.read(min(int(headers.get("Content-Length", 0)), MOST_ANSWER_BYTES))
+            if 300 <= status < 400:
+                target = urlsplit(headers.get("Location", ""))
+                same = (target.hostname, target.port or RTSP_PORT) == (
+                    parts.hostname, parts.port or RTSP_PORT
+                )  # fmt: skip
+                return "" if same else urlunsplit(target)
+            if status == 401 and challenge is None:
+                challenge = challenge_of(headers.get_all("WWW-Authenticate") or [])
+    return ""
+
+
+def unresolved(url: str) -> str:
+    """Why the host's name is none, which FFmpeg calls an input/output error; else nothing. May
+    take as long as the system's own asking."""
+    host = urlsplit(url).hostname or ""
+    try:
+        socket.getaddrinfo(host, None)
+    except (OSError, UnicodeError) as error:  # the latter: a name that can be none
+        why = getattr(error, "strerror", None) or "it is no host's name"
+        return f"the host name {host!r} cannot be resolved ({why}): correct it, or give the address"
+    return ""
+
+
+def _gone(errors: Any) -> tuple[type[Exception], ...]:
+    """What trying again would not mend."""
+    return (
+        errors.HTTPUnauthorizedError,
+        errors.HTTPForbiddenError,
+        errors.HTTPNotFoundError,
+        errors.HTTPBadRequestError,
+        errors.ProtocolNotFoundError,
+        errors.DecoderNotFoundError,
+    )
+
+
+def _ffmpeg_reason(error: Exception) -> str:
+    """Without the URL that FFmpeg's own texts have in them, the password too."""
+    name = type(error).__name__
+    return _REASONS.get(name) or str(getattr(error, "strerror", None) or name)
+
+
+_REASONS = {
+    "HTTPUnauthorizedError": "it wants another name or password (401), as in "
+    "rtsp://NAME:PASSWORD@HOST/PATH (@ is %40 there, : is %3A)",
+    "HTTPForbiddenError": "this name may not see the stream (403)",
+    "HTTPNotFoundError": "there is no such stream (404); look for the path in its manual",
+    "ConnectionRefusedError": "connection refused",
+    "ExitError": "no answer in time",
+    "InvalidDataError": "no answer in time, or none of RTSP",
+    "TimeoutError": "no answer in time",
+}

@@ -1,0 +1,145 @@
+"""Telemetry at the edge: signs, time, and a sample that is as old as its oldest part."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perchctl.link.telemetry import (
+    ATTITUDE_BLOCK,
+    BATTERY_BLOCK,
+    BLOCKS,
+    MOST_CARRIED_S,
+    NEEDED,
+    STATE_BLOCK,
+    WRAP_MS,
+    Assembler,
+    Timebase,
+    telemetry_from,
+)
+from perchctl.mission import Condition, Context, Observation, Phase, PlannerState
+from perchctl.mission.conditions import BY_PLACE, PROOFS, conditions_since
+from perchctl.profile import Profile
+from perchctl.vehicle import Telemetry
+
+SIZES = {"float": 4, "FP16": 2, "uint16_t": 2, "int8_t": 1}
+
+
+@pytest.mark.parametrize("block", [STATE_BLOCK, ATTITUDE_BLOCK, BATTERY_BLOCK])
+def test_blocks_fit_into_a_packet(block: dict[str, str]) -> None:
+    """Firmware facts, "Link": at most 26 bytes a log block."""
+    assert sum(SIZES[ctype] for ctype in block.values()) <= 26
+
+
+def test_pitch_and_degrees_turn_at_the_edge() -> None:
+    """stateEstimate.pitch is nose up in degrees; inside it is nose down in radians."""
+    values = dict.fromkeys(NEEDED, 0.0) | {
+        "stateEstimate.roll": 10.0,
+        "stateEstimate.pitch": 20.0,
+        "stateEstimate.yaw": 30.0,
+        "supervisor.info": 0x021E,
+    }
+    sample = telemetry_from(values, 1.5)
+    assert sample.roll_rad == pytest.approx(math.radians(10))
+    assert sample.pitch_rad == pytest.approx(-math.radians(20))
+    assert sample.yaw_rad == pytest.approx(math.radians(30))
+    assert sample.supervisor == 0x021E
+    assert sample.t_s == 1.5
+    assert sample.position_variance_m2 is None
+    assert sample.climb_variance_m2ps2 is None
+    assert sample.battery_v == 0.0  # unknown, which to the planner is not empty
+
+
+def test_the_vertical_speed_s_variance_stands_by_itself() -> None:
+    variances = {"kalman.varPX": 3e-4, "kalman.varPY": 2e-4, "kalman.varPZ": 1e-4}
+    sample = telemetry_from(dict.fromkeys(NEEDED, 0.0) | variances, 1.5)
+    assert (sample.position_variance_m2, sample.climb_variance_m2ps2) == (3e-4, 1e-4)
+
+
+@given(
+    start_ms=st.integers(0, WRAP_MS - 1),
+    delays_ms=st.lists(st.integers(0, 80), min_size=20, max_size=60),
+)
+def test_timebase_follows_stamps_not_arrivals(start_ms: int, delays_ms: list[int]) -> None:
+    """Also across the wrap of the three-byte stamp; the best delivery sets the offset."""
+    base = Timebase()
+    times = []
+    for i, delay_ms in enumerate(delays_ms):
+        stamp = (start_ms + 10 * i) % WRAP_MS
+        times.append(base.to_loop_s(stamp, 100.0 + 0.01 * i + 0.001 * delay_ms))
+    best_s = min(delays_ms) / 1000.0
+    after = delays_ms.index(min(delays_ms))
+    for i in range(after, len(times)):
+        assert times[i] == pytest.approx(100.0 + 0.01 * i + best_s, abs=2e-4)
+
+
+def test_a_vehicle_that_has_started_again_is_followed_from_its_first_stamp_on() -> None:
+    """Packets that overtake each other are no new start."""
+    base = Timebase()
+    assert base.to_loop_s(60_000, 100.0) == pytest.approx(100.0)
+    assert base.to_loop_s(59_990, 100.0) == pytest.approx(99.99)
+    assert base.start == 0
+    assert base.to_loop_s(300, 103.0) == pytest.approx(103.0)
+    assert base.to_loop_s(310, 103.02) == pytest.approx(103.01)
+    assert base.start == 1
+
+
+STILL = {name: dict.fromkeys(variables, 0.0) for name, variables in BLOCKS.items()}
+
+
+def test_nothing_without_both_fast_blocks() -> None:
+    assembler = Assembler()
+    assert assembler.accept("attitude", STILL["attitude"], 0.0) is None
+    assert "stateEstimate.x" in assembler.missing()
+    assert assembler.accept("state", STILL["state"], 0.01) is None
+    assert assembler.accept("attitude", STILL["attitude"], 0.01) is not None
+
+
+@given(silent_ms=st.integers(0, 3000), speed_mps=st.floats(-1, 1))
+def test_a_dead_block_shows_in_the_sample(silent_ms: int, speed_mps: float) -> None:
+    assembler = Assembler()
+    assembler.accept("state", STILL["state"] | {"stateEstimate.vz": speed_mps}, 1.0)
+    sample = assembler.accept("attitude", STILL["attitude"], 1.0 + silent_ms / 1e3)
+    assert sample is not None
+    assert sample.behind_s == pytest.approx(silent_ms / 1e3)
+    carried_m = speed_mps * min(silent_ms / 1e3, MOST_CARRIED_S)
+    assert sample.position_m[2] == pytest.approx(carried_m)
+
+
+def test_what_a_vehicle_told_before_it_started_anew_is_over() -> None:
+    assembler = Assembler()
+    assembler.accept("state", STILL["state"], 1.0)
+    assert assembler.accept("attitude", STILL["attitude"], 2.0, 1) is None
+    assembler.accept("state", STILL["state"], 2.01, 1)
+    assert assembler.accept("attitude", STILL["attitude"], 1.01, 0) is None  # it came late
+    sample = assembler.accept("attitude", STILL["attitude"], 2.02, 1)
+    assert sample is not None
+    assert (sample.start, sample.behind_s) == (1, pytest.approx(0.01))
+
+
+HANGS = Telemetry(
+    1.0, (0.0, 0.0, 2.0), (0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 1.0, 0.0, 3.9, supervisor=0x020E
+)  # fmt: skip
+HANGING = PlannerState(
+    phase=Phase.COMPLETE, released_s=0.0, contact_z_m=2.0, hover_thrust=50000.0,
+    ground_m=(0.0, 0.0, 0.0),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("behind_s", [0.0, 0.15, 2.0])
+def test_a_frozen_position_proves_no_place(behind_s: float) -> None:
+    """A position block that alone stops arriving looks like a vehicle at rest. What rests on
+    acceleration, thrust and the supervisor's word, which are fresh, is proven all the same."""
+    obs = Observation(1.0, replace(HANGS, behind_s=behind_s))
+    proven = PROOFS & conditions_since(Context(HANGING, obs, Profile())).keys()
+    assert not (proven & BY_PLACE and behind_s > 0.0)
+    assert Condition.WEIGHT_HANGS in proven
+    old = replace(HANGS, t_s=1.0 - 0.15)
+    assert (
+        not PROOFS
+        & conditions_since(Context(HANGING, replace(obs, telemetry=old), Profile())).keys()
+    )
