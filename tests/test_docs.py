@@ -173,7 +173,8 @@ def run_python(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     code: Any = 0
     try:
         if words[1] == "-m":
-            monkeypatch.delitem(sys.modules, words[2], raising=False)
+            for name in (words[2], f"{words[2]}.__main__"):
+                monkeypatch.delitem(sys.modules, name, raising=False)
             runpy.run_module(words[2], run_name="__main__")
         else:
             runpy.run_path(str(script), run_name="__main__")
