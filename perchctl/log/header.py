@@ -10,6 +10,7 @@ import base64
 import contextlib
 import math
 import platform
+import warnings
 import zlib
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -24,7 +25,7 @@ from pydantic import ValidationError
 import perchctl
 from perchctl.calibration import profile_camera
 from perchctl.camera import profile_record, without_password
-from perchctl.errors import InvalidValue, PerchError
+from perchctl.errors import InvalidValue, Note, PerchError
 from perchctl.log.exact import from_exact, to_exact
 from perchctl.log.fields import EVENT_FIELDS, FIELDS, FORMAT, SCHEMA_VERSION
 from perchctl.profile import Profile, first_invalid_key, read_mask
@@ -116,7 +117,12 @@ def computer_differences(header: Mapping[str, Any]) -> str:
 
 
 def flown_profile(header: Mapping[str, Any]) -> Profile:
-    """The profile that was flown, but for passwords. Errors: InvalidValue."""
+    """The profile that was flown, but for passwords. A `Note` names each key that was flown with
+    another value than the constant that it is now. Errors: InvalidValue."""
+    values = header.get("profile")
+    for sentence in Profile.lost_values(values) if isinstance(values, dict) else ():
+        said = sentence.removesuffix("; remove it")
+        warnings.warn(f"the flight was by an older perchctl: {said}", Note, stacklevel=2)
     try:
         return Profile.model_validate(header.get("profile"))
     except ValidationError as error:

@@ -51,9 +51,9 @@ def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--
         except ValueError as error:
             raise InvalidValue(f"{option} {clip_text(f'{key}={text}')}: {error}") from None
     try:
-        _, notes = with_present_keys(values, Profile)
-        if notes:
-            raise InvalidValue(f"{option}: {notes[0]}")
+        _, notes, lost = with_present_keys(values, Profile)
+        if notes or lost:
+            raise InvalidValue(f"{option}: {(notes + lost)[0]}")
         return Profile.model_validate(values)
     except ValidationError as error:
         key, why = first_invalid_key(error)

@@ -167,9 +167,11 @@ def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[s
 
 def _with_present_keys(values: dict[str, Any], path: Path) -> dict[str, Any]:
     try:
-        values, notes = with_present_keys(values, Profile)
+        values, notes, lost = with_present_keys(values, Profile)
     except ValueError as error:
         raise InvalidValue(f"{path}: {error}") from None
+    if lost:
+        raise InvalidValue(f"{path}: {lost[0]}")
     for note in notes:
         warnings.warn(f"{path}: {note}", ProfileNote, stacklevel=2)
     return values

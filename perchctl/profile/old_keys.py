@@ -23,11 +23,12 @@ UNUSED: tuple[str, ...] = (
 
 def with_present_keys(
     values: dict[str, Any], model: type[BaseModel]
-) -> tuple[dict[str, Any], list[str]]:
-    """The values of a profile under their present keys, and a note for each old one.
+) -> tuple[dict[str, Any], list[str], list[str]]:
+    """The values of a profile under their present keys; a note for each old one; and a sentence
+    for each whose value would be lost.
 
     A key that has become a constant of its section (a class variable of `model`, or of a model
-    within it) is left out.
+    within it) is left out. It is lost where it has another value than the constant.
 
     Raises ValueError where a key stands under both of its names.
     """
@@ -45,22 +46,34 @@ def with_present_keys(
         section, old = _section_of(result, dotted)
         if section is not None and section.pop(old, None) is not None:
             notes.append(f"{dotted} is no longer used: remove it")
-    return result, notes + _without_constants(result, model)
+    lost: list[str] = []
+    for dotted, value, constant in _without_constants(result, model):
+        now = f"{dotted} is no longer a key: it is {constant} for every profile"
+        if _plain(value) == _plain(constant):
+            notes.append(f"{now}; remove it")
+        else:
+            lost.append(f"{now}, and {value} here; remove it")
+    return result, notes, lost
 
 
-def _without_constants(values: dict[str, Any], model: type[BaseModel], path: str = "") -> list[str]:
-    """Removes the keys that are constants from the values; returns a note for each."""
-    notes: list[str] = []
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _without_constants(
+    values: dict[str, Any], model: type[BaseModel], path: str = ""
+) -> list[tuple[str, Any, Any]]:
+    """Removes the keys that are constants from the values; returns each with its value and the
+    constant."""
+    removed: list[tuple[str, Any, Any]] = []
     for key in list(values):
         field, value = model.model_fields.get(key), values[key]
         kind = field.annotation if field is not None else None
         if key in model.__class_vars__:
-            del values[key]
-            constant = f"{getattr(model, key)} for every profile"
-            notes.append(f"{path}{key} is no longer a key: it is {constant}; remove it")
+            removed.append((f"{path}{key}", values.pop(key), getattr(model, key)))
         elif isinstance(value, dict) and isinstance(kind, type) and issubclass(kind, BaseModel):
-            notes += _without_constants(value, kind, f"{path}{key}.")
-    return notes
+            removed += _without_constants(value, kind, f"{path}{key}.")
+    return removed
 
 
 def _section_of(values: dict[str, Any], dotted: str) -> tuple[dict[str, Any] | None, str]:

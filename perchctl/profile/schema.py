@@ -7,6 +7,7 @@ larger sections.
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 from typing import Any
 
@@ -69,6 +70,13 @@ class Profile(Section):
     positioning: PositioningConfig = PositioningConfig()
     simulation: SimulationConfig = SimulationConfig()
     log: LogConfig = LogConfig()
+
+    @classmethod
+    def lost_values(cls, values: dict[str, Any]) -> list[str]:
+        """A sentence for each key of the values that is a constant now, and had another value."""
+        with contextlib.suppress(ValueError):  # one under both of its names, which is refused
+            return with_present_keys(values, cls)[2]
+        return []
 
     @model_validator(mode="before")
     @classmethod

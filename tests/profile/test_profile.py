@@ -12,7 +12,8 @@ from pydantic import BaseModel, ValidationError
 
 import perchctl
 from perchctl.calibration import load_calibration
-from perchctl.errors import InvalidValue, NotFound, PerchError, ProfileNote
+from perchctl.errors import InvalidValue, Note, NotFound, PerchError, ProfileNote
+from perchctl.log.header import flown_profile
 from perchctl.places import file_names
 from perchctl.profile import Profile, changed_profile, find_calibration, load_profile
 
@@ -211,7 +212,7 @@ def test_a_profile_round_trips_through_its_own_dump() -> None:
 OLD = """
 extends: sim
 camera: {T_body_cam: {position_m: [0.01, 0.02, 0.03]}}
-planner: {trim_per_s: 0.3, recover: {speed_mps: 0.2}, ascend: {near_m: 0.5}}
+planner: {trim_per_s: 0.3, recover: {speed_mps: 0.2}, ascend: {near_m: 0.35}}
 merge: {z1_m: 1.2}
 """
 
@@ -236,6 +237,9 @@ def test_old_keys_are_read_and_said(tmp_path: Path) -> None:
     ]  # fmt: skip
     assert profile.planner.ascend.near_m == 0.35
     assert "it is 0.35" in said[2]
+    path.write_text(OLD.replace("near_m: 0.35", "near_m: 0.5"))
+    with pytest.raises(InvalidValue, match=r"near_m.*0\.35.*and 0\.5 here"):
+        load_profile(str(path))
 
 
 @pytest.mark.parametrize("setting", ["planner.ascend.near_m=0.5", "merge.z1_m=1.0"])
@@ -255,6 +259,10 @@ def test_a_profile_in_an_old_log_is_read() -> None:
     values["merge"]["z1_m"] = 1.15
     values["planner"]["ascend"]["near_m"] = 0.35
     assert Profile.model_validate(values) == load_profile("sim")
+    assert Profile.lost_values(values) == []
+    values["planner"]["ascend"]["near_m"] = 0.5
+    with pytest.warns(Note, match=r"planner\.ascend\.near_m"):
+        assert flown_profile({"profile": values}) == load_profile("sim")
 
 
 def test_a_calibration_is_found_beside_the_profile_that_names_it(tmp_path: Path) -> None:
