@@ -86,6 +86,16 @@ def test_the_list_has_the_first_sentence_of_each_help(name: str) -> None:
     assert COMMANDS[name][1] in shown
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_help_fits_a_terminal_of_80_columns(name: str) -> None:
+    helps = [run(name, "--help").stdout]
+    listed = re.split(r"Subcommands; without one it is \w+:|Commands:", helps[0])[1:]
+    subcommands = re.findall(r"^  (\w+)  ", listed[0], re.M) if listed else []
+    helps += [run(name, each, "--help").stdout for each in subcommands]
+    for line in "".join(helps).splitlines():
+        assert len(line) <= 80, line
+
+
 def test_fly_help_lists_every_exit_code() -> None:
     text = run("fly", "--help").stdout
     for code, meaning in EXIT_CODES.items():

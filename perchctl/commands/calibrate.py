@@ -129,8 +129,7 @@ OutputOption = Annotated[
     typer.Option(
         "--output",
         "-o",
-        help="Calibration file; camera writes its report beside it as .png. "
-        "Default: calib/NAME_WIDTHxHEIGHT.yaml.",
+        help="Calibration file. Default: calib/NAME_WIDTHxHEIGHT.yaml.",
     ),
 ]
 
@@ -224,9 +223,8 @@ def camera(
 app.command(
     cls=Command,
     epilog=examples(
-        "perchctl calibrate mount -p my_vehicle.yaml -u radio://0/80/2M/E7E7E7E7E7",
-        "perchctl calibrate mount -p my_vehicle.yaml --from calib/mounting_my_vehicle.jsonl "
-        "--write",
+        "perchctl calibrate mount -p mine.yaml -u radio://0/80/2M/E7E7E7E7E7",
+        "perchctl calibrate mount -p mine.yaml --from mounting.jsonl --write",
         "perchctl calibrate mount --truth sim --seed 3",
     ),
 )(mount)
@@ -279,7 +277,7 @@ def mask(
     epilog=examples(
         "perchctl calibrate check camera.yaml images:board",
         "perchctl calibrate check camera.yaml camera:0 --view",
-        "perchctl calibrate check camchain.yaml images:april --cam cam0 --board april_6x6.yaml",
+        "perchctl calibrate check camchain.yaml images:april --cam cam0",
     ),
 )
 @reporting
@@ -334,7 +332,7 @@ def check(
     cls=Command,
     epilog=examples(
         "perchctl calibrate convert opencv.yaml",
-        "perchctl calibrate convert camchain.yaml --cam cam0 -o calib/from_kalibr.yaml",
+        "perchctl calibrate convert camchain.yaml --cam cam0 -o mine.yaml",
         "perchctl calibrate convert ost.yaml --name fpv",
     ),
 )

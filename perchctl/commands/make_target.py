@@ -136,6 +136,7 @@ app = new_app(Group)
 
 @app.command(
     cls=Command,
+    short_help="Print the target true to size, front and back.",
     epilog=examples(
         "perchctl make-target -p crazyflie -o target.pdf",
         "perchctl make-target --large 120mm --small 20mm --page letter",
@@ -311,10 +312,9 @@ def suggest(
 @app.command(
     cls=Command,
     epilog=examples(
-        "perchctl make-target measured -p my_vehicle.yaml --measured-large 149.6 "
-        "--measured-small 24.9 --force",
-        "perchctl make-target measured -p crazyflie -o my_vehicle.yaml --measured-large 149.6",
-        "perchctl make-target measured -p new.yaml --large 120mm --measured-large 119.8",
+        "perchctl make-target measured -p mine.yaml --measured-large 149.6 --force",
+        "perchctl make-target measured -p mine.yaml --measured-small 24.9 --force",
+        "perchctl make-target measured -p new.yaml --measured-large 119.8",
     ),
 )
 @reporting

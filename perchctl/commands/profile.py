@@ -63,6 +63,7 @@ app = new_app(Group)
 
 @app.command(
     cls=Command,
+    short_help="Show a profile as it is flown, every key explained.",
     epilog=examples(
         "perchctl profile -p crazyflie",
         "perchctl profile new -o my_vehicle.yaml",

@@ -238,7 +238,7 @@ def run(
     cls=Command,
     epilog=examples(
         "perchctl simulate compare sim paper -n 60 --jobs 4",
-        "perchctl simulate compare crazyflie.yaml changed.yaml -n 200 --cluster local:4",
+        "perchctl simulate compare mine.yaml changed.yaml -n 200 --jobs 4",
         "perchctl simulate compare sim rough --positioning mocap --json",
     ),
 )
@@ -289,8 +289,8 @@ def compare(
     cls=Command,
     epilog=examples(
         "perchctl simulate sweep planner.align.xy_m=0.02,0.04,0.08 -n 30",
-        "perchctl simulate sweep planner.integral_per_s=0,0.4 planner.align.xy_m=0.02,0.04 -n 30",
-        "perchctl simulate sweep 'simulation.mass_kg=[0.038,0.038],[0.046,0.046]' --json",
+        "perchctl simulate sweep planner.integral_per_s=0,0.4 -n 30 --jobs 4",
+        "perchctl simulate sweep planner.ascend.speed_mps=0.1,0.2 --json",
     ),
 )
 @reporting
