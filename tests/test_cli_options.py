@@ -90,7 +90,7 @@ def test_calibrate_refuses_a_page_without_a_live_camera() -> None:
 )
 def test_calibrate_knows_no_option_that_it_would_not_heed(arguments: str, option: str) -> None:
     Path("pictures").mkdir()
-    said = run("calibrate", "pictures", "--view")
+    said = run("calibrate", *arguments.split())
     assert said.code == 2
     assert f"No such option: {option}" in said.stderr
     assert not Path("d.yaml").exists()
