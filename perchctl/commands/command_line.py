@@ -303,25 +303,19 @@ def main() -> Any:
 P = ParamSpec("P")
 
 
-def reporting(run: Callable[P, int]) -> Callable[P, NoReturn]:
-    """The function of a subcommand, which returns its exit code: its failures become sentences,
-    and with `as_json` an object."""
+def reporting(run: Callable[P, int]) -> Callable[P, None]:
+    """The function of a subcommand, which returns its exit code: it leaves with that code, and its
+    failures become sentences, and with `as_json` an object."""
 
     @functools.wraps(run)
-    def do(*args: P.args, **kwargs: P.kwargs) -> NoReturn:
+    def do(*args: P.args, **kwargs: P.kwargs) -> None:
         with reported(bool(kwargs.get("as_json"))):
-            perform(run, *args, **kwargs)
-        raise AssertionError("perform leaves")
+            loaded()
+            code = run(*args, **kwargs)
+            sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
+            raise typer.Exit(code)
 
     return do
-
-
-def perform(run: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> NoReturn:
-    """Do the command's work, its libraries being loaded, and leave with its exit code."""
-    loaded()
-    code = run(*args, **kwargs)
-    sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
-    raise typer.Exit(code)
 
 
 @contextlib.contextmanager

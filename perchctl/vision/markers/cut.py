@@ -476,7 +476,6 @@ _LENS_PX = 0.02  # by which a whole line may be off, of lens and light
 _TILT_RAD, _TURN_RAD, _PLACE = math.radians(2.0), math.radians(20.0), 1.0  # of a prediction
 _SHIFT_PX = 0.15  # by which white may have grown over black
 _PRIOR: Array = np.array([_TILT_RAD, _TILT_RAD, _TURN_RAD, _PLACE, _PLACE, _PLACE]) ** -2.0
-_SHIFT = 6  # the unknown after the rigid body's
 
 
 @dataclass(frozen=True, eq=False)

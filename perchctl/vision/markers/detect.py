@@ -595,7 +595,6 @@ def _mean_cov_px2(a: Detection, b: Detection) -> Array | None:
 
 SLOW_PX_S = 80.0
 """Markers that move no faster have fields too near to each other to be told apart."""
-FIELDS_APART_S = 0.02
 _EVERY = 4
 _PLACES: Array = np.linspace(0.12, 0.88, 32)
 _STEP_PX = 0.5

@@ -1,1 +1,0 @@
-"""Options of the subcommands whose work is in a file of its own."""
