@@ -450,3 +450,19 @@ def test_the_library_s_tracebacks_stay_away(profile: str, eyes: str, tmp_path: P
         assert cause in done.stderr
         assert "Traceback" not in done.stderr
         assert "link error callback" not in done.stderr
+
+
+def test_the_help_of_simulate_needs_no_simulator() -> None:
+    hide = (
+        "import sys\nsys.modules['mujoco'] = None\nsys.argv = ['perchctl', 'simulate', '--help']\n"
+        "from perchctl.__main__ import main\nsys.exit(main())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", hide],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Usage: perchctl simulate" in done.stdout

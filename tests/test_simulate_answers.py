@@ -21,7 +21,7 @@ from tests.helpers.results import landed, perched
 
 SIM = load_profile("sim")
 KEY = "planner.integral_per_s"
-FLY_VARIANTS = "perchctl.commands.simulate.fly_variants"
+FLY_VARIANTS = "perchctl.campaign.fly_variants"
 Note = Callable[[Any], None]
 
 

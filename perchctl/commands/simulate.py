@@ -17,6 +17,9 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
+# By their packages, whose names load as they are used: the help needs no simulator.
+from perchctl import campaign as campaigns
+from perchctl import faults as fault_campaigns
 from perchctl.analysis import profile_differences
 from perchctl.commands.command_line import (
     Command,
@@ -47,40 +50,7 @@ from perchctl.errors import (
 from perchctl.log import make_log_folder, summary_text, to_plain
 from perchctl.profile import Profile, load_profile
 
-try:
-    from perchctl.campaign import (
-        CampaignFlight,
-        CampaignResults,
-        FlightResult,
-        LoggedFlight,
-        VariantResult,
-        align_columns,
-        campaign_results,
-        campaign_summary,
-        campaign_table,
-        compare_profiles,
-        defer_interrupts,
-        flight_processes,
-        fly_all,
-        fly_logged,
-        fly_variants,
-        none_took_off,
-        parse_address,
-        run_campaign,
-        sweep_grid,
-    )
-    from perchctl.faults import (
-        FAULTS,
-        FaultResult,
-        fault_summary,
-        fault_table,
-        run_fault_campaign,
-        select_faults,
-    )
-except ModuleNotFoundError as error:
-    raise no_simulator(error.name) from None
-
-R = TypeVar("R", bound=CampaignFlight)
+R = TypeVar("R", bound="campaigns.CampaignFlight")
 AGAIN_S = 0.5
 """A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
 _NO_DIFFERENCE = ("name", "description", "date")
@@ -175,6 +145,7 @@ def run(
     force: ForceOption = False,
 ) -> int:
     """Fly many seeded scenarios in lockstep, faster than real time, and count."""
+    _require_simulator()
     many = {"-n": flights, "--seed": seed, "--jobs": jobs, "--cluster": cluster, "--out": out}
     if faults == "list":
         others = {**many, "--only": only, "--log-dir": log_dir}
@@ -204,16 +175,25 @@ def run(
     }  # fmt: skip
     with signals_to(stop_once()):
         if faults is not None:
-            names = tuple(fault.name for fault in select_faults(faults))
+            names = tuple(fault.name for fault in fault_campaigns.select_faults(faults))
             if only is not None:
                 folder = log_dir or Path(flown.log.directory)
                 return _fly_fault(flown, only, names, folder, record, as_json)
-            with campaign_results(flown, seeds, FaultResult, faults=names, **files) as faulty:
+            with campaigns.campaign_results(
+                flown, seeds, fault_campaigns.FaultResult, faults=names, **files
+            ) as faulty:
                 return fly_each(
-                    lambda executor, note: run_fault_campaign(
+                    lambda executor, note: fault_campaigns.run_fault_campaign(
                         flown, faulty.left, names, executor, note, log_dir, record
                     ),
-                    partial(_report, fault_summary, fault_table, as_json, log_dir, keep),
+                    partial(
+                        _report,
+                        fault_campaigns.fault_summary,
+                        fault_campaigns.fault_table,
+                        as_json,
+                        log_dir,
+                        keep,
+                    ),
                     len(seeds),
                     executor,
                     faulty,
@@ -221,16 +201,23 @@ def run(
         if only is not None:
             folder = log_dir or Path(flown.log.directory)
             return _fly_only(flown, only, folder, record, as_json)
-        with campaign_results(flown, seeds, FlightResult, **files) as kept:
+        with campaigns.campaign_results(flown, seeds, campaigns.FlightResult, **files) as kept:
             return fly_each(
-                lambda executor, note: run_campaign(
+                lambda executor, note: campaigns.run_campaign(
                     flown, kept.left, executor, note, log_dir, record
                 ),
-                partial(_report, campaign_summary, campaign_table, as_json, log_dir, keep),
+                partial(
+                    _report,
+                    campaigns.campaign_summary,
+                    campaigns.campaign_table,
+                    as_json,
+                    log_dir,
+                    keep,
+                ),
                 len(seeds),
                 executor,
                 kept,
-                none_took_off,
+                campaigns.none_took_off,
             )
 
 
@@ -264,13 +251,14 @@ def compare(
     as_json: JsonOption = False,
 ) -> int:
     """Fly each seed by two profiles: what differs, and what of it is proven."""
+    _require_simulator()
     names = (profile_a, profile_b)
     profiles = [positioned(load_profile(name), positioning) for name in names]
     keys = profile_differences(*(p.model_dump(mode="json") for p in profiles))
     keys = {key: values for key, values in keys.items() if key not in _NO_DIFFERENCE}
 
-    def report(results: list[VariantResult], problem: PerchError | None) -> None:
-        found = compare_profiles(names, results)
+    def report(results: list[campaigns.VariantResult], problem: PerchError | None) -> None:
+        found = campaigns.compare_profiles(names, results)
         if as_json:
             differences = {key: {"a": a, "b": b} for key, (a, b) in keys.items()}
             record = {"a": profile_a, "b": profile_b, **found.record(), "profile": differences}
@@ -311,12 +299,13 @@ def sweep(
     as_json: JsonOption = False,
 ) -> int:
     """Fly the same seeds with several values of a profile's keys: which is the best."""
-    grid = sweep_grid(positioned(load_profile(profile), positioning), values)
+    _require_simulator()
+    grid = campaigns.sweep_grid(positioned(load_profile(profile), positioning), values)
     profiles = [cell.profile for cell in grid.cells]
     seeds = _seeds(flights, seed)
     say(f"{len(profiles)} cells of {len(seeds)} seeds are {len(profiles) * len(seeds)} flights")
 
-    def report(results: list[VariantResult], problem: PerchError | None) -> None:
+    def report(results: list[campaigns.VariantResult], problem: PerchError | None) -> None:
         found = grid.compared(results)
         if as_json:
             print_record(with_problem(found.record(), problem))
@@ -331,15 +320,21 @@ def _fly_by_each(
     seeds: Sequence[int],
     jobs: int | None,
     cluster: str | None,
-    report: Callable[[list[VariantResult], PerchError | None], None],
+    report: Callable[[list[campaigns.VariantResult], PerchError | None], None],
 ) -> int:
     with signals_to(stop_once()):
         return fly_each(
-            lambda executor, note: fly_variants(profiles, seeds, executor, note),
+            lambda executor, note: campaigns.fly_variants(profiles, seeds, executor, note),
             report,
             len(profiles) * len(seeds),
             executor_of(jobs, cluster, profiles),
         )
+
+
+def _require_simulator() -> None:
+    """Raises UsageError where the extra ``sim`` is not installed."""
+    if find_spec("mujoco") is None:
+        raise no_simulator()
 
 
 def _seeds(flights: int | None, first: int | None) -> list[int]:
@@ -368,24 +363,24 @@ def executor_of(
     """Processes of this computer, or the workers of a cluster. `profiles`: with the files that
     flights read; `log_dir`: where they write. Errors: UsageError."""
     if cluster is None:
-        return lambda flights: flight_processes(max(1, min(jobs or 1, flights)))
+        return lambda flights: campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:
         raise UsageError(
             f"--cluster {cluster} flies as many at a time as it has workers: --jobs {jobs} does "
             f"not apply; leave it out, or --cluster"
         )
-    address = parse_address(cluster)
+    address = campaigns.parse_address(cluster)
     if find_spec("distributed") is None:
         raise no_cluster()
 
     @contextlib.contextmanager
     def workers(flights: int) -> Iterator[Executor]:
         if not flights:
-            with flight_processes(1) as processes:
+            with campaigns.flight_processes(1) as processes:
                 yield processes
             return
         try:
-            with defer_interrupts():
+            with campaigns.defer_interrupts():
                 from perchctl.campaign import cluster_pool
         except ImportError as error:
             raise no_cluster(str(error)) from error
@@ -402,7 +397,7 @@ def fly_each(
     report: Callable[[list[R], PerchError | None], None],
     total: int,
     executor_of: ExecutorOf,
-    kept: CampaignResults[R] | None = None,
+    kept: campaigns.CampaignResults[R] | None = None,
     objection: Callable[[list[R]], PerchError | None] = lambda results: None,
 ) -> int:
     """Fly a campaign of `total` flights, and report those that were flown, however it ends: also
@@ -425,7 +420,7 @@ def fly_each(
             begun = True
 
             def note(result: R) -> None:
-                with defer_interrupts():
+                with campaigns.defer_interrupts():
                     results.append(result)
                     if kept is not None:
                         kept.note(result)
@@ -495,7 +490,7 @@ def _report(
 
 
 def say_where_logs_are(
-    results: Sequence[CampaignFlight], log_dir: Path | None, keep: str | None = None
+    results: Sequence[campaigns.CampaignFlight], log_dir: Path | None, keep: str | None = None
 ) -> None:
     """Where the logs are, and what they lack, on stderr."""
     if log_dir is None or not results:
@@ -510,7 +505,7 @@ def say_where_logs_are(
 def _fly_only(profile: Profile, seed: int, folder: Path, record: bool, as_json: bool) -> int:
     """Fly one seed, and tell it as `perchctl fly` tells a flight."""
 
-    def report(flights: list[LoggedFlight], _problem: PerchError | None) -> None:
+    def report(flights: list[campaigns.LoggedFlight], _problem: PerchError | None) -> None:
         (flight,) = flights
         if not as_json:
             start_s = flight.events[0].t_s
@@ -528,9 +523,9 @@ def _fly_only(profile: Profile, seed: int, folder: Path, record: bool, as_json: 
         elif plot is not None:
             print(f"plot:      {plot}")
 
-    fly = partial(fly_logged, profile, folder, record=record)
+    fly = partial(campaigns.fly_logged, profile, folder, record=record)
     return fly_each(
-        lambda executor, note: fly_all(fly, [seed], executor, note),
+        lambda executor, note: campaigns.fly_all(fly, [seed], executor, note),
         report,
         1,
         executor_of(None, None, [profile]),
@@ -542,7 +537,7 @@ def _fly_fault(
 ) -> int:
     """Fly one seed with its fault, and print all that is known of the flight."""
 
-    def report(results: list[FaultResult], _problem: PerchError | None) -> None:
+    def report(results: list[fault_campaigns.FaultResult], _problem: PerchError | None) -> None:
         (result,) = results
         known = asdict(result)
         if not as_json:
@@ -555,7 +550,7 @@ def _fly_fault(
             print(f"{'plot':<18} {plot}")
 
     return fly_each(
-        lambda executor, note: run_fault_campaign(
+        lambda executor, note: fault_campaigns.run_fault_campaign(
             profile, [seed], faults, executor, note, folder, record
         ),
         report,
@@ -572,7 +567,13 @@ def _plot(log: Path, profile: Profile) -> Path | None:
 
 def _list_faults(as_json: bool) -> int:
     if as_json:
-        print_record({"faults": {fault.name: fault.what for fault in FAULTS}})
+        print_record({"faults": {fault.name: fault.what for fault in fault_campaigns.FAULTS}})
     else:
-        print("\n".join(align_columns([(fault.name, fault.what) for fault in FAULTS])))
+        print(
+            "\n".join(
+                campaigns.align_columns(
+                    [(fault.name, fault.what) for fault in fault_campaigns.FAULTS]
+                )
+            )
+        )
     return 0
