@@ -131,6 +131,14 @@ def test_tab_offers_profiles_and_sources(tmp_path: Path) -> None:
     assert offered("track", "im") == ["images:"]
 
 
+def test_tab_offers_subcommands_and_what_the_main_one_takes(tmp_path: Path) -> None:
+    assert offered("simulate", "com") == ["compare"]
+    assert offered("profile", "") == ["show", "new", "schema"]
+    assert offered("calibrate", "im") == ["images:"]
+    assert "--faults" in offered("simulate", "--fa")
+    assert "--part" in offered("calibrate", "mount", "--pa")
+
+
 def test_tab_offers_cameras_that_are_there_and_files_behind_a_colon(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -104,14 +104,31 @@ class Group(TyperGroup):
     """Subcommands, of which the first is the main one: it is done where none is named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args and ctx.resilient_parsing:  # a shell asks what may come
+            return super().parse_args(ctx, args)
         if not args or args[0] not in (*self.commands, *_SETTINGS["help_option_names"]):
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
 
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        """That of the main subcommand, with the others listed below it."""
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """The subcommands, and what the main one takes: its options, or its first argument."""
+        _, main_command, inner = self._main(ctx)
+        arguments = [p for p in main_command.params if p.param_type_name == "argument"]
+        offers = [] if incomplete.startswith("-") else arguments[:1]
+        return [
+            *super().shell_complete(ctx, incomplete),
+            *(item for each in offers for item in each.shell_complete(inner, incomplete)),
+            *(main_command.shell_complete(inner, incomplete) if not offers else ()),
+        ]
+
+    def _main(self, ctx: Any) -> tuple[str, Any, typer.Context]:
         name, main_command = next(iter(self.commands.items()))
         inner = typer.Context(main_command, info_name=ctx.info_name, parent=ctx.parent, **_SETTINGS)
+        return name, main_command, inner
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """That of the main subcommand, with the others listed below it."""
+        name, main_command, inner = self._main(ctx)
         main_command.format_usage(inner, formatter)
         main_command.format_help_text(inner, formatter)
         main_command.format_options(inner, formatter)
