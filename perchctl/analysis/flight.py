@@ -112,8 +112,8 @@ class FlightAnalysis:
     """What one flight was, worked out from its log; each part once, when it is first used.
 
     Times count from the flight's first turn. Where a part needs a value that no flight writes it
-    raises InvalidValue, TypeError, ValueError, LookupError or AttributeError: `open_log` makes one
-    error of them.
+    raises InvalidValue, TypeError, ValueError, LookupError or AttributeError, of which
+    `perchctl.log.log_values` makes one error.
     """
 
     def __init__(self, log: FlightLog) -> None:

@@ -369,12 +369,20 @@ def measured(
     }
     found = measured_target(nominal, sides_m)
     files: dict[Path, bytes] = {}
+    before: Path | None = None
     if not changed:
         files[path] = found.profile_text(_named_from(base, path)).encode()
     else:
-        write_profile_values(path, _changed_values(found.target, config.target))
+        values = _changed_values(found.target, config.target)
+        before = write_profile_values(path, values) if values else None
     lines = [*found.notes, f"{'changed' if changed else 'wrote'} {path}: fly -p {path}"]
-    record = {"target": found.target.model_dump(mode="json"), "notes": list(found.notes)}
+    if before is not None:
+        lines.append(f"as it was before it is {before}")
+    record = {
+        "target": found.target.model_dump(mode="json"),
+        "notes": list(found.notes),
+        "profile_before": before and str(before),
+    }
     return _write(files, lines, {"files": [str(path)]} | record, force, as_json)
 
 
@@ -398,7 +406,7 @@ def _profile_to_write(name: str | None, output: Path | None) -> tuple[str, Path]
         if output.suffix.lower() not in (".yaml", ".yml"):
             raise UsageError(f"-o {output}: measured sizes go into a profile, a .yaml file")
         return name or BASE_FOR_NEW, output
-    if name is None or not _is_file(name):
+    if name is None or not _is_path(name):
         shown = name or BASE_FOR_NEW
         raise UsageError(
             f"name the profile that gets the sizes: -p my_vehicle.yaml, or -p {shown} "
@@ -410,13 +418,14 @@ def _profile_to_write(name: str | None, output: Path | None) -> tuple[str, Path]
 
 def _named_from(base: str, path: Path) -> str:
     """How the new profile at `path` names its base: a file by its path from there."""
-    if not _is_file(base):
+    if not _is_path(base):
         return base
     file = Path(base).expanduser().resolve()
     return file.name if file.parent == path.resolve().parent else str(file)
 
 
-def _is_file(profile: str) -> bool:
+def _is_path(profile: str) -> bool:
+    """Whether a profile is named by its file, not by its name alone."""
     return "/" in profile or profile.endswith((".yaml", ".yml"))
 
 

@@ -173,7 +173,8 @@ def test_an_existing_profile_is_changed_in_place_with_force_only(name: str) -> N
     _, err = call(*words, code=30)
     assert "--force" in err
     assert path.read_text() == PROFILES[name]
-    call(*words, "--force")
+    out, err = call(*words, "--force")
+    assert "mine.yaml.bak" in out + err
     after = load_profile("./mine.yaml")
     assert (after.target.large.side_m, after.target.small.side_m) == (0.1496, 0.0249)
     assert after.target.size_sigma == 0.001
@@ -182,6 +183,8 @@ def test_an_existing_profile_is_changed_in_place_with_force_only(name: str) -> N
     assert "keep" in path.read_text()
     assert files() == {"mine.yaml", "mine.yaml.bak"}
     assert Path("mine.yaml.bak").read_text() == PROFILES[name]
+    call(*words, "--force")
+    assert files() == {"mine.yaml", "mine.yaml.bak"}, "nothing changed, and nothing is kept twice"
 
 
 def test_a_small_profile_of_a_file_in_another_folder_finds_it() -> None:
