@@ -1,4 +1,5 @@
-"""One opened `cflib.crazyflie.Crazyflie`: opened and closed within bounds, and sent to."""
+"""One opened `cflib.crazyflie.Crazyflie`: opened and closed within bounds, sent to,
+and locked against other programs."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ class Scenario:
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
         target_tilt_rad: the target's turns about the world's x and y, after its heading.
         gloss: peak of the lamp's reflection in the print, in whites of the paper; `lamp_m` the
-            lamp's place (`perchctl.sim.gloss`).
+            lamp's place (`perchctl.sim.sheets`).
         flow_noise_radps, flow_bias_radps: of the flow deck's readings, the latter in x and y.
         flow_reach_m: above this it sees no flow; None: it always does.
         bare_floors: x, y and radius of patches without texture (`perchctl.sim.firmware.estimator`).

@@ -255,7 +255,7 @@ def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
 
 
 # --- Rotation and translation from corners: closed forms, then least squares in which each -----
-# corner counts as it was measured (`perchctl.vision.pose`).
+# corner counts as it was measured.
 
 
 Solver = Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"]

@@ -1,4 +1,4 @@
-"""CRTP on the wire: what the firmware answers, and its number types."""
+"""CRTP on the wire: what the firmware answers, its number types, and its tables of contents."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The simulated vehicle as a process of its own: handle, messages, child, pace."""
+"""The simulated vehicle as a process of its own: handle, child, host."""

@@ -1,7 +1,7 @@
 """Markers in pictures so blurred that no search decodes them.
 
 Candidates may come from anywhere, because none is taken that the marker's drawing, laid
-over the picture itself, does not verify (`perchctl.vision.markers.blurred`).
+over the picture itself, does not verify.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""A marker's square in the picture: its sides, its area, and the squares that share its centre.
+"""A marker's square in the picture: its sides, its area, and the squares that share its centre;
+its corners as they were refined; and by how much white has grown over black.
 
 The unit square is a marker in its own coordinates: corners at (-1, -1), (1, -1), (1, 1),
 (-1, 1) in the order of `Detection.corners_px`.

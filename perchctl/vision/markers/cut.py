@@ -1,11 +1,10 @@
 """The target so near, or so far aside, that no marker is wholly in the picture.
 
-What is left of the drawing is aligned from where the target is expected
-(`perchctl.vision.markers.cut`), and one marker's corners follow, of which some are outside
-of the picture: with the covariance of what was seen, since some directions may be
-hardly known. A part of a drawing looks like many things. So it is never a first sight of the
-target, and it counts only if the picture looks like the drawing all over and nearly all edges
-that should be in view are.
+What is left of the drawing is aligned from where the target is expected, and one marker's
+corners follow, of which some are outside of the picture: with the covariance of what was seen,
+since some directions may be hardly known. A part of a drawing looks like many things. So it is
+never a first sight of the target, and it counts only if the picture looks like the drawing all
+over and nearly all edges that should be in view are.
 """
 
 from __future__ import annotations
@@ -455,7 +454,7 @@ def _edges(cells: Array, half: float, places: int) -> Iterator[_Edge]:
 
 
 # --- The target's pose from the edges that are in view, where its markers are cut by the picture
-# The drawing of both markers (`perchctl.vision.markers.cut`) is laid over the picture: at
+# The drawing of both markers is laid over the picture: at
 # places along its edges the edge of the picture is looked for across them, and Gauss-Newton
 # turns and moves the drawing until both agree. Its unknowns are those of a rigid body, not those
 # of a homography: a part of a drawing does not show eight of them. What it does not show of the

@@ -5,9 +5,9 @@
 3. by a search in a window around that place, then in the whole picture (`search`);
 4. where blur may hide them (`blurred`).
 
-A marker of which the picture's edge, light that glares, or the vehicle's own gear (`mask`) hides
-a part is measured by what is seen of it (`partly`). Each step takes place within the same frame,
-and only where the one before saw too little.
+A marker of which the picture's edge, light that glares, or the vehicle's own gear (`detector`)
+hides a part is measured by what is seen of it (`partial`). Each step takes place within the same
+frame, and only where the one before saw too little.
 """
 
 from __future__ import annotations

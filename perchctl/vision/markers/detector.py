@@ -1,4 +1,5 @@
-"""What finding the target's markers needs, made once: their dictionaries and patterns.
+"""What finding the target's markers needs, made once: their dictionaries and patterns,
+and the mask of the vehicle's own gear.
 
 Each marker has a dictionary that holds its one id, so nothing else can be taken for it
 (0/1 correction bits: no false accept in 28 pictures without a target; 0/3: 7 of 28).

@@ -1,9 +1,8 @@
 """Corners to a hundredth of a pixel: lines fitted to a marker's sides, intersected.
 
 A side is hundreds of gradient samples instead of one point, and a blur that is equal on
-both of its flanks does not move it. So each side's edge points
-(`perchctl.vision.markers.edge_fit`) are undistorted, a line is fitted to them by total least
-squares in normalised coordinates, and neighbours are intersected.
+both of its flanks does not move it. So each side's edge points are undistorted, a line is fitted
+to them by total least squares in normalised coordinates, and neighbours are intersected.
 
 White that is clipped, glares or went through a gamma curve does move edges: all of
 them, from white towards black, by the same number of pixels. The inner edge of a
@@ -618,7 +617,6 @@ _LEAST_MOMENT2, _MOST_MOMENT = _single(0.01), _single(0.8)
 _PER_NEAR = _single(1.0 / 0.6)  # of the wide window's spread
 _TUKEY = _single(3.5 * 1.4826)
 _POWERS: Floats = (ALONG[:, None] ** np.arange(3)).astype(np.float32)
-_PROFILE_ONES: Floats = np.ones(PROFILES, dtype=np.float32)
 _STEP_ONES: Floats = np.ones(STEPS, dtype=np.float32)
 _LEAST_SHARE = _single(0.3)  # of the row's mean gradient, for a profile to count
 _TUKEY_FLOOR_PX = _single(3.5 * 0.05)  # of the scatter that is taken for noise
@@ -735,7 +733,7 @@ def _gradients(grey: Floats, half_px: Array, near_px: Array, around: Surrounding
         side=outside - inside,
         can=can,
         # Multiplies a sum over a row's profiles: a part of the mean over those possible.
-        part=_LEAST_SHARE / np.maximum(can.dot(_PROFILE_ONES), _ONE),
+        part=_LEAST_SHARE / np.maximum(can.dot(_ONES32), _ONE),
     )
 
 
@@ -748,7 +746,7 @@ def _wide(g: _Gradients) -> _Centroids:
     np.multiply(window[..., 0], g.u, out=window[..., 1])
     moments: Floats = np.maximum(g.gradient, _ZERO) @ window
     total = moments[..., 0] * g.can
-    usable = total > (total.dot(_PROFILE_ONES) * g.part)[:, None]
+    usable = total > (total.dot(_ONES32) * g.part)[:, None]
     edge = np.divide(moments[..., 1], np.where(usable, total, _ONE))
     return _Centroids(edge, usable, np.ones(len(g.near), dtype=np.float32))
 
@@ -763,7 +761,7 @@ def _narrow(g: _Gradients, line: Floats, blur2: Floats) -> _Centroids:
     np.exp(mass, out=mass)
     mass *= g.gradient
     total = (mass @ _STEP_ONES) * g.can
-    usable = total > np.maximum(total.dot(_PROFILE_ONES) * g.part, _TINY)[:, None]
+    usable = total > np.maximum(total.dot(_ONES32) * g.part, _TINY)[:, None]
     # A neighbour seen through the window has this share, at this place, with this
     # spread; the one outside lies at the same distance on the other flank.
     wide2 = w2 + blur2
@@ -775,8 +773,8 @@ def _narrow(g: _Gradients, line: Floats, blur2: Floats) -> _Centroids:
     first = relative @ _STEP_ONES + total * g.side * (lost * place)[:, None]
     mass *= squared
     second = mass @ _STEP_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
-    moment = (second * usable).dot(_PROFILE_ONES)
-    moment /= np.maximum((total * usable).dot(_PROFILE_ONES), _TINY)
+    moment = (second * usable).dot(_ONES32)
+    moment /= np.maximum((total * usable).dot(_ONES32), _TINY)
     moment = np.minimum(np.maximum(moment, _LEAST_MOMENT2), _MOST_MOMENT * w2)
     found2 = moment * w2 / (w2 - moment)
     # The window pulls the centroid towards its own middle: undo that.

@@ -2,8 +2,8 @@
 
 Where blur has run the cells together, or cells are a few pixels wide, the picture of
 the whole marker still is its drawing, blurred and lit. Gauss-Newton finds the
-homography together with the light (`perchctl.vision.markers.photometric_fit`) and the blur. What
-does not look like the drawing then, cell by cell, is not the marker.
+homography together with the light and the blur. What does not look like the drawing then, cell
+by cell, is not the marker.
 
 The increment p of the homography H in a round is H (1 + P), with P's terms in the order
 of its rows and its last one 0. Coordinates are the marker's own, see
