@@ -44,6 +44,9 @@ BEFORE_BLOW_S, BOUNCES_S = 0.05, 0.5
 """A blow is noticed so long after it began, and what follows within so long is the same one."""
 STEADY_MPS = 0.06
 """Vertical speeds so near to each other are one speed."""
+STEADY_ASIDE_MPS = 0.15
+"""The same of sideways speeds, which drift more: 0.01 rad of wrong attitude makes 0.1 m/s of
+them each second."""
 REST_MEMORY_S = 0.5
 """At rest on the ground the accelerometer's offsets are learned in so long."""
 SPEED_MEMORY_S, BIAS_MEMORY_S = 3.0, 4.0
@@ -161,6 +164,7 @@ class ImuMotion:
         started_s: when the vehicle was first heard again after it had started anew.
         sunk_m: by how much the estimate has sunk while the accelerometer has stood still.
         steady_s: since when the vertical speed has stayed what it is.
+        steady_aside_s: the same of the sideways speed.
         offset_g: what the accelerometer read too much at rest on the ground, body axes.
         frozen_s, attitude_frozen_s, place_frozen_s: for how long the accelerometer, the attitude,
             and position with velocity have read the very same, as none that lives does; `-inf`
@@ -185,6 +189,8 @@ class ImuMotion:
     sunk_m: float = 0.0
     steady_s: float = math.inf
     steady_mps: float = 0.0
+    steady_aside_s: float = math.inf
+    steady_aside_mps: tuple[float, float] = (0.0, 0.0)
     light_since_s: float = math.inf
     sink_mps: float = 0.0
     offset_mps2: float = 0.0
@@ -239,7 +245,8 @@ def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> 
         return replace(
             motion, t_s=new.t_s, silent_s=silent_s, gap_s=gap_s, sunk_m=sunk_m,
             started_s=started_s, steady_s=new.t_s, sink_mps=0.0, blow_mps=0.0,
-            steady_mps=motion.velocity_mps[2], light_since_s=math.inf, frozen_s=frozen_s,
+            steady_mps=motion.velocity_mps[2], steady_aside_s=new.t_s,
+            steady_aside_mps=motion.velocity_mps[:2], light_since_s=math.inf, frozen_s=frozen_s,
             attitude_frozen_s=attitude_frozen_s, place_frozen_s=place_frozen_s,
             corrections=corrections, off_s=off_s,
         )  # fmt: skip
@@ -264,6 +271,9 @@ def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> 
     steady_s, steady_mps = motion.steady_s, motion.steady_mps
     if abs(z - steady_mps) > STEADY_MPS:
         steady_s, steady_mps = new.t_s, z
+    steady_aside_s, steady_aside_mps = motion.steady_aside_s, motion.steady_aside_mps
+    if math.dist((x, y), steady_aside_mps) > STEADY_ASIDE_MPS:
+        steady_aside_s, steady_aside_mps = new.t_s, (x, y)
     now = Blow(new.t_s, new.velocity_mps[2], z, new.acc_z_g)
     aside_g = _aside_g(motion.aside_g, new, offset_g, dt_s)
     last_moment = (*(m for m in motion.last_moment if new.t_s - m.t_s <= BEFORE_BLOW_S), now)
@@ -277,6 +287,8 @@ def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> 
         started_s=started_s,
         steady_s=steady_s,
         steady_mps=steady_mps,
+        steady_aside_s=steady_aside_s,
+        steady_aside_mps=steady_aside_mps,
         light_since_s=light,
         sink_mps=sink,
         offset_mps2=offset,

@@ -466,10 +466,11 @@ def _reckon(c: Context) -> PlannerState:
     new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray)
     if c.located and not c.by_sight and state.last is not None:
         new = stepped(new, state.last, obs.telemetry)
-    rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
+    moved_s = max(obs.imu.steady_s, obs.imu.steady_aside_s)
+    rests = obs.t_s - moved_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
     if state.contact_z_m is not None and new.below_m < REACH_M and rests:
         # What the impact left of a speed is none: pressed or hanging it stands still. On its way
-        # to the target a gust moves it.
+        # to the target a gust moves it, and a blow knocks it off the magnet.
         new = replace(new, velocity_mps=(0.0, 0.0, 0.0))
     felt, late = obs.felt, latency_changed(c)
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):

@@ -32,6 +32,8 @@ CATCH_LEAST_S, CATCH_LIMIT_S = 0.1, 2.0
 CARRIED_RATIO = 0.85
 """Of the hover thrust: what still has so much sinks, and is let sink by its own controller. More
 thrust would bring it back to the ceiling, beside the target's centre."""
+POSITION_GAIN_PER_S = 2.0
+"""The firmware's `posCtlPid.xKp` and `yKp`."""
 CAUGHT_MPS = -0.1
 """By then the thrust is above the weight, and goes on rising until the setpoint is below."""
 
@@ -131,12 +133,23 @@ def catch(c: Context) -> Acted | None:
         return None
     begun = c.in_phase_s < CATCH_LEAST_S
     if begun or (c.climb_mps < CAUGHT_MPS and c.in_phase_s < CATCH_LIMIT_S):
-        x, y, _ = state.entry_m
+        x, y = _braked_place_m(c) if c.is_blown else state.entry_m[:2]
         setpoint = PositionSetpoint(
             x, y, tel.position_m[2] + state.catch_above_m, state.entry_yaw_rad
         )
         return replace(state, setpoint=setpoint), limited(c, setpoint)
     return None
+
+
+def _braked_place_m(c: Context) -> tuple[float, float]:
+    """Where a setpoint takes out the sideways speed that the vehicle has and its estimate has not:
+    the position mode asks for `POSITION_GAIN_PER_S` times the way to it."""
+    tel, reckoned_mps = c.obs.telemetry, c.state.reckoning.velocity_mps
+    x_m, y_m = (
+        tel.position_m[i] - (reckoned_mps[i] - tel.velocity_mps[i]) / POSITION_GAIN_PER_S
+        for i in range(2)
+    )
+    return x_m, y_m
 
 
 def left_contact(c: Context, below_m: float) -> Context:

@@ -74,6 +74,17 @@ def test_no_fault_of_its_sight_makes_it_fall_or_lie(seed: int) -> None:
     assert not result.counted, (result.fault, result.phase, result.reason, result.counted)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [16, 30])
+def test_what_a_blow_knocks_off_the_magnet_is_braked(seed: int) -> None:
+    """In COMPLETE, and in a landing that has released it: by its estimate it stands still."""
+    scenario = draw_scenario(TARGET_ONLY, seed)
+    result = FaultyFlight(TARGET_ONLY, draw_case(seed, scenario, ON_IT), scenario).fly()
+    assert result.fault == "kick"
+    assert not result.counted, (result.phase, result.reason, result.counted)
+    assert result.astray_m < 0.5
+
+
 @pytest.mark.campaign
 @pytest.mark.parametrize("wrong_s", [-0.03, 0.03])
 def test_a_latency_that_is_wrong_does_not_swing_the_alignment(wrong_s: float) -> None:

@@ -25,7 +25,7 @@ from perchctl.mission import (
 )
 from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
 from perchctl.mission.guards import BLIND_VARIANCE_M2, LOWEST_M
-from perchctl.mission.imu import Reckoning
+from perchctl.mission.imu import STEADY_ASIDE_MPS, Reckoning
 from perchctl.mission.lander import (
     BRAKE_RAD_PER_MPS,
     HOVER_WITHIN,
@@ -33,6 +33,7 @@ from perchctl.mission.lander import (
     SINK_MPS,
     UNLEARNED_WITHIN,
 )
+from perchctl.mission.release import POSITION_GAIN_PER_S
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, Idle, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import (
@@ -360,6 +361,56 @@ def test_what_an_impact_left_of_a_speed_goes_while_it_rests_at_its_contact(
         state, _ = planner.step_mission(state, obs, PROFILE)
     rests = state.reckoning.velocity_mps == (0.0, 0.0, 0.0)
     assert rests is goes
+
+
+@given(aside_g=st.floats(-1.5, 1.5), ahead_g=st.floats(-1.5, 1.5), yaw_rad=st.floats(-3.1, 3.1))
+def test_a_blow_from_the_side_is_no_rest_though_it_hangs_at_its_contact(
+    aside_g: float, ahead_g: float, yaw_rad: float
+) -> None:
+    """The magnet holds its height for some moments while the blow knocks it off: all of the speed
+    that it leaves is reckoned, but for what an accelerometer at rest drifts by."""
+    felt, state = Felt(), blind(1.0, (0.0, 0.0, 0.0), contact_z_m=1.0)
+    begun = felt(unseen(BEGIN_S, 1.0, 2.0))
+    state = replace(state, reckoning=replace(state.reckoning, imu=begun.imu, below_m=0.0))
+    for i in range(1, 30):
+        blown = i > 25
+        tel = telemetry(
+            BEGIN_S + TURN_S * i, 1.0, yaw_rad=yaw_rad,
+            acc_x_g=ahead_g if blown else 0.0, acc_y_g=aside_g if blown else 0.0,
+            acc_z_g=1.0 + 0.001 * (i % 2),
+        )  # fmt: skip
+        obs = felt(unseen(tel.t_s, 1.0, 2.0, telemetry=tel))
+        state, _ = planner.step_mission(state, obs, PROFILE)
+    gained_mps = 9.81 * 3.5 * TURN_S * math.hypot(aside_g, ahead_g)  # the first by its half
+    x_mps, y_mps, _ = state.reckoning.velocity_mps
+    assert math.hypot(x_mps, y_mps) >= gained_mps - STEADY_ASIDE_MPS - 1e-6
+
+
+@given(x_mps=st.floats(-1.0, 1.0), y_mps=st.floats(-1.0, 1.0))
+def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_mps: float) -> None:
+    """Knocked off the magnet it is caught by position, and the position mode would tilt it by its
+    estimate, which has felt no blow: the setpoint asks for the opposite of what that lacks."""
+    unknown_mps = math.hypot(x_mps, y_mps)
+    assume(abs(unknown_mps - BLOWN_MPS) > 0.01)
+    t_s = BEGIN_S + TURN_S
+    imu = ImuMotion(t_s=BEGIN_S)
+    state = replace(
+        state_in(Phase.LANDING, z_m=1.9), contact_z_m=1.9, released_s=BEGIN_S - 1.0,
+        reach_s=BEGIN_S - 6.0, blind_s=BEGIN_S - 3.0,
+        reckoning=Reckoning(imu=imu, velocity_mps=(x_mps, y_mps, -0.5)),
+    )  # fmt: skip
+    falls = telemetry(t_s, 1.85, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)
+    obs = unseen(t_s, 1.85, 2.0, telemetry=falls, imu=replace(imu, t_s=t_s))
+    state, command = planner.step_mission(state, obs, PROFILE)
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m > 1.85
+    x_m, y_m, _ = falls.position_m
+    ahead_m, aside_m = command.x_m - x_m, command.y_m - y_m
+    if unknown_mps > BLOWN_MPS:
+        assert ahead_m == pytest.approx(-x_mps / POSITION_GAIN_PER_S, abs=0.02)
+        assert aside_m == pytest.approx(-y_mps / POSITION_GAIN_PER_S, abs=0.02)
+    else:
+        assert (ahead_m, aside_m) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("hover", [0.0, HOVER_THRUST])
