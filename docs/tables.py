@@ -9,6 +9,8 @@ to what this command would write. A key's meaning is its description in the sche
 from __future__ import annotations
 
 import argparse
+import ast
+import inspect
 import re
 import sys
 from collections.abc import Callable
@@ -19,17 +21,21 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
+from perchctl.camera import FrameSource  # noqa: E402
 from perchctl.errors import EXIT_CODES  # noqa: E402
 from perchctl.faults import FAULTS  # noqa: E402
 from perchctl.faults.catalogue import AIR, FROM_THE_START, Fault  # noqa: E402
 from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
 from perchctl.faults.promises import PROMISES  # noqa: E402
+from perchctl.link import Link  # noqa: E402
 from perchctl.log.fields import EVENT_FIELDS, FIELDS  # noqa: E402
-from perchctl.mission import FLYING_PHASES, Phase, table  # noqa: E402
+from perchctl.mission import FLYING_PHASES, Phase, step_mission, table  # noqa: E402
 from perchctl.mission.lander import MANOEUVRES, Evidence, Reach, Stage  # noqa: E402
+from perchctl.perception import Perception  # noqa: E402
 from perchctl.profile import Profile, SimulationConfig  # noqa: E402
 from perchctl.profile.keys import UNITS, keys  # noqa: E402
 from perchctl.profile.simulation import WORLDS  # noqa: E402
+from perchctl.vision import step  # noqa: E402
 
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 PART = re.compile(r"(<!-- begin ([\w-]+) -->\n).*?(<!-- end \2 -->)", re.DOTALL)
@@ -90,6 +96,72 @@ def log_fields(fields: dict[str, str] = FIELDS) -> str:
 def _unit_of_field(name: str) -> str:
     last = name.rpartition("_")[2]
     return UNITS.get(last, "") if "_" in name else ""
+
+
+WAY_OF_A_FRAME: tuple[tuple[str, Callable[..., Any]], ...] = (
+    ("camera", FrameSource.poll),
+    ("vision", step),
+    ("perception", Perception.target),
+    ("mission", step_mission),
+    ("link", Link.send),
+)
+"""The calls that lead from a picture to a command, in order."""
+
+
+def frame_diagram() -> str:
+    """The calls that lead from a picture to a command, with what each gives."""
+    lines = ["flowchart LR"]
+    for number, (package, call) in enumerate(WAY_OF_A_FRAME):
+        lines.append(f'    c{number}["{package}<br>{call.__qualname__}"]')
+    for number, (_, call) in enumerate(WAY_OF_A_FRAME[:-1]):
+        given = _mermaid_type(inspect.signature(call).return_annotation)
+        lines.append(f'    c{number} -->|"{given}"| c{number + 1}')
+    return "\n".join(lines)
+
+
+def _mermaid_type(annotation: str) -> str:
+    """The value that goes on: not None, and of a pair with a memory the second."""
+    return annotation.removesuffix(" | None").rpartition(", ")[2].removesuffix("]")
+
+
+def package_diagram() -> str:
+    """Which package imports which, without what a longer path implies already."""
+    from tests.test_architecture import IMPORTS, LAYERS, room_of
+
+    packages = [
+        room for rooms in LAYERS for room in rooms if (ROOT / room.replace(".", "/")).is_dir()
+    ]
+    needs: dict[str, set[str]] = {package: set() for package in packages}
+    for found in IMPORTS:
+        importer, imported = room_of(found.importer), room_of(found.imported)
+        if importer in needs and imported in needs and importer != imported:
+            needs[importer].add(imported)
+    lines = ["flowchart BT"]
+    for package in packages:
+        implied = {far for near in needs[package] for far in _reached(needs, near)}
+        for other in sorted(needs[package] - implied):
+            lines.append(f"    {package.split('.')[1]} --> {other.split('.')[1]}")
+    return "\n".join(lines)
+
+
+def _reached(needs: dict[str, set[str]], package: str) -> set[str]:
+    reached = set(needs[package])
+    for near in needs[package]:
+        reached |= _reached(needs, near)
+    return reached
+
+
+def packages() -> str:
+    """What each package holds: the first sentence of its docstring."""
+    rows = []
+    for path in sorted((ROOT / "perchctl").iterdir()):
+        source = path / "__init__.py" if path.is_dir() else path
+        if path.name == "__main__.py" or source.suffix != ".py" or not source.exists():
+            continue
+        text = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
+        first = " ".join(text.split("\n\n")[0].split())
+        rows.append(f"| `perchctl/{path.name}` | {first} |")
+    return "\n".join(["| package | what it holds |", "|---|---|", *rows])
 
 
 def import_order() -> str:
@@ -195,6 +267,9 @@ def _order(phase: Phase) -> int:
 
 
 PARTS: dict[str, Callable[[], str]] = {
+    "frame-diagram": lambda: f"```mermaid\n{frame_diagram()}\n```",
+    "package-diagram": lambda: f"```mermaid\n{package_diagram()}\n```",
+    "packages": packages,
     "import-order": import_order,
     "diagram": lambda: f"```mermaid\n{mission_diagram()}\n```",
     "rows": mission_rows,

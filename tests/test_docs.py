@@ -314,7 +314,7 @@ def test_every_profile_key_has_its_meaning() -> None:
 
 
 def test_a_changed_table_is_seen() -> None:
-    page = TEXT[DOCS / "architecture.md"]
+    page = TEXT[DOCS / "mission.md"]
     assert tables()["filled"](page.replace("| 1 | operator-stop |", "| 1 | operator |")) == page
 
 

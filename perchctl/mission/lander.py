@@ -3,7 +3,7 @@ the rescue after an exception.
 
 Pure: `step_landing(state, observation, profile) -> (state, command)`.
 
-What it does follows from three things (`MANOEUVRES`, the table of docs/architecture.md):
+What it does follows from three things (`MANOEUVRES`, the table of docs/mission.md):
 
 - the `Evidence` that is fresh: a position from outside the picture, a position by the target,
   height alone, accelerometer and attitude alone, or nothing;

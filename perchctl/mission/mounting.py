@@ -4,7 +4,7 @@ Where `camera.mount` is turned by an angle a about the vehicle's upward axis, th
 placed T = p + M (t - p), with the true target t, M the turn by -a, and p the place where that
 axis meets the target's plane: it moves with the vehicle and with each of its tilts, by
 (1 - M) of the motion of p. In the plane a turn is a complex number of length 1, so one least
-squares over a decimetre of that motion gives s = 1 - M (docs/architecture.md, "The mounting").
+squares over a decimetre of that motion gives s = 1 - M (docs/mission.md, "The mounting").
 """
 
 from __future__ import annotations

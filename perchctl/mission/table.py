@@ -1,6 +1,6 @@
 """The mission as one ordered table: first match wins, safety rows on top.
 
-The diagram and the table of docs/architecture.md are drawn from `TABLE`.
+The diagram and the table of docs/mission.md are drawn from `TABLE`.
 """
 
 from __future__ import annotations
