@@ -25,8 +25,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.patches import Rectangle
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.text import Text
@@ -271,7 +273,140 @@ def report(flown: Flight, file: Path) -> None:
         _photograph(file, told.as_uri(), REPORT_PX, scale=0.7)
 
 
+def vehicle_drawing(flown: Flight, file: Path) -> None:
+    """The vehicle from the side and from above, to scale: camera, gear, deck, axes."""
+    figure = new_figure(11.0, 4.6, dpi=100)
+    side, above = figure.subplots(1, 2)
+    lens_m, gear_m = flown.profile.camera.mount.position_m, flown.profile.vehicle.gear_body_m
+    for ax, title in ((side, "from its right side"), (above, "from above")):
+        ax.set_title(title, fontsize=11)
+        ax.set_aspect("equal")
+        ax.set_axis_off()
+    side.set_xlim(-0.085, 0.115)
+    side.set_ylim(-0.045, 0.075)
+    for x, up, width, height, colour in _body_parts(gear_m[2], spins=False):
+        side.add_patch(Rectangle((x, up), width, height, color=colour))
+    side.add_patch(Rectangle((-0.014, -0.012), 0.028, 0.0025, color=ORANGE))
+    side.add_patch(
+        Rectangle((lens_m[0] - 0.006, 0.002), 0.012, lens_m[2] - 0.002, color=VERMILLION)
+    )
+    side.fill(
+        (lens_m[0], lens_m[0] - 0.04, lens_m[0] + 0.04), (lens_m[2], 0.058, 0.058),
+        color=VERMILLION, alpha=0.12, linewidth=0.0,
+    )  # fmt: skip
+    _label(side, "gear tip: the highest point", (gear_m[0], gear_m[2]), (-0.08, 0.064))
+    _label(side, "camera, looks up", (lens_m[0], lens_m[2]), (0.058, 0.064))
+    _label(side, "battery", (-0.012, 0.006), (-0.084, 0.028))
+    _label(side, "positioning deck, below", (0.0, -0.011), (-0.07, -0.034))
+    _arrow(side, (0.06, -0.03), (0.035, 0.0), "x: front")
+    _arrow(side, (0.06, -0.03), (0.0, 0.026), "z: up")
+    above.set_xlim(-0.085, 0.115)
+    above.set_ylim(-0.072, 0.072)
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            x, y = sx * MOTOR_M, sy * MOTOR_M
+            above.plot((0.0, x), (0.0, y), color=BLUE, linewidth=5.0)
+            above.add_patch(Circle((x, y), 0.0225, fill=False, color=GREY, linewidth=1.5))
+    above.add_patch(Rectangle((-0.016, -0.011), 0.032, 0.022, color=GREY))
+    above.add_patch(
+        Rectangle((lens_m[0] - 0.006, lens_m[1] - 0.006), 0.012, 0.012, color=VERMILLION)
+    )
+    above.add_patch(Circle(gear_m[:2], 0.004, color=BLACK))
+    _label(above, "gear tip, over the middle", (gear_m[0], gear_m[1]), (-0.083, 0.066))
+    _label(above, "camera", (lens_m[0], lens_m[1]), (0.052, 0.016))
+    _arrow(above, (0.075, -0.04), (0.032, 0.0), "x: front")
+    _arrow(above, (0.075, -0.04), (0.0, 0.032), "y: left")
+    _save_svg(figure, file)
+
+
+def sheet_drawing(flown: Flight, file: Path) -> None:
+    """A cut through the sheet under a ceiling, with its magnet, and the vehicle below."""
+    figure = new_figure(8.0, 4.2, dpi=100)
+    ax = figure.subplots()
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+    ax.set_xlim(-0.17, 0.17)
+    ax.set_ylim(-0.09, 0.07)
+    half_m = 0.105
+    ax.add_patch(Rectangle((-0.17, 0.042), 0.34, 0.028, color="#D5D5D5"))
+    for x in (-0.09, 0.075):
+        ax.add_patch(Rectangle((x, 0.006), 0.015, 0.036, color="#B89B72"))
+    ax.add_patch(Rectangle((-half_m, 0.002), 2 * half_m, 0.004, color="#B89B72"))
+    ax.add_patch(Rectangle((-0.025, 0.006), 0.05, 0.005, color=VERMILLION))
+    ax.add_patch(Rectangle((-half_m, 0.0), 2 * half_m, 0.002, color=BLACK))
+    for x, up, width, height, colour in _body_parts(flown.profile.vehicle.gear_body_m[2], True):
+        z = -flown.profile.vehicle.gear_body_m[2]
+        ax.add_patch(Rectangle((x, z + up - 0.022), width, height, color=colour))
+    _label(ax, "ceiling or shelf", (-0.14, 0.05), (-0.165, 0.058))
+    _label(ax, "spacers, two or more", (0.083, 0.024), (0.1, 0.03))
+    _label(ax, "stiff board, flat", (-0.09, 0.004), (-0.168, 0.016))
+    _label(ax, "magnet, 50 mm, glued on the back", (0.02, 0.008), (-0.058, 0.03))
+    _label(ax, "printed side, faces down", (0.06, 0.0), (0.07, -0.02))
+    _arrow(ax, (-0.15, -0.07), (0.03, 0.0), "target x")
+    _arrow(ax, (-0.15, -0.07), (0.0, 0.03), "target z: up")
+    _save_svg(figure, file)
+
+
+def wiring_drawing(_: Flight, file: Path) -> None:
+    """How an analogue video transmitter gets its power."""
+    figure = new_figure(8.0, 2.6, dpi=100)
+    ax = figure.subplots()
+    ax.set_axis_off()
+    ax.set_xlim(0.0, 10.0)
+    ax.set_ylim(0.0, 3.2)
+    boxes = (
+        (0.2, "battery\n1 cell, 250 mAh", GREY), (2.9, "Crazyflie\nVCOM, GND", BLUE),
+        (5.6, "camera with\ntransmitter", VERMILLION), (8.3, "receiver\nUSB", GREEN),
+    )  # fmt: skip
+    for x, text, colour in boxes:
+        ax.add_patch(Rectangle((x, 1.0), 1.6, 1.3, fill=False, edgecolor=colour, linewidth=2.0))
+        ax.text(x + 0.8, 1.65, text, ha="center", va="center", fontsize=9)
+    for x, text in ((1.8, "plug"), (4.5, "+ and -"), (7.2, "5.8 GHz")):
+        style = "dashed" if text == "5.8 GHz" else "solid"
+        ax.plot((x, x + 1.1), (1.65, 1.65), color=BLACK, linestyle=style)
+        ax.text(x + 0.55, 1.8, text, ha="center", fontsize=8)
+    ax.text(5.05, 0.45, "VCOM is the battery's voltage, 3.0 to 4.2 V", ha="center", fontsize=9)
+    _save_svg(figure, file)
+
+
+MOTOR_M = 0.0325
+"""Of a motor from the middle, along x and along y."""
+
+
+def _body_parts(gear_m: float, spins: bool) -> list[tuple[float, float, float, float, str]]:
+    """Rectangles of a Crazyflie from the side, m: x, z, width, height, colour."""
+    parts = [
+        (-0.046, -0.002, 0.092, 0.004, BLUE),
+        (-0.016, 0.002, 0.032, 0.007, GREY),
+        (-0.003, 0.002, 0.006, gear_m - 0.002, BLACK),
+    ]
+    for side in (-0.046, 0.046):
+        parts.append((side - 0.0035, -0.012, 0.007, 0.02, GREY))
+        parts.append((side - 0.0225, 0.008, 0.045, 0.002, GREEN if spins else BLACK))
+    return parts
+
+
+def _label(ax: Axes, text: str, at: tuple[float, float], words: tuple[float, float]) -> None:
+    line = {"arrowstyle": "-", "color": GREY, "linewidth": 0.8}
+    ax.annotate(text, at, words, fontsize=9, arrowprops=line)
+
+
+def _arrow(ax: Axes, at: tuple[float, float], way: tuple[float, float], text: str) -> None:
+    to = (at[0] + way[0], at[1] + way[1])
+    ax.annotate("", to, at, arrowprops={"arrowstyle": "->", "color": BLACK})
+    ax.text(to[0] + 0.002, to[1] + 0.001, text, fontsize=9)
+
+
+def _save_svg(figure: Figure, file: Path) -> None:
+    """The same bytes for the same drawing: no date, ids from a fixed salt."""
+    with rc_context({"svg.hashsalt": "perchctl", "svg.fonttype": "path"}):
+        figure.savefig(file, format="svg", metadata={"Date": None}, bbox_inches="tight")
+
+
 PICTURES: dict[str, Callable[[Flight, Path], None]] = {
+    "vehicle.svg": vehicle_drawing,
+    "sheet.svg": sheet_drawing,
+    "wiring.svg": wiring_drawing,
     "target.png": target,
     "flight.png": flight,
     "strip.png": strip,
@@ -351,14 +486,7 @@ def _vehicle(ax: Axes, flown: Flight, s_m: float, record: dict[str, Any]) -> Non
     """Board, battery, motors, propellers and gear of a Crazyflie, true to size."""
     z, gear_m = record["true_z_m"], flown.profile.vehicle.gear_body_m[2]
     spins = (record["thrust"] or 0) > 0
-    parts = [
-        (-0.046, -0.002, 0.092, 0.004, BLUE),
-        (-0.016, 0.002, 0.032, 0.007, GREY),
-        (-0.003, 0.002, 0.006, gear_m - 0.002, BLACK),
-    ]
-    for side in (-0.046, 0.046):
-        parts.append((side - 0.0035, -0.012, 0.007, 0.02, GREY))
-        parts.append((side - 0.0225, 0.008, 0.045, 0.002, GREEN if spins else BLACK))
+    parts = _body_parts(gear_m, spins)
     for x, up, width, height, colour in parts:
         ax.add_patch(Rectangle((s_m + x, z + up), width, height, color=colour, zorder=3))
 
