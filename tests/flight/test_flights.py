@@ -18,7 +18,8 @@ from perchctl.errors import EXIT_CODES
 from perchctl.flight import PLAIN_SEED, fly_lockstep
 from perchctl.geometry import rot_z
 from perchctl.log import FlightLog, read_log
-from perchctl.mission import SEVEN_PHASES, Event, EventKeeper, Operator, Outcome, Phase, Tick
+from perchctl.mission import Event, EventKeeper, Operator, Outcome, Phase, Tick
+from perchctl.mission.state import SEVEN_PHASES
 from perchctl.perception.perception import SLEW
 from perchctl.profile import load_profile
 from perchctl.sim import draw_scenario

@@ -253,7 +253,7 @@ def test_a_terminal_that_is_gone_is_no_failure() -> None:
         "import os, sys\n"
         "from perchctl.commands.output import say, tell\n"
         "from perchctl.display import open_panel\n"
-        "from perchctl.mission.watch import Event, EventKind\n"
+        "from perchctl.mission.records import Event, EventKind\n"
         "say('one'); panel = open_panel(stream=sys.stderr)\n"
         "panel.event(Event(0.0, EventKind.NOTE, 'two'))\n"
         "panel.close(); tell('three')\n"

@@ -10,16 +10,8 @@ import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link import MockLink
-from perchctl.mission import (
-    Condition,
-    Context,
-    Finding,
-    Observation,
-    Phase,
-    PlannerState,
-    lander,
-    planner,
-)
+from perchctl.mission import Condition, Finding, Observation, Phase, PlannerState, lander, planner
+from perchctl.mission.context import Context
 from perchctl.perception import History, add_samples
 from perchctl.profile import Profile
 from perchctl.sim import REST_HEIGHT_M, SimulatedVehicle, draw_scenario

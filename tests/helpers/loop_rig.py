@@ -12,8 +12,17 @@ import pytest
 
 from perchctl.flight import FlightParts, fly
 from perchctl.flight.loop import Positions
-from perchctl.flight.rescue import Rescued, rescue
-from perchctl.mission import Event, FlightReport, Observation, Operator, Phase, Tick, planner
+from perchctl.flight.watchdog import rescue
+from perchctl.mission import (
+    Event,
+    FlightReport,
+    Observation,
+    Operator,
+    Phase,
+    Rest,
+    Tick,
+    planner,
+)
 from perchctl.perception import History
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -234,7 +243,7 @@ class Rig:
     def fly(self) -> FlightReport:
         return fly(self.parts())
 
-    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> Rescued:
+    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> Rest:
         """A rescue of what was flying as `known` and `state` say, its positions `age_s` old."""
         ground = replace(known, position_m=(0.0, 0.0, 0.0))
         told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last": known} | state

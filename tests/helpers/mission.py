@@ -14,10 +14,10 @@ from perchctl.mission import (
     Observation,
     Phase,
     PlannerState,
-    Severity,
     integrate_imu,
     planner,
 )
+from perchctl.mission.state import Severity
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     ARMED,

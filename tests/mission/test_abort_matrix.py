@@ -8,16 +8,8 @@ from dataclasses import replace
 
 import pytest
 
-from perchctl.mission import (
-    FLYING_PHASES,
-    Observation,
-    Operator,
-    Outcome,
-    Phase,
-    PlannerState,
-    Severity,
-    planner,
-)
+from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, planner
+from perchctl.mission.state import FLYING_PHASES, Severity
 from perchctl.vehicle import (
     CRASHED,
     LOCKED,

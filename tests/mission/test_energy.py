@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import (
-    Context,
     EnergyState,
     Outcome,
     Phase,
@@ -20,10 +19,19 @@ from perchctl.mission import (
     fit_battery,
     planner,
     update_energy,
-    used_mah,
 )
-from perchctl.mission.budget import floor_of, needs_of, outlook, watched
-from perchctl.mission.energy import CURVE, Floor, left_s, loaded_v, resting_v
+from perchctl.mission.battery import (
+    CURVE,
+    Floor,
+    floor_of,
+    left_s,
+    loaded_v,
+    needs_of,
+    outlook,
+    read_battery,
+    resting_v,
+)
+from perchctl.mission.context import Context
 from perchctl.profile import Profile, load_profile
 from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.powertrain import Cell, CellKind
@@ -147,7 +155,7 @@ def test_the_count_of_the_thrust() -> None:
     energy = EnergyState()
     for _ in range(500):
         energy = update_energy(energy, PERIOD_S, 3.7, FULL_THRUST, MAH)
-    assert used_mah(energy, MAH) == pytest.approx(4.4 / 3.6 * 10.0)
+    assert energy.used * MAH == pytest.approx(4.4 / 3.6 * 10.0)
 
 
 @pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan])
@@ -309,7 +317,7 @@ def test_a_reading_that_stands_still_is_none() -> None:
     state = state_in(Phase.ALIGN)
     for age_s, known in ((0.5, True), (4.0, True), (9.0, False)):
         later = observation(state.t_s + 4.0, battery_age_s=age_s)
-        state = replace(state, energy=watched(Context(state, later, PROFILE)), t_s=later.t_s)
+        state = replace(state, energy=read_battery(Context(state, later, PROFILE)), t_s=later.t_s)
         c = Context(state, later, PROFILE)
         assert (outlook(c).left_s is not None) is known
 

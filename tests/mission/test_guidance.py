@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import FLYING_PHASES, Context, Operator, Phase, planner
+from perchctl.mission import Operator, Phase, planner
+from perchctl.mission.context import Context
 from perchctl.mission.guidance import FLOOR_M, limited
+from perchctl.mission.state import FLYING_PHASES
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers.mission import PROFILE, READY, observation, state_in, target_at, telemetry
 

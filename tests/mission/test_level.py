@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import BEFORE_CONTACT, Phase, PlannerState, planner
+from perchctl.mission import Phase, PlannerState, planner
 from perchctl.mission.lander import SINK_MPS
+from perchctl.mission.state import BEFORE_CONTACT
 from perchctl.vehicle import Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import HOVER_THRUST, PROFILE, observation, state_in, telemetry
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.mission import Context, Observation, Outcome, Phase, PlannerState, planner
+from perchctl.mission import Observation, Outcome, Phase, PlannerState, planner
 from perchctl.mission.conditions import contact_aside_m
+from perchctl.mission.context import Context
 from perchctl.mission.imu import Reckoning, stepped
 from perchctl.profile import Profile
 from perchctl.vehicle import LOCKED, Command, Land, PositionSetpoint, RawThrust, StopMotors
@@ -225,7 +226,7 @@ def released(it: Hangs, state: PlannerState, lasts_s: float = 12.0) -> tuple[Pla
         state, command = planner.step_mission(state, it.look(t_s), MOCAP)
         it.obeys(command)
         sent.append((t_s, command))
-        if planner.is_mission_over(state):
+        if state.phase.is_over:
             break
     return state, sent
 
@@ -306,7 +307,7 @@ def test_what_nobody_saw_hang_has_not_perched(
         state, command = planner.step_mission(state, replace(obs, t_s=t_s), MOCAP)
         assert not isinstance(command, Land | PositionSetpoint)
         reasons.append(state.reason)
-        if planner.is_mission_over(state):
+        if state.phase.is_over:
             break
     assert state.phase is ends
     if ends is Phase.ABORTED:

@@ -12,21 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import (
-    FLYING_PHASES,
-    TERMINALS,
-    ImuMotion,
-    Observation,
-    Operator,
-    Outcome,
-    Phase,
-    PlannerState,
-    Severity,
-    planner,
-)
+from perchctl.mission import ImuMotion, Observation, Operator, Outcome, Phase, PlannerState, planner
 from perchctl.mission.felt import Mismatch
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
-from perchctl.mission.table import TABLE, Row, first_match, risen
+from perchctl.mission.state import FLYING_PHASES, TERMINALS, Severity
+from perchctl.mission.table import TABLE, Transition, first_match, risen
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     CRASHED,
@@ -79,7 +69,7 @@ class Case:
     profile: Any = PROFILE
     row: str | None = None
 
-    def holds(self, table: tuple[Row, ...] = TABLE) -> bool:
+    def holds(self, table: tuple[Transition, ...] = TABLE) -> bool:
         state = replace(state_in(self.phase, START_S, self.z_m), **self.state)
         for i in range(1, max(2, round(self.lasts_s / PERIOD_S)) + 1):
             obs = self.look(START_S + PERIOD_S * i)
@@ -367,7 +357,7 @@ def test_what_was_locked_while_it_landed_has_not_perched() -> None:
 
 # --- severity ------------------------------------------------------------------------------
 
-ROGUE = Row("rogue", FLYING_PHASES | {P.LANDING}, lambda c: True, P.SEARCH, "take off again")
+ROGUE = Transition("rogue", FLYING_PHASES | {P.LANDING}, lambda c: True, P.SEARCH, "take off again")
 
 
 def test_no_row_undoes_a_landing() -> None:

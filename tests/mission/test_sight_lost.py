@@ -12,19 +12,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission import (
-    Context,
-    ImuMotion,
-    Observation,
-    Operator,
-    Phase,
-    PlannerState,
-    Severity,
-    lander,
-    planner,
-)
-from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
-from perchctl.mission.guards import BLIND_VARIANCE_M2, LOWEST_M
+from perchctl.mission import ImuMotion, Observation, Operator, Phase, PlannerState, lander, planner
+from perchctl.mission.context import BLOWN_MPS, CORRECTED_S, Context
+from perchctl.mission.guidance import LOWEST_M, POSITION_GAIN_PER_S
 from perchctl.mission.imu import STEADY_ASIDE_MPS, Reckoning
 from perchctl.mission.lander import (
     BRAKE_RAD_PER_MPS,
@@ -33,7 +23,8 @@ from perchctl.mission.lander import (
     SINK_MPS,
     UNLEARNED_WITHIN,
 )
-from perchctl.mission.release import POSITION_GAIN_PER_S
+from perchctl.mission.state import Severity
+from perchctl.mission.table import BLIND_VARIANCE_M2
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, Idle, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import (
@@ -261,7 +252,7 @@ def test_what_was_stopped_as_it_hung_and_has_not_fallen_since_hangs(
         if TURN_S * i < 0.6:
             obs = replace(obs, telemetry=replace(tel, thrust=1.0))  # not seen to be off yet
         state, command = planner.step_mission(state, felt(obs), PROFILE)
-        if planner.is_mission_over(state):
+        if state.phase.is_over:
             break
         assert not isinstance(command, Land | PositionSetpoint | RawThrust)
     assert state.phase is ends, state.reason
@@ -474,7 +465,7 @@ def test_a_blind_way_down_whose_speed_has_drifted_ends_all_the_same(
         stopped |= isinstance(command, StopMotors)
         thrust = float(command.thrust) if isinstance(command, RawThrust) else thrust
         thrust = 0.0 if stopped else thrust
-        if planner.is_mission_over(state):
+        if state.phase.is_over:
             break
     assert stopped
     assert state.phase is ends, state.reason

@@ -7,17 +7,9 @@ from typing import Any
 
 import pytest
 
-from perchctl.mission import (
-    Condition,
-    Context,
-    Observation,
-    Outcome,
-    Phase,
-    PlannerState,
-    lander,
-    planner,
-)
+from perchctl.mission import Condition, Observation, Outcome, Phase, PlannerState, lander, planner
 from perchctl.mission.conditions import CONDITIONS, contact_thrust
+from perchctl.mission.context import Context
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, PositionSetpoint
 from tests.helpers.mission import CEILING_M, PROFILE, observation, state_in, target_at, telemetry

@@ -239,7 +239,7 @@ def test_a_cut_in_the_air_is_answered_at_once(z_m: float, age_s: float, again: b
 def test_no_landing_of_its_own_goes_up(z_m: float) -> None:
     """Wherever the estimate has drifted to: below the ground it would climb to the ground."""
     config = PROFILE.planner.landing
-    order = own_landing(config, 0.0, 10.0, telemetry(1.0, z_m))
+    order = own_landing(config, 0.0, 10.0, z_m)
     assert order.height_m <= min(0.0, z_m) - config.undershoot_m
     assert order.height_m >= min(0.0, z_m) - config.undershoot_m - 2.0 * MOST_DRIFT_M
     assert 1.0 < order.duration_s < 20.0
@@ -247,17 +247,17 @@ def test_no_landing_of_its_own_goes_up(z_m: float) -> None:
 
 def test_a_landing_aims_the_lower_the_longer_the_estimate_may_have_drifted() -> None:
     config = PROFILE.planner.landing
-    aims = [own_landing(config, 0.0, flown_s, telemetry(1.0, 2.0)).height_m for flown_s in (0, 20)]
+    aims = [own_landing(config, 0.0, flown_s, 2.0).height_m for flown_s in (0, 20)]
     assert aims[0] == pytest.approx(-config.undershoot_m)
     assert aims[1] == pytest.approx(aims[0] - 20 * config.drift_mps)
-    assert own_landing(config, 0.0, 1e6, None).height_m >= aims[0] - MOST_DRIFT_M
+    assert own_landing(config, 0.0, 1e6, math.nan).height_m >= aims[0] - MOST_DRIFT_M
 
 
 @pytest.mark.parametrize("height_m", [0.1, 0.5, 2.5])
 def test_its_own_landing_is_slow_from_any_height(height_m: float) -> None:
     """Of a quintic the largest speed is 15/8 of the mean; it begins while the vehicle sinks,
     which costs time that is not way."""
-    order = own_landing(PROFILE.planner.landing, 0.0, 10.0, telemetry(1.0, height_m))
+    order = own_landing(PROFILE.planner.landing, 0.0, 10.0, height_m)
     way_m = height_m - order.height_m
     assert 15 / 8 * way_m / order.duration_s < PLANNED_MPS
     assert order.duration_s - 15 / 8 * way_m / PLANNED_MPS == pytest.approx(SETTLING_S)
@@ -292,8 +292,7 @@ def test_a_height_that_has_frozen_far_below_the_target_is_no_hanging() -> None:
 @pytest.mark.parametrize("z_m", [math.nan, math.inf])
 def test_an_unknown_height_is_landed_slowly(z_m: float) -> None:
     config = PROFILE.planner.landing
-    order = own_landing(config, 0.0, 1.0, telemetry(1.0, z_m))
-    assert order.duration_s == own_landing(config, 0.0, 1.0, None).duration_s > 5.0
+    assert own_landing(config, 0.0, 1.0, z_m).duration_s > 5.0
 
 
 @pytest.mark.parametrize(("age_s", "level"), [(0.02, True), (0.2, True), (0.5, False)])

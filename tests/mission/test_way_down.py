@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, planner
 from perchctl.mission.conditions import touched_aside_m
 from perchctl.mission.context import Context
-from perchctl.mission.release import UNREAD_S
+from perchctl.mission.guidance import UNREAD_S
 from perchctl.mission.state import Condition
 from perchctl.mission.table import TABLE
 from perchctl.profile import Profile
@@ -285,7 +285,7 @@ def in_a_hand(
         obs = observation(t_s, telemetry=tel, target=target, position_age_s=unseen_s)
         state, command = planner.step_mission(state, felt(obs), profile)
         sent.append((t_s, command))
-        if planner.is_mission_over(state):
+        if state.phase.is_over:
             break
         match command:
             case RawThrust(order):
@@ -366,7 +366,7 @@ def backed_off_from(
         obs = observation(t_s, telemetry=tel, target=target, position_age_s=unseen_s)
         state, command = planner.step_mission(state, felt(obs), profile)
         rows.add(state.row)
-        if planner.is_mission_over(state):
+        if state.phase.is_over:
             break
         match command:
             case RawThrust(order):
@@ -642,6 +642,6 @@ def test_a_completion_whose_telemetry_stands_still_ends(
         tel = telemetry(t_s, HANG_Z_M, **frozen)
         state, command = planner.step_mission(state, felt(observation(t_s, telemetry=tel)), profile)
         assert isinstance(command, (StopMotors, Idle))
-        if planner.is_mission_over(state):
+        if state.phase.is_over:
             break
     assert state.phase is ends
