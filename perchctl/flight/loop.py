@@ -14,7 +14,7 @@ from typing import Protocol, runtime_checkable
 from perchctl.camera import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
-from perchctl.flight.outside import AtRest
+from perchctl.flight.criteria import AtRest
 from perchctl.flight.inputs import FlightInputs
 from perchctl.flight.preflight import (
     refuse,

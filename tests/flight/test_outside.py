@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight import unmeasured_problem, world_problem
-from perchctl.flight.outside import AtRest, apart, with_another_up
+from perchctl.flight.criteria import AtRest, apart, with_another_up
 from perchctl.flight.preflight import refuse_strange
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.mission import Operator, Outcome

@@ -16,7 +16,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight import out_of_view, place_seen, target_from, world_problem
-from perchctl.flight.outside import AtRest
+from perchctl.flight.criteria import AtRest
 from perchctl.flight.preflight import (
     LEAN_DEG,
     refuse_out_of_view,
