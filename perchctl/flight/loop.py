@@ -40,7 +40,6 @@ from perchctl.mission import (
     SentCommand,
     Tick,
     Watcher,
-    drop_sights,
     events_of,
     flight_report,
     start_mission,
@@ -232,7 +231,7 @@ def _mission(
         inputs.sends_sights = state.blind_s is None
         if state.astray and parts.positions is not None and not (before and before.astray):
             parts.positions.stop()
-            inputs.perception.motion = drop_sights(inputs.perception.motion)
+            inputs.perception.drop_sights()
         events = events_of(before, state, obs, parts.profile)
         if obs.log_problem is not None and not log_noted:
             log_noted = True

@@ -2,11 +2,8 @@ from .battery import BatteryFit as BatteryFit
 from .battery import charge_at as charge_at
 from .battery import fit_battery as fit_battery
 from .battery import update_energy as update_energy
-from .felt import VisualInertialMotion as VisualInertialMotion
-from .felt import VisualInertialWindow as VisualInertialWindow
-from .felt import drop_sights as drop_sights
-from .felt import estimate_motion as estimate_motion
 from .imu import ImuMotion as ImuMotion
+from .imu import acceleration_mps2 as acceleration_mps2
 from .imu import integrate_imu as integrate_imu
 from .lander import Finding as Finding
 from .lander import step_landing as step_landing
@@ -40,10 +37,12 @@ from .report import turn_text as turn_text
 from .state import BatteryOutlook as BatteryOutlook
 from .state import Condition as Condition
 from .state import EnergyState as EnergyState
+from .state import Mismatch as Mismatch
 from .state import Observation as Observation
 from .state import Operator as Operator
 from .state import Outcome as Outcome
 from .state import Phase as Phase
 from .state import PlannerState as PlannerState
+from .state import VisualInertialMotion as VisualInertialMotion
 from .table import CATCHABLE_M as CATCHABLE_M
 from .table import NO_PICTURE_TEXT as NO_PICTURE_TEXT

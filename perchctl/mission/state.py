@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
 from perchctl.geometry import Array
-from perchctl.mission.felt import Mismatch, VisualInertialMotion
 from perchctl.mission.imu import ImuMotion, Reckoning
 from perchctl.mission.mounting import MountWatch
 from perchctl.vehicle import PositionSetpoint, Telemetry
@@ -127,6 +126,25 @@ class Operator(IntEnum):
     NONE = 0
     LAND = 1
     STOP = 2
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """What would bring the target to rest: pictures `later_s` later than assumed, or a camera
+    turned by `turn_rad` about the vehicle's upward axis; the other is 0."""
+
+    later_s: float = 0.0
+    turn_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class VisualInertialMotion:
+    """The vehicle's motion by pictures and accelerometer at `t_s`, world axes."""
+
+    t_s: float
+    velocity_mps: tuple[float, float]  # sideways
+    bias_mps2: tuple[float, float]  # excess of accelerometer and attitude
+    climb_mps: float | None  # None if the delay that it rests on may be over
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ import perchctl
 from perchctl.mission import (
     Finding,
     ImuMotion,
+    Mismatch,
     Observation,
     Operator,
     Phase,
@@ -26,7 +27,6 @@ from perchctl.mission import (
     planner,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.felt import Mismatch
 from perchctl.mission.imu import Corrections, Reckoning
 from perchctl.mission.lander import (
     MANOEUVRES,

@@ -12,8 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import ImuMotion, Observation, Operator, Outcome, Phase, PlannerState, planner
-from perchctl.mission.felt import Mismatch
+from perchctl.mission import (
+    ImuMotion,
+    Mismatch,
+    Observation,
+    Operator,
+    Outcome,
+    Phase,
+    PlannerState,
+    planner,
+)
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
 from perchctl.mission.state import FLYING_PHASES, TERMINALS, Severity
 from perchctl.mission.table import TABLE, Transition, first_match, risen

@@ -15,9 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.mission.imu import Vector, acceleration_mps2
+from perchctl.mission import Mismatch, VisualInertialMotion, acceleration_mps2
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
+
+Vector = tuple[float, float, float]
 
 WINDOW_S, LEAST_S, LEAST_SIGHTS = 1.2, 0.6, 10
 EVERY_S, AGREED = 0.05, 3  # between judgements, and how many in a row have to agree
@@ -31,25 +33,6 @@ LEAST_LATER_S = 0.1  # less swings an alignment by centimetres, and is reported 
 WANDERS_M, WANDERS_MORE = 0.005, 3.0  # by so much, and so much more than with the right delay
 ROUGH_M = 0.03  # a sum that wanders so far within a second gives the speed to 0.05 m/s
 ALIKE_S = 3 * STEP_S
-
-
-@dataclass(frozen=True)
-class Mismatch:
-    """What would bring the target to rest: pictures `later_s` later than assumed, or a camera
-    turned by `turn_rad` about the vehicle's upward axis; the other is 0."""
-
-    later_s: float = 0.0
-    turn_rad: float = 0.0
-
-
-@dataclass(frozen=True)
-class VisualInertialMotion:
-    """The vehicle's motion by pictures and accelerometer at `t_s`, world axes."""
-
-    t_s: float
-    velocity_mps: tuple[float, float]  # sideways
-    bias_mps2: tuple[float, float]  # excess of accelerometer and attitude
-    climb_mps: float | None  # None if the delay that it rests on may be over
 
 
 @dataclass(frozen=True)
