@@ -14,6 +14,7 @@ from perchctl.vehicle import (
     PositionSetpoint,
 )
 from tests.helpers.loop_rig import PROFILE, Camera, Rig, SleepyClock, Vehicle, noise
+from tests.helpers.mission import changed
 
 PERIOD_S = 1.0 / PROFILE.link.loop_hz
 
@@ -108,9 +109,8 @@ def test_a_lost_link_lands() -> None:
 
 @pytest.mark.parametrize("strict", [False, True])
 def test_a_log_that_fails_lands_only_where_the_profile_wants_it(strict: bool) -> None:
-    safety = PROFILE.safety.model_copy(update={"land_on_log_error": strict})
     rig = Rig(
-        profile=PROFILE.model_copy(update={"safety": safety}),
+        profile=changed({"safety.land_on_log_error": strict}),
         operator=lambda: Operator.LAND if rig.link.now_s > 3.0 else Operator.NONE,
     )
     rig.watcher.problem = "the disk is full"

@@ -16,6 +16,7 @@ from perchctl.faults.flight import FaultyFlight
 from perchctl.flight import fly_lockstep
 from perchctl.mission import Event, Phase, Tick
 from perchctl.sim import draw_scenario
+from tests.helpers.mission import changed
 from tests.helpers.sights import TARGET_ONLY
 
 MISS_M = 0.006
@@ -90,7 +91,6 @@ def test_what_a_blow_knocks_off_the_magnet_is_braked(seed: int) -> None:
 def test_a_latency_that_is_wrong_does_not_swing_the_alignment(wrong_s: float) -> None:
     scenario = draw_scenario(TARGET_ONLY, 1)
     latency_s = scenario.camera_latency_s + wrong_s
-    camera = TARGET_ONLY.camera.model_copy(update={"latency_s": latency_s})
     aside_m: list[float] = []
 
     class Aside:
@@ -103,7 +103,7 @@ def test_a_latency_that_is_wrong_does_not_swing_the_alignment(wrong_s: float) ->
         def event(self, event: Event) -> None:
             return None
 
-    profile = TARGET_ONLY.model_copy(update={"camera": camera})
+    profile = changed({"camera.latency_s": latency_s}, TARGET_ONLY)
     it = fly_lockstep(profile, scenario=scenario, watchers=(Aside(),))
     assert it.report.phase is Phase.PERCHED
     assert max(aside_m) < 0.02

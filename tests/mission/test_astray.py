@@ -15,6 +15,7 @@ from perchctl.vehicle import HL_ACTIVE, RawThrust, StopMotors
 from tests.helpers.mission import (
     AIRBORNE,
     HOVER_THRUST,
+    MOCAP,
     PROFILE,
     READY,
     Felt,
@@ -23,7 +24,7 @@ from tests.helpers.mission import (
     target_at,
     telemetry,
 )
-from tests.mission.test_positions import BEGIN_S, MOCAP, TURN_S, times
+from tests.mission.test_positions import BEGIN_S, TURN_S, times
 
 
 @pytest.mark.parametrize("felt_too_much_g", [0.0, 0.015, -0.015])

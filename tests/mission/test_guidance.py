@@ -13,7 +13,15 @@ from perchctl.mission.context import Context
 from perchctl.mission.guidance import FLOOR_M, limited
 from perchctl.mission.state import FLYING_PHASES
 from perchctl.vehicle import PositionSetpoint
-from tests.helpers.mission import PROFILE, READY, observation, state_in, target_at, telemetry
+from tests.helpers.mission import (
+    PROFILE,
+    READY,
+    changed,
+    observation,
+    state_in,
+    target_at,
+    telemetry,
+)
 
 GROUND_Z_M = 0.4
 """A table, in a world whose zero is the floor."""
@@ -56,9 +64,7 @@ def test_a_take_off_begins_on_the_ground() -> None:
 @pytest.mark.parametrize("handover_m", [0.1, 0.3])
 def test_a_landing_is_handed_over_above_the_floor(handover_m: float) -> None:
     """The lowest setpoint of a landing still leads below where it is handed over."""
-    landing = PROFILE.planner.landing.model_copy(update={"handover_m": handover_m})
-    planner_config = PROFILE.planner.model_copy(update={"landing": landing})
-    profile = PROFILE.model_copy(update={"planner": planner_config})
+    profile = changed({"planner.landing.handover_m": handover_m})
     state, z_m, lowest_m = state_in(Phase.ALIGN), 1.0, 1.0
     for i in range(1, 1000):
         t_s = 10.0 + 0.02 * i

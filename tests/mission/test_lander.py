@@ -53,9 +53,12 @@ from perchctl.vehicle import (
 )
 from tests.helpers.mission import (
     AIRBORNE,
+    BY_TARGET,
     CEILING_M,
     HANG_Z_M,
     HOVER_THRUST,
+    MOCAP,
+    PROFILES,
     READY,
     Felt,
     observation,
@@ -64,8 +67,7 @@ from tests.helpers.mission import (
     telemetry,
 )
 
-PROFILES = {by: Profile.model_validate({"positioning": by}) for by in ("deck", "mocap", "target")}
-DECKS, MOCAP, BY_TARGET = PROFILES["deck"], PROFILES["mocap"], PROFILES["target"]
+DECKS = PROFILES["deck"]
 NOW_S, TURN_S = 10.0, 0.02
 HIGH_M, LOW_M = 1.5, 0.2
 PERCHCTL = Path(perchctl.__file__).parent

@@ -20,6 +20,7 @@ from tests.helpers.mission import (
     AIRBORNE,
     HANG_Z_M,
     HOVER_THRUST,
+    MOCAP,
     PROFILE,
     READY,
     Felt,
@@ -29,9 +30,6 @@ from tests.helpers.mission import (
     telemetry,
 )
 
-MOCAP = PROFILE.model_copy(
-    update={"positioning": PROFILE.positioning.model_copy(update={"by": "mocap"})}
-)
 HOLD_S, LAND_S = MOCAP.positioning.hold_s, MOCAP.positioning.land_s
 HIDDEN = "motion capture at vicon:lab does not see the rigid body 'cf2'"
 TURN_S, BEGIN_S = 0.02, 10.0

@@ -25,7 +25,6 @@ from perchctl.mission import (
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
 from perchctl.mission.state import FLYING_PHASES, TERMINALS, Severity
 from perchctl.mission.table import TABLE, Transition, first_match, risen
-from perchctl.profile import Profile
 from perchctl.vehicle import (
     CRASHED,
     LOCKED,
@@ -39,11 +38,14 @@ from perchctl.vehicle import (
 )
 from tests.helpers.mission import (
     AIRBORNE,
+    BY_TARGET,
     CEILING_M,
     FINE_BATTERY,
     HOVER_THRUST,
+    MOCAP,
     PROFILE,
     READY,
+    changed,
     observation,
     state_in,
     target_at,
@@ -147,13 +149,7 @@ def unknown(t_s: float) -> Observation:
     return replace(obs, imu=ImuMotion(t_s=t_s, gap_s=START_S))
 
 
-BY_TARGET = Profile.model_validate({"positioning": "target"})
-MOCAP = PROFILE.model_copy(
-    update={"positioning": PROFILE.positioning.model_copy(update={"by": "mocap"})}
-)
-LAND_ON_LOG = PROFILE.model_copy(
-    update={"safety": PROFILE.safety.model_copy(update={"land_on_log_error": True})}
-)
+LAND_ON_LOG = changed({"safety.land_on_log_error": True})
 QUIET = HOVER_THRUST * 0.5
 PRESSED = HOVER_THRUST * 1.12
 FULL = 65535.0

@@ -12,7 +12,15 @@ from perchctl.mission.conditions import CONDITIONS, contact_thrust
 from perchctl.mission.context import Context
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, PositionSetpoint
-from tests.helpers.mission import CEILING_M, PROFILE, observation, state_in, target_at, telemetry
+from tests.helpers.mission import (
+    CEILING_M,
+    PROFILE,
+    changed,
+    observation,
+    state_in,
+    target_at,
+    telemetry,
+)
 
 CONTACT_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
 
@@ -99,15 +107,11 @@ def test_a_contact_can_be_proven_with_what_thrust_there_is(hover: float) -> None
     assert pressing(hover, hover).phase is Phase.PERCH
 
 
-def raw_profile() -> Profile:
-    perch = PROFILE.planner.perch.model_copy(update={"mode": "raw"})
-    return PROFILE.model_copy(
-        update={"planner": PROFILE.planner.model_copy(update={"perch": perch})}
-    )
+RAW = changed({"planner.perch.mode": "raw"})
 
 
 def test_a_raw_press_is_measured_by_its_own_thrust() -> None:
-    c = Context(replace(state_in(Phase.PERCH), hover_thrust=58500.0), observation(1), raw_profile())
+    c = Context(replace(state_in(Phase.PERCH), hover_thrust=58500.0), observation(1), RAW)
     assert 58500.0 < contact_thrust(c) < 60000.0
 
 
@@ -116,7 +120,7 @@ def test_a_press_that_could_not_press_is_not_begun(hover: float, presses: bool) 
     """Raw thrust of 60000 at a hover thrust of 59500: the vehicle would hang in the air."""
     z_m = CONTACT_Z_M - PROFILE.planner.ascend.standoff_m
     start = replace(state_in(Phase.ASCEND, z_m=z_m), hover_thrust=hover)
-    state = flown(start, 0.5, z_m, raw_profile(), thrust=hover)
+    state = flown(start, 0.5, z_m, RAW, thrust=hover)
     assert state.phase is (Phase.PERCH if presses else Phase.LANDING)
     if not presses:
         assert state.outcome is Outcome.SAFETY

@@ -28,6 +28,7 @@ from tests.helpers.mission import (
     PROFILE,
     READY,
     Felt,
+    changed,
     observation,
     state_in,
     telemetry,
@@ -69,9 +70,7 @@ def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
 
 
 def test_a_raw_release_waits_for_telemetry_too() -> None:
-    perch = PROFILE.planner.perch.model_copy(update={"mode": "raw"})
-    planned = PROFILE.planner.model_copy(update={"perch": perch})
-    profile = PROFILE.model_copy(update={"planner": planned})
+    profile = changed({"planner.perch.mode": "raw"})
     state = replace(released(), released_s=None, setpoint=None, entered_s=9.6)
     obs = observation(10.2, telemetry=hangs(10.0))
     assert isinstance(planner.step_mission(state, obs, profile)[1], PositionSetpoint)

@@ -37,6 +37,7 @@ from tests.helpers.mission import (
     PROFILE,
     READY,
     Felt,
+    changed,
     observation,
     state_in,
     target_at,
@@ -545,9 +546,7 @@ def test_a_vehicle_still_at_the_ceiling_has_not_recovered() -> None:
 
 @pytest.mark.parametrize("descend_m", [0.02, 0.1])
 def test_a_short_descent_is_enough_to_have_left(descend_m: float) -> None:
-    recover = PROFILE.planner.recover.model_copy(update={"descend_m": descend_m})
-    planned = PROFILE.planner.model_copy(update={"recover": recover})
-    profile = PROFILE.model_copy(update={"planner": planned})
+    profile = changed({"planner.recover.descend_m": descend_m})
     state = replace(state_in(Phase.RECOVER, z_m=HANG_Z_M), contact_z_m=HANG_Z_M)
     for i in range(1, 60):
         obs = observation(10.0 + 0.02 * i, HANG_Z_M - descend_m)
