@@ -39,23 +39,12 @@ from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, telemetry
 from tests.helpers.scripted_link import ScriptedLink
 
 SIZE_PX = (64, 48)
-
-
 CAMERA = CameraModel(
     SIZE_PX, np.array([[40.0, 0.0, 32.0], [0.0, 40.0, 24.0], [0.0, 0.0, 1.0]]), np.zeros(5)
 )
-
-
 PROFILE = Profile()
-
-
 SETUP = make_pipeline(PROFILE, CAMERA)
-
-
-CLIMB_MPS = 0.5
-
-
-SINK_MPS = 0.4
+CLIMB_MPS, SINK_MPS = 0.5, 0.4
 
 
 class Broken(RuntimeError):
@@ -81,7 +70,6 @@ class Vehicle(ScriptedLink):
         self._goal_m: float | None = None
         self.by_itself = False
         self.motors = False
-        self.by_itself = False
         self._off_s = -math.inf
 
     def advance_to(self, t_s: float) -> None:

@@ -468,15 +468,23 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str) -> None:
 # --- Where it is, in the end --------------------------------------------------------------------
 
 
-def ended(reach_s: float | None, imu: ImuMotion, **observed: Any) -> Finding:
+UNMOVED, UNRECKONED = ImuMotion(t_s=NOW_S), Reckoning()
+
+
+def ended(
+    reach_s: float | None = None,
+    imu: ImuMotion = UNMOVED,
+    reckoning: Reckoning = UNRECKONED,
+    touch_s: float | None = None,
+    **observed: Any,
+) -> Finding:
     tel = telemetry(NOW_S, HANG_Z_M, thrust=0.0, supervisor=READY)
-    obs = observation(
-        NOW_S, telemetry=tel, **{"target": None, "position_age_s": 3.0, "imu": imu, **observed}
-    )
+    seen = {"target": None, "position_age_s": 3.0, "imu": imu, **observed}
     state = replace(
-        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M),
-        stopped_s=NOW_S - 1.0, reach_s=reach_s, reckoning=Reckoning(imu=imu),
+        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), stopped_s=NOW_S - 1.0,
+        reach_s=reach_s, touch_s=touch_s, reckoning=replace(reckoning, imu=imu),
     )  # fmt: skip
+    obs = observation(NOW_S, telemetry=tel, **seen)
     return lander.rest_finding(Context(state, obs, BY_TARGET))
 
 
@@ -497,19 +505,6 @@ def test_what_was_in_reach_and_has_not_fallen_since_hangs(
     assert ended(reach_s, ImuMotion(t_s=NOW_S, fell_s=fell_s, gap_s=gap_s)) is found
 
 
-def ended_after(
-    reckoning: Reckoning, *, reach_s: float | None = None, touch_s: float | None = None
-) -> Finding:
-    tel = telemetry(NOW_S, HANG_Z_M, thrust=0.0, supervisor=READY)
-    imu = ImuMotion(t_s=NOW_S)
-    obs = observation(NOW_S, telemetry=tel, target=None, position_age_s=3.0, imu=imu)
-    state = replace(
-        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), stopped_s=NOW_S - 1.0,
-        reach_s=reach_s, touch_s=touch_s, reckoning=replace(reckoning, imu=imu),
-    )  # fmt: skip
-    return lander.rest_finding(Context(state, obs, BY_TARGET))
-
-
 @pytest.mark.parametrize("reach_s", [None, NOW_S - 2.0])
 def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
     reach_s: float | None,
@@ -517,18 +512,18 @@ def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
     """Whether it counted as in reach since or not: it may have met the floor meanwhile, too. A
     sight or a floor that was felt afterwards tells."""
     silence = Reckoning(unsure_s=NOW_S - 3.0)
-    assert ended_after(silence, reach_s=reach_s) is Finding.UNKNOWN
-    assert ended_after(silence, reach_s=reach_s, touch_s=NOW_S - 1.5) is Finding.STANDS
+    assert ended(reach_s, reckoning=silence) is Finding.UNKNOWN
+    assert ended(reach_s, reckoning=silence, touch_s=NOW_S - 1.5) is Finding.STANDS
     seen = replace(silence, sight_s=NOW_S - 2.5)
     told = Finding.STANDS if reach_s is None else Finding.HANGS
-    assert ended_after(seen, reach_s=reach_s) is told
+    assert ended(reach_s, reckoning=seen) is told
 
 
 def test_a_floor_that_was_felt_on_the_way_down_is_where_it_stands() -> None:
     """It came down too gently for a fall, though it pressed before."""
     pressed_s = NOW_S - 4.0
-    assert ended_after(Reckoning(), reach_s=pressed_s) is Finding.HANGS
-    assert ended_after(Reckoning(), reach_s=pressed_s, touch_s=NOW_S - 2.0) is Finding.STANDS
+    assert ended(pressed_s) is Finding.HANGS
+    assert ended(pressed_s, touch_s=NOW_S - 2.0) is Finding.STANDS
 
 
 @pytest.mark.parametrize(("phase", "below_m"), [(Phase.PERCH, math.inf), (Phase.ASCEND, 0.02)])
