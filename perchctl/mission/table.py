@@ -406,13 +406,45 @@ def hold_reason(c: Context) -> str:
     return ""
 
 
+# --- The three ways out of the mission ------------------------------------------------------------
+
+
+def stops(
+    name: str, when: Predicate, reason: str, motor_stop: MotorStop, outcome: Outcome = O.SAFETY
+) -> Transition:
+    """The motors are stopped, wherever in the air it is."""
+    return Transition(
+        name, AIR, when, P.ABORTED, reason, S.STOP, outcome, motor_stop=motor_stop
+    )  # fmt: skip
+
+
+def lands(
+    name: str,
+    phases: frozenset[Phase],
+    when: Predicate,
+    reason: str | Callable[[Context], str],
+    outcome: Outcome = O.SAFETY,
+) -> Transition:
+    """The flight is over: the way down begins."""
+    return Transition(name, phases, when, P.LANDING, reason, S.LAND, outcome)
+
+
+def backs_off(
+    name: str,
+    phases: frozenset[Phase],
+    when: Predicate,
+    reason: str | Callable[[Context], str],
+) -> Transition:
+    """The attempt has failed: down a little, and another one."""
+    return Transition(name, phases, when, P.RECOVER, reason, S.BACK_OFF, counts_attempt=True)
+
+
 # --- The safety rows, gravest first --------------------------------------------------------------
 
 SAFETY: tuple[Transition, ...] = (
-    Transition(
-        "operator-stop", AIR, lambda c: c.obs.operator >= Operator.STOP, P.ABORTED,
-        "second Ctrl-C: emergency stop", S.STOP, O.EMERGENCY,
-        motor_stop=MotorStop.EMERGENCY,
+    stops(
+        "operator-stop", lambda c: c.obs.operator >= Operator.STOP,
+        "second Ctrl-C: emergency stop", MotorStop.EMERGENCY, O.EMERGENCY,
     ),
     Transition(
         "hung-but-locked", only(P.COMPLETE, P.LANDING),
@@ -420,160 +452,134 @@ SAFETY: tuple[Transition, ...] = (
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
         outcome=O.PERCHED,
     ),
-    Transition(
-        "locked", AIR, lambda c: c.obs.telemetry.has(LOCKED), P.ABORTED,
-        "the supervisor has locked the vehicle: inspect and restart it", S.STOP, O.SAFETY,
-        motor_stop=MotorStop.PLAIN,
+    stops(
+        "locked", lambda c: c.obs.telemetry.has(LOCKED),
+        "the supervisor has locked the vehicle: inspect and restart it", MotorStop.PLAIN,
     ),
-    Transition(
-        "tumbled", AIR, lambda c: c.obs.telemetry.has(TUMBLED), P.ABORTED,
-        "the vehicle has tumbled: inspect and restart it", S.STOP, O.SAFETY,
-        motor_stop=MotorStop.PLAIN,
+    stops(
+        "tumbled", lambda c: c.obs.telemetry.has(TUMBLED),
+        "the vehicle has tumbled: inspect and restart it", MotorStop.PLAIN,
     ),
-    Transition(
-        "crashed", AIR, lambda c: c.obs.telemetry.has(CRASHED), P.ABORTED,
-        "the supervisor reports a crash: inspect and restart the vehicle", S.STOP, O.SAFETY,
-        motor_stop=MotorStop.PLAIN,
+    stops(
+        "crashed", lambda c: c.obs.telemetry.has(CRASHED),
+        "the supervisor reports a crash: inspect and restart the vehicle", MotorStop.PLAIN,
     ),
-    Transition(
-        "tilted", AIR,
+    stops(
+        "tilted",
         lambda c: c.held(C.TILTED) >= c.profile.safety.tilt_debounce_s
         and c.state.stopped_s is None,
-        P.ABORTED, "tilted beyond the limit: motors cut", S.STOP, O.SAFETY,
-        motor_stop=MotorStop.EMERGENCY,
+        "tilted beyond the limit: motors cut", MotorStop.EMERGENCY,
     ),
-    Transition(
-        "operator-land", FLYING_PHASES, lambda c: c.obs.operator >= Operator.LAND, P.LANDING,
-        "the operator asked to land", S.LAND, O.OPERATOR,
+    lands(
+        "operator-land", FLYING_PHASES, lambda c: c.obs.operator >= Operator.LAND,
+        "the operator asked to land", O.OPERATOR,
     ),
-    Transition(
-        "link-lost", FLYING_PHASES, lambda c: c.obs.link_problem is not None, P.LANDING,
-        lambda c: f"link lost: {c.obs.link_problem}", S.LAND, O.SAFETY,
+    lands(
+        "link-lost", FLYING_PHASES, lambda c: c.obs.link_problem is not None,
+        lambda c: f"link lost: {c.obs.link_problem}",
     ),
-    Transition(
+    lands(
         "telemetry-stale", FLYING_PHASES,
-        lambda c: c.telemetry_age_s > c.profile.safety.telemetry_land_s, P.LANDING,
-        lambda c: f"no telemetry for {c.telemetry_age_s:.1f} s", S.LAND, O.SAFETY,
+        lambda c: c.telemetry_age_s > c.profile.safety.telemetry_land_s,
+        lambda c: f"no telemetry for {c.telemetry_age_s:.1f} s",
     ),
-    Transition(
-        "heading-lost", BEFORE_CONTACT, lambda c: c.state.heading_lost, P.LANDING,
-        "the estimated heading jumped: down level, by thrust alone", S.LAND, O.SAFETY,
+    lands(
+        "heading-lost", BEFORE_CONTACT, lambda c: c.state.heading_lost,
+        "the estimated heading jumped: down level, by thrust alone",
     ),
-    Transition(
-        "position-astray", IN_THE_OPEN | {P.LANDING}, is_astray, P.LANDING, why_astray, S.LAND,
-        O.SAFETY,
+    lands("position-astray", IN_THE_OPEN | {P.LANDING}, is_astray, why_astray),
+    lands(
+        "position-lost", IN_THE_OPEN | {P.PERCH}, is_lost,
+        lambda c: f"{unplaced_text(c)}; down level, by thrust alone",
     ),
-    Transition(
-        "position-lost", IN_THE_OPEN | {P.PERCH}, is_lost, P.LANDING,
-        lambda c: f"{unplaced_text(c)}; down level, by thrust alone", S.LAND, O.SAFETY,
+    lands(
+        "estimator-jump", BEFORE_CONTACT, left_jump_hold,
+        "the state estimate jumped: landing where it is",
     ),
-    Transition(
-        "estimator-jump", BEFORE_CONTACT, left_jump_hold, P.LANDING,
-        "the state estimate jumped: landing where it is", S.LAND, O.SAFETY,
-    ),
-    Transition(
+    lands(
         "estimate-unsure", IN_THE_OPEN,
-        lambda c: c.held(C.UNSURE) >= c.profile.safety.variance_land_s, P.LANDING,
-        lambda c: f"{unsure(c)}: is the positioning system gone?", S.LAND, O.SAFETY,
+        lambda c: c.held(C.UNSURE) >= c.profile.safety.variance_land_s,
+        lambda c: f"{unsure(c)}: is the positioning system gone?",
     ),
-    Transition(
+    lands(
         "battery-low", BEFORE_CONTACT,
-        lambda c: c.held(C.BATTERY_LOW) >= c.profile.safety.battery_debounce_s, P.LANDING,
-        lambda c: f"battery at {c.obs.telemetry.battery_v:.2f} V under load", S.LAND, O.SAFETY,
+        lambda c: c.held(C.BATTERY_LOW) >= c.profile.safety.battery_debounce_s,
+        lambda c: f"battery at {c.obs.telemetry.battery_v:.2f} V under load",
     ),
-    Transition(
+    lands(
         "battery-unknown", BEFORE_CONTACT,
-        lambda c: c.obs.battery_age_s > c.profile.safety.battery_stale_s, P.LANDING,
-        "the battery's reading stands still", S.LAND, O.SAFETY,
+        lambda c: c.obs.battery_age_s > c.profile.safety.battery_stale_s,
+        "the battery's reading stands still",
     ),
-    Transition(
-        "latency", IN_THE_OPEN, latency_changed, P.LANDING, why_latency, S.LAND, O.SAFETY,
+    lands("latency", IN_THE_OPEN, latency_changed, why_latency),
+    lands("mounting", IN_THE_OPEN, mounted_wrong, why_mounted_wrong),
+    lands(
+        "height-limit", BEFORE_CONTACT, lambda c: c.height_m > c.profile.safety.max_height_m,
+        lambda c: f"height {c.height_m:.2f} m is above the limit",
     ),
-    Transition(
-        "mounting", IN_THE_OPEN, mounted_wrong, P.LANDING, why_mounted_wrong, S.LAND, O.SAFETY,
-    ),
-    Transition(
-        "height-limit", BEFORE_CONTACT,
-        lambda c: c.height_m > c.profile.safety.max_height_m, P.LANDING,
-        lambda c: f"height {c.height_m:.2f} m is above the limit", S.LAND, O.SAFETY,
-    ),
-    Transition(
-        "fence", BEFORE_CONTACT, fence_broken, P.LANDING, "outside the fence", S.LAND, O.SAFETY,
-    ),
-    Transition(
-        "camera-gone", BY_CAMERA,
-        lambda c: c.obs.camera_age_s > c.profile.safety.camera_land_s, P.LANDING,
+    lands("fence", BEFORE_CONTACT, fence_broken, "outside the fence"),
+    lands(
+        "camera-gone", BY_CAMERA, lambda c: c.obs.camera_age_s > c.profile.safety.camera_land_s,
         lambda c: c.obs.camera_problem or f"no picture for {c.obs.camera_age_s:.1f} s",
-        S.LAND, O.SAFETY,
     ),
-    Transition(
-        "loop-late", FLYING_PHASES,
-        lambda c: c.obs.loop_late_s > c.profile.safety.loop_late_land_s, P.LANDING,
-        lambda c: f"the control loop was {c.obs.loop_late_s:.1f} s late", S.LAND, O.SAFETY,
+    lands(
+        "loop-late", FLYING_PHASES, lambda c: c.obs.loop_late_s > c.profile.safety.loop_late_land_s,
+        lambda c: f"the control loop was {c.obs.loop_late_s:.1f} s late",
     ),
-    Transition(
+    lands(
         "markers-disagree", BY_CAMERA,
-        lambda c: c.obs.disagreeing_frames >= c.profile.merge.disagreement_frames, P.LANDING,
+        lambda c: c.obs.disagreeing_frames >= c.profile.merge.disagreement_frames,
         "large and small marker contradict each other: check the printed sizes in the "
         "profile and the camera's calibration",
-        S.LAND, O.SAFETY,
     ),
-    Transition(
+    lands(
         "log-lost", BEFORE_CONTACT,
         lambda c: c.profile.safety.land_on_log_error and c.obs.log_problem is not None,
-        P.LANDING, lambda c: f"flight log: {c.obs.log_problem}", S.LAND, O.SAFETY,
+        lambda c: f"flight log: {c.obs.log_problem}",
     ),
-    Transition(
+    lands(
         "time-over", BEFORE_CONTACT,
-        lambda c: c.obs.t_s - c.state.started_s > c.profile.planner.perching_time_s, P.LANDING,
-        "the perching time is over", S.LAND, O.ATTEMPTS_USED_UP,
+        lambda c: c.obs.t_s - c.state.started_s > c.profile.planner.perching_time_s,
+        "the perching time is over", O.ATTEMPTS_USED_UP,
     ),
 )  # fmt: skip
 
-# --- The whole table ---------------------------------------------------------------------------
+# --- The whole table -----------------------------------------------------------------------------
+
+BEFORE_COMPLETION = only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER)
 
 TABLE: tuple[Transition, ...] = (
     *SAFETY,
     # --- the magnet may catch early ---------------------------------------------
     Transition(
-        "caught", only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
-        is_caught, P.COMPLETE, "hanging on the magnet already",
+        "caught", BEFORE_COMPLETION, is_caught, P.COMPLETE, "hanging on the magnet already",
     ),
-    Transition(
-        HELD, only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
-        is_held_elsewhere, P.LANDING, why_held, S.LAND, O.SAFETY,
-    ),
-    Transition(
-        "hangs-at-contact", only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
-        is_held, P.LANDING, why_hangs_at_contact, S.LAND, O.SAFETY,
-    ),
+    lands(HELD, BEFORE_COMPLETION, is_held_elsewhere, why_held),
+    lands("hangs-at-contact", BEFORE_COMPLETION, is_held, why_hangs_at_contact),
     # --- something is in the way -----------------------------------------------
-    Transition(
-        "cannot-rise", only(P.APPROACH), lambda c: is_blocked(c) or too_weak(c), P.LANDING,
+    lands(
+        "cannot-rise", only(P.APPROACH), lambda c: is_blocked(c) or too_weak(c),
         lambda c: f"pressed at {c.height_m:.2f} m: something is above, or the thrust is weak",
-        S.LAND, O.SAFETY,
     ),
-    Transition(
-        "blocked", only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
-        is_blocked_off_target, P.RECOVER,
+    backs_off(
+        "blocked", BEFORE_COMPLETION, is_blocked_off_target,
         lambda c: f"pressed against something at {c.height_m:.2f} m"
-        + ("" if c.state.hover_thrust else ", or the thrust is weak"), S.BACK_OFF,
-        counts_attempt=True,
+        + ("" if c.state.hover_thrust else ", or the thrust is weak"),
     ),
-    Transition(
-        "too-weak", BY_CAMERA, too_weak, P.LANDING,
+    lands(
+        "too-weak", BY_CAMERA, too_weak,
         "hovering takes all the thrust: the vehicle is too heavy, the battery too low, or "
-        "something is above", S.LAND, O.SAFETY,
+        "something is above",
     ),
     # --- phase 1: approach ---------------------------------------------------
     Transition(
         "approached", only(P.APPROACH), lambda c: c.held(C.AT_TAKEOFF_HEIGHT) >= 0.3, P.SEARCH,
         "hovering in the perching area",
     ),
-    Transition(
+    lands(
         "approach-timeout", only(P.APPROACH),
-        lambda c: c.in_phase_s > c.profile.planner.approach_timeout_s, P.LANDING,
-        lambda c: f"take-off reached only {c.height_m:.2f} m", S.LAND, O.SAFETY,
+        lambda c: c.in_phase_s > c.profile.planner.approach_timeout_s,
+        lambda c: f"take-off reached only {c.height_m:.2f} m",
     ),
     # --- phase 2: search -----------------------------------------------------
     Transition(
@@ -581,10 +587,10 @@ TABLE: tuple[Transition, ...] = (
         lambda c: c.state.confirmed >= c.profile.planner.search.confirm_frames, P.ESTIMATE,
         "target seen",
     ),
-    Transition(
+    lands(
         "searched-out", only(P.SEARCH),
-        lambda c: c.state.searches >= c.profile.planner.search.attempts, P.LANDING, why_not_found,
-        S.LAND, O.TARGET_NOT_FOUND,
+        lambda c: c.state.searches >= c.profile.planner.search.attempts, why_not_found,
+        O.TARGET_NOT_FOUND,
     ),
     # --- phase 3: estimate ---------------------------------------------------
     Transition(
@@ -603,33 +609,27 @@ TABLE: tuple[Transition, ...] = (
         "align-lost", only(P.ALIGN), lambda c: not c.tracked, P.SEARCH,
         "target lost in alignment", S.HOLD,
     ),
-    Transition(
+    backs_off(
         "align-timeout", only(P.ALIGN),
-        lambda c: c.in_phase_s > c.profile.planner.align.timeout_s, P.RECOVER,
-        "alignment took too long", S.BACK_OFF, counts_attempt=True,
+        lambda c: c.in_phase_s > c.profile.planner.align.timeout_s, "alignment took too long",
     ),
-    Transition(
-        "too-little-left", only(P.ALIGN, P.RECOVER), too_little_left, P.LANDING, why_short,
-        S.LAND, O.SAFETY,
-    ),
+    lands("too-little-left", only(P.ALIGN, P.RECOVER), too_little_left, why_short),
     Transition(
         "aligned", only(P.ALIGN), is_aligned, P.ASCEND, "aligned in position and heading",
     ),
     # --- phase 5: ascend -----------------------------------------------------
-    Transition(
-        "ascend-lost", only(P.ASCEND), lambda c: not c.tracked, P.RECOVER,
-        "target lost in ascent", S.BACK_OFF, counts_attempt=True,
+    backs_off(
+        "ascend-lost", only(P.ASCEND), lambda c: not c.tracked, "target lost in ascent",
     ),
     Transition(
-        "outside-cone", only(P.ASCEND),
-        lambda c: c.error_xy_m > c.cone_m, P.ALIGN,
+        "outside-cone", only(P.ASCEND), lambda c: c.error_xy_m > c.cone_m, P.ALIGN,
         "drifted out of the cone", S.HOLD,
     ),
-    Transition(
+    backs_off(
         "ascend-timeout", only(P.ASCEND),
         lambda c: c.in_phase_s > c.profile.planner.ascend.timeout_s
         or c.held(C.NEAR_STANDOFF) > c.profile.planner.ascend.settle_timeout_s,
-        P.RECOVER, "does not settle under the target", S.BACK_OFF, counts_attempt=True,
+        "does not settle under the target",
     ),
     Transition(
         "settled", only(P.ASCEND),
@@ -637,71 +637,61 @@ TABLE: tuple[Transition, ...] = (
         "settled at the stand-off",
     ),
     # --- phase 6: perch ------------------------------------------------------
-    Transition(
-        "beside-the-magnet", only(P.PERCH), is_beside_magnet, P.RECOVER, why_beside_magnet,
-        S.BACK_OFF, counts_attempt=True,
-    ),
+    backs_off("beside-the-magnet", only(P.PERCH), is_beside_magnet, why_beside_magnet),
     Transition(
         "contact", only(P.PERCH),
         lambda c: c.held(C.CONTACT) >= c.profile.planner.perch.contact_dwell_s, P.COMPLETE,
         why_contact,
     ),
-    Transition(
+    backs_off(
         # The last centimetres are flown unseen: by the target alone, by dead reckoning.
         "pressed-blindly", only(P.PERCH), lambda c: c.by_sight and c.position_age_s > BLIND_PRESS_S,
-        P.RECOVER, lambda c: f"no contact {c.position_age_s:.1f} s after the last sight of the "
-        f"target", S.BACK_OFF, counts_attempt=True,
+        lambda c: f"no contact {c.position_age_s:.1f} s after the last sight of the target",
     ),
-    Transition(
-        "knocked-aside", only(P.PERCH), lambda c: c.held(C.KNOCKED) >= KNOCKED_S, P.RECOVER,
-        "pushed aside under the target", S.BACK_OFF, counts_attempt=True,
+    backs_off(
+        "knocked-aside", only(P.PERCH), lambda c: c.held(C.KNOCKED) >= KNOCKED_S,
+        "pushed aside under the target",
     ),
-    Transition(
+    backs_off(
         # Not in time, or not before the next turn of a loop as late as this one.
         "no-contact", only(P.PERCH),
-        lambda c: c.in_phase_s + c.obs.loop_late_s > c.profile.planner.perch.timeout_s, P.RECOVER,
-        "no proof of contact", S.BACK_OFF, counts_attempt=True,
+        lambda c: c.in_phase_s + c.obs.loop_late_s > c.profile.planner.perch.timeout_s,
+        "no proof of contact",
     ),
     # --- phase 7: completion -------------------------------------------------
-    Transition(
-        "slipped", only(P.COMPLETE), has_slipped, P.RECOVER,
+    backs_off(
+        "slipped", only(P.COMPLETE), has_slipped,
         lambda c: "slipped while hanging" if c.state.stopped_s else "the magnet does not hold",
-        S.BACK_OFF, counts_attempt=True,
     ),
-    Transition(
+    backs_off(
         "not-released", only(P.COMPLETE),
         lambda c: c.state.stopped_s is None
         and c.in_phase_s > c.profile.planner.complete.release_timeout_s,
-        P.RECOVER, "the thrust could not be released", S.BACK_OFF, counts_attempt=True,
+        "the thrust could not be released",
     ),
     Transition(
         "perched", only(P.COMPLETE), lambda c: release_monitored(c) and hangs_where_it_did(c),
         P.PERCHED, "hanging still with the motors off", outcome=O.PERCHED,
     ),
-    Transition(
-        "fell-unseen", only(P.COMPLETE), release_monitored, P.LANDING, why_fell_unseen,
-        S.LAND, O.SAFETY,
-    ),
-    Transition(
+    lands("fell-unseen", only(P.COMPLETE), release_monitored, why_fell_unseen),
+    lands(
         "not-stopped", only(P.COMPLETE),
-        lambda c: stopped_for_s(c) > c.profile.planner.complete.watch_s + UNSTOPPED_S, P.LANDING,
+        lambda c: stopped_for_s(c) > c.profile.planner.complete.watch_s + UNSTOPPED_S,
         lambda c: f"motors stopped, but their thrust still reads {c.obs.telemetry.thrust:.0f}",
-        S.LAND, O.SAFETY,
     ),
     # --- the failed attempt --------------------------------------------------
-    Transition(
-        "attempts-used", only(P.RECOVER),
-        lambda c: attempts_used(c) and c.in_phase_s > 0.5, P.LANDING,
-        "all perching attempts are used up", S.LAND, O.ATTEMPTS_USED_UP,
+    lands(
+        "attempts-used", only(P.RECOVER), lambda c: attempts_used(c) and c.in_phase_s > 0.5,
+        "all perching attempts are used up", O.ATTEMPTS_USED_UP,
     ),
     Transition(
         "recovered", only(P.RECOVER), has_recovered, P.ESTIMATE,
         "steady again, trying once more",
     ),
-    Transition(
+    lands(
         "recover-timeout", only(P.RECOVER),
-        lambda c: c.in_phase_s > c.profile.planner.recover.timeout_s, P.LANDING,
-        "the vehicle does not become steady", S.LAND, O.SAFETY,
+        lambda c: c.in_phase_s > c.profile.planner.recover.timeout_s,
+        "the vehicle does not become steady",
     ),
     # --- landing ---------------------------------------------------------------
     Transition(
