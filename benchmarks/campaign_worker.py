@@ -48,7 +48,6 @@ PARTS: dict[str, tuple[str, ...]] = {
         "perchctl.perception.perception:update_calibration",
         "perchctl.flight.turns:Turns.flown",
         "perchctl.flight.turns:Turns.waiting",
-        "perchctl.flight.loop:_tick",
         "perchctl.flight.lockstep:Truth.tick",
     ),
 }

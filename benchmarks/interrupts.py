@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 
 from perchctl.log import read_log
-from perchctl.mission import SEVEN_PHASES
+from perchctl.mission.state import SEVEN_PHASES
 from perchctl.vehicle import LOCKED
 
 TIMEOUT_S = 120.0

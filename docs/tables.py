@@ -29,8 +29,9 @@ from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
 from perchctl.faults.promises import PROMISES  # noqa: E402
 from perchctl.link import Link  # noqa: E402
 from perchctl.log.fields import EVENT_FIELDS, FIELDS  # noqa: E402
-from perchctl.mission import FLYING_PHASES, Phase, step_mission, table  # noqa: E402
+from perchctl.mission import Phase, step_mission, table  # noqa: E402
 from perchctl.mission.lander import MANOEUVRES, Evidence, Reach, Stage  # noqa: E402
+from perchctl.mission.state import BEFORE_CONTACT, FLYING_PHASES  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
 from perchctl.profile import Profile, SimulationConfig  # noqa: E402
 from perchctl.profile.keys import UNITS, keys  # noqa: E402
@@ -227,7 +228,7 @@ def manoeuvres() -> str:
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
     (table.AIR, "in the air"),
     (FLYING_PHASES, "before landing"),
-    (table.BEFORE_CONTACT, "before contact"),
+    (BEFORE_CONTACT, "before contact"),
     (table.BY_CAMERA, "by camera"),
     (table.IN_THE_OPEN, "in the open"),
 )
@@ -258,7 +259,7 @@ def mission_rows() -> str:
     return "\n".join(lines)
 
 
-def _group(row: table.Row) -> str | None:
+def _group(row: table.Transition) -> str | None:
     return next((name for phases, name in _GROUPS if row.phases == phases), None)
 
 

@@ -96,7 +96,7 @@ MOST_NAMES = {
     "flight": 42,
     "link": 26,
     "log": 21,
-    "mission": 60,
+    "mission": 48,
     "perception": 15,
     "positioning": 15,
     "profile": 38,

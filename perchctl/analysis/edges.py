@@ -16,7 +16,6 @@ from perchctl.mission import (
     charge_at,
     fit_battery,
     update_energy,
-    used_mah,
 )
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -218,7 +217,7 @@ def battery_of(log: FlightLog) -> BatteryUse:
         state = update_energy(
             state, float(step_s[i]), float(volts[i]), float(thrust[i]), battery_mah
         )
-        count_mah[i] = used_mah(state, battery_mah)
+        count_mah[i] = state.used * battery_mah
         rest_v[i] = math.nan if state.rest_v is None else state.rest_v
     step_mah = np.diff(count_mah, prepend=0.0)
     phases = np.array(log.texts("phase"))

@@ -12,12 +12,12 @@ from perchctl.analysis.edges import runs_of
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.sight import Loss, Stay
 from perchctl.analysis.words import count, length
-from perchctl.mission import FLYING_PHASES, SEVEN_PHASES
+from perchctl.mission import Phase
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 HELD_LEAST_S = 0.1
 BACKED_OFF_M = 0.01
-FLYING = frozenset(phase.value for phase in FLYING_PHASES)
+FLYING = frozenset(phase.value for phase in Phase if phase.is_flying)
 TOOK_OVER = {
     "watchdog": "The watchdog took over",
     "rescue": "The rescue took over, after an error",
@@ -30,7 +30,7 @@ ACTS = {
     "stop": "it stopped the motors",
     "emergency": "it cut the motors",
 }
-SEVEN = tuple(phase.value for phase in SEVEN_PHASES)
+SEVEN = tuple(phase.value for phase in Phase if phase.is_flying and phase is not Phase.RECOVER)
 
 
 @dataclass(frozen=True)

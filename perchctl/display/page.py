@@ -15,7 +15,7 @@ from perchctl.display.live import LivePage, PageState
 from perchctl.display.panel import status_of, status_rows
 from perchctl.display.sketch import Sketch
 from perchctl.log import FlightSummary
-from perchctl.mission import RESCUE, TERMINALS, Event, EventKind, Phase, Tick, is_mission_over
+from perchctl.mission import RESCUE, Event, EventKind, Phase, Tick
 from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput
 
 AXES_OF_SIDE = 0.5
@@ -57,7 +57,7 @@ class FlightPage:
             if self._pressed_s is None and self.page.stop_requested:
                 self._pressed_s = tick.t_s
             did = answered(self._events, self._pressed_s)
-            self.page.tell(partial(flight_state, tick, did), live=not is_mission_over(tick.state))
+            self.page.tell(partial(flight_state, tick, did), live=not tick.state.phase.is_over)
         except Exception as error:
             self.page.remember(error)
 
@@ -104,7 +104,7 @@ def flight_state(tick: Tick, stop_did: str = "") -> PageState:
         "battery_v": volts if math.isfinite(volts) else None,
         "rows": [list(row) for row in status_rows(status)],
         "note": f"held: {status.hold}" if status.hold else _seen_note(tick.output),
-        "over": is_mission_over(tick.state),
+        "over": tick.state.phase.is_over,
         "stop_did": stop_did,
     }
 
@@ -160,8 +160,7 @@ def answered(events: Sequence[Event], pressed_s: float | None) -> str:
     if not ordered and landing is not None:
         parts.append(f"it lands already, since {landing.t_s - start_s:.1f} s: {landing.reason}")
     last = phases[-1]
-    if last.phase in TERMINALS and last.row not in _ORDERED:
-        assert last.phase is not None
+    if last.phase is not None and last.phase.is_over and last.row not in _ORDERED:
         parts.append(f"{last.phase.value} at {last.t_s - start_s:.1f} s: {last.reason}")
     if not parts:
         parts.append("STOP has come; the flight has not answered yet")

@@ -17,7 +17,6 @@ from rich.table import Table
 from rich.text import Text
 
 from perchctl.mission import (
-    BEFORE_CONTACT,
     BatteryOutlook,
     Event,
     EventKind,
@@ -91,7 +90,7 @@ def status_of(tick: Tick) -> FlightStatus:
         reason=state.reason,
         hold=state.hold,
         outside=tick.outside,
-        battery=state.battery if state.phase in BEFORE_CONTACT else None,
+        battery=state.battery if state.phase.is_before_contact else None,
     )
 
 

@@ -14,10 +14,9 @@ if TYPE_CHECKING:
     from perchctl.sim import SharedTime
 
 SIM_PATIENCE_S = 5.0
-"""The clock waits so long, on the wall's clock, for a simulator that does not go on: longer than
-the simulator waits for the loop, so that they never wait for each other."""
-SLOW_S = 1.0
-"""A flight that has fallen so far behind the wall's clock says that it is slow."""
+"""Wait for a stopped simulator, on the wall's clock: longer than the simulator waits for the loop,
+so that they never wait for each other."""
+SLOW_S = 1.0  # behind the wall's clock, from which on the flight is called slow
 SLOW = (
     "this computer is busy: the simulated flight runs slower than real time; its times are "
     "simulated ones"
@@ -52,9 +51,8 @@ class SimulatedClock:
 
     The simulator advances it with the wall's clock. On a busy computer it stands still until the
     slower of the two has caught up, so no age grows by that. `now` may be called from any thread.
-    `margin_s`: by how much the simulator may run past the moment that the loop waits for.
-    `zero_s` is its reading at the simulator's start, such that it first agrees with
-    `time.monotonic`.
+    `margin_s`: how far the simulator may run past the moment that the loop waits for. `zero_s`: its
+    reading at the simulator's start, such that it first agrees with `time.monotonic`.
     """
 
     def __init__(
@@ -92,8 +90,7 @@ class SimulatedClock:
 
     @contextlib.contextmanager
     def waiting_for_loop(self) -> Iterator[None]:
-        """Within it each `wait_until` is the loop's sign of life, and without one simulated time
-        goes on for `margin_s` only."""
+        """A context in which simulated time goes on for `margin_s` after each `wait_until` only."""
         self._began_s = self._wall(), self.now()
         try:
             yield
@@ -102,7 +99,7 @@ class SimulatedClock:
             self._shared.limit_s = math.inf
 
     def remarks(self) -> list[str]:
-        """Says once that the flight is slow, when it has become so."""
+        """The remark that the flight is slow, once."""
         if self._began_s is None or self._slow_told:
             return []
         wall_s, own_s = self._began_s
@@ -111,5 +108,5 @@ class SimulatedClock:
 
 
 def wall_date() -> datetime:
-    """Now, in this computer's time zone; for what is kept from one day to the next."""
+    """Now, in this computer's time zone."""
     return datetime.now().astimezone()

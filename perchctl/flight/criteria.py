@@ -1,6 +1,10 @@
-"""What is asked of a vehicle on the ground: by `fly` before it takes off, and by `check`.
+"""Criteria for a vehicle on the ground, used by `fly` before it takes off and by `check`. Pure.
 
-Each criterion gives what is wrong, or None. Pure.
+Each gives what is wrong, or None. Of a vehicle at rest two things are known without a motion
+capture: where the ground is, and which way is up. A world with another axis up, or a body whose
+axes are turned, shows against the second once the vehicle stands in another heading than the one in
+which its body was defined; a height in millimetres against the first. The rest shows when a hand
+lifts and turns the vehicle (`perchctl check --lift`), or in its first centimetres in the air.
 """
 
 from __future__ import annotations
@@ -8,7 +12,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from perchctl.errors import distinct_figures
+from perchctl.geometry import (
+    Array,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+    wrap_rad,
+    yaw_of,
+)
+from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     CAN_FLY,
@@ -19,16 +33,21 @@ from perchctl.vehicle import (
     NO_BATTERY_READING_V,
     POSITION_DECKS,
     TUMBLED,
+    ExternalPosition,
     MeasuredBy,
     Telemetry,
 )
 from perchctl.vision import TargetEstimate
 
 KNOWN_SUPERVISOR_BITS = 0x0FFF
-REST_ACC_G = 0.15
-"""At rest the accelerometer reads 1 g, give or take so much."""
-WITHIN_REACH_M = 0.35
-"""Of the gear. From the ground no target is so near: a take-off needs more height."""
+REST_ACC_G = 0.15  # at rest the accelerometer reads 1 g, give or take so much
+WITHIN_REACH_M = 0.35  # of the gear: a take-off needs more height, so no target is so near
+ROOM_M = 50.0  # no capture is larger: what is farther off is in another unit
+HIGH_M = 4.0  # of a vehicle at its take-off place: what is higher is in another unit
+UPRIGHT_DEG = 20.0  # between attitude and capture: a rigid body's attitude is defined by eye
+AXIS_DEG = 30.0  # within it of an axis, up is that axis
+WANDERED_M = 0.1  # far beyond a capture's noise
+AGREE_M, AGREE_DEG = 0.1, 15.0  # estimate and capture, once positions and heading are fused
 
 _FORBIDDEN = (
     (LOCKED, "is locked", "inspect it and restart it"),
@@ -41,7 +60,7 @@ _FORBIDDEN = (
 
 @dataclass(frozen=True)
 class Problem:
-    """What was found, with what is allowed, and what to do."""
+    """What was found, with what is allowed, and what to do about it."""
 
     found: str
     advice: str
@@ -52,7 +71,7 @@ class Problem:
 
 
 def forbidden_problem(telemetry: Telemetry) -> Problem | None:
-    """What the supervisor reports that waiting will not mend."""
+    """A supervisor's report that waiting will not mend."""
     raw = f"0x{telemetry.supervisor:04X}"
     for bit, what, advice in _FORBIDDEN:
         if telemetry.has(bit):
@@ -66,7 +85,7 @@ def forbidden_problem(telemetry: Telemetry) -> Problem | None:
 
 
 def battery_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
-    """A reading below `NO_BATTERY_READING_V` is none, and no problem here."""
+    """A battery too low to take off; a missing reading is no problem here."""
     needed_v = profile.safety.min_rest_v
     if not NO_BATTERY_READING_V <= telemetry.battery_v < needed_v:
         return None
@@ -78,7 +97,7 @@ def battery_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
 
 
 def unsettled_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
-    """The estimate's variance; one that is no number is not settled either."""
+    """A state estimate that is not settled: its variance is too large, or no number."""
     variance, most = telemetry.position_variance_m2, profile.safety.estimator_variance_m2
     if variance is None or variance <= most:
         return None
@@ -90,7 +109,7 @@ def unsettled_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
 
 
 def unmeasured_problem(by: MeasuredBy, profile: Profile) -> Problem | None:
-    """Nothing tells the vehicle where it is: it would fly by a sum of accelerations."""
+    """A vehicle without any position source: it would fly by a sum of accelerations."""
     config = profile.positioning
     if config.by != "deck" or by.placed_by(config.decks) or by.external:
         return None
@@ -109,7 +128,7 @@ def unmeasured_problem(by: MeasuredBy, profile: Profile) -> Problem | None:
 
 
 def height_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
-    """A vehicle that hangs, or is held, by the settled estimate."""
+    """A vehicle off the ground by its settled estimate: it hangs, or is held."""
     safety, z_m = profile.safety, telemetry.position_m[2]
     if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
         return None
@@ -122,7 +141,7 @@ def height_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
 
 
 def tilt_deg(telemetry: Telemetry) -> float:
-    """NaN where one of the angles is."""
+    """The larger of roll and pitch; NaN if one of them is."""
     roll_rad, pitch_rad = abs(telemetry.roll_rad), abs(telemetry.pitch_rad)
     return math.degrees(max(roll_rad, pitch_rad) + 0.0 * (roll_rad + pitch_rad))
 
@@ -137,21 +156,21 @@ def tilt_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
 
 
 def motion_problem(telemetry: Telemetry) -> Problem | None:
-    """The vehicle is moved or vibrates: its accelerometer does not read one g."""
+    """A vehicle that is moved or vibrates: its accelerometer does not read one g."""
     if abs(telemetry.acc_z_g - 1.0) <= REST_ACC_G:
         return None
     return Problem(f"its accelerometer reads {telemetry.acc_z_g:.2f} g", "let it stand still")
 
 
 def not_allowed_problem(telemetry: Telemetry) -> Problem | None:
-    """The supervisor does not let it fly (yet)."""
+    """A supervisor that does not allow flight (yet)."""
     if telemetry.has(CAN_FLY):
         return None
     return Problem(f"0x{telemetry.supervisor:04X}", "wait, or restart it")
 
 
 def too_near_problem(target: TargetEstimate | None) -> Problem | None:
-    """A target that is too near to be seen from the ground."""
+    """A target that is too near for a vehicle on the ground."""
     if target is None or not target.tracked:
         return None
     away_m = math.hypot(*(float(e) for e in target.e_m))
@@ -161,4 +180,177 @@ def too_near_problem(target: TargetEstimate | None) -> Problem | None:
     return Problem(
         f"the target is only {away} m away, at least {needed} m are needed",
         "the vehicle hangs, or stands too close under it; take it down first",
+    )
+
+
+# --- External positions --------------------------------------------------------------------------
+
+
+def measurer(profile: Profile) -> str:
+    """The source of the external positions, in words."""
+    by_target = profile.positioning.by == "target"
+    return "the sight of the target" if by_target else "the motion capture"
+
+
+def world_problem(
+    place: ExternalPosition, telemetry: Telemetry, profile: Profile
+) -> Problem | None:
+    """An external position in another unit, with another axis up, or elsewhere, which waiting will
+    not mend. By the target the world is the vehicle's own, so only the fence counts."""
+    if profile.positioning.by == "target":
+        return unreachable(place, profile)
+    return (
+        millimetres_problem(place, profile)
+        or with_another_up(place, telemetry)
+        or external_height_problem(place, profile)
+        or unreachable(place, profile)
+    )
+
+
+def unreachable(place: ExternalPosition, profile: Profile) -> Problem | None:
+    """A place from which no flight reaches the expected target: perhaps another vehicle's body."""
+    target, (x, y, _) = profile.target, place.position_m
+    if target.expected_xy_m is None:
+        return None
+    away_m = math.dist((x, y), target.expected_xy_m)
+    if not away_m > profile.safety.fence_radius_m + target.expected_within_m:
+        return None
+    if profile.positioning.by == "target":
+        return Problem(
+            f"the target is expected {away_m:.1f} m from where the vehicle stands, and the fence "
+            f"is {profile.safety.fence_radius_m:g} m",
+            "with positioning: target the world's zero is where it stands: correct "
+            "target.expected_xy_m",
+        )
+    return Problem(
+        f"the motion capture has the vehicle at x {x:.2f}, y {y:.2f} m, {away_m:.1f} m from where "
+        f"its target is expected, and the fence is {profile.safety.fence_radius_m:g} m",
+        f"is the rigid body {profile.positioning.body!r} another vehicle's? correct "
+        f"positioning.body, or target.expected_xy_m",
+    )
+
+
+def millimetres_problem(place: ExternalPosition, profile: Profile) -> Problem | None:
+    """An external position that seems to be in millimetres."""
+    safety, (x, y, z) = profile.safety, place.position_m
+    far_m = max(abs(v) for v in place.position_m)
+    on_ground = abs(z / 1000.0 - safety.ground_z_m) <= safety.ground_tolerance_m
+    if not far_m >= ROOM_M and not (z >= HIGH_M and on_ground):
+        return None
+    return Problem(
+        f"the motion capture has the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m: these look "
+        f"like millimetres",
+        "set the unit of its stream to metres",
+    )
+
+
+def with_another_up(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
+    """A capture whose up is not the vehicle's, by the vehicle's own attitude."""
+    if place.quaternion is None:
+        return None
+    up = up_in_capture(place.quaternion, telemetry)
+    off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
+    if not off_deg > UPRIGHT_DEG:
+        return None
+    axis = nearest_axis(up)
+    if axis is None:
+        return Problem(
+            f"the motion capture has the vehicle tilted by {off_deg:.0f} deg against its own "
+            f"attitude",
+            "is it the right rigid body? set its axes level in the capture, or "
+            "positioning.body_rpy_deg; perchctl check --lift tells by how much",
+        )
+    return Problem(
+        f"swapped axes: up is {axis} in the motion capture",
+        "set its world to z up; if only the rigid body's own axes lie so, define them anew "
+        "with the vehicle level, or set positioning.body_rpy_deg",
+    )
+
+
+def up_in_capture(quaternion: tuple[float, float, float, float], telemetry: Telemetry) -> Array:
+    """The world's vertical in the capture's axes, (3,), if its body's axes are the vehicle's."""
+    R_own = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)
+    return np.asarray(rotation_from_quaternion(quaternion) @ R_own.T[:, 2])
+
+
+def nearest_axis(direction: Array) -> str | None:
+    """The axis within `AXIS_DEG` of a unit vector, such as ``-y``; None for none."""
+    i = int(np.argmax(np.abs(direction)))
+    if abs(float(direction[i])) < math.cos(math.radians(AXIS_DEG)):
+        return None
+    return f"{'-' if direction[i] < 0 else ''}{'xyz'[i]}"
+
+
+def external_height_problem(place: ExternalPosition, profile: Profile) -> Problem | None:
+    """An external height that is not the ground's."""
+    safety, z_m = profile.safety, place.position_m[2]
+    if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
+        return None
+    found = (
+        f"the motion capture has the vehicle at {z_m:.2f} m, and the ground is at "
+        f"{safety.ground_z_m:.2f} m"
+    )
+    level = [
+        axis
+        for axis, v in zip("xy", place.position_m[:2], strict=True)
+        if abs(v - safety.ground_z_m) <= safety.ground_tolerance_m
+    ]
+    perhaps = f"swapped axes (is its {' or its '.join(level)} up?)" if level else "swapped axes"
+    return Problem(
+        found,
+        f"{perhaps}, another rigid body or zero: perchctl check --lift tells; "
+        f"safety.ground_z_m is the height that it has where it stands",
+    )
+
+
+class AtRest:
+    """Finds a body that moves in the capture while the vehicle stands still: another's."""
+
+    def __init__(self) -> None:
+        self._from: ExternalPosition | None = None
+
+    def strange(self, place: ExternalPosition | None, profile: Profile) -> Problem | None:
+        """To be called in each turn with fresh telemetry and a fresh position; `place` None begins
+        anew, since the vehicle does not stand still."""
+        self._from = None if place is None else self._from or place
+        if place is None or self._from is None:
+            return None
+        way_m = math.dist(self._from.position_m, place.position_m)
+        if not way_m > WANDERED_M:
+            return None
+        if profile.positioning.by == "target":
+            return Problem(
+                f"by the target the vehicle has moved by {way_m:.2f} m, and it stands still",
+                "the target has moved: let it hang still, then start anew",
+            )
+        body = profile.positioning.body
+        return Problem(
+            f"the rigid body {body!r} has moved by {way_m:.2f} m in the motion capture, and the "
+            f"vehicle stands still",
+            "it is another body's: correct positioning.body; if somebody carried it, put it down",
+        )
+
+
+def missing(status: FeedStatus, profile: Profile) -> Problem | None:
+    """External positions that do not come."""
+    if status.problem is not None:
+        return Problem(status.problem, "see perchctl check")
+    if status.age_s <= profile.positioning.hold_s:
+        return None
+    age = f"{status.age_s:.2f} s old" if math.isfinite(status.age_s) else "none was sent yet"
+    return Problem(age, "see perchctl check")
+
+
+def apart(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
+    """An estimate at another place, or with another heading, than the capture's."""
+    away_m = math.dist(place.position_m, telemetry.position_m)
+    turned_deg = 0.0
+    if place.quaternion is not None:
+        yaw_rad = yaw_of(rotation_from_quaternion(place.quaternion))
+        turned_deg = abs(math.degrees(wrap_rad(telemetry.yaw_rad - yaw_rad)))
+    if away_m <= AGREE_M and turned_deg <= AGREE_DEG:
+        return None
+    return Problem(
+        f"they are {away_m:.2f} m and {turned_deg:.0f} deg of heading apart",
+        "do the positions arrive at this vehicle, and is it this rigid body?",
     )

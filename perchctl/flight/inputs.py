@@ -31,8 +31,7 @@ from perchctl.vision import (
     surest_pose,
 )
 
-HEARD_S = 0.15
-"""A sight that is carried on by an older estimate swings the vehicle that flies by it."""
+HEARD_S = 0.15  # a sight carried on by an older estimate swings the vehicle
 ENDED_TEXT = " has ended"
 SENSED = (
     "telemetry", "target", "new_frame", "camera_age_s", "camera_problem", "battery_age_s",
@@ -50,26 +49,22 @@ class GivesTelemetry(Protocol):
 
 @dataclass(eq=False)
 class FlightInputs:
-    """What a tick of the loop takes in: telemetry, at most one frame, and what follows from them.
-
-    `output` is what this tick's frame gave, None where there was none to look at; `repeated`: it
-    was the one before once more. `target_positioning`: where the target is the vehicle's
-    positioning system, what hands its places to `send`; else None.
-    """
+    """What a tick of the loop takes in: telemetry, at most one frame, and what follows."""
 
     link: GivesTelemetry
     source: FrameSource
     pipeline: Pipeline
     profile: Profile
     send: SendPosition = lambda place: True
-    recorded: bool = False  # the ticks are: with the pictures' checksums and the present's spread
+    recorded: bool = False  # then with the pictures' checksums and the present's spread
     perception: Perception = field(init=False)
+    # Hands the vehicle's places to `send`, where the target is its positioning system.
     target_positioning: TargetPositioning | None = field(init=False, default=None)
     sends_sights: bool = True  # until the way down goes on without them
-    output: PipelineOutput | None = None
+    output: PipelineOutput | None = None  # of this tick's frame, if it was searched
     taken: TurnInputs = field(default_factory=TurnInputs)  # in this tick
     blind: bool = False
-    repeated: bool = False
+    repeated: bool = False  # this tick's frame is the one before
     last_good_frame_s: float = -math.inf
     camera_problem: str | None = None
     frames: int = 0
@@ -86,8 +81,8 @@ class FlightInputs:
         return self.perception.history
 
     def take_in(self, now_s: float, *, look: bool = True) -> None:
-        """Telemetry and at most one frame. Without `look`, at the ceiling, the frame only counts
-        as a sign of the camera's life."""
+        """Takes in telemetry and at most one frame. Without `look`, at the ceiling, the frame only
+        shows that the camera lives."""
         perception, positioning = self.perception, self._positioning
         samples = self.link.telemetry()
         perception.history = add_samples(self.history, samples, self.profile.safety)
@@ -114,7 +109,7 @@ class FlightInputs:
         rejection = problem or self._rejection(frame, now_s)
         self.repeated = rejection == VERDICT_TEXTS["repeated"]
         if rejection is not None:
-            if not self.repeated:  # which says nothing new, of the camera's troubles neither
+            if not self.repeated:  # else nothing is new, the camera's problem neither
                 self.camera_problem = rejection
             return
         self.last_good_frame_s = now_s
@@ -131,20 +126,20 @@ class FlightInputs:
         return self.target_positioning if self.sends_sights else None
 
     def _is_heard(self, now_s: float) -> bool:
-        """Whether the telemetry is new enough to carry a sight on to the present."""
+        """True if the telemetry is new enough to carry a sight on to the present."""
         newest = self.history.newest
         return newest is not None and now_s - newest.t_s + newest.behind_s <= HEARD_S
 
     def present(self, began_s: float, now_s: float) -> None:
-        """What has arrived while camera or vision hung, since the tick of `began_s`."""
+        """Takes in what has arrived while camera or vision hung, since the tick of `began_s`."""
         late = self.link.telemetry()
         self.perception.history = add_late_samples(self.history, late, self.profile.safety)
         self.taken = replace(self.taken, late=tuple(late))
         if self.last_good_frame_s == began_s:
-            self.last_good_frame_s = now_s  # the picture came: it is not the camera that is gone
+            self.last_good_frame_s = now_s  # the picture came: the camera is not gone
 
     def observation(self, now_s: float) -> Observation:
-        """The part of it that is seen: the fields of `SENSED`."""
+        """The observation with the fields of `SENSED`; the loop adds the others."""
         perception, newest = self.perception, self.history.newest
         assert newest is not None
         return Observation(
@@ -167,13 +162,13 @@ class FlightInputs:
 
     @property
     def poses(self) -> dict[str, PoseSeen]:
-        """The unfiltered ones of this tick's picture."""
+        """The unfiltered poses of this tick's picture."""
         poses = {} if self.output is None else self.output.poses
         return {name: PoseSeen(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
 
     def target(self, now_s: float) -> TargetEstimate | None:
-        """The estimate at the present. The filter coasts by frames: while none are looked
-        at, its target is a remembered place."""
+        """The estimate at the present. The filter coasts by frames: while none are searched, its
+        target is a remembered place, and not tracked."""
         target = self.perception.target(now_s, spread=self.recorded)
         if self._positioning is not None:  # else the estimate runs away
             target = self._positioning.steered(target, self.history)
@@ -193,8 +188,8 @@ class FlightInputs:
         if self.recorded and self.taken.frame is not None:
             seen = replace(self.taken.frame, checksum=zlib.crc32(frame.image.tobytes()))
             self.taken = replace(self.taken, frame=seen)
-        # A dark target may still be seen, and a bare ceiling looks like an empty screen:
-        # such pictures are searched all the same, but the user is shown why.
+        # A dark target may still be seen, and a bare ceiling looks like an empty screen: such
+        # pictures are searched all the same, with a note.
         self._note = verdict.text if verdict.kind in ("dark", "uniform") else None
         if not verdict.usable and self._note is None:
             return verdict.text
@@ -202,7 +197,7 @@ class FlightInputs:
 
 
 def lateness_text(age_s: float, safety: SafetyConfig) -> str | None:
-    """Why a live picture of this age is no measurement."""
+    """Why a live picture of this age is no measurement; None if it is one."""
     return f"the picture is {age_s:.1f} s late" if age_s > safety.max_frame_age_s else None
 
 
@@ -212,25 +207,22 @@ def _seen(frame: Frame | None) -> FrameSeen | None:
     return FrameSeen(frame.index, frame.t_s, frame.t_arrival_s, frame.fields, frame.repeated)
 
 
-# --- The target as positioning system, tick by tick --------------------------------------------
-# Standing, pressed or hanging, the place is known better than by any picture, and is sent in its
-# stead; only while the accelerometer says that something carries the vehicle. What falls while it
-# is told that it hangs would look as if it hung, so the first sample that says otherwise ends that.
+# --- The target as positioning system, tick by tick ----------------------------------------------
+# Standing, pressed or hanging, the place is known better than by any picture, and is sent instead;
+# only while the accelerometer shows that something carries the vehicle, up to the first sample that
+# does not: what falls while it gets the position of a hanging vehicle would look as if it hung.
 
 
 CARRIED_FOR_S = 0.1
-CARRIED_G, CARRIED_MEAN_G = 0.25, 0.06
-"""An accelerometer at rest reads one g; with turning motors it scatters by 0.04, the mean of ten by
-0.013."""
-SINKING_MPS = -0.15
-"""No such speed comes of a bias while the place is sent."""
+CARRIED_G, CARRIED_MEAN_G = 0.25, 0.06  # turning motors scatter 1 g by 0.04, the mean by 0.013
+SINKING_MPS = -0.15  # more than a bias makes while the place is sent
 FROZEN_S = 0.06
-"""An attitude that reads the very same for so long is not the one at the picture's exposure, and
-0.1 rad of it places a vehicle 1.2 m under the target 12 cm aside."""
+"""An attitude that stands still for longer is not the one at the picture's exposure, and 0.1 rad
+places a vehicle 1.2 m under the target 12 cm aside."""
 
 
 class TargetPositioning:
-    """Of one flight. `status` goes to the planner as that of a motion capture does."""
+    """The target as the positioning system of one flight; `status` is as a motion capture's."""
 
     def __init__(self, send: SendPosition, pipeline: Pipeline, profile: Profile) -> None:
         self.feed = SightFeed(send, profile, pipeline.pose)
@@ -240,8 +232,7 @@ class TargetPositioning:
         return self.feed.status(now_s)
 
     def begin(self, history: History, now_s: float, *, touches: bool) -> None:
-        """A tick, before its picture. `touches`: contact was proven, and nothing has shown since
-        that it ended."""
+        """Begins a tick, before its picture. `touches`: contact was proven and has not ended."""
         newest = history.newest
         self._touches = touches
         if newest is None or not is_carried(history, now_s):
@@ -253,7 +244,7 @@ class TargetPositioning:
             self.feed.known(touching_m, now_s)
 
     def see(self, measured: MeasuredMarkers, history: History, now_s: float) -> None:
-        """A picture. What is pressed or hangs needs none, and the last ones were of before."""
+        """Sends the position by a picture, unless the vehicle is pressed or hangs."""
         pose = surest_pose(measured)
         if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_S:
             return
@@ -262,7 +253,7 @@ class TargetPositioning:
             self.feed.see(pose, then, now, now_s, at_rest=is_carried(history, now_s))
 
     def steered(self, target: TargetEstimate | None, history: History) -> TargetEstimate | None:
-        """The target where it stands; as it is seen until its place is known."""
+        """The estimate with the target where it stands; as seen until its place is known."""
         newest = history.newest
         if target is None or newest is None:
             return target
@@ -270,7 +261,7 @@ class TargetPositioning:
 
 
 def is_carried(history: History, now_s: float) -> bool:
-    """Whether something has carried the vehicle for the last moments, by fresh samples."""
+    """True if something has carried the vehicle for the last moments, by fresh samples."""
     newest = history.newest
     if newest is None or now_s - newest.t_s + newest.behind_s > CARRIED_FOR_S:
         return False

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -34,10 +33,9 @@ from perchctl.vehicle import LOCKED
 from perchctl.vision import CameraModel, Frame, Pipeline, make_pipeline
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
-_QUEUED = 2
-"""Pictures that wait where nobody takes them; one that is newer replaces the oldest."""
-HARD_LANDING_MPS = 1.0
-"""Sinking faster than this into the floor is a fall, whatever the log calls it."""
+_QUEUED = 2  # pictures that wait; a newer one replaces the oldest
+HARD_LANDING_MPS = 1.0  # sinking faster into the floor is a fall, whatever the log calls it
+FIRST_FRAME_S = 1.0
 
 
 class LockstepClock:
@@ -55,8 +53,7 @@ class LockstepClock:
 
 
 def _newest(frames: list[DeliveredFrame]) -> list[DeliveredFrame]:
-    """Of the last exposures, each as it first came and as it came last: what else waited meanwhile
-    nobody looks at."""
+    """The last exposures, each as it first came and as it came last."""
     last = sorted({frame.index for frame in frames})[-_QUEUED:]
     ends = [[frame for frame in frames if frame.index == index] for index in last]
     return [frame for same in ends for frame in same[:: max(1, len(same) - 1)]]
@@ -105,7 +102,7 @@ def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
 
 
 class Truth:
-    """Watches the true vehicle, which the flight cannot see."""
+    """A watcher of the true vehicle, which the flight cannot see."""
 
     problem: str | None = None
 
@@ -197,11 +194,11 @@ def fly_lockstep(
         watchers = (*watchers, log)
         source = log.watched(source)
     operator = _OperatorAt(operator_at or {})
-    tell = EventExplainer(scenario)
+    explain = EventExplainer(scenario)
     pipeline = _pipeline_of(profile, camera)
     parts = FlightParts(
         link, source, LockstepClock(link), profile, pipeline, (*watchers, operator), operator.read,
-        lambda event: tell(event, event.t_s),  # the clock is the simulation's
+        lambda event: explain(event, event.t_s),  # the clock is the simulation's
         positions, tuple if log is None else log.remarks,
     )  # fmt: skip
     link.connect()
@@ -212,25 +209,19 @@ def fly_lockstep(
     return _flown(report, vehicle, truth)
 
 
-@dataclass(frozen=True)
-class _Seeing:
-    """What a pipeline is made of; those that say the same are equal."""
-
-    told: tuple[object, ...]
-    profile: Profile = field(compare=False)
-    camera: CameraModel = field(compare=False)
-
-
 def _pipeline_of(profile: Profile, camera: CameraModel) -> Pipeline:
     """A campaign's flights share it: to make one takes as long as 10 pictures."""
     if profile.camera.mask is not None:
         return make_pipeline(profile, camera)  # from a file that may have changed
-    return _shared(_Seeing((profile.model_dump_json(), *camera.contents), profile, camera))
+    key = (profile.model_dump_json(), *camera.contents)
+    if key not in _PIPELINES:
+        while len(_PIPELINES) >= 2:
+            _PIPELINES.pop(next(iter(_PIPELINES)))
+        _PIPELINES[key] = make_pipeline(profile, camera)
+    return _PIPELINES[key]
 
 
-@lru_cache(maxsize=2)
-def _shared(seeing: _Seeing) -> Pipeline:
-    return make_pipeline(seeing.profile, seeing.camera)
+_PIPELINES: dict[tuple[object, ...], Pipeline] = {}  # the newest, by what they are made of
 
 
 def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> LockstepFlight:
@@ -268,25 +259,21 @@ class _OperatorAt:
         return None
 
 
-# --- Positions from outside in lockstep: the simulated motion capture, the same feed as in real
-# time, and the simulated vehicle prepared as a real one is.
-
-
-FIRST_FRAME_S = 1.0
+# --- External positions in lockstep: the simulated motion capture, by the same feed --------------
 
 
 def with_positioning(by: Literal["deck", "mocap"], profile: Profile) -> Profile:
-    """The same with its position by decks, or from outside."""
+    """The profile with its position by decks, or by motion capture."""
     config = profile.positioning.model_copy(update={"by": by})
     return profile.model_copy(update={"positioning": config})
 
 
 def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
-    """A feed that turns with the link's time, for the flight loop; None with decks, and where
-    the target is the positioning system: the loop feeds then.
+    """A feed that turns with the link's time; None with decks, and where the target is the
+    positioning system, since the loop feeds then.
 
     Lets the time pass until the vehicle's body is seen, and starts the estimate there. Errors:
-    ConnectionFailed when it is not.
+    ConnectionFailed if it is not.
     """
     capture, config = link.vehicle.capture, profile.positioning
     if config.by == "target":

@@ -9,13 +9,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from perchctl.camera import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
+from perchctl.flight.criteria import AtRest
 from perchctl.flight.inputs import FlightInputs
-from perchctl.flight.outside import AtRest
 from perchctl.flight.preflight import (
     refuse,
     refuse_out_of_view,
@@ -23,46 +23,36 @@ from perchctl.flight.preflight import (
     refuse_unmeasured,
     still_waiting_for,
 )
-from perchctl.flight.rescue import Rescued, rescue
 from perchctl.flight.turns import Turns
-from perchctl.flight.watchdog import Watchdog
+from perchctl.flight.watchdog import Watchdog, rescue
 from perchctl.link import Link
 from perchctl.mission import (
-    FLYING_PHASES,
     RESCUE,
-    Context,
     Event,
     EventKind,
     Finding,
     FlightReport,
     Observation,
     Operator,
-    Outcome,
     Phase,
     PlannerState,
+    Rest,
     SentCommand,
-    SentWatcher,
-    Severity,
     Tick,
-    Turn,
     Watcher,
-    contact_error_of,
-    drop_sights,
-    flight_findings,
-    is_mission_over,
+    events_of,
+    flight_report,
     start_mission,
     step_mission,
-    touchdown_of,
-    unplaced_text,
 )
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vehicle import FRESH_S, LOCKED, Command, Idle, is_battery_reading
-from perchctl.vision import Consistency, Pipeline
+from perchctl.vehicle import Idle
+from perchctl.vision import Pipeline
 
 HUNG_S = 0.25
-"""A turn that takes longer was hung up somewhere: what it knew of the vehicle is old."""
+"""A turn that takes longer hung somewhere: what it knew of the vehicle is old."""
 
 
 class Positions(Protocol):
@@ -75,9 +65,11 @@ class Positions(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class FlightParts:
-    """The edges. `simulated` says what the scenario of a simulated flight did that explains
-    an event; `positions` how it goes with those from outside, None where decks measure them;
-    `remarks` what is new about what goes along and matters to nobody's safety, as a recording."""
+    """The edges of the loop.
+
+    `simulated` gives what the scenario of a simulated flight did that explains an event;
+    `positions` the external ones, None where decks measure them; `remarks` what is new about
+    things that do not matter to safety, as a recording."""
 
     link: Link
     source: FrameSource
@@ -91,21 +83,20 @@ class FlightParts:
     remarks: Callable[[], Sequence[str]] = tuple
 
     def position_age_s(self, now_s: float) -> float:
-        """Of the newest position that a motion capture gave; 0 without one."""
+        """Age of the newest position that a motion capture gave; 0 without one."""
         return 0.0 if self.positions is None else self.positions.status(now_s).age_s
 
 
 def fly(parts: FlightParts) -> FlightReport:
-    """Connect is done: wait until ready, fly the mission, return how it ended.
+    """Wait until ready, fly the mission, and return how it ended; the link is connected.
 
-    Whatever is raised on the way, the vehicle is landed first. Errors:
-    `SafetyAbort`, `TimedOut`, `NotFound` and `Interrupted` before take-off, and
-    anything unforeseen after the rescue.
+    Whatever is raised on the way, the vehicle is landed first. Errors: `SafetyAbort`, `TimedOut`,
+    `NotFound` and `Interrupted` before take-off, and anything unforeseen after the rescue.
     """
     turns = Turns(parts.clock, parts.watchers)
     inputs = FlightInputs(
         parts.link, parts.source, parts.pipeline, parts.profile, send=parts.link.external,
-        recorded=turns.are_told,
+        recorded=turns.are_watched,
     )  # fmt: skip
     _wait_until_ready(parts, inputs, turns)  # nothing is started before it returns
     if inputs.history.newest is not None:
@@ -133,8 +124,16 @@ def fly(parts: FlightParts) -> FlightReport:
         raise
 
 
+@runtime_checkable
+class SentWatcher(Watcher, Protocol):
+    """A watcher of what was sent in the loop's place, too."""
+
+    def sent(self, sent: SentCommand) -> None:
+        """Called in the sender's own thread: must neither wait nor raise."""
+
+
 def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
-    """What is sent in the loop's place is told to those who want it."""
+    """Passes on what is sent in the loop's place to those who watch it."""
     told = [watcher for watcher in parts.watchers if isinstance(watcher, SentWatcher)]
 
     def tell(sent: SentCommand) -> None:
@@ -154,7 +153,7 @@ RESCUED = {
 }
 
 
-def _tell_rescue(parts: FlightParts, error: BaseException, found: Rescued) -> None:
+def _tell_rescue(parts: FlightParts, error: BaseException, found: Rest) -> None:
     text = f"{type(error).__name__}{RESCUE}{RESCUED[found.finding]}"
     if found.touchdown is not None and found.touchdown.is_hard:
         text += f"; it {found.touchdown.text}"
@@ -204,7 +203,7 @@ def _mission(
     state: PlannerState | None = None
     passed: list[Event] = []
     redone = log_noted = False
-    told = inputs.perception.calibration.newest  # to the log
+    logged = inputs.perception.calibration.newest
     while True:
         now_s = clock.now()
         turns.begin(now_s)
@@ -219,7 +218,7 @@ def _mission(
         new, command = step_mission(before or start_mission(obs), obs, parts.profile)
         turns.decided(obs, new, command, outside)
         turns.lap()
-        overruled = new.phase in FLYING_PHASES and watchdog.overruled_s > late_s
+        overruled = new.phase.is_flying and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > HUNG_S):
             redone = True  # nothing that was decided before a hang is sent after it
             turns.redone(inputs, obs, new, command)
@@ -232,7 +231,7 @@ def _mission(
         inputs.sends_sights = state.blind_s is None
         if state.astray and parts.positions is not None and not (before and before.astray):
             parts.positions.stop()
-            inputs.perception.motion = drop_sights(inputs.perception.motion)
+            inputs.perception.drop_sights()
         events = events_of(before, state, obs, parts.profile)
         if obs.log_problem is not None and not log_noted:
             log_noted = True
@@ -247,13 +246,20 @@ def _mission(
             for watcher in parts.watchers:
                 watcher.event(event)
         turn = turns.flown(inputs, obs, state, command, outside)
-        tick = _tick(inputs, state, command, obs, told, turn)
-        told = inputs.perception.calibration.newest
+        newest = inputs.perception.calibration.newest
+        tick = Tick(
+            obs.t_s, obs.telemetry, inputs.output, obs.target, state, command, obs.loop_late_s,
+            obs.camera_age_s, obs.t_s - obs.telemetry.t_s + obs.telemetry.behind_s,
+            None if newest is logged else newest, obs.delay_s, turn.outside, turn,
+        )  # fmt: skip
+        logged = newest
         for watcher in parts.watchers:
             watcher.tick(tick)
-        if is_mission_over(state):
+        if state.phase.is_over:
             watchdog.end(motors_off=state.phase is not Phase.ABORTED)
-            return report_of(state, obs, tuple(passed), inputs)
+            return flight_report(
+                state, obs, parts.profile, tuple(passed), inputs.perception.consistency()
+            )
         due_s += period_s
         if due_s < now_s:
             due_s = now_s + period_s  # never try to catch up with a burst of old ticks
@@ -261,15 +267,15 @@ def _mission(
 
 
 def _outside(parts: FlightParts, inputs: FlightInputs, now_s: float) -> FeedStatus | None:
-    """How it goes with positions from outside, or by the target; None where decks measure."""
+    """Status of the external positions, or of those by the target; None where decks measure."""
     if inputs.target_positioning is not None:
         return inputs.target_positioning.status(now_s)
     return None if parts.positions is None else parts.positions.status(now_s)
 
 
 def _present(parts: FlightParts, inputs: FlightInputs, began_s: float) -> float:
-    """The turn's time. Where camera or vision hung, it is the present, with what has arrived
-    meanwhile: a setpoint for the time before the hang would be a stale one."""
+    """The turn's time: after a hang of camera or vision the present, with what has arrived
+    meanwhile, since a setpoint for the time before the hang would be stale."""
     now_s = parts.clock.now()
     if now_s - began_s <= HUNG_S:
         return began_s
@@ -277,34 +283,8 @@ def _present(parts: FlightParts, inputs: FlightInputs, began_s: float) -> float:
     return now_s
 
 
-def _tick(
-    inputs: FlightInputs,
-    state: PlannerState,
-    command: Command,
-    obs: Observation,
-    told: Consistency | None,
-    turn: Turn,
-) -> Tick:
-    newest = inputs.perception.calibration.newest
-    return Tick(
-        obs.t_s,
-        obs.telemetry,
-        inputs.output,
-        obs.target,
-        state,
-        command,
-        obs.loop_late_s,
-        obs.camera_age_s,
-        obs.t_s - obs.telemetry.t_s + obs.telemetry.behind_s,
-        None if newest is told else newest,
-        obs.delay_s,
-        turn.outside,
-        turn,
-    )
-
-
 def _is_blind(state: PlannerState | None) -> bool:
-    """Against the ceiling nothing is steered by the picture, and it shows no target."""
+    """True against the ceiling, where the picture shows no target and steers nothing."""
     return state is not None and state.phase is Phase.COMPLETE
 
 
@@ -324,77 +304,3 @@ def _observe(
         position_age_s=0.0 if outside is None else outside.age_s,
         position_problem=None if outside is None else outside.problem,
     )
-
-
-# --- What is told of a flight: what happened in a turn, and how it ended -----------------------
-
-
-def events_of(
-    before: PlannerState | None, state: PlannerState, obs: Observation, profile: Profile
-) -> list[Event]:
-    """What happened in this turn; `before` is None in the first."""
-    events: list[Event] = []
-    if before is None:
-        start = start_mission(obs)
-        events.append(Event(obs.t_s, EventKind.PHASE, start.reason, start.phase))
-        if not is_battery_reading(obs.telemetry.battery_v):
-            grace_s = profile.safety.battery_stale_s
-            text = f"no battery reading: landing after {grace_s:.0f} s at most"
-            events.append(Event(obs.t_s, EventKind.NOTE, text, start.phase))
-        before = start
-    if state.phase is not before.phase:
-        entered = Event(
-            obs.t_s, EventKind.PHASE, state.reason, state.phase, state.row, state.severity
-        )
-        events.append(entered)
-    elif state.hold and not before.hold:
-        events.append(
-            Event(obs.t_s, EventKind.HOLD, state.hold, state.phase, severity=Severity.HOLD)
-        )
-    elif state.stale_s == obs.t_s and before.stale_s != before.t_s and not state.hold:
-        # Where it is not held for it the pilot is told all the same.
-        text = unplaced_text(Context(state, obs, profile))
-        events.append(Event(obs.t_s, EventKind.NOTE, text, state.phase))
-    return events
-
-
-def report_of(
-    state: PlannerState, obs: Observation, passed: tuple[Event, ...], inputs: FlightInputs
-) -> FlightReport:
-    seen, camera = inputs.perception.consistency(), inputs.profile.camera
-    c = Context(state, obs, inputs.profile)
-    return FlightReport(
-        phase=state.phase,
-        outcome=state.outcome or Outcome.SAFETY,
-        reason=_reason(state, obs, passed),
-        attempts=_attempts(state),
-        duration_s=obs.t_s - state.started_s,
-        # The telemetry at hand is older than an emergency stop, which always locks.
-        locked=obs.telemetry.has(LOCKED) or state.outcome is Outcome.EMERGENCY,
-        history=passed,
-        findings=None if seen is None else flight_findings(seen, camera),
-        contact=contact_error_of(c),
-        touchdown=touchdown_of(c),
-    )
-
-
-def _attempts(state: PlannerState) -> int:
-    """The failed ones, and the one that hangs; a hold that is noticed once they are used up
-    has been counted as failed."""
-    hangs = state.phase is Phase.PERCHED and state.outcome is not Outcome.ATTEMPTS_USED_UP
-    return state.attempts + int(hangs)
-
-
-def _reason(state: PlannerState, obs: Observation, passed: tuple[Event, ...]) -> str:
-    """Why it ended so, with what led to the landing where there was one."""
-    why = next((e.reason for e in reversed(passed) if e.phase is Phase.LANDING), "")
-    if state.phase in (Phase.LANDED, Phase.PERCHED):
-        return f"{why}; {state.reason}" if why else state.reason
-    if state.row != "landing-timeout":
-        return state.reason
-    age_s = obs.t_s - obs.telemetry.t_s
-    cause = "by its telemetry the vehicle still flies"
-    if age_s > FRESH_S:
-        cause = f"nothing was heard from the vehicle for {age_s:.1f} s"
-    text = f"the landing was ordered but could not be confirmed: {cause}"
-    return f"{why}; {text}" if why else text

@@ -8,18 +8,22 @@ import numpy as np
 
 from perchctl.errors import SafetyAbort, TimedOut, distinct_figures
 from perchctl.flight.criteria import (
+    AtRest,
     Problem,
+    apart,
     battery_problem,
     forbidden_problem,
     height_problem,
+    measurer,
+    missing,
     motion_problem,
     not_allowed_problem,
     tilt_problem,
     too_near_problem,
     unmeasured_problem,
     unsettled_problem,
+    world_problem,
 )
-from perchctl.flight.outside import AtRest, apart, measurer, missing, world_problem
 from perchctl.geometry import Place, rot_z
 from perchctl.link import Link
 from perchctl.positioning import FeedStatus
@@ -45,8 +49,8 @@ def refuse(telemetry: Telemetry | None, profile: Profile) -> None:
 
 
 def refuse_unmeasured(link: Link, profile: Profile, *, positions: bool) -> None:
-    """Raises SafetyAbort where nothing would tell the vehicle its position. `positions`: those
-    of the profile's motion capture are being sent."""
+    """Raises SafetyAbort without any position source. `positions`: those of the profile's motion
+    capture are being sent."""
     if profile.positioning.by == "deck":
         _refuse(unmeasured_problem(link.measured_by(), profile))
     elif profile.positioning.by == "mocap" and not positions:
@@ -60,17 +64,16 @@ def refuse_strange(
     now_s: float,
     at_rest: AtRest | None = None,
 ) -> None:
-    """Raises SafetyAbort for positions in another unit, or of another world or body. Held askew or
-    moved it is not judged, nor by anything old: capture and attitude are not of one moment.
-    `at_rest`: what has been seen in the turns before."""
+    """Raises SafetyAbort for positions in another unit, or of another world or body. A tilted or
+    moved vehicle is not judged, nor anything old. `at_rest`: the turns before."""
     if status is None or telemetry is None:
         return
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
-        return  # unknown: neither judged, nor is what was seen so far forgotten
+        return  # unknown: not judged, and nothing is forgotten
     stands = tilt_problem(telemetry, profile) is None and motion_problem(telemetry) is None
-    # What was sent last before a problem may have been elsewhere.
-    told = status.problem is None and status.age_s <= profile.positioning.hold_s
-    if stands and not told:
+    # The last position before a problem may have been elsewhere.
+    sent = status.problem is None and status.age_s <= profile.positioning.hold_s
+    if stands and not sent:
         return
     place = status.measured if stands else None
     if place is not None:
@@ -82,8 +85,8 @@ def refuse_strange(
 def refuse_out_of_view(
     target: Place | None, telemetry: Telemetry, profile: Profile, camera: CameraModel
 ) -> None:
-    """Raises SafetyAbort where the way up leads out of sight of a target that is the positioning
-    system. `target`: its place in the estimate's world, None where something else measures."""
+    """Raises SafetyAbort if the way up leads out of sight of a target that is the positioning
+    system. `target`: its place in the estimate's world; None if something else measures."""
     if target is not None:
         start_m = telemetry.position_m
         _refuse(out_of_view(target, start_m, telemetry.yaw_rad, profile, camera))
@@ -100,8 +103,8 @@ def still_waiting_for(
     outside: FeedStatus | None = None,
     camera: CameraModel | None = None,
 ) -> str:
-    """What is missing yet, or empty when ready. Errors: TimedOut past the bound, and
-    SafetyAbort off the ground."""
+    """What is missing yet; empty when ready. Errors: TimedOut past the bound, SafetyAbort off the
+    ground."""
     limit_s, by_sight = profile.safety.estimator_wait_s, profile.positioning.by == "target"
     if telemetry is None:
         return _bounded("telemetry", waited_s, limit_s)
@@ -146,22 +149,21 @@ def _bounded(what: str, waited_s: float, limit_s: float) -> str:
     return what
 
 
-# --- Whether the target stays in view on the way up, where it is the positioning system. Pure ---
-# On the ground the way up is known: straight, then to `planner.approach_xy_m`. The higher the
-# vehicle, the less of the ceiling is in its picture; without the target it has no position.
+# --- Whether a target that is the positioning system stays in view on the way up. Pure -----------
+# The way up is known: straight, then to `planner.approach_xy_m`. The higher the vehicle, the less
+# of the ceiling is in its picture; without the target it has no position.
 
 
-LEAN_DEG = 5.0
-"""On its way up, and against a draught: nearer to the picture's edge, the target would leave it."""
-Start = tuple[float, float, float]
-"""Where it stands, in the world that the target's place is in."""
+LEAN_DEG = 5.0  # on its way up, and against a draught
+Start = tuple[float, float, float]  # where it stands, in the world of the target's place
 
 
 def out_of_view(
     target: Place, start_m: Start, yaw_rad: float, profile: Profile, camera: CameraModel
 ) -> Problem | None:
-    """From the take-off height over the start, or from `planner.approach_xy_m`, no marker would be
-    wholly in the picture of a vehicle that leans a little. `yaw_rad`: its heading at the start."""
+    """A way up that loses the target: no marker would be wholly in the picture of a vehicle that
+    leans a little, at take-off height over the start or over `planner.approach_xy_m`. `yaw_rad`:
+    its heading at the start."""
     planner, (x, y, z) = profile.planner, start_m
     top_m = z + planner.takeoff_height_m
     over = _seen_leaning((x, y, top_m), yaw_rad, target, profile, camera)
@@ -192,7 +194,7 @@ def out_of_view(
 def target_from(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetFromBody:
-    """The target from a place in its world, the vehicle level."""
+    """The target as seen from a level vehicle at a place in its world."""
     return sight_from(
         np.array(body_m), yaw_rad, target.position_m, target.yaw_rad,
         profile.target, camera, profile.camera.mount,
@@ -202,8 +204,8 @@ def target_from(
 def _seen_leaning(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetFromBody:
-    """`target_from` of a vehicle that leans so that the target goes towards the picture's edge: as
-    if it stood farther away."""
+    """`target_from` of a vehicle that leans so that the target moves to the picture's edge, as if
+    it stood farther away."""
     level = target_from(body_m, yaw_rad, target, profile, camera)
     aside_m = math.hypot(*level.aside_m)
     if not (level.whole and aside_m > 1e-9):
@@ -219,14 +221,14 @@ def _leant_m(sight: TargetFromBody) -> float:
 
 
 def place_seen(target: TargetEstimate, profile: Profile) -> Place:
-    """Of a target that a level vehicle sees: in the world in which it stands at the origin, at the
-    ground's height, with its front along x."""
+    """Place of a target that a level vehicle sees, in a world with the vehicle at the origin, at
+    the ground's height, its front along x."""
     feet_m = np.array([0.0, 0.0, profile.safety.ground_z_m])
     return Place(feet_m + target.e_m + np.asarray(profile.vehicle.gear_body_m), target.e_yaw_rad)
 
 
 def _too_far(sight: TargetFromBody, profile: Profile, camera: CameraModel) -> str:
-    """How far aside it would be, and how far it might be."""
+    """How far aside the target would be, and how far it may be."""
     if not sight.height_m > 0.0:
         return "it would be no higher than the camera"
     aside_m, most = math.hypot(*sight.aside_m), ""
@@ -247,8 +249,7 @@ def not_in_view(
     profile: Profile,
     camera: CameraModel | None,
 ) -> Problem:
-    """What is said of a target that has not been measured from the ground. `note`: what is
-    remarkable about the pictures."""
+    """A target that has not been measured from the ground. `note`: a remark on the pictures."""
     if seen is not None and seen.tracked:
         return Problem(
             f"it is seen, and was not measured at rest yet (the accelerometer reads "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from typing import Protocol, runtime_checkable
 
 from perchctl.flight.clock import Clock, SimulatedClock, WallClock
 from perchctl.flight.inputs import FlightInputs
@@ -12,9 +13,7 @@ from perchctl.mission import (
     Observation,
     PlannerState,
     Turn,
-    TurnRole,
     TurnTiming,
-    TurnWatcher,
     Watcher,
 )
 from perchctl.positioning import FeedStatus
@@ -22,8 +21,18 @@ from perchctl.values import replace
 from perchctl.vehicle import Command
 
 
+@runtime_checkable
+class TurnWatcher(Watcher, Protocol):
+    """A watcher of the turns without a tick, too: before take-off, and those decided anew."""
+
+    def turn(self, turn: Turn) -> None: ...
+
+
+Decision = tuple[PlannerState, Command, FeedStatus | None]
+
+
 class Turns:
-    """Counts them. In lockstep there are no timings: the same seed gives the same turns."""
+    """Counts the turns. In lockstep there are no timings: the same seed gives the same turns."""
 
     def __init__(
         self,
@@ -32,69 +41,67 @@ class Turns:
         wall: Callable[[], float] = time.perf_counter,
     ) -> None:
         self._wall = wall if isinstance(clock, (WallClock, SimulatedClock)) else None
-        self._told = [w for w in watchers if isinstance(w, TurnWatcher)]
+        self._watchers = [w for w in watchers if isinstance(w, TurnWatcher)]
         self._count = 0
         self._began_s = 0.0
         self._laps_s = [0.0]
-        self._undecided: Observation | None = None
-        self._untold: tuple[Observation, PlannerState, Command, FeedStatus | None] | None = None
+        self._open: tuple[Observation, Decision | None] | None = None  # observed, not yet reported
 
     @property
-    def are_told(self) -> bool:
-        """Whether somebody records them."""
-        return bool(self._told)
+    def are_watched(self) -> bool:
+        """True if somebody records them."""
+        return bool(self._watchers)
 
     def begin(self, now_s: float) -> None:
+        """A turn begins."""
         self._began_s, self._laps_s = now_s, []
         self.lap()
 
     def lap(self) -> None:
-        """Begun; taken in; decided; sent."""
+        """Its next part is done: begun, taken in, decided, sent."""
         if self._wall is not None:
             self._laps_s.append(self._wall())
 
     def waiting(self, inputs: FlightInputs, now_s: float, outside: FeedStatus | None) -> None:
+        """A turn before take-off."""
         turn = Turn(
             self._counted(), "waiting", now_s, now_s, inputs.taken, inputs.poses,
-            outside=told_of(outside),
+            outside=external_positions(outside),
         )  # fmt: skip
-        self._tell(turn)
+        self._report(turn)
+
+    def observed(self, obs: Observation) -> None:
+        """The planner is about to decide on this."""
+        self._open = obs, None
+
+    def decided(
+        self, obs: Observation, new: PlannerState, command: Command, outside: FeedStatus | None
+    ) -> None:
+        """The planner has done its part: what fails from now on is not its fault."""
+        self._open = obs, (new, command, outside)
 
     def redone(
         self, inputs: FlightInputs, obs: Observation, new: PlannerState, command: Command
     ) -> None:
-        self._tell(self._turn("redone", inputs, obs, new, command, None))
-
-    def observed(self, obs: Observation) -> None:
-        """What is about to be decided on."""
-        self._undecided = obs
-
-    def decided(
-        self,
-        obs: Observation,
-        new: PlannerState,
-        command: Command,
-        outside: FeedStatus | None,
-    ) -> None:
-        """The planner has done its part: what fails from now on is not its fault."""
-        self._undecided, self._untold = None, (obs, new, command, outside)
+        """A turn that is not sent, and decided anew in the next one."""
+        self._report(replace(self.flown(inputs, obs, new, command, None), role="redone"))
 
     def failed(self, inputs: FlightInputs, error: BaseException) -> None:
-        """The flight broke off. Where the planner raised, tell what it was shown: by that its
-        fault can be found again. Where it had decided, tell what: it may have been sent."""
-        obs, untold = self._undecided, self._untold
-        self._undecided = self._untold = None
-        if untold is not None:
-            obs, new, command, outside = untold
-            turn = self._turn("flown", inputs, obs, new, command, told_of(outside))
-            self._tell(replace(turn, timing=None))  # by now the rescue's time is in it
-        elif obs is not None and isinstance(error, Exception):  # else it was only interrupted
-            self._tell(
-                Turn(
-                    self._counted(), "failed", self._began_s, obs.t_s, inputs.taken, inputs.poses,
-                    observation=obs, error=type(error).__name__,
-                )
+        """The flight broke off. If the planner raised, the turn holds what it was given; if it had
+        decided, what: the command may have been sent."""
+        if self._open is None:
+            return
+        obs, decision = self._open
+        if decision is not None:
+            turn = self.flown(inputs, obs, *decision)
+            self._report(replace(turn, timing=None))  # by now the rescue's time is in it
+        elif isinstance(error, Exception):  # else the planner was only interrupted
+            self._open = None
+            turn = Turn(
+                self._counted(), "failed", self._began_s, obs.t_s, inputs.taken, inputs.poses,
+                observation=obs, error=type(error).__name__,
             )  # fmt: skip
+            self._report(turn)
 
     def flown(
         self,
@@ -104,21 +111,11 @@ class Turns:
         command: Command,
         outside: FeedStatus | None,
     ) -> Turn:
-        return self._turn("flown", inputs, obs, new, command, told_of(outside))
-
-    def _turn(
-        self,
-        role: TurnRole,
-        inputs: FlightInputs,
-        obs: Observation,
-        new: PlannerState,
-        command: Command,
-        outside: ExternalPositions | None,
-    ) -> Turn:
-        self._undecided = self._untold = None
+        """The turn, once its command was sent."""
+        self._open = None
         return Turn(
             number=self._counted(),
-            role=role,
+            role="flown",
             began_s=self._began_s,
             t_s=obs.t_s,
             taken=inputs.taken,
@@ -129,7 +126,7 @@ class Turns:
             row=new.row,
             held=bool(new.hold),
             attempts=new.attempts,
-            outside=outside,
+            outside=external_positions(outside),
             timing=self._timing(),
             outcome=new.outcome,
             reason=new.reason,
@@ -138,7 +135,7 @@ class Turns:
     def _timing(self) -> TurnTiming | None:
         if self._wall is None:
             return None
-        # Of a turn that was not sent, or not decided, that part took no time.
+        # A part that a turn did not come to took no time.
         laps_s = [*self._laps_s, *[self._laps_s[-1]] * 3]
         began_s, seen_s, decided_s, sent_s = laps_s[:4]
         return TurnTiming(
@@ -149,12 +146,13 @@ class Turns:
         self._count += 1
         return self._count - 1
 
-    def _tell(self, turn: Turn) -> None:
-        for watcher in self._told:
+    def _report(self, turn: Turn) -> None:
+        for watcher in self._watchers:
             watcher.turn(turn)
 
 
-def told_of(status: FeedStatus | None) -> ExternalPositions | None:
+def external_positions(status: FeedStatus | None) -> ExternalPositions | None:
+    """The feed's status as the log has it."""
     if status is None:
         return None
     return ExternalPositions(status.age_s, status.problem, status.sent, status.rate_hz, status.pose)

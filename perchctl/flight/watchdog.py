@@ -1,19 +1,32 @@
-"""What is sent while the flight loop is silent, and the operator's stop: decided here, sent by the
-link (`Link.guard`) from where the loop's hanging does not reach.
+"""Who lands in the loop's place: the watchdog of a silent loop, and the rescue after an error.
 
-From `REPEAT_AFTER_S` of silence on the last position is held: never above where the vehicle is,
-so it neither climbs nor presses. While it sinks, a setpoint above stays: it brakes. From
-`safety.loop_late_land_s` on, or when the operator asks for it, or where the loop was already on
-its way down or had put the weight on the magnet, the `perchctl.mission.lander` goes on in the
-loop's place.
+The watchdog decides here what the link sends (`Link.guard`) from where the loop's hanging does not
+reach. From `REPEAT_AFTER_S` of silence on the last position is held: never above the vehicle, so
+that it neither climbs nor presses. While it sinks, a setpoint above stays: it brakes. From
+`safety.loop_late_land_s` on, or on the operator's order, or where the loop was already on its way
+down or had put the weight on the magnet, the lander of `perchctl.mission` goes on in its place.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
-from perchctl.mission import Observation, Operator, Phase, PlannerState, step_landing
+from perchctl.flight.clock import Clock
+from perchctl.link import Link, SentCallback, ignore_sent
+from perchctl.mission import (
+    Observation,
+    Operator,
+    Phase,
+    PlannerState,
+    Rest,
+    SentCommand,
+    VisualInertialMotion,
+    rest_of,
+    step_landing,
+)
 from perchctl.perception import History, add_samples
 from perchctl.profile import Profile
 from perchctl.values import replace
@@ -28,26 +41,21 @@ from perchctl.vehicle import (
     knows_its_position,
 )
 
-REPEAT_AFTER_S = 0.3
-"""The vehicle levels out by itself at 0.5 s (docs/firmware.md, "When setpoints stop")."""
-STOP_AFTER_S = 0.1
-"""For so long the operator's stop is left to the loop, whose row records it."""
+REPEAT_AFTER_S = 0.3  # the vehicle levels out by itself at 0.5 s
+STOP_AFTER_S = 0.1  # for so long the operator's stop is left to the loop, which records it
 CUT_PERIOD_S, MAX_CUTS = 0.1, 50
 SINKING_MPS = -0.1
 STILL_MPS = 0.06
+LOOK_S = 0.5  # a rescue leaves a vehicle whose motors have been seen off for so long
 
 
 @dataclass(frozen=True, eq=False)
 class LastTick:
-    """The last tick of the loop whose command was sent.
+    """The last tick of the loop whose command was sent."""
 
-    `due_s`: when the next one is due, from which the loop measures its lateness. `command`: the
-    last that was streamed.
-    """
-
-    due_s: float
+    due_s: float  # when the next one is due, from which the loop measures its lateness
     state: PlannerState
-    command: Command
+    command: Command  # the last that was streamed
     obs: Observation
 
 
@@ -55,8 +63,8 @@ class Watchdog:
     """A `perchctl.link.protocol.Guard`. `tick`, `rescuing` and `end` are called by the loop's
     thread, `poll` by the link's; each writes its own fields.
 
-    `position_age_s` tells at a time how old the newest position from outside is. `overruled_s` is
-    how late the loop was when a landing was decided for it, else 0.
+    `position_age_s` gives the age of the newest external position at a time. `overruled_s` is how
+    late the loop was when a landing was decided for it, else 0.
     """
 
     def __init__(
@@ -66,7 +74,6 @@ class Watchdog:
         position_age_s: Callable[[float], float] = lambda now_s: 0.0,
     ) -> None:
         self._profile = profile
-        self._land_s = profile.safety.loop_late_land_s
         self._operator = operator
         self._position_age_s = position_age_s
         self._last: LastTick | None = None
@@ -91,7 +98,7 @@ class Watchdog:
         self._last = LastTick(due_s, state, self._streamed or command, obs)
 
     def rescuing(self) -> None:
-        """The loop has ended by an error; what is left is the operator's stop."""
+        """The loop has ended by an error: only the operator's stop is left."""
         self._closing = True
 
     def end(self, *, motors_off: bool) -> None:
@@ -108,7 +115,7 @@ class Watchdog:
     def poll(
         self, now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
     ) -> Command | None:
-        """What has to be sent now in the loop's place, if anything."""
+        """The command that has to be sent now in the loop's place; None for none."""
         last = self._last
         if self._cut_ordered:
             return self._cut(now_s, newest)
@@ -124,7 +131,7 @@ class Watchdog:
             self._history = self._held = self._way_down = None
             return None
         late_s = now_s - last.due_s
-        overruled = operator is Operator.LAND or late_s > self._land_s
+        overruled = operator is Operator.LAND or late_s > self._profile.safety.loop_late_land_s
         if overruled:
             self.overruled_s = max(self.overruled_s, late_s)
         obs = self._observed(now_s, last, newest, waiting)
@@ -147,7 +154,7 @@ class Watchdog:
         newest: Telemetry | None,
         waiting: Sequence[Telemetry],
     ) -> Observation:
-        """What is known now: the newest telemetry, and no picture."""
+        """The present observation: the newest telemetry, and no picture."""
         if self._history is None:
             self._history = History((last.obs.telemetry,), imu=last.obs.imu)
         new = [*waiting, *([] if newest is None else [newest])]
@@ -191,7 +198,7 @@ class Watchdog:
 
 
 def _is_on_its_way_down(state: PlannerState) -> bool:
-    """Also where the weight is on the magnet: its release goes on under watch."""
+    """True also while the weight is on the magnet: its release goes on, monitored."""
     return state.phase is Phase.LANDING or (
         state.phase is Phase.COMPLETE
         and (state.released_s is not None or state.stopped_s is not None)
@@ -207,3 +214,70 @@ def _held_place(last: LastTick, known: Telemetry | None) -> PositionSetpoint:
             return replace(last.command, z_m=min(z_m, z))
         case _:
             return PositionSetpoint(x, y, z, sample.yaw_rad)
+
+
+# --- After an error: the last resort of every error path ---------------------------------------
+
+
+def rescue(
+    link: Link,
+    clock: Clock,
+    profile: Profile,
+    operator: Callable[[], Operator],
+    state: PlannerState | None,
+    history: History,
+    position_age_s: Callable[[float], float] = lambda now_s: 0.0,
+    told: SentCallback = ignore_sent,
+    felt: VisualInertialMotion | None = None,
+) -> Rest:
+    """Land whatever still flies, without planner, camera and log, bounded by the landing's time.
+    Returns where the vehicle came to rest, once its motors have been seen off.
+
+    Args:
+        state: the planner's last; None before its first tick.
+        history: the telemetry so far.
+        position_age_s: age of the newest external position at a time; by the target none is sent
+            any more.
+        told: called with what was sent.
+        felt: the motion that pictures and accelerometer last agreed on.
+    """
+
+    def send(command: Command) -> None:
+        with suppress(Exception):  # the link may be what failed: the next one goes out all the same
+            link.send(command)
+            told(SentCommand(clock.now(), "rescue", command))
+
+    by_target = profile.positioning.by == "target"
+    start_s, period_s = clock.now(), 1.0 / profile.link.loop_hz
+    while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
+        if operator() is Operator.STOP:
+            send(EmergencyStop())  # the link's guard repeats it
+            return Rest()
+        with suppress(Exception):
+            history = add_samples(history, link.telemetry(), profile.safety)
+        newest = history.newest
+        if newest is not None:
+            obs = Observation(
+                t_s=now_s,
+                telemetry=newest,
+                link_problem=link.problem(now_s),
+                jumped=history.jumped,
+                turned_rad=history.turned_rad,
+                position_age_s=math.inf if by_target else position_age_s(now_s),
+                imu=history.imu,
+                felt=felt,
+            )
+            state, command = step_landing(state or _before_take_off(obs), obs, profile)
+            if not isinstance(command, Idle):
+                send(command)
+            rest = rest_of(state, obs, profile, LOOK_S)
+            if rest is not None:
+                return rest
+        clock.wait_until(now_s + period_s)
+    return Rest()
+
+
+def _before_take_off(obs: Observation) -> PlannerState:
+    """The state if the planner's first tick was the one that failed."""
+    position_m = obs.telemetry.position_m
+    return PlannerState(t_s=obs.t_s, started_s=obs.t_s, ground_m=position_m, entry_m=position_m)

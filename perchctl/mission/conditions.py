@@ -12,37 +12,24 @@ from collections.abc import Callable
 from perchctl.mission.context import Context
 from perchctl.mission.state import Condition, Phase
 from perchctl.profile import Profile
-from perchctl.vehicle import FULL_THRUST
+from perchctl.vehicle import FLYING, FULL_THRUST, LOW_POWER, NO_BATTERY_READING_V
 
 DESCENDED_M, HELD_WITHIN_M = 0.1, 0.1
-CARRIED_ON_MPS = 0.1
-"""By so much the height of a pressed vehicle may run away from the last sight's."""
-TOUCHES_M = 0.001
-"""By so much the touch itself moves the gear, whatever was known of it before."""
-SHAKEN_M, SLIDES_MPS = 0.002, 0.01
-"""An estimate by decks is off by so much after the blow on the ceiling, and by so much more for
-each second without a sight."""
-DRIFTED_M = 0.02
-"""So far the estimate may have drifted up from the contact, and a slip counts all the same."""
-PRESSED_M = 0.08
-"""A setpoint so far above a vehicle that stands still presses it against something."""
+CARRIED_ON_MPS = 0.1  # a pressed vehicle's height may run away from the last sight's by this
+TOUCHES_M = 0.001  # by which the touch itself moves the gear
+SHAKEN_M, SLIDES_MPS = 0.002, 0.01  # error by decks: from the blow, and for each second unseen
+DRIFTED_M = 0.02  # a slip counts though the estimate has drifted up from the contact by this
+PRESSED_M = 0.08  # a setpoint so far above a vehicle that stands still presses it
 HARD_CLIMB_MPS = 0.27
-BELOW_M = 0.3
-"""A target on the ceiling that seems so far below the vehicle is not there."""
-KNOCKED_MPS = 0.5
-"""Sideways, under the target: no draught gives a held vehicle so much."""
-OTHERWISE_MPS = 0.15
-"""True positions make at most 0.07, also those that are 0.15 s late."""
-SATURATED = 0.98
-"""Of the largest thrust: from here on nothing tells how much more it takes."""
-LITTLE_LEFT = 0.93
-"""A hover thrust above this part of the largest: full thrust is no sign of pressing then."""
-SUPERVISOR_S = 5.0
-"""The flying bit outlives the motors by 2 s (docs/firmware.md, "Supervisor")."""
-PROVABLE = 0.99
-"""Of the thrust that presses: so much at most is asked of a contact."""
-STILL_MOTORS_THRUST = 5000
-"""At and below it the motors stand still (docs/firmware.md, "Release in raw mode")."""
+BELOW_M = 0.3  # no target on the ceiling can be so far below the vehicle
+KNOCKED_MPS = 0.5  # sideways, under the target: no draught gives a held vehicle so much
+OTHERWISE_MPS = 0.15  # true positions make at most 0.07, also those that are 0.15 s late
+SATURATED = 0.98  # of the full thrust: how much more it takes is unknown
+LITTLE_LEFT = 0.93  # of the full thrust: hovering on more, full thrust is no sign of a press
+SUPERVISOR_S = 5.0  # the flying bit outlives the motors by 2 s (docs/firmware.md, "Supervisor")
+PROVABLE = 0.99  # of the pressing thrust: a contact's proof asks for no more
+STILL_MOTORS_THRUST = 5000  # and less stops them (docs/firmware.md, "Release in raw mode")
+FALLING_MPS = -0.05
 
 
 def _aligned(c: Context) -> bool:
@@ -73,8 +60,8 @@ def _near_standoff(c: Context) -> bool:
 
 
 def _moves_otherwise(c: Context) -> bool:
-    """The positions of a motion capture lead the estimate elsewhere than the vehicle feels to go:
-    mirrored, turned or swapped axes, which a vehicle at rest cannot tell."""
+    """The estimate follows a motion capture whose axes are mirrored, turned or swapped, against
+    the accelerometer. A vehicle at rest cannot show it."""
     by_capture = c.profile.positioning.by == "mocap"
     return by_capture and math.hypot(*c.state.reckoning.beside_mps) > OTHERWISE_MPS
 
@@ -82,12 +69,10 @@ def _moves_otherwise(c: Context) -> bool:
 def _contact(c: Context) -> bool:
     """Position, acceleration and thrust together (fault 40).
 
-    The gear is where the target is and has stopped; the accelerometer reads the
-    one g of a body at rest; yet the thrust is above what hovering takes, so the
-    ceiling must be carrying the difference.
-    Where the target is the positioning system, its place is the last sight's, carried on; and
-    that nothing climbs is felt, since an impact leaves the estimated speed a decimetre a second
-    wrong (docs/firmware.md, "After the impact").
+    The gear has stopped at the target's height, the accelerometer reads one g, and the thrust is
+    above what hovering takes: the ceiling must carry the difference. By the target alone, the
+    height is the last sight's, carried on, and the accelerometer shows that nothing climbs: an
+    impact spoils the estimated speed (docs/firmware.md, "After the impact").
     """
     perch, tel = c.profile.planner.perch, c.obs.telemetry
     steady = abs(tel.velocity_mps[2]) <= perch.contact_speed_mps and c.placed
@@ -103,17 +88,16 @@ def _contact(c: Context) -> bool:
 
 
 def unseen_s(c: Context) -> float:
-    """Since the exposure of the last sight."""
+    """Seconds since the exposure of the last sight."""
     return max(0.0, c.obs.t_s - c.state.reckoning.sight_s)
 
 
 def contact_aside_m(c: Context) -> tuple[float, float]:
-    """How far the gear is from the target's axis, and the standard deviation of that.
+    """Distance of the gear from the target's axis, and its standard deviation.
 
-    By decks the place of the last sight is carried on by an estimate that slides, and that the blow
-    on the ceiling shakes; where no position comes, `reckoned` has counted that already. A step of
-    the estimate since the last sight makes the place unsure by as much: before it or after it the
-    estimate was wrong."""
+    By decks, the last sight is carried on by an estimate that slides and that the blow on the
+    ceiling shakes; without positions `reckoned` has counted that already. A step of the estimate
+    since the last sight makes the place unsure by as much."""
     reckoning = c.state.reckoning
     sigma_m = math.hypot(reckoning.aside_sigma_m, TOUCHES_M, *reckoning.stepped_m)
     if c.profile.positioning.by == "deck" and c.placed:
@@ -122,9 +106,9 @@ def contact_aside_m(c: Context) -> tuple[float, float]:
 
 
 def touched_aside_m(c: Context) -> tuple[float, float] | None:
-    """The same as it was when it touched something at the target's height and backed off: what has
-    not left since is still there, wherever decks let the estimate slide to. None where it has left,
-    and where a sight of now or a motion capture tells its place."""
+    """`contact_aside_m` as it was when the gear touched something at the target's height and
+    backed off; what has not left since is still there. None after it left, and where a sight of
+    now or a motion capture gives the place."""
     state = c.state
     if state.phase is not Phase.RECOVER or state.contact_aside_m is None or c.fresh:
         return None
@@ -137,36 +121,36 @@ def touched_aside_m(c: Context) -> tuple[float, float] | None:
 
 
 def contact_within_m(c: Context) -> float:
-    """How far from the target's height a gear may seem to be that touches it: the contact's
-    tolerance, and what the estimate may have drifted by since the last sight, bounded."""
+    """Tolerance of the target's height for a gear in contact, with the estimate's bounded drift
+    since the last sight."""
     planner = c.profile.planner
     drift_mps = CARRIED_ON_MPS if c.by_sight else planner.landing.drift_mps
     return planner.perch.contact_z_m + min(planner.perch.contact_z_m, drift_mps * unseen_s(c))
 
 
 def is_at_target(c: Context) -> bool:
-    """Whether the gear is where the target's magnet can hold it: at its height, and within the
-    magnet's radius of its axis. What is not known is not there."""
+    """True if the gear is at the target's height and within the magnet's radius of its axis, all
+    known well enough."""
     aside_m, sigma_m = contact_aside_m(c)
     near = aside_m + sigma_m <= c.profile.planner.perch.contact_xy_m
     return near and abs(c.error_z_m) <= contact_within_m(c)
 
 
 def press_thrust(profile: Profile) -> float:
-    """The most that a press can have."""
+    """The largest thrust that a press can have."""
     perch = profile.planner.perch
     return float(perch.thrust) if perch.mode == "raw" else FULL_THRUST
 
 
 def contact_thrust(c: Context) -> float:
-    """What proves a contact: more than hovering takes, as far as there is more."""
+    """The thrust that proves a contact: more than hovering takes, as far as there is more."""
     wanted = c.profile.planner.perch.contact_thrust_ratio * c.state.hover_thrust
     return min(wanted, PROVABLE * press_thrust(c.profile))
 
 
 def hovers(c: Context) -> bool:
-    """Whether the thrust is what hovering takes: carried by nothing, pressed to nothing, not
-    at its limit, and hardly accelerated."""
+    """True if the thrust is what hovering takes: the vehicle is neither carried nor pressed, not
+    at its thrust's limit, and hardly accelerated."""
     tel, setpoint = c.obs.telemetry, c.state.setpoint
     vz = tel.velocity_mps[2]
     stuck = setpoint is not None and setpoint.z_m - tel.position_m[2] > PRESSED_M and vz < 0.05
@@ -183,33 +167,27 @@ def hovers(c: Context) -> bool:
 
 def _magnet_holds(c: Context) -> bool:
     """The vehicle stays up on a thrust that could not carry it."""
-    held = _is_carried(c) and not _slipping(c)
-    return held and (c.placed or _still(c))
+    return _is_carried(c) and not _slipping(c) and (c.placed or _still(c))
 
 
 def _is_carried(c: Context) -> bool:
-    """Whether the thrust could not carry the vehicle."""
+    """True if the thrust could not carry the vehicle."""
     most = c.profile.planner.complete.hold_ratio * c.state.hover_thrust
     return c.thrust_is_known and c.state.hover_thrust > 0 and c.obs.telemetry.thrust <= most
 
 
 def _slipping(c: Context) -> bool:
-    """Falling away from the proven contact, by position or by acceleration.
-
-    With the motors still, at the first sign: a fall is caught at the cost of the height it
-    has made by then (docs/firmware.md, "Catching a slip")."""
+    """Falling away from the proven contact, by position or by acceleration."""
     complete, tel = c.profile.planner.complete, c.obs.telemetry
-    if c.state.contact_z_m is None:
-        return False
-    if not c.sinks(complete.slip_mps):
+    if c.state.contact_z_m is None or not c.sinks(complete.slip_mps):
         return False
     above_m = tel.position_m[2] - c.state.contact_z_m
     return not c.placed or above_m < DRIFTED_M or tel.acc_z_g < complete.slip_acc_g
 
 
 def _still(c: Context) -> bool:
-    """Not moving, and carried by something: the accelerometer reads one g. It alone tells while
-    no position corrects the speed."""
+    """Not moving, and carried by something: the accelerometer reads one g. While no position
+    corrects the speed, it alone counts."""
     tel = c.obs.telemetry
     at_rest = abs(tel.acc_z_g - 1.0) <= c.profile.planner.perch.contact_acc_g
     return at_rest and (abs(tel.velocity_mps[2]) < 0.05 or not c.placed)
@@ -226,11 +204,10 @@ def _weight_hangs(c: Context) -> bool:
 
 
 def _hanging(c: Context) -> bool:
-    """Held up by something, wherever the mission is: still, off the floor, on a thrust that could
-    not carry the vehicle. Whether that is the target's magnet, `is_at_target` tells.
+    """Held up by something: still, off the floor, on a thrust that could not carry the vehicle.
+    `is_at_target` tells if that is the target's magnet.
 
-    Where no position comes from outside nothing tells a magnet from the floor. Either carries
-    it, and what follows, a slow release under watch, suits both."""
+    Without a position a magnet looks like the floor; the slow release that follows suits both."""
     tel, complete = c.obs.telemetry, c.profile.planner.complete
     if not c.placed:
         return _is_carried(c) and _still(c)
@@ -264,24 +241,21 @@ def _estimated(c: Context) -> bool:
 
 
 def _tilted(c: Context) -> bool:
-    """By attitudes that are fresh; the position's packet does not matter to it."""
-    safety = c.profile.safety
-    if c.obs.t_s - c.obs.telemetry.t_s > safety.proof_age_s:
-        return False
-    return c.tilt_rad > math.radians(safety.max_tilt_deg)
+    """By a fresh attitude, however old the position is."""
+    return c.imu_proves and c.tilt_rad > math.radians(c.profile.safety.max_tilt_deg)
 
 
 def _down(c: Context) -> bool:
-    """Motors off by the telemetry, and the supervisor agrees that nothing flies; its word is
-    old where it has not agreed for long."""
+    """Motors off by the telemetry, and the supervisor agrees that nothing flies, or has not
+    changed its word for long."""
     stopped_s = c.state.stopped_s
     long_off = stopped_s is not None and c.obs.t_s - stopped_s > SUPERVISOR_S
-    return c.obs.telemetry.thrust < 1 and (not c.flying or long_off)
+    return c.obs.telemetry.thrust < 1 and (not c.obs.telemetry.has(FLYING) or long_off)
 
 
 def _on_floor(c: Context) -> bool:
-    """Low, or come down from where the landing began, since a drifting estimate has the floor
-    anywhere; not moving, and on a thrust that could not carry the vehicle."""
+    """Low, or come down from where the landing began (a drifting estimate may place the floor
+    anywhere); not moving, on a thrust that could not carry the vehicle."""
     near_target = c.obs.target is not None and abs(c.error_z_m) <= 0.3
     came_down_m = c.state.entry_m[2] - c.obs.telemetry.position_m[2]
     came_down = c.state.phase is Phase.LANDING and came_down_m > DESCENDED_M
@@ -292,9 +266,8 @@ def _on_floor(c: Context) -> bool:
 
 
 def _blocked(c: Context) -> bool:
-    """Pressed against something: the setpoint is above, the thrust at its limit or above
-    what hovering takes, and nothing moves. Where hovering takes nearly all there is, the limit
-    tells nothing."""
+    """Pressed against something: the setpoint is above, the thrust at its limit or above what
+    hovering takes, and nothing moves. If hovering takes nearly all thrust, that is no proof."""
     setpoint, tel, safety = c.state.setpoint, c.obs.telemetry, c.profile.safety
     if setpoint is None or setpoint.z_m - tel.position_m[2] < PRESSED_M:
         return False
@@ -307,8 +280,8 @@ def _blocked(c: Context) -> bool:
 
 
 def _carried(c: Context) -> bool:
-    """By what is felt alone: much more or much less than hovering takes, and one g over a steady
-    speed. In the air it would rise or sink, whatever late pictures say of its place."""
+    """By accelerometer and thrust alone: much more or much less than hovering takes, at one g and
+    a steady speed. In the air the vehicle would rise or sink."""
     tel, perch, hover = c.obs.telemetry, c.profile.planner.perch, c.state.hover_thrust
     apart = (c.profile.safety.blocked_thrust_ratio - 1.0) * hover
     pressed = tel.thrust >= min(hover + apart, SATURATED * FULL_THRUST)
@@ -327,9 +300,17 @@ def _knocked(c: Context) -> bool:
 
 
 def _saturated(c: Context) -> bool:
-    """All the thrust there is, and it does not rise (nor is it just being caught)."""
+    """Full thrust, and the vehicle does not rise (nor is it just being caught)."""
     full = c.obs.telemetry.thrust >= SATURATED * FULL_THRUST
     return full and -0.15 < c.climb_mps < 0.05
+
+
+def _battery_is_low(c: Context) -> bool:
+    """By the firmware's word, or by a voltage that was measured at all."""
+    tel = c.obs.telemetry
+    known = tel.battery_v >= NO_BATTERY_READING_V
+    low = known and tel.battery_v < c.profile.safety.min_load_v
+    return tel.battery_state == LOW_POWER or low
 
 
 CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
@@ -354,43 +335,27 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.SATURATED: _saturated,
     Condition.UNSURE: lambda c: c.variance_m2 > c.profile.safety.flight_variance_m2,
     Condition.TARGET_BELOW: lambda c: c.fresh and c.error_z_m < -BELOW_M,
-    Condition.BATTERY_LOW: lambda c: c.battery_is_low,
+    Condition.BATTERY_LOW: _battery_is_low,
     Condition.OTHERWISE: _moves_otherwise,
 }
-KEPT_OVER_A_CHANGE = (
-    Condition.BATTERY_LOW,
-    Condition.TILTED,
-    Condition.UNSURE,
-    Condition.SATURATED,
-    Condition.CARRIED,
-    Condition.OTHERWISE,
+C = Condition
+KEPT_OVER_A_CHANGE = frozenset(
+    {C.BATTERY_LOW, C.TILTED, C.UNSURE, C.SATURATED, C.CARRIED, C.OTHERWISE}
 )
 """The vehicle's own, whatever the phase, and however it is held."""
-
-_NONE: frozenset[Condition] = frozenset()
-
 PROOFS = frozenset(
     {
-        Condition.HANGING,
-        Condition.CONTACT,
-        Condition.MAGNET_HOLDS,
-        Condition.WEIGHT_HANGS,
-        Condition.DOWN,
-        Condition.ON_FLOOR,
-        Condition.CARRIED,
-        Condition.SATURATED,
+        C.HANGING, C.CONTACT, C.MAGNET_HOLDS, C.WEIGHT_HANGS, C.DOWN, C.ON_FLOOR, C.CARRIED,
+        C.SATURATED,
     }
-)
-"""What may stop the motors or end a flight: it counts over fresh telemetry only."""
-
-BY_PLACE = frozenset({Condition.HANGING, Condition.CONTACT, Condition.ON_FLOOR})
-"""Proofs that say where the vehicle is: where its position comes from outside they count only
-while it does. The others have the accelerometer to go by."""
+)  # fmt: skip
+"""What may stop the motors or end a flight: these count over fresh telemetry only."""
+BY_PLACE = frozenset({C.HANGING, C.CONTACT, C.ON_FLOOR})
+"""Proofs that rest on the position: these count only while it is measured."""
 
 
 def conditions_since(c: Context) -> dict[Condition, float]:
-    """`PlannerState.since` of this tick. A condition seen while the vehicle is held
-    in place for a fault does not count, a proof in old telemetry neither."""
+    """`PlannerState.since` of this tick, without the conditions that are void in it."""
     old, now_s, void = c.state.since, c.obs.t_s, _void(c)
     return {
         name: old.get(name, now_s)
@@ -399,21 +364,41 @@ def conditions_since(c: Context) -> dict[Condition, float]:
     }
 
 
+def kept_over_a_change(since: dict[Condition, float]) -> dict[Condition, float]:
+    """Those of `PlannerState.since` that go on when the phase changes, or the vehicle is held."""
+    return {name: s for name, s in since.items() if name in KEPT_OVER_A_CHANGE}
+
+
 def _void(c: Context) -> frozenset[Condition]:
-    """Those that do not count in this tick, whatever they say: each asks for the freshness of what
-    it rests on. A position block that is dead voids what rests on a place, and no more."""
+    """Those that do not count in this tick, since what they rest on is not fresh."""
+    void: frozenset[Condition] = frozenset()
     if not c.imu_proves:
         void = PROOFS
-    elif c.placed:
-        void = _NONE
-    else:
+    elif not c.placed:
         void = BY_PLACE
         if c.by_sight and c.state.phase is Phase.PERCH:
-            void = void - {Condition.CONTACT}  # by the last sight's place, for a while
+            void = void - {C.CONTACT}  # by the last sight's place, for a while
     if c.state.phase is not Phase.LANDING:
         return void
-    # In a landing it begins a release, which goes on over fresh telemetry only: late telemetry
-    # may do that, where the vehicle would else hang there until it is cut.
-    # By the same right it goes on without a position.
+    # In a landing it begins a release, which goes on over fresh telemetry only. Late telemetry may
+    # begin it, and so may a missing position: else the vehicle would hang there until it is cut.
     late = c.attitude_age_s > c.profile.safety.telemetry_hold_s
-    return void | {Condition.HANGING} if late else void - {Condition.HANGING}
+    return void | {C.HANGING} if late else void - {C.HANGING}
+
+
+# --- What both the table and the way down ask ----------------------------------------------------
+
+
+def has_slipped(c: Context) -> bool:
+    """Debounced; in free fall at once: each 10 ms costs what full thrust takes 80 ms to give
+    back."""
+    tel, complete = c.obs.telemetry, c.profile.planner.complete
+    falls = c.state.released_s is not None and tel.acc_z_g < complete.slip_acc_g
+    if falls and c.imu_proves and c.climb_mps < FALLING_MPS:
+        return True
+    return c.held(C.SLIPPING) >= complete.slip_dwell_s
+
+
+def latency_changed(c: Context) -> bool:
+    """True if the pictures show the vehicle's motion later or earlier than assumed."""
+    return c.obs.mismatch is not None and c.obs.mismatch.later_s != 0.0

@@ -1,6 +1,4 @@
-"""What one tick means to the mission: state, observation and profile, and what follows from
-them: the vehicle's height and tilt, the target's error, the ages of what is known.
-"""
+"""One tick as the mission sees it: state, observation and profile, and what follows from them."""
 
 from __future__ import annotations
 
@@ -11,26 +9,25 @@ from functools import cached_property
 from perchctl.geometry import Array
 from perchctl.mission.state import Condition, Observation, PlannerState
 from perchctl.profile import Profile
-from perchctl.vehicle import FLYING, HL_ACTIVE, LOW_POWER, NO_BATTERY_READING_V
 
 FAR_BELOW_M = 0.5
-PUT_RIGHT_S = 0.5
-"""Once positions from outside come again, the estimate is drawn back to them for so long: its
-steps and its speed are not the vehicle's."""
-CORRECTED_S, BLOWN_MPS = 0.2, 0.2
-"""An estimate that the newest sights agree with is no farther from the felt speed: 0.06 m/s in
-flights without a fault."""
-ANSWER_S = 0.2
-"""A raw thrust that is ordered shows in the telemetry within that."""
-HANGING_S = 1.0
-"""For how long a thrust below the weight must be enough before it proves the magnet."""
+PUT_RIGHT_S = 0.5  # when external positions come again, the estimate is drawn back for so long
+CORRECTED_S, BLOWN_MPS = 0.2, 0.2  # of a newest sight, and 0.06 m/s in flights without a fault
+ANSWER_S = 0.2  # within it the telemetry shows an ordered raw thrust
+HANGING_S = 1.0  # a thrust below the weight must be enough for so long to prove the magnet
 
 
 @dataclass(frozen=True, eq=False)
 class Context:
+    """What the table's predicates and the phases' actions are given."""
+
     state: PlannerState
     obs: Observation
     profile: Profile
+
+    def with_state(self, state: PlannerState) -> Context:
+        """The same tick with another state."""
+        return Context(state, self.obs, self.profile)
 
     @property
     def in_phase_s(self) -> float:
@@ -49,69 +46,72 @@ class Context:
 
     @property
     def height_m(self) -> float:
-        """Above the ground the flight started from, in the estimate's world."""
+        """Above the ground that the flight started from, in the estimate's world."""
         ground = self.state.ground_m
         return self.obs.telemetry.position_m[2] - (ground[2] if ground else 0.0)
 
     @property
     def telemetry_age_s(self) -> float:
-        """Age of the oldest part: position and velocity come in a packet of their own, and what
-        reads the very same is as old as its first reading."""
+        """Age of its oldest part: position and velocity come in a packet of their own, and a
+        frozen reading is as old as its first one."""
         tel, imu = self.obs.telemetry, self.obs.imu
         return self.obs.t_s - tel.t_s + max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
 
     @property
     def attitude_age_s(self) -> float:
-        """Of attitude, acceleration, thrust and the supervisor's word, which come together."""
+        """Of attitude, acceleration, thrust and supervisor bits, which come together."""
         return self.obs.t_s - self.obs.telemetry.t_s
 
     @property
     def position_age_s(self) -> float:
-        """Of the newest position from outside that was sent to the vehicle; where it has them from
-        elsewhere, as by its decks, of the newest that corrected its estimate."""
+        """Of the newest external position that was sent to the vehicle; with decks, of the newest
+        correction of its estimate."""
         age_s = self.obs.position_age_s
         if self.profile.positioning.by == "deck":
             age_s = max(age_s, self.obs.imu.corrections.age_s(self.obs.t_s))
         return age_s
 
     @property
+    def position_is_stale(self) -> bool:
+        """True while no external position is fresh (fault 10)."""
+        return self.position_age_s > self.profile.positioning.hold_s
+
+    @property
     def proves(self) -> bool:
-        """Whether all of the telemetry is new enough to prove anything. What is old is unknown."""
+        """True if all of the telemetry is new enough to prove anything."""
         return self.telemetry_age_s <= self.profile.safety.proof_age_s
 
     @property
     def imu_proves(self) -> bool:
-        """Whether attitude, acceleration, thrust and the supervisor's word are new enough to prove
-        anything, whatever became of the position's packets."""
+        """`proves` for attitude, acceleration, thrust and supervisor bits alone."""
         return self.attitude_age_s <= self.profile.safety.proof_age_s
 
     @property
     def thrust_is_known(self) -> bool:
-        """Whether the thrust that is read follows what is ordered."""
+        """True if the thrust that is read follows what is ordered."""
         unanswered_s = self.state.unanswered_s
         return unanswered_s is None or self.obs.t_s - unanswered_s <= ANSWER_S
 
     @property
     def located(self) -> bool:
-        """Whether the estimated position and speed are believed. Not where no
-        position comes, or they have only just come again, nor by pictures that do not fit the
-        motion that is felt."""
+        """True if the estimated position and speed are believed: positions come, not only just
+        again, and pictures that give them fit the accelerometer."""
         if self.by_sight and self.obs.mismatch is not None:
             return False
-        if self.state.astray or self.position_age_s > self.profile.positioning.hold_s:
+        if self.state.astray or self.position_is_stale:
             return False
         stale_s = self.state.stale_s
         return stale_s is None or self.obs.t_s - stale_s > PUT_RIGHT_S
 
     @property
     def placed(self) -> bool:
-        """Whether the estimated position and speed can prove anything: believed, and fresh."""
+        """True if the estimated position and speed can prove anything: believed, and fresh."""
         return self.located and self.proves
 
     @property
     def is_blown(self) -> bool:
-        """Whether the accelerometer has felt a blow or a gust that the estimate has not, and no
-        sight since corrects it: sideways the firmware's estimator feels nothing."""
+        """True after a blow or gust that only the accelerometer has measured, until a sight
+        corrects the estimate: the firmware's estimator ignores sideways forces."""
         reckoning = self.state.reckoning
         if not self.by_sight or reckoning.imu is None or self.position_age_s <= CORRECTED_S:
             return False
@@ -120,7 +120,7 @@ class Context:
 
     @property
     def climb_mps(self) -> float:
-        """Vertical speed: the estimate's where that is believed and fresh, else as reckoned by the
+        """Vertical speed, by the estimate where that is believed and fresh, else by the
         accelerometer."""
         blind = self.state.blind_s is not None or not self.placed
         reckoning = self.state.reckoning
@@ -130,12 +130,12 @@ class Context:
 
     @property
     def by_sight(self) -> bool:
-        """Whether the target itself is the positioning system."""
+        """True if the target itself is the positioning system."""
         return self.profile.positioning.by == "target"
 
     def sinks(self, mps: float) -> bool:
-        """Faster than that. A speed that drifts, since no position corrects it, counts only where
-        the accelerometer shows, too, that something less than its weight carries the vehicle."""
+        """True if it sinks faster than that. A speed that no position corrects counts only while
+        the accelerometer reads less than the weight, too."""
         tel = self.obs.telemetry
         if self.climb_mps >= -mps:
             return False
@@ -143,30 +143,14 @@ class Context:
 
     @property
     def variance_m2(self) -> float:
-        """Of the position; 0 where the firmware tells none, endless where it is no number."""
+        """Of the position; 0 if the firmware reports none, infinite if it is no number."""
         variance = self.obs.telemetry.position_variance_m2 or 0.0
         return math.inf if math.isnan(variance) else variance
-
-    @property
-    def flying(self) -> bool:
-        return self.obs.telemetry.has(FLYING)
-
-    @property
-    def high_level_active(self) -> bool:
-        return self.obs.telemetry.has(HL_ACTIVE)
 
     @property
     def tilt_rad(self) -> float:
         tel = self.obs.telemetry
         return math.acos(max(-1.0, min(1.0, math.cos(tel.roll_rad) * math.cos(tel.pitch_rad))))
-
-    @property
-    def battery_is_low(self) -> bool:
-        tel = self.obs.telemetry
-        known = tel.battery_v >= NO_BATTERY_READING_V
-        return tel.battery_state == LOW_POWER or (
-            known and tel.battery_v < self.profile.safety.min_load_v
-        )
 
     # --- the target ------------------------------------------------------
 
@@ -202,7 +186,7 @@ class Context:
 
     @property
     def tracked(self) -> bool:
-        """Seen, or coasting within the filter's n_max frames."""
+        """True if the target is seen, or coasts within the filter's n_max frames."""
         return self.obs.target is not None and self.obs.target.tracked
 
     @property
@@ -218,7 +202,7 @@ class Context:
 
     @property
     def _fresh_limit_s(self) -> float:
-        # A frame is as old as the camera's latency when it arrives.
+        # On its arrival a frame is as old as the camera's latency.
         latency_s = self.profile.camera.start_latency_s + self.obs.delay_s
         return self.profile.planner.ascend.fresh_s + latency_s
 
@@ -231,8 +215,8 @@ class Context:
 
     @property
     def far_below_target(self) -> bool:
-        """By the camera nothing holds it where it is, though its height stands still: that may be
-        a positioning system's which has frozen."""
+        """True if the camera sees that nothing holds the vehicle where it is, whatever height a
+        frozen positioning system reports."""
         return self.target_m is not None and self.error_z_m > FAR_BELOW_M
 
     @property

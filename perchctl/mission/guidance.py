@@ -1,4 +1,10 @@
-"""Setpoints: where the body has to go, and how fast the setpoint may walk there."""
+"""Setpoints, the release at the ceiling, and the catch of a slip: for the phases and the lander.
+
+In position mode the onboard controller never goes below `THRUST_MIN`, so a magnet that carries half
+of the weight would pass for one that holds. Raw thrust goes on to where the motors stand still
+while the stream lives, ready to spin again (docs/firmware.md, "Release in raw mode"): the whole
+weight is put on the magnet and monitored, and only then the motors are stopped.
+"""
 
 from __future__ import annotations
 
@@ -6,26 +12,43 @@ import math
 
 from perchctl.geometry import rot_z, wrap_rad
 from perchctl.mission.context import Context
-from perchctl.mission.state import Phase, PlannerState
+from perchctl.mission.state import Condition, Phase, PlannerState
 from perchctl.values import replace
-from perchctl.vehicle import FULL_THRUST, PositionSetpoint
+from perchctl.vehicle import (
+    FULL_THRUST,
+    Command,
+    Idle,
+    PositionSetpoint,
+    RawThrust,
+    StopMotors,
+)
 
-HEIGHT_GAIN = 1.5
-HEIGHT_RATE_S = 0.25
-HEIGHT_LIMIT_M = 0.15
-POSITION_GAIN = 1.0
-VELOCITY_GAIN_S = 0.3
-STIFF_BELOW_M = 0.8
-STIFF_RANGE_M = 0.4
-STIFF_LIMIT_M = 0.1
-FLOOR_M = 0.05
-"""Above the ground, no lower; what is left is the vehicle's own landing."""
+Acted = tuple[PlannerState, Command]
+
+HEIGHT_GAIN, HEIGHT_RATE_S, HEIGHT_LIMIT_M = 1.5, 0.25, 0.15
+POSITION_GAIN, VELOCITY_GAIN_S = 1.0, 0.3
+STIFF_BELOW_M, STIFF_RANGE_M, STIFF_LIMIT_M = 0.8, 0.4, 0.1
+FLOOR_M = 0.05  # above the ground, no lower; what is left is the vehicle's own landing
 PRESSING_PART, PRESSING_RATIO = 0.95, 1.05
 UNPRESSED_MPS, UNPRESSED_M, FALLING_MPS = 0.05, 0.08, -0.3
 UNWIND_M, UNWIND_AWAY_M, UNPRESS_LIMIT_S = 1.0, 0.25, 4.0
-LIFTED_M = 0.1
-"""Below it a vehicle may still stand, and its height is not to be corrected."""
+LIFTED_M = 0.1  # below it a vehicle may still stand, and its height is not to be corrected
 FREE_SPEED_MPS = 10.0  # a speed limit that limits nothing
+SINK_MPS, LOWEST_M = 0.2, 0.3
+STILL_THRUST = 1000  # raw: the motors stand still and the stream lives (5000 and less)
+UNREAD_S = 1.5  # longer hang if thrust is not read: lost orders end in the firmware's cut at 2 s
+THRUST_MIN = 20000  # the least of position mode
+STOPS, STOP_PERIOD_S, STOP_AGAIN_S = 5, 0.1, 0.5
+CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M = 1.0, 0.2
+"""Motors that stand still need all the thrust there is. Those that turn with most of it would carry
+the vehicle back to the ceiling, beside the target's centre."""
+CATCH_LEAST_S, CATCH_LIMIT_S = 0.1, 2.0
+CARRIED_RATIO = 0.85  # of the hover thrust: what still has so much sinks slowly by itself
+POSITION_GAIN_PER_S = 2.0  # the firmware's `posCtlPid.xKp` and `yKp`
+CAUGHT_MPS = -0.1  # by then the thrust is above the weight, and rises on
+
+
+# --- Setpoints -----------------------------------------------------------------------------------
 
 
 def hold_here(c: Context) -> PositionSetpoint:
@@ -35,7 +58,7 @@ def hold_here(c: Context) -> PositionSetpoint:
 
 
 def under_target_xy(c: Context, yaw_rad: float) -> tuple[float, float]:
-    """Where the body has to be so that the gear is under the target at that heading."""
+    """The body's place at which the gear is under the target at that heading."""
     target = c.target_m
     assert target is not None
     gear = rot_z(yaw_rad) @ c.profile.vehicle.gear_body_m
@@ -67,9 +90,8 @@ def walk(
 def integrated(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
     """Integral of the gear's position error, world axes, limited.
 
-    The onboard position loop answers a steady draught with a steady offset; this
-    slow integral takes it away. It rests while the error is large, so that a
-    journey does not wind it up.
+    It takes away the offset that a steady draught leaves to the onboard position loop, and rests
+    while the error is large.
     """
     planner = c.profile.planner
     ex = goal_xy[0] - c.obs.telemetry.position_m[0]
@@ -87,11 +109,9 @@ def integrated(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[f
 def corrected(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> PositionSetpoint:
     """The setpoint that brings the vehicle to the reference.
 
-    Horizontally the learned trim is added and, near the target, the position loop is
-    stiffened (`_stiffened`). In height the onboard integrator has wound up in a climb
-    and carries the vehicle several centimetres past a setpoint that stops (`zKi` over
-    `zKp` of the firmware: a time constant of 4 s); adding a multiple of the height
-    error takes that down to the multiple's part.
+    Horizontally the learned trim is added and, near the target, the position loop is stiffened. In
+    height a multiple of the error is added: the onboard integrator, wound up in a climb, carries
+    the vehicle several centimetres past a setpoint that stops.
     """
     tel = c.obs.telemetry
     rise = HEIGHT_GAIN * (reference.z_m - tel.position_m[2]) - HEIGHT_RATE_S * tel.velocity_mps[2]
@@ -106,11 +126,8 @@ def corrected(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> 
 
 
 def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
-    """Position and velocity feedback on top of the onboard loop, near the target only.
-
-    Far away an attitude that is some milliseconds beside its frame moves the seen
-    target by centimetres, and a stiff loop would chase that into an oscillation.
-    """
+    """Position and velocity feedback on top of the onboard loop, near the target only: far away
+    attitude errors move the seen target by centimetres, which a stiff loop would chase."""
     near = (STIFF_BELOW_M - c.error_z_m) / STIFF_RANGE_M
     gain = max(0.0, min(1.0, near))
     if gain == 0.0:
@@ -123,10 +140,19 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
     return part * dx, part * dy
 
 
+def sinking(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
+    """The held setpoint, a tick later. Without a sight of the target it sinks: the camera's cone
+    opens upwards, so the target is soonest seen again from lower down."""
+    if not (c.by_sight and c.position_is_stale) or c.state.ground_m is None:
+        return setpoint
+    lowest_m = min(setpoint.z_m, c.state.ground_m[2] + LOWEST_M)
+    z_m = setpoint.z_m - SINK_MPS * max(0.0, c.obs.t_s - c.state.t_s)
+    return replace(setpoint, z_m=max(lowest_m, z_m))
+
+
 def limited(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The setpoint inside the fence, under the height limit and above the ground (fault 36):
-    wherever a wrong target or a step of the estimate would lead, nothing dives into the floor.
-    Only a take-off begins lower."""
+    """The setpoint inside the fence, under the height limit and above the ground (fault 36), lower
+    only in a take-off."""
     ground, safety = c.state.ground_m, c.profile.safety
     if ground is None:
         return setpoint
@@ -143,8 +169,11 @@ def limited(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     )
 
 
+# --- The press, its release, and the catch of a slip ---------------------------------------------
+
+
 def presses(c: Context) -> bool:
-    """The vehicle is at its thrust's limit, or above what hovering takes, and does not move."""
+    """True if it is at its thrust's limit, or above what hovering takes, and does not move."""
     return (
         _is_strong(c)
         and abs(c.obs.telemetry.velocity_mps[2]) <= UNPRESSED_MPS
@@ -158,11 +187,11 @@ def _is_strong(c: Context) -> bool:
 
 
 def unpressed(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
-    """Below where the vehicle is, until it is away from what it pressed against and the
-    integrators have come down; None once they have, or where nothing was pressed.
+    """A setpoint below the vehicle until it is away from what it pressed against and the onboard
+    integrators have come down; None once they have, or if nothing was pressed.
 
-    Pressed for a second at full thrust they take many seconds to come down by a setpoint
-    that is a little below, and the change to the vehicle's own landing does not reset them.
+    After a second at full thrust they need many seconds of a setpoint just below, and a change to
+    the vehicle's own landing does not reset them.
     """
     state, tel = c.state, c.obs.telemetry
     x, y, z = state.entry_m
@@ -177,3 +206,124 @@ def unpressed(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
         below_m = 0.0
     setpoint = PositionSetpoint(x, y, tel.position_m[2] - below_m, state.entry_yaw_rad)
     return state, limited(c, setpoint)
+
+
+def lower(c: Context) -> Acted:
+    """Stage one: the setpoint goes down in steps, or the raw thrust where it pressed."""
+    complete, perch, state = c.profile.planner.complete, c.profile.planner.perch, c.state
+    step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
+    part = step / complete.steps
+    if perch.mode == "raw":
+        if not c.imu_proves:
+            return ready(c)
+        # The lowest step stays below what could carry the vehicle, above the idle cut.
+        lowest = 0.9 * complete.hold_ratio * state.hover_thrust
+        return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
+    setpoint = state.setpoint or hold_here(c)
+    assert state.contact_z_m is not None
+    # Without a position the estimate slides, and the vehicle does not: the setpoint goes with it.
+    slid_m = 0.0 if c.placed else c.obs.telemetry.position_m[2] - state.contact_z_m
+    top = state.entry_m[2] + perch.press_m + slid_m
+    low = state.contact_z_m - complete.release_drop_m + slid_m
+    setpoint = replace(setpoint, z_m=top + part * (low - top))
+    sent = limited(c, corrected(c, setpoint, lift=False))
+    return replace(state, setpoint=setpoint), sent
+
+
+def let_go(c: Context) -> Acted:
+    """Stage two: raw thrust down to still motors, and the stop when the whole weight has hung long
+    enough. Without fresh telemetry it begins anew; in a landing late telemetry is enough, or what
+    hangs would end by its own landing."""
+    late_s = c.profile.safety.telemetry_hold_s if c.state.phase is Phase.LANDING else 0.0
+    if not c.imu_proves and c.attitude_age_s > late_s:
+        return ready(c)
+    complete, state = c.profile.planner.complete, c.state
+    if state.released_s is None:
+        z_m = c.obs.telemetry.position_m[2]
+        state = replace(state, released_s=c.obs.t_s, contact_z_m=state.contact_z_m or z_m)
+    assert state.released_s is not None
+    hung_s = c.held(Condition.WEIGHT_HANGS)
+    unread_s = UNREAD_S if state.unread_s >= c.obs.t_s - hung_s else 0.0
+    if hung_s >= complete.hang_s + unread_s:
+        return stop_motors(c)
+    part = min(1.0, (c.obs.t_s - state.released_s) / complete.ramp_s)
+    start = c.profile.planner.perch.thrust if state.setpoint is None else THRUST_MIN
+    start = min(start, THRUST_MIN)
+    return state, RawThrust(int(start + part * (STILL_THRUST - start)))
+
+
+def ready(c: Context) -> Acted:
+    """Hold by position while telemetry is old: what hangs stays, what falls unseen is caught.
+    Still motors would be a stop without a proof."""
+    state, tel = c.state, c.obs.telemetry
+    x, y, z_m = tel.position_m
+    if state.contact_z_m is not None and c.placed:  # else the estimate has slid away from it
+        z_m = state.contact_z_m
+    setpoint = PositionSetpoint(x, y, z_m + CATCH_TURNING_ABOVE_M, tel.yaw_rad)
+    return replace(state, setpoint=setpoint, released_s=None), limited(c, setpoint)
+
+
+def is_still(c: Context) -> bool:
+    """True if the motors stand still by raw thrust: a stop then only ends the stream without a
+    lock."""
+    released_s = c.state.released_s
+    return released_s is not None and c.obs.t_s - released_s > c.profile.planner.complete.ramp_s
+
+
+def stop_motors(c: Context) -> Acted:
+    """Stop and notify, `STOPS` times whatever the telemetry shows: one lost notify locks a vehicle
+    that hangs. Again while there is thrust."""
+    state, now_s = c.state, c.obs.t_s
+    if state.stopped_s is None:
+        return replace(state, stopped_s=now_s, ordered_s=now_s, orders=1), StopMotors()
+    waited_s = now_s - (state.ordered_s if state.ordered_s is not None else state.stopped_s)
+    still_to_send = state.orders < STOPS and waited_s >= STOP_PERIOD_S
+    if still_to_send or (c.obs.telemetry.thrust >= 1 and waited_s >= STOP_AGAIN_S):
+        return replace(state, ordered_s=now_s, orders=state.orders + 1), StopMotors()
+    return state, Idle()
+
+
+def catch_above_m(hover_thrust: float, thrust: float) -> float:
+    """Height of the setpoint that stops a fall, above the vehicle."""
+    turning = thrust > 0.5 * hover_thrust
+    return CATCH_TURNING_ABOVE_M if turning else CATCH_STILL_ABOVE_M
+
+
+def is_carried(hover_thrust: float, thrust: float) -> bool:
+    """True if what slips hardly falls, since the motors carry most of the weight."""
+    return thrust >= CARRIED_RATIO * hover_thrust
+
+
+def catch(c: Context) -> Acted | None:
+    """After a slip a setpoint far above, until the vehicle hardly sinks; None when it is caught, or
+    its telemetry is old."""
+    state, tel = c.state, c.obs.telemetry
+    if state.caught or not c.imu_proves:
+        return None
+    begun = c.in_phase_s < CATCH_LEAST_S
+    if begun or (c.climb_mps < CAUGHT_MPS and c.in_phase_s < CATCH_LIMIT_S):
+        x, y = _braked_place_m(c) if c.is_blown else state.entry_m[:2]
+        setpoint = PositionSetpoint(
+            x, y, tel.position_m[2] + state.catch_above_m, state.entry_yaw_rad
+        )
+        return replace(state, setpoint=setpoint), limited(c, setpoint)
+    return None
+
+
+def _braked_place_m(c: Context) -> tuple[float, float]:
+    """The setpoint that takes out a sideways speed which the estimate misses: the position mode
+    asks for `POSITION_GAIN_PER_S` times the way to it."""
+    tel, reckoned_mps = c.obs.telemetry, c.state.reckoning.velocity_mps
+    x_m, y_m = (
+        tel.position_m[i] - (reckoned_mps[i] - tel.velocity_mps[i]) / POSITION_GAIN_PER_S
+        for i in range(2)
+    )
+    return x_m, y_m
+
+
+def left_contact(c: Context, below_m: float) -> Context:
+    """The context without its contact once the vehicle is so far below it."""
+    contact_z_m = c.state.contact_z_m
+    if contact_z_m is None or c.obs.telemetry.position_m[2] >= contact_z_m - below_m:
+        return c
+    return c.with_state(replace(c.state, contact_z_m=None, contact_aside_m=None))

@@ -1,12 +1,10 @@
-"""What accelerometer and attitude tell of the vehicle's motion where no position does.
+"""The vehicle's motion by accelerometer and attitude, where no position tells it.
 
-`ImuMotion` is fed with each sample of the telemetry: it integrates the specific force, and notes
-when the vehicle fell, sank or was not heard of. `Reckoning` is the planner's: the speed and the
-place under the target, carried on from the last position that was good.
-
-In flight the firmware's own estimator feels accelerations along the thrust only
-(docs/firmware.md, "Target as position"): a blow or a gust from the side moves the vehicle and not
-its estimate. The accelerometer's other two axes tell of both.
+`ImuMotion` integrates the specific force over each sample of the telemetry, and notes when the
+vehicle fell, sank or was silent. `Reckoning` is the planner's: the speed and the place under the
+target, carried on from the last good position. In flight the firmware's estimator measures
+accelerations along the thrust only (docs/firmware.md, "Target as position"): a blow or a gust from
+the side moves the vehicle and not its estimate, and shows in the accelerometer's other two axes.
 """
 
 from __future__ import annotations
@@ -22,105 +20,71 @@ from perchctl.vehicle import FLYING, FULL_THRUST, Telemetry
 Vector = tuple[float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
 
-GAP_S = 0.2
-"""A silence in which a vehicle falls by 20 cm, or more than it may and still hang."""
+GAP_S = 0.2  # a silence in which a vehicle falls 20 cm, more than it may and still hang
 NO_FALL_MPS, NO_FALL_M = 0.25, 0.25
-"""What hangs gains no more by its estimate while nothing is heard of it, beyond the speed that this
-had before. A fall of half a metre gains 3 m/s, or where the floor has taken that again, the way."""
-SINKS_MPS = -0.3
-"""By the estimate of each moment what hangs is no faster: 5 cm of a fall are."""
-FROZEN_S = 0.2
-"""An accelerometer that reads the very same for so long is a silence, too."""
-FALL_G, FALL_S = 0.6, 0.1
-"""Specific force of a fall, and how long it lasts before it counts: an impact is shorter."""
-SINK_MPS = -0.25
-"""Speed of a vehicle that begins to come down, whatever the offsets of its accelerometer."""
+"""By its estimate what hangs gains no more speed in a silence, beyond its speed before; a fall of
+half a metre gains 3 m/s, or, where the floor has stopped it, the way."""
+SINKS_MPS = -0.3  # by the estimate of each moment what hangs is no faster: 5 cm of a fall are
+FROZEN_S = 0.2  # an accelerometer that reads the same for so long counts as a silence
+FALL_G, FALL_S = 0.6, 0.1  # specific force of a fall, and its least time: an impact is shorter
+SINK_MPS = -0.25  # a vehicle that begins to come down, whatever its accelerometer's offsets
 SINK_MEMORY_S, OFFSET_MEMORY_S = 1.5, 3.0
-IMPACT_G = -0.3
-"""What brakes a climb harder is an impact on the ceiling, and no way down."""
-BLOW_MPS, BLOW_S = 0.22, 0.1
-"""A speed upwards gained within that time: more than any thrust gives, so the floor was met."""
-BEFORE_BLOW_S, BOUNCES_S = 0.05, 0.5
-"""A blow is noticed so long after it began, and what follows within so long is the same one."""
-STEADY_MPS = 0.06
-"""Vertical speeds so near to each other are one speed."""
-STEADY_ASIDE_MPS = 0.15
-"""The same of sideways speeds, which drift more: 0.01 rad of wrong attitude makes 0.1 m/s of
-them each second."""
-REST_MEMORY_S = 0.5
-"""At rest on the ground the accelerometer's offsets are learned in so long."""
+IMPACT_G = -0.3  # what brakes a climb harder is an impact on the ceiling, and no way down
+BLOW_MPS, BLOW_S = 0.22, 0.1  # gained upwards in that time, more than any thrust gives: the floor
+BEFORE_BLOW_S, BOUNCES_S = 0.05, 0.5  # a blow shows so much later; what follows belongs to it
+STEADY_MPS, STEADY_ASIDE_MPS = 0.06, 0.15
+"""Speeds so near to each other are one speed. Sideways ones drift: 0.01 rad of wrong attitude adds
+0.1 m/s each second."""
+REST_MEMORY_S = 0.5  # at rest on the ground the offsets are learned in so long
 SPEED_MEMORY_S, BIAS_MEMORY_S = 3.0, 4.0
-"""In so long the reckoned speed is drawn to the estimate's while that is believed, and what is
-left of the offsets is learned, a wrong attitude's too. Wrong or late pictures lead the
-estimate astray within a second."""
-MOST_BIAS_MPS2, MOST_WRONG_MPS2 = 0.3, 0.5
-"""More at a time is a blow, or a correction of the estimate."""
-CLIMB_SPARE_MPS = 0.1
-"""Reckoned, the vehicle may have come nearer to the target by so much each second."""
-MOST_CLIMB_MPS = 1.0
-"""What the position mode's own limit lets a vehicle climb while nothing is heard of it."""
-REACH_M = 0.04
-"""A gear so near below the target may have been caught by its magnet since."""
+"""In so long the reckoned speed is drawn to a believed estimate's, and what is left of the offsets,
+a wrong attitude's too, is learned: wrong pictures lead the estimate astray within a second."""
+MOST_BIAS_MPS2, MOST_WRONG_MPS2 = 0.3, 0.5  # more is a blow, or a correction of the estimate
+CLIMB_SPARE_MPS = 0.1  # by which the vehicle may come nearer to the target than reckoned
+MOST_CLIMB_MPS = 1.0  # in a silence, by the position mode's own limit
+REACH_M = 0.04  # a gear so near below the target may have been caught by its magnet
 BESIDE_MEMORY_S, PUSHED_G, PUSHED_S = 0.5, 0.06, 1.5
-"""In so long a difference between the speeds gained by estimate and accelerometer is forgotten. A
-push from the side shows in the accelerometer at once, and in the estimate a second or two later."""
+"""Memory of the difference between the speeds gained by estimate and accelerometer; a push from the
+side shows in the accelerometer at once, and in the estimate a second or two later."""
 PUSH_MEMORY_S = 0.05
-"""The sideways force is a mean of so long, since turning motors shake single samples by as much as
-a push gives, and each of these would end the comparison for `PUSHED_S`. Of that mean the limit is
-below what a gust gives that gains 1 m/s in a second, 0.09 g."""
+"""Of the mean sideways force: turning motors shake single samples by as much as a push gives. A
+gust that gains 1 m/s in a second makes a mean of 0.09 g."""
 STEP_M, STEP_MPS = 0.005, 0.2
-"""The estimate's position moves by less than that, and that times the time between two samples,
-beyond its speed: by at most 4 mm in 10 ms in flights without a fault of it, kicks included."""
-UNSEEN_S = 0.15
-"""Where samples are missing for longer, a step of the position may be the vehicle's motion."""
-CARRIED_S = 0.05
-"""For at most so long a position is carried on to its sample's time."""
+"""Motion of the estimated position beyond its speed, and beyond that times the samples' distance:
+at most 4 mm in 10 ms without a fault, kicks included."""
+UNSEEN_S = 0.15  # samples missing for longer: a step of the position may be the vehicle's motion
+CARRIED_S = 0.05  # for at most so long a position is carried on to its sample's time
 BIAS_SIGMA_MPS2, SPEED_SIGMA_MPS, BLOW_SHARE = 0.06, 0.01, 0.3
-"""Of a reckoned place: what the learned offset and the speed at the last sight leave open, and
-the share of the way itself, since the samples of a blow come each 10 ms."""
-
-
-CORRECTED_MPS, CORRECTED_MPS2 = 0.08, 5.0
+"""Spread of a reckoned place: by the learned offset, by the speed at the last sight, and the share
+of the way, since the samples of a blow come each 10 ms."""
+CORRECTED_MPS, CORRECTED_MPS2, CORRECTED_MEMORY_S = 0.08, 5.0, 6.0
 """A sideways speed that the estimate gains at once, and beyond what a tilt gives, is a correction
-by a position; where that is wrong the attitude turned with it is, too."""
-CORRECTED_MEMORY_S = 6.0
+by a position, which may have turned the attitude, too."""
 HOVER_MEMORY_S, LEAST_FLYING, SATURATED = 0.5, 0.4, 0.95
-"""Of the felt hover thrust; with less of the full thrust nothing flies, with more it tells
-nothing."""
-
-
+"""Of the measured hover thrust, which needs a share of the full thrust within these."""
 LED_PER_S = 1.5
-"""The acceleration that wrong positions feign for each m/s by which they have led the speed astray:
-the filter on board corrects the attitude with it (docs/firmware.md, "Estimator in flight")."""
-
-
+"""Acceleration that wrong positions feign for each m/s by which they have led the speed astray: the
+onboard filter corrects the attitude with it (docs/firmware.md, "Estimator in flight")."""
 UNCORRECTED_M2PS2_PER_S, UNCORRECTED_S = 5e-4, 0.45
-"""The variance of the estimated vertical speed grows by 1e-3 a second where nothing corrects it
-(docs/firmware.md, "Variances"), by less or not at all where anything does. Growth at half that
-rate over five of the variance's packets is no chance."""
+"""The variance of the estimated vertical speed grows by 1e-3 a second if nothing corrects it
+(docs/firmware.md, "Variances"); half that rate over five of its packets is no chance."""
 
 
 @dataclass(frozen=True)
 class Corrections:
-    """Whether anything still corrects the estimate's height, by the variance of its vertical speed.
+    """Shows by the variance of the vertical speed if anything still corrects the estimate."""
 
-    Attributes:
-        variance_m2ps2: the newest; None before the first.
-        changed_s: when that came.
-        none_since_s: since when it has grown without a break as it does uncorrected.
-    """
-
-    variance_m2ps2: float | None = None
-    changed_s: float = -math.inf
-    none_since_s: float = math.inf
+    variance_m2ps2: float | None = None  # the newest
+    changed_s: float = -math.inf  # when that came
+    none_since_s: float = math.inf  # since when it has grown without a break as uncorrected
 
     def age_s(self, now_s: float) -> float:
-        """Of the last correction, where it is certain that none comes any more; else 0."""
+        """Age of the last correction, if it is certain that none comes any more; else 0."""
         certain = self.changed_s - self.none_since_s >= UNCORRECTED_S
         return now_s - self.none_since_s if certain else 0.0
 
     def watched(self, sample: Telemetry) -> Corrections:
-        """With one more sample. A variance that stands still is one whose packets do not come."""
+        """With one more sample. An unchanged variance means that no packet came."""
         variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
         if variance is None or variance == before:
             return self
@@ -132,124 +96,77 @@ class Corrections:
 
 @dataclass(frozen=True)
 class Blow:
-    """A blow from below: as from the floor.
+    """A blow from below: as from the floor."""
 
-    Attributes:
-        t_s: when it was felt; `-inf` where none was.
-        estimated_mps, felt_mps: the vertical speed just before it, by the state estimate, and as
-            `ImuMotion.velocity_mps` has it.
-        peak_g: the largest specific force that was read in it, along the body's z axis.
-        z_m: where the state estimate had the vehicle.
-    """
-
-    t_s: float = -math.inf
-    estimated_mps: float = 0.0
-    felt_mps: float = 0.0
-    peak_g: float = 0.0
-    z_m: float = 0.0
+    t_s: float = -math.inf  # -inf: there was none
+    estimated_mps: float = 0.0  # vertical speed just before it, by the state estimate
+    felt_mps: float = 0.0  # the same by `ImuMotion.velocity_mps`
+    peak_g: float = 0.0  # the largest specific force read in it, along the body's z axis
+    z_m: float = 0.0  # where the state estimate had the vehicle
 
 
 @dataclass(frozen=True)
 class ImuMotion:
-    """The vehicle's motion by its accelerometer and attitude alone.
+    """The vehicle's motion by its accelerometer and attitude alone. Times are on the loop's clock,
+    `-inf` for what never happened."""
 
-    Attributes:
-        t_s: of the newest sample.
-        velocity_mps: integral of the acceleration since the first sample, world axes. It drifts:
-            only differences over some seconds mean anything.
-        fell_s: when it last fell, or came down and met the floor; `-inf` if it never did.
-        silent_s: end of the newest silence, that of an accelerometer that stood still among them.
-        gap_s: end of the newest one that a fall could hide in: where the estimate, which goes on
-            feeling on board, shows none, it hides none.
-        started_s: when the vehicle was first heard again after it had started anew.
-        sunk_m: by how much the estimate has sunk while the accelerometer has stood still.
-        steady_s: since when the vertical speed has stayed what it is.
-        steady_aside_s: the same of the sideways speed.
-        offset_g: what the accelerometer read too much at rest on the ground, body axes.
-        frozen_s, attitude_frozen_s, place_frozen_s: for how long the accelerometer, the attitude,
-            and position with velocity have read the very same, as none that lives does; `-inf`
-            before they first changed.
-        hover_thrust: what the thrust is for each g that is felt in flight, 0..65535; 0 before it.
-        aside_g: mean sideways specific force of the last moment, body axes, without the offsets.
-        pushed_s: when something last pushed it sideways: in flight only air does, by far less.
-        misled_rad: roll and pitch by which corrections of the estimate turned the attitude at once;
-            the motion is reckoned without them.
-        corrections: whether anything corrects the estimate that stands beside this motion.
-        blow: the newest one from below; `last_moment`: what one that begins now has ended.
-        off_s: since when the motors have been off; `inf` while they turn.
-    """
-
-    t_s: float = -math.inf
-    velocity_mps: Vector = ZERO
-    offset_g: Vector = ZERO
-    fell_s: float = -math.inf
-    silent_s: float = -math.inf
-    gap_s: float = -math.inf
-    started_s: float = -math.inf
-    sunk_m: float = 0.0
-    steady_s: float = math.inf
+    t_s: float = -math.inf  # of the newest sample
+    velocity_mps: Vector = ZERO  # integral since the first sample, world axes; it drifts
+    offset_g: Vector = ZERO  # what the accelerometer read too much at rest, body axes
+    fell_s: float = -math.inf  # when it last fell, or came down and met the floor
+    silent_s: float = -math.inf  # end of the newest silence, or of a frozen accelerometer
+    gap_s: float = -math.inf  # end of the newest one over which the estimate may hide a fall
+    started_s: float = -math.inf  # first heard again after it had started anew
+    sunk_m: float = 0.0  # by the estimate, while the accelerometer has stood still
+    steady_s: float = math.inf  # since when the vertical speed has stayed what it is
     steady_mps: float = 0.0
-    steady_aside_s: float = math.inf
+    steady_aside_s: float = math.inf  # the same of the sideways speed
     steady_aside_mps: tuple[float, float] = (0.0, 0.0)
     light_since_s: float = math.inf
     sink_mps: float = 0.0
     offset_mps2: float = 0.0
     blow_mps: float = 0.0
     blow_s: float = -math.inf
-    frozen_s: float = 0.0
-    attitude_frozen_s: float = -math.inf
-    place_frozen_s: float = -math.inf
-    hover_thrust: float = 0.0
-    aside_g: tuple[float, float] = (0.0, 0.0)
-    pushed_s: float = -math.inf
-    misled_rad: tuple[float, float] = (0.0, 0.0)
+    frozen_s: float = 0.0  # for how long the accelerometer has read the very same
+    attitude_frozen_s: float = -math.inf  # the same of the attitude; -inf before a change
+    place_frozen_s: float = -math.inf  # the same of position and velocity
+    hover_thrust: float = 0.0  # thrust for each measured g in flight, 0..65535; 0 before it
+    aside_g: tuple[float, float] = (0.0, 0.0)  # mean sideways force, body axes, without offsets
+    pushed_s: float = -math.inf  # when something last pushed it sideways
+    misled_rad: tuple[float, float] = (0.0, 0.0)  # roll and pitch turned by corrections
     turning_radps: tuple[float, float] = (0.0, 0.0)
-    corrections: Corrections = Corrections()
-    last_moment: tuple[Blow, ...] = ()
-    blow: Blow = Blow()
-    off_s: float = math.inf
+    corrections: Corrections = Corrections()  # of the estimate beside this motion
+    last_moment: tuple[Blow, ...] = ()  # what a blow that begins now has ended
+    blow: Blow = Blow()  # the newest from below
+    off_s: float = math.inf  # since when the motors have been off; inf while they turn
 
     @property
     def attitude_age_s(self) -> float:
-        """For how long the attitude has read the same while the accelerometer lives: 0 where
-        neither changes, as in a simulated vehicle at rest."""
+        """For how long the attitude has read the same while the accelerometer changed."""
         return max(0.0, self.attitude_frozen_s - self.frozen_s)
 
     @property
     def place_age_s(self) -> float:
-        """The same of the position and the velocity."""
+        """`attitude_age_s` of position and velocity."""
         return max(0.0, self.place_frozen_s - self.frozen_s)
 
 
 def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
     """The motion with one more sample; `last` is the one before, None at the first."""
     dt_s = math.inf if last is None else new.t_s - last.t_s
-    off_s = min(motion.off_s, new.t_s) if new.thrust < 1 else math.inf
-    frozen_s = _still_s(motion.frozen_s, last, new, lambda s: (s.acc_x_g, s.acc_y_g, s.acc_z_g))
-    attitude_frozen_s = _still_s(
-        motion.attitude_frozen_s, last, new, lambda s: (s.roll_rad, s.pitch_rad, s.yaw_rad)
+    started_anew = last is not None and new.start != last.start
+    motion = replace(
+        motion,
+        t_s=new.t_s,
+        started_s=new.t_s if started_anew else motion.started_s,
+        frozen_s=_still_s(motion.frozen_s, last, new, _acceleration),
+        attitude_frozen_s=_still_s(motion.attitude_frozen_s, last, new, _attitude),
+        place_frozen_s=_still_s(motion.place_frozen_s, last, new, _place),
+        corrections=motion.corrections.watched(new),
+        off_s=min(motion.off_s, new.t_s) if new.thrust < 1 else math.inf,
     )
-    place_frozen_s = _still_s(
-        motion.place_frozen_s, last, new, lambda s: (*s.position_m, *s.velocity_mps)
-    )
-    corrections = motion.corrections.watched(new)
-    started_s = motion.started_s if last is None or new.start == last.start else new.t_s
-    if last is None or not 0.0 < dt_s <= GAP_S or frozen_s > FROZEN_S:
-        silent_s, gap_s, sunk_m = motion.silent_s, motion.gap_s, 0.0
-        if last is not None:
-            silent_s = new.t_s
-            sunk_m = min(0.0, motion.sunk_m + new.position_m[2] - last.position_m[2])
-            alive = 0.0 <= place_frozen_s <= FROZEN_S and new.start == last.start
-            if not (alive and _shows_no_fall(last, new, sunk_m)):
-                gap_s, sunk_m = new.t_s, 0.0
-        return replace(
-            motion, t_s=new.t_s, silent_s=silent_s, gap_s=gap_s, sunk_m=sunk_m,
-            started_s=started_s, steady_s=new.t_s, sink_mps=0.0, blow_mps=0.0,
-            steady_mps=motion.velocity_mps[2], steady_aside_s=new.t_s,
-            steady_aside_mps=motion.velocity_mps[:2], light_since_s=math.inf, frozen_s=frozen_s,
-            attitude_frozen_s=attitude_frozen_s, place_frozen_s=place_frozen_s,
-            corrections=corrections, off_s=off_s,
-        )  # fmt: skip
+    if last is None or not 0.0 < dt_s <= GAP_S or motion.frozen_s > FROZEN_S:
+        return _after_silence(motion, last, new)
     offset_g = motion.offset_g
     if new.thrust < 1 and not new.has(FLYING):
         offset_g = _offset_at_rest(offset_g, new, min(1.0, dt_s / REST_MEMORY_S))
@@ -277,14 +194,12 @@ def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> 
     now = Blow(new.t_s, new.velocity_mps[2], z, new.acc_z_g)
     aside_g = _aside_g(motion.aside_g, new, offset_g, dt_s)
     last_moment = (*(m for m in motion.last_moment if new.t_s - m.t_s <= BEFORE_BLOW_S), now)
-    return ImuMotion(
-        t_s=new.t_s,
+    return replace(
+        motion,
         velocity_mps=(x, y, z),
         offset_g=offset_g,
         fell_s=new.t_s if fell else motion.fell_s,
-        silent_s=motion.silent_s,
-        gap_s=motion.gap_s,
-        started_s=started_s,
+        sunk_m=0.0,
         steady_s=steady_s,
         steady_mps=steady_mps,
         steady_aside_s=steady_aside_s,
@@ -294,24 +209,35 @@ def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> 
         offset_mps2=offset,
         blow_mps=blow,
         blow_s=new.t_s if blow > BLOW_MPS else motion.blow_s,
-        frozen_s=frozen_s,
-        attitude_frozen_s=attitude_frozen_s,
-        place_frozen_s=place_frozen_s,
         hover_thrust=_hover_thrust(motion.hover_thrust, new, dt_s),
         aside_g=aside_g,
         pushed_s=new.t_s if math.hypot(*aside_g) > PUSHED_G else motion.pushed_s,
         misled_rad=misled_rad,
         turning_radps=turning_radps,
-        corrections=corrections,
         last_moment=last_moment,
         blow=_struck(motion, new, last_moment, blow),
-        off_s=off_s,
     )
 
 
+def _after_silence(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
+    """The motion with the first sample, or with one that continues none."""
+    motion = replace(
+        motion, steady_s=new.t_s, steady_mps=motion.velocity_mps[2], steady_aside_s=new.t_s,
+        steady_aside_mps=motion.velocity_mps[:2], sink_mps=0.0, blow_mps=0.0,
+        light_since_s=math.inf,
+    )  # fmt: skip
+    if last is None:
+        return replace(motion, sunk_m=0.0)
+    sunk_m = min(0.0, motion.sunk_m + new.position_m[2] - last.position_m[2])
+    alive = 0.0 <= motion.place_frozen_s <= FROZEN_S and new.start == last.start
+    if alive and _shows_no_fall(last, new, sunk_m):
+        return replace(motion, silent_s=new.t_s, sunk_m=sunk_m)
+    return replace(motion, silent_s=new.t_s, gap_s=new.t_s, sunk_m=0.0)
+
+
 def _shows_no_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
-    """What the estimate tells of a silence between two samples, or of a moment in which only the
-    accelerometer stood still. It is drawn astray, but by nothing as a fall and a blow draw it."""
+    """True if the estimate excludes a fall in a silence between two samples, or in a moment in
+    which only the accelerometer stood still."""
     dt_s = new.t_s - last.t_s
     gained_mps = new.velocity_mps[2] - last.velocity_mps[2]
     way_m = new.position_m[2] - last.position_m[2] - last.velocity_mps[2] * dt_s
@@ -323,8 +249,8 @@ def _shows_no_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
 
 
 def _struck(motion: ImuMotion, new: Telemetry, last_moment: tuple[Blow, ...], mps: float) -> Blow:
-    """The newest blow, which has gained `mps` by now; of its bounces the hardest counts. On board
-    the estimate has the whole of a blow before its second sample is here."""
+    """The newest blow, which has gained `mps` by now; of its bounces the hardest counts. The
+    onboard estimate has the whole of a blow before its second sample arrives."""
     old = motion.blow
     follows = new.t_s - old.t_s <= BOUNCES_S
     if mps > BLOW_MPS:
@@ -359,7 +285,7 @@ def _aside_g(
 def _misled(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """What corrections have turned roll and pitch by, and the rates that are no correction."""
+    """By how much corrections have turned roll and pitch, and the rates that are no correction."""
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
     kept = 1.0 - dt_s / CORRECTED_MEMORY_S
@@ -379,20 +305,32 @@ def _led_right(sample: Telemetry, misled_rad: tuple[float, float]) -> Telemetry:
     return replace(sample, roll_rad=sample.roll_rad - roll, pitch_rad=sample.pitch_rad - pitch)
 
 
+def _acceleration(sample: Telemetry) -> Vector:
+    return sample.acc_x_g, sample.acc_y_g, sample.acc_z_g
+
+
+def _attitude(sample: Telemetry) -> Vector:
+    return sample.roll_rad, sample.pitch_rad, sample.yaw_rad
+
+
+def _place(sample: Telemetry) -> tuple[float, ...]:
+    return *sample.position_m, *sample.velocity_mps
+
+
 def _still_s(
     before_s: float,
-    a: Telemetry | None,
-    b: Telemetry,
+    last: Telemetry | None,
+    new: Telemetry,
     reading: Callable[[Telemetry], tuple[float, ...]],
 ) -> float:
-    """For how long a reading has been the very same."""
-    if a is None:
+    """Seconds for which a reading has been the very same."""
+    if last is None:
         return before_s
-    return 0.0 if reading(a) != reading(b) else before_s + max(0.0, b.t_s - a.t_s)
+    return 0.0 if reading(last) != reading(new) else before_s + max(0.0, new.t_s - last.t_s)
 
 
 def _hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
-    """Neither at a standstill nor pressed against anything, as far as this sample tells."""
+    """The hover thrust with one sample of free flight: neither at rest nor pressed."""
     flies = sample.has(FLYING) and sample.thrust < SATURATED * FULL_THRUST
     if not flies or sample.thrust < LEAST_FLYING * FULL_THRUST or not 0.8 <= sample.acc_z_g <= 1.2:
         return old
@@ -424,50 +362,29 @@ def acceleration_mps2(sample: Telemetry, offset_g: Vector = ZERO) -> Vector:
 
 @dataclass(frozen=True)
 class Reckoning:
-    """Speed, and place under the target, carried on by the accelerometer.
+    """Speed, and place under the target, carried on by the accelerometer. World axes."""
 
-    Attributes:
-        imu: the motion up to which it is reckoned; None before the first tick.
-        velocity_mps: world axes.
-        bias_mps2: what the accelerometer and the attitude give too much, world axes, as learned
-            beside the estimate.
-        beside_mps: the speed that the estimate has gained of late and the accelerometer has not,
-            x and y, world axes.
-        below_m: how far the gear is below the target at the least, as far as the telemetry was
-            heard; inf before the first sight, and after a fall.
-        nearest_m: the same with what it may have climbed while nothing was heard; a fall only adds
-            to it.
-        unsure_s: end of the newest silence in which it may have come into the magnet's reach.
-        aside_m: from the gear to the target's axis, world axes.
-        aside_sigma_m: standard deviation of that; inf where it is unknown.
-        sight_s: exposure of the sight that it is carried on from.
-        stepped_m: by how much the estimate's position has moved beyond its speed since then, x and
-            y, world axes: either it was wrong before, or it is now.
-        stepped_s: when it last did so.
-        struck_mps: vertical speed just before `ImuMotion.blow`.
-    """
-
-    imu: ImuMotion | None = None
+    imu: ImuMotion | None = None  # the motion up to which it is reckoned
     velocity_mps: Vector = ZERO
-    bias_mps2: Vector = ZERO
+    bias_mps2: Vector = ZERO  # excess of accelerometer and attitude, learned beside the estimate
     estimated_mps: Vector = ZERO
-    beside_mps: tuple[float, float] = (0.0, 0.0)
-    below_m: float = math.inf
-    nearest_m: float = math.inf
-    unsure_s: float = -math.inf
-    aside_m: tuple[float, float] = (0.0, 0.0)
-    aside_sigma_m: float = math.inf
-    sight_s: float = -math.inf
-    stepped_m: tuple[float, float] = (0.0, 0.0)
-    stepped_s: float = -math.inf
-    struck_mps: float = 0.0
+    beside_mps: tuple[float, float] = (0.0, 0.0)  # recently gained by the estimate alone
+    below_m: float = math.inf  # gear below the target at the least; inf if unseen or fallen
+    nearest_m: float = math.inf  # the same with a climb in silences; a fall only adds to it
+    unsure_s: float = -math.inf  # end of the newest silence that may have led to the magnet
+    aside_m: tuple[float, float] = (0.0, 0.0)  # from the gear to the target's axis
+    aside_sigma_m: float = math.inf  # standard deviation of that; inf if unknown
+    sight_s: float = -math.inf  # exposure of the sight that it is carried on from
+    stepped_m: tuple[float, float] = (0.0, 0.0)  # steps of the estimate beyond its speed since
+    stepped_s: float = -math.inf  # the newest of them
+    struck_mps: float = 0.0  # vertical speed just before `ImuMotion.blow`
 
 
 def reckoned(
     old: Reckoning, imu: ImuMotion, sample: Telemetry, *, believed: bool, astray: bool = False
 ) -> Reckoning:
-    """One tick on. `believed`: the sample's estimated velocity is true; `astray`: it may be
-    another axis', and after a silence, too, the reckoned one is better."""
+    """The reckoning one tick later. `believed`: the sample's estimated velocity is true; `astray`:
+    it may be of another axis, and even after a silence the reckoned one is better."""
     estimated, blow = sample.velocity_mps, imu.blow
     if old.imu is not None and blow.t_s > old.imu.blow.t_s:
         carried = not old.imu.t_s < imu.silent_s <= blow.t_s
@@ -483,7 +400,7 @@ def reckoned(
                 vz += imu.velocity_mps[2] - old.imu.velocity_mps[2]
             velocity_mps = (vx, vy, vz)
         elif not believed and old.imu is not None:
-            # No position corrects the estimate in a silence: its change is what was felt on board.
+            # No position corrects the estimate in a silence: its change was measured on board.
             vx, vy, vz = (
                 v + e - o
                 for v, e, o in zip(old.velocity_mps, estimated, old.estimated_mps, strict=True)
@@ -543,19 +460,19 @@ def reckoned(
 
 def led_astray(old: Reckoning) -> Reckoning:
     """The reckoning once the positions are found to be wrong: they have turned the attitude, too,
-    and nothing turns it back. In so short a time hardly any of that was learned."""
+    of which hardly any was learned in so short a time."""
     (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.beside_mps
     return replace(old, bias_mps2=(bx + LED_PER_S * x_mps, by + LED_PER_S * y_mps, bz))
 
 
 def _may_have_flown(before: ImuMotion, after: ImuMotion) -> bool:
-    """All through a silence: not with motors that were off, or by a vehicle that started anew."""
+    """True unless the motors were off around a silence, or the vehicle started anew."""
     off = before.off_s <= before.t_s and after.off_s <= after.t_s
     return not (off or after.started_s > before.t_s)
 
 
 def _most_climb_m(old: Reckoning, now_s: float, *, flew: bool) -> float:
-    """In a silence; without thrust it goes on by the speed that it had."""
+    """The highest climb in a silence; without thrust, by the speed before it."""
     if flew:
         return MOST_CLIMB_MPS * (now_s - (old.imu.t_s if old.imu else now_s))
     climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_SPARE_MPS
@@ -563,9 +480,9 @@ def _most_climb_m(old: Reckoning, now_s: float, *, flew: bool) -> float:
 
 
 def stepped(old: Reckoning, last: Telemetry, sample: Telemetry) -> Reckoning:
-    """The reckoning with the step of the estimate's position between two samples: what its speed
-    does not explain. Steps that a correction smears over some samples add up, a position that steps
-    aside and back is where it was. Where samples are missing in between nothing tells."""
+    """The reckoning with the step of the estimate's position between two samples, which its speed
+    does not explain. Steps smeared over some samples add up, a step aside and back cancels; where
+    samples are missing none is seen."""
     dt_s = _position_s(sample) - _position_s(last)
     if not 0.0 < dt_s <= UNSEEN_S:
         return old
@@ -582,16 +499,15 @@ def stepped(old: Reckoning, last: Telemetry, sample: Telemetry) -> Reckoning:
 
 
 def _position_s(sample: Telemetry) -> float:
-    """When the position was: its packet may be older than the sample, and is carried on by so
-    much (`perchctl.link`)."""
+    """Time of the position, whose older packet is carried on by at most `CARRIED_S`."""
     return sample.t_s - max(0.0, sample.behind_s - CARRIED_S)
 
 
 def sighted(
     old: Reckoning, t_s: float, aside_m: tuple[float, float], below_m: float, sigma_m: float
 ) -> Reckoning:
-    """With a sight of the target: `aside_m` from the gear to its axis, world axes, `below_m`
-    from the gear up to it."""
+    """The reckoning with a sight: `aside_m` from the gear to the target's axis, world axes,
+    `below_m` from the gear up to it."""
     return replace(
         old, sight_s=t_s, aside_m=aside_m, below_m=below_m, nearest_m=below_m, aside_sigma_m=sigma_m
     )

@@ -1,19 +1,18 @@
-"""The one way down, for the planner's LANDING, for the watchdog while the loop is silent, and for
-the rescue after an exception.
+"""The one way down: for the planner's LANDING, the watchdog of a silent loop, and the rescue.
 
 Pure: `step_landing(state, observation, profile) -> (state, command)`.
 
-What it does follows from three things (`MANOEUVRES`, the table of docs/mission.md):
+`MANOEUVRES` (the table of docs/mission.md) decides by three things:
 
-- the `Evidence` that is fresh: a position from outside the picture, a position by the target,
-  height alone, accelerometer and attitude alone, or nothing;
+- the `Evidence` that is fresh: an external position, a position by the target, height alone,
+  accelerometer and attitude alone, or nothing;
 - the `Reach`: whether the vehicle may be where the magnet holds it;
 - the `Stage`: coming down, landing by itself, the weight put on the magnet, or stopped.
 
-Two proofs go before the table: what falls off the magnet is caught, and what stands on the floor
-is stopped. The vehicle's own landing follows a trajectory by its clock and then stops the motors,
-wherever it is by then: it is ordered only where a position that does not rest on pictures tells
-that it is away from the ceiling, and in flight.
+Two proofs go before the table: what falls off the magnet is caught, and what stands on the floor is
+stopped. The vehicle's own landing follows a trajectory by its clock and then stops the motors,
+wherever it is by then: it is ordered only where a position that does not rest on pictures shows the
+vehicle away from the ceiling, and in flight.
 
 Before each command: if it is the last packet, a position setpoint or a raw thrust ends in the
 firmware's level-out after 0.5 s and its cut after 2 s, an own landing goes on by itself
@@ -26,26 +25,36 @@ import math
 from enum import Enum
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, contact_within_m
+from perchctl.mission.conditions import (
+    conditions_since,
+    contact_within_m,
+    has_slipped,
+    kept_over_a_change,
+    latency_changed,
+)
 from perchctl.mission.context import FAR_BELOW_M, HANGING_S, PUT_RIGHT_S, Context
-from perchctl.mission.guards import has_slipped, latency_changed
-from perchctl.mission.guidance import hold_here, limited, presses, unpressed, walk
-from perchctl.mission.imu import REACH_M, UNSEEN_S, reckoned, sighted, stepped
-from perchctl.mission.release import (
+from perchctl.mission.guidance import (
     CATCH_STILL_ABOVE_M,
     STILL_THRUST,
     THRUST_MIN,
     Acted,
     catch,
     catch_above_m,
+    hold_here,
     left_contact,
     let_go,
+    limited,
+    presses,
     stop_motors,
+    unpressed,
+    walk,
 )
+from perchctl.mission.imu import REACH_M, UNSEEN_S, Vector, reckoned, sighted, stepped
 from perchctl.mission.state import Condition, Observation, Phase, PlannerState, Severity
 from perchctl.profile import LandingConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import (
+    FLYING,
     FULL_THRUST,
     HL_ACTIVE,
     Command,
@@ -53,7 +62,6 @@ from perchctl.vehicle import (
     Land,
     PositionSetpoint,
     RawThrust,
-    Telemetry,
 )
 
 
@@ -127,76 +135,54 @@ class Finding(Enum):
     UNKNOWN = "not known"
 
 
-LOOKED_S = 2.0
-"""For so long it is looked whether a target that is seen far above tells where it is."""
+LOOKED_S = 2.0  # a target that is seen far above has so long to show where the vehicle is
 HUNG_WITHIN_M = 0.3
-CARRIED_WITHIN_M = 0.3
-"""What carries or presses a vehicle in flight, so near below the target, is the target."""
-REPEAT_ORDER_S = 0.3
-LEAST_ORDERS, MAX_ORDERS = 3, 6
-"""An order without its notify shows *HL active* and is not flown, and 2 s later the vehicle
-is cut (docs/firmware.md, "Order without notify"): no telemetry tells a lost notify, so the
-pair is sent three times, and more often while nothing shows."""
-PLANNED_MPS, SETTLING_S = 0.35, 1.8
-"""The quintic's largest speed, and time added for its begin: it starts at rest, while the
-vehicle comes sinking, and what the vehicle then catches up with must be slow."""
+CARRIED_WITHIN_M = 0.3  # what carries or presses a vehicle so near below the target is the target
+REPEAT_ORDER_S, LEAST_ORDERS, MAX_ORDERS = 0.3, 3, 6
+"""No telemetry shows a lost notify, without which an order is not flown and the vehicle is cut 2 s
+later (docs/firmware.md, "Order without notify"): so the pair is sent three times, and more often
+while nothing shows."""
+PLANNED_MPS, SETTLING_S = 0.35, 1.8  # of the own landing's quintic: largest speed; time to begin
+PEAK_OF_MEAN = 1.875  # of a quintic from rest to rest: its largest speed over its mean
 MOST_DRIFT_M = 1.0
-UNKNOWN_M = 1.0
-"""The height to come down from where none is known."""
-PEELED_M = 0.1
-"""Below the contact by so much, the magnet has let go."""
+UNKNOWN_M = 1.0  # to come down from an unknown height
+PEELED_M = 0.1  # below the contact by so much, the magnet has let go
 PEEL_BELOW_M, PEEL_S = 0.35, 4.0
 DROPPING_MPS = -0.35
-"""Of the landing's time: what is up there by then is left to its own landing."""
-FALLING_G, FALLEN_MPS = 0.5, 1.0
-"""A landing that ends 5 cm above the floor drops it no faster, and is over."""
-FALLEN_BELOW_M = 0.4
-"""By an estimate that is placed, such an end is not higher up: that is a cut in the air."""
-_PEAK_OF_MEAN = 1.875
-"""Of a quintic from rest to rest: its largest speed over its mean."""
-
+FALLING_G, FALLEN_MPS = 0.5, 1.0  # a landing that ends 5 cm above the floor drops it no faster
+FALLEN_BELOW_M = 0.4  # by a position: such an end from higher up is a cut in the air
 HIGH_M, LOW_M, STAYED_M = 0.45, 0.3, 0.15
-HELD = "held"
-"""The row of a landing that began since something held it."""
+HELD = "held"  # the transition of a landing that began since something held the vehicle
 SINK_MPS, LOW_SINK_MPS, SLOW_BELOW_M = 0.7, 0.4, 0.6
-"""Level it comes down fast from high up: sideways it goes with the third power of the time, by
-the gyroscope's offset, 2 m in 4 s."""
+"""Level it comes down fast from high up: by the gyroscope's offset it goes sideways with the third
+power of the time, 2 m in 4 s."""
 MOST_GAIN_S_PER_M, LEAST_GAIN_S_PER_M, GAIN_AGE_S2_PER_M = 0.5, 0.2, 0.06
-"""Part of the hover thrust for each m/s. A speed of long ago wants less, or it swings."""
+"""Part of the hover thrust for each m/s; an older speed wants less, or it swings."""
 HOVER_MEMORY_S, HOVER_WITHIN, UNLEARNED_WITHIN = 0.3, 0.12, 0.35
-"""The hover thrust is what the thrust is for each g that is felt, in free flight."""
 LATEST_S, UNHEARD_PART, OWN_ESTIMATE_S = 1.0, 0.98, 1.5
-"""Telemetry so late still tells how fast it sank, and what was ordered since adds to that. Where
-nothing is heard, a little less than what should be right: it has to come down."""
-ON_THE_SPOT_S = 0.6
-"""So long by setpoints at one place, and no speed of before is left."""
-RAMP_PER_S, STILL_MPS = 0.25, 0.05
-"""What does not sink gets less and less thrust."""
+"""Later telemetry no longer tells the speed; then a little less thrust lets it come down."""
+ON_THE_SPOT_S = 0.6  # so long by setpoints at one place, and no speed of before is left
+RAMP_PER_S, STILL_MPS = 0.25, 0.05  # what does not sink gets less and less thrust
 LEAST_PART, MOST_RAW = 0.4, 60000.0
-BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD = 0.25, 0.22
-"""Sideways speed goes down by 1/e in 0.4 s, several times the age of what is known of it; so much
-tilt takes 2.5 % of the thrust."""
-BRAKED_AGE_S = 0.2
-"""An older speed is braked the less, or it swings."""
+BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD = 0.25, 0.22  # by 1/e in 0.4 s; takes 2.5 % of the thrust
+BRAKED_AGE_S = 0.2  # an older speed is braked less, or it swings
 UNSURE_MPS, UNSURE_MPS2, MOST_UNSURE_MPS = 0.05, 0.1, 0.3
-"""Of the reckoned speed so much is left alone: an attitude that is 0.01 rad wrong makes 0.1 m/s of
-it each second, and braking that would drive the vehicle aside."""
-LEVEL_FELT_S = 6.0
-"""An attitude's error that pictures told is not the present one for longer."""
+"""Left of the reckoned speed: an attitude error of 0.01 rad adds 0.1 m/s to it each second."""
+LEVEL_FELT_S = 6.0  # an attitude error that pictures measured is not the present one for longer
 STOP_BELOW_M, RESTS_MPS = 0.05, 0.1
-UNANSWERED_PART = 0.12
-"""Of full thrust: farther from the order no ramp leads in the time that an order takes."""
+UNANSWERED_PART = 0.12  # of full thrust: no ramp leads farther before an order is answered
 CARRIED_G, CARRIED_PART, AIRBORNE_G = 0.95, 0.88, 0.85
 TOUCH_PART, TOUCH_S, TOUCH_BELOW_M = 0.5, 0.25, 0.7
-"""A blow from below so near to the floor is the floor: half of the hover thrust proves it, since
-what is in the air falls with it."""
+"""A blow from below so near the floor is the floor: half of the hover thrust proves it, since in
+the air the vehicle falls with it."""
 LEVEL_SPARE_S, UNHEARD_SPARE_S, LEVEL_MEAN_MPS = 2.0, 0.8, 0.35
+AT_REST_S = 0.3
 
 
 def step_landing(
     state: PlannerState, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
-    """One tick of the way down without the mission's table: for who lands in the loop's place."""
+    """One tick of the way down without the mission's table, for watchdog and rescue."""
     state = observed(begun(state, obs, profile), obs, profile)
     state = replace(state, since=conditions_since(Context(state, obs, profile)))
     state, command = act(Context(state, obs, profile))
@@ -204,13 +190,13 @@ def step_landing(
 
 
 def begun(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """The state with its way down begun; as it is where that has."""
+    """The state with its way down begun, unless that has."""
     if state.phase is Phase.LANDING:
         return state
     c = Context(state, obs, profile)
     new = replace(
         state, phase=Phase.LANDING, entered_s=obs.t_s, severity=max(state.severity, Severity.LAND),
-        since={name: s for name, s in state.since.items() if name in KEPT_OVER_A_CHANGE},
+        since=kept_over_a_change(state.since),
         entry_m=obs.telemetry.position_m, entry_yaw_rad=obs.telemetry.yaw_rad,
         pressed=state.caught and presses(c), ordered_s=None, orders=0,
     )  # fmt: skip
@@ -220,24 +206,24 @@ def begun(state: PlannerState, obs: Observation, profile: Profile) -> PlannerSta
 def started(
     new: PlannerState, old: PlannerState, obs: Observation, profile: Profile
 ) -> PlannerState:
-    """What a way down that `old` leads to starts with, beyond its entry."""
+    """The state that a way down from `old` starts with; `new` has its entry already."""
     tel, stopped_s = obs.telemetry, old.stopped_s
     heard = obs.t_s - tel.t_s <= profile.safety.proof_age_s
     ordered = heard and tel.has(HL_ACTIVE) and profile.positioning.by != "target"
     if ordered and not new.astray:  # else it would follow the wrong positions to its end
         new = replace(new, orders=LEAST_ORDERS, ordered_s=obs.t_s)
     elif heard and tel.thrust < 1 and stopped_s is None:
-        # Somebody has stopped the motors, or they never turned: nothing spins them up again.
+        # The motors were stopped, or never turned: nothing spins them up again.
         new = replace(new, stopped_s=obs.t_s)
     contact_z_m = old.contact_z_m
     c = Context(new, obs, profile)
     if contact_z_m is None and (old.phase is Phase.PERCH or (new.pressed and c.by_sight)):
-        # It may be in the magnet's reach, below the sheet too, where that hangs above a ceiling
-        # that the camera does not see: it has to be seen below before it counts as free.
+        # It may be in the magnet's reach, also below a sheet that hangs above an unseen ceiling:
+        # it has to be seen below before it counts as free.
         contact_z_m = tel.position_m[2]
     hover = _hover_thrust(old, obs)
-    # While the loop was silent the watchdog may have brought it down, or up to the magnet and no
-    # farther: what was felt meanwhile counts from the tick before.
+    # While the loop was silent the watchdog may have brought it down or to the magnet: what was
+    # measured meanwhile counts from the tick before.
     within = contact_z_m is not None or new.reckoning.below_m < REACH_M
     new = replace(
         new, reach_s=old.t_s if within and old.reach_s is None else old.reach_s,
@@ -266,7 +252,7 @@ def evidence_of(c: Context) -> Evidence:
 
 
 def _is_doubtful(c: Context) -> bool:
-    """Whether the height, the stream or this loop cannot be relied on."""
+    """True if the height, the stream or this loop cannot be relied on."""
     safety = c.profile.safety
     return (
         c.obs.link_problem is not None
@@ -277,12 +263,12 @@ def _is_doubtful(c: Context) -> bool:
 
 
 def _is_sighted(c: Context) -> bool:
-    """Whether the position by the target is one to come down by."""
+    """True if the position by the target is good enough to come down by."""
     return c.located and not c.is_blown and not _is_doubtful(c)
 
 
 def _has_lost_its_position(c: Context) -> bool:
-    """Whether accelerometer and attitude are what is left: nothing from outside places it."""
+    """True if only accelerometer and attitude are left."""
     if c.by_sight:
         return not _is_sighted(c)
     return not (c.located or c.state.astray)
@@ -304,8 +290,8 @@ def stage_of(c: Context) -> Stage:
 def rest_finding(c: Context) -> Finding:
     """Where the vehicle is, once its motors are off.
 
-    What was within the magnet's reach and has not fallen since hangs, as long as no silence of
-    the telemetry could hide a fall. Else a position tells, or the picture of a target far above.
+    What was within the magnet's reach and has not fallen since hangs, unless a silence of the
+    telemetry could hide a fall. Else a position decides, or the picture of a target far above.
     """
     tel, state = c.obs.telemetry, c.state
     if _is_held_elsewhere(c):
@@ -323,8 +309,8 @@ def rest_finding(c: Context) -> Finding:
 
 
 def _is_held_elsewhere(c: Context) -> bool:
-    """Up, and not on the target's magnet: in a hand, or caught by something. It was felt to be held
-    as the landing began and has not fallen since, or it is below the target by a position."""
+    """True if it is up, and not on the target's magnet: held as the landing began and not fallen
+    since, or below the target by a position."""
     state = c.state
     if state.phase is not Phase.LANDING:
         return False
@@ -338,10 +324,10 @@ def _is_held_elsewhere(c: Context) -> bool:
 
 
 def _by_fall(c: Context, since_s: float | None) -> Finding:
-    """`since_s`: within the magnet's reach since."""
+    """By falls and silences, of a vehicle that is within the magnet's reach since `since_s`."""
     imu, reckoning = c.obs.imu, c.state.reckoning
     down_s = max(imu.fell_s, -math.inf if c.state.touch_s is None else c.state.touch_s)
-    unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sight tells where it was
+    unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sight ends the doubt
     if since_s is None or down_s > since_s:
         return Finding.UNKNOWN if unsure else Finding.STANDS
     came_unheard = unsure and reckoning.unsure_s <= since_s
@@ -349,15 +335,15 @@ def _by_fall(c: Context, since_s: float | None) -> Finding:
 
 
 def hangs_where_it_did(c: Context) -> bool:
-    """At its contact by a position; or, wherever the estimate has it, felt to have hung all the
-    time. What telemetry did not show for as long as a fall takes may lie on the floor by now."""
+    """True if it is at its contact by a position, or has hung all the time by the accelerometer.
+    A silence as long as a fall leaves it unknown."""
     if not c.by_sight and c.placed and _is_at_contact(c):
         return True
     return _by_fall(c, c.state.reach_s) is Finding.HANGS
 
 
 def hangs_stopped(c: Context) -> bool:
-    """The motors were stopped where it hung, and there it still is."""
+    """True if the motors were stopped where it hung, and it is still there."""
     stopped_s, landing = c.state.stopped_s, c.state.phase is Phase.LANDING
     if stopped_s is None or (landing and stopped_s >= c.state.entered_s and c.state.orders == 0):
         return False
@@ -365,8 +351,8 @@ def hangs_stopped(c: Context) -> bool:
 
 
 def _is_at_contact(c: Context) -> bool:
-    """Where the magnet has it: a slip ends the contact at once, and what the estimate drifts while
-    it hangs is less than this."""
+    """True if it is where the magnet has it: a slip ends the contact at once, and the estimate of
+    a hanging vehicle drifts less."""
     contact_z_m, tel = c.state.contact_z_m, c.obs.telemetry
     if contact_z_m is None:
         return False
@@ -397,28 +383,26 @@ def why_fell_unseen(c: Context) -> str:
 
 
 def observed(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """The state with what one more observation tells: whoever notices a hang, a jump or a loss
-    of positions, it is noticed here."""
+    """The state with one more observation. Hangs of the loop, jumps of the estimate and lost
+    positions are noticed here, for all who fly a way down."""
     if state.last is not None and obs.t_s - state.t_s > profile.positioning.hold_s:
-        # After a hang everything from before is stale; dwell times begin anew.
-        kept = {name: s for name, s in state.since.items() if name in KEPT_OVER_A_CHANGE}
+        # After a hang of the loop everything from before is stale; dwell times begin anew.
+        kept = kept_over_a_change(state.since)
         off_s = max(obs.imu.off_s, obs.imu.silent_s)
         if Condition.DOWN in state.since and math.isfinite(off_s):
-            # Each sample of the hang has come, and in none do the motors turn: a loop that hangs
-            # in every turn would never see a landing end.
+            # All samples of the hang have come, and in none do the motors turn: else a loop that
+            # hangs in every turn would never see a landing end.
             kept[Condition.DOWN] = max(off_s, state.since[Condition.DOWN])
         stale_s = obs.t_s if profile.positioning.by == "target" else state.stale_s
         # A catch is over, and its setpoint far above with it: held, it would press.
         setpoint = state.setpoint if state.caught else None
         state = replace(state, since=kept, stale_s=stale_s, caught=True, setpoint=setpoint)
-    if Context(state, obs, profile).position_age_s > profile.positioning.hold_s:
+    if Context(state, obs, profile).position_is_stale:
         state = replace(state, stale_s=obs.t_s)
     if obs.jumped:
         state = _jumped(state, obs)
     if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
-        # Where no hover thrust was learned yet, the present one has to do.
-        hover = _hover_thrust(state, obs)
-        state = replace(state, heading_lost=True, hover_thrust=hover)
+        state = replace(state, heading_lost=True, hover_thrust=_hover_thrust(state, obs))
     state = _reckon(Context(_answered(state, obs, profile), obs, profile))
     c = Context(state, obs, profile)
     comes_down = state.phase is Phase.LANDING and stage_of(c) in (Stage.DOWN, Stage.ORDERED)
@@ -428,7 +412,7 @@ def observed(state: PlannerState, obs: Observation, profile: Profile) -> Planner
 
 
 def ordered(state: PlannerState, command: Command) -> PlannerState:
-    """With what was commanded: the thrust that is read has to follow it."""
+    """The state with what was commanded: the thrust that is read has to follow it."""
     match command:
         case RawThrust(thrust):
             return replace(state, raw_order=thrust)
@@ -439,7 +423,7 @@ def ordered(state: PlannerState, command: Command) -> PlannerState:
 
 
 def _answered(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """A reading that stands still under a changed order says nothing of the thrust."""
+    """A reading that stands still under a changed order leaves the thrust unknown."""
     if state.raw_order is None:
         return state
     wanted = 0.0 if state.raw_order < STILL_THRUST else min(MOST_RAW, state.raw_order)
@@ -451,8 +435,8 @@ def _answered(state: PlannerState, obs: Observation, profile: Profile) -> Planne
 
 
 def blinded(state: PlannerState, obs: Observation) -> PlannerState:
-    """Accelerometer and attitude are all that is left, for good: no sight is believed again on
-    this way down, since each change of the mode costs height."""
+    """The state once accelerometer and attitude are all that is left, for good: each change of the
+    mode costs height, so no sight is believed again on this way down."""
     hover = _hover_thrust(state, obs)
     height_m = obs.telemetry.position_m[2] - (state.ground_m[2] if state.ground_m else 0.0)
     return replace(state, blind_s=obs.t_s, blind_height_m=height_m, hover_thrust=hover)
@@ -461,7 +445,7 @@ def blinded(state: PlannerState, obs: Observation) -> PlannerState:
 def _reckon(c: Context) -> PlannerState:
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
-    # By the target no sight is sent on the way down: the estimate's change is what it felt itself.
+    # By the target no sight is sent on the way down: the estimate's change is its own.
     astray = state.astray and not c.by_sight
     new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray)
     if c.located and not c.by_sight and state.last is not None:
@@ -469,12 +453,12 @@ def _reckon(c: Context) -> PlannerState:
     moved_s = max(obs.imu.steady_s, obs.imu.steady_aside_s)
     rests = obs.t_s - moved_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
     if state.contact_z_m is not None and new.below_m < REACH_M and rests:
-        # What the impact left of a speed is none: pressed or hanging it stands still. On its way
-        # to the target a gust moves it, and a blow knocks it off the magnet.
+        # Pressed or hanging it stands still, whatever speed the impact left to the estimate. On
+        # its way to the target a gust moves it, and a blow knocks it off the magnet.
         new = replace(new, velocity_mps=(0.0, 0.0, 0.0))
     felt, late = obs.felt, latency_changed(c)
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
-        # Pictures that are late have led the estimate's height astray, too.
+        # Late pictures have led the estimate's height astray, too.
         climb_mps = felt.climb_mps if late else None
         climb_mps = new.velocity_mps[2] if climb_mps is None else climb_mps
         new = replace(
@@ -490,7 +474,7 @@ def _reckon(c: Context) -> PlannerState:
             cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
             sigma_m = float(max(target.sigma_m[:2]))
             aside_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
-            # An estimate that was without a position since then was moved when that came back.
+            # An estimate without a position since then was moved when that came back.
             if not seen and state.stale_s is not None and state.stale_s >= target.measured_s:
                 aside_m, sigma_m = new.aside_m, new.aside_sigma_m
             new = sighted(new, target.measured_s, aside_m, float(ez), sigma_m)
@@ -500,17 +484,17 @@ def _reckon(c: Context) -> PlannerState:
     flies = state.phase is not Phase.LANDING  # there the hover thrust is no more than learned
     near = c.by_sight and flies and new.below_m < CARRIED_WITHIN_M
     if near and held_s >= c.profile.planner.perch.contact_dwell_s:
-        # It is at the target: by late pictures it is lower.
+        # It is at the target; late pictures show it lower.
         new = replace(
             new, below_m=min(0.0, new.below_m), nearest_m=min(0.0, new.nearest_m),
             velocity_mps=(*new.velocity_mps[:2], 0.0),
         )  # fmt: skip
     reach_s = state.reach_s
     if stage_of(c) in (Stage.DOWN, Stage.ORDERED):  # what is released or stopped moves no more
-        # What has felt the floor climbs no more, whatever may have been reckoned since.
+        # After the floor was touched nothing climbs, whatever was reckoned since.
         near = new.below_m < REACH_M and state.touch_s is None
         within = state.contact_z_m is not None or near
-        # Caught below the magnet it may be drawn to it again: what fell before says nothing then.
+        # Caught below the magnet it may be drawn to it again: an earlier fall proves nothing then.
         again = reach_s is not None and obs.imu.fell_s > reach_s and new.below_m < REACH_M
         reach_s = (obs.t_s if reach_s is None or again else reach_s) if within else None
     down_m = 0.0
@@ -520,22 +504,17 @@ def _reckon(c: Context) -> PlannerState:
         last, tel = state.last, obs.telemetry
         heard_again = obs.imu.silent_s > state.reckoning.imu.t_s and c.proves and not obs.jumped
         if heard_again and last is not None and tel.start == last.start:
-            # No position corrected the estimate in the silence: its change is what was felt.
+            # No position corrected the estimate in the silence: its change was measured on board.
             down_m = tel.position_m[2] - last.position_m[2]
     return replace(
         state, reckoning=new, reach_s=reach_s, blind_height_m=state.blind_height_m + down_m
     )
 
 
-AT_REST_S = 0.3
-Place = tuple[float, float, float]
-
-
 def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
-    """The estimate's world has moved, the vehicle has not: ground, contact and what else is
-    remembered are where the estimate has them now, and it is held where it is. Where samples
-    are missing before the step, it may be the vehicle that has moved, even to the floor; where
-    positions from outside have come again, the step ends a drift, and what was true before is."""
+    """The estimate's world has moved, the vehicle has not: ground, contact and all that is
+    remembered move with it. Not where samples are missing before the step, since the vehicle may
+    have moved, nor where external positions have come again and the step ends a drift."""
     tel, last = obs.telemetry, state.last
     if last is None:
         return replace(state, jump_s=obs.t_s if state.jump_s is None else state.jump_s)
@@ -549,15 +528,11 @@ def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
         moved_m = (0.0, 0.0, 0.0)
     setpoint, contact_z_m, blocked_z_m = state.setpoint, state.contact_z_m, state.blocked_z_m
     if state.phase is Phase.LANDING and state.orders and tel.thrust >= 1:
-        # Its own landing goes on along a line in the world that was: it dives, or climbs.
+        # Its own landing goes on along a line in the old world: it dives, or climbs.
         state = replace(
-            state,
-            entered_s=obs.t_s,
-            orders=0,
-            ordered_s=None,
-            caught=False,
+            state, entered_s=obs.t_s, orders=0, ordered_s=None, caught=False,
             catch_above_m=CATCH_STILL_ABOVE_M,
-        )
+        )  # fmt: skip
     if setpoint is not None:
         z_m = z if contact_z_m is None else setpoint.z_m + moved_m[2]
         setpoint = PositionSetpoint(x, y, z_m, tel.yaw_rad)
@@ -572,33 +547,30 @@ def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
     )
 
 
-def _moved(place: Place, by_m: Place) -> Place:
+def _moved(place: Vector, by_m: Vector) -> Vector:
     return (place[0] + by_m[0], place[1] + by_m[1], place[2] + by_m[2])
 
 
 def _hover_thrust(state: PlannerState, obs: Observation) -> float:
-    return state.hover_thrust or obs.imu.hover_thrust or felt_hover_thrust(obs.telemetry)
-
-
-def felt_hover_thrust(tel: Telemetry) -> float:
-    """In a climb, or sinking, the accelerometer tells by how much the thrust is beside the
-    weight. Motors that stand still tell nothing, and nothing hovers on the least of position mode.
-    """
-    return max(THRUST_MIN, tel.thrust / min(1.5, max(0.75, tel.acc_z_g)))
+    """As learned; else the thrust for each g that is measured, now: in a climb, or sinking, it is
+    beside the weight. Nothing hovers on the least of position mode."""
+    tel = obs.telemetry
+    measured = max(THRUST_MIN, tel.thrust / min(1.5, max(0.75, tel.acc_z_g)))
+    return state.hover_thrust or obs.imu.hover_thrust or measured
 
 
 # --- What is commanded --------------------------------------------------------------------------
 
 
 def act(c: Context) -> Acted:
-    """One tick: the two proofs, then the table."""
+    """The command of one tick: by the two proofs, then by the table."""
     state = c.state
     if _falls_free(c):
         return _caught_again(c)
     if state.stopped_s is None and not state.caught:
         if (caught := _catch(c)) is not None:
             return caught
-        c = Context(replace(state, caught=True), c.obs, c.profile)
+        c = c.with_state(replace(state, caught=True))
     if c.state.stopped_s is None and _stands(c):
         return stop_motors(c)
     if c.held(Condition.HANGING) >= HANGING_S and stage_of(c) is Stage.DOWN:
@@ -608,8 +580,8 @@ def act(c: Context) -> Acted:
 
 
 def _falls_free(c: Context) -> bool:
-    """What hung has come off: it was released or stopped up there, or peeled with too little
-    thrust left to go on down slowly."""
+    """True if it has come off the magnet: released or stopped up there, or peeled with too little
+    thrust left to go down slowly."""
     if not c.imu_proves or stage_of(c) is Stage.ORDERED:
         return False
     if c.state.released_s is not None or c.state.stopped_s is not None:
@@ -618,17 +590,17 @@ def _falls_free(c: Context) -> bool:
 
 
 def _stands(c: Context) -> bool:
-    """On the floor, by proof."""
+    """True if it is on the floor, by proof."""
     if c.proves and c.held(Condition.ON_FLOOR) >= 0.5:
         return True
-    # Where height is measured, it stops instead of sliding: as soon as it sinks no more.
+    # Where height is measured, it stops as soon as it sinks no more, instead of sliding.
     level = c.by_sight and c.placed and c.state.blind_s is None and c.state.level_thrust > 0.0
     low = c.height_m < STOP_BELOW_M and reach_of(c) is Reach.FREE
     return level and low and c.climb_mps > -RESTS_MPS
 
 
 def _caught_again(c: Context) -> Acted:
-    """It is free of the magnet, and falls: the landing begins anew below."""
+    """The landing, begun anew below: the vehicle is free of the magnet, and falls."""
     tel = c.obs.telemetry
     state = replace(
         c.state, released_s=None, stopped_s=None, contact_z_m=None, reach_s=None, caught=False,
@@ -637,13 +609,13 @@ def _caught_again(c: Context) -> Acted:
         entered_s=c.obs.t_s, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
         reckoning=replace(c.state.reckoning, below_m=math.inf),
     )  # fmt: skip
-    c = Context(state, c.obs, c.profile)
+    c = c.with_state(state)
     return _catch(c) or ACTIONS[MANOEUVRES[evidence_of(c), Reach.FREE, Stage.DOWN]](c)
 
 
 def _catch(c: Context) -> Acted | None:
-    """By position, which without a heading, or astray, would lead away from where it is: there the
-    raw thrust of the level descent brakes the fall."""
+    """A catch by position; None without a heading, or astray, where position control would lead
+    away and the raw thrust of the level descent brakes the fall."""
     return None if c.state.heading_lost or c.state.astray else catch(c)
 
 
@@ -652,8 +624,8 @@ def _setpoints(c: Context) -> Acted:
     state, away = unpressed(c)
     if away is not None:
         return state, away
-    c = Context(state, c.obs, c.profile)
-    # When its time is over nothing is sent any more: by then it must be landing by itself.
+    c = c.with_state(state)
+    # When the landing's time is over nothing is sent: by then it must be landing by itself.
     overdue = c.in_phase_s > c.profile.planner.landing.overdue_s
     if overdue or c.height_m <= c.profile.planner.landing.handover_m:
         return _own_landing(c)
@@ -661,25 +633,25 @@ def _setpoints(c: Context) -> Acted:
 
 
 def _setpoints_level(c: Context) -> Acted:
-    """Down by setpoints to the hand-over, the rest level: the vehicle's own landing would go by an
-    estimate that rests on pictures, to a floor that nobody measures."""
+    """Down by setpoints to the hand-over, the rest level: the vehicle's own landing would follow an
+    estimate that rests on pictures, to an unmeasured floor."""
     state, away = unpressed(c)
     if away is not None:
         return state, away
-    c = Context(state, c.obs, c.profile)
+    c = c.with_state(state)
     if c.state.level_thrust or c.height_m <= c.profile.planner.landing.handover_m:
         return _level(c)
     return _by_setpoints(c)
 
 
 def _peel(c: Context) -> Acted:
-    """A setpoint below takes the thrust to its least. What that has not moved is given to the
-    magnet; where nobody can watch that, the setpoint goes on down to the floor."""
+    """A setpoint below takes the thrust to its least. What that does not move is given to the
+    magnet; without fresh telemetry the setpoint goes on down to the floor."""
     if c.by_sight:
         state, away = unpressed(c)
         if away is not None:
             return state, away
-        c = Context(state, c.obs, c.profile)
+        c = c.with_state(state)
     watched = evidence_of(c) is not Evidence.ONBOARD or c.imu_proves
     if c.in_phase_s > PEEL_S and watched:
         return let_go(c)
@@ -687,11 +659,11 @@ def _peel(c: Context) -> Acted:
 
 
 def _by_setpoints(c: Context) -> Acted:
-    """Straight down at the landing's speed, where it was when the landing began."""
+    """Straight down at the landing's speed, from where the landing began."""
     landing, state = c.profile.planner.landing, c.state
     here = hold_here(c)
     start = state.setpoint if state.caught and state.setpoint is not None else here
-    # A setpoint far above (the press, a search step) must not be walked down slowly.
+    # A setpoint far above (the press, a search step) is not walked down slowly.
     start = replace(start, z_m=min(start.z_m, here.z_m))
     x, y, _ = state.entry_m
     ground_z = state.ground_m[2] if state.ground_m else 0.0
@@ -705,63 +677,55 @@ def _by_setpoints(c: Context) -> Acted:
         down_mps=landing.speed_mps,
         yaw_rate_radps=0.0,
     )
-    # A vehicle that does not follow is not pulled by a setpoint that runs away from it,
-    # beyond what takes the thrust down to its least.
+    # The setpoint does not run away from a vehicle that does not follow, beyond what takes the
+    # thrust down to its least.
     if c.telemetry_age_s <= c.profile.safety.telemetry_hold_s:
         setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - PEEL_BELOW_M))
     state = replace(left_contact(c, PEELED_M).state, setpoint=setpoint, caught=True)
     return state, limited(c, setpoint)
 
 
-def own_landing(
-    landing: LandingConfig,
-    ground_z_m: float,
-    flown_s: float,
-    newest: Telemetry | None,
-) -> Land:
-    """The order for the vehicle's own landing, which follows a quintic from rest to rest.
+def own_landing(landing: LandingConfig, ground_z_m: float, flown_s: float, z_m: float) -> Land:
+    """The order for the vehicle's own landing from `z_m`, a quintic from rest to rest.
 
-    It aims below the ground, and the lower the longer the estimate has had to drift: the
-    motors stop at the trajectory's end, and over a floor that lies lower they would drop it.
-    It never aims above where the estimate has the vehicle, which may be far below the ground by
-    now: that would be a climb.
+    It aims below the ground, and the lower the longer the estimate has had to drift: at the
+    trajectory's end the motors stop, and over a lower floor they would drop it. It never aims above
+    the vehicle, whose estimate may be far below the ground by now. A `z_m` that is no number counts
+    as `UNKNOWN_M`.
     """
-    z_m = math.nan if newest is None else newest.position_m[2]
     below_m = landing.undershoot_m + min(MOST_DRIFT_M, landing.drift_mps * max(0.0, flown_s))
     known = math.isfinite(z_m)
     aim_m = (min(ground_z_m, z_m) if known else ground_z_m) - below_m
     way_m = z_m - aim_m if known else UNKNOWN_M
-    lasts_s = SETTLING_S + _PEAK_OF_MEAN * way_m / PLANNED_MPS
+    lasts_s = SETTLING_S + PEAK_OF_MEAN * way_m / PLANNED_MPS
     return Land(aim_m, lasts_s)
 
 
 def _own_landing(c: Context) -> Acted:
-    """The vehicle's own landing, given again while it shows no effect."""
+    """The vehicle's own landing, ordered again while it shows no effect."""
     landing, state, tel = c.profile.planner.landing, c.state, c.obs.telemetry
     state, away = unpressed(c)
     if away is not None and not _is_doubtful(c) and not state.orders:
         return state, away
-    # Where it has been given often enough, a short fall is its end, and not that it was lost:
-    # near the floor, or where nothing tells how near that is.
+    # Ordered often enough, a short fall near the floor, or at an unknown height, is its end.
     ends = state.orders >= LEAST_ORDERS and not (c.placed and c.height_m >= FALLEN_BELOW_M)
     carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
-    if c.imu_proves and tel.thrust < 1 and carried and (state.orders or not c.flying):
+    if c.imu_proves and tel.thrust < 1 and carried and (state.orders or not tel.has(FLYING)):
         return state, Idle()  # on the floor: another order would spin the motors up again
     ground_z = state.ground_m[2] if state.ground_m else 0.0
     waited = math.inf if state.ordered_s is None else c.obs.t_s - state.ordered_s
-    seen = state.orders >= LEAST_ORDERS and c.imu_proves and c.high_level_active
+    seen = state.orders >= LEAST_ORDERS and c.imu_proves and tel.has(HL_ACTIVE)
     if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
         flown_s = c.obs.t_s - state.started_s
-        order = own_landing(landing, ground_z, flown_s, tel)
+        order = own_landing(landing, ground_z, flown_s, tel.position_m[2])
         return replace(state, ordered_s=c.obs.t_s, orders=state.orders + 1, setpoint=None), order
     return state, Idle()
 
 
 def _level(c: Context) -> Acted:
-    """Level by raw thrust, on the vertical speed that the accelerometer and, where it is believed,
-    the estimate tell. What does not sink gets less and less thrust: a hovering vehicle begins to
-    sink, the ceiling lets go or proves that it holds, and the floor is proven by what carries
-    the vehicle. Tilted against the sideways speed that it has."""
+    """Level by raw thrust, on the vertical speed of the accelerometer and, where it is believed,
+    the estimate; tilted against the sideways speed. What does not sink gets less and less thrust:
+    it begins to sink, the ceiling lets go or proves that it holds, and the floor proves itself."""
     state, tel = c.state, c.obs.telemetry
     dt_s = max(0.0, min(0.1, c.obs.t_s - state.t_s))
     age_s = max(1e-3, dt_s, c.attitude_age_s)
@@ -769,13 +733,13 @@ def _level(c: Context) -> Acted:
     unlearned = state.level_thrust == 0.0 and state.level_within == UNLEARNED_WITHIN
     if unheard and unlearned and c.in_phase_s < OWN_ESTIMATE_S:
         return _by_setpoints(c)  # the vehicle's own estimate is nearer than an unknown thrust
-    # Unheard since before it came down, it was held by setpoints until then: it hardly moves.
+    # Without telemetry since before, it was held by setpoints until now: it hardly moves.
     held = tel.t_s < state.entered_s - ON_THE_SPOT_S
     climb_mps = (0.0 if held else c.climb_mps) + state.under_way_mps
     hover = _learned_hover(c, dt_s)
     height_m = c.height_m if state.blind_s is None else state.blind_height_m
     height_m += min(0.0, climb_mps) * age_s
-    # By late pictures the floor may be half a metre nearer than it seems.
+    # Late pictures may show the floor half a metre too far.
     low = height_m <= SLOW_BELOW_M or latency_changed(c)
     sink_mps = LOW_SINK_MPS if low else SINK_MPS
     gain = GAIN_AGE_S2_PER_M / max(1e-3, c.attitude_age_s)
@@ -787,12 +751,12 @@ def _level(c: Context) -> Acted:
     if unheard:
         thrust *= UNHEARD_PART
     touched_s = math.inf if touch_s is None else c.obs.t_s - touch_s
-    # In the air it would read what the thrust gives, on the floor one g: nearer to which it is.
+    # In the air the accelerometer reads what the thrust gives, on the floor one g.
     if touched_s >= TOUCH_S and c.imu_proves and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover):
         touch_s = None  # it falls with its thrust: that was no floor
-    # With less thrust than that the accelerometer reads one g on something only.
+    # With less thrust than that it reads one g only if something carries it.
     carried = c.imu_proves and tel.acc_z_g > CARRIED_G and tel.thrust < CARRIED_PART * hover
-    # What is in the air falls with its thrust, however long it takes.
+    # In the air it falls with its thrust, however long it takes.
     overdue = _is_overdue(c) and not (c.imu_proves and tel.acc_z_g < AIRBORNE_G)
     before = state.level_thrust or hover
     if touched_s < TOUCH_S:
@@ -800,7 +764,7 @@ def _level(c: Context) -> Acted:
     elif touch_s is not None or carried or climb_mps > -STILL_MPS or overdue:
         thrust = min(thrust, before - RAMP_PER_S * hover * dt_s)
     thrust = max(LEAST_PART * hover, min(MOST_RAW, thrust))
-    # What the orders give since the newest sample; without a new one all of it goes on counting.
+    # The speed that orders have given since the newest sample.
     shown_s = 0.0 if state.last is None else max(0.0, tel.t_s - state.level_sample_s)
     gained_mps = GRAVITY_MPS2 * (thrust / hover - 1.0) * dt_s
     under_way_mps = state.under_way_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
@@ -814,9 +778,8 @@ def _level(c: Context) -> Acted:
 
 
 def is_spent(c: Context) -> bool:
-    """Whether a way down is over, whatever became of it: a level one has come to its least thrust,
-    on which nothing flies for long, or the setpoint to the floor. What only ended the stream would
-    be cut and locked by the firmware 2 s later."""
+    """True if a way down is over: a level one has come to its least thrust, on which nothing flies
+    for long, or the setpoint to the floor. Without a stop the firmware would lock it 2 s later."""
     setpoint, ground_m = c.state.setpoint, c.state.ground_m
     if setpoint is not None and ground_m is not None:
         landing = c.profile.planner.landing
@@ -826,7 +789,7 @@ def is_spent(c: Context) -> bool:
 
 
 def left_level(c: Context) -> Context:
-    """Away from the contact: seen below it by a position, or felt to have come down."""
+    """The context without its contact, once a position shows it below, or it fell."""
     if c.placed and c.state.blind_s is None:
         return left_contact(c, PEELED_M)
     reach_s = c.state.reach_s
@@ -836,13 +799,13 @@ def left_level(c: Context) -> Context:
         state = replace(
             c.state, contact_z_m=None, reach_s=None, reckoning=reckoning, blind_s=blind_s
         )
-        return Context(state, c.obs, c.profile)
+        return c.with_state(state)
     return c
 
 
 def _learned_hover(c: Context, dt_s: float) -> float:
-    """The hover thrust, drawn to what the thrust gives for each g: learned in a climb, or not at
-    all, it is several per cent beside the true one. Only in free flight, where both are known."""
+    """The hover thrust, drawn to the thrust for each g in free flight: what was learned in a climb,
+    or not at all, is several per cent off."""
     state, tel = c.state, c.obs.telemetry
     first = state.level_hover or state.hover_thrust
     within = state.level_within
@@ -857,23 +820,24 @@ def _learned_hover(c: Context, dt_s: float) -> float:
 
 
 def _is_overdue(c: Context) -> bool:
-    """Blind for so long, it has come down, or hangs, or its reckoned speed has drifted away."""
+    """True if it was blind for so long that it has come down, or hangs, or its reckoned speed has
+    drifted away."""
     if c.state.blind_s is None and not c.state.astray:
         return False
     ground_m = c.state.ground_m[2] if c.state.ground_m else 0.0
     way_m = max(0.0, c.state.entry_m[2] - ground_m)
-    # What hung on the magnet, and slipped, begins anew.
+    # After a slip off the magnet the time begins anew.
     began_s = max(c.state.blind_s or 0.0, c.state.entered_s)
     heard = c.attitude_age_s <= LATEST_S
     spare_s = LEVEL_SPARE_S if heard else UNHEARD_SPARE_S
     if not heard and c.state.level_within == UNLEARNED_WITHIN:
-        spare_s += OWN_ESTIMATE_S  # by then its own estimate has flown it, on the spot
+        spare_s += OWN_ESTIMATE_S  # in which its own estimate has flown it on the spot
     return c.obs.t_s - began_s > spare_s + way_m / LEVEL_MEAN_MPS
 
 
 def _braking(c: Context) -> tuple[float, float]:
-    """Roll and pitch against the sideways speed, and against the attitude's error where pictures
-    tell it, unless the heading is lost."""
+    """Roll and pitch against the sideways speed, and against the attitude's error as pictures
+    measured it; level without a heading."""
     if c.state.heading_lost or reach_of(c) is Reach.MAGNET:
         return 0.0, 0.0
     yaw_rad = c.obs.telemetry.yaw_rad
@@ -898,8 +862,8 @@ def _against(mps: float) -> float:
 
 
 def _weight_on_magnet(c: Context) -> Acted:
-    """The whole weight is put on whatever carries it, and watched; unwatched for long, what would
-    carry most of it is ordered: what hangs stays, what has fallen does not rise."""
+    """Put the whole weight on whatever carries it, and monitor that; without telemetry order what
+    carries most of it: what hangs stays, what has fallen does not rise."""
     if c.attitude_age_s <= c.profile.safety.telemetry_hold_s:
         return let_go(c)
     thrust = int(max(STILL_THRUST, min(THRUST_MIN, LEAST_PART * c.state.hover_thrust)))

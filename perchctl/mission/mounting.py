@@ -1,4 +1,4 @@
-"""Whether the camera is mounted as the profile says: the target stands still in the world.
+"""Checks that the camera is mounted as the profile says: the target stands still in the world.
 
 Where `camera.mount` is turned by an angle a about the vehicle's upward axis, the target is
 placed T = p + M (t - p), with the true target t, M the turn by -a, and p the place where that
@@ -17,36 +17,24 @@ from perchctl.geometry import Array, rotation_from_rpy
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
-WINDOW_S = 3.0
-"""Older sights are left out: a drifting estimate moves both, slowly and together."""
+WINDOW_S = 3.0  # older sights are left out: a drifting estimate moves vehicle and target together
 LEAST_SIGHTS = 10
-JUDGED_M = 0.12
-"""The vehicle's own motion, as its upward axis draws it at the target's height, from which on
-it is judged, and ..."""
-PROVEN_M = 0.3
-"""... beyond which a target that has stood still ends the watch."""
-STANDS_STILL = 0.35
-MOVES_ALONG = 0.6
-"""Of the vehicle's motion: below the first the target stands still, above the second it
-moves with it. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
+JUDGED_M, PROVEN_M = 0.12, 0.3
+"""Motion of the vehicle's upward axis at the target's height from which on the mounting is judged,
+and beyond which a target that has stood still ends the watch."""
+STANDS_STILL, MOVES_ALONG = 0.35, 0.6
+"""Share of the vehicle's motion: below the first the target stands still, above the second it moves
+along. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
 LEAST_SPREAD_M = 0.05
-MOST_UNEXPLAINED = 0.45
-"""Of the target's spread: more of it, and no turn explains how it moves."""
-LEAST_TURN = 0.5
-"""Length of M. About 0 is a world that drifts under both, and no turn."""
-LEAST_TURN_RAD = math.radians(65.0)
-"""A lesser turn leads to the target all the same, in a bow."""
+MOST_UNEXPLAINED = 0.45  # of the target's spread: more, and no turn explains its motion
+LEAST_TURN = 0.5  # length of M; about 0 is a world that drifts under both, and no turn
+LEAST_TURN_RAD = math.radians(65.0)  # a lesser turn leads to the target all the same, in a bow
 SIGHTS_IN_A_ROW = 4
-JUMPS = ((0.1, 0.1), (0.15, 0.2))
-"""Metres, seconds: a target that moves so much farther than twice the vehicle within so short
-a time has been moved, or is another one. What was seen before says nothing then, ..."""
-SETTLES_S = 0.4
-"""... nor does the filter's way to the new place."""
-ESTIMATE_JUMP_M, FASTEST_MPS = 0.05, 1.5
-"""A vehicle that moves more between two sights has a new world."""
+JUMPS, SETTLES_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
+"""Metres, seconds: a target that moves so much farther than twice the vehicle so quickly has
+been moved, or is another one; then sights count again after `SETTLES_S`."""
+ESTIMATE_JUMP_M, FASTEST_MPS = 0.05, 1.5  # farther between two sights is a new world
 _LONGEST_JUMP_S = max(within_s for _, within_s in JUMPS)
-
-Turn = float
 
 
 @dataclass(frozen=True)
@@ -65,7 +53,7 @@ class Sight:
 
 
 def sight_of(t_s: float, telemetry: Telemetry, target_m: Array) -> Sight:
-    """Of a target at `target_m` (3,) in the estimate's world, by the vehicle's newest sample."""
+    """The sight of a target at `target_m` (3,), by the vehicle's newest sample."""
     x, y, z = telemetry.position_m
     up = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)[:, 2]
     lean_m = (float(target_m[2]) - z) * up
@@ -75,21 +63,14 @@ def sight_of(t_s: float, telemetry: Telemetry, target_m: Array) -> Sight:
 
 @dataclass(frozen=True)
 class MountWatch:
-    """What was seen since the target came into view.
-
-    Attributes:
-        fits: the target has stood still over `PROVEN_M`: nothing is watched any more.
-        still: so far it has, judged by the newest sight.
-        against: sights in a row that speak against the mounting.
-        turn_rad: the turn about the vertical that would make the target stand still.
-    """
+    """The sights since the target came into view, and what they show of the mounting."""
 
     sights: tuple[Sight, ...] = ()
     deaf_until_s: float = -math.inf
-    fits: bool = False
-    still: bool = False
-    against: int = 0
-    turn_rad: Turn = 0.0
+    fits: bool = False  # the target has stood still over `PROVEN_M`: the watch is over
+    still: bool = False  # it has stood still so far
+    against: int = 0  # sights in a row that speak against the mounting
+    turn_rad: float = 0.0  # the turn that would make the target stand still
 
     @property
     def wrong(self) -> bool:
@@ -97,18 +78,18 @@ class MountWatch:
 
     @property
     def last_from(self) -> tuple[float, float] | None:
-        """Where the vehicle was at the last sight."""
+        """The vehicle's place, x and y, at the last sight."""
         place = self.sights[-1].vehicle if self.sights else None
         return None if place is None else (place.real, place.imag)
 
     @property
     def open(self) -> bool:
-        """Nothing speaks for the mounting yet."""
+        """True while nothing confirms the mounting."""
         return not (self.fits or self.still)
 
 
 def watched(old: MountWatch, sight: Sight) -> MountWatch:
-    """The watch with one more sight of a target that was measured."""
+    """The watch with one more sight of a measured target."""
     if old.fits or old.wrong:
         return old
     kept = tuple(s for s in old.sights if sight.t_s - s.t_s <= WINDOW_S)
@@ -161,8 +142,8 @@ def _judged(watch: MountWatch, against: int) -> MountWatch:
     return watch
 
 
-def explained(turn_rad: Turn) -> str:
-    """In words, the turn to the nearest quarter where it is about one, else to 10 degrees."""
+def explained(turn_rad: float) -> str:
+    """A sentence on the turn, to the nearest quarter if it is about one, else to 10 degrees."""
     turn_deg = math.degrees(turn_rad)
     quarter = 90.0 * round(turn_deg / 90.0)
     near = abs(turn_deg - quarter) <= 35.0 and quarter != 0.0

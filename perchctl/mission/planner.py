@@ -1,51 +1,76 @@
-"""The perching planner.
-
-`step_mission(state, observation, profile) -> (state, command)`.
+"""The perching planner: `step_mission(state, observation, profile) -> (state, command)`.
 
 Pure: no clock, no input but its arguments, so a log replays to the same commands
-(`perchctl.analysis.decide`, and `tests/replay/test_corpus.py` demands it).
-One tick: remember what was observed, look up the table, act for the phase.
+(`perchctl.analysis.decide`, and `tests/replay/test_corpus.py` demands it). One tick: remember what
+was observed, look up the table, act for the phase.
+
+Before each command ask: what if it is the last packet? A position setpoint left alone levels out
+after 0.5 s and is cut after 2 s (docs/firmware.md, "When setpoints stop").
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+
 import numpy as np
 
-from perchctl.mission import budget, lander
-from perchctl.mission.actions import act
+from perchctl.mission import battery, lander
 from perchctl.mission.conditions import (
-    KEPT_OVER_A_CHANGE,
     conditions_since,
     contact_aside_m,
     contact_within_m,
     hovers,
+    kept_over_a_change,
     touched_aside_m,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.guards import hold_reason
-from perchctl.mission.guidance import presses
+from perchctl.mission.guidance import (
+    FREE_SPEED_MPS,
+    LIFTED_M,
+    Acted,
+    catch,
+    catch_above_m,
+    corrected,
+    hold_here,
+    integrated,
+    is_carried,
+    is_still,
+    left_contact,
+    let_go,
+    limited,
+    lower,
+    presses,
+    sinking,
+    stop_motors,
+    under_target_xy,
+    unpressed,
+    walk,
+)
 from perchctl.mission.imu import led_astray
 from perchctl.mission.mounting import MountWatch, sight_of, watched
-from perchctl.mission.release import catch_above_m, is_carried
 from perchctl.mission.state import (
-    TERMINALS,
     Condition,
+    MotorStop,
     Observation,
     Outcome,
     Phase,
     PlannerState,
 )
-from perchctl.mission.table import IN_THE_OPEN, TABLE, Row, first_match, risen
+from perchctl.mission.table import IN_THE_OPEN, TABLE, Transition, first_match, hold_reason, risen
 from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vehicle import Command
+from perchctl.vehicle import Command, EmergencyStop, Idle, PositionSetpoint, RawThrust, StopMotors
 
 HOVER_WITHIN = 0.2
+AWAY_M = 0.05  # below the contact by so much, or by half of the descent, it has left the ceiling
+BLOCKED_ROOM_M = 0.1  # how far a search keeps from what it was once pressed against
+WARY_MPS, WARY_M = 0.25, 0.2  # sideways, while nothing confirms the camera's mounting
 _LEARNING = (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
 
 
 def start_mission(obs: Observation) -> PlannerState:
-    """A planner on the ground, before take-off."""
+    """The state of a planner on the ground, before take-off."""
     tel = obs.telemetry
     return PlannerState(
         entered_s=obs.t_s,
@@ -59,9 +84,9 @@ def start_mission(obs: Observation) -> PlannerState:
 
 
 def step_mission(
-    state: PlannerState, obs: Observation, profile: Profile, table: tuple[Row, ...] = TABLE
+    state: PlannerState, obs: Observation, profile: Profile, table: tuple[Transition, ...] = TABLE
 ) -> tuple[PlannerState, Command]:
-    """One tick of the mission."""
+    """One tick of the mission: the new state, and the command to send."""
     state = _remember(state, obs, profile)
     row = first_match(Context(state, obs, profile), table)
     if row is not None:
@@ -71,29 +96,24 @@ def step_mission(
     return replace(lander.ordered(new, command), t_s=obs.t_s), command
 
 
-def is_mission_over(state: PlannerState) -> bool:
-    """True once the mission is in a phase that it never leaves."""
-    return state.phase in TERMINALS
-
-
 def _remember(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
     state = lander.observed(_with_target(state, obs), obs, profile)
     context = Context(state, obs, profile)
     state = replace(state, hold=hold_reason(context))
     since = conditions_since(context)
     if state.hold:
-        since = _kept(since)  # a held vehicle proves nothing: the dwell times begin anew
+        since = kept_over_a_change(since)  # a held vehicle proves nothing: dwell times begin anew
     # Near the target an ascent may press against a ceiling that is lower than thought.
     away = state.phase is not Phase.ASCEND or context.error_z_m > profile.planner.ascend.near_m
     if away and state.phase in _LEARNING and hovers(context):
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
-    state = replace(state, last=obs.telemetry, energy=budget.watched(context))
-    state = replace(state, battery=budget.outlook(Context(state, obs, profile)))
+    state = replace(state, last=obs.telemetry, energy=battery.read_battery(context))
+    state = replace(state, battery=battery.outlook(Context(state, obs, profile)))
     return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
 
 
 def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
-    """Whether frames in a row measure the target, and how far they agree on its place."""
+    """The state with how many frames in a row measured the target, and how far they differ."""
     target = obs.target
     if not obs.new_frame:
         return state
@@ -112,7 +132,8 @@ def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
 
 
 def _mount_watched(c: Context) -> MountWatch:
-    """With this tick's frame, where it measured the target and the telemetry is fresh."""
+    """The mounting's watch with this tick's frame, if that measured the target over fresh
+    telemetry."""
     mount, target = c.state.mount, c.obs.target
     if c.state.phase not in IN_THE_OPEN or c.state.hold or not (c.obs.new_frame and c.proves):
         return mount
@@ -127,16 +148,12 @@ def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
     if state.hover_thrust == 0.0:
         return obs.imu.hover_thrust or thrust
     if abs(thrust / state.hover_thrust - 1.0) > HOVER_WITHIN:
-        return state.hover_thrust  # held by the ceiling, or by a hand: nothing hovers on that
+        return state.hover_thrust  # held by the ceiling, or by a hand
     part = min(1.0, (obs.t_s - state.t_s) / 1.5)
     return state.hover_thrust + part * (thrust - state.hover_thrust)
 
 
-def _kept(since: dict[Condition, float]) -> dict[Condition, float]:
-    return {name: since_s for name, since_s in since.items() if name in KEPT_OVER_A_CHANGE}
-
-
-def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
+def _enter(state: PlannerState, row: Transition, context: Context) -> PlannerState:
     obs = context.obs
     new = replace(
         state,
@@ -147,14 +164,14 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
         severity=risen(state.severity, row.severity),
         motor_stop=row.motor_stop,
         outcome=_outcome(state, row),
-        since=_kept(state.since),
+        since=kept_over_a_change(state.since),
         attempts=state.attempts + int(row.counts_attempt),
         entry_m=obs.telemetry.position_m,
         entry_yaw_rad=obs.telemetry.yaw_rad,
         search_step_s=obs.t_s,
         confirmed=0,
-        # A fall that is just being caught turns at full thrust, in the air. A press that was
-        # ordered has wound the integrators up, whatever thrust is read.
+        # An ordered press has wound the integrators up, whatever thrust is read; a fall that is
+        # just being caught turns at full thrust in the air.
         pressed=row.to in (Phase.RECOVER, Phase.LANDING)
         and state.caught
         and (state.phase is Phase.PERCH or presses(context)),
@@ -164,9 +181,9 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
     return _started_phase(new, state, context)
 
 
-def _outcome(state: PlannerState, row: Row) -> Outcome | None:
-    """What hangs after all has found its target, by whatever it was brought there. What was found
-    hanging on its way down is told as what led to that: nobody has seen whether it hangs there."""
+def _outcome(state: PlannerState, row: Transition) -> Outcome | None:
+    """The flight's outcome. What is found hanging on its way down keeps the outcome of what led to
+    the landing: nobody has seen whether it hangs on the target."""
     if state.phase is Phase.LANDING and row.outcome is Outcome.PERCHED and state.outcome:
         return state.outcome
     if row.name == "hung" and state.outcome is Outcome.TARGET_NOT_FOUND:
@@ -175,7 +192,7 @@ def _outcome(state: PlannerState, row: Row) -> Outcome | None:
 
 
 def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerState:
-    """What a phase starts with, beyond the clock."""
+    """The state that a phase starts with."""
     obs = c.obs
     match new.phase:
         case Phase.COMPLETE:
@@ -205,14 +222,14 @@ def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerS
                 blocked_z_m=blocked_z_m,
             )
         case Phase.LANDING:
-            # The mounting may be right, and the motion capture's axes wrong: nothing tells which,
-            # and by such positions the landing would speed up until it tilts over.
+            # The mounting may be right and the motion capture's axes wrong, by which the landing
+            # would speed up until it tilts over.
             capture = c.profile.positioning.by == "mocap" and old.mount.wrong
             if new.row == "position-astray" or (new.row == "mounting" and capture):
                 reckoning = old.reckoning if old.astray else led_astray(old.reckoning)
                 new = replace(new, astray=True, reckoning=reckoning)
             if new.row == "mounting":
-                # The setpoint is ahead, and every centimetre there is one in a wrong direction.
+                # The setpoint is ahead, in a wrong direction.
                 new = replace(new, setpoint=None)
             if old.phase is Phase.RECOVER and new.row != "hangs-at-contact":
                 new = replace(new, contact_aside_m=None)  # nothing was felt to hold it there
@@ -227,8 +244,8 @@ def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerS
 
 
 def _touched_aside(old: PlannerState, row: str, c: Context) -> tuple[float | None, float]:
-    """How far aside of the target it touched something at the target's height, with the standard
-    deviation, for what backs off from there; None where nothing was felt to be touched."""
+    """How far aside of the target the gear touched something at the target's height, with the
+    standard deviation, for what backs off from there; None if nothing was touched."""
     kept = old.contact_aside_m, old.contact_sigma_m
     if row == "not-released":  # the contact was proven, and nothing has come off
         return kept
@@ -239,3 +256,207 @@ def _touched_aside(old: PlannerState, row: str, c: Context) -> tuple[float | Non
     if old.phase is Phase.PERCH and carried and abs(c.error_z_m) <= contact_within_m(c):
         return contact_aside_m(c)
     return None, 0.0
+
+
+# --- What each phase sends -----------------------------------------------------------------------
+
+
+def act(c: Context) -> Acted:
+    """The phase's command for this tick."""
+    # A fall is caught and a press ended although the vehicle is held: the setpoint is above.
+    leaves = c.state.phase is Phase.RECOVER and (c.state.pressed or not c.state.caught)
+    if c.state.hold and c.state.setpoint is not None and not leaves:
+        lift = c.state.phase is not Phase.APPROACH or c.height_m > LIFTED_M
+        return _fly_to(c, sinking(c, c.state.setpoint), lift=lift)
+    return ACTIONS[c.state.phase](c)
+
+
+def _fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Acted:
+    """Remember the reference, and send it corrected; without `lift` at its own height."""
+    return replace(c.state, setpoint=reference), limited(c, corrected(c, reference, lift=lift))
+
+
+def _walk_to(
+    c: Context, goal: PositionSetpoint, *, up_mps: float = 0.0, down_mps: float = 0.4
+) -> Acted:
+    """Only SEARCH and ASCEND pass an `up_mps`; APPROACH, the press and a catch climb too."""
+    return _fly_to(c, _walked(c, goal, up_mps, down_mps))
+
+
+def _walked(c: Context, goal: PositionSetpoint, up_mps: float, down_mps: float) -> PositionSetpoint:
+    align = c.profile.planner.align
+    xy_mps = align.speed_mps
+    if c.state.phase in (Phase.ALIGN, Phase.ASCEND) and c.state.mount.open:
+        xy_mps = min(xy_mps, WARY_MPS) if c.fresh else 0.0
+    return walk(
+        c.state.setpoint or hold_here(c),
+        goal,
+        c.obs.t_s - c.state.t_s,
+        xy_mps=xy_mps,
+        up_mps=up_mps,
+        down_mps=down_mps,
+        yaw_rate_radps=math.radians(align.yaw_rate_dps),
+    )
+
+
+def _under_target(c: Context, z_m: float, *, up_mps: float = 0.0, down_mps: float = 0.4) -> Acted:
+    """Walk under the target at height `z_m`, and learn the trim that keeps the gear there."""
+    goal = _target_goal(c, z_m)
+    trim = integrated(c, (goal.x_m, goal.y_m), c.obs.t_s - c.state.t_s)
+    c = c.with_state(replace(c.state, integral_m=trim))
+    return _walk_to(c, goal, up_mps=up_mps, down_mps=down_mps)
+
+
+def _target_goal(c: Context, z_m: float) -> PositionSetpoint:
+    yaw = c.target_yaw_rad
+    assert yaw is not None
+    x, y = under_target_xy(c, yaw)
+    return PositionSetpoint(x, y, z_m, yaw)
+
+
+def _approach(c: Context) -> Acted:
+    """Rise from the ground on position setpoints: if they stop at any moment, the firmware levels
+    out and cuts, and the vehicle never hovers on its own."""
+    planner, state = c.profile.planner, c.state
+    assert state.ground_m is not None
+    x, y, z = state.ground_m
+    start = state.setpoint or PositionSetpoint(x, y, z, state.entry_yaw_rad)
+    if planner.approach_xy_m is not None and c.height_m > 0.7 * planner.takeoff_height_m:
+        x, y = planner.approach_xy_m
+    goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry_yaw_rad)
+    c = c.with_state(replace(state, setpoint=start))
+    setpoint = _walked(c, goal, planner.takeoff_speed_mps, 0.4)
+    return _fly_to(c, setpoint, lift=c.height_m > LIFTED_M)
+
+
+def _search(c: Context) -> Acted:
+    """Wait, climb a step, turn a step, wait again; never above the limit. A target that was seen
+    before is looked for from under it; while nothing confirms the camera's mounting, only a little
+    nearer than where it was seen last."""
+    search, state, ground_m = c.profile.planner.search, c.state, c.state.ground_m
+    assert ground_m is not None
+    if c.obs.t_s - state.search_step_s > search.wait_s:
+        state = replace(state, searches=state.searches + 1, search_step_s=c.obs.t_s)
+        c = c.with_state(state)
+    x, y, z = state.entry_m
+    if c.target_m is not None:
+        there = under_target_xy(c, state.entry_yaw_rad)
+        x, y = _not_far(state.mount.last_from or (x, y), there) if state.mount.open else there
+        height = min(z, c.contact_goal_z_m - c.profile.planner.ascend.near_m)
+    else:
+        top = max(z, ground_m[2] + search.max_height_m)
+        if state.blocked_z_m is not None:
+            top = min(top, state.blocked_z_m - BLOCKED_ROOM_M)
+        height = min(z + search.step_m * state.searches, top)
+    yaw = state.entry_yaw_rad + math.radians(search.yaw_step_deg) * state.searches
+    up_mps = c.profile.planner.ascend.speed_mps
+    return _walk_to(c, PositionSetpoint(x, y, height, yaw), up_mps=up_mps)
+
+
+def _not_far(start: tuple[float, float], goal: tuple[float, float]) -> tuple[float, float]:
+    """The goal, or as far towards it as a wrong mounting may lead."""
+    dx, dy = goal[0] - start[0], goal[1] - start[1]
+    part = min(1.0, WARY_M / max(math.hypot(dx, dy), 1e-6))
+    return start[0] + part * dx, start[1] + part * dy
+
+
+def _estimate(c: Context) -> Acted:
+    return _fly_to(c, c.state.setpoint or hold_here(c))
+
+
+def _align(c: Context) -> Acted:
+    setpoint = c.state.setpoint or hold_here(c)
+    return _under_target(c, setpoint.z_m)
+
+
+def _ascend(c: Context) -> Acted:
+    """Climb only with a fresh target and well inside the cone; slower near the target."""
+    ascend = c.profile.planner.ascend
+    setpoint = c.state.setpoint or hold_here(c)
+    goal_z = c.contact_goal_z_m - ascend.standoff_m
+    may_climb = c.fresh and c.error_xy_m < 0.7 * c.cone_m
+    lag = setpoint.z_m - c.obs.telemetry.position_m[2]
+    speed = ascend.near_speed_mps if c.error_z_m < ascend.near_m else ascend.speed_mps
+    # Slower towards the stand-off; the setpoint does not run away from a vehicle short of thrust.
+    speed = min(speed, max(0.02, goal_z - setpoint.z_m))
+    return _under_target(c, goal_z, up_mps=speed if may_climb and lag < 0.15 else 0.0)
+
+
+def _perch(c: Context) -> Acted:
+    """Press. Position and trim stay as they are: against the ceiling they would wind up."""
+    perch = c.profile.planner.perch
+    if perch.mode == "raw":
+        return c.state, RawThrust(perch.thrust)
+    if c.target_m is None:
+        return _fly_to(c, c.state.setpoint or hold_here(c), lift=False)
+    goal = _target_goal(c, c.contact_goal_z_m + perch.press_m)
+    return _fly_to(c, _walked(c, goal, perch.climb_mps, 0.0), lift=False)
+
+
+def _complete(c: Context) -> Acted:
+    """Release in two stages; stop the motors once the whole weight hangs; watch."""
+    if c.state.stopped_s is not None:
+        return stop_motors(c)
+    holds = c.held(Condition.MAGNET_HOLDS) >= c.profile.planner.complete.hold_dwell_s
+    return let_go(c) if holds or c.state.released_s is not None else lower(c)
+
+
+def _recover(c: Context) -> Acted:
+    """Hold in the air `descend_m` below where the attempt ended, in position mode all along, so
+    that no controller is reset."""
+    if (caught := catch(c)) is not None:
+        return caught
+    recover = c.profile.planner.recover
+    c = left_contact(c, min(AWAY_M, 0.5 * recover.descend_m))
+    state, away = unpressed(c)
+    if away is not None:
+        return state, away
+    if not state.caught:
+        x, y, z = c.obs.telemetry.position_m  # from where it sinks no more
+        state = replace(state, caught=True, setpoint=None, entry_m=(x, y, z + recover.descend_m))
+    z = state.entry_m[2] - recover.descend_m
+    setpoint = state.setpoint or hold_here(c)
+    if setpoint.z_m > z:
+        setpoint = replace(setpoint, z_m=z)
+    if c.target_m is not None and c.target_age_s < 3.0:
+        x, y = under_target_xy(c, setpoint.yaw_rad)
+        goal = PositionSetpoint(x, y, z, setpoint.yaw_rad)
+    else:
+        goal = replace(setpoint, z_m=z)
+    c = c.with_state(replace(state, setpoint=setpoint))
+    return _walk_to(c, goal, up_mps=0.0, down_mps=FREE_SPEED_MPS)
+
+
+def _terminal(c: Context) -> Acted:
+    return c.state, Idle()
+
+
+def _aborted(c: Context) -> Acted:
+    """The motor stop, once, as the transition wants it. What hangs with its motors still would be
+    locked 2 s after the stream's end: it gets the pair that prevents that."""
+    if c.state.orders:
+        return c.state, Idle()
+    state = replace(c.state, orders=1, ordered_s=c.obs.t_s)
+    match state.motor_stop:
+        case MotorStop.EMERGENCY:
+            return state, EmergencyStop()
+        case MotorStop.PLAIN:
+            return state, StopMotors()
+        case MotorStop.NONE:
+            return state, StopMotors() if is_still(c) or lander.is_spent(c) else Idle()
+
+
+ACTIONS: dict[Phase, Callable[[Context], Acted]] = {
+    Phase.APPROACH: _approach,
+    Phase.SEARCH: _search,
+    Phase.ESTIMATE: _estimate,
+    Phase.ALIGN: _align,
+    Phase.ASCEND: _ascend,
+    Phase.PERCH: _perch,
+    Phase.COMPLETE: _complete,
+    Phase.RECOVER: _recover,
+    Phase.LANDING: lander.act,
+    Phase.PERCHED: _terminal,
+    Phase.LANDED: _terminal,
+    Phase.ABORTED: _aborted,
+}

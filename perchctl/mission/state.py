@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
 from perchctl.geometry import Array
-from perchctl.mission.energy import EnergyState
-from perchctl.mission.felt import Mismatch, VisualInertialMotion
 from perchctl.mission.imu import ImuMotion, Reckoning
 from perchctl.mission.mounting import MountWatch
 from perchctl.vehicle import PositionSetpoint, Telemetry
@@ -18,7 +16,7 @@ from perchctl.vision import TargetEstimate
 class Phase(Enum):
     """The paper's seven phases, the two ways down, and the terminals."""
 
-    __hash__ = object.__hash__  # as of any single object: each row of the table looks it up
+    __hash__ = object.__hash__  # by identity: each row of the table looks it up
 
     APPROACH = "APPROACH"
     SEARCH = "SEARCH"
@@ -33,6 +31,21 @@ class Phase(Enum):
     LANDED = "LANDED"
     ABORTED = "ABORTED"
 
+    @property
+    def is_flying(self) -> bool:
+        """True until a way down begins."""
+        return self in FLYING_PHASES
+
+    @property
+    def is_before_contact(self) -> bool:
+        """True while flying, until a contact is proven."""
+        return self in BEFORE_CONTACT
+
+    @property
+    def is_over(self) -> bool:
+        """True for a phase that is never left."""
+        return self in TERMINALS
+
 
 SEVEN_PHASES = (
     Phase.APPROACH,
@@ -44,6 +57,7 @@ SEVEN_PHASES = (
     Phase.COMPLETE,
 )
 FLYING_PHASES = frozenset({*SEVEN_PHASES, Phase.RECOVER})
+BEFORE_CONTACT = FLYING_PHASES - {Phase.COMPLETE}
 TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
 
 
@@ -71,7 +85,7 @@ class Outcome(Enum):
 class Condition(Enum):
     """What the table debounces; `perchctl.mission.conditions` says when each holds."""
 
-    __hash__ = object.__hash__  # as of any single object: twenty are looked up in each tick
+    __hash__ = object.__hash__  # by identity: twenty are looked up in each tick
 
     AT_TAKEOFF_HEIGHT = "at take-off height"
     ESTIMATED = "estimated"
@@ -114,70 +128,75 @@ class Operator(IntEnum):
     STOP = 2
 
 
-@dataclass(frozen=True, eq=False)
-class Observation:
-    """All that is known in one tick. Times on the loop's clock; ages in seconds.
+@dataclass(frozen=True)
+class Mismatch:
+    """What would bring the target to rest: pictures `later_s` later than assumed, or a camera
+    turned by `turn_rad` about the vehicle's upward axis; the other is 0."""
 
-    Attributes:
-        telemetry: the newest sample; its age is `t_s - telemetry.t_s`.
-        target: the pipeline's estimate at `t_s`, None when no target was seen yet.
-        new_frame: a good frame was processed in this tick.
-        camera_age_s: since the last good frame arrived.
-        camera_problem, link_problem: None, or one sentence.
-        jumped: the state estimate moved farther than any flight could.
-        turned_rad: the estimated heading's step beyond what a vehicle can turn.
-        loop_late_s: how late this tick began.
-        disagreeing_frames: frames in a row in which the markers contradicted.
-        log_problem: the flight log cannot be written.
-        delay_s: taken off the frames' times beyond the profile's latency (`measured`).
-        target_refused: why the last target that was seen is another vehicle's; None: none was.
-        position_age_s: of the newest position from outside that was sent to the vehicle; 0 where
-            its decks measure it.
-        position_problem: why none is sent, None while they are.
-        imu: the motion that accelerometer and attitude tell, by all samples up to `telemetry`.
-        felt: the motion sideways that pictures and accelerometer last agreed on.
-        mismatch: what the pictures show otherwise than `imu` feels it; None while they agree.
-    """
+    later_s: float = 0.0
+    turn_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class VisualInertialMotion:
+    """The vehicle's motion by pictures and accelerometer at `t_s`, world axes."""
 
     t_s: float
-    telemetry: Telemetry
-    target: TargetEstimate | None = None
-    new_frame: bool = False
-    camera_age_s: float = 0.0
-    camera_problem: str | None = None
-    link_problem: str | None = None
+    velocity_mps: tuple[float, float]  # sideways
+    bias_mps2: tuple[float, float]  # excess of accelerometer and attitude
+    climb_mps: float | None  # None if the delay that it rests on may be over
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """All that is known in one tick. Times are on the loop's clock; ages are in seconds."""
+
+    t_s: float
+    telemetry: Telemetry  # the newest sample; its age is `t_s - telemetry.t_s`
+    target: TargetEstimate | None = None  # the pipeline's, at `t_s`; None before the first
+    new_frame: bool = False  # a good frame was processed in this tick
+    camera_age_s: float = 0.0  # since the last good frame arrived
+    camera_problem: str | None = None  # None, or one sentence
+    link_problem: str | None = None  # None, or one sentence
     battery_age_s: float = 0.0
-    jumped: bool = False
-    turned_rad: float = 0.0
-    loop_late_s: float = 0.0
-    disagreeing_frames: int = 0
+    jumped: bool = False  # the state estimate moved farther than any flight could
+    turned_rad: float = 0.0  # step of the estimated heading beyond what a vehicle can turn
+    loop_late_s: float = 0.0  # how late this tick began
+    disagreeing_frames: int = 0  # in a row, in which the markers contradicted each other
     operator: Operator = Operator.NONE
-    log_problem: str | None = None
-    delay_s: float = 0.0
-    target_refused: str | None = None
-    position_age_s: float = 0.0
-    position_problem: str | None = None
-    imu: ImuMotion = field(default_factory=ImuMotion)
-    felt: VisualInertialMotion | None = None
-    mismatch: Mismatch | None = None
+    log_problem: str | None = None  # the flight log cannot be written
+    delay_s: float = 0.0  # off the frames' times beyond the profile's latency (`measured`)
+    target_refused: str | None = None  # why the last target seen is another vehicle's
+    position_age_s: float = 0.0  # of the newest external position sent; 0 where decks measure
+    position_problem: str | None = None  # why none is sent; None while they are
+    imu: ImuMotion = field(default_factory=ImuMotion)  # by all samples up to `telemetry`
+    felt: VisualInertialMotion | None = None  # sideways, as pictures and accelerometer agreed
+    mismatch: Mismatch | None = None  # between the pictures and `imu`; None while they agree
+
+
+@dataclass(frozen=True)
+class EnergyState:
+    """The battery as fitted so far. Shares are of the full charge, loads of full thrust."""
+
+    ground_v: float | None = None  # at rest; from the first reading where that was under load
+    used: float = 0.0  # by the count of the thrust, for a battery as assumed
+    load: float = 0.0  # as the reading follows it
+    mean_load: float = 0.0  # over the last seconds in the air
+    rest_v: float | None = None  # estimated resting voltage now
+    loaded_s: float = 0.0  # how long there were readings under load
+    unknown_s: float = 0.0  # since the last reading
+    # Sums of least squares: sag^2, sag * hunger, hunger^2, and the two right sides.
+    fit: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class BatteryOutlook:
-    """What the battery is enough for, by the energy model.
+    """What the battery is enough for, by the energy model; None where that is unknown."""
 
-    Attributes:
-        left_s: hovering, until `battery-low` would land it; None where that is not known.
-        attempts: for so many more there is enough, with the landing after the last; None before
-            a target was seen, too.
-        used_mah: by the count of the thrust.
-        rest_v: what it would have at rest; None where that is not known.
-    """
-
-    left_s: float | None = None
-    attempts: int | None = None
-    used_mah: float = 0.0
-    rest_v: float | None = None
+    left_s: float | None = None  # of hovering, until `battery-low` would land it
+    attempts: int | None = None  # with the landing after the last; None before a target
+    used_mah: float = 0.0  # by the count of the thrust
+    rest_v: float | None = None  # what it would have at rest
 
 
 @dataclass(frozen=True, eq=False)

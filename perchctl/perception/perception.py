@@ -13,8 +13,12 @@ from dataclasses import dataclass, field
 
 from perchctl.camera import HealthState, HealthVerdict, assess_frame
 from perchctl.geometry import finite
-from perchctl.mission import VisualInertialWindow, estimate_motion
 from perchctl.perception.history import History, attitude_at, attitude_of, velocity_at
+from perchctl.perception.visual_inertial import (
+    VisualInertialWindow,
+    drop_sights,
+    estimate_motion,
+)
 from perchctl.profile import USED_LATENCY_S, CameraConfig, Profile
 from perchctl.values import replace
 from perchctl.vision import (
@@ -112,6 +116,10 @@ class Perception:
     def consistency(self) -> Consistency | None:
         """Latency and mounting by all pictures so far; None of too few."""
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
+
+    def drop_sights(self) -> None:
+        """Judge the vehicle's motion anew: wrong positions have turned its attitude."""
+        self.motion = drop_sights(self.motion)
 
     def take_remarks(self) -> list[str]:
         """What is new about the pictures since the last call."""

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from perchctl.analysis.edges import USUAL_MAH, battery_of
-from perchctl.mission.energy import FULL_A
+from perchctl.mission.battery import FULL_A
 from perchctl.vehicle import FULL_THRUST
 from tests.helpers.log import PLAN
 from tests.helpers.told import made

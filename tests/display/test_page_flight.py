@@ -18,7 +18,7 @@ from perchctl.commands.fly import live_page
 from perchctl.commands.track import resolve, track_source
 from perchctl.display import FlightPage, LivePage, Sketch
 from perchctl.flight import FlyOptions, OperatorSwitch
-from perchctl.flight.session import AGAIN_S, HELD_S
+from perchctl.flight.operator import AGAIN_S, HELD_S
 from perchctl.mission import Operator, Phase, PlannerState, Tick
 from perchctl.profile import load_profile
 from perchctl.vehicle import Idle

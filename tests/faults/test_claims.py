@@ -20,17 +20,8 @@ from perchctl.faults.claims import (
 )
 from perchctl.faults.oracle import SAY_OFF
 from perchctl.flight import RESCUED
-from perchctl.mission import (
-    RESCUE,
-    TERMINALS,
-    Event,
-    EventKind,
-    Finding,
-    FlightReport,
-    Outcome,
-    Phase,
-)
-from perchctl.mission.state import MotorStop
+from perchctl.mission import RESCUE, Event, EventKind, Finding, FlightReport, Outcome, Phase
+from perchctl.mission.state import TERMINALS, MotorStop
 from perchctl.mission.table import TABLE
 
 LAST_ROWS = {row.name: row for row in TABLE if row.to in TERMINALS}

@@ -17,18 +17,10 @@ from perchctl.faults import flight as faulty
 from perchctl.faults.flight import fly_fault_seed
 from perchctl.faults.oracle import Flag
 from perchctl.flight import OperatorSwitch, loop
-from perchctl.mission import (
-    Context,
-    Observation,
-    Operator,
-    Phase,
-    PlannerState,
-    actions,
-    lander,
-    planner,
-)
+from perchctl.mission import Observation, Operator, Phase, PlannerState, lander, planner
+from perchctl.mission.context import Context
+from perchctl.mission.guidance import Acted, stop_motors
 from perchctl.mission.lander import Manoeuvre
-from perchctl.mission.release import Acted, stop_motors
 from perchctl.profile import Profile, load_profile
 from perchctl.vehicle import Command, Land
 from tests.helpers.flights import SHORT
@@ -39,12 +31,12 @@ Patch = pytest.MonkeyPatch
 
 def stops_after_contact(patch: Patch) -> None:
     """The motors stop 0.3 s after the contact, whatever the magnet carries."""
-    complete = actions.ACTIONS[Phase.COMPLETE]
+    complete = planner.ACTIONS[Phase.COMPLETE]
 
     def stopping(c: Context) -> Acted:
         return stop_motors(c) if c.in_phase_s >= 0.3 else complete(c)
 
-    patch.setitem(actions.ACTIONS, Phase.COMPLETE, stopping)
+    patch.setitem(planner.ACTIONS, Phase.COMPLETE, stopping)
 
 
 def ignores_the_second_press(patch: Patch) -> None:
@@ -58,9 +50,7 @@ def lands_fast(patch: Patch) -> None:
 
     def fast(*known: Any) -> Land:
         land = order(*known)
-        newest = known[-1]
-        way_m = 1.0 if newest is None else newest.position_m[2] - land.height_m
-        return Land(land.height_m, max(0.1, way_m / 1.5))
+        return Land(land.height_m, max(0.1, (known[-1] - land.height_m) / 1.5))
 
     patch.setattr(lander, "own_landing", fast)
     patch.setitem(lander.ACTIONS, Manoeuvre.SETPOINTS, lander._own_landing)
@@ -74,7 +64,7 @@ def says_landed(patch: Patch) -> None:
 
     def landed(*given: Any) -> tuple[PlannerState, Command]:
         state, command = step(*given)
-        if planner.is_mission_over(state):
+        if state.phase.is_over:
             state = replace(state, phase=Phase.LANDED, row="landed")
         return state, command
 

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl.calibration import profile_camera
 from perchctl.campaign import FlightResult, campaign_summary, run_campaign
 from perchctl.campaign.flights import fly_seed
 from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.errors import EXIT_CODES
-from perchctl.flight import PLAIN_SEED, fly_lockstep
+from perchctl.flight import PLAIN_SEED, fly_lockstep, lockstep
+from perchctl.flight.lockstep import LockstepFlight
 from perchctl.geometry import rot_z
 from perchctl.log import FlightLog, read_log
-from perchctl.mission import SEVEN_PHASES, Event, EventKeeper, Operator, Outcome, Phase, Tick
+from perchctl.mission import Event, EventKeeper, EventKind, Operator, Outcome, Phase, Tick
+from perchctl.mission.state import SEVEN_PHASES
 from perchctl.perception.perception import SLEW
 from perchctl.profile import load_profile
 from perchctl.sim import draw_scenario
+from perchctl.vision import TargetEstimate
 from tests.helpers.flights import SEED, SHORT, Flown, fly_short, short_profile
 
 SEVEN_NAMES = [phase.value for phase in SEVEN_PHASES]
@@ -377,3 +383,119 @@ def test_ctrl_c_twice_cuts_the_motors(phase: Phase) -> None:
     assert EXIT_CODE_OF[report.outcome] == 53
     assert flown.flight.locked  # docs/firmware.md, "Emergency stop"
     assert report.locked  # which is said, though no telemetry has told it yet
+
+
+# --- Receivers that repeat, add noise, and blank --------------------------------------------------
+
+
+PAL = {"camera_rate_hz": 25.0}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("scenario", [
+    PAL | {"camera_receiver_hz": 60.0},
+    PAL | {"camera_receiver_hz": 30.0},
+    PAL | {"camera_receiver_hz": 60.0, "camera_receiver_noise": 1.5},
+    PAL | {"camera_receiver_hz": 60.0, "camera_fields": "top"},
+    {"camera_blank_rate": 0.2},
+])  # fmt: skip
+def test_it_perches_and_is_never_held(scenario: dict[str, Any]) -> None:
+    flown = fly_short(**scenario)
+    assert flown.report.phase is Phase.PERCHED
+    assert flown.flight.miss_m < 0.010
+    assert not any(event.kind is EventKind.HOLD for event in flown.report.history)
+
+
+@pytest.mark.long
+def test_a_receiver_that_is_stuck_in_flight_ends_in_a_landing() -> None:
+    flown = fly_short(**PAL, camera_receiver_hz=60.0, camera_freeze_at_s=6.0)
+    assert flown.report.phase is Phase.LANDED
+    reasons = {event.row: event.reason for event in flown.report.history}
+    assert reasons["camera-gone"] == "the picture stands still"
+    assert not flown.flight.fell
+
+
+# --- A flight that nobody records is the same, but for the spread of the present ------------------
+
+
+SPREAD = {"sigma_m", "sigma_yaw_rad"}
+
+
+class Shown:
+    """What the planner was shown of the target, and what it sent."""
+
+    problem: str | None = None
+
+    def __init__(self) -> None:
+        self.targets: list[TargetEstimate | None] = []
+        self.commands: list[Any] = []
+
+    def tick(self, tick: Tick) -> None:
+        self.targets.append(tick.target)
+        self.commands.append(tick.command)
+
+    def event(self, event: Event) -> None:
+        return None
+
+
+def flown(log: Path | None) -> tuple[LockstepFlight, Shown]:
+    shown = Shown()
+    return fly_lockstep(short_profile({}), SEED, log, watchers=(shown,)), shown
+
+
+@pytest.mark.long
+def test_the_planner_is_shown_the_same(tmp_path: Path) -> None:
+    (bare, unlogged), (whole, logged) = flown(None), flown(tmp_path / "flight.jsonl")
+    assert unlogged.commands == logged.commands
+    assert (bare.miss_m, bare.simulated_s) == (whole.miss_m, whole.simulated_s)
+    other_spread = 0
+    for one, other in zip(unlogged.targets, logged.targets, strict=True):
+        assert (one is None) == (other is None)
+        if one is None or other is None:
+            continue
+        for field in dataclasses.fields(TargetEstimate):
+            a, b = getattr(one, field.name), getattr(other, field.name)
+            if field.name in SPREAD:
+                other_spread += not np.array_equal(a, b)
+            else:
+                assert np.array_equal(a, b), field.name
+    assert other_spread > 100
+
+
+# --- Flights of one profile share their pipeline; no other one does -------------------------------
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"kalman.n_max": 7}, {"camera.mount.rpy_deg": (0.0, 1.0, 0.0)}, {"target.large.side_m": 0.12}],
+    ids=lambda change: next(iter(change)),
+)
+def test_a_profile_that_differs_has_its_own(change: dict[str, object]) -> None:
+    profile, other = short_profile(), short_profile(change)
+    camera, again = profile_camera(profile.camera), profile_camera(profile.camera)
+    shared = lockstep._pipeline_of(profile, camera)
+    assert lockstep._pipeline_of(short_profile(), again) is shared
+    assert lockstep._pipeline_of(other, camera) is not shared
+
+
+def test_so_has_a_camera_that_differs() -> None:
+    profile = short_profile()
+    camera = profile_camera(profile.camera)
+    other = replace(camera, dist=camera.dist + 1e-9)
+    assert lockstep._pipeline_of(profile, other) is not lockstep._pipeline_of(profile, camera)
+    assert lockstep._pipeline_of(profile, other).camera is other
+
+
+def test_and_a_mask_is_read_each_time(tmp_path_factory: pytest.TempPathFactory) -> None:
+    file = tmp_path_factory.mktemp("mask") / "mask.png"
+    profile = short_profile()
+    camera = profile_camera(profile.camera)
+    width, height = camera.size_px
+    masked = short_profile({"camera.mask": str(file)})
+    for rows in (20, 40):
+        covered = np.zeros((height, width), np.uint8)
+        covered[:rows, :60] = 255
+        cv2.imwrite(str(file), covered)
+        mask = lockstep._pipeline_of(masked, camera).detector.mask
+        assert mask is not None
+        assert np.count_nonzero(mask.whole) == rows * 60

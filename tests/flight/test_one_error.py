@@ -17,7 +17,8 @@ from perchctl.flight import fly_lockstep
 from perchctl.geometry import Array, rot_z, wrap_rad
 from perchctl.log.fields import tick_record
 from perchctl.log.watch import Truth
-from perchctl.mission import Context, Phase, Tick, planner
+from perchctl.mission import Phase, Tick, planner
+from perchctl.mission.context import Context
 from perchctl.perception import perception
 from perchctl.sim import draw_scenario
 from perchctl.vision import merge

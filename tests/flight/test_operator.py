@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from perchctl.errors import Interrupted, UsageError
 from perchctl.flight import OperatorSwitch, session
-from perchctl.flight.session import AGAIN_S, DELAY_S, HELD_S, INSIST_S
+from perchctl.flight.operator import AGAIN_S, DELAY_S, HELD_S, INSIST_S
 from perchctl.mission import Operator
 from perchctl.profile import load_profile
 
@@ -125,7 +125,7 @@ HANGING = """
 import hashlib, sys, time
 from perchctl.commands.interrupt import signals_to_operator
 from perchctl.commands.output import say
-from perchctl.flight.session import OperatorSwitch
+from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.watchdog import Watchdog
 from perchctl.link.sender import Sender
 from perchctl.mission.state import Observation, Phase, PlannerState
@@ -217,7 +217,7 @@ def test_a_hang_up_that_is_ignored_stays_ignored() -> None:
     code = (
         "import os, signal\n"
         "from perchctl.commands.interrupt import signals_to_operator\n"
-        "from perchctl.flight.session import OperatorSwitch\n"
+        "from perchctl.flight.operator import OperatorSwitch\n"
         "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
         "switch = OperatorSwitch(listening=True)\n"
         "with signals_to_operator(switch, print):\n"
@@ -234,7 +234,7 @@ def test_before_the_flight_each_signal_leaves_by_one_sentence() -> None:
         "import os, signal, sys, time\n"
         "from perchctl.commands.interrupt import signals_to_operator\n"
         "from perchctl.errors import Interrupted\n"
-        "from perchctl.flight.session import OperatorSwitch\n"
+        "from perchctl.flight.operator import OperatorSwitch\n"
         "for name in ('SIGINT', 'SIGTERM', 'SIGHUP', 'SIGTSTP'):\n"
         "    try:\n"
         "        with signals_to_operator(OperatorSwitch(), print):\n"
@@ -253,7 +253,7 @@ def test_a_terminal_that_is_gone_is_no_failure() -> None:
         "import os, sys\n"
         "from perchctl.commands.output import say, tell\n"
         "from perchctl.display import open_panel\n"
-        "from perchctl.mission.watch import Event, EventKind\n"
+        "from perchctl.mission.records import Event, EventKind\n"
         "say('one'); panel = open_panel(stream=sys.stderr)\n"
         "panel.event(Event(0.0, EventKind.NOTE, 'two'))\n"
         "panel.close(); tell('three')\n"

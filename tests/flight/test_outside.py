@@ -16,23 +16,18 @@ from hypothesis import strategies as st
 
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight import unmeasured_problem, world_problem
-from perchctl.flight.outside import AtRest, apart, with_another_up
+from perchctl.flight.criteria import AtRest, apart, with_another_up
 from perchctl.flight.preflight import refuse_strange
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.mission import Operator, Outcome
 from perchctl.positioning import FeedStatus
-from perchctl.profile import PositioningConfig, Profile
+from perchctl.profile import Profile
 from perchctl.vehicle import ExternalPosition, MeasuredBy, PositionSetpoint
 from tests.helpers.capture import TURNS, named_up
 from tests.helpers.loop_rig import PROFILE, Rig, Vehicle
-from tests.helpers.mission import READY, telemetry
+from tests.helpers.mission import MOCAP, READY, changed, telemetry
 
-MOCAP = PROFILE.model_copy(
-    update={"positioning": PROFILE.positioning.model_copy(update={"by": "mocap"})}
-)
-WITH_OWN_DECK = PROFILE.model_copy(
-    update={"positioning": PositioningConfig.model_validate({"decks": ["labUwb"]})}
-)
+WITH_OWN_DECK = Profile.model_validate({"positioning": {"decks": ["labUwb"]}})
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 REST = telemetry(1.0, 0.02, thrust=0.0, supervisor=READY)
 HIDDEN = "motion capture vicon:lab does not see the rigid body 'cf2'"
@@ -65,8 +60,8 @@ def test_a_place_that_is_none_is_named(place: ExternalPosition, words: str | Non
 
 def test_a_body_that_stands_out_of_the_target_s_reach_is_another_vehicle_s() -> None:
     """Two vehicles in one room: the other one stands level, on the ground, two metres aside."""
-    own = MOCAP.target.model_copy(update={"expected_xy_m": (0.3, 0.0), "expected_within_m": 0.3})
-    profile = MOCAP.model_copy(update={"target": own})
+    own = {"target.expected_xy_m": (0.3, 0.0), "target.expected_within_m": 0.3}
+    profile = changed(own, MOCAP)
     assert world_problem(at(0.2, -0.5, 0.012), REST, profile) is None
     assert world_problem(at(3.0, -0.5, 0.012), REST, MOCAP) is None, (
         "nobody has said where it hangs"

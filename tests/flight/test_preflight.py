@@ -18,7 +18,7 @@ from perchctl.vehicle import PositionSetpoint
 from perchctl.vision import Detections
 from tests.helpers.flights import fly_short
 from tests.helpers.loop_rig import PROFILE, Camera, Rig, Vehicle, noise
-from tests.helpers.mission import READY, target_at, telemetry
+from tests.helpers.mission import READY, changed, target_at, telemetry
 
 LOWEST_M = PROFILE.planner.takeoff_height_m
 
@@ -160,8 +160,7 @@ def test_a_mirrored_picture_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(perception, "step", mirrored)
     for is_set in (False, True):
-        camera = PROFILE.camera.model_copy(update={"mirrored": is_set})
-        it = Rig(profile=PROFILE.model_copy(update={"camera": camera}))
+        it = Rig(profile=changed({"camera.mirrored": is_set}))
         report = it.fly()
         assert report.outcome is Outcome.TARGET_NOT_FOUND
         assert "the picture is mirrored" in report.reason

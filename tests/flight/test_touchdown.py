@@ -21,7 +21,6 @@ from perchctl.log import (
 )
 from perchctl.mission import (
     ContactError,
-    Context,
     EventKind,
     ImuMotion,
     Observation,
@@ -30,10 +29,10 @@ from perchctl.mission import (
     Touchdown,
     integrate_imu,
     planner,
-    touchdown_of,
 )
-from perchctl.mission.ending import HARD_MPS
+from perchctl.mission.context import Context
 from perchctl.mission.imu import BLOW_MPS, Blow, Reckoning, reckoned
+from perchctl.mission.report import HARD_MPS, touchdown_of
 from perchctl.profile import load_profile
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
 from tests.flight.test_silent_loop import Guarded, hanging_camera

@@ -9,7 +9,7 @@ import pytest
 
 from perchctl.analysis.decide import decide, first_of
 from perchctl.flight import SENSED, WallClock, fly
-from perchctl.flight.turns import Turns
+from perchctl.flight.turns import Turns, TurnWatcher
 from perchctl.mission import (
     Observation,
     Operator,
@@ -17,7 +17,6 @@ from perchctl.mission import (
     PlannerState,
     Tick,
     Turn,
-    TurnWatcher,
     step_mission,
 )
 from perchctl.profile import Profile

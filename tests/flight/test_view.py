@@ -16,7 +16,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight import out_of_view, place_seen, target_from, world_problem
-from perchctl.flight.outside import AtRest
+from perchctl.flight.criteria import AtRest
 from perchctl.flight.preflight import (
     LEAN_DEG,
     refuse_out_of_view,
@@ -30,7 +30,7 @@ from perchctl.profile import Profile
 from perchctl.vehicle import ExternalPosition
 from perchctl.vision import CameraModel
 from tests.helpers.flights import fly_short, short_profile
-from tests.helpers.mission import READY, target_at, telemetry
+from tests.helpers.mission import READY, changed, target_at, telemetry
 
 CAMERA = CameraModel(
     (640, 480), np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]]), np.zeros(5)
@@ -44,8 +44,7 @@ angles = st.floats(-math.pi, math.pi)
 
 
 def approaching(x: float, y: float) -> Profile:
-    planner = TARGET.planner.model_copy(update={"approach_xy_m": (x, y)})
-    return TARGET.model_copy(update={"planner": planner})
+    return changed({"planner.approach_xy_m": (x, y)}, TARGET)
 
 
 # --- The way up -----------------------------------------------------------------------------
@@ -169,8 +168,7 @@ def test_what_is_refused_speaks_of_the_target() -> None:
     assert "by the target the vehicle has moved by 0.20 m" in moved.sentence
     # A height or a far place cannot be another world's: there is only the vehicle's own.
     assert world_problem(ExternalPosition((0.0, 0.0, 0.4)), REST, TARGET) is None
-    own = TARGET.target.model_copy(update={"expected_xy_m": (4.0, 0.0)})
-    far = TARGET.model_copy(update={"target": own})
+    far = changed({"target.expected_xy_m": (4.0, 0.0)}, TARGET)
     status = FeedStatus(0.05, None, 20, None, 30.0, ExternalPosition(FEET))
     with pytest.raises(SafetyAbort, match=r"expected 4\.0 m from where the vehicle stands"):
         refuse_strange(status, REST, far, REST.t_s)

@@ -9,8 +9,8 @@ import pytest
 
 from perchctl.flight.watchdog import CUT_PERIOD_S, MAX_CUTS, REPEAT_AFTER_S, Watchdog
 from perchctl.mission import Observation, Operator, Phase, PlannerState
+from perchctl.mission.guidance import CATCH_STILL_ABOVE_M, STILL_THRUST, STOPS
 from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S
-from perchctl.mission.release import CATCH_STILL_ABOVE_M, STILL_THRUST, STOPS
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     HL_ACTIVE,

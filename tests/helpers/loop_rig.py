@@ -12,8 +12,17 @@ import pytest
 
 from perchctl.flight import FlightParts, fly
 from perchctl.flight.loop import Positions
-from perchctl.flight.rescue import Rescued, rescue
-from perchctl.mission import Event, FlightReport, Observation, Operator, Phase, Tick, planner
+from perchctl.flight.watchdog import rescue
+from perchctl.mission import (
+    Event,
+    FlightReport,
+    Observation,
+    Operator,
+    Phase,
+    Rest,
+    Tick,
+    planner,
+)
 from perchctl.perception import History
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -30,23 +39,12 @@ from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, telemetry
 from tests.helpers.scripted_link import ScriptedLink
 
 SIZE_PX = (64, 48)
-
-
 CAMERA = CameraModel(
     SIZE_PX, np.array([[40.0, 0.0, 32.0], [0.0, 40.0, 24.0], [0.0, 0.0, 1.0]]), np.zeros(5)
 )
-
-
 PROFILE = Profile()
-
-
 SETUP = make_pipeline(PROFILE, CAMERA)
-
-
-CLIMB_MPS = 0.5
-
-
-SINK_MPS = 0.4
+CLIMB_MPS, SINK_MPS = 0.5, 0.4
 
 
 class Broken(RuntimeError):
@@ -72,7 +70,6 @@ class Vehicle(ScriptedLink):
         self._goal_m: float | None = None
         self.by_itself = False
         self.motors = False
-        self.by_itself = False
         self._off_s = -math.inf
 
     def advance_to(self, t_s: float) -> None:
@@ -234,7 +231,7 @@ class Rig:
     def fly(self) -> FlightReport:
         return fly(self.parts())
 
-    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> Rescued:
+    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> Rest:
         """A rescue of what was flying as `known` and `state` say, its positions `age_s` old."""
         ground = replace(known, position_m=(0.0, 0.0, 0.0))
         told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last": known} | state

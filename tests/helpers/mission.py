@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +16,10 @@ from perchctl.mission import (
     Observation,
     Phase,
     PlannerState,
-    Severity,
     integrate_imu,
     planner,
 )
+from perchctl.mission.state import Severity
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     ARMED,
@@ -42,6 +44,8 @@ FINE_BATTERY = EnergyState(
 )
 """After some seconds of flight: enough for every attempt."""
 PROFILE = Profile()
+PROFILES = {by: Profile.model_validate({"positioning": by}) for by in ("deck", "mocap", "target")}
+MOCAP, BY_TARGET = PROFILES["mocap"], PROFILES["target"]
 HANG_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
 """Height of the body that hangs with its gear at the target."""
 
@@ -100,6 +104,20 @@ def observation(t_s: float, z_m: float = 1.0, **changes: object) -> Observation:
         new_frame=True,  # type: ignore[arg-type]
     )
     return replace(obs, **changes)  # type: ignore[arg-type]
+
+
+def changed(changes: Mapping[str, Any], profile: Profile = PROFILE) -> Profile:
+    """The profile with some keys changed, each named by its dotted path, without a check."""
+    for dotted, value in changes.items():
+        *sections, key = dotted.split(".")
+        models: list[Any] = [profile]
+        for name in sections:
+            models.append(getattr(models[-1], name))
+        new = models.pop().model_copy(update={key: value})
+        for model, name in zip(reversed(models), reversed(sections), strict=True):
+            new = model.model_copy(update={name: new})
+        profile = new
+    return profile
 
 
 class Felt:

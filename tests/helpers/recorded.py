@@ -15,7 +15,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from perchctl.log.fields import event_record
 from perchctl.log.recorder import Recorder
-from perchctl.mission import Event, EventKind, Phase, Severity
+from perchctl.mission import Event, EventKind, Phase
+from perchctl.mission.state import Severity
 from perchctl.profile import Profile
 from perchctl.vision import Frame
 from tests.helpers import log as synthetic

@@ -21,8 +21,9 @@ from perchctl.link.telemetry import (
     Timebase,
     telemetry_from,
 )
-from perchctl.mission import Condition, Context, Observation, Phase, PlannerState
+from perchctl.mission import Condition, Observation, Phase, PlannerState
 from perchctl.mission.conditions import BY_PLACE, PROOFS, conditions_since
+from perchctl.mission.context import Context
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
 

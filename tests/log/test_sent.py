@@ -14,7 +14,7 @@ import pytest
 from perchctl.analysis import FlightAnalysis, show_record, show_text
 from perchctl.analysis.story import story_of
 from perchctl.flight import fly
-from perchctl.flight.rescue import rescue
+from perchctl.flight.watchdog import rescue
 from perchctl.link.sender import Sender
 from perchctl.log import LogWatcher, export_mcap, read_log, write
 from perchctl.log import recorder as recording_module

@@ -8,16 +8,8 @@ from dataclasses import replace
 
 import pytest
 
-from perchctl.mission import (
-    FLYING_PHASES,
-    Observation,
-    Operator,
-    Outcome,
-    Phase,
-    PlannerState,
-    Severity,
-    planner,
-)
+from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, planner
+from perchctl.mission.state import FLYING_PHASES, Severity
 from perchctl.vehicle import (
     CRASHED,
     LOCKED,
@@ -36,6 +28,7 @@ from tests.helpers.mission import (
     HOVER_THRUST,
     PROFILE,
     READY,
+    changed,
     observation,
     state_in,
     telemetry,
@@ -241,25 +234,10 @@ def test_no_stop_without_contact_tumble_word_or_attitude() -> None:
             assert not isinstance(command, EmergencyStop | StopMotors)
 
 
-def test_landing_ends_when_the_motors_are_off() -> None:
-    state, command = planner.step_mission(
-        state_in(Phase.ALIGN), observation(10.02, operator=Operator.LAND), PROFILE
-    )
-    down(command, 1.0, by_itself=False)
-    for i in range(20):
-        off = telemetry(14.0 + 0.02 * i, 0.01, thrust=0.0, supervisor=READY)
-        state, _ = planner.step_mission(state, observation(off.t_s, telemetry=off), PROFILE)
-    assert state.phase is Phase.LANDED
-    assert state.outcome is Outcome.OPERATOR
-
-
 @pytest.mark.parametrize("mode", ["raw", "position"])
 def test_the_perch_ends_by_itself(mode: str) -> None:
     """Without proof of contact the press is bounded and backs off down."""
-    planner_config = PROFILE.planner.model_copy(
-        update={"perch": PROFILE.planner.perch.model_copy(update={"mode": mode})}
-    )
-    profile = PROFILE.model_copy(update={"planner": planner_config})
+    profile = changed({"planner.perch.mode": mode})
     state = state_in(Phase.PERCH, z_m=2.09)
     sent: list[object] = []
     for i in range(1, 200):

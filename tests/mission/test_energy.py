@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import (
-    Context,
     EnergyState,
     Outcome,
     Phase,
@@ -20,10 +19,19 @@ from perchctl.mission import (
     fit_battery,
     planner,
     update_energy,
-    used_mah,
 )
-from perchctl.mission.budget import floor_of, needs_of, outlook, watched
-from perchctl.mission.energy import CURVE, Floor, left_s, loaded_v, resting_v
+from perchctl.mission.battery import (
+    CURVE,
+    Floor,
+    floor_of,
+    left_s,
+    loaded_v,
+    needs_of,
+    outlook,
+    read_battery,
+    resting_v,
+)
+from perchctl.mission.context import Context
 from perchctl.profile import Profile, load_profile
 from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.powertrain import Cell, CellKind
@@ -32,6 +40,7 @@ from tests.helpers.mission import (
     FINE_BATTERY,
     HOVER_THRUST,
     PROFILE,
+    changed,
     observation,
     state_in,
     telemetry,
@@ -147,7 +156,7 @@ def test_the_count_of_the_thrust() -> None:
     energy = EnergyState()
     for _ in range(500):
         energy = update_energy(energy, PERIOD_S, 3.7, FULL_THRUST, MAH)
-    assert used_mah(energy, MAH) == pytest.approx(4.4 / 3.6 * 10.0)
+    assert energy.used * MAH == pytest.approx(4.4 / 3.6 * 10.0)
 
 
 @pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan])
@@ -245,8 +254,7 @@ def test_fewer_and_fewer_attempts_are_left() -> None:
 
 @pytest.mark.parametrize(("reserve_s", "share"), [(math.nan, 0), (math.inf, 0), (-math.inf, 1)])
 def test_figures_that_are_no_numbers_end_no_flight(reserve_s: float, share: int) -> None:
-    safety = PROFILE.safety.model_copy(update={"energy_reserve_s": reserve_s})
-    profile = PROFILE.model_copy(update={"safety": safety})
+    profile = changed({"safety.energy_reserve_s": reserve_s})
     c = Context(state_in(Phase.ALIGN), observation(20.0), profile)
     assert outlook(c).attempts == share * PROFILE.planner.attempts
 
@@ -283,8 +291,7 @@ def test_what_was_begun_is_flown(phase: Phase) -> None:
 
 
 def test_the_gate_can_be_taken_away() -> None:
-    safety = PROFILE.safety.model_copy(update={"energy_gate": False})
-    open_ = PROFILE.model_copy(update={"safety": safety})
+    open_ = changed({"safety.energy_gate": False})
     assert flown(Phase.ALIGN, NEAR_ITS_END, 2.0, open_, battery_v=3.24).row == "aligned"
     assert not load_profile("paper").safety.energy_gate
 
@@ -309,25 +316,21 @@ def test_a_reading_that_stands_still_is_none() -> None:
     state = state_in(Phase.ALIGN)
     for age_s, known in ((0.5, True), (4.0, True), (9.0, False)):
         later = observation(state.t_s + 4.0, battery_age_s=age_s)
-        state = replace(state, energy=watched(Context(state, later, PROFILE)), t_s=later.t_s)
+        state = replace(state, energy=read_battery(Context(state, later, PROFILE)), t_s=later.t_s)
         c = Context(state, later, PROFILE)
         assert (outlook(c).left_s is not None) is known
 
 
 def test_the_firmware_s_word_is_heard() -> None:
     """It reports low power below `pm.lowVoltage`, and the vehicle is landed for it."""
-    link = PROFILE.link.model_copy(update={"parameters": {"pm.lowVoltage": 3.4}})
     assert floor_of(PROFILE) == Floor(3.2, 2.7)
-    assert floor_of(PROFILE.model_copy(update={"link": link})) == Floor(3.4, 2.7)
+    assert floor_of(changed({"link.parameters": {"pm.lowVoltage": 3.4}})) == Floor(3.4, 2.7)
 
 
 def test_a_press_counts_by_what_it_takes_and_how_long_it_lasts() -> None:
-    perch = PROFILE.planner.perch.model_copy(update={"contact_dwell_s": 1.0})
-    planned = PROFILE.planner.model_copy(update={"perch": perch})
-    assert floor_of(PROFILE.model_copy(update={"planner": planned})) == Floor(3.2, 3.0)
-    perch = PROFILE.planner.perch.model_copy(update={"mode": "raw", "thrust": 52428})
-    planned = PROFILE.planner.model_copy(update={"perch": perch})
-    assert floor_of(PROFILE.model_copy(update={"planner": planned})) == Floor(3.2, 2.7, 0.8)
+    assert floor_of(changed({"planner.perch.contact_dwell_s": 1.0})) == Floor(3.2, 3.0)
+    raw = changed({"planner.perch.mode": "raw", "planner.perch.thrust": 52428})
+    assert floor_of(raw) == Floor(3.2, 2.7, 0.8)
 
 
 def test_who_has_no_target_goes_on_searching() -> None:

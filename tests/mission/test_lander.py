@@ -15,20 +15,18 @@ from hypothesis import strategies as st
 
 import perchctl
 from perchctl.mission import (
-    FLYING_PHASES,
-    Context,
     Finding,
     ImuMotion,
+    Mismatch,
     Observation,
     Operator,
     Phase,
     PlannerState,
     VisualInertialMotion,
-    actions,
     lander,
     planner,
 )
-from perchctl.mission.felt import Mismatch
+from perchctl.mission.context import Context
 from perchctl.mission.imu import Corrections, Reckoning
 from perchctl.mission.lander import (
     MANOEUVRES,
@@ -42,6 +40,7 @@ from perchctl.mission.lander import (
     stage_of,
 )
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
+from perchctl.mission.state import FLYING_PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     HL_ACTIVE,
@@ -54,9 +53,12 @@ from perchctl.vehicle import (
 )
 from tests.helpers.mission import (
     AIRBORNE,
+    BY_TARGET,
     CEILING_M,
     HANG_Z_M,
     HOVER_THRUST,
+    MOCAP,
+    PROFILES,
     READY,
     Felt,
     observation,
@@ -65,8 +67,7 @@ from tests.helpers.mission import (
     telemetry,
 )
 
-PROFILES = {by: Profile.model_validate({"positioning": by}) for by in ("deck", "mocap", "target")}
-DECKS, MOCAP, BY_TARGET = PROFILES["deck"], PROFILES["mocap"], PROFILES["target"]
+DECKS = PROFILES["deck"]
 NOW_S, TURN_S = 10.0, 0.02
 HIGH_M, LOW_M = 1.5, 0.2
 PERCHCTL = Path(perchctl.__file__).parent
@@ -306,7 +307,7 @@ def test_an_end_on_the_least_thrust_does_not_lock(part: float) -> None:
     """Nothing flies on that for long; on more it may, and motors stop on proof only."""
     c = context((Evidence.NOTHING, Reach.FREE, Stage.DOWN))
     state = replace(c.state, phase=Phase.ABORTED, level_thrust=part * c.state.hover_thrust)
-    _, command = actions.ACTIONS[Phase.ABORTED](Context(state, c.obs, c.profile))
+    _, command = planner.ACTIONS[Phase.ABORTED](Context(state, c.obs, c.profile))
     assert isinstance(command, StopMotors if part == 0.4 else Idle)
 
 
@@ -320,7 +321,7 @@ def test_a_setpoint_to_the_floor_that_nobody_saw_obeyed_ends_without_a_lock(
         c.state, phase=Phase.ABORTED, row="landing-timeout",
         setpoint=PositionSetpoint(0.0, 0.0, z_m, 0.0),
     )  # fmt: skip
-    _, command = actions.ACTIONS[Phase.ABORTED](Context(state, c.obs, c.profile))
+    _, command = planner.ACTIONS[Phase.ABORTED](Context(state, c.obs, c.profile))
     assert isinstance(command, StopMotors if spent else Idle)
 
 
@@ -467,15 +468,23 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str) -> None:
 # --- Where it is, in the end --------------------------------------------------------------------
 
 
-def ended(reach_s: float | None, imu: ImuMotion, **observed: Any) -> Finding:
+UNMOVED, UNRECKONED = ImuMotion(t_s=NOW_S), Reckoning()
+
+
+def ended(
+    reach_s: float | None = None,
+    imu: ImuMotion = UNMOVED,
+    reckoning: Reckoning = UNRECKONED,
+    touch_s: float | None = None,
+    **observed: Any,
+) -> Finding:
     tel = telemetry(NOW_S, HANG_Z_M, thrust=0.0, supervisor=READY)
-    obs = observation(
-        NOW_S, telemetry=tel, **{"target": None, "position_age_s": 3.0, "imu": imu, **observed}
-    )
+    seen = {"target": None, "position_age_s": 3.0, "imu": imu, **observed}
     state = replace(
-        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M),
-        stopped_s=NOW_S - 1.0, reach_s=reach_s, reckoning=Reckoning(imu=imu),
+        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), stopped_s=NOW_S - 1.0,
+        reach_s=reach_s, touch_s=touch_s, reckoning=replace(reckoning, imu=imu),
     )  # fmt: skip
+    obs = observation(NOW_S, telemetry=tel, **seen)
     return lander.rest_finding(Context(state, obs, BY_TARGET))
 
 
@@ -496,19 +505,6 @@ def test_what_was_in_reach_and_has_not_fallen_since_hangs(
     assert ended(reach_s, ImuMotion(t_s=NOW_S, fell_s=fell_s, gap_s=gap_s)) is found
 
 
-def ended_after(
-    reckoning: Reckoning, *, reach_s: float | None = None, touch_s: float | None = None
-) -> Finding:
-    tel = telemetry(NOW_S, HANG_Z_M, thrust=0.0, supervisor=READY)
-    imu = ImuMotion(t_s=NOW_S)
-    obs = observation(NOW_S, telemetry=tel, target=None, position_age_s=3.0, imu=imu)
-    state = replace(
-        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), stopped_s=NOW_S - 1.0,
-        reach_s=reach_s, touch_s=touch_s, reckoning=replace(reckoning, imu=imu),
-    )  # fmt: skip
-    return lander.rest_finding(Context(state, obs, BY_TARGET))
-
-
 @pytest.mark.parametrize("reach_s", [None, NOW_S - 2.0])
 def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
     reach_s: float | None,
@@ -516,18 +512,18 @@ def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
     """Whether it counted as in reach since or not: it may have met the floor meanwhile, too. A
     sight or a floor that was felt afterwards tells."""
     silence = Reckoning(unsure_s=NOW_S - 3.0)
-    assert ended_after(silence, reach_s=reach_s) is Finding.UNKNOWN
-    assert ended_after(silence, reach_s=reach_s, touch_s=NOW_S - 1.5) is Finding.STANDS
+    assert ended(reach_s, reckoning=silence) is Finding.UNKNOWN
+    assert ended(reach_s, reckoning=silence, touch_s=NOW_S - 1.5) is Finding.STANDS
     seen = replace(silence, sight_s=NOW_S - 2.5)
     told = Finding.STANDS if reach_s is None else Finding.HANGS
-    assert ended_after(seen, reach_s=reach_s) is told
+    assert ended(reach_s, reckoning=seen) is told
 
 
 def test_a_floor_that_was_felt_on_the_way_down_is_where_it_stands() -> None:
     """It came down too gently for a fall, though it pressed before."""
     pressed_s = NOW_S - 4.0
-    assert ended_after(Reckoning(), reach_s=pressed_s) is Finding.HANGS
-    assert ended_after(Reckoning(), reach_s=pressed_s, touch_s=NOW_S - 2.0) is Finding.STANDS
+    assert ended(pressed_s) is Finding.HANGS
+    assert ended(pressed_s, touch_s=NOW_S - 2.0) is Finding.STANDS
 
 
 @pytest.mark.parametrize(("phase", "below_m"), [(Phase.PERCH, math.inf), (Phase.ASCEND, 0.02)])
@@ -636,7 +632,7 @@ def flown(
         step = lander.step_landing if alone else planner.step_mission
         state, command = step(state, obs, profile)
         yield before, state, command, obs
-        if planner.is_mission_over(state):
+        if state.phase.is_over:
             return
 
 
@@ -705,27 +701,26 @@ def test_only_the_lander_orders_a_landing() -> None:
 
 
 VALUES = {
-    "Condition", "Context", "Finding", "Observation", "Operator", "Phase", "PlannerState",
-    "SentCommand", "Touchdown", "VisualInertialMotion",
+    "Observation", "Operator", "Phase", "PlannerState", "Rest", "SentCommand",
+    "VisualInertialMotion",
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("path", ["flight/watchdog.py", "flight/rescue.py"])
-def test_who_lands_in_the_loop_s_place_has_no_landing_of_its_own(path: str) -> None:
-    names = imported(path)
-    verbs = {"step_landing", "rest_finding", "touchdown_of"}
+def test_who_lands_in_the_loop_s_place_has_no_landing_of_its_own() -> None:
+    names = imported("flight/watchdog.py")
+    verbs = {"step_landing", "rest_of"}
     assert "step_landing" in names["perchctl.mission"] <= VALUES | verbs
     assert not any(module.startswith("perchctl.mission.") for module in names)
     assert not names["perchctl.vehicle"] & {"Land", "StopMotors", "HL_ACTIVE"}
 
 
 def test_the_planner_s_landing_is_the_lander() -> None:
-    assert actions.ACTIONS[Phase.LANDING] is lander.act
+    assert planner.ACTIONS[Phase.LANDING] is lander.act
     takers = {
         path.stem
         for path in (PERCHCTL / "mission").glob("*.py")
         for module in imported(f"mission/{path.name}")
         if module == "perchctl.mission.lander"
     }
-    assert takers == {"table"}
-    assert not imported("mission/planner.py")["perchctl.vehicle"] & {"Land", "StopMotors"}
+    assert takers == {"report", "table"}
+    assert not imported("mission/planner.py")["perchctl.vehicle"] & {"Land"}

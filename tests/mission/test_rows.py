@@ -13,21 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import (
-    FLYING_PHASES,
-    TERMINALS,
     ImuMotion,
+    Mismatch,
     Observation,
     Operator,
     Outcome,
     Phase,
     PlannerState,
-    Severity,
     planner,
 )
-from perchctl.mission.felt import Mismatch
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
-from perchctl.mission.table import TABLE, Row, first_match, risen
-from perchctl.profile import Profile
+from perchctl.mission.state import FLYING_PHASES, TERMINALS, Severity
+from perchctl.mission.table import TABLE, Transition, first_match, risen
 from perchctl.vehicle import (
     CRASHED,
     LOCKED,
@@ -41,11 +38,14 @@ from perchctl.vehicle import (
 )
 from tests.helpers.mission import (
     AIRBORNE,
+    BY_TARGET,
     CEILING_M,
     FINE_BATTERY,
     HOVER_THRUST,
+    MOCAP,
     PROFILE,
     READY,
+    changed,
     observation,
     state_in,
     target_at,
@@ -79,7 +79,7 @@ class Case:
     profile: Any = PROFILE
     row: str | None = None
 
-    def holds(self, table: tuple[Row, ...] = TABLE) -> bool:
+    def holds(self, table: tuple[Transition, ...] = TABLE) -> bool:
         state = replace(state_in(self.phase, START_S, self.z_m), **self.state)
         for i in range(1, max(2, round(self.lasts_s / PERIOD_S)) + 1):
             obs = self.look(START_S + PERIOD_S * i)
@@ -149,13 +149,7 @@ def unknown(t_s: float) -> Observation:
     return replace(obs, imu=ImuMotion(t_s=t_s, gap_s=START_S))
 
 
-BY_TARGET = Profile.model_validate({"positioning": "target"})
-MOCAP = PROFILE.model_copy(
-    update={"positioning": PROFILE.positioning.model_copy(update={"by": "mocap"})}
-)
-LAND_ON_LOG = PROFILE.model_copy(
-    update={"safety": PROFILE.safety.model_copy(update={"land_on_log_error": True})}
-)
+LAND_ON_LOG = changed({"safety.land_on_log_error": True})
 QUIET = HOVER_THRUST * 0.5
 PRESSED = HOVER_THRUST * 1.12
 FULL = 65535.0
@@ -367,7 +361,7 @@ def test_what_was_locked_while_it_landed_has_not_perched() -> None:
 
 # --- severity ------------------------------------------------------------------------------
 
-ROGUE = Row("rogue", FLYING_PHASES | {P.LANDING}, lambda c: True, P.SEARCH, "take off again")
+ROGUE = Transition("rogue", FLYING_PHASES | {P.LANDING}, lambda c: True, P.SEARCH, "take off again")
 
 
 def test_no_row_undoes_a_landing() -> None:

@@ -1,4 +1,4 @@
-"""The target is the positioning system, and is not seen any more: hold, sink, down blindly."""
+"""Down without a position or a heading: hold, sink, and level by raw thrust."""
 
 from __future__ import annotations
 
@@ -12,19 +12,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission import (
-    Context,
-    ImuMotion,
-    Observation,
-    Operator,
-    Phase,
-    PlannerState,
-    Severity,
-    lander,
-    planner,
-)
-from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
-from perchctl.mission.guards import BLIND_VARIANCE_M2, LOWEST_M
+from perchctl.mission import ImuMotion, Observation, Operator, Phase, PlannerState, lander, planner
+from perchctl.mission.context import BLOWN_MPS, CORRECTED_S, Context
+from perchctl.mission.guidance import LOWEST_M, POSITION_GAIN_PER_S
 from perchctl.mission.imu import STEADY_ASIDE_MPS, Reckoning
 from perchctl.mission.lander import (
     BRAKE_RAD_PER_MPS,
@@ -33,7 +23,8 @@ from perchctl.mission.lander import (
     SINK_MPS,
     UNLEARNED_WITHIN,
 )
-from perchctl.mission.release import POSITION_GAIN_PER_S
+from perchctl.mission.state import BEFORE_CONTACT, Severity
+from perchctl.mission.table import BLIND_VARIANCE_M2
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, Idle, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import (
@@ -48,6 +39,7 @@ from tests.helpers.mission import (
     target_at,
     telemetry,
 )
+from tests.helpers.mission import PROFILE as DECKS
 
 PROFILE = Profile.model_validate({"positioning": "target"})
 HOLD_S, LAND_S = PROFILE.positioning.hold_s, PROFILE.positioning.land_s
@@ -261,7 +253,7 @@ def test_what_was_stopped_as_it_hung_and_has_not_fallen_since_hangs(
         if TURN_S * i < 0.6:
             obs = replace(obs, telemetry=replace(tel, thrust=1.0))  # not seen to be off yet
         state, command = planner.step_mission(state, felt(obs), PROFILE)
-        if planner.is_mission_over(state):
+        if state.phase.is_over:
             break
         assert not isinstance(command, Land | PositionSetpoint | RawThrust)
     assert state.phase is ends, state.reason
@@ -474,7 +466,7 @@ def test_a_blind_way_down_whose_speed_has_drifted_ends_all_the_same(
         stopped |= isinstance(command, StopMotors)
         thrust = float(command.thrust) if isinstance(command, RawThrust) else thrust
         thrust = 0.0 if stopped else thrust
-        if planner.is_mission_over(state):
+        if state.phase.is_over:
             break
     assert stopped
     assert state.phase is ends, state.reason
@@ -568,3 +560,66 @@ def test_a_contact_beside_the_magnet_or_nobody_knows_where_is_none(
 ) -> None:
     state = pressed_past_the_sight(aside_m, sigma_m)
     assert (state.phase, state.row, state.attempts) == (Phase.RECOVER, "beside-the-magnet", 1)
+
+
+# --- Without a heading: level, on the vertical speed alone ----------------------------------------
+
+
+DT_S = 0.02
+TURNED_RAD = 1.5
+
+
+def heading_lost(phase: Phase = Phase.LANDING) -> PlannerState:
+    return replace(state_in(phase, z_m=1.0), heading_lost=True, hover_thrust=HOVER_THRUST)
+
+
+@pytest.mark.parametrize("phase", sorted(BEFORE_CONTACT, key=lambda p: p.value))
+def test_a_heading_that_jumps_ends_position_control_at_once(phase: Phase) -> None:
+    """With a heading that is far off, a position setpoint leads away from its place."""
+    state, command = planner.step_mission(
+        state_in(phase), observation(10.02, 1.0, jumped=True, turned_rad=TURNED_RAD), DECKS
+    )
+    assert state.phase is Phase.LANDING
+    assert state.heading_lost
+    assert isinstance(command, RawThrust)
+
+
+def test_a_small_step_of_the_heading_is_held_as_any_other() -> None:
+    obs = observation(10.02, 1.0, jumped=True, turned_rad=0.4)
+    state, command = planner.step_mission(state_in(Phase.ALIGN), obs, DECKS)
+    assert not state.heading_lost
+    assert state.hold
+    assert isinstance(command, PositionSetpoint)
+
+
+@given(speed_mps=st.floats(-1.5, 0.5))
+def test_it_brakes_what_sinks_fast_and_lets_sink_what_does_not(speed_mps: float) -> None:
+    tel = telemetry(10.02, 1.0, velocity_mps=(0.0, 0.0, speed_mps))
+    _, command = planner.step_mission(heading_lost(), observation(10.02, telemetry=tel), DECKS)
+    assert isinstance(command, RawThrust)
+    beside = abs(speed_mps + SINK_MPS) < 0.02
+    assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -SINK_MPS)
+    assert command.thrust <= 60000  # more is clipped
+    assert (command.roll_rad, command.pitch_rad) == (0.0, 0.0)
+
+
+def test_what_does_not_sink_gets_less_until_the_floor_proves_itself() -> None:
+    state = heading_lost()
+    thrust = HOVER_THRUST
+    for i in range(1, 300):
+        tel = telemetry(10.0 + DT_S * i, 0.05, thrust=thrust)
+        state, command = planner.step_mission(state, observation(tel.t_s, telemetry=tel), DECKS)
+        if isinstance(command, StopMotors):
+            break
+        assert isinstance(command, RawThrust)
+        assert command.thrust < thrust + 1
+        thrust = float(command.thrust)
+    assert isinstance(command, StopMotors)
+    assert i * DT_S < 4.0
+
+
+def test_unseen_it_is_the_vehicles_own_landing() -> None:
+    """Without its vertical speed raw thrust would be blind."""
+    tel = telemetry(9.5, 1.0)
+    _, command = planner.step_mission(heading_lost(), observation(10.02, telemetry=tel), DECKS)
+    assert isinstance(command, Land)

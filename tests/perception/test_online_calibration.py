@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perchctl.mission import Context, Phase
+from perchctl.mission import Phase
+from perchctl.mission.context import Context
 from perchctl.perception import History
 from perchctl.perception.perception import (
     SLEW,

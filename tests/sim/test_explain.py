@@ -13,7 +13,8 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.display.panel import event_text
 from perchctl.flight import fly_lockstep
 from perchctl.log import read_log
-from perchctl.mission import Event, EventKeeper, EventKind, Phase, Severity
+from perchctl.mission import Event, EventKeeper, EventKind, Phase
+from perchctl.mission.state import Severity
 from perchctl.sim import Bursts, EventExplainer, Scenario, draw_scenario
 from perchctl.sim.explain import LOSSES
 from tests.helpers.flights import SEED, short_profile

@@ -1,11 +1,10 @@
-"""Whether the pictures show the motion that the vehicle feels.
+"""Checks whether the pictures show the motion that the accelerometer measures.
 
-The target stands still. Its way from the body, turned by the attitude at the picture's exposure,
-and the body's own motion by its accelerometer add up to one place, but for what the
-accelerometer cannot know: the speed at the window's begin, and a constant offset. Where pictures
-are later than they are taken to be, or the camera is turned about the upward axis, the sum wanders;
-with the right delay or turn it comes to rest. The vehicle's estimate has no part in it: by the
-target alone it goes by the pictures itself.
+The target stands still. The way from the body to it, turned by the attitude at the exposure, and
+the body's own motion by its accelerometer add up to one place, but for the speed at the window's
+begin and a constant offset. If pictures are later than assumed, or the camera is turned about the
+upward axis, the sum wanders; with the right delay or turn it comes to rest. The vehicle's estimate
+has no part in it: by the target alone it follows the pictures itself.
 """
 
 from __future__ import annotations
@@ -16,65 +15,37 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.mission.imu import Vector, acceleration_mps2
+from perchctl.mission import Mismatch, VisualInertialMotion, acceleration_mps2
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
+Vector = tuple[float, float, float]
+
 WINDOW_S, LEAST_S, LEAST_SIGHTS = 1.2, 0.6, 10
-EVERY_S, AGREED = 0.05, 3
-"""It is judged so often, and so many judgements in a row have to agree."""
+EVERY_S, AGREED = 0.05, 3  # between judgements, and how many in a row have to agree
 STEP_S = 0.02
 _DELAYS_S, _QUARTERS_RAD = np.arange(-8, 32) * STEP_S, np.array([0.5, 1.0, -0.5]) * math.pi
 LATER_S = np.concatenate([_DELAYS_S, np.zeros(len(_QUARTERS_RAD))])
 TURNS_RAD = np.concatenate([np.zeros(len(_DELAYS_S)), _QUARTERS_RAD])
-"""What is tried: delays beyond the one that is taken off the pictures' times, and turns."""
-OFFSET_MPS2, SIGMA_M = 0.2, 0.003
-"""Standard deviations: of the offset, an attitude's error of 1 deg with it, and of a sight."""
-LEAST_LATER_S = 0.1
-"""A lesser change swings an alignment by centimetres, and is told after the flight."""
-WANDERS_M, WANDERS_MORE = 0.005, 3.0
-"""The sum wanders: by so much, and by so much more than with the right delay or turn."""
-ROUGH_M = 0.03
-"""A sum that wanders by so much within a second tells the speed to 0.05 m/s."""
+"""What is tried: delays beyond the assumed one, and turns of the camera."""
+OFFSET_MPS2, SIGMA_M = 0.2, 0.003  # sigma of the offset (with 1 deg of attitude) and of a sight
+LEAST_LATER_S = 0.1  # less swings an alignment by centimetres, and is reported after the flight
+WANDERS_M, WANDERS_MORE = 0.005, 3.0  # by so much, and so much more than with the right delay
+ROUGH_M = 0.03  # a sum that wanders so far within a second gives the speed to 0.05 m/s
 ALIKE_S = 3 * STEP_S
 
 
 @dataclass(frozen=True)
-class Mismatch:
-    """What would bring the target to rest: the pictures are `later_s` later than they are taken
-    to be, or the camera is turned by `turn_rad` about the vehicle's upward axis; the other is 0."""
-
-    later_s: float = 0.0
-    turn_rad: float = 0.0
-
-
-@dataclass(frozen=True)
-class VisualInertialMotion:
-    """The vehicle's motion by pictures and accelerometer, world axes: its speed sideways at `t_s`,
-    by how much the accelerometer and the attitude give too much there, and its vertical speed; None
-    where the delay that it rests on may be over, which a place that hardly changes does not tell.
-    """
-
-    t_s: float
-    velocity_mps: tuple[float, float]
-    bias_mps2: tuple[float, float]
-    climb_mps: float | None
-
-
-@dataclass(frozen=True)
 class VisualInertialWindow:
-    """`sights` of the last `WINDOW_S`, each its time and the way from body to target in body
-    axes, m. `found`: the newest judgement, made at `found_s`, and `agreed`: how many in a row say
-    the same. Once enough agree, it stays. `motion`: the newest in which the sum wandered by at most
-    `motion_within_m`."""
+    """The sights of the last `WINDOW_S`, and what they were judged to show."""
 
-    sights: tuple[tuple[float, Vector], ...] = ()
+    sights: tuple[tuple[float, Vector], ...] = ()  # time, way from body to target, body axes, m
     judged_s: float = -math.inf
-    found: Mismatch | None = None
+    found: Mismatch | None = None  # the newest judgement; once enough agree, it stays
     found_s: float = -math.inf
-    agreed: int = 0
-    motion: VisualInertialMotion | None = None
-    motion_within_m: float = WANDERS_M
+    agreed: int = 0  # judgements in a row that say the same
+    motion: VisualInertialMotion | None = None  # the newest in which the sum wandered by at most
+    motion_within_m: float = WANDERS_M  # ... this
 
     @property
     def mismatch(self) -> Mismatch | None:
@@ -82,8 +53,8 @@ class VisualInertialWindow:
 
 
 def drop_sights(old: VisualInertialWindow) -> VisualInertialWindow:
-    """The watch after wrong positions have turned the attitude: the sights from before go, and what
-    they leave turned is better felt roughly than not at all."""
+    """The window once wrong positions have turned the attitude: without the sights from before, and
+    content with a rougher speed."""
     return replace(old, sights=(), motion_within_m=ROUGH_M)
 
 
@@ -94,8 +65,8 @@ def estimate_motion(
     samples: tuple[Telemetry, ...],
     offset_g: Vector,
 ) -> VisualInertialWindow:
-    """With one more sight. `samples`: the telemetry of the last 2 s, oldest first; `offset_g`: what
-    the accelerometer reads too much."""
+    """The window with one more sight. `samples`: the telemetry of the last 2 s, oldest first;
+    `offset_g`: what the accelerometer reads too much."""
     kept = tuple(s for s in old.sights if t_s - WINDOW_S <= s[0] < t_s)
     new = replace(old, sights=(*kept, (t_s, way_m)))
     short = t_s - new.sights[0][0] < LEAST_S or len(new.sights) < LEAST_SIGHTS
@@ -122,21 +93,21 @@ def _alike(a: Mismatch, b: Mismatch) -> bool:
 
 
 def _nearest(mismatch: Mismatch) -> int:
-    """Which of those that are tried."""
+    """Its index among those that are tried."""
     later_s, turn_rad = mismatch.later_s, mismatch.turn_rad
     return int(np.argmin(np.abs(LATER_S - later_s) + np.abs(TURNS_RAD - turn_rad)))
 
 
 def _best_about(mismatch: Mismatch, wanders_m: Array) -> int:
-    """Of those that are no other mismatch: a delay that is some hundredths of a second beside makes
-    0.1 m/s of speed that is none, and leans by as much."""
+    """The index that wanders least among those that are no other mismatch: a delay that is wrong by
+    some hundredths of a second adds 0.1 m/s."""
     about = np.abs(LATER_S - mismatch.later_s) < LEAST_LATER_S
     about &= mismatch.turn_rad == TURNS_RAD
     return int(np.argmin(np.where(about, wanders_m, np.inf)))
 
 
 def _found(wanders_m: Array) -> Mismatch | None:
-    """What explains the pictures where the profile does not."""
+    """What explains the pictures if the profile does not."""
     best = int(np.argmin(wanders_m))
     as_it_is = float(wanders_m[_nearest(Mismatch())])
     if as_it_is < max(WANDERS_M, WANDERS_MORE * float(wanders_m[best])):
@@ -148,8 +119,8 @@ def _found(wanders_m: Array) -> Mismatch | None:
 def explained(
     sights: tuple[tuple[float, Vector], ...], samples: tuple[Telemetry, ...], offset_g: Vector
 ) -> tuple[Array, Array, Array]:
-    """For each pair of `LATER_S` and `TURNS_RAD`, (n,): by how much the target moves sideways, rms
-    in m; and with that the vehicle's speed at the newest sample and the offset, (3, n)."""
+    """For each pair of `LATER_S` and `TURNS_RAD`: the target's sideways motion, rms in m, (n,); and
+    with it the vehicle's speed at the newest sample and the offset, (3, n)."""
     stamps_s = np.array([s.t_s for s in samples])
     attitudes = np.array([(s.roll_rad, s.pitch_rad, s.yaw_rad) for s in samples])
     attitudes[:, 2] = np.unwrap(attitudes[:, 2])
@@ -185,6 +156,6 @@ def _turned(a: Array, b: Array, by_rad: Array) -> tuple[Array, Array]:
 
 
 def _integral(t_s: Array, values: Array) -> Array:
-    """By trapezia, 0 at the first, (n, k)."""
+    """The integral by trapezia, (n, k); 0 at the first."""
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t_s)[:, None]
     return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])

@@ -11,8 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, Array, rot_z, rotation_from_rpy
-from perchctl.mission import VisualInertialWindow, drop_sights, estimate_motion
-from perchctl.mission.felt import LEAST_LATER_S, STEP_S, WINDOW_S
+from perchctl.perception.visual_inertial import (
+    LEAST_LATER_S,
+    STEP_S,
+    WINDOW_S,
+    VisualInertialWindow,
+    drop_sights,
+    estimate_motion,
+)
 from perchctl.vehicle import Telemetry
 
 TARGET_M = np.array([0.3, -0.2, 1.9])

@@ -1,0 +1,77 @@
+"""The operator's commands: Ctrl-C, the other signals, and the live page's STOP button."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from perchctl.errors import Interrupted
+from perchctl.mission import Operator
+
+AGAIN_S = 0.5  # a second press counts this long after the first
+HELD_S = 0.3  # faster presses are one: a key held down repeats at 5 to 33 Hz
+DELAY_S = 1.0  # a keyboard waits no longer before it repeats a key; 0.25 to 0.66 s are usual
+INSIST_S = 2.0  # who presses on for so long wants the motors stopped
+_EPS_S = 1e-9
+
+
+@dataclass
+class OperatorSwitch:
+    """Ctrl-C as the planner understands it: once lands, twice stops.
+
+    `press` is Ctrl-C. A second press counts after at least `HELD_S` of silence and `AGAIN_S` after
+    the first. The first repetition of a key held down looks the same, so after a silence of up to
+    `DELAY_S` it counts once no other has followed for `HELD_S`. Presses that still follow each
+    other `INSIST_S` after the first are a stop as well. `land` is for STOP on the live page and for
+    the signals that ask a program to end: it lands however often it comes, and never stops the
+    motors. All methods may be called from any thread.
+
+    Until the flight loop listens there is nothing to land: `leave` raises `Interrupted`.
+    """
+
+    listening: bool = False
+    landing_requested: bool = False
+    clock: Callable[[], float] = time.monotonic
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    _first_s: float | None = None
+    _last_s: float = 0.0
+    _second_s: float | None = None
+    _stopped: bool = False
+
+    def read(self) -> Operator:
+        with self._lock:
+            self._confirm(self.clock())
+            if self._stopped:
+                return Operator.STOP
+            pressed = self._first_s is not None or self.landing_requested
+            return Operator.LAND if pressed else Operator.NONE
+
+    def land(self) -> None:
+        self.landing_requested = True
+
+    def press(self) -> None:
+        with self._lock:
+            now_s = self.clock()
+            self._confirm(now_s)
+            silent_s = now_s - self._last_s
+            if self._first_s is None:
+                self._first_s = now_s
+            elif silent_s < HELD_S - _EPS_S:  # a key has begun to repeat, or it is hammered
+                self._second_s = None
+                self._stopped |= now_s - self._first_s >= INSIST_S - _EPS_S
+            elif now_s - self._first_s >= AGAIN_S - _EPS_S:
+                self._second_s = now_s
+                self._stopped |= silent_s > DELAY_S + _EPS_S
+            self._last_s = now_s
+
+    def leave(self) -> None:
+        """On a signal, in the main thread."""
+        if not self.listening:
+            raise Interrupted("interrupted before take-off: nothing was started")
+
+    def _confirm(self, now_s: float) -> None:
+        second_s = self._second_s
+        if second_s is not None and now_s - second_s >= HELD_S - _EPS_S:
+            self._stopped = True

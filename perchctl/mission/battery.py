@@ -1,0 +1,300 @@
+"""How much the battery has left, and whether it is enough for an attempt and a landing.
+
+No current is measured on a Crazyflie. Known are the resting voltage on the ground, the voltage
+under load, and the thrust that the load follows. Assumed are a lithium polymer cell's resting
+voltage by its charge (`CURVE`) and the current at full thrust (`FULL_A`), for a battery of
+`vehicle.battery_mah`. Fitted from the voltages are the sag under full thrust and `hunger`: how much
+faster this battery empties than assumed, both by least squares around usual values, with old
+readings fading.
+
+Before each attempt, what is left is compared with what the way up, the press and the way down take
+at the profile's speeds, with a reserve. The charge ends where `battery-low` would fire; what is
+below that is for a landing that nobody planned.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass
+
+from perchctl.mission.conditions import press_thrust
+from perchctl.mission.context import Context
+from perchctl.mission.state import BatteryOutlook, EnergyState, Phase
+from perchctl.profile import Profile
+from perchctl.values import replace
+from perchctl.vehicle import FULL_THRUST, is_battery_reading
+
+CURVE: tuple[tuple[float, float], ...] = (
+    (0.0, 3.0), (0.02, 3.4), (0.05, 3.64), (0.1, 3.76), (0.2, 3.82), (0.3, 3.86), (0.4, 3.885),
+    (0.5, 3.915), (0.6, 3.955), (0.7, 3.995), (0.8, 4.04), (0.9, 4.1), (1.0, 4.2),
+)  # fmt: skip
+"""Share of the charge, and the resting voltage: a little below the firmware's own table."""
+FULL_A = 4.4  # four motors at full thrust; proportional to the thrust below
+LOW_POWER_V = 3.2  # the firmware reports low power after 5 s, unless `pm.lowVoltage` differs
+USUAL_SAG_V, SAG_WITHIN_V, LEAST_SAG_V = 0.63, 0.3, 0.2
+USUAL_HUNGER, HUNGER_WITHIN, LEAST_HUNGER, MOST_HUNGER = 1.1, 0.3, 1.0, 3.0
+READING_V, FADES_S = 0.02, 40.0  # error of a second of readings, and how long it counts
+SMOOTH_S, LAG_S = 1.0, 0.3  # of the resting voltage; of a reading behind its thrust
+STEADY_LOAD = 0.06  # a thrust that changed by more does not belong to the present reading
+COUNTED_SHARE = 0.05  # below this charge the voltage alone tells what is spent
+LEAST_LOAD, LEAST_LOADED_S = 0.2, 1.0  # an estimate needs so much thrust for so long
+FRESH_S = 1.0  # in flight a reading changes all the time: an older one counts as none
+UNKNOWN_S = 5.0  # without a reading for longer, the remaining charge is unknown
+SETTLING_S, TOUCHING_S, LANDING_S = 3.0, 1.0, 3.0  # as measured in simulated flights
+PRESS_DIP_V = 0.3  # below `safety.min_load_v`, for a press shorter than the debounce
+BACK_OFF_S = 3.0  # from a failed attempt until it is steady and sees the target again
+
+_SHARES, _VOLTS = zip(*CURVE, strict=True)
+
+
+# --- The battery's state, fitted reading by reading ----------------------------------------------
+
+
+@dataclass(frozen=True)
+class BatteryFit:
+    """`sag_v` under full thrust; `hunger`: how much faster it empties than assumed."""
+
+    sag_v: float
+    hunger: float
+
+
+def read_battery(c: Context) -> EnergyState:
+    """The battery's state with this tick's reading; one that is not fresh counts as none."""
+    tel = c.obs.telemetry
+    reading_v = tel.battery_v if c.obs.battery_age_s <= FRESH_S else math.nan
+    dt_s = max(0.0, c.obs.t_s - c.state.t_s)
+    return update_energy(c.state.energy, dt_s, reading_v, tel.thrust, c.profile.vehicle.battery_mah)
+
+
+def update_energy(
+    state: EnergyState, dt_s: float, battery_v: float, thrust: float, battery_mah: float
+) -> EnergyState:
+    """The state after `dt_s` under a commanded thrust 0..65535.
+
+    A `battery_v` that no cell can have, or NaN, counts as no reading."""
+    load = max(0.0, min(1.0, thrust / FULL_THRUST))
+    state = replace(
+        state,
+        used=state.used + load * _per_s(battery_mah) * dt_s,
+        load=_towards(state.load, load, dt_s / LAG_S),
+    )
+    if load >= LEAST_LOAD:
+        known = dt_s / 3.0 if state.mean_load else 1.0
+        state = replace(state, mean_load=_towards(state.mean_load, load, known))
+    if not is_battery_reading(battery_v):
+        return _counted(state, dt_s, battery_mah)
+    state = replace(state, unknown_s=0.0)
+    if load == 0.0 and not state.loaded_s:
+        return replace(state, ground_v=battery_v, rest_v=battery_v)
+    if abs(load - state.load) > STEADY_LOAD:
+        return state
+    if state.ground_v is None:
+        state = replace(state, ground_v=battery_v + USUAL_SAG_V * state.load)
+    if state.load >= LEAST_LOAD:
+        fit = _summed(state, dt_s, battery_v)
+        state = replace(state, fit=fit, loaded_s=state.loaded_s + dt_s)
+    now_v = battery_v + fit_battery(state).sag_v * state.load
+    rest_v = now_v if state.rest_v is None else _towards(state.rest_v, now_v, dt_s / SMOOTH_S)
+    return replace(state, rest_v=rest_v)
+
+
+def fit_battery(state: EnergyState) -> BatteryFit:
+    """The least-squares fit to the readings, around the usual values and within bounds."""
+    a, b, c, p, q = state.fit
+    a += SAG_WITHIN_V**-2
+    c += HUNGER_WITHIN**-2
+    det = a * c - b * b
+    sag_v = USUAL_SAG_V + (c * p - b * q) / det
+    hunger = USUAL_HUNGER + (a * q - b * p) / det
+    return BatteryFit(max(LEAST_SAG_V, sag_v), min(MOST_HUNGER, max(LEAST_HUNGER, hunger)))
+
+
+def loaded_v(state: EnergyState, load: float) -> float | None:
+    """The present voltage under a share of the full thrust; None if it is unknown."""
+    return None if state.rest_v is None else state.rest_v - fit_battery(state).sag_v * load
+
+
+def charge_at(rest_v: float) -> float:
+    """The share of its charge, 0..1, that a cell with that resting voltage has."""
+    return min(1.0, max(0.0, _along(_VOLTS, _SHARES, rest_v)))
+
+
+def resting_v(share: float) -> float:
+    """The resting voltage at a share of the charge."""
+    return _along(_SHARES, _VOLTS, share)
+
+
+def _along(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> float:
+    i = min(max(bisect_right(xs, x), 1), len(xs) - 1)
+    return ys[i - 1] + (x - xs[i - 1]) * (ys[i] - ys[i - 1]) / (xs[i] - xs[i - 1])
+
+
+def _counted(state: EnergyState, dt_s: float, battery_mah: float) -> EnergyState:
+    """Without a reading: the last estimate, less what the thrust takes."""
+    state = replace(state, unknown_s=state.unknown_s + dt_s)
+    if state.rest_v is None:
+        return state
+    spent = fit_battery(state).hunger * state.load * _per_s(battery_mah) * dt_s
+    return replace(state, rest_v=resting_v(charge_at(state.rest_v) - spent))
+
+
+def _summed(
+    state: EnergyState, dt_s: float, battery_v: float
+) -> tuple[float, float, float, float, float]:
+    """`EnergyState.fit` with one more reading, as deviations from the usual values."""
+    assert state.ground_v is not None
+    # A battery larger than assumed goes on where the count has come to the curve's steep end:
+    # counted on, a sag would make up for it. A voltage above the curve counts as nothing spent.
+    begun = charge_at(state.ground_v)
+    counted = max(min(begun, COUNTED_SHARE), begun - state.used)
+    spent_v = resting_v(begun) - resting_v(counted)
+    off_v = state.ground_v - battery_v - USUAL_SAG_V * state.load - USUAL_HUNGER * spent_v
+    weight, keep = dt_s / READING_V**2, math.exp(-dt_s / FADES_S)
+    a, b, c, p, q = (keep * each for each in state.fit)
+    return (
+        a + weight * state.load * state.load,
+        b + weight * state.load * spent_v,
+        c + weight * spent_v * spent_v,
+        p + weight * state.load * off_v,
+        q + weight * spent_v * off_v,
+    )
+
+
+def _per_s(battery_mah: float) -> float:
+    """Share of the charge that a second of full thrust takes."""
+    return FULL_A / (3.6 * battery_mah)
+
+
+def _towards(value: float, goal: float, part: float) -> float:
+    return value + min(1.0, part) * (goal - value)
+
+
+# --- What that is enough for ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Where the battery ends a flight: the voltage under a long load, and under that of a press,
+    which takes `press_load` of the full thrust."""
+
+    hover_v: float
+    press_v: float
+    press_load: float = 1.0
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Seconds of flight for the attempt at hand, for each further one, and for the landing."""
+
+    attempt_s: float
+    again_s: float
+    landing_s: float
+
+
+def outlook(c: Context) -> BatteryOutlook:
+    """What is left, and for how many attempts that is enough.
+
+    An unknown charge counts as what the last reading left, less what was used since, and at most
+    as the grace of a vehicle without a reading (fault 7)."""
+    energy, battery_mah = c.state.energy, c.profile.vehicle.battery_mah
+    used_mah = energy.used * battery_mah
+    counted_s = left_s(energy, floor_of(c.profile), battery_mah, _hover_load(c))
+    seconds = None if energy.unknown_s > UNKNOWN_S else counted_s
+    if c.target_m is None:
+        return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
+    needs = needs_of(c)
+    if seconds is None:
+        enough_s = _grace_s(c) if counted_s is None else min(counted_s, _grace_s(c))
+    else:
+        enough_s = seconds
+    spare_s = enough_s - c.profile.safety.energy_reserve_s - needs.landing_s - needs.attempt_s
+    left = c.profile.planner.attempts - c.state.attempts
+    attempts = 0  # also where the figures are no numbers
+    if spare_s >= 0.0:
+        attempts = 1 + math.floor(min(spare_s / needs.again_s, max(0, left)))
+    return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
+
+
+def left_s(
+    state: EnergyState, floor: Floor, battery_mah: float, hover_load: float | None = None
+) -> float | None:
+    """For how long hovering keeps the voltage above the floor; None if that is unknown.
+
+    `hover_load`: of the full thrust; by default that of the last seconds."""
+    load = hover_load or state.mean_load
+    if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
+        return None
+    fit = fit_battery(state)
+    press_load = max(load, floor.press_load)
+    end_v = max(floor.hover_v + fit.sag_v * load, floor.press_v + fit.sag_v * press_load)
+    share = charge_at(state.rest_v) - charge_at(end_v)
+    return max(0.0, share) / (fit.hunger * load * _per_s(battery_mah))
+
+
+def floor_of(profile: Profile) -> Floor:
+    """Where `battery-low` fires: by the firmware's limit under a long load, by the profile's under
+    one that outlasts `safety.battery_debounce_s`, which a press seldom does."""
+    safety = profile.safety
+    low_v = float(profile.link.parameters.get("pm.lowVoltage", LOW_POWER_V))
+    press_s = TOUCHING_S + profile.planner.perch.contact_dwell_s
+    dip_v = 0.0 if press_s > safety.battery_debounce_s else PRESS_DIP_V
+    press_load = press_thrust(profile) / FULL_THRUST
+    return Floor(max(low_v, safety.min_load_v), safety.min_load_v - dip_v, press_load)
+
+
+def needs_of(c: Context) -> Needs:
+    """By the height of the target, which must have been seen."""
+    planner = c.profile.planner
+    up_m = max(0.0, c.contact_goal_z_m - c.obs.telemetry.position_m[2])
+    touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
+    touch_s += planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
+    aligned_s = 0.0
+    if c.state.phase not in (Phase.ALIGN, Phase.ASCEND, Phase.PERCH):
+        aligned_s = BACK_OFF_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_S
+    again_m = planner.recover.descend_m + planner.ascend.standoff_m
+    return Needs(
+        aligned_s + _climb_s(c.profile, up_m) + touch_s,
+        2.0 * BACK_OFF_S + _climb_s(c.profile, again_m) + touch_s,
+        max(0.0, c.height_m + up_m) / planner.landing.speed_mps + LANDING_S,
+    )
+
+
+def is_short_of_charge(c: Context) -> bool:
+    """True if the attempt that would begin now has not enough. Without a remembered target none
+    begins: a search comes first, and the question after it."""
+    gated = c.profile.safety.energy_gate and c.target_m is not None
+    return gated and not c.state.battery.attempts
+
+
+def why_short(c: Context) -> str:
+    """The shortfall with its figures, as a sentence."""
+    seconds, volts = c.state.battery.left_s, loaded_v(c.state.energy, _hover_load(c))
+    needs = needs_of(c)
+    if seconds is None or volts is None:
+        has = (
+            f"what the battery has left is not known, and of the time that it may fly without a "
+            f"reading (safety.battery_stale_s) {max(0.0, _grace_s(c)):.0f} s are left"
+        )
+    else:
+        has = f"the battery has {max(0.0, seconds):.0f} s left at {volts:.2f} V under load"
+    return (
+        f"{has}; an attempt takes {needs.attempt_s:.0f} s, the landing {needs.landing_s:.0f} s, "
+        f"the reserve is {c.profile.safety.energy_reserve_s:g} s"
+    )
+
+
+def _grace_s(c: Context) -> float:
+    """What `battery-unknown` leaves of its time to a vehicle whose reading is unknown."""
+    return c.profile.safety.battery_stale_s - max(c.state.energy.unknown_s, c.obs.battery_age_s)
+
+
+def _hover_load(c: Context) -> float:
+    """The share of the full thrust that hovering takes."""
+    return (c.state.hover_thrust or FULL_THRUST * c.state.energy.mean_load) / FULL_THRUST
+
+
+def _climb_s(profile: Profile, up_m: float) -> float:
+    ascend = profile.planner.ascend
+    near_m = min(up_m, ascend.near_m)
+    return (up_m - near_m) / ascend.speed_mps + near_m / ascend.near_speed_mps

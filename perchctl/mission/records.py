@@ -1,0 +1,213 @@
+"""The records of a flight: events, ticks, and each turn of the loop whole and exact.
+
+From a flight's turns it can be decided again (`perchctl.analysis`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Literal, Protocol
+
+from perchctl.geometry import Array
+from perchctl.mission.context import Context
+from perchctl.mission.planner import start_mission
+from perchctl.mission.state import Observation, Outcome, Phase, PlannerState, Severity
+from perchctl.mission.table import unplaced_text
+from perchctl.profile import Profile
+from perchctl.vehicle import Command, ExternalPosition, Telemetry, is_battery_reading
+from perchctl.vision import Consistency, PictureKind, PipelineOutput, TargetEstimate
+
+SentBy = Literal["watchdog", "rescue", "reconnect", "farewell"]
+TurnRole = Literal["waiting", "redone", "flown", "failed"]
+RESCUE = " in flight: "
+"""In the note of what a rescue did after an error, behind the error's name."""
+
+
+class EventKind(Enum):
+    """The kind of an event."""
+
+    PHASE = "phase"  # a phase was entered
+    HOLD = "hold"  # the vehicle is held in place
+    NOTE = "note"  # something worth a line
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened. It becomes words only where it is shown."""
+
+    t_s: float
+    kind: EventKind
+    reason: str  # a sentence without its end
+    phase: Phase | None = None  # the one entered, or the one that was flown
+    row: str = ""  # the table's transition; empty at the start and where there was none
+    severity: Severity = Severity.CONTINUE
+    simulated: str = ""  # what the simulated scenario did that led to it
+
+
+def events_of(
+    before: PlannerState | None, state: PlannerState, obs: Observation, profile: Profile
+) -> list[Event]:
+    """The events of one tick; `before` is None in the first."""
+    events: list[Event] = []
+    if before is None:
+        before = start_mission(obs)
+        events.append(Event(obs.t_s, EventKind.PHASE, before.reason, before.phase))
+        if not is_battery_reading(obs.telemetry.battery_v):
+            grace_s = profile.safety.battery_stale_s
+            text = f"no battery reading: landing after {grace_s:.0f} s at most"
+            events.append(Event(obs.t_s, EventKind.NOTE, text, before.phase))
+    if state.phase is not before.phase:
+        entered = EventKind.PHASE, state.reason, state.phase, state.row, state.severity
+        events.append(Event(obs.t_s, *entered))
+    elif state.hold and not before.hold:
+        held = Event(obs.t_s, EventKind.HOLD, state.hold, state.phase, severity=Severity.HOLD)
+        events.append(held)
+    elif state.stale_s == obs.t_s and before.stale_s != before.t_s and not state.hold:
+        # The pilot reads it also where the vehicle is not held for it.
+        text = unplaced_text(Context(state, obs, profile))
+        events.append(Event(obs.t_s, EventKind.NOTE, text, state.phase))
+    return events
+
+
+@dataclass(frozen=True)
+class SentCommand:
+    """A command that no turn of the loop decided, handed to the link at `t_s` on the loop's clock;
+    as of any packet, its arrival is unknown.
+
+    `by`: ``watchdog`` while the loop is silent, and the operator's stop; ``rescue`` after an error;
+    ``reconnect``, an order once more over a link that was lost; ``farewell``, the zero setpoint
+    that closes the link.
+    """
+
+    t_s: float
+    by: SentBy
+    command: Command
+
+
+@dataclass(frozen=True)
+class ExternalPositions:
+    """The external positions that are sent to the vehicle."""
+
+    age_s: float  # of the newest
+    problem: str | None  # why none is sent now
+    sent: int
+    rate_hz: float
+    place: ExternalPosition | None  # the newest
+
+
+@dataclass(frozen=True)
+class FrameSeen:
+    """A `perchctl.vision.Frame` as its source gave it, without its picture."""
+
+    index: int
+    t_s: float
+    t_arrival_s: float
+    fields: PictureKind | None = None
+    repeated: bool = False
+    checksum: int | None = None  # the picture's; None if it was not searched, or not recorded
+
+
+@dataclass(frozen=True)
+class TurnInputs:
+    """What link and camera gave in one turn."""
+
+    samples: tuple[Telemetry, ...] = ()  # in the order in which they came
+    late: tuple[Telemetry, ...] = ()  # those that came while camera or vision hung
+    frame: FrameSeen | None = None
+    problem: str | None = None  # problem, ended, live: the source's own
+    ended: bool = False
+    live: bool = True
+    look: bool = True  # the frame was to be searched
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSeen:
+    """An unfiltered pose of the target, as of a `perchctl.vision.MarkerPose`."""
+
+    t_s: float
+    e_m: Array
+    e_yaw_rad: float
+
+
+@dataclass(frozen=True)
+class TurnTiming:
+    """Duration of a turn's parts: perception, planner, sending, and all but the watchers."""
+
+    pipeline_s: float
+    planner_s: float
+    send_s: float
+    turn_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """One turn of the loop, whole and exact.
+
+    `role`: ``waiting`` before take-off; ``flown``; ``redone``: decided before a hang was noticed,
+    not sent, and decided anew in the next turn; ``failed``: the planner raised on it.
+    `phase` to `reason` are the planner's after its decision.
+    """
+
+    number: int  # from 0; a gap is a turn that is missing
+    role: TurnRole
+    began_s: float
+    t_s: float  # for which it was decided; later than `began_s` where it hung
+    taken: TurnInputs
+    poses: dict[str, PoseSeen] = field(default_factory=dict)  # by large, small, joint
+    observation: Observation | None = None  # None while waiting
+    command: Command | None = None  # None while waiting, and of one that failed
+    phase: Phase | None = None
+    row: str = ""
+    held: bool = False
+    attempts: int = 0
+    outside: ExternalPositions | None = None
+    timing: TurnTiming | None = None  # None in lockstep
+    outcome: Outcome | None = None
+    reason: str | None = None  # None: of a log before version 4, without outcome, too
+    error: str | None = None  # name of what the planner raised
+
+
+@dataclass(frozen=True, eq=False)
+class Tick:
+    """All that one flown turn knew and did, for the log and the display."""
+
+    t_s: float
+    telemetry: Telemetry
+    output: PipelineOutput | None  # of this tick's new frame
+    target: TargetEstimate | None  # the estimate that the planner steered by
+    state: PlannerState
+    command: Command
+    loop_late_s: float
+    camera_age_s: float
+    telemetry_age_s: float
+    consistency: Consistency | None = None  # of latency and mounting, if worked out in this tick
+    delay_used_s: float = 0.0  # off the frames' times
+    outside: ExternalPositions | None = None  # None where decks measure the position
+    turn: Turn | None = None
+
+
+class Watcher(Protocol):
+    """Looks on at a flight: flight log, panel, live page. Must not raise."""
+
+    def tick(self, tick: Tick) -> None: ...
+
+    def event(self, event: Event) -> None: ...
+
+    @property
+    def problem(self) -> str | None: ...
+
+
+class EventKeeper:
+    """A watcher that keeps the events."""
+
+    problem: str | None = None
+
+    def __init__(self) -> None:
+        self.seen: list[Event] = []
+
+    def tick(self, tick: Tick) -> None:
+        return None
+
+    def event(self, event: Event) -> None:
+        self.seen.append(event)

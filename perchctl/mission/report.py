@@ -1,0 +1,229 @@
+"""How a flight ended: where it met the target, how hard it met the floor, and what it showed of the
+camera's latency and mounting. None of it needs a simulator.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from perchctl.mission.context import Context
+from perchctl.mission.lander import Finding, rest_finding
+from perchctl.mission.records import Event
+from perchctl.mission.state import Condition, Observation, Outcome, Phase, PlannerState
+from perchctl.profile import USED_LATENCY_S, CameraConfig, Profile
+from perchctl.values import replace
+from perchctl.vehicle import FRESH_S, LOCKED
+from perchctl.vision import Consistency
+
+HARD_MPS = 0.6  # no way down that goes as it should ends faster
+LATEST_S = 5.0  # from the touchdown to the motors' stop: an earlier blow was no floor
+SAME_HEIGHT_M = 0.3  # a blow higher above the present place was none by the floor
+SURE = 1.96  # standard deviations on both sides of a 95 % interval
+LATENCY_GATE_S = 0.02  # 30 ms make an alignment swing by centimetres
+TURN_GATE_DEG = 2.0  # 35 mm at 1 m, more than the cone of an ascent forgives
+
+
+@dataclass(frozen=True)
+class ContactError:
+    """Horizontal distance of the gear from the target's axis as contact was proven, and its
+    standard deviation."""
+
+    aside_m: float
+    sigma_m: float
+
+    @property
+    def text(self) -> str:
+        """``1.8 +- 0.6 mm off centre``."""
+        return f"{1e3 * self.aside_m:.1f} +- {1e3 * self.sigma_m:.1f} mm off centre"
+
+
+@dataclass(frozen=True)
+class Touchdown:
+    """The speed, downwards, at which the floor was met, and the largest acceleration that a sample
+    of the telemetry shows, one each 10 ms."""
+
+    speed_mps: float
+    peak_g: float
+
+    @property
+    def is_hard(self) -> bool:
+        """True if the way down did not go as it should."""
+        return self.speed_mps > HARD_MPS
+
+    @property
+    def text(self) -> str:
+        """One sentence without its end."""
+        how = "touched down hard" if self.is_hard else "touched down"
+        return f"{how}: {self.speed_mps:.1f} m/s, {self.peak_g:.1f} g"
+
+
+class Rest(NamedTuple):
+    """Where a vehicle came to rest, and how it met the floor; None for what is unknown."""
+
+    finding: Finding | None = None
+    touchdown: Touchdown | None = None
+
+
+@dataclass(frozen=True)
+class FlightReport:
+    """How the flight ended."""
+
+    phase: Phase
+    outcome: Outcome
+    reason: str
+    attempts: int
+    duration_s: float
+    locked: bool
+    history: tuple[Event, ...] = ()  # its phases' events, the first at the start
+    findings: Findings | None = None  # of latency and mounting, where it was long enough
+    contact: ContactError | None = None  # of what hangs
+    touchdown: Touchdown | None = None  # of what met the floor
+
+
+def flight_report(
+    state: PlannerState,
+    obs: Observation,
+    profile: Profile,
+    history: tuple[Event, ...],
+    consistency: Consistency | None,
+) -> FlightReport:
+    """The report of a mission that is over, by its last tick."""
+    c = Context(state, obs, profile)
+    # A hold that is noticed once the attempts are used up has been counted as failed.
+    hangs = state.phase is Phase.PERCHED and state.outcome is not Outcome.ATTEMPTS_USED_UP
+    return FlightReport(
+        phase=state.phase,
+        outcome=state.outcome or Outcome.SAFETY,
+        reason=_reason(state, obs, history),
+        attempts=state.attempts + int(hangs),
+        duration_s=obs.t_s - state.started_s,
+        # The telemetry at hand is older than an emergency stop, which always locks.
+        locked=obs.telemetry.has(LOCKED) or state.outcome is Outcome.EMERGENCY,
+        history=history,
+        findings=None if consistency is None else flight_findings(consistency, profile.camera),
+        contact=_contact_error(state),
+        touchdown=touchdown_of(c),
+    )
+
+
+def rest_of(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> Rest | None:
+    """Where the vehicle is, once its motors have been seen off for `off_s`; None before that."""
+    c = Context(state, obs, profile)
+    if c.held(Condition.DOWN) < off_s:
+        return None
+    finding = rest_finding(c)
+    hangs = finding in (Finding.HANGS, Finding.HELD)
+    return Rest(finding, None if hangs else touchdown_of(c))
+
+
+def touchdown_of(c: Context) -> Touchdown | None:
+    """The newest blow from below, where it may have been the floor's; None if there was none.
+
+    Its speed is the estimate's where that is believed, else as reckoned by the accelerometer."""
+    tel, imu, reckoning = c.obs.telemetry, c.obs.imu, c.state.reckoning
+    blow = imu.blow
+    if c.state.phase is Phase.PERCHED or min(tel.t_s, imu.off_s) - blow.t_s > LATEST_S:
+        return None
+    if c.placed and c.state.blind_s is None and blow.z_m - tel.position_m[2] > SAME_HEIGHT_M:
+        return None
+    reckoned = c.state.blind_s is not None or c.state.astray
+    speed_mps = -(reckoning.struck_mps if reckoned else blow.estimated_mps)
+    return Touchdown(max(0.0, speed_mps), blow.peak_g)
+
+
+def _contact_error(state: PlannerState) -> ContactError | None:
+    """Of what hangs, where the contact was ever placed."""
+    aside_m, sigma_m = state.contact_aside_m, state.contact_sigma_m
+    if state.phase is not Phase.PERCHED or aside_m is None or not math.isfinite(sigma_m):
+        return None
+    return ContactError(aside_m, sigma_m)
+
+
+def _reason(state: PlannerState, obs: Observation, history: tuple[Event, ...]) -> str:
+    """Why it ended so, after what led to the landing where there was one."""
+    why = next((e.reason for e in reversed(history) if e.phase is Phase.LANDING), "")
+    if state.phase in (Phase.LANDED, Phase.PERCHED):
+        return f"{why}; {state.reason}" if why else state.reason
+    if state.row != "landing-timeout":
+        return state.reason
+    age_s = obs.t_s - obs.telemetry.t_s
+    cause = "by its telemetry the vehicle still flies"
+    if age_s > FRESH_S:
+        cause = f"nothing was heard from the vehicle for {age_s:.1f} s"
+    text = f"the landing was ordered but could not be confirmed: {cause}"
+    return f"{why}; {text}" if why else text
+
+
+# --- What the flight showed of latency and mounting ----------------------------------------------
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Latency, and the camera's turn from what the profile says about body x, y and z, each with
+    one standard deviation; `advice` in sentences, empty if the profile fits."""
+
+    latency_s: float
+    latency_sigma_s: float
+    turn_deg: tuple[float, float, float]
+    turn_sigma_deg: tuple[float, float, float]
+    advice: tuple[str, ...] = ()
+
+
+def flight_findings(seen: Consistency, camera: CameraConfig) -> Findings:
+    """The flight's findings, with advice where the flown profile differs."""
+    x, y, z = (math.degrees(turn) for turn in seen.turn_rad)
+    sx, sy, sz = (math.degrees(sigma) for sigma in seen.turn_sigma_rad)
+    found = Findings(
+        latency_s=camera.start_latency_s + seen.delay_s,
+        latency_sigma_s=seen.delay_sigma_s,
+        turn_deg=(x, y, z),
+        turn_sigma_deg=(sx, sy, sz),
+    )
+    advice = [*_about_latency(found, camera), *_about_turn(found)]
+    return replace(found, advice=tuple(advice))
+
+
+def _about_latency(found: Findings, camera: CameraConfig) -> list[str]:
+    least_s, most_s = USED_LATENCY_S
+    measured = isinstance(camera.latency_s, str)
+    used_s = min(max(found.latency_s, least_s), most_s) if measured else camera.start_latency_s
+    off_s, interval_s = found.latency_s - used_s, SURE * found.latency_sigma_s
+    if not abs(off_s) > max(LATENCY_GATE_S, interval_s):
+        return []
+    if measured:
+        return [
+            f"latency {latency_text(found)}, and {least_s * 1e3:.0f} to {most_s * 1e3:.0f} are "
+            f"used with camera.latency_s: measured: find what delays the pictures"
+        ]
+    to_set = f"{max(0.0, found.latency_s):.3f}"
+    return [
+        f"latency {latency_text(found)}, profile says {used_s * 1e3:.0f}: set "
+        f"camera.latency_s to {to_set}"
+    ]
+
+
+def _about_turn(found: Findings) -> list[str]:
+    off = [
+        f"{turn:.1f} +- {SURE * sigma:.1f} deg about {axis}"
+        for axis, turn, sigma in zip("xyz", found.turn_deg, found.turn_sigma_deg, strict=True)
+        if abs(turn) > max(TURN_GATE_DEG, SURE * sigma)
+    ]
+    if not off:
+        return []
+    return [
+        f"the camera is turned by {', '.join(off)} from what the profile says: measure it with "
+        f"`perchctl calibrate mount`"
+    ]
+
+
+def latency_text(found: Findings) -> str:
+    """``92 +- 6 ms``, the 95 % interval."""
+    return f"{found.latency_s * 1e3:.0f} +- {SURE * found.latency_sigma_s * 1e3:.0f} ms"
+
+
+def turn_text(found: Findings) -> str:
+    """``0.2 +- 0.6, -0.1 +- 0.6, 0.4 +- 1.8 deg``, about x, y and z."""
+    each = zip(found.turn_deg, found.turn_sigma_deg, strict=True)
+    return ", ".join(f"{turn:.1f} +- {SURE * sigma:.1f}" for turn, sigma in each) + " deg"
