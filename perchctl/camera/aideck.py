@@ -24,6 +24,7 @@ from perchctl.errors import InvalidValue
 
 PORT = 5000
 FORM = "aideck://HOST[:5000]"
+CONNECT_TIMEOUT_S = 3.0
 
 # What waits unread would be taken for new: the kernel holds back the deck instead.
 _RECEIVE_BYTES = 131072
@@ -90,16 +91,10 @@ class AiDeckSource(StreamSource):
     def _connection(self) -> str:
         with socket.socket(_family(self._address.host), socket.SOCK_STREAM) as connection:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
-            connection.settimeout(self.connect_timeout_s)
+            connection.settimeout(CONNECT_TIMEOUT_S)
             connection.connect((self._address.host, self._address.port))
-            self._socket = connection
-            try:
-                if self._stop.is_set():
-                    return "closed"
-                connection.settimeout(self.read_timeout_s)
-                return self._read(connection)
-            finally:
-                self._socket = None
+            connection.settimeout(self.read_timeout_s)
+            return self._read(connection)
 
     def _read(self, connection: socket.socket) -> str:
         """Until the stream ends; why it did."""

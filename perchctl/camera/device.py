@@ -214,8 +214,6 @@ class DeviceSource(CaptureSource):
     Errors: NotFound; InvalidValue, a control or format that the driver does not take.
     """
 
-    _converted = True
-
     def __init__(
         self,
         number: int,

@@ -73,7 +73,7 @@ class CameraConfig(Section):
     source: str = key(
         "sim:",
         "`camera:N` or its name, `rtsp://...`, `http://...`, `aideck://HOST`, "
-        "`gst:PIPELINE`, `video:FILE`, `images:DIR`, `sim:`",
+        "`video:FILE`, `images:DIR`, `sim:`",
     )
     calibration: str = key(
         "example_640x480.yaml", "file beside the profile, in `calib/`, or a whole path"

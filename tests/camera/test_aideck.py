@@ -217,18 +217,6 @@ def test_nobody_listens(deck: AiDeck) -> None:
         open_camera(deck.url, Clock(), timeout_s=WAIT_S)
 
 
-def test_closing_does_not_wait_for_a_stalled_deck(deck: AiDeck) -> None:
-    end = threading.Event()
-    deck.scripts.put([raw(picture(60)), end])
-    source = AiDeckSource(aideck_address(deck.url), 0.0, Clock())
-    begun(source, read_timeout_s=1000.0)
-    next_frame(source)
-    source.close()
-    assert source._thread is not None
-    assert not source._thread.is_alive()
-    end.set()
-
-
 @pytest.mark.parametrize(
     ("spec", "address"),
     [

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -148,17 +147,14 @@ def test_a_bare_path_becomes_a_source(tmp_path: Path) -> None:
     "rtsp://admin:12/secret@cam/s", "RTSP://admin:12/34secret@cam/s", "Http:admin:secret@cam",
     "http://cam/x?user=admin&password=secret", "http://cam/x?PWD=secret&y=1",
     "http://cam/x?loginpass=secret", "rtsp://admin:se cret@cam/s", "video:rtsp://a:secret@cam",
-    "gst:rtspsrc location=rtsp://admin:secret@cam/s latency=0 ! decodebin ! appsink",
-    'gst:rtspsrc location="rtsp://admin:secret@cam/s" ! appsink',
-    'gst:rtspsrc location=rtsp://cam/s user-id=admin user-pw="secret" ! appsink',
     "--source=rtsp://admin:secret@cam/s", "a vehicle with its camera at rtsp://admin:secret@cam",
 ])  # fmt: skip
 def test_no_form_of_a_password_is_shown(text: str) -> None:
     shown = without_password(text)
     assert "cret" not in shown
     assert "cam" in shown
-    for part in ("latency=0 ! decodebin", "a vehicle with its camera at"):
-        assert (part in shown) == (part in text)
+    words = "a vehicle with its camera at"
+    assert (words in shown) == (words in text)
 
 
 @pytest.mark.parametrize("text", [
@@ -187,7 +183,7 @@ def test_no_message_and_no_record_shows_a_password(tmp_path: Path) -> None:
 
 def test_an_unknown_scheme_is_told_from_a_missing_file_and_known_ones_in_any_case() -> None:
     for spec in ("rtmp://host/live", "ftp://host/a.mp4"):
-        with pytest.raises(InvalidValue, match=r"is unknown; allowed are .*gst:PIPELINE"):
+        with pytest.raises(InvalidValue, match=r"is unknown; allowed are .*aideck"):
             open_camera(spec, clock)
     for spec in ("RTSP://host/s", "Http://host/s", "AIDECK://192.168.4.1", "Camera:0"):
         source = parse_source(spec)
@@ -212,7 +208,7 @@ def test_videos_that_are_none(tmp_path: Path) -> None:
         VideoSource(tmp_path / "flight.avi")
 
 
-@pytest.mark.parametrize("spec", ["webcam:0", "ftp://x", "video:", "images:", "http://", "gst:"])
+@pytest.mark.parametrize("spec", ["webcam:0", "ftp://x", "video:", "images:", "http://"])
 def test_unknown_schemes_say_what_is_allowed(spec: str) -> None:
     with pytest.raises(InvalidValue, match=r"allowed are camera:N, .*video:FILE, images:DIR"):
         open_camera(spec, clock)
@@ -321,30 +317,6 @@ def test_a_url_without_a_host_is_refused_and_its_password_not_shown(url: str) ->
 def test_a_port_that_is_none_is_named(url: str, found: str) -> None:
     with pytest.raises(InvalidValue, match=rf"has port {found}; allowed are 1 to 65535, as in"):
         open_camera(url, clock)
-
-
-def test_gst_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("perchctl.camera.open.has_gstreamer", lambda: False)
-    with pytest.raises(InvalidValue, match=r"^gst: needs an OpenCV .* GStreamer.*rtsp://"):
-        open_camera("gst:videotestsrc ! appsink", clock)
-    monkeypatch.setattr("perchctl.camera.open.has_gstreamer", lambda: True)
-    with pytest.raises(NotFound, match="does not run; try it with gst-launch"):
-        open_camera("gst:nonsense", clock)
-
-
-def test_gst_reads_where_opencv_can(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Capture:
-        def read(self) -> tuple[bool, Any]:
-            return True, np.random.default_rng().integers(0, 255, (48, 64), np.uint8)
-
-        def release(self) -> None:
-            return None
-
-    monkeypatch.setattr("perchctl.camera.open.open_pipeline", lambda text: Capture())
-    source = open_camera("gst:videotestsrc ! appsink", clock)
-    assert source.size_px == (64, 48)
-    assert source.describe().startswith("gst:videotestsrc")
-    source.close()
 
 
 def test_the_size_of_a_calibration_is_asked_of_a_camera_of_this_computer_only() -> None:
