@@ -147,7 +147,7 @@ def _live(
         return DeviceSource(number, latency_s, asked, clock, find=finder_of(number))
     stream: StreamSource | None = None
     if name.scheme == "aideck":
-        stream = AiDeckSource(aideck_address(name.spec), latency_s, clock)
+        stream = AiDeckSource(*aideck_address(name.spec), latency_s, clock)
     elif name.scheme in _USUAL_PORT and name.place.strip("/"):
         _check_address(name)
         kind = RtspSource if name.scheme == "rtsp" else MjpegSource

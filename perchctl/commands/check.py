@@ -72,7 +72,7 @@ def check(
         bool,
         typer.Option(
             "--cameras",
-            help="Only list this computer's cameras: number, name, path, modes, controls.",
+            help="Only list this computer's cameras: number, name, path, controls.",
         ),
     ] = False,
     lift: Annotated[
@@ -231,9 +231,6 @@ def camera_record(camera: ConnectedCamera) -> dict[str, Any]:
         "name": camera.name,
         "path": f"/dev/video{camera.number}",
         "stable_path": camera.stable_path or None,
-        "modes": [
-            {"format": m.format, "size_px": m.size_px, "rates_hz": m.rates_hz} for m in camera.modes
-        ],
         "controls": [_control_record(*each) for each in camera.controls],
         "problem": camera.problem or None,
     }
@@ -257,10 +254,6 @@ def camera_lines(camera: ConnectedCamera) -> list[str]:
         lines.append(f"  {camera.stable_path}")
     if camera.problem:
         lines.append(f"  {camera.problem}; close other programs that use it, or get the right to")
-    for mode in camera.modes:
-        size = "any size" if mode.size_px is None else "{}x{}".format(*mode.size_px)
-        rates = f" at {', '.join(f'{hz:g}' for hz in mode.rates_hz)} Hz" if mode.rates_hz else ""
-        lines.append(f"  {mode.format:<5}{size}{rates}")
     for control, value in camera.controls:
         now = "?" if value is None else str(value)
         held = ", held by an automatic one" if control.inactive else ""

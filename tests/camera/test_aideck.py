@@ -15,7 +15,6 @@ from perchctl.calibration import load_calibration
 from perchctl.camera import aideck as aideck_module
 from perchctl.camera import check_size, open_camera
 from perchctl.camera.aideck import (
-    AiDeckAddress,
     AiDeckSource,
     CpxPicture,
     aideck_address,
@@ -60,7 +59,7 @@ def opened() -> Iterator[Callable[..., AiDeckSource]]:
     sources: list[AiDeckSource] = []
 
     def make(deck: AiDeck, clock: Clock | None = None, **options: float) -> AiDeckSource:
-        source = AiDeckSource(aideck_address(deck.url), 0.06, clock or Clock())
+        source = AiDeckSource(*aideck_address(deck.url), 0.06, clock or Clock())
         sources.append(begun(source, reconnect_wait_s=0.0, **options))
         return source
 
@@ -217,33 +216,22 @@ def test_nobody_listens(deck: AiDeck) -> None:
         open_camera(deck.url, Clock(), timeout_s=WAIT_S)
 
 
-@pytest.mark.parametrize(
-    ("spec", "address"),
-    [
-        ("aideck://192.168.4.1", AiDeckAddress("192.168.4.1", 5000, None)),
-        ("aideck://192.168.4.1:5000/", AiDeckAddress("192.168.4.1", 5000, None)),
-        ("aideck://aideck-4E4BDC.local:81", AiDeckAddress("aideck-4e4bdc.local", 81, None)),
-        ("aideck://10.0.0.7?colour=yes", AiDeckAddress("10.0.0.7", 5000, True)),
-        ("aideck://10.0.0.7?colour=no", AiDeckAddress("10.0.0.7", 5000, False)),
-        ("aideck://[::1]:5001", AiDeckAddress("::1", 5001, None)),
-    ],
-)
-def test_an_address(spec: str, address: AiDeckAddress) -> None:
+@pytest.mark.parametrize(("spec", "address"), [
+    ("aideck://192.168.4.1", ("192.168.4.1", 5000)),
+    ("aideck://192.168.4.1:5000/", ("192.168.4.1", 5000)),
+    ("aideck://aideck-4E4BDC.local:81", ("aideck-4e4bdc.local", 81)),
+    ("aideck://[::1]:5001", ("::1", 5001)),
+])  # fmt: skip
+def test_an_address(spec: str, address: tuple[str, int]) -> None:
     assert aideck_address(spec) == address
 
 
-@pytest.mark.parametrize(
-    "spec",
-    [
-        "aideck:", "aideck://", "aideck:192.168.4.1", "aideck://:5000", "aideck://a:b", "aideck://a:0",
-        "aideck://a:70000", "aideck://a/stream", "aideck://u:p@a", "aideck://a?colour=maybe",
-        "aideck://a?color=yes", "aideck://a?", "aideck://a b", "aideck://a#x", "aideck://[::1",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("spec", [
+    "aideck:", "aideck://", "aideck:192.168.4.1", "aideck://:5000", "aideck://a:b", "aideck://a:0",
+    "aideck://a:70000", "aideck://a/stream", "aideck://u:p@a", "aideck://a?colour=yes",
+    "aideck://a b", "aideck://a#x", "aideck://[::1",
+])  # fmt: skip
 def test_a_wrong_address_is_one_sentence(spec: str) -> None:
-    if spec == "aideck://a?":
-        assert aideck_address(spec).host == "a"
-        return
     with pytest.raises(InvalidValue, match=r"write aideck://HOST\[:5000\], as in aideck://192"):
         open_camera(spec, Clock())
 

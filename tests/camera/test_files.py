@@ -159,7 +159,7 @@ def test_no_form_of_a_password_is_shown(text: str) -> None:
 
 @pytest.mark.parametrize("text", [
     "sim:", "camera:0", "images:/a@b/*.png", "radio://0/80/2M/E7E7E7E7E7", "http://host:81/a",
-    "udp://127.0.0.1:19850", "aideck://192.168.4.1:5000?colour=yes", "-p", "",
+    "udp://127.0.0.1:19850", "aideck://192.168.4.1:5000", "-p", "",
 ])  # fmt: skip
 def test_what_has_no_password_is_shown_as_it_is(text: str) -> None:
     assert without_password(text) == text

@@ -6,6 +6,7 @@ import queue
 import ssl
 import struct
 import threading
+import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -19,7 +20,6 @@ from perchctl.camera import network, open_camera
 from perchctl.camera.device import (
     LOST_AFTER_FAILURES,
     Asked,
-    CaptureSource,
     DeviceSource,
     open_capture,
 )
@@ -485,33 +485,18 @@ def test_a_device_that_comes_back_is_opened_again_under_its_new_number(
     assert not again.released.is_set()
 
 
-def test_attempts_to_open_a_lost_device_are_bounded_in_rate() -> None:
-    waits: list[float] = []
-    reads = LOST_AFTER_FAILURES - 1
-
-    class Instant(threading.Event):
-        """Waiting takes no time, is noted, and ends with a close."""
-
-        def is_set(self) -> bool:
-            return len(waits) >= reads + 10
-
-        def wait(self, timeout: float | None = None) -> bool:
-            waits.append(timeout or 0.0)
-            return self.is_set()
-
-    def no_camera() -> None:
-        attempts.append(len(waits))
-        raise NotFound("camera:0 was not found")
-
-    attempts: list[int] = []
-    source = CaptureSource("camera:0", 0.0, Clock(), no_camera, retry_s=0.25, reopen_every_s=0.5)
-    source._put(grey(60))
-    source._capture = capture = Capture()
-    capture.unplugged = True
-    source._stop = Instant()
-    source._grab()
-    assert waits == [0.25] * reads + [0.5] * 10
-    assert attempts == list(range(reads + 1, reads + 10)), "one behind each wait"
+def test_attempts_to_open_a_lost_device_are_bounded_in_rate(opened: list[LiveSource]) -> None:
+    capture = Capture()
+    capture.pictures.put(grey(60))
+    bus = Bus(capture)
+    source = DeviceSource(0, 0.0, Asked(), Clock(), bus.open, retry_s=0.0, reopen_every_s=0.1)
+    opened.append(source)
+    assert source.wait_first(WAIT_S)
+    bus.capture, capture.unplugged = None, True
+    until(lambda: len(bus.numbers) == 2)
+    began_s = time.monotonic()
+    until(lambda: len(bus.numbers) == 6)
+    assert time.monotonic() - began_s > 0.35
 
 
 def test_a_device_that_flaps_is_never_given_up(opened: list[LiveSource]) -> None:
