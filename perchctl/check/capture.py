@@ -73,19 +73,18 @@ WILD_M = 0.1
 
 @dataclass(frozen=True)
 class Listened:
-    """What came while it was listened to: for how long, the vehicle's telemetry, the capture's
-    frames with the age that each had when it was read, and what the capture complained of."""
+    """What came while it was listened to: the vehicle's telemetry, the capture's frames, and what
+    the capture complained of."""
 
-    lasted_s: float
     telemetry: tuple[Telemetry, ...] = ()
-    frames: tuple[tuple[CaptureFrame, float], ...] = ()
+    frames: tuple[CaptureFrame, ...] = ()
     problem: str | None = None
 
     def places(self, config: PositioningConfig) -> list[Placed]:
         """Of the vehicle's body, at the moments of exposure, oldest first."""
         return [
             Placed.of(frame.bodies[config.body], config, frame.t_s - config.latency_s)
-            for frame, _ in self.frames
+            for frame in self.frames
             if config.body in frame.bodies
         ]
 
@@ -101,21 +100,20 @@ def listen(
     """For so long, or until it is enough; that is asked every half second."""
     began_s = asked_s = clock()
     telemetry: list[Telemetry] = []
-    frames: list[tuple[CaptureFrame, float]] = []
+    frames: list[CaptureFrame] = []
     source.poll(began_s)  # what came before is old
     take()
     while (now_s := clock()) - began_s < for_s:
         telemetry.extend(take())
         frame = source.poll(now_s)
         if frame is not None:
-            frames.append((frame, now_s - frame.t_s))
+            frames.append(frame)
         if now_s - asked_s > 0.5:
             asked_s = now_s
-            if is_enough(Listened(now_s - began_s, tuple(telemetry), tuple(frames))):
+            if is_enough(Listened(tuple(telemetry), tuple(frames))):
                 break
         wait(POLL_S)
-    now_s = clock()
-    return Listened(now_s - began_s, tuple(telemetry), tuple(frames), source.problem(now_s))
+    return Listened(tuple(telemetry), tuple(frames), source.problem(clock()))
 
 
 # --- At rest ------------------------------------------------------------------------------------
@@ -135,7 +133,7 @@ def capture_rows(heard: Listened, profile: Profile) -> list[Row]:
     first = Row("capture", *passed(f"{config.label} sends"))
     places = heard.places(config)
     if not places:
-        others = sorted({name for frame, _ in heard.frames for name in frame.bodies})
+        others = sorted({name for frame in heard.frames for name in frame.bodies})
         found = f"no rigid body {config.body!r}; it sees {', '.join(others) or 'none'}"
         body = failed(found, "correct positioning.body, or show it to the cameras")
         return [first, Row("body", *body), *skip_all(CAPTURE, "the rigid body is not seen")]
@@ -160,15 +158,6 @@ def _rate(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
         by_limits(-rate_hz, -50.0, -20.0, found, advice),
         by_limits(gap_s, hold_s / 2.0, hold_s, found, advice),
     )
-
-
-def _age(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
-    """From its arrival to its reading; what passes before, from the exposure on, no clock of
-    this computer's tells."""
-    ages = sorted(age_s for _, age_s in heard.frames)
-    age_s = ages[int(0.95 * (len(ages) - 1))]
-    found = f"95 % read within {1e3 * max(0.0, age_s):.0f} ms of their arrival"
-    return by_limits(age_s, 0.03, 0.1, found, "close what loads this computer")
 
 
 def _noise(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
@@ -209,7 +198,6 @@ def _place(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
 
 CAPTURE: dict[str, Callable[[Listened, list[Placed], Profile], Finding]] = {
     "body rate": _rate,
-    "body age": _age,
     "body noise": _noise,
     "body place": _place,
 }

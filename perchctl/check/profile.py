@@ -13,7 +13,6 @@ from pathlib import Path
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import without_password
-from perchctl.check.camera import LARGER
 from perchctl.check.computer import disk_finding
 from perchctl.check.row import (
     Finding,
@@ -30,16 +29,13 @@ from perchctl.errors import PerchError, SafetyAbort
 from perchctl.flight import FlyOptions
 from perchctl.places import data_folder
 from perchctl.profile import DOUBTFUL, Profile, find_calibration
-from perchctl.target import check_target, mm_text, overhead_view, sees_small_marker
+from perchctl.target import mm_text, sees_small_marker
 from perchctl.vision import CameraModel
 
 FAR_M = 0.15
 """No gear and no camera is farther from the centre of a vehicle of 42 g."""
 APART_M = 0.003
 """A camera is not where the gear is."""
-NEAR_AN_ANGLE_RAD = 0.02
-NOTABLE_RAD = tuple(sorted({k * math.pi / n for n in (4, 6) for k in range(1, 2 * n + 1)}))
-"""Eighths and twelfths of a circle."""
 LOOKS_UP = math.cos(math.radians(45.0))
 """Of the view's upward part: with less the camera does not look at the ceiling."""
 
@@ -61,7 +57,7 @@ def profile_rows(
     rows += [ask(name, _limits, name, profile) for name in DOUBTFUL]
     rows.append(ask("way", _way, plan))
     if profile.positioning.by == "target":
-        rows += [ask("latency", _latency, plan), ask("marker size", _marker_size, plan)]
+        rows.append(ask("latency", _latency, plan))
     return rows
 
 
@@ -95,10 +91,6 @@ class _Plan:
     profile: Profile
     uri: str
     source: str
-
-    @property
-    def simulated(self) -> bool:
-        return self.uri.startswith("sim://")
 
     @property
     def camera(self) -> CameraModel:
@@ -161,13 +153,6 @@ def _place(key: str, place_m: Sequence[float]) -> Finding:
 def _camera_turn(plan: _Plan) -> Finding:
     mount = plan.profile.camera.mount
     found = f"rpy {' '.join(f'{angle:g}' for angle in mount.rpy_deg)} deg"
-    turned = [abs(angle) for angle in mount.rpy_deg if angle]
-    if turned and all(any(abs(a - n) <= NEAR_AN_ANGLE_RAD for n in NOTABLE_RAD) for a in turned):
-        meant = [f"{math.degrees(angle):.0f}" for angle in mount.rpy_deg]
-        return warned(
-            f"{found}: this looks like radians, of {' '.join(meant)} deg",
-            f"if so write camera.mount.rpy_deg: [{', '.join(meant)}]",
-        )
     up = float(mount.T_body_cam[2, 2])  # of the view
     if up < LOOKS_UP:
         tilted_deg = math.degrees(math.acos(max(-1.0, up)))
@@ -175,20 +160,6 @@ def _camera_turn(plan: _Plan) -> Finding:
             f"{found}: the camera looks {tilted_deg:.0f} deg away from straight up",
             "camera.mount.rpy_deg: 0 0 0 looks up, the last angle turns the picture",
         )
-    return passed(found)
-
-
-def _markers(plan: _Plan) -> Finding:
-    target = plan.profile.target
-    found = " around ".join(
-        f"{mm_text(marker.side_m)} mm {marker.dictionary}/{marker.id}"
-        for marker in (target.large, target.small)
-    )
-    try:
-        # The magnet is no part of a profile: one that just covers the small marker.
-        check_target(target, 1.01 * math.sqrt(2.0) * target.small.side_m)
-    except PerchError as error:
-        return warned(f"{found}: {error}", "print a target that can be read")
     return passed(found)
 
 
@@ -209,7 +180,6 @@ JUDGES: dict[str, Callable[[_Plan], Finding]] = {
     "gear place": _gear_place,
     "camera place": _camera_place,
     "camera turn": _camera_turn,
-    "markers": _markers,
     "stand-off": _standoff,
 }
 
@@ -228,26 +198,14 @@ def _limits(name: str, profile: Profile) -> Finding:
 
 
 def _way(plan: _Plan) -> Finding:
-    """Whether the fence and the height limit leave room for the way to the target."""
+    """Whether the fence leaves room for the way to the target."""
     profile, safety = plan.profile, plan.profile.safety
-    found = f"fence {safety.fence_radius_m:g} m, height limit {safety.max_height_m:g} m"
+    found = f"fence {safety.fence_radius_m:g} m"
     away_m = math.hypot(*(profile.planner.approach_xy_m or (0.0, 0.0)))
     if away_m >= safety.fence_radius_m:
         return warned(
             f"{found}: planner.approach_xy_m is {away_m:.2f} m from the estimate's zero",
             "raise safety.fence_radius_m unless it takes off near that place",
-        )
-    offset_m = math.hypot(*[profile.simulation.start_offset_m] * 2)
-    if plan.simulated and offset_m >= safety.fence_radius_m:
-        return warned(
-            f"{found}: simulated flights start up to {offset_m:.2f} m aside of the target",
-            "raise safety.fence_radius_m, or lower simulation.start_offset_m",
-        )
-    highest_m = profile.simulation.ceiling_z_m[1] - profile.vehicle.gear_body_m[2]
-    if plan.simulated and highest_m >= safety.max_height_m:
-        return warned(
-            f"{found}: simulated ceilings are touched at up to {highest_m:.2f} m",
-            "raise safety.max_height_m, or lower simulation.ceiling_z_m",
         )
     return passed(found)
 
@@ -265,14 +223,3 @@ def _latency(plan: _Plan) -> Finding:
         f"that is 30 ms wrong makes the vehicle swing under the target",
         "set camera.latency_s: measured",
     )
-
-
-def _marker_size(plan: _Plan) -> Finding:
-    profile, mount = plan.profile, plan.profile.camera.mount
-    highest_m = overhead_view(profile.target, plan.camera, mount).highest_m
-    side = mm_text(profile.target.large.side_m)
-    found = f"{side} mm, seen from the ground up to {highest_m:.1f} m above the camera"
-    ceiling_m = profile.simulation.ceiling_z_m[1]
-    if plan.simulated and ceiling_m - mount.position_m[2] > highest_m:
-        return warned(f"{found}; simulated ceilings are up to {ceiling_m:g} m high", LARGER)
-    return passed(found)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
@@ -26,7 +25,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.fly import resolve
 from perchctl.commands.interrupt import interruptible, unheeded
-from perchctl.commands.output import confirmed, say
+from perchctl.commands.output import say
 from perchctl.errors import (
     ConnectionFailed,
     Interrupted,
@@ -79,15 +78,6 @@ def check(
         bool,
         typer.Option("--lift", help="Also watch the position while you lift the vehicle by hand."),
     ] = False,
-    prop_test: Annotated[
-        bool,
-        typer.Option(
-            "--prop-test", help="Also turn each propeller for a moment, and load the battery; asks."
-        ),
-    ] = False,
-    yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Do not ask before --prop-test.")
-    ] = False,
     as_json: Annotated[
         bool,
         typer.Option("--json", help="A list of name, verdict, found and advice on stdout."),
@@ -96,15 +86,10 @@ def check(
     """Look at vehicle, camera, computer and profile on the ground, and say what is not fit to fly.
 
     A row passes, warns, fails, or is skipped where it could not be known. Nothing is armed, and
-    no motor turns but with --prop-test, which asks first. Exits with 0 when nothing fails, with
-    10 when the vehicle does not answer, 20 when the camera gives no picture, 52 for any other
-    failing row.
+    no motor turns. Exits with 0 when nothing fails, with 10 when the vehicle does not answer, 20
+    when the camera gives no picture, 52 for any other failing row.
     """
-    beyond = {"--source": source, "--seed": seed, "--log-dir": log_dir, "--lift": lift,
-              "--prop-test": prop_test}  # fmt: skip
-    given = any(value not in (None, False) for value in beyond.values())
-    if yes and not prop_test:
-        raise UsageError("--yes answers --prop-test: add that, or leave --yes out")
+    given = any(value not in (None, False) for value in (source, seed, log_dir, lift))
     if scan and given:
         raise UsageError("--scan only shows which vehicles answer: give it -u and --json at most")
     if cameras and (given or scan or uri is not None):
@@ -114,17 +99,9 @@ def check(
     if scan:
         say("scanning all channels and rates")
         return report(_scanned(uri), as_json)
-    if prop_test and not yes and not sys.stdin.isatty():
-        raise UsageError("--prop-test turns the motors, and there is nobody to ask: add --yes")
-    may_turn_motors = (lambda: yes or confirm_motors()) if prop_test else None
     options = resolve(profile, uri, source, seed=seed, log_dir=log_dir)
-    scope = CheckScope(may_turn_motors=may_turn_motors, lift=lift, tell=say)
+    scope = CheckScope(lift=lift, tell=say)
     return report(check_rows(options, scope), as_json)
-
-
-def confirm_motors() -> bool:
-    """Whether somebody at the terminal allows the motors' test, now."""
-    return confirmed("About to turn each propeller. Is it free, the vehicle held by nobody?")
 
 
 def _scanned(uri: str | None) -> Iterator[Row]:

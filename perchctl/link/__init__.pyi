@@ -10,7 +10,6 @@ from .mock import MockLink as MockLink
 from .mock import Radio as Radio
 from .motion import MotionLink as MotionLink
 from .probe import Echoes as Echoes
-from .probe import HealthTest as HealthTest
 from .probe import ProbeLink as ProbeLink
 from .probe import ScanResult as ScanResult
 from .probe import address_of as address_of

@@ -30,10 +30,9 @@ class Scripted:
         self,
         changed: Changed = lambda t_s, pose: {"cf2": pose},
         hz: float = 100.0,
-        late_s: float = 0.0,
         complaint: str | None = None,
     ) -> None:
-        self.now_s, self._changed, self._hz, self._late_s = 0.0, changed, hz, late_s
+        self.now_s, self._changed, self._hz = 0.0, changed, hz
         self._next_s, self._rng, self._complaint = 0.0, np.random.default_rng(1), complaint
 
     def clock(self) -> float:
@@ -49,7 +48,7 @@ class Scripted:
         place = np.array([0.3, -0.2, 0.02]) + self._rng.normal(0.0, 0.001, 3)
         R = rotation_from_rpy(*self._rng.normal(0.0, 0.004, 3))
         bodies = self._changed(now_s, BodyPose(tuple(place), quaternion_from_rotation(R)))
-        return None if bodies is None else CaptureFrame(now_s - self._late_s, bodies)
+        return None if bodies is None else CaptureFrame(now_s, bodies)
 
     def problem(self, now_s: float) -> str | None:
         return self._complaint
@@ -109,8 +108,6 @@ FAULTS: list[tuple[str, Scripted, str, str]] = [
     ("body rate", Scripted(hz=40.0), "warn", "40 Hz"),
     ("body rate", Scripted(hz=10.0), "fail", "10 Hz"),
     ("body rate", Scripted(hidden_at_times), "fail", "gap 41"),
-    ("body age", Scripted(late_s=0.05), "warn", "50 ms"),
-    ("body age", Scripted(late_s=0.5), "fail", "500 ms"),
     ("body noise", Scripted(frozen), "fail", "frozen"),
     ("body noise", Scripted(lambda t_s, p: moved(p, 8.0)), "warn", "7.9 mm"),
     ("body noise", Scripted(lambda t_s, p: moved(p, 1000.0)), "fail", "mm (one sigma)"),

@@ -17,7 +17,7 @@ from perchctl.check.capture import CAPTURE, COMPARED
 from perchctl.check.vehicle import GONE
 from perchctl.commands import app
 from perchctl.commands import check as command
-from perchctl.commands.check import confirm_motors, exit_code, report, table
+from perchctl.commands.check import exit_code, report, table
 from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options
 from tests.helpers.flights import ROOT
@@ -59,10 +59,7 @@ def test_json_is_a_list_of_rows(quick: None) -> None:
     (("-u", NOWHERE), 2, "belongs to the simulated vehicle"),
     (("-u", NOWHERE, "--source", "video:old.mp4"), 2, "is a recording"),
     (("--seed", "-1"), 30, "seed -1 is negative"),
-    (("--prop-test",), 2, "nobody to ask"),
-    (("--yes",), 2, "--yes answers --prop-test"),
     (("--scan", "--lift"), 2, "--scan only shows"),
-    (("--scan", "--prop-test", "--yes"), 2, "--scan only shows"),
     (("--cameras", "--scan"), 2, "--cameras only lists"),
     (("--cameras", "--source", "camera:0"), 2, "--cameras only lists"),
 ])  # fmt: skip
@@ -100,20 +97,6 @@ def test_ctrl_c_ends_with_what_was_found(
     assert ("supervisor" in printed.out) is (stage == "opening")
     assert not printed.out or "not finished" in printed.out
     assert "nothing fails" not in printed.out
-
-
-@pytest.mark.parametrize(("answer", "leave"), [("y", True), ("yes", True), ("", False),
-                                               ("no", False), (None, False)])  # fmt: skip
-def test_only_yes_is_a_yes(
-    answer: str | None, leave: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def typed() -> str:
-        if answer is None:
-            raise EOFError
-        return answer
-
-    monkeypatch.setattr("builtins.input", typed)
-    assert confirm_motors() is leave
 
 
 ROWS = [
@@ -188,7 +171,6 @@ def test_every_row_is_on_its_page() -> None:
         COMPARED,
         GONE,
         *camera.PICTURES,
-        *camera.DESIGN,
         *camera.SIGHT,
         "capture",
         "body",

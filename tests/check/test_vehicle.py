@@ -88,7 +88,6 @@ def vehicles(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, dic
 
 FAULTS = [
     ("packets", "lossy", "fail", "% of 20 lost"),
-    ("signal", "bad", "fail", "-97 dBm"),
     ("self-test", "bad", "fail", "failed at boot"),
     ("supervisor", "bad", "fail", "locked (supervisor 0x"),
     ("decks", "bad", "warn", "none"),
@@ -108,7 +107,8 @@ def test_a_fault_of_the_simulated_crazyflie_makes_its_row(
     name: str, which: str, verdict: str, words: str, vehicles: dict[str, dict[str, Row]]
 ) -> None:
     row = vehicles[which][name]
-    assert vehicles["good"][name].verdict is Verdict.PASS
+    if name != "packets":  # how fast they come back is the computer's
+        assert vehicles["good"][name].verdict is Verdict.PASS
     assert row.verdict == verdict
     assert words in row.found
     assert row.advice
@@ -117,11 +117,11 @@ def test_a_fault_of_the_simulated_crazyflie_makes_its_row(
 def test_a_good_vehicle_fails_nothing(vehicles: dict[str, dict[str, Row]]) -> None:
     rows = vehicles["good"].values()
     # How fast packets come back is the computer's, not the vehicle's.
-    timed = ("round trip", "telemetry")
+    timed = ("packets", "telemetry")
     bad = [r for r in rows if r.verdict in ("fail", "warn") and r.name not in timed]
     assert bad == []
-    assert vehicles["good"]["radio"].verdict is Verdict.SKIPPED
-    assert "2026.08, protocol 12" in vehicles["good"]["firmware"].found
+    assert vehicles["good"]["signal"].verdict is Verdict.SKIPPED
+    assert "protocol 12" in vehicles["good"]["firmware"].found
 
 
 def test_without_telemetry_nothing_that_hangs_on_it_passes(
@@ -135,7 +135,6 @@ def test_without_telemetry_nothing_that_hangs_on_it_passes(
 
 GOOD = Vehicle(
     uri="radio://0/80/2M/E7E7E7E7E7",
-    firmware="2026.08",
     parameters={
         "system.selftestPassed": 1, "deck.bcFlow2": 1, "stabilizer.estimator": 2,
         "health.startPropTest": 0,
@@ -160,13 +159,14 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("packets", "fail", {"echoes": Echoes(100, (0.004,) * 80)}),
     ("packets", "warn", {"quality": 80.0}),
     ("packets", "fail", {"quality": 40.0}),
-    ("round trip", "warn", {"echoes": Echoes(100, (0.05,) * 100)}),
-    ("round trip", "fail", {"echoes": Echoes(100, (0.2,) * 100)}),
+    ("packets", "warn", {"echoes": Echoes(100, (0.05,) * 100)}),
+    ("packets", "fail", {"echoes": Echoes(100, (0.2,) * 100)}),
+    ("packets", "fail", {"echoes": Echoes(100, ())}),
     ("telemetry", "warn", {"samples_hz": 80.0}),
     ("telemetry", "fail", {"samples_hz": 40.0}),
     ("telemetry", "fail", {"age_s": 0.5}),
-    ("radio", "warn", {"uri": "radio://0/80/250K"}),
-    ("radio", "skipped", {"uri": "usb://0", "rssi_dbm": None}),
+    ("signal", "warn", {"uri": "radio://0/80/250K"}),
+    ("signal", "skipped", {"uri": "usb://0", "rssi_dbm": None}),
     ("signal", "warn", {"rssi_dbm": -80.0}),
     ("signal", "fail", {"rssi_dbm": -95.0}),
     ("signal", "skipped", {"rssi_dbm": None}),

@@ -88,7 +88,7 @@ def _refusal(tmp_path: Path, text: str) -> str:
                                ("{auto: off}", "auto: False"), ("null", "None")]),
         ("camera: {controls: {auto: on}}", ["write 1 for on and 0 for off"]),
         *((f"camera: {{format: {value}}}",
-           ["camera.format", f"found {found};", "three or four capitals", "check --cameras"])
+           ["camera.format", f"found {found};", "three or four capitals"])
           for value, found in [("4", "4"), ("mjpeg", "'mjpeg'"), ("[MJPG]", "['MJPG']")]),
         ("camera: {latency_s: yes}", ["camera.latency_s"]),
         ("target: {small: {dictionary: DICT_4X4_1000, id: 997, side_m: 0.025}}",
