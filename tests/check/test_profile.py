@@ -18,7 +18,7 @@ CASES: tuple[tuple[str, Mapping[str, Any], str], ...] = (
     ("gear place", {"vehicle.gear_body_m": [0.1, 0.1, 0.1]}, "17 cm"),
     ("camera place", {"camera.mount.position_m": [0, 0, -0.2]}, "20 cm"),
     ("camera place", {"camera.mount.position_m": [0, 0, 0.03]}, "the gear's tip"),
-    ("heights", {"planner.search.max_height_m": 2.95}, "safety.max_height_m (3)"),
+    ("heights", {"planner.search.max_height_m": 2.95}, "safety.max_height_m (3 m)"),
     ("heights", {"safety.ground_tolerance_m": 1.0}, "one on the ground"),
     ("fence", {"safety.fence_radius_m": 0.2}, "draught"),
     ("battery limits", {"safety.min_rest_v": 3.6, "safety.min_load_v": 3.6}, "as soon as it lifts"),
