@@ -270,28 +270,17 @@ def _value(controls: Mapping[str, CameraControl], name: str, value: int | str, s
     key = f"{source}: camera.controls.{name}"
     if not control.settable:
         raise InvalidValue(f"{key} can only be read; leave it out")
-    if control.menu:
-        return _entry(control, value, key)
-    if isinstance(value, str):
-        raise InvalidValue(f"{key}: found {value!r}; needed is {_range(control)}")
-    if not control.low <= value <= control.high or (value - control.low) % max(control.step, 1):
-        raise InvalidValue(f"{key}: found {value}; allowed are {_range(control)}")
+    if control.menu and isinstance(value, str):
+        texts = {text.lower(): index for index, text in control.menu}
+        value = texts.get(value.lower(), value)
+    if (
+        isinstance(value, str)
+        or not control.low <= value <= control.high
+        or (value - control.low) % max(control.step, 1)
+        or (control.menu and value not in dict(control.menu))
+    ):
+        raise InvalidValue(f"{key}: found {value!r}; allowed are {control.allowed}")
     return value
-
-
-def _entry(control: CameraControl, value: int | str, key: str) -> int:
-    for index, text in control.menu:
-        if value == index or (isinstance(value, str) and value.lower() == text.lower()):
-            return index
-    entries = ", ".join(f"{index} ({text})" for index, text in control.menu)
-    raise InvalidValue(f"{key}: found {value!r}; allowed are {entries}")
-
-
-def _range(control: CameraControl) -> str:
-    if control.kind == "boolean":
-        return "0 (off) or 1 (on)"
-    steps = f" in steps of {control.step}" if control.step > 1 else ""
-    return f"{control.low} to {control.high}{steps}"
 
 
 # --- The cameras of this computer: their numbers, names, lasting paths and controls

@@ -66,6 +66,16 @@ class CameraControl:
     def settable(self) -> bool:
         return not self.flags & _READ_ONLY
 
+    @property
+    def allowed(self) -> str:
+        """The values that it takes, in words."""
+        if self.menu:
+            return ", ".join(f"{index} ({text})" for index, text in self.menu)
+        if self.kind == "boolean":
+            return "0 (off) or 1 (on)"
+        steps = f" in steps of {self.step}" if self.step > 1 else ""
+        return f"{self.low} to {self.high}{steps}"
+
 
 @contextlib.contextmanager
 def open_driver(number: int) -> Iterator[Call]:

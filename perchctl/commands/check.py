@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from perchctl.camera import CameraControl, ConnectedCamera, find_cameras
+from perchctl.camera import ConnectedCamera, find_cameras
 from perchctl.check import CheckScope, Row, Verdict, scan_rows
 from perchctl.check import check as check_rows
 from perchctl.commands.command_line import (
@@ -208,20 +208,22 @@ def camera_record(camera: ConnectedCamera) -> dict[str, Any]:
         "name": camera.name,
         "path": f"/dev/video{camera.number}",
         "stable_path": camera.stable_path or None,
-        "controls": [_control_record(*each) for each in camera.controls],
+        "controls": [
+            {
+                "name": control.name,
+                "kind": control.kind,
+                "value": value,
+                "default": control.default,
+                "min": control.low,
+                "max": control.high,
+                "step": control.step,
+                "inactive": control.inactive,
+                **({"menu": {str(k): text for k, text in control.menu}} if control.menu else {}),
+            }
+            for control, value in camera.controls
+        ],
         "problem": camera.problem or None,
     }
-
-
-def _control_record(control: CameraControl, value: int | None) -> dict[str, Any]:
-    record: dict[str, Any] = {
-        "name": control.name, "kind": control.kind, "value": value, "default": control.default,
-        "min": control.low, "max": control.high, "step": control.step,
-        "inactive": control.inactive,
-    }  # fmt: skip
-    if control.menu:
-        record["menu"] = {str(index): text for index, text in control.menu}
-    return record
 
 
 def camera_lines(camera: ConnectedCamera) -> list[str]:
@@ -234,14 +236,5 @@ def camera_lines(camera: ConnectedCamera) -> list[str]:
     for control, value in camera.controls:
         now = "?" if value is None else str(value)
         held = ", held by an automatic one" if control.inactive else ""
-        lines.append(f"  {control.name} = {now}  ({_allowed(control)}{held})")
+        lines.append(f"  {control.name} = {now}  ({control.allowed}{held})")
     return lines
-
-
-def _allowed(control: CameraControl) -> str:
-    if control.menu:
-        return ", ".join(f"{index}: {text}" for index, text in control.menu)
-    if control.kind == "boolean":
-        return "0 or 1"
-    step = f" in steps of {control.step}" if control.step > 1 else ""
-    return f"{control.low} to {control.high}{step}"

@@ -24,7 +24,7 @@ from perchctl.camera.device import (
     open_capture,
 )
 from perchctl.camera.network import MAX_FAILED_CONNECTIONS, MjpegSource, StreamSource
-from perchctl.camera.source import SILENT_AFTER_S, LiveSource, UnmirroredSource
+from perchctl.camera.source import SILENT_AFTER_S, LiveSource
 from perchctl.errors import NotFound, TimedOut
 from perchctl.profile import CameraConfig
 from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
@@ -165,14 +165,6 @@ def test_a_frame_has_the_jpeg_that_it_came_as(server: Server, opened: list[LiveS
     np.testing.assert_array_equal(decoded, frame.image)
 
 
-def test_a_picture_that_was_turned_right_is_none_of_its_jpeg(
-    server: Server, opened: list[LiveSource]
-) -> None:
-    server.scripts.put([part(jpeg(90)), threading.Event()])
-    frame = next_frame(UnmirroredSource(stream(server, Clock(), opened)))
-    assert frame.encoded is None
-
-
 def test_the_newest_frame_wins(server: Server, opened: list[LiveSource]) -> None:
     server.scripts.put([part(jpeg(60)), part(jpeg(100)), part(jpeg(160)), threading.Event()])
     source = stream(server, Clock(), opened)
@@ -284,16 +276,6 @@ def test_it_reconnects_when_the_stream_ends(server: Server, opened: list[LiveSou
     assert (level(frame), frame.index) == (160, 1)
     assert source.connections == 2
     assert source.problem(clock.t_s) is None
-
-
-def test_it_reconnects_when_the_stream_stalls(server: Server, opened: list[LiveSource]) -> None:
-    never = threading.Event()
-    server.scripts.put([part(jpeg(60)), never])
-    server.scripts.put([part(jpeg(160)), never])
-    source = stream(server, Clock(), opened, read_timeout_s=0.1)
-    until(lambda: source.connections >= 2)
-    until(lambda: source.size_px is not None)
-    never.set()
 
 
 def test_reconnects_are_bounded(server: Server, opened: list[LiveSource]) -> None:
