@@ -22,8 +22,8 @@ from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_place, mode_of, write_files
 from perchctl.places import data_folder
 from perchctl.plain_yaml import clip_text, parse_yaml
+from perchctl.profile.base import without_constants
 from perchctl.profile.load import check_profile, find_profile, first_invalid_key
-from perchctl.profile.old_keys import RENAMED, with_present_keys
 from perchctl.profile.schema import Profile
 from perchctl.profile.simulation import in_world
 
@@ -54,7 +54,7 @@ def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--
         except ValueError as error:
             raise InvalidValue(f"{option} {clip_text(f'{key}={text}')}: {error}") from None
     try:
-        _, notes, lost = with_present_keys(values, Profile)
+        _, notes, lost = without_constants(values, Profile)
         if notes or lost:
             raise InvalidValue(f"{option}: {(notes + lost)[0]}")
         return Profile.model_validate(values)
@@ -173,14 +173,15 @@ def with_values(text: str, values: Mapping[str, Value]) -> str:
         new = yaml.load(_flow(value))
         sections, key = dotted.split(".")[:-1], dotted.rpartition(".")[2]
         place, plain = document, wanted
-        for depth, section in enumerate(sections):
-            place = place.setdefault(_name_in(place, sections[:depth], section), CommentedMap())
+        for section in sections:
+            place = place.setdefault(section, CommentedMap())
             plain = plain.setdefault(section, {})
             if not isinstance(place, dict):
                 raise ValueError(f"{section} holds no keys and values")
         old = place.get(key)
         if isinstance(old, list) and isinstance(value, tuple) and len(old) == len(value):
-            old[:] = new
+            for index, number in enumerate(new):  # one by one: their comments stay
+                old[index] = number
         else:
             place[key] = new
         plain[key] = parse_yaml(_flow(value))
@@ -197,20 +198,11 @@ def _as_null(representer: Any, nothing: None) -> Any:
     return representer.represent_scalar("tag:yaml.org,2002:null", "null")
 
 
-def _name_in(place: Mapping[str, Any], above: list[str], section: str) -> str:
-    """The section's name in the file, which may be its name of earlier versions."""
-    for old, present in RENAMED.items():
-        *where, former = old.split(".")
-        if present == section and where == above and former in place:
-            return former
-    return section
-
-
 def _values_of(text: str) -> dict[str, Any]:
     values = parse_yaml(text)
     if not isinstance(values, dict):
         raise ValueError("holds no keys and values")
-    return with_present_keys(values, Profile)[0]
+    return without_constants(values, Profile)[0]
 
 
 def _flow(value: Value) -> str:
