@@ -91,8 +91,7 @@ class DeviceSource(LiveSource):
     `opener` its driver. Controls are set before the first picture and once more after it, since
     some drivers reset them when they begin to stream. A picture that cannot be read or decoded is
     dropped. After `LOST_AFTER_FAILURES` in a row the camera counts as lost: it is released, and
-    opened again as soon as it is back, under the number that `find` gives. One that has never
-    given a picture fails at once.
+    opened again as soon as it is back. One that has never given a picture fails at once.
 
     Errors: NotFound; InvalidValue, a control that the driver does not take.
     """
@@ -107,7 +106,6 @@ class DeviceSource(LiveSource):
         opener: Opener = open_driver,
         retry_s: float = RETRY_S,
         reopen_every_s: float = REOPEN_EVERY_S,
-        find: Callable[[], int] | None = None,
     ) -> None:
         super().__init__(f"camera:{number}", latency_s, clock)
         self._number = number
@@ -116,7 +114,6 @@ class DeviceSource(LiveSource):
         self._opener = opener
         self._retry_s = retry_s
         self._reopen_every_s = reopen_every_s
-        self._find = find
         self._format, self._rate_hz = "", 0.0
         self._reopened = False
         self._capture = self._prepared()
@@ -209,8 +206,6 @@ class DeviceSource(LiveSource):
         self._why_silent = lost
         while not self._stop.wait(self._reopen_every_s):
             try:
-                if self._find is not None:
-                    self._number = self._find()
                 self._capture = self._prepared()
                 self._reopened = True
                 return
@@ -391,33 +386,6 @@ def camera_number(
         )
     there = f"there are {listed(known)}" if known else "this computer has no camera"
     raise NotFound(f"camera:{wanted} was not found; {there}; plug in the receiver or camera")
-
-
-def finder_of(
-    number: int, opener: Opener = open_driver, devices: Path = DEVICES, names: Path = NAMES
-) -> Callable[[], int]:
-    """A function that finds the camera of that number again after it was unplugged: by its
-    lasting path, else by its name, as the system may give it another number.
-
-    Errors of that function: NotFound.
-    """
-    before = next((c for c in find_cameras(opener, devices, names) if c.number == number), None)
-
-    def find() -> int:
-        if before is None or not (before.stable_path or before.name):
-            return number
-        known = find_cameras(opener, devices, names)
-        back = [c.number for c in known if c.stable_path and c.stable_path == before.stable_path]
-        if not back and not before.stable_path:
-            back = [c.number for c in known if c.name == before.name]
-        if number in back:
-            return number
-        if len(back) == 1:
-            return back[0]
-        there = f"there are {listed(known, paths=True)}" if known else "no camera is there"
-        raise NotFound(f"{before} is not back; {there}")
-
-    return find
 
 
 def _fitting(wanted: str, known: Sequence[ConnectedCamera]) -> list[ConnectedCamera]:

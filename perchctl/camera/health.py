@@ -46,17 +46,13 @@ class HealthState:
 
     picture: NDArray[np.uint8] | None = None
     changed_at_s: float = 0.0
-    repeats: int = 0
 
 
 @dataclass(frozen=True)
 class HealthVerdict:
-    """`repeats`: times in a row that this same picture came again;
-    `unchanged_s`: how long ago the picture last changed."""
+    """What a picture is like; a measurement only if it is `usable`."""
 
     kind: Kind
-    repeats: int = 0
-    unchanged_s: float = 0.0
 
     @property
     def usable(self) -> bool:
@@ -79,14 +75,11 @@ def assess_frame(
     """
     image = frame.image
     if live and state.picture is not None and same_bytes(state.picture, image):
-        state = HealthState(state.picture, state.changed_at_s, state.repeats + 1)
-        unchanged_s = frame.t_s - state.changed_at_s
-        frozen = unchanged_s >= FROZEN_AFTER_S
-        return state, HealthVerdict("frozen" if frozen else "repeated", state.repeats, unchanged_s)
+        frozen = frame.t_s - state.changed_at_s >= FROZEN_AFTER_S
+        return state, HealthVerdict("frozen" if frozen else "repeated")
     if live and frame.repeated:
-        repeats = state.repeats + 1
-        return HealthState(image, state.changed_at_s, repeats), HealthVerdict("repeated", repeats)
-    return HealthState(image, frame.t_s, 0), HealthVerdict(content(image))
+        return HealthState(image, state.changed_at_s), HealthVerdict("repeated")
+    return HealthState(image, frame.t_s), HealthVerdict(content(image))
 
 
 def content(image: NDArray[np.uint8]) -> Kind:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -38,7 +37,6 @@ from tests.helpers.aideck import (
     picture,
     raw,
 )
-from tests.helpers.boards import CHARUCO, BoardRenderer, draw_poses
 from tests.helpers.commands import run
 from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
 from tests.helpers.waiting import until
@@ -217,7 +215,7 @@ def test_a_wrong_address_is_one_sentence(spec: str) -> None:
         open_camera(spec, Clock())
 
 
-# -- the commands ------------------------------------------------------------
+# -- a command through it -------------------------------------------------------
 
 
 RANGES_M = np.linspace(0.8, 0.1, 8)
@@ -243,31 +241,3 @@ def test_track_through_it(deck: AiDeck) -> None:
     for x_m, y_m, z_m in seen:
         assert (x_m, y_m) == pytest.approx((-0.02, 0.03), abs=0.001)
         assert min(abs(z_m / at_m - 1.0) for at_m in RANGES_M) < 0.01
-
-
-def views(pause_s: float) -> list[bytes | threading.Event | Pause]:
-    """Of a board, each held still; the same picture to the bit would be no new one."""
-    rng = np.random.default_rng(5)
-    renderer = BoardRenderer(CAMERA, CHARUCO)
-    script: list[bytes | threading.Event | Pause] = []
-    for pose in draw_poses(rng, CAMERA, CHARUCO, 16):
-        image = renderer.render(pose, rng)
-        for _ in range(3):
-            noise = rng.integers(0, 2, image.shape, dtype=np.uint8)
-            script += [raw(np.maximum(image, noise) - noise), Pause(pause_s)]
-    return script
-
-
-@pytest.mark.long
-def test_calibrate_through_it(deck: AiDeck, tmp_path: Path) -> None:
-    for pause_s in (0.2, 1.0):  # a computer that is busy sees too few: slower, then
-        deck.scripts.put(views(pause_s))  # and then it is gone, which ends the capture
-        output = tmp_path / f"{pause_s}" / "mine.yaml"
-        output.parent.mkdir()
-        said = run("calibrate", deck.url, "--board", CHARUCO.notation(), "-o", str(output))
-        if said.code == 0:
-            break
-    assert said.code == 0, said.stderr
-    found = load_calibration(output)
-    assert found.size_px == (324, 244)
-    assert np.allclose(found.K, CAMERA.K, atol=2.0)

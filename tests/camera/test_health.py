@@ -106,8 +106,6 @@ def test_a_frozen_picture_first_repeats_then_is_frozen() -> None:
     assert not any(v.usable for v in verdicts[2:])
     assert verdicts[2].kind == "repeated"
     assert verdicts[-1].kind == "frozen"
-    assert verdicts[-1].repeats == 20
-    assert verdicts[-1].unchanged_s == pytest.approx(20 / 30.0)
     first_frozen = next(k for k, v in enumerate(verdicts) if v.kind == "frozen")
     assert first_frozen == 1 + 12, "0.4 s at 30 Hz"
 
@@ -126,9 +124,8 @@ def test_recordings_may_repeat() -> None:
 
 
 def test_every_verdict_says_what_it_means() -> None:
-    state, verdict = assess_frame(HealthState(), frame(snow(3, 0.5)))
+    _, verdict = assess_frame(HealthState(), frame(snow(3, 0.5)))
     assert "no signal" in verdict.text
-    assert state.repeats == 0
 
 
 # --- Pictures that a receiver gives out again ---------------------------------------------
