@@ -52,7 +52,6 @@ ROOM_WARN = 0.03
 """Of the picture's larger side: by so much a lean of 2 to 3 deg moves the target."""
 LEAST_RATED = 10
 """Pictures; of fewer no rate is known."""
-LARGER = "print a larger target: perchctl make-target suggest --ceiling M proposes one"
 _SEE = "see docs/check.md"
 _AGAIN = "plug the receiver or camera in again"
 _LIGHT = "more light, a longer exposure, or the lens cap off"
@@ -260,20 +259,6 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
 # --- Where the target is the positioning system -------------------------------------------------
 
 
-def _sight_range(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
-    """With this camera, and a sharp picture."""
-    where = overhead_view(profile.target, camera, profile.camera.mount)
-    found = f"the target has to be {where.words}"
-    if not where.reaches:
-        return failed(found, "see camera turn")
-    if rehearsal.target is not None:
-        place = place_seen(rehearsal.target, profile)
-        seen = target_from((0.0, 0.0, profile.safety.ground_z_m), 0.0, place, profile, camera)
-        if seen.height_m > where.highest_m:
-            return warned(f"it is {seen.height_m:.1f} m above it; {found}", LARGER)
-    return passed(found)
-
-
 def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
     """From where the vehicle stands, and on its way up: what `fly` refuses fails."""
     if not rehearsal.found:
@@ -281,7 +266,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
         return failed("no, and fly refuses", f"put the vehicle under the target: {where}")
     found = _share_found(rehearsal)
     if rehearsal.found < SEEN_WARN * rehearsal.pictures:
-        return warned(found, "nearer, sharper, or more light: see sight range and focus")
+        return warned(found, "nearer, sharper, or more light: see focus")
     if rehearsal.target is None:
         return warned(f"{found}, and not at the end", "see lost frames; once more")
     place = place_seen(rehearsal.target, profile)
@@ -303,7 +288,6 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
 
 
 SIGHT: dict[str, Callable[[Rehearsal, Profile, CameraModel], Finding]] = {
-    "sight range": _sight_range,
     "in view": _in_view,
 }
 

@@ -137,44 +137,43 @@ def capture_rows(heard: Listened, profile: Profile) -> list[Row]:
         found = f"no rigid body {config.body!r}; it sees {', '.join(others) or 'none'}"
         body = failed(found, "correct positioning.body, or show it to the cameras")
         return [first, Row("body", *body), *skip_all(CAPTURE, "the rigid body is not seen")]
-    # `Capture.poll` prefers frames with the body, so a frame without is one more unseen.
-    share = 1.0 - len(places) / len(heard.frames)
-    found = f"{config.body!r} seen in {100.0 * (1.0 - share):.0f} % of the frames"
-    advice = "it is hidden at times, or has too few markers: look at it in the capture"
-    body = by_limits(share, 0.02, 0.2, found, advice)
+    body = _body(heard, places, profile)
     return [first, Row("body", *body), *ask_all(CAPTURE, heard, places, profile)]
 
 
-def _rate(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
-    """Between two at 20 Hz a vehicle falls by 12 mm before it gets the next."""
-    times = [place.t_s for place in places]
-    span_s = times[-1] - times[0]
-    rate_hz = (len(times) - 1) / span_s if span_s > 0.0 else 0.0
-    gap_s = max((b - a for a, b in itertools.pairwise(times)), default=math.inf)
-    found = f"{rate_hz:.0f} Hz, the longest gap {1e3 * gap_s:.0f} ms"
-    advice = "raise the capture's rate, use a cable, close what loads this computer"
-    hold_s = profile.positioning.hold_s
-    return worst(
-        by_limits(-rate_hz, -50.0, -20.0, found, advice),
-        by_limits(gap_s, hold_s / 2.0, hold_s, found, advice),
-    )
-
-
-def _noise(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
-    """Of a vehicle at rest: of the worst axis, about the middle; a few wild ones do not make it."""
+def _body(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
+    """How often it is seen, and how well, at rest. Between two frames at 20 Hz a vehicle falls by
+    12 mm. The noise is that of the worst axis, about the middle: a few wild ones do not make it."""
+    config = profile.positioning
     at = np.array([place.position_m for place in places])
     if len(at) > 2 and not np.ptp(at, axis=0).any():
         advice = "a measured pose has noise: is the capture paused, or the body hidden?"
         return failed("frozen: all of its numbers repeat", advice)
     sigma_m = float(np.max(1.4826 * np.median(np.abs(at - np.median(at, axis=0)), axis=0)))
-    found = f"{1e3 * sigma_m:.1f} mm (one sigma)"
-    advice = (
+    times = [place.t_s for place in places]
+    span_s = times[-1] - times[0]
+    rate_hz = (len(times) - 1) / span_s if span_s > 0.0 else 0.0
+    gap_s = max((b - a for a, b in itertools.pairwise(times)), default=math.inf)
+    # `Capture.poll` prefers frames with the body, so a frame without is one more unseen.
+    share = 1.0 - len(places) / len(heard.frames)
+    found = (
+        f"{config.body!r} seen in {100.0 * (1.0 - share):.0f} % of the frames, {rate_hz:.0f} Hz, "
+        f"the longest gap {1e3 * gap_s:.0f} ms, noise {1e3 * sigma_m:.1f} mm"
+    )
+    hidden = "it is hidden at times, or has too few markers: look at it in the capture"
+    slow = "raise the capture's rate, use a cable, close what loads this computer"
+    noisy = (
         "let it stand still; calibrate the capture, or raise positioning.position_sigma_m"
         if sigma_m < WILD_M
         else "these look like millimetres: set the unit of its stream to metres"
     )
-    limit_m = profile.positioning.position_sigma_m
-    return by_limits(sigma_m, limit_m, NOISE_FAIL * limit_m, found, advice)
+    limit_m = config.position_sigma_m
+    return worst(
+        by_limits(share, 0.02, 0.2, found, hidden),
+        by_limits(-rate_hz, -50.0, -20.0, found, slow),
+        by_limits(gap_s, config.hold_s / 2.0, config.hold_s, found, slow),
+        by_limits(sigma_m, limit_m, NOISE_FAIL * limit_m, found, noisy),
+    )
 
 
 def _place(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
@@ -197,8 +196,6 @@ def _place(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
 
 
 CAPTURE: dict[str, Callable[[Listened, list[Placed], Profile], Finding]] = {
-    "body rate": _rate,
-    "body noise": _noise,
     "body place": _place,
 }
 """The rows of a body that is seen, in their order."""

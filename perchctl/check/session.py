@@ -23,7 +23,7 @@ from perchctl.flight import (
     simulated_vehicle,
     wall_date,
 )
-from perchctl.link import ProbeLink, ScanResult, address_of, check_uri, find_vehicles
+from perchctl.link import ProbeLink, ScanResult, check_uri, find_vehicles
 from perchctl.positioning import CaptureSource, open_capture
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vision import Pipeline, make_pipeline
@@ -44,14 +44,14 @@ class CheckScope:
     tell: Callable[[str], None] = lambda text: None
     open_capture: Callable[[PositioningConfig], CaptureSource] = open_capture
     capture_s: float = capture.CAPTURE_S
-    other_vehicles: Callable[[str], ScanResult] = lambda uri: find_vehicles([address_of(uri)])
+    other_vehicles: Callable[[str], ScanResult] = find_vehicles
 
 
 def scan_rows(uri: str | None) -> list[Row]:
     """`--scan`: what answers, at the usual address and at that of `uri`. Errors: InvalidValue."""
     if uri is not None:
         check_uri(uri)
-    return vehicle.answering_rows(find_vehicles([address_of(uri or "")]))
+    return vehicle.answering_rows(find_vehicles(uri or ""))
 
 
 def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:

@@ -34,13 +34,11 @@ from perchctl.flight import (
     unsettled_problem,
 )
 from perchctl.link import (
-    EXTERNAL_POSITION_TICK,
     NEEDED_PROTOCOL,
     UDEV_HELP,
     Echoes,
     ProbeLink,
     ScanResult,
-    decks_found,
 )
 from perchctl.profile import Profile
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, MeasuredBy, Telemetry
@@ -63,7 +61,7 @@ class Vehicle:
     """What was found out about a vehicle.
 
     `telemetry` is the newest, with its age, None without any. While it was listened to, its
-    position moved by `moved_m`; `external`: some positions came from outside.
+    position moved by `moved_m`.
     """
 
     uri: str
@@ -77,7 +75,7 @@ class Vehicle:
     age_s: float = 0.0
     samples_hz: float = 0.0
     rssi_dbm: float | None = None
-    external: bool | None = None
+    measured_by: MeasuredBy = field(default_factory=MeasuredBy)
     moved_m: float = 0.0
 
     @property
@@ -87,23 +85,18 @@ class Vehicle:
             raise Unknown("no telemetry")
         return self.telemetry
 
-    @property
-    def measured_by(self) -> MeasuredBy:
-        return MeasuredBy(decks_found(self.parameters), self.external)
-
     def position_decks(self, profile: Profile) -> tuple[str, ...]:
         return self.measured_by.placed_by(profile.positioning.decks)
 
 
 def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
     """Ask a connected vehicle, and listen to it for so long."""
-    before = link.variables([EXTERNAL_POSITION_TICK]).get(EXTERNAL_POSITION_TICK)
+    measured_by = link.measured_by()
     link.telemetry()
     echoes = link.echoes(listen_s)
     samples = link.telemetry()
     span_s = samples[-1].t_s - samples[0].t_s if len(samples) > 1 else 0.0
-    values = link.variables([RSSI, EXTERNAL_POSITION_TICK])
-    after, rssi = values.get(EXTERNAL_POSITION_TICK), values.get(RSSI)
+    rssi = link.variables([RSSI]).get(RSSI)
     later = link.telemetry() or samples
     return Vehicle(
         uri=uri,
@@ -118,7 +111,7 @@ def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
         samples_hz=(len(samples) - 1) / span_s if span_s > 0.0 else 0.0,
         rssi_dbm=-rssi if rssi else None,
         moved_m=moved_m(samples),
-        external=None if before is None or after is None else after != before,
+        measured_by=measured_by,
     )
 
 
@@ -227,7 +220,7 @@ def _positioning(vehicle: Vehicle, profile: Profile) -> Finding:
     decks = ", ".join(vehicle.position_decks(profile))
     found = {
         "mocap": f"by {profile.positioning.label}, see its rows",
-        "target": "by the target, see sight range and in view",
+        "target": "by the target, see in view",
         "deck": f"by {decks}" if decks else "by positions from outside",
     }
     problem = unmeasured_problem(vehicle.measured_by, profile)

@@ -149,7 +149,7 @@ class ScanResult:
     radio: str = ""
 
 
-def address_of(uri: str) -> int | None:
+def _address_of(uri: str) -> int | None:
     """A radio's address, of five bytes; None of another URI, or where it is the usual one."""
     parts = uri.partition("?")[0].split("/")
     if not uri.startswith("radio://") or len(parts) < 6:
@@ -158,14 +158,12 @@ def address_of(uri: str) -> int | None:
     return None if address == USUAL_ADDRESS else address
 
 
-def find_vehicles(
-    addresses: Iterable[int | None] = (), timeout_s: float = SCAN_TIMEOUT_S
-) -> ScanResult:
-    """What answers now at the usual address and at these; sends null packets only.
+def find_vehicles(uri: str = "", timeout_s: float = SCAN_TIMEOUT_S) -> ScanResult:
+    """What answers now at a radio's usual address and at that of `uri`; sends null packets only.
 
     A radio's driver may hang: it gets a thread, and what came by then counts.
     """
-    asked = list(dict.fromkeys((None, *addresses)))
+    asked = dict.fromkeys((None, _address_of(uri)))
     found: list[str] = []
     why: list[str] = ["the radio did not answer in time"]
 

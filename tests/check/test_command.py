@@ -153,13 +153,13 @@ def test_a_flight_is_refused_for_what_the_profile_or_the_disk_fails(
 
 def test_a_flight_says_what_its_profile_makes_doubtful(tmp_path: Path) -> None:
     (tmp_path / "p.yaml").write_text(
-        "extends: sim\nvehicle: {gear_body_m: [0.2, 0, 0.03]}\n"
-        "camera: {mount: {position_m: [0.2, 0.0, 0.0]}}\nlink: {connect_timeout_s: 0.4}\n"
+        "extends: sim\nvehicle: {gear_body_m: [0.0, 0, 0.03]}\n"
+        "camera: {mount: {position_m: [0.0, 0.0, 0.03]}}\nlink: {connect_timeout_s: 0.4}\n"
     )
     words = ["fly", "-p", "p.yaml", "-u", NOWHERE, "--source", "camera:97", "--yes"]
     said = CliRunner().invoke(app, words)
     warned_of = [line for line in said.stderr.splitlines() if line.startswith("perchctl: check: ")]
-    assert any("gear place" in line for line in warned_of)
+    assert any("camera place" in line for line in warned_of)
     assert said.exit_code in (10, 20)
 
 

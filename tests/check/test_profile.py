@@ -14,9 +14,6 @@ from perchctl.profile import DOUBTFUL, Profile, load_profile
 from tests.helpers.flights import short_profile
 
 CASES: tuple[tuple[str, Mapping[str, Any], str], ...] = (
-    ("gear place", {"vehicle.gear_body_m": [0, 0, 0.16]}, "16 cm"),
-    ("gear place", {"vehicle.gear_body_m": [0.1, 0.1, 0.1]}, "17 cm"),
-    ("camera place", {"camera.mount.position_m": [0, 0, -0.2]}, "20 cm"),
     ("camera place", {"camera.mount.position_m": [0, 0, 0.03]}, "the gear's tip"),
     ("heights", {"planner.search.max_height_m": 2.95}, "safety.max_height_m (3 m)"),
     ("heights", {"safety.ground_tolerance_m": 1.0}, "one on the ground"),

@@ -16,7 +16,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.check import CheckScope, Verdict, camera, check, session
 from perchctl.commands.check import exit_code
 from perchctl.errors import UsageError, broken_motion_capture
-from perchctl.link import ScanResult, address_of, find_vehicles
+from perchctl.link import ScanResult, find_vehicles
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options, wait_for
@@ -135,7 +135,7 @@ def test_a_scan_names_what_answers() -> None:
     """cflib leaves the sockets of its scan open."""
     answerer = Answerer()
     try:
-        found = find_vehicles([None, 0xE7E7E7E701])
+        found = find_vehicles("radio://0/80/2M/E7E7E7E701")
         rows = {row.found: row for row in session.scan_rows(None)}
     finally:
         answerer.socket.close()
@@ -146,14 +146,3 @@ def test_a_scan_names_what_answers() -> None:
         assert radio.verdict is Verdict.SKIPPED
         assert "Crazyradio" in radio.found
         assert "udev" in radio.advice
-
-
-@pytest.mark.parametrize(("uri", "address"), [
-    ("radio://0/80/2M/E7E7E7E701", 0xE7E7E7E701),
-    ("radio://0/80/2M/E7E7E7E7E7", None),
-    ("radio://0/80/2M/0000000001?rate_limit=100", 0x01),
-    ("radio://0", None),
-    ("usb://0", None),
-])  # fmt: skip
-def test_a_radio_s_own_address_is_scanned_too(uri: str, address: int | None) -> None:
-    assert address_of(uri) == address

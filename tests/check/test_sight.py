@@ -14,7 +14,7 @@ from perchctl.check.rehearsal import Blur, Looked, Rehearsal, telemetry_for
 from perchctl.check.row import ask_all
 from perchctl.check.vehicle import BY_FLY, VEHICLE, Vehicle
 from perchctl.profile import Profile, load_profile
-from perchctl.vehicle import Telemetry
+from perchctl.vehicle import MeasuredBy, Telemetry
 from perchctl.vision import CameraModel, Detection, Detections, Frame
 from tests.helpers.checks import AT_REST, PROFILE
 from tests.helpers.flights import short_profile
@@ -52,7 +52,6 @@ def test_under_the_target_both_rows_pass_and_say_from_how_far() -> None:
     rows = rows_of(rehearsed())
     assert list(rows) == list(SIGHT)
     assert {row.verdict for row in rows.values()} == {Verdict.PASS}
-    assert "at most 3.2 m above the camera" in rows["sight range"].found
     assert "0.07 m aside of the camera's axis 2.00 m above it" in rows["in view"].found
 
 
@@ -63,8 +62,6 @@ def test_under_the_target_both_rows_pass_and_say_from_how_far() -> None:
     ("in view", "warn", "not at the end", rehearsed(target=None)),
     ("in view", "warn", "only 1 % of the picture's width", rehearsed(looked=[shown(5.0)])),
     ("in view", "skipped", "no picture came", rehearsed(pictures=0)),
-    ("sight range", "warn", "it is 3.4 m above it", rehearsed(z=3.4)),
-    ("sight range", "skipped", "no picture came", rehearsed(pictures=0)),
 ])  # fmt: skip
 def test_a_sight_makes_its_row(name: str, verdict: str, words: str, done: Rehearsal) -> None:
     row = rows_of(done)[name]
@@ -76,7 +73,6 @@ def test_where_to_put_it_is_told() -> None:
     absent = rows_of(rehearsed(found=0, target=None))["in view"]
     assert "at most 3.2 m above the camera" in absent.advice
     assert "forward" in rows_of(rehearsed(1.3))["in view"].advice
-    assert "make-target suggest" in rows_of(rehearsed(z=3.4))["sight range"].advice
 
 
 def test_what_measures_otherwise_has_no_such_rows() -> None:
@@ -97,10 +93,10 @@ def test_a_latency_that_is_written_down_is_doubted() -> None:
 def test_decks_and_an_estimate_are_not_asked_for() -> None:
     """Its estimate runs away while nothing is sent, and says nothing against it."""
     away = replace(AT_REST, position_m=(3.0, -2.0, 9.0), position_variance_m2=50.0)
-    vehicle = Vehicle("radio://0/80/2M", telemetry=away, external=False)
+    vehicle = Vehicle("radio://0/80/2M", telemetry=away, measured_by=MeasuredBy((), False))
     rows = {row.name: row for row in ask_all(VEHICLE, vehicle, TARGET)}
     assert rows["decks"].verdict is Verdict.PASS
-    assert rows["positioning"].found == "by the target, see sight range and in view"
+    assert rows["positioning"].found == "by the target, see in view"
     assert rows["estimator"].verdict is rows["ground"].verdict is Verdict.SKIPPED
     assert rows["estimator"].found == BY_FLY
 

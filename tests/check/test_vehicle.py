@@ -28,6 +28,7 @@ from perchctl.vehicle import (
     LOCKED,
     LOW_POWER,
     TUMBLED,
+    MeasuredBy,
 )
 from tests.helpers.checks import AT_REST, PROFILE, said, wait_for
 from tests.helpers.mission import READY
@@ -136,8 +137,7 @@ def test_without_telemetry_nothing_that_hangs_on_it_passes(
 GOOD = Vehicle(
     uri="radio://0/80/2M/E7E7E7E7E7",
     parameters={
-        "system.selftestPassed": 1, "deck.bcFlow2": 1, "stabilizer.estimator": 2,
-        "health.startPropTest": 0,
+        "system.selftestPassed": 1, "stabilizer.estimator": 2,
     },
     echoes=Echoes(100, (0.004,) * 100),
     quality=99.0,
@@ -145,7 +145,7 @@ GOOD = Vehicle(
     age_s=0.01,
     samples_hz=100.0,
     rssi_dbm=-50.0,
-    external=False,
+    measured_by=MeasuredBy(("bcFlow2",), False),
 )  # fmt: skip
 
 
@@ -183,9 +183,8 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
             READY | 1 << 12, READY & ~CAN_FLY,
         )
     ),
-    ("positioning", "fail", {"parameters": parameters(deck__bcBuzzer=1, deck__bcFlow2=0),
-                             "external": None}),
-    ("positioning", "fail", {"parameters": parameters(deck__bcBuzzer=1, deck__bcFlow2=0)}),
+    ("positioning", "fail", {"measured_by": MeasuredBy(("bcBuzzer",), None)}),
+    ("positioning", "fail", {"measured_by": MeasuredBy(("bcBuzzer",), False)}),
     ("estimator", "fail", {"telemetry": said(position_variance_m2=0.5)}),
     ("estimator", "fail", {"telemetry": said(position_variance_m2=math.nan)}),
     ("estimator", "skipped", {"telemetry": said(position_variance_m2=None)}),
@@ -218,7 +217,7 @@ def test_a_fault_alone_makes_its_row_and_no_other(
 
 
 def test_a_deck_of_one_s_own_is_believed_where_it_is_named() -> None:
-    vehicle = replace(GOOD, parameters=parameters(deck__labUwb=1, deck__bcFlow2=0), external=None)
+    vehicle = replace(GOOD, measured_by=MeasuredBy(("labUwb",), None))
     known = Profile.model_validate({"positioning": {"decks": ["labUwb"]}})
     assert rows_of(vehicle, known)["positioning"].found == "by labUwb"
     before = rows_of(vehicle)["positioning"]
