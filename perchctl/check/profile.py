@@ -38,19 +38,13 @@ LOOKS_UP = math.cos(math.radians(45.0))
 """Of the view's upward part: with less the camera does not look at the ceiling."""
 
 
-def profile_rows(
-    profile: Profile, *, uri: str | None = None, source: str | None = None
-) -> list[Row]:
+def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
     """A row for each question, in the order in which they matter.
 
-    `uri` and `source` take the place of the profile's. Opens no link and no camera; reads the
-    calibration's file. Raises nothing.
+    `source` takes the place of the profile's. Opens no link and no camera; reads the calibration's
+    file. Raises nothing.
     """
-    plan = _Plan(
-        profile,
-        profile.link.uri if uri is None else uri,
-        profile.camera.source if source is None else source,
-    )
+    plan = _Plan(profile, profile.camera.source if source is None else source)
     rows = ask_all(JUDGES, plan)
     rows += [ask(name, _limits, name, profile) for name in DOUBTFUL]
     rows.append(ask("way", _way, plan))
@@ -63,7 +57,7 @@ def quick_rows(options: FlyOptions) -> list[Row]:
     """What costs no time: the computer's disk and the profile. Opens no link and no camera."""
     return [
         ask("disk", disk_finding, options.log_dir),
-        *profile_rows(options.profile, uri=options.uri, source=options.source),
+        *profile_rows(options.profile, source=options.source),
     ]
 
 
@@ -84,10 +78,9 @@ def _sentence(row: Row) -> str:
 
 @dataclass(frozen=True)
 class _Plan:
-    """A profile, with the vehicle and the camera that it would be flown with."""
+    """A profile, with the camera that it would be flown with."""
 
     profile: Profile
-    uri: str
     source: str
 
     @property

@@ -159,7 +159,6 @@ class VehicleSession:
             yield ask(name, judge, seen, self.profile)
         yield from self._room_rows(self.probe.telemetry)
         yield from self._lift_rows()
-        yield from vehicle.gone_rows(self.probe)
 
     def _room_rows(self, take: TakeTelemetry) -> list[Row]:
         """Of the motion capture; none with decks."""

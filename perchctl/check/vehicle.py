@@ -366,32 +366,6 @@ def lift_finding(seen: Sequence[Telemetry]) -> Finding:
     return passed(found)
 
 
-# --- Whether a vehicle that answered is still there ---------------------------------------------
-
-GONE = "link"
-GONE_S = 1.0
-"""Without telemetry for so long, one that had sent some is switched off or restarting."""
-
-
-def gone(link: ProbeLink) -> str:
-    """Why it is there no more, or empty.
-
-    Silence tells, too: a radio keeps its link to a vehicle that is off, cflib to one that restarts.
-    """
-    if lost := link.lost():
-        return f"the link was lost: {lost}"
-    if link.newest() is not None and link.age_s() > GONE_S:
-        return f"no telemetry came for {link.age_s():.1f} s"
-    return ""
-
-
-def gone_rows(link: ProbeLink) -> list[Row]:
-    """One only for a vehicle that is gone: the others' rows say that they answer."""
-    why = gone(link)
-    advice = "look at its battery and plug, restart it"
-    return [Row(GONE, *failed(f"the vehicle is gone: {why}", advice))] if why else []
-
-
 # --- Which vehicles answer ----------------------------------------------------------------------
 
 

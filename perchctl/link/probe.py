@@ -21,7 +21,6 @@ from perchctl.link.crtp import Packet, Port
 from perchctl.link.firmware import has_variable, missing_variables, parameters, variables
 from perchctl.link.uri import FORMS, with_whole_address
 from perchctl.profile import LinkConfig
-from perchctl.vehicle import Telemetry
 
 ANSWER_S = 0.5
 ECHO_PERIOD_S = 0.02
@@ -89,9 +88,6 @@ class ProbeLink(EstimateLink):
     def lost(self) -> str | None:
         """Why the link is gone, None while it is there."""
         return "it was closed" if self.connection is None else self.connection.lost
-
-    def newest(self) -> Telemetry | None:
-        return self._blocks.newest
 
     def has_variable(self, name: str) -> bool:
         return has_variable(self.cf, name)

@@ -14,7 +14,6 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.check import CheckScope, Row, Verdict, camera, check, session
 from perchctl.check.capture import CAPTURE, COMPARED
-from perchctl.check.vehicle import GONE
 from perchctl.commands import app
 from perchctl.commands import check as command
 from perchctl.commands.check import exit_code, report, table
@@ -169,7 +168,6 @@ def test_every_row_is_on_its_page() -> None:
         *VEHICLE,
         *CAPTURE,
         COMPARED,
-        GONE,
         *camera.PICTURES,
         *camera.SIGHT,
         "capture",
