@@ -344,15 +344,6 @@ def test_no_first_frame_in_time(server: Server) -> None:
     quiet.set()
 
 
-def test_opening_waits_for_the_first_frame(server: Server) -> None:
-    server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = open_camera(server.url, Clock(), timeout_s=WAIT_S)
-    assert source.live
-    assert source.size_px == (64, 48)
-    assert source.describe() == f"{server.url} (64x48 px)"
-    source.close()
-
-
 # -- the device -----------------------------------------------------------------
 
 
