@@ -100,11 +100,16 @@ def hidden_at_times(t_s: float, pose: BodyPose) -> dict[str, BodyPose]:
     return {} if t_s % 1.0 < 0.4 else {"cf2": pose}
 
 
+def hidden_in_turn(t_s: float, pose: BodyPose) -> dict[str, BodyPose]:
+    return {} if round(t_s * 100.0) % 2 else {"cf2": pose}
+
+
 FAULTS: list[tuple[str, Scripted, str, str]] = [
     ("capture", Scripted(lambda t_s, pose: None, complaint="silent for 2 s"), "fail", "silent"),
     ("body", Scripted(lambda t_s, pose: {"wand": pose, "cf3": pose}), "fail", "sees cf3, wand"),
     ("body", Scripted(lambda t_s, pose: {}), "fail", "it sees none"),
     ("body", Scripted(hidden_at_times), "fail", "seen in 60 %"),
+    ("body", Scripted(hidden_in_turn), "fail", "seen in 50 %"),
     ("body", Scripted(hz=40.0), "warn", "40 Hz"),
     ("body", Scripted(hz=10.0), "fail", "10 Hz"),
     ("body", Scripted(hidden_at_times), "fail", "gap 41"),
