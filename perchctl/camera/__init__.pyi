@@ -2,7 +2,6 @@ from .credentials import profile_record as profile_record
 from .credentials import without_password as without_password
 from .credentials import without_passwords as without_passwords
 from .device import ConnectedCamera as ConnectedCamera
-from .device import camera_numbers as camera_numbers
 from .device import find_cameras as find_cameras
 from .files import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from .files import BrokenPicture as BrokenPicture
@@ -27,4 +26,3 @@ from .source import check_size as check_size
 from .source import mirrored_as_profiled as mirrored_as_profiled
 from .source import mirrored_note as mirrored_note
 from .source import unmirror_frame as unmirror_frame
-from .v4l2 import CameraControl as CameraControl

@@ -10,7 +10,7 @@ import re
 import socket
 import struct
 from dataclasses import dataclass
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -24,50 +24,30 @@ from perchctl.errors import InvalidValue
 
 PORT = 5000
 FORM = "aideck://HOST[:5000]"
+CONNECT_TIMEOUT_S = 3.0
 
 # What waits unread would be taken for new: the kernel holds back the deck instead.
 _RECEIVE_BYTES = 131072
 _READ_BYTES = 4 * _RECEIVE_BYTES
-_COLOURS: dict[str, bool | None] = {"auto": None, "yes": True, "no": False}
 _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|[0-9A-Fa-f:]+")
 
 
-@dataclass(frozen=True)
-class AiDeckAddress:
-    """`colour`: whether the camera has a colour mosaic; None is found out by its pictures."""
-
-    host: str
-    port: int = PORT
-    colour: bool | None = None
-
-
-def aideck_address(spec: str) -> AiDeckAddress:
-    """Of ``aideck://HOST[:PORT][?colour=auto|yes|no]``. Errors: InvalidValue."""
+def aideck_address(spec: str) -> tuple[str, int]:
+    """Host and port of ``aideck://HOST[:PORT]``. Errors: InvalidValue."""
     wrong = InvalidValue(
         f"camera source {without_password(spec)!r} is no AI-deck's address; write {FORM}, as in "
-        f"aideck://192.168.4.1, and behind it ?colour=yes or ?colour=no where the picture "
-        f"does not tell"
+        f"aideck://192.168.4.1"
     )
     try:
         parts = urlsplit(spec)
         port = PORT if parts.port is None else parts.port
-        given = parse_qsl(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query))
     except ValueError:
         raise wrong from None
-    options = dict(given)
-    colour = options.pop("colour", "auto")
-    if (
-        parts.scheme != "aideck"
-        or not _HOST_NAME.fullmatch(parts.hostname or "")
-        or port == 0
-        or parts.username is not None
-        or parts.path not in ("", "/")
-        or parts.fragment
-        or options
-        or colour not in _COLOURS
-    ):
+    host = parts.hostname or ""
+    more = parts.username or parts.path.strip("/") or parts.query or parts.fragment
+    if parts.scheme != "aideck" or not _HOST_NAME.fullmatch(host) or port == 0 or more:
         raise wrong
-    return AiDeckAddress(str(parts.hostname), port, _COLOURS[colour])
+    return host, port
 
 
 class AiDeckSource(StreamSource):
@@ -81,25 +61,20 @@ class AiDeckSource(StreamSource):
     no_picture_s = 5.0
     """Bytes that come for so long without a whole picture end the connection."""
 
-    def __init__(self, address: AiDeckAddress, latency_s: float, clock: Clock) -> None:
-        super().__init__(f"aideck://{address.host}:{address.port}", latency_s, clock)
-        self._address = address
+    def __init__(self, host: str, port: int, latency_s: float, clock: Clock) -> None:
+        super().__init__(f"aideck://{host}:{port}", latency_s, clock)
+        self._address = host, port
         self.bytes_seen = 0
-        self._grey = MosaicFilter(address.colour)
+        self._grey = MosaicFilter()
 
     def _connection(self) -> str:
-        with socket.socket(_family(self._address.host), socket.SOCK_STREAM) as connection:
+        family = socket.AF_INET6 if ":" in self._address[0] else socket.AF_INET
+        with socket.socket(family, socket.SOCK_STREAM) as connection:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
-            connection.settimeout(self.connect_timeout_s)
-            connection.connect((self._address.host, self._address.port))
-            self._socket = connection
-            try:
-                if self._stop.is_set():
-                    return "closed"
-                connection.settimeout(self.read_timeout_s)
-                return self._read(connection)
-            finally:
-                self._socket = None
+            connection.settimeout(CONNECT_TIMEOUT_S)
+            connection.connect(self._address)
+            connection.settimeout(self.read_timeout_s)
+            return self._read(connection)
 
     def _read(self, connection: socket.socket) -> str:
         """Until the stream ends; why it did."""
@@ -149,10 +124,6 @@ def decoded(picture: CpxPicture) -> NDArray[np.uint8] | None:
     return image if image is not None and image.shape == shape else None
 
 
-def _family(host: str) -> socket.AddressFamily:
-    return socket.AF_INET6 if ":" in host else socket.AF_INET
-
-
 # --- A colour camera's mosaic in what is delivered as a grey picture ---
 # The sensor's pixels look through colour filters, two by two, and a raw picture, or a JPEG that
 # was made of one as if it were grey, has their pattern all over it. Corners measured on it are
@@ -186,18 +157,15 @@ def without_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 class MosaicFilter:
-    """Takes the mosaic out of a stream's pictures; None: where one is found, and from then on."""
+    """Takes the mosaic out of a stream's pictures, where one is found and from then on."""
 
-    def __init__(self, colour: bool | None = None) -> None:
-        self.colour = colour
+    def __init__(self) -> None:
         self._in_a_row = 0
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        if self.colour is None:
+        if self._in_a_row < PICTURES_IN_A_ROW:
             self._in_a_row = self._in_a_row + 1 if has_mosaic(image) else 0
-            if self._in_a_row >= PICTURES_IN_A_ROW:
-                self.colour = True
-        return without_mosaic(image) if self.colour or self._in_a_row else image
+        return without_mosaic(image) if self._in_a_row else image
 
 
 # --- An AI-deck's pictures, cut out of the bytes of its TCP stream ------------------------------

@@ -1,7 +1,7 @@
 """Cameras of this computer: ``camera:N`` is /dev/videoN, read by a thread.
 
-OpenCV delivers the pictures; the driver itself is asked what it is set to, and told what the
-profile has fixed (`perchctl.camera.v4l2`). Without V4L2 the pictures come all the same.
+OpenCV delivers the pictures; the driver itself sets what the profile has fixed
+(`perchctl.camera.v4l2`). Without V4L2 the pictures come all the same.
 """
 
 from __future__ import annotations
@@ -19,14 +19,9 @@ from perchctl.camera.source import Clock, LiveSource, one_line
 from perchctl.camera.v4l2 import (
     Call,
     CameraControl,
-    Delivered,
-    Mode,
     Opener,
     card_of,
     controls_of,
-    delivered_of,
-    fourcc_text,
-    modes_of,
     open_driver,
     set_value,
     value_of,
@@ -89,69 +84,87 @@ def set_up(capture: Any, asked: Asked) -> None:
     capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # old frames waiting would add latency
 
 
-def differences(asked: Asked, got: Delivered, modes: tuple[Mode, ...], source: str) -> list[str]:
-    """A sentence for each wish that the driver did not fulfil, with what it has instead."""
-    told = []
-    if asked.format is not None and got.format and asked.format != got.format:
-        has = ", ".join(dict.fromkeys(mode.format for mode in modes))
-        told.append(
-            f"{source} was asked for {asked.format} (camera.format) and gives {got.format}"
-            + (f"; it has {has}" if has else "")
-        )
-    here = [mode for mode in modes if mode.format == got.format]
-    if asked.size_px is not None and asked.size_px != got.size_px:
-        has = ", ".join(dict.fromkeys("{}x{}".format(*m.size_px) for m in here if m.size_px))
-        told.append(
-            "{} was asked for {}x{} px, the calibration's, and gives {}x{} px".format(
-                source, *asked.size_px, *got.size_px
-            )
-            + (f"; in {got.format} it has {has}" if has else "")
-        )
-    rate_hz = got.rate_hz
-    if asked.rate_hz is not None and rate_hz and not _near(asked.rate_hz, rate_hz):
-        rates = [hz for mode in here if mode.size_px == got.size_px for hz in mode.rates_hz]
-        has = ", ".join(f"{hz:g}" for hz in rates)
-        told.append(
-            f"{source} was asked for {asked.rate_hz:g} Hz (camera.rate_hz) and gives "
-            f"{rate_hz:.3g} Hz" + (f"; at this size and format it has {has} Hz" if has else "")
-        )
-    return told
+class DeviceSource(LiveSource):
+    """A camera of this computer: only the newest frame is kept, stamped when the grab returns.
 
+    `opened` replaces the real camera, anything with read(), get(), set() and release(), and
+    `opener` its driver. Controls are set before the first picture and once more after it, since
+    some drivers reset them when they begin to stream. A picture that cannot be read or decoded is
+    dropped. After `LOST_AFTER_FAILURES` in a row the camera counts as lost: it is released, and
+    opened again as soon as it is back. One that has never given a picture fails at once.
 
-def _near(one_hz: float, other_hz: float) -> bool:
-    return abs(one_hz - other_hz) <= RATE_TOLERANCE * one_hz
-
-
-class CaptureSource(LiveSource):
-    """Keeps only the newest frame of what has read() and release(), as cv2.VideoCapture,
-    stamped when the grab returns.
-
-    A picture that cannot be read or decoded is dropped. After `LOST_AFTER_FAILURES` in a row the
-    camera counts as lost: it is released, and opened again as soon as it is back. One that has
-    never given a picture fails at once.
+    Errors: NotFound; InvalidValue, a control that the driver does not take.
     """
 
     def __init__(
         self,
-        name: str,
+        number: int,
         latency_s: float,
+        asked: Asked,
         clock: Clock,
-        opened: Callable[[], Any],
+        opened: Callable[[int, Asked], Any] = open_capture,
+        opener: Opener = open_driver,
         retry_s: float = RETRY_S,
         reopen_every_s: float = REOPEN_EVERY_S,
     ) -> None:
-        """`opened` opens the camera, the first time and again."""
-        super().__init__(name, latency_s, clock)
-        self._opened = opened
+        super().__init__(f"camera:{number}", latency_s, clock)
+        self._number = number
+        self._asked = asked
+        self._open_number = opened
+        self._opener = opener
         self._retry_s = retry_s
         self._reopen_every_s = reopen_every_s
-        self._capture: Any = None
+        self._format, self._rate_hz = "", 0.0
         self._reopened = False
-
-    def begin(self) -> None:
-        """Open the camera, and read from it in a thread. Errors: those of `opened`."""
-        self._capture = self._opened()
+        self._capture = self._prepared()
         self._start(self._grab)
+
+    def _prepared(self) -> Any:
+        """The opened camera, with its controls set."""
+        capture = self._open_number(self._number, self._asked)
+        try:
+            with contextlib.suppress(cv2.error, AttributeError):  # before a thread reads from it
+                code = int(capture.get(cv2.CAP_PROP_FOURCC))
+                self._format = _fourcc_text(code) if code > 0 else ""
+                self._rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
+            self._set_controls()
+        except BaseException:
+            capture.release()
+            raise
+        return capture
+
+    def _set_controls(self) -> None:
+        """Errors: InvalidValue."""
+        if not self._asked.controls:
+            return
+        try:
+            with self._opener(self._number) as call:
+                set_controls(call, self._asked.controls, self._name)
+        except OSError as error:
+            raise InvalidValue(
+                f"{self._name}: camera.controls cannot be set, as its driver cannot be asked "
+                f"({error.strerror or error}); leave them out, or fix the exposure otherwise"
+            ) from None
+
+    def remarks(self) -> list[str]:
+        """What the driver did not do as it was asked; to be asked once, after the first frame."""
+        asked, got = self._asked, f"{self._name} was asked for"
+        told = []
+        if asked.format is not None and self._format not in ("", asked.format):
+            told.append(f"{got} {asked.format} (camera.format) and gives {self._format}")
+        if asked.size_px is not None and self._size_px not in (None, asked.size_px):
+            wanted, given = ("{}x{} px".format(*size) for size in (asked.size_px, self._size_px))
+            told.append(f"{got} {wanted}, the calibration's, and gives {given}")
+        if asked.rate_hz is not None and self._rate_hz > 0.0:
+            off_hz = abs(asked.rate_hz - self._rate_hz)
+            if off_hz > RATE_TOLERANCE * asked.rate_hz:
+                gives = f"{self._rate_hz:.3g} Hz"
+                told.append(f"{got} {asked.rate_hz:g} Hz (camera.rate_hz) and gives {gives}")
+        try:
+            self._set_controls()
+        except InvalidValue as error:
+            told.append(str(error))
+        return told
 
     def _grab(self) -> None:
         try:
@@ -176,7 +189,8 @@ class CaptureSource(LiveSource):
                     failures = 0
                     if self._reopened:
                         self._reopened = False
-                        self._streams_again()
+                        with contextlib.suppress(InvalidValue):
+                            self._set_controls()
                     continue
             except Exception as error:  # whatever a damaged picture does to OpenCV
                 why = f"gives pictures that cannot be decoded ({one_line(error)})"
@@ -186,16 +200,13 @@ class CaptureSource(LiveSource):
             self._stop.wait(self._retry_s)
         return None
 
-    def _streams_again(self) -> None:
-        """Called in the thread when the first picture after a loss has come."""
-
     def _reopen(self, why: str) -> None:
         """Try until the camera is open, or the source is closed."""
         lost = f"it {why}, and is opened again every {self._reopen_every_s:g} s"
         self._why_silent = lost
         while not self._stop.wait(self._reopen_every_s):
             try:
-                self._capture = self._opened()
+                self._capture = self._prepared()
                 self._reopened = True
                 return
             except Exception as error:
@@ -203,116 +214,9 @@ class CaptureSource(LiveSource):
                 self._why_silent = f"{lost}; the last attempt: {reason}"
 
 
-class DeviceSource(CaptureSource):
-    """A camera of this computer.
-
-    `opened` replaces the real camera, anything with read(), get(), set() and release(), and
-    `opener` its driver. Controls are set before the first picture, and once more after it where
-    the driver has changed them when it began to stream. `find` gives the camera's number when it
-    has come back after a loss; without it that is the same one.
-
-    Errors: NotFound; InvalidValue, a control or format that the driver does not take.
-    """
-
-    _converted = True
-
-    def __init__(
-        self,
-        number: int,
-        latency_s: float,
-        asked: Asked,
-        clock: Clock,
-        opened: Callable[[int, Asked], Any] = open_capture,
-        opener: Opener = open_driver,
-        retry_s: float = RETRY_S,
-        reopen_every_s: float = REOPEN_EVERY_S,
-        find: Callable[[], int] | None = None,
-    ) -> None:
-        super().__init__(
-            f"camera:{number}", latency_s, clock, self._prepared, retry_s, reopen_every_s
-        )
-        self._number = number
-        self._asked = asked
-        self._open_number = opened
-        self._opener = opener
-        self._find = find
-        self.begin()
-
-    def _driver(self) -> contextlib.AbstractContextManager[Call]:
-        return self._opener(self._number)
-
-    def _prepared(self) -> Any:
-        """The opened camera, with its controls set."""
-        if self._capture is not None and self._find is not None:
-            self._number = self._find()
-        capture = self._open_number(self._number, self._asked)
-        try:
-            self._prepare()
-        except BaseException:
-            capture.release()
-            raise
-        return capture
-
-    def _prepare(self) -> None:
-        asked, source = self._asked, self._name
-        if asked.format is None and not asked.controls:
-            return
-        try:
-            with self._driver() as call:
-                formats = dict.fromkeys(mode.format for mode in modes_of(call))
-                if asked.format is not None and formats and asked.format not in formats:
-                    raise InvalidValue(
-                        f"{source} has no format {asked.format!r} (camera.format); it has "
-                        f"{', '.join(formats)}"
-                    )
-                if asked.controls:
-                    set_controls(call, asked.controls, source)
-        except OSError as error:
-            if asked.controls:
-                raise InvalidValue(
-                    f"{source}: camera.controls cannot be set, as its driver cannot be asked "
-                    f"({error.strerror or error}); leave them out, or fix the exposure otherwise"
-                ) from None
-
-    def remarks(self) -> list[str]:
-        """What the driver did not do as it was asked; to be asked once, after the first frame."""
-        asked, told = self._asked, []
-        try:
-            with self._driver() as call:
-                told = differences(asked, delivered_of(call), modes_of(call), self._name)
-                told += self._controls_again(call)
-        except OSError:
-            with contextlib.suppress(cv2.error, AttributeError):
-                told = differences(asked, self._without_driver(), (), self._name)
-        return told
-
-    def _without_driver(self) -> Delivered:
-        """The size is the pictures': OpenCV is only asked for what they do not tell, as the
-        grabbing thread is reading from it."""
-        if self._asked.format is None and self._asked.rate_hz is None:
-            return Delivered("", self._size_px or (0, 0), None)
-        return _by_opencv(self._capture, self._size_px)
-
-    def _streams_again(self) -> None:
-        with contextlib.suppress(OSError), self._driver() as call:
-            self._controls_again(call)
-
-    def _controls_again(self, call: Call) -> list[str]:
-        asked = self._asked.controls
-        if not asked or not strayed_controls(call, asked, self._name):
-            return []
-        try:
-            set_controls(call, asked, self._name)
-        except InvalidValue as error:
-            return [str(error)]
-        return []
-
-
-def _by_opencv(capture: Any, size_px: tuple[int, int] | None) -> Delivered:
-    """What OpenCV says, where the driver cannot be asked; empty where it does not know either."""
-    width, height = size_px or (0, 0)
-    code, rate_hz = int(capture.get(cv2.CAP_PROP_FOURCC)), float(capture.get(cv2.CAP_PROP_FPS))
-    return Delivered(fourcc_text(code) if code > 0 else "", (width, height), rate_hz or None)
+def _fourcc_text(code: int) -> str:
+    """Of a pixel format's number: ``MJPG``, ``YUYV``, ..."""
+    return code.to_bytes(4, "little").decode("ascii", "replace").rstrip("\0 ")
 
 
 # --- `camera.controls`: exposure, white balance, gain and focus as the profile has them --------
@@ -325,7 +229,7 @@ def set_controls(call: Call, wanted: Wanted, source: str) -> None:
     """Set them, switches and menus first: an automatic one holds others fast. Read back.
 
     Errors: InvalidValue, a control that the driver lacks, a value that it does not take, one
-    that did not stay.
+    that did not stay; OSError.
     """
     controls = controls_of(call)
     values = {name: _value(controls, name, value, source) for name, value in wanted.items()}
@@ -337,28 +241,13 @@ def set_controls(call: Call, wanted: Wanted, source: str) -> None:
                 f"{source}: camera.controls.{name} could not be set to {values[name]} "
                 f"({error.strerror}){_held(call, name)}; change it, or leave it out"
             ) from None
-    strayed = strayed_controls(call, wanted, source)
-    if strayed:
-        raise InvalidValue(strayed[0])
-
-
-def strayed_controls(call: Call, wanted: Wanted, source: str) -> list[str]:
-    """A sentence for each control that reads otherwise than wanted; none is set."""
-    controls = controls_of(call)
-    told = []
-    for name, value in wanted.items():
-        try:
-            number = _value(controls, name, value, source)
-            reads = value_of(call, controls[name])
-        except (OSError, InvalidValue) as error:
-            told.append(f"{source}: camera.controls.{name} cannot be read back: {error}")
-            continue
+    for name, number in values.items():
+        reads = value_of(call, controls[name])
         if reads != number:
-            told.append(
+            raise InvalidValue(
                 f"{source}: camera.controls.{name} was set to {number} and reads "
                 f"{reads}{_held(call, name)}; change it, or leave it out"
             )
-    return told
 
 
 def _held(call: Call, name: str) -> str:
@@ -376,31 +265,20 @@ def _value(controls: Mapping[str, CameraControl], name: str, value: int | str, s
     key = f"{source}: camera.controls.{name}"
     if not control.settable:
         raise InvalidValue(f"{key} can only be read; leave it out")
-    if control.menu:
-        return _entry(control, value, key)
-    if isinstance(value, str):
-        raise InvalidValue(f"{key}: found {value!r}; needed is {_range(control)}")
-    if not control.low <= value <= control.high or (value - control.low) % max(control.step, 1):
-        raise InvalidValue(f"{key}: found {value}; allowed are {_range(control)}")
+    if control.menu and isinstance(value, str):
+        texts = {text.lower(): index for index, text in control.menu}
+        value = texts.get(value.lower(), value)
+    if (
+        isinstance(value, str)
+        or not control.low <= value <= control.high
+        or (value - control.low) % max(control.step, 1)
+        or (control.menu and value not in dict(control.menu))
+    ):
+        raise InvalidValue(f"{key}: found {value!r}; allowed are {control.allowed}")
     return value
 
 
-def _entry(control: CameraControl, value: int | str, key: str) -> int:
-    for index, text in control.menu:
-        if value == index or (isinstance(value, str) and value.lower() == text.lower()):
-            return index
-    entries = ", ".join(f"{index} ({text})" for index, text in control.menu)
-    raise InvalidValue(f"{key}: found {value!r}; allowed are {entries}")
-
-
-def _range(control: CameraControl) -> str:
-    if control.kind == "boolean":
-        return "0 (off) or 1 (on)"
-    steps = f" in steps of {control.step}" if control.step > 1 else ""
-    return f"{control.low} to {control.high}{steps}"
-
-
-# --- The cameras of this computer: their numbers, names, lasting paths, and what they can ------
+# --- The cameras of this computer: their numbers, names, lasting paths and controls
 
 
 DEVICES = Path("/dev")
@@ -410,12 +288,11 @@ NAMES = Path("/sys/class/video4linux")
 @dataclass(frozen=True)
 class ConnectedCamera:
     """`stable_path` names it wherever it is plugged in, where the system keeps such a link;
-    `problem` says why the driver was not asked for modes and controls."""
+    `problem` says why the driver was not asked for controls."""
 
     number: int
     name: str = ""
     stable_path: str = ""
-    modes: tuple[Mode, ...] = ()
     controls: tuple[tuple[CameraControl, int | None], ...] = ()
     problem: str = ""
 
@@ -438,13 +315,12 @@ def find_cameras(
 ) -> list[ConnectedCamera]:
     """Those that give pictures; a node that cannot be asked counts as one.
 
-    `asked`: also for modes and controls. Opens each for a moment, streams from none.
+    `asked`: also for its controls. Opens each for a moment, streams from none.
     """
     stable = _stable_paths(devices)
     found = []
     for number in camera_numbers(devices):
         name, problem = _name_of(number, names), ""
-        modes: tuple[Mode, ...] = ()
         controls: tuple[tuple[CameraControl, int | None], ...] = ()
         try:
             with opener(number) as call:
@@ -452,13 +328,10 @@ def find_cameras(
                 if not gives_pictures:
                     continue
                 if asked:
-                    modes = modes_of(call)
                     controls = tuple((c, _read(call, c)) for c in controls_of(call).values())
         except OSError as error:
             problem = f"it cannot be asked: {error.strerror or error}"
-        found.append(
-            ConnectedCamera(number, name, stable.get(number, ""), modes, controls, problem)
-        )
+        found.append(ConnectedCamera(number, name, stable.get(number, ""), controls, problem))
     return found
 
 
@@ -513,33 +386,6 @@ def camera_number(
         )
     there = f"there are {listed(known)}" if known else "this computer has no camera"
     raise NotFound(f"camera:{wanted} was not found; {there}; plug in the receiver or camera")
-
-
-def finder_of(
-    number: int, opener: Opener = open_driver, devices: Path = DEVICES, names: Path = NAMES
-) -> Callable[[], int]:
-    """A function that finds the camera of that number again after it was unplugged: by its
-    lasting path, else by its name, as the system may give it another number.
-
-    Errors of that function: NotFound.
-    """
-    before = next((c for c in find_cameras(opener, devices, names) if c.number == number), None)
-
-    def find() -> int:
-        if before is None or not (before.stable_path or before.name):
-            return number
-        known = find_cameras(opener, devices, names)
-        back = [c.number for c in known if c.stable_path and c.stable_path == before.stable_path]
-        if not back and not before.stable_path:
-            back = [c.number for c in known if c.name == before.name]
-        if number in back:
-            return number
-        if len(back) == 1:
-            return back[0]
-        there = f"there are {listed(known, paths=True)}" if known else "no camera is there"
-        raise NotFound(f"{before} is not back; {there}")
-
-    return find
 
 
 def _fitting(wanted: str, known: Sequence[ConnectedCamera]) -> list[ConnectedCamera]:

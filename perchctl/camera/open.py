@@ -6,15 +6,11 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
-
-import cv2
-from cv2 import videoio_registry
 
 from perchctl.camera.aideck import FORM, AiDeckSource, aideck_address
 from perchctl.camera.credentials import without_password
-from perchctl.camera.device import CaptureSource, DeviceSource, asked_of, camera_number, finder_of
+from perchctl.camera.device import DeviceSource, asked_of, camera_number
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.network import MjpegSource, RtspSource, StreamSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource, mirrored_as_profiled
@@ -23,10 +19,10 @@ from perchctl.profile import CameraConfig
 
 REAL = (
     "camera:N, camera:NAME, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, "
-    f"rtsp://HOST/PATH, {FORM}, gst:PIPELINE"
+    f"rtsp://HOST/PATH, {FORM}"
 )
 ALLOWED = f"{REAL}, sim:"
-SCHEMES = ("camera", "video", "images", "http", "https", "rtsp", "aideck", "gst", "sim")
+SCHEMES = ("camera", "video", "images", "http", "https", "rtsp", "aideck", "sim")
 FIRST_FRAME_WITHIN_S = 8.0
 
 
@@ -146,16 +142,11 @@ def _live(
 ) -> LiveSource:
     """A camera or stream whose first frame is still to come."""
     if name.scheme == "camera":
-        number = camera_number(name.place)
         asked = asked_of(config, size_px)
-        return DeviceSource(number, latency_s, asked, clock, find=finder_of(number))
-    if name.scheme == "gst" and name.place.strip():
-        pipeline = CaptureSource(str(name), latency_s, clock, lambda: open_pipeline(name.place))
-        pipeline.begin()
-        return pipeline
+        return DeviceSource(camera_number(name.place), latency_s, asked, clock)
     stream: StreamSource | None = None
     if name.scheme == "aideck":
-        stream = AiDeckSource(aideck_address(name.spec), latency_s, clock)
+        stream = AiDeckSource(*aideck_address(name.spec), latency_s, clock)
     elif name.scheme in _USUAL_PORT and name.place.strip("/"):
         _check_address(name)
         kind = RtspSource if name.scheme == "rtsp" else MjpegSource
@@ -230,37 +221,3 @@ def _started(source: LiveSource, timeout_s: float, tell: Callable[[str], None]) 
         f"{described}: no first frame within {timeout_s:g} s; is the camera powered, and its "
         f"receiver on the right channel?"
     )
-
-
-# --- ``gst:PIPELINE``: what GStreamer makes of it, where this OpenCV was built with it ---------
-
-
-READ_TIMEOUT_MS = 2000
-
-
-def has_gstreamer() -> bool:
-    return bool(videoio_registry.hasBackend(cv2.CAP_GSTREAMER))
-
-
-def open_pipeline(text: str) -> Any:
-    """An opened cv2.VideoCapture.
-
-    Errors: InvalidValue, this OpenCV has no GStreamer; NotFound, the pipeline does not run.
-    """
-    if not has_gstreamer():
-        raise InvalidValue(
-            f"gst: needs an OpenCV that was built with GStreamer, and this one ({cv2.__version__}) "
-            f"was not, as none from pip is; name the camera by rtsp://..., http://... or camera:N"
-        )
-    capture = cv2.VideoCapture(
-        text,
-        cv2.CAP_GSTREAMER,
-        [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, READ_TIMEOUT_MS],
-    )
-    if not capture.isOpened():
-        capture.release()
-        raise NotFound(
-            f"the pipeline gst:{without_password(text)} does not run; try it with gst-launch-1.0, "
-            f"and let it end in appsink drop=true max-buffers=1 sync=false"
-        )
-    return capture

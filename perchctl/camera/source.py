@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from perchctl.camera.credentials import without_password
-from perchctl.camera.health import Grey, RepeatState, repeated
+from perchctl.camera.health import Grey, same_bytes
 from perchctl.errors import InvalidValue
 from perchctl.profile import CameraConfig
 from perchctl.vision import CameraModel, Frame
@@ -22,21 +22,20 @@ class NewestSlot:
 
     One that a receiver gives out again takes no new one's place: it would make it look younger
     than it is. Where the new one has been taken already it comes with the same index, and
-    `Frame.repeated`: a sign of life, and no measurement. `by_noise`: as `repeated` has it.
+    `Frame.repeated`: a sign of life, and no measurement.
     """
 
-    def __init__(self, by_noise: bool = False) -> None:
-        self._by_noise = by_noise
+    def __init__(self) -> None:
         self._frame: Frame | None = None
-        self._repeats = RepeatState()
+        self._last: Grey | None = None
         self.count = 0
 
     def put(
         self, image: Grey, t_s: float, t_arrival_s: float, encoded: bytes | None = None
     ) -> None:
         """Times of exposure and of arrival; `encoded` as `Frame` has it."""
-        self._repeats, again = repeated(self._repeats, image, t_arrival_s, self._by_noise)
-        if not again:
+        if self._last is None or not same_bytes(self._last, image):
+            self._last = image
             self._frame = Frame(self.count, t_s, image, t_arrival_s, encoded=encoded)
             self.count += 1
         elif self._frame is None or self._frame.repeated:
@@ -129,8 +128,6 @@ class LiveSource:
 
     live = True
     finished = False
-    _converted = False
-    """Whether an analogue converter may stand before it: then its repetitions differ."""
 
     def __init__(self, name: str, latency_s: float, clock: Clock) -> None:
         self._name = name
@@ -140,7 +137,7 @@ class LiveSource:
         self._stop = threading.Event()
         self._first = threading.Event()  # set by the first frame, or by failing before it
         self._thread: threading.Thread | None = None
-        self._slot = NewestSlot(self._converted)
+        self._slot = NewestSlot()
         self._last_arrival_s = clock()
         self._arrived = 0  # pictures, a receiver's repetitions too
         self._failure: str | None = None

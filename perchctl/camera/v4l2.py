@@ -1,9 +1,8 @@
 """What a camera's driver says of itself and is told, by V4L2's ioctls (Linux).
 
-OpenCV delivers the pictures, and knows neither a camera's name nor its modes, nor a control by
-the name that the driver has for it. Everything here goes through one function, `Call`, that
-answers a request in the caller's bytes as the kernel does: a stand-in for a device is one more
-such function.
+OpenCV delivers the pictures, and knows neither a camera's name nor a control by the name that the
+driver has for it. Everything here goes through one function, `Call`, that answers a request in the
+caller's bytes as the kernel does: a stand-in for a device is one more such function.
 """
 
 from __future__ import annotations
@@ -24,14 +23,12 @@ Opener = Callable[[int], contextlib.AbstractContextManager[Call]]
 """The driver of camera N for a while. Errors: OSError."""
 
 _MOST = 256  # of whatever a driver lists: no listing goes on for ever
-_CAPTURE = 1  # V4L2_CAP_VIDEO_CAPTURE, and the type of its buffer
+_CAPTURE = 1  # V4L2_CAP_VIDEO_CAPTURE
 _HAS_DEVICE_CAPS = 0x80000000
 _NEXT_CONTROL = 0x80000000
 _DISABLED, _READ_ONLY, _INACTIVE, _WRITE_ONLY = 0x01, 0x04, 0x10, 0x40
 _MENU, _INTEGER_MENU = 3, 9
 _VALUED = {1: "integer", 2: "boolean", _MENU: "menu", 8: "bitmask", _INTEGER_MENU: "menu"}
-_DISCRETE = 1
-_FORMAT_BYTES = 204 if struct.calcsize("P") == 4 else 208  # its union holds pointers
 
 
 def _ioctl(number: int, size: int, writes: bool = True) -> int:
@@ -40,24 +37,10 @@ def _ioctl(number: int, size: int, writes: bool = True) -> int:
 
 
 QUERYCAP = _ioctl(0, 104, writes=False)
-ENUM_FMT = _ioctl(2, 64)
-G_FMT = _ioctl(4, _FORMAT_BYTES)
-G_PARM = _ioctl(21, 204)
 G_CTRL = _ioctl(27, 8)
 S_CTRL = _ioctl(28, 8)
 QUERYCTRL = _ioctl(36, 68)
 QUERYMENU = _ioctl(37, 44)
-ENUM_FRAMESIZES = _ioctl(74, 44)
-ENUM_FRAMEINTERVALS = _ioctl(75, 52)
-
-
-@dataclass(frozen=True)
-class Mode:
-    """A pixel format at a size (None: any), with the rates that the driver lists for it."""
-
-    format: str
-    size_px: tuple[int, int] | None
-    rates_hz: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -83,14 +66,15 @@ class CameraControl:
     def settable(self) -> bool:
         return not self.flags & _READ_ONLY
 
-
-@dataclass(frozen=True)
-class Delivered:
-    """What the driver is set to."""
-
-    format: str
-    size_px: tuple[int, int]
-    rate_hz: float | None
+    @property
+    def allowed(self) -> str:
+        """The values that it takes, in words."""
+        if self.menu:
+            return ", ".join(f"{index} ({text})" for index, text in self.menu)
+        if self.kind == "boolean":
+            return "0 (off) or 1 (on)"
+        steps = f" in steps of {self.step}" if self.step > 1 else ""
+        return f"{self.low} to {self.high}{steps}"
 
 
 @contextlib.contextmanager
@@ -119,63 +103,6 @@ def card_of(call: Call) -> tuple[str, bool]:
     call(QUERYCAP, data)
     _, card, _, _, whole, device = struct.unpack_from("=16s32s32sIII", data)
     return _text(card), bool((device if whole & _HAS_DEVICE_CAPS else whole) & _CAPTURE)
-
-
-def modes_of(call: Call) -> tuple[Mode, ...]:
-    """All formats with their sizes and rates, as far as the driver lists them."""
-    found: list[Mode] = []
-    for format_data in _listed(call, ENUM_FMT, 64, "=II", (_CAPTURE,)):
-        pixels = struct.unpack_from("=I", format_data, 44)[0]
-        sizes = [
-            struct.unpack_from("=II", data, 12)
-            for data in _listed(call, ENUM_FRAMESIZES, 44, "=II", (pixels,))
-            if struct.unpack_from("=I", data, 8)[0] == _DISCRETE
-        ]
-        name = fourcc_text(pixels)
-        found += [Mode(name, size, _rates(call, pixels, *size)) for size in sizes]
-        if not sizes:
-            found.append(Mode(name, None))
-    return tuple(found)
-
-
-def _rates(call: Call, pixels: int, width: int, height: int) -> tuple[float, ...]:
-    rates = set()
-    for data in _listed(call, ENUM_FRAMEINTERVALS, 52, "=IIII", (pixels, width, height)):
-        kind, numerator, denominator = struct.unpack_from("=III", data, 16)
-        if kind == _DISCRETE and numerator:
-            rates.add(round(denominator / numerator, 3))
-    return tuple(sorted(rates, reverse=True))
-
-
-def _listed(
-    call: Call, request: int, size: int, form: str, rest: tuple[int, ...]
-) -> Iterator[bytearray]:
-    """The answers for index 0, 1, ..., until the driver has no more."""
-    for index in range(_MOST):
-        data = bytearray(size)
-        struct.pack_into(form, data, 0, index, *rest)
-        try:
-            call(request, data)
-        except OSError:
-            return
-        yield data
-
-
-def delivered_of(call: Call) -> Delivered:
-    """Errors: OSError."""
-    data = bytearray(_FORMAT_BYTES)
-    struct.pack_into("=I", data, 0, _CAPTURE)
-    call(G_FMT, data)
-    at = _FORMAT_BYTES - 200
-    width, height, pixels = struct.unpack_from("=III", data, at)
-    rate_hz = None
-    with contextlib.suppress(OSError):
-        data = bytearray(204)
-        struct.pack_into("=I", data, 0, _CAPTURE)
-        call(G_PARM, data)
-        numerator, denominator = struct.unpack_from("=II", data, 12)
-        rate_hz = denominator / numerator if numerator else None
-    return Delivered(fourcc_text(pixels), (width, height), rate_hz)
 
 
 def controls_of(call: Call) -> dict[str, CameraControl]:
@@ -232,12 +159,6 @@ def set_value(call: Call, control: CameraControl, value: int) -> None:
 def control_name(text: str) -> str:
     """``Exposure Time, Absolute`` is ``exposure_time_absolute``."""
     return re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
-
-
-def fourcc_text(code: int) -> str:
-    """Of a pixel format's number: ``MJPG``, ``YUYV``, ..."""
-    letters = struct.pack("=I", code & 0x7FFFFFFF).decode("ascii", "replace")
-    return letters.rstrip("\0 ")
 
 
 def _text(raw: Any) -> str:

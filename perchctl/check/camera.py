@@ -34,14 +34,11 @@ from perchctl.flight import (
 from perchctl.perception import MIRRORED_FRAMES
 from perchctl.profile import Profile
 from perchctl.target import (
-    Optics,
-    TargetDesign,
     edge_margin,
-    make_design,
     offset_text,
     overhead_view,
 )
-from perchctl.vision import BLENDED, CameraModel, Pipeline
+from perchctl.vision import BLENDED, CameraModel
 
 RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 7.0
 """An AI-deck's program as it comes gives 8, and a simulated one perches with 7."""
@@ -55,10 +52,6 @@ ROOM_WARN = 0.03
 """Of the picture's larger side: by so much a lean of 2 to 3 deg moves the target."""
 LEAST_RATED = 10
 """Pictures; of fewer no rate is known."""
-BLUR_STEP_PX = 0.25
-FEW_TRIALS = 8
-"""Enough for two digits; the designer takes three times as many."""
-LARGER = "print a larger target: perchctl make-target suggest --ceiling M proposes one"
 _SEE = "see docs/check.md"
 _AGAIN = "plug the receiver or camera in again"
 _LIGHT = "more light, a longer exposure, or the lens cap off"
@@ -102,34 +95,16 @@ def size_finding(size_px: tuple[int, int] | None, wanted_px: tuple[int, int]) ->
     )
 
 
-def picture_rows(
-    rehearsal: Rehearsal, design: TargetDesign, profile: Profile, camera: CameraModel
-) -> list[Row]:
-    """What the pictures show. `design` is `design_of` them."""
+def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> list[Row]:
+    """What the pictures show."""
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture came in the rehearsal"
         first, *rest = names_of(profile)
         return [Row(first, *failed(why, _AGAIN)), *skip_all(rest, why)]
-    rows = ask_all(PICTURES, rehearsal, profile) + ask_all(DESIGN, rehearsal, design)
+    rows = ask_all(PICTURES, rehearsal, profile)
     if profile.positioning.by == "target":
-        rows += ask_all(SIGHT, rehearsal, design, profile, camera)
+        rows += ask_all(SIGHT, rehearsal, profile, camera)
     return rows
-
-
-def design_of(rehearsal: Rehearsal, pipeline: Pipeline, profile: Profile) -> TargetDesign:
-    """The target's ranges with the blur and noise of these pictures, and under this ceiling
-    where the target was seen from a known height."""
-    usual = Optics()
-    blur_px = usual.blur_px if rehearsal.blur is None else rehearsal.blur.least_px
-    noise = usual.noise if rehearsal.noise is None else rehearsal.noise
-    # Rounded: the ranges are by trial, which is remembered.
-    optics = Optics(BLUR_STEP_PX * max(1, round(blur_px / BLUR_STEP_PX)), float(round(noise)))
-    ceiling_m = None
-    if rehearsal.target is not None and rehearsal.height_m is not None:
-        gear_m = profile.vehicle.gear_body_m[2]
-        ceiling_m = rehearsal.height_m + gear_m + float(rehearsal.target.e_m[2])
-    target, model = profile.target, pipeline.camera
-    return make_design(target, model, optics, profile, ceiling_m, trials=FEW_TRIALS)
 
 
 # --- The pictures -------------------------------------------------------------------------------
@@ -218,14 +193,6 @@ def _light(rehearsal: Rehearsal, profile: Profile) -> Finding:
     return passed(found)
 
 
-def _noise(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    if rehearsal.noise is None:
-        return skipped("it takes two pictures")
-    found = f"sigma {rehearsal.noise:.1f} of 255"
-    advice = "more light; for analogue video a better antenna or channel"
-    return by_limits(rehearsal.noise, 15.0, 30.0, found, advice)
-
-
 def _focus(rehearsal: Rehearsal, profile: Profile) -> Finding:
     blur = rehearsal.blur
     if blur is None:
@@ -260,7 +227,7 @@ def _target(rehearsal: Rehearsal, profile: Profile) -> Finding:
         if problem := too_near_problem(target):
             return failed(problem.found, problem.advice)
     if rehearsal.found < SEEN_WARN * rehearsal.pictures:
-        return warned(found, "nearer, sharper, or more light: see ranges and focus")
+        return warned(found, "nearer, sharper, or more light: see focus")
     return passed(found)
 
 
@@ -282,7 +249,6 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
     "picture age": _age,
     "pictures": _pictures,
     "light": _light,
-    "noise": _noise,
     "focus": _focus,
     "mirrored": _mirrored,
     "target": _target,
@@ -290,71 +256,17 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
 }
 
 
-# --- From where the target is measured ----------------------------------------------------------
-
-
-def _ranges(rehearsal: Rehearsal, design: TargetDesign) -> Finding:
-    r = design.ranges
-    each = (("z1", r.z1_m), ("z2", r.z2_m), ("z3", r.z3_m))
-    found = ", ".join(f"{n} {'never' if z is None else f'{100.0 * z:.3g} cm'}" for n, z in each)
-    optics = f"blur {design.optics.blur_px:g} px, noise {design.optics.noise:g}"
-    if rehearsal.blur is None:
-        return skipped(f"{found} with a guessed {optics}", "see focus")
-    if design.warnings:
-        advice = "see perchctl make-target suggest"
-        return warned(f"{found} ({optics}): {design.warnings[0]}", advice)
-    return passed(f"{found} ({optics})")
-
-
-def _blind(rehearsal: Rehearsal, design: TargetDesign) -> Finding:
-    """From where on nothing is measured any more, and whether a turn of the camera helps."""
-    found, *advice = design.mount.lines()
-    return warned(found, advice[0]) if advice else passed(found)
-
-
-DESIGN: dict[str, Callable[[Rehearsal, TargetDesign], Finding]] = {
-    "ranges": _ranges,
-    "blind": _blind,
-}
-
-
 # --- Where the target is the positioning system -------------------------------------------------
 
 
-def _sight_range(
-    rehearsal: Rehearsal, design: TargetDesign, profile: Profile, camera: CameraModel
-) -> Finding:
-    """With this camera, and its blur where that is known."""
-    plain_px, measured = design.ranges.large_px, rehearsal.blur is not None
-    if plain_px is None:
-        return failed(
-            "no marker is read through this blur and noise", "a sharper picture is needed"
-        )
-    mount = profile.camera.mount
-    where = overhead_view(profile.target, camera, mount, plain_px if measured else None)
-    found = f"the target has to be {where.words}"
-    if not where.reaches:
-        return failed(found, "see camera turn")
-    if not measured:
-        return skipped(f"with a sharp picture {found}", "see focus")
-    if rehearsal.target is not None:
-        place = place_seen(rehearsal.target, profile)
-        seen = target_from((0.0, 0.0, profile.safety.ground_z_m), 0.0, place, profile, camera)
-        if seen.height_m > where.highest_m:
-            return warned(f"it is {seen.height_m:.1f} m above it; {found}", LARGER)
-    return passed(found)
-
-
-def _in_view(
-    rehearsal: Rehearsal, design: TargetDesign, profile: Profile, camera: CameraModel
-) -> Finding:
+def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
     """From where the vehicle stands, and on its way up: what `fly` refuses fails."""
     if not rehearsal.found:
         where = overhead_view(profile.target, camera, profile.camera.mount).words
         return failed("no, and fly refuses", f"put the vehicle under the target: {where}")
     found = _share_found(rehearsal)
     if rehearsal.found < SEEN_WARN * rehearsal.pictures:
-        return warned(found, "nearer, sharper, or more light: see sight range and focus")
+        return warned(found, "nearer, sharper, or more light: see focus")
     if rehearsal.target is None:
         return warned(f"{found}, and not at the end", "see lost frames; once more")
     place = place_seen(rehearsal.target, profile)
@@ -375,12 +287,11 @@ def _in_view(
     return passed(found)
 
 
-SIGHT: dict[str, Callable[[Rehearsal, TargetDesign, Profile, CameraModel], Finding]] = {
-    "sight range": _sight_range,
+SIGHT: dict[str, Callable[[Rehearsal, Profile, CameraModel], Finding]] = {
     "in view": _in_view,
 }
 
 
 def names_of(profile: Profile) -> tuple[str, ...]:
     """The rows of the pictures, in their order."""
-    return (*PICTURES, *DESIGN, *(SIGHT if profile.positioning.by == "target" else ()))
+    return (*PICTURES, *(SIGHT if profile.positioning.by == "target" else ()))

@@ -73,19 +73,18 @@ WILD_M = 0.1
 
 @dataclass(frozen=True)
 class Listened:
-    """What came while it was listened to: for how long, the vehicle's telemetry, the capture's
-    frames with the age that each had when it was read, and what the capture complained of."""
+    """What came while it was listened to: the vehicle's telemetry, the capture's frames, and what
+    the capture complained of."""
 
-    lasted_s: float
     telemetry: tuple[Telemetry, ...] = ()
-    frames: tuple[tuple[CaptureFrame, float], ...] = ()
+    frames: tuple[CaptureFrame, ...] = ()
     problem: str | None = None
 
     def places(self, config: PositioningConfig) -> list[Placed]:
         """Of the vehicle's body, at the moments of exposure, oldest first."""
         return [
             Placed.of(frame.bodies[config.body], config, frame.t_s - config.latency_s)
-            for frame, _ in self.frames
+            for frame in self.frames
             if config.body in frame.bodies
         ]
 
@@ -101,21 +100,20 @@ def listen(
     """For so long, or until it is enough; that is asked every half second."""
     began_s = asked_s = clock()
     telemetry: list[Telemetry] = []
-    frames: list[tuple[CaptureFrame, float]] = []
+    frames: list[CaptureFrame] = []
     source.poll(began_s)  # what came before is old
     take()
     while (now_s := clock()) - began_s < for_s:
         telemetry.extend(take())
         frame = source.poll(now_s)
         if frame is not None:
-            frames.append((frame, now_s - frame.t_s))
+            frames.append(frame)
         if now_s - asked_s > 0.5:
             asked_s = now_s
-            if is_enough(Listened(now_s - began_s, tuple(telemetry), tuple(frames))):
+            if is_enough(Listened(tuple(telemetry), tuple(frames))):
                 break
         wait(POLL_S)
-    now_s = clock()
-    return Listened(now_s - began_s, tuple(telemetry), tuple(frames), source.problem(now_s))
+    return Listened(tuple(telemetry), tuple(frames), source.problem(clock()))
 
 
 # --- At rest ------------------------------------------------------------------------------------
@@ -135,57 +133,47 @@ def capture_rows(heard: Listened, profile: Profile) -> list[Row]:
     first = Row("capture", *passed(f"{config.label} sends"))
     places = heard.places(config)
     if not places:
-        others = sorted({name for frame, _ in heard.frames for name in frame.bodies})
+        others = sorted({name for frame in heard.frames for name in frame.bodies})
         found = f"no rigid body {config.body!r}; it sees {', '.join(others) or 'none'}"
         body = failed(found, "correct positioning.body, or show it to the cameras")
         return [first, Row("body", *body), *skip_all(CAPTURE, "the rigid body is not seen")]
-    # `Capture.poll` prefers frames with the body, so a frame without is one more unseen.
-    share = 1.0 - len(places) / len(heard.frames)
-    found = f"{config.body!r} seen in {100.0 * (1.0 - share):.0f} % of the frames"
-    advice = "it is hidden at times, or has too few markers: look at it in the capture"
-    body = by_limits(share, 0.02, 0.2, found, advice)
+    body = _body(heard, places, profile)
     return [first, Row("body", *body), *ask_all(CAPTURE, heard, places, profile)]
 
 
-def _rate(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
-    """Between two at 20 Hz a vehicle falls by 12 mm before it gets the next."""
-    times = [place.t_s for place in places]
-    span_s = times[-1] - times[0]
-    rate_hz = (len(times) - 1) / span_s if span_s > 0.0 else 0.0
-    gap_s = max((b - a for a, b in itertools.pairwise(times)), default=math.inf)
-    found = f"{rate_hz:.0f} Hz, the longest gap {1e3 * gap_s:.0f} ms"
-    advice = "raise the capture's rate, use a cable, close what loads this computer"
-    hold_s = profile.positioning.hold_s
-    return worst(
-        by_limits(-rate_hz, -50.0, -20.0, found, advice),
-        by_limits(gap_s, hold_s / 2.0, hold_s, found, advice),
-    )
-
-
-def _age(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
-    """From its arrival to its reading; what passes before, from the exposure on, no clock of
-    this computer's tells."""
-    ages = sorted(age_s for _, age_s in heard.frames)
-    age_s = ages[int(0.95 * (len(ages) - 1))]
-    found = f"95 % read within {1e3 * max(0.0, age_s):.0f} ms of their arrival"
-    return by_limits(age_s, 0.03, 0.1, found, "close what loads this computer")
-
-
-def _noise(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
-    """Of a vehicle at rest: of the worst axis, about the middle; a few wild ones do not make it."""
+def _body(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
+    """How often it is seen, and how well, at rest. Between two frames at 20 Hz a vehicle falls by
+    12 mm. The noise is that of the worst axis, about the middle: a few wild ones do not make it."""
+    config = profile.positioning
     at = np.array([place.position_m for place in places])
     if len(at) > 2 and not np.ptp(at, axis=0).any():
         advice = "a measured pose has noise: is the capture paused, or the body hidden?"
         return failed("frozen: all of its numbers repeat", advice)
     sigma_m = float(np.max(1.4826 * np.median(np.abs(at - np.median(at, axis=0)), axis=0)))
-    found = f"{1e3 * sigma_m:.1f} mm (one sigma)"
-    advice = (
+    times = [place.t_s for place in places]
+    span_s = times[-1] - times[0]
+    rate_hz = (len(times) - 1) / span_s if span_s > 0.0 else 0.0
+    gap_s = max((b - a for a, b in itertools.pairwise(times)), default=math.inf)
+    # `Capture.poll` prefers frames with the body, so a frame without is one more unseen.
+    share = 1.0 - len(places) / len(heard.frames)
+    found = (
+        f"{config.body!r} seen in {100.0 * (1.0 - share):.0f} % of the frames, {rate_hz:.0f} Hz, "
+        f"the longest gap {1e3 * gap_s:.0f} ms, noise {1e3 * sigma_m:.1f} mm"
+    )
+    hidden = "it is hidden at times, or has too few markers: look at it in the capture"
+    slow = "raise the capture's rate, use a cable, close what loads this computer"
+    noisy = (
         "let it stand still; calibrate the capture, or raise positioning.position_sigma_m"
         if sigma_m < WILD_M
         else "these look like millimetres: set the unit of its stream to metres"
     )
-    limit_m = profile.positioning.position_sigma_m
-    return by_limits(sigma_m, limit_m, NOISE_FAIL * limit_m, found, advice)
+    limit_m = config.position_sigma_m
+    return worst(
+        by_limits(share, 0.02, 0.2, found, hidden),
+        by_limits(-rate_hz, -50.0, -20.0, found, slow),
+        by_limits(gap_s, config.hold_s / 2.0, config.hold_s, found, slow),
+        by_limits(sigma_m, limit_m, NOISE_FAIL * limit_m, found, noisy),
+    )
 
 
 def _place(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
@@ -208,9 +196,6 @@ def _place(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
 
 
 CAPTURE: dict[str, Callable[[Listened, list[Placed], Profile], Finding]] = {
-    "body rate": _rate,
-    "body age": _age,
-    "body noise": _noise,
     "body place": _place,
 }
 """The rows of a body that is seen, in their order."""

@@ -7,13 +7,12 @@ and was hardly meant. `fly` asks the same, with the computer's disk, before it c
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import without_password
-from perchctl.check.camera import LARGER
 from perchctl.check.computer import disk_finding
 from perchctl.check.row import (
     Finding,
@@ -30,38 +29,27 @@ from perchctl.errors import PerchError, SafetyAbort
 from perchctl.flight import FlyOptions
 from perchctl.places import data_folder
 from perchctl.profile import DOUBTFUL, Profile, find_calibration
-from perchctl.target import check_target, mm_text, overhead_view, sees_small_marker
+from perchctl.target import mm_text, sees_small_marker
 from perchctl.vision import CameraModel
 
-FAR_M = 0.15
-"""No gear and no camera is farther from the centre of a vehicle of 42 g."""
 APART_M = 0.003
 """A camera is not where the gear is."""
-NEAR_AN_ANGLE_RAD = 0.02
-NOTABLE_RAD = tuple(sorted({k * math.pi / n for n in (4, 6) for k in range(1, 2 * n + 1)}))
-"""Eighths and twelfths of a circle."""
 LOOKS_UP = math.cos(math.radians(45.0))
 """Of the view's upward part: with less the camera does not look at the ceiling."""
 
 
-def profile_rows(
-    profile: Profile, *, uri: str | None = None, source: str | None = None
-) -> list[Row]:
+def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
     """A row for each question, in the order in which they matter.
 
-    `uri` and `source` take the place of the profile's. Opens no link and no camera; reads the
-    calibration's file. Raises nothing.
+    `source` takes the place of the profile's. Opens no link and no camera; reads the calibration's
+    file. Raises nothing.
     """
-    plan = _Plan(
-        profile,
-        profile.link.uri if uri is None else uri,
-        profile.camera.source if source is None else source,
-    )
+    plan = _Plan(profile, profile.camera.source if source is None else source)
     rows = ask_all(JUDGES, plan)
     rows += [ask(name, _limits, name, profile) for name in DOUBTFUL]
     rows.append(ask("way", _way, plan))
     if profile.positioning.by == "target":
-        rows += [ask("latency", _latency, plan), ask("marker size", _marker_size, plan)]
+        rows.append(ask("latency", _latency, plan))
     return rows
 
 
@@ -69,7 +57,7 @@ def quick_rows(options: FlyOptions) -> list[Row]:
     """What costs no time: the computer's disk and the profile. Opens no link and no camera."""
     return [
         ask("disk", disk_finding, options.log_dir),
-        *profile_rows(options.profile, uri=options.uri, source=options.source),
+        *profile_rows(options.profile, source=options.source),
     ]
 
 
@@ -90,15 +78,10 @@ def _sentence(row: Row) -> str:
 
 @dataclass(frozen=True)
 class _Plan:
-    """A profile, with the vehicle and the camera that it would be flown with."""
+    """A profile, with the camera that it would be flown with."""
 
     profile: Profile
-    uri: str
     source: str
-
-    @property
-    def simulated(self) -> bool:
-        return self.uri.startswith("sim://")
 
     @property
     def camera(self) -> CameraModel:
@@ -132,42 +115,19 @@ def _is_shipped_example(path: Path) -> bool:
         return False
 
 
-def _gear_place(plan: _Plan) -> Finding:
-    return _place("vehicle.gear_body_m", plan.profile.vehicle.gear_body_m)
-
-
 def _camera_place(plan: _Plan) -> Finding:
+    """The profile refuses what lies off the vehicle; no camera is where the gear's tip is."""
     place_m = plan.profile.camera.mount.position_m
-    finding = _place("camera.mount.position_m", place_m)
-    apart_m = math.dist(place_m, plan.profile.vehicle.gear_body_m)
-    if finding.verdict is Verdict.PASS and apart_m < APART_M:
-        advice = "measure both: camera.mount.position_m, vehicle.gear_body_m"
-        return warned(f"{finding.found}, where the gear's tip is", advice)
-    return finding
-
-
-def _place(key: str, place_m: Sequence[float]) -> Finding:
-    """The place of a part in body axes."""
-    away_m = math.hypot(*place_m)
     found = f"{' '.join(mm_text(part) for part in place_m)} mm (forward, left, up)"
-    if away_m <= FAR_M:
-        return passed(found)
-    return warned(
-        f"{found}: {away_m * 1e2:.0f} cm from the vehicle's centre",
-        f"measure {key} anew: no part is farther than {FAR_M * 1e2:.0f} cm",
-    )
+    if math.dist(place_m, plan.profile.vehicle.gear_body_m) < APART_M:
+        advice = "measure both: camera.mount.position_m, vehicle.gear_body_m"
+        return warned(f"{found}, where the gear's tip is", advice)
+    return passed(found)
 
 
 def _camera_turn(plan: _Plan) -> Finding:
     mount = plan.profile.camera.mount
     found = f"rpy {' '.join(f'{angle:g}' for angle in mount.rpy_deg)} deg"
-    turned = [abs(angle) for angle in mount.rpy_deg if angle]
-    if turned and all(any(abs(a - n) <= NEAR_AN_ANGLE_RAD for n in NOTABLE_RAD) for a in turned):
-        meant = [f"{math.degrees(angle):.0f}" for angle in mount.rpy_deg]
-        return warned(
-            f"{found}: this looks like radians, of {' '.join(meant)} deg",
-            f"if so write camera.mount.rpy_deg: [{', '.join(meant)}]",
-        )
     up = float(mount.T_body_cam[2, 2])  # of the view
     if up < LOOKS_UP:
         tilted_deg = math.degrees(math.acos(max(-1.0, up)))
@@ -175,20 +135,6 @@ def _camera_turn(plan: _Plan) -> Finding:
             f"{found}: the camera looks {tilted_deg:.0f} deg away from straight up",
             "camera.mount.rpy_deg: 0 0 0 looks up, the last angle turns the picture",
         )
-    return passed(found)
-
-
-def _markers(plan: _Plan) -> Finding:
-    target = plan.profile.target
-    found = " around ".join(
-        f"{mm_text(marker.side_m)} mm {marker.dictionary}/{marker.id}"
-        for marker in (target.large, target.small)
-    )
-    try:
-        # The magnet is no part of a profile: one that just covers the small marker.
-        check_target(target, 1.01 * math.sqrt(2.0) * target.small.side_m)
-    except PerchError as error:
-        return warned(f"{found}: {error}", "print a target that can be read")
     return passed(found)
 
 
@@ -206,10 +152,8 @@ def _standoff(plan: _Plan) -> Finding:
 
 JUDGES: dict[str, Callable[[_Plan], Finding]] = {
     "calibration file": _calibration,
-    "gear place": _gear_place,
     "camera place": _camera_place,
     "camera turn": _camera_turn,
-    "markers": _markers,
     "stand-off": _standoff,
 }
 
@@ -228,26 +172,14 @@ def _limits(name: str, profile: Profile) -> Finding:
 
 
 def _way(plan: _Plan) -> Finding:
-    """Whether the fence and the height limit leave room for the way to the target."""
+    """Whether the fence leaves room for the way to the target."""
     profile, safety = plan.profile, plan.profile.safety
-    found = f"fence {safety.fence_radius_m:g} m, height limit {safety.max_height_m:g} m"
+    found = f"fence {safety.fence_radius_m:g} m"
     away_m = math.hypot(*(profile.planner.approach_xy_m or (0.0, 0.0)))
     if away_m >= safety.fence_radius_m:
         return warned(
             f"{found}: planner.approach_xy_m is {away_m:.2f} m from the estimate's zero",
             "raise safety.fence_radius_m unless it takes off near that place",
-        )
-    offset_m = math.hypot(*[profile.simulation.start_offset_m] * 2)
-    if plan.simulated and offset_m >= safety.fence_radius_m:
-        return warned(
-            f"{found}: simulated flights start up to {offset_m:.2f} m aside of the target",
-            "raise safety.fence_radius_m, or lower simulation.start_offset_m",
-        )
-    highest_m = profile.simulation.ceiling_z_m[1] - profile.vehicle.gear_body_m[2]
-    if plan.simulated and highest_m >= safety.max_height_m:
-        return warned(
-            f"{found}: simulated ceilings are touched at up to {highest_m:.2f} m",
-            "raise safety.max_height_m, or lower simulation.ceiling_z_m",
         )
     return passed(found)
 
@@ -265,14 +197,3 @@ def _latency(plan: _Plan) -> Finding:
         f"that is 30 ms wrong makes the vehicle swing under the target",
         "set camera.latency_s: measured",
     )
-
-
-def _marker_size(plan: _Plan) -> Finding:
-    profile, mount = plan.profile, plan.profile.camera.mount
-    highest_m = overhead_view(profile.target, plan.camera, mount).highest_m
-    side = mm_text(profile.target.large.side_m)
-    found = f"{side} mm, seen from the ground up to {highest_m:.1f} m above the camera"
-    ceiling_m = profile.simulation.ceiling_z_m[1]
-    if plan.simulated and ceiling_m - mount.position_m[2] > highest_m:
-        return warned(f"{found}; simulated ceilings are up to {ceiling_m:g} m high", LARGER)
-    return passed(found)

@@ -5,15 +5,12 @@ The vehicle stays as it is: a rehearsal has only the telemetry of a link, and ca
 
 from __future__ import annotations
 
-import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from perchctl.camera import FrameSource, WrappedSource
 from perchctl.flight import Clock, FlightInputs
@@ -68,8 +65,7 @@ class Rehearsal:
         looked: the newest few; found: of how many pictures there was a target, and mirrored ones.
         silent_s: since the last picture, at the end.
         target: where it was at the end; None where it was not seen then.
-        light, noise, blur: what the pictures are like, noise as a sigma in grey levels; None
-            where it could not be measured.
+        light, blur: what the pictures are like; None where it could not be measured.
     """
 
     live: bool
@@ -90,7 +86,6 @@ class Rehearsal:
     height_m: float | None = None
     print_verdict: PrintVerdict | None = None
     light: Light | None = None
-    noise: float | None = None
     blur: Blur | None = None
 
     @property
@@ -173,8 +168,7 @@ def rehearse(
     newest = senses.history.newest
     done.height_m = None if newest is None else newest.position_m[2] - profile.safety.ground_z_m
     done.print_verdict = prints.verdict() if prints.judged else None
-    done.light, done.noise = _light(done.looked), _noise(done.looked)
-    done.blur = _blur(done.looked, pipeline)
+    done.light, done.blur = _light(done.looked), _blur(done.looked, pipeline)
     return done
 
 
@@ -208,9 +202,6 @@ def _note(
 
 # --- What the pictures are like -----------------------------------------------------------------
 
-_CALM = 0.98  # of the differences: edges that moved are no noise
-_MEAN_OF_NORMAL = 0.7979  # of |x|, standard normal
-
 
 def _light(looked: Sequence[Looked]) -> Light | None:
     """Of the newest picture."""
@@ -218,20 +209,6 @@ def _light(looked: Sequence[Looked]) -> Light | None:
         return None
     image = looked[-1].frame.image[::2, ::2]
     return Light(float(image.mean()), float(np.mean(image >= 250)))
-
-
-def _noise(looked: Sequence[Looked]) -> float | None:
-    """Sigma in grey levels, from what differs between neighbouring pictures at rest; None of
-    fewer than two."""
-    pairs = [(a.frame.image, b.frame.image) for a, b in pairwise(looked)]
-    sigmas = [_noise_between(a, b) for a, b in pairs if a.shape == b.shape]
-    return float(np.median(sigmas)) if sigmas else None
-
-
-def _noise_between(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
-    difference = np.abs(one[::2, ::2].astype(np.int16) - other[::2, ::2])
-    calm = np.sort(difference.ravel())[: max(1, int(_CALM * difference.size))]
-    return float(calm.mean()) / _MEAN_OF_NORMAL / math.sqrt(2.0)
 
 
 def _blur(looked: Sequence[Looked], pipeline: Pipeline) -> Blur | None:

@@ -23,40 +23,35 @@ from perchctl.flight import (
     simulated_vehicle,
     wall_date,
 )
-from perchctl.link import ProbeLink, ScanResult, address_of, check_uri, find_vehicles
+from perchctl.link import ProbeLink, ScanResult, check_uri, find_vehicles
 from perchctl.positioning import CaptureSource, open_capture
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vision import Pipeline, make_pipeline
-
-AFTERWARDS = "the motor test ends by itself within 15 s: keep clear of the propellers"
 
 
 @dataclass(frozen=True)
 class CheckScope:
     """What is looked at beyond what can be seen at rest, and for how long, s.
 
-    `may_turn_motors` asks for leave when the moment has come; None: no motor is turned. `tell`
-    says what goes on. `other_vehicles` looks for those that answer, `open_capture` opens a motion
-    capture.
+    `tell` says what goes on. `other_vehicles` looks for those that answer, `open_capture` opens a
+    motion capture.
     """
 
-    may_turn_motors: Callable[[], bool] | None = None
     lift: bool = False
     listen_s: float = vehicle.LISTEN_S
     rehearse_s: float = REHEARSED_S
     lift_s: float = vehicle.LIFT_S
-    health_s: float | None = None
     tell: Callable[[str], None] = lambda text: None
     open_capture: Callable[[PositioningConfig], CaptureSource] = open_capture
     capture_s: float = capture.CAPTURE_S
-    other_vehicles: Callable[[str], ScanResult] = lambda uri: find_vehicles([address_of(uri)])
+    other_vehicles: Callable[[str], ScanResult] = find_vehicles
 
 
 def scan_rows(uri: str | None) -> list[Row]:
     """`--scan`: what answers, at the usual address and at that of `uri`. Errors: InvalidValue."""
     if uri is not None:
         check_uri(uri)
-    return vehicle.answering_rows(find_vehicles([address_of(uri or "")]))
+    return vehicle.answering_rows(find_vehicles(uri or ""))
 
 
 def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
@@ -145,7 +140,7 @@ class VehicleSession:
             self.scope.tell("nothing answers there: looking who else does")
             advice = vehicle.advice_for_silent(self.uri, self.scope.other_vehicles(self.uri))
         yield Row("address", *failed(found, advice))
-        yield from _not_answering([*vehicle.VEHICLE, vehicle.LIFTED, *vehicle.MOTORS])
+        yield from _not_answering([*vehicle.VEHICLE, vehicle.LIFTED])
         yield from self._room_rows(list)
         yield from self._compared_rows()
 
@@ -157,15 +152,13 @@ class VehicleSession:
             first, *rest = vehicle.VEHICLE
             advice = "see address; restart the vehicle"
             yield Row(first, *failed(f"the link was lost: {lost}", advice))
-            yield from _not_answering([*rest, vehicle.LIFTED, *vehicle.MOTORS])
+            yield from _not_answering([*rest, vehicle.LIFTED])
             yield from self._compared_rows()
             return
         for name, judge in vehicle.VEHICLE.items():
             yield ask(name, judge, seen, self.profile)
         yield from self._room_rows(self.probe.telemetry)
         yield from self._lift_rows()
-        yield from self._motor_rows()
-        yield from vehicle.gone_rows(self.probe)
 
     def _room_rows(self, take: TakeTelemetry) -> list[Row]:
         """Of the motion capture; none with decks."""
@@ -220,22 +213,6 @@ class VehicleSession:
         )  # fmt: skip
         return capture.hand_finding(moved(seen), config)
 
-    def _motor_rows(self) -> list[Row]:
-        """What somebody has to keep clear of; it may end with a dead vehicle."""
-        probe, scope = self.probe, self.scope
-        if scope.may_turn_motors is None:
-            return skip_all(vehicle.MOTORS, "not asked for", "add --prop-test")
-        if why := vehicle.hindrance(probe.newest(), probe.age_s(), self.profile):
-            return skip_all(vehicle.MOTORS, f"not begun: {why}")
-        if not scope.may_turn_motors():
-            return skip_all(vehicle.MOTORS, "not confirmed")
-        scope.tell("turning each propeller for a moment: keep clear")
-        try:
-            return vehicle.motor_rows(probe, self.profile, time.sleep, scope.health_s)
-        except KeyboardInterrupt:
-            scope.tell(AFTERWARDS)
-            raise
-
 
 def _not_answering(names: list[str]) -> list[Row]:
     return skip_all(names, "the vehicle does not answer")
@@ -263,6 +240,5 @@ def _camera_rows(
         return None
     scope.tell(f"rehearsing on live pictures for {scope.rehearse_s:g} s")
     done = rehearse(take, source, pipeline, profile, WallClock(), scope.rehearse_s)
-    design = camera.design_of(done, pipeline, profile)
-    yield from camera.picture_rows(done, design, profile, pipeline.camera)
+    yield from camera.picture_rows(done, profile, pipeline.camera)
     return done

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
@@ -12,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from perchctl.camera import CameraControl, ConnectedCamera, find_cameras
+from perchctl.camera import ConnectedCamera, find_cameras
 from perchctl.check import CheckScope, Row, Verdict, scan_rows
 from perchctl.check import check as check_rows
 from perchctl.commands.command_line import (
@@ -26,7 +25,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.fly import resolve
 from perchctl.commands.interrupt import interruptible, unheeded
-from perchctl.commands.output import confirmed, say
+from perchctl.commands.output import say
 from perchctl.errors import (
     ConnectionFailed,
     Interrupted,
@@ -72,21 +71,12 @@ def check(
         bool,
         typer.Option(
             "--cameras",
-            help="Only list this computer's cameras: number, name, path, modes, controls.",
+            help="Only list this computer's cameras: number, name, path, controls.",
         ),
     ] = False,
     lift: Annotated[
         bool,
         typer.Option("--lift", help="Also watch the position while you lift the vehicle by hand."),
-    ] = False,
-    prop_test: Annotated[
-        bool,
-        typer.Option(
-            "--prop-test", help="Also turn each propeller for a moment, and load the battery; asks."
-        ),
-    ] = False,
-    yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Do not ask before --prop-test.")
     ] = False,
     as_json: Annotated[
         bool,
@@ -96,15 +86,10 @@ def check(
     """Look at vehicle, camera, computer and profile on the ground, and say what is not fit to fly.
 
     A row passes, warns, fails, or is skipped where it could not be known. Nothing is armed, and
-    no motor turns but with --prop-test, which asks first. Exits with 0 when nothing fails, with
-    10 when the vehicle does not answer, 20 when the camera gives no picture, 52 for any other
-    failing row.
+    no motor turns. Exits with 0 when nothing fails, with 10 when the vehicle does not answer, 20
+    when the camera gives no picture, 52 for any other failing row.
     """
-    beyond = {"--source": source, "--seed": seed, "--log-dir": log_dir, "--lift": lift,
-              "--prop-test": prop_test}  # fmt: skip
-    given = any(value not in (None, False) for value in beyond.values())
-    if yes and not prop_test:
-        raise UsageError("--yes answers --prop-test: add that, or leave --yes out")
+    given = any(value not in (None, False) for value in (source, seed, log_dir, lift))
     if scan and given:
         raise UsageError("--scan only shows which vehicles answer: give it -u and --json at most")
     if cameras and (given or scan or uri is not None):
@@ -114,17 +99,9 @@ def check(
     if scan:
         say("scanning all channels and rates")
         return report(_scanned(uri), as_json)
-    if prop_test and not yes and not sys.stdin.isatty():
-        raise UsageError("--prop-test turns the motors, and there is nobody to ask: add --yes")
-    may_turn_motors = (lambda: yes or confirm_motors()) if prop_test else None
     options = resolve(profile, uri, source, seed=seed, log_dir=log_dir)
-    scope = CheckScope(may_turn_motors=may_turn_motors, lift=lift, tell=say)
+    scope = CheckScope(lift=lift, tell=say)
     return report(check_rows(options, scope), as_json)
-
-
-def confirm_motors() -> bool:
-    """Whether somebody at the terminal allows the motors' test, now."""
-    return confirmed("About to turn each propeller. Is it free, the vehicle held by nobody?")
 
 
 def _scanned(uri: str | None) -> Iterator[Row]:
@@ -231,23 +208,22 @@ def camera_record(camera: ConnectedCamera) -> dict[str, Any]:
         "name": camera.name,
         "path": f"/dev/video{camera.number}",
         "stable_path": camera.stable_path or None,
-        "modes": [
-            {"format": m.format, "size_px": m.size_px, "rates_hz": m.rates_hz} for m in camera.modes
+        "controls": [
+            {
+                "name": control.name,
+                "kind": control.kind,
+                "value": value,
+                "default": control.default,
+                "min": control.low,
+                "max": control.high,
+                "step": control.step,
+                "inactive": control.inactive,
+                **({"menu": {str(k): text for k, text in control.menu}} if control.menu else {}),
+            }
+            for control, value in camera.controls
         ],
-        "controls": [_control_record(*each) for each in camera.controls],
         "problem": camera.problem or None,
     }
-
-
-def _control_record(control: CameraControl, value: int | None) -> dict[str, Any]:
-    record: dict[str, Any] = {
-        "name": control.name, "kind": control.kind, "value": value, "default": control.default,
-        "min": control.low, "max": control.high, "step": control.step,
-        "inactive": control.inactive,
-    }  # fmt: skip
-    if control.menu:
-        record["menu"] = {str(index): text for index, text in control.menu}
-    return record
 
 
 def camera_lines(camera: ConnectedCamera) -> list[str]:
@@ -257,21 +233,8 @@ def camera_lines(camera: ConnectedCamera) -> list[str]:
         lines.append(f"  {camera.stable_path}")
     if camera.problem:
         lines.append(f"  {camera.problem}; close other programs that use it, or get the right to")
-    for mode in camera.modes:
-        size = "any size" if mode.size_px is None else "{}x{}".format(*mode.size_px)
-        rates = f" at {', '.join(f'{hz:g}' for hz in mode.rates_hz)} Hz" if mode.rates_hz else ""
-        lines.append(f"  {mode.format:<5}{size}{rates}")
     for control, value in camera.controls:
         now = "?" if value is None else str(value)
         held = ", held by an automatic one" if control.inactive else ""
-        lines.append(f"  {control.name} = {now}  ({_allowed(control)}{held})")
+        lines.append(f"  {control.name} = {now}  ({control.allowed}{held})")
     return lines
-
-
-def _allowed(control: CameraControl) -> str:
-    if control.menu:
-        return ", ".join(f"{index}: {text}" for index, text in control.menu)
-    if control.kind == "boolean":
-        return "0 or 1"
-    step = f" in steps of {control.step}" if control.step > 1 else ""
-    return f"{control.low} to {control.high}{step}"

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from perchctl.camera import IMAGE_SUFFIXES, camera_numbers
+from perchctl.camera import IMAGE_SUFFIXES
 from perchctl.commands.positioning import POSITIONINGS
 from perchctl.places import file_names
 
@@ -36,7 +36,8 @@ def sources(begun: str) -> list[str]:
     kind, colon, place = begun.partition(":")
     if colon and f"{kind}:" in _SCHEMES:
         return [f"{kind}:{path}" for path in _files(place, _PICTURES)]
-    offered = (*(f"camera:{number}" for number in camera_numbers(_DEVICES)), *_SCHEMES)
+    cameras = (path.name.removeprefix("video") for path in _DEVICES.glob("video*"))
+    offered = (*(f"camera:{n}" for n in sorted(filter(str.isdigit, cameras), key=int)), *_SCHEMES)
     return [*_that_begin(begun, offered), *_files(begun, _PICTURES)]
 
 

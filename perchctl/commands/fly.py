@@ -306,7 +306,7 @@ def plan(options: FlyOptions) -> dict[str, Any]:
         "check": [
             dataclasses.asdict(row)
             for row in (
-                *profile_rows(options.profile, uri=options.uri, source=options.source),
+                *profile_rows(options.profile, source=options.source),
                 *_compared(options),
             )
         ],

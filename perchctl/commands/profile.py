@@ -386,7 +386,7 @@ def _source(text: str, answers: Texts) -> str:
         raise InvalidValue(
             f"{source} is no camera that flies with {answers['uri']}; allowed are "
             f"camera:N, camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH, "
-            f"aideck://HOST, gst:PIPELINE"
+            f"aideck://HOST"
         )
     return text
 

@@ -68,7 +68,7 @@ class LockstepSource:
     def __init__(self, camera: SimCamera, latency_s: float) -> None:
         self._camera = camera
         self._latency_s = latency_s
-        self._slot = NewestSlot(by_noise=True)
+        self._slot = NewestSlot()
         self._count = 0
 
     def poll(self, now_s: float) -> Frame | None:

@@ -3,17 +3,13 @@ from .cflib_link import EstimateLink as EstimateLink
 from .crtp import Packet as Packet
 from .crtp import Port as Port
 from .external_position import check_estimator_parameters as check_estimator_parameters
-from .firmware import EXTERNAL_POSITION_TICK as EXTERNAL_POSITION_TICK
 from .firmware import NEEDED_PROTOCOL as NEEDED_PROTOCOL
-from .firmware import decks_found as decks_found
 from .mock import MockLink as MockLink
 from .mock import Radio as Radio
 from .motion import MotionLink as MotionLink
 from .probe import Echoes as Echoes
-from .probe import HealthTest as HealthTest
 from .probe import ProbeLink as ProbeLink
 from .probe import ScanResult as ScanResult
-from .probe import address_of as address_of
 from .probe import find_vehicles as find_vehicles
 from .protocol import Guard as Guard
 from .protocol import Link as Link

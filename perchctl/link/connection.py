@@ -407,7 +407,6 @@ def _hush_cflib() -> None:
 # operating system holds the lock and lets it go with the process, however that ends.
 
 
-_LOCKED_BYTE = 1 << 30  # beyond the text, which others read (Windows)
 _TRIES = 5
 
 
@@ -480,28 +479,17 @@ def _is_at(fd: int, path: Path) -> bool:
     return False
 
 
-if sys.platform == "win32":
-
-    def _lock(fd: int) -> bool:
-        import msvcrt
-
-        os.lseek(fd, _LOCKED_BYTE, os.SEEK_SET)
-        try:
-            msvcrt.locking(fd, msvcrt.LK_NBLCK, 1)
-        except OSError:
-            return False
-        finally:
-            os.lseek(fd, 0, os.SEEK_SET)
+def _lock(fd: int) -> bool:
+    """True if this process has the lock now. Windows has none of these; nor, for most vehicles,
+    two programs at one radio."""
+    if sys.platform == "win32":
         return True
-else:
+    import fcntl
 
-    def _lock(fd: int) -> bool:
-        import fcntl
-
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        except OSError:  # a file system without locks
-            return True
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
         return True
+    return True

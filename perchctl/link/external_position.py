@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.link.firmware import order_parameter, set_parameters
-from perchctl.positioning import FeedStatus, Placed
+from perchctl.positioning import Placed, PositionFeed, StandingFeed
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import Telemetry, knows_its_position, may_fly
 
@@ -35,12 +35,8 @@ _POLL_S = 0.02
 NEEDED_BY = "positioning from outside"
 
 
-class Feed(Protocol):
-    """The part of `perchctl.positioning.feed.PositionFeed` that is needed here."""
-
-    def status(self, now_s: float) -> FeedStatus: ...
-
-    def place(self) -> Placed | None: ...
+Feed = PositionFeed | StandingFeed
+"""What sends the positions, and says which."""
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """A vehicle's link, looked at: which vehicles answer, what one holds, how good the radio is.
 
-Nothing that is sent here flies, arms or turns a motor, but `start_health_test`.
+Nothing that is sent here flies, arms or turns a motor.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from perchctl.errors import NotFound, TimedOut
 from perchctl.link.cflib_link import EstimateLink
@@ -21,14 +21,10 @@ from perchctl.link.crtp import Packet, Port
 from perchctl.link.firmware import has_variable, missing_variables, parameters, variables
 from perchctl.link.uri import FORMS, with_whole_address
 from perchctl.profile import LinkConfig
-from perchctl.vehicle import Telemetry
 
 ANSWER_S = 0.5
-ASKED_TIMES = 3
 ECHO_PERIOD_S = 0.02
 _ECHO_MARK = 1  # cflib's own pings begin with 0
-_VERSION_CHANNEL, _GET_FIRMWARE = 1, 1
-HealthTest = Literal["startPropTest", "startBatTest"]
 
 
 @dataclass(frozen=True)
@@ -80,12 +76,6 @@ class ProbeLink(EstimateLink):
         """-1 where the vehicle is too old to have one."""
         return int(self.cf.platform.get_protocol_version())
 
-    def firmware(self) -> str | None:
-        """The firmware's version, None where it does not tell."""
-        question = Packet(Port.PLATFORM, _VERSION_CHANNEL, bytes((_GET_FIRMWARE,)))
-        answer = self._ask(question)
-        return None if answer is None else answer[1:].rstrip(b"\0").decode(errors="replace")
-
     def parameters(self) -> dict[str, float]:
         """All, as they were read when the link was opened."""
         return parameters(self.cf)
@@ -98,9 +88,6 @@ class ProbeLink(EstimateLink):
     def lost(self) -> str | None:
         """Why the link is gone, None while it is there."""
         return "it was closed" if self.connection is None else self.connection.lost
-
-    def newest(self) -> Telemetry | None:
-        return self._blocks.newest
 
     def has_variable(self, name: str) -> bool:
         return has_variable(self.cf, name)
@@ -136,35 +123,8 @@ class ProbeLink(EstimateLink):
         trips = tuple(t_s - sent_s[n] for n, t_s in list(back_s.items()) if n < len(sent_s))
         return Echoes(count, trips)
 
-    def start_health_test(self, test: HealthTest) -> None:
-        """Turns motors: to be asked for first. In the air it cuts them
-        (docs/firmware.md, "Propeller test")."""
-        with contextlib.suppress(KeyError, AttributeError):  # the link is gone: no result comes
-            self.cf.param.set_value(f"health.{test}", "1")
-
     def _on_quality(self, percent: float) -> None:
         self.quality = float(percent)
-
-    def _ask(self, question: Packet) -> bytes | None:
-        """The answer that begins as the question does; None where none comes."""
-        arrived = threading.Event()
-        answers: list[bytes] = []
-
-        def on_packet(packet: Any) -> None:
-            data = bytes(packet.data)
-            if data.startswith(question.data):
-                answers.append(data)
-                arrived.set()
-
-        self.cf.add_header_callback(on_packet, question.port, question.channel)
-        try:
-            for _ in range(ASKED_TIMES):
-                send_packets(self.cf, [question])
-                if arrived.wait(ANSWER_S):
-                    return answers[0]
-        finally:
-            self.cf.remove_header_callback(on_packet, question.port, question.channel)
-        return None
 
 
 _ECHO = struct.Struct("<BQ")  # as long as cflib's own, which it takes all of them for
@@ -185,7 +145,7 @@ class ScanResult:
     radio: str = ""
 
 
-def address_of(uri: str) -> int | None:
+def _address_of(uri: str) -> int | None:
     """A radio's address, of five bytes; None of another URI, or where it is the usual one."""
     parts = uri.partition("?")[0].split("/")
     if not uri.startswith("radio://") or len(parts) < 6:
@@ -194,14 +154,12 @@ def address_of(uri: str) -> int | None:
     return None if address == USUAL_ADDRESS else address
 
 
-def find_vehicles(
-    addresses: Iterable[int | None] = (), timeout_s: float = SCAN_TIMEOUT_S
-) -> ScanResult:
-    """What answers now at the usual address and at these; sends null packets only.
+def find_vehicles(uri: str = "", timeout_s: float = SCAN_TIMEOUT_S) -> ScanResult:
+    """What answers now at a radio's usual address and at that of `uri`; sends null packets only.
 
     A radio's driver may hang: it gets a thread, and what came by then counts.
     """
-    asked = list(dict.fromkeys((None, *addresses)))
+    asked = dict.fromkeys((None, _address_of(uri)))
     found: list[str] = []
     why: list[str] = ["the radio did not answer in time"]
 

@@ -323,10 +323,6 @@ class _LoadingFailed(Exception):
     pass
 
 
-class _Unresolved(Exception):
-    pass
-
-
 def _loaded() -> Callable[[str, dict[str, str]], Any]:
     try:
         import motioncapture
@@ -349,18 +345,10 @@ def _bounded(setup: CaptureSetup) -> Iterator[None]:
 
 
 def _by_address(setup: CaptureSetup) -> dict[str, str]:
-    """OptiTrack's reader knows addresses only. Errors: _Unresolved."""
+    """OptiTrack's reader knows addresses only. Errors: OSError, UnicodeError."""
     if setup.kind != "optitrack":
         return setup.options
-    host = setup.options["hostname"]
-    try:
-        return setup.options | {"hostname": socket.gethostbyname(host)}
-    except (OSError, UnicodeError) as error:  # the latter: a name that can be none
-        why = getattr(error, "strerror", None) or "it is no host's name"
-        raise _Unresolved(
-            f"the host name {host!r} cannot be resolved ({why}): correct positioning.host, or give "
-            f"the address, as in 192.168.1.2"
-        ) from None
+    return setup.options | {"hostname": socket.gethostbyname(setup.options["hostname"])}
 
 
 def _pass_on(client: Any, channel: Channel, partial: bool) -> None:

@@ -109,3 +109,29 @@ def key_unit(path: str) -> str:
     name = path.rpartition(".")[2]
     endings = (name.split("_", n)[-1] for n in range(1, name.count("_") + 1))
     return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")
+
+
+# --- Keys that have become constants of their section --------------------------------------------
+
+
+def without_constants(
+    values: dict[str, Any], model: type[BaseModel], path: str = ""
+) -> tuple[dict[str, Any], list[str], list[str]]:
+    """The values of a profile without keys that are constants by now: class variables of `model`,
+    or of a model within it. Also a note for each of these, and a sentence for each whose value
+    would be lost, as it is another one than the constant."""
+    result, notes, lost = dict(values), list[str](), list[str]()
+    for key, value in values.items():
+        kind = model.model_fields[key].annotation if key in model.model_fields else None
+        if key in model.__class_vars__:
+            del result[key]
+            constant = getattr(model, key)
+            now = f"{path}{key} is no longer a key: it is {constant} for every profile"
+            if value == (list(constant) if isinstance(value, list) else constant):
+                notes.append(f"{now}; remove it")
+            else:
+                lost.append(f"{now}, and {value} here; remove it")
+        elif isinstance(value, dict) and isinstance(kind, type) and issubclass(kind, BaseModel):
+            result[key], more, gone = without_constants(value, kind, f"{path}{key}.")
+            notes, lost = notes + more, lost + gone
+    return result, notes, lost

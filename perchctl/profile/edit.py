@@ -1,26 +1,29 @@
 """Changes of a profile: some keys of a loaded one, and numbers written into its file.
 
-In the file nothing else is touched: comments, order and layout stay as they are.
+In the file comments and order stay as they are.
 """
 
 from __future__ import annotations
 
 import copy
+import io
 import itertools
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap
+from ruamel.yaml.error import YAMLError
 
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_place, mode_of, write_files
 from perchctl.places import data_folder
 from perchctl.plain_yaml import clip_text, parse_yaml
+from perchctl.profile.base import without_constants
 from perchctl.profile.load import check_profile, find_profile, first_invalid_key
-from perchctl.profile.old_keys import RENAMED, with_present_keys
 from perchctl.profile.schema import Profile
 from perchctl.profile.simulation import in_world
 
@@ -51,7 +54,7 @@ def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--
         except ValueError as error:
             raise InvalidValue(f"{option} {clip_text(f'{key}={text}')}: {error}") from None
     try:
-        _, notes, lost = with_present_keys(values, Profile)
+        _, notes, lost = without_constants(values, Profile)
         if notes or lost:
             raise InvalidValue(f"{option}: {(notes + lost)[0]}")
         return Profile.model_validate(values)
@@ -97,7 +100,7 @@ def _put(values: dict[str, Any], dotted: str, value: Any) -> None:
 Value = float | int | str | tuple[float, ...]
 
 _DECIMALS = 6
-_STEP = "  "
+_BOM = "\ufeff"
 
 
 def writable_profile(name: str) -> Path:
@@ -135,8 +138,9 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
     try:
         old, mode = path.read_bytes().decode(), mode_of(path)
         new = with_values(old, values)
-    except (OSError, ValueError) as error:
-        raise InvalidValue(f"{path}: {error}: {by_hand}") from None
+    except (OSError, ValueError, YAMLError) as error:
+        why = " ".join(str(error).split())
+        raise InvalidValue(f"{path}: {why}: {by_hand}") from None
     try:
         check_profile(path, new)
     except PerchError as error:
@@ -154,97 +158,51 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
 def with_values(text: str, values: Mapping[str, Value]) -> str:
     """The text of a profile with the values under their dotted keys, as in ``camera.latency_s``.
 
-    A number, or each of a list, is replaced where it stands; a key that is missing is put under
-    its section, a section at the end.
+    Comments, order and quotes stay. A list of as many numbers keeps its layout; a key that is
+    missing is put at its section's end, a section at the file's.
 
     Raises:
-        ValueError: the layout does not allow it without a change of something else.
+        ValueError: a section holds no keys.
     """
-    new, wanted = text, copy.deepcopy(_values_of(text))
+    yaml = YAML()
+    yaml.preserve_quotes, yaml.width = True, 10**6
+    yaml.representer.add_representer(type(None), _as_null)
+    document = yaml.load(text.removeprefix(_BOM))
+    wanted = copy.deepcopy(_values_of(text))
     for dotted, value in values.items():
-        *sections, key = dotted.split(".")
-        new = _with_value(new, [*sections, key], value)
-        place = wanted
+        new = yaml.load(_flow(value))
+        sections, key = dotted.split(".")[:-1], dotted.rpartition(".")[2]
+        place, plain = document, wanted
         for section in sections:
-            place = place.setdefault(section, {})
-        place[key] = yaml.safe_load(_flow(value))
-    try:
-        written = _values_of(new)
-    except ValueError:
-        written = {}
-    if written != wanted:
+            place = place.setdefault(section, CommentedMap())
+            plain = plain.setdefault(section, {})
+            if not isinstance(place, dict):
+                raise ValueError(f"{section} holds no keys and values")
+        old = place.get(key)
+        if isinstance(old, list) and isinstance(value, tuple) and len(old) == len(value):
+            for index, number in enumerate(new):  # one by one: their comments stay
+                old[index] = number
+        else:
+            place[key] = new
+        plain[key] = parse_yaml(_flow(value))
+    stream = io.StringIO()
+    yaml.dump(document, stream)
+    written = (_BOM if text.startswith(_BOM) else "") + stream.getvalue()
+    if _values_of(written) != wanted:  # as where an anchor's value is another key's, too
         raise ValueError("the numbers do not fit into this file's layout")
-    return new
+    return written.replace("\n", "\r\n") if "\r\n" in text else written
+
+
+def _as_null(representer: Any, nothing: None) -> Any:
+    """As most people write it; by itself ruamel leaves the value out."""
+    return representer.represent_scalar("tag:yaml.org,2002:null", "null")
 
 
 def _values_of(text: str) -> dict[str, Any]:
     values = parse_yaml(text)
     if not isinstance(values, dict):
         raise ValueError("holds no keys and values")
-    return with_present_keys(values, Profile)[0]
-
-
-def _with_value(text: str, keys: list[str], value: Value) -> str:
-    node = yaml.compose(text, yaml.SafeLoader)
-    if not isinstance(node, yaml.MappingNode):
-        raise ValueError("holds no keys and values")
-    above: yaml.Node | None = None
-    for depth, name in enumerate(keys):
-        found = _child(node, keys[:depth], name)
-        if found is None:
-            return _inserted(text, node, above, keys[depth:], value)
-        above, inner = found
-        if depth == len(keys) - 1:
-            return _replaced(text, inner, value)
-        if not isinstance(inner, yaml.MappingNode):
-            break
-        node = inner
-    raise ValueError(f"{'.'.join(keys[:-1])} holds no keys and values")
-
-
-def _child(
-    node: yaml.MappingNode, sections: list[str], name: str
-) -> tuple[yaml.Node, yaml.Node] | None:
-    """Key and value of that name, or of its name in earlier versions."""
-    names = {name}
-    for old, present in RENAMED.items():
-        *place, former = old.split(".")
-        if present == name and place == sections:
-            names.add(former)
-    return next(((k, v) for k, v in node.value if k.value in names), None)
-
-
-def _replaced(text: str, node: yaml.Node, value: Value) -> str:
-    numbers = value if isinstance(value, tuple) else ()
-    if isinstance(node, yaml.SequenceNode) and len(node.value) == len(numbers):
-        parts = list(zip(node.value, map(_flow, numbers), strict=True))
-    else:
-        parts = [(node, _flow(value))]
-    for part, number in reversed(parts):
-        text = text[: part.start_mark.index] + number + text[part.end_mark.index :]
-    return text
-
-
-def _inserted(
-    text: str, node: yaml.MappingNode, above: yaml.Node | None, keys: list[str], value: Value
-) -> str:
-    """Below the line of the section's own key, so that what stands above the first of its keys,
-    as a comment does, stays there; in braces at their beginning; at the end of the file."""
-    if node.flow_style:
-        new = f"{keys[-1]}: {_flow(value)}"
-        for key in reversed(keys[:-1]):
-            new = f"{key}: {{{new}}}"
-        at = text.index("{", node.start_mark.index) + 1
-        return text[:at] + new + (", " if node.value else "") + text[at:]
-    end = "\r\n" if "\r\n" in text else "\n"
-    indent = " " * node.value[0][0].start_mark.column
-    lines = [f"{indent}{_STEP * depth}{key}:" for depth, key in enumerate(keys)]
-    block = end.join(lines) + f" {_flow(value)}{end}"
-    if above is None:
-        gap = "" if text.endswith("\n") else end
-        return f"{text}{gap}{end}{block}"
-    at = text.index("\n", above.end_mark.index) + 1
-    return text[:at] + block + text[at:]
+    return without_constants(values, Profile)[0]
 
 
 def _flow(value: Value) -> str:

@@ -6,10 +6,8 @@ A profile that breaks a limit of `IMPOSSIBLE` is refused when it is read; `perch
 
 from __future__ import annotations
 
-import operator
 import re
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any
 
 from perchctl.profile.base import key_unit
@@ -17,8 +15,7 @@ from perchctl.profile.mission import OVERDUE_SHARE, AscendConfig
 
 REACHED_SHARE = 0.8
 """Of the take-off height: from here on it counts as reached (`Condition.AT_TAKEOFF_HEIGHT`)."""
-_OPERATORS = {"+": operator.add, "*": operator.mul, "/": operator.truediv}
-_OPERATOR = re.compile(r" ([+*/]) ")
+_KEY = re.compile(r"[a-z_]+(?:\.[a-z0-9_]+)+")
 
 
 @dataclass(frozen=True)
@@ -26,77 +23,37 @@ class Limit:
     """A relation between keys that a profile must hold.
 
     Attributes:
-        relation: as in ``kalman.k1 + 0.1 < kalman.k2``, or with ``<=``. The left side holds keys
-            by their dotted paths and numbers, with +, * and / between; it is worked out from
-            left to right. The right side is one key or number.
+        relation: in Python's own words, as in ``kalman.k1 + 0.1 < kalman.k2``.
         because: what happens otherwise.
-        words: of a left side that is no sum, what it is: {0}, {1}, ... stand for its keys.
     """
 
     relation: str
     because: str
-    words: str = ""
-
-    @property
-    def _sides(self) -> tuple[str, str, str]:
-        """Left, the relation's sign, right."""
-        left, sign, right = re.split(" (<=?) ", self.relation)
-        return left, sign, right
 
     @property
     def keys(self) -> tuple[str, ...]:
-        left, _, right = self._sides
-        sides = (*_OPERATOR.split(left)[::2], right)
-        return tuple(side for side in sides if side[0].isalpha())
+        """The dotted paths in the relation, in their order."""
+        return tuple(_KEY.findall(self.relation))
 
     def holds(self, profile: Any) -> bool:
-        """Also where a key has no number to compare."""
-        left, sign, right = self._sides
-        found, most = _evaluate(left, profile), _evaluate(right, profile)
-        return found is None or most is None or found < most or (sign == "<=" and found == most)
+        """True where the profile's values fulfil the relation."""
+        # The relations are those of this module, and name keys and numbers only.
+        return bool(eval(_KEY.sub(_read, self.relation), {"profile": profile}))
 
     def sentence(self, profile: Any) -> str:
-        """What is found, and what must hold."""
-        left, sign, right = self._sides
-        relation = "must not exceed" if sign == "<=" else "must be less than"
-        limit = _named(profile, right, units=bool(self.words))
-        return f"{self._found(left, right, profile)} {relation} {limit}: {self.because}"
+        """The relation with the value of each key, and what happens as it does not hold."""
 
-    def _found(self, left: str, right: str, profile: Any) -> str:
-        """The left side, and what it comes to where it has parts."""
-        parts, value = _OPERATOR.split(left)[::2], _evaluate(left, profile)
-        if self.words:
-            named = [_named(profile, part, units=True) for part in parts if part[0].isalpha()]
-            result = f"{value:.3g} {key_unit(right)}".strip()
-            return f"{self.words.format(*named)} is {result}, and"
-        total = " + ".join(_named(profile, part) for part in parts)
-        return total if len(parts) == 1 else f"{total}, together {value:.3g},"
+        def shown(found: re.Match[str]) -> str:
+            value = eval(_read(found), {"profile": profile})
+            return f"{found[0]} ({f'{value:g} {key_unit(found[0])}'.strip()})"
+
+        return f"{_KEY.sub(shown, self.relation)} does not hold: {self.because}"
 
 
-def _evaluate(side: str, profile: Any) -> float | None:
-    first, *rest = _OPERATOR.split(side)
-    value = _value(profile, first)
-    for sign, part in zip(rest[::2], rest[1::2], strict=True):
-        other = _value(profile, part)
-        if value is None or other is None:
-            return None
-        value = _OPERATORS[sign](value, other)
-    return value
-
-
-def _value(profile: Any, part: str) -> float | None:
-    """The number that stands there, or that the profile has at that key; None where it has none."""
-    if part == "camera.latency_s":
-        part = "camera.start_latency_s"
-    value = reduce(getattr, part.split("."), profile) if part[0].isalpha() else float(part)
-    return value if isinstance(value, (int, float)) else None
-
-
-def _named(profile: Any, part: str, units: bool = False) -> str:
-    value = _value(profile, part)
-    if not part[0].isalpha():
-        return f"{value:g}"
-    return f"{part} ({f'{value:g} {key_unit(part) if units else str()}'.strip()})"
+def _read(found: re.Match[str]) -> str:
+    """The key of a profile as an expression; of a latency that is measured its beginning."""
+    key = found[0]
+    return f"profile.{'camera.start_latency_s' if key == 'camera.latency_s' else key}"
 
 
 IMPOSSIBLE: tuple[Limit, ...] = (
@@ -112,7 +69,6 @@ IMPOSSIBLE: tuple[Limit, ...] = (
         f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
         " < planner.approach_timeout_s",
         "the take-off takes longer than it is waited for",
-        words=f"the climb to {REACHED_SHARE:g} of {{0}} at {{1}}",
     ),
     Limit(
         "camera.latency_s < safety.max_frame_age_s", "every picture would be too old to measure by"
@@ -188,19 +144,16 @@ DOUBTFUL: dict[str, tuple[Limit, ...]] = {
             " + planner.estimate.dwell_s + planner.align.dwell_s + planner.ascend.settle_dwell_s"
             " + planner.perch.contact_dwell_s < planner.perching_time_s",
             "the perching time is over before a contact",
-            words="the least time for {0} at {1}, with {2}, {3}, {4} and {5}",
         ),
         Limit(
             "planner.search.attempts * planner.search.wait_s < planner.perching_time_s",
             "the perching time is over before the search",
-            words="{0} times {1}",
         ),
         Limit(
             f"safety.max_height_m / planner.landing.speed_mps / {OVERDUE_SHARE:g}"
             " < planner.landing.timeout_s",
             "from there it is not down by setpoints when half of that is over, and is left to its "
             "own landing",
-            words="twice the time that landing from {0} takes at {1}",
         ),
         Limit("safety.camera_hold_s < safety.camera_land_s", "it lands before it was held"),
         Limit("safety.telemetry_hold_s < safety.telemetry_land_s", "it lands before it was held"),

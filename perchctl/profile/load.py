@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from perchctl.errors import InvalidValue, NotFound, ProfileNote
 from perchctl.places import data_file, file_names
 from perchctl.plain_yaml import clip_text, parse_yaml
-from perchctl.profile.old_keys import with_present_keys
+from perchctl.profile.base import without_constants
 from perchctl.profile.schema import Profile
 from perchctl.profile.vision import WeightsConfig
 
@@ -48,8 +48,8 @@ def find_profile(name: str) -> Path:
 
 def load_profile(name: str, *, with_weights: bool = True) -> Profile:
     """Read, resolve `extends` and check a profile; the weights of its `merge.weights_file`
-    take the place of `merge.weights` unless told otherwise. Old keys are read, with a
-    `ProfileNote` as warning. Errors: NotFound, InvalidValue."""
+    take the place of `merge.weights` unless told otherwise. A key that is a
+    constant by now is left out, with a `ProfileNote` as warning. Errors: NotFound, InvalidValue."""
     path = find_profile(name)
     profile = _checked(path, _read_yaml(path))
     if profile.merge.weights_file is None or not with_weights:
@@ -129,7 +129,7 @@ def read_weights(path: Path) -> FittedWeights:
     try:
         return FittedWeights.model_validate(values)
     except ValidationError as error:
-        raise InvalidValue(_one_sentence(path, error, FittedWeights)) from None
+        raise InvalidValue(_one_sentence(path, error)) from None
 
 
 # --- Reading ------------------------------------------------------------------------------------
@@ -143,7 +143,7 @@ def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[s
     """What the file at `path` holds itself, on top of what it extends."""
     if path in seen:
         raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
-    values = _with_present_keys(own, path)
+    values = _without_constants(own, path)
     if not values:
         raise InvalidValue(
             f"{path}: the profile is empty, and would fly what nobody chose: begin with a line "
@@ -165,11 +165,8 @@ def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[s
     return _merged(_resolved(base, _read_yaml(base), (*seen, path)), values)
 
 
-def _with_present_keys(values: dict[str, Any], path: Path) -> dict[str, Any]:
-    try:
-        values, notes, lost = with_present_keys(values, Profile)
-    except ValueError as error:
-        raise InvalidValue(f"{path}: {error}") from None
+def _without_constants(values: dict[str, Any], path: Path) -> dict[str, Any]:
+    values, notes, lost = without_constants(values, Profile)
     if lost:
         raise InvalidValue(f"{path}: {lost[0]}")
     for note in notes:
@@ -226,21 +223,17 @@ _MOST_OF_A_FAULT = 1000
 _BOUNDS = ("less_than_equal", "greater_than_equal")
 
 
-_COUNTS = ("tuple_type", "too_long", "missing")
-
-
-def _one_sentence(path: Path, error: ValidationError, model: type[BaseModel] = Profile) -> str:
-    key, text = first_invalid_key(error, model)
+def _one_sentence(path: Path, error: ValidationError) -> str:
+    key, text = first_invalid_key(error)
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     return f"{path}: {key or 'profile'}: {text}{more}"
 
 
-def first_invalid_key(error: ValidationError, model: type[BaseModel] = Profile) -> tuple[str, str]:
-    """The key of the first fault that was found in values of `model`, empty where it is of no
-    single one, and what is wrong."""
+def first_invalid_key(error: ValidationError) -> tuple[str, str]:
+    """The key of the first fault that was found, empty where it is of no single one, and what is
+    wrong."""
     first = error.errors(include_url=False)[0]
     key = clip_text(".".join(str(part) for part in first["loc"]))
-    count = _numbers_at(model, first["loc"]) if first["type"] in _COUNTS else 0
     if first["type"] == "extra_forbidden":
         above = first["loc"][:-1]
         keys = _keys_at(above) if above else ["extends", *_keys_at(above)]
@@ -250,9 +243,6 @@ def first_invalid_key(error: ValidationError, model: type[BaseModel] = Profile) 
     elif first["type"] == "model_type":
         found = clip_text(repr(first["input"]))
         text = f"must hold keys and values, found {found}; give some, or remove it"
-    elif count:
-        key = clip_text(".".join(part for part in first["loc"] if isinstance(part, str)))
-        text = f"needed are {count} numbers, found {clip_text(repr(first['input']))}"
     else:
         found = clip_text(repr(first["input"]))
         text = f"{first['msg'][:1].lower()}{first['msg'][1:]}, found {found}"
@@ -260,17 +250,6 @@ def first_invalid_key(error: ValidationError, model: type[BaseModel] = Profile) 
         if names and names[-1].endswith("_m") and first["type"] in _BOUNDS:
             text += " (metres: were millimetres or centimetres meant?)"
     return key, text
-
-
-def _numbers_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> int:
-    """How many the key there takes in a row; 0 of any other key."""
-    kind: Any = model
-    for part in loc:
-        if isinstance(part, str):
-            field = getattr(kind, "model_fields", {}).get(part)
-            kind = field.annotation if field else None
-    rows = [each for each in (kind, *get_args(kind)) if get_origin(each) is tuple]
-    return len(get_args(rows[0])) if rows else 0
 
 
 def _keys_at(loc: tuple[int | str, ...]) -> list[str]:

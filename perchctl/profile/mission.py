@@ -61,13 +61,13 @@ class AscendConfig(Section):
     """The cone's radius grows by it a metre below."""
     standoff_m: float = key(0.08, "between gear and target where it settles", gt=0.01, le=0.5)
     settle_xy_m: float = key(0.004, "settled: distance from the axis", gt=0, le=0.1)
-    settle_z_m: float = key(0.02, "settled: at most so far below the stand-off", gt=0, le=0.1)
+    settle_z_m: ClassVar[float] = 0.02  # settled: at most so far below the stand-off
     settle_yaw_deg: ClassVar[float] = 3.0
     """Settled: heading."""
     settle_speed_mps: ClassVar[float] = 0.04
     """Settled: speed."""
     settle_dwell_s: float = key(0.3, "for which all must hold", ge=0, le=10)
-    settle_timeout_s: float = key(10.0, "at the stand-off", gt=0, le=60)
+    settle_timeout_s: ClassVar[float] = 10.0  # at the stand-off
     fresh_s: float = key(
         0.25, "a target older than this, beyond the latency, is not fresh", gt=0, le=2
     )
@@ -82,20 +82,16 @@ class PerchConfig(Section):
         "position", "press by a setpoint above the contact, or by raw thrust"
     )
     thrust: int = key(60000, "of the raw mode", ge=1000, le=65535)
-    press_m: float = key(0.25, "the setpoint above the contact", gt=0, le=1)
+    press_m: ClassVar[float] = 0.25  # the setpoint above the contact
     climb_mps: float = key(0.2, "of the setpoint", gt=0, le=1)
     contact_dwell_s: float = key(0.25, "for which contact must hold", gt=0, le=5)
     contact_z_m: float = key(0.05, "contact: the gear's distance from the target", gt=0, le=0.3)
     contact_xy_m: float = key(
         0.025, "contact: its distance from the axis, the magnet's radius", gt=0, le=0.5
     )
-    contact_speed_mps: float = key(0.06, "contact: vertical speed", gt=0, le=1)
-    contact_acc_g: float = key(
-        0.12, "contact: acceleration differs from 1 g by at most this", gt=0, le=1
-    )
-    contact_thrust_ratio: float = key(
-        1.03, "contact: thrust over hover thrust, where there is more", gt=1, le=2
-    )
+    contact_speed_mps: ClassVar[float] = 0.06  # contact: vertical speed
+    contact_acc_g: ClassVar[float] = 0.12  # contact: off 1 g by at most this
+    contact_thrust_ratio: ClassVar[float] = 1.03  # contact: at least, over hover thrust
     timeout_s: float = key(3.0, "without contact", gt=0, le=20)
 
 
@@ -114,7 +110,7 @@ class CompleteConfig(Section):
     release_drop_m: ClassVar[float] = 0.25
     """The setpoint's last step lies below the contact."""
     hold_ratio: float = key(0.6, "thrust over the hover thrust that proves the magnet", gt=0, lt=1)
-    hold_dwell_s: float = key(0.3, "for which it must prove it", ge=0, le=5)
+    hold_dwell_s: ClassVar[float] = 0.3  # for which it must prove it
     ramp_s: float = key(
         0.5, "of raw thrust, from the least of position mode to still motors", gt=0, le=10
     )
@@ -122,14 +118,10 @@ class CompleteConfig(Section):
         1.0, "that the whole weight must hang before the motors stop", ge=0.3, le=10
     )
     release_timeout_s: float = key(8.0, "then the attempt counts as failed", gt=0, le=30)
-    slip_m: float = key(0.03, "hanging: at most so far below the contact", gt=0, le=0.3)
-    slip_mps: float = key(0.12, "a slip: sinking faster", gt=0, le=1)
-    slip_dwell_s: float = key(
-        0.03, "a slip: for so long; a free fall is answered at once", ge=0, le=0.5
-    )
-    slip_acc_g: float = key(
-        0.5, "a free fall, or a slip wherever the estimate is: less", gt=0, lt=1
-    )
+    slip_m: ClassVar[float] = 0.03  # hanging: at most so far below the contact
+    slip_mps: ClassVar[float] = 0.12  # a slip: sinking faster
+    slip_dwell_s: ClassVar[float] = 0.03  # a slip: for so long; a free fall is answered at once
+    slip_acc_g: ClassVar[float] = 0.5  # a free fall, or a slip wherever the estimate is: less
     watch_s: float = key(1.5, "after the motor stop, before it counts as perched", gt=0, le=60)
 
 
@@ -172,7 +164,7 @@ class PlannerConfig(Section):
     approach_xy_m: tuple[float, float] | None = key(
         None, "fly here after take-off, in the estimate's world"
     )
-    approach_timeout_s: float = key(15.0, "for take-off and way", gt=0, le=120)
+    approach_timeout_s: ClassVar[float] = 15.0  # for take-off and way
     search: SearchConfig = SearchConfig()
     estimate: EstimateConfig = EstimateConfig()
     align: AlignConfig = AlignConfig()
@@ -215,14 +207,14 @@ class SafetyConfig(Section):
     )
     jump_mps: float = key(1.0, "a step of its velocity", gt=0, le=10)
     flight_variance_m2: float = key(0.05, "of the position in flight: above it, held", gt=0, le=10)
-    variance_land_s: float = key(1.0, "above it for so long: landed", ge=0, le=30)
+    variance_land_s: ClassVar[float] = 1.0  # above it for so long: landed
     jump_hold_s: float = key(0.5, "held, then landed", ge=0, le=0.5)
     max_height_m: float = key(3.0, "above the ground: lands when higher", gt=0, le=20)
     fence_radius_m: float = key(
         2.0, "of the fence around the place of take-off: lands outside", gt=0, le=50
     )
     max_tilt_deg: float = key(55.0, "beyond it the motors are cut", gt=0, le=180)
-    tilt_debounce_s: float = key(0.2, "for which it must be tilted", ge=0, le=2)
+    tilt_debounce_s: ClassVar[float] = 0.2  # for which it must be tilted
     loop_late_hold_s: float = key(0.25, "a turn so late: held", gt=0, le=5)
     loop_late_land_s: float = key(1.0, "a turn so late: landed", gt=0, le=10)
     estimator_wait_s: float = key(10.0, "on the ground", gt=0, le=60)
@@ -236,10 +228,6 @@ class SafetyConfig(Section):
         0.15, "farther from it the vehicle hangs, or is held: no take-off", gt=0, le=10
     )
     start_tilt_deg: float = key(10.0, "roll and pitch, at most, before take-off", gt=0, le=45)
-    blocked_s: float = key(
-        0.7, "pressed against something and not moving: back off down", gt=0, le=5
-    )
-    blocked_thrust_ratio: float = key(
-        1.1, "of the hover thrust: from here on it is pressed", gt=1, le=2
-    )
+    blocked_s: ClassVar[float] = 0.7  # pressed and not moving: back off down
+    blocked_thrust_ratio: ClassVar[float] = 1.1  # of the hover thrust: pressed from here on
     land_on_log_error: bool = key(False, "land when the log cannot be written")

@@ -7,17 +7,15 @@ larger sections.
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 from typing import Any
 
 from pydantic import Field, model_validator
 
-from perchctl.profile.base import Section, key
+from perchctl.profile.base import Section, key, without_constants
 from perchctl.profile.dictionaries import check_marker_id
 from perchctl.profile.limits import IMPOSSIBLE
 from perchctl.profile.mission import PlannerConfig, SafetyConfig
-from perchctl.profile.old_keys import with_present_keys
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.profile.simulation import SimulationConfig
 from perchctl.profile.vision import (
@@ -74,15 +72,13 @@ class Profile(Section):
     @classmethod
     def lost_values(cls, values: dict[str, Any]) -> list[str]:
         """A sentence for each key of the values that is a constant now, and had another value."""
-        with contextlib.suppress(ValueError):  # one under both of its names, which is refused
-            return with_present_keys(values, cls)[2]
-        return []
+        return without_constants(values, cls)[2]
 
     @model_validator(mode="before")
     @classmethod
-    def _present_keys(cls, values: Any) -> Any:
-        """Logs of earlier versions hold profiles with old keys."""
-        return with_present_keys(values, cls)[0] if isinstance(values, dict) else values
+    def _without_constants(cls, values: Any) -> Any:
+        """Logs of earlier versions hold profiles with keys that are constants by now."""
+        return without_constants(values, cls)[0] if isinstance(values, dict) else values
 
     @model_validator(mode="after")
     def _neighbours_can_be_printed(self) -> Profile:

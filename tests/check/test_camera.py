@@ -28,17 +28,12 @@ from perchctl.flight.lockstep import LockstepClock, LockstepSource
 from perchctl.link import MockLink
 from perchctl.profile import Profile, load_profile
 from perchctl.sim import Scenario, SimulatedVehicle
-from perchctl.target import Optics, TargetDesign, make_design
-from perchctl.target.design import GearRanges, Ranges
-from perchctl.target.sight import Blind, Mounted
 from perchctl.vision import make_pipeline
 from tests.helpers.mission import target_at
 
 PROFILE = load_profile("sim")
 CAMERA = profile_camera(PROFILE.camera)
 PIPELINE = make_pipeline(PROFILE, CAMERA)
-RANGES = Ranges(3.0, 0.5, 0.16, 0.12, 0.03, 20.0, 20.0, 380.0)
-DESIGN = make_design(PROFILE.target, CAMERA, Optics(), PROFILE, ranges=RANGES)
 NEAR_M = 0.45
 """From the gear to the target: both markers are seen."""
 FAR_FOR_BOTH_M = 1.4
@@ -84,10 +79,8 @@ def rehearsed(
     return rehearse(link.telemetry, source, PIPELINE, PROFILE, clock, duration_s, Stopwatch(0.005))
 
 
-def rows_of(
-    done: Rehearsal, profile: Profile = PROFILE, design: TargetDesign = DESIGN
-) -> dict[str, Row]:
-    found = camera.picture_rows(done, design, profile, CAMERA)
+def rows_of(done: Rehearsal, profile: Profile = PROFILE) -> dict[str, Row]:
+    found = camera.picture_rows(done, profile, CAMERA)
     assert [row.name for row in found] == list(camera.names_of(profile))
     loop = ask("loop", computer.loop_finding, done, profile)
     return {row.name: row for row in [*found, loop]}
@@ -101,7 +94,7 @@ FAULTS: dict[str, dict[str, Any]] = {
     "mirrored": {"fault": CameraFault("mirrored", FOR_EVER)},
     "lossy, and a wrong print": {"camera_drop_rate": 0.35, "small_side_m": 0.024,
                                  "duration_s": 0.8},
-    "slow and noisy": {"camera_rate_hz": 6.0, "camera_noise_sigma": 22.0, "duration_s": 0.8},
+    "slow": {"camera_rate_hz": 6.0, "duration_s": 0.8},
     "out of focus": {"camera_defocus_px": 3.2},
     "bare": {"no_target": True},
     "silent": {"fault": CameraFault("silent", FOR_EVER), "duration_s": 0.8},
@@ -144,8 +137,7 @@ def test_a_good_camera_fails_nothing() -> None:
     ("mirrored", "mirrored", "fail", "mirrored"),
     ("lossy, and a wrong print", "lost frames", "warn", "longest gap"),
     ("lossy, and a wrong print", "print", "fail", "print error"),
-    ("slow and noisy", "frame rate", "fail", "6 Hz"),
-    ("slow and noisy", "noise", "warn", "sigma"),
+    ("slow", "frame rate", "fail", "6 Hz"),
     ("out of focus", "focus", "fail", "blur sigma 3"),
     ("bare", "target", "skipped", "not in view"),
     ("silent", "lost frames", "fail", "none for the last 0."),
@@ -162,7 +154,7 @@ def test_a_fault_of_the_simulated_camera_makes_its_row(
 
 
 def test_what_a_target_would_tell_is_not_known_without_one() -> None:
-    for name in ("target", "focus", "mirrored", "print", "ranges"):
+    for name in ("target", "focus", "mirrored", "print"):
         assert shown("bare")[1][name].verdict is Verdict.SKIPPED, name
 
 
@@ -211,11 +203,8 @@ def gaps(*gaps_s: float) -> list[tuple[int, float]]:
     ("light", "warn", {"light": Light(200.0, 0.5)}),
     ("light", "warn", {"light": Light(30.0, 0.0)}),
     ("light", "skipped", {"light": None}),
-    ("noise", "fail", {"noise": 40.0}),
-    ("noise", "skipped", {"noise": None}),
     ("focus", "warn", {"blur": Blur(2.0, 2.0)}),
     ("focus", "warn", {"blur": Blur(0.8, 2.5)}),
-    ("ranges", "skipped", {"blur": None}),
     ("target", "warn", {"found": 3, "target": None}),
     ("target", "fail", {"target": target_at(1.0, (0.0, 0.0, 0.23), (0.0, 0.0, 0.0))}),
     ("loop", "warn", {"work_s": [0.028] * 20}),
@@ -254,52 +243,6 @@ def test_what_the_camera_does_not_do_as_asked_is_told() -> None:
     row = camera.opened_finding("camera:0", ["camera:0 (USB Video)"], ["it gives YUYV"])
     assert (row.verdict, "YUYV" in row.found) == (Verdict.WARN, True)
     assert camera.opened_finding("camera:0", []).verdict is Verdict.PASS
-
-
-def test_a_gap_in_the_target_s_ranges_is_told() -> None:
-    blind = Mounted(Blind(None, None))
-    gap = replace(DESIGN, warnings=("gap between the markers",), gear=GearRanges(None, None),
-                  mount=blind)  # fmt: skip
-    rows = rows_of(good()[0], design=gap)
-    assert rows["ranges"].verdict is Verdict.WARN
-    assert "gap between the markers" in rows["ranges"].found
-
-
-def test_the_better_turn_of_the_camera_is_told() -> None:
-    """As `make-target` tells it: with the gear beside the picture's height."""
-    profile = PROFILE.model_copy(update={"camera": PROFILE.camera.model_copy(update={
-        "mount": PROFILE.camera.mount.model_copy(update={
-            "position_m": (0.0, 0.03, 0.03), "rpy_deg": (0.0, 0.0, 0.0)})})})  # fmt: skip
-    design = make_design(profile.target, CAMERA, Optics(), profile, ranges=RANGES)
-    row = rows_of(good()[0], profile, design)["blind"]
-    assert row.verdict is Verdict.WARN
-    assert "camera.mount.rpy_deg" in row.advice
-
-
-def test_the_ranges_are_those_of_these_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Optics] = []
-
-    def ranges(target: Any, model: Any, optics: Optics, trials: int) -> Ranges:
-        asked.append(optics)
-        return RANGES
-
-    monkeypatch.setattr("perchctl.target.design.design_ranges", ranges)
-    high = target_at(1.0, (0.0, 0.0, 2.2), (0.0, 0.0, 0.0))
-    done = altered(target=high, height_m=0.0, noise=9.3, blur=Blur(1.4, 1.6))
-    design = camera.design_of(done, PIPELINE, PROFILE)
-    assert asked == [Optics(1.5, 9.0)]
-    assert design.search_range_m == pytest.approx(2.2 - 1.3 - 0.005, abs=0.01)
-
-
-def test_an_unknown_height_says_nothing_of_the_ceiling(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seen from 1 m, and without telemetry: that is no ceiling at 1 m."""
-    monkeypatch.setattr("perchctl.target.design.design_ranges", lambda *_: RANGES)
-    near = {"target": target_at(1.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)), "noise": 4.0}
-    design = camera.design_of(altered(**near, height_m=None), PIPELINE, PROFILE)
-    assert design.search_range_m is None
-    assert design.warnings == DESIGN.warnings  # those of no ceiling
-    on_the_floor = camera.design_of(altered(**near, height_m=0.0), PIPELINE, PROFILE)
-    assert len(on_the_floor.warnings) > len(design.warnings)
 
 
 def test_pictures_of_another_size_are_not_looked_at() -> None:

@@ -14,10 +14,9 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.check import CheckScope, Row, Verdict, camera, check, session
 from perchctl.check.capture import CAPTURE, COMPARED
-from perchctl.check.vehicle import GONE
 from perchctl.commands import app
 from perchctl.commands import check as command
-from perchctl.commands.check import confirm_motors, exit_code, report, table
+from perchctl.commands.check import exit_code, report, table
 from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options
 from tests.helpers.flights import ROOT
@@ -59,10 +58,7 @@ def test_json_is_a_list_of_rows(quick: None) -> None:
     (("-u", NOWHERE), 2, "belongs to the simulated vehicle"),
     (("-u", NOWHERE, "--source", "video:old.mp4"), 2, "is a recording"),
     (("--seed", "-1"), 30, "seed -1 is negative"),
-    (("--prop-test",), 2, "nobody to ask"),
-    (("--yes",), 2, "--yes answers --prop-test"),
     (("--scan", "--lift"), 2, "--scan only shows"),
-    (("--scan", "--prop-test", "--yes"), 2, "--scan only shows"),
     (("--cameras", "--scan"), 2, "--cameras only lists"),
     (("--cameras", "--source", "camera:0"), 2, "--cameras only lists"),
 ])  # fmt: skip
@@ -100,20 +96,6 @@ def test_ctrl_c_ends_with_what_was_found(
     assert ("supervisor" in printed.out) is (stage == "opening")
     assert not printed.out or "not finished" in printed.out
     assert "nothing fails" not in printed.out
-
-
-@pytest.mark.parametrize(("answer", "leave"), [("y", True), ("yes", True), ("", False),
-                                               ("no", False), (None, False)])  # fmt: skip
-def test_only_yes_is_a_yes(
-    answer: str | None, leave: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def typed() -> str:
-        if answer is None:
-            raise EOFError
-        return answer
-
-    monkeypatch.setattr("builtins.input", typed)
-    assert confirm_motors() is leave
 
 
 ROWS = [
@@ -170,13 +152,13 @@ def test_a_flight_is_refused_for_what_the_profile_or_the_disk_fails(
 
 def test_a_flight_says_what_its_profile_makes_doubtful(tmp_path: Path) -> None:
     (tmp_path / "p.yaml").write_text(
-        "extends: sim\nvehicle: {gear_body_m: [0.2, 0, 0.03]}\n"
-        "camera: {mount: {position_m: [0.2, 0.0, 0.0]}}\nlink: {connect_timeout_s: 0.4}\n"
+        "extends: sim\nvehicle: {gear_body_m: [0.0, 0, 0.03]}\n"
+        "camera: {mount: {position_m: [0.0, 0.0, 0.03]}}\nlink: {connect_timeout_s: 0.4}\n"
     )
     words = ["fly", "-p", "p.yaml", "-u", NOWHERE, "--source", "camera:97", "--yes"]
     said = CliRunner().invoke(app, words)
     warned_of = [line for line in said.stderr.splitlines() if line.startswith("perchctl: check: ")]
-    assert any("gear place" in line for line in warned_of)
+    assert any("camera place" in line for line in warned_of)
     assert said.exit_code in (10, 20)
 
 
@@ -186,9 +168,7 @@ def test_every_row_is_on_its_page() -> None:
         *VEHICLE,
         *CAPTURE,
         COMPARED,
-        GONE,
         *camera.PICTURES,
-        *camera.DESIGN,
         *camera.SIGHT,
         "capture",
         "body",

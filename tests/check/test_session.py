@@ -13,12 +13,12 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import CheckScope, Row, Verdict, camera, check, session, vehicle
+from perchctl.check import CheckScope, Verdict, camera, check, session
 from perchctl.commands.check import exit_code
 from perchctl.errors import UsageError, broken_motion_capture
-from perchctl.link import ScanResult, address_of, find_vehicles
+from perchctl.link import ScanResult, find_vehicles
 from perchctl.profile import PositioningConfig, Profile
-from perchctl.sim import Scenario, SimProcess
+from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options, wait_for
 from tests.helpers.flights import short_profile
 from tests.helpers.relay import Relay
@@ -46,62 +46,17 @@ def test_a_library_that_does_not_load_ends_the_check_as_it_ends_a_flight() -> No
 # --- What goes out ----------------------------------------------------------------------
 
 
-def test_nothing_arms_flies_or_turns_without_a_yes(sim: SimProcess, relay: Relay) -> None:
+def test_nothing_arms_flies_or_turns(sim: SimProcess, relay: Relay) -> None:
     """The whole check, from the first packet to the last, through the wire."""
-    asked: list[str] = []
-
-    def no() -> bool:
-        asked.append("?")
-        return False
-
     wait_for(sim, 1.5)
-    rows = list(check(options(relay.uri, sim.stream_url), CheckScope(no, lift=True, **QUICK)))
+    rows = list(check(options(relay.uri, sim.stream_url), CheckScope(lift=True, **QUICK)))
     by_name = {row.name: row for row in rows}
     assert by_name["address"].verdict is Verdict.PASS
     assert [row.name for row in rows][: len(VEHICLE)] == VEHICLE
-    assert {
-        *camera.PICTURES,
-        *camera.DESIGN,
-        "camera",
-        "size",
-        "loop",
-        "disk",
-        "log folder",
-        "markers",
-    } <= set(by_name)
-    assert asked == ["?"]
-    assert by_name["propellers"].found == "not confirmed"
+    others = {*camera.PICTURES, "camera", "size", "loop", "disk", "log folder", "stand-off"}
+    assert others <= set(by_name)
     assert len(relay.up) > 100
     assert relay.commands() == []
-    assert relay.writes() == []
-
-
-def test_a_yes_starts_the_motor_test_and_nothing_else(sim: SimProcess, relay: Relay) -> None:
-    wait_for(sim, 1.5)
-    rows = {row.name: row for row in check(options(relay.uri), CheckScope(lambda: True, **QUICK))}
-    begun = [packet.data[2:] for packet in relay.writes()]
-    assert begun == [b"\1"]  # no result within 0.2 s: it may still run, and no other beside it
-    assert rows["propellers"].verdict is Verdict.WARN
-    assert "not begun" in rows["battery sag"].found
-    assert "keep clear" in rows["propellers"].advice
-    assert relay.commands() == []
-    assert rows["camera"].verdict is Verdict.FAIL
-    sim.replace_vehicle(Scenario())  # the test goes on in this one, which is deaf meanwhile
-
-
-def test_a_flying_vehicle_s_motors_are_not_even_asked_for(sim: SimProcess, relay: Relay) -> None:
-    asked: list[str] = []
-    wait_for(sim, 1.5)
-    sim.set_pose((0.0, 0.0, 0.5), hold=True)
-    try:
-        wait_for(sim, 0.3)
-        wanted = CheckScope(lambda: bool(asked.append("?")) or True, **QUICK)
-        rows = {row.name: row for row in check(options(relay.uri), wanted)}
-    finally:
-        sim.set_pose((0.0, 0.0, 0.012))
-        sim.let_go()
-    assert asked == []
-    assert "not begun: the state estimate places" in rows["propellers"].found
     assert relay.writes() == []
 
 
@@ -132,7 +87,6 @@ def test_pictures_of_another_size_fail_their_row(
     simulated = options("sim://", f"images:{tmp_path}")
     rows = {row.name: row for row in check(simulated, CheckScope(**QUICK))}
     assert rows["size"].verdict is Verdict.FAIL
-    assert rows["propellers"].advice == "add --prop-test"  # and nobody was asked
     assert rows["lifted"].advice.startswith("add --lift")
     assert rows["loop"].verdict is rows["target"].verdict is Verdict.SKIPPED
 
@@ -150,23 +104,6 @@ def test_a_link_that_is_lost_on_the_way_is_told() -> None:
     assert rows["packets"].verdict is Verdict.FAIL
     assert "the link was lost" in rows["packets"].found
     assert rows["decks"].verdict is rows["battery"].verdict is Verdict.SKIPPED
-
-
-@pytest.mark.long
-def test_ctrl_c_in_the_motor_test_says_that_it_goes_on(
-    sim: SimProcess, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    said: list[str] = []
-
-    def interrupted(*_: object) -> list[Row]:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(vehicle, "motor_rows", interrupted)
-    wait_for(sim, 1.5)
-    rows = check(options(sim.uri), CheckScope(lambda: True, **QUICK, tell=said.append))
-    with pytest.raises(KeyboardInterrupt):
-        list(rows)
-    assert "keep clear" in said[-1]
 
 
 class Answerer:
@@ -198,7 +135,7 @@ def test_a_scan_names_what_answers() -> None:
     """cflib leaves the sockets of its scan open."""
     answerer = Answerer()
     try:
-        found = find_vehicles([None, 0xE7E7E7E701])
+        found = find_vehicles("radio://0/80/2M/E7E7E7E701")
         rows = {row.found: row for row in session.scan_rows(None)}
     finally:
         answerer.socket.close()
@@ -209,14 +146,3 @@ def test_a_scan_names_what_answers() -> None:
         assert radio.verdict is Verdict.SKIPPED
         assert "Crazyradio" in radio.found
         assert "udev" in radio.advice
-
-
-@pytest.mark.parametrize(("uri", "address"), [
-    ("radio://0/80/2M/E7E7E7E701", 0xE7E7E7E701),
-    ("radio://0/80/2M/E7E7E7E7E7", None),
-    ("radio://0/80/2M/0000000001?rate_limit=100", 0x01),
-    ("radio://0", None),
-    ("usb://0", None),
-])  # fmt: skip
-def test_a_radio_s_own_address_is_scanned_too(uri: str, address: int | None) -> None:
-    assert address_of(uri) == address

@@ -14,9 +14,7 @@ from perchctl.check.rehearsal import Blur, Looked, Rehearsal, telemetry_for
 from perchctl.check.row import ask_all
 from perchctl.check.vehicle import BY_FLY, VEHICLE, Vehicle
 from perchctl.profile import Profile, load_profile
-from perchctl.target import Optics, make_design
-from perchctl.target.design import GearRanges, Ranges
-from perchctl.vehicle import Telemetry
+from perchctl.vehicle import MeasuredBy, Telemetry
 from perchctl.vision import CameraModel, Detection, Detections, Frame
 from tests.helpers.checks import AT_REST, PROFILE
 from tests.helpers.flights import short_profile
@@ -26,7 +24,6 @@ TARGET = short_profile({"positioning": "target"}, base="sim")
 CAMERA = CameraModel(
     (640, 480), np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]]), np.zeros(5)
 )
-RANGES = Ranges(3.4, 0.5, 0.16, 0.12, 0.03, 16.6, 17.0, 380.0)
 NOTHING = Detections(frame_index=1, t_s=0.0)
 PICTURE = Frame(1, 0.0, np.zeros((480, 640), np.uint8), 0.0)
 
@@ -46,11 +43,8 @@ def rehearsed(x: float = 0.1, y: float = 0.0, z: float = 2.0, **changes: Any) ->
     return replace(made, **changes)
 
 
-def rows_of(done: Rehearsal, profile: Profile = TARGET, **ranges: Any) -> dict[str, Row]:
-    given = replace(RANGES, **ranges)
-    design = make_design(profile.target, CAMERA, Optics(), profile, ranges=given)
-    assert isinstance(design.gear, GearRanges)
-    found = picture_rows(done, design, profile, CAMERA)
+def rows_of(done: Rehearsal, profile: Profile = TARGET) -> dict[str, Row]:
+    found = picture_rows(done, profile, CAMERA)
     return {row.name: row for row in found if row.name in SIGHT}
 
 
@@ -58,7 +52,6 @@ def test_under_the_target_both_rows_pass_and_say_from_how_far() -> None:
     rows = rows_of(rehearsed())
     assert list(rows) == list(SIGHT)
     assert {row.verdict for row in rows.values()} == {Verdict.PASS}
-    assert "at most 3.0 m above the camera" in rows["sight range"].found
     assert "0.07 m aside of the camera's axis 2.00 m above it" in rows["in view"].found
 
 
@@ -69,8 +62,6 @@ def test_under_the_target_both_rows_pass_and_say_from_how_far() -> None:
     ("in view", "warn", "not at the end", rehearsed(target=None)),
     ("in view", "warn", "only 1 % of the picture's width", rehearsed(looked=[shown(5.0)])),
     ("in view", "skipped", "no picture came", rehearsed(pictures=0)),
-    ("sight range", "warn", "it is 3.4 m above it", rehearsed(z=3.4)),
-    ("sight range", "skipped", "no picture came", rehearsed(pictures=0)),
 ])  # fmt: skip
 def test_a_sight_makes_its_row(name: str, verdict: str, words: str, done: Rehearsal) -> None:
     row = rows_of(done)[name]
@@ -82,22 +73,13 @@ def test_where_to_put_it_is_told() -> None:
     absent = rows_of(rehearsed(found=0, target=None))["in view"]
     assert "at most 3.2 m above the camera" in absent.advice
     assert "forward" in rows_of(rehearsed(1.3))["in view"].advice
-    assert "make-target suggest" in rows_of(rehearsed(z=3.4))["sight range"].advice
-
-
-def test_a_range_by_a_guessed_blur_is_no_pass() -> None:
-    row = rows_of(rehearsed(blur=None))["sight range"]
-    assert row.verdict is Verdict.SKIPPED
-    assert "at most 3.2 m" in row.found
-    blind = rows_of(rehearsed(), large_px=None, z1_m=None)["sight range"]
-    assert blind.verdict is Verdict.FAIL
 
 
 def test_what_measures_otherwise_has_no_such_rows() -> None:
     assert rows_of(rehearsed(), PROFILE) == {}
     assert set(names_of(TARGET)) - set(names_of(PROFILE)) == set(SIGHT)
     names = {row.name for row in profile_rows(PROFILE)}
-    assert {row.name for row in profile_rows(TARGET)} - names == {"latency", "marker size"}
+    assert {row.name for row in profile_rows(TARGET)} - names == {"latency"}
 
 
 def test_a_latency_that_is_written_down_is_doubted() -> None:
@@ -108,23 +90,13 @@ def test_a_latency_that_is_written_down_is_doubted() -> None:
     assert {row.verdict for row in shipped} == {Verdict.PASS}
 
 
-def test_a_simulated_ceiling_out_of_sight_is_doubted() -> None:
-    high = short_profile(
-        {"positioning": "target", "simulation.ceiling_z_m": [2.0, 3.5], "safety.max_height_m": 5.0},
-        base="sim",
-    )  # fmt: skip
-    for uri, verdict in (("sim://", Verdict.WARN), ("radio://0/80/2M", Verdict.PASS)):
-        (row,) = (row for row in profile_rows(high, uri=uri) if row.name == "marker size")
-        assert row.verdict is verdict, row
-
-
 def test_decks_and_an_estimate_are_not_asked_for() -> None:
     """Its estimate runs away while nothing is sent, and says nothing against it."""
     away = replace(AT_REST, position_m=(3.0, -2.0, 9.0), position_variance_m2=50.0)
-    vehicle = Vehicle("radio://0/80/2M", telemetry=away, external=False)
+    vehicle = Vehicle("radio://0/80/2M", telemetry=away, measured_by=MeasuredBy((), False))
     rows = {row.name: row for row in ask_all(VEHICLE, vehicle, TARGET)}
     assert rows["decks"].verdict is Verdict.PASS
-    assert rows["positioning"].found == "by the target, see sight range and in view"
+    assert rows["positioning"].found == "by the target, see in view"
     assert rows["estimator"].verdict is rows["ground"].verdict is Verdict.SKIPPED
     assert rows["estimator"].found == BY_FLY
 

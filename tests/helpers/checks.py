@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 from typing import Any
 
-from perchctl.check.vehicle import LIFTED, MOTORS
+from perchctl.check.vehicle import LIFTED
 from perchctl.check.vehicle import VEHICLE as ANSWERING
 from perchctl.flight import FlyOptions
 from perchctl.link import ScanResult
@@ -19,10 +19,10 @@ PROFILE = load_profile("sim")
 NOWHERE = "udp://127.0.0.1:9"
 NO_CAMERA = "camera:97"
 QUICK: dict[str, Any] = {
-    "listen_s": 0.1, "rehearse_s": 0.2, "lift_s": 0.2, "health_s": 0.2,
+    "listen_s": 0.1, "rehearse_s": 0.2, "lift_s": 0.2,
     "other_vehicles": lambda uri: ScanResult((), "no Crazyradio is plugged in"),
 }  # fmt: skip
-VEHICLE = ["address", *ANSWERING, LIFTED, *MOTORS]
+VEHICLE = ["address", *ANSWERING, LIFTED]
 AT_REST = telemetry(
     1.0, 0.0, thrust=0.0, supervisor=READY, battery_v=4.1, position_variance_m2=1e-4
 )

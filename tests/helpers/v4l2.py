@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 
 from perchctl.camera.v4l2 import Call
@@ -17,54 +18,10 @@ U32, S32 = c.c_uint32, c.c_int32
 INACTIVE, READ_ONLY, DISABLED = 0x10, 0x04, 0x01
 
 
-def fourcc(text: str) -> int:
-    return int.from_bytes(text.ljust(4).encode(), "little")
-
-
 class Capability(c.Structure):
     _fields_ = (
         ("driver", c.c_char * 16), ("card", c.c_char * 32), ("bus_info", c.c_char * 32),
         ("version", U32), ("capabilities", U32), ("device_caps", U32), ("reserved", U32 * 3),
-    )  # fmt: skip
-
-
-class FormatDescription(c.Structure):
-    _fields_ = (
-        ("index", U32), ("type", U32), ("flags", U32), ("description", c.c_char * 32),
-        ("pixelformat", U32), ("mbus_code", U32), ("reserved", U32 * 3),
-    )  # fmt: skip
-
-
-class FrameSize(c.Structure):
-    _fields_ = (
-        ("index", U32), ("pixel_format", U32), ("type", U32), ("width", U32), ("height", U32),
-        ("rest", U32 * 4), ("reserved", U32 * 2),
-    )  # fmt: skip
-
-
-class FrameInterval(c.Structure):
-    _fields_ = (
-        ("index", U32), ("pixel_format", U32), ("width", U32), ("height", U32), ("type", U32),
-        ("numerator", U32), ("denominator", U32), ("rest", U32 * 4), ("reserved", U32 * 2),
-    )  # fmt: skip
-
-
-class Pixels(c.Structure):
-    _fields_ = (("width", U32), ("height", U32), ("pixelformat", U32), ("field", U32))
-
-
-class _Body(c.Union):
-    _fields_ = (("pix", Pixels), ("raw", c.c_uint8 * 200), ("align", c.c_void_p))
-
-
-class Format(c.Structure):
-    _fields_ = (("type", U32), ("fmt", _Body))
-
-
-class Parameters(c.Structure):
-    _fields_ = (
-        ("type", U32), ("capability", U32), ("capturemode", U32), ("numerator", U32),
-        ("denominator", U32), ("rest", c.c_uint8 * 184),
     )  # fmt: skip
 
 
@@ -121,17 +78,11 @@ class FakeDevice:
     """
 
     name: str = "USB Video"
-    formats: dict[str, dict[tuple[int, int], tuple[int, ...]]] = field(
-        default_factory=lambda: {
-            "MJPG": {(640, 480): (30, 25), (720, 576): (25,)},
-            "YUYV": {(640, 480): (15,)},
-        }
-    )
     controls: list[FakeControl] = field(default_factory=exposure_controls)
     pictures_node: bool = True
     format: str = "YUYV"
     size: tuple[int, int] = (640, 480)
-    rate: tuple[int, int] = (1, 30)
+    rate_hz: float = 30.0
     resets: dict[str, int] = field(default_factory=dict)
     stubborn: tuple[str, ...] = ()
     log: list[str] = field(default_factory=list)
@@ -149,11 +100,9 @@ class FakeDevice:
 
     def call(self, request: int, data: bytearray) -> None:
         kind = {
-            0: (Capability, self._capability), 2: (FormatDescription, self._format_at),
-            4: (Format, self._format), 21: (Parameters, self._parameters),
-            27: (ControlValue, self._get), 28: (ControlValue, self._set),
-            36: (QueryControl, self._query), 37: (QueryMenu, self._menu),
-            74: (FrameSize, self._size_at), 75: (FrameInterval, self._interval_at),
+            0: (Capability, self._capability), 27: (ControlValue, self._get),
+            28: (ControlValue, self._set), 36: (QueryControl, self._query),
+            37: (QueryMenu, self._menu),
         }  # fmt: skip
         structure, answer = kind[request & 0xFF]
         assert (request >> 16) & 0x3FFF == c.sizeof(structure) == len(data), structure
@@ -164,27 +113,6 @@ class FakeDevice:
     def _capability(self, out: Any) -> None:
         out.card = self.name.encode()
         out.capabilities, out.device_caps = 0x84A00001, 0x04200001 if self.pictures_node else 0
-
-    def _format_at(self, out: Any) -> None:
-        out.pixelformat = fourcc(_at(list(self.formats), out.index))
-
-    def _size_at(self, out: Any) -> None:
-        sizes = next(v for k, v in self.formats.items() if fourcc(k) == out.pixel_format)
-        (out.width, out.height), out.type = _at(list(sizes), out.index), 1
-
-    def _interval_at(self, out: Any) -> None:
-        sizes = next(v for k, v in self.formats.items() if fourcc(k) == out.pixel_format)
-        out.denominator = _at(list(sizes[out.width, out.height]), out.index)
-        out.numerator = out.type = 1
-
-    def _format(self, out: Any) -> None:
-        assert out.type == 1
-        pix = out.fmt.pix
-        (pix.width, pix.height), pix.pixelformat = self.size, fourcc(self.format)
-
-    def _parameters(self, out: Any) -> None:
-        assert out.type == 1
-        out.numerator, out.denominator = self.rate
 
     def _query(self, out: Any) -> None:
         after = out.id & ~0x80000000
@@ -212,6 +140,10 @@ class FakeDevice:
             self.control("Exposure Time, Absolute").flags = INACTIVE if out.value == 3 else 0
 
     # --- the capture
+
+    def get(self, prop: int) -> float:
+        code = int.from_bytes(self.format.ljust(4).encode(), "little") if self.format else 0
+        return {cv2.CAP_PROP_FOURCC: float(code), cv2.CAP_PROP_FPS: self.rate_hz}[prop]
 
     def read(self) -> tuple[bool, Any]:
         self.log.append("read")

@@ -10,8 +10,9 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 import pytest
 
-from perchctl.link import EXTERNAL_POSITION_TICK, MockLink, Packet, Radio
+from perchctl.link import MockLink, Packet, Radio
 from perchctl.link.crtp import UNLOCK_TIMES
+from perchctl.link.firmware import EXTERNAL_POSITION_TICK
 from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.vehicle import ExternalPosition, RawThrust
 

@@ -260,7 +260,7 @@ def test_an_error_of_the_library_is_reported_and_the_order_offered_again(
     until(lambda: library.offered > 1)
     assert "no radio" in str(sender.problem)
     library.now_s += HANGS_S + 0.01
-    until(lambda: blamed[-1])
+    until(lambda: blamed and blamed[-1])
     library.error = None
     assert sender.drain(LIMIT_S)
     assert library.taken == [LAND]

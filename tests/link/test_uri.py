@@ -64,7 +64,7 @@ def test_a_scan_gives_uris_that_are_taken(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("cflib.crtp.CLASSES", [Radio])
     monkeypatch.setattr(scan_room, "ready_cflib", lambda: None)
     monkeypatch.setattr(scan_room, "_radio_problem", lambda: "")
-    found = scan_room.find_vehicles([0x01]).uris
+    found = scan_room.find_vehicles("radio://0/80/2M/0000000001?rate_limit=100").uris
     assert found == ("radio://0/80/2M", "radio://0/80/2M/0000000001")
     assert list(map(check_uri, found)) == ["radio", "radio"]
 

@@ -301,18 +301,11 @@ class Parent:
         self.said.append(message)
 
 
-@pytest.mark.parametrize(("host", "raised", "words"), [
-    ("lab", socket.gaierror(-2, "Name or service not known"),
-     "the host name 'lab' cannot be resolved (Name or service not known): correct"),
-    ("a..b", UnicodeError("label empty or too long"), "'a..b' cannot be resolved (it is no host"),
-])  # fmt: skip
-def test_a_host_that_cannot_be_resolved_is_named(
-    host: str, raised: Exception, words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_host_that_cannot_be_resolved_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     def resolve(name: str) -> str:
-        raise raised
+        raise socket.gaierror(-2, "Name or service not known")
 
-    parent = Parent(capture.CaptureSetup("optitrack", {"hostname": host}))
+    parent = Parent(capture.CaptureSetup("optitrack", {"hostname": "lab"}))
     monkeypatch.setattr(capture, "connect_back", lambda: parent)
     monkeypatch.setattr(capture, "_loaded", lambda: None)
     monkeypatch.setattr(capture.signal, "signal", lambda *_: None)
@@ -320,7 +313,7 @@ def test_a_host_that_cannot_be_resolved_is_named(
     capture.serve_parent()
     (said,) = parent.said
     assert isinstance(said, capture.Failed)
-    assert words in said.text
+    assert "Name or service not known" in said.text
 
 
 def test_a_parent_that_is_gone_is_left_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,15 +19,7 @@ from perchctl.commands import app
 from perchctl.errors import SafetyAbort
 from perchctl.flight import session
 from perchctl.positioning import compared
-from perchctl.positioning.compared import (
-    NEVER,
-    Comparison,
-    ComparisonRecord,
-    NoComparison,
-    decoded,
-    encoded,
-    unreadable,
-)
+from perchctl.positioning.compared import NEVER, Comparison, ComparisonRecord, NoComparison
 from perchctl.profile import PositioningConfig
 from tests.helpers.capture import compared as was_compared
 
@@ -37,6 +29,7 @@ URI, OTHER_URI = "udp://127.0.0.1:1", "udp://127.0.0.1:2"
 VEHICLE, OTHER = "udp/127.0.0.1:1", "udp/127.0.0.1:2"
 SWAPPED = "swapped axes: up is y in the motion capture"
 DAY_S = 24 * 3600.0
+YEAR_1 = "0001-01-01T00:00:00+05:00"  # which no other time zone can tell
 OTHERS: list[dict[str, Any]] = [
     {"system": "vrpn"}, {"host": "lab2"}, {"body": "cf3"}, {"body_rpy_deg": (0.0, 0.0, 90.0)},
     {"body_position_m": (0.0, 0.0, 0.02)},
@@ -75,7 +68,6 @@ def test_only_a_pass_of_the_last_day_is_flown_by(seconds: float, passes: bool) -
     (ago(400 * DAY_S), "last compared 400 days ago, on 18 Oct 2025 15:00"),
     (ago(-7200.0), "compared on 22 Nov 17:00, which is yet to come: set this computer's clock"),
     (ago(3000.0, False, SWAPPED), f"{SWAPPED} (found by check --lift on 22 Nov 14:10): mend"),
-    (unreadable(Path("x.json"), "is damaged"), "is not known: x.json is damaged: remove"),
 ])  # fmt: skip
 def test_each_objection_says_what_is_and_what_to_do(record: ComparisonRecord, words: str) -> None:
     said = record.objection(NOW)
@@ -89,15 +81,15 @@ def test_each_objection_says_what_is_and_what_to_do(record: ComparisonRecord, wo
 
 @given(st.text(), st.booleans(), st.datetimes(datetime(2001, 1, 1), datetime(2900, 1, 1)))
 def test_what_is_written_is_read(found: str, passes: bool, at: datetime) -> None:
-    set_up = compared.set_up_of(CONFIG, VEHICLE)
     record = Comparison(at.replace(tzinfo=UTC), passes, found)
-    back = decoded(encoded(set_up, record), set_up)
+    assert compared.save_comparison(CONFIG, VEHICLE, record) is None
+    back = compared.load_comparison(CONFIG, VEHICLE)
+    assert isinstance(back, Comparison)
     assert (back.at, back.passed) == (record.at, passes)
     assert back.found.isprintable()
     assert len(back.found) <= compared.MOST_FOUND
 
 
-@pytest.mark.long
 @given(st.one_of(st.binary(), st.recursive(
     st.none() | st.booleans() | st.floats() | st.text(),
     lambda inner: st.lists(inner) | st.dictionaries(
@@ -105,8 +97,9 @@ def test_what_is_written_is_read(found: str, passes: bool, at: datetime) -> None
     ),
 ).map(lambda value: json.dumps(value).encode())))  # fmt: skip
 def test_what_is_no_record_is_told_as_such(data: bytes) -> None:
-    with pytest.raises(ValueError, match=r"is damaged|is of another set-up"):
-        decoded(data, compared.set_up_of(CONFIG, VEHICLE))
+    was_compared(CONFIG, URI)
+    compared.path_of(CONFIG, VEHICLE).write_bytes(data)
+    assert is_unreadable(compared.load_comparison(CONFIG, VEHICLE))
 
 
 @pytest.mark.parametrize("change", OTHERS)
@@ -115,35 +108,27 @@ def test_another_set_up_was_never_compared(change: dict[str, Any], folder: Path)
     other = CONFIG.model_copy(update=change)
     assert compared.load_comparison(other, VEHICLE) == NEVER
     # Nor by a file that was copied to its place.
-    (mine, theirs) = (compared.path_of(compared.set_up_of(c, VEHICLE)) for c in (CONFIG, other))
+    mine, theirs = (compared.path_of(c, VEHICLE) for c in (CONFIG, other))
     theirs.write_bytes(mine.read_bytes())
     assert is_unreadable(compared.load_comparison(other, VEHICLE))
 
 
-def test_another_vehicle_s_record_lets_none_fly_and_is_named() -> None:
+def test_another_vehicle_s_record_lets_none_fly() -> None:
     """Two vehicles with the same body's name by turns."""
     was_compared(CONFIG, OTHER_URI)
-    with pytest.raises(SafetyAbort) as refused:
+    with pytest.raises(SafetyAbort, match="never compared with this vehicle"):
         session.require_comparison(CONFIG, URI, simulated=False)
-    said = str(refused.value)
-    assert f"compared with another vehicle ({OTHER}), and never with this one ({VEHICLE})" in said
-    assert "run perchctl check --lift" in said
     session.require_comparison(CONFIG, OTHER_URI, simulated=False)
-    # Nor by a file that was copied to its place; what is damaged beside it is no vehicle.
-    (mine, theirs) = (compared.path_of(compared.set_up_of(CONFIG, v)) for v in (VEHICLE, OTHER))
+    # Nor by a file that was copied to its place.
+    mine, theirs = (compared.path_of(CONFIG, v) for v in (VEHICLE, OTHER))
     mine.write_bytes(theirs.read_bytes())
     assert is_unreadable(compared.load_comparison(CONFIG, VEHICLE))
-    mine.unlink()
-    theirs.write_bytes(b"{")
-    assert compared.load_comparison(CONFIG, VEHICLE) == NEVER
-    was_compared(CONFIG.model_copy(update={"host": "lab2"}), OTHER_URI)
-    assert compared.load_comparison(CONFIG, VEHICLE) == NEVER
 
 
 def test_a_vehicle_found_by_another_dongle_is_the_same() -> None:
     was_compared(CONFIG, "radio://0/80/2M/E7E7E7E701")
     session.require_comparison(CONFIG, "radio://1/80/2M/e7e7e7e701", simulated=False)
-    with pytest.raises(SafetyAbort, match="another vehicle"):
+    with pytest.raises(SafetyAbort, match="never compared"):
         session.require_comparison(CONFIG, "radio://0/80/2M/E7E7E7E702", simulated=False)
 
 
@@ -154,20 +139,21 @@ def test_what_says_nothing_of_the_axes_is_no_other_set_up() -> None:
 
 
 def spoil(how: str) -> None:
-    path = compared.path_of(compared.set_up_of(CONFIG, VEHICLE))
+    path = compared.path_of(CONFIG, VEHICLE)
     if how == "folder":
         path.unlink()
         path.mkdir()
     else:
         text = {
-            "empty": "", "cut": path.read_text()[:40], "huge": " " * 10**6,
+            "empty": "", "cut": path.read_text()[:40],
             "no zone": path.read_text().replace("+00:00", ""),
-            "deep": "[" * 50_000, "of old": path.read_text().replace("202", "102"),
+            "deep": "[" * 50_000,
+            "year 1": json.dumps(json.loads(path.read_text()) | {"at": YEAR_1}),
         }[how]  # fmt: skip
         path.write_text(text, encoding="utf-8")
 
 
-@pytest.mark.parametrize("how", ["empty", "cut", "huge", "no zone", "deep", "folder", "of old"])
+@pytest.mark.parametrize("how", ["empty", "cut", "no zone", "deep", "year 1", "folder"])
 def test_a_damaged_record_refuses_in_one_sentence(how: str) -> None:
     was_compared(CONFIG, URI)
     session.require_comparison(CONFIG, URI, simulated=False)

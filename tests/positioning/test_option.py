@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from pydantic import ValidationError
@@ -18,7 +15,6 @@ from perchctl.commands.positioning import positioned
 from perchctl.errors import InvalidValue
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.profile.positioning import MOST_LATENCY_S
-from perchctl.startup import failure_record
 from perchctl.weights import open_named
 
 REAL = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x", "--yes")
@@ -112,25 +108,6 @@ def test_a_host_that_is_none_is_refused_in_the_profile(tmp_path: Path, host: str
     pytest.importorskip("motioncapture")
     with pytest.raises(InvalidValue, match="NAME:PORT"):
         open_named(f"vrpn:{host}", "cf")
-
-
-def test_a_flight_that_is_refused_on_the_ground_is_one_of_the_benchmark_s(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """It has no log."""
-    path = Path(__file__).parents[2] / "benchmarks" / "mocap.py"
-    spec = importlib.util.spec_from_file_location("benchmark_mocap", path)
-    assert spec is not None
-    assert spec.loader is not None
-    bench = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, spec.name, bench)
-    spec.loader.exec_module(bench)
-    said = failure_record("no frame came", 10)
-    monkeypatch.setattr(
-        bench.subprocess, "run", lambda *words, **options: SimpleNamespace(stdout=said, stderr="")
-    )
-    flown = bench.fly("sim", 0, tmp_path)
-    assert (flown.outcome, flown.reason) == ("refused", "no frame came")
 
 
 def test_the_library_that_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
