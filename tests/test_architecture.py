@@ -104,7 +104,7 @@ MOST_NAMES = {
     "target": 29,
     "track": 15,
     "vision": 50,
-    "weights": 15,
+    "weights": 9,
 }
 
 

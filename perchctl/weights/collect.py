@@ -162,27 +162,21 @@ class SessionFile:
             raise cannot_be_written(self.path, error) from None
 
     def _continue(self, frames: int) -> None:
-        try:
-            text = self.path.read_bytes()
-        except OSError as error:
-            raise InvalidValue(f"{self.path}: cannot be read: {error.strerror}") from None
-        *lines, torn = text.split(b"\n")
+        *lines, torn = self.path.read_bytes().split(b"\n")
         if not lines or lines[0].strip() != HEADER.encode():
             raise InvalidValue(
                 f"{self.path}: line 1: not a session of perchctl (its header differs), so "
                 f"nothing is appended; name a new file"
             )
-        positions = []
-        for number, line in enumerate(lines[1:], start=2):
-            cell = line.partition(b",")[0]
-            if not cell.isdigit():
-                raise InvalidValue(f"{self.path}: line {number}: position: not a whole number")
-            positions.append(int(cell))
+        try:
+            positions = [int(line.partition(b",")[0]) for line in lines[1:]]
+        except ValueError:
+            raise InvalidValue(f"{self.path}: a row's position is not a whole number") from None
         counts = Counter(positions)
-        if torn and positions and counts[positions[-1]] < frames:
-            # The position that was being written: its tail is lost, so all of it is taken again.
-            del lines[-counts.pop(positions[-1]) :]
         if torn:
+            # The position that was being written: its tail is lost, so all of it is taken again.
+            if positions and counts[positions[-1]] < frames:
+                del lines[-counts.pop(positions[-1]) :]
             os.truncate(self.path, sum(len(line) + 1 for line in lines))
             self.note = f"{self.path}: an unfinished end was taken off"
         self.done = list(counts)
