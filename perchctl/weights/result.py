@@ -15,7 +15,7 @@ import yaml
 
 from perchctl.files import write_files
 from perchctl.geometry import Array
-from perchctl.weights.data import AXES, UNITS, YAW, read_data, wrap
+from perchctl.weights.data import AXES, YAW, read_data, wrap
 from perchctl.weights.fit import (
     FITTED,
     LABELS,
@@ -31,6 +31,7 @@ from perchctl.weights.fit import (
     odd_positions,
 )
 
+FORMAT = "perchctl-merge-weights"
 _HEAD = """\
 # Merge weights of the large marker (the small one's are 1 - w), fitted by perchctl
 # fit-weights. Named by a profile: merge: {method: weights, weights_file: THIS_FILE}
@@ -126,8 +127,9 @@ def fit_weights(
 
 
 def _by_axis(values: Iterable[float]) -> dict[str, float | None]:
+    """To six figures, as a person may read them."""
     return {
-        axis: float(value) if math.isfinite(value) else None
+        axis: float(f"{value:.6g}") if math.isfinite(value) else None
         for axis, value in zip(AXES, values, strict=True)
     }
 
@@ -143,24 +145,19 @@ def weights_record(result: Result) -> dict[str, Any]:
         "better_single": dict(zip(AXES, result.better, strict=True)),
         "half_width": {name: _by_axis(fit.half) for name, fit in result.fits.items()},
         "errors": _errors_record(result.evidence),
+        "bias": {name: _by_axis(mean) for name, (mean, _) in result.errors.biases.items()},
+        "outliers": dict(zip(AXES, (~result.errors.use).sum(axis=0).tolist(), strict=True)),
+        "data": {
+            "file": result.errors.name,
+            "sha256": result.sha256,
+            "rows": len(result.errors),
+            "positions": len(result.errors.positions),
+        },
+        "notes": result.notes,
     }
     if result.other is not None:
         record["test"] = {"file": result.other_name, "errors": _errors_record(result.other)}
-    return record | {
-        "bias": {name: _by_axis(mean) for name, (mean, _) in result.errors.biases.items()},
-        "outliers": dict(zip(AXES, (~result.errors.use).sum(axis=0).tolist(), strict=True)),
-        "data": _data_record(result),
-        "notes": result.notes,
-    }
-
-
-def _data_record(result: Result) -> dict[str, Any]:
-    return {
-        "file": result.errors.name,
-        "sha256": result.sha256,
-        "rows": len(result.errors),
-        "positions": len(result.errors.positions),
-    }
+    return record
 
 
 def _errors_record(found: Evidence) -> dict[str, Any]:
@@ -178,35 +175,12 @@ def _errors_record(found: Evidence) -> dict[str, Any]:
 
 
 def write_weights(path: Path, result: Result, date: str, *, anyway: bool) -> None:
-    """Write the weights file: those that are recommended, or, `anyway`, all that were fitted.
-    Errors in it are in m and rad, on positions not fitted to. Errors: InvalidValue when it cannot
-    be written; the old one then stays."""
-
-    def rounded(weights: Array) -> dict[str, float]:
-        return {axis: round(float(w), 6) for axis, w in zip(AXES, weights, strict=True)}
-
-    fitted = rounded(result.fits[result.chosen].weights)
-    content = {
-        "format": "perchctl-merge-weights",
-        "date": date,
-        "method": result.chosen,
-        "weights": dict(fitted) if anyway else rounded(result.recommended),
-        "axes": {
-            axis: "merged" if anyway or proven else f"{name} alone"
-            for axis, proven, name in zip(AXES, result.proven, result.better, strict=True)
-        },
-        "fitted": fitted,
-        "data": _data_record(result),
-        "errors": {
-            name: {
-                f"{axis}_{unit}": float(f"{value:.6g}")
-                for axis, unit, value in zip(AXES, UNITS, result.evidence.rms(name)[0], strict=True)
-            }
-            for name in result.evidence.squares
-        },
-    }
-    text = _HEAD + yaml.safe_dump(content, sort_keys=False)
-    write_files({path: text.encode("utf-8")})
+    """Write the weights file: those that are recommended, or, `anyway`, all that were fitted; and
+    the record of the fit behind them. Errors: InvalidValue when it cannot be written; the old one
+    then stays."""
+    flown = result.fits[result.chosen].weights if anyway else result.recommended
+    content = {"format": FORMAT, "date": date, "weights": _by_axis(flown)} | weights_record(result)
+    write_files({path: (_HEAD + yaml.safe_dump(content, sort_keys=False)).encode("utf-8")})
 
 
 # --- The report, for a terminal of 80 columns: the verdict first, notes last -------------------
