@@ -21,7 +21,6 @@ WRITING = [
     ["calibrate", "mask", "images:.", "-o", "OUT.png"],
     ["make-target", "-o", "OUT.pdf"],
     ["make-target", "board", "chessboard:9x6:20mm", "-o", "OUT.pdf"],
-    ["make-target", "design", "example_640x480.yaml", "--plot", "OUT.png"],
     ["make-target", "measured", "--measured-large", "150", "-o", "OUT.yaml"],
     ["track", "images:.", "--csv", "OUT.csv"],
     ["track", "images:.", "--overlay", "OUT.mp4"],
