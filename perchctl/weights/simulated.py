@@ -17,7 +17,7 @@ from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, w
 from perchctl.profile import Profile
 from perchctl.sim import Renderer, Scenario
 from perchctl.vision import CameraModel, Frame, project, rotation_vector, square_corners
-from perchctl.weights.collect import MarkerReader, SessionFile, fault_of, rows_of
+from perchctl.weights.collect import SessionFile, fault_of, read_markers, rows_of
 
 NOISE_SIGMA, BLUR_PX = 4.0, 1.0
 MARGIN_PX = 4.0
@@ -55,9 +55,9 @@ class SimulatedStand:
         while len(session.done) < self._positions:
             position = session.next_position
             place, readings = self.place(position), []
-            reader = MarkerReader(self._profile, self._camera)
-            for frame in self.frames(position, place, frames):
-                readings.append(reader.read(frame))
+            shown = self.frames(position, place, frames)
+            for reading in read_markers(shown, self._profile, self._camera):
+                readings.append(reading)
                 advance()
             fault = fault_of(readings)
             if fault is not None:

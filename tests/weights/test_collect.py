@@ -14,7 +14,7 @@ from perchctl.errors import ConnectionFailed, NotFound
 from perchctl.positioning import BodyPose, CaptureFrame
 from perchctl.profile import PositioningConfig, find_calibration, load_profile
 from perchctl.weights import MocapTruth, SessionFile, SimulatedStand
-from perchctl.weights.collect import MarkerReader, fault_of
+from perchctl.weights.collect import fault_of, read_markers
 from perchctl.weights.data import HEADER, NEEDED, read_csv
 from perchctl.weights.truth import Actual, moved
 from tests.helpers.fit_weights import run
@@ -60,13 +60,12 @@ def test_shaken_and_half_seen_positions_are_refused() -> None:
     camera = load_calibration(find_calibration(profile.camera.calibration))
     stand = SimulatedStand(profile, camera, 2, 0)
     place = stand.place(1)
-    reader = MarkerReader(profile, camera)
-    good = [reader.read(frame) for frame in stand.frames(1, place, 6)]
+    good = list(read_markers(stand.frames(1, place, 6), profile, camera))
     assert fault_of(good) is None
     moved = place.T_world_cam.copy()
     moved[0, 3] += 0.002
     other = type(place)(moved, place.actual)
-    late = [reader.read(frame) for frame in stand.frames(1, other, 6)]
+    late = list(read_markers(stand.frames(1, other, 6), profile, camera))
     assert "shaken" in (fault_of([*good, *late]) or "")
     blind = [type(s)(s.t_s, s.large, None, None, None) for s in good]
     assert "the small marker was found in 6 of 12" in (fault_of([*good, *blind]) or "")
