@@ -86,7 +86,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # many names it has at most.
 MOST_NAMES = {
     "analysis": 15,
-    "calibration": 31,
+    "calibration": 30,
     "camera": 28,
     "campaign": 25,
     "check": 15,
@@ -104,7 +104,7 @@ MOST_NAMES = {
     "target": 29,
     "track": 15,
     "vision": 50,
-    "weights": 15,
+    "weights": 9,
 }
 
 

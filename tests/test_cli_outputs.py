@@ -21,12 +21,10 @@ WRITING = [
     ["calibrate", "mask", "images:.", "-o", "OUT.png"],
     ["make-target", "-o", "OUT.pdf"],
     ["make-target", "board", "chessboard:9x6:20mm", "-o", "OUT.pdf"],
-    ["make-target", "design", "example_640x480.yaml", "--plot", "OUT.png"],
     ["make-target", "measured", "--measured-large", "150", "-o", "OUT.yaml"],
     ["track", "images:.", "--csv", "OUT.csv"],
     ["track", "images:.", "--overlay", "OUT.mp4"],
     ["fit-weights", "session.csv", "-o", "OUT.yaml"],
-    ["fit-weights", "session.csv", "--plot", "OUT.png"],
 ]
 
 
@@ -59,7 +57,7 @@ def test_one_rule_for_what_is_there_already(
         ["make-target", "board", "chessboard:9x6:20mm", "-o", "OUT.pdf"],
         ["make-target", "measured", "--measured-large", "150", "-o", "OUT.yaml"],
         ["track", "images:pictures", "--stills", "--csv", "OUT.csv"],
-        ["fit-weights", "session.csv", "--plot", "OUT.png"],
+        ["fit-weights", "session.csv", "-o", "OUT.yaml"],
     ],
     ids=lambda words: f"{words[0]} {words[-2]}",
 )

@@ -22,7 +22,6 @@ from .mounting.carry import solve_carry as solve_carry
 from .mounting.eye import Eye as Eye
 from .mounting.eye import pose_basis as pose_basis
 from .mounting.pivot import solve_pivot as solve_pivot
-from .mounting.plot import draw_mounting as draw_mounting
 from .mounting.recording import AttitudeSample as AttitudeSample
 from .mounting.recording import MountingPart as MountingPart
 from .mounting.recording import MountingRecording as MountingRecording

@@ -65,7 +65,7 @@ from perchctl.commands.page import live_page, page_port
 from perchctl.commands.progress import search_bar
 from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files
-from perchctl.target import NOTABLE_SCALE_ERROR, Board, mm_text, parse_board, parse_length
+from perchctl.target import NOTABLE_SCALE_ERROR, Board, mm_text, parse_board
 from perchctl.vision import CameraModel
 
 FOLDER = Path("calib")
@@ -95,17 +95,13 @@ BoardOption = Annotated[
         "gap as a share of a tag), or Kalibr's .yaml of a board.",
     ),
 ]
-WidthOption = Annotated[
+MeasuredOption = Annotated[
     str | None,
     typer.Option(
-        "--measured-width",
-        help="Width of the board's black area as printed, mm.",
+        "--measured",
+        help="Width and height of the board's black area as printed, mm: 249.3x174.9.",
         rich_help_panel=DETAILS,
     ),
-]
-HeightOption = Annotated[
-    str | None,
-    typer.Option("--measured-height", help="Its height as printed, mm.", rich_help_panel=DETAILS),
 ]
 SizeOption = Annotated[
     str | None,
@@ -116,14 +112,6 @@ SizeOption = Annotated[
     ),
 ]
 NameOption = Annotated[str, typer.Option("--name", help="The camera's name.")]
-SkipBrokenOption = Annotated[
-    bool,
-    typer.Option(
-        "--skip-broken",
-        help="Leave out pictures that cannot be read.",
-        rich_help_panel=DETAILS,
-    ),
-]
 OutputOption = Annotated[
     Path | None,
     typer.Option(
@@ -154,60 +142,41 @@ def camera(
     view: ViewOption = False,
     view_port: ViewPortOption = 0,
     as_json: JsonOption = False,
-    measured_width: WidthOption = None,
-    measured_height: HeightOption = None,
+    measured: MeasuredOption = None,
     size: SizeOption = None,
     model: Annotated[
         Literal["auto", "plumb_bob", "rational_polynomial", "fisheye"],
         typer.Option(
             "--model",
-            help="Lens model; auto takes the recommended one.",
+            help="Lens model; auto takes the simplest one that follows the lens.",
             rich_help_panel=DETAILS,
         ),
     ] = "auto",
-    reject: Annotated[
-        bool,
-        typer.Option(
-            "--reject/--no-reject",
-            help="Leave out outlier views and corners.",
-            rich_help_panel=DETAILS,
-        ),
-    ] = True,
-    skip_broken: SkipBrokenOption = False,
-    keep_pictures: Annotated[
-        Path | None,
-        typer.Option(
-            "--keep-pictures",
-            help="Folder for a live camera's pictures. Default: beside the output.",
-            rich_help_panel=DETAILS,
-        ),
-    ] = None,
 ) -> int:
     """Calibrate the camera, and report what its error means in mm at the target.
 
     A view is rejected when its RMS is above 2.5 times the median view's, a corner when it is off
-    by more than 5 times its view's spread; both are named.
+    by more than 5 times its view's spread; both are named, as are pictures without a board. The
+    pictures of a live camera are kept in a folder beside the output.
     """
     pictures = _source(source, size, view)
     _check_name(name)
     if output is not None:
         _check_output(output, force)
-    if keep_pictures is not None:
-        check_place(keep_pictures / "view_001.png", force=True)
-    layout = _measured_board(board, measured_width, measured_height)
+    layout = _measured_board(board, measured)
 
     def kept_in(size_px: tuple[int, int]) -> Path:
         """The folder for a live camera's pictures; raises before a person has worked for them."""
         file = _file(output, name, size_px)
         _check_output(file, force)
-        return keep_pictures or _free_folder(file)
+        return _free_folder(file)
 
     port = page_port(view, view_port)
-    views, missing = _find_views(pictures, layout, skip_broken, kept_in, port)
+    views, missing = _find_views(pictures, layout, kept_in, port)
     file = _file(output, name, views[0].size_px)
     _check_output(file, force)
     say(f"{len(views)} views of the board" + (f", {len(missing)} without" if missing else ""))
-    result = calibrate_camera(views, layout.notation(), model, reject, missing)
+    result = calibrate_camera(views, layout.notation(), model, missing)
     write_files({file: result.text(name, _now()).encode()})
     for line in result.lines():
         say(line)
@@ -289,29 +258,17 @@ def check(
     view: ViewOption = False,
     view_port: ViewPortOption = 0,
     as_json: JsonOption = False,
-    measured_width: WidthOption = None,
-    measured_height: HeightOption = None,
+    measured: MeasuredOption = None,
     size: SizeOption = None,
-    skip_broken: SkipBrokenOption = False,
-    keep_pictures: Annotated[
-        Path | None,
-        typer.Option(
-            "--keep-pictures",
-            help="Folder for a live camera's pictures.",
-            rich_help_panel=DETAILS,
-        ),
-    ] = None,
 ) -> int:
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
     pictures = _source(source, size, view)
-    if keep_pictures is not None:
-        check_place(keep_pictures / "view_001.png", force=True)
-    layout = _measured_board(board, measured_width, measured_height)
+    layout = _measured_board(board, measured)
     model: CameraModel | None = None
     with contextlib.suppress(SizeMissing):  # then the pictures' own is taken
         model = load_calibration(calibration, cam=cam)
     port = page_port(view, view_port)
-    views, missing = _find_views(pictures, layout, skip_broken, lambda _: keep_pictures, port)
+    views, missing = _find_views(pictures, layout, lambda _: None, port)
     size_px = views[0].size_px
     model = model or load_calibration(calibration, size_px, cam)
     check_size(size_px, model, str(pictures))
@@ -478,26 +435,16 @@ def _watched(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]
 # -- the board and its views ----------------------------------------------------
 
 
-def _measured_board(notation: str, width: str | None, height: str | None) -> Board:
-    """The board with its measured sides (of the black area, mm), which are compared with those
-    that it was meant to have. Raises NotFound, InvalidValue, UsageError."""
+def _measured_board(notation: str, measured: str | None) -> Board:
+    """The board, with its black area's measured sides compared with those that it was meant to
+    have. Raises NotFound, InvalidValue."""
     board = parse_board(notation)
-    if width is None and height is None:
+    if measured is None:
         return board
-    if width is None or height is None:
-        raise UsageError(
-            "--measured-width and --measured-height go together: a lens is told from the "
-            "print's proportions, which one of them leaves open"
-        )
-    sides_m = (
-        parse_length(width, "--measured-width", bare_unit="mm"),
-        parse_length(height, "--measured-height", bare_unit="mm"),
-    )
-    board = board.measured(*sides_m)
-    for name, meant_m, is_m, scale in zip(
-        ("width", "height"), board.size_m, sides_m, board.scale, strict=True
-    ):
-        say(f"{name}: {mm_text(is_m)} mm, {100 * (scale - 1):+.2f} % against {mm_text(meant_m)} mm")
+    board = parse_board(f"{board.notation()}:measured={measured.removesuffix('mm')}mm")
+    for name, meant_m, scale in zip(("width", "height"), board.size_m, board.scale, strict=True):
+        off = f"{100 * (scale - 1):+.2f} % against {mm_text(meant_m)} mm"
+        say(f"{name}: {mm_text(scale * meant_m)} mm, {off}")
         if abs(scale - 1) > NOTABLE_SCALE_ERROR:
             say(f"{name}: more than 1 % off: was the page scaled when it was printed?")
     return board
@@ -506,7 +453,6 @@ def _measured_board(notation: str, width: str | None, height: str | None) -> Boa
 def _find_views(
     source: Source,
     board: Board,
-    skip_broken: bool,
     kept_in: Callable[[tuple[int, int]], Path | None],
     port: int | None,
 ) -> tuple[list[BoardView], list[Rejection]]:
@@ -525,14 +471,15 @@ def _find_views(
     with search_bar("searching the board") as progress:
         if source.scheme == "images":
             files = image_files(source.files or source.place)
-            views, missing = views_of_images(files, board, progress, skip_broken)
+            views, missing = views_of_images(files, board, progress)
         else:
             views, missing = views_of_video(Path(source.place), board, progress)
     if not views:
         count = f"{len(missing)} pictures" if source.scheme == "images" else missing[0].view
         raise InvalidValue(
-            f"none of {count} of {source} shows the board {board.notation()}; is it wholly in "
-            f"view, sharp, and --board its true layout?"
+            f"none of {count} of {source} shows the board {board.notation()} "
+            f"({missing[0].view}: {missing[0].reason}); is it wholly in view, sharp, and --board "
+            f"its true layout?"
         )
     return views, missing
 
@@ -573,27 +520,25 @@ def captured_views(
 
 
 class _Keeper:
-    """Writes each picture as it is taken, behind those that the folder has already."""
+    """Writes each picture as it is taken."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
         self._kept = 0
-        self._failed = False
 
     def keep(self, picture: Grey) -> None:
         """Never raises: pictures that cannot be kept are still calibrated from."""
-        if self._folder is None or self._failed:
+        if self._folder is None:
             return
-        numbers = (path.stem.removeprefix("view_") for path in self._folder.glob("view_*.png"))
-        newest = max((int(number) for number in numbers if number.isdecimal()), default=0)
         png = cv2.imencode(".png", picture)[1].tobytes()
         try:
-            write_files({self._folder / f"view_{newest + 1:03d}.png": png})
+            write_files({self._folder / f"view_{self._kept + 1:03d}.png": png})
             self._kept += 1
         except InvalidValue as error:
-            self._failed = True
+            self._folder = None
             say(f"pictures are no longer kept: {error}")
 
     def report(self) -> None:
-        if self._kept:
+        """Says where the pictures are."""
+        if self._kept and self._folder is not None:
             say(f"kept {self._kept} pictures: images:{self._folder} takes them again")

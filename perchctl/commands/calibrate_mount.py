@@ -51,7 +51,7 @@ from perchctl.commands.command_line import (
     reporting,
 )
 from perchctl.commands.guide import guide
-from perchctl.commands.interrupt import Stopper, drawn, unheeded
+from perchctl.commands.interrupt import Stopper, unheeded
 from perchctl.commands.output import print_record, say, tell
 from perchctl.commands.page import live_page, page_port
 from perchctl.commands.progress import count_bar
@@ -60,12 +60,11 @@ from perchctl.errors import (
     Interrupted,
     InvalidValue,
     NotFound,
-    PerchError,
     SafetyAbort,
     UsageError,
     no_simulator,
 )
-from perchctl.files import check_output, check_place, write_files
+from perchctl.files import check_output
 from perchctl.link import MotionLink, check_uri
 from perchctl.profile import (
     Profile,
@@ -77,11 +76,6 @@ from perchctl.profile import (
 from perchctl.vision import CameraModel
 
 FOLDER = Path("calib")
-PARTS: dict[str, tuple[MountingPart, ...]] = {
-    "carry": ("carry",),
-    "pivot": ("pivot",),
-    "both": ("carry", "pivot"),
-}
 HOW: dict[MountingPart, str] = {
     "carry": "carry: hold the vehicle under the target (or the target before its camera); turn it "
     "about all its axes and move it, the target in view",
@@ -114,9 +108,11 @@ def mount(
         ),
     ] = None,
     part: Annotated[
-        Literal["carry", "pivot", "both"] | None,
+        Literal["carry", "pivot"] | None,
         typer.Option(
-            "--part", help="carry: turn and latency; pivot: the gear's tip, by the camera alone."
+            "--part",
+            help="Only the carry (turn and latency), or only the pivot (the gear's tip, by the "
+            "camera alone).",
         ),
     ] = None,
     logs: Annotated[
@@ -131,7 +127,7 @@ def mount(
     ] = False,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="The report, .png; the recording goes beside it."),
+        typer.Option("--output", "-o", help="The recording of a live run, .jsonl."),
     ] = None,
     force: ForceOption = False,
     view: ViewOption = False,
@@ -149,7 +145,7 @@ def mount(
     its gear (pivot). Its motors are off, and nothing arms.
     """
     port = page_port(view, view_port)
-    _check_together(uri, source, logs, truth, seed, port)
+    _check_together(uri, source, logs, output, truth, seed, port)
     if profile is None and truth is None:
         raise UsageError("name a profile (-p): what is measured is compared with what it says")
     name = profile or "sim"
@@ -160,27 +156,28 @@ def mount(
             f"--truth sim measures a simulated vehicle, and {name} flies {vehicle.link.uri} with "
             f"{without_password(vehicle.camera.source)}: leave --write out"
         )
-    parts = PARTS[part or "both"]
-    live = not (logs or truth)
-    frames, link_uri = _live_sources(source, uri, vehicle, parts) if live else ("", None)
-    report, log = _places(output, find_profile(name).stem, force, live)
+    parts: tuple[MountingPart, ...] = ("carry", "pivot") if part is None else (part,)
     camera = profile_camera(vehicle.camera)
-    again = ["perchctl", "calibrate", "mount", "-p", name]
-    again += [word for path in logs or [log] for word in ("--from", str(path))]
     true = None
     recordings: Sequence[MountingRecording]
+    again = ["perchctl", "calibrate", "mount", "-p", name]
+    only = [] if part is None else ["--part", part]
     if truth:
-        again = [*again[:5], "--truth", "sim", "--seed", str(seed or 0)]
+        again += ["--truth", "sim", "--seed", str(seed or 0), *only]
         recordings, true = _simulated(vehicle, camera, parts, seed or 0)
     elif logs:
+        again += [*(word for path in logs for word in ("--from", str(path))), *only]
         recordings = _read_parts(logs, part)
         _check_seen_by(recordings, pose_basis(vehicle, camera))
     else:
+        frames, link_uri = _live_sources(source, uri, vehicle, parts)
+        log = _recording_place(output, find_profile(name).stem, force)
+        again += ["--from", str(log)]
         recordings = _recorded(
             vehicle, camera, frames, link_uri, parts, log, shlex.join(again), port
         )
-    if part is not None:
-        again += ["--part", part]
+        logs = [log] if log.exists() else []
+        again += only
     measured = solved(vehicle, recordings)
     for line in measured.lines():
         tell(line)
@@ -198,18 +195,13 @@ def mount(
             say(str(error))
     elif not truth:
         say("--write puts these numbers into the profile")
-    picture = drawn(lambda: _draw(measured, report))
-    if picture is not None:
-        say(f"drew {picture}")
     code = 0 if problem is None else problem.exit_code
     if not as_json:
         print(measured.keys_text())
         return code
-    kept = logs or ([log] if log.exists() and not truth else [])
     record = measured.record() | ({} if true is None else {"true": true})
     record |= {
-        "recordings": [str(path) for path in kept],
-        "report": picture and str(picture),
+        "recordings": [str(path) for path in logs or []],
         "profile": written and str(written),
         "profile_before": before and str(before),
     }
@@ -224,6 +216,7 @@ def _check_together(
     uri: str | None,
     source: str | None,
     logs: Sequence[Path] | None,
+    output: Path | None,
     truth: str | None,
     seed: int | None,
     port: int | None,
@@ -234,8 +227,8 @@ def _check_together(
     other = "--truth sim" if truth else "--from" if logs else None
     if other is None:
         return
-    given = {"--uri": uri, "--source": source, "--view": port, "--from": truth and logs}
-    for option, value in given.items():
+    live = {"--uri": uri, "--source": source, "--view": port, "--output": output}
+    for option, value in (live | {"--from": truth and logs}).items():
         if value is not None:
             raise UsageError(f"{other} takes no camera, no vehicle, no page: leave {option} out")
 
@@ -268,19 +261,14 @@ def _live_sources(
     return name.spec, link_uri
 
 
-def _places(output: Path | None, name: str, force: bool, live: bool) -> tuple[Path, Path]:
-    """The report and, beside it, a live recording. Those that are not named by `output` take
-    the next name that is free, so that nothing is measured in vain."""
+def _recording_place(output: Path | None, name: str, force: bool) -> Path:
+    """Where a live recording goes: `output`, or the next name that is free, so that nothing is
+    measured in vain."""
     if output is None:
         stems = (f"mounting_{name}{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
-        pairs = ((FOLDER / f"{stem}.png", FOLDER / f"{stem}.jsonl") for stem in stems)
-        report, log = next(p for p in pairs if not (p[0].exists() or p[1].exists()))
-    else:
-        report, log = output, output.with_suffix(".jsonl")
-    check_output(report, (".png",), force, "the report's format")
-    if live:
-        check_place(log, force)
-    return report, log
+        output = next(p for stem in stems if not (p := FOLDER / f"{stem}.jsonl").exists())
+    check_output(output, (".jsonl",), force, "the recording's format")
+    return output
 
 
 # -- recordings of files and of the simulator -------------------------------------
@@ -291,7 +279,7 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecordin
     named = [(path, recording) for path in logs for recording in read_recordings(path)]
     places: dict[MountingPart, Path] = {}
     for path, recording in named:
-        if part not in (None, "both", recording.part):
+        if part not in (None, recording.part):
             continue
         if recording.part in places:
             raise InvalidValue(
@@ -299,14 +287,12 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecordin
                 f"recording of each part"
             )
         places[recording.part] = path
-    required = ("carry", "pivot") if part == "both" else () if part is None else (part,)
-    for name in required:
-        if name not in places:
-            held = " and ".join(dict.fromkeys(recording.part for _, recording in named))
-            raise InvalidValue(
-                f"{', '.join(map(str, logs))} holds no {name}, but a {held}: leave --part out, or "
-                f"name the other recording too"
-            )
+    if not places:
+        held = " and ".join(dict.fromkeys(recording.part for _, recording in named))
+        raise InvalidValue(
+            f"{', '.join(map(str, logs))} holds no {part}, but a {held}: leave --part out, or "
+            f"name the other recording too"
+        )
     return [recording for _, recording in named if recording.part in places]
 
 
@@ -481,14 +467,3 @@ def _check_unchanged(name: str, then: Profile, again: str) -> None:
             f"{find_profile(name)} was changed meanwhile, and nothing is written: these numbers "
             f"rest on what it said before; measure again: {again}"
         )
-
-
-def _draw(measured: MountingReport, picture: Path) -> Path | None:
-    from perchctl.calibration import draw_mounting
-
-    try:
-        write_files({picture: draw_mounting(measured)})
-    except PerchError as error:  # a full disk: the result stands
-        say(str(error))
-        return None
-    return picture

@@ -24,7 +24,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.output import print_record
 from perchctl.errors import InvalidValue, PerchError, UsageError
-from perchctl.files import check_output, check_place, write_files
+from perchctl.files import check_place, write_files
 from perchctl.profile import (
     MarkerConfig,
     Profile,
@@ -35,6 +35,7 @@ from perchctl.profile import (
     write_profile_values,
 )
 from perchctl.target import (
+    PAGES_MM,
     Optics,
     board_pdf,
     check_target,
@@ -52,6 +53,8 @@ from perchctl.vision import CameraModel
 DEFAULT_PROFILE = "sim"
 BASE_FOR_NEW = "crazyflie"
 """What a new profile extends where -p names a file that does not exist yet."""
+TILE = "a3"
+"""Sheets that are proposed for a page that is larger than the named ones."""
 SIDE_LIMITS_M = (0.004, 2.0)
 ANOTHER = "Another target than the profile's"
 
@@ -129,7 +132,6 @@ NoiseOption = Annotated[
         help="Sigma of the picture's noise, grey levels of 255.",
     ),
 ]
-PlotOption = Annotated[Path, typer.Option("--plot", help="The design's picture.")]
 
 app = new_app(Group)
 
@@ -168,20 +170,16 @@ def sheet(
     config = load_profile(profile or DEFAULT_PROFILE)
     target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
     magnet_m = parse_length(magnet, "--magnet")
-    check = check_target(target, magnet_m)
+    check_target(target, magnet_m)
     _check_pdf(output)
     pdf = target_pdf(target, page, magnet_m, *_origin(config, target), tile)
     lines = [
         f"wrote {output}",
-        check.text(target),
+        "both markers are read from the drawing",
         "print at 100 % and measure both rulers: 100 mm each",
         *_mounting(config, target),
     ]
-    record = {
-        "target": target.model_dump(mode="json"),
-        "white_centre": check.white_centre,
-        "white_centre_ids": list(check.white_ids),
-    }
+    record = {"target": target.model_dump(mode="json")}
     return _write({output: pdf}, lines, record, force, as_json)
 
 
@@ -239,9 +237,7 @@ def design(
     ceiling: CeilingOption = None,
     blur: BlurOption = 1.0,
     noise: NoiseOption = 5.0,
-    plot: PlotOption = Path("design.png"),
     cam: CamOption = None,
-    force: ForceOption = False,
     as_json: JsonOption = False,
     large: LargeOption = None,
     large_id: LargeIdOption = None,
@@ -253,14 +249,10 @@ def design(
     """Compute from where to where a camera sees each marker, how exactly, and where a gap is."""
     config = load_profile(profile or DEFAULT_PROFILE)
     name, model = _camera(config, camera, cam)
-    check_output(plot, (".png",), force)
     target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
     found = make_design(target, model, Optics(blur, noise), config, ceiling)
-    from perchctl.target import draw_design  # matplotlib takes a second to load
-
-    lines = [found.text(name), f"wrote {plot}"]
     record = found.record() | {"target": target.model_dump(mode="json")}
-    return _write({plot: draw_design(found)}, lines, record, force, as_json)
+    return _write({}, [found.text(name)], record, False, as_json)
 
 
 @app.command(
@@ -280,33 +272,22 @@ def suggest(
     magnet: MagnetOption = "50mm",
     blur: BlurOption = 1.0,
     noise: NoiseOption = 5.0,
-    plot: PlotOption = Path("suggestion.png"),
     cam: CamOption = None,
-    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Propose sizes and ids for a camera, and compare them with the profile's target."""
+    """Propose sizes and ids for a camera, the largest that the page holds and that are seen."""
     config = load_profile(profile or DEFAULT_PROFILE)
     name, model = _camera(config, camera, cam)
-    check_output(plot, (".png",), force)
-    optics = Optics(blur, noise)
     magnet_m = parse_length(magnet, "--magnet")
-    found, proposed = suggest_target(model, optics, config, magnet_m, ceiling, page)
-    present = make_design(config.target, model, optics, config, ceiling)
-    from perchctl.target import draw_design  # matplotlib takes a second to load
-
-    lines = [f"note: {note}" for note in found.notes] + [found.command(), ""]
-    lines += [f"why: {reason}" for reason in found.reasons]
-    lines += [*proposed.compared_with(present, f"profile {config.name}"), ""]
-    lines += [proposed.text(name), f"wrote {plot}"]
-    record = {
-        "command": found.command(),
-        "reasons": list(found.reasons),
-        "notes": list(found.notes),
-        **proposed.record(),
-        "target": found.target.model_dump(mode="json"),
-    }
-    return _write({plot: draw_design(proposed)}, lines, record, force, as_json)
+    found, held_by = suggest_target(model, Optics(blur, noise), config, magnet_m, ceiling, page)
+    large, small = found.target.large, found.target.small
+    command = (
+        f"perchctl make-target --large {large.side_m * 1e3:g}mm --large-id {large.id} "
+        f"--large-dict {large.dictionary} --small {small.side_m * 1e3:g}mm --small-id {small.id} "
+        f"--small-dict {small.dictionary} --page {held_by}"
+    ) + ("" if held_by in PAGES_MM else f" --tile {TILE}")
+    record = {"command": command, "target": found.target.model_dump(mode="json")}
+    return _write({}, [command, "", found.text(name)], record | found.record(), False, as_json)
 
 
 @app.command(

@@ -244,15 +244,8 @@ def T_target_cam_at(hand: Hand, t_s: float) -> Array:
 # --- what the sensors make of it ---------------------------------------------------------
 
 
-def attitudes(
-    hand: Hand, positioned: bool = False, errors: bool = True
-) -> tuple[AttitudeSample, ...]:
-    """The vehicle's samples, those that the radio loses left out.
-
-    Args:
-        positioned: with a trusted position, as of motion capture.
-        errors: False: the truth.
-    """
+def attitudes(hand: Hand, errors: bool = True) -> tuple[AttitudeSample, ...]:
+    """The vehicle's samples, those that the radio loses left out; without `errors` the truth."""
     rng = np.random.default_rng([hand.seed, HAND_STREAM, 2, ("carry", "pivot").index(hand.part)])
     t_s = np.arange(0.0, hand.seconds + 0.3, TELEMETRY_S)
     R_cam_body = hand.T_body_cam[:3, :3].T
@@ -265,8 +258,6 @@ def attitudes(
     before, after = R_world_body(t_s - h), R_world_body(t_s + h)
     rate = Rotation.from_matrix(before.transpose(0, 2, 1) @ after).as_rotvec() / (2.0 * h)
     rpy = np.array([rpy_from_rotation(R) for R in now])
-    place = cam_target_m(hand, t_s) @ hand.R_world_target.T - now @ hand.T_body_cam[:3, 3]
-    sigma_m = max(hand.scenario.estimate_noise_m, 1e-4)
     kept = np.ones(len(t_s), bool)
     if errors:
         noise = rng.normal(size=rate.shape) * math.radians(GYRO_NOISE_DPS)
@@ -275,7 +266,6 @@ def attitudes(
         rate = np.round(measured / step) * step
         slow = math.radians(ATTITUDE_NOISE_DEG) * _slow_noise(rng, len(t_s), ATTITUDE_MEMORY_S)
         rpy = rpy + hand.attitude_bias_rad + slow
-        place = place + hand.scenario.estimate_noise_m * _slow_noise(rng, len(t_s), 0.3)
         kept = rng.random(len(t_s)) >= LOST_TELEMETRY
     rpy = (rpy + math.pi) % (2.0 * math.pi) - math.pi
     return tuple(
@@ -285,8 +275,6 @@ def attitudes(
             pitch_rad=float(rpy[k, 1]),
             yaw_rad=float(rpy[k, 2]),
             gyro_radps=rate[k],
-            position_m=place[k] if positioned else None,
-            position_sigma_m=sigma_m if positioned else None,
         )
         for k in np.flatnonzero(kept)
     )
@@ -326,7 +314,6 @@ def record_hand(
     hand: Hand,
     profile: Profile,
     camera: CameraModel,
-    positioned: bool = False,
     told: Callable[[], None] = lambda: None,
 ) -> MountingRecording:
     """Record the whole part, through renderer and pipeline; `told` is called for each
@@ -339,5 +326,5 @@ def record_hand(
             picture = unmirror_frame(picture)
         poses += eye.look(picture)
         told()
-    felt, by = attitudes(hand, positioned), pose_basis(profile, camera)
+    felt, by = attitudes(hand), pose_basis(profile, camera)
     return MountingRecording(hand.part, felt, tuple(poses), eye.mirrored, by)

@@ -5,13 +5,14 @@ from .boards import parse_board as parse_board
 from .boards import tag_cells as tag_cells
 from .design import TargetDesign as TargetDesign
 from .design import make_design as make_design
+from .design import suggest_target as suggest_target
 from .drawing import TargetDrawing as TargetDrawing
 from .drawing import draw_target as draw_target
 from .drawing import mm_text as mm_text
 from .drawing import parse_length as parse_length
 from .measured import NOTABLE_SCALE_ERROR as NOTABLE_SCALE_ERROR
 from .measured import measured_target as measured_target
-from .plot import draw_design as draw_design
+from .page import PAGES_MM as PAGES_MM
 from .print_check import PrintCheck as PrintCheck
 from .print_check import PrintVerdict as PrintVerdict
 from .reading import Optics as Optics
@@ -26,4 +27,3 @@ from .sight import overhead_view as overhead_view
 from .sight import reach_at as reach_at
 from .sight import sees_small_marker as sees_small_marker
 from .sight import sight_from as sight_from
-from .suggest import suggest_target as suggest_target

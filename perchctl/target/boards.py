@@ -21,12 +21,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_validator
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
@@ -40,6 +39,7 @@ from perchctl.target.drawing import (
     parse_length,
 )
 
+_MOST_CHARACTERS = 200  # of a file's faults in a sentence
 BoardKind = Literal["chessboard", "charuco", "aprilgrid"]
 EXAMPLES = "chessboard:9x6:25mm, charuco:10x7:25mm:18mm:DICT_5X5_100 or aprilgrid:6x6:22mm:0.3"
 MAX_COUNT = 100
@@ -263,65 +263,32 @@ def _wrong(text: str, why: str) -> InvalidValue:
 # --- Kalibr's own description of a board (``target_type: aprilgrid``) in perchctl's notation ---
 
 
-class _Aprilgrid(BaseModel, strict=True):
-    target_type: Literal["aprilgrid"]
-    tagCols: int
-    tagRows: int
-    tagSize: float
-    tagSpacing: float
-
-    def notation(self) -> str:
-        counts = f"{self.tagCols}x{self.tagRows}"
-        return f"aprilgrid:{counts}:{1e3 * self.tagSize:.9g}mm:{self.tagSpacing:g}"
-
-
-class _Checkerboard(BaseModel, strict=True):
-    """It counts inner corners, as perchctl does."""
-
-    target_type: Literal["checkerboard"]
-    targetCols: int
-    targetRows: int
-    colSpacingMeters: float
-    rowSpacingMeters: float
-
-    @model_validator(mode="after")
-    def _square(self) -> Self:
-        if self.colSpacingMeters != self.rowSpacingMeters:
-            raise ValueError(
-                "colSpacingMeters and rowSpacingMeters differ: squares of a chessboard are "
-                "square; a print that is not is given by its measured sides"
-            )
-        return self
-
-    def notation(self) -> str:
-        counts = f"{self.targetCols}x{self.targetRows}"
-        return f"chessboard:{counts}:{1e3 * self.colSpacingMeters:.9g}mm"
-
-
-_KALIBR: TypeAdapter[_Aprilgrid | _Checkerboard] = TypeAdapter(
-    Annotated[_Aprilgrid | _Checkerboard, Field(discriminator="target_type")]
-)
-_MOST_CHARACTERS = 200  # of the file's faults in a sentence
-
-
 def kalibr_notation(path: Path) -> str:
     """``aprilgrid:6x6:88mm:0.3`` from the file that is given to Kalibr as --target.
 
     Raises NotFound, InvalidValue.
     """
     try:
-        return _KALIBR.validate_python(parse_yaml(path.read_text(encoding="utf-8"))).notation()
+        keys = parse_yaml(path.read_text(encoding="utf-8"))
+        if keys["target_type"] == "aprilgrid":
+            counts, side_mm = f"{keys['tagCols']}x{keys['tagRows']}", 1e3 * float(keys["tagSize"])
+            return f"aprilgrid:{counts}:{side_mm:.9g}mm:{float(keys['tagSpacing']):g}"
+        if keys["target_type"] == "checkerboard":
+            # It counts inner corners, as perchctl does.
+            sides = keys["colSpacingMeters"], keys["rowSpacingMeters"]
+            if sides[0] == sides[1]:
+                counts = f"{keys['targetCols']}x{keys['targetRows']}"
+                return f"chessboard:{counts}:{1e3 * float(sides[0]):.9g}mm"
+        why = "it must be an aprilgrid, or a checkerboard with square squares"
     except FileNotFoundError:
         raise NotFound(f"board file {path} does not exist") from None
+    except KeyError as error:
+        why = f"{error.args[0]} is missing"
     except UnicodeDecodeError:
         why = "not a text file"
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = "".join(f"{key}: " for key in first["loc"][1:])
-        why = f"{place}{first['msg']}"
-    except (OSError, ValueError) as error:
-        why = str(error)
-    raise InvalidValue(f"{path}: cannot be read as Kalibr's board: {why[:_MOST_CHARACTERS]}")
+    except (OSError, TypeError, ValueError) as error:
+        why = str(error)[:_MOST_CHARACTERS]
+    raise InvalidValue(f"{path}: cannot be read as Kalibr's board: {why}")
 
 
 # --- What of a board is black ------------------------------------------------------------------

@@ -1,5 +1,5 @@
 """What a target will do with a camera: from where to where each marker is seen, and how
-exactly.
+exactly; and sizes that cover the way from the search height to the contact.
 
 z1 and z2 are the farthest ranges of the large and the small marker, z3 the nearest of the
 whole large one (paper, section III-B: 115, 25, 12 cm). They follow from the smallest side
@@ -10,20 +10,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
+from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.profile import Profile, TargetConfig
+from perchctl.profile import MarkerConfig, Profile, TargetConfig
 from perchctl.target.drawing import marker_corners_m, mm_text
-from perchctl.target.reading import TRIALS, Optics, smallest_side_px
+from perchctl.target.page import parse_page
+from perchctl.target.reading import TRIALS, Optics, check_target, smallest_side_px
+from perchctl.target.sheets import fits, fitting_page
 from perchctl.target.sight import (
     FieldOfView,
     Mounted,
     gear_from_camera,
     least_side_px,
     mounted_camera,
+    raised,
     square_outline,
     turned_outline,
 )
@@ -31,9 +34,7 @@ from perchctl.vision import CameraModel
 
 CORNER_SIGMA_PX = 0.2
 """Spread of a corner that the error bound is drawn for: a plainly refined one."""
-CURVE_POINTS = 160
 _TABLE_CM = (3, 5, 7, 10, 15, 20, 25, 30, 50, 75, 100, 150, 200, 300, 500)
-_COMPARED_M = (1.0, 0.5, 0.2, 0.1)
 
 
 @dataclass(frozen=True)
@@ -68,22 +69,6 @@ class GearRanges:
     small_nearest_m: float | None
 
 
-@dataclass(frozen=True, eq=False)
-class ErrorCurve:
-    """The bound over the range: `z_m` (n,), and x, z (m) and yaw (rad) for each of
-    ``large``, ``small`` and ``both``, NaN where that is not seen."""
-
-    z_m: Array
-    bounds: dict[str, Array]  # (n, 3)
-
-    def best_at(self, z_m: float) -> tuple[int, str | None]:
-        """The point nearest to that range, and what gives the least error there; None where
-        nothing is whole and readable."""
-        i = int(np.abs(self.z_m - z_m).argmin())
-        names = (n for n in ("both", "large", "small") if math.isfinite(self.bounds[n][i, 0]))
-        return i, next(names, None)
-
-
 @dataclass(frozen=True)
 class TargetDesign:
     """A target, a camera and a profile, and what follows from them.
@@ -105,22 +90,16 @@ class TargetDesign:
     search_height_m: float
     warnings: tuple[str, ...]
 
-    @cached_property
-    def curve(self) -> ErrorCurve:
-        """The least pose error that the corners allow, from contact to z1."""
-        return _error_curve(self.target, self.ranges)
+    @property
+    def spans_m(self) -> dict[str, tuple[float | None, float | None]]:
+        """The nearest and the farthest range of each marker."""
+        r = self.ranges
+        return {"large": (r.z3_m, r.z1_m), "small": (r.z4_m, r.z2_m)}
 
     def record(self) -> dict[str, object]:
         """Ranges, gaps and blind range for machines; metres."""
-        r = self.ranges
         return {
-            "z1_m": r.z1_m,
-            "z2_m": r.z2_m,
-            "z3_m": r.z3_m,
-            "z3_upright_m": r.z3_upright_m,
-            "z4_m": r.z4_m,
-            "large_px": r.large_px,
-            "small_px": r.small_px,
+            **vars(self.ranges),
             "gear_large_nearest_m": self.gear.large_nearest_m,
             "gear_small_nearest_m": self.gear.small_nearest_m,
             "blind": self.mount.record(),
@@ -131,27 +110,6 @@ class TargetDesign:
     def text(self, camera_name: str) -> str:
         """Ranges, overlap, error over the range, warnings; several lines."""
         return _text(self, camera_name)
-
-    def compared_with(self, present: TargetDesign, name: str) -> list[str]:
-        """A table of sizes, ranges and errors beside those of the present target, whose name is
-        `name`."""
-        pair = (self, present)
-        rows: list[tuple[str, ...]] = [("", "proposed", name)]
-        rows.append(("large marker, mm", *(mm_text(d.target.large.side_m) for d in pair)))
-        rows.append(("small marker, mm", *(mm_text(d.target.small.side_m) for d in pair)))
-        for key, what in (
-            ("z1_m", "large one read up to, cm"),
-            ("z2_m", "small one read up to, cm"),
-            ("z3_m", "large one whole down to, cm"),
-            ("z4_m", "small one whole down to, cm"),
-        ):
-            cells = (_cm(getattr(d.ranges, key)).removesuffix(" cm") for d in pair)
-            rows.append((what, *cells))
-        for z_m in _COMPARED_M:
-            cells = (_height_error(d.curve, z_m) for d in pair)
-            rows.append((f"least error in z at {100 * z_m:.0f} cm, mm", *cells))
-        first, new, old = (max(len(row[i]) for row in rows) for i in range(3))
-        return [f"   {row[0]:<{first}}  {row[1]:>{new}}  {row[2]:>{old}}" for row in rows]
 
 
 def focal_px(camera: CameraModel) -> float:
@@ -295,38 +253,33 @@ def _text(design: TargetDesign, camera_name: str) -> str:
         if design.search_height_m == 0.0:
             where = "on the ground, from where it has to be seen"
         lines.append(f"search    target {_cm(design.search_range_m)} away {where}")
-    lines += ["", *_table(design.curve), ""]
+    lines += ["", *_error_table(design), ""]
     lines += [f"warning: {text}" for text in design.warnings] or ["no gap from search to stand-off"]
     return "\n".join(lines)
 
 
-def _table(curve: ErrorCurve) -> list[str]:
-    """Least possible errors at a few ranges, by the best that is seen there."""
+def _error_table(design: TargetDesign) -> list[str]:
+    """Least possible errors at a few ranges, by the markers that are seen there."""
     lines = [
         f"least error that the corners allow (sigma {CORNER_SIGMA_PX:g} px):",
         "   range cm   x, y mm     z mm   turn deg   seen",
     ]
+    sides_m = {"large": design.target.large.side_m, "small": design.target.small.side_m}
     for z_cm in _TABLE_CM:
-        if not curve.z_m[0] <= z_cm / 100.0 <= curve.z_m[-1]:
-            continue
-        i, name = curve.best_at(z_cm / 100.0)
-        line = f"   {100 * curve.z_m[i]:8.1f}   nothing whole and readable"
-        if name is not None:
-            x, z, yaw = curve.bounds[name][i]
-            line = (
-                f"   {100 * curve.z_m[i]:8.1f}  {1e3 * x:8.3f}  {1e3 * z:7.3f}  "
-                f"{math.degrees(yaw):9.3f}   {name}"
+        z_m = z_cm / 100.0
+        seen = [
+            name
+            for name, (near, far) in design.spans_m.items()
+            if near is not None and far is not None and near <= z_m <= far
+        ]
+        if seen:
+            sides = [sides_m[name] for name in seen]
+            x, _, z, yaw = pose_bound(sides, z_m, design.ranges.focal_px, CORNER_SIGMA_PX)
+            lines.append(
+                f"   {z_cm:8.1f}  {1e3 * x:8.3f}  {1e3 * z:7.3f}  {math.degrees(yaw):9.3f}   "
+                f"{' and '.join(seen)}"
             )
-        lines.append(line)
     return lines
-
-
-def _height_error(curve: ErrorCurve, z_m: float) -> str:
-    """By the best that is seen at the range nearest to it, in mm."""
-    i, name = curve.best_at(z_m)
-    if name is None or not curve.z_m[0] <= z_m <= curve.z_m[-1]:
-        return "-"
-    return f"{1e3 * curve.bounds[name][i, 1]:.3f}"
 
 
 def _cm(length_m: float | None) -> str:
@@ -338,27 +291,6 @@ def _px(side_px: float | None) -> str:
 
 
 # --- The least pose error that corners of a given spread allow (Cramer-Rao bound) --------------
-
-
-def _error_curve(target: TargetConfig, r: Ranges) -> ErrorCurve:
-    spans = {"large": (r.z3_m, r.z1_m), "small": (r.z4_m, r.z2_m)}
-    ends = [v for span in spans.values() for v in span if v is not None]
-    z = np.geomspace(min(ends, default=0.02), max(ends, default=2.0), CURVE_POINTS)
-    sides = {"large": target.large.side_m, "small": target.small.side_m}
-    bounds = {name: np.full((len(z), 3), np.nan) for name in ("large", "small", "both")}
-    for i, z_m in enumerate(z):
-        seen = [
-            name
-            for name, (near, far) in spans.items()
-            if near is not None and far is not None and near * 0.9999 <= z_m <= far * 1.0001
-        ]
-        used = {name: [sides[name]] for name in seen}
-        if len(seen) == 2:
-            used["both"] = list(sides.values())
-        for name, sides_m in used.items():
-            x, _, z_sigma, yaw = pose_bound(sides_m, float(z_m), r.focal_px, CORNER_SIGMA_PX)
-            bounds[name][i] = x, z_sigma, yaw
-    return ErrorCurve(z, bounds)
 
 
 def pose_bound(
@@ -383,3 +315,106 @@ def pose_bound(
     J: Array = np.concatenate([du, dv])
     sigma = sigma_px * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
     return float(sigma[3]), float(sigma[4]), float(sigma[5]), float(sigma[2])
+
+
+# --- Sizes and ids that cover the way from the search height to the contact ----------------------
+
+
+DEFAULT_SEARCH_M = 1.15
+"""Range to cover where no ceiling is named: the paper's z1."""
+DEFAULT_CEILING_M = 2.5
+"""Of a room, where none is named and the target has to be seen from the ground."""
+FAR_MARGIN, OVERLAP_MARGIN, NEAR_MARGIN = 1.10, 1.20, 0.95
+SMALL_RANGE = (0.08, 0.19)
+"""Side of the small marker per side of the large one: up to 0.19 the large one is read as far
+as around a smaller one, by trial (from 13 px on at a blur of 0.6 px; at 0.21 from 36 px on)."""
+_LARGE = ("DICT_4X4_1000", 997)
+_SMALL = ("DICT_ARUCO_ORIGINAL", 5)
+_LARGE_STEP_M, _SMALL_STEP_M = 0.005, 0.0005
+_LARGE_LIMITS_M = (0.03, 1.0)
+
+
+def suggest_target(
+    camera: CameraModel,
+    optics: Optics,
+    profile: Profile,
+    magnet_m: float,
+    ceiling_m: float | None = None,
+    page: str = "a4",
+) -> tuple[TargetDesign, str]:
+    """The design of the largest markers that the page holds and of which the small one takes over
+    from the large one, as every error falls with the size, and the page: a larger one only where
+    the search needs it. What they do not cover is in the design's warnings.
+
+    Raises InvalidValue where the blur leaves nothing to read, or for a ceiling too low.
+    """
+    search_m = _search_range_m(profile, ceiling_m)
+    base, picture_px = _sized(0.150, 0.025), max(camera.size_px)
+    large_px = smallest_side_px(base, "large", optics, picture_px)
+    small_px = smallest_side_px(base, "small", optics, picture_px)
+    if large_px is None or small_px is None:
+        raise InvalidValue(
+            f"no marker is read through a blur of {optics.blur_px:g} px and noise "
+            f"{optics.noise:g}: a sharper picture is needed"
+        )
+    f, view = focal_px(camera), FieldOfView(camera)
+    far_px = least_side_px(large_px) if is_seen_from_ground(profile) else FAR_MARGIN * large_px
+    needed_m = math.ceil(search_m * far_px / f / _LARGE_STEP_M) * _LARGE_STEP_M
+    needed_m = min(max(needed_m, _LARGE_LIMITS_M[0]), _LARGE_LIMITS_M[1])
+    most_m = min(
+        magnet_m / math.sqrt(2.0),
+        NEAR_MARGIN * _largest_at_standoff_m(view, profile),
+    )
+
+    def target_of(large_m: float) -> TargetConfig:
+        """With the largest small marker."""
+        small_m = max(min(SMALL_RANGE[1] * large_m, most_m), SMALL_RANGE[0] * large_m, 0.005)
+        small_m = math.floor(small_m / _SMALL_STEP_M + 1e-6) * _SMALL_STEP_M
+        return _sized(round(large_m, 4), round(small_m, 4))
+
+    def takes_over(target: TargetConfig) -> bool:
+        """Whether the small marker is read before the large one leaves the picture."""
+        near_m = view.nearest_m(turned_outline(target.large.side_m), np.eye(3), np.zeros(3))
+        return near_m is None or f * target.small.side_m >= OVERLAP_MARGIN * near_m * small_px
+
+    count = int((_LARGE_LIMITS_M[1] - needed_m) / _LARGE_STEP_M)
+    larger = (target_of(needed_m + k * _LARGE_STEP_M) for k in range(count, 0, -1))
+    held = (each for each in larger if fits(each, parse_page(page)) and takes_over(each))
+    target = next(held, target_of(needed_m))
+    check_target(target, max(magnet_m, math.sqrt(2.0) * target.small.side_m))
+    held_by = page if fits(target, parse_page(page)) else fitting_page(target)
+    return make_design(target, camera, optics, profile, ceiling_m), held_by
+
+
+def _search_range_m(profile: Profile, ceiling_m: float | None) -> float:
+    """Camera to target at the highest search position, or on the ground where it has to be seen
+    from there."""
+    if is_seen_from_ground(profile):
+        return (ceiling_m or DEFAULT_CEILING_M) - profile.camera.mount.position_m[2]
+    if ceiling_m is None:
+        return DEFAULT_SEARCH_M
+    range_m = ceiling_m - profile.planner.search.max_height_m
+    if range_m <= 0.0:
+        raise InvalidValue(
+            f"--ceiling {ceiling_m:g} is below the highest search position "
+            f"({profile.planner.search.max_height_m:g} m): lower planner.search.max_height_m"
+        )
+    return range_m
+
+
+def _sized(large_m: float, small_m: float) -> TargetConfig:
+    return TargetConfig(
+        large=MarkerConfig(dictionary=_LARGE[0], id=_LARGE[1], side_m=large_m),
+        small=MarkerConfig(dictionary=_SMALL[0], id=_SMALL[1], side_m=small_m),
+    )
+
+
+def _largest_at_standoff_m(view: FieldOfView, profile: Profile) -> float:
+    """The largest side whose circle is in the picture with the gear at the stand-off."""
+    R, gear = gear_from_camera(profile)
+    low, high = 0.0, 1.0
+    while high - low > 1e-4:
+        middle = (low + high) / 2.0
+        points = raised(turned_outline(middle), profile.planner.ascend.standoff_m)
+        low, high = (middle, high) if view.holds(points @ R.T + gear) else (low, middle)
+    return low

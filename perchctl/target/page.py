@@ -9,7 +9,7 @@ import datetime
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
@@ -94,11 +94,13 @@ Item = Filled | Line | Circle | Polygon | Text
 
 @dataclass(frozen=True)
 class Page:
-    """Width and height of the paper, mm, and what is printed on it."""
+    """Width and height of the paper, mm, and what is printed on it, with the items' origin at
+    `origin` on the paper."""
 
     width: float
     height: float
     items: tuple[Item, ...]
+    origin: tuple[float, float] = (0.0, 0.0)
 
 
 def parse_page(text: str) -> tuple[float, float]:
@@ -145,27 +147,6 @@ def filled(rectangles: Sequence[Rectangle], x: float, y: float) -> Filled:
             for r in rectangles
         )
     )
-
-
-def placed(item: Item, x: float, y: float, mirror: bool = False) -> Item:
-    """The item moved by x and y; with `mirror` its own x runs to the left, and texts stay
-    readable."""
-    sign = -1.0 if mirror else 1.0
-    match item:
-        case Filled(boxes):
-            return Filled(
-                tuple((x + sign * left - w * mirror, y + top, w, h) for left, top, w, h in boxes)
-            )
-        case Line(x0, y0, x1, y1):
-            return replace(item, x0=x + sign * x0, y0=y + y0, x1=x + sign * x1, y1=y + y1)
-        case Polygon(points):
-            return Polygon(tuple((x + sign * px, y + py) for px, py in points))
-        case Circle():
-            return replace(item, x=x + sign * item.x, y=y + item.y)
-        case Text(anchor=anchor):
-            other: dict[Anchor, Anchor] = {"start": "end", "end": "start", "middle": "middle"}
-            there = other[anchor] if mirror else anchor
-            return replace(item, x=x + sign * item.x, y=y + item.y, anchor=there)
 
 
 @cache
@@ -216,14 +197,7 @@ def tile_page(page: Page, paper: tuple[float, float]) -> list[Page]:
         *(Line(a, y, a + _CUT_MARK, y) for y in cuts_y for a in (0.0, page.width - _CUT_MARK)),
     ]
     return [
-        Page(
-            width,
-            height,
-            tuple(
-                placed(item, UNPRINTABLE - i * dx, UNPRINTABLE - j * dy)
-                for item in (*page.items, *marks)
-            ),
-        )
+        Page(width, height, (*page.items, *marks), (UNPRINTABLE - i * dx, UNPRINTABLE - j * dy))
         for j in range(rows)
         for i in range(columns)
     ]
@@ -269,11 +243,12 @@ def pdf_bytes(
     for page in pages:
         pdf.add_page(orientation="portrait", format=(page.width, page.height))
         for item in page.items:
-            _draw(pdf, item)
+            _draw(pdf, item, *page.origin)
     return bytes(pdf.output())
 
 
-def _draw(pdf: FPDF, item: Item) -> None:
+def _draw(pdf: FPDF, item: Item, dx: float, dy: float) -> None:
+    """The item, moved by dx and dy."""
     match item:
         case Filled() | Polygon():
             with pdf.new_path(paint_rule=PathPaintRule.FILL_NONZERO) as path:
@@ -281,25 +256,26 @@ def _draw(pdf: FPDF, item: Item) -> None:
                 path.style.stroke_color = None
                 if isinstance(item, Filled):
                     for x, y, w, h in item.boxes:
-                        path.rectangle(x, y, w, h)
+                        path.rectangle(x + dx, y + dy, w, h)
                 else:
-                    path.move_to(*item.points[0])
-                    for point in item.points[1:]:
-                        path.line_to(*point)
+                    (x, y), *others = item.points
+                    path.move_to(x + dx, y + dy)
+                    for x, y in others:
+                        path.line_to(x + dx, y + dy)
                     path.close()
         case Line(x0, y0, x1, y1, width, dash):
             pdf.set_line_width(width)
             pdf.set_dash_pattern(dash=dash, gap=dash)
-            pdf.line(x0, y0, x1, y1)
+            pdf.line(x0 + dx, y0 + dy, x1 + dx, y1 + dy)
         case Circle(x, y, radius, width):
             pdf.set_line_width(width)
             pdf.set_dash_pattern()
-            pdf.circle(x, y, radius)
+            pdf.circle(x + dx, y + dy, radius)
         case Text(x, y, text, size, anchor, upwards):
             pdf.set_font("helvetica", size=size * _PT_PER_MM)
             back = {"start": 0.0, "middle": 0.5, "end": 1.0}[anchor] * text_width(text, size)
             if upwards:
-                with pdf.rotation(90.0, x, y):
-                    pdf.text(x - back, y, text)
+                with pdf.rotation(90.0, x + dx, y + dy):
+                    pdf.text(x + dx - back, y + dy, text)
             else:
-                pdf.text(x - back, y, text)
+                pdf.text(x + dx - back, y + dy, text)

@@ -18,14 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue
-from perchctl.profile import MarkerConfig, TargetConfig, aruco_dictionary, dictionary_size
-from perchctl.target.drawing import (
-    RING_MIN_PER_LARGE_SIDE,
-    TargetDrawing,
-    draw_target,
-    marker_cells,
-    mm_text,
-)
+from perchctl.profile import MarkerConfig, TargetConfig, aruco_dictionary
+from perchctl.target.drawing import TargetDrawing, draw_target, marker_cells, mm_text
 from perchctl.vision import MARKERS, MarkerName
 
 
@@ -166,83 +160,29 @@ def sample_pictures(
 # --- What is checked before ink is spent ---------------------------------------------------------
 
 
-RING_RANGE_PER_LARGE_SIDE = (RING_MIN_PER_LARGE_SIDE, 9.0 / 150.0)
-"""White ring around the small marker, per side of the large one, where the large one's
-own centre is not white (measured: at 0 mm of 150 the small marker is never found, from
-10 mm on the large one fails)."""
 MIN_DISTANCE = 3
 """Cells in which two patterns of one size must differ: one more than the wrong bits that
 are corrected in both."""
-LISTED_IDS = 6
 _READ_SIDE_PX = 480.0
 
 
-@dataclass(frozen=True)
-class TargetCheck:
-    """What the checks found: `ring_m` of white around the small marker, whether the large
-    marker's centre is white by itself, and the ids of its dictionary of which that is so."""
-
-    ring_m: float
-    white_centre: bool
-    white_ids: tuple[int, ...]
-
-    def text(self, target: TargetConfig) -> str:
-        if self.white_centre:
-            white = f"id {target.large.id} is white in the middle"
-        else:
-            white = f"a ring of {self.ring_m * 1e3:.1f} mm is white around the small marker"
-        return f"{white}; both markers are read from the drawing"
-
-
-def check_target(target: TargetConfig, magnet_m: float) -> TargetCheck:
+def check_target(target: TargetConfig, magnet_m: float) -> None:
     """Raises InvalidValue, in one sentence, for the first thing that is wrong."""
     _check_magnet(target, magnet_m)
-    large, small = target.large, target.small
-    for name, marker in (("large", large), ("small", small)):
+    for name, marker in (("large", target.large), ("small", target.small)):
         if _turns_onto_itself(marker):
             raise InvalidValue(
                 f"{name} marker: id {marker.id} of {marker.dictionary} looks the same when turned, "
                 f"so that its heading is ambiguous: take another id"
             )
-    white_ids = white_centre_ids(large.dictionary, small.side_m / large.side_m)
-    check = TargetCheck(draw_target(target).ring_m, large.id in white_ids, white_ids)
-    if not check.white_centre:
-        low, high = (r * large.side_m for r in RING_RANGE_PER_LARGE_SIDE)
-        if not low - 1e-9 <= check.ring_m <= high + 1e-9:
-            raise InvalidValue(
-                f"the white ring around the small marker would be {check.ring_m * 1e3:.1f} mm, "
-                f"and {low * 1e3:.1f} to {high * 1e3:.1f} mm are needed: "
-                f"{_white_hint(target, white_ids)}"
-            )
-    _check_reading(target, white_ids)
-    return check
-
-
-def white_centre_ids(dictionary: str, ratio: float) -> tuple[int, ...]:
-    """Ids whose cells under a small marker of `ratio` times the side, with the least ring
-    of white around it, are all white."""
-    source = aruco_dictionary(dictionary)
-    n = int(source.markerSize)
-    reach = (ratio / 2.0 + RING_MIN_PER_LARGE_SIDE) * (n + 2)  # cells from the centre
-    edges = np.arange(-n / 2.0, n / 2.0 + 0.5)
-    under = (edges[:-1] < reach - 1e-9) & (edges[1:] > -reach + 1e-9)
-    if reach > n / 2.0:
-        return ()
-    bits = all_bits(dictionary)
-    return tuple(int(i) for i in np.flatnonzero(bits[:, under][:, :, under].all(axis=(1, 2))))
-
-
-def all_bits(dictionary: str) -> NDArray[np.bool_]:
-    """Inner bits of every id, True is white, (ids, n, n)."""
-    source = aruco_dictionary(dictionary)
-    n = int(source.markerSize)
-    rows = [
-        cv2.aruco.Dictionary.getBitsFromByteList(
-            np.ascontiguousarray(source.bytesList[i : i + 1]), n
+    if _distance(target.large, target.small) < MIN_DISTANCE:
+        large, small = target.large, target.small
+        raise InvalidValue(
+            f"id {large.id} of {large.dictionary} and id {small.id} of {small.dictionary} are "
+            f"nearly the same pattern, so one marker would be taken for the other: take another "
+            f"id for one of them"
         )
-        for i in range(dictionary_size(dictionary))
-    ]
-    return np.array(rows, dtype=np.uint8) > 0
+    _check_reading(target)
 
 
 def _check_magnet(target: TargetConfig, magnet_m: float) -> None:
@@ -265,23 +205,17 @@ def _turns_onto_itself(marker: MarkerConfig) -> bool:
     return any(np.array_equal(cells, np.rot90(cells, turn)) for turn in (1, 2, 3))
 
 
-def _check_reading(target: TargetConfig, white_ids: tuple[int, ...]) -> None:
+def _check_reading(target: TargetConfig) -> None:
     """Reads the drawing: both markers must be found, and each whole dictionary must find
     nothing else in it."""
     large, small = target.large, target.small
-    if _distance(large, small) < MIN_DISTANCE:
-        raise InvalidValue(
-            f"id {large.id} of {large.dictionary} and id {small.id} of {small.dictionary} are "
-            f"nearly the same pattern, so one marker would be taken for the other: take another "
-            f"id for one of them"
-        )
     image = draw_target(target).bitmap(_READ_SIDE_PX / large.side_m)
     seen = PlainReader(target).read(image)
     for name in MARKERS:
         if name not in seen:
             raise InvalidValue(
-                f"the {name} marker cannot be read from this drawing: "
-                f"{_white_hint(target, white_ids)}"
+                f"the {name} marker cannot be read from this drawing: take a smaller --small, or "
+                f"a --large-id that is white in the middle, such as 997 of DICT_4X4_1000"
             )
     same_size = (
         aruco_dictionary(large.dictionary).markerSize
@@ -311,12 +245,3 @@ def _distance(a: MarkerConfig, b: MarkerConfig) -> int:
     if first.shape != second.shape:
         return first.size
     return min(int((np.rot90(first, turn) != second).sum()) for turn in range(4))
-
-
-def _white_hint(target: TargetConfig, white_ids: tuple[int, ...]) -> str:
-    small = "take a smaller --small"
-    if not white_ids or target.large.id in white_ids:
-        return small
-    listed = ", ".join(str(i) for i in white_ids[:LISTED_IDS])
-    dictionary = target.large.dictionary
-    return f"{small}, or a --large-id that is white in the middle ({dictionary}: {listed})"

@@ -27,7 +27,6 @@ from perchctl.target.page import (
     page_name,
     parse_page,
     pdf_bytes,
-    placed,
     text_width,
     wrapped,
 )
@@ -127,7 +126,7 @@ def board_page(board: Board, page: tuple[float, float]) -> Page:
         f"perchctl {board.notation()}   print at 100 %, not scaled: both rulers must measure "
         f"100 mm",
         f"Then measure the black area ({width:g} x {height:g} mm) and give its sides to perchctl "
-        f"calibrate --measured-width and --measured-height.",
+        f"calibrate --measured WIDTHxHEIGHT.",
     )
     left = max(UNPRINTABLE, cx - width / 2)
     lines = wrapped(texts, _LABEL, w - UNPRINTABLE - left)
@@ -230,7 +229,7 @@ def _front(target: TargetConfig, place: Place) -> Page:
 
 
 def _back(target: TargetConfig, place: Place, magnet_m: float) -> Page:
-    """As seen from the back, the sheet turned about its upright axis."""
+    """As seen from the back, the sheet turned about its upright axis: all of it is symmetric."""
     cx, cy, half = place.width / 2, place.height / 2, place.sheet / 2
     radius = 500.0 * magnet_m
     items: list[Item] = [*_cut_marks(cx, cy, half), *_up_arrow(cx, cy - half - 2.0)]
@@ -251,8 +250,7 @@ def _back(target: TargetConfig, place: Place, magnet_m: float) -> Page:
     base = cy + half + _MARK_GAP + _MARK + 2.0 + _TEXT
     for i, line in enumerate(wrapped(texts, _TEXT, place.width - 2 * UNPRINTABLE)):
         items.append(Text(cx, base + _LINE * i, line, _TEXT, "middle"))
-    back = tuple(placed(item, place.width, 0.0, mirror=True) for item in items)
-    return Page(place.width, place.height, back)
+    return Page(place.width, place.height, tuple(items))
 
 
 def _rulers(cx: float, cy: float, half_x: float, half_y: float) -> list[Item]:

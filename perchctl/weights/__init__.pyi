@@ -1,15 +1,9 @@
 from .collect import Experiment as Experiment
 from .collect import SessionFile as SessionFile
-from .fit import FITTED as FITTED
-from .fit import LmsOptions as LmsOptions
-from .plot import draw_weights as draw_weights
 from .result import fit_weights as fit_weights
 from .result import report_text as report_text
 from .result import weights_record as weights_record
 from .result import write_weights as write_weights
 from .simulated import SimulatedStand as SimulatedStand
-from .truth import EstimateTruth as EstimateTruth
 from .truth import MocapTruth as MocapTruth
 from .truth import TypedTruth as TypedTruth
-from .truth import four_numbers as four_numbers
-from .truth import open_named as open_named

@@ -17,8 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
+from perchctl.calibration import polled
 from perchctl.camera import FrameSource, check_size
-from perchctl.errors import Interrupted, InvalidValue, NotFound, TimedOut
+from perchctl.errors import Interrupted, InvalidValue, NotFound
 from perchctl.files import cannot_be_written
 from perchctl.geometry import Array, wrap_rad
 from perchctl.profile import Profile
@@ -41,7 +42,6 @@ SEEN_SHARE = 0.9
 STILL_PX = 1.0
 """The target's picture must not wander farther than this within a position (between its
 thirds), nor shake with a greater standard deviation."""
-SILENT_S = 5.0
 FAR_M, FAR_RAD = 0.03, math.radians(10.0)
 """A typed pose that differs from the camera's by more is asked about."""
 _LEAST_FRAMES = 3
@@ -62,26 +62,23 @@ class MarkerReading:
     center_px: Array | None
 
 
-class MarkerReader:
-    """Takes the frames of one place through the profile's pipeline, as it is when it merges by
-    weights; a new place needs a new reader."""
-
-    def __init__(
-        self, profile: Profile, camera: CameraModel, attitude: Attitude | None = None
-    ) -> None:
-        merge = profile.merge.model_copy(update={"method": "weights"})
-        self._setup = make_pipeline(profile.model_copy(update={"merge": merge}), camera)
-        self._attitude = attitude
-        self._state = PipelineState()
-
-    def read(self, frame: Frame) -> MarkerReading:
-        """The poses of one frame, relative to the gear in the level frame."""
-        self._state, output = step(self._state, frame, self._attitude, self._setup)
-        detections = output.detections
-        seen = [d for name in MARKERS if (d := detections.get(name)) is not None]
+def read_markers(
+    frames: Iterable[Frame],
+    profile: Profile,
+    camera: CameraModel,
+    attitude: Attitude | None = None,
+) -> Iterator[MarkerReading]:
+    """The poses in the frames of one place, relative to the gear in the level frame, by the
+    profile's pipeline as it is when it merges by weights."""
+    merge = profile.merge.model_copy(update={"method": "weights"})
+    setup = make_pipeline(profile.model_copy(update={"merge": merge}), camera)
+    state = PipelineState()
+    for frame in frames:
+        state, output = step(state, frame, attitude, setup)
+        seen = [d for name in MARKERS if (d := output.detections.get(name)) is not None]
         both = len(seen) == 2
-        joint = estimate_pose(seen, frame.t_s, self._attitude, self._setup.pose) if both else None
-        return MarkerReading(
+        joint = estimate_pose(seen, frame.t_s, attitude, setup.pose) if both else None
+        yield MarkerReading(
             frame.t_s,
             _vector(output.poses.get("large")),
             _vector(output.poses.get("small")),
@@ -162,27 +159,21 @@ class SessionFile:
             raise cannot_be_written(self.path, error) from None
 
     def _continue(self, frames: int) -> None:
-        try:
-            text = self.path.read_bytes()
-        except OSError as error:
-            raise InvalidValue(f"{self.path}: cannot be read: {error.strerror}") from None
-        *lines, torn = text.split(b"\n")
+        *lines, torn = self.path.read_bytes().split(b"\n")
         if not lines or lines[0].strip() != HEADER.encode():
             raise InvalidValue(
                 f"{self.path}: line 1: not a session of perchctl (its header differs), so "
                 f"nothing is appended; name a new file"
             )
-        positions = []
-        for number, line in enumerate(lines[1:], start=2):
-            cell = line.partition(b",")[0]
-            if not cell.isdigit():
-                raise InvalidValue(f"{self.path}: line {number}: position: not a whole number")
-            positions.append(int(cell))
+        try:
+            positions = [int(line.partition(b",")[0]) for line in lines[1:]]
+        except ValueError:
+            raise InvalidValue(f"{self.path}: a row's position is not a whole number") from None
         counts = Counter(positions)
-        if torn and positions and counts[positions[-1]] < frames:
-            # The position that was being written: its tail is lost, so all of it is taken again.
-            del lines[-counts.pop(positions[-1]) :]
         if torn:
+            # The position that was being written: its tail is lost, so all of it is taken again.
+            if positions and counts[positions[-1]] < frames:
+                del lines[-counts.pop(positions[-1]) :]
             os.truncate(self.path, sum(len(line) + 1 for line in lines))
             self.note = f"{self.path}: an unfinished end was taken off"
         self.done = list(counts)
@@ -234,11 +225,11 @@ class Experiment:
         except InvalidValue as error:
             return str(error)
         self._answer("hold still and press Enter (q stops): ")
-        reader = MarkerReader(self._profile, self._camera, before.attitude)
+        shown = self._frames(frames)
         readings = []
         with self._bar("frames", frames) as advance:
-            for frame in self._frames(frames):
-                readings.append(reader.read(frame))
+            for reading in read_markers(shown, self._profile, self._camera, before.attitude):
+                readings.append(reading)
                 advance()
         fault = fault_of(readings)
         if fault is None and self._truth.repeatable:
@@ -279,28 +270,20 @@ class Experiment:
     def _frames(self, count: int) -> Iterator[Frame]:
         if self._source.live:
             self._source.poll(self._now())  # taken before Enter was pressed
-        since_s = self._now()
         got = 0
-        while got < count:
-            now_s = self._now()
-            frame = self._source.poll(now_s)
-            if frame is not None and not frame.repeated:
-                if got == 0:
-                    height, width = frame.image.shape[:2]
-                    check_size((width, height), self._camera, self._source.describe())
-                got, since_s = got + 1, now_s
-                yield frame
+        for _, frame in polled(self._source, self._now, self._wait):
+            if frame is None or frame.repeated:
                 continue
-            if self._source.finished:
-                raise NotFound(
-                    f"{self._source.describe()} ended after {got} of {count} frames of the position"
-                )
-            if now_s - since_s > SILENT_S:
-                raise TimedOut(
-                    self._source.problem(now_s)
-                    or f"{self._source.describe()} gave no frame for {SILENT_S:g} s"
-                )
-            self._wait(0.002)
+            if got == 0:
+                height, width = frame.image.shape[:2]
+                check_size((width, height), self._camera, self._source.describe())
+            got += 1
+            yield frame
+            if got == count:
+                return
+        raise NotFound(
+            f"{self._source.describe()} ended after {got} of {count} frames of the position"
+        )
 
 
 def _pose_text(pose: Array) -> str:

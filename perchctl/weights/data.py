@@ -12,12 +12,10 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import math
 import operator
-import os
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +28,12 @@ from perchctl.geometry import Array
 AXES = ("x", "y", "z", "yaw")
 YAW = 3
 UNITS = ("m", "m", "m", "rad")
-SOURCES = ("large", "small", "actual")
+SOURCES = ("large", "small", "actual", "joint")
 
-LEAST_M = 0.005
-"""Coordinates below this are too small to compare scales by."""
 FARTHEST_M = 5.0
 """No pair of markers is seen from farther away than this."""
-_SLIPS = {100.0: ("centimetres", 50.0, 300.0), 1000.0: ("millimetres", 300.0, 3000.0)}
-"""A slip of units by its factor: its name, and the ratios that show it."""
-_MOST_POSITIONS = 1000  # whose units are looked at
+MOST_APART = np.array([0.3, 0.3, 0.3, np.radians(30.0)])
+"""A marker that measures a position so far from the truth was written in other units."""
 
 
 def pose_columns(source: str) -> tuple[str, ...]:
@@ -46,7 +41,7 @@ def pose_columns(source: str) -> tuple[str, ...]:
     return tuple(f"{source}_{axis}_{unit}" for axis, unit in zip(AXES, UNITS, strict=True))
 
 
-NEEDED = ("position", "t_s", *(column for source in SOURCES for column in pose_columns(source)))
+NEEDED = ("position", "t_s", *(column for source in SOURCES[:3] for column in pose_columns(source)))
 JOINT = pose_columns("joint")
 HEADER = ",".join((*NEEDED, *JOINT))
 
@@ -63,8 +58,6 @@ class Measurements:
         large, small: (n, 4), NaN where the marker was not seen.
         actual: (n, 4), the truth.
         joint: (n, 4), both markers solved together; NaN where it is missing.
-        line: the row's line in its file, (n,).
-        notes: sentences about the data that are no faults.
     """
 
     name: str
@@ -75,8 +68,6 @@ class Measurements:
     small: Array
     actual: Array
     joint: Array
-    line: NDArray[np.int64]
-    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.position)
@@ -100,19 +91,21 @@ def row_text(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
     return ",".join(cells) + "\n"
 
 
-def read_data(paths: Sequence[Path], test: Path | None = None) -> tuple[Measurements, Any]:
+def read_data(
+    paths: Sequence[Path], test: Path | None = None
+) -> tuple[Measurements, Measurements | None]:
     """All files as one, and the data of `test` (None without it), all of them checked.
 
     Positions of different files stay different. Errors: NotFound, UsageError; InvalidValue for a
-    file that cannot be fitted, and for a row that is there twice: it would narrow the intervals
-    and is no more evidence."""
+    file that cannot be fitted, and for a row that is there twice."""
     if not paths:
         raise UsageError("no data: name a CSV file; perchctl fit-weights collect makes one")
     parts = [read_csv(path) for path in paths]
     tested = None if test is None else read_csv(test)
-    for part in (*parts, *([tested] if tested is not None else [])):
-        check(part)
-    refuse_repeated(parts, tested)
+    whole = [*parts, *([] if tested is None else [tested])]
+    for part in whole:
+        _check_positions(part)
+    _refuse_repeated(whole, tested)
     return _joined(parts), tested
 
 
@@ -124,48 +117,14 @@ def _joined(parts: list[Measurements]) -> Measurements:
         positions.append(part.position - int(part.position.min()) + offset)
         offset = int(positions[-1].max()) + 1
     arrays: dict[str, Any] = {
-        key: np.concatenate([getattr(part, key) for part in parts])
-        for key in ("t_s", "large", "small", "actual", "joint", "line")
+        field.name: np.concatenate([getattr(part, field.name) for part in parts])
+        for field in fields(Measurements)[2:]
     }
     return Measurements(
-        name=", ".join(part.name for part in parts),
-        sha256=",".join(part.sha256 for part in parts),
-        position=np.concatenate(positions),
-        notes=tuple(note for part in parts for note in part.notes),
-        **arrays,
+        ", ".join(part.name for part in parts),
+        ",".join(part.sha256 for part in parts),
+        **arrays | {"position": np.concatenate(positions)},
     )
-
-
-def refuse_repeated(parts: Sequence[Measurements], test: Measurements | None = None) -> None:
-    """Raises InvalidValue where a row is there twice; `test` judges the fit, and must hold none
-    of the others' rows.
-
-    Without times, rows of one position may well be equal: rounded, of a camera at rest.
-    """
-    files = [*parts, *([] if test is None else [test])]
-    first: dict[bytes, tuple[Measurements, int]] = {}
-    for part in files:
-        timeless = float(np.ptp(part.t_s)) == 0.0
-        poses = [np.nan_to_num(getattr(part, source)) for source in SOURCES]
-        values = np.column_stack([part.t_s, *poses]) + 0.0  # no zero with a minus
-        content, size = values.tobytes(), values.itemsize * values.shape[1]
-        for row in range(len(part)):
-            key = content[row * size : (row + 1) * size]
-            if key not in first:
-                first[key] = (part, row)
-                continue
-            before, old_row = first[key]
-            if before is part and timeless and part.position[row] == part.position[old_row]:
-                continue
-            why = (
-                "--test judges by other data than was fitted to"
-                if part is test and before is not test
-                else "the same rows twice are no more evidence; take out what is there twice"
-            )
-            raise InvalidValue(
-                f"{part.name}: line {int(part.line[row])}: this row stands in line "
-                f"{int(before.line[old_row])} of {before.name} too: {why}"
-            )
 
 
 # --- Reading the CSV ---------------------------------------------------------------------------
@@ -176,263 +135,133 @@ def read_csv(path: Path) -> Measurements:
     try:
         with path.open("rb") as stream:
             sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-            stream.seek(-min(1, stream.tell()), os.SEEK_END)
-            ended = stream.read() == b"\n"
         with path.open(encoding="utf-8-sig", newline="") as text:
-            return _parsed(path, sha256, csv.reader(text, skipinitialspace=True), ended)
-    except FileNotFoundError:
-        raise NotFound(f"data file {path} does not exist") from None
-    except IsADirectoryError:
-        raise NotFound(f"data file {path} is a folder; name a .csv file") from None
+            columns, lines, table = _read_table(path, csv.reader(text, skipinitialspace=True))
     except OSError as error:
         raise NotFound(f"data file {path} cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error):
         raise InvalidValue(f"{path}: line 1: not a text file in UTF-8; a CSV is needed") from None
+    values = dict(zip(columns, table.T, strict=True))
+    poses = {
+        source: np.column_stack([values.get(name, np.nan * table[:, 0]) for name in names])
+        for source in SOURCES
+        for names in [pose_columns(source)]
+    }
+    _check_cells(path, lines, table[:, :2], poses)
+    return Measurements(
+        str(path), sha256, table[:, 0].astype(np.int64), table[:, 1].copy(), **poses
+    )
 
 
-def _parsed(path: Path, sha256: str, reader: Any, ended: bool) -> Measurements:
-    """`ended`: whether the last line has an end."""
-
-    def fault(line: int, text: str) -> InvalidValue:
-        return InvalidValue(f"{path}: line {line}: {text}")
-
-    columns = [name.strip() for name in next(reader, [])]
-    _check_header(columns, fault)
-    names = [name for name in (*NEEDED, *JOINT) if name in columns]
-    if not all(name in columns for name in JOINT):
-        names = list(NEEDED)
-    wanted = [columns.index(name) for name in names]
-    pick = operator.itemgetter(*wanted)
+def _read_table(path: Path, reader: Any) -> tuple[tuple[str, ...], NDArray[np.int64], Array]:
+    """The columns that count, each row's line (n,), and the numbers, NaN where a cell is empty."""
+    header = [name.strip() for name in next(reader, [])]
+    missing = [name for name in NEEDED if header.count(name) != 1]
+    if missing:
+        raise InvalidValue(
+            f"{path}: line 1: column {missing[0]} is missing, or there twice; needed are "
+            f"{','.join(NEEDED)}, separated by commas"
+        )
+    columns = (*NEEDED, *(JOINT if set(JOINT) <= set(header) else ()))
+    pick = operator.itemgetter(*(header.index(name) for name in columns))
     numbers, lines = array("d"), array("q")
     for cells in reader:
-        if len(cells) < 2 and not "".join(cells).strip():
+        if not any(cells):
             continue
-        line = reader.line_num
-        if len(cells) != len(columns):
-            if not ended and len(cells) < len(columns) and next(reader, None) is None:
-                raise fault(
-                    line,
-                    f"the file is cut in the middle of this line ({len(cells)} of {len(columns)} "
-                    f"cells): remove the line, or take the original file",
-                )
-            raise fault(line, f"{len(cells)} cells where the header has {len(columns)} columns")
+        lines.append(reader.line_num)
         try:
-            row = list(map(float, pick(cells)))
-            plain = math.isfinite(sum(row))
-        except ValueError:
-            plain = False
-        if not plain:  # a marker that was not seen, or a fault
-            row = [
-                _number(cells[k], name, line, fault) for k, name in zip(wanted, names, strict=True)
-            ]
-        numbers.extend(row)
-        lines.append(line)
+            if len(cells) != len(header):
+                raise ValueError(f"{len(cells)} cells where the header has {len(header)} columns")
+            numbers.extend([float(cell or "nan") for cell in pick(cells)])
+        except ValueError as error:
+            raise InvalidValue(f"{path}: line {reader.line_num}: {error}") from None
     if not lines:
-        raise fault(2, "there is no row of data after the header")
-    table = np.array(numbers).reshape(len(lines), len(names))
-    at = np.array(lines, dtype=np.int64)
-    _check_cells(table, names, at, fault)
-
-    def pose(source: str) -> Array:
-        first = names.index(pose_columns(source)[0])
-        return np.ascontiguousarray(table[:, first : first + 4])
-
-    note = (
-        f"{path}: line {int(at[-1])}: the last line has no end; if the file was cut, its last "
-        f"value may be short"
-    )
-    return Measurements(
-        name=str(path),
-        sha256=sha256,
-        position=table[:, 0].astype(np.int64),
-        t_s=table[:, 1].copy(),
-        large=pose("large"),
-        small=pose("small"),
-        actual=pose("actual"),
-        joint=pose("joint") if JOINT[0] in names else np.full((len(at), 4), np.nan),
-        line=at,
-        notes=() if ended else (note,),
-    )
+        raise InvalidValue(f"{path}: line 2: there is no row of data after the header")
+    table = np.array(numbers).reshape(len(lines), len(columns))
+    return columns, np.array(lines), table
 
 
-def _check_header(columns: list[str], fault: Any) -> None:
-    if not any(columns):
-        raise fault(1, f"the file is empty; its first line must be {','.join(NEEDED)}")
-    missing = [name for name in NEEDED if name not in columns]
-    if missing:
-        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
-        text = columns[0]
-        hint = " (cells must be separated by commas)" if ";" in text or "\t" in text else ""
-        raise fault(
-            1, f"column {missing[0]} is missing{more}{hint}; needed are {', '.join(NEEDED)}"
-        )
-    twice = [name for name in NEEDED if columns.count(name) > 1]
-    if twice:
-        raise fault(1, f"column {twice[0]} is there twice")
+def _check_cells(
+    path: Path, lines: NDArray[np.int64], heads: Array, poses: dict[str, Array]
+) -> None:
+    """Raises InvalidValue for a number that is none, an empty cell, or half a pose."""
 
-
-def _number(cell: str, column: str, line: int, fault: Any) -> float:
-    text = cell.strip()
-    try:
-        value = float(text or "nan")
-    except ValueError:
-        raise fault(line, f"{column}: {text!r} is not a number") from None
-    if text and not math.isfinite(value):
-        raise fault(
-            line,
-            f"{column}: {text} is not a measurement; leave the cell empty where a marker was "
-            f"not seen",
-        )
-    return value
-
-
-def _check_cells(table: Array, names: list[str], lines: NDArray[np.int64], fault: Any) -> None:
-    """Empty cells where there must be a value, half poses, positions that are no number."""
-
-    def refuse(bad: NDArray[np.bool_], columns: Sequence[str], text: str) -> None:
+    def refuse(bad: Any, text: str) -> None:
         if bad.any():
-            row = int(np.argmax(bad.any(axis=1)))
-            column = columns[int(np.argmax(bad[row]))]
-            raise fault(int(lines[row]), f"{column}: {text}")
+            raise InvalidValue(f"{path}: line {int(lines[np.argmax(bad)])}: {text}")
 
-    empty = np.isnan(table)
-    must = ("position", "t_s", *pose_columns("actual"))
-    text = "the cell is empty; only cells of a marker that was not seen may be"
-    refuse(empty[:, [names.index(name) for name in must]], must, text)
-    place = table[:, :1]
-    refuse((place != np.floor(place)) | (np.abs(place) > 2**52), names, "must be a whole number")
-    for source in ("large", "small", "joint"):
-        if pose_columns(source)[0] not in names:
-            continue
-        first = names.index(pose_columns(source)[0])
-        part = empty[:, first : first + 4]
+    refuse(
+        ~np.isfinite(heads).all(axis=1) | (heads[:, 0] != np.floor(heads[:, 0])),
+        "position must be a whole number, and t_s a number",
+    )
+    for source, pose in poses.items():
+        refuse(np.isinf(pose).any(axis=1), f"the {source} pose holds an infinite number")
         refuse(
-            part & ~part.all(axis=1, keepdims=True), pose_columns(source),
-            f"the cell is empty, but others of the {source} pose are not; leave all four empty "
-            f"where it was not seen",
-        )  # fmt: skip
-
-
-# --- Data that would fit to nonsense: unit slips, markers never seen, values that stand still --
-
-
-def check(data: Measurements) -> None:
-    """Raises InvalidValue, with file and line, for data that cannot be fitted."""
-    _check_seen(data)
-    _check_units(data)
-    _check_variation(data)
-
-
-def _check_seen(data: Measurements) -> None:
-    seen = {name: ~np.isnan(getattr(data, name)[:, 0]) for name in ("large", "small")}
-    unseen = [f"the {name} marker is never seen" for name, rows in seen.items() if not rows.any()]
-    if not data.both.any():
-        what = unseen[0] if unseen else "no row holds both markers"
-        raise InvalidValue(
-            f"{data.name}: lines {int(data.line[0])} to {int(data.line[-1])}: {what}, so there is "
-            f"nothing to merge; take positions from which both markers are whole in the picture"
+            np.abs(pose[:, YAW]) > 2.0 * np.pi + 1e-6,
+            f"{source}_yaw_rad looks like degrees where radians are needed",
         )
+        empty = np.isnan(pose)
+        refuse(
+            empty.any(axis=1) & ~empty.all(axis=1),
+            f"a cell of the {source} pose is empty, but others are not; leave all four empty "
+            f"where the marker was not seen",
+        )
+    refuse(np.isnan(poses["actual"][:, 0]), "the actual pose is empty")
+
+
+# --- Data that would fit to nonsense -------------------------------------------------------------
+
+
+def _check_positions(data: Measurements) -> None:
+    """Raises InvalidValue for a marker that was never seen, a single position, or wrong units."""
+    for source in ("large", "small"):
+        if np.isnan(getattr(data, source)).all():
+            raise InvalidValue(f"{data.name}: the {source} marker is never seen")
     places = np.unique(data.position[data.both])
     if len(places) < 2:
         raise InvalidValue(
-            f"{data.name}: line {int(data.line[data.both][0])}: all rows with both markers are of "
-            f"position {int(places[0])}; frames of one position are not independent, so at "
-            f"least 2 positions are needed (10 are usual)"
+            f"{data.name}: {len(places)} positions show both markers; frames of one position are "
+            f"not independent, so at least 2 are needed (10 are usual)"
         )
-
-
-def _check_variation(data: Measurements) -> None:
-    large, small = data.large[data.both], data.small[data.both]
-    where = f"{data.name}: line {int(data.line[data.both][0])}"
-    for source, values in (("large", large), ("small", small)):
-        still = np.ptp(values, axis=0) == 0.0
-        # A plain truth may stand still on one axis; a measurement of it cannot.
-        if len(values) > 2 and still.any():
-            axis = int(np.argmax(still))
+    for place in places:
+        rows = data.both & (data.position == place)
+        actual = data.actual[rows]
+        if np.linalg.norm(np.median(actual[:, :YAW], axis=0)) > FARTHEST_M:
             raise InvalidValue(
-                f"{where}: {pose_columns(source)[axis]} is {values[0, axis]:g} in every row with "
-                f"both markers: constant data are no measurement"
+                f"{data.name}: position {place} is more than {FARTHEST_M:g} m away: metres and "
+                f"radians are needed, not centimetres and degrees"
             )
-    same = np.abs(large - small).max(axis=0) < 1e-12
+        for source in ("large", "small"):
+            apart = getattr(data, source)[rows] - actual
+            apart[:, YAW] = wrap(apart[:, YAW])
+            far = np.abs(np.median(apart, axis=0)) > MOST_APART
+            if far.any():
+                raise InvalidValue(
+                    f"{data.name}: position {place}: {source} and actual do not agree in "
+                    f"{AXES[int(np.argmax(far))]}: all poses must be in metres and radians, and "
+                    f"in one frame"
+                )
+
+
+def _refuse_repeated(parts: Sequence[Measurements], test: Measurements | None) -> None:
+    """Raises InvalidValue where a row is there twice: it would narrow the intervals and is no more
+    evidence, and one that was fitted to is no test.
+
+    Without times, rows of one file may well be equal: rounded, of a camera at rest.
+    """
+    if len({part.sha256 for part in parts}) < len(parts):
+        raise InvalidValue(f"{parts[-1].name}: the same file twice is no more evidence")
+    timed = [part for part in parts if np.ptp(part.t_s) > 0.0]
+    if not timed:
+        return
+    rows = np.concatenate(
+        [np.nan_to_num(np.column_stack([p.t_s, p.large, p.small, p.actual])) for p in timed]
+    )
+    owner = np.repeat(np.arange(len(timed)), [len(part) for part in timed])
+    order = np.lexsort(rows.T)
+    same = (np.diff(rows[order], axis=0) == 0.0).all(axis=1)
     if same.any():
-        raise InvalidValue(
-            f"{where}: both markers give the same {AXES[int(np.argmax(same))]} in every row, so "
-            f"every weight fits alike; was one marker's column copied?"
-        )
-
-
-def _check_units(data: Measurements) -> None:
-    medians, lines = _medians(data)
-    _check_radians(data, medians, lines)
-
-    def slipped(place: int, source: int, axis: int, times: float, whole: bool) -> InvalidValue:
-        column = pose_columns(SOURCES[source])[axis]
-        subject = "all positions look" if whole else f"{column} looks"
-        return InvalidValue(
-            f"{data.name}: line {int(lines[place])}: {subject} like {_SLIPS[times][0]} where "
-            f"metres are needed ({column} is {medians[place, source, axis]:g}): divide by {times:g}"
-        )
-
-    for place, poses in enumerate(np.abs(medians)):
-        for axis in range(YAW):
-            slip = _odd_one_out(poses[:, axis])
-            if slip is not None:
-                raise slipped(place, slip[0], axis, slip[1], whole=False)
-    # All three alike, but farther away than anything can be.
-    typical = float(np.median(np.linalg.norm(medians[:, SOURCES.index("actual"), :YAW], axis=1)))
-    if typical > FARTHEST_M:
-        raise slipped(0, 0, 2, 1000.0 if typical > 60.0 else 100.0, whole=True)
-
-
-def _medians(data: Measurements) -> tuple[Array, NDArray[np.int64]]:
-    """Of each position the medians, (positions, source, axis), and its first line."""
-    order = np.argsort(data.position, kind="stable")
-    places = np.split(order, np.flatnonzero(np.diff(data.position[order])) + 1)
-    places = places[:: max(1, len(places) // _MOST_POSITIONS)]
-    medians = np.full((len(places), len(SOURCES), 4), np.nan)
-    for row, rows in enumerate(places):
-        for column, source in enumerate(SOURCES):
-            values = getattr(data, source)[rows]
-            seen = values[~np.isnan(values[:, 0])]
-            if len(seen):
-                medians[row, column] = np.median(seen, axis=0)
-    return medians, np.array([data.line[rows[0]] for rows in places])
-
-
-def _odd_one_out(size: Array) -> tuple[int, float] | None:
-    """Which of large, small and actual is 100 or 1000 times the others, and how many times."""
-    for source in range(len(size)):
-        others = [s for s in range(len(size)) if s != source and not np.isnan(size[s])]
-        if np.isnan(size[source]) or not others:
-            continue
-        if size[others].max() > 3.0 * size[others].min():
-            continue  # the others do not agree either
-        rest = float(size[others].mean())
-        wrong = source if size[source] > rest else others[0]  # a slip makes numbers larger
-        low, high = sorted((float(size[source]), rest))
-        for times, (_, least, most) in _SLIPS.items():
-            if low >= LEAST_M and least <= high / low < most:
-                return wrong, times
-    return None
-
-
-def _check_radians(data: Measurements, medians: Array, lines: NDArray[np.int64]) -> None:
-    advice = "looks like degrees where radians are needed: multiply by pi / 180"
-    for source in SOURCES:
-        values = getattr(data, source)[:, YAW]
-        far = np.abs(values) > 2.0 * math.pi + 1e-6
-        if far.any():
-            row = int(np.argmax(far))
-            raise InvalidValue(
-                f"{data.name}: line {int(data.line[row])}: {pose_columns(source)[YAW]} is "
-                f"{values[row]:g}, which {advice}"
-            )
-    # Small angles in degrees stay below a turn: their ratio gives them away.
-    yaw = np.abs(medians[:, :, YAW])
-    for column, source in enumerate(SOURCES):
-        others = np.delete(yaw, column, axis=1).mean(axis=1)
-        clear = ~np.isnan(yaw).any(axis=1) & (others > math.radians(0.5))
-        if clear.sum() >= 2 and 45.0 < float(np.median(yaw[clear, column] / others[clear])) < 70.0:
-            raise InvalidValue(
-                f"{data.name}: line {int(lines[clear][0])}: {pose_columns(source)[YAW]} {advice}"
-            )
+        row = int(order[1:][same][0])
+        part = timed[int(owner[row])]
+        why = "the test's rows were fitted to" if part is test else "it is no more evidence"
+        raise InvalidValue(f"{part.name}: the row of t_s {rows[row, 0]:g} is there twice: {why}")

@@ -17,13 +17,9 @@ from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, w
 from perchctl.profile import Profile
 from perchctl.sim import Renderer, Scenario
 from perchctl.vision import CameraModel, Frame, project, rotation_vector, square_corners
-from perchctl.weights.collect import (
-    MarkerReader,
-    SessionFile,
-    fault_of,
-    rows_of,
-)
+from perchctl.weights.collect import SessionFile, fault_of, read_markers, rows_of
 
+NOISE_SIGMA, BLUR_PX = 4.0, 1.0
 MARGIN_PX = 4.0
 FRAME_S = 1.0 / 30.0
 _TRIES = 400
@@ -41,43 +37,33 @@ class Place:
 class SimulatedStand:
     """The simulated camera on its stand. Same seed, same places, same pictures."""
 
-    def __init__(
-        self,
-        profile: Profile,
-        camera: CameraModel,
-        positions: int,
-        seed: int,
-        noise_sigma: float,
-        blur_px: float,
-    ) -> None:
+    def __init__(self, profile: Profile, camera: CameraModel, positions: int, seed: int) -> None:
         self._profile, self._camera, self._seed = profile, camera, seed
         self._positions = positions
         self._scenario = Scenario(
             seed=seed,
             large_side_m=profile.target.large.side_m,
             small_side_m=profile.target.small.side_m,
-            camera_noise_sigma=noise_sigma,
-            camera_defocus_px=blur_px,
+            camera_noise_sigma=NOISE_SIGMA,
+            camera_defocus_px=BLUR_PX,
         )
         self._renderer = Renderer(self._scenario, camera, profile.target, seed)
         self._corners = square_corners(profile.target.large.side_m)
 
-    def fill(
-        self, session: SessionFile, positions: int, frames: int, advance: Callable[[], None]
-    ) -> None:
-        """Append so many positions to the session; `advance` is called with each frame.
-        Errors: InvalidValue."""
-        for position in range(session.next_position, session.next_position + positions):
+    def fill(self, session: SessionFile, frames: int, advance: Callable[[], None]) -> None:
+        """Complete the session; `advance` is called with each frame. Errors: InvalidValue."""
+        while len(session.done) < self._positions:
+            position = session.next_position
             place, readings = self.place(position), []
-            reader = MarkerReader(self._profile, self._camera)
-            for frame in self.frames(position, place, frames):
-                readings.append(reader.read(frame))
+            shown = self.frames(position, place, frames)
+            for reading in read_markers(shown, self._profile, self._camera):
+                readings.append(reading)
                 advance()
             fault = fault_of(readings)
             if fault is not None:
                 raise InvalidValue(
-                    f"position {position} of the simulated experiment cannot be used ({fault}); "
-                    f"less --noise or --blur, or another --seed, makes it seen"
+                    f"position {position} of the simulated experiment cannot be used ({fault}): "
+                    f"take another --seed"
                 )
             session.append(position, rows_of(position, readings, place.actual))
 
@@ -102,6 +88,7 @@ class SimulatedStand:
         )
 
     def frames(self, position: int, place: Place, count: int) -> Iterator[Frame]:
+        """The pictures of a place."""
         for k in range(count):
             index = position * 100_000 + k
             image = self._renderer.render([place.T_world_cam], frame_index=index)

@@ -146,7 +146,7 @@ def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("words", [
     ("calibrate", "convert", "{chain}", "-o", "{out}.yaml"),
     ("calibrate", "check", "{chain}", "{pictures}"),
-    ("make-target", "design", "{chain}", "--plot", "{out}.png"),
+    ("make-target", "design", "{chain}"),
     ("track", "{pictures}", "--stills", "--json", "--calibration", "{chain}"),
     ("track", "{pictures}", "--stills", "--json", "-p", "{profile}"),
 ])  # fmt: skip

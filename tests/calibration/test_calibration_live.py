@@ -177,13 +177,11 @@ def test_live_pictures_are_kept_as_they_come_also_of_a_camera_that_goes(
     for pose in draw_poses(rng, camera, CHESSBOARD, 2):
         images += [renderer.render(pose, rng, noise=1.0)] * 2
     folder = tmp_path / "calib" / "pictures"
-    for names in (["view_001.png", "view_002.png"], ["view_003.png", "view_004.png"]):
-        with pytest.raises(TimedOut, match="only 2 views"):
-            captured_views(_Ended(list(images)), CHESSBOARD, folder, None)
-        assert f"kept 2 pictures: images:{folder} takes them again" in capsys.readouterr().err
-        kept = [cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) for name in names]
-        assert (kept[0] == images[0]).all()
-        assert (kept[1] == images[2]).all()
+    with pytest.raises(TimedOut, match="only 2 views"):
+        captured_views(_Ended(list(images)), CHESSBOARD, folder, None)
+    assert f"kept 2 pictures: images:{folder} takes them again" in capsys.readouterr().err
+    for k, name in enumerate(("view_001.png", "view_002.png")):
+        assert (cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) == images[2 * k]).all()
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(TimedOut, match="only 2 views"):  # a full disk is no reason to end
         captured_views(_Ended(list(images)), CHESSBOARD, tmp_path / "file" / "p", None)
@@ -202,7 +200,6 @@ def test_a_live_camera_is_refused_before_anybody_has_worked_for_it(
         url = page.url.replace("/?", "/stream?")
         sentence = refused(calibrate(url), 30)
         assert "camera_64x48.yaml exists already; add --force" in sentence
-        assert "is a file" in refused(calibrate(url, "--keep-pictures", str(output)), 30)
     assert output.read_text() == "mine"
 
 

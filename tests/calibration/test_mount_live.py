@@ -95,8 +95,6 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     newest = recording.attitudes[-1]
     rpy_rad = (newest.roll_rad, newest.pitch_rad, newest.yaw_rad)
     assert rpy_rad == pytest.approx(sim.truth()["rpy_rad"], abs=0.05)
-    assert newest.position_m is not None
-    assert newest.position_m == pytest.approx([0.0, 0.0, 0.6], abs=0.1)
     ages_s = np.diff([a.t_s for a in recording.attitudes])
     assert np.median(ages_s) == pytest.approx(0.01, abs=1e-4)
     assert abs(recording.poses[-1].t_s - newest.t_s) < 0.5  # one clock

@@ -22,7 +22,7 @@ def _recordings() -> tuple[MountingRecording, MountingRecording]:
     rng = np.random.default_rng(1)
     attitudes = (
         AttitudeSample(1.25, 0.1, -0.2, 3.0, rng.normal(size=3)),
-        AttitudeSample(1.26, 0.1, -0.2, -3.1, rng.normal(size=3), rng.normal(size=3), 0.02),
+        AttitudeSample(1.26, 0.1, -0.2, -3.1, np.array([0.02, 1.0, 2.0])),
     )
     root = rng.normal(size=(6, 6)) * 1e-4
     R = rotation_from_rpy(3.0, 0.4, -2.0)

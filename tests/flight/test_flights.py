@@ -395,7 +395,6 @@ PAL = {"camera_rate_hz": 25.0}
 @pytest.mark.parametrize("scenario", [
     PAL | {"camera_receiver_hz": 60.0},
     PAL | {"camera_receiver_hz": 30.0},
-    PAL | {"camera_receiver_hz": 60.0, "camera_receiver_noise": 1.5},
     PAL | {"camera_receiver_hz": 60.0, "camera_fields": "top"},
     {"camera_blank_rate": 0.2},
 ])  # fmt: skip

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 
 from perchctl.calibration import BoardView
-from perchctl.calibration.board.adjust import pixel_grid
 from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.target import Board, parse_board
@@ -103,19 +102,6 @@ def corner_views(
     return [
         corner_view(rng, camera, board, pose, noise_px, f"view {i}") for i, pose in enumerate(poses)
     ]
-
-
-def ray_difference_px(camera: CameraModel, truth: CameraModel) -> Array:
-    """Distance in px between where two cameras image the same rays, over `pixel_grid` of
-    the second, (n,); NaN where a ray cannot be had."""
-    grid = pixel_grid(truth.size_px)
-    rays = undistort(grid, truth)
-    result = np.full(len(grid), np.nan)
-    good = np.isfinite(rays).all(axis=1)
-    points = np.column_stack([rays[good], np.ones(good.sum())])
-    there = project(points, np.zeros(3), np.zeros(3), camera)
-    result[good] = np.linalg.norm(there - grid[good], axis=1)
-    return result
 
 
 class BoardRenderer:

@@ -44,7 +44,6 @@ def hand(
 def seen(
     held: Hand,
     errors: bool = True,
-    positioned: bool = False,
     wrong: float = 0.0,
     claimed: float = 1.0,
     salt: int = 0,
@@ -78,4 +77,4 @@ def seen(
         for k, t in enumerate(stamped_s)
     )
     by = pose_basis(profile(), profile_camera(profile().camera))
-    return MountingRecording(held.part, attitudes(held, positioned, errors), poses, seen_by=by)
+    return MountingRecording(held.part, attitudes(held, errors), poses, seen_by=by)

@@ -66,7 +66,6 @@ def measured(
         small=turned(actual + b),
         actual=turned(actual),
         joint=np.full((n, 4), np.nan),
-        line=np.arange(n) + 2,
     )
 
 

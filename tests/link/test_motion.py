@@ -14,41 +14,31 @@ import pytest
 from perchctl.errors import TimedOut
 from perchctl.link import MotionLink, motion
 from perchctl.link.cflib_link import SILENCE_S
-from perchctl.link.motion import PLACE_BLOCK, TURN_BLOCK, Motions
-from perchctl.link.telemetry import VARIANCE_BLOCK
+from perchctl.link.motion import MOTORS_BLOCK, TURN_BLOCK, Motions
 from perchctl.profile import LinkConfig
 from perchctl.vehicle import FLYING
 
 
 def test_whether_motors_turn_is_the_newest_packet_s() -> None:
     motions = Motions(lambda: 0.0)
-    place = {f"stateEstimate.{axis}": 0.0 for axis in "xyz"}
     for bits in (FLYING, 0, FLYING | 0x2):
-        motions.on_place(0, place | {"supervisor.info": bits})
+        motions.on_motors(0, {"supervisor.info": bits})
         assert motions.motors_run == bool(bits)
 
 
 def test_samples_are_in_radians_right_handed_and_of_one_moment() -> None:
     now = [5.0]
     motions = Motions(lambda: now[0])
-    place = {"stateEstimate.x": 1.0, "stateEstimate.y": 0.0, "stateEstimate.z": 0.5}
-    known = {f"kalman.varP{axis}": 1e-4 for axis in "XYZ"} | {"supervisor.info": 0.0}
     turned = {"stateEstimate.roll": 10.0, "stateEstimate.pitch": 20.0, "stateEstimate.yaw": -30.0}
     rates = {"gyro.x": 1.0, "gyro.y": 2.0, "gyro.z": 3.0}
     motions.on_turn(1000, turned | rates)
-    motions.on_place(1000, place | known)
-    now[0] += 0.01
-    motions.on_place(1010, place | {"stateEstimate.x": 1.01} | known)
-    now[0] += 0.005
+    now[0] += 0.015
     motions.on_turn(1015, turned | rates)
     first, second = motions.take()
-    assert first.position_m is None  # nothing was known of it yet
     assert second.t_s - first.t_s == pytest.approx(0.015)
     rpy = (second.roll_rad, second.pitch_rad, second.yaw_rad)
     assert rpy == pytest.approx(np.radians([10.0, -20.0, -30.0]))
     assert second.gyro_radps == pytest.approx(np.radians([1.0, 2.0, 3.0]))
-    assert second.position_m == pytest.approx([1.015, 0.0, 0.5])
-    assert second.position_sigma_m == pytest.approx(0.01)
     assert motions.take() == []
 
 
@@ -62,27 +52,6 @@ def test_a_turn_that_is_no_number_is_dropped_alone(name: str, number: float) -> 
     taken = motions.take()
     assert len(taken) == 2
     assert np.isfinite([[a.roll_rad, a.pitch_rad, a.yaw_rad, *a.gyro_radps] for a in taken]).all()
-
-
-@pytest.mark.parametrize("name", [*list(PLACE_BLOCK)[:3], *VARIANCE_BLOCK])
-@pytest.mark.parametrize("number", [math.nan, math.inf])
-def test_a_place_that_is_no_number_is_none_but_tells_of_the_motors(
-    name: str, number: float
-) -> None:
-    now = [5.0]
-    motions = Motions(lambda: now[0])
-    whole = dict.fromkeys((*PLACE_BLOCK, *VARIANCE_BLOCK), 1.0) | {"supervisor.info": 0}
-    places = (whole, whole, whole | {name: number, "supervisor.info": FLYING}, whole, whole)
-    for step, place in enumerate(places):
-        now[0] = 5.0 + 0.01 * step
-        motions.on_place(1000 + 10 * step, place)
-        assert motions.motors_run == bool(place["supervisor.info"])
-        motions.on_turn(1000 + 10 * step, dict.fromkeys(TURN_BLOCK, 1.0))
-    taken = motions.take()
-    known = [a.position_m is not None and a.position_sigma_m is not None for a in taken]
-    assert known == [False, True, False, True, True]
-    assert taken[2].position_m is taken[2].position_sigma_m is None
-    assert all(np.isfinite(a.position_m).all() for a in taken if a.position_m is not None)
 
 
 def sending(blocks: Iterable[str], monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
@@ -107,7 +76,7 @@ def connection() -> Any:
 
 
 @pytest.mark.parametrize(
-    ("blocks", "missing"), [(["turn"], "whether its motors turn"), (["place"], "how it is turned")]
+    ("blocks", "missing"), [(["turn"], "whether its motors turn"), (["motors"], "how it is turned")]
 )
 def test_nothing_begins_before_both_blocks_came(
     blocks: list[str], missing: str, monkeypatch: pytest.MonkeyPatch
@@ -120,17 +89,17 @@ def test_nothing_begins_before_both_blocks_came(
 
 
 @pytest.mark.parametrize(
-    ("stops", "lost"), [("place", "whether its motors turn"), ("turn", "how it is turned")]
+    ("stops", "lost"), [("motors", "whether its motors turn"), ("turn", "how it is turned")]
 )
 def test_a_block_that_ends_is_a_problem_while_the_other_goes_on(
     stops: str, lost: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    takers = sending(["turn", "place"], monkeypatch)
+    takers = sending(["turn", "motors"], monkeypatch)
     now = [0.0]
     link = MotionLink("usb://0", LinkConfig(), lambda: now[0])
     link._prepare(connection())
-    whole = dict.fromkeys((*TURN_BLOCK, *PLACE_BLOCK), 0.0)
-    other = "turn" if stops == "place" else "place"
+    whole = dict.fromkeys((*TURN_BLOCK, *MOTORS_BLOCK), 0.0)
+    other = "turn" if stops == "motors" else "motors"
     while now[0] < SILENCE_S:
         assert link.problem(now[0]) is None
         now[0] += 0.1
@@ -141,10 +110,10 @@ def test_a_block_that_ends_is_a_problem_while_the_other_goes_on(
 
 
 def test_both_blocks_are_waited_for_whichever_comes_first() -> None:
-    whole = dict.fromkeys((*TURN_BLOCK, *PLACE_BLOCK), 0.0)
+    whole = dict.fromkeys((*TURN_BLOCK, *MOTORS_BLOCK), 0.0)
     for turn_first in (True, False):
         motions = Motions(lambda: 0.0)
-        takers = (motions.on_turn, motions.on_place)
+        takers = (motions.on_turn, motions.on_motors)
         for count, take in enumerate(takers if turn_first else takers[::-1], start=1):
             take(1000, whole)
             assert motions.both.is_set() == (count == 2)

@@ -19,16 +19,16 @@ from perchctl.target import (
     Optics,
     TargetDesign,
     check_target,
-    draw_design,
     make_design,
     suggest_target,
 )
 from perchctl.target.design import Ranges, pose_bound
 from perchctl.target.drawing import marker_corners_m
+from perchctl.target.page import parse_page
+from perchctl.target.sheets import fits
 from perchctl.target.sight import SURE_PX, FieldOfView, square_outline, turned_outline
-from perchctl.target.suggest import Suggestion
 from tests.helpers.flights import short_profile
-from tests.target.rig import camera_of
+from tests.target.rig import camera_of, sized
 
 TARGET = TargetConfig()
 ROOT = Path(__file__).resolve().parents[2]
@@ -125,17 +125,6 @@ def test_the_bound_is_what_least_squares_spreads(sides: list[float], z_m: float)
     assert spread == pytest.approx(bound, rel=0.15)
 
 
-def test_the_curve_holds_what_is_seen(paper_design: TargetDesign) -> None:
-    curve = paper_design.curve
-    r = paper_design.ranges
-    assert r.z2_m is not None
-    assert r.z3_m is not None
-    both = np.isfinite(curve.bounds["both"][:, 0])
-    assert curve.z_m[both].min() == pytest.approx(r.z3_m, rel=0.05)
-    assert curve.z_m[both].max() == pytest.approx(r.z2_m, rel=0.05)
-    assert (curve.bounds["both"][both] <= curve.bounds["large"][both] + 1e-12).all()
-
-
 def warnings_of(profile: Profile, ranges: Ranges, **changes: Any) -> str:
     design = make_design(
         TARGET, PAPER_CAMERA, Optics(), profile, 2.4, dataclasses.replace(ranges, **changes)
@@ -165,58 +154,41 @@ def test_gaps_are_named(profile: Profile, paper_design: TargetDesign) -> None:
 def test_what_is_suggested_covers_the_way(
     profile: Profile, focal_px: float, blur_px: float, ceiling_m: float | None
 ) -> None:
-    found, design = suggest_target(camera_of(focal_px), Optics(blur_px), profile, 0.05, ceiling_m)
-    assert design.warnings == ()
-    assert found.notes == ()
-    assert design.ranges.z1_m is not None
-    assert design.ranges.z1_m >= (1.15 if ceiling_m is None else ceiling_m - 1.3)
+    found, page = suggest_target(camera_of(focal_px), Optics(blur_px), profile, 0.05, ceiling_m)
+    assert page == "a4"
+    assert found.warnings == ()
+    assert found.ranges.z1_m is not None
+    assert found.ranges.z1_m >= (1.15 if ceiling_m is None else ceiling_m - 1.3)
     check_target(found.target, 0.05)
-    assert found.page == "a4"
-    assert f"--large {found.target.large.side_m * 1e3:g}mm" in found.command()
+    assert fits(found.target, parse_page("a4"))
+    assert not fits(sized(1e3 * found.target.large.side_m + 5, 25.0), parse_page("a4"))
 
 
 @pytest.mark.long
-def test_what_is_suggested_is_more_exact_than_the_target_there_is(profile: Profile) -> None:
-    """At every range at which both are seen; and it says what its sizes follow from."""
+def test_a_larger_page_or_a_smaller_magnet_gives_other_sizes(profile: Profile) -> None:
     camera, optics = camera_of(380.0), Optics(2.0)
-    found, design = suggest_target(camera, optics, profile, 0.05, 2.4)
-    present = make_design(profile.target, camera, optics, profile, 2.4)
+    found, _ = suggest_target(camera, optics, profile, 0.05, 2.4)
     assert found.target.large.side_m > profile.target.large.side_m
-    rows = {row[:30].strip(): row[30:].split()[-2:] for row in design.compared_with(present, "sim")}
-    assert rows[""] == ["proposed", "sim"]
-    errors = [values for what, values in rows.items() if what.startswith("least error")]
-    assert len(errors) == 4
-    assert all(float(new) < float(old) for new, old in errors)
-    large, small = found.reasons
-    assert "a4 holds no larger" in large
-    assert "the larger, the more exact" in small
-    larger, _ = suggest_target(camera, optics, profile, 0.05, 2.4, "a3")
-    assert larger.page == "a3"
+    larger, page = suggest_target(camera, optics, profile, 0.05, 2.4, "a3")
+    assert page == "a3"
     assert larger.target.large.side_m > found.target.large.side_m
-    assert "not inside of the magnet" in larger.reasons[1]
+    tiny, page = suggest_target(camera_of(250.0), Optics(1.5), profile, 0.008, 4.0)
+    assert page != "a4", "the search needs more than it holds"
+    assert any("gap between the markers" in warning for warning in tiny.warnings)
 
 
-@pytest.mark.long
-def test_what_no_target_can_cover_is_said(profile: Profile) -> None:
-    found, _ = suggest_target(camera_of(250.0), Optics(1.5), profile, 0.008, 4.0)
-    assert any("small marker would have to be" in note for note in found.notes)
-
-
-def test_the_plot_and_the_record(paper_design: TargetDesign) -> None:
-    png = draw_design(paper_design)
-    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-    assert picture is not None
-    assert min(picture.shape[:2]) > 500
+def test_the_text_and_the_record_hold_ranges_and_errors(paper_design: TargetDesign) -> None:
     record = paper_design.record()
     assert record["z1_m"] == paper_design.ranges.z1_m
     assert record["warnings"] == []
-
-
-def test_a_target_beyond_the_named_pages_is_proposed_in_sheets() -> None:
-    target = load_profile("sim").target
-    assert Suggestion(target, "a3", (), ()).command().endswith("--page a3")
-    command = Suggestion(target, "460x500mm", (), ()).command()
-    assert command.endswith("--page 460x500mm --tile a3")
+    text = paper_design.text("camera.yaml")
+    rows = [line.split() for line in text.splitlines() if line.endswith(("large", "small"))]
+    seen = {float(row[0]): (float(row[2]), " ".join(row[4:])) for row in rows if len(row) >= 5}
+    assert seen[20.0][1] == "large and small"
+    assert seen[10.0][1] == "small"
+    assert seen[100.0][1] == "large"
+    bound = pose_bound([0.15, 0.025], 0.2, 380.0, 0.2)
+    assert seen[20.0][0] == pytest.approx(1e3 * bound[2], abs=6e-4)
 
 
 def test_a_gap_on_the_ground_is_named_where_the_target_is_the_position() -> None:

@@ -33,7 +33,7 @@ from perchctl.target.page import (
 )
 from perchctl.target.page import text_width as width_of
 from perchctl.target.reading import PlainReader
-from perchctl.target.sheets import board_page, fitting_page, target_pages
+from perchctl.target.sheets import board_page, target_pages
 from tests.helpers.raster import PX_PER_MM, black_runs_mm, page_picture
 from tests.target.rig import sized, target_of
 
@@ -218,7 +218,6 @@ def test_a_page_too_small_is_refused_with_the_one_that_fits(large: float, page: 
     named = re.search(r"--page (\S+) holds it", str(refused.value))
     if named is not None:
         assert pages_of(target, named[1])[0].width > large
-        assert named[1] == fitting_page(target)
     else:
         assert "allowed are a4, letter, a3" in str(refused.value)
 
@@ -297,8 +296,8 @@ def shown_on(sheets: list[Page], size: tuple[float, float]) -> list[Circle]:
         for page in sheets
         for item in page.items
         if isinstance(item, Circle)
-        and UNPRINTABLE - 1e-6 <= item.x <= page.width - UNPRINTABLE + 1e-6
-        and UNPRINTABLE - 1e-6 <= item.y <= page.height - UNPRINTABLE + 1e-6
+        and UNPRINTABLE - 1e-6 <= item.x + page.origin[0] <= page.width - UNPRINTABLE + 1e-6
+        and UNPRINTABLE - 1e-6 <= item.y + page.origin[1] <= page.height - UNPRINTABLE + 1e-6
     ]
 
 
@@ -324,11 +323,20 @@ def test_a_page_that_fits_stays_as_it_is() -> None:
 def test_neighbours_share_the_seam_and_its_mark() -> None:
     page = Page(500.0, 250.0, (Text(250.0, 120.0, "x"),))
     left, right = tile_page(page, PAGES_MM["a3"])
-    for sheet in (left, right):
-        assert len([i for i in sheet.items if isinstance(i, Line)]) == 2
-    (mark, _), (same, _) = (
-        [i for i in sheet.items if isinstance(i, Line)] for sheet in (left, right)
-    )
-    assert mark.x0 - (left.width - UNPRINTABLE) == -OVERLAP / 2
-    assert same.x0 - UNPRINTABLE == OVERLAP / 2
-    assert mark.x0 - same.x0 == left.width - 2 * UNPRINTABLE - OVERLAP
+    assert left.items == right.items
+    (mark, _) = (item for item in left.items if isinstance(item, Line))
+    assert mark.x0 + left.origin[0] - (left.width - UNPRINTABLE) == -OVERLAP / 2
+    assert mark.x0 + right.origin[0] - UNPRINTABLE == OVERLAP / 2
+
+
+def test_a_tiled_page_s_sheets_show_it_true_to_size() -> None:
+    """The small marker, from corner to corner, on the sheet that holds it."""
+    sheets = tile_page(pages_of(sized(150.0, 25.0), "450x460mm")[0], PAGES_MM["a3"])
+    assert len(sheets) > 1
+    found = []
+    for number in range(len(sheets)):
+        picture = page_picture(pdf_bytes(sheets, "target"), number, 200)
+        if (quad := PlainReader(TARGET).read(picture).get("small")) is not None:
+            found.append(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1) * 25.4 / 200)
+    assert found
+    assert np.abs(np.array(found) - 25.0).max() < 2 * 25.4 / 200

@@ -86,14 +86,6 @@ def project_with_derivatives(
     return pixels, np.asarray(lens, np.float64), np.asarray(outside, np.float64)
 
 
-def pixel_derivatives(camera: CameraModel, rays: Array) -> Array:
-    """How pixels of fixed rays move with the lens parameters, (n, 2, p), by their normalised
-    coordinates (n, 2)."""
-    points = np.column_stack([rays, np.ones(len(rays))])
-    p = parameters_of(camera)
-    return project_with_derivatives(camera.model, p, np.zeros(6), points)[1].reshape(-1, 2, len(p))
-
-
 def pixel_grid(size_px: tuple[int, int], columns: int = 17, rows: int = 13) -> Array:
     """Pixels over the whole image with its rims, (columns * rows, 2)."""
     x, y = np.meshgrid(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,31 +36,24 @@ def views_of_images(
     where: str | Sequence[Path],
     board: Board,
     progress: Progress = lambda done, total: None,
-    skip_broken: bool = False,
 ) -> tuple[list[BoardView], list[Rejection]]:
-    """Every picture of a folder or glob (or those given): the views, and those without a board.
-
-    Args:
-        skip_broken: leave out what is no picture, or only a part of one.
+    """Every picture of a folder or glob (or those given): the views, and those without a board or
+    broken.
 
     Raises:
-        NotFound: no pictures. InvalidValue: broken ones (all are named), or unequal sizes.
+        NotFound: no pictures. InvalidValue: unequal sizes.
     """
     paths = image_files(where)
     names = [path.name for path in paths]
     if len(set(names)) < len(names):  # a glob reached into several folders
         names = [str(path) for path in paths]
-    broken: dict[str, str] = {}
 
     def search(job: tuple[str, Path]) -> tuple[str, tuple[int, int] | None, BoardView | str]:
         name, path = job
         try:
             image = read_grey(path)
         except BrokenPicture as error:
-            broken[name] = error.reason
             return name, None, error.reason
-        if broken and not skip_broken:
-            return name, None, ""  # only the broken ones are still asked for
         return name, (image.shape[1], image.shape[0]), find_board(image, board, name)
 
     views: list[BoardView] = []
@@ -83,20 +76,7 @@ def views_of_images(
             else:
                 missing.append(Rejection(name, seen))
             progress(done, len(paths))
-    if broken and not (skip_broken and first):
-        raise InvalidValue(_broken_text(broken, len(paths)))
     return views, missing
-
-
-def _broken_text(broken: Mapping[str, str], count: int) -> str:
-    """All of them by name, and what to do."""
-    named = ", ".join(f"{name} {reason}" for name, reason in broken.items())
-    if len(broken) == count:
-        return f"none of the {count} pictures can be used: {named}"
-    return (
-        f"{len(broken)} of {count} pictures cannot be used: {named}; replace or remove them, or "
-        f"leave them out with --skip-broken"
-    )
 
 
 def views_of_video(

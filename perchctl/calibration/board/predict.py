@@ -1,4 +1,4 @@
-"""What a calibration's error means: in pixels over the image, in mm at the target.
+"""What a calibration's error means in mm at the target.
 
 The pose solve takes up a part of a wrong calibration: a wrong focal length becomes a
 wrong height, not a wrong angle. So the error at the target is not the ray's error times
@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 
 from perchctl.calibration.board.adjust import (
     parameters_of,
-    pixel_derivatives,
     pixel_grid,
     poses_only,
     project_with_derivatives,
 )
 from perchctl.calibration.board.detect import BoardView
 from perchctl.geometry import Array
-from perchctl.vision import CameraModel, distort, project, undistort
+from perchctl.vision import CameraModel, project, undistort
 
 RANGES_M = (0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.25, 1.5)
 LARGE_M, SMALL_M = 0.150, 0.025
@@ -105,21 +104,6 @@ def position_errors_mm(
             np.inf if solved is None else 1e3 * np.linalg.norm(solved.poses[0, 3:] - place)
         )
     return np.array(errors)
-
-
-def ray_errors_px(camera: CameraModel, covariance: Array) -> tuple[float, float, Array]:
-    """95 % lines of the RMS and of the largest error of fixed rays over the image, in px,
-    and the 95 % line at each pixel of `pixel_grid` (n,), NaN where the lens images no ray."""
-    grid = pixel_grid(camera.size_px)
-    rays = undistort(grid, camera)
-    # Where the lens model folds back, no ray is imaged.
-    good = np.abs(distort(rays, camera) - grid).max(axis=1) < 0.5
-    moved = np.einsum("nkp,dp->dnk", pixel_derivatives(camera, rays[good]), _draws(covariance))
-    distance2 = (moved**2).sum(axis=2)
-    each = np.full(len(rays), np.nan)
-    each[good] = np.sqrt(np.quantile(distance2, CONFIDENCE, axis=0))
-    rms = float(np.quantile(np.sqrt(distance2.mean(axis=1)), CONFIDENCE))
-    return rms, float(np.quantile(np.sqrt(distance2.max(axis=1)), CONFIDENCE)), each
 
 
 def _draws(covariance: Array, seed: int = 0) -> Array:

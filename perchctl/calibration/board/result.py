@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,17 +40,6 @@ class Lack:
         return f"{self.what}: {self.advice}"
 
 
-@dataclass(frozen=True)
-class ModelScore:
-    """How a lens model predicts views it was not fitted to."""
-
-    model: str
-    rms_px: float | None  # None: it could not be fitted
-    held_out_px: float | None
-    per_view_px: tuple[float, ...] = field(default=(), repr=False)
-    note: str = ""
-
-
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """The result of a calibration.
@@ -58,11 +47,9 @@ class Calibration:
     Attributes:
         fit: the adjustment's minimum; covariance (p, p) of its lens parameters.
         views: those used, without rejected corners; `fit` belongs to them.
-        seen: all views in which the board was found, as found.
         missing: pictures without a board, and why.
+        tried: the spread of the residuals that each lens model leaves, in px.
         errors: what it means at the target, by distance.
-        ray_rms_px95, ray_max_px95: 95 % lines of the ray error over the image, RMS and
-            worst place, in px.
         covered: the picture's cells (rows, columns) that boards were seen in.
         lacks: what keeps it from being a good one, whatever its error.
     """
@@ -71,14 +58,10 @@ class Calibration:
     fit: Fit
     covariance: Array
     views: tuple[BoardView, ...]
-    seen: tuple[BoardView, ...]
     rejections: tuple[Rejection, ...]
     missing: tuple[Rejection, ...]
-    scores: tuple[ModelScore, ...]
-    recommended: str
+    tried: dict[str, float]
     errors: tuple[RangeError, ...]
-    ray_rms_px95: float
-    ray_max_px95: float
     covered: NDArray[np.bool_]
     lacks: tuple[Lack, ...] = ()
 
@@ -135,14 +118,8 @@ class Calibration:
             )
         ]
         lines.append(f"{len(self.views)} views, RMS {self.fit.rms_px:.3f} px, {', '.join(lens)} px")
-        tried = [
-            f"{s.model} {'-' if s.held_out_px is None else format(s.held_out_px, '.3f')} px"
-            + (f" ({s.note})" if s.note else "")
-            for s in self.scores
-        ]
-        lines.append(f"on views held out: {', '.join(tried)}; {self.recommended} is recommended")
-        if self.fit.model != self.recommended:
-            lines.append(f"--model {self.fit.model} was used as asked")
+        tried = ", ".join(f"{name} {spread:.3f} px" for name, spread in self.tried.items())
+        lines.append(f"lens model {self.fit.model}; spread of the residuals: {tried}")
         return [*lines, *map(str, self.lacks), self.sentence]
 
     def record(self, file: Path, report: Path | None) -> dict[str, Any]:
@@ -165,12 +142,7 @@ class Calibration:
             "pictures_without_board": rejected_views(self.missing),
             "std": dict(zip(names, self.std.tolist(), strict=True)),
             "error_mm": [vars(e) | {"limit_mm": limit_mm(e.z_m)} for e in self.errors],
-            "ray_error_px": {"rms95": self.ray_rms_px95, "max95": self.ray_max_px95},
-            "models": [
-                {"model": s.model, "rms_px": s.rms_px, "held_out_px": s.held_out_px, "note": s.note}
-                for s in self.scores
-            ],
-            "recommended": self.recommended,
+            "models": self.tried,
             "coverage": float(self.covered.mean()),
             "warnings": [str(lack) for lack in self.lacks],
             "verdict": self.level,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -14,18 +13,15 @@ from perchctl.calibration.board.adjust import (
     Fit,
     NoSolution,
     Robust,
-    fit_from,
     lens_covariance,
     pixel_grid,
-    poses_only,
-    refit,
     reject,
     weighted_fit,
 )
 from perchctl.calibration.board.capture import MIN_VIEWS
 from perchctl.calibration.board.detect import BoardView, Rejection
-from perchctl.calibration.board.predict import coverage, predict_errors, ray_errors_px
-from perchctl.calibration.board.result import Calibration, Lack, ModelScore
+from perchctl.calibration.board.predict import coverage, predict_errors
+from perchctl.calibration.board.result import Calibration, Lack
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.vision import distort, undistort
@@ -38,14 +34,13 @@ def calibrate_camera(
     views: Sequence[BoardView],
     board: str,
     model: str = "auto",
-    rejecting: bool = True,
     missing: Sequence[Rejection] = (),
 ) -> Calibration:
-    """Solve, reject, compare, predict.
+    """Solve, leave outliers out, predict the error at the target.
 
     Args:
-        model: ``plumb_bob``, ``rational_polynomial``, ``fisheye``, or ``auto`` for the recommended.
-        rejecting: leave out outliers.
+        model: ``plumb_bob``, ``rational_polynomial`` or ``fisheye``; ``auto`` for the simplest one
+            that follows the lens.
         missing: pictures in which no board was found, for the report.
 
     Raises:
@@ -54,62 +49,49 @@ def calibrate_camera(
     """
     pictures = len(views) + len(missing)
     _check_count(views, pictures)
-    robust, starts = _robust_fit(views, rejecting)
+    robust, tried = _robust_fit(views, MODEL_NAMES if model == "auto" else (model,))
     _check_count(robust.views, pictures)
     # Tilt and coverage first: their messages name best what to add.
-    covered = coverage(robust.views)
+    covered, fit = coverage(robust.views), robust.fit
     _check_variety(robust, covered)
-    fits, scores = _fit_models(robust, starts)
-    recommended = _recommend(scores)
-    chosen = recommended if model == "auto" else model
-    if chosen not in fits:
-        [note] = [score.note for score in scores if score.model == chosen]
-        raise InvalidValue(f"the lens model {chosen} cannot be fitted: {note}")
-    fit = fits[chosen]
     covariance = lens_covariance(fit)
     _check_focal(fit.parameters, np.sqrt(np.diag(covariance)))
-    rms95, max95, _ = ray_errors_px(fit.camera, covariance)
     return Calibration(
         board=board,
         fit=fit,
         covariance=covariance,
         views=robust.views,
-        seen=tuple(views),
         rejections=robust.rejections,
         missing=tuple(missing),
-        scores=tuple(scores),
-        recommended=recommended,
+        tried=tried,
         errors=predict_errors(fit.camera, covariance, covered=covered),
-        ray_rms_px95=rms95,
-        ray_max_px95=max95,
         covered=covered,
         lacks=tuple(_lacks(fit, len(robust.views), covered)),
     )
 
 
-def _robust_fit(views: Sequence[BoardView], rejecting: bool) -> tuple[Robust, dict[str, Fit]]:
-    """The views without outliers, and each model's fit that outliers do not bend. They are judged
-    by the simplest model that follows the lens: one that cannot would call the views at the
-    picture's rim outliers.
+def _robust_fit(
+    views: Sequence[BoardView], models: Sequence[str]
+) -> tuple[Robust, dict[str, float]]:
+    """The views without outliers and their fit, by the simplest of `models` that follows the lens:
+    one that cannot would call the views at the picture's rim outliers. And the spread of the
+    residuals that each model leaves, in px.
 
     Raises InvalidValue: the views fit no camera.
     """
     fits: dict[str, tuple[Fit, float]] = {}
-    for name in MODEL_NAMES:
+    for name in models:
         try:
             fits[name] = weighted_fit(views, name)
         except NoSolution as error:
-            if name == MODEL_NAMES[0]:
+            if name == models[0]:
                 hint = "is --board the true layout of the board?"
                 raise InvalidValue(f"{error}: {hint}") from None
-    starts = {name: fit for name, (fit, _) in fits.items()}
-    best, best_spread = fits[MODEL_NAMES[0]]
-    if not rejecting:
-        return Robust(refit(views, best), tuple(views), ()), starts
+    best, best_spread = fits[models[0]]
     for fit, spread in fits.values():
         if spread < _EASIER * best_spread and _is_usable(fit):
             best, best_spread = fit, spread
-    return reject(views, best), starts
+    return reject(views, best), {name: spread for name, (_, spread) in fits.items()}
 
 
 def _is_usable(fit: Fit) -> bool:
@@ -121,81 +103,6 @@ def _is_usable(fit: Fit) -> bool:
     if not (0 < camera.K[0, 2] < w and 0 < camera.K[1, 2] < h and np.isfinite(rays).all()):
         return False
     return bool(np.abs(distort(rays, camera) - grid).max() < 0.05)
-
-
-# --- Which lens model: the one that best predicts views it was not fitted to -------------------
-# The views are split into at most ten groups. Each group in turn is left out, the camera
-# is solved from the others, and the group's corners are compared with that camera (only
-# the boards' poses are fitted to them). A richer model is recommended only when its
-# held-out error is smaller by 2 % and by two standard errors of the views' differences;
-# otherwise the simpler one, which extrapolates better, stays.
-
-
-FOLDS = 10
-MIN_GAIN = 0.02
-MIN_SIGMAS = 2.0
-
-
-def _fit_models(
-    robust: Robust, starts: Mapping[str, Fit]
-) -> tuple[dict[str, Fit], list[ModelScore]]:
-    """Every lens model that can be fitted to the views, and how each predicts."""
-    fits: dict[str, Fit] = {}
-    scores: list[ModelScore] = []
-    for name in MODEL_NAMES:
-        try:
-            if name == robust.fit.model:
-                fit = robust.fit
-            elif name in starts:
-                fit = fit_from(robust.views, starts[name].camera)
-            else:
-                raise NoSolution(f"no {name} camera fits the corners")
-        except NoSolution as error:
-            scores.append(ModelScore(name, None, None, note=str(error)))
-            continue
-        fits[name] = fit
-        score = _cross_validate(robust.views, fit)
-        scores.append(score if _is_usable(fit) else replace(score, note=FOLDS_BACK))
-    return fits, scores
-
-
-def _cross_validate(views: Sequence[BoardView], fit: Fit) -> ModelScore:
-    """How the model of `fit`, which is its solution of all views, predicts views left out."""
-    held_out = np.full(len(views), np.nan)
-    group = np.arange(len(views)) % min(FOLDS, len(views))
-    for k in range(group.max() + 1):
-        rest = [view for view, g in zip(views, group, strict=True) if g != k]
-        left_out = [view for view, g in zip(views, group, strict=True) if g == k]
-        try:
-            judged = poses_only(left_out, refit(rest, fit, kept=group != k).camera)
-        except NoSolution:
-            judged = None
-        if judged is None:
-            return ModelScore(fit.model, fit.rms_px, None, note="unsteady without some views")
-        held_out[group == k] = judged.view_rms_px()
-    counts = np.array([len(v) for v in views])
-    total = float(np.sqrt((counts * held_out**2).sum() / counts.sum()))
-    return ModelScore(fit.model, fit.rms_px, total, tuple(held_out.tolist()))
-
-
-def _recommend(scores: Sequence[ModelScore]) -> str:
-    """The simplest model that none of the others beats clearly."""
-    judged = [s for s in scores if s.held_out_px is not None]
-    judged = [s for s in judged if not s.note] or judged
-    if not judged:
-        return MODEL_NAMES[0]
-    best = judged[0]
-    for score in judged[1:]:
-        if _beats(score, best):
-            best = score
-    return best.model
-
-
-def _beats(challenger: ModelScore, holder: ModelScore) -> bool:
-    gain = np.array(holder.per_view_px) - np.array(challenger.per_view_px)
-    error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
-    relative = gain.mean() / max(float(np.mean(holder.per_view_px)), 1e-9)
-    return bool(relative > MIN_GAIN and gain.mean() > MIN_SIGMAS * error)
 
 
 # --- Whether there is enough to calibrate from; if not, what to add ----------------------------

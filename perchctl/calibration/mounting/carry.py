@@ -31,7 +31,6 @@ from perchctl.calibration.mounting.robust import (
     inverses,
     likeliest,
     normal_equations,
-    robust_least_squares,
     squared_distance,
     student_weights,
 )
@@ -69,27 +68,17 @@ class Carried:
     Attributes:
         R_body_cam: (3, 3); turn_cov_rad2 (3, 3) of a small turn of it in body axes.
         latency_s: from exposure to the picture's timestamp; positive is a late picture.
-        jitter_s: spread of a single picture's latency.
         attitude_bias_rad: of the vehicle's own estimate, (3,) in body axes; only roll and pitch
             are known.
-        cam_body_m: place of the camera in body axes (3,), where a position was trusted.
-        t_s, residual_rad, counted: of each pose: its time, the misfit (n, 3) in camera
-            axes, and how much it counted, 0 to 1.
-        body_rpy_rad: the vehicle's attitude at each pose, (n, 3), heading unwrapped.
+        counted: how much each pose counted, (n,), 0 to 1.
     """
 
     R_body_cam: Array
     turn_cov_rad2: Array
     latency_s: float
     latency_sigma_s: float
-    jitter_s: float
     attitude_bias_rad: Array
-    cam_body_m: Array | None
-    cam_body_sigma_m: Array | None
-    t_s: Array
-    residual_rad: Array
     counted: Array
-    body_rpy_rad: Array
 
     @property
     def rpy_deg(self) -> tuple[float, float, float]:
@@ -122,21 +111,13 @@ def solve_carry(recording: MountingRecording) -> Carried:
         raise InvalidValue(f"the target was not seen twice within half a second: {AGAIN['carry']}")
     solved = _solve(imu, poses, *start)
     _check(solved)
-    place_m, place_sigma_m = _camera_place(imu, poses, solved)
-    rpy = np.stack([rpy_from_rotation(R) for R in solved.body.R_world_body])
     return Carried(
         R_body_cam=solved.state.R_body_cam,
         turn_cov_rad2=solved.cov[TURN, TURN],
         latency_s=solved.state.latency_s,
         latency_sigma_s=float(np.sqrt(solved.cov[LATENCY, LATENCY])),
-        jitter_s=solved.jitter_s,
         attitude_bias_rad=solved.state.off_rad,
-        cam_body_m=place_m,
-        cam_body_sigma_m=place_sigma_m,
-        t_s=poses.t_s,
-        residual_rad=solved.misfit,
         counted=solved.counted,
-        body_rpy_rad=np.unwrap(rpy, axis=0),
     )
 
 
@@ -149,14 +130,12 @@ def solve_carry(recording: MountingRecording) -> Carried:
 
 @dataclass(frozen=True, eq=False)
 class ImuArrays:
-    """Samples in the order of time, each time once: t_s (n,), estimate (n, 3, 3) R_world_body,
-    gyro_radps (n, 3), and position_m (n, 3) with sigma (n,), NaN where none was given."""
+    """Samples in the order of time, each time once: t_s (n,), estimate (n, 3, 3) R_world_body and
+    gyro_radps (n, 3)."""
 
     t_s: Array
     estimate: Array
     gyro_radps: Array
-    position_m: Array
-    position_sigma_m: Array
 
 
 def imu_arrays(samples: Sequence[AttitudeSample]) -> ImuArrays:
@@ -164,19 +143,10 @@ def imu_arrays(samples: Sequence[AttitudeSample]) -> ImuArrays:
     _, kept = np.unique([a.t_s for a in samples], return_index=True)
     ordered = [samples[k] for k in kept.tolist()]
     rpy = np.array([(a.roll_rad, a.pitch_rad, a.yaw_rad) for a in ordered])
-    nothing = (np.full(3, np.nan), np.nan)
-    places = [
-        nothing
-        if a.position_m is None or a.position_sigma_m is None
-        else (a.position_m, a.position_sigma_m)
-        for a in ordered
-    ]
     return ImuArrays(
         t_s=np.array([a.t_s for a in ordered]),
         estimate=Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix(),
         gyro_radps=np.array([a.gyro_radps for a in ordered]),
-        position_m=np.array([place for place, _ in places]),
-        position_sigma_m=np.array([sigma for _, sigma in places]),
     )
 
 
@@ -342,15 +312,14 @@ class State:
 @dataclass(frozen=True, eq=False)
 class _Rows:
     """All rows at a state: the poses' design (n, 3, p), misfits (n, 3) in camera axes, inverse
-    covariances and weights, what a second of latency does (n, 3), the vehicle's rotation at each
-    pose, and the normal equations of all."""
+    covariances and weights, what a second of latency does (n, 3), and the normal equations of
+    all."""
 
     design: Array
     misfit: Array
     inverse: Array
     counted: Array
     along: Array
-    body: Integrated
     information: Array
     gradient: Array
 
@@ -362,9 +331,7 @@ class _Solved:
     state: State
     misfit: Array
     counted: Array
-    body: Integrated
     cov: Array
-    jitter_s: float
 
 
 def _solve(imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: float) -> _Solved:
@@ -387,7 +354,7 @@ def _solve(imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: floa
     of_poses, _ = normal_equations(rows.design, rows.misfit, rows.inverse, rows.counted)
     known = rows.information - of_poses
     cov = covariance(rows.design, rows.misfit, rows.inverse, rows.counted, known, KNOTS)
-    return _Solved(state, rows.misfit, np.minimum(rows.counted, 1.0), rows.body, cov, jitter_s)
+    return _Solved(state, rows.misfit, np.minimum(rows.counted, 1.0), cov)
 
 
 def _begin(imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: float) -> State:
@@ -435,8 +402,7 @@ def _rows(
     information, gradient = normal_equations(design, misfit, inverse, counted)
     for more in (_known(state), _estimated(state, imu, whole)):
         information, gradient = information + more[0], gradient + more[1]
-    body = replace(body, R_world_body=R_world_body)
-    return _Rows(design, misfit, inverse, counted, along, body, information, gradient)
+    return _Rows(design, misfit, inverse, counted, along, information, gradient)
 
 
 def _known(state: State) -> tuple[Array, Array]:
@@ -514,50 +480,3 @@ def _check(solved: _Solved) -> None:
             f"the pictures are stamped {-1e3 * solved.state.latency_s:.0f} ms before they can have "
             f"been taken: camera and telemetry must be on one clock"
         )
-
-
-# --- Where the camera sits in the body, from a vehicle that knows its position -------------------
-# ``p_world_body + R_world_body (t_body_cam + R_body_cam p_cam_target) = p_world_target`` at each
-# picture's exposure, with a world that drifts evenly. The rotations are those solved for above.
-
-
-LEAST_PLACED = 100
-_DRIFT_SIGMA_MPS = 0.02
-_PLACE_ROUNDS = 8
-
-
-def _camera_place(
-    imu: ImuArrays, poses: PoseArrays, solved: _Solved
-) -> tuple[Array, Array] | tuple[None, None]:
-    """t_body_cam (3,) m and its sigma; None where too few pictures have a trusted position."""
-    trusted = np.isfinite(imu.position_sigma_m)
-    t_s = solved.body.t_s
-    if trusted.sum() < LEAST_PLACED:
-        return None, None
-    known_s = imu.t_s[trusted]
-    near = np.abs(known_s[np.clip(np.searchsorted(known_s, t_s), 0, len(known_s) - 1)] - t_s) < 0.1
-    if near.sum() < LEAST_PLACED:
-        return None, None
-    body_m = np.stack([np.interp(t_s, known_s, axis) for axis in imu.position_m[trusted].T], 1)
-    sigma_m = np.interp(t_s, known_s, imu.position_sigma_m[trusted])[near]
-    R, p_cam_target_m = solved.body.R_world_body[near], poses.p_cam_target_m[near]
-    design = np.zeros((len(R), 3, 9))  # the camera's place, the target's, and the drift
-    design[:, :, :3] = R
-    design[:, :, 3:6] = -np.eye(3)
-    design[:, :, 6:] = (t_s[near] - t_s[near].mean())[:, None, None] * np.eye(3)
-    known = np.diag([0.0] * 6 + [_DRIFT_SIGMA_MPS**-2] * 3)
-    inverse = np.eye(3) / sigma_m[:, None, None] ** 2
-
-    def place(R_body_cam: Array) -> tuple[Array, Array, Array]:
-        way_m = p_cam_target_m @ R_body_cam.T
-        right = -(np.einsum("nij,nj->ni", R, way_m) + body_m[near])
-        return robust_least_squares(design, right, inverse, _PLACE_ROUNDS, known)
-
-    found, misfit, counted = place(solved.state.R_body_cam)
-    cov = covariance(design, misfit, inverse, counted, known, 3)
-    # The camera's turn is not known exactly either.
-    values, axes = np.linalg.eigh(solved.cov[TURN, TURN])
-    for turn in _turns((axes * np.sqrt(np.maximum(values, 0.0))).T):
-        moved_m = (place(turn @ solved.state.R_body_cam)[0] - found)[:3]
-        cov += np.outer(moved_m, moved_m)
-    return found[:3], np.sqrt(np.diagonal(cov))

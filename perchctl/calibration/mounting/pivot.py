@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.calibration.mounting.carry import COUNTS_LITTLE, MOST_LEFT_OUT
-from perchctl.calibration.mounting.motion import AGAIN, check_recording, tilts_rad
+from perchctl.calibration.mounting.motion import AGAIN, check_recording
 from perchctl.calibration.mounting.recording import (
     MountingRecording,
     PoseArrays,
-    in_order,
     pose_arrays,
 )
 from perchctl.calibration.mounting.robust import (
@@ -43,18 +42,11 @@ class Pivoted:
     Attributes:
         gear_cam_m: tip of the gear in the camera's frame; its covariance (3, 3).
         point_target_m: where the tip stood, in the target's frame, (3,).
-        t_s, residual_m, counted: of each pose: its time, the tip's way from where it should
-            be (n, 3) in the target's axes, and how much it counted, 0 to 1.
-        tilt_rad: (n, 2): of the camera's view to the target's x and y.
     """
 
     gear_cam_m: Array
     covariance_m2: Array
     point_target_m: Array
-    t_s: Array
-    residual_m: Array
-    counted: Array
-    tilt_rad: Array
 
     @property
     def gear_cam_sigma_m(self) -> Array:
@@ -90,10 +82,6 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
         gear_cam_m=tip_m,
         covariance_m2=cov_m2 + size_sigma**2 * np.outer(tip_m, tip_m),
         point_target_m=found[3:],
-        t_s=poses.t_s,
-        residual_m=np.einsum("nji,nj->ni", R, misfit),
-        counted=np.minimum(counted, 1.0),
-        tilt_rad=tilts_rad(in_order(recording)),
     )
 
 

@@ -7,13 +7,13 @@ attitudes, then all poses. A file holds one part or both.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
-from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.files import write_files
@@ -31,17 +31,13 @@ _MOST_NOT_A_ROTATION = 1e-3  # of R R^T - 1
 class AttitudeSample:
     """The vehicle's own estimate at `t_s` of its own clock, right-handed (pitch nose down).
 
-    gyro_radps (3,) is in body axes. `position_m` (3,) in the world, where the estimate has one,
-    to `position_sigma_m`.
-    """
+    gyro_radps (3,) is in body axes."""
 
     t_s: float
     roll_rad: float
     pitch_rad: float
     yaw_rad: float
     gyro_radps: Array
-    position_m: Array | None = None
-    position_sigma_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +126,7 @@ def _records(recording: MountingRecording) -> Iterator[dict[str, Any]]:
     }
     for a in recording.attitudes:
         rpy = (a.roll_rad, a.pitch_rad, a.yaw_rad)
-        record = {"t_s": _plain(a.t_s), "rpy_rad": _plain(rpy), "gyro_radps": _plain(a.gyro_radps)}
-        if a.position_m is not None:
-            record["position_m"] = _plain(a.position_m)
-        if a.position_sigma_m is not None:
-            record["position_sigma_m"] = _plain(a.position_sigma_m)
-        yield record
+        yield {"t_s": _plain(a.t_s), "rpy_rad": _plain(rpy), "gyro_radps": _plain(a.gyro_radps)}
     for p in recording.poses:
         record = {
             "t_s": _plain(p.t_s),
@@ -152,44 +143,6 @@ def _plain(value: Any) -> Any:
     return np.round(np.asarray(value, dtype=np.float64), _DECIMALS).tolist()
 
 
-_Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-_Row = Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)]
-
-
-class _Part(BaseModel):
-    part: MountingPart
-    format: Literal[1]
-    mirrored_pictures: int
-    seen_by: str = ""
-
-
-class _Attitude(BaseModel):
-    t_s: FiniteFloat
-    rpy_rad: _Vector
-    gyro_radps: _Vector
-    position_m: _Vector | None = None
-    position_sigma_m: FiniteFloat | None = None
-
-    def sample(self) -> AttitudeSample:
-        place = None if self.position_m is None else np.array(self.position_m)
-        gyro = np.array(self.gyro_radps)
-        return AttitudeSample(self.t_s, *self.rpy_rad, gyro, place, self.position_sigma_m)
-
-
-class _Pose(BaseModel):
-    t_s: FiniteFloat
-    rotation_cam_target: tuple[_Vector, _Vector, _Vector]
-    position_cam_target_m: _Vector
-    covariance: Annotated[list[_Row], Field(min_length=6, max_length=6)] | None = None
-
-    def pose(self) -> SeenPose:
-        R = np.array(self.rotation_cam_target)
-        if np.abs(R @ R.T - np.eye(3)).max() > _MOST_NOT_A_ROTATION or np.linalg.det(R) < 0.0:
-            raise ValueError("rotation_cam_target is no rotation")
-        cov = None if self.covariance is None else np.array(self.covariance)
-        return SeenPose(self.t_s, R, np.array(self.position_cam_target_m), cov)
-
-
 def read_recordings(path: Path) -> tuple[MountingRecording, ...]:
     """The parts of a file, in its order.
 
@@ -204,35 +157,57 @@ def read_recordings(path: Path) -> tuple[MountingRecording, ...]:
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text"
         raise InvalidValue(f"{path} cannot be read: {why}") from None
-    parts: list[tuple[_Part, list[AttitudeSample], list[SeenPose]]] = []
+    parts: list[tuple[dict[str, Any], list[AttitudeSample], list[SeenPose]]] = []
     for number, line in enumerate(text.splitlines(), start=1):
         try:
             record = json.loads(line)
             if "part" in record:
-                parts.append((_Part.model_validate(record), [], []))
-            elif not parts:
-                raise ValueError("the file does not begin with a part")
+                parts.append((_head(record), [], []))
             elif "rotation_cam_target" in record:
-                parts[-1][2].append(_Pose.model_validate(record).pose())
+                parts[-1][2].append(_pose(record))
             else:
-                parts[-1][1].append(_Attitude.model_validate(record).sample())
-        except (TypeError, ValueError, RecursionError) as error:
+                parts[-1][1].append(_attitude(record))
+        except (IndexError, KeyError, TypeError, ValueError, RecursionError) as error:
             raise InvalidValue(
-                f"{path}, line {number} is no line of a recording of calibrate mount: "
-                f"{_reason(error)}"
+                f"{path}, line {number} is no line of a recording of calibrate mount: {error}"
             ) from None
     if not parts:
         raise InvalidValue(f"{path} is empty: name a recording of calibrate mount")
     return tuple(
-        MountingRecording(
-            head.part, tuple(attitudes), tuple(poses), head.mirrored_pictures, head.seen_by
-        )
+        MountingRecording(attitudes=tuple(attitudes), poses=tuple(poses), **head)
         for head, attitudes, poses in parts
     )
 
 
-def _reason(error: Exception) -> str:
-    if not isinstance(error, ValidationError):
-        return str(error)
-    first = error.errors()[0]
-    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+def _head(record: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a recording beside its samples."""
+    if record["format"] != _FORMAT or record["part"] not in get_args(MountingPart):
+        raise ValueError("the part or its format is unknown")
+    return {
+        "part": record["part"],
+        "mirrored_pictures": int(record["mirrored_pictures"]),
+        "seen_by": str(record.get("seen_by", "")),
+    }
+
+
+def _attitude(record: Mapping[str, Any]) -> AttitudeSample:
+    roll, pitch, yaw = _numbers(record, "rpy_rad", 3).tolist()
+    t_s, gyro_radps = float(_numbers(record, "t_s")), _numbers(record, "gyro_radps", 3)
+    return AttitudeSample(t_s, roll, pitch, yaw, gyro_radps)
+
+
+def _pose(record: Mapping[str, Any]) -> SeenPose:
+    R = _numbers(record, "rotation_cam_target", 3, 3)
+    if np.abs(R @ R.T - np.eye(3)).max() > _MOST_NOT_A_ROTATION or np.linalg.det(R) < 0.0:
+        raise ValueError("rotation_cam_target is no rotation")
+    cov = _numbers(record, "covariance", 6, 6) if "covariance" in record else None
+    t_s, position_m = float(_numbers(record, "t_s")), _numbers(record, "position_cam_target_m", 3)
+    return SeenPose(t_s, R, position_m, cov)
+
+
+def _numbers(record: Mapping[str, Any], key: str, *shape: int) -> Array:
+    """Raises KeyError, TypeError or ValueError where the key does not hold such numbers."""
+    values = np.array(record[key], dtype=np.float64)
+    if values.shape != shape or not np.isfinite(values).all():
+        raise ValueError(f"{key} must hold {math.prod(shape)} numbers")
+    return values

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from perchctl.calibration import load_calibration
-from perchctl.commands.fit_weights import _open_truth
-from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, UsageError
-from perchctl.geometry import rot_z
-from perchctl.positioning import BodyPose, CaptureFrame, capture
+from perchctl.errors import ConnectionFailed, NotFound
+from perchctl.positioning import BodyPose, CaptureFrame
 from perchctl.profile import PositioningConfig, find_calibration, load_profile
-from perchctl.weights import SessionFile, truth
-from perchctl.weights.collect import MarkerReader, fault_of
+from perchctl.weights import MocapTruth, SessionFile, SimulatedStand
+from perchctl.weights.collect import fault_of, read_markers
 from perchctl.weights.data import HEADER, NEEDED, read_csv
+from perchctl.weights.truth import Actual, moved
 from tests.helpers.fit_weights import run
 
 
@@ -48,28 +46,26 @@ def test_the_simulated_experiment_is_continued_where_it_stopped(simulated: Path)
     assert torn.read_bytes() == whole
 
 
-def test_a_file_that_is_no_session_is_left_alone(session: Path) -> None:
-    before = session.read_bytes()
-    done = run("collect", session, "--truth", "sim")
+def test_a_file_that_is_no_session_is_left_alone(tmp_path: Path) -> None:
+    other = tmp_path / "other.csv"
+    other.write_text("position,t_s\n1,0.1\n", encoding="utf-8")
+    done = run("collect", other, "--truth", "sim")
     assert done.exit_code == 30
     assert "nothing is appended" in done.stderr
-    assert session.read_bytes() == before
+    assert other.read_text(encoding="utf-8") == "position,t_s\n1,0.1\n"
 
 
 def test_shaken_and_half_seen_positions_are_refused() -> None:
-    from perchctl.weights import SimulatedStand
-
     profile = load_profile("sim")
     camera = load_calibration(find_calibration(profile.camera.calibration))
-    stand = SimulatedStand(profile, camera, 2, 0, 4.0, 1.0)
+    stand = SimulatedStand(profile, camera, 2, 0)
     place = stand.place(1)
-    reader = MarkerReader(profile, camera)
-    good = [reader.read(frame) for frame in stand.frames(1, place, 6)]
+    good = list(read_markers(stand.frames(1, place, 6), profile, camera))
     assert fault_of(good) is None
     moved = place.T_world_cam.copy()
     moved[0, 3] += 0.002
     other = type(place)(moved, place.actual)
-    late = [reader.read(frame) for frame in stand.frames(1, other, 6)]
+    late = list(read_markers(stand.frames(1, other, 6), profile, camera))
     assert "shaken" in (fault_of([*good, *late]) or "")
     blind = [type(s)(s.t_s, s.large, None, None, None) for s in good]
     assert "the small marker was found in 6 of 12" in (fault_of([*good, *blind]) or "")
@@ -78,11 +74,9 @@ def test_shaken_and_half_seen_positions_are_refused() -> None:
 
 def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:
     """Pictures of two places; the person mistypes, doubts, stops, and goes on."""
-    from perchctl.weights import SimulatedStand
-
     profile = load_profile("sim")
     camera = load_calibration(find_calibration(profile.camera.calibration))
-    stand = SimulatedStand(profile, camera, 2, 0, 4.0, 1.0)
+    stand = SimulatedStand(profile, camera, 2, 0)
     pictures, typed = tmp_path / "pictures", []
     pictures.mkdir()
     for position, name in ((1, "a"), (1, "b"), (2, "c")):
@@ -107,29 +101,6 @@ def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert "holds 1 positions already" in done.stderr
     assert np.unique(read_csv(path).position).tolist() == [1, 2]
-
-
-def test_the_estimate_s_truth_is_learned_by_touching() -> None:
-    gear = np.array([0.0, 0.0, 0.03])
-    target = np.array([0.4, -0.3, 2.0])
-    poses = [((*(target - gear),), 0.5), ((0.35, -0.25, 1.8), 0.7)]
-    asked: list[str] = []
-
-    def telemetry() -> list[SimpleNamespace]:
-        position, yaw = poses[min(len(asked) // 2, 1)]
-        return [SimpleNamespace(position_m=position, roll_rad=0.0, pitch_rad=0.0, yaw_rad=yaw)] * 9
-
-    source = truth.EstimateTruth(telemetry, None, gear, wait=lambda s: None)  # type: ignore[arg-type]
-
-    def ask(question: str) -> str:
-        asked.append(question)
-        return ""
-
-    found = source.actual(ask)
-    expected = rot_z(-0.7) @ (target - [0.35, -0.25, 1.8]) - gear
-    assert found.pose[:3] == pytest.approx(expected)
-    assert found.pose[3] == pytest.approx(-0.2)
-    assert truth.moved(found, source.actual(ask)) is None
 
 
 class Recorded:
@@ -162,21 +133,25 @@ class Recorded:
         return None
 
 
-def test_motion_capture_gives_the_median_or_names_the_bodies() -> None:
-    gear = np.array([0.0, 0.0, 0.03])
+GEAR = np.array([0.0, 0.0, 0.03])
 
-    def truth_of(
-        capture: Recorded, body: str, mounted: PositioningConfig | None = None
-    ) -> truth.MocapTruth:
-        return truth.MocapTruth(
-            capture, "vicon:host", body, "target", gear, mounted, capture.clock, capture.wait
-        )
 
-    found = truth_of(Recorded(), "cf").actual(lambda question: "")
+def truth_of(capture: Recorded, body: str, yaw_deg: float = 0.0) -> MocapTruth:
+    config = PositioningConfig(by="mocap", body=body, body_rpy_deg=(0.0, 0.0, yaw_deg))
+    return MocapTruth(capture, config, "target", GEAR, capture.clock, capture.wait)
+
+
+@pytest.mark.parametrize(("body", "yaw_rad"), [("cf", 0.0), ("askew", 0.4)])
+def test_motion_capture_gives_the_median_of_the_vehicle_s_axes(body: str, yaw_rad: float) -> None:
+    found = truth_of(Recorded(), body, math.degrees(yaw_rad)).actual(lambda question: "")
     assert found.pose == pytest.approx([0.0, 0.05, 0.17, 0.4], abs=2e-4)
-    mounted = PositioningConfig(by="mocap", body_rpy_deg=(0.0, 0.0, math.degrees(0.4)))
-    found = truth_of(Recorded(), "askew", mounted).actual(lambda question: "")
-    assert found.pose == pytest.approx([0.0, 0.05, 0.17, 0.4], abs=2e-4)
+    assert found.attitude is not None
+    later = truth_of(Recorded(), body, math.degrees(yaw_rad)).actual(lambda question: "")
+    assert moved(found, later) is None
+    assert "moved by" in (moved(found, Actual(later.pose + 0.004)) or "")
+
+
+def test_a_capture_that_does_not_see_the_body_is_named() -> None:
     with pytest.raises(NotFound, match="rigid body 'drone'; it sees askew, cf, target"):
         truth_of(Recorded(), "drone").actual(lambda question: "")
     with pytest.raises(NotFound, match="'cf' frozen"):
@@ -187,47 +162,11 @@ def test_motion_capture_gives_the_median_or_names_the_bodies() -> None:
         truth_of(gone, "drone").actual(lambda question: "")
 
 
-def test_motion_capture_is_asked_for_with_its_computer(monkeypatch: pytest.MonkeyPatch) -> None:
-    profile = load_profile("sim")
-    for mocap in (None, "vicon", "vicon: "):
-        with pytest.raises(UsageError, match="--mocap TYPE:HOST"):
-            _open_truth("mocap", profile, mocap=mocap)
-    monkeypatch.setattr(capture, "find_spec", lambda name: object())
-    with pytest.raises(InvalidValue, match="'nokov' is unknown; allowed are vicon, optitrack"):
-        _open_truth("mocap", profile, mocap="nokov:h")
-    monkeypatch.setattr(capture, "find_spec", lambda name: None)
-    with pytest.raises(UsageError, match="needs the library motioncapture"):
-        _open_truth("mocap", profile, mocap="vicon:h")
-
-
-OWN = PositioningConfig(by="mocap", system="qualisys", host="lab:22223", body="cf2")
-
-
-@pytest.mark.parametrize(
-    ("options", "positioning", "expected"),
-    [
-        ({}, OWN, ("qualisys:lab:22223", "cf2")),
-        ({"mocap": "vicon:h"}, OWN, ("vicon:h", "cf2")),
-        ({"bodies": "cf7,board"}, OWN, ("qualisys:lab:22223", "cf7")),
-        ({"mocap": "vicon:h"}, PositioningConfig(), ("vicon:h", "cf")),
-    ],
-)
-def test_motion_capture_is_the_profile_s_where_no_option_names_it(
-    options: dict[str, str],
-    positioning: PositioningConfig,
-    expected: tuple[str, str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked: list[tuple[str, str]] = []
-
-    def opened(system: str, body: str) -> Recorded:
-        asked.append((system, body))
-        return Recorded()
-
-    monkeypatch.setattr("perchctl.commands.fit_weights.open_named", opened)
-    profile = load_profile("sim").model_copy(update={"positioning": positioning})
-    _open_truth("mocap", profile, **options)
-    assert asked == [expected]
+def test_motion_capture_is_the_profile_s(tmp_path: Path) -> None:
+    done = run("collect", tmp_path / "s.csv", "-p", "sim", "--truth", "mocap")
+    assert done.exit_code == 2
+    assert "by: mocap" in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_session_of_another_header_and_the_shipped_header_agree(tmp_path: Path) -> None:
@@ -235,11 +174,3 @@ def test_a_session_of_another_header_and_the_shipped_header_agree(tmp_path: Path
     assert file.path.read_text() == HEADER + "\n"
     assert HEADER.startswith(",".join(NEEDED))
     assert file.next_position == 1
-
-
-def test_the_readers_of_nothing_are_told(tmp_path: Path) -> None:
-    done = run()
-    assert done.exit_code == 2
-    assert "fit-weights collect" in done.stderr
-    assert run(tmp_path / "none.csv").exit_code == 20
-    assert run("x.csv", "--method", "magic").exit_code == 30
