@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from perchctl.geometry import Array
 from perchctl.profile import TargetConfig
 from perchctl.target.drawing import marker_corners_m
-from perchctl.vision import CameraModel, PipelineOutput, undistort_px
+from perchctl.vision import CameraModel, PipelineOutput, undistort
 
 CORNER_BIAS_PX = 0.02
 """What a refined corner errs inwards or outwards in all frames alike; no number of frames
@@ -64,7 +64,8 @@ def size_ratio(
     None where the corners give no pose, or spread so far that the ratio is unknown.
     """
     X_large, X_small = (marker_corners_m(m.side_m) for m in (target.large, target.small))
-    seen = undistort_px(np.concatenate([large_px, small_px]), camera)
+    rays = undistort(np.concatenate([large_px, small_px]), camera)
+    seen = rays @ camera.K[:2, :2].T + camera.K[:2, 2]
     if not np.isfinite(seen).all() or not all(math.isfinite(s) and s > 0.0 for s in sigma_px):
         return None
     weight = np.repeat(1.0 / np.array(sigma_px), 8)

@@ -19,7 +19,7 @@ from perchctl.flight import PLAIN_SEED, fly_lockstep
 from perchctl.geometry import rot_z
 from perchctl.log import FlightLog, read_log
 from perchctl.mission import SEVEN_PHASES, Event, EventKeeper, Operator, Outcome, Phase, Tick
-from perchctl.perception.perception import SLEW
+from perchctl.perception.online_calibration import SLEW
 from perchctl.profile import load_profile
 from perchctl.sim import draw_scenario
 from tests.helpers.flights import SEED, SHORT, Flown, fly_short, short_profile

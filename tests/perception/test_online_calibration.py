@@ -10,7 +10,7 @@ import pytest
 
 from perchctl.mission import Context, Phase
 from perchctl.perception import History
-from perchctl.perception.perception import (
+from perchctl.perception.online_calibration import (
     SLEW,
     USED_SIGMA_S,
     OnlineCalibration,
