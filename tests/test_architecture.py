@@ -103,7 +103,7 @@ MOST_NAMES = {
     "sim": 27,
     "target": 29,
     "track": 15,
-    "vision": 50,
+    "vision": 30,
     "weights": 9,
 }
 

@@ -22,7 +22,6 @@ from perchctl.vision import (
     MarkerPose,
     PipelineOutput,
     Stage,
-    better_conditioned,
 )
 
 
@@ -117,7 +116,8 @@ def _behind(output: PipelineOutput, stage: Stage) -> tuple[MarkerPose | None, bo
         return poses.get(stage.value), True
     if "joint" in poses:
         return poses["joint"], True
-    return better_conditioned(poses["large"], poses["small"]), False
+    surest = min((poses["large"], poses["small"]), key=lambda p: float(np.linalg.norm(p.sigma_m)))
+    return surest, False
 
 
 def _rotation(rvec: Array) -> Array:

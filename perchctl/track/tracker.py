@@ -14,12 +14,10 @@ import numpy as np
 from perchctl.camera import mirrored_note
 from perchctl.display import PageState, Sketch
 from perchctl.geometry import wrap_rad, yaw_of
-from perchctl.perception import Perception
+from perchctl.perception import INTERLACED, Perception
 from perchctl.profile import CameraConfig, Profile
 from perchctl.track.result import Tracked, text_rows, track_record, tracked_of
 from perchctl.vision import (
-    BLENDED,
-    INTERLACED,
     MARKERS,
     CameraModel,
     Frame,
@@ -98,8 +96,6 @@ class Tracker:
             self._interlaced = interlaced = interlaced or self._interlaced
         if interlaced:
             self.notes += (INTERLACED,)
-        if output.detections.ghost_px > 0.0:
-            self.notes += (BLENDED,)
         if output.lock_note:
             self.notes += (output.lock_note,)
         pose = pose_in(output)

@@ -1,4 +1,4 @@
-"""`perchctl track` on an interlaced and on a blended recording."""
+"""`perchctl track` on an interlaced recording."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_stills_have_one_result_each(
     truth = {}
     for k, frame in enumerate(scene.frames(3)):
         cv2.imwrite(str(tmp_path / f"{k}.png"), frame.image)
-        truth[f"{k}.png"] = scene.target_m(frame.t_s)
+        truth[f"{k}.png"] = scene.target_m(frame.t_s - PAL_S / 4.0)  # of its top field
     lines = track(tmp_path, calibration, stills=True)
     assert [line["frame"] for line in lines] == list(truth)
     for line in lines:
@@ -88,21 +88,9 @@ def test_stills_have_one_result_each(
     assert "interlaced" in capsys.readouterr().err
 
 
-def test_blended_fields_are_named(
-    tmp_path: Path, calibration: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene = Pass(0.3, (0.25, 0.05, 0.0), camera_fields="top", camera_blended=True)
-    track(recording(tmp_path, scene), calibration)
-    said = capsys.readouterr().err
-    assert "blended" in said
-    assert "interlaced" not in said
-
-
-def test_whole_pictures_are_neither(
+def test_whole_pictures_are_not(
     tmp_path: Path, calibration: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lines = track(recording(tmp_path, Pass(0.3, (0.2, 0.05, 0.0))), calibration)
     assert [line["frame"] for line in lines] == list(range(FRAMES))
-    said = capsys.readouterr().err
-    assert "interlaced" not in said
-    assert "blended" not in said
+    assert "interlaced" not in capsys.readouterr().err
