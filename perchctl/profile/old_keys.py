@@ -17,8 +17,17 @@ UNUSED: tuple[str, ...] = (
     "merge.z1_m",
     "planner.recover.speed_mps",
     "planner.takeoff_duration_s",
+    "simulation.bare_floor_aside_m",
+    "simulation.bare_floor_m",
+    "simulation.gloss",
+    "simulation.gust_every_s",
+    "simulation.gust_mps",
+    "simulation.lamp_aside_m",
+    "simulation.lamp_z_m",
 )
 """Nothing depends on them any more: left out."""
+WORLD = "simulation.set"
+"""It named the profile `rough` or `extreme` for the keys that were not written."""
 
 
 def with_present_keys(
@@ -47,6 +56,12 @@ def with_present_keys(
         if section is not None and section.pop(old, None) is not None:
             notes.append(f"{dotted} is no longer used: remove it")
     lost: list[str] = []
+    section, old = _section_of(result, WORLD)
+    world = None if section is None else section.pop(old, None)
+    if world == "nominal":
+        notes.append(f"{WORLD} is no longer used: remove it")
+    elif world is not None:
+        lost.append(f"{WORLD} is no longer a key: remove it, and extend the profile {world}")
     for dotted, value, constant in _without_constants(result, model):
         now = f"{dotted} is no longer a key: it is {constant} for every profile"
         if _plain(value) == _plain(constant):

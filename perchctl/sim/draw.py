@@ -14,14 +14,12 @@ import numpy as np
 from perchctl.geometry import GRAVITY_MPS2, Array, make_T, rotation_from_rpy
 from perchctl.profile import Profile, SimulationConfig
 from perchctl.sim.capture import CaptureFault, CaptureSettings
-from perchctl.sim.scenario import Gust, Neighbour, Scenario
+from perchctl.sim.scenario import Neighbour, Scenario
 
 _STREAM, _GROUPS_STREAM, _IMU_STREAM = 1, 21, 22  # the scenario's own random streams
-_AIR, _CELL, _TILT, _LAMP, _FLOW, _FLOOR, _RADIO, _CAPTURE = range(8)
+_AIR, _CELL, _TILT, _FLOW, _RADIO, _CAPTURE = 0, 1, 2, 4, 6, 7
 _LONGEST_S = 240.0
 """No simulated flight lasts longer."""
-_GUST_S = (0.5, 2.0)
-_GUST_UPWARD = 0.3
 _LEAST_GAP_S = 1.0
 
 
@@ -71,7 +69,22 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         camera_burst=burst,
         camera_noise_sigma=noise_sigma,
         camera_mirrored=profile.camera.mirrored,
-        **_as_they_stand(sim),
+        estimate_noise_m=sim.estimate_noise_m,
+        magnet_force_n=sim.magnet_force_n,
+        no_target=sim.no_target,
+        camera_rate_hz=sim.camera_rate_hz,
+        camera_jitter_s=sim.camera_jitter_s,
+        camera_drop_rate=sim.camera_drop_rate,
+        camera_exposure_s=sim.camera_exposure_s,
+        camera_defocus_px=sim.camera_defocus_px,
+        camera_fields=sim.camera_fields,
+        camera_blended=sim.camera_blended,
+        camera_readout_s=sim.camera_readout_s,
+        camera_flicker=sim.camera_flicker,
+        camera_pumping=sim.camera_pumping,
+        camera_receiver_hz=sim.camera_receiver_hz,
+        camera_receiver_noise=sim.camera_receiver_noise,
+        camera_blank_rate=sim.camera_blank_rate,
         estimate_tilt_bias_rad=_pinned(tilt_bias, sim.estimate_tilt_bias_xy_deg, in_degrees=True),
         drift_mps=_pinned(drift, sim.drift_xyz_mps),
         draught_mps=(wind_mps * math.cos(wind_angle), wind_mps * math.sin(wind_angle), 0.0),
@@ -79,7 +92,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         **_imu_errors(sim, seed),
         extra=_extra(profile),
         neighbours=_neighbours(sim),
-        **_groups(sim, seed, target_xy_m),
+        **_groups(sim, seed),
     )
 
 
@@ -146,28 +159,6 @@ def _extra(profile: Profile) -> dict[str, float]:
     return extra
 
 
-def _as_they_stand(sim: SimulationConfig) -> dict[str, Any]:
-    """The values that are not drawn."""
-    return {
-        "estimate_noise_m": sim.estimate_noise_m,
-        "magnet_force_n": sim.magnet_force_n,
-        "no_target": sim.no_target,
-        "camera_rate_hz": sim.camera_rate_hz,
-        "camera_jitter_s": sim.camera_jitter_s,
-        "camera_drop_rate": sim.camera_drop_rate,
-        "camera_exposure_s": sim.camera_exposure_s,
-        "camera_defocus_px": sim.camera_defocus_px,
-        "camera_fields": sim.camera_fields,
-        "camera_blended": sim.camera_blended,
-        "camera_readout_s": sim.camera_readout_s,
-        "camera_flicker": sim.camera_flicker,
-        "camera_pumping": sim.camera_pumping,
-        "camera_receiver_hz": sim.camera_receiver_hz,
-        "camera_receiver_noise": sim.camera_receiver_noise,
-        "camera_blank_rate": sim.camera_blank_rate,
-    }
-
-
 def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
     """A turn and a shift that the profile lacks: up to `mount_error_deg` and `mount_error_m`."""
     sim = profile.simulation
@@ -186,17 +177,23 @@ def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
 # --- What harder worlds draw beyond that ---------------------------------------------------------
 
 
-def _groups(sim: SimulationConfig, seed: int, target_xy_m: tuple[float, float]) -> dict[str, Any]:
+def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
     """Fields of the scenario. Where the ranges are those of the nominal world, its defaults."""
+    air, cell, tilt, flow, radio, capture = (
+        _Draws(seed, group) for group in (_AIR, _CELL, _TILT, _FLOW, _RADIO, _CAPTURE)
+    )
+    ohm = sim.cell_resistance_ohm
     return {
-        **_air(sim, _Draws(seed, _AIR)),
-        **_cell(sim, _Draws(seed, _CELL)),
-        **_tilt(sim, _Draws(seed, _TILT)),
-        **_lamp(sim, _Draws(seed, _LAMP), target_xy_m),
-        **_flow(sim, _Draws(seed, _FLOW)),
-        **_floor(sim, _Draws(seed, _FLOOR), target_xy_m),
-        **_radio(sim, _Draws(seed, _RADIO)),
-        **_capture(sim, _Draws(seed, _CAPTURE)),
+        "ceiling_suction": air.between(sim.ceiling_suction),
+        "cell_resistance_ohm": None if ohm is None else cell.between(ohm),
+        "cell_slow_ohm": cell.between(sim.cell_slow_ohm),
+        "cell_charge": cell.between(sim.cell_charge),
+        "cell_knee": cell.between(sim.cell_knee),
+        "target_tilt_rad": _tilt(sim, tilt),
+        **_flow(sim, flow),
+        "radio_loss": radio.between(sim.radio_loss),
+        "radio_burst_s": radio.between(sim.radio_burst_s),
+        "capture_holes_s": _capture_holes(sim, capture),
     }
 
 
@@ -212,53 +209,15 @@ class _Draws:
     def angle_rad(self, bounds_deg: tuple[float, float] = (-180.0, 180.0)) -> float:
         return math.radians(self.between(bounds_deg))
 
-    def around(self, xy_m: tuple[float, float], aside_m: float) -> tuple[float, float]:
-        """A point so far from another one."""
-        angle = self.angle_rad()
-        return (xy_m[0] + aside_m * math.cos(angle), xy_m[1] + aside_m * math.sin(angle))
 
-
-def _air(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
-    fields: dict[str, Any] = {"ceiling_suction": draws.between(sim.ceiling_suction)}
-    if not sim.gust_mps[1]:
-        return fields
-    gusts, t_s = [], 0.0
-    while (t_s := t_s + float(draws.rng.exponential(sim.gust_every_s))) < _LONGEST_S:
-        angle, upward = draws.angle_rad(), _GUST_UPWARD * float(draws.rng.uniform(-1.0, 1.0))
-        peak_mps, length_s = draws.between(sim.gust_mps), draws.between(_GUST_S)
-        level_mps = peak_mps * math.sqrt(1.0 - upward**2)
-        peak = (level_mps * math.cos(angle), level_mps * math.sin(angle), peak_mps * upward)
-        gusts.append(Gust(t_s, length_s, peak))
-    return fields | {"gusts": tuple(gusts)}
-
-
-def _cell(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
-    ohm = None
-    if sim.cell_resistance_ohm is not None:
-        ohm = draws.between(sim.cell_resistance_ohm)
-    return {
-        "cell_resistance_ohm": ohm,
-        "cell_slow_ohm": draws.between(sim.cell_slow_ohm),
-        "cell_charge": draws.between(sim.cell_charge),
-        "cell_knee": draws.between(sim.cell_knee),
-    }
-
-
-def _tilt(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
+def _tilt(sim: SimulationConfig, draws: _Draws) -> tuple[float, float]:
+    """The target's turns about the world's x and y."""
     tilt_rad = draws.angle_rad(sim.target_tilt_deg)
     towards_rad = draws.angle_rad(sim.target_tilt_towards_deg)
     if not tilt_rad:
-        return {}
+        return (0.0, 0.0)
     # Lifted on the side of +x is a turn about -y, on that of +y one about x.
-    about = (tilt_rad * math.sin(towards_rad), -tilt_rad * math.cos(towards_rad))
-    return {"target_tilt_rad": about}
-
-
-def _lamp(sim: SimulationConfig, draws: _Draws, target_xy_m: tuple[float, float]) -> dict[str, Any]:
-    gloss, aside_m, z_m = map(draws.between, (sim.gloss, sim.lamp_aside_m, sim.lamp_z_m))
-    if not gloss:
-        return {}
-    return {"gloss": gloss, "lamp_m": (*draws.around(target_xy_m, aside_m), z_m)}
+    return (tilt_rad * math.sin(towards_rad), -tilt_rad * math.cos(towards_rad))
 
 
 def _flow(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
@@ -270,26 +229,13 @@ def _flow(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
     return fields
 
 
-def _floor(
-    sim: SimulationConfig, draws: _Draws, target_xy_m: tuple[float, float]
-) -> dict[str, Any]:
-    radius_m, aside_m = draws.between(sim.bare_floor_m), draws.between(sim.bare_floor_aside_m)
-    if not radius_m:
-        return {}
-    return {"bare_floors": ((*draws.around(target_xy_m, aside_m), radius_m),)}
-
-
-def _radio(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
-    loss, burst_s = draws.between(sim.radio_loss), draws.between(sim.radio_burst_s)
-    return {"radio_loss": loss, "radio_burst_s": burst_s}
-
-
-def _capture(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
+def _capture_holes(sim: SimulationConfig, draws: _Draws) -> tuple[tuple[float, float], ...]:
+    """Begin and length of each."""
     if not sim.capture_hole_s[1]:
-        return {}
+        return ()
     holes, t_s = [], 0.0
     while (t_s := t_s + float(draws.rng.exponential(sim.capture_hole_every_s))) < _LONGEST_S:
         length_s = draws.between(sim.capture_hole_s)
         holes.append((t_s, length_s))
         t_s += length_s + _LEAST_GAP_S
-    return {"capture_holes_s": tuple(holes)}
+    return tuple(holes)

@@ -69,14 +69,10 @@ class EventExplainer:
         return held or event.row in LOSSES
 
     def _why_no_pictures(self, t_s: float) -> str:
-        if self._in_burst(t_s):
-            assert self._scenario.camera_burst is not None
-            return f"{self._scenario.camera_burst[1]} frames lost"
-        return "perhaps a lamp's reflection in the glossy print" if self._scenario.gloss else ""
-
-    def _in_burst(self, t_s: float) -> bool:
         burst, rate_hz = self._scenario.camera_burst, self._scenario.camera_rate_hz
-        return burst is not None and 0.0 <= t_s - burst[0] <= burst[1] / rate_hz + FELT_FOR_S
+        if burst is None or not 0.0 <= t_s - burst[0] <= burst[1] / rate_hz + FELT_FOR_S:
+            return ""
+        return f"{burst[1]} frames lost"
 
     def _silence(self, t_s: float) -> str:
         self._bursts.lost(t_s)
@@ -92,14 +88,10 @@ class EventExplainer:
         return ""
 
     def _blind_deck(self) -> str:
-        scenario = self._scenario
-        where = []
-        if scenario.flow_reach_m is not None and scenario.ceiling_z_m > scenario.flow_reach_m:
-            where.append(f"above {scenario.flow_reach_m:g} m")
-        where += [
-            f"over {2 * radius_m:.1f} m of bare floor" for *_, radius_m in scenario.bare_floors
-        ]
-        return f"the flow deck is blind {' and '.join(where)}" if where else ""
+        reach_m = self._scenario.flow_reach_m
+        if reach_m is None or self._scenario.ceiling_z_m <= reach_m:
+            return ""
+        return f"the flow deck is blind above {reach_m:g} m"
 
     def _load(self) -> str:
         """What is heavier or weaker than a good vehicle with a good cell."""

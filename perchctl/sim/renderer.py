@@ -46,7 +46,6 @@ from perchctl.sim.sheets import (
     fill,
     pixels_of,
     printed_sheet,
-    shone_upon,
 )
 from perchctl.vision import CameraModel
 
@@ -108,9 +107,6 @@ class Renderer:
         )
         own = () if scenario.no_target else (Placed(printed_sheet(printed.model_dump_json())),)
         self._sheets = (*own, *(beside(n, printed) for n in scenario.neighbours))
-        self._glossy_half_m = 0.0
-        if own and scenario.gloss > 0.0:
-            self._glossy_half_m = own[0].sheet.drawing.sheet_side_m / 2.0
         self._still: tuple[bytes, float, Picture] | None = None
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
@@ -129,7 +125,6 @@ class Renderer:
         turn = rotation_from_rpy(*scenario.target_tilt_rad, 0.0) @ rot_z(scenario.target_yaw_rad)
         self.T_world_target = make_T(turn, (*xy_m, z_m))
         self._T_target_world = invert_T(self.T_world_target)
-        self._lamp_m = (self._T_target_world @ (*scenario.lamp_m, 1.0))[:3]
 
     def render(
         self,
@@ -202,12 +197,6 @@ class Renderer:
         by_row = [plane_map(spread(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
         picture, box = self._optical(maps, motion_px, length_px)
-        if self._glossy_half_m:
-            middle = rows[len(rows) // 2]
-            picture = shone_upon(
-                picture, self._coarse, middle[len(middle) // 2], self._lamp_m,
-                self.scenario.gloss, self._glossy_half_m,
-            )  # fmt: skip
         lens = math.sqrt(max(sigma_px**2 - SAMPLING_SIGMA_PX**2, 0.0))
         if lens > _PLAIN_PX:
             picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), lens), np.uint8)

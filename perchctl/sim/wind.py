@@ -1,17 +1,12 @@
-"""The air in the room: a draught with smooth gusts, together up to a given speed, and single gusts.
-
-A single gust is the "one minus cosine" by which gusts are modelled in aviation (MIL-F-8785C):
-smooth from nothing to its peak and back, once.
-"""
+"""The air in the room: a draught with smooth gusts, together up to a given speed."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
-from perchctl.sim.scenario import Gust, Scenario
+from perchctl.sim.scenario import Scenario
 
 Vector = tuple[float, float, float]
 
@@ -25,8 +20,7 @@ _Terms = tuple[tuple[float, float, float], ...]
 
 
 class Wind:
-    """`Scenario.draught_mps` is the speed that the smooth gusts reach at two standard deviations;
-    single ones (`Scenario.gusts`) are added."""
+    """`Scenario.draught_mps` is the speed that the gusts reach at two standard deviations."""
 
     def __init__(self, scenario: Scenario) -> None:
         draught = scenario.draught_mps
@@ -35,20 +29,15 @@ class Wind:
         speed_mps = math.hypot(*draught)
         rng = np.random.default_rng([scenario.seed, _STREAM])
         self._still = speed_mps == 0.0
-        self._single = scenario.gusts
         self._gusts = tuple(_draw(rng, share * speed_mps) for share in _SHARES)
 
     def at(self, t_s: float) -> Vector:
         """The wind at t, m/s, world axes; exactly zero in still air."""
-        smooth = (0.0, 0.0, 0.0)
-        if not self._still:
-            x, y, z = self._mean
-            gust_x, gust_y, gust_z = self._gusts
-            smooth = (x + _sum(gust_x, t_s), y + _sum(gust_y, t_s), z + _sum(gust_z, t_s))
-        if not self._single:
-            return smooth
-        single = blown(self._single, t_s)
-        return (smooth[0] + single[0], smooth[1] + single[1], smooth[2] + single[2])
+        if self._still:
+            return (0.0, 0.0, 0.0)
+        x, y, z = self._mean
+        gust_x, gust_y, gust_z = self._gusts
+        return (x + _sum(gust_x, t_s), y + _sum(gust_y, t_s), z + _sum(gust_z, t_s))
 
 
 def _draw(rng: np.random.Generator, sigma_mps: float) -> _Terms:
@@ -64,15 +53,3 @@ def _draw(rng: np.random.Generator, sigma_mps: float) -> _Terms:
 
 def _sum(terms: _Terms, t_s: float) -> float:
     return sum(a * math.sin(w * t_s + phase) for a, w, phase in terms)
-
-
-def blown(gusts: Sequence[Gust], t_s: float) -> Vector:
-    """What all of them add to the wind at that time, m/s."""
-    x = y = z = 0.0
-    for gust in gusts:
-        phase = (t_s - gust.start_s) / gust.length_s
-        if 0.0 < phase < 1.0:
-            share = 0.5 * (1.0 - math.cos(2.0 * math.pi * phase))
-            px, py, pz = gust.peak_mps
-            x, y, z = x + share * px, y + share * py, z + share * pz
-    return (x, y, z)

@@ -1,4 +1,4 @@
-"""What seeds draw in the named worlds, and that nothing moves where one condition is taken away."""
+"""What seeds draw in the shipped worlds, each condition by itself."""
 
 from __future__ import annotations
 
@@ -56,34 +56,20 @@ def test_a_harder_world_is_drawn_within_its_ranges(name: str) -> None:
         assert math.hypot(*drawn.draught_mps) <= sim.draught_mps[1]
         tilt_deg = math.degrees(math.hypot(*drawn.target_tilt_rad))
         assert sim.target_tilt_deg[0] - 1e-9 <= tilt_deg <= sim.target_tilt_deg[1] + 1e-9
-        assert sim.gloss[0] <= drawn.gloss <= sim.gloss[1]
-        aside_m = math.dist(drawn.lamp_m[:2], drawn.target_xy_m)
-        assert sim.lamp_aside_m[0] <= aside_m <= sim.lamp_aside_m[1]
         assert drawn.cell_resistance_ohm is not None
         assert drawn.cell_charge <= sim.cell_charge[1]
         bias_dps = math.degrees(math.hypot(*drawn.flow_bias_radps))
         assert sim.flow_bias_dps[0] - 1e-9 <= bias_dps <= sim.flow_bias_dps[1] + 1e-9
-        assert len(drawn.bare_floors) == 1
         assert drawn.flow_reach_m == 2.5
         assert sim.radio_loss[0] <= drawn.radio_loss <= sim.radio_loss[1]
-        peaks = [math.hypot(*gust.peak_mps) for gust in drawn.gusts]
-        assert peaks
-        assert sim.gust_mps[0] <= min(peaks)
-        assert max(peaks) <= sim.gust_mps[1]
-        assert all(
-            a.start_s < b.start_s for a, b in zip(drawn.gusts, drawn.gusts[1:], strict=False)
-        )
 
 
 def test_one_range_moves_no_other_value_of_a_seed() -> None:
     """So that one condition can be taken away, and all else is as it was."""
     whole = asdict(draw_scenario(load_profile("extreme"), 7))
     for key, value, fields in (
-        ("gloss", [0.0, 0.0], {"gloss", "lamp_m"}),
         ("target_tilt_deg", [0.0, 0.0], {"target_tilt_rad"}),
-        ("gust_mps", [0.0, 0.0], {"gusts"}),
         ("radio_loss", [0.0, 0.0], {"radio_loss"}),
-        ("bare_floor_m", [0.0, 0.0], {"bare_floors"}),
         ("flow_noise_radps", [0.0, 0.0], {"flow_noise_radps"}),
         ("mass_kg", [0.04, 0.04], {"mass_kg", "first_contact_force_n"}),
         ("capture_hole_s", [0.0, 0.0], {"capture_holes_s"}),

@@ -55,7 +55,8 @@ def camera_pose(
 
 def project(camera: CameraModel, scene: Scenario, T_world_cam: Array, points_m: Array) -> Array:
     """Image of points given in OpenCV's marker axes, by OpenCV's own projection."""
-    T_world_target = make_T(rot_z(scene.target_yaw_rad), (*scene.target_xy_m, scene.ceiling_z_m))
+    turn = rotation_from_rpy(*scene.target_tilt_rad, 0.0) @ rot_z(scene.target_yaw_rad)
+    T_world_target = make_T(turn, (*scene.target_xy_m, scene.ceiling_z_m))
     T_cam_marker = invert_T(T_world_cam) @ T_world_target @ make_T(R_MARKER_TARGET, (0, 0, 0))
     rvec = cv2.Rodrigues(T_cam_marker[:3, :3])[0]
     tvec = T_cam_marker[:3, 3].copy()
@@ -212,6 +213,16 @@ def test_true_print_sizes_come_from_the_scenario() -> None:
     renderer = Renderer(scene, PLUMB_BOB, TARGET)
     image = evenly_lit(renderer.render([pose]), renderer)
     errors = corner_errors_px(image, PLUMB_BOB, scene, pose, 0.1485, reach_px)
+    assert np.abs(errors).max() < 0.025
+
+
+@pytest.mark.parametrize("tilt_deg", [(3.0, 0.0), (-2.0, 2.0)])
+def test_the_corners_of_a_tilted_target_are_in_its_plane(tilt_deg: tuple[float, float]) -> None:
+    tilted = scenario(target_tilt_rad=(math.radians(tilt_deg[0]), math.radians(tilt_deg[1])))
+    pose = camera_pose(0.35, 0.02, 0.01, (0.03, -0.02, 0.2))
+    renderer = Renderer(tilted, PLUMB_BOB, TARGET)
+    image = evenly_lit(renderer.render([pose]), renderer)
+    errors = corner_errors_px(image, PLUMB_BOB, tilted, pose, 0.150, 4.0)
     assert np.abs(errors).max() < 0.025
 
 

@@ -25,8 +25,6 @@ from perchctl.sim.powertrain import (
     motor_v,
     thrust_n,
 )
-from perchctl.sim.scenario import Gust
-from perchctl.sim.wind import Wind, blown
 from perchctl.sim.world import (
     DRAG_LEVEL_NSPM,
     DRAG_VERTICAL_NSPM,
@@ -334,28 +332,8 @@ def test_the_gear_touches_before_the_frame() -> None:
 # The air ------------------------------------------------------------------------------
 
 
-GUST = Gust(2.0, 1.0, (0.6, 0.0, 0.1))
 ROTOR_RADIUS_M = 0.023
 ROTORS_OVER_CENTRE_M = 0.01
-
-
-def test_a_gust_rises_to_its_peak_and_goes() -> None:
-    assert blown([GUST], 2.0) == blown([GUST], 3.0) == blown([GUST], 9.0) == (0.0, 0.0, 0.0)
-    assert blown([GUST], 2.5) == pytest.approx(GUST.peak_mps)
-    assert blown([GUST], 2.25) == pytest.approx([0.5 * v for v in GUST.peak_mps])
-    mean = sum(blown([GUST], 2.0 + k / 1000.0)[0] for k in range(1000)) / 1000.0
-    assert mean == pytest.approx(0.3, rel=1e-3)
-    assert blown([GUST, GUST], 2.5) == pytest.approx([2.0 * v for v in GUST.peak_mps])
-
-
-def test_gusts_are_added_to_the_draught() -> None:
-    steady = Scenario(seed=3, draught_mps=(0.3, -0.1, 0.0))
-    gusty = Scenario(seed=3, draught_mps=(0.3, -0.1, 0.0), gusts=(GUST,))
-    for t_s in (1.0, 2.3, 2.5, 4.0):
-        expected = [a + b for a, b in zip(Wind(steady).at(t_s), blown([GUST], t_s), strict=True)]
-        assert Wind(gusty).at(t_s) == pytest.approx(expected)
-    assert Wind(Scenario(gusts=(GUST,))).at(2.5) == pytest.approx(GUST.peak_mps)
-    assert Wind(Scenario(gusts=(GUST,))).at(1.0) == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("height_m", [0.03, 0.035, 0.04, 0.05, 0.07, 0.1, 0.15])
