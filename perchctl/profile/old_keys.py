@@ -19,11 +19,18 @@ UNUSED: tuple[str, ...] = (
     "planner.takeoff_duration_s",
     "simulation.bare_floor_aside_m",
     "simulation.bare_floor_m",
+    "simulation.draught_towards_deg",
+    "simulation.drift_xyz_mps",
+    "simulation.estimate_tilt_bias_xy_deg",
     "simulation.gloss",
     "simulation.gust_every_s",
     "simulation.gust_mps",
     "simulation.lamp_aside_m",
     "simulation.lamp_z_m",
+    "simulation.mount_error_rpy_deg",
+    "simulation.mount_error_xyz_m",
+    "simulation.target_tilt_towards_deg",
+    "simulation.target_xy_m",
 )
 """Nothing depends on them any more: left out."""
 WORLD = "simulation.set"

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from perchctl.profile.base import Ordered, Range, Section, Vector3, key
+from perchctl.profile.base import Ordered, Range, Section, key
 
 MarkerId = Annotated[int, Field(ge=0)]
 Amounts = Ordered[Annotated[float, Field(ge=0)]]
@@ -95,21 +95,8 @@ class SimulationConfig(Section):
     neighbour_ids: tuple[MarkerId, MarkerId] | None = key(
         None, "of their large and small markers; none: the own target's"
     )
-    target_xy_m: tuple[float, float] | None = key(
-        None, "the target's centre, instead of what `start_offset_m` draws"
-    )
-    camera_burst_start_s: Range = key((4.0, 22.0), "of the frames lost in one go")
-    mount_error_rpy_deg: Vector3 | None = key(
-        None, "what the mount is turned by, instead of what `mount_error_deg` draws"
-    )
-    mount_error_xyz_m: Vector3 | None = key(
-        None, "what the mount is shifted by, instead of what `mount_error_m` draws"
-    )
-    drift_xyz_mps: Vector3 | None = key(None, "the drift, instead of what `drift_mps` draws")
-    draught_towards_deg: Range = key((-180.0, 180.0), "counted from the world's x")
-    estimate_tilt_bias_xy_deg: tuple[float, float] | None = key(
-        None, "of roll and pitch, instead of what `estimate_tilt_bias_deg` draws"
-    )
+    camera_burst_start_s: ClassVar[tuple[float, float]] = (4.0, 22.0)
+    """Of the frames lost in one go."""
     first_contact_share: ClassVar[tuple[float, float]] = (0.0, 0.6)
     """Of the weight, that a first contact carries which does not hold."""
     ceiling_suction: Shares = key(
@@ -120,9 +107,6 @@ class SimulationConfig(Section):
     cell_charge: Charges = key((1.0, 1.0), "share of a new one's that it holds")
     cell_knee: Knees = key((0.1, 0.1), "share of its charge where the steep end begins")
     target_tilt_deg: Tilts = key((0.0, 0.0), "of the target out of the horizontal")
-    target_tilt_towards_deg: Range = key(
-        (-180.0, 180.0), "which of its sides is lifted, from the world's x"
-    )
     flow_noise_radps: Amounts = key(
         (0.0, 0.0), "of each reading of the flow sensor; times the height it is a speed"
     )

@@ -38,7 +38,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         return np.asarray(vector / np.linalg.norm(vector))
 
     offset = rng.uniform(-sim.start_offset_m, sim.start_offset_m, size=2)
-    target_xy_m = sim.target_xy_m or (float(offset[0]), float(offset[1]))
+    target_xy_m = (float(offset[0]), float(offset[1]))
     yaw_rad = math.radians(between("target_yaw_deg"))
     ceiling_z_m = between("ceiling_z_m")
     mass_kg = between("mass_kg")
@@ -47,11 +47,11 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     noise_sigma = between("camera_noise_sigma")
     burst = _burst(sim, rng, between("camera_burst_start_s"))
     T_body_cam = profile.camera.mount.T_body_cam @ _mounting_error(profile, rng)
-    drift = direction() * sim.drift_mps
-    towards_deg = sim.draught_towards_deg
-    wind_angle = float(rng.uniform(math.radians(towards_deg[0]), math.radians(towards_deg[1])))
+    drift_x, drift_y, drift_z = (direction() * sim.drift_mps).tolist()
+    wind_angle = float(rng.uniform(-math.pi, math.pi))
     wind_mps = between("draught_mps")
-    tilt_bias = rng.uniform(-1, 1, size=2) * math.radians(sim.estimate_tilt_bias_deg)
+    tilt_bias_rad = math.radians(sim.estimate_tilt_bias_deg)
+    bias_x, bias_y = (rng.uniform(-1, 1, size=2) * tilt_bias_rad).tolist()
     fails = rng.uniform() < sim.first_contact_fails
     weak_part = between("first_contact_share")
     return Scenario(
@@ -85,8 +85,8 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         camera_receiver_hz=sim.camera_receiver_hz,
         camera_receiver_noise=sim.camera_receiver_noise,
         camera_blank_rate=sim.camera_blank_rate,
-        estimate_tilt_bias_rad=_pinned(tilt_bias, sim.estimate_tilt_bias_xy_deg, in_degrees=True),
-        drift_mps=_pinned(drift, sim.drift_xyz_mps),
+        estimate_tilt_bias_rad=(bias_x, bias_y),
+        drift_mps=(drift_x, drift_y, drift_z),
         draught_mps=(wind_mps * math.cos(wind_angle), wind_mps * math.sin(wind_angle), 0.0),
         first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
         **_imu_errors(sim, seed),
@@ -105,13 +105,6 @@ def _burst(
         rng.integers(2)  # numpy draws none of one number, and what comes later must stay
     frames = int(rng.integers(low, high + 1))
     return None if sim.camera_burst_frames is None else (start_s, frames)
-
-
-def _pinned(drawn: Array, pin: tuple[float, ...] | None, *, in_degrees: bool = False) -> Any:
-    """What the profile says that it is, or else what was drawn."""
-    if pin is None:
-        return tuple(float(value) for value in drawn)
-    return tuple(math.radians(value) if in_degrees else value for value in pin)
 
 
 def _neighbours(sim: SimulationConfig) -> tuple[Neighbour, ...]:
@@ -167,10 +160,6 @@ def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
     turn = axis * math.radians(rng.uniform(0, sim.mount_error_deg))
     way = rng.normal(size=3)
     way *= rng.uniform(0, sim.mount_error_m) / np.linalg.norm(way)
-    if sim.mount_error_rpy_deg is not None:
-        turn = np.radians(sim.mount_error_rpy_deg)
-    if sim.mount_error_xyz_m is not None:
-        way = np.asarray(sim.mount_error_xyz_m)
     return make_T(rotation_from_rpy(*(float(a) for a in turn)), way)
 
 
@@ -213,7 +202,7 @@ class _Draws:
 def _tilt(sim: SimulationConfig, draws: _Draws) -> tuple[float, float]:
     """The target's turns about the world's x and y."""
     tilt_rad = draws.angle_rad(sim.target_tilt_deg)
-    towards_rad = draws.angle_rad(sim.target_tilt_towards_deg)
+    towards_rad = draws.angle_rad()
     if not tilt_rad:
         return (0.0, 0.0)
     # Lifted on the side of +x is a turn about -y, on that of +y one about x.

@@ -40,7 +40,8 @@ def test_the_set_of_earlier_versions_is_named_with_the_profile_to_extend(tmp_pat
 def test_a_log_of_an_earlier_version_is_read() -> None:
     """It holds every key of the world in which was flown."""
     values = load_profile("extreme").model_dump(mode="json")
-    values["simulation"] |= {"set": "extreme", "gust_mps": [0.2, 0.6], "bare_floor_m": [0.2, 0.6]}
+    values["simulation"] |= {"set": "extreme", "gust_mps": [0.2, 0.6], "drift_xyz_mps": None}
+    values["simulation"] |= {"camera_burst_start_s": [4.0, 22.0]}
     assert Profile.model_validate(values) == load_profile("extreme")
 
 
