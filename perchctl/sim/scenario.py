@@ -51,7 +51,7 @@ class Scenario:
         camera_blank_rate: share of pictures that are a blue screen.
         camera_mirrored: it gives its pictures flipped left to right.
         drift_mps: drift of the state estimate, world axes.
-        draught_mps: the wind with its smooth gusts (`perchctl.sim.wind`).
+        draught_mps: the wind with its smooth gusts (`perchctl.sim.world.Wind`).
         ceiling_suction: share of thrust gained with the rotors' plane at the ceiling.
         magnet_force_n: pull the magnet can hold.
         first_contact_force_n: pull at the first contact; None means the same.
