@@ -33,9 +33,8 @@ from perchctl.mission import Phase, step_mission, table  # noqa: E402
 from perchctl.mission.lander import MANOEUVRES, Evidence, Reach, Stage  # noqa: E402
 from perchctl.mission.state import BEFORE_CONTACT, FLYING_PHASES  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
-from perchctl.profile import Profile, SimulationConfig  # noqa: E402
+from perchctl.profile import Profile, load_profile  # noqa: E402
 from perchctl.profile.keys import UNITS, keys  # noqa: E402
-from perchctl.profile.simulation import WORLDS  # noqa: E402
 from perchctl.vision import step  # noqa: E402
 
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -78,13 +77,14 @@ def _shown(value: Any) -> str:
 
 
 def worlds() -> str:
-    """The keys in which the named worlds differ."""
-    world = {name: SimulationConfig.model_validate({"set": name}) for name in WORLDS}
+    """The keys of the simulation in which the harder worlds differ from `sim`."""
+    world = {name: load_profile(name).simulation for name in ("sim", "rough", "extreme")}
     rows = []
-    for key in keys(SimulationConfig()):
-        if any(key.path in values for values in WORLDS.values()):
-            shown = (_shown(getattr(sim, key.path)) for sim in world.values())
-            rows.append(f"| `{key.path}` | {key.unit} | {' | '.join(shown)} | {key.meaning} |")
+    for key in keys(world["sim"]):
+        values = [getattr(simulation, key.path) for simulation in world.values()]
+        if any(value != values[0] for value in values):
+            shown = " | ".join(_shown(value) for value in values)
+            rows.append(f"| `{key.path}` | {key.unit} | {shown} | {key.meaning} |")
     head = f"| key | unit | {' | '.join(f'`{name}`' for name in world)} | meaning |"
     return "\n".join([head, "|---" * (len(world) + 3) + "|", *rows])
 

@@ -100,7 +100,7 @@ MOST_NAMES = {
     "perception": 15,
     "positioning": 15,
     "profile": 38,
-    "sim": 27,
+    "sim": 25,
     "target": 29,
     "track": 15,
     "vision": 30,

@@ -33,7 +33,7 @@ from perchctl.link import (
     Port,
     Radio,
 )
-from perchctl.sim import PROTOCOL_VERSION, CommandService, Firmware
+from perchctl.sim import CommandService, Firmware
 from perchctl.vision import Frame
 
 # --- The radio: what arrives, what does not, and what comes late -------------------------------
@@ -78,7 +78,7 @@ class FaultyRadio(Radio):
 
     def serves(self, firmware: Firmware) -> None:
         """Where the second copy of a packet goes."""
-        self._service = CommandService(firmware, PROTOCOL_VERSION)
+        self._service = CommandService(firmware)
 
     def begin(self, effect: RadioEffect, now_s: float) -> None:
         match effect:

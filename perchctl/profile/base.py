@@ -111,27 +111,57 @@ def key_unit(path: str) -> str:
     return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")
 
 
-# --- Keys that have become constants of their section --------------------------------------------
+# --- Keys that have become constants of their section, or are gone -----------------------------
+
+GONE = frozenset(
+    f"simulation.{key}"
+    for key in (
+        "bare_floor_aside_m",
+        "bare_floor_m",
+        "draught_towards_deg",
+        "drift_xyz_mps",
+        "estimate_tilt_bias_xy_deg",
+        "gloss",
+        "gust_every_s",
+        "gust_mps",
+        "lamp_aside_m",
+        "lamp_z_m",
+        "mount_error_rpy_deg",
+        "mount_error_xyz_m",
+        "target_tilt_towards_deg",
+        "target_xy_m",
+    )
+)
+"""Nothing depends on them any more: left out, so that a flight's log is still read."""
+WORLD = "simulation.set"
+"""It named the profile `rough` or `extreme` for the keys that were not written."""
 
 
 def without_constants(
     values: dict[str, Any], model: type[BaseModel], path: str = ""
 ) -> tuple[dict[str, Any], list[str], list[str]]:
-    """The values of a profile without keys that are constants by now: class variables of `model`,
-    or of a model within it. Also a note for each of these, and a sentence for each whose value
-    would be lost, as it is another one than the constant."""
+    """The values of a profile without keys that are gone or constants by now: class variables of
+    `model`, or of a model within it. Also a note for each of these, and a sentence for each whose
+    value would be lost, as it is another one than the constant."""
     result, notes, lost = dict(values), list[str](), list[str]()
     for key, value in values.items():
         kind = model.model_fields[key].annotation if key in model.model_fields else None
-        if key in model.__class_vars__:
+        dotted = f"{path}{key}"
+        if dotted in GONE or (dotted == WORLD and value == "nominal"):
+            del result[key]
+            notes.append(f"{dotted} is no longer used; remove it")
+        elif dotted == WORLD:
+            del result[key]
+            lost.append(f"{WORLD} is no longer a key: remove it, and extend the profile {value}")
+        elif key in model.__class_vars__:
             del result[key]
             constant = getattr(model, key)
-            now = f"{path}{key} is no longer a key: it is {constant} for every profile"
+            now = f"{dotted} is no longer a key: it is {constant} for every profile"
             if value == (list(constant) if isinstance(value, list) else constant):
                 notes.append(f"{now}; remove it")
             else:
                 lost.append(f"{now}, and {value} here; remove it")
         elif isinstance(value, dict) and isinstance(kind, type) and issubclass(kind, BaseModel):
-            result[key], more, gone = without_constants(value, kind, f"{path}{key}.")
+            result[key], more, gone = without_constants(value, kind, f"{dotted}.")
             notes, lost = notes + more, lost + gone
     return result, notes, lost

@@ -25,11 +25,8 @@ from perchctl.plain_yaml import clip_text, parse_yaml
 from perchctl.profile.base import without_constants
 from perchctl.profile.load import check_profile, find_profile, first_invalid_key
 from perchctl.profile.schema import Profile
-from perchctl.profile.simulation import in_world
 
 # --- Keys of a loaded profile -------------------------------------------------------------------
-
-WORLD = "simulation.set"
 
 
 def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
@@ -42,15 +39,9 @@ def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--
     """
     values = profile.model_dump(mode="json")
     pairs = [_parsed(setting, option) for setting in settings]
-    for key, text in sorted(pairs, key=lambda pair: pair[0] != WORLD):  # keys win over a world
+    for key, text in pairs:
         try:
             _put(values, key, parse_yaml(text))
-            if key == WORLD:
-                world = in_world(profile.simulation, str(parse_yaml(text)))
-                values["simulation"] = world.model_dump(mode="json")
-        except ValidationError as error:
-            setting = clip_text(f"{key}={text}")
-            raise InvalidValue(f"{option} {setting}: {first_invalid_key(error)[1]}") from None
         except ValueError as error:
             raise InvalidValue(f"{option} {clip_text(f'{key}={text}')}: {error}") from None
     try:

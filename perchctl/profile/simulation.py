@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from perchctl.profile.base import Ordered, Range, Section, Vector3, key
+from perchctl.profile.base import Ordered, Range, Section, key
 
 MarkerId = Annotated[int, Field(ge=0)]
 Amounts = Ordered[Annotated[float, Field(ge=0)]]
@@ -20,14 +20,8 @@ Bursts = Ordered[Annotated[float, Field(ge=0.01, le=10)]]
 
 
 class SimulationConfig(Section):
-    """Ranges from which a seed draws one flight's conditions (`perchctl.sim.draw`).
+    """Ranges from which a seed draws one flight's conditions (`perchctl.sim.draw`)."""
 
-    `set` gives the defaults (`perchctl.profile.simulation`); keys that are written win over it.
-    """
-
-    set: Literal["nominal", "rough", "extreme"] = key(
-        "nominal", "the world whose values stand where a key is not written"
-    )
     start_offset_m: float = key(
         0.5, "start under the target, at most so far aside in x and in y", ge=0, le=5
     )
@@ -99,26 +93,10 @@ class SimulationConfig(Section):
     neighbour_ids: tuple[MarkerId, MarkerId] | None = key(
         None, "of their large and small markers; none: the own target's"
     )
-    target_xy_m: tuple[float, float] | None = key(
-        None, "the target's centre, instead of what `start_offset_m` draws"
-    )
-    camera_burst_start_s: Range = key((4.0, 22.0), "of the frames lost in one go")
-    mount_error_rpy_deg: Vector3 | None = key(
-        None, "what the mount is turned by, instead of what `mount_error_deg` draws"
-    )
-    mount_error_xyz_m: Vector3 | None = key(
-        None, "what the mount is shifted by, instead of what `mount_error_m` draws"
-    )
-    drift_xyz_mps: Vector3 | None = key(None, "the drift, instead of what `drift_mps` draws")
-    draught_towards_deg: Range = key((-180.0, 180.0), "counted from the world's x")
-    estimate_tilt_bias_xy_deg: tuple[float, float] | None = key(
-        None, "of roll and pitch, instead of what `estimate_tilt_bias_deg` draws"
-    )
+    camera_burst_start_s: ClassVar[tuple[float, float]] = (4.0, 22.0)
+    """Of the frames lost in one go."""
     first_contact_share: ClassVar[tuple[float, float]] = (0.0, 0.6)
     """Of the weight, that a first contact carries which does not hold."""
-    gust_mps: Amounts = key((0.0, 0.0), "peak of single gusts beside the draught")
-    gust_every_s: ClassVar[float] = 8.0
-    """On average."""
     ceiling_suction: Shares = key(
         (0.1, 0.1), "share of thrust gained with the rotors at the ceiling"
     )
@@ -127,16 +105,6 @@ class SimulationConfig(Section):
     cell_charge: Charges = key((1.0, 1.0), "share of a new one's that it holds")
     cell_knee: Knees = key((0.1, 0.1), "share of its charge where the steep end begins")
     target_tilt_deg: Tilts = key((0.0, 0.0), "of the target out of the horizontal")
-    target_tilt_towards_deg: Range = key(
-        (-180.0, 180.0), "which of its sides is lifted, from the world's x"
-    )
-    gloss: Amounts = key(
-        (0.0, 0.0), "brightest of the lamp's reflection in the print, in paper whites"
-    )
-    lamp_aside_m: ClassVar[tuple[float, float]] = (0.1, 0.6)
-    """Of the lamp, from under the target."""
-    lamp_z_m: ClassVar[tuple[float, float]] = (0.0, 1.2)
-    """Of the lamp, over the floor."""
     flow_noise_radps: Amounts = key(
         (0.0, 0.0), "of each reading of the flow sensor; times the height it is a speed"
     )
@@ -146,95 +114,9 @@ class SimulationConfig(Section):
     flow_reach_m: float | None = key(
         None, "above this the flow sensor sees nothing; none: it always does", gt=0, le=20
     )
-    bare_floor_m: Amounts = key(
-        (0.0, 0.0), "radius of a patch of floor without texture, where flow is blind"
-    )
-    bare_floor_aside_m: ClassVar[tuple[float, float]] = (0.0, 0.6)
-    """Of it, from under the target."""
     radio_loss: Losses = key((0.0, 0.0), "share of the time in which no packet passes")
     radio_burst_s: Bursts = key((0.1, 0.1), "mean length of such a time")
     capture_hole_s: Amounts = key(
         (0.0, 0.0), "motion capture: for so long it does not see the vehicle"
     )
     capture_hole_every_s: float = key(15.0, "on average", gt=0, le=1000)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_the_set(cls, values: Any) -> Any:
-        return with_world(values) if isinstance(values, dict) else values
-
-
-def in_world(simulation: SimulationConfig, name: str) -> SimulationConfig:
-    """The same keys in another named world: those that are as their own set has them become as
-    the other has them, what was written stays. Raises pydantic's ValidationError for no world."""
-    before = SimulationConfig.model_validate({"set": simulation.set})
-    written = {
-        key: value for key, value in simulation if value != getattr(before, key) and key != "set"
-    }
-    return SimulationConfig.model_validate(written | {"set": name})
-
-
-# --- Named worlds to simulate in: what `simulation.set` puts in the place of the keys' defaults
-# `nominal` is the schema's defaults as they stand. The others are harder in everything that a
-# flight has to cope with, each value within what is known of Crazyflies, rooms and cameras
-# (docs/campaigns.md, "Harder worlds").
-
-
-NOMINAL = "nominal"
-
-WORLDS: dict[str, dict[str, Any]] = {
-    NOMINAL: {},
-    "rough": {
-        "mass_kg": (0.042, 0.045),
-        "battery_rest_v": (4.0, 4.2),
-        "cell_resistance_ohm": (0.143, 0.17),
-        "cell_slow_ohm": (0.0, 0.03),
-        "cell_charge": (0.8, 1.0),
-        "cell_knee": (0.07, 0.13),
-        "draught_mps": (0.2, 0.5),
-        "gust_mps": (0.1, 0.3),
-        "ceiling_suction": (0.1, 0.2),
-        "target_tilt_deg": (0.0, 1.5),
-        "gloss": (0.2, 0.8),
-        "camera_readout_s": 0.01,
-        "camera_analogue": 0.15,
-        "flow_noise_radps": (0.02, 0.05),
-        "flow_bias_dps": (0.1, 0.4),
-        "flow_reach_m": 2.5,
-        "bare_floor_m": (0.1, 0.3),
-        "radio_loss": (0.0, 0.03),
-        "radio_burst_s": (0.05, 0.15),
-        "capture_hole_s": (0.2, 1.0),
-    },
-    "extreme": {
-        "ceiling_z_m": (1.8, 2.8),
-        "mass_kg": (0.044, 0.045),
-        "battery_rest_v": (3.9, 4.2),
-        "cell_resistance_ohm": (0.15, 0.19),
-        "cell_slow_ohm": (0.0, 0.05),
-        "cell_charge": (0.5, 0.9),
-        "cell_knee": (0.07, 0.15),
-        "draught_mps": (0.4, 0.8),
-        "gust_mps": (0.2, 0.6),
-        "ceiling_suction": (0.1, 0.3),
-        "target_tilt_deg": (1.0, 3.0),
-        "gloss": (0.5, 2.0),
-        "camera_readout_s": 0.02,
-        "camera_analogue": 0.4,
-        "flow_noise_radps": (0.05, 0.15),
-        "flow_bias_dps": (0.3, 1.0),
-        "flow_reach_m": 2.5,
-        "bare_floor_m": (0.2, 0.6),
-        "radio_loss": (0.02, 0.08),
-        "radio_burst_s": (0.1, 0.3),
-        "capture_hole_s": (1.0, 1.0),
-        "capture_hole_every_s": 8.0,
-    },
-}
-
-
-def with_world(values: dict[str, Any]) -> dict[str, Any]:
-    """The simulation's keys on top of what their `set` has; an unknown one adds nothing, and is
-    refused by the schema."""
-    name = values.get("set", NOMINAL)
-    return (WORLDS.get(name, {}) if isinstance(name, str) else {}) | values

@@ -1,12 +1,10 @@
-from .bursts import Bursts as Bursts
 from .bursts import radio_bursts as radio_bursts
 from .camera import DeliveredFrame as DeliveredFrame
 from .camera import SimCamera as SimCamera
 from .capture import MILLIMETRES_PER_M as MILLIMETRES_PER_M
 from .capture import CaptureFault as CaptureFault
 from .capture import CaptureSettings as CaptureSettings
-from .crtp.commands import CommandService as CommandService
-from .crtp.server import PROTOCOL_VERSION as PROTOCOL_VERSION
+from .crtp.server import CommandService as CommandService
 from .draw import draw_capture as draw_capture
 from .draw import draw_scenario as draw_scenario
 from .explain import EventExplainer as EventExplainer
@@ -16,9 +14,9 @@ from .hand import draw_hand as draw_hand
 from .hand import record_hand as record_hand
 from .powertrain import MOTOR_FORCE_N as MOTOR_FORCE_N
 from .powertrain import most_thrust_n as most_thrust_n
-from .process.handle import CLOCK_MARGIN_S as CLOCK_MARGIN_S
-from .process.handle import SharedTime as SharedTime
-from .process.handle import SimProcess as SimProcess
+from .process import CLOCK_MARGIN_S as CLOCK_MARGIN_S
+from .process import SharedTime as SharedTime
+from .process import SimProcess as SimProcess
 from .renderer import Renderer as Renderer
 from .scenario import CONTROL_PERIOD_S as CONTROL_PERIOD_S
 from .scenario import Neighbour as Neighbour

@@ -24,8 +24,7 @@ PoseAt = Callable[[float], Array]
 
 
 class SimCamera:
-    """Exposes at `camera_rate_hz` with its own phase; same seed, same bytes, whether or not the
-    other frames are looked at.
+    """Exposes at `camera_rate_hz` with its own phase; same seed, same bytes.
 
     Each exposure draws the same random numbers whether or not it is lost, and a
     frame's noise hangs on its index, so neither faults nor the steps of
@@ -53,7 +52,7 @@ class SimCamera:
         self._index = 0
         self._burst_left = scenario.camera_burst[1] if scenario.camera_burst else 0
         self._last_arrival_s = -np.inf
-        self._last: Later | None = None
+        self._last: Picture | None = None
         self._t_s = -np.inf
         self._under_way: deque[DeliveredFrame] = deque()
         self._receiver = Receiver(scenario)
@@ -62,11 +61,6 @@ class SimCamera:
     def exposed_s(self) -> float:
         """Time from the first light on a frame to the last, s."""
         return 2.0 * self._half_s
-
-    @property
-    def next_s(self) -> float:
-        """When the next exposure ends."""
-        return self._first_s + self._index / self.scenario.camera_rate_hz + self._half_s
 
     def advance(self, t_s: float, pose_at: PoseAt) -> None:
         """Take all exposures that end at or before `t_s`.
@@ -105,31 +99,17 @@ class SimCamera:
         if self._last is None or not frozen:
             self._last = self._picture(middle_s, pose_at)
             if s.camera_mirrored:
-                self._last = _flipped(self._last)
-        picture = blanked(s, self._index, self._last)
-        self._under_way.append(DeliveredFrame(arrival_s, middle_s, picture, self._index))
+                self._last = np.ascontiguousarray(self._last[:, ::-1])
+        image = blanked(s, self._index, self._last)
+        self._under_way.append(DeliveredFrame(arrival_s, middle_s, image, self._index))
 
-    def develop(self) -> None:
-        """Make the pictures that are under way: what they show is about to change."""
-        for frame in self._under_way:
-            frame.picture()
-        if self._last is not None:
-            self._last()
-        self._receiver.develop()
-
-    def _picture(self, middle_s: float, pose_at: PoseAt) -> Later:
-        """The poses are of now; the picture is made when it is looked at."""
-
+    def _picture(self, middle_s: float, pose_at: PoseAt) -> Picture:
         def T_world_cam_at(t_s: float) -> Array:
             return np.asarray(pose_at(t_s) @ self._T_body_cam)
 
-        index, renderer = self._index, self.renderer
-        shots = self._shutter.shots(middle_s, T_world_cam_at, renderer.camera.size_px[1])
-        return Later(lambda: renderer.expose(shots, frame_index=index))
-
-
-def _flipped(picture: Later) -> Later:
-    return Later(lambda: np.ascontiguousarray(picture()[:, ::-1]))
+        height = self.renderer.camera.size_px[1]
+        shots = self._shutter.shots(middle_s, T_world_cam_at, height)
+        return self.renderer.expose(shots, frame_index=self._index)
 
 
 # --- When each row of a frame is exposed and in what light ---------------------------------------
@@ -206,21 +186,6 @@ BLUE_GREY, BLUE_NOISE = 41.0, 0.6
 _BLANKS, _TICKS = 1, 2  # streams of random numbers
 
 
-class Later:
-    """A picture that is made when it is first looked at: most of a simulated camera's time would
-    go into those that nobody takes. What it shows must not hang on when that is."""
-
-    def __init__(self, make: Callable[[], Picture]) -> None:
-        self._make: Callable[[], Picture] | None = make
-        self._made: Picture | None = None
-
-    def __call__(self) -> Picture:
-        if self._make is not None:
-            self._made, self._make = self._make(), None
-        assert self._made is not None
-        return self._made
-
-
 @dataclass(frozen=True, eq=False)
 class DeliveredFrame:
     """A frame that has arrived; `t_exposure_s` is the middle of its exposure: between the
@@ -228,12 +193,8 @@ class DeliveredFrame:
 
     t_arrival_s: float
     t_exposure_s: float
-    picture: Later
+    image: Picture
     index: int  # of the exposure: gaps are lost frames
-
-    @property
-    def image(self) -> Picture:
-        return self.picture()
 
 
 class Receiver:
@@ -246,11 +207,6 @@ class Receiver:
         rng = np.random.default_rng([scenario.seed, STREAM])
         self._first_s = float(rng.random()) / (scenario.camera_receiver_hz or 1.0)
         self._given = 0
-
-    def develop(self) -> None:
-        """Make the picture that is held: what it shows is about to change."""
-        if self._newest is not None:
-            self._newest.picture()
 
     def given_out(self, arrived: list[DeliveredFrame], t_s: float) -> list[DeliveredFrame]:
         """Until `t_s`, of what has arrived since the last call, oldest first."""
@@ -269,27 +225,27 @@ class Receiver:
             while waiting and waiting[0].t_arrival_s <= at_s:
                 self._newest = waiting.pop(0)
             if self._newest is not None:
-                yield replace(self._newest, t_arrival_s=at_s, picture=self._noisy(self._newest))
+                yield replace(self._newest, t_arrival_s=at_s, image=self._noisy(self._newest.image))
             self._given += 1
         if waiting:
             self._newest = waiting[-1]
 
-    def _noisy(self, frame: DeliveredFrame) -> Later:
-        sigma, number = self._scenario.camera_receiver_noise, self._given
+    def _noisy(self, image: Picture) -> Picture:
+        sigma = self._scenario.camera_receiver_noise
         if not sigma:
-            return frame.picture
-        seed = [self._scenario.seed, STREAM, _TICKS, number]
-        return Later(lambda: _noisy(frame.image, sigma, np.random.default_rng(seed)))
+            return image
+        rng = np.random.default_rng([self._scenario.seed, STREAM, _TICKS, self._given])
+        return _noisy(image, sigma, rng)
 
 
-def blanked(scenario: Scenario, index: int, picture: Later) -> Later:
+def blanked(scenario: Scenario, index: int, picture: Picture) -> Picture:
     """The picture, or the blue screen in its place."""
     if not scenario.camera_blank_rate:
         return picture
     rng = np.random.default_rng([scenario.seed, STREAM, _BLANKS, index])
     if float(rng.random()) >= scenario.camera_blank_rate:
         return picture
-    return Later(lambda: _noisy(np.full_like(picture(), BLUE_GREY), BLUE_NOISE, rng))
+    return _noisy(np.full_like(picture, BLUE_GREY), BLUE_NOISE, rng)
 
 
 def _noisy(image: Picture, sigma: float, rng: np.random.Generator) -> Picture:

@@ -9,15 +9,14 @@ import re
 import socket
 import struct
 import threading
-import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perchctl.errors import ConnectionFailed, InvalidValue
+from perchctl.errors import InvalidValue
 from perchctl.geometry import (
     Array,
     quaternion_from_rotation,
@@ -253,7 +252,6 @@ class SimCapture:
 
 
 CONNECT, SERVER_INFO, ASK_MODELS, MODELS, FRAME = 0, 1, 4, 5, 7
-COMMAND_PORT = 1510
 _VERSION = bytes((3, 1, 0, 0))
 _NAME_BYTES = 256
 _TICKS_HZ = 1_000_000
@@ -315,40 +313,18 @@ def frame_message(number: int, names: Sequence[str], seen: CaptureFrame) -> byte
 
 _HOST = "127.0.0.1"
 _POLL_S = 0.2
-_GONE_S = 3.0
-_MOST_CLIENTS = 32
-
-
-@dataclass
-class _Client:
-    """`refused_s`: since when nobody listens there."""
-
-    socket: socket.socket
-    refused_s: float | None = None
 
 
 class CaptureServer:
-    """Answers clients in a thread of its own; `publish` sends a frame to each at once.
+    """Answers clients in a thread of its own; `publish` sends a frame to each at once."""
 
-    `port` 0 lets the operating system choose. Raises ConnectionFailed when it is taken.
-    """
-
-    def __init__(
-        self, names: Sequence[str], port: int = 0, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
-        self._clock = clock
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.settimeout(_POLL_S)
-        try:
-            self._socket.bind((_HOST, port))
-        except OSError as error:
-            self._socket.close()
-            raise ConnectionFailed(
-                f"UDP port {port} on {_HOST} cannot be used ({error.strerror}): choose another"
-            ) from None
+        self._socket.bind((_HOST, 0))
         self.host = f"{_HOST}:{self._socket.getsockname()[1]}"
-        self._clients: list[_Client] = []
+        self._clients: list[socket.socket] = []
         self._lock = threading.Lock()
         self._count = 0
         self._closed = False
@@ -356,17 +332,18 @@ class CaptureServer:
         self._thread.start()
 
     def publish(self, seen: CaptureFrame) -> None:
-        """Costs next to nothing while nobody is connected."""
+        """Costs next to nothing while nobody is connected. A client that has gone, and a full
+        buffer, lose a frame, as on any network."""
         self._count += 1
         with self._lock:
             if not self._clients:
                 return
             datagram = frame_message(self._count, self._names, seen)
             for client in self._clients:
-                self._send(client, datagram)
-            for client in [c for c in self._clients if self._is_gone(c)]:
-                client.socket.close()
-                self._clients.remove(client)
+                for _ in range(2):  # the first time may tell of the frame before: not bound yet
+                    with contextlib.suppress(OSError):
+                        client.send(datagram)
+                        break
 
     def close(self) -> None:
         self._closed = True
@@ -374,24 +351,8 @@ class CaptureServer:
         self._socket.close()
         with self._lock:
             for client in self._clients:
-                client.socket.close()
+                client.close()
             self._clients.clear()
-
-    def _send(self, client: _Client, datagram: bytes) -> None:
-        try:
-            client.socket.send(datagram)
-        except ConnectionRefusedError:  # told of the frame before: not bound yet, or no longer
-            if client.refused_s is None:
-                client.refused_s = self._clock()
-            with contextlib.suppress(OSError):
-                client.socket.send(datagram)
-        except OSError:  # a full buffer: a frame is lost, as on any network
-            return
-        else:
-            client.refused_s = None
-
-    def _is_gone(self, client: _Client) -> bool:
-        return client.refused_s is not None and self._clock() - client.refused_s > _GONE_S
 
     def _answer(self) -> None:
         while not self._closed:
@@ -409,15 +370,13 @@ class CaptureServer:
     def _admit(self, host: str) -> int:
         """A port of the client's own: several on one computer could not share one."""
         with self._lock:
-            taken = {client.socket.getpeername()[1] for client in self._clients}
+            taken = {client.getpeername()[1] for client in self._clients}
             while (port := _free_port()) in taken:
                 pass
-            out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            out.setblocking(False)
-            out.connect((host, port))
-            self._clients.append(_Client(out))
-            if len(self._clients) > _MOST_CLIENTS:
-                self._clients.pop(0).socket.close()
+            client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            client.setblocking(False)
+            client.connect((host, port))
+            self._clients.append(client)
         return port
 
 

@@ -14,14 +14,12 @@ import numpy as np
 from perchctl.geometry import GRAVITY_MPS2, Array, make_T, rotation_from_rpy
 from perchctl.profile import Profile, SimulationConfig
 from perchctl.sim.capture import CaptureFault, CaptureSettings
-from perchctl.sim.scenario import Gust, Neighbour, Scenario
+from perchctl.sim.scenario import Neighbour, Scenario
 
 _STREAM, _GROUPS_STREAM, _IMU_STREAM = 1, 21, 22  # the scenario's own random streams
-_AIR, _CELL, _TILT, _LAMP, _FLOW, _FLOOR, _RADIO, _CAPTURE = range(8)
+_AIR, _CELL, _TILT, _FLOW, _RADIO, _CAPTURE = 0, 1, 2, 4, 6, 7
 _LONGEST_S = 240.0
 """No simulated flight lasts longer."""
-_GUST_S = (0.5, 2.0)
-_GUST_UPWARD = 0.3
 _LEAST_GAP_S = 1.0
 
 
@@ -40,7 +38,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         return np.asarray(vector / np.linalg.norm(vector))
 
     offset = rng.uniform(-sim.start_offset_m, sim.start_offset_m, size=2)
-    target_xy_m = sim.target_xy_m or (float(offset[0]), float(offset[1]))
+    target_xy_m = (float(offset[0]), float(offset[1]))
     yaw_rad = math.radians(between("target_yaw_deg"))
     ceiling_z_m = between("ceiling_z_m")
     mass_kg = between("mass_kg")
@@ -49,11 +47,11 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     noise_sigma = between("camera_noise_sigma")
     burst = _burst(sim, rng, between("camera_burst_start_s"))
     T_body_cam = profile.camera.mount.T_body_cam @ _mounting_error(profile, rng)
-    drift = direction() * sim.drift_mps
-    towards_deg = sim.draught_towards_deg
-    wind_angle = float(rng.uniform(math.radians(towards_deg[0]), math.radians(towards_deg[1])))
+    drift_x, drift_y, drift_z = (direction() * sim.drift_mps).tolist()
+    wind_angle = float(rng.uniform(-math.pi, math.pi))
     wind_mps = between("draught_mps")
-    tilt_bias = rng.uniform(-1, 1, size=2) * math.radians(sim.estimate_tilt_bias_deg)
+    tilt_bias_rad = math.radians(sim.estimate_tilt_bias_deg)
+    bias_x, bias_y = (rng.uniform(-1, 1, size=2) * tilt_bias_rad).tolist()
     fails = rng.uniform() < sim.first_contact_fails
     weak_part = between("first_contact_share")
     return Scenario(
@@ -71,15 +69,30 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         camera_burst=burst,
         camera_noise_sigma=noise_sigma,
         camera_mirrored=profile.camera.mirrored,
-        **_as_they_stand(sim),
-        estimate_tilt_bias_rad=_pinned(tilt_bias, sim.estimate_tilt_bias_xy_deg, in_degrees=True),
-        drift_mps=_pinned(drift, sim.drift_xyz_mps),
+        estimate_noise_m=sim.estimate_noise_m,
+        magnet_force_n=sim.magnet_force_n,
+        no_target=sim.no_target,
+        camera_rate_hz=sim.camera_rate_hz,
+        camera_jitter_s=sim.camera_jitter_s,
+        camera_drop_rate=sim.camera_drop_rate,
+        camera_exposure_s=sim.camera_exposure_s,
+        camera_defocus_px=sim.camera_defocus_px,
+        camera_fields=sim.camera_fields,
+        camera_blended=sim.camera_blended,
+        camera_readout_s=sim.camera_readout_s,
+        camera_flicker=sim.camera_flicker,
+        camera_pumping=sim.camera_pumping,
+        camera_receiver_hz=sim.camera_receiver_hz,
+        camera_receiver_noise=sim.camera_receiver_noise,
+        camera_blank_rate=sim.camera_blank_rate,
+        estimate_tilt_bias_rad=(bias_x, bias_y),
+        drift_mps=(drift_x, drift_y, drift_z),
         draught_mps=(wind_mps * math.cos(wind_angle), wind_mps * math.sin(wind_angle), 0.0),
         first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
         **_imu_errors(sim, seed),
         extra=_extra(profile),
         neighbours=_neighbours(sim),
-        **_groups(sim, seed, target_xy_m),
+        **_groups(sim, seed),
     )
 
 
@@ -92,13 +105,6 @@ def _burst(
         rng.integers(2)  # numpy draws none of one number, and what comes later must stay
     frames = int(rng.integers(low, high + 1))
     return None if sim.camera_burst_frames is None else (start_s, frames)
-
-
-def _pinned(drawn: Array, pin: tuple[float, ...] | None, *, in_degrees: bool = False) -> Any:
-    """What the profile says that it is, or else what was drawn."""
-    if pin is None:
-        return tuple(float(value) for value in drawn)
-    return tuple(math.radians(value) if in_degrees else value for value in pin)
 
 
 def _neighbours(sim: SimulationConfig) -> tuple[Neighbour, ...]:
@@ -146,28 +152,6 @@ def _extra(profile: Profile) -> dict[str, float]:
     return extra
 
 
-def _as_they_stand(sim: SimulationConfig) -> dict[str, Any]:
-    """The values that are not drawn."""
-    return {
-        "estimate_noise_m": sim.estimate_noise_m,
-        "magnet_force_n": sim.magnet_force_n,
-        "no_target": sim.no_target,
-        "camera_rate_hz": sim.camera_rate_hz,
-        "camera_jitter_s": sim.camera_jitter_s,
-        "camera_drop_rate": sim.camera_drop_rate,
-        "camera_exposure_s": sim.camera_exposure_s,
-        "camera_defocus_px": sim.camera_defocus_px,
-        "camera_fields": sim.camera_fields,
-        "camera_blended": sim.camera_blended,
-        "camera_readout_s": sim.camera_readout_s,
-        "camera_flicker": sim.camera_flicker,
-        "camera_pumping": sim.camera_pumping,
-        "camera_receiver_hz": sim.camera_receiver_hz,
-        "camera_receiver_noise": sim.camera_receiver_noise,
-        "camera_blank_rate": sim.camera_blank_rate,
-    }
-
-
 def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
     """A turn and a shift that the profile lacks: up to `mount_error_deg` and `mount_error_m`."""
     sim = profile.simulation
@@ -176,27 +160,29 @@ def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
     turn = axis * math.radians(rng.uniform(0, sim.mount_error_deg))
     way = rng.normal(size=3)
     way *= rng.uniform(0, sim.mount_error_m) / np.linalg.norm(way)
-    if sim.mount_error_rpy_deg is not None:
-        turn = np.radians(sim.mount_error_rpy_deg)
-    if sim.mount_error_xyz_m is not None:
-        way = np.asarray(sim.mount_error_xyz_m)
     return make_T(rotation_from_rpy(*(float(a) for a in turn)), way)
 
 
 # --- What harder worlds draw beyond that ---------------------------------------------------------
 
 
-def _groups(sim: SimulationConfig, seed: int, target_xy_m: tuple[float, float]) -> dict[str, Any]:
+def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
     """Fields of the scenario. Where the ranges are those of the nominal world, its defaults."""
+    air, cell, tilt, flow, radio, capture = (
+        _Draws(seed, group) for group in (_AIR, _CELL, _TILT, _FLOW, _RADIO, _CAPTURE)
+    )
+    ohm = sim.cell_resistance_ohm
     return {
-        **_air(sim, _Draws(seed, _AIR)),
-        **_cell(sim, _Draws(seed, _CELL)),
-        **_tilt(sim, _Draws(seed, _TILT)),
-        **_lamp(sim, _Draws(seed, _LAMP), target_xy_m),
-        **_flow(sim, _Draws(seed, _FLOW)),
-        **_floor(sim, _Draws(seed, _FLOOR), target_xy_m),
-        **_radio(sim, _Draws(seed, _RADIO)),
-        **_capture(sim, _Draws(seed, _CAPTURE)),
+        "ceiling_suction": air.between(sim.ceiling_suction),
+        "cell_resistance_ohm": None if ohm is None else cell.between(ohm),
+        "cell_slow_ohm": cell.between(sim.cell_slow_ohm),
+        "cell_charge": cell.between(sim.cell_charge),
+        "cell_knee": cell.between(sim.cell_knee),
+        "target_tilt_rad": _tilt(sim, tilt),
+        **_flow(sim, flow),
+        "radio_loss": radio.between(sim.radio_loss),
+        "radio_burst_s": radio.between(sim.radio_burst_s),
+        "capture_holes_s": _capture_holes(sim, capture),
     }
 
 
@@ -212,53 +198,15 @@ class _Draws:
     def angle_rad(self, bounds_deg: tuple[float, float] = (-180.0, 180.0)) -> float:
         return math.radians(self.between(bounds_deg))
 
-    def around(self, xy_m: tuple[float, float], aside_m: float) -> tuple[float, float]:
-        """A point so far from another one."""
-        angle = self.angle_rad()
-        return (xy_m[0] + aside_m * math.cos(angle), xy_m[1] + aside_m * math.sin(angle))
 
-
-def _air(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
-    fields: dict[str, Any] = {"ceiling_suction": draws.between(sim.ceiling_suction)}
-    if not sim.gust_mps[1]:
-        return fields
-    gusts, t_s = [], 0.0
-    while (t_s := t_s + float(draws.rng.exponential(sim.gust_every_s))) < _LONGEST_S:
-        angle, upward = draws.angle_rad(), _GUST_UPWARD * float(draws.rng.uniform(-1.0, 1.0))
-        peak_mps, length_s = draws.between(sim.gust_mps), draws.between(_GUST_S)
-        level_mps = peak_mps * math.sqrt(1.0 - upward**2)
-        peak = (level_mps * math.cos(angle), level_mps * math.sin(angle), peak_mps * upward)
-        gusts.append(Gust(t_s, length_s, peak))
-    return fields | {"gusts": tuple(gusts)}
-
-
-def _cell(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
-    ohm = None
-    if sim.cell_resistance_ohm is not None:
-        ohm = draws.between(sim.cell_resistance_ohm)
-    return {
-        "cell_resistance_ohm": ohm,
-        "cell_slow_ohm": draws.between(sim.cell_slow_ohm),
-        "cell_charge": draws.between(sim.cell_charge),
-        "cell_knee": draws.between(sim.cell_knee),
-    }
-
-
-def _tilt(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
+def _tilt(sim: SimulationConfig, draws: _Draws) -> tuple[float, float]:
+    """The target's turns about the world's x and y."""
     tilt_rad = draws.angle_rad(sim.target_tilt_deg)
-    towards_rad = draws.angle_rad(sim.target_tilt_towards_deg)
+    towards_rad = draws.angle_rad()
     if not tilt_rad:
-        return {}
+        return (0.0, 0.0)
     # Lifted on the side of +x is a turn about -y, on that of +y one about x.
-    about = (tilt_rad * math.sin(towards_rad), -tilt_rad * math.cos(towards_rad))
-    return {"target_tilt_rad": about}
-
-
-def _lamp(sim: SimulationConfig, draws: _Draws, target_xy_m: tuple[float, float]) -> dict[str, Any]:
-    gloss, aside_m, z_m = map(draws.between, (sim.gloss, sim.lamp_aside_m, sim.lamp_z_m))
-    if not gloss:
-        return {}
-    return {"gloss": gloss, "lamp_m": (*draws.around(target_xy_m, aside_m), z_m)}
+    return (tilt_rad * math.sin(towards_rad), -tilt_rad * math.cos(towards_rad))
 
 
 def _flow(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
@@ -270,26 +218,13 @@ def _flow(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
     return fields
 
 
-def _floor(
-    sim: SimulationConfig, draws: _Draws, target_xy_m: tuple[float, float]
-) -> dict[str, Any]:
-    radius_m, aside_m = draws.between(sim.bare_floor_m), draws.between(sim.bare_floor_aside_m)
-    if not radius_m:
-        return {}
-    return {"bare_floors": ((*draws.around(target_xy_m, aside_m), radius_m),)}
-
-
-def _radio(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
-    loss, burst_s = draws.between(sim.radio_loss), draws.between(sim.radio_burst_s)
-    return {"radio_loss": loss, "radio_burst_s": burst_s}
-
-
-def _capture(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
+def _capture_holes(sim: SimulationConfig, draws: _Draws) -> tuple[tuple[float, float], ...]:
+    """Begin and length of each."""
     if not sim.capture_hole_s[1]:
-        return {}
+        return ()
     holes, t_s = [], 0.0
     while (t_s := t_s + float(draws.rng.exponential(sim.capture_hole_every_s))) < _LONGEST_S:
         length_s = draws.between(sim.capture_hole_s)
         holes.append((t_s, length_s))
         t_s += length_s + _LEAST_GAP_S
-    return {"capture_holes_s": tuple(holes)}
+    return tuple(holes)

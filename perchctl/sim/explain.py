@@ -3,29 +3,19 @@ who sees the target lost should not look for the fault in the program."""
 
 from __future__ import annotations
 
-import math
-
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import NO_PICTURE_TEXT, Event, EventKind
 from perchctl.sim.bursts import Bursts
-from perchctl.sim.powertrain import RESISTANCE_OHM
 from perchctl.sim.scenario import Scenario
 
 LOSSES = ("estimate-lost", "align-lost", "ascend-lost", "camera-gone")
 """Rows of the mission's table that lost pictures lead to."""
-SLIP = "slipped"
-NOT_FOUND = "searched-out"
 UNHEARD = ("link-lost", "telemetry-stale")
-WEAK = ("battery-low", "too-little-left", "too-weak", "cannot-rise", "blocked")
 UNSURE = ("estimate-unsure", "position-astray", "estimator-jump", "fence")
 UNSEEN = (*UNSURE, "position-lost", "heading-lost")
 """Rows that a motion capture leads to which sees nothing."""
-MISSED = ("no-contact", "not-released")
 FELT_FOR_S = 1.2
 """After the last lost frame: a second of no track, and the latency of the next picture."""
-HEAVY_KG = 0.0435
-_OLD_CHARGE, _OLD_OHM = 0.9, 1.1 * RESISTANCE_OHM
-_TELEMETRY = "telemetry is"
 
 
 class EventExplainer:
@@ -40,43 +30,31 @@ class EventExplainer:
         """What the scenario did, in a few words, or the empty string. `t_s` is the event's time in
         the simulation."""
         scenario = self._scenario
-        if self._lacks_pictures(event):
-            return self._why_no_pictures(t_s)
-        if event.row == SLIP:
+        held = event.reason if event.kind is EventKind.HOLD else ""
+        if event.row in LOSSES or held.startswith(NO_PICTURE_TEXT):
+            return self._lost_frames(t_s)
+        if event.row == "slipped":
             self._slips += 1
             force_n = scenario.first_contact_force_n
             if force_n is not None and self._slips == 1:
                 part = force_n / (scenario.mass_kg * GRAVITY_MPS2)
                 return f"the first contact holds {100 * part:.0f} % of the weight"
-        if event.row == NOT_FOUND and scenario.no_target:
+        if event.row == "searched-out" and scenario.no_target:
             return "there is no target"
-        if event.row in UNHEARD or event.reason.startswith(_TELEMETRY):
+        if event.row in UNHEARD or event.reason.startswith("telemetry is"):
             return self._silence(t_s)
         if event.row in UNSEEN and (hidden := self._hidden(t_s)):
             return hidden
-        if event.row in UNSURE:
-            return self._blind_deck()
-        if event.row in WEAK:
-            return self._load()
-        if event.row in MISSED and any(scenario.target_tilt_rad):
-            tilt_deg = math.degrees(math.hypot(*scenario.target_tilt_rad))
-            return f"the target is tilted by {tilt_deg:.1f} deg"
+        reach_m = scenario.flow_reach_m
+        if event.row in UNSURE and reach_m is not None and scenario.ceiling_z_m > reach_m:
+            return f"the flow deck is blind above {reach_m:g} m"
         return ""
 
-    @staticmethod
-    def _lacks_pictures(event: Event) -> bool:
-        held = event.kind is EventKind.HOLD and event.reason.startswith(NO_PICTURE_TEXT)
-        return held or event.row in LOSSES
-
-    def _why_no_pictures(self, t_s: float) -> str:
-        if self._in_burst(t_s):
-            assert self._scenario.camera_burst is not None
-            return f"{self._scenario.camera_burst[1]} frames lost"
-        return "perhaps a lamp's reflection in the glossy print" if self._scenario.gloss else ""
-
-    def _in_burst(self, t_s: float) -> bool:
+    def _lost_frames(self, t_s: float) -> str:
         burst, rate_hz = self._scenario.camera_burst, self._scenario.camera_rate_hz
-        return burst is not None and 0.0 <= t_s - burst[0] <= burst[1] / rate_hz + FELT_FOR_S
+        if burst is None or not 0.0 <= t_s - burst[0] <= burst[1] / rate_hz + FELT_FOR_S:
+            return ""
+        return f"{burst[1]} frames lost"
 
     def _silence(self, t_s: float) -> str:
         self._bursts.lost(t_s)
@@ -90,26 +68,3 @@ class EventExplainer:
             if 0.0 <= t_s - begin_s <= length_s + FELT_FOR_S:
                 return f"the motion capture did not see it for {length_s:.1f} s"
         return ""
-
-    def _blind_deck(self) -> str:
-        scenario = self._scenario
-        where = []
-        if scenario.flow_reach_m is not None and scenario.ceiling_z_m > scenario.flow_reach_m:
-            where.append(f"above {scenario.flow_reach_m:g} m")
-        where += [
-            f"over {2 * radius_m:.1f} m of bare floor" for *_, radius_m in scenario.bare_floors
-        ]
-        return f"the flow deck is blind {' and '.join(where)}" if where else ""
-
-    def _load(self) -> str:
-        """What is heavier or weaker than a good vehicle with a good cell."""
-        scenario, parts = self._scenario, []
-        if scenario.mass_kg > HEAVY_KG:
-            parts.append(f"{1e3 * scenario.mass_kg:.1f} g")
-        ohm = scenario.cell_resistance_ohm or RESISTANCE_OHM
-        if scenario.cell_charge < _OLD_CHARGE or ohm > _OLD_OHM:
-            parts.append(
-                f"a cell of {1e3 * ohm:.0f} mohm that holds {100 * scenario.cell_charge:.0f} % of "
-                f"a new one's charge"
-            )
-        return ", ".join(parts)

@@ -19,8 +19,8 @@ from perchctl.vision import CameraModel
 Picture = NDArray[np.uint8]
 
 FINE_PX, COARSE_PX = 2, 8
-"""Distances of the nodes of the two ray grids; the image is padded to whole coarse blocks, tiles
-that have a coarse node in their centre each."""
+"""Distances of the nodes of the two ray grids; the image is padded to whole coarse blocks, each
+with a coarse node in its centre."""
 
 FAR_AWAY_M = 1e4
 """The coordinates given to rays that miss the plane."""
@@ -31,9 +31,10 @@ _NOTHING = np.array([0.0, 0.0, -1.0])
 
 @dataclass(frozen=True, eq=False)
 class RayGrid:
-    """Undistorted rays (x, y, 1) at nodes `stride` px apart, with one node around.
+    """Undistorted rays (x, y, 1) at nodes `stride` px apart, with one node around where they are
+    further apart than one pixel.
 
-    Node (j, i) sits at pixel ``stride * (i - 1) + (stride - 1) / 2``: where
+    Node (j, i) then sits at pixel ``stride * (i - 1) + (stride - 1) / 2``: where
     cv2.resize by `stride` puts its sample centres.
     """
 
@@ -47,6 +48,11 @@ class RayGrid:
         """(x, y, 1), shape (3, rows, cols)."""
         x, y = self.xy[..., 0], self.xy[..., 1]
         return np.stack([x, y, np.ones_like(x)])
+
+    def window(self, rows: slice, cols: slice) -> RayGrid:
+        """A part of it, whose outline stays that of the whole."""
+        xy = np.ascontiguousarray(self.xy[rows, cols])
+        return RayGrid(self.stride, xy, self.down[rows], self.outline)
 
 
 def undistorted_rays(camera: CameraModel, pixels: Array) -> Array:
@@ -146,42 +152,21 @@ VIGNETTING_EXPONENT = 0.6
 bare lens, real ones correct most of it."""
 
 
-@dataclass(frozen=True, eq=False)
-class TileRays:
-    """Rays of all pixels, tile by tile: xy (tiles, 64, 2), down (tiles, 8)."""
-
-    xy: NDArray[np.float32]
-    down: NDArray[np.float32]
-    outline: NDArray[np.float32]
-
-    def of(self, tiles: NDArray[np.intp]) -> RayGrid:
-        """Eight rows of eight rays for each of these tiles."""
-        xy = self.xy.take(tiles, axis=0).reshape(-1, COARSE_PX, 2)
-        return RayGrid(1, xy, self.down.take(tiles, axis=0).ravel(), self.outline)
-
-
-def tile_rays(fine: RayGrid) -> TileRays:
-    """All rays of a picture; between the nodes they are interpolated (1e-4 px)."""
+def pixel_rays(fine: RayGrid) -> RayGrid:
+    """The rays of all pixels; between the nodes they are interpolated (1e-4 px)."""
     xy = cv2.resize(fine.xy, None, fx=FINE_PX, fy=FINE_PX)[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX]
-    rows, cols = (n // COARSE_PX for n in xy.shape[:2])
-    blocks = xy.reshape(rows, COARSE_PX, cols, COARSE_PX, 2).transpose(0, 2, 1, 3, 4)
-    down = np.arange(rows * COARSE_PX) * ((fine.down[2] - fine.down[1]) / FINE_PX)
-    by_tile = np.repeat(down.reshape(rows, 1, COARSE_PX), cols, axis=1)
-    return TileRays(
-        np.ascontiguousarray(blocks, np.float32).reshape(rows * cols, COARSE_PX**2, 2),
-        np.asarray(by_tile, np.float32).reshape(rows * cols, COARSE_PX),
-        fine.outline,
-    )
+    down = np.arange(len(xy)) * ((fine.down[2] - fine.down[1]) / FINE_PX)
+    return RayGrid(1, np.asarray(xy, np.float32), np.asarray(down, np.float32), fine.outline)
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """`coarse` the rays of every eighth pixel, `tiles` of all of them; `shade` the relative light
+    """`coarse` the rays of every eighth pixel, `pixels` of all of them; `shade` the relative light
     (height, width), 255 for all of it; `places` rays (3, 5) to the picture's middle and into its
     quarters; `focal_px` the mean of both directions."""
 
     coarse: RayGrid
-    tiles: TileRays
+    pixels: RayGrid
     shade: Picture
     places: Array
     focal_px: float
@@ -198,7 +183,7 @@ def _lens(size_px: tuple[int, int], model: str, K: bytes, dist: bytes) -> Lens:
     fine, coarse = ray_grid(camera, FINE_PX), ray_grid(camera, COARSE_PX)
     focal_px = float(camera.K[0, 0] + camera.K[1, 1]) / 2.0
     shade = vignetting(fine, size_px)
-    return Lens(coarse, tile_rays(fine), shade, _five_places(coarse), focal_px)
+    return Lens(coarse, pixel_rays(fine), shade, _five_places(coarse), focal_px)
 
 
 def _five_places(coarse: RayGrid) -> Array:

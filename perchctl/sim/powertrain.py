@@ -197,32 +197,22 @@ class Powertrain:
         self.battery_v = rest_v
         self.forces_n = (0.0, 0.0, 0.0, 0.0)
         self.strength: Forces = (1.0, 1.0, 1.0, 1.0)  # what is left of each motor's thrust
-        self._speeds_v = (0.0, 0.0, 0.0, 0.0)  # each as the voltage that would keep it
+        self._speeds_v = [0.0] * 4  # each as the voltage that would keep it
         self._down = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_COAST_S)
 
     def step(self, pwm: Forces) -> Forces:
         """The forces after one control period under four duty cycles 0..65535."""
         scale = self.battery_v / FULL_COMMAND
-        down, a, b = self._down, _STANDING, _PER_V
-        v1, v2, v3, v4 = self._speeds_v
-        d1, d2, d3, d4 = pwm
-        d1, d2, d3, d4 = scale * d1 - v1, scale * d2 - v2, scale * d3 - v3, scale * d4 - v4
-        v1 += (sqrt(a + b * v1) if d1 > 0.0 else down) * d1
-        v2 += (sqrt(a + b * v2) if d2 > 0.0 else down) * d2
-        v3 += (sqrt(a + b * v3) if d3 > 0.0 else down) * d3
-        v4 += (sqrt(a + b * v4) if d4 > 0.0 else down) * d4
-        self._speeds_v = (v1, v2, v3, v4)
-        # `thrust_n`, four times: 500 calls a second each would cost more than the cubic.
-        still = STANDSTILL_V
-        f1 = C0 + v1 * (C1 + v1 * (C2 + v1 * C3)) if v1 > still else 0.0
-        f2 = C0 + v2 * (C1 + v2 * (C2 + v2 * C3)) if v2 > still else 0.0
-        f3 = C0 + v3 * (C1 + v3 * (C2 + v3 * C3)) if v3 > still else 0.0
-        f4 = C0 + v4 * (C1 + v4 * (C2 + v4 * C3)) if v4 > still else 0.0
+        for motor, duty in enumerate(pwm):
+            speed_v = self._speeds_v[motor]
+            missing_v = scale * duty - speed_v
+            share = sqrt(_STANDING + _PER_V * speed_v) if missing_v > 0.0 else self._down
+            self._speeds_v[motor] = speed_v + share * missing_v
         s1, s2, s3, s4 = self.strength
-        f1, f2, f3, f4 = s1 * f1, s2 * f2, s3 * f3, s4 * f4
-        self.forces_n = forces = (f1, f2, f3, f4)
+        f1, f2, f3, f4 = map(thrust_n, self._speeds_v)
+        self.forces_n = f1, f2, f3, f4 = s1 * f1, s2 * f2, s3 * f3, s4 * f4
         self.battery_v = self.cell.step(_AMPERES_PER_N * (f1 + f2 + f3 + f4))
-        return forces
+        return self.forces_n
 
 
 def most_thrust_n(rest_v: float) -> float:

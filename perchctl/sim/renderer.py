@@ -2,8 +2,7 @@
 
 Every image pixel is a ray, traced to the ceiling's plane and looked up in
 textures; lens distortion lies in the rays, which are precomputed. The sheets' map
-is exact at each pixel of a tile in which they show an edge; other tiles are filled
-(`perchctl.sim.sheets`). The ceiling's is evaluated at every eighth and interpolated,
+is exact at each pixel. The ceiling's is evaluated at every eighth and interpolated,
 which errs by less than 0.01 px for lenses up to 90 degrees.
 
 Pixel (0, 0) is the centre of the top-left pixel, as in OpenCV.
@@ -42,11 +41,8 @@ from perchctl.sim.sheets import (
     View,
     beside,
     box_around,
-    by_tile,
-    fill,
     pixels_of,
     printed_sheet,
-    shone_upon,
 )
 from perchctl.vision import CameraModel
 
@@ -108,14 +104,11 @@ class Renderer:
         )
         own = () if scenario.no_target else (Placed(printed_sheet(printed.model_dump_json())),)
         self._sheets = (*own, *(beside(n, printed) for n in scenario.neighbours))
-        self._glossy_half_m = 0.0
-        if own and scenario.gloss > 0.0:
-            self._glossy_half_m = own[0].sheet.drawing.sheet_side_m / 2.0
         self._still: tuple[bytes, float, Picture] | None = None
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
         lens = lens_of(camera)
-        self._coarse, self._tiles, self.shade = lens.coarse, lens.tiles, lens.shade
+        self._coarse, self._pixels, self.shade = lens.coarse, lens.pixels, lens.shade
         self._places, self._focal_px = lens.places, lens.focal_px
         self._ceiling_px = 4 if scenario.camera_noise_sigma >= _COVERING_SIGMA else 2
         self._noise, self._noise_at = self._noise_bank()
@@ -129,7 +122,6 @@ class Renderer:
         turn = rotation_from_rpy(*scenario.target_tilt_rad, 0.0) @ rot_z(scenario.target_yaw_rad)
         self.T_world_target = make_T(turn, (*xy_m, z_m))
         self._T_target_world = invert_T(self.T_world_target)
-        self._lamp_m = (self._T_target_world @ (*scenario.lamp_m, 1.0))[:3]
 
     def render(
         self,
@@ -202,12 +194,6 @@ class Renderer:
         by_row = [plane_map(spread(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
         picture, box = self._optical(maps, motion_px, length_px)
-        if self._glossy_half_m:
-            middle = rows[len(rows) // 2]
-            picture = shone_upon(
-                picture, self._coarse, middle[len(middle) // 2], self._lamp_m,
-                self.scenario.gloss, self._glossy_half_m,
-            )  # fmt: skip
         lens = math.sqrt(max(sigma_px**2 - SAMPLING_SIGMA_PX**2, 0.0))
         if lens > _PLAIN_PX:
             picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), lens), np.uint8)
@@ -220,22 +206,22 @@ class Renderer:
     def _optical(
         self, maps: Array, motion_px: Array, length_px: float
     ) -> tuple[Picture, Box | None]:
-        """The picture before defocus, at the ray grids' padded size, and the tiles among which
+        """The picture before defocus, at the ray grids' padded size, and the blocks among which
         there is a sheet, None without one."""
         middle = maps[len(maps) // 2]
         if len(maps) % 2 == 0:
             middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
         nodes, misses = trace(self._coarse, middle)
         views = [view for s in self._sheets if (view := s.view(nodes, length_px)) is not None]
-        rows, cols = (n - 2 for n in nodes.shape[:2])
-        hiding = [view for view in views if view.hides(rows * cols)]
-        if hiding:
-            picture = np.empty((rows * COARSE_PX, cols * COARSE_PX), np.uint8)
+        if any(view.covers for view in views):
+            views = [view for view in views if view.covers]
+            rows, cols = (COARSE_PX * (n - 2) for n in nodes.shape[:2])
+            picture = np.empty((rows, cols), np.uint8)
         else:
             picture = self._background(nodes, misses, motion_px, length_px)
-        for view in hiding or views:
+        for view in views:
             self._add_sheet(picture, view, maps)
-        return picture, box_around([view.box for view in hiding or views])
+        return picture, box_around([view.box for view in views])
 
     def _background(
         self,
@@ -267,31 +253,15 @@ class Renderer:
         return np.asarray(cv2.resize(picture, None, fx=step, fy=step), np.uint8)
 
     def _add_sheet(self, picture: Picture, view: View, maps: Array) -> None:
-        tiles, texture, plane = view.tiles, view.texture, view.placed.plane
-        whole = by_tile(picture)
-        into = whole[view.box]
-        fill(into, tiles.even, tiles.grey)
-        outline = np.flatnonzero(tiles.outline)
-        wanted = np.concatenate([outline, np.flatnonzero(tiles.edges)])
-        if not len(wanted):
-            return
-        scale, centre = texture.px_per_m, texture.center_px
-        to_texels = np.array([[scale, 0.0, centre], [0.0, scale, centre], [0.0, 0.0, 1.0]])
-        if plane is not None:
-            to_texels = to_texels @ plane
-        places = np.divmod(wanted, into.shape[1])
-        top, left = (each.start for each in view.box)
-        grid = self._tiles.of((places[0] + top) * whole.shape[1] + places[1] + left)
-        texels = [trace(grid, to_texels @ each)[0].reshape(-1, COARSE_PX**2, 2) for each in maps]
-        pixels = mean_of([sample(texture.value, each) for each in texels])
-        if len(outline):
-            alpha = mean_of([sample(texture.alpha, each[: len(outline)]) for each in texels])
-            on = pixels[: len(outline)]
-            rows, cols = (axis[: len(outline)] for axis in places)
-            behind = into[rows, cols].view(np.uint8)
-            rest: Any = cv2.multiply(behind, cv2.bitwise_not(alpha), scale=1.0 / 255.0)
-            on[:] = cv2.add(rest, on)
-        into[places] = pixels.view(np.uint64)
+        rows, cols = pixels_of(view.box)
+        rays = self._pixels.window(rows, cols)
+        texels = [trace(rays, view.to_texels @ each)[0] for each in maps]
+        seen = mean_of([sample(view.texture.value, each) for each in texels])
+        if not view.covers:
+            alpha = mean_of([sample(view.texture.alpha, each) for each in texels])
+            rest: Any = cv2.multiply(picture[rows, cols], ~alpha, scale=1.0 / 255.0)
+            seen = np.asarray(cv2.add(rest, seen), np.uint8)
+        picture[rows, cols] = seen
 
     # -- motion -------------------------------------------------------------
 
@@ -345,7 +315,7 @@ def sample(texture: Picture, texels: Any, border: int = cv2.BORDER_CONSTANT) -> 
 
 
 def defocused(picture: Picture, sigma_px: float, box: Box) -> None:
-    """Blurs the tiles of `box`, and what is so near to them that it shows a part of their blur."""
+    """Blurs the blocks of `box`, and what is so near to them that it shows a part of their blur."""
     reach = math.ceil(3.0 * sigma_px) + 1
     near, far = pixels_of(box, reach), pixels_of(box, 2 * reach)
     blurred = cv2.GaussianBlur(picture[far], (0, 0), sigma_px)

@@ -25,16 +25,6 @@ class Neighbour:
 
 
 @dataclass(frozen=True)
-class Gust:
-    """A single gust: a door, a passer-by, an air conditioner that starts. It blows from `start_s`
-    for `length_s`, at the most with `peak_mps` (world axes)."""
-
-    start_s: float
-    length_s: float
-    peak_mps: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
 class Scenario:
     """Everything that differs between two simulated flights; SI, world frame.
 
@@ -61,8 +51,7 @@ class Scenario:
         camera_blank_rate: share of pictures that are a blue screen.
         camera_mirrored: it gives its pictures flipped left to right.
         drift_mps: drift of the state estimate, world axes.
-        draught_mps: the wind with its smooth gusts (`perchctl.sim.wind`).
-        gusts: single ones beside it.
+        draught_mps: the wind with its smooth gusts (`perchctl.sim.world.Wind`).
         ceiling_suction: share of thrust gained with the rotors' plane at the ceiling.
         magnet_force_n: pull the magnet can hold.
         first_contact_force_n: pull at the first contact; None means the same.
@@ -81,11 +70,8 @@ class Scenario:
             too much; body axes, of a vehicle without a deck (`perchctl.sim.firmware.outside`).
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
         target_tilt_rad: the target's turns about the world's x and y, after its heading.
-        gloss: peak of the lamp's reflection in the print, in whites of the paper; `lamp_m` the
-            lamp's place (`perchctl.sim.sheets`).
         flow_noise_radps, flow_bias_radps: of the flow deck's readings, the latter in x and y.
         flow_reach_m: above this it sees no flow; None: it always does.
-        bare_floors: x, y and radius of patches without texture (`perchctl.sim.firmware.estimator`).
         radio_loss, radio_burst_s: share of the time in which no packet passes, and how long
             such a time lasts on average (`perchctl.sim.bursts`).
         capture_holes_s: begin and length of the times in which a motion capture does not see
@@ -144,15 +130,11 @@ class Scenario:
     camera_gone_at_s: float | None = None
     target_above_ceiling_m: float = 0.0
     neighbours: tuple[Neighbour, ...] = ()
-    gusts: tuple[Gust, ...] = ()
     ceiling_suction: float = 0.10
     target_tilt_rad: tuple[float, float] = (0.0, 0.0)
-    gloss: float = 0.0
-    lamp_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     flow_noise_radps: float = 0.0
     flow_bias_radps: tuple[float, float] = (0.0, 0.0)
     flow_reach_m: float | None = None
-    bare_floors: tuple[tuple[float, float, float], ...] = ()
     radio_loss: float = 0.0
     radio_burst_s: float = 0.1
     capture_holes_s: tuple[tuple[float, float], ...] = ()

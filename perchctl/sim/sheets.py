@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array, invert_T, make_T, rot_z
 from perchctl.profile import TargetConfig
-from perchctl.sim.optics import COARSE_PX, Picture, RayGrid, local_px_per_m, plane_map, trace
+from perchctl.sim.optics import COARSE_PX, Picture, local_px_per_m
 from perchctl.sim.scenario import Neighbour
 from perchctl.target import TargetDrawing, draw_target
 
@@ -35,8 +34,6 @@ window, or one that is no whole number of texels, aliases: edges would be out of
 place by up to 0.03 px."""
 SAMPLING_SIGMA_PX = 1.0 / (PIXEL_WINDOW_TEXELS * math.sqrt(6.0))
 """Blur that bilinear sampling between texels adds to the pixel's own window."""
-FARTHEST_EDGE_TEXELS = 128
-"""All edges farther away than that count as that far."""
 
 TILE_M = 2.0
 """The ceiling's texture repeats after this length."""
@@ -61,16 +58,13 @@ class SheetTexture:
     """The sheet at one resolution: `value` is grey times coverage, `alpha` coverage.
 
     A point (x, y) of the target's plane (target axes) is at column
-    ``center_px + x * px_per_m`` and row ``center_px + y * px_per_m``. `to_edge` is how many
-    texels, along rows or columns, it is to the next that differs from its neighbours; it has
-    `FARTHEST_EDGE_TEXELS` more at each side, and says no more than these.
+    ``center_px + x * px_per_m`` and row ``center_px + y * px_per_m``.
     """
 
     value: Picture
     alpha: Picture
     px_per_m: float
     center_px: float
-    to_edge: Picture
 
 
 class Sheet:
@@ -103,17 +97,7 @@ class Sheet:
         value += sheet
         grey = np.rint(value, out=value).astype(np.uint8)
         del sheet, value
-        return SheetTexture(grey, alpha, px_per_m, (size - 1) / 2.0, _to_edge(grey, alpha))
-
-
-def _to_edge(value: Picture, alpha: Picture) -> Picture:
-    even = np.ones(np.add(value.shape, 2 * FARTHEST_EDGE_TEXELS), np.bool_)
-    inside = slice(FARTHEST_EDGE_TEXELS, -FARTHEST_EDGE_TEXELS)
-    near = np.ones((3, 3), np.uint8)
-    for each in (value, alpha):
-        even[inside, inside] &= cv2.dilate(each, near) == cv2.erode(each, near)
-    distance = cv2.distanceTransform(even.astype(np.uint8), cv2.DIST_C, 3)
-    return np.minimum(distance, FARTHEST_EDGE_TEXELS - 1).astype(np.uint8)
+        return SheetTexture(grey, alpha, px_per_m, (size - 1) / 2.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,83 +147,80 @@ def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
     return np.asarray(big[2 * zoom : -2 * zoom], np.float32)
 
 
-# --- Which tiles of 8 x 8 pixels a sheet fills with one grey -------------------------------------
-# Most of a near sheet is even paper or even ink. A tile whose pixels, on all their way within the
-# exposure, look up equal texels needs no look-up at each of them.
+# --- Sheets on the ceiling, and where each is seen in one exposure -----------------------------
 
 
-_ROOM_TEXELS = 1.5
-"""For the neighbours that a bilinear look-up reads, and the centre's rounding."""
-_EVERY_BYTE = np.uint64(0x0101010101010101)
-Mask = NDArray[np.bool_]
 Box = tuple[slice, slice]
-"""Rows and columns of tiles."""
+"""Rows and columns of blocks of `COARSE_PX` pixels."""
+_ROOM_TEXELS = 1.5
+"""For the neighbours that a bilinear look-up reads, and a centre's rounding."""
 
 
 @dataclass(frozen=True, eq=False)
-class Reach:
-    """Where the tiles lie in a sheet's axes, all (rows, columns): their centres' texture
-    coordinates are not yet scaled; `off_m` is how far the centre is from the sheet's, along the
-    axis along which it is farther, `reach_m` from there to the farthest that its pixels look."""
+class Placed:
+    """A sheet, and how (3, 3) the own target's plane maps to its: None for the own."""
 
-    centres_m: NDArray[np.float32]
-    off_m: NDArray[np.float32]
-    reach_m: NDArray[np.float32]
+    sheet: Sheet
+    plane: Array | None = None
 
-    def near(self, side_m: float) -> Mask:
-        """Tiles that may show a sheet of that side."""
-        return np.asarray(self.off_m - np.minimum(self.reach_m, 1.0) < side_m / 2.0)
+    def view(self, nodes: NDArray[np.float32], length_px: float) -> View | None:
+        """At the coarse nodes (rows, columns, 2), in the own target's axes; `length_px` is the
+        longest way of the picture within the exposure. None where the sheet is out of view."""
+        if self.plane is not None:
+            turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
+            nodes = nodes @ turn.astype(np.float32) + shift.astype(np.float32)
+        off_m, reach_m = _off_and_reach(nodes, length_px)
+        half_m = self.sheet.drawing.sheet_side_m / 2.0
+        box = _box_of(off_m - np.minimum(reach_m, 1.0) < half_m)
+        if box is None:
+            return None
+        j, i = ((each.start + each.stop - 1) // 2 + 1 for each in box)
+        texture = self.sheet.texture(local_px_per_m(nodes, j, i, COARSE_PX))
+        scale, centre = texture.px_per_m, texture.center_px
+        to_texels = np.array([[scale, 0.0, centre], [0.0, scale, centre], [0.0, 0.0, 1.0]])
+        if self.plane is not None:
+            to_texels = to_texels @ self.plane
+        room_m = _ROOM_TEXELS / scale
+        return View(texture, box, to_texels, bool((off_m + reach_m < half_m - room_m).all()))
 
-    def within(self, box: Box) -> Reach:
-        """The part of these tiles alone."""
-        return Reach(self.centres_m[box], self.off_m[box], self.reach_m[box])
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A sheet in one exposure: in the picture's `box`; `to_texels` (3, 3) maps the own target's
+    plane to the texture's columns and rows; `covers`: nothing else is in the picture."""
+
+    texture: SheetTexture
+    box: Box
+    to_texels: Array
+    covers: bool
 
 
-def reach_of(nodes: NDArray[np.float32], length_px: float) -> Reach:
-    """`nodes` are the coarse ones in the sheet's axes, `length_px` is the longest way of its
-    picture within the exposure."""
+def _off_and_reach(
+    nodes: NDArray[np.float32], length_px: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """How far each block's centre is from the sheet's, along the axis along which it is farther,
+    and how far from there its pixels look at most, both (rows, columns) in m. `nodes` are the
+    coarse ones in the sheet's axes."""
     x, y = np.ascontiguousarray(nodes.transpose(2, 0, 1), np.float32)
-    # Half a tile to each side, by the distance of the nodes at both sides; the outermost pixels'
+    # Half a block to each side, by the distance of the nodes at both sides; the outermost pixels'
     # centres lie an eighth less far out.
     reach_m = cv2.max(_span(x), _span(y)) * np.float32(0.25 + 0.5 * length_px / COARSE_PX)
     off_m = cv2.max(np.abs(x[1:-1, 1:-1]), np.abs(y[1:-1, 1:-1]))
-    return Reach(nodes[1:-1, 1:-1], np.asarray(off_m, np.float32), reach_m)
+    return np.asarray(off_m, np.float32), np.asarray(reach_m, np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class Tiles:
-    """What a sheet does to each tile; all (rows, columns).
-
-    even: it fills the tile with `grey`; edges, outline: the tile's pixels differ, and all of it
-    is on the sheet, or is not; inner: all of it is on the sheet.
-    """
-
-    even: Mask
-    edges: Mask
-    outline: Mask
-    inner: Mask
-    grey: Picture
-
-
-def tiles_of(reach: Reach, texture: SheetTexture, side_m: float) -> Tiles:
-    """What a sheet of that side does to the tiles."""
-    scale, half_m = np.float32(texture.px_per_m), side_m / 2.0
-    room_m = _ROOM_TEXELS / texture.px_per_m
-    inner = reach.off_m + reach.reach_m < half_m - room_m
-    texels = reach.centres_m * scale + np.float32(texture.center_px)
-    to_edge = _nearest(texture.to_edge, texels + np.float32(FARTHEST_EDGE_TEXELS))
-    plain = to_edge > reach.reach_m * scale + np.float32(_ROOM_TEXELS)
-    plain |= reach.off_m - reach.reach_m > half_m + room_m
-    grey = _nearest(texture.value, texels)
-    return Tiles(plain & (grey > 0), inner & ~plain, ~inner & ~plain, inner, grey)
-
-
-def box_of(near: Mask) -> Box | None:
-    """What holds all tiles that are `near`; None where there are none."""
+def _box_of(near: NDArray[np.bool_]) -> Box | None:
+    """What holds all blocks that are `near`; None where there are none."""
     rows, cols = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
     if not len(rows):
         return None
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+
+
+def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Between the nodes to the left and right, and above and below, in sum."""
+    level = cv2.absdiff(x[1:-1, 2:], x[1:-1, :-2])
+    return np.asarray(cv2.add(level, cv2.absdiff(x[2:, 1:-1], x[:-2, 1:-1])), np.float32)
 
 
 def box_around(boxes: Sequence[Box]) -> Box | None:
@@ -253,82 +234,13 @@ def box_around(boxes: Sequence[Box]) -> Box | None:
     return rows, cols
 
 
-def pixels_of(box: Box, margin_px: int) -> Box:
+def pixels_of(box: Box, margin_px: int = 0) -> tuple[slice, slice]:
     """The rows and columns of pixels in a box, and so many around it."""
     rows, cols = (
         slice(max(COARSE_PX * each.start - margin_px, 0), COARSE_PX * each.stop + margin_px)
         for each in box
     )
     return rows, cols
-
-
-def by_tile(picture: Picture) -> NDArray[np.uint64]:
-    """A view of a picture of whole tiles: (rows, columns, 8), each number a row of 8 pixels."""
-    height, width = picture.shape
-    words = picture.view(np.uint64).reshape(height // COARSE_PX, COARSE_PX, width // COARSE_PX)
-    return words.transpose(0, 2, 1)
-
-
-def fill(picture: NDArray[np.uint64], which: Mask, grey: Picture) -> None:
-    """Tiles of a picture `by_tile` become even."""
-    words = (grey * _EVERY_BYTE)[:, None]
-    np.copyto(picture.transpose(0, 2, 1), words, where=which[:, None])
-
-
-def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Between the nodes to the left and right, and above and below, in sum."""
-    level = cv2.absdiff(x[1:-1, 2:], x[1:-1, :-2])
-    return np.asarray(cv2.add(level, cv2.absdiff(x[2:, 1:-1], x[:-2, 1:-1])), np.float32)
-
-
-def _nearest(image: Picture, texels: NDArray[np.float32]) -> Picture:
-    remap: Any = cv2.remap  # its stub denies that the second map may be None
-    return np.asarray(remap(image, texels, None, cv2.INTER_NEAREST), np.uint8)
-
-
-# --- Sheets on the ceiling, and where each is seen in one exposure -----------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """A sheet, and how (3, 3) the own target's plane maps to its: None for the own."""
-
-    sheet: Sheet
-    plane: Array | None = None
-
-    def seen_from(self, nodes: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The coarse nodes (rows, columns, 2) in this sheet's axes, m."""
-        if self.plane is None:
-            return nodes
-        turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
-        return np.asarray(nodes @ turn.astype(np.float32) + shift.astype(np.float32))
-
-    def view(self, nodes: NDArray[np.float32], length_px: float) -> View | None:
-        """At the coarse nodes (rows, columns, 2), in the own target's axes; `length_px` is the
-        longest way of the picture within the exposure. None where the sheet is out of view."""
-        moved = self.seen_from(nodes)
-        side_m = self.sheet.drawing.sheet_side_m
-        reach = reach_of(moved, length_px)
-        box = box_of(reach.near(side_m))
-        if box is None:
-            return None
-        j, i = ((each.start + each.stop - 1) // 2 + 1 for each in box)
-        texture = self.sheet.texture(local_px_per_m(moved, j, i, COARSE_PX))
-        return View(self, texture, box, tiles_of(reach.within(box), texture, side_m))
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A sheet in one exposure, in the picture's `box` of tiles."""
-
-    placed: Placed
-    texture: SheetTexture
-    box: Box
-    tiles: Tiles
-
-    def hides(self, tiles: int) -> bool:
-        """True if nothing else is seen in a picture of so many tiles."""
-        return self.tiles.inner.size == tiles and bool(self.tiles.inner.all())
 
 
 def beside(neighbour: Neighbour, own: TargetConfig) -> Placed:
@@ -347,90 +259,3 @@ def beside(neighbour: Neighbour, own: TargetConfig) -> Placed:
 def printed_sheet(target_json: str) -> Sheet:
     """The sheet of a target; its textures cost more than a second, and flights share them."""
     return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))
-
-
-# --- Gloss -------------------------------------------------------------------------------------
-# A glossy print: the reflection of a lamp in it, which moves with the viewpoint.
-#
-# - Where a ray from the camera, mirrored at the print, meets the lamp, the print is brightest.
-#   Around it the brightness falls as the slopes of a smooth but not flat surface are spread:
-#   Beckmann's lobe over the half-way direction, with `SLOPE` its rms slope.
-# - How bright: varnish reflects 4 % at right angles (a refractive index of 1.5). A bulb of 800 lm
-#   and 10 cm shines with 8000 cd/m^2, of which 4 % are 3.8 times what white paper has under
-#   300 lx; spread over the lobe of a print that is not quite flat, 0.2 to 2 paper whites are left.
-# - The reflection lies upon the ink as upon the paper, so that at one paper white and more both
-#   are saturated, and the pattern is gone there.
-#
-# It is worked out for the middle of the exposure: a highlight has no edges to blur.
-
-
-SLOPE = 0.03
-_LEAST_GREY = 0.5
-
-
-def lobe(points_m: NDArray[np.float32], eye_m: Array, lamp_m: Array) -> NDArray[np.float32]:
-    """The reflection's brightness, 1 at its peak.
-
-    Args:
-        points_m: on the print (..., 2), its own axes (z up, away from the viewer).
-        eye_m, lamp_m: the camera and the lamp (3,) in these axes, both below (z < 0).
-    """
-    at = np.concatenate([points_m, np.zeros((*points_m.shape[:-1], 1), np.float32)], axis=-1)
-    half = _unit(np.asarray(eye_m, np.float32) - at) + _unit(np.asarray(lamp_m, np.float32) - at)
-    slope2 = (half[..., 0] ** 2 + half[..., 1] ** 2) / np.maximum(half[..., 2] ** 2, 1e-9)
-    return np.asarray(np.exp(-slope2 / SLOPE**2), np.float32)
-
-
-def shone_upon(
-    picture: Picture,
-    coarse: RayGrid,
-    T_target_cam: Array,
-    lamp_m: Array,
-    gloss: float,
-    half_side_m: float,
-) -> Picture:
-    """The picture, at the coarse grid's padded size, with the lamp's reflection in the sheet
-    (written into it).
-
-    Args:
-        T_target_cam: (4, 4), in the middle of the exposure.
-        lamp_m: (3,) in the target's axes.
-        gloss: the peak, in whites of the paper.
-        half_side_m: of the sheet.
-    """
-    eye_m = T_target_cam[:3, 3]
-    if gloss <= 0.0 or eye_m[2] >= 0.0 or lamp_m[2] >= 0.0:
-        return picture
-    nodes, _ = trace(coarse, plane_map(T_target_cam))
-    inside_m = half_side_m - np.abs(nodes).max(axis=2)
-    step_m = np.abs(np.diff(nodes, axis=1, append=nodes[:, -1:])).max(axis=2)
-    grey = np.minimum(gloss * PAPER_GREY * lobe(nodes, eye_m, lamp_m), 255.0)
-    shown = (grey > _LEAST_GREY) & (inside_m > -2.0 * step_m)
-    if not shown.any():
-        return picture
-    rows, cols = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
-    top, left = max(rows[0] - 1, 0), max(cols[0] - 1, 0)
-    bottom = min(max(rows[-1], rows[0] + 1), len(nodes) - 2)
-    right = min(max(cols[-1], cols[0] + 1), nodes.shape[1] - 2)
-    if bottom <= top or right <= left:
-        return picture
-    window = (slice(top, bottom + 2), slice(left, right + 2))
-    light = _full(np.rint(grey[window]).astype(np.uint8))
-    if (inside_m[window] < step_m[window]).any():
-        # Over one pixel at the sheet's edge the reflection ends.
-        px = inside_m[window] * (COARSE_PX / np.maximum(step_m[window], 1e-6))
-        cover = np.clip(_full(np.clip(px, -100.0, 100.0).astype(np.float32)) + 0.5, 0.0, 1.0)
-        light = np.asarray(cv2.multiply(light, cover, dtype=cv2.CV_8U), np.uint8)
-    area = picture[top * COARSE_PX : bottom * COARSE_PX, left * COARSE_PX : right * COARSE_PX]
-    area[:] = cv2.add(area, light)
-    return picture
-
-
-def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True), np.float32)
-
-
-def _full(nodes: Any) -> Any:
-    """Values at each pixel of a window, from those at its coarse nodes."""
-    values = cv2.resize(nodes, None, fx=COARSE_PX, fy=COARSE_PX)
-    return np.ascontiguousarray(values[COARSE_PX:-COARSE_PX, COARSE_PX:-COARSE_PX])

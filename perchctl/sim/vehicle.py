@@ -10,8 +10,7 @@ from perchctl.link import Packet
 from perchctl.profile import TargetConfig
 from perchctl.sim.camera import SimCamera
 from perchctl.sim.capture import CaptureSettings, SimCapture
-from perchctl.sim.crtp.commands import CommandService
-from perchctl.sim.crtp.server import PROTOCOL_VERSION
+from perchctl.sim.crtp.server import CommandService
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
@@ -20,8 +19,6 @@ from perchctl.vision import CameraModel
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-
-_TICK_S = 1e-6  # less than a control period: an exposure is never passed over
 
 
 class PastPoses:
@@ -62,7 +59,7 @@ class SimulatedVehicle:
         self.scenario = scenario
         self.world = World(scenario)
         self.firmware = Firmware(self.world, scenario)
-        self._commands = CommandService(self.firmware, PROTOCOL_VERSION)
+        self._commands = CommandService(self.firmware)
         self.camera: SimCamera | None = None
         if camera is not None:
             renderer = Renderer(scenario, camera, target or TargetConfig(), scenario.seed)
@@ -79,22 +76,8 @@ class SimulatedVehicle:
 
     def advance_to(self, t_s: float) -> None:
         """Step until `t_s` (to the nearest control period)."""
-        end_s = t_s - CONTROL_PERIOD_S / 2
-        if self.camera is None or not self.watched:
-            while self.world.t_s < end_s:
-                self.step_blindly()
-            return
-        exposed_s = self.camera.exposed_s + 2.0 * CONTROL_PERIOD_S
-        due_s, t_s = self.camera.next_s - _TICK_S, self.world.t_s
-        while t_s < end_s:
-            self.step_blindly()
-            t_s = self.world.t_s
-            if t_s >= due_s - exposed_s:
-                self._past.add(self.world)
-                if t_s >= due_s:
-                    self.camera.advance(t_s, self._past)
-                    due_s = self.camera.next_s - _TICK_S
-        self.camera.advance(t_s, self._past)
+        while self.world.t_s < t_s - CONTROL_PERIOD_S / 2:
+            self.step()
 
     def receive(self, packet: Packet) -> None:
         """Take a packet as it comes from the radio."""
@@ -102,20 +85,15 @@ class SimulatedVehicle:
 
     def step(self) -> None:
         """One control period, and the exposures that fall into it."""
-        self.step_blindly()
-        if self.camera is not None and self.watched:
-            self._past.add(self.world)
-            self.camera.advance(self.world.t_s, self._past)
-
-    def step_blindly(self) -> None:
-        """One control period without the camera, which somebody else exposes."""
         self.firmware.step()
         if self.capture is not None:
             self.capture.advance(self.world)
+        if self.camera is not None and self.watched:
+            self._past.add(self.world)
+            self.camera.advance(self.world.t_s, self._past)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
         """The target and its magnet hang there from now on."""
         self.world.magnet.target_xy_m = xy_m
         if self.camera is not None:
-            self.camera.develop()
             self.camera.renderer.move_target(xy_m)

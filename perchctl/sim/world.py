@@ -13,7 +13,7 @@ Assumptions of the model, each with its source:
   each), which makes 0.007 and 0.008. The camera, its board and the gear are some
   10 cm^2 of bluff body (c_d 1.2): 0.0015 more at 1 m/s. The rounded sums are `DRAG_*`.
 - A draught is a wind whose speed steady part and smooth gusts reach together, at two
-  standard deviations of the gusts (`perchctl.sim.wind`).
+  standard deviations of the gusts (`Wind`).
 - Near the ceiling the rotors pull themselves towards it, `Scenario.ceiling_suction` of their
   thrust at the ceiling itself. With 0.1 it is within 0.6 per cent of the thrust what momentum
   theory with a ceiling gives, and benches with rotors of this size (23 mm) measured (Hsiao and
@@ -24,9 +24,9 @@ Assumptions of the model, each with its source:
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -39,6 +39,7 @@ os.environ.setdefault("MUJOCO_GL", "disable")
 
 import mujoco
 
+from perchctl.errors import InvalidValue
 from perchctl.geometry import (
     GRAVITY_MPS2,
     Array,
@@ -46,23 +47,14 @@ from perchctl.geometry import (
     rotation_from_rpy,
     rpy_from_rotation,
 )
-from perchctl.sim.carried import Stop, Way
 from perchctl.sim.powertrain import CellKind, Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.sim.wind import Wind
 
 ARM_M = 0.046  # hub to motor axis, X configuration
 YAW_TORQUE_M = 0.006  # N.m of reaction per N of thrust
 DRAG_LEVEL_NSPM = 0.009
 DRAG_VERTICAL_NSPM = 0.009
 SUCTION_LENGTH_M = 0.02
-CLEAR_M = 0.05  # 25 m/s through a control period
-_BIT = mujoco.mjtDisableBit
-_UNUSED_IN_THE_OPEN = int(
-    _BIT.mjDSBL_CONTACT | _BIT.mjDSBL_CONSTRAINT | _BIT.mjDSBL_ACTUATION | _BIT.mjDSBL_EULERDAMP
-)
-"""Parts of a step that a body which touches nothing does not need."""
-_SIX = struct.Struct("6d")
 _SQRT_HALF = math.sqrt(0.5)
 _WIND_EVERY = 10  # the wind is evaluated every 20 ms
 
@@ -99,12 +91,6 @@ class World:
         self._model = build_model(scenario)
         self._data = mujoco.MjData(self._model)
         self._qpos, self._qvel = self._data.qpos, self._data.qvel
-        self._force = memoryview(self._data.qfrc_applied)
-        # Farther than this from floor and ceiling nothing can touch them within a step.
-        self._clear_m = extent_m(scenario) + CLEAR_M
-        self._on_contact = self._model.opt.disableflags
-        self._off_contact = self._on_contact | _UNUSED_IN_THE_OPEN
-        self._clear = False
         self._floor, self._ceiling = (self._model.geom(n).id for n in ("floor", "ceiling"))
         # Farther than this below the ceiling the gear cannot touch it.
         self._reach_m = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + MAGNET_RANGE_M
@@ -180,10 +166,7 @@ class World:
             torque_x += pull_n * (gy * r22 - gz * r21)
             torque_y += pull_n * (gz * r20 - gx * r22)
             torque_z += pull_n * (gx * r21 - gy * r20)
-        _SIX.pack_into(self._force, 0, force_x, force_y, force_z, torque_x, torque_y, torque_z)
-        clear = self._clear_m < self.z_m and self._clear_m < height_m
-        if clear is not self._clear:
-            self._look_for_contacts(not clear)
+        self._data.qfrc_applied = (force_x, force_y, force_z, torque_x, torque_y, torque_z)
         vx, vy, vz = self.vx_mps, self.vy_mps, self.vz_mps
         mujoco.mj_step(self._model, self._data)
         self._read()
@@ -191,11 +174,6 @@ class World:
         self._set_specific_force(
             (self.vx_mps - vx) * rate, (self.vy_mps - vy) * rate, (self.vz_mps - vz) * rate
         )
-
-    def _look_for_contacts(self, near: bool) -> None:
-        """A third of a step's time, for which there is nothing to find in the open."""
-        self._clear = not near
-        self._model.opt.disableflags = self._on_contact if near else self._off_contact
 
     def state(self) -> TrueState:
         """The true state as arrays."""
@@ -274,7 +252,6 @@ class World:
         velocity_mps: Sequence[float] | Array,
         rates_radps: Sequence[float] | Array,
     ) -> None:
-        self._look_for_contacts(True)
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, R.ravel())
         self._data.qpos[:3] = position_m
@@ -349,12 +326,6 @@ _MODEL = """
   </worldbody>
 </mujoco>
 """
-
-
-def extent_m(scenario: Scenario) -> float:
-    """How far from its centre any part of the vehicle is, at most."""
-    gear = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + math.hypot(GEAR_RADIUS_M, 0.004)
-    return max(math.hypot(*FRAME_HALF_M), gear)
 
 
 def build_model(scenario: Scenario) -> Any:
@@ -432,3 +403,121 @@ class Magnet:
         elif self.engaged and gap_m > 2 * MAGNET_TOUCH_M:
             self.engaged = False
             self._came_off = True
+
+
+# --- The air in the room: a draught with smooth gusts ------------------------------------------
+
+
+_TERMS = 5
+_SLOWEST_HZ, _FASTEST_HZ = 0.05, 1.0
+_STEADY = 0.7  # the steady part of the draught's speed
+_SHARES = (0.15, 0.15, 0.1)  # standard deviation of the gusts over that speed: x, y, z
+_WIND_STREAM = 1
+
+_Terms = tuple[tuple[float, float, float], ...]
+
+
+class Wind:
+    """`Scenario.draught_mps` is the speed that the gusts reach at two standard deviations."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        draught = scenario.draught_mps
+        x, y, z = draught
+        self._mean = (_STEADY * x, _STEADY * y, _STEADY * z)
+        speed_mps = math.hypot(*draught)
+        rng = np.random.default_rng([scenario.seed, _WIND_STREAM])
+        self._still = speed_mps == 0.0
+        self._gusts = tuple(_draw_sines(rng, share * speed_mps) for share in _SHARES)
+
+    def at(self, t_s: float) -> tuple[float, float, float]:
+        """The wind at t, m/s, world axes; exactly zero in still air."""
+        if self._still:
+            return (0.0, 0.0, 0.0)
+        x, y, z = self._mean
+        gust_x, gust_y, gust_z = self._gusts
+        return (x + _sum_of(gust_x, t_s), y + _sum_of(gust_y, t_s), z + _sum_of(gust_z, t_s))
+
+
+def _draw_sines(rng: np.random.Generator, sigma_mps: float) -> _Terms:
+    """(amplitude m/s, pulsation rad/s, phase) of each sine."""
+    amplitude = sigma_mps * math.sqrt(2.0 / _TERMS)
+    hz = np.exp(rng.uniform(math.log(_SLOWEST_HZ), math.log(_FASTEST_HZ), _TERMS))
+    phases = rng.uniform(0.0, 2.0 * math.pi, _TERMS)
+    return tuple(
+        (amplitude, 2.0 * math.pi * float(f), float(phase))
+        for f, phase in zip(hz, phases, strict=True)
+    )
+
+
+def _sum_of(terms: _Terms, t_s: float) -> float:
+    return sum(a * math.sin(w * t_s + phase) for a, w, phase in terms)
+
+
+# --- A hand that carries the vehicle from stop to stop, smoothly, and turns it on the way -------
+
+
+_HAND_STEP_S = 1e-4
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Reached `after_s` after the one before, at rest."""
+
+    after_s: float
+    position_m: tuple[float, float, float]
+    rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """At one moment, world axes; `rates_radps` (3,) in the body's, as a gyroscope has them."""
+
+    position_m: Array
+    velocity_mps: Array
+    acceleration_mps2: Array
+    R: Array
+    rates_radps: Array
+
+
+class Way:
+    """The way through all stops, from where the vehicle is; at the last it is held still.
+
+    Errors: InvalidValue for a stop that takes no time.
+    """
+
+    def __init__(self, start: Stop, stops: Sequence[Stop]) -> None:
+        for stop in stops:
+            if not stop.after_s > 0.0:
+                raise InvalidValue(f"a hand needs time for its way, not {stop.after_s:g} s")
+        self._stops = (start, *stops)
+        self._ends_s = (0.0, *itertools.accumulate(stop.after_s for stop in stops))
+
+    def at(self, t_s: float) -> Motion:
+        """`t_s`: since it was taken in the hand."""
+        before, here, after = (self._pose(t_s + k * _HAND_STEP_S) for k in (-1, 0, 1))
+        turn = before[1].T @ after[1]  # so small a turn is its own vector
+        rates = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / (2.0 * _HAND_STEP_S)
+        return Motion(
+            here[0],
+            (after[0] - before[0]) / (2.0 * _HAND_STEP_S),
+            (after[0] - 2.0 * here[0] + before[0]) / _HAND_STEP_S**2,
+            here[1],
+            rates,
+        )
+
+    def _pose(self, t_s: float) -> tuple[Array, Array]:
+        """Place (3,) and turn (3, 3)."""
+        t_s = min(max(t_s, 0.0), self._ends_s[-1])
+        leg = next(n for n, end_s in enumerate(self._ends_s) if t_s <= end_s)
+        if leg == 0:
+            stop = self._stops[0]
+            return np.asarray(stop.position_m), rotation_from_rpy(*stop.rpy_rad)
+        one, other = self._stops[leg - 1], self._stops[leg]
+        share = (t_s - self._ends_s[leg - 1]) / other.after_s
+        # At both ends neither speed nor acceleration.
+        share = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        place, rpy = (
+            np.asarray(a) + share * (np.asarray(b) - np.asarray(a))
+            for a, b in ((one.position_m, other.position_m), (one.rpy_rad, other.rpy_rad))
+        )
+        return place, rotation_from_rpy(*(float(angle) for angle in rpy))

@@ -124,10 +124,3 @@ def test_seeds_count_that_every_cell_has_flown() -> None:
     assert [(row[0].seed, row[0].attempts, row[1].attempts) for row in seeds] == [
         (3, 0, 1), (4, 0, 1),
     ]  # fmt: skip
-
-
-def test_swept_worlds_are_other_worlds() -> None:
-    """A world's values are those of its keys: a profile that has them written out keeps none."""
-    grid = sweep_grid(load_profile("sim"), ["simulation.set=nominal,rough,extreme"])
-    weights = [cell.profile.simulation.mass_kg for cell in grid.cells]
-    assert weights == [(0.038, 0.042), (0.042, 0.045), (0.044, 0.045)]

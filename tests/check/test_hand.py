@@ -17,7 +17,7 @@ from perchctl.check.row import Finding
 from perchctl.geometry import Array, rot_z, rotation_from_rpy
 from perchctl.positioning import BodyPose, Placed
 from perchctl.profile import PositioningConfig
-from perchctl.sim.carried import Stop, Way
+from perchctl.sim.world import Stop, Way
 from perchctl.vehicle import Telemetry
 from tests.helpers.capture import TURNS, UPRIGHT, named_up
 from tests.helpers.carried import lifted_and_turned

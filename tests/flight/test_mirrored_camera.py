@@ -25,8 +25,8 @@ from perchctl.mission import Phase
 from perchctl.profile import CameraConfig, Profile
 from perchctl.sim import SimulatedVehicle, draw_hand, draw_scenario, record_hand
 from perchctl.sim.hand import pictures
-from perchctl.sim.process.handle import HostSetup
-from perchctl.sim.process.host import VehicleHost
+from perchctl.sim.host import VehicleHost
+from perchctl.sim.process import HostSetup
 from perchctl.vision import Frame
 from tests.helpers.flights import SEED, fly_short, short_profile
 
@@ -78,7 +78,7 @@ def published(profile: Profile) -> list[Picture]:
         target=profile.target,
     )  # fmt: skip
     out: list[Picture] = []
-    with contextlib.closing(VehicleHost(setup, live=False)) as host:
+    with contextlib.closing(VehicleHost(setup)) as host:
         assert host.stream is not None
         host.stream.publish = out.append  # type: ignore[method-assign]
         host.advance(LOOKED_S)

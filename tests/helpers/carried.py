@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from perchctl.sim.carried import Stop
+from perchctl.sim.world import Stop
 
 
 def lifted_and_turned(home: tuple[float, float, float], yaw_rad: float = 0.0) -> tuple[Stop, ...]:

@@ -31,7 +31,6 @@ ROOT = str(Path(perchctl.__file__).resolve().parents[1])
 
 WAIT_S = 10.0
 CONNECTED_S = 60.0  # all tables, where a busy machine gives it a tenth of a core
-LOG_PERIOD_S = 0.010
 AIRBORNE_S = 2.0  # after a take-off: enough where only the supervisor is tested
 CHUNK_S = 0.4  # so few packets fit into cflib's receive buffer
 BLOCKS = (
@@ -124,29 +123,47 @@ class Pilot(Client):
         self.sim = sim
         self.t_s = 0.0
         self.samples: list[tuple[float, dict[str, float]]] = []
-        self._stamps = [-1.0] * len(BLOCKS)
+        self._stamps: list[float] = []
+        self._periods_s: list[float] = []
         self._news = threading.Condition()
 
     def start_log(self) -> None:
-        for index, variables in enumerate(BLOCKS):
-            block = LogConfig(name=f"rig{index}", period_in_ms=1000 * LOG_PERIOD_S)
-            for name, ctype in variables.items():
-                block.add_variable(name, ctype)
-            self.cf.log.add_config(block)
-            started = threading.Event()
-            block.started_cb.add_callback(lambda _block, _on, event=started: event.set())
-            block.data_received_cb.add_callback(
-                lambda stamp, data, _block, index=index: self._take(index, stamp, data)
-            )
-            block.start()
-            assert started.wait(WAIT_S)
+        for variables in BLOCKS:
+            self._start(variables)
+
+    @contextlib.contextmanager
+    def logging(self, variables: dict[str, str], period_ms: int = 10) -> Iterator[None]:
+        """These are logged meanwhile, too; begun at a multiple of the period."""
+        block = self._start(variables, period_ms)
+        try:
+            yield
+        finally:
+            block.stop()
+            block.delete()
+            self._stamps.pop()
+            self._periods_s.pop()
+
+    def _start(self, variables: dict[str, str], period_ms: int = 10) -> LogConfig:
+        index = len(self._stamps)
+        self._stamps.append(-1.0)
+        self._periods_s.append(period_ms / 1000.0)
+        block = log_block(f"rig{index}", variables, period_ms)
+        self.cf.log.add_config(block)
+        started = threading.Event()
+        block.started_cb.add_callback(lambda _block, _on: started.set())
+        block.data_received_cb.add_callback(
+            lambda stamp, data, _block: self._take(index, stamp, data)
+        )
+        block.start()
+        assert started.wait(WAIT_S)
+        return block
 
     def fresh(self, *, settle_s: float = 0.6, **scenario: Any) -> Pilot:
         """A new vehicle on the floor, its raw thrust unlocked as the facts advise."""
         self.sim.replace_vehicle(Scenario(**scenario))
         self.t_s = 0.0
         self.samples = []
-        self._stamps = [-1.0] * len(BLOCKS)
+        self._stamps = [-1.0] * len(self._stamps)
         self.advance(settle_s)
         return self
 
@@ -223,16 +240,19 @@ class Pilot(Client):
     def _take(self, index: int, stamp_ms: int, data: dict[str, float]) -> None:
         with self._news:
             self.samples.append((stamp_ms / 1000.0, data))
-            self._stamps[index] = stamp_ms / 1000.0
+            if index < len(self._stamps):
+                self._stamps[index] = stamp_ms / 1000.0
             self._news.notify_all()
 
     def _sync(self) -> None:
-        due_s = int(self.t_s / LOG_PERIOD_S + 1e-6) * LOG_PERIOD_S - 1e-6
-        if due_s < LOG_PERIOD_S / 2:
-            return
+        counts = [int(self.t_s / period_s + 1e-6) for period_s in self._periods_s]
+        periods = zip(counts, self._periods_s, strict=True)
+        due = [count * period_s - 1e-6 if count else -1.0 for count, period_s in periods]
         with self._news:
-            arrived = self._news.wait_for(lambda: min(self._stamps) >= due_s, WAIT_S)
-        assert arrived, f"no log data up to {due_s} s, only {self._stamps}"
+            arrived = self._news.wait_for(
+                lambda: all(s >= at for s, at in zip(self._stamps, due, strict=True)), WAIT_S
+            )
+        assert arrived, f"no log data up to {due} s, only {self._stamps}"
 
 
 def height(pilot: Pilot) -> float:

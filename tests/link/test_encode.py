@@ -19,7 +19,7 @@ from perchctl.errors import InvalidValue
 from perchctl.link import MockLink, Packet
 from perchctl.link.connection import send_packets
 from perchctl.link.crtp import ARM, LAND_TIMES, MAX_DATA, UNLOCK_THRUST, encode
-from perchctl.sim import PROTOCOL_VERSION, CommandService
+from perchctl.sim import CommandService
 from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.planner import HlLand
 from perchctl.vehicle import (
@@ -113,7 +113,7 @@ class Calls:
 def in_lockstep(command: Command) -> list[tuple[str, tuple[Any, ...]]]:
     """What the lockstep link makes the firmware do."""
     firmware = Calls()
-    receive = CommandService(firmware, PROTOCOL_VERSION).handle  # type: ignore[arg-type]
+    receive = CommandService(firmware).handle  # type: ignore[arg-type]
     MockLink(SimpleNamespace(t_s=0.0, receive=receive)).send(command)  # type: ignore[arg-type]
     return firmware.made
 

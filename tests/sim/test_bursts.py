@@ -11,8 +11,8 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.faults.edges import FaultyRadio
 from perchctl.link import Packet, Radio
 from perchctl.link.mock import TELEMETRY_DELAY_S
-from perchctl.sim import Bursts, Scenario, radio_bursts
-from perchctl.sim.bursts import CONNECTED_S
+from perchctl.sim import Scenario, radio_bursts
+from perchctl.sim.bursts import CONNECTED_S, Bursts
 
 STEP_S = 0.005
 PACKET = Packet(7, 0, b"\x07")

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-import socket
 import struct
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from perchctl.errors import ConnectionFailed, InvalidValue
+from perchctl.errors import InvalidValue
 from perchctl.positioning import BodyPose, CaptureFrame
 from perchctl.sim import CaptureFault, CaptureSettings, Scenario, SimProcess
 from perchctl.sim import capture as natnet
-from perchctl.sim.capture import CaptureServer, SimCapture
+from perchctl.sim.capture import SimCapture
 
 WAIT_S = 10.0
 NAMES = ("crazyflie", "target")
@@ -66,33 +65,6 @@ class Reader:
                 self._news.notify_all()
 
 
-@pytest.fixture
-def server() -> Iterator[CaptureServer]:
-    served = CaptureServer(NAMES)
-    yield served
-    served.close()
-
-
-def test_clients_that_have_gone_are_forgotten() -> None:
-    now_s = [0.0]
-    server = CaptureServer(NAMES, clock=lambda: now_s[0])
-    try:
-        port = asked(server.host, natnet.CONNECT)
-        assert len(server._clients) == 1
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
-            listening.bind(("127.0.0.1", port))
-            listening.settimeout(WAIT_S)
-            for _ in range(3):
-                server.publish(SEEN)
-                assert listening.recv(4096)[:2] == b"\x07\x00"
-        for _ in range(6):
-            server.publish(SEEN)
-            now_s[0] += 1.0
-        assert not server._clients
-    finally:
-        server.close()
-
-
 def test_a_hidden_body_is_told_from_one_at_the_origin() -> None:
     frame = natnet.frame_message(7, NAMES, CaptureFrame(1.3, {"target": SEEN.bodies["target"]}))
     kind, length = struct.unpack_from("<HH", frame)
@@ -100,24 +72,6 @@ def test_a_hidden_body_is_told_from_one_at_the_origin() -> None:
     bodies = [struct.unpack_from("<i3f4ffh", frame, 4 + 16 + 38 * i) for i in range(2)]
     assert [body[-1] for body in bodies] == [0, 1]
     assert bodies[1][1:8] == pytest.approx((0.0, 0.0, 2.2, 0.0, 0.0, 0.0, 1.0))
-
-
-def asked(host: str, kind: int) -> int:
-    """The port at which frames will come."""
-    name, port = host.split(":")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        out.settimeout(WAIT_S)
-        out.sendto(b"\x01", (name, int(port)))  # noise is not answered
-        out.sendto(natnet.message(kind, b""), (name, int(port)))
-        answer = out.recv(4096)
-    assert struct.unpack_from("<HH", answer) == (natnet.SERVER_INFO, len(answer) - 4)
-    return int(struct.unpack_from("<H", answer, 4 + 256 + 4 + 4 + 8)[0])
-
-
-def test_a_port_that_is_taken_is_named(server: CaptureServer) -> None:
-    port = int(server.host.split(":")[1])
-    with pytest.raises(ConnectionFailed, match=f"UDP port {port}"):
-        CaptureServer(NAMES, port)
 
 
 def test_the_library_reads_the_room_of_the_vehicle_s_process() -> None:

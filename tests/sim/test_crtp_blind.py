@@ -8,69 +8,30 @@ from __future__ import annotations
 
 import math
 import random
-import threading
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
-from cflib.crazyflie.log import LogConfig
 
-from tests.helpers.crtp_rig import WAIT_S, Pilot, kept, read
+from tests.helpers.crtp_rig import Pilot, kept, read
 
 NO_DECK = {"external_position": 1.0}
 SIGHT_S = 0.034
 """30 Hz, in control periods."""
 SIGHT_NOISE_M = 0.005
 FLYING_M = 0.8
-PERIOD_MS = 20
-NAMES = ("varX", "varY", "varZ", "varPX", "varPY", "varPZ")
-
-
-class Variances:
-    """The newest of `kalman.var*`."""
-
-    def __init__(self, pilot: Pilot) -> None:
-        self._pilot = pilot
-        self._news = threading.Condition()
-        self._stamp_ms, self._data = -1, dict.fromkeys(NAMES, 0.0)
-        self.block = LogConfig(name="variances", period_in_ms=PERIOD_MS)
-        for name in NAMES:
-            self.block.add_variable(f"kalman.{name}", "float")
-        pilot.cf.log.add_config(self.block)
-        self.block.data_received_cb.add_callback(self._take)
-        started = threading.Event()
-        self.block.started_cb.add_callback(lambda log_block, _on: started.set())
-        self.block.start()
-        assert started.wait(WAIT_S)  # from when on its samples are counted
-
-    def now(self) -> dict[str, float]:
-        due_ms = PERIOD_MS * int(1000.0 * self._pilot.t_s / PERIOD_MS + 1e-6)
-        with self._news:
-            assert self._news.wait_for(lambda: self._stamp_ms >= due_ms, WAIT_S)
-            return {name: self._data[f"kalman.{name}"] for name in NAMES}
-
-    @property
-    def told(self) -> float:
-        """The largest of those of which the figures are."""
-        now = self.now()
-        return max(now["varPX"], now["varPY"], now["varPZ"])
-
-    def _take(self, stamp_ms: int, data: dict[str, float], log_block: Any) -> None:
-        with self._news:
-            self._stamp_ms, self._data = stamp_ms, data
-            self._news.notify_all()
+VARIANCES = {f"kalman.var{name}": "float" for name in ("X", "Y", "Z", "PX", "PY", "PZ")}
 
 
 @pytest.fixture
-def bare(pilot: Pilot) -> Pilot:
-    return pilot.fresh(extra=NO_DECK)
+def bare(pilot: Pilot) -> Iterator[Pilot]:
+    """Without a deck; its variances are logged."""
+    with pilot.logging(VARIANCES, period_ms=20):
+        yield pilot.fresh(extra=NO_DECK)
 
 
-@pytest.fixture
-def variances(bare: Pilot) -> Iterator[Variances]:
-    made = Variances(bare)
-    yield made
-    made.block.delete()
+def spread_m2(pilot: Pilot) -> float:
+    """The largest of the variances of which the figures are."""
+    return max(pilot.now(f"kalman.varP{axis}") for axis in "XYZ")
 
 
 def sights(pilot: Pilot, then: Callable[[], None] | None = None) -> Callable[[], None]:
@@ -105,23 +66,21 @@ def set_to(pilot: Pilot, name: str, value: float) -> None:
     kept(pilot, name, value)
 
 
-def test_covered_for_good_the_variance_grows_and_the_vehicle_slides(
-    bare: Pilot, variances: Variances
-) -> None:
+def test_covered_for_good_the_variance_grows_and_the_vehicle_slides(bare: Pilot) -> None:
     """Rows "3e-4 m^2 all the way", "0.05 m^2 4 s after the loss, 0.2 after 7 s" and "12 s, 0.9 m
     aside", at 28 g."""
     bare.fresh(extra=NO_DECK, mass_kg=0.028)
     hovering(bare)
-    assert variances.told == pytest.approx(3e-4, rel=0.3)
+    assert spread_m2(bare) == pytest.approx(3e-4, rel=0.3)
     assert max(map(abs, error_m(bare))) < 0.02
     bare.advance(3.6)
-    assert variances.told < 0.05
+    assert spread_m2(bare) < 0.05
     bare.advance(1.2)
-    assert variances.told > 0.05
+    assert spread_m2(bare) > 0.05
     bare.advance(1.6)
-    assert variances.told < 0.2
+    assert spread_m2(bare) < 0.2
     bare.advance(1.6)
-    assert variances.told > 0.2
+    assert spread_m2(bare) > 0.2
     bare.advance(4.0)
     x, y, z = bare.sim.truth()["position_m"]
     assert 0.3 < math.hypot(x, y) < 1.5
@@ -129,18 +88,18 @@ def test_covered_for_good_the_variance_grows_and_the_vehicle_slides(
     assert math.hypot(bare.now("stateEstimate.x"), bare.now("stateEstimate.y")) < 0.1
 
 
-def test_covered_for_a_moment_it_stays_where_it_is(bare: Pilot, variances: Variances) -> None:
+def test_covered_for_a_moment_it_stays_where_it_is(bare: Pilot) -> None:
     """Row "0.7 s: recovered"."""
     hovering(bare)
     bare.advance(0.7)
-    assert variances.told < 0.003
+    assert spread_m2(bare) < 0.003
     assert max(map(abs, error_m(bare))) < 0.05
     bare.stream(0.5, sights(bare), SIGHT_S)
-    assert variances.told == pytest.approx(3e-4, rel=0.3)
+    assert spread_m2(bare) == pytest.approx(3e-4, rel=0.3)
     assert max(map(abs, error_m(bare))) < 0.02
 
 
-def test_pressed_and_blind_the_height_runs_away(bare: Pilot, variances: Variances) -> None:
+def test_pressed_and_blind_the_height_runs_away(bare: Pilot) -> None:
     """Row "z 0.1 to 0.2 m/s, variance 0.04 after 5 s and 0.2 after 8 s"."""
     bare.fresh(extra=NO_DECK, ceiling_z_m=0.95, no_target=True)
     hovering(bare)
@@ -149,19 +108,19 @@ def test_pressed_and_blind_the_height_runs_away(bare: Pilot, variances: Variance
         bare.hold(1.6)
 
     bare.stream(2.0, sights(bare, press), SIGHT_S)
-    assert variances.told < 5e-4
+    assert spread_m2(bare) < 5e-4
     assert bare.sim.truth()["position_m"][2] == pytest.approx(0.92, abs=0.005)
     bare.stream(4.0, press, 0.2)
     four_m = error_m(bare)[2]
     bare.stream(1.0, press, 0.2)
     assert 0.1 < abs(error_m(bare)[2] - four_m) < 0.2
-    assert 0.03 < variances.told < 0.08
+    assert 0.03 < spread_m2(bare) < 0.08
     bare.stream(3.0, press, 0.2)
-    assert variances.told == pytest.approx(0.2, rel=0.2)
+    assert spread_m2(bare) == pytest.approx(0.2, rel=0.2)
     assert bare.sim.truth()["position_m"][2] == pytest.approx(0.92, abs=0.005)
 
 
-def test_after_a_reset_the_first_position_is_believed(bare: Pilot, variances: Variances) -> None:
+def test_after_a_reset_the_first_position_is_believed(bare: Pilot) -> None:
     """Variance 100 m^2 level and 1 m^2 in height, whatever `kalman.initial*` says (source)."""
     assert read(bare, "deck.bcFlow2") == 0.0
     bare.stream(1.0, sights(bare), SIGHT_S)
@@ -178,16 +137,15 @@ def test_after_a_reset_the_first_position_is_believed(bare: Pilot, variances: Va
             (0.4, -0.3, 0.1), abs=0.002
         )
         assert bare.now("stateEstimate.yaw") == pytest.approx(math.degrees(0.5), abs=0.2)
-        now = variances.now()
-        assert (now["varX"], now["varY"]) == pytest.approx((100.0, 100.0), rel=0.01)
-        assert now["varZ"] == pytest.approx(1.0, rel=0.01)
-        assert now["varPX"] == pytest.approx(1e-4, rel=0.3)
+        now = [bare.now(f"kalman.var{name}") for name in ("X", "Y", "Z")]
+        assert now == pytest.approx((100.0, 100.0, 1.0), rel=0.01)
+        assert bare.now("kalman.varPX") == pytest.approx(1e-4, rel=0.3)
         bare.cf.extpos.send_extpos(1.2, -0.7, 0.3)
         bare.advance(0.05)
         assert [bare.now(f"stateEstimate.{axis}") for axis in "xyz"] == pytest.approx(
             (1.2, -0.7, 0.3), abs=0.002
         )
-        assert variances.now()["varX"] < 2e-4
+        assert bare.now("kalman.varX") < 2e-4
         assert bare.now("stateEstimate.yaw") == pytest.approx(math.degrees(0.5), abs=0.5)
     finally:
         for name in initial:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import threading
-
 import pytest
-from cflib.crazyflie.log import LogConfig
 
 from tests.helpers.crtp_rig import (
     FLYING_BIT,
     LOCKED_BIT,
     READY,
-    WAIT_S,
     WEIGHT_N,
     Pilot,
     height,
@@ -126,25 +122,7 @@ def test_catching_a_slip(pilot: Pilot, answer: str, share: float, lost_m: float)
     assert not pilot.info & LOCKED_BIT
 
 
-class DutyCycle:
-    """`motor.m1` as cflib logs it."""
-
-    def __init__(self, pilot: Pilot) -> None:
-        self.values: list[int] = []
-        self.log_block = LogConfig(name="duty", period_in_ms=10)
-        self.log_block.add_variable("motor.m1", "uint16_t")
-        pilot.cf.log.add_config(self.log_block)
-        started = threading.Event()
-        self.log_block.started_cb.add_callback(lambda log_block, _on: started.set())
-        self.log_block.data_received_cb.add_callback(
-            lambda _stamp, data, log_block: self.values.append(int(data["motor.m1"]))
-        )
-        self.log_block.start()
-        assert started.wait(WAIT_S)
-
-    def close(self) -> None:
-        self.log_block.stop()
-        self.log_block.delete()
+DUTY = {"motor.m1": "uint16_t"}
 
 
 @pytest.mark.parametrize(
@@ -163,13 +141,12 @@ def test_thrust_command_to_duty_cycle(
     pilot.fresh(battery_rest_v=4.11)
     pilot.unlock()
     pilot.sim.set_pose((0.0, 0.0, 0.5), hold=True)
-    duty = DutyCycle(pilot)
     full = command > 60_000  # more than a raw setpoint can
-    pilot.stream(1.0, lambda: pilot.hold(3.0) if full else raw(pilot, command), 0.1)
-    duty.close()
+    with pilot.logging(DUTY):
+        pilot.stream(1.0, lambda: pilot.hold(3.0) if full else raw(pilot, command), 0.1)
     pilot.sim.let_go()
     assert pilot.now("stabilizer.thrust") == pytest.approx(command, abs=1)
-    last = duty.values[-10:]
+    last = [duty for _, duty in pilot.log("motor.m1")[-10:]]
     assert sum(last) / len(last) == pytest.approx(pwm, rel=0.02)
     assert pilot.now("pm.vbat") == pytest.approx(battery_v, abs=0.06)
 
@@ -184,12 +161,10 @@ def test_a_yaw_step_costs_no_height(pilot: Pilot, yaw_deg: float) -> None:
     pilot.advance(3.02)
     assert pilot.sim.truth()["velocity_mps"][2] > 0.5
     since_s = pilot.t_s
-    duty = DutyCycle(pilot)
-    pilot.stream(
-        5.0, lambda: pilot.cf.commander.send_position_setpoint(0, 0, 1.5, yaw_deg), period_s=0.01
-    )
-    duty.close()
-    assert min(duty.values) == pytest.approx(32_000, abs=1500)
+    turn = pilot.cf.commander.send_position_setpoint
+    with pilot.logging(DUTY):
+        pilot.stream(5.0, lambda: turn(0, 0, 1.5, yaw_deg), period_s=0.01)
+    assert min(duty for _, duty in pilot.log("motor.m1")) == pytest.approx(32_000, abs=1500)
     curve = heights(pilot, since_s)
     assert max(z for _, z in curve) == pytest.approx(1.75, abs=0.1)
     assert height(pilot) == pytest.approx(1.59, abs=0.06)

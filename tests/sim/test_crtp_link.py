@@ -7,9 +7,7 @@ import threading
 from typing import Any
 
 import pytest
-from cflib.crtp.udpdriver import UdpDriver
 
-from perchctl.errors import ConnectionFailed
 from perchctl.sim import SimProcess
 from tests.helpers.crtp_rig import WAIT_S, Client
 
@@ -67,22 +65,6 @@ def test_echo(client: Client) -> None:
     got = threading.Event()
     client.cf.link_statistics.latency_updated.add_callback(lambda _: got.set())
     assert got.wait(WAIT_S)
-
-
-@pytest.mark.filterwarnings("ignore::ResourceWarning")  # cflib's scan leaves sockets open
-def test_scan_finds_it(toc_cache: str) -> None:
-    """cflib's scan of ports 19850 to 19859 finds the vehicle, also while one is connected."""
-    for port in range(19859, 19849, -1):
-        try:
-            process = SimProcess.start(pace="stepped", port=port)
-        except ConnectionFailed:  # taken by another
-            continue
-        with process:
-            uris = [uri for uri, _ in UdpDriver().scan_interface()]
-            assert process.uri == f"udp://127.0.0.1:{port}"
-            assert process.uri in uris
-        return
-    pytest.skip("all ten ports of the scan are taken")
 
 
 def test_an_oversized_or_empty_datagram_is_passed_over(client: Client) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import itertools
-import struct
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -101,8 +100,9 @@ def test_log_errors_on_the_wire(clean: Client) -> None:
 
 def test_blocks_longer_than_one_packet(sim: SimProcess, clean: Client) -> None:
     """Create and append V2: 13 two-byte variables need a second packet."""
-    names = [f"stateEstimateZ.{n}" for n in ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az")]
-    names += ["pm.vbatMV", "motor.m1", "motor.m2", "supervisor.info"]
+    names = [f"stateEstimateZ.{n}" for n in ("x", "y", "z", "vx", "vy", "vz")]
+    names += ["pm.vbatMV", "motor.m1", "motor.m2", "motor.m3", "motor.m4", "range.zrange"]
+    names.append("supervisor.info")
     block = log_block("long", dict.fromkeys(names, "uint16_t"))
     clean.cf.log.add_config(block)
     got: list[dict[str, float]] = []
@@ -119,27 +119,11 @@ def test_blocks_longer_than_one_packet(sim: SimProcess, clean: Client) -> None:
 
 
 def test_memories(client: Client) -> None:
-    """Row "memories 4C 01, 4C 02 n": the deck's 1-wire memory and the EEPROM make sense."""
-    mem = client.cf.mem
-    (deck,) = mem.get_mems(MemoryElement.TYPE_1W)
-    assert deck.valid
-    assert deck.elements["Board name"] == "bcFlow2"
-    (eeprom,) = mem.get_mems(MemoryElement.TYPE_I2C)
-    done = threading.Event()
-    eeprom.update(lambda _: done.set())
-    assert done.wait(WAIT_S)
-    assert eeprom.valid
-    assert eeprom.elements["radio_address"] == 0xE7E7E7E7E7
-
-
-def test_memory_is_read_in_chunks(client: Client) -> None:
-    """Port 4: 24 bytes a packet, an address beyond the end is refused."""
-    (deck,) = client.cf.mem.get_mems(MemoryElement.TYPE_1W)
-    head = struct.pack("<BI", deck.id, 0)
-    assert client.ask(4, 1, head + b"\x01") == head + b"\x00\xeb"
-    assert client.ask(4, 1, head + b"\x19") == head + bytes((errno.EACCES,))
-    beyond = struct.pack("<BI", deck.id, deck.size - 2)
-    assert client.ask(4, 1, beyond + b"\x05") == beyond + bytes((errno.EACCES,))
+    """Row "memories 4C 01, 4C 02 n": there is an EEPROM, and no other."""
+    assert client.ask(4, 0, b"\x01") == b"\x01\x01"
+    assert client.ask(4, 0, b"\x02\x01") == b"\x02\x01"
+    (eeprom,) = client.cf.mem.mems
+    assert (eeprom.type, eeprom.size) == (MemoryElement.TYPE_I2C, 8192)
 
 
 def test_console_reports_boot_and_lock(pilot: Pilot) -> None:

@@ -1,4 +1,4 @@
-"""The simulated vehicle's process: start, paces, and what happens without a parent."""
+"""The simulated vehicle's process: start, paces, video, and what happens without a parent."""
 
 from __future__ import annotations
 
@@ -14,13 +14,18 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.link import Packet, Port
+from perchctl.places import data_file
 from perchctl.sim import CONTROL_PERIOD_S, Scenario, SimProcess
-from perchctl.sim.process.child import MAX_LAG_S, Runner
-from tests.helpers.crtp_rig import ROOT, WAIT_S, Client, wired
+from perchctl.sim.endpoint import MjpegServer
+from perchctl.sim.host import MAX_LAG_S, Runner
+from tests.helpers.crtp_rig import ROOT, WAIT_S, Client, pictures_of, wired
 
 
 def eventually(condition: Callable[[], bool], limit_s: float = WAIT_S) -> bool:
@@ -71,6 +76,8 @@ def test_stepped_time_passes_only_by_advance(stepped: SimProcess) -> None:
     assert stepped.truth()["t_s"] == pytest.approx(start_s + 0.5)
     with pytest.raises(InvalidValue, match="back"):
         stepped.advance(-0.1)
+    with pytest.raises(AttributeError):
+        stepped.no_such_request()
 
 
 def test_the_same_scenario_gives_the_same_flight(stepped: SimProcess) -> None:
@@ -167,43 +174,75 @@ def test_real_time_catches_up_and_cuts_long_hiccups() -> None:
     assert host.elapsed_s == pytest.approx(0.710 + MAX_LAG_S, abs=0.003)
 
 
-def test_stop_ends_the_process_and_frees_the_port() -> None:
+def test_a_child_that_ends_or_does_not_come_up_is_a_clear_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     sim = SimProcess.start(pace="stepped")
-    port = int(sim.uri.rsplit(":", 1)[1])
     sim.stop()
     sim.stop()
     assert not sim.is_running()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
-        mine.bind(("127.0.0.1", port))
     with pytest.raises(ConnectionFailed, match="ended"):
         sim.truth()
-
-
-def test_a_taken_port_is_a_clear_error() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
-        mine.bind(("127.0.0.1", 0))
-        port = mine.getsockname()[1]
-        with pytest.raises(ConnectionFailed, match=f"UDP port {port} .* choose another"):
-            SimProcess.start(pace="stepped", port=port)
-
-
-def test_a_child_that_dies_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(ConnectionFailed, match="ended with code"):
-        SimProcess.start(pace="stepped")
-
-
-def test_an_unknown_pace_is_refused() -> None:
-    with pytest.raises(InvalidValue, match="'realtime' or 'stepped'"):
-        SimProcess.start(pace="slow")  # type: ignore[arg-type]
-
-
-def test_a_killed_child_is_reported() -> None:
     sim = SimProcess.start(pace="stepped")
     os.kill(sim.pid, signal.SIGKILL)
     with pytest.raises(ConnectionFailed, match="has ended"):
         sim.advance(0.1)
     sim.stop()
+    with pytest.raises(InvalidValue, match="'realtime' or 'stepped'"):
+        SimProcess.start(pace="slow")  # type: ignore[arg-type]
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(ConnectionFailed, match="ended with code"):
+        SimProcess.start(pace="stepped")
+
+
+# --- Video ---------------------------------------------------------------------------
+
+
+def test_newest_picture_wins_for_several_clients() -> None:
+    server = MjpegServer()
+    try:
+        for grey in (10, 100, 200):
+            server.publish(np.full((48, 64), grey, np.uint8))
+        results: list[list[np.ndarray]] = []
+        watchers = [
+            threading.Thread(target=lambda: results.append(pictures_of(server.url, 1)))
+            for _ in range(3)
+        ]
+        for watcher in watchers:
+            watcher.start()
+        for watcher in watchers:
+            watcher.join(WAIT_S)
+        assert len(results) == 3
+        for (picture,) in results:
+            assert picture.shape == (48, 64)  # grey
+            assert abs(float(picture.mean()) - 200) < 2
+    finally:
+        server.close()
+
+
+@pytest.mark.parametrize("pace", ["realtime", "stepped"])
+def test_the_vehicles_picture_is_streamed(pace: str) -> None:
+    """In real time it is rendered in its own thread; a stock reader opens it too."""
+    path = data_file("calib", "example_640x480")
+    assert path is not None
+    camera = load_calibration(path)
+    with SimProcess.start(Scenario(seed=1), pace, camera=camera) as sim:  # type: ignore[arg-type]
+        if pace == "stepped":
+            sim.advance(0.3)
+            first, again = (pictures_of(sim.stream_url, 1)[0] for _ in range(2))
+            assert np.array_equal(first, again)
+            sim.advance(0.1)
+            (later,) = pictures_of(sim.stream_url, 1)
+        else:
+            first, _, later = pictures_of(sim.stream_url, 3)
+            capture = cv2.VideoCapture(sim.stream_url, cv2.CAP_FFMPEG)
+            ok, frame = capture.read()
+            capture.release()
+            assert ok
+            assert frame.shape[1::-1] == camera.size_px
+        assert first.shape[::-1] == camera.size_px
+        assert first.std() > 3.0
+        assert not np.array_equal(first, later)  # noise, motion
 
 
 # --- Without a parent ----------------------------------------------------------------
@@ -213,9 +252,7 @@ _PARENT = """
 import sys
 sys.path.insert(0, {root!r})
 from pathlib import Path
-from perchctl.sim.process.handle import HostSetup
-from perchctl.sim.process.handle import SimProcess
-from perchctl.sim.process.host import VehicleHost
+from perchctl.sim import SimProcess
 started = []
 for pace in ("realtime", "stepped"):
     sim = SimProcess.start(pace=pace, truth_file=Path({folder!r}, pace), linger_s=3.0)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 from cflib.utils.power_switch import PowerSwitch
 
-from perchctl.errors import InvalidValue
 from perchctl.sim import Scenario, SimProcess
 from perchctl.sim.crtp.server import LinkOptions
-from tests.helpers.crtp_rig import LOCKED_BIT, READY, Client, Pilot, log_block
+from perchctl.sim.host import VehicleHost
+from perchctl.sim.process import HostSetup
+from tests.helpers.crtp_rig import LOCKED_BIT, READY, Client, Pilot, log_block, wired
 
 
 @pytest.fixture
@@ -114,7 +116,46 @@ def test_a_silent_peer_is_never_reported(pilot: Pilot) -> None:
     assert lost == []
 
 
-@pytest.mark.parametrize("wrong", [{"protocol_version": 10}, {"loss_rate": 1.5}])
-def test_options_are_checked(wrong: dict[str, Any]) -> None:
-    with pytest.raises(InvalidValue, match="choose"):
-        LinkOptions(**wrong)
+def arrived(mine: socket.socket) -> list[bytes]:
+    """The datagrams that have come."""
+    datagrams = []
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            datagrams.append(mine.recv(64))
+    return datagrams
+
+
+def test_a_scans_probe_is_answered_and_takes_nobodys_place() -> None:
+    """What the vehicle sends by itself, here its boot's text, goes to who has asked for more."""
+    with (
+        contextlib.closing(VehicleHost(HostSetup())) as host,
+        wired(host.uri) as scan,
+        wired(host.uri) as client,
+    ):
+        scan.send(b"\xff\x01\x01\x01")
+        host.step()
+        assert arrived(scan) == [b"\xff\x01\x01\x01"]
+        client.send(b"\xfc\x07")
+        scan.send(b"\xff\x01\x01\x01")
+        host.step()
+        assert len(arrived(scan)) == 1
+        echo, *text = arrived(client)
+        assert echo == b"\xfc\x07"
+        assert b"2026.08" in b"".join(part[1:] for part in text)
+
+
+def test_a_lossy_link_is_the_same_for_a_seed() -> None:
+    """Loss is drawn by its own seed: the same packets are lost in each run."""
+
+    def answered(seed: int) -> list[int]:
+        setup = HostSetup(link=LinkOptions(loss_rate=0.3, loss_seed=seed))
+        with contextlib.closing(VehicleHost(setup)) as host, wired(host.uri) as mine:
+            for number in range(40):
+                mine.send(bytes((0xFC, number)))
+            host.step()  # all have been served by its end
+            return [datagram[1] for datagram in arrived(mine)]
+
+    first = answered(1)
+    assert 5 < len(first) < 35
+    assert answered(1) == first
+    assert answered(2) != first

@@ -1,4 +1,4 @@
-"""What seeds draw in the named worlds, and that nothing moves where one condition is taken away."""
+"""What seeds draw in the shipped worlds, each condition by itself."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import math
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
 import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
@@ -56,34 +55,20 @@ def test_a_harder_world_is_drawn_within_its_ranges(name: str) -> None:
         assert math.hypot(*drawn.draught_mps) <= sim.draught_mps[1]
         tilt_deg = math.degrees(math.hypot(*drawn.target_tilt_rad))
         assert sim.target_tilt_deg[0] - 1e-9 <= tilt_deg <= sim.target_tilt_deg[1] + 1e-9
-        assert sim.gloss[0] <= drawn.gloss <= sim.gloss[1]
-        aside_m = math.dist(drawn.lamp_m[:2], drawn.target_xy_m)
-        assert sim.lamp_aside_m[0] <= aside_m <= sim.lamp_aside_m[1]
         assert drawn.cell_resistance_ohm is not None
         assert drawn.cell_charge <= sim.cell_charge[1]
         bias_dps = math.degrees(math.hypot(*drawn.flow_bias_radps))
         assert sim.flow_bias_dps[0] - 1e-9 <= bias_dps <= sim.flow_bias_dps[1] + 1e-9
-        assert len(drawn.bare_floors) == 1
         assert drawn.flow_reach_m == 2.5
         assert sim.radio_loss[0] <= drawn.radio_loss <= sim.radio_loss[1]
-        peaks = [math.hypot(*gust.peak_mps) for gust in drawn.gusts]
-        assert peaks
-        assert sim.gust_mps[0] <= min(peaks)
-        assert max(peaks) <= sim.gust_mps[1]
-        assert all(
-            a.start_s < b.start_s for a, b in zip(drawn.gusts, drawn.gusts[1:], strict=False)
-        )
 
 
 def test_one_range_moves_no_other_value_of_a_seed() -> None:
     """So that one condition can be taken away, and all else is as it was."""
     whole = asdict(draw_scenario(load_profile("extreme"), 7))
     for key, value, fields in (
-        ("gloss", [0.0, 0.0], {"gloss", "lamp_m"}),
         ("target_tilt_deg", [0.0, 0.0], {"target_tilt_rad"}),
-        ("gust_mps", [0.0, 0.0], {"gusts"}),
         ("radio_loss", [0.0, 0.0], {"radio_loss"}),
-        ("bare_floor_m", [0.0, 0.0], {"bare_floors"}),
         ("flow_noise_radps", [0.0, 0.0], {"flow_noise_radps"}),
         ("mass_kg", [0.04, 0.04], {"mass_kg", "first_contact_force_n"}),
         ("capture_hole_s", [0.0, 0.0], {"capture_holes_s"}),
@@ -91,39 +76,6 @@ def test_one_range_moves_no_other_value_of_a_seed() -> None:
         other = asdict(draw_scenario(changed("extreme", **{key: value}), 7))
         moved = {name for name in whole if whole[name] != other[name]}
         assert moved - {"first_contact_force_n"} == fields - {"first_contact_force_n"}, key
-
-
-def test_what_has_a_direction_can_be_pinned() -> None:
-    pinned = {
-        "target_xy_m": [0.1, -0.2],
-        "drift_xyz_mps": [0.0, 0.02, 0.0],
-        "estimate_tilt_bias_xy_deg": [0.2, -0.1],
-        "camera_burst_start_s": [9.0, 9.0],
-        "draught_mps": [0.5, 0.5],
-        "draught_towards_deg": [90.0, 90.0],
-        "target_tilt_deg": [3.0, 3.0],
-        "target_tilt_towards_deg": [0.0, 0.0],
-        "mount_error_rpy_deg": [0.0, 0.0, 0.0],
-        "mount_error_xyz_m": [0.0, 0.0, 0.0],
-    }
-    profile = changed("sim", **pinned)
-    for seed in (0, 1):
-        drawn = draw_scenario(profile, seed)
-        assert drawn.target_xy_m == (0.1, -0.2)
-        assert drawn.drift_mps == (0.0, 0.02, 0.0)
-        assert drawn.estimate_tilt_bias_rad == pytest.approx(
-            (math.radians(0.2), math.radians(-0.1))
-        )
-        assert drawn.camera_burst is not None
-        assert drawn.camera_burst[0] == 9.0
-        assert drawn.draught_mps == pytest.approx((0.0, 0.5, 0.0))
-        assert drawn.target_tilt_rad == pytest.approx((0.0, -math.radians(3.0)))
-        own = profile.camera.mount.T_body_cam
-        assert np.array(drawn.T_body_cam_true) == pytest.approx(own)
-    # Nothing that was not pinned has moved.
-    assert (
-        draw_scenario(profile, 3).ceiling_z_m == draw_scenario(load_profile("sim"), 3).ceiling_z_m
-    )
 
 
 def test_a_motion_capture_has_the_scenarios_holes() -> None:
@@ -138,14 +90,9 @@ def test_a_motion_capture_has_the_scenarios_holes() -> None:
         (begin_s, pytest.approx(length_s)) for begin_s, length_s in holes
     ]
     assert all(fault.occluded for *_, fault in settings.faults)
+    assert all(length_s == 1.0 for _, length_s in holes)
+    assert all(b[0] > a[0] + a[1] for a, b in itertools.pairwise(holes))
     assert draw_capture(profile, 4) is None
-
-
-def test_holes_do_not_overlap_and_last_as_long_as_is_said() -> None:
-    for seed in range(10):
-        holes = draw_scenario(load_profile("extreme"), seed).capture_holes_s
-        assert all(length_s == 1.0 for _, length_s in holes)
-        assert all(b[0] > a[0] + a[1] for a, b in itertools.pairwise(holes))
 
 
 @pytest.mark.parametrize("frames", [None, (0, 0), (9, 9), (8, 9)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 import statistics
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +13,6 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim import Scenario
 from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.outside import IMU_EVERY, Imu
-from perchctl.sim.firmware.planner import HlTakeoff
 from tests.helpers.firmware_rig import Rig, make_rig
 
 Place = tuple[float, float, float]
@@ -35,23 +33,30 @@ def send_truth(rig: Rig) -> None:
     rig.firmware.external_position(place(rig))
 
 
+def errors(rig: Rig) -> Place:
+    """The estimate less the truth."""
+    now = rig.firmware.estimator.now
+    x, y, z = place(rig)
+    return now.x_m - x, now.y_m - y, now.z_m - z
+
+
+def error_m(rig: Rig) -> float:
+    return math.hypot(*errors(rig))
+
+
 def fed(
     rig: Rig, seconds: float, send: Sender = send_truth, stream: Setpoint | None = None
 ) -> list[Place]:
     """Positions at 100 Hz; estimate less truth after each."""
-    errors = []
+    found = []
     for i in range(round(seconds / PERIOD_S)):
         if stream is not None and i % 2 == 0:
             rig.firmware.low_level(stream)
         send(rig)
         for _ in range(5):
             rig.firmware.step()
-        log = rig.firmware.log_value
-        x, y, z = place(rig)
-        errors.append(
-            (log("stateEstimate.x") - x, log("stateEstimate.y") - y, log("stateEstimate.z") - z)
-        )
-    return errors
+        found.append(errors(rig))
+    return found
 
 
 def reset(rig: Rig) -> None:
@@ -73,14 +78,6 @@ def told_variance(rig: Rig) -> float:
     return max(rig.firmware.log_value(f"kalman.varP{axis}") for axis in "XYZ")
 
 
-def error_m(rig: Rig) -> float:
-    log = rig.firmware.log_value
-    x, y, z = place(rig)
-    return math.dist(
-        (log("stateEstimate.x"), log("stateEstimate.y"), log("stateEstimate.z")), (x, y, z)
-    )
-
-
 @pytest.fixture(scope="module")
 def in_the_air() -> Rig:
     """Hovering by ideal positions; each test looks, and leaves it there."""
@@ -89,8 +86,8 @@ def in_the_air() -> Rig:
 
 def test_it_flies_by_ideal_positions_as_measured(in_the_air: Rig) -> None:
     """Row "ideal outside positioning: 2.5e-4 m^2"."""
-    errors = fed(in_the_air, 1.0, stream=HERE)
-    assert max(math.hypot(*error) for error in errors) < 0.01
+    found = fed(in_the_air, 1.0, stream=HERE)
+    assert max(math.hypot(*error) for error in found) < 0.01
     assert math.hypot(*place(in_the_air)[:2]) < 0.03
     assert place(in_the_air)[2] == pytest.approx(0.8, abs=0.12)  # the integral settles slowly
     assert told_variance(in_the_air) == pytest.approx(2.5e-4, rel=0.1)
@@ -128,24 +125,8 @@ def test_a_late_position_is_a_lag() -> None:
     rig.world.set_pose((0.0, 0.0, 0.5), hold=True)
     for step in range(200):  # carried at 0.5 m/s
         rig.world.set_pose((0.005 * step, 0.0, 0.5), velocity_mps=(0.5, 0.0, 0.0), hold=True)
-        errors = fed(rig, PERIOD_S, late)
-    assert errors[-1][0] == pytest.approx(-0.05, abs=0.01)
-
-
-def test_blind_for_twelve_seconds_it_slides_by_what_was_measured() -> None:
-    """Row "touched down 0.9 m aside, at 28 g": seeds differ by where they slide to."""
-    aside_m = []
-    for seed in range(3):
-        rig = outside_rig(seed=seed, mass_kg=0.028)
-        numbers = random.Random(seed)
-        noisy = lambda rig: rig.firmware.external_position(  # noqa: E731
-            tuple(value + numbers.gauss(0.0, 0.005) for value in place(rig))  # noqa: B023
-        )
-        rig.firmware.high_level(HlTakeoff(0.8, 2.0))
-        fed(rig, 5.0, noisy)
-        rig.run(12.0)
-        aside_m.append(math.hypot(*place(rig)[:2]))
-    assert statistics.median(aside_m) == pytest.approx(0.9, abs=0.3)
+        fed(rig, PERIOD_S, late)
+    assert errors(rig)[0] == pytest.approx(-0.05, abs=0.01)
 
 
 def test_a_wrong_initial_heading_cannot_be_flown() -> None:
@@ -191,17 +172,11 @@ def test_what_is_no_number_does_no_harm(number: float) -> None:
     assert error_m(rig) < 0.01
 
 
-# What the IMU's errors do, flying and standing -----------------------------------------
+# --- What the IMU's errors do, flying and standing --------------------------------------------
 
 
 G = GRAVITY_MPS2
 SEVERAL = range(400)
-
-
-def errors(rig: Rig) -> tuple[float, float, float]:
-    log = rig.firmware.log_value
-    x, y, z = place(rig)
-    return log("stateEstimate.x") - x, log("stateEstimate.y") - y, log("stateEstimate.z") - z
 
 
 def wrong_heading_deg(rig: Rig) -> float:

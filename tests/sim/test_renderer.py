@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from perchctl.geometry import (
@@ -20,6 +23,8 @@ from perchctl.geometry import (
 )
 from perchctl.profile import TargetConfig
 from perchctl.sim import Neighbour, Renderer, Scenario
+from perchctl.sim.renderer import defocused, rounded
+from perchctl.sim.sheets import pixels_of
 from perchctl.target.drawing import marker_corners_m
 from perchctl.vision import CameraModel
 
@@ -55,7 +60,8 @@ def camera_pose(
 
 def project(camera: CameraModel, scene: Scenario, T_world_cam: Array, points_m: Array) -> Array:
     """Image of points given in OpenCV's marker axes, by OpenCV's own projection."""
-    T_world_target = make_T(rot_z(scene.target_yaw_rad), (*scene.target_xy_m, scene.ceiling_z_m))
+    turn = rotation_from_rpy(*scene.target_tilt_rad, 0.0) @ rot_z(scene.target_yaw_rad)
+    T_world_target = make_T(turn, (*scene.target_xy_m, scene.ceiling_z_m))
     T_cam_marker = invert_T(T_world_cam) @ T_world_target @ make_T(R_MARKER_TARGET, (0, 0, 0))
     rvec = cv2.Rodrigues(T_cam_marker[:3, :3])[0]
     tvec = T_cam_marker[:3, 3].copy()
@@ -186,12 +192,9 @@ def test_both_markers_read_unmirrored_with_their_corners_in_order(renderer: Rend
     ):
         truth = project(PLUMB_BOB, scenario(), pose, marker_corners_m(side_m))
         assert np.abs(detect(image, dictionary)[wanted] - truth).max() < 1.5
-
-
-def test_with_an_aligned_camera_the_marker_is_upright() -> None:
-    """No rotation between body, camera and target: top-left corner at the top left."""
-    renderer = Renderer(scenario(target_yaw_rad=0.0), PLUMB_BOB, TARGET)
-    corners = detect(renderer.render([camera_pose(0.6)]), "DICT_4X4_1000")[997]
+    # No rotation between body, camera and target: the top-left corner is at the top left.
+    aligned = Renderer(scenario(target_yaw_rad=0.0), PLUMB_BOB, TARGET)
+    corners = detect(aligned.render([camera_pose(0.6)]), "DICT_4X4_1000")[997]
     assert corners[0, 0] < corners[1, 0]
     assert corners[0, 1] < corners[3, 1]
     assert abs(corners[0, 1] - corners[1, 1]) < 2.0
@@ -206,12 +209,22 @@ def test_ids_with_a_black_centre_get_a_white_ring_and_are_found(marker_id: int) 
     assert 5 in detect(image, "DICT_ARUCO_ORIGINAL")
 
 
-def test_true_print_sizes_come_from_the_scenario() -> None:
-    scene = scenario(large_side_m=0.1485)
-    pose, _, reach_px = POSES["near"]
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"target_tilt_rad": (math.radians(3.0), 0.0)},
+        {"target_tilt_rad": (math.radians(-2.0), math.radians(2.0))},
+        {"large_side_m": 0.1485},
+    ],
+)
+def test_a_target_that_is_tilted_or_printed_small_is_so_in_the_picture(
+    changes: dict[str, object],
+) -> None:
+    scene = scenario(**changes)
+    pose = camera_pose(0.35, 0.02, 0.01, (0.03, -0.02, 0.2))
     renderer = Renderer(scene, PLUMB_BOB, TARGET)
     image = evenly_lit(renderer.render([pose]), renderer)
-    errors = corner_errors_px(image, PLUMB_BOB, scene, pose, 0.1485, reach_px)
+    errors = corner_errors_px(image, PLUMB_BOB, scene, pose, scene.large_side_m, 4.0)
     assert np.abs(errors).max() < 0.025
 
 
@@ -338,3 +351,94 @@ def test_analogue_faults_spoil_but_repeat() -> None:
     spoilt = poor.render([pose], frame_index=2)
     assert np.array_equal(spoilt, poor.render([pose], frame_index=2))
     assert np.abs(spoilt.astype(int) - clean).mean() > 2.0
+
+
+# --- Noise and blur ----------------------------------------------------------------------------
+
+
+def test_noise_has_its_spread_and_no_memory() -> None:
+    """Neither of the pixel beside, nor of the frame before; and no mean."""
+    paper = [camera_pose(0.1, 0.02, -0.01)]
+    bare = Renderer(scenario(), PLUMB_BOB, TARGET).render(paper).astype(float)
+    noisy = Renderer(scenario(camera_noise_sigma=6.0), PLUMB_BOB, TARGET)
+    one, other = (noisy.render(paper, frame_index=i) - bare for i in (1, 2))
+    for noise in (one, other):
+        assert abs(noise.mean()) < 0.05
+        assert noise.std() == pytest.approx(6.0, rel=0.02)
+        assert np.abs(noise).max() > 3.5 * 6.0
+        assert abs((noise[:, 1:] * noise[:, :-1]).mean()) < 0.01 * 36.0
+        assert abs((noise[1:] * noise[:-1]).mean()) < 0.01 * 36.0
+    assert abs((one * other).mean()) < 0.01 * 36.0
+
+
+SPAN = st.tuples(st.integers(0, 9), st.integers(1, 6))
+"""First block, and how many."""
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.integers(0, 2**31), st.floats(0.1, 1.5), SPAN, SPAN)
+def test_a_blur_of_some_tiles_is_that_of_the_whole_picture_there(
+    seed: int, sigma_px: float, rows: tuple[int, int], cols: tuple[int, int]
+) -> None:
+    """And as far around as they spread; what is farther off stays as it was."""
+    sharp = np.random.default_rng(seed).integers(0, 256, (128, 128)).astype(np.uint8)
+    box = (slice(rows[0], rows[0] + rows[1]), slice(cols[0], cols[0] + cols[1]))
+    picture = sharp.copy()
+    defocused(picture, sigma_px, box)
+    near = pixels_of(box, math.ceil(3.0 * sigma_px))
+    assert np.array_equal(picture[near], cv2.GaussianBlur(sharp, (0, 0), sigma_px)[near])
+    far = np.ones(sharp.shape, np.bool_)
+    far[pixels_of(box, 8)] = False
+    assert np.array_equal(picture[far], sharp[far])
+
+
+# --- A camera at rest, whose picture is kept ---------------------------------------------------
+
+
+STIRRED = Scenario(ceiling_z_m=2.0, camera_noise_sigma=3.0)
+
+
+def stirring(below_m: float, stir: float, *, moving: bool = False) -> list[Array]:
+    """The poses of an exposure; `stir` in m and rad."""
+    far = 0.02 if moving else 0.0
+    return [
+        make_T(rotation_from_rpy(0.02 + stir, 0.1, 0.5 + k * far), (stir, 0.01, 2.0 - below_m))
+        for k in range(3)
+    ]
+
+
+def test_no_picture_hangs_on_those_before() -> None:
+    """Which of them are looked at is the flight's affair, and no other bytes may follow from it."""
+    exposures = [stirring(0.6, 3e-6 * k) for k in range(8)]
+    all_seen = Renderer(STIRRED, PLUMB_BOB, TARGET)
+    frames = [all_seen.render(poses, frame_index=7) for poses in exposures]
+    for poses, frame in zip(exposures, frames, strict=True):
+        alone = Renderer(STIRRED, PLUMB_BOB, TARGET)
+        assert np.array_equal(alone.render(poses, frame_index=7), frame)
+
+
+@pytest.mark.parametrize("below_m", [0.02, 0.3, 2.0])
+def test_a_rounded_pose_shows_each_place_where_it_is(below_m: float) -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        T = make_T(
+            rotation_from_rpy(*rng.uniform(-0.3, 0.3, 3)),
+            (*rng.uniform(-0.5, 0.5, 2) * below_m, -below_m),
+        )
+        points = np.array([[*rng.uniform(-0.5, 0.5, 2) * below_m, 0.0] for _ in range(9)])
+        seen = [(points - t[:3, 3]) @ t[:3, :3] for t in (T, rounded(T))]
+        one, other = (400.0 * cam[:, :2] / cam[:, 2:] for cam in seen)
+        within = (np.abs(one) < (400.0, 300.0)).all(axis=1)
+        assert np.abs(one - other)[within].max(initial=0.0) < 0.01
+
+
+def test_without_noise_a_kept_picture_is_nobody_s_to_spoil() -> None:
+    renderer = Renderer(replace(STIRRED, camera_noise_sigma=0.0), PLUMB_BOB, TARGET)
+    first = renderer.render(stirring(1.0, 0.0))
+    kept = first.copy()
+    first[:] = 0
+    assert np.array_equal(renderer.render(stirring(1.0, 0.0)), kept)
+    moved = renderer.render(stirring(1.0, 0.0, moving=True))
+    renderer.move_target((0.1, 0.0))
+    assert not np.array_equal(moved, kept)
+    assert not np.array_equal(renderer.render(stirring(1.0, 0.0)), kept)

@@ -1,1 +1,1 @@
-"""The simulated Crazyflie's end of the link: its ports, tables and the UDP carrier."""
+"""The Crazyflie's side of CRTP: its tables and its server."""

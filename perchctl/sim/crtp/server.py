@@ -1,29 +1,29 @@
 """A Crazyflie's end of the link: packets in, firmware calls, packets out.
 
-Uses no socket and no clock; `perchctl.sim.process.host` carries the packets. Everything
-an unmodified cflib sends is answered as in docs/firmware.md, "Connect sequence".
+Uses no socket and no clock; `perchctl.sim.endpoint` carries the packets. Everything an
+unmodified cflib sends is answered as in docs/firmware.md, "Connect sequence"; ports and layouts
+are those of "Link" there, signs those of "Signs and units".
 """
 
 from __future__ import annotations
 
+import math
 import struct
-import zlib
 from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from perchctl.errors import InvalidValue
-from perchctl.sim.crtp.codec import MAX_DATA, Packet, Port, Status
-from perchctl.sim.crtp.commands import CommandService
-from perchctl.sim.crtp.log import LogService
-from perchctl.sim.crtp.param import ParamService
+from perchctl.link import Packet, Port
+from perchctl.sim.crtp.tables import MAX_DATA, LogService, ParamService, Status
+from perchctl.sim.firmware.controller import Setpoint
+from perchctl.sim.firmware.planner import HighLevelCommand, HlGoTo, HlLand, HlStop, HlTakeoff
 from perchctl.vehicle import CAN_FLY, CRASHED, LOCKED
 
 if TYPE_CHECKING:
     from perchctl.sim.firmware import Firmware
 
 PROTOCOL_VERSION = 12
-OLDEST_PROTOCOL_VERSION = 11
 FIRMWARE_VERSION = "2026.08"
 DEVICE_TYPE = "C21B"
 _ECHO, _SOURCE, _SINK, _NULL = 0, 1, 2, 3
@@ -61,15 +61,6 @@ class LinkOptions:
     loss_rate: float = 0.0
     loss_seed: int = 0
 
-    def __post_init__(self) -> None:
-        if not OLDEST_PROTOCOL_VERSION <= self.protocol_version <= PROTOCOL_VERSION:
-            raise InvalidValue(
-                f"protocol version {self.protocol_version} is not simulated, choose "
-                f"{OLDEST_PROTOCOL_VERSION} to {PROTOCOL_VERSION}"
-            )
-        if not 0.0 <= self.loss_rate <= 1.0:
-            raise InvalidValue(f"loss rate {self.loss_rate} is no share, choose 0 to 1")
-
 
 class CrtpServer:
     """Serves one firmware to one peer at a time."""
@@ -81,7 +72,6 @@ class CrtpServer:
         self._version = version
         self._log = LogService(firmware, options.missing_log_variables)
         self._param = ParamService(firmware)
-        self._mem = MemService()
         self._commands = CommandService(firmware, version)
         self._console: deque[Packet] = deque(maxlen=64)
         self._info = 0
@@ -97,7 +87,7 @@ class CrtpServer:
             case Port.PARAM:
                 return self._param.handle(packet)
             case Port.MEM:
-                return self._mem.handle(packet)
+                return _memories(packet)
             case Port.PLATFORM:
                 return self._platform(packet)
             case _:
@@ -177,76 +167,173 @@ class CrtpServer:
         return [Packet(Port.PLATFORM, packet.channel, bytes((command,)) + answer)]
 
 
-# --- The memory port: which memories the vehicle has, and what is in them ----------------------
+# --- The memory port: one EEPROM, whose contents no client of this vehicle reads ---------------
 
 
-_INFO, _READ = 0, 1
+_MEM_INFO = 0
 _MEM_VERSION, _MEM_COUNT, _MEM_DETAILS = 0, 1, 2
-_CHUNK = 24
-I2C, ONE_WIRE = 0x00, 0x01
+_I2C, _EEPROM_BYTES = 0x00, 8192
 
 
-@dataclass(frozen=True)
-class _Memory:
-    kind: int
-    content: bytes
-    serial: bytes = bytes(8)
+def _memories(packet: Packet) -> list[Packet]:
+    data = packet.data
+    if packet.channel != _MEM_INFO or not data:
+        return []
+    if data[0] in (_MEM_VERSION, _MEM_COUNT):
+        answer = bytes((data[0], 1))
+    elif data[0] == _MEM_DETAILS:
+        details = struct.pack("<BI", _I2C, _EEPROM_BYTES) + bytes(8)
+        answer = data[:2] + (details if data[1:2] == b"\0" else b"")
+    else:
+        return []
+    return [Packet(Port.MEM, _MEM_INFO, answer)]
 
 
-class MemService:
-    """The EEPROM with the radio's settings and the flow deck's 1-wire memory, to be read."""
+# --- Packets that command the vehicle, turned into the firmware model's calls ------------------
 
-    def __init__(self) -> None:
-        serial = bytes.fromhex("0D2F4C1BA0000055")
-        self._memories = (
-            _Memory(I2C, _eeprom().ljust(8192, b"\xff")),
-            _Memory(ONE_WIRE, _flow_deck().ljust(112, b"\xff"), serial),
-        )
+
+# Port 8.
+HL_SET_GROUP, HL_STOP, HL_TAKEOFF_2, HL_LAND_2, HL_GO_TO_2 = 0, 3, 7, 8, 12
+# Port 9.
+GET_STATE, ARM, RECOVER, EMERGENCY_STOP, WATCHDOG = 0x0C, 0x01, 0x02, 0x03, 0x04
+REPLY = 0x80
+# Port 6, channel 1.
+_LOC_EMERGENCY_STOP, _LOC_WATCHDOG, _LOC_POSE = 3, 4, 8
+_NOTIFY_STOP = 0
+
+
+def _raw(data: bytes) -> Setpoint:
+    """Port 3: ``<fffH``; cflib negates the pitch on its way out."""
+    roll, pitch, yaw_rate, thrust = struct.unpack_from("<fffH", data)
+    return Setpoint.raw(roll, -pitch, yaw_rate, thrust)
+
+
+_GENERIC: dict[int, Callable[[bytes], Setpoint]] = {
+    0: lambda data: Setpoint(),
+    7: lambda data: Setpoint.position(*struct.unpack_from("<ffff", data)),
+    8: lambda data: Setpoint.velocity(*struct.unpack_from("<ffff", data)),
+    9: lambda data: Setpoint.z_distance(*struct.unpack_from("<ffff", data)),
+    10: lambda data: Setpoint.hover(*struct.unpack_from("<ffff", data)),
+    11: _raw,  # manual, by angles
+}
+"""Port 7: setpoints by their type, as cflib sends them since protocol 11."""
+
+
+class CommandService:
+    """Serves the ports that command; holds the group mask."""
+
+    def __init__(self, firmware: Firmware, protocol_version: int = PROTOCOL_VERSION) -> None:
+        self.firmware = firmware
+        self._has_supervisor_port = protocol_version >= 12
+        self._groups = 0
+        self._handlers: dict[int, Callable[[Packet], list[Packet]]] = {
+            Port.COMMANDER: self._commander,
+            Port.COMMANDER_GENERIC: self._generic,
+            Port.HIGH_LEVEL: self._high_level,
+            Port.LOCALIZATION: self._localization,
+            Port.SUPERVISOR: self._supervisor,
+        }
 
     def handle(self, packet: Packet) -> list[Packet]:
-        """The answer to one packet; writing has none."""
+        """The answers to one packet. What is too short for its command is passed over, as the
+        firmware does."""
+        handler = self._handlers.get(packet.port)
+        if handler is None or not packet.data:
+            return []
+        try:
+            return handler(packet)
+        except struct.error:
+            return []
+
+    def arm(self, do_arm: bool) -> bytes:
+        """(success, armed) as bytes; shared with the platform port."""
+        return bytes(self.firmware.arm(do_arm))
+
+    def recover(self) -> bytes:
+        """(success, recovered) as bytes; shared with the platform port."""
+        return bytes(self.firmware.recover_from_crash())
+
+    def _commander(self, packet: Packet) -> list[Packet]:
+        if packet.channel == 0:
+            self._low_level(_raw(packet.data))
+        return []
+
+    def _generic(self, packet: Packet) -> list[Packet]:
         data = packet.data
-        answer = b""
-        if packet.channel == _INFO and data:
-            answer = self._info(data)
-        elif packet.channel == _READ and len(data) >= 6:
-            answer = self._read(data)
-        return [Packet(Port.MEM, packet.channel, answer)] if answer else []
+        if packet.channel == 0 and data[0] in _GENERIC:
+            self._low_level(_GENERIC[data[0]](data[1:]))
+        elif packet.channel == 1 and data[0] == _NOTIFY_STOP:
+            (remain_ms,) = struct.unpack_from("<I", data, 1)
+            self.firmware.notify_setpoint_stop(remain_ms / 1000.0)
+        return []
 
-    def _info(self, data: bytes) -> bytes:
-        if data[0] == _MEM_VERSION:
-            return bytes((_MEM_VERSION, 1))
-        if data[0] == _MEM_COUNT:
-            return bytes((_MEM_COUNT, len(self._memories)))
-        if data[0] != _MEM_DETAILS or len(data) < 2:
-            return b""
-        if data[1] >= len(self._memories):
-            return data[:2]
-        memory = self._memories[data[1]]
-        return data[:2] + struct.pack("<BI", memory.kind, len(memory.content)) + memory.serial
+    def _low_level(self, setpoint: Setpoint) -> None:
+        values = (getattr(setpoint, name) for name in Setpoint.__slots__)
+        if _all_finite(value for value in values if isinstance(value, float)):
+            self.firmware.low_level(setpoint)
 
-    def _read(self, data: bytes) -> bytes:
-        ident, at, length = struct.unpack_from("<BIB", data)
-        content = self._memories[ident].content if ident < len(self._memories) else b""
-        if length > _CHUNK or at + length > len(content):
-            return data[:5] + bytes((Status.EACCES,))
-        return data[:5] + bytes((Status.OK,)) + content[at : at + length]
+    def _high_level(self, packet: Packet) -> list[Packet]:
+        data, status = packet.data, Status.OK
+        if data[0] == HL_SET_GROUP:
+            self._groups = data[1]
+        elif (command := _high_level(data)) is None:
+            status = Status.ENOEXEC
+        elif data[1] == 0 or data[1] & self._groups:
+            values = vars(command).values()
+            if _all_finite(value for value in values if value is not None):
+                self.firmware.high_level(command)
+        return [Packet(Port.HIGH_LEVEL, 0, data[:3].ljust(3, b"\0") + bytes((status,)))]
+
+    def _localization(self, packet: Packet) -> list[Packet]:
+        data = packet.data
+        if packet.channel == 0:
+            self.firmware.external_position(struct.unpack_from("<fff", data))
+        elif packet.channel == 1 and data[0] == _LOC_EMERGENCY_STOP:
+            self.firmware.emergency_stop()
+        elif packet.channel == 1 and data[0] == _LOC_WATCHDOG:
+            self.firmware.emergency_stop_watchdog()
+        elif packet.channel == 1 and data[0] == _LOC_POSE:
+            x, y, z, *quaternion = struct.unpack_from("<fffffff", data, 1)
+            qx, qy, qz, qw = quaternion
+            self.firmware.external_pose((x, y, z), (qx, qy, qz, qw))
+        return []
+
+    def _supervisor(self, packet: Packet) -> list[Packet]:
+        if not self._has_supervisor_port:
+            return []
+        command = packet.data[0]
+        answer: bytes | None = None
+        if packet.channel == 0 and command == GET_STATE:
+            answer = struct.pack("<H", self.firmware.supervisor_info)
+        elif packet.channel == 1 and command == ARM and len(packet.data) > 1:
+            answer = self.arm(bool(packet.data[1]))
+        elif packet.channel == 1 and command == RECOVER:
+            answer = self.recover()
+        elif packet.channel == 1 and command == EMERGENCY_STOP:
+            self.firmware.emergency_stop()
+        elif packet.channel == 1 and command == WATCHDOG:
+            self.firmware.emergency_stop_watchdog()
+        if answer is None:
+            return []
+        return [Packet(Port.SUPERVISOR, packet.channel, bytes((REPLY | command,)) + answer)]
 
 
-def _eeprom() -> bytes:
-    """The radio's settings, version 1: channel 80, 2 Mbit/s, address E7E7E7E7E7."""
-    body = b"0xBC" + struct.pack("<BBBffBI", 1, 80, 2, 0.0, 0.0, 0xE7, 0xE7E7E7E7)
-    return body + bytes((sum(body) % 256,))
+def _high_level(data: bytes) -> HighLevelCommand | None:
+    """The command of a packet on port 8; None for one that this vehicle does not have
+    (trajectories, spirals)."""
+    command = data[0]
+    if command == HL_STOP:
+        return HlStop()
+    if command in (HL_TAKEOFF_2, HL_LAND_2):
+        height, yaw, keep_yaw, duration = struct.unpack_from("<ff?f", data, 2)
+        kind = HlTakeoff if command == HL_TAKEOFF_2 else HlLand
+        return kind(height, duration, None if keep_yaw else yaw)
+    if command == HL_GO_TO_2:  # data[3] is a flag for straight lines
+        x, y, z, yaw, duration = struct.unpack_from("<fffff", data, 4)
+        return HlGoTo(x, y, z, yaw, duration, bool(data[2]))
+    return None
 
 
-def _flow_deck() -> bytes:
-    """A deck's description: header, then board name and revision, each with a CRC."""
-    header = struct.pack("<BIBB", 0xEB, 0, 0xBC, 0x0F)
-    name, revision = b"bcFlow2", b"A"
-    body = bytes((1, len(name))) + name + bytes((2, len(revision))) + revision
-    elements = bytes((0, len(body))) + body
-    return _with_crc(header) + _with_crc(elements)
-
-
-def _with_crc(data: bytes) -> bytes:
-    return data + bytes((zlib.crc32(data) & 0xFF,))
+def _all_finite(values: Iterable[float]) -> bool:
+    """Numbers that are none would poison the controller for good: such packets are dropped."""
+    return all(map(math.isfinite, values))

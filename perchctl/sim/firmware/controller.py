@@ -228,7 +228,6 @@ class Controller:
         self.desired_roll_deg = 0.0
         self.desired_pitch_deg = 0.0
         self.desired_yaw_deg = 0.0
-        self.outputs = (0.0, 0.0, 0.0)
 
     def limits_changed(self) -> None:
         """Hand the limits to the loops that keep them."""
@@ -261,7 +260,6 @@ class Controller:
         if self.thrust == 0.0:
             self._reset(now)
             self.desired_yaw_deg = now.yaw_deg
-            self.outputs = (0.0, 0.0, 0.0)
             return MOTORS_OFF
         roll = _saturated(
             self.roll_rate.update(
@@ -278,7 +276,6 @@ class Controller:
                 self.yaw.update(self.desired_yaw_deg, now.yaw_deg, True), now.gyro_z_dps
             )
         )
-        self.outputs = (roll, pitch, yaw)
         return _distribute(self.thrust, 0.5 * roll, 0.5 * pitch, yaw)
 
     def _position(self, setpoint: Setpoint, now: Estimate) -> None:

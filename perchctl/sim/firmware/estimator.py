@@ -1,7 +1,7 @@
 """The state estimate: the truth with the errors of a flow deck or of motion capture.
 
-Drift runs from the moment the motors first turn; what a flow deck adds on a bad floor or high
-above it is `FlowDeck`. A vehicle without a deck (scenario
+Drift runs from the moment the motors first turn; what a flow deck adds high above the floor is
+`FlowDeck`. A vehicle without a deck (scenario
 `extra["external_position"]`) has what it is sent from outside instead, which counts with
 parameter `stabilizer.estimator` = 2: `perchctl.sim.firmware.outside`.
 
@@ -271,9 +271,8 @@ class Estimator:
 #   height, so the position walks the more the higher it is.
 # - The vehicle's own turning is taken out by the gyroscope: what that is off by is taken for flow.
 #   Times the height it is a drift.
-# - It needs texture. Where all that it sees (42 deg) is bare floor it sees nothing, and above
-#   `Scenario.flow_reach_m`. Then the attitude's error alone is summed up, twice, as in
-#   docs/firmware.md, "The target as the only positioning system".
+# - Above `Scenario.flow_reach_m` it sees nothing. Then the attitude's error alone is summed up,
+#   twice, as in docs/firmware.md, "The target as the only positioning system".
 # - The height is measured by a laser. Its error is that which the firmware counts on: 2.5 mm, and
 #   from 2.5 m on more by a factor of 80 within 1.5 m (source).
 #
@@ -287,8 +286,6 @@ _DT_S = _EVERY * CONTROL_PERIOD_S
 _FLOW_BATCH = 1024
 _LEAST_HEIGHT_M = 0.1
 """The firmware takes no height for less (source)."""
-_VIEW_PER_M = math.tan(math.radians(21.0))
-"""Half the width of what the sensor sees, a metre of height."""
 _BIAS_MPS2 = 0.0125
 """What an attitude that is a little off feigns. Level accelerations are not looked at in flight:
 vibration is nothing to the speed in x and y (source)."""
@@ -308,7 +305,6 @@ def has_flow_errors(scenario: Scenario) -> bool:
         scenario.flow_noise_radps
         or any(scenario.flow_bias_radps)
         or scenario.flow_reach_m is not None
-        or scenario.bare_floors
     )
 
 
@@ -341,14 +337,8 @@ class FlowDeck:
 
     def sees(self, world: World) -> bool:
         """True if there is anything in view whose motion can be measured."""
-        scenario = self._scenario
-        if scenario.flow_reach_m is not None and world.z_m > scenario.flow_reach_m:
-            return False
-        view_m = world.z_m * _VIEW_PER_M
-        return not any(
-            math.hypot(world.x_m - x_m, world.y_m - y_m) + view_m < radius_m
-            for x_m, y_m, radius_m in scenario.bare_floors
-        )
+        reach_m = self._scenario.flow_reach_m
+        return reach_m is None or world.z_m <= reach_m
 
     def step(self, world: World) -> None:
         """One control period of flight."""

@@ -63,7 +63,7 @@ class Firmware:
         self._steps = 0
         self._flown = False
         self.motors = MOTORS_OFF
-        self._setpoint = self.flown_setpoint = _NULL
+        self._setpoint = _NULL
         self._setpoint_s = 0.0
         self._low_level = False
         self._thrust_locked = True
@@ -133,7 +133,6 @@ class Firmware:
         if motors is not MOTORS_OFF:
             self._flown = True
         self.motors = motors
-        self.flown_setpoint = setpoint
         self._steps = step + 1
         self.world.step(motors)
 

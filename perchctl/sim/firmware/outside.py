@@ -133,68 +133,46 @@ _MOST, _LEAST = 100.0, 1e-6
 _NOISE_PER_S = (0.0, 0.0, 0.0, 2.5e-4, 2.5e-4, 1e-3, 1e-5, 1e-5, 1e-5)
 """(m/s)^2 and rad^2 a second: `kalman.pNAcc_xy` 0.5 m/s^2, `pNAcc_z` 1 m/s^2 and `mNGyro_*`
 0.1 rad/s, each added as one of 1000 steps a second (source)."""
-_STATES = range(9)
 
 
 class Covariance:
     """What the estimate knows of its own errors: position, velocity and attitude, with all that
-    one says about another. SI, radians, world axes; `rows[i][j]` is symmetric.
+    one says about another. SI, radians, world axes; `rows` (9, 9) is symmetric.
 
     As in the firmware (source: `kalman_core`), but for the axes: velocity and attitude errors are
     the world's here and the body's there, which is the same for a vehicle that is nearly level.
     """
 
     def __init__(self) -> None:
-        self.rows: list[list[float]] = []
         self.forget()
 
     def forget(self) -> None:
         """Begin anew, as after `kalman.resetEstimation`."""
         m2, height_m2 = min(_FIRST_M**2, _MOST), _FIRST_HEIGHT_M**2
-        first = [m2, m2, height_m2] + [_FIRST_MPS**2] * 3 + [_FIRST_RAD**2] * 3
-        self.rows = [[first[i] if i == j else 0.0 for j in _STATES] for i in _STATES]
+        self.rows = np.diag([m2, m2, height_m2] + [_FIRST_MPS**2] * 3 + [_FIRST_RAD**2] * 3)
 
     def grow(self, period_s: float, force_mps2: tuple[float, float, float]) -> None:
         """After a prediction. `force_mps2`: specific force in world axes; an attitude that is wrong
         sends it elsewhere."""
-        x, y, z, u, v, w, a, b, c = self.rows
-        t = period_s
-        sx, sy, sz = force_mps2
-        sx, sy, sz = t * sx, t * sy, t * sz
-        rows = self.rows = [
-            [p + t * q for p, q in zip(x, u, strict=True)],
-            [p + t * q for p, q in zip(y, v, strict=True)],
-            [p + t * q for p, q in zip(z, w, strict=True)],
-            [p + sz * q - sy * r for p, q, r in zip(u, b, c, strict=True)],
-            [p + sx * q - sz * r for p, q, r in zip(v, c, a, strict=True)],
-            [p + sy * q - sx * r for p, q, r in zip(w, a, b, strict=True)],
-            a, b, c,
-        ]  # fmt: skip
-        for row in rows:
-            x_, y_, z_, u_, v_, w_, a_, b_, c_ = row
-            row[0], row[1], row[2] = x_ + t * u_, y_ + t * v_, z_ + t * w_
-            row[3] = u_ + sz * b_ - sy * c_
-            row[4] = v_ + sx * c_ - sz * a_
-            row[5] = w_ + sy * a_ - sx * b_
-        for i in _STATES:
-            rows[i][i] = _bounded(rows[i][i] + t * _NOISE_PER_S[i])
+        sx, sy, sz = (period_s * part for part in force_mps2)
+        for rows in (self.rows, self.rows.T):
+            rows[POSITION:VELOCITY] += period_s * rows[VELOCITY:ATTITUDE]
+            a, b, c = rows[ATTITUDE:]
+            u, v, w = rows[VELOCITY:ATTITUDE]
+            rows[VELOCITY:ATTITUDE] = u + sz * b - sy * c, v + sx * c - sz * a, w + sy * a - sx * b
+        self.rows += period_s * np.diag(_NOISE_PER_S)
+        self._bound()
 
     def measure(self, state: int, variance: float) -> list[float]:
         """One state was measured with this variance: what to add to each of the nine for every
         unit that the measurement is more than the estimate."""
-        rows = self.rows
-        row_of = rows[state]
-        spread = row_of[state] + variance
-        gains = [p / spread for p in row_of]
-        for i in _STATES:
-            gain = gains[i]
-            row = rows[i] = [p - gain * q for p, q in zip(rows[i], row_of, strict=True)]
-            row[i] = _bounded(row[i])
-        return gains
+        gains = self.rows[state] / (self.rows[state, state] + variance)
+        self.rows -= np.outer(gains, self.rows[state])
+        self._bound()
+        return [float(gain) for gain in gains]
 
-
-def _bounded(variance: float) -> float:
-    return _LEAST if variance < _LEAST else _MOST if variance > _MOST else variance
+    def _bound(self) -> None:
+        np.fill_diagonal(self.rows, np.clip(np.diag(self.rows), _LEAST, _MOST))
 
 
 # --- The filter ----------------------------------------------------------------------------------
@@ -230,7 +208,7 @@ class OutsideFilter:
 
     def variance(self, state: int) -> float:
         """The variance of a state; `Covariance` says which it is, and its units."""
-        return self._covariance.rows[state][state]
+        return float(self._covariance.rows[state, state])
 
     def reset(self) -> None:
         """At the place and heading of `kalman.initial*`, level and at rest, whatever is true."""

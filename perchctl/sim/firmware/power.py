@@ -44,25 +44,18 @@ class MotorDriver:
             self.requested = MOTORS_OFF
             return MOTORS_OFF
         scale = FULL_COMMAND / supply_v
-        m1, m2, m3, m4 = requests
-        p1 = scale * motor_v(_N_PER_COMMAND * m1) if m1 >= THRUST_MIN else 0.0
-        p2 = scale * motor_v(_N_PER_COMMAND * m2) if m2 >= THRUST_MIN else 0.0
-        p3 = scale * motor_v(_N_PER_COMMAND * m3) if m3 >= THRUST_MIN else 0.0
-        p4 = scale * motor_v(_N_PER_COMMAND * m4) if m4 >= THRUST_MIN else 0.0
+        p1, p2, p3, p4 = (
+            scale * motor_v(_N_PER_COMMAND * request) if request >= THRUST_MIN else 0.0
+            for request in requests
+        )
         self.requested = pwm = (p1, p2, p3, p4)
-        most = max(pwm)
-        if most == 0.0:
+        if max(pwm) == 0.0:
             return MOTORS_OFF
-        if most > FULL_COMMAND:
+        excess = max(pwm) - FULL_COMMAND
+        if excess > 0.0:
             # Attitude comes before thrust: all four give way together.
-            excess = most - FULL_COMMAND
-            return (
-                max(0.0, p1 - excess),
-                max(0.0, p2 - excess),
-                max(0.0, p3 - excess),
-                max(0.0, p4 - excess),
-            )
-        return pwm
+            p1, p2, p3, p4 = (max(0.0, duty - excess) for duty in pwm)
+        return (p1, p2, p3, p4)
 
 
 # --- The battery as the power management reports it: voltage, level, low-power state -----------

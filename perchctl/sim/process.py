@@ -1,8 +1,8 @@
 """The simulated vehicle as a process of its own: a Crazyflie on UDP, its camera on HTTP.
 
-`SimProcess` is the handle in the process that flies, `child` runs in the other one. The
-child does not share its terminal's Ctrl-C and outlives a killed parent by a few seconds
-(`child`), as a real vehicle would.
+`SimProcess` is the handle in the process that flies, `perchctl.sim.host` runs in the other one.
+The child does not share its terminal's Ctrl-C and outlives a killed parent by a few seconds, as a
+real vehicle would.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ import math
 import subprocess
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Literal, get_args
@@ -32,8 +33,7 @@ from perchctl.children import (
 )
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
 from perchctl.profile import TargetConfig
-from perchctl.sim.capture import CaptureFault, CaptureSettings
-from perchctl.sim.carried import Stop
+from perchctl.sim.capture import CaptureSettings
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.scenario import Scenario
 from perchctl.vision import CameraModel
@@ -92,8 +92,7 @@ LINGER_S = 12.0
 class HostSetup:
     """How the simulated vehicle's process is set up.
 
-    `camera` None: no camera and no stream; `capture` None: no motion capture. Ports 0: chosen
-    by the operating system.
+    `camera` None: no camera and no stream; `capture` None: no motion capture.
     `truth_file`: JSON lines of the true state, 50 a simulated second, also after the
     parent has ended. `heard_file`: JSON lines of every packet that arrived, and who had sent it.
     `linger_s`: how long the vehicle then runs on, in wall-clock time. `time_file`: a
@@ -106,9 +105,6 @@ class HostSetup:
     target: TargetConfig | None = None
     capture: CaptureSettings | None = None
     link: LinkOptions = field(default_factory=LinkOptions)
-    port: int = 0
-    http_port: int = 0
-    capture_port: int = 0
     truth_file: Path | None = None
     heard_file: Path | None = None
     linger_s: float = LINGER_S
@@ -122,11 +118,17 @@ ANSWER_TIMEOUT_S = 15.0
 SLOWEST_PACE = 20.0
 """Wall-clock seconds allowed for one simulated second of `advance`."""
 _STOP_TIMEOUT_S = 5.0
-_CHILD = "from perchctl.sim.process.child import serve_parent; serve_parent()"
+_CHILD = "from perchctl.sim.host import serve_parent; serve_parent()"
+REQUESTS = (
+    "truth", "set_pose", "carry", "let_go", "set_battery", "push", "silence", "capture_fault",
+    "reboot", "replace_vehicle",
+)  # fmt: skip
+"""Methods of the child's `VehicleHost` that a `SimProcess` has, too."""
 
 
 class SimProcess:
-    """Handle of a running simulated vehicle; a context manager.
+    """Handle of a running simulated vehicle; a context manager. It has the methods `REQUESTS` of
+    `perchctl.sim.host.VehicleHost`.
 
     `uri` is for cflib, `stream_url` for a network camera ("" without a camera), `capture` the
     motion capture's kind and address for `motioncapture` (None without one). `shared_time`
@@ -209,56 +211,12 @@ class SimProcess:
         if dt_s < 0.0:
             raise InvalidValue(f"time cannot go back ({dt_s} s)")
         allowed_s = ANSWER_TIMEOUT_S + SLOWEST_PACE * dt_s
-        return float(self._ask("advance", allowed_s, dt_s=dt_s))
+        return float(self._ask("advance", dt_s, timeout_s=allowed_s))
 
-    def truth(self) -> dict[str, Any]:
-        """The true state: `VehicleHost.truth`, SI and radians, world frame."""
-        state: dict[str, Any] = self._ask("truth")
-        return state
-
-    def set_pose(
-        self,
-        position_m: tuple[float, float, float],
-        rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        *,
-        velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        hold: bool = False,
-    ) -> None:
-        """Put the vehicle somewhere; `hold` pins it there until `let_go`."""
-        self._ask(
-            "set_pose", position_m=position_m, rpy_rad=rpy_rad, velocity_mps=velocity_mps, hold=hold
-        )
-
-    def carry(self, stops: Sequence[Stop]) -> None:
-        """A hand takes it through all stops, and holds it at the last until `let_go`."""
-        self._ask("carry", stops=tuple(stops))
-
-    def let_go(self) -> None:
-        self._ask("let_go")
-
-    def set_battery(self, rest_v: float) -> None:
-        """Change the battery's resting voltage."""
-        self._ask("set_battery", rest_v=rest_v)
-
-    def push(self, force_n: tuple[float, float, float]) -> None:
-        """A constant outside force, world axes, until changed."""
-        self._ask("push", force_n=force_n)
-
-    def silence(self, duration_s: float) -> None:
-        """The link receives and sends nothing for `duration_s` of simulated time."""
-        self._ask("silence", duration_s=duration_s)
-
-    def capture_fault(self, fault: CaptureFault | None, for_s: float = math.inf) -> None:
-        """Something goes wrong in the motion capture for so long; None ends all that does."""
-        self._ask("capture_fault", fault=fault, for_s=for_s)
-
-    def reboot(self) -> None:
-        """Restart the firmware, as the power button does; log blocks are lost."""
-        self._ask("reboot")
-
-    def replace_vehicle(self, scenario: Scenario) -> None:
-        """A new vehicle under the same link; a client's log blocks go on."""
-        self._ask("replace_vehicle", scenario=scenario)
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name not in REQUESTS:
+            raise AttributeError(name)
+        return partial(self._ask, name)
 
     def stop(self) -> None:
         """End the vehicle's process. May be called twice."""
@@ -266,7 +224,7 @@ class SimProcess:
             return
         self._stopped = True
         with contextlib.suppress(PerchError):
-            self._ask("stop", _STOP_TIMEOUT_S)
+            self._ask("stop", timeout_s=_STOP_TIMEOUT_S)
         self._channel.close()
         end(self._child, _STOP_TIMEOUT_S)
         self._stderr.close()
@@ -282,10 +240,12 @@ class SimProcess:
     ) -> None:
         self.stop()
 
-    def _ask(self, name: str, timeout_s: float = ANSWER_TIMEOUT_S, **arguments: Any) -> Any:
+    def _ask(
+        self, name: str, *arguments: Any, timeout_s: float = ANSWER_TIMEOUT_S, **named: Any
+    ) -> Any:
         with self._lock:
             try:
-                self._channel.send((name, arguments))
+                self._channel.send((name, arguments, named))
                 good, result = self._channel.receive(timeout_s)
             except TimeoutError:
                 raise TimedOut(

@@ -1,0 +1,322 @@
+"""The simulated vehicle behind its link, its video and the room's motion capture: what runs in a
+process of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import select
+import signal
+import time
+from collections.abc import Callable
+from typing import Any, TextIO
+
+import cv2
+
+from perchctl.children import Channel, connect_back
+from perchctl.errors import PerchError
+from perchctl.geometry import rpy_from_rotation
+from perchctl.sim.bursts import radio_bursts
+from perchctl.sim.capture import CaptureFault, CaptureServer, SimCapture
+from perchctl.sim.crtp.server import CrtpServer
+from perchctl.sim.endpoint import Address, MjpegServer, UdpEndpoint
+from perchctl.sim.process import (
+    CLOCK_MARGIN_S,
+    LOOP_PATIENCE_S,
+    START_TIMEOUT_S,
+    HostSetup,
+    SharedTime,
+)
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.vehicle import SimulatedVehicle
+
+TRUTH_EVERY = 10  # control periods between two lines of the truth file
+
+
+class VehicleHost:
+    """One vehicle, its CRTP endpoint, its video stream and the server of a motion capture."""
+
+    def __init__(self, setup: HostSetup) -> None:
+        self._setup = setup
+        self._steps = 0
+        self.vehicle = self._new_vehicle(setup.scenario)
+        self.server = CrtpServer(self.vehicle.firmware, setup.link)
+        with contextlib.ExitStack() as opened:
+            use = opened.enter_context
+            bursts = radio_bursts(setup.scenario)
+            self.endpoint = use(contextlib.closing(UdpEndpoint(setup.link, bursts)))
+            self.stream: MjpegServer | None = None
+            if setup.camera is not None:
+                self.stream = use(contextlib.closing(MjpegServer()))
+            self.positions: CaptureServer | None = None
+            if setup.capture is not None:
+                self.positions = use(contextlib.closing(CaptureServer(setup.capture.names)))
+            self._truth: TextIO | None = None
+            if setup.truth_file is not None:
+                self._truth = use(setup.truth_file.open("w", encoding="utf-8"))
+            self._heard: TextIO | None = None
+            if setup.heard_file is not None:
+                self._heard = use(setup.heard_file.open("w", encoding="utf-8"))
+                self.endpoint.heard = self._write_heard
+            self._opened = opened.pop_all()
+
+    @property
+    def uri(self) -> str:
+        return f"udp://127.0.0.1:{self.endpoint.port}"
+
+    @property
+    def capture(self) -> tuple[str, str] | None:
+        """The motion capture's kind, as `motioncapture` calls it, and its address."""
+        return None if self.positions is None else (SimCapture.SYSTEM, self.positions.host)
+
+    @property
+    def elapsed_s(self) -> float:
+        """Simulated time since the start; unlike the firmware's, no reboot resets it."""
+        return self._steps * CONTROL_PERIOD_S
+
+    def serve(self) -> None:
+        """Answer what has arrived, without time passing; log data waits for the next step."""
+        self.endpoint.serve(self.server, self.elapsed_s)
+
+    def step(self) -> None:
+        """Packets that have arrived, one control period, then what is due to be sent."""
+        self.endpoint.serve(self.server, self.elapsed_s)
+        vehicle = self.vehicle
+        vehicle.step()
+        if vehicle.camera is not None and self.stream is not None:
+            for picture in vehicle.camera.take()[-1:]:
+                self.stream.publish(picture.image)
+        if vehicle.capture is not None and self.positions is not None:
+            for frame in vehicle.capture.take():
+                self.positions.publish(frame)
+        self._steps += 1
+        self.endpoint.send_due(self.server, self.elapsed_s)
+        if self._truth is not None and self._steps % TRUTH_EVERY == 0:
+            self._truth.write(json.dumps(self.truth()) + "\n")
+            self._truth.flush()
+
+    def advance(self, dt_s: float) -> float:
+        """Let `dt_s` pass; the simulated time since the start."""
+        for _ in range(round(dt_s / CONTROL_PERIOD_S)):
+            self.step()
+        return self.elapsed_s
+
+    def answer(self, name: str, *arguments: Any, **named: Any) -> Any:
+        """What the method gives: of this host, or `set_pose`, `carry` and `let_go` of its
+        world."""
+        of: Any = self.vehicle.world if hasattr(self.vehicle.world, name) else self
+        return getattr(of, name)(*arguments, **named)
+
+    def set_battery(self, rest_v: float) -> None:
+        """Change the battery's resting voltage."""
+        self.vehicle.world.battery_rest_v = rest_v
+
+    def push(self, force_n: tuple[float, float, float]) -> None:
+        """A constant outside force, world axes, until changed."""
+        self.vehicle.world.external_force_n = force_n
+
+    def silence(self, duration_s: float) -> None:
+        """The link receives and sends nothing for `duration_s` of simulated time."""
+        self.endpoint.silence(self.elapsed_s, duration_s)
+
+    def capture_fault(self, fault: CaptureFault | None, for_s: float = math.inf) -> None:
+        """Something goes wrong in the motion capture for so long; None ends all that does."""
+        capture = self.vehicle.capture
+        if capture is None:
+            raise RuntimeError("it was started without a motion capture")
+        if fault is None:
+            capture.heal()
+        else:
+            capture.lay(fault, for_s)
+
+    def reboot(self) -> None:
+        """Restart the firmware, as the power button does; log blocks are lost."""
+        self.server.reboot()
+
+    def truth(self) -> dict[str, Any]:
+        """The true state, SI and radians, and the firmware's outputs: no Crazyflie reports it."""
+        world, firmware = self.vehicle.world, self.vehicle.firmware
+        state = world.state()
+        return {
+            "t_s": self.elapsed_s,
+            "position_m": tuple(state.position_m.tolist()),
+            "velocity_mps": tuple(state.velocity_mps.tolist()),
+            "rpy_rad": rpy_from_rotation(state.R_world_body),
+            "specific_force_mps2": tuple(state.specific_force_mps2.tolist()),
+            "battery_v": world.battery_v,
+            "motors": tuple(int(firmware.log_value(f"motor.m{i}")) for i in (1, 2, 3, 4)),
+            "supervisor_info": firmware.supervisor_info,
+            "floor_contact": state.floor_contact,
+            "ceiling_force_n": state.ceiling_force_n,
+            "magnet_engaged": state.magnet_engaged,
+            "gear_miss_m": world.gear_miss_m(),
+        }
+
+    def replace_vehicle(self, scenario: Scenario) -> None:
+        """A new vehicle under the same link: connection and log blocks stay."""
+        self.vehicle = self._new_vehicle(scenario)
+        self.server.replace_firmware(self.vehicle.firmware, keep_blocks=True)
+
+    def close(self) -> None:
+        """Free the ports and close the files."""
+        self._opened.close()
+
+    def _write_heard(self, t_s: float, address: Address, datagram: bytes) -> None:
+        assert self._heard is not None
+        heard = {"t_s": t_s, "from": f"{address[0]}:{address[1]}", "packet": datagram.hex()}
+        self._heard.write(json.dumps(heard) + "\n")
+        self._heard.flush()
+
+    def _new_vehicle(self, scenario: Scenario) -> SimulatedVehicle:
+        setup = self._setup
+        return SimulatedVehicle(scenario, setup.camera, setup.target, setup.capture)
+
+
+# --- The child process: runs the vehicle that the parent describes ------------------------------
+
+
+def serve_parent() -> None:
+    """Run the vehicle that the parent describes, until it sends stop or is gone."""
+    cv2.setNumThreads(1)  # the picture must not take the physics' core
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    channel = connect_back()
+    setup = channel.receive(START_TIMEOUT_S)
+    realtime = setup.pace == "realtime"
+    try:
+        shared = SharedTime(setup.time_file)
+        host = VehicleHost(setup)
+    except (PerchError, OSError, ValueError) as error:
+        channel.send(f"{type(error).__name__}: {error}")
+        return
+    with contextlib.closing(host):
+        stream_url = host.stream.url if host.stream is not None else ""
+        channel.send((host.uri, stream_url, host.capture))
+        Runner(host, channel, realtime=realtime, linger_s=setup.linger_s, shared=shared).run()
+
+
+# --- How time passes in the simulated vehicle's process, and when it ends ----------------------
+# - real time: paced by the wall clock; catches up after a hiccup, never runs ahead. While a flight
+#   sets `SharedTime.limit_s`, it waits for the flight's loop instead;
+# - stepped: only the parent's `advance` moves time; between two of them the link is
+#   answered, so that cflib connects without simulated time passing.
+#
+# When the parent is gone, however it went, the vehicle flies on in real time for
+# `HostSetup.linger_s` and then ends, so that the firmware's reaction can be observed.
+
+
+MAX_LAG_S = 1.0
+"""A longer hiccup (a suspended computer) is cut off instead of being caught up with."""
+_IDLE_S = 0.25
+_BATCH = 50  # steps between two polls of the control connection while catching up
+
+
+class Runner:
+    """Runs one host until it is stopped or its parent has been gone for a while."""
+
+    def __init__(
+        self,
+        host: VehicleHost,
+        channel: Channel | None,
+        *,
+        realtime: bool,
+        linger_s: float,
+        clock: Callable[[], float] = time.monotonic,
+        shared: SharedTime | None = None,
+    ) -> None:
+        self._host = host
+        self._channel = channel
+        self._realtime = realtime
+        self._linger_s = linger_s
+        self._clock = clock
+        self._shared = shared or SharedTime()
+        self._waiting_since_s: float | None = None
+        self._limit_s = math.inf
+        self._parent = os.getppid()
+        self._end_s: float | None = None
+        self._stopped = False
+        self._origin_s = clock() - host.elapsed_s
+
+    def run(self) -> None:
+        while not self._stopped and not self._is_over():
+            self._wait(self.catch_up() if self._realtime else _IDLE_S)
+
+    def _restart_clock(self) -> None:
+        self._origin_s = self._clock() - self._host.elapsed_s
+
+    def catch_up(self) -> float:
+        """Step up to now, some steps at most at once; how long to wait for the next step."""
+        now_s = self._clock() - self._origin_s
+        max_lag_s = MAX_LAG_S if math.isinf(self._shared.limit_s) else CLOCK_MARGIN_S
+        if now_s - self._host.elapsed_s > max_lag_s:
+            self._origin_s += now_s - self._host.elapsed_s - max_lag_s
+            now_s = self._clock() - self._origin_s
+        for _ in range(_BATCH):
+            if self._host.elapsed_s + CONTROL_PERIOD_S > now_s:
+                break
+            if self._must_wait():
+                return CONTROL_PERIOD_S
+            self._host.step()
+            self._shared.reached_s = self._host.elapsed_s
+        next_s = self._origin_s + self._host.elapsed_s + CONTROL_PERIOD_S
+        return max(0.0, next_s - self._clock())
+
+    def _must_wait(self) -> bool:
+        """True while the flight's loop has not kept up, for `LOOP_PATIENCE_S` at most: what hangs
+        for good must not stop time."""
+        limit_s, before_s = self._shared.limit_s, self._limit_s
+        if self._host.elapsed_s < limit_s:
+            self._waiting_since_s = None
+            return False
+        now_s, self._limit_s = self._clock(), limit_s
+        if self._waiting_since_s is None or limit_s != before_s:
+            self._waiting_since_s = now_s  # the loop has given a sign of life
+        return now_s - self._waiting_since_s < LOOP_PATIENCE_S
+
+    def _wait(self, timeout_s: float) -> None:
+        sockets = [self._host.endpoint.socket]
+        if self._channel is not None:
+            sockets.append(self._channel.socket)
+        ready, _, _ = select.select(sockets, [], [], timeout_s)
+        if self._host.endpoint.socket in ready:
+            self._host.serve()
+        if self._channel is not None and self._channel.socket in ready:
+            self._answer(self._channel)
+
+    def _answer(self, channel: Channel) -> None:
+        """One request of the parent: (name, arguments, named ones) -> (True, result) or
+        (False, text)."""
+        try:
+            name, arguments, named = channel.receive()
+        except EOFError:
+            self._lose_parent()
+            return
+        answer: tuple[bool, Any] = True, None
+        try:
+            if name == "stop":
+                self._stopped = True
+            elif name == "advance" and self._realtime:
+                raise RuntimeError("only a stepped vehicle can be advanced")
+            else:
+                answer = True, self._host.answer(name, *arguments, **named)
+        except Exception as error:
+            answer = False, f"{type(error).__name__}: {error}"
+        try:
+            channel.send(answer)
+        except OSError:
+            self._lose_parent()
+
+    def _is_over(self) -> bool:
+        if self._channel is not None and os.getppid() != self._parent:
+            self._lose_parent()
+        return self._end_s is not None and self._clock() >= self._end_s
+
+    def _lose_parent(self) -> None:
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None
+        self._end_s = self._clock() + self._linger_s
+        self._realtime = True
+        self._shared = SharedTime()
+        self._restart_clock()

@@ -1,1 +1,0 @@
-"""The simulated vehicle as a process of its own: handle, child, host."""
