@@ -1,6 +1,7 @@
 from .cluster import cluster_pool as cluster_pool
 from .compare import VariantResult as VariantResult
-from .compare import compare_profiles as compare_profiles
+from .compare import compare_variants as compare_variants
+from .compare import comparison_text as comparison_text
 from .compare import fly_variants as fly_variants
 from .flights import LoggedFlight as LoggedFlight
 from .flights import fly_all as fly_all
@@ -22,4 +23,4 @@ from .results import rate_text as rate_text
 from .results_file import CampaignFlight as CampaignFlight
 from .results_file import CampaignResults as CampaignResults
 from .results_file import campaign_results as campaign_results
-from .sweep import sweep_grid as sweep_grid
+from .sweep import make_sweep as make_sweep

@@ -258,13 +258,13 @@ def compare(
     keys = {key: values for key, values in keys.items() if key not in _NO_DIFFERENCE}
 
     def report(results: list[campaigns.VariantResult], problem: PerchError | None) -> None:
-        found = campaigns.compare_profiles(names, results)
+        found = campaigns.compare_variants(results)
         if as_json:
             differences = {key: {"a": a, "b": b} for key, (a, b) in keys.items()}
-            record = {"a": profile_a, "b": profile_b, **found.record(), "profile": differences}
+            record = {"a": profile_a, "b": profile_b, **found, "profile": differences}
             print_record(with_problem(record, problem))
             return
-        print(found.text())
+        print(campaigns.comparison_text(names, found))
         for key, (a, b) in keys.items():
             print(f"differs: {key} is {a} in A, {b} in B")
         if not keys:
@@ -284,11 +284,8 @@ def compare(
 @reporting
 def sweep(
     values: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="KEY=VALUE,VALUE...",
-            help="A key of the profile with its values; two keys: each value with each.",
-        ),
+        str,
+        typer.Argument(metavar="KEY=VALUE,VALUE", help="A key of the profile with its values."),
     ],
     profile: ProfileOption = "sim",
     flights: FlightsOption = None,
@@ -298,21 +295,20 @@ def sweep(
     positioning: PositioningOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Fly the same seeds with several values of a profile's keys: which is the best."""
+    """Fly the same seeds with several values of a profile's key: which is the best."""
     _require_simulator()
-    grid = campaigns.sweep_grid(positioned(load_profile(profile), positioning), values)
-    profiles = [cell.profile for cell in grid.cells]
-    seeds = _seeds(flights, seed)
-    say(f"{len(profiles)} cells of {len(seeds)} seeds are {len(profiles) * len(seeds)} flights")
+    asked = campaigns.make_sweep(positioned(load_profile(profile), positioning), values)
+    seeds, cells = _seeds(flights, seed), len(asked.profiles)
+    say(f"{cells} cells of {len(seeds)} seeds are {cells * len(seeds)} flights")
 
     def report(results: list[campaigns.VariantResult], problem: PerchError | None) -> None:
-        found = grid.compared(results)
+        record = asked.record(results)
         if as_json:
-            print_record(with_problem(found.record(), problem))
+            print_record(with_problem(record, problem))
         else:
-            print(found.text(), flush=True)
+            print(asked.text(record), flush=True)
 
-    return _fly_by_each(profiles, seeds, jobs, cluster, report)
+    return _fly_by_each(asked.profiles, seeds, jobs, cluster, report)
 
 
 def _fly_by_each(
