@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,18 +36,6 @@ class VariantResult:
     @property
     def outcome(self) -> str:
         return self.result.outcome
-
-    @property
-    def badness(self) -> tuple[Any, ...]:
-        return self.result.badness
-
-    @property
-    def log(self) -> Path | None:
-        return self.result.log
-
-    @property
-    def log_problem(self) -> str | None:
-        return self.result.log_problem
 
 
 @dataclass(frozen=True)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Executor
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from perchctl.calibration import profile_camera
-from perchctl.campaign import fly_all, fly_measured, seed_log_path
+from perchctl.campaign import fly_measured, seed_log_path
 from perchctl.errors import PerchError
 from perchctl.faults import effects as e
 from perchctl.faults.bounds import DescentBound, PlaceBound, UnfeltDrift
@@ -288,6 +286,14 @@ def fly_fault_seed(
     return fly_measured(profile, seed, fly_drawn)
 
 
+def fly_fault_in_folder(
+    profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
+) -> FaultResult:
+    """`fly_fault_seed` with the log in a folder, if one is given."""
+    log = None if log_dir is None else seed_log_path(seed, log_dir)
+    return fly_fault_seed(profile, seed, faults, log, record)
+
+
 def _scenario_of(case: Case, scenario: Scenario) -> Scenario:
     if case.first_hold is not None:
         hold_n = case.first_hold * scenario.mass_kg * GRAVITY_MPS2
@@ -325,28 +331,3 @@ def _parameters(case: Case) -> dict[str, Any]:
     if case.first_hold is not None:
         found["first_hold"] = case.first_hold
     return found
-
-
-# --- Seeded flights, each with a fault out of a selection --------------------------------------
-
-
-def run_fault_campaign(
-    profile: Profile,
-    seeds: Iterable[int],
-    faults: tuple[str, ...],
-    executor: Executor | None = None,
-    on_result: Callable[[FaultResult], None] = lambda result: None,
-    log_dir: Path | None = None,
-    record: bool = False,
-) -> list[FaultResult]:
-    """Fly all seeds, as `perchctl.campaign.run_campaign` does."""
-    return fly_all(
-        partial(_fly_logged, profile, faults, log_dir, record), seeds, executor, on_result
-    )
-
-
-def _fly_logged(
-    profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
-) -> FaultResult:
-    log = None if log_dir is None else seed_log_path(seed, log_dir)
-    return fly_fault_seed(profile, seed, faults, log, record)

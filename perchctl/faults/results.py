@@ -79,12 +79,6 @@ class FaultResult:
         """True if a flag counts."""
         return bool(self.counted)
 
-    @property
-    def badness(self) -> tuple[bool, int, int, float]:
-        """The larger the worse: by the gravest flag that counts, by how many, then the misses."""
-        gravest = max((-FLAGS.index(flag) for flag in self.counted), default=-len(FLAGS))
-        return bool(self.counted), gravest, len(self.counted), self.miss_m or 0.0
-
 
 # --- A campaign's figures ----------------------------------------------------------------------
 
