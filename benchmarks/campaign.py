@@ -1,6 +1,6 @@
 """How fast simulated flights are, and where their time goes.
 
-    python benchmarks/campaign.py [--seeds 16] [--against DIR] [--memory 200]
+    python benchmarks/campaign.py [--seeds 16] [--against DIR]
 
 Each seed is flown by one process, then the seeds by two at a time; of each flight the simulated
 seconds a second of CPU time and of wall time. A further flight tells the share of each part.
@@ -28,7 +28,6 @@ from common import ROOT, table
 WORKER = Path(__file__).with_name("campaign_worker.py")
 HERE, THERE = "this code", "--against"
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-SHOWN_MEMORY = 8
 TURN_SEEDS = 4
 
 Flight = dict[str, Any]
@@ -75,18 +74,14 @@ def factors(flights: Sequence[Flight], by: str) -> list[float]:
     return [f["simulated_s"] / f[by] for f in flights]
 
 
-def one_at_a_time(workers: dict[str, Worker], seeds: range, passes: int) -> dict[str, list[Flight]]:
-    """In turns; of several passes the quickest of each seed."""
+def one_at_a_time(workers: dict[str, Worker], seeds: range) -> dict[str, list[Flight]]:
+    """In turns."""
     flights: dict[str, list[Flight]] = {name: [] for name in workers}
     for worker in workers.values():
         worker.fly(seeds[0])  # what a first flight loads and keeps
     for seed in seeds:
-        tries: dict[str, list[Flight]] = {name: [] for name in workers}
-        for _ in range(passes):
-            for name, worker in workers.items():
-                tries[name].append(worker.fly(seed))
-        for name, flown in tries.items():
-            flights[name].append(min(flown, key=lambda f: float(f["cpu_s"])))
+        for name, worker in workers.items():
+            flights[name].append(worker.fly(seed))
     return flights
 
 
@@ -164,26 +159,11 @@ def show_parts(workers: dict[str, Worker], seeds: Sequence[int]) -> None:
     table(f"CPU time by part, seeds {[*seeds]}", ("", *head), rows)
 
 
-def show_memory(checkout: Path, profile: str, flights: int) -> None:
-    """The most that one process has held, as its flights add up."""
-    worker = Worker(checkout, profile)
-    every = max(1, flights // SHOWN_MEMORY)
-    rows = []
-    for count in range(1, flights + 1):
-        flight = worker.fly(count - 1)
-        if count == 1 or count % every == 0 or count == flights:
-            rows.append((count, float(round(flight["peak_mb"]))))
-    worker.close()
-    table("peak memory of one process", ("flights", "MB"), rows)
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--profile", default="sim")
     parser.add_argument("--seeds", type=int, default=16, help="0 to this less one")
-    parser.add_argument("--passes", type=int, default=1, help="of one process; the quickest counts")
     parser.add_argument("--against", type=Path, metavar="DIR", help="another checkout")
-    parser.add_argument("--memory", type=int, default=0, metavar="FLIGHTS", help="in one process")
     parser.add_argument("--least", type=float, default=0.0, help="factor by CPU time")
     options = parser.parse_args()
     seeds = range(max(2, options.seeds))
@@ -191,7 +171,7 @@ def main() -> int:
     if options.against is not None:
         homes[THERE] = options.against.resolve()
     workers = {name: Worker(home, options.profile) for name, home in homes.items()}
-    flights = one_at_a_time(workers, seeds, max(1, options.passes))
+    flights = one_at_a_time(workers, seeds)
     rows = [row(name, 1, flown) for name, flown in flights.items()]
     pairs = {name: (workers[name], Worker(home, options.profile)) for name, home in homes.items()}
     paired = two_at_a_time(pairs, seeds)
@@ -208,8 +188,6 @@ def main() -> int:
     show_parts(workers, seeds[1:3] if len(seeds) > 2 else seeds)
     for worker in workers.values():
         worker.close()
-    if options.memory > 0:
-        show_memory(ROOT, options.profile, options.memory)
     return int(statistics.median(factors(flights[HERE], "cpu_s")) < options.least)
 
 

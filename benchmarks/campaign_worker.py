@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import importlib
 import json
-import resource
 import sys
 import time
 from collections.abc import Callable
@@ -102,22 +101,13 @@ class Stopwatch:
         return before
 
 
-def fly_seed() -> Any:
-    """The function that flies a seed, wherever this checkout has it."""
-    try:
-        from perchctl.campaign.flights import fly_seed
-    except ModuleNotFoundError:
-        from perchctl.flight.campaign import fly_seed
-    return fly_seed
-
-
-def flown(profile: Any, seed: int, by_parts: bool) -> dict[str, Any]:
+def flown(fly_seed: Any, profile: Any, seed: int, by_parts: bool) -> dict[str, Any]:
     """One flight, its times and what came of it."""
     watch = Stopwatch()
     before = watch.watch() if by_parts else []
     wall_s, cpu_s = time.perf_counter(), time.process_time()
     try:
-        result = fly_seed()(profile, seed)
+        result = fly_seed(profile, seed)
         watch._go_on()
     finally:
         for owner, name, function in before:
@@ -131,29 +121,22 @@ def flown(profile: Any, seed: int, by_parts: bool) -> dict[str, Any]:
         "simulated_s": result.time_s,
         "wall_s": wall_s,
         "cpu_s": cpu_s,
-        "peak_mb": _peak_mb(),
         "parts_s": watch.spent_s if by_parts else {},
     }
 
 
-def _peak_mb() -> float:
-    """In millions of bytes. On macOS it is counted in bytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return 1e-6 * peak * (1.0 if sys.platform == "darwin" else 1024.0)
-
-
 def main() -> None:
     import perchctl
+    from perchctl.campaign.flights import fly_seed
     from perchctl.profile import load_profile
 
-    fly_seed()  # what a process loads first
     profile = load_profile(sys.argv[1])
     home = str(Path(perchctl.__file__).resolve().parents[1])
     hello = {"home": home, "start_s": time.perf_counter() - STARTED_S}
     print(json.dumps(hello), flush=True)
     for line in sys.stdin:
         request = json.loads(line)
-        answer = flown(profile, int(request["seed"]), bool(request.get("parts")))
+        answer = flown(fly_seed, profile, int(request["seed"]), bool(request.get("parts")))
         print(json.dumps(answer), flush=True)
 
 

@@ -59,7 +59,7 @@ def test_a_note_stands_before_the_sentence_of_a_failure(
         ("--only 3 --out x.jsonl", ["--out x.jsonl does not apply"]),
         ("--resume", ["--resume", "--out"]),
         ("--keep failed", ["--keep", "--log-dir"]),
-        ("--keep best --log-dir x", ["--keep best", "all, failed and worst:N"]),
+        ("--keep best --log-dir x", ["--keep best", "all and failed"]),
     ],
 )
 def test_options_that_do_not_apply_are_refused(arguments: str, words: list[str]) -> None:

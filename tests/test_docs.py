@@ -20,7 +20,6 @@ from typer.testing import CliRunner
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration, write_recordings
-from perchctl.campaign import parse_address
 from perchctl.commands import app
 from perchctl.flight import fly_lockstep
 from perchctl.log import decode_line
@@ -103,8 +102,8 @@ def cheap(line: str) -> list[str]:
         case ["perchctl", "simulate"]:
             if "--cluster" in words:  # the form is looked at; a cluster of one is this computer's
                 at = words.index("--cluster")
-                place = parse_address(words[at + 1])
-                words[at : at + 2] = [] if place.scheduler else ["--cluster", "local:1"]
+                local = words[at + 1].startswith("local:")
+                words[at : at + 2] = ["--cluster", "local:1"] if local else []
             if words[2] == "compare":
                 words[3:5] = ["quick.yaml", "quick.yaml"]
             else:

@@ -1,24 +1,21 @@
 """The same seeds flown by several profiles: what differs between two, and whether it is proven.
 
 Each seed is its own pair, so what differs from seed to seed takes no part. A figure's difference
-is the mean over the pairs, with a bootstrap's interval (BCa, Efron 1987); success is compared by
-the pairs in which only one of both succeeded (McNemar's test, the exact one). All questions that
+is the mean over the pairs, with Student's interval; success is compared by the pairs in which only
+one of both succeeded (McNemar's test, the exact one). All questions that
 are asked together err together in one comparison of twenty at most: each gets its part of the 5 %.
 """
 
 from __future__ import annotations
 
-import math
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap
+from scipy.stats import binomtest, ttest_1samp
 
 from perchctl.campaign.flights import fly_all, fly_seed
 from perchctl.campaign.results import LEVEL, FlightResult, align_columns, rate_record, rate_text
@@ -39,18 +36,6 @@ class VariantResult:
     @property
     def outcome(self) -> str:
         return self.result.outcome
-
-    @property
-    def badness(self) -> tuple[Any, ...]:
-        return self.result.badness
-
-    @property
-    def log(self) -> Path | None:
-        return self.result.log
-
-    @property
-    def log_problem(self) -> str | None:
-        return self.result.log_problem
 
 
 @dataclass(frozen=True)
@@ -91,16 +76,29 @@ def whole_seeds(results: Iterable[VariantResult], profiles: int) -> list[tuple[F
     ]
 
 
+def compare_variants(results: Iterable[VariantResult]) -> Comparison:
+    """The comparison of two profiles, by the seeds that both have flown."""
+    return compare_pairs([(a, b) for a, b in whole_seeds(results, 2)])
+
+
 # --- What is compared --------------------------------------------------------------------------
 
 
+Pair = tuple[FlightResult, FlightResult]
+Comparison = dict[str, Any]
+"""What is known of two flights a seed, A's and B's, ready for JSON, in SI; `better` is "A", "B", or
+None where nothing is proven:
+
+- `flights`, and how many of them ended the same in all that a result tells, `identical`;
+- `success` (perched, neither locked nor fallen): the rates of `A` and `B`; the seeds of which only
+  one succeeded, `only_a` and `only_b`; the chance `p` that they split so unevenly, times the
+  questions that were asked; `better`;
+- for each figure the `pairs` that have it, its means `a` and `b`, their `difference` (B's less
+  A's) with its `interval` (None for fewer than `FEWEST_PAIRS`), and `better`.
+"""
 FEWEST_PAIRS = 20
-"""An interval of fewer would promise too much: of 8 pairs a bootstrap's is wrong five times as
-often as it says."""
-RESAMPLES, TAIL_RESAMPLES = 9999, 20
-"""At least, and so many beyond each end of an interval, of which the level may be high."""
-_MOST_AT_ONCE = 500
-_SEED = 0
+"""An interval of fewer would promise too much: differences have no normal law, and only the mean
+of many is near one."""
 _SAME = 1e-9
 """Values that differ by less of themselves do so by rounding."""
 NOT_PROVEN = "no difference proven"
@@ -118,266 +116,124 @@ class Figure:
     of: Callable[[FlightResult], float | None]
 
 
-def _perched_miss_m(result: FlightResult) -> float | None:
-    return result.miss_m if result.outcome == "perched" else None
-
-
-def _flown_s(result: FlightResult) -> float | None:
-    return result.time_s if result.outcome != "refused" else None
-
-
-def _attempts(result: FlightResult) -> float | None:
-    return float(result.attempts) if result.outcome != "refused" else None
-
-
-MISS = Figure("miss", "miss_m", "mm", 1e3, _perched_miss_m)
+MISS = Figure("miss", "miss_m", "mm", 1e3, lambda r: r.miss_m if r.outcome == "perched" else None)
 FIGURES = (
     MISS,
-    Figure("flight time", "time_s", "s", 1.0, _flown_s),
-    Figure("attempts", "attempts", "", 1.0, _attempts),
+    Figure("flight time", "time_s", "s", 1.0, lambda r: _flown(r, r.time_s)),
+    Figure("attempts", "attempts", "", 1.0, lambda r: _flown(r, r.attempts)),
 )
 
 
-@dataclass(frozen=True)
-class Difference:
-    """The difference of a figure, B's less A's, in SI.
-
-    Attributes:
-        pairs: the seeds of which both have the figure.
-        means: A's and B's over these; None without any.
-        interval: of the difference of the means; None for fewer than `FEWEST_PAIRS`.
-    """
-
-    figure: Figure
-    pairs: int
-    means: tuple[float, float] | None = None
-    interval: tuple[float, float] | None = None
-
-    @property
-    def mean(self) -> float | None:
-        return None if self.means is None else self.means[1] - self.means[0]
-
-    @property
-    def better(self) -> int | None:
-        """Which of both is proven to be better, 0 or 1; None where neither is."""
-        if self.interval is None or self.interval[0] <= 0.0 <= self.interval[1]:
-            return None
-        return int(self.interval[1] < 0.0)
-
-
-@dataclass(frozen=True)
-class Success:
-    """Flights that perched, and were neither locked nor fell.
-
-    Attributes:
-        flights: of each of both.
-        good: how many of A's and of B's did.
-        alone: seeds of which only A's did, and only B's.
-        p: that chance alone splits these so unevenly, times the questions that were asked.
-    """
-
-    flights: int
-    good: tuple[int, int]
-    alone: tuple[int, int]
-    p: float
-
-    @property
-    def better(self) -> int | None:
-        if self.p > 1.0 - LEVEL or self.alone[0] == self.alone[1]:
-            return None
-        return int(self.alone[1] > self.alone[0])
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """`identical`: the seeds whose two flights ended the same in all that a result tells."""
-
-    names: tuple[str, str]
-    success: Success
-    differences: tuple[Difference, ...]
-    identical: int
-
-    @property
-    def flights(self) -> int:
-        return self.success.flights
-
-    @property
-    def all_identical(self) -> bool:
-        return 0 < self.identical == self.flights
-
-    @property
-    def better(self) -> set[int]:
-        """Those of both that are proven to be better in something."""
-        found = {self.success.better, *(each.better for each in self.differences)}
-        return {which for which in found if which is not None}
-
-    def text(self) -> str:
-        """The comparison as a table, for people."""
-        return "\n".join(_lines(self))
-
-    def record(self) -> dict[str, Any]:
-        """For programs: SI; a difference is B's less A's, `better` "A", "B" or None."""
-        success = self.success
-        return {
-            "flights": self.flights,
-            "identical": self.identical,
-            "success": {
-                **{
-                    name: {"good": k, **rate_record(k, success.flights)}
-                    for name, k in zip("AB", success.good, strict=True)
-                },
-                "only_a": success.alone[0],
-                "only_b": success.alone[1],
-                "p": round(success.p, 9),
-                "better": _letter(success.better),
-            },
-            **{each.figure.key: _difference_record(each) for each in self.differences},
-        }
-
-
-def compare_profiles(names: tuple[str, str], results: Iterable[VariantResult]) -> Comparison:
-    """The comparison of two profiles, by the seeds that both have flown."""
-    return compare_pairs(names, [(a, b) for a, b in whole_seeds(results, len(names))])
+def _flown(result: FlightResult, value: float) -> float | None:
+    return None if result.outcome == "refused" else float(value)
 
 
 def compare_pairs(
-    names: tuple[str, str],
-    pairs: Sequence[tuple[FlightResult, FlightResult]],
-    figures: Sequence[Figure] = FIGURES,
-    times_asked: int = 1,
+    pairs: Sequence[Pair], figures: Sequence[Figure] = FIGURES, times_asked: int = 1
 ) -> Comparison:
     """The comparison of two flights a seed. `times_asked`: comparisons that are made together."""
     questions = times_asked * (1 + len(figures))
     level = 1.0 - (1.0 - LEVEL) / questions
-    return Comparison(
-        names,
-        _success(pairs, questions),
-        tuple(_difference(figure, pairs, level) for figure in figures),
-        sum(_ending(a) == _ending(b) for a, b in pairs),
-    )
-
-
-def _success(pairs: Sequence[tuple[FlightResult, FlightResult]], questions: int) -> Success:
-    alone = (
-        sum(b.is_bad and not a.is_bad for a, b in pairs),
-        sum(a.is_bad and not b.is_bad for a, b in pairs),
-    )
-    good = (sum(not a.is_bad for a, _ in pairs), sum(not b.is_bad for _, b in pairs))
-    p = float(binomtest(alone[0], sum(alone)).pvalue) if any(alone) else 1.0
-    return Success(len(pairs), good, alone, min(1.0, questions * p))
-
-
-def _difference(
-    figure: Figure, pairs: Sequence[tuple[FlightResult, FlightResult]], level: float
-) -> Difference:
-    both = [(figure.of(a), figure.of(b)) for a, b in pairs]
-    values = np.array([(a, b) for a, b in both if a is not None and b is not None])
-    if not len(values):
-        return Difference(figure, 0)
-    means = (float(values[:, 0].mean()), float(values[:, 1].mean()))
-    interval = None
-    if len(values) >= FEWEST_PAIRS:
-        interval = mean_interval(values[:, 1] - values[:, 0], level)
-    return Difference(figure, len(values), means, interval)
-
-
-def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
-    """The bootstrap's interval of the mean; the same for the same values."""
-    if np.ptp(values) <= _SAME * np.max(np.abs(values)):
-        return float(values[0]), float(values[0])
-    resamples = max(RESAMPLES, math.ceil(2 * TAIL_RESAMPLES / (1.0 - level)))
-    for method in ("BCa", "percentile"):
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")  # of values for which BCa has no answer
-            found = bootstrap(
-                (values,), np.mean, n_resamples=resamples, batch=_MOST_AT_ONCE, method=method,
-                confidence_level=level, rng=np.random.default_rng(_SEED),
-            ).confidence_interval  # fmt: skip
-        low, high = float(found.low), float(found.high)
-        if math.isfinite(low) and math.isfinite(high):
-            break
-    return low, high
+    return {
+        "flights": len(pairs),
+        "identical": sum(_ending(a) == _ending(b) for a, b in pairs),
+        "success": _success(pairs, questions),
+        **{figure.key: _difference(figure, pairs, level) for figure in figures},
+    }
 
 
 def _ending(r: FlightResult) -> tuple[Any, ...]:
     return r.outcome, r.reason, r.miss_m, r.time_s, r.attempts, r.locked, r.fell
 
 
-def _lines(found: Comparison) -> Iterator[str]:
-    a, b = found.names
-    success = found.success
-    n = success.flights
-    alone = f"only A {success.alone[0]}, only B {success.alone[1]}"
-    rate_a, rate_b = (rate_text(k, n) for k in success.good)
-    yield from align_columns(
-        [
-            ("", f"A: {a}", f"B: {b}", "B less A", ""),
-            ("success", rate_a, rate_b, alone, success_verdict(success)),
-            *(_cells(each) for each in found.differences),
-        ]
-    )
-    yield ""
-    if found.all_identical:
-        yield f"identical in all {n} flights"
-        return
-    if found.identical:
-        yield f"identical in {found.identical} of {n} flights"
-    yield (
-        f"the {1 + len(found.differences)} answers hold together at {100 * LEVEL:.0f} %: intervals "
-        f"of differences and p are widened for it"
-    )
-
-
-def _cells(each: Difference) -> tuple[str, str, str, str, str]:
-    figure = each.figure
-    unit = f" [{figure.unit}]" if figure.unit else ""
-    name = f"{figure.name}{unit}"
-    if each.means is None or each.mean is None:
-        return name, "-", "-", "-", NOT_PROVEN
-    a, b = (f"{figure.scale * mean:.2f}" for mean in each.means)
-    return name, a, b, _signed(each), difference_verdict(each)
-
-
-def _signed(each: Difference) -> str:
-    assert each.mean is not None
-    text = f"{each.figure.scale * each.mean:+.2f}"
-    if each.interval is None:
-        return text
-    low, high = (f"{each.figure.scale * bound:+.2f}" for bound in each.interval)
-    return f"{text} ({low} to {high})"
-
-
-def success_verdict(success: Success) -> str:
-    if success.better is None:
-        return f"{NOT_PROVEN} (p = {success.p:.2g})"
-    share = 100.0 * abs(success.good[1] - success.good[0]) / success.flights
-    return f"{'AB'[success.better]} is better by {share:.1f} % (p = {success.p:.2g})"
-
-
-def difference_verdict(each: Difference) -> str:
-    if each.mean is None or each.interval is None:
-        return f"{NOT_PROVEN}: {each.pairs} pairs, {FEWEST_PAIRS} are needed"
-    if each.better is None:
-        return NOT_PROVEN
-    unit = f" {each.figure.unit}" if each.figure.unit else ""
-    return f"{'AB'[each.better]} is better by {each.figure.scale * abs(each.mean):.2f}{unit}"
-
-
-def _difference_record(each: Difference) -> dict[str, Any]:
-    means = each.means or (None, None)
+def _success(pairs: Sequence[Pair], questions: int) -> dict[str, Any]:
+    only_a = sum(b.is_bad and not a.is_bad for a, b in pairs)
+    only_b = sum(a.is_bad and not b.is_bad for a, b in pairs)
+    p = float(binomtest(only_a, only_a + only_b).pvalue) if only_a + only_b else 1.0
+    p = min(1.0, questions * p)
+    better = None
+    if p <= 1.0 - LEVEL and only_a != only_b:
+        better = "B" if only_b > only_a else "A"
+    good_a, good_b = (sum(not pair[which].is_bad for pair in pairs) for which in (0, 1))
     return {
-        "pairs": each.pairs,
-        "a": _rounded(means[0]),
-        "b": _rounded(means[1]),
-        "difference": _rounded(each.mean),
-        "interval": None if each.interval is None else [_rounded(b) for b in each.interval],
-        "better": _letter(each.better),
+        "A": {"good": good_a, **rate_record(good_a, len(pairs))},
+        "B": {"good": good_b, **rate_record(good_b, len(pairs))},
+        "only_a": only_a,
+        "only_b": only_b,
+        "p": round(p, 9),
+        "better": better,
     }
 
 
-def _letter(which: int | None) -> str | None:
-    return None if which is None else "AB"[which]
+def _difference(figure: Figure, pairs: Sequence[Pair], level: float) -> dict[str, Any]:
+    both = [(figure.of(a), figure.of(b)) for a, b in pairs]
+    values = np.array([(a, b) for a, b in both if a is not None and b is not None])
+    found = dict.fromkeys(("a", "b", "difference", "interval", "better"))
+    if len(values):
+        a, b = map(float, values.mean(axis=0))
+        found |= {"a": round(a, 9), "b": round(b, 9), "difference": round(b - a, 9)}
+    if len(values) >= FEWEST_PAIRS:
+        low, high = mean_interval(values[:, 1] - values[:, 0], level)
+        better = None if low <= 0.0 <= high else "B" if high < 0.0 else "A"
+        found |= {"interval": [round(low, 9), round(high, 9)], "better": better}
+    return {"pairs": len(values), **found}
 
 
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 9)
+def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
+    """Student's interval of the mean."""
+    if np.ptp(values) <= _SAME * np.max(np.abs(values)):
+        return float(values[0]), float(values[0])
+    found = ttest_1samp(values, 0.0).confidence_interval(level)
+    return float(found.low), float(found.high)
+
+
+# --- For people --------------------------------------------------------------------------------
+
+
+def comparison_text(names: tuple[str, str], found: Comparison) -> str:
+    """The comparison as a table, and what is proven."""
+    flights, identical = found["flights"], found["identical"]
+    figures = [figure for figure in FIGURES if figure.key in found]
+    head = ("", f"A: {names[0]}", f"B: {names[1]}", "B less A", "")
+    rows = [head, _success_row(found["success"], flights)]
+    lines = align_columns(rows + [_figure_row(each, found[each.key]) for each in figures])
+    if 0 < identical == flights:
+        return "\n".join([*lines, "", f"identical in all {flights} flights"])
+    if identical:
+        lines += ["", f"identical in {identical} of {flights} flights"]
+    together = (
+        f"the {1 + len(figures)} answers hold together at {100 * LEVEL:.0f} %: intervals of "
+        f"differences and p are widened for it"
+    )
+    return "\n".join([*lines, "", together])
+
+
+def _success_row(success: Mapping[str, Any], flights: int) -> tuple[str, ...]:
+    good_a, good_b = success["A"]["good"], success["B"]["good"]
+    verdict = NOT_PROVEN
+    if success["better"] is not None:
+        share = 100.0 * abs(good_b - good_a) / flights
+        verdict = f"{success['better']} is better by {share:.1f} %"
+    return (
+        "success",
+        rate_text(good_a, flights),
+        rate_text(good_b, flights),
+        f"only A {success['only_a']}, only B {success['only_b']}",
+        f"{verdict} (p = {success['p']:.2g})",
+    )
+
+
+def _figure_row(figure: Figure, found: Mapping[str, Any]) -> tuple[str, ...]:
+    name = f"{figure.name} [{figure.unit}]" if figure.unit else figure.name
+    if not found["pairs"]:
+        return name, "-", "-", "-", NOT_PROVEN
+    a, b, difference = (figure.scale * found[key] for key in ("a", "b", "difference"))
+    text, verdict = f"{difference:+.2f}", NOT_PROVEN
+    if found["interval"] is None:
+        verdict += f": {found['pairs']} pairs, {FEWEST_PAIRS} are needed"
+    else:
+        low, high = (figure.scale * bound for bound in found["interval"])
+        text += f" ({low:+.2f} to {high:+.2f})"
+    if found["better"] is not None:
+        verdict = f"{found['better']} is better by {abs(difference):.2f} {figure.unit}".rstrip()
+    return name, f"{a:.2f}", f"{b:.2f}", text, verdict

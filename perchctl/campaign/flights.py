@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import gc
 import os
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 import cv2
 
-from perchctl.campaign.pool import defer_interrupts, give_back_memory, peak_memory_mb
-from perchctl.campaign.results import FlightEnd, FlightResult
+from perchctl.campaign.pool import FlightPool
+from perchctl.campaign.results import FlightEnd, FlightResult, peak_memory_mb
 from perchctl.errors import PerchError, SafetyAbort, TimedOut
 from perchctl.flight import LockstepFlight, fly_lockstep
 from perchctl.log import FlightSummary, LogWatcher
-from perchctl.mission import Event, EventKeeper, Phase, Watcher
+from perchctl.mission import Event, EventKeeper, Phase
 from perchctl.profile import Profile
 from perchctl.sim import Scenario, draw_scenario
 
@@ -35,6 +38,10 @@ OUTCOMES: dict[Phase, FlightEnd] = {
 }
 FLOWN_AGAIN = 2
 """Times that a flight may be lost with the process that flew it, and is flown again."""
+_POLL_S = 0.25
+
+
+# --- One flight --------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -47,14 +54,6 @@ class LoggedFlight:
     log: Path
     events: tuple[Event, ...]
 
-    @property
-    def log_problem(self) -> str | None:
-        return self.summary.log_problem
-
-    @property
-    def badness(self) -> tuple[bool]:
-        return (self.outcome != "perched",)
-
 
 def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R:
     """The result of `fly`, a dataclass, called with the seed's scenario on one core; completed by
@@ -65,9 +64,22 @@ def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R
     scenario = draw_scenario(profile, seed)
     result: Any = fly(scenario)
     cpu_s = time.process_time() - cpu_began_s
-    give_back_memory()
+    _give_back_memory()
     flown: R = replace(result, cpu_s=cpu_s, peak_memory_mb=peak_memory_mb(), scenario=scenario)
     return flown
+
+
+def _give_back_memory() -> None:
+    """Free what a flight leaves behind. Its objects refer to each other, so Python frees them when
+    it next looks through everything, which may be many flights later; and the C library keeps
+    what it gets back in pieces."""
+    gc.collect()
+    if not gc.get_freeze_count():
+        # What is left are the program's own modules and what it keeps for all flights: nothing
+        # to look through again and again, which takes as long as 30 pictures.
+        gc.freeze()
+    with contextlib.suppress(AttributeError, OSError):  # glibc has it, others do not
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def fly_seed(
@@ -84,11 +96,12 @@ def _fly(profile: Profile, seed: int, log_path: Path | None, record: bool) -> Fl
     began_s = time.perf_counter()
     log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
     try:
-        flight, summary = _flown(profile, seed, log)
+        flight = fly_lockstep(profile, seed, log)
     except (SafetyAbort, TimedOut) as error:
         if log is not None:
             log.abandon(str(error))
         return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False, 0.0)
+    summary = None if log is None else _closed(log, flight)
     return FlightResult(
         seed=seed,
         outcome=_outcome(flight),
@@ -109,22 +122,26 @@ def fly_logged(profile: Profile, folder: Path, seed: int, record: bool = False) 
     cv2.setNumThreads(1)
     log = LogWatcher.lockstep(seed_log_path(seed, folder), profile, seed, record)
     events = EventKeeper()
-    flight, summary = _flown(profile, seed, log, events)
+    flight = fly_lockstep(profile, seed, log, watchers=(events,))
+    summary = _closed(log, flight)
     assert summary is not None
     return LoggedFlight(seed, _outcome(flight), summary, log.path, tuple(events.seen))
 
 
-def _flown(
-    profile: Profile, seed: int, log: LogWatcher | None, *watchers: Watcher
-) -> tuple[LockstepFlight, FlightSummary | None]:
-    flight = fly_lockstep(profile, seed, log, watchers=watchers)
-    if log is None:
-        return flight, None
-    return flight, log.close(flight.report, flight.perched_miss_m, flight.fell)
+def _closed(log: LogWatcher, flight: LockstepFlight) -> FlightSummary | None:
+    return log.close(flight.report, flight.perched_miss_m, flight.fell)
 
 
 def _outcome(flight: LockstepFlight) -> FlightEnd:
     return OUTCOMES[flight.report.phase] if not flight.fell else "aborted"
+
+
+def seed_log_path(seed: int, log_dir: Path) -> Path:
+    """The file for a seed's log."""
+    return log_dir / f"flight_seed{seed}.jsonl"
+
+
+# --- Many flights ------------------------------------------------------------------------------
 
 
 def run_campaign(
@@ -136,17 +153,13 @@ def run_campaign(
     record: bool = False,
 ) -> list[FlightResult]:
     """Fly all seeds, as `fly_all` does; results in the order of the seeds."""
-    return fly_all(partial(_fly_in_folder, profile, log_dir, record), seeds, executor, on_result)
+    return fly_all(partial(fly_in_folder, profile, log_dir, record), seeds, executor, on_result)
 
 
-def _fly_in_folder(profile: Profile, log_dir: Path | None, record: bool, seed: int) -> FlightResult:
+def fly_in_folder(profile: Profile, log_dir: Path | None, record: bool, seed: int) -> FlightResult:
+    """`fly_seed` with the log in a folder, if one is given."""
     log_path = None if log_dir is None else seed_log_path(seed, log_dir)
     return fly_seed(profile, seed, log_path, record)
-
-
-def seed_log_path(seed: int, log_dir: Path) -> Path:
-    """The file for a seed's log."""
-    return log_dir / f"flight_seed{seed}.jsonl"
 
 
 def fly_all(
@@ -158,9 +171,10 @@ def fly_all(
     """`fly` of each seed, each once, in the order of the seeds; `on_result` as they are done.
 
     `executor` is anything with ``submit(fly, seed)`` that returns a future of
-    `concurrent.futures`' kind, or None to fly here. A flight whose future fails with
-    `BrokenExecutor` was lost with the process that flew it, and is flown again, `FLOWN_AGAIN`
-    times at most. Errors: PerchError.
+    `concurrent.futures`' kind, or None to fly here; a `FlightPool` gets no more flights at a time
+    than it has places. A flight whose future fails with `BrokenExecutor` (or another error of
+    `FlightPool.lost`), or is cancelled, was lost with the process that flew it, and is flown
+    again, `FLOWN_AGAIN` times at most. Errors: PerchError.
     """
     seeds = list(dict.fromkeys(seeds))
     by_seed: dict[K, R] = {}
@@ -169,20 +183,32 @@ def fly_all(
             by_seed[seed] = fly(seed)
             on_result(by_seed[seed])
         return list(by_seed.values())
-    ended: SimpleQueue[tuple[K, Future[R]]] = SimpleQueue()
-
-    def hand_over(*some: K) -> None:
-        with defer_interrupts():  # the executor may start processes as flights are handed to it
-            for seed in some:
-                _submitted(executor, fly, seed).add_done_callback(partial(_put, ended, seed))
-
-    hand_over(*seeds)
+    pool = executor if isinstance(executor, FlightPool) else None
+    lost_errors = FlightPool.lost if pool is None else pool.lost
+    waiting, flying = deque(seeds), 0
     lost: Counter[K] = Counter()
+    ended: SimpleQueue[tuple[K, Future[R]]] = SimpleQueue()
     while len(by_seed) < len(seeds):
-        seed, future = ended.get()
-        if _was_lost(future) and lost[seed] < FLOWN_AGAIN:
+        places = len(seeds) if pool is None else pool.places()
+        while waiting and flying < places:
+            seed = waiting.popleft()
+            future = _submitted(executor, fly, seed)
+            future.add_done_callback(partial(_put, ended, seed))
+            flying += 1
+        try:
+            seed, future = ended.get(timeout=_POLL_S)
+        except Empty:
+            continue
+        flying -= 1
+        was_lost = future.cancelled() or isinstance(future.exception(), lost_errors)
+        if was_lost and lost[seed] < FLOWN_AGAIN:
             lost[seed] += 1
-            hand_over(seed)
+            waiting.appendleft(seed)
+        elif was_lost:
+            raise PerchError(
+                f"the process that flew seed {seed} was ended from outside, {1 + FLOWN_AGAIN} "
+                f"times in all (where memory is short, fly fewer at a time: --jobs)"
+            )
         else:
             by_seed[seed] = result = _result(future, seed)
             on_result(result)
@@ -192,7 +218,7 @@ def fly_all(
 def _submitted(executor: Executor, fly: Callable[[K], R], seed: K) -> Future[R]:
     try:
         return executor.submit(fly, seed)
-    except BrokenExecutor as error:  # nobody is left who could fly it
+    except BrokenExecutor as error:  # the process was lost while it had no flight
         future: Future[R] = Future()
         future.set_exception(error)
         return future
@@ -202,18 +228,9 @@ def _put(ended: SimpleQueue[tuple[K, Future[R]]], seed: K, future: Future[R]) ->
     ended.put((seed, future))
 
 
-def _was_lost(future: Future[Any]) -> bool:
-    return future.cancelled() or isinstance(future.exception(), BrokenExecutor)
-
-
 def _result(future: Future[R], seed: K) -> R:
     try:
         return future.result()
-    except (BrokenExecutor, CancelledError):
-        raise PerchError(
-            f"the process that flew seed {seed} was ended from outside, {1 + FLOWN_AGAIN} times "
-            f"in all (where memory is short, fly fewer at a time: --jobs)"
-        ) from None
     except PerchError:
         raise
     except Exception as error:

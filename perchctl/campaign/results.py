@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import resource
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.special import betaincinv
 
-from perchctl.campaign.pool import peak_memory_mb
 from perchctl.errors import SafetyAbort
 from perchctl.sim import Scenario
 
@@ -19,13 +21,6 @@ ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
 WORST = 5
 """So many of the bad flights are named."""
 _SEVERITY: tuple[FlightEnd, ...] = ("perched", "refused", "landed", "aborted")
-
-
-class HasPeak(Protocol):
-    """The result of a flight in any kind of campaign."""
-
-    @property
-    def peak_memory_mb(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -65,13 +60,8 @@ class FlightResult:
 
     @property
     def is_bad(self) -> bool:
+        """True if it did not perch, is locked or fell."""
         return self.outcome != "perched" or self.locked or self.fell
-
-    @property
-    def badness(self) -> tuple[bool, int, bool, float]:
-        """The larger the worse: bad ones by their end, then the misses."""
-        harmed = self.locked or self.fell
-        return self.is_bad, _SEVERITY.index(self.outcome), harmed, self.miss_m or 0.0
 
 
 def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
@@ -104,10 +94,22 @@ def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
     }
 
 
-def peak_mb(results: Iterable[HasPeak]) -> float:
+def peak_mb(results: Iterable[Any]) -> float:
     """The most memory that any process of the campaign ever held (1e6 bytes): this one, and those
     that flew."""
-    return round(max([peak_memory_mb(), *(r.peak_memory_mb for r in results)]), 1)
+    peaks = (float(r.peak_memory_mb) for r in results)
+    return round(max([peak_memory_mb(), *peaks]), 1)
+
+
+def peak_memory_mb() -> float:
+    """The most memory that this process ever held (1e6 bytes)."""
+    # Linux hands a program the peak of the one that started it; its own stands elsewhere.
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024e-6
+    unit = 1 if sys.platform == "darwin" else 1024  # of getrusage, bytes
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit * 1e-6)
 
 
 def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
@@ -123,10 +125,6 @@ def none_took_off(results: Sequence[FlightResult]) -> SafetyAbort | None:
         return None
     first = min(results, key=lambda r: r.seed)
     return SafetyAbort(f"every flight was refused before take-off: {first.reason}")
-
-
-def _miss_m(result: FlightResult) -> float:
-    return result.miss_m or 0.0
 
 
 def _rounded(value: Any) -> float:
@@ -177,7 +175,9 @@ def _rows(figures: Mapping[str, Any], results: Sequence[FlightResult]) -> list[t
     miss = figures["miss_m"]
     if miss["max"] is not None:
         text = ", ".join(f"{k} {miss[k] * 1e3:.1f}" for k in ("median", "p95", "max"))
-        farthest = max((r for r in results if r.outcome == "perched"), key=_miss_m)
+        farthest = max(
+            (r for r in results if r.outcome == "perched"), key=lambda r: r.miss_m or 0.0
+        )
         rows.append(("miss [mm]", f"{text} (seed {farthest.seed})"))
     flown = [r for r in results if r.outcome != "refused"]
     if flown:
@@ -199,12 +199,7 @@ LEVEL = 0.95
 
 def rate_interval(k: int, n: int, level: float = LEVEL) -> tuple[float, float]:
     """Where the true rate is after `k` of `n`: the exact interval of Clopper and Pearson (1934),
-    which holds it in at least `level` of all campaigns; half of the rest is on either side.
-    Nothing seen is (0, 1). Raises ValueError where `k` of `n` cannot be."""
-    if not 0 <= k <= n:
-        raise ValueError(f"{k} of {n} is no rate")
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"a level is between 0 and 1, found {level}")
+    which holds it in at least `level` of all campaigns; half of the rest is on either side."""
     side = 0.5 * (1.0 - level)
     low = float(betaincinv(k, n - k + 1, side)) if k else 0.0
     high = float(betaincinv(k + 1, n - k, 1.0 - side)) if k < n else 1.0

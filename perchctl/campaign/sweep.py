@@ -1,10 +1,10 @@
-"""One or two keys of a profile at several values each, over the same seeds."""
+"""A key of a profile at several values, over the same seeds."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,12 +12,9 @@ import numpy as np
 
 from perchctl.campaign.compare import (
     MISS,
-    NOT_PROVEN,
-    Comparison,
     VariantResult,
     compare_pairs,
-    difference_verdict,
-    success_verdict,
+    comparison_text,
     whole_seeds,
 )
 from perchctl.campaign.results import FlightResult, align_columns, rate_record, rate_text
@@ -25,198 +22,97 @@ from perchctl.errors import InvalidValue, UsageError
 from perchctl.plain_yaml import clip_text, split_values
 from perchctl.profile import Profile, changed_profile, profile_value, scalar_text
 
-MOST_KEYS = 2
-
 
 @dataclass(frozen=True)
-class Cell:
-    """`texts`: the value of each key. `own`: these are the profile's own values."""
+class Sweep:
+    """The profiles with each value of a key, `texts`, of which number `own` is the profile's own:
+    the last one where it is none of those that were asked for."""
 
+    key: str
     texts: tuple[str, ...]
-    profile: Profile
-    own: bool = False
+    profiles: tuple[Profile, ...]
+    own: int
+
+    def record(self, results: Iterable[VariantResult]) -> dict[str, Any]:
+        """The figures of each value (a cell), by the seeds that were flown with every value: for
+        programs, in SI. `best`: the value with the most successes, of these the one with the
+        smallest median miss; `best_against_own` is the `Comparison` of the own value, A, with it,
+        None where they are the same. What is proven there counts that it was picked out of all."""
+        seeds = whole_seeds(results, len(self.profiles))
+        by_cell = list(zip(*seeds, strict=True)) or [()] * len(self.profiles)
+        cells = [
+            {"values": {self.key: profile_value(profile, self.key)}, "own": number == self.own}
+            | _figures(by_cell[number])
+            for number, profile in enumerate(self.profiles)
+        ]
+        best = min(range(len(cells)), key=lambda n: (*_rank(cells[n]), n != self.own, n))
+        against = None
+        if best != self.own:
+            pairs = list(zip(by_cell[self.own], by_cell[best], strict=True))
+            against = compare_pairs(pairs, (MISS,), times_asked=len(cells) - 1)
+        return {"cells": cells, "best": cells[best]["values"], "best_against_own": against}
+
+    def text(self, record: dict[str, Any]) -> str:
+        """The table of a sweep's `record`, and how the best value compares, for people."""
+        rows = [(self.key, "success", "miss [mm]: median", "p95", "")]
+        for text, cell in zip(self.texts, record["cells"], strict=True):
+            is_best = cell["values"] == record["best"]
+            notes = [word for word, on in (("best", is_best), ("own", cell["own"])) if on]
+            misses = (_mm(cell["miss_m"]["median"]), _mm(cell["miss_m"]["p95"]))
+            rate = rate_text(cell["good"], cell["flights"])
+            rows.append((text, rate, *misses, ", ".join(notes)))
+        lines = [*align_columns(rows), ""]
+        if not record["cells"][0]["flights"]:
+            return "\n".join([*lines, "no seed was flown with every value: nothing can be said"])
+        if record["best_against_own"] is None:
+            return "\n".join([*lines, "the profile's own value is the best"])
+        counted = f"the best was picked out of {len(rows) - 1}, which is counted:"
+        table = comparison_text(("own", "best"), record["best_against_own"])
+        return "\n".join([*lines, counted, table])
 
 
-@dataclass(frozen=True)
-class Grid:
-    """`cells`: each value of one key with each of the other, and the profile's own values at the
-    end where they are none of these."""
-
-    keys: tuple[str, ...]
-    cells: tuple[Cell, ...]
-
-    @property
-    def own(self) -> int:
-        return next(number for number, cell in enumerate(self.cells) if cell.own)
-
-    def name(self, number: int) -> str:
-        texts = zip(self.keys, self.cells[number].texts, strict=True)
-        return ", ".join(f"{key}={text}" for key, text in texts)
-
-    def compared(self, results: Iterable[VariantResult]) -> Swept:
-        """The figures of all cells, by the seeds that were flown in every cell."""
-        return sweep_results(self, whole_seeds(results, len(self.cells)))
-
-
-def sweep_grid(profile: Profile, sweeps: Sequence[str]) -> Grid:
-    """The grid of each ``key=value,value``; the values as in a profile's file. Errors: UsageError,
+def make_sweep(profile: Profile, sweep: str) -> Sweep:
+    """The sweep of ``key=value,value``; the values as in a profile's file. Errors: UsageError,
     InvalidValue."""
-    if len(sweeps) > MOST_KEYS:
-        raise UsageError(
-            f"{len(sweeps)} keys are given: a sweep takes one or two, each value with each"
-        )
-    keys, texts = zip(*map(_split, sweeps), strict=True)
-    if len(set(keys)) < len(keys):
-        raise UsageError(f"{keys[0]} is given twice: give all its values at once")
-    cells = []
-    for row in itertools.product(*texts):
-        settings = [f"{key}={text}" for key, text in zip(keys, row, strict=True)]
-        swept = changed_profile(profile, settings, "sweep")
-        cells.append(Cell(row, swept, swept == changed_profile(profile, ())))
-    if not any(cell.own for cell in cells):
-        own = tuple(scalar_text(profile_value(profile, key)) for key in keys)
-        cells.append(Cell(own, profile, True))
-    for one, other in itertools.combinations(cells, 2):
-        if one.profile == other.profile:
-            raise UsageError(f"sweep: {_row(one)} and {_row(other)} are the same: keep one")
-    return Grid(keys, tuple(cells))
-
-
-def _split(sweep: str) -> tuple[str, tuple[str, ...]]:
-    key, equals, text = sweep.partition("=")
+    key, equals, text = (part.strip() for part in sweep.partition("="))
     try:
-        parts = split_values(text)
+        texts = list(split_values(text))
     except ValueError as error:
         raise InvalidValue(f"sweep {clip_text(sweep)}: {error}") from None
-    if not equals or not key.strip() or not parts:
+    if not equals or not key or not texts:
         raise UsageError(
             f"{clip_text(sweep)} must be KEY=VALUE,VALUE with a key of the profile, as in "
             f"planner.align.xy_m=0.02,0.04"
         )
-    return key.strip(), tuple(parts)
+    profiles = [changed_profile(profile, [f"{key}={text}"], "sweep") for text in texts]
+    for (n, one), (m, other) in itertools.combinations(enumerate(profiles), 2):
+        if one == other:
+            raise UsageError(f"sweep: {texts[n]} and {texts[m]} are the same: keep one")
+    own = changed_profile(profile, ())
+    number = profiles.index(own) if own in profiles else len(profiles)
+    if own not in profiles:
+        profiles.append(profile)
+        texts.append(scalar_text(profile_value(profile, key)))
+    return Sweep(key, tuple(texts), tuple(profiles), number)
 
 
-def _row(cell: Cell) -> str:
-    return " with ".join(cell.texts)
-
-
-@dataclass(frozen=True)
-class Figures:
-    """Figures of one cell's flights; misses are those of the perched ones, None without any."""
-
-    flights: int
-    good: int
-    median_m: float | None
-    p95_m: float | None
-
-
-@dataclass(frozen=True)
-class Swept:
-    """`best`: the cell with the most successes, of these the one with the smallest median miss.
-    `against_own`: the profile's own values (A) against these (B); None where they are the same.
-    What is proven there counts that the best was picked out of all cells."""
-
-    grid: Grid
-    figures: tuple[Figures, ...]
-    best: int
-    against_own: Comparison | None
-
-    def text(self) -> str:
-        """The table of a sweep, and the best of its values, for people."""
-        return "\n".join(_lines(self))
-
-    def record(self) -> dict[str, Any]:
-        """For programs: SI; `values` as the profile has them."""
-        cells = [
-            {
-                "values": {key: profile_value(cell.profile, key) for key in self.grid.keys},
-                "own": cell.own,
-                "flights": figures.flights,
-                "good": figures.good,
-                **rate_record(figures.good, figures.flights),
-                "miss_m": {"median": _rounded(figures.median_m), "p95": _rounded(figures.p95_m)},
-            }
-            for cell, figures in zip(self.grid.cells, self.figures, strict=True)
-        ]
-        against = None if self.against_own is None else self.against_own.record()
-        return {"cells": cells, "best": cells[self.best]["values"], "best_against_own": against}
-
-
-def sweep_results(grid: Grid, seeds: Sequence[tuple[FlightResult, ...]]) -> Swept:
-    """The sweep's figures from each seed's flights, one a cell."""
-    by_cell = list(zip(*seeds, strict=True)) or [()] * len(grid.cells)
-    figures = tuple(map(_figures, by_cell))
-    best = min(range(len(figures)), key=lambda n: (*_rank(figures[n]), n != grid.own, n))
-    against = None
-    if best != grid.own:
-        pairs = list(zip(by_cell[grid.own], by_cell[best], strict=True))
-        names = (grid.name(grid.own), grid.name(best))
-        against = compare_pairs(names, pairs, (MISS,), times_asked=len(figures) - 1)
-    return Swept(grid, figures, best, against)
-
-
-def _figures(results: Sequence[FlightResult]) -> Figures:
-    found = [miss for r in results if (miss := MISS.of(r)) is not None]
+def _figures(results: Sequence[FlightResult]) -> dict[str, Any]:
+    """Figures of one value's flights; misses are those of the perched ones, None without any."""
+    misses = [miss for r in results if (miss := MISS.of(r)) is not None]
     good = sum(not r.is_bad for r in results)
-    if not found:
-        return Figures(len(results), good, None, None)
-    median_m, p95_m = (float(np.percentile(found, percent)) for percent in (50, 95))
-    return Figures(len(results), good, median_m, p95_m)
+    median_m, p95_m = np.percentile(misses, (50, 95)).round(6).tolist() if misses else (None, None)
+    return {
+        "flights": len(results),
+        "good": good,
+        **rate_record(good, len(results)),
+        "miss_m": {"median": median_m, "p95": p95_m},
+    }
 
 
-def _rank(figures: Figures) -> tuple[float, float]:
-    return -figures.good, math.inf if figures.median_m is None else figures.median_m
-
-
-def _lines(found: Swept) -> Iterator[str]:
-    grid = found.grid
-    rows = [(*grid.keys, "success", "miss [mm]: median", "p95", "")]
-    for number, (cell, figures) in enumerate(zip(grid.cells, found.figures, strict=True)):
-        notes = [word for word, on in (("best", number == found.best), ("own", cell.own)) if on]
-        rows.append(
-            (
-                *cell.texts,
-                rate_text(figures.good, figures.flights),
-                _mm(figures.median_m),
-                _mm(figures.p95_m),
-                ", ".join(notes),
-            )
-        )
-    yield from align_columns(rows)
-    yield ""
-    yield f"best:  {grid.name(found.best)}"
-    yield f"own:   {grid.name(grid.own)}"
-    yield _verdict(found)
-
-
-def _verdict(found: Swept) -> str:
-    against = found.against_own
-    if not found.figures[0].flights:
-        return "no seed was flown in every cell: nothing can be said"
-    if against is None:
-        return "the profile's own values are the best"
-    if against.all_identical:
-        return f"the flights of both are identical, all {against.flights}"
-    miss = against.differences[0]
-    said = [
-        f"{name}, {verdict}"
-        for name, better, verdict in (
-            ("success", against.success.better, success_verdict(against.success)),
-            ("miss", miss.better, difference_verdict(miss)),
-        )
-        if better is not None
-    ]
-    asked = f"counting that it was picked out of {len(found.figures)}"
-    if not said:
-        return f"of the best against the profile's own values: {NOT_PROVEN}, {asked}"
-    return f"proven of the profile's own values (A) against the best (B), {asked}: " + "; ".join(
-        said
-    )
+def _rank(cell: dict[str, Any]) -> tuple[float, float]:
+    median_m = cell["miss_m"]["median"]
+    return -cell["good"], math.inf if median_m is None else median_m
 
 
 def _mm(value_m: float | None) -> str:
     return "-" if value_m is None else f"{1e3 * value_m:.1f}"
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 6)

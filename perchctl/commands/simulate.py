@@ -13,7 +13,7 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Protocol, TypeVar
 
 import typer
 
@@ -50,10 +50,22 @@ from perchctl.errors import (
 from perchctl.log import make_log_folder, summary_text, to_plain
 from perchctl.profile import Profile, load_profile
 
-R = TypeVar("R", bound="campaigns.CampaignFlight")
+R = TypeVar("R", bound="_Flown")
+C = TypeVar("C", bound="campaigns.CampaignFlight")
 AGAIN_S = 0.5
 """A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
 _NO_DIFFERENCE = ("name", "description", "date")
+
+
+class _Flown(Protocol):
+    """A flight's result, of whatever kind."""
+
+    @property
+    def seed(self) -> int: ...
+
+    @property
+    def outcome(self) -> str: ...
+
 
 FlightsOption = Annotated[
     int | None, typer.Option("-n", "--flights", min=1, help="How many; 10 by default.")
@@ -123,7 +135,7 @@ def run(
         str | None,
         typer.Option(
             "--keep",
-            metavar="all|failed|worst:N",
+            metavar="all|failed",
             help="Of the logs in --log-dir; all by default.",
             rich_help_panel="Files",
         ),
@@ -159,6 +171,8 @@ def run(
             f"{'--record' if record else '--keep'} concerns the logs of the flights: name their "
             f"folder with --log-dir"
         )
+    if keep not in (None, "all", "failed"):
+        raise UsageError(f"--keep {keep}: allowed are all and failed")
     if resume and out is None:
         raise UsageError("--resume goes on with a file of results: name it with --out")
     if out is not None and out.suffix != ".jsonl":
@@ -169,56 +183,48 @@ def run(
     if cluster is not None and log_dir is not None:
         log_dir = log_dir.absolute()  # workers are started in other folders
     seeds = _seeds(flights, seed)
+    names = None
+    if faults is not None:
+        names = tuple(fault.name for fault in fault_campaigns.select_faults(faults))
+    folder = log_dir or Path(flown.log.directory)
     executor = executor_of(jobs, cluster, [flown], log_dir)
-    files: dict[str, Any] = {
-        "out": out, "resume": resume, "force": force, "keep": keep, "log_dir": log_dir,
-    }  # fmt: skip
-    with signals_to(stop_once()):
-        if faults is not None:
-            names = tuple(fault.name for fault in fault_campaigns.select_faults(faults))
-            if only is not None:
-                folder = log_dir or Path(flown.log.directory)
-                return _fly_fault(flown, only, names, folder, record, as_json)
-            with campaigns.campaign_results(
-                flown, seeds, fault_campaigns.FaultResult, faults=names, **files
-            ) as faulty:
-                return fly_each(
-                    lambda executor, note: fault_campaigns.run_fault_campaign(
-                        flown, faulty.left, names, executor, note, log_dir, record
-                    ),
-                    partial(
-                        _report,
-                        fault_campaigns.fault_summary,
-                        fault_campaigns.fault_table,
-                        as_json,
-                        log_dir,
-                        keep,
-                    ),
-                    len(seeds),
-                    executor,
-                    faulty,
-                )
-        if only is not None:
-            folder = log_dir or Path(flown.log.directory)
-            return _fly_only(flown, only, folder, record, as_json)
-        with campaigns.campaign_results(flown, seeds, campaigns.FlightResult, **files) as kept:
+
+    def fly_campaign(
+        kind: type[C],
+        fly: Callable[[int], C],
+        summary: Callable[[list[C]], Mapping[str, Any]],
+        table: Callable[[list[C]], str],
+        objection: Callable[[list[C]], PerchError | None] = lambda results: None,
+    ) -> int:
+        with campaigns.campaign_results(
+            flown, seeds, kind, faults=names, out=out, resume=resume, force=force, log_dir=log_dir,
+            failed_logs_only=keep == "failed",
+        ) as kept:  # fmt: skip
             return fly_each(
-                lambda executor, note: campaigns.run_campaign(
-                    flown, kept.left, executor, note, log_dir, record
-                ),
-                partial(
-                    _report,
-                    campaigns.campaign_summary,
-                    campaigns.campaign_table,
-                    as_json,
-                    log_dir,
-                    keep,
-                ),
-                len(seeds),
-                executor,
-                kept,
-                campaigns.none_took_off,
+                lambda executor, note: campaigns.fly_all(fly, kept.left, executor, note),
+                partial(_report, summary, table, as_json, log_dir, keep),
+                len(seeds), executor, kept.earlier, kept.note, objection,
+            )  # fmt: skip
+
+    with signals_to(stop_once()):
+        if only is not None and names is not None:
+            return _fly_fault(flown, only, names, folder, record, as_json)
+        if only is not None:
+            return _fly_only(flown, only, folder, record, as_json)
+        if names is not None:
+            return fly_campaign(
+                fault_campaigns.FaultResult,
+                partial(fault_campaigns.fly_fault_in_folder, flown, names, log_dir, record),
+                fault_campaigns.fault_summary,
+                fault_campaigns.fault_table,
             )
+        return fly_campaign(
+            campaigns.FlightResult,
+            partial(campaigns.fly_in_folder, flown, log_dir, record),
+            campaigns.campaign_summary,
+            campaigns.campaign_table,
+            campaigns.none_took_off,
+        )
 
 
 @app.command(
@@ -258,13 +264,13 @@ def compare(
     keys = {key: values for key, values in keys.items() if key not in _NO_DIFFERENCE}
 
     def report(results: list[campaigns.VariantResult], problem: PerchError | None) -> None:
-        found = campaigns.compare_profiles(names, results)
+        found = campaigns.compare_variants(results)
         if as_json:
             differences = {key: {"a": a, "b": b} for key, (a, b) in keys.items()}
-            record = {"a": profile_a, "b": profile_b, **found.record(), "profile": differences}
+            record = {"a": profile_a, "b": profile_b, **found, "profile": differences}
             print_record(with_problem(record, problem))
             return
-        print(found.text())
+        print(campaigns.comparison_text(names, found))
         for key, (a, b) in keys.items():
             print(f"differs: {key} is {a} in A, {b} in B")
         if not keys:
@@ -284,11 +290,8 @@ def compare(
 @reporting
 def sweep(
     values: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="KEY=VALUE,VALUE...",
-            help="A key of the profile with its values; two keys: each value with each.",
-        ),
+        str,
+        typer.Argument(metavar="KEY=VALUE,VALUE", help="A key of the profile with its values."),
     ],
     profile: ProfileOption = "sim",
     flights: FlightsOption = None,
@@ -298,21 +301,20 @@ def sweep(
     positioning: PositioningOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Fly the same seeds with several values of a profile's keys: which is the best."""
+    """Fly the same seeds with several values of a profile's key: which is the best."""
     _require_simulator()
-    grid = campaigns.sweep_grid(positioned(load_profile(profile), positioning), values)
-    profiles = [cell.profile for cell in grid.cells]
-    seeds = _seeds(flights, seed)
-    say(f"{len(profiles)} cells of {len(seeds)} seeds are {len(profiles) * len(seeds)} flights")
+    asked = campaigns.make_sweep(positioned(load_profile(profile), positioning), values)
+    seeds, cells = _seeds(flights, seed), len(asked.profiles)
+    say(f"{cells} cells of {len(seeds)} seeds are {cells * len(seeds)} flights")
 
     def report(results: list[campaigns.VariantResult], problem: PerchError | None) -> None:
-        found = grid.compared(results)
+        record = asked.record(results)
         if as_json:
-            print_record(with_problem(found.record(), problem))
+            print_record(with_problem(record, problem))
         else:
-            print(found.text(), flush=True)
+            print(asked.text(record), flush=True)
 
-    return _fly_by_each(profiles, seeds, jobs, cluster, report)
+    return _fly_by_each(asked.profiles, seeds, jobs, cluster, report)
 
 
 def _fly_by_each(
@@ -369,7 +371,6 @@ def executor_of(
             f"--cluster {cluster} flies as many at a time as it has workers: --jobs {jobs} does "
             f"not apply; leave it out, or --cluster"
         )
-    address = campaigns.parse_address(cluster)
     if find_spec("distributed") is None:
         raise no_cluster()
 
@@ -384,7 +385,7 @@ def executor_of(
                 from perchctl.campaign import cluster_pool
         except ImportError as error:
             raise no_cluster(str(error)) from error
-        with cluster_pool(address, profiles, log_dir) as pool:
+        with cluster_pool(cluster, profiles, log_dir) as pool:
             for note in pool.notes:
                 say(note)
             yield pool
@@ -397,18 +398,19 @@ def fly_each(
     report: Callable[[list[R], PerchError | None], None],
     total: int,
     executor_of: ExecutorOf,
-    kept: campaigns.CampaignResults[R] | None = None,
+    earlier: Sequence[R] = (),
+    keep: Callable[[R], None] = lambda result: None,
     objection: Callable[[list[R]], PerchError | None] = lambda results: None,
 ) -> int:
     """Fly a campaign of `total` flights, and report those that were flown, however it ends: also
     by Ctrl-C, or when a flight fails. Returns the exit code.
 
     `campaign` gets who flies, and the function to call with each result; `report` gets the
-    results, and why not all were flown. `kept`: those that were flown before, which count, too,
-    and where each goes. `objection`: what all of them together amount to. Errors: PerchError if
-    none was flown.
+    results, and why not all were flown. `earlier`: those that were flown before, which count, too;
+    `keep` writes each of the others. `objection`: what all of them together amount to. Errors:
+    PerchError if none was flown.
     """
-    results: list[R] = [] if kept is None else list(kept.earlier)
+    results = list(earlier)
     problem: PerchError | None = None
     begun = False
     try:
@@ -422,8 +424,7 @@ def fly_each(
             def note(result: R) -> None:
                 with campaigns.defer_interrupts():
                     results.append(result)
-                    if kept is not None:
-                        kept.note(result)
+                    keep(result)
                     advance(result)
 
             campaign(executor, note)
@@ -474,12 +475,12 @@ def with_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[
 
 
 def _report(
-    summary: Callable[[list[R]], Mapping[str, Any]],
-    table: Callable[[list[R]], str],
+    summary: Callable[[list[C]], Mapping[str, Any]],
+    table: Callable[[list[C]], str],
     as_json: bool,
     log_dir: Path | None,
     keep: str | None,
-    results: list[R],
+    results: list[C],
     problem: PerchError | None,
 ) -> None:
     if as_json:
@@ -549,10 +550,9 @@ def _fly_fault(
         elif plot is not None:
             print(f"{'plot':<18} {plot}")
 
+    fly = partial(fault_campaigns.fly_fault_in_folder, profile, faults, folder, record)
     return fly_each(
-        lambda executor, note: fault_campaigns.run_fault_campaign(
-            profile, [seed], faults, executor, note, folder, record
-        ),
+        lambda executor, note: campaigns.fly_all(fly, [seed], executor, note),
         report,
         1,
         executor_of(None, None, [profile]),

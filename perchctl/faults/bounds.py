@@ -9,21 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from perchctl.faults.effects import (
-    BlockDead,
-    CameraFault,
-    DeckSilent,
-    Effect,
-    EstimateError,
-    ExternalPositions,
-    Hung,
-    Operator,
-    Push,
-    Raises,
-    Silence,
-    Suspended,
-    TelemetryDelayed,
-)
+from perchctl.faults import effects as e
 from perchctl.geometry import rot_z
 from perchctl.mission import Phase
 from perchctl.profile import Profile
@@ -132,10 +118,10 @@ class UnfeltDrift:
     the target is the positioning system and out of view, by a force as long as it acts. A step of
     the estimate is none of these: it can be seen."""
 
-    def __init__(self, effects: Sequence[Effect], scenario: Scenario, *, by_target: bool) -> None:
-        slides = [effect for effect in effects if isinstance(effect, EstimateError)]
+    def __init__(self, effects: Sequence[e.Effect], scenario: Scenario, *, by_target: bool) -> None:
+        slides = [effect for effect in effects if isinstance(effect, e.EstimateError)]
         self._slides = [(math.hypot(*slide.drift_mps[:2]), slide.for_s) for slide in slides]
-        pushes = [effect for effect in effects if isinstance(effect, Push) and by_target]
+        pushes = [effect for effect in effects if isinstance(effect, e.Push) and by_target]
         self._pushes = [
             (math.hypot(*push.force_n[:2]) / scenario.mass_kg, push.for_s) for push in pushes
         ]
@@ -159,7 +145,7 @@ class DescentBound:
     loop ends by an exception, else where what the fault takes away is lost for longer than the
     profile waits for it."""
 
-    def __init__(self, effects: Sequence[Effect], profile: Profile) -> None:
+    def __init__(self, effects: Sequence[e.Effect], profile: Profile) -> None:
         self._effects, self._profile = effects, profile
         self._due_s = math.inf
         self._from_m: float | None = None  # its height when the way down was due
@@ -196,31 +182,31 @@ class DescentBound:
         begins = lands and height_m <= self._from_m + SUNK_M
         return late and not (comes_down or begins)
 
-    def _limit_s(self, effect: Effect, phase: Phase) -> float:
+    def _limit_s(self, effect: e.Effect, phase: Phase) -> float:
         """After how long it lands for this; never where it need not."""
         safety, positioning = self._profile.safety, self._profile.positioning
         lasts_s, limits_s = 0.0, [math.inf]
         match effect:
-            case Operator(presses_s):
+            case e.Operator(presses_s):
                 return min(presses_s) if phase in IN_THE_OPEN else math.inf
-            case Raises():
+            case e.Raises():
                 return 0.0 if phase in IN_THE_OPEN else math.inf
-            case Silence(lasts_s, down=True) | BlockDead("state" | "attitude", lasts_s):
+            case e.Silence(lasts_s, down=True) | e.BlockDead("state" | "attitude", lasts_s):
                 limits_s.append(safety.telemetry_land_s)
-            case Suspended(lasts_s):
+            case e.Suspended(lasts_s):
                 limits_s.append(safety.loop_late_land_s)
-            case TelemetryDelayed(delay_s, lasts_s) if delay_s > safety.telemetry_land_s:
+            case e.TelemetryDelayed(delay_s, lasts_s) if delay_s > safety.telemetry_land_s:
                 limits_s.append(safety.telemetry_land_s)
-            case Hung(lasts_s):
+            case e.Hung(lasts_s):
                 limits_s.append(safety.loop_late_land_s)
-            case CameraFault(kind, lasts_s):
+            case e.CameraFault(kind, lasts_s):
                 if kind in NO_PICTURE and phase in BY_CAMERA:
                     limits_s.append(safety.camera_land_s)
                 if kind in NO_SIGHT and positioning.by == "target":
                     limits_s.append(positioning.land_s)
-            case DeckSilent(lasts_s):
+            case e.DeckSilent(lasts_s):
                 limits_s.append(positioning.land_s)
-            case ExternalPositions(how, lasts_s) if how in NO_POSITION:
+            case e.ExternalPositions(how, lasts_s) if how in NO_POSITION:
                 limits_s.append(positioning.land_s)
         limit_s = min(limits_s)
         flown = phase in IN_THE_OPEN and lasts_s > limit_s + LASTS_S

@@ -16,48 +16,9 @@ from typing import TypeVar
 import numpy as np
 
 from perchctl.errors import UsageError
-from perchctl.faults.effects import (
-    FOR_EVER,
-    BatterySags,
-    BlockDead,
-    CameraFault,
-    DeckSilent,
-    DiskFull,
-    Effect,
-    EstimateError,
-    ExternalPositions,
-    Hung,
-    Killed,
-    LogReads,
-    MagnetHolds,
-    MagnetLetsGo,
-    MotorWeak,
-    Operator,
-    PacketLost,
-    PacketTwice,
-    Push,
-    Raises,
-    Reboots,
-    Room,
-    Silence,
-    Slow,
-    Suspended,
-    TargetMoves,
-    TelemetryDelayed,
-    ThrustChanged,
-)
-from perchctl.faults.expected_outcomes import (
-    BROWN_OUT,
-    CUT,
-    KNOCKED_OFF,
-    LEFT_LANDING,
-    LETS_GO_LATER,
-    NO_LIFT,
-    OPERATOR_STOPS,
-    SAGS_TOO_FAST,
-    TOO_LOW,
-    ExpectedOutcome,
-)
+from perchctl.faults import effects as e
+from perchctl.faults import expected_outcomes as expected
+from perchctl.faults.expected_outcomes import ExpectedOutcome
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import Phase
 from perchctl.sim import Scenario
@@ -87,7 +48,7 @@ class Draw:
     def lasting_s(self, low: float = 0.1) -> float:
         """From `low` to `LONGEST_S`, log-uniform; one in four for ever."""
         for_s = self.log_between(low, LONGEST_S)
-        return FOR_EVER if self.chance(EVER_SHARE) else for_s
+        return e.FOR_EVER if self.chance(EVER_SHARE) else for_s
 
     def chance(self, share: float) -> bool:
         """True in that share of all draws."""
@@ -106,12 +67,12 @@ class Draw:
         angle = float(self._rng.uniform(-math.pi, math.pi))
         return math.cos(angle), math.sin(angle)
 
-    def packet_lost(self, order: str) -> PacketLost:
+    def packet_lost(self, order: str) -> e.PacketLost:
         """One packet of an order is lost, or two."""
-        return PacketLost(order, 1 if self.chance(0.6) else 2)
+        return e.PacketLost(order, 1 if self.chance(0.6) else 2)
 
 
-DrawEffects = Callable[[Draw], Effect | tuple[Effect, ...]]
+DrawEffects = Callable[[Draw], e.Effect | tuple[e.Effect, ...]]
 
 
 def _together(*parts: DrawEffects) -> DrawEffects:
@@ -119,7 +80,7 @@ def _together(*parts: DrawEffects) -> DrawEffects:
     return lambda draw: tuple(effect for part in parts for effect in _effects(part(draw)))
 
 
-def _effects(drawn: Effect | tuple[Effect, ...]) -> tuple[Effect, ...]:
+def _effects(drawn: e.Effect | tuple[e.Effect, ...]) -> tuple[e.Effect, ...]:
     return drawn if isinstance(drawn, tuple) else (drawn,)
 
 
@@ -127,137 +88,137 @@ def _effects(drawn: Effect | tuple[Effect, ...]) -> tuple[Effect, ...]:
 
 
 def _silence(*, up: bool, down: bool) -> DrawEffects:
-    return lambda draw: Silence(draw.lasting_s(), up, down)
+    return lambda draw: e.Silence(draw.lasting_s(), up, down)
 
 
 def _lost(order: str, *presses_s: float) -> DrawEffects:
     """The packet of an order, which the operator's presses bring about."""
-    operator = (Operator(presses_s),) if presses_s else ()
+    operator = (e.Operator(presses_s),) if presses_s else ()
     return lambda draw: (draw.packet_lost(order), *operator)
 
 
-def _packet_twice(draw: Draw) -> tuple[Effect, ...]:
+def _packet_twice(draw: Draw) -> tuple[e.Effect, ...]:
     order = draw.one_of(("setpoint", "land", "notify", "stop"))
-    presses = (Operator((0.0,)),) if order in ("land", "notify") else ()
-    return (PacketTwice(order), *presses)
+    presses = (e.Operator((0.0,)),) if order in ("land", "notify") else ()
+    return (e.PacketTwice(order), *presses)
 
 
 def _block_dead(name: str) -> DrawEffects:
-    return lambda draw: BlockDead(name, draw.lasting_s())
+    return lambda draw: e.BlockDead(name, draw.lasting_s())
 
 
 def _camera(kind: str) -> DrawEffects:
-    return lambda draw: CameraFault(kind, draw.lasting_s())
+    return lambda draw: e.CameraFault(kind, draw.lasting_s())
 
 
 def _external(how: str) -> DrawEffects:
-    return lambda draw: ExternalPositions(how, draw.lasting_s())
+    return lambda draw: e.ExternalPositions(how, draw.lasting_s())
 
 
-def _external_ends(draw: Draw) -> Effect:
+def _external_ends(draw: Draw) -> e.Effect:
     how = "frozen" if draw.chance(0.5) else "silent"
-    return ExternalPositions(how, draw.lasting_s())
+    return e.ExternalPositions(how, draw.lasting_s())
 
 
-def _external_occluded(draw: Draw) -> Effect:
+def _external_occluded(draw: Draw) -> e.Effect:
     """For 0.3 s, as somebody walks by, or longer."""
     for_s = 0.3 if draw.chance(0.5) else draw.lasting_s(0.5)
-    return ExternalPositions("occluded", for_s)
+    return e.ExternalPositions("occluded", for_s)
 
 
-def _external_late(draw: Draw) -> Effect:
+def _external_late(draw: Draw) -> e.Effect:
     late_s = draw.log_between(0.05, 0.15)
-    return ExternalPositions("late", draw.lasting_s(1.0), late_s)
+    return e.ExternalPositions("late", draw.lasting_s(1.0), late_s)
 
 
 def _frozen(*names: str) -> DrawEffects:
     """Log variables whose values stand still while their packets go on coming."""
-    return lambda draw: LogReads(names, None, draw.lasting_s())
+    return lambda draw: e.LogReads(names, None, draw.lasting_s())
 
 
 STATE_NAMES = tuple(f"stateEstimate.{axis}" for axis in ("x", "y", "z", "vx", "vy", "vz"))
 
 
-def _jump_xy(draw: Draw) -> Effect:
+def _jump_xy(draw: Draw) -> e.Effect:
     x, y = draw.direction()
     step_m = draw.log_between(0.1, 2.0)
-    return EstimateError(step_m=(x * step_m, y * step_m, 0.0), for_s=draw.lasting_s())
+    return e.EstimateError(step_m=(x * step_m, y * step_m, 0.0), for_s=draw.lasting_s())
 
 
-def _jump_z(draw: Draw) -> Effect:
+def _jump_z(draw: Draw) -> e.Effect:
     step_m = draw.sign() * draw.log_between(0.1, 1.0)
-    return EstimateError(step_m=(0.0, 0.0, step_m), for_s=draw.lasting_s())
+    return e.EstimateError(step_m=(0.0, 0.0, step_m), for_s=draw.lasting_s())
 
 
-def _jump_yaw(draw: Draw) -> Effect:
+def _jump_yaw(draw: Draw) -> e.Effect:
     turn_deg = draw.sign() * draw.log_between(10.0, 180.0)
-    return EstimateError(turn_deg=turn_deg, for_s=draw.lasting_s())
+    return e.EstimateError(turn_deg=turn_deg, for_s=draw.lasting_s())
 
 
-def _drift(draw: Draw) -> Effect:
+def _drift(draw: Draw) -> e.Effect:
     x, y = draw.direction()
     speed_mps = draw.log_between(0.03, 0.3)
     z = draw.between(-0.2, 0.2)
     drift_mps = (x * speed_mps, y * speed_mps, z * speed_mps)
-    return EstimateError(drift_mps=drift_mps, for_s=draw.lasting_s(2.0))
+    return e.EstimateError(drift_mps=drift_mps, for_s=draw.lasting_s(2.0))
 
 
-def _reading_low(draw: Draw) -> Effect:
+def _reading_low(draw: Draw) -> e.Effect:
     if draw.chance(0.5):
-        return LogReads(("pm.vbat",), draw.between(2.6, 3.1), draw.lasting_s())
-    return LogReads(("pm.state",), 3.0, draw.lasting_s())
+        return e.LogReads(("pm.vbat",), draw.between(2.6, 3.1), draw.lasting_s())
+    return e.LogReads(("pm.state",), 3.0, draw.lasting_s())
 
 
-def _kick(draw: Draw) -> Effect:
+def _kick(draw: Draw) -> e.Effect:
     """A blow of 40 ms that changes the speed by up to 1 m/s, mostly sideways."""
     x, y = draw.direction()
     z = draw.between(-0.5, 0.5)
     force_n = draw.mass_kg * draw.between(0.2, 1.0) / 0.04
-    return Push((x * force_n, y * force_n, z * force_n), 0.04)
+    return e.Push((x * force_n, y * force_n, z * force_n), 0.04)
 
 
-def _gust(draw: Draw) -> Effect:
+def _gust(draw: Draw) -> e.Effect:
     """Half a second to one, with up to a fifth of the weight, mostly sideways."""
     x, y = draw.direction()
     z = draw.between(-0.3, 0.3)
     force_n = draw.mass_kg * GRAVITY_MPS2 * draw.between(0.05, 0.2)
     for_s = draw.between(0.5, 1.0)
-    return Push((x * force_n, y * force_n, z * force_n), for_s)
+    return e.Push((x * force_n, y * force_n, z * force_n), for_s)
 
 
-def _unusual_ceiling(draw: Draw) -> Effect:
+def _unusual_ceiling(draw: Draw) -> e.Effect:
     low_m, high_m = (1.1, 1.6) if draw.chance(0.5) else (2.7, 3.4)
-    return Room(ceiling_z_m=draw.between(low_m, high_m))
+    return e.Room(ceiling_z_m=draw.between(low_m, high_m))
 
 
-def _target_moves(draw: Draw) -> Effect:
+def _target_moves(draw: Draw) -> e.Effect:
     x, y = draw.direction()
-    return TargetMoves((0.3 * x, 0.3 * y))
+    return e.TargetMoves((0.3 * x, 0.3 * y))
 
 
-def _second_target(draw: Draw) -> Effect:
+def _second_target(draw: Draw) -> e.Effect:
     x, y = draw.direction()
     away_m = draw.between(0.35, 1.2)
-    return Room(second_target_m=(x * away_m, y * away_m))
+    return e.Room(second_target_m=(x * away_m, y * away_m))
 
 
-def _presses_every(period_s: float, for_s: float) -> Operator:
-    return Operator(tuple(round(float(t), 3) for t in np.arange(0.0, for_s, period_s)))
+def _presses_every(period_s: float, for_s: float) -> e.Operator:
+    return e.Operator(tuple(round(float(t), 3) for t in np.arange(0.0, for_s, period_s)))
 
 
-def _weak_magnet(draw: Draw) -> Effect:
-    return MagnetHolds(draw.between(0.2, 1.1))
+def _weak_magnet(draw: Draw) -> e.Effect:
+    return e.MagnetHolds(draw.between(0.2, 1.1))
 
 
-def _pressed_once(_draw: Draw) -> Effect:
-    return Operator((0.0,))
+def _pressed_once(_draw: Draw) -> e.Effect:
+    return e.Operator((0.0,))
 
 
-def _hung(draw: Draw) -> Effect:
-    return Hung(draw.lasting_s(0.3))
+def _hung(draw: Draw) -> e.Effect:
+    return e.Hung(draw.lasting_s(0.3))
 
 
-def _hung_and_packet_lost(draw: Draw) -> tuple[Effect, ...]:
+def _hung_and_packet_lost(draw: Draw) -> tuple[e.Effect, ...]:
     """The loop is stuck, and the first packets of what is sent in its place are lost."""
     order = draw.one_of(("raw", "stop", "land"))
     return (_hung(draw), draw.packet_lost(order))
@@ -310,9 +271,9 @@ FAULTS: tuple[Fault, ...] = (
     Fault("downlink-silent", (13, 14), "no telemetry for 0.1 s to ever",
           AIR, "telemetry", _silence(up=False, down=True)),
     Fault("uplink-silent", (13, 14), "no command arrives for 0.1 s to ever",
-          AIR, "link", _silence(up=True, down=False), (CUT,)),
+          AIR, "link", _silence(up=True, down=False), (expected.CUT,)),
     Fault("link-silent", (13, 14), "both ways silent for 0.1 s to ever",
-          AIR, "link", _silence(up=True, down=True), (CUT,)),
+          AIR, "link", _silence(up=True, down=True), (expected.CUT,)),
     Fault("landing-lost", (14,),
           "the operator lands; one or two packets of the landing order are lost",
           BEFORE_LANDING, "packet", _lost("land", 0.0)),
@@ -324,7 +285,7 @@ FAULTS: tuple[Fault, ...] = (
           STOPPING, "packet", _lost("notify")),
     Fault("emergency-stop-lost", (14, 16),
           "the operator stops; one or two packets of the stop are lost",
-          AIR, "stop", _lost("emergency-stop", 0.0, 0.8), (OPERATOR_STOPS,)),
+          AIR, "stop", _lost("emergency-stop", 0.0, 0.8), (expected.OPERATOR_STOPS,)),
     Fault("packet-twice", (14,), "a setpoint, landing order, notify or stop arrives twice",
           AIR, "packet", _packet_twice),
     Fault("state-block-dead", (12, 14), "position and velocity come no more, the attitude does",
@@ -337,7 +298,7 @@ FAULTS: tuple[Fault, ...] = (
           AIR, "estimate", _block_dead("variance")),
     Fault("telemetry-delayed", (12,), "telemetry 50 ms to 2 s late",
           AIR, "telemetry",
-          lambda draw: TelemetryDelayed(draw.log_between(0.05, 2.0), draw.lasting_s(0.5))),
+          lambda draw: e.TelemetryDelayed(draw.log_between(0.05, 2.0), draw.lasting_s(0.5))),
     # --- the camera ---------------------------------------------------------------
     Fault("camera-silent", (21,), "no picture for 0.1 s to ever",
           AIR, "camera", _camera("silent")),
@@ -353,11 +314,11 @@ FAULTS: tuple[Fault, ...] = (
           AIR, "camera", _camera("covered")),
     Fault("camera-late", (24,), "pictures 50 to 600 ms late that look fresh",
           AIR, "camera",
-          lambda draw: CameraFault("late", draw.lasting_s(1.0), draw.log_between(0.05, 0.6))),
+          lambda draw: e.CameraFault("late", draw.lasting_s(1.0), draw.log_between(0.05, 0.6))),
     Fault("camera-out-of-order", (24, 35), "pictures in pairs, the newer one first",
           AIR, "camera", _camera("out-of-order")),
     Fault("camera-mirrored", (26,), "mirrored pictures from the start",
-          FROM_THE_START, "mirrored", lambda draw: CameraFault("mirrored", FOR_EVER)),
+          FROM_THE_START, "mirrored", lambda draw: e.CameraFault("mirrored", e.FOR_EVER)),
     # --- the state estimate ---------------------------------------------------------
     Fault("estimate-jumps", (9,), "steps sideways by 0.1 to 2 m",
           AIR, "estimate", _jump_xy),
@@ -368,7 +329,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("estimate-drifts", (9,), "slides by 3 to 30 cm/s",
           AIR, "estimate", _drift),
     Fault("estimate-nan", (35,), "position and velocity are logged as NaN",
-          AIR, "estimate", lambda draw: LogReads(STATE_NAMES, math.nan, draw.lasting_s(0.02))),
+          AIR, "estimate", lambda draw: e.LogReads(STATE_NAMES, math.nan, draw.lasting_s(0.02))),
     Fault("external-position", (10,), "positions from outside freeze or end",
           AIR, "positions", _external_ends),
     Fault("external-occluded", (10,), "the rigid body is hidden for 0.3 s to ever",
@@ -382,67 +343,69 @@ FAULTS: tuple[Fault, ...] = (
     # --- power and motors -----------------------------------------------------------
     Fault("battery-sags", (6,), "loses 0.2 to 0.6 V at 10 to 100 mV/s",
           AIR, "battery",
-          lambda draw: BatterySags(draw.log_between(0.01, 0.1), draw.between(0.2, 0.6)),
-          (SAGS_TOO_FAST,)),
+          lambda draw: e.BatterySags(draw.log_between(0.01, 0.1), draw.between(0.2, 0.6)),
+          (expected.SAGS_TOO_FAST,)),
     Fault("battery-reading-frozen", (7,), "its reading stands still",
           AIR, "battery", _frozen("pm.vbat")),
     Fault("battery-low", (6,), "its reading is low",
           AIR, "battery", _reading_low),
     Fault("motor-weak", (37,), "one motor gives 15 % less",
-          AIR, "pushed", lambda draw: MotorWeak(draw.one_of((1, 2, 3, 4)), 0.85), (NO_LIFT,)),
+          AIR, "pushed", lambda draw: e.MotorWeak(draw.one_of((1, 2, 3, 4)), 0.85),
+          (expected.NO_LIFT,)),
     # --- what pushes ------------------------------------------------------------------
     Fault("kick", (37,), "a blow that changes the speed by 0.2 to 1 m/s",
-          AIR, "pushed", _kick, (KNOCKED_OFF,)),
+          AIR, "pushed", _kick, (expected.KNOCKED_OFF,)),
     Fault("gust", (37,), "5 to 20 % of the weight, for 0.5 to 1 s",
           AIR, "pushed", _gust),
     # --- the magnet -------------------------------------------------------------------
     Fault("no-magnet", (38,), "nothing holds",
-          AT_CONTACT, "magnet", lambda draw: MagnetHolds(0.0)),
+          AT_CONTACT, "magnet", lambda draw: e.MagnetHolds(0.0)),
     Fault("weak-magnet", (39,), "carries 0.2 to 1.1 of the weight",
-          AT_CONTACT, "magnet", _weak_magnet, (TOO_LOW,)),
+          AT_CONTACT, "magnet", _weak_magnet, (expected.TOO_LOW,)),
     Fault("magnet-lets-go", (39, 40), "lets go 1 to 25 s after the contact",
           AT_CONTACT, "magnet",
-          lambda draw: MagnetLetsGo(draw.log_between(1.0, 25.0)), (LETS_GO_LATER, TOO_LOW)),
+          lambda draw: e.MagnetLetsGo(draw.log_between(1.0, 25.0)),
+          (expected.LETS_GO_LATER, expected.TOO_LOW)),
     # --- the room and the target ------------------------------------------------------
     Fault("ceiling-beside-its-plane", (38, 40),
           "the target lies 2 to 20 cm above or below what the gear meets",
           FROM_THE_START, "beside",
-          lambda draw: Room(target_above_ceiling_m=draw.sign() * draw.log_between(0.02, 0.2))),
+          lambda draw: e.Room(target_above_ceiling_m=draw.sign() * draw.log_between(0.02, 0.2))),
     Fault("ceiling-unusual", (36, 38), "at 1.1 to 1.6 m or at 2.7 to 3.4 m",
           FROM_THE_START, "ceiling", _unusual_ceiling),
     Fault("bare-ceiling", (43,), "no target",
-          FROM_THE_START, "ceiling", lambda draw: Room(no_target=True)),
+          FROM_THE_START, "ceiling", lambda draw: e.Room(no_target=True)),
     Fault("low-bare-ceiling", (37, 43), "no target, at 0.35 to 1.3 m",
           FROM_THE_START, "ceiling",
-          lambda draw: Room(ceiling_z_m=draw.between(0.35, 1.3), no_target=True)),
+          lambda draw: e.Room(ceiling_z_m=draw.between(0.35, 1.3), no_target=True)),
     Fault("target-moves", (28,), "by 0.3 m",
           (P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER), "moved", _target_moves),
     Fault("second-target", (28,), "the same sheet 0.35 to 1.2 m away",
           FROM_THE_START, "moved", _second_target),
     Fault("camera-turned", (26,), "mounted 90, 180 or -90 deg from what the profile says",
           FROM_THE_START, "turned",
-          lambda draw: Room(mount_turned_deg=draw.one_of((90.0, 180.0, -90.0)))),
+          lambda draw: e.Room(mount_turned_deg=draw.one_of((90.0, 180.0, -90.0)))),
     # --- the operator -----------------------------------------------------------------
     Fault("operator-once", (16,), "Ctrl-C",
           AIR, "operator", _pressed_once),
     Fault("operator-twice", (16,), "Ctrl-C, and again 0.6 to 10 s later",
           AIR, "stop",
-          lambda draw: Operator((0.0, draw.log_between(0.6, 10.0))), (OPERATOR_STOPS,)),
+          lambda draw: e.Operator((0.0, draw.log_between(0.6, 10.0))), (expected.OPERATOR_STOPS,)),
     Fault("operator-held", (16,), "Ctrl-C held for 0.1 to 1.8 s: it repeats every 30 ms",
           AIR, "operator", lambda draw: _presses_every(0.03, draw.log_between(0.1, 1.8))),
     Fault("hang-up", (16,), "the terminal is closed",
-          AIR, "operator", lambda draw: Operator((0.0,), hang_up=True)),
+          AIR, "operator", lambda draw: e.Operator((0.0,), hang_up=True)),
     # --- the program ------------------------------------------------------------------
     Fault("killed", (15,), "killed at once",
-          AIR, "killed", lambda draw: Killed(), (CUT, LEFT_LANDING)),
+          AIR, "killed", lambda draw: e.Killed(), (expected.CUT, expected.LEFT_LANDING)),
     Fault("suspended", (17,), "suspended for 0.3 to 5 s",
-          AIR, "killed", lambda draw: Suspended(draw.log_between(0.3, 5.0)), (CUT,)),
+          AIR, "killed", lambda draw: e.Suspended(draw.log_between(0.3, 5.0)), (expected.CUT,)),
     Fault("hung", (18, 19, 20), "the loop is stuck for 0.3 s to ever",
           AIR, "telemetry", _hung),
     Fault("slow", (20,), "turns take 0.1 to 0.4 s",
-          AIR, "telemetry", lambda draw: Slow(draw.between(0.1, 0.4), draw.lasting_s(0.5))),
+          AIR, "telemetry", lambda draw: e.Slow(draw.between(0.1, 0.4), draw.lasting_s(0.5))),
     Fault("disk-full", (44,), "the log cannot be written",
-          AIR, "disk", lambda draw: DiskFull(draw.lasting_s())),
+          AIR, "disk", lambda draw: e.DiskFull(draw.lasting_s())),
     # --- readings that stand still, though their packets come -------------------------
     Fault("position-frozen", (12,), "position and velocity are logged as they were",
           AIR, "telemetry", _frozen(*STATE_NAMES)),
@@ -457,15 +420,15 @@ FAULTS: tuple[Fault, ...] = (
           AIR, "telemetry", _frozen("supervisor.info")),
     # --- what nothing announces --------------------------------------------------------
     Fault("thrust-changed", (37,), "hovering takes up to 8 % more or less thrust",
-          AIR, "pushed", lambda draw: ThrustChanged(round(1.0 / draw.between(0.92, 1.08), 4))),
+          AIR, "pushed", lambda draw: e.ThrustChanged(round(1.0 / draw.between(0.92, 1.08), 4))),
     Fault("external-mirrored", (11,), "positions come mirrored",
           AIR, "positions", _external("mirrored")),
     Fault("exception", (18,), "an unforeseen exception ends the loop",
-          AIR, "exception", lambda draw: Raises()),
+          AIR, "exception", lambda draw: e.Raises()),
     Fault("operator-hammers", (16,), "Ctrl-C every 80 to 250 ms, for 2.5 to 4 s",
           AIR, "stop",
           lambda draw: _presses_every(draw.between(0.08, 0.25), draw.between(2.5, 4.0)),
-          (OPERATOR_STOPS,)),
+          (expected.OPERATOR_STOPS,)),
     # --- two at once ------------------------------------------------------------------
     Fault("covered-and-kick", (27, 37), "a blow, and the target is hidden from then on",
           BY_CAMERA, "camera", _together(_camera("covered"), _kick)),
@@ -476,19 +439,19 @@ FAULTS: tuple[Fault, ...] = (
     Fault("weak-magnet-uplink", (14, 39),
           "the magnet carries 0.2 to 1.1 of the weight, and no command arrives for a time",
           (P.PERCH, P.COMPLETE), "link",
-          _together(_weak_magnet, _silence(up=True, down=False)), (TOO_LOW, CUT)),
+          _together(_weak_magnet, _silence(up=True, down=False)), (expected.TOO_LOW, expected.CUT)),
     Fault("hung-and-packet-lost", (14, 20),
           "the loop is stuck, and one or two packets of what is sent in its place are lost",
           AIR, "telemetry",
           _hung_and_packet_lost),
     # --- what comes at once, and stays --------------------------------------------------
     Fault("latency-falls", (24,), "pictures come 100 to 200 ms sooner than before",
-          AIR, "camera", lambda draw: CameraFault("sooner", FOR_EVER, draw.between(0.1, 0.2))),
+          AIR, "camera", lambda draw: e.CameraFault("sooner", e.FOR_EVER, draw.between(0.1, 0.2))),
     Fault("brown-out", (6, 13), "the voltage breaks down, and the vehicle starts again",
-          AIR, "link", lambda draw: Reboots(draw.between(0.5, 1.5)), (BROWN_OUT,)),
+          AIR, "link", lambda draw: e.Reboots(draw.between(0.5, 1.5)), (expected.BROWN_OUT,)),
     Fault("deck-silent", (10,), "the positions of the vehicle's own deck end for 0.3 s to ever",
           AIR, "positions",
-          lambda draw: DeckSilent(draw.lasting_s(0.3), draw.sign() * draw.between(0.03, 0.08))),
+          lambda draw: e.DeckSilent(draw.lasting_s(0.3), draw.sign() * draw.between(0.03, 0.08))),
 )  # fmt: skip
 
 BY_NAME = {fault.name: fault for fault in FAULTS}
@@ -503,7 +466,7 @@ class Case:
     fault: Fault
     phase: Phase
     moment_s: float
-    effects: tuple[Effect, ...]
+    effects: tuple[e.Effect, ...]
     landed_from: Phase | None = None
     landed_after_s: float = 0.0
     first_hold: float | None = None

@@ -3,28 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from perchctl.camera import FrameSource
-from perchctl.faults.effects import (
-    FOR_EVER,
-    BlockDead,
-    CameraFault,
-    Hung,
-    Killed,
-    PacketLost,
-    PacketTwice,
-    Raises,
-    Reboots,
-    Silence,
-    Slow,
-    Suspended,
-    TelemetryDelayed,
-)
+from perchctl.faults import effects as e
 from perchctl.link import (
     BLOCKS_DELETED_AFTER_S,
     RESUME_PERIOD_S,
@@ -41,8 +26,6 @@ from perchctl.vision import Frame
 
 ORDERS = ("setpoint", "raw", "land", "notify", "stop", "emergency-stop")
 """The packets that faults can name."""
-
-RadioEffect = Silence | PacketLost | PacketTwice | BlockDead | TelemetryDelayed | Reboots
 
 
 def order_of(packet: Packet) -> str:
@@ -71,7 +54,7 @@ class FaultyRadio(Radio):
     def __init__(self, air: Radio | None = None) -> None:
         self._air = air or Radio()
         self.cut = False
-        self._begun: list[tuple[Silence | BlockDead | TelemetryDelayed, float]] = []
+        self._begun: list[tuple[e.Silence | e.BlockDead | e.TelemetryDelayed, float]] = []
         self._left: dict[str, int] = {}  # packets of an order still to be lost
         self._twice: set[str] = set()
         self._service: CommandService | None = None
@@ -80,17 +63,18 @@ class FaultyRadio(Radio):
         """Where the second copy of a packet goes."""
         self._service = CommandService(firmware)
 
-    def begin(self, effect: RadioEffect, now_s: float) -> None:
+    def begin(self, effect: e.RadioEffect, now_s: float) -> None:
+        """The fault begins."""
         match effect:
-            case PacketLost(order, count):
+            case e.PacketLost(order, count):
                 self._left[order] = count
-            case PacketTwice(order):
+            case e.PacketTwice(order):
                 self._twice.add(order)
-            case Reboots(boots_s):
-                self._begun.append((Silence(boots_s, up=True, down=True), now_s))
+            case e.Reboots(boots_s):
+                self._begun.append((e.Silence(boots_s, up=True, down=True), now_s))
                 unasked_s = boots_s + BLOCKS_DELETED_AFTER_S + RESUME_PERIOD_S
-                self._begun.append((Silence(unasked_s, up=False, down=True), now_s))
-            case Silence() | BlockDead() | TelemetryDelayed():
+                self._begun.append((e.Silence(unasked_s, up=False, down=True), now_s))
+            case e.Silence() | e.BlockDead() | e.TelemetryDelayed():
                 self._begun.append((effect, now_s))
 
     def up(self, packet: Packet, now_s: float) -> bool:
@@ -101,7 +85,7 @@ class FaultyRadio(Radio):
             self._left[order] -= 1
             return False
         for effect, begin_s in self._begun:
-            if isinstance(effect, Silence) and effect.up and now_s < begin_s + effect.for_s:
+            if isinstance(effect, e.Silence) and effect.up and now_s < begin_s + effect.for_s:
                 return False
         if order in self._twice and self._service is not None:
             self._twice.remove(order)
@@ -115,11 +99,11 @@ class FaultyRadio(Radio):
         for effect, begin_s in self._begun:
             if now_s >= begin_s + effect.for_s:
                 continue
-            if isinstance(effect, Silence) and effect.down:
+            if isinstance(effect, e.Silence) and effect.down:
                 return None
-            if isinstance(effect, BlockDead) and effect.block == block:
+            if isinstance(effect, e.BlockDead) and effect.block == block:
                 return None
-            if isinstance(effect, TelemetryDelayed):
+            if isinstance(effect, e.TelemetryDelayed):
                 delay_s = max(delay_s, effect.delay_s)
         return delay_s
 
@@ -144,14 +128,14 @@ class FaultyCamera:
     def __init__(self, inner: FrameSource, seed: int) -> None:
         self._inner = inner
         self._rng = np.random.default_rng([seed, SNOW_STREAM])
-        self._fault: CameraFault | None = None
+        self._fault: e.CameraFault | None = None
         self._begin_s = 0.0
         self._last: Frame | None = None
         self._queue: deque[Frame] = deque()
         self._overtaken: Frame | None = None
         self.late_s = 0.0  # until a fault begins, and known to the profile
 
-    def begin(self, fault: CameraFault, now_s: float) -> None:
+    def begin(self, fault: e.CameraFault, now_s: float) -> None:
         self._fault, self._begin_s = fault, now_s
         self.late_s = 0.0
         self._queue.clear()
@@ -183,7 +167,7 @@ class FaultyCamera:
     def close(self) -> None:
         self._inner.close()
 
-    def _spoilt(self, fault: CameraFault, frame: Frame | None, now_s: float) -> Frame | None:
+    def _spoilt(self, fault: e.CameraFault, frame: Frame | None, now_s: float) -> Frame | None:
         if fault.kind == "late":
             return self._late(frame, fault.late_s, now_s)
         if fault.kind == "out-of-order":
@@ -194,21 +178,21 @@ class FaultyCamera:
             return None
         match fault.kind:
             case "frozen":
-                return replace(frame, image=(self._last or frame).image, encoded=None)
+                image = (self._last or frame).image
             case "snow":
-                noise = self._rng.normal(120.0, SNOW_SIGMA, frame.image.shape)
-                return replace(frame, image=np.clip(noise, 0, 255).astype(np.uint8), encoded=None)
+                image = self._noise(frame.image, 120.0, SNOW_SIGMA)
             case "covered":  # by a sheet of the ceiling's grey, under the target
-                sheet = self._rng.normal(frame.image.mean(), SHEET_SIGMA, frame.image.shape)
-                return replace(frame, image=np.clip(sheet, 0, 255).astype(np.uint8), encoded=None)
+                image = self._noise(frame.image, float(frame.image.mean()), SHEET_SIGMA)
             case "dark":
-                dark = cv2.convertScaleAbs(frame.image, alpha=DARK_GAIN)
-                return replace(frame, image=np.asarray(dark, np.uint8), encoded=None)
+                image = np.asarray(cv2.convertScaleAbs(frame.image, alpha=DARK_GAIN), np.uint8)
             case "mirrored":
-                return replace(
-                    frame, image=np.ascontiguousarray(frame.image[:, ::-1]), encoded=None
-                )
-        return frame
+                image = np.ascontiguousarray(frame.image[:, ::-1])
+            case _:
+                return frame
+        return replace(frame, image=image, encoded=None)
+
+    def _noise(self, image: np.ndarray, mean: float, sigma: float) -> np.ndarray:
+        return np.clip(self._rng.normal(mean, sigma, image.shape), 0, 255).astype(np.uint8)
 
     def _late(self, frame: Frame | None, late_s: float, now_s: float) -> Frame | None:
         """Queued on its way: it looks as if it had just been taken."""
@@ -253,24 +237,21 @@ class PlantedError(Exception):
 
 
 class FaultyClock:
-    """The vehicle's own time. Faults happen where the loop waits for its next turn.
+    """The vehicle's own time. Faults happen where the loop waits for its next turn. A program that
+    is killed sends nothing by the `radio` any more. `stop_s`: no flight goes on for longer."""
 
-    `on_killed` cuts the uplink. `stop_s`: no flight goes on for longer.
-    """
-
-    def __init__(self, link: MockLink, on_killed: Callable[[], None], stop_s: float) -> None:
-        self._link = link
-        self._on_killed = on_killed
-        self._stop_s = stop_s
-        self._pending: Killed | Suspended | Hung | Raises | None = None
-        self._slow: Slow | None = None
+    def __init__(self, link: MockLink, radio: FaultyRadio, stop_s: float) -> None:
+        self._link, self._radio, self._stop_s = link, radio, stop_s
+        self._pending: e.ProgramEffect | None = None
+        self._slow: e.Slow | None = None
         self._slow_until_s = 0.0
         self._gone = False
         self.endless = False
         self.killed_s: float | None = None
 
-    def begin(self, effect: Killed | Suspended | Hung | Slow | Raises, now_s: float) -> None:
-        if isinstance(effect, Slow):
+    def begin(self, effect: e.ProgramEffect, now_s: float) -> None:
+        """The fault begins: where the loop next waits, or with its next turns."""
+        if isinstance(effect, e.Slow):
             self._slow, self._slow_until_s = effect, now_s + effect.for_s
         else:
             self._pending = effect
@@ -288,16 +269,16 @@ class FaultyClock:
             self._link.advance_to(t_s)
         effect, self._pending = self._pending, None
         match effect:
-            case Killed():
+            case e.Killed():
                 self._kill()
-            case Suspended(for_s):
+            case e.Suspended(for_s):
                 # Past the link: none of the program's threads runs.
                 self._link.vehicle.advance_to(self._link.now_s + for_s)
-            case Hung(for_s):
+            case e.Hung(for_s):
                 self._link.advance_to(self._link.now_s + min(for_s, LONGEST_S))
-                if for_s >= FOR_EVER:
+                if for_s >= e.FOR_EVER:
                     self._kill()
-            case Raises():
+            case e.Raises():
                 raise PlantedError("an exception that the fault raised")
         if self._link.now_s > self._stop_s:
             self.endless = True
@@ -309,4 +290,4 @@ class FaultyClock:
         if not self._gone:
             self._gone = True
             self.killed_s = self._link.now_s
-            self._on_killed()
+            self._radio.cut = True

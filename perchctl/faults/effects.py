@@ -11,7 +11,17 @@ FOR_EVER = 1e6
 
 
 @dataclass(frozen=True)
-class Silence:
+class RadioEffect:
+    """What befalls the radio (`perchctl.faults.edges.FaultyRadio`)."""
+
+
+@dataclass(frozen=True)
+class ProgramEffect:
+    """What befalls the program's loop (`perchctl.faults.edges.FaultyClock`)."""
+
+
+@dataclass(frozen=True)
+class Silence(RadioEffect):
     """The radio carries nothing, up, down or both."""
 
     for_s: float
@@ -20,7 +30,7 @@ class Silence:
 
 
 @dataclass(frozen=True)
-class PacketLost:
+class PacketLost(RadioEffect):
     """The next `count` packets of an order are lost (`ORDERS` of `perchctl.faults.edges`)."""
 
     order: str
@@ -28,14 +38,14 @@ class PacketLost:
 
 
 @dataclass(frozen=True)
-class PacketTwice:
+class PacketTwice(RadioEffect):
     """The next packet of an order arrives twice."""
 
     order: str
 
 
 @dataclass(frozen=True)
-class BlockDead:
+class BlockDead(RadioEffect):
     """One log block comes no more."""
 
     block: str
@@ -43,7 +53,7 @@ class BlockDead:
 
 
 @dataclass(frozen=True)
-class TelemetryDelayed:
+class TelemetryDelayed(RadioEffect):
     delay_s: float
     for_s: float
 
@@ -106,7 +116,7 @@ class BatterySags:
 
 
 @dataclass(frozen=True)
-class Reboots:
+class Reboots(RadioEffect):
     """The voltage breaks down and the vehicle starts again: its motors stop, for `boots_s` it hears
     nothing, and its log blocks are gone until the link starts them again."""
 
@@ -173,26 +183,26 @@ class Operator:
 
 
 @dataclass(frozen=True)
-class Killed:
+class Killed(ProgramEffect):
     """The program is gone at once, and sends nothing more."""
 
 
 @dataclass(frozen=True)
-class Suspended:
+class Suspended(ProgramEffect):
     """Not a line of the program runs."""
 
     for_s: float
 
 
 @dataclass(frozen=True)
-class Hung:
+class Hung(ProgramEffect):
     """The loop's thread is stuck; the program's other threads live."""
 
     for_s: float
 
 
 @dataclass(frozen=True)
-class Slow:
+class Slow(ProgramEffect):
     """Each turn of the loop takes so long."""
 
     turn_s: float
@@ -200,7 +210,7 @@ class Slow:
 
 
 @dataclass(frozen=True)
-class Raises:
+class Raises(ProgramEffect):
     """An exception that the program does not foresee, in the loop's thread."""
 
 
@@ -210,8 +220,7 @@ class DiskFull:
 
 
 Effect = (
-    Silence | PacketLost | PacketTwice | BlockDead | TelemetryDelayed | CameraFault
-    | EstimateError | ExternalPositions | DeckSilent | LogReads | BatterySags | Reboots
-    | MotorWeak | ThrustChanged | Push | MagnetHolds | MagnetLetsGo | Room | TargetMoves | Operator
-    | Killed | Suspended | Hung | Slow | Raises | DiskFull
+    RadioEffect | ProgramEffect | CameraFault | EstimateError | ExternalPositions | DeckSilent
+    | LogReads | BatterySags | MotorWeak | ThrustChanged | Push | MagnetHolds | MagnetLetsGo | Room
+    | TargetMoves | Operator | DiskFull
 )  # fmt: skip

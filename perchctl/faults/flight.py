@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Executor
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from perchctl.calibration import profile_camera
-from perchctl.campaign import fly_all, fly_measured, seed_log_path
+from perchctl.campaign import fly_measured, seed_log_path
 from perchctl.errors import PerchError
+from perchctl.faults import effects as e
 from perchctl.faults.bounds import DescentBound, PlaceBound, UnfeltDrift
 from perchctl.faults.catalogue import BY_NAME, FROM_THE_START, Case, draw_case
 from perchctl.faults.claims import REFUSAL_CLAIMS, claims_of, claims_of_rescue, last_row
@@ -23,15 +22,6 @@ from perchctl.faults.edges import (
     PlantedError,
     ProgramKilled,
 )
-from perchctl.faults.effects import (
-    CameraFault,
-    DeckSilent,
-    Effect,
-    ExternalPositions,
-    LogReads,
-    Suspended,
-)
-from perchctl.faults.effects import Operator as Presses
 from perchctl.faults.expected_outcomes import unexpected
 from perchctl.faults.inject import Disk, Edges, Injector, changed_scenario
 from perchctl.faults.oracle import Limits, Oracle, Sample
@@ -94,7 +84,7 @@ class FaultyFlight:
         self._link = MockLink(vehicle, profile.link.telemetry_period_s, radio)
         source = FaultyCamera(lockstep_source(vehicle, profile), scenario.seed)
         source.late_s = sooner_s
-        self._clock = FaultyClock(self._link, lambda: _cut(radio), LONGEST_FLIGHT_S)
+        self._clock = FaultyClock(self._link, radio, LONGEST_FLIGHT_S)
         self._switch = OperatorSwitch(listening=True, clock=self._clock.now)
         disk = Disk()
         edges = Edges(vehicle, radio, source, self._clock, self._press, self._switch.land, disk)
@@ -102,7 +92,7 @@ class FaultyFlight:
         self._injector.on_begin = self._note_beginning
         self._injectors = [self._injector]
         if case.landed_from is not None:
-            lands: tuple[Effect, ...] = (Presses((0.0,), hang_up=True),)
+            lands: tuple[e.Effect, ...] = (e.Operator((0.0,), hang_up=True),)
             self._injectors.append(Injector(edges, lands, case.landed_from, case.landed_after_s))
         watchers: tuple[Watcher, ...] = (*self._injectors, disk, self)
         if log is not None:
@@ -210,7 +200,7 @@ class FaultyFlight:
 
     def _is_heard(self, block: str, t_s: float) -> bool:
         if self._injector.begin_s is not None and any(
-            isinstance(effect, LogReads) for effect in self._case.effects
+            isinstance(effect, e.LogReads) for effect in self._case.effects
         ):
             return False
         delay_s = self._radio.down(block, t_s)
@@ -219,7 +209,7 @@ class FaultyFlight:
     def _is_suspended(self, t_s: float) -> bool:
         begin_s = self._injector.begin_s
         return begin_s is not None and any(
-            isinstance(effect, Suspended) and begin_s <= t_s < begin_s + effect.for_s
+            isinstance(effect, e.Suspended) and begin_s <= t_s < begin_s + effect.for_s
             for effect in self._case.effects
         )
 
@@ -228,7 +218,6 @@ class FaultyFlight:
 
     def _result(self, ended: _Ended, end_s: float, wall_s: float) -> FaultResult:
         case, report = self._case, ended.report
-        verdict = self._oracle.verdict()
         facts = self._recorder.complete(
             begin_s=self._injector.begin_s,
             killed_s=self._clock.killed_s,
@@ -248,20 +237,15 @@ class FaultyFlight:
             end=ended.end,
             cause="" if report is None else report.outcome.value,
             reason=ended.error if report is None else report.reason,
-            flags=verdict.flags,
-            counted=unexpected(verdict.flags, listed, facts),
+            counted=unexpected(self._oracle.verdict.flags, listed, facts),
             unavoidable="; ".join(outcome.reason for outcome in expected) or None,
             time_s=end_s,
             miss_m=self._vehicle.world.gear_miss_m() if perched else None,
-            drop_m=verdict.drop_m,
-            slip_ratio=verdict.slip_ratio,
             wall_s=wall_s,
-            way=() if report is None else tuple(e.phase.value for e in report.history if e.phase),
+            way=() if report is None else tuple(x.phase.value for x in report.history if x.phase),
             row="" if report is None else last_row(report),
             expected=tuple(outcome.name for outcome in expected),
-            touchdown_mps=verdict.touchdown_mps,
-            touchdown_aside_mps=verdict.touchdown_aside_mps,
-            astray_m=verdict.astray_m,
+            **vars(self._oracle.verdict),
         )
         if self._log is not None:
             self._log.close(report, result.miss_m, "fell" in result.flags)
@@ -302,6 +286,14 @@ def fly_fault_seed(
     return fly_measured(profile, seed, fly_drawn)
 
 
+def fly_fault_in_folder(
+    profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
+) -> FaultResult:
+    """`fly_fault_seed` with the log in a folder, if one is given."""
+    log = None if log_dir is None else seed_log_path(seed, log_dir)
+    return fly_fault_seed(profile, seed, faults, log, record)
+
+
 def _scenario_of(case: Case, scenario: Scenario) -> Scenario:
     if case.first_hold is not None:
         hold_n = case.first_hold * scenario.mass_kg * GRAVITY_MPS2
@@ -309,17 +301,17 @@ def _scenario_of(case: Case, scenario: Scenario) -> Scenario:
     return changed_scenario(scenario, case.effects)
 
 
-def _sooner_s(effects: Sequence[Effect]) -> float:
+def _sooner_s(effects: Sequence[e.Effect]) -> float:
     """By how much the pictures will come sooner than the profile is told."""
-    found = [e.late_s for e in effects if isinstance(e, CameraFault) and e.kind == "sooner"]
+    found = [f.late_s for f in effects if isinstance(f, e.CameraFault) and f.kind == "sooner"]
     return max(found, default=0.0)
 
 
 def _flown_by(profile: Profile, case: Case) -> Profile:
     """The profile as the case needs it."""
-    if any(isinstance(effect, ExternalPositions) for effect in case.effects):
+    if any(isinstance(effect, e.ExternalPositions) for effect in case.effects):
         profile = with_positioning("mocap", profile)
-    if any(isinstance(effect, DeckSilent) for effect in case.effects):
+    if any(isinstance(effect, e.DeckSilent) for effect in case.effects):
         profile = with_positioning("deck", profile)
     more_s = _sooner_s(case.effects)
     if more_s == 0.0:
@@ -339,32 +331,3 @@ def _parameters(case: Case) -> dict[str, Any]:
     if case.first_hold is not None:
         found["first_hold"] = case.first_hold
     return found
-
-
-def _cut(radio: FaultyRadio) -> None:
-    radio.cut = True
-
-
-# --- Seeded flights, each with a fault out of a selection --------------------------------------
-
-
-def run_fault_campaign(
-    profile: Profile,
-    seeds: Iterable[int],
-    faults: tuple[str, ...],
-    executor: Executor | None = None,
-    on_result: Callable[[FaultResult], None] = lambda result: None,
-    log_dir: Path | None = None,
-    record: bool = False,
-) -> list[FaultResult]:
-    """Fly all seeds, as `perchctl.campaign.run_campaign` does."""
-    return fly_all(
-        partial(_fly_logged, profile, faults, log_dir, record), seeds, executor, on_result
-    )
-
-
-def _fly_logged(
-    profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
-) -> FaultResult:
-    log = None if log_dir is None else seed_log_path(seed, log_dir)
-    return fly_fault_seed(profile, seed, faults, log, record)

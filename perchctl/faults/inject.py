@@ -10,37 +10,10 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
+from perchctl.faults import effects as e
 from perchctl.faults.edges import FaultyCamera, FaultyClock, FaultyRadio
-from perchctl.faults.effects import (
-    BatterySags,
-    BlockDead,
-    CameraFault,
-    DeckSilent,
-    DiskFull,
-    Effect,
-    EstimateError,
-    ExternalPositions,
-    Hung,
-    Killed,
-    LogReads,
-    MagnetHolds,
-    MagnetLetsGo,
-    MotorWeak,
-    Operator,
-    PacketLost,
-    PacketTwice,
-    Push,
-    Raises,
-    Reboots,
-    Room,
-    Silence,
-    Slow,
-    Suspended,
-    TargetMoves,
-    TelemetryDelayed,
-    ThrustChanged,
-)
 from perchctl.faults.truth import SAMPLE_S, WatchedVehicle
 from perchctl.geometry import GRAVITY_MPS2, rot_z
 from perchctl.mission import Event, Phase, Tick
@@ -58,26 +31,26 @@ CAPTURE_FAULTS = {
 }
 
 
-def changed_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
+def changed_scenario(scenario: Scenario, effects: tuple[e.Effect, ...]) -> Scenario:
     """The scenario as the effects have it from the start."""
     weight_n = scenario.mass_kg * GRAVITY_MPS2
     for effect in effects:
         match effect:
-            case MagnetHolds(of_weight):
+            case e.MagnetHolds(of_weight):
                 hold_n = of_weight * weight_n
                 scenario = replace(scenario, magnet_force_n=hold_n, first_contact_force_n=None)
-            case Room():
+            case e.Room():
                 scenario = _other_room(scenario, effect)
-            case ExternalPositions() | DeckSilent():
+            case e.ExternalPositions() | e.DeckSilent():
                 extra = {**scenario.extra, "external_position": 1.0}
                 parameters = scenario.parameters
-                if isinstance(effect, DeckSilent):
+                if isinstance(effect, e.DeckSilent):
                     parameters = {**parameters, LIGHTHOUSE: 1.0}
                 scenario = replace(scenario, extra=extra, parameters=parameters)
     return scenario
 
 
-def _other_room(scenario: Scenario, room: Room) -> Scenario:
+def _other_room(scenario: Scenario, room: e.Room) -> Scenario:
     turn = rot_z(math.radians(room.mount_turned_deg))
     rows = [list(row) for row in scenario.T_body_cam_true]
     for i in range(3):
@@ -128,7 +101,7 @@ class Injector:
     problem: str | None = None
 
     def __init__(
-        self, edges: Edges, effects: tuple[Effect, ...], phase: Phase, moment_s: float
+        self, edges: Edges, effects: tuple[e.Effect, ...], phase: Phase, moment_s: float
     ) -> None:
         self._edges = edges
         self._effects = effects
@@ -136,12 +109,11 @@ class Injector:
         self._moment_s = moment_s
         self._due_s: float | None = None
         self._later: list[tuple[float, Callable[[], None]]] = []
-        self._estimate: tuple[EstimateError, float] | None = None
-        self._sag: tuple[BatterySags, float] | None = None
+        self._sag: tuple[e.BatterySags, float] | None = None
         self._deck: random.Random | None = None  # the noise of a deck whose positions come
         self._shakes_mps2 = 0.0
         for effect in effects:
-            if isinstance(effect, DeckSilent):
+            if isinstance(effect, e.DeckSilent):
                 self._deck = random.Random(edges.vehicle.firmware.scenario.seed)
                 self._shakes_mps2 = effect.acc_z_mps2
         self._lets_go: float | None = None
@@ -180,7 +152,7 @@ class Injector:
             self._sag = (sag, left_v - step_v) if left_v > step_v else None
         if self._lets_go is not None and world.magnet_engaged:
             after_s, self._lets_go = self._lets_go, None
-            self._at(t_s + after_s, self._let_go)
+            self._at(t_s + after_s, partial(setattr, world.magnet, "let_go", True))
 
     def begin_now(self) -> None:
         """Before the flight: for what is so from the start."""
@@ -196,59 +168,67 @@ class Injector:
         self._later.append((t_s, act))
         self._later.sort(key=lambda entry: entry[0])
 
-    def _lay(self, effect: Effect, t_s: float) -> None:
+    def _set(self, owner: object, name: str, value: object, after: object, end_s: float) -> None:
+        """Set an attribute from now on, and to what it is `after` at `end_s`."""
+        setattr(owner, name, value)
+        self._at(end_s, partial(setattr, owner, name, after))
+
+    def _lay(self, effect: e.Effect, t_s: float) -> None:
         edges = self._edges
         vehicle = edges.vehicle
         match effect:
-            case Reboots():
+            case e.Reboots():
                 vehicle.firmware.reboot()
                 edges.radio.begin(effect, t_s)
-            case Silence() | PacketLost() | PacketTwice() | BlockDead() | TelemetryDelayed():
+            case e.RadioEffect():
                 edges.radio.begin(effect, t_s)
-            case CameraFault():
+            case e.CameraFault():
                 edges.camera.begin(effect, t_s)
-            case Killed() | Suspended() | Hung() | Slow() | Raises():
+            case e.ProgramEffect():
                 edges.clock.begin(effect, t_s)
-            case Operator():
+            case e.Operator():
                 act = edges.hang_up if effect.hang_up else edges.press
                 for press_s in effect.presses_s:
                     self._at(t_s + press_s, act)
-            case EstimateError():
-                self._estimate = (effect, t_s)
-                vehicle.firmware.estimator.spoil = self._spoil
-                self._at(t_s + effect.for_s, self._heal)
-            case ExternalPositions():
+            case e.EstimateError():
+                estimator, spoil = vehicle.firmware.estimator, partial(self._spoil, effect, t_s)
+                self._set(estimator, "spoil", spoil, None, t_s + effect.for_s)
+            case e.ExternalPositions():
                 assert vehicle.capture is not None
                 fault = replace(CAPTURE_FAULTS[effect.how], late_s=effect.late_s)
                 vehicle.capture.lay(fault, effect.for_s)
-            case DeckSilent(for_s):
-                noise, self._deck = self._deck, None
-                self._at(t_s + for_s, lambda: setattr(self, "_deck", noise))
-            case LogReads():
-                self._read_wrongly(effect, t_s)
-            case BatterySags():
+            case e.DeckSilent(for_s):
+                self._set(self, "_deck", None, self._deck, t_s + for_s)
+            case e.LogReads():
+                firmware = vehicle.firmware
+                for name in effect.names:
+                    value = firmware.log_value(name) if effect.value is None else effect.value
+                    firmware.log_overrides[name] = value
+                self._at(t_s + effect.for_s, firmware.log_overrides.clear)
+            case e.BatterySags():
                 self._sag = (effect, effect.by_v)
-            case MotorWeak():
-                strength = [1.0] * 4
-                strength[effect.motor - 1] = effect.strength
-                s1, s2, s3, s4 = strength
+            case e.MotorWeak():
+                s1, s2, s3, s4 = (
+                    effect.strength if m == effect.motor else 1.0 for m in (1, 2, 3, 4)
+                )
                 vehicle.world.powertrain.strength = (s1, s2, s3, s4)
-            case ThrustChanged(to):
+            case e.ThrustChanged(to):
                 powertrain = vehicle.world.powertrain
                 s1, s2, s3, s4 = powertrain.strength or (1.0,) * 4
                 powertrain.strength = (s1 * to, s2 * to, s3 * to, s4 * to)
-            case Push():
-                vehicle.world.external_force_n = effect.force_n
-                self._at(t_s + effect.for_s, self._leave_alone)
-            case MagnetLetsGo():
+            case e.Push():
+                still_n = (0.0, 0.0, 0.0)
+                end_s = t_s + effect.for_s
+                self._set(vehicle.world, "external_force_n", effect.force_n, still_n, end_s)
+            case e.MagnetLetsGo():
                 self._lets_go = effect.after_s
-            case TargetMoves(by_m):
+            case e.TargetMoves(by_m):
                 x, y = vehicle.world.magnet.target_xy_m
                 vehicle.move_target((x + by_m[0], y + by_m[1]))
-            case DiskFull():
-                edges.disk.problem = "No space left on device"
-                self._at(t_s + effect.for_s, self._make_room)
-            case MagnetHolds() | Room():
+            case e.DiskFull():
+                problem = "No space left on device"
+                self._set(edges.disk, "problem", problem, None, t_s + effect.for_s)
+            case e.MagnetHolds() | e.Room():
                 pass  # from the start: `changed_scenario`
 
     def _measure(self, noise: random.Random) -> None:
@@ -258,9 +238,7 @@ class Injector:
         x_m, y_m, z_m = (p + noise.gauss(0.0, sigma_m) for p in (world.x_m, world.y_m, world.z_m))
         firmware.estimator.external_position((x_m, y_m, z_m))
 
-    def _spoil(self, now: Estimate) -> None:
-        assert self._estimate is not None
-        error, begin_s = self._estimate
+    def _spoil(self, error: e.EstimateError, begin_s: float, now: Estimate) -> None:
         t_s = self._edges.vehicle.t_s - begin_s
         x, y, z = error.step_m
         vx, vy, vz = error.drift_mps
@@ -271,22 +249,3 @@ class Injector:
         now.vy_mps += vy
         now.vz_mps += vz
         now.yaw_deg = math.remainder(now.yaw_deg + error.turn_deg, 360.0)
-
-    def _heal(self) -> None:
-        self._edges.vehicle.firmware.estimator.spoil = None
-
-    def _read_wrongly(self, effect: LogReads, t_s: float) -> None:
-        firmware = self._edges.vehicle.firmware
-        for name in effect.names:
-            value = firmware.log_value(name) if effect.value is None else effect.value
-            firmware.log_overrides[name] = value
-        self._at(t_s + effect.for_s, firmware.log_overrides.clear)
-
-    def _leave_alone(self) -> None:
-        self._edges.vehicle.world.external_force_n = (0.0, 0.0, 0.0)
-
-    def _let_go(self) -> None:
-        self._edges.vehicle.world.magnet.let_go = True
-
-    def _make_room(self) -> None:
-        self._edges.disk.problem = None

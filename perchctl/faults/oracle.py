@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal, NamedTuple, get_args
 
@@ -106,19 +106,25 @@ class Limits:
     magnet_radius_m: float = 0.025
 
 
-@dataclass(frozen=True)
+@dataclass
 class Verdict:
-    """`flags` with when each was first raised; `drop_m` the deepest fall until caught, and
-    `slip_ratio` the magnet's hold over the weight where that was a slip from the magnet.
-    `touchdown_mps`, `touchdown_aside_mps`: the largest speeds, downwards and sideways, with which
-    the floor was met. `astray_m`: the farthest from where it should have been, in the air."""
+    """What the oracle has found so far.
 
-    flags: dict[Flag, float]
-    drop_m: float
-    slip_ratio: float | None
-    touchdown_mps: float
-    touchdown_aside_mps: float
-    astray_m: float
+    Attributes:
+        flags: with when each was first raised, in that order.
+        drop_m: the deepest fall until caught; `slip_ratio`: the magnet's hold over the weight,
+            where that was a slip from the magnet.
+        touchdown_mps, touchdown_aside_mps: the largest speeds, downwards and sideways, with which
+            the floor was met.
+        astray_m: the farthest from where it should have been, in the air.
+    """
+
+    flags: dict[Flag, float] = field(default_factory=dict)
+    drop_m: float = 0.0
+    slip_ratio: float | None = None
+    touchdown_mps: float = 0.0
+    touchdown_aside_mps: float = 0.0
+    astray_m: float = 0.0
 
 
 def drop_limit_m(hold_ratio: float) -> float:
@@ -142,31 +148,54 @@ def second_press_s(presses_s: Sequence[float]) -> float | None:
     return None
 
 
+class _Lasting:
+    """Whether a condition has held for a time, without a break."""
+
+    def __init__(self, for_s: float) -> None:
+        self._for_s, self._since_s = for_s, math.inf
+
+    def see(self, holds: bool, t_s: float) -> bool:
+        """Whether it has, with this moment."""
+        self._since_s = min(self._since_s, t_s) if holds else math.inf
+        return self.holds(t_s)
+
+    def holds(self, t_s: float) -> bool:
+        """Whether it had until the last moment, and goes on."""
+        return t_s - self._since_s >= self._for_s - 1e-9
+
+
+@dataclass
+class _Fall:
+    """`slip_ratio`: the magnet's hold over the weight; None for what is no slip."""
+
+    top_m: float
+    slip_ratio: float | None = None
+    slow: _Lasting = field(default_factory=lambda: _Lasting(SLOW_AGAIN_S))
+
+
 class Oracle:
-    """Samples in, at most 20 ms apart; flags out."""
+    """Samples in, at most 20 ms apart; `verdict` is what was found."""
 
     def __init__(self, limits: Limits) -> None:
-        self._limits = limits
-        self.flags: dict[Flag, float] = {}
+        self.verdict = Verdict()
         self.newest: Sample | None = None
-        self._drop_m = 0.0
-        self._slip_ratio: float | None = None
-        self._touchdown_mps = self._touchdown_aside_mps = 0.0
-        self._astray_m = 0.0
+        self._max_height_m = limits.max_height_m
+        self._magnet_radius_m = limits.magnet_radius_m
+        self._tilted_up_z = math.cos(math.radians(limits.max_tilt_deg))
+        self._tilt_up_z = math.cos(math.radians(limits.max_tilt_deg - TILT_WITHIN_DEG))
         self._hung: Sample | None = None  # last sample that hung
-        self._off_s: float | None = None
-        self._free_s: float | None = None
-        self._press_s: float | None = None  # newest sample that pressed
-        self._pressed_s: float | None = None
+        self._unpowered, self._weightless = _Lasting(OFF_S), _Lasting(FREE_FALL_S)
+        self._press_s = -math.inf  # newest sample that pressed
+        self._pressed = _Lasting(PRESSED_S)
         self._calm_height_m = 0.0  # where it last did not sink fast
         self._fall: _Fall | None = None
-        self._weak_s: float | None = None  # when it was last without the thrust to slow down
+        self._weak_s = -math.inf  # when it was last without the thrust to slow down
         self._before: Sample | None = None
         self._least_up_z = 1.0
         self._ended_by_vehicle = False
         self._may_lock = False
         self._claims: dict[Claim, float] = {}  # those that are not found true yet
-        self._seen_down_s: float | None = None  # at rest with still motors, and heard, since
+        self._seen_down = _Lasting(SEEN_S)  # at rest with still motors, and heard
         self._said_off = False  # a claim that the motors are off has been found true
         self._presses_s: list[float] = []
         self._muted_s = -math.inf  # when last nothing arrived
@@ -194,18 +223,8 @@ class Oracle:
         """When the operator asked for the emergency stop."""
         return second_press_s(self._presses_s)
 
-    def verdict(self) -> Verdict:
-        """After the last sample."""
-        return Verdict(
-            dict(sorted(self.flags.items(), key=lambda raised: raised[1])),
-            self._drop_m,
-            self._slip_ratio,
-            self._touchdown_mps,
-            self._touchdown_aside_mps,
-            self._astray_m,
-        )
-
     def see(self, s: Sample) -> None:
+        """The next sample."""
         self.newest = s
         if s.hanging:
             self._hung = s
@@ -224,11 +243,12 @@ class Oracle:
 
     @property
     def in_the_air(self) -> bool:
+        """Whether it flies or falls."""
         s = self.newest
         return s is not None and _airborne(s) and not (s.hanging and not s.motors_on)
 
     def _raise(self, flag: Flag, t_s: float) -> None:
-        self.flags.setdefault(flag, t_s)
+        self.verdict.flags.setdefault(flag, t_s)
 
     def _from_hanging(self, s: Sample) -> bool:
         """Whether it hung a moment ago: let go, and about to be caught."""
@@ -236,9 +256,9 @@ class Oracle:
 
     def _watch_unpowered(self, s: Sample) -> None:
         free = _airborne(s) and not s.hanging and not self._from_hanging(s)
-        self._off_s = _since(self._off_s, free and not s.motors_on, s.t_s)
-        self._free_s = _since(self._free_s, free and s.acc_g < FREE_FALL_G, s.t_s)
-        if _lasts(self._off_s, OFF_S, s.t_s) or _lasts(self._free_s, FREE_FALL_S, s.t_s):
+        unpowered = self._unpowered.see(free and not s.motors_on, s.t_s)
+        weightless = self._weightless.see(free and s.acc_g < FREE_FALL_G, s.t_s)
+        if unpowered or weightless:
             self._raise("fell", s.t_s)
 
     def _watch_fall(self, s: Sample) -> None:
@@ -250,19 +270,19 @@ class Oracle:
             if sinking <= FAST_MPS or not _airborne(s):
                 self._calm_height_m = s.height_m
                 return
-            hung = self._hung if self._from_hanging(s) else None
-            top_m = self._calm_height_m if hung is None else hung.height_m
-            self._fall = _Fall(top_m, None if hung is None else hung.hold_ratio)
+            self._fall = _Fall(self._calm_height_m)
+            if self._hung is not None and self._from_hanging(s):
+                self._fall = _Fall(self._hung.height_m, self._hung.hold_ratio)
         fall = self._fall
         drop_m = fall.top_m - s.height_m
-        if drop_m > self._drop_m:
-            self._drop_m, self._slip_ratio = drop_m, fall.slip_ratio
-        unpowered = self._weak_s is not None and s.t_s - self._weak_s <= FROM_HANGING_S
+        if drop_m > self.verdict.drop_m:
+            self.verdict.drop_m, self.verdict.slip_ratio = drop_m, fall.slip_ratio
+        unpowered = s.t_s - self._weak_s <= FROM_HANGING_S
         too_deep = fall.slip_ratio is not None and drop_m > drop_limit_m(fall.slip_ratio)
         if unpowered and (too_deep or s.floor):
             self._raise("fell", s.t_s)
-        fall.slow_s = _since(fall.slow_s, sinking < FAST_MPS, s.t_s)
-        caught = sinking < CAUGHT_MPS or _lasts(fall.slow_s, SLOW_AGAIN_S, s.t_s)
+        slow_again = fall.slow.see(sinking < FAST_MPS, s.t_s)
+        caught = sinking < CAUGHT_MPS or slow_again
         if s.floor or caught:
             self._fall = None
             self._calm_height_m = s.height_m
@@ -273,8 +293,9 @@ class Oracle:
         if before is None or before.floor or not s.floor:
             return
         sink_mps = -before.vz_mps
-        self._touchdown_mps = max(self._touchdown_mps, sink_mps)
-        self._touchdown_aside_mps = max(self._touchdown_aside_mps, before.aside_mps)
+        found = self.verdict
+        found.touchdown_mps = max(found.touchdown_mps, sink_mps)
+        found.touchdown_aside_mps = max(found.touchdown_aside_mps, before.aside_mps)
         if sink_mps > TOUCHDOWN_MPS:
             self._raise("fell", s.t_s)
         if before.aside_mps > TOUCHDOWN_ASIDE_MPS:
@@ -283,16 +304,14 @@ class Oracle:
     def _watch_pressing(self, s: Sample) -> None:
         if s.pressing:
             self._press_s = s.t_s
-        presses = self._press_s is not None and s.t_s - self._press_s <= RELEASED_S
-        self._pressed_s = _since(self._pressed_s, presses, s.t_s)
-        if s.pressing and _lasts(self._pressed_s, PRESSED_S, s.t_s):
+        if self._pressed.see(s.t_s - self._press_s <= RELEASED_S, s.t_s) and s.pressing:
             self._raise("pressed", s.t_s)
 
     def _watch_place(self, s: Sample) -> None:
         if not _airborne(s):
             return
-        self._astray_m = max(self._astray_m, s.astray_m)
-        if s.astray_m > ASTRAY_M or s.height_m > self._limits.max_height_m + TOO_HIGH_M:
+        self.verdict.astray_m = max(self.verdict.astray_m, s.astray_m)
+        if s.astray_m > ASTRAY_M or s.height_m > self._max_height_m + TOO_HIGH_M:
             self._raise("strayed", s.t_s)
 
     def _watch_end(self, s: Sample) -> None:
@@ -305,7 +324,7 @@ class Oracle:
         if self._said_off and s.motors_on:
             self._raise("lied", s.t_s)
         at_rest = not s.motors_on and (s.hanging or not _airborne(s))
-        self._seen_down_s = _since(self._seen_down_s, at_rest and s.heard, s.t_s)
+        self._seen_down.see(at_rest and s.heard, s.t_s)
         for claim, claimed_s in list(self._claims.items()):
             if self._is_true(claim, s):
                 del self._claims[claim]
@@ -315,18 +334,20 @@ class Oracle:
                 self._raise("lied", s.t_s)
 
     def _is_true(self, claim: Claim, s: Sample) -> bool:
+        hangs = s.hanging and not s.motors_on
+        # What lies on its side or its back does not stand.
+        stands = not s.motors_on and not _airborne(s) and s.up_z > self._tilted_up_z
         match claim:
             case "hangs on the target":
-                return s.hanging and not s.motors_on and s.miss_m <= self._limits.magnet_radius_m
+                return hangs and s.miss_m <= self._magnet_radius_m
             case "held off the target":
-                off_m = math.hypot(s.miss_m, s.below_m)
-                return s.hanging and not s.motors_on and off_m > self._limits.magnet_radius_m
+                return hangs and math.hypot(s.miss_m, s.below_m) > self._magnet_radius_m
             case "hangs":
-                return s.hanging and not s.motors_on
+                return hangs
             case "stands":
-                return not s.motors_on and self._is_upright_below(s)
+                return stands
             case "hangs or stands":
-                return not s.motors_on and (s.hanging or self._is_upright_below(s))
+                return hangs or stands
             case "motors off":
                 return not s.motors_on
             case "locked":
@@ -334,15 +355,9 @@ class Oracle:
             case "ended by the supervisor":
                 return self._ended_by_vehicle
             case "tilted":
-                limit_deg = self._limits.max_tilt_deg - TILT_WITHIN_DEG
-                return self._least_up_z < math.cos(math.radians(limit_deg))
+                return self._least_up_z < self._tilt_up_z
             case "not seen down":
-                return not _lasts(self._seen_down_s, SEEN_S, s.t_s)
-
-    def _is_upright_below(self, s: Sample) -> bool:
-        """What lies on its side or its back does not stand."""
-        tilted_up_z = math.cos(math.radians(self._limits.max_tilt_deg))
-        return not _airborne(s) and s.up_z > tilted_up_z
+                return not self._seen_down.holds(s.t_s)
 
     def _watch_stop(self, s: Sample) -> None:
         """Only while packets pass: what cannot be heard is not disobeyed. Motors that are off by
@@ -357,31 +372,11 @@ class Oracle:
 
     def _watch_lock(self, s: Sample) -> None:
         """What comes after the lock, as the tumble of what was cut in the air, is no reason."""
-        tilted_up_z = math.cos(math.radians(self._limits.max_tilt_deg))
-        if s.ended_by_vehicle or s.up_z < tilted_up_z:
+        if s.ended_by_vehicle or s.up_z < self._tilted_up_z:
             self._may_lock = True
         if s.locked and not self._may_lock:
             self._raise("locked_needlessly", s.t_s)
 
 
-@dataclass
-class _Fall:
-    """`slip_ratio`: the magnet's hold over the weight; None for what is no slip."""
-
-    top_m: float
-    slip_ratio: float | None
-    slow_s: float | None = None
-
-
 def _airborne(s: Sample) -> bool:
     return not s.floor and s.height_m > LOW_M
-
-
-def _since(since_s: float | None, holds: bool, t_s: float) -> float | None:
-    if not holds:
-        return None
-    return t_s if since_s is None else since_s
-
-
-def _lasts(since_s: float | None, for_s: float, t_s: float) -> bool:
-    return since_s is not None and t_s - since_s >= for_s - 1e-9

@@ -75,10 +75,9 @@ class FaultResult:
         return self.end
 
     @property
-    def badness(self) -> tuple[bool, int, int, float]:
-        """The larger the worse: by the gravest flag that counts, by how many, then the misses."""
-        gravest = max((-FLAGS.index(flag) for flag in self.counted), default=-len(FLAGS))
-        return bool(self.counted), gravest, len(self.counted), self.miss_m or 0.0
+    def is_bad(self) -> bool:
+        """True if a flag counts."""
+        return bool(self.counted)
 
 
 # --- A campaign's figures ----------------------------------------------------------------------
@@ -91,6 +90,8 @@ SLIPS = {"to 0.3": (0.0, 0.3), "to 0.75": (0.3, 0.75), "above": (0.75, math.inf)
 """What the magnet held, over the weight, where it let go."""
 HEADS = ("appr", "srch", "est", "align", "asc", "perch", "compl", "recov", "land")
 """The phases' heads, as narrow as their columns."""
+RARE = {outcome.name for outcome in EXPECTED_OUTCOMES if not outcome.chosen}
+"""The expected outcomes that neither the user nor the firmware chose."""
 
 
 def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
@@ -101,49 +102,41 @@ def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
     vehicle hangs or stands, `unconfirmed` of those whose landing it did not see; `drop_m` the
     deepest slips from a magnet that held up to so much of the weight, `touchdown` the hardest
     ones outside of expected outcomes."""
+    counts, expected = _counts(results), _expected(results)
+    own = [r for r in results if not r.expected]
     return {
         "flights": len(results),
         **{end: sum(r.end == end for r in results) for end in ENDS},
         **{flag: sum(flag in r.counted for r in results) for flag in FLAGS},
-        "wrong": rate_record(sum(bool(r.counted) for r in results), len(results)),
         "unavoidable": sum(_is_unavoidable(r) for r in results),
         "expected_outcomes": {
-            name: rate_record(count, len(results)) for name, count in expected(results).items()
+            name: rate_record(count, len(results)) for name, count in expected.items()
         },
-        "rare_outcomes": rate_record(_rare(results), len(results)),
-        "not_known": rate_record(_ended_by(results, NOT_KNOWN), len(results)),
-        "unconfirmed": rate_record(_ended_by(results, UNCONFIRMED), len(results)),
+        **{name: rate_record(count, len(results)) for name, count in counts.items()},
         "drop_m": {name: _deepest_m(results, *bounds) for name, bounds in SLIPS.items()},
         "touchdown": {
-            "down_mps": _hardest_mps(results, "touchdown_mps"),
-            "aside_mps": _hardest_mps(results, "touchdown_aside_mps"),
+            "down_mps": round(max((r.touchdown_mps for r in own), default=0.0), 3),
+            "aside_mps": round(max((r.touchdown_aside_mps for r in own), default=0.0), 3),
         },
         "peak_memory_mb": peak_mb(results),
         "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
     }
 
 
-def expected(results: Iterable[FaultResult]) -> dict[str, int]:
+def _counts(results: Sequence[FaultResult]) -> dict[str, int]:
+    """The flights with each of what is told as a share of all."""
+    return {
+        "wrong": sum(r.is_bad for r in results),
+        "rare_outcomes": sum(bool(RARE & set(r.expected)) for r in results),
+        "not_known": sum(r.row == NOT_KNOWN for r in results),
+        "unconfirmed": sum(r.row == UNCONFIRMED for r in results),
+    }
+
+
+def _expected(results: Iterable[FaultResult]) -> dict[str, int]:
     """In how many flights the cause of each expected outcome came."""
     names = Counter(name for r in results for name in r.expected)
     return {outcome.name: names[outcome.name] for outcome in EXPECTED_OUTCOMES}
-
-
-def _rare(results: Iterable[FaultResult]) -> int:
-    """Flights with an expected outcome that neither the user nor the firmware chose."""
-    rare = {outcome.name for outcome in EXPECTED_OUTCOMES if not outcome.chosen}
-    return sum(bool(rare & set(r.expected)) for r in results)
-
-
-def _ended_by(results: Iterable[FaultResult], row: str) -> int:
-    return sum(r.row == row for r in results)
-
-
-def _hardest_mps(
-    results: Iterable[FaultResult], of: Literal["touchdown_mps", "touchdown_aside_mps"]
-) -> float:
-    found: list[float] = [getattr(r, of) for r in results if not r.expected]
-    return round(max(found, default=0.0), 3)
 
 
 def _deepest_m(results: Iterable[FaultResult], above: float, to: float) -> float | None:
@@ -153,44 +146,49 @@ def _deepest_m(results: Iterable[FaultResult], above: float, to: float) -> float
 
 def worst_first(results: Iterable[FaultResult]) -> list[FaultResult]:
     """Flights with flags of their own, the gravest first."""
-    bad = [r for r in results if r.counted]
+    bad = [r for r in results if r.is_bad]
     return sorted(bad, key=lambda r: (min(map(FLAGS.index, r.counted)), -len(r.counted), r.seed))
 
 
 def fault_table(results: Sequence[FaultResult]) -> str:
     """The figures, faults against phases, and the worst flights, as plain text."""
-    figures = fault_summary(results)
+    figures, counts = fault_summary(results), _counts(results)
     flown = {r.fault for r in results}
-    cells: list[tuple[str, ...]] = [("fault", *HEADS)]
-    cells += [
-        (fault.name, *(_cell(results, fault.name, phase) for phase in PHASES))
-        for fault in FAULTS
-        if fault.name in flown
-    ]
-    lines = align_columns(cells)
-    lines += ["", "a cell: flights, !k of them wrong, u: unavoidable among them", ""]
-    ends = ", ".join(f"{figures[end]} {end}" for end in ENDS if figures[end])
-    lines.append(f"flights            {figures['flights']}" + (f": {ends}" if ends else ""))
-    lines.append(f"with a flag        {rate_text(len(worst_first(results)), len(results))}")
-    lines += [f"{flag.replace('_', ' '):<18} {figures[flag]}" for flag in FLAGS]
-    flights = len(results)
-    lines.append(f"unavoidable        {figures['unavoidable']}")
-    lines.append(f"expected outcomes  {rate_text(_rare(results), flights)}, those chosen aside")
-    lines += [
-        f"  {rate_text(count, flights)} {name}"
-        for name, count in expected(results).items()
-        if count
-    ]
-    lines.append(f"not known          {rate_text(_ended_by(results, NOT_KNOWN), flights)}")
-    lines.append(f"unconfirmed        {rate_text(_ended_by(results, UNCONFIRMED), flights)}")
-    hardest = figures["touchdown"]
-    lines.append(
-        f"hardest touchdown  {hardest['down_mps']:.2f} m/s down, "
-        f"{hardest['aside_mps']:.2f} m/s sideways"
+    lines = align_columns(
+        [
+            ("fault", *HEADS),
+            *(
+                (fault.name, *(_cell(results, fault.name, phase) for phase in PHASES))
+                for fault in FAULTS
+                if fault.name in flown
+            ),
+        ]
     )
+    ends = ", ".join(f"{figures[end]} {end}" for end in ENDS if figures[end])
+    shares = {name: rate_text(count, len(results)) for name, count in counts.items()}
+    hardest = figures["touchdown"]
     drops = ", ".join(f"{d:.2f} m {n}" for n, d in figures["drop_m"].items() if d is not None)
-    if drops:
-        lines.append(f"deepest slip       {drops} of the weight")
+    rows = [
+        ("flights", str(figures["flights"]) + (f": {ends}" if ends else "")),
+        ("with a flag", shares["wrong"]),
+        *((flag.replace("_", " "), str(figures[flag])) for flag in FLAGS),
+        ("unavoidable", str(figures["unavoidable"])),
+        ("expected outcomes", f"{shares['rare_outcomes']}, those chosen aside"),
+        *(
+            (f"  {rate_text(count, len(results))} {name}", "")
+            for name, count in _expected(results).items()
+            if count
+        ),
+        ("not known", shares["not_known"]),
+        ("unconfirmed", shares["unconfirmed"]),
+        (
+            "hardest touchdown",
+            f"{hardest['down_mps']:.2f} m/s down, {hardest['aside_mps']:.2f} m/s sideways",
+        ),
+        *([("deepest slip", f"{drops} of the weight")] if drops else []),
+    ]
+    lines += ["", "a cell: flights, !k of them wrong, u: unavoidable among them", ""]
+    lines += [f"{name:<18} {text}".rstrip() for name, text in rows]
     worst = worst_first(results)[:WORST]
     if worst:
         lines += ["", "worst flights"]
@@ -207,7 +205,7 @@ def _cell(results: Iterable[FaultResult], fault: str, phase: str) -> str:
     here = [r for r in results if r.fault == fault and r.phase == phase]
     if not here:
         return "."
-    wrong = sum(bool(r.counted) for r in here)
+    wrong = sum(r.is_bad for r in here)
     unavoidable = "u" if any(_is_unavoidable(r) for r in here) else ""
     return f"{len(here)}{f'!{wrong}' if wrong else ''}{unavoidable}"
 

@@ -2,53 +2,109 @@
 
 from __future__ import annotations
 
+import importlib.util
 import multiprocessing
 import shutil
 import signal
+import socket
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import Executor
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
 
-from perchctl.campaign import cluster, cluster_pool, fly_all, parse_address, run_campaign
+from perchctl.campaign import (
+    FlightResult,
+    cluster,
+    cluster_pool,
+    flight_processes,
+    fly_all,
+    run_campaign,
+)
 from perchctl.campaign.cluster import ClusterPool
 from perchctl.campaign.flights import FLOWN_AGAIN
 from perchctl.campaign.results_file import flown_record
-from perchctl.errors import ConnectionFailed, InvalidValue, PerchError
+from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
 from perchctl.profile import load_profile
 from tests.helpers.cluster import dies_in_flight, scheduler, worker
+from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.ended import ended
 from tests.helpers.flights import ROOT, SEED, SHORT
-from tests.helpers.seeds import (
-    Ended,
-    ends_at_once,
-    ends_first_only,
-    fails_later,
-    is_lost,
-    no_form,
-)
-
-pytestmark = pytest.mark.long
+from tests.helpers.seeds import Ended, ends_at_once, ends_first_only, fails_later, is_lost
 
 AT_ONCE_S = 20.0
 """Beside the time for which the flights would go on; on a busy machine, too."""
 
 
-# --- workers of this computer ----------------------------------------------------------------
+# --- the address, and what it goes together with ------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "address", ["local:", "local:0", "local:-1", "local:\u00b2", "localhost", "http://10.0.0.5:1"]
+)
+def test_what_is_no_address_is_refused(address: str) -> None:
+    with pytest.raises(UsageError, match=r"must be "), cluster_pool(address, []):
+        raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--jobs", "2"), "--jobs 2 does not apply"),
+        (("--only", "3"), "--cluster local:2 does not apply; leave it out, or --only"),
+        (("--faults", "list"), "--cluster local:2 does not apply"),
+        (("sweep", "planner.attempts=1", "--jobs", "1"), "--jobs 1 does not apply"),
+    ],
+)
+def test_what_does_not_go_with_it_is_refused(words: tuple[str, ...], named: str) -> None:
+    said = run("simulate", *words, "--cluster", "local:2")
+    assert said.code == UsageError.exit_code
+    assert named in said.stderr
+
+
+def test_without_the_library_one_sentence_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    there = importlib.util.find_spec
+    hide = lambda name, *rest: None if name == "distributed" else there(name, *rest)  # noqa: E731
+    monkeypatch.setattr("perchctl.commands.simulate.find_spec", hide)
+    said = run("simulate", "-p", SHORT, "-n", "2", "--cluster", "local:2")
+    assert said.code == 2
+    assert said.complaint.startswith("--cluster needs the library distributed (it is missing)")
+    assert said.complaint.endswith("-m pip install 'perchctl[cluster]'")
+
+
+def test_an_address_that_nobody_answers_is_told_in_time(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(cluster, "ANSWER_S", 0.3)
+    with socket.socket() as deaf:  # is bound, and takes no call
+        deaf.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{deaf.getsockname()[1]}"
+        said = run(
+            "simulate", "-p", SHORT, "-n", "2", "--cluster", address, "--log-dir", str(tmp_path)
+        )
+    assert said.code == 10
+    assert said.stdout == ""
+    assert said.complaint.startswith(f"no dask scheduler answers at {address} within")
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- workers of this computer -------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def local(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterPool]:
-    with cluster_pool(parse_address("local:2"), [load_profile(SHORT)]) as pool:
+def local() -> Iterator[ClusterPool]:
+    with cluster_pool("local:2", [load_profile(SHORT)]) as pool:
         yield pool
 
 
@@ -56,30 +112,25 @@ def workers_of_this_computer() -> set[int | None]:
     return {process.pid for process in multiprocessing.active_children()}
 
 
-def test_each_flight_is_flown_once_by_a_worker(local: ClusterPool) -> None:
+@pytest.mark.long
+def test_each_flight_is_flown_once_by_a_worker_and_what_fails_is_told(local: ClusterPool) -> None:
     told: list[int] = []
     flown = fly_all(ends_at_once, [3, 0, 1, 3, 2], local, lambda result: told.append(result.seed))
     assert [flight.seed for flight in flown] == [3, 0, 1, 2]
     assert sorted(told) == [0, 1, 2, 3]
     assert {flight.pid for flight in flown} <= workers_of_this_computer()
+    assert all(flight.deaf for flight in flown)
     assert local.notes == []
-
-
-def test_what_fails_is_told_as_in_processes(local: ClusterPool) -> None:
     with pytest.raises(PerchError, match="unforeseen ZeroDivisionError in the flight of seed 1"):
         fly_all(fails_later, [0, 1], local)
-    assert isinstance(local.submit(no_form).exception(), RuntimeError)
-    assert local.submit(lambda: None).exception() is not None
-    assert local.submit(len, (1, 2)).result() == 2
 
 
+@pytest.mark.long
 def test_a_lost_worker_is_replaced_and_its_flight_flown_again(
     local: ClusterPool, tmp_path: Path
 ) -> None:
     """What dask gives up, here after the first time, is the campaign's to hand over again."""
-    fly = partial(is_lost, folder=tmp_path, times=FLOWN_AGAIN)
-    assert isinstance(local.submit(fly, 1).exception(AT_ONCE_S), BrokenExecutor)
-    flown = fly_all(fly, [0, 1, 2, 3], local)
+    flown = fly_all(partial(is_lost, folder=tmp_path, times=FLOWN_AGAIN), [0, 1, 2, 3], local)
     assert [flight.seed for flight in flown] == [0, 1, 2, 3]
     marks = Counter(path.name[0] for path in tmp_path.iterdir())
     assert marks["1"] == 1 + FLOWN_AGAIN
@@ -88,24 +139,25 @@ def test_a_lost_worker_is_replaced_and_its_flight_flown_again(
     assert max(marks[seed] for seed in "023") <= 1 + FLOWN_AGAIN
 
 
+@pytest.mark.long
 def test_a_real_flight_survives_a_worker_that_is_killed_in_the_middle(
     local: ClusterPool, tmp_path: Path
 ) -> None:
-    """They end as in one process. (40 whole ones: `test_identical.py`.)"""
+    """They end as in one process."""
     profile = load_profile(SHORT)
-    fly = partial(dies_in_flight, profile, tmp_path, (SEED,))
-    flown = fly_all(fly, [SEED], local)
+    flown = fly_all(partial(dies_in_flight, profile, tmp_path, (SEED,)), [SEED], local)
     assert [path.name for path in tmp_path.iterdir()] == [str(SEED)]
     alone = run_campaign(profile, [SEED])
     assert [flown_record(flight) for flight in flown] == [flown_record(flight) for flight in alone]
 
 
+@pytest.mark.long
 def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No process, no folder, and no page's port of dask's."""
+    """No process, and no folder of dask's."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     before = workers_of_this_computer()
-    with cluster_pool(parse_address("local:1"), []) as pool:
+    with cluster_pool("local:1", []) as pool:
         (pid,) = workers_of_this_computer() - before
         assert fly_all(ends_at_once, [1], pool)[0].pid == pid
         assert len(list(tmp_path.iterdir())) == 1
@@ -113,10 +165,9 @@ def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     while list(tmp_path.iterdir()) or Path(f"/proc/{pid}").exists():
         assert time.monotonic() < end_s
         time.sleep(0.02)
-    with pytest.raises(RuntimeError):
-        pool.submit(ends_at_once, 1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_a_program_that_is_ended_leaves_nothing_behind(
     number: signal.Signals, tmp_path: Path
@@ -131,19 +182,18 @@ def test_a_program_that_is_ended_leaves_nothing_behind(
         assert not list(tmp_path.glob("perchctl-cluster-*"))
 
 
-# --- a scheduler that is there, with workers as users start them ------------------------------
+# --- a scheduler that is there, with workers as users start them --------------------------------
 
 
+@pytest.mark.long
 def test_two_workers_one_of_which_is_killed(tmp_path: Path) -> None:
-    """dask pool its flight to the other; each seed counts once. Then the scheduler is lost."""
+    """dask hands its flight to the other; each seed counts once. Then the scheduler is lost."""
     marks, logs = tmp_path / "marks", tmp_path / "logs"
     marks.mkdir()
     logs.mkdir()
     with scheduler(tmp_path) as (address, process), ExitStack() as stack:
         workers = [stack.enter_context(worker(address, tmp_path)) for _ in range(2)]
-        pool = stack.enter_context(
-            cluster_pool(parse_address(address), [load_profile("sim")], logs)
-        )
+        pool = stack.enter_context(cluster_pool(address, [load_profile("sim")], logs))
         flown = fly_all(partial(is_lost, folder=marks, times=1), [0, 1, 2, 3], pool)
         assert [flight.seed for flight in flown] == [0, 1, 2, 3]
         assert {flight.pid for flight in flown} <= {each.pid for each in workers}
@@ -159,11 +209,10 @@ def test_two_workers_one_of_which_is_killed(tmp_path: Path) -> None:
         with pytest.raises(ConnectionFailed, match="does not answer any more: start it again, and"):
             fly_all(ends_first_only, [0, 1, 2], pool, lose)
         assert [flight.seed for flight in told] == [0]
-        error = pool.submit(ends_at_once, 1).exception(AT_ONCE_S)
-        assert isinstance(error, ConnectionFailed)
     assert list(logs.iterdir()) == []
 
 
+@pytest.mark.long
 def test_workers_that_must_not_fly_and_none_at_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -175,16 +224,41 @@ def test_workers_that_must_not_fly_and_none_at_all(
         monkeypatch.setattr(cluster, "WORKERS_S", 0.3)
         with (
             pytest.raises(ConnectionFailed, match=r"has had no worker for .* dask worker tcp://"),
-            cluster_pool(parse_address(address), []),
+            cluster_pool(address, []),
         ):
             raise AssertionError
         monkeypatch.setattr(cluster, "WORKERS_S", 60.0)
-        unfit = partial(pytest.raises, InvalidValue, match=r"^worker tcp://127.* the source ")
-        with worker(address, tmp_path), cluster_pool(parse_address(address), []) as pool:
+        unfit = partial(pytest.raises, InvalidValue, match=r"^worker tcp://127.* has perchctl ")
+        with worker(address, tmp_path), cluster_pool(address, []) as pool:
             assert fly_all(ends_at_once, [1], pool)
             pool.submit(ends_first_only, 1)
             with worker(address, tmp_path, root=other):  # comes later
                 with unfit():
                     fly_all(ends_at_once, range(2, 4), pool)
-                with unfit(), cluster_pool(parse_address(address), []):
+                with unfit(), cluster_pool(address, []):
                     raise AssertionError
+
+
+# --- who flies a seed changes nothing of it -----------------------------------------------------
+
+
+@pytest.mark.campaign
+def test_forty_seeds_in_one_process_in_two_and_on_a_cluster(tmp_path: Path) -> None:
+    """Two of them lose the cluster's worker at first, on the way up."""
+    profile, seeds, deadly = load_profile("sim"), range(40), (7, 23)
+
+    def flown(executor: Executor) -> list[dict[str, Any]]:
+        return [flown_record(result) for result in run_campaign(profile, seeds, executor)]
+
+    with flight_processes(1) as one:
+        alone = flown(one)
+    assert [record["seed"] for record in alone] == list(seeds)
+    with flight_processes(2) as two:
+        assert flown(two) == alone
+    told: list[FlightResult] = []
+    with cluster_pool("local:2", [profile]) as pool:
+        fly = partial(dies_in_flight, profile, tmp_path, deadly)
+        results = fly_all(fly, seeds, pool, told.append)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(map(str, deadly))
+    assert [flown_record(result) for result in results] == alone
+    assert sorted(result.seed for result in told) == list(seeds)

@@ -12,7 +12,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.campaign import flight_processes, fly_all
 from perchctl.campaign.flights import fly_seed
-from perchctl.campaign.pool import peak_memory_mb
+from perchctl.campaign.results import peak_memory_mb
 from perchctl.profile import Profile
 from tests.helpers.flights import SEED, short_profile
 

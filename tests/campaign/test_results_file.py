@@ -7,24 +7,26 @@ import os
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.campaign import CampaignResults, FlightResult
+from perchctl.campaign import FlightResult
 from perchctl.campaign.results_file import (
-    CampaignHeader,
+    CampaignResults,
     campaign_header,
+    campaign_results,
     commit_of,
     flown_record,
-    log_keeper,
     open_results,
     profile_sha256,
     result_from,
     result_record,
+    source_sha256,
 )
-from perchctl.errors import InvalidValue, UsageError
+from perchctl.errors import InvalidValue
 from perchctl.faults import FAULTS, FaultResult
 from perchctl.faults.catalogue import draw_case
 from perchctl.faults.flight import _parameters
@@ -32,13 +34,14 @@ from perchctl.log.write import recording_path
 from perchctl.profile import load_profile
 from perchctl.sim import draw_scenario
 from tests.helpers.flights import SHORT
-from tests.helpers.results import perched
+from tests.helpers.results import landed
 
-HEADER = CampaignHeader("1.0", "abc", "sim", "0123456789", None)
+SIM = load_profile("sim")
+HEADER = campaign_header(SIM) | {"profile_sha256": "0123456789", "source": "0a0b0c0d0e"}
 FLOWN = FlightResult(0, "perched", "hanging still", 0.1 / 3, 20.0, 1, False, False, 5.0)
 
 
-def _written(path: Path, *seeds: int, header: CampaignHeader = HEADER) -> Path:
+def _written(path: Path, *seeds: int, header: dict[str, Any] = HEADER) -> Path:
     results = open_results(path, header, FlightResult)
     for seed in seeds:
         results.append(replace(FLOWN, seed=seed))
@@ -46,7 +49,7 @@ def _written(path: Path, *seeds: int, header: CampaignHeader = HEADER) -> Path:
     return path
 
 
-def _resumed(path: Path, header: CampaignHeader = HEADER, force: bool = False) -> list[int]:
+def _resumed(path: Path, header: dict[str, Any] = HEADER, force: bool = False) -> list[int]:
     results = open_results(path, header, FlightResult, resume=True, force=force)
     try:
         assert all(replace(FLOWN, seed=seed) == r for seed, r in results.earlier.items())
@@ -85,10 +88,6 @@ def test_wherever_the_computer_died_it_goes_on(tmp_path: Path) -> None:
         assert _resumed(path) == [*range(max(0, lines - 1)), 9]
 
 
-def test_a_seed_that_is_there_twice_counts_once(tmp_path: Path) -> None:
-    assert _resumed(_written(tmp_path / "out.jsonl", 3, 3, 1)) == [1, 3]
-
-
 def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     path = _written(tmp_path / "out.jsonl", 0)
     before = path.read_bytes()
@@ -102,20 +101,19 @@ def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        ({"profile_sha256": "9876543210"}, "another profile .sim 01234567, now sim 98765432."),
-        ({"faults": ("killed",)}, "with no faults, and this one flies killed"),
-        ({"commit": "def"}, r"another program .perchctl 1.0 .abc.; this is perchctl 1.0 .def"),
-        ({"perchctl": "2.0"}, "another program"),
+        ({"profile_sha256": "9876543210"}, "another profile .0123456789; this campaign has 98765"),
+        ({"faults": ["killed"]}, "other faults .None; this campaign has .'killed'"),
+        ({"source": "ffffffffff"}, "another program .its source is 0a0b0c0d, and here it is ffff"),
     ],
 )
-def test_other_flights_are_refused(other: dict[str, object], words: str, tmp_path: Path) -> None:
+def test_other_flights_are_refused(other: dict[str, Any], words: str, tmp_path: Path) -> None:
     path = _written(tmp_path / "out.jsonl", 0)
     before = path.read_bytes()
-    header = replace(HEADER, **other)  # type: ignore[arg-type]
+    header = HEADER | other
     with pytest.raises(InvalidValue, match=words):
         _resumed(path, header)
     assert path.read_bytes() == before
-    if "program" in words:
+    if "source" in other:
         assert _resumed(path, header, force=True) == [0]
         assert _resumed(path, header) == [0]
         assert len(path.read_text().splitlines()) == 3
@@ -148,24 +146,29 @@ def test_two_campaigns_do_not_write_one_file(tmp_path: Path) -> None:
 
 
 def test_a_profile_is_known_by_what_it_flies() -> None:
-    profile = load_profile("sim")
-    named = profile.model_copy(update={"name": "other", "description": "mine"})
-    assert profile_sha256(named) == profile_sha256(profile)
-    camera = profile.camera.model_copy(update={"latency_s": 0.05})
-    other = profile.model_copy(update={"camera": camera})
-    assert profile_sha256(other) != profile_sha256(profile)
-    assert campaign_header(profile, ["killed"]).faults == ("killed",)
+    named = SIM.model_copy(update={"name": "other", "description": "mine"})
+    assert profile_sha256(named) == profile_sha256(SIM)
+    camera = SIM.camera.model_copy(update={"latency_s": 0.05})
+    assert profile_sha256(SIM.model_copy(update={"camera": camera})) != profile_sha256(SIM)
+    assert campaign_header(SIM, ["killed"])["faults"] == ["killed"]
 
 
-def test_a_commit_is_the_checkouts_own(tmp_path: Path) -> None:
+def test_the_program_is_known_by_its_source(tmp_path: Path) -> None:
+    """Whatever its version; its commit is named for people."""
     assert commit_of(tmp_path) is None
+    (tmp_path / "flight").mkdir()
+    module = tmp_path / "flight" / "loop.py"
+    module.write_bytes(b"a = 1\nb = 2\n")
+    here = source_sha256(tmp_path)
+    module.write_bytes(b"a = 1\r\nb = 2\r\n")
+    assert source_sha256(tmp_path) == here
+    module.write_bytes(b"a = 1\nb = 3\n")
+    assert source_sha256(tmp_path) != here
 
     def git(*words: str) -> None:
         who = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
         subprocess.run(["git", "-C", str(tmp_path), *who, *words], check=True, capture_output=True)
 
-    (tmp_path / "perchctl").mkdir()
-    (tmp_path / "perchctl" / "a.py").write_text("a")
     git("init")
     assert commit_of(tmp_path) is None
     git("add", ".")
@@ -173,15 +176,8 @@ def test_a_commit_is_the_checkouts_own(tmp_path: Path) -> None:
     commit = commit_of(tmp_path)
     assert commit is not None
     assert len(commit) == 40
-    assert commit_of(tmp_path / "perchctl") is None
-    found = {commit}
-    for name, text in (("a.py", "b"), ("a.py", "c"), ("new.py", "a"), ("new.py", "b")):
-        (tmp_path / "perchctl" / name).write_text(text)
-        changed = commit_of(tmp_path)
-        assert changed == commit_of(tmp_path)
-        assert str(changed).startswith(f"{commit}+changed-")
-        found.add(changed)
-    assert len(found) == 5  # each change has a name of its own
+    module.write_bytes(b"")
+    assert commit_of(tmp_path) == f"{commit}-dirty"
 
 
 def test_a_result_is_on_the_disk_before_the_next_flight(
@@ -196,80 +192,36 @@ def test_a_result_is_on_the_disk_before_the_next_flight(
     results.close()
 
 
-def _logs(folder: Path) -> list[FlightResult]:
-    """Six flights, of which 1 aborted, 3 landed, and 4 missed most."""
-    results = []
-    for seed in range(6):
-        log = folder / f"flight_seed{seed}.jsonl"
-        log.touch()
-        recording_path(log).touch()
-        outcome = {1: "aborted", 3: "landed"}.get(seed, "perched")
-        miss_m = None if outcome != "perched" else {4: 0.009}.get(seed, 0.001 * (seed + 1))
-        result = replace(FLOWN, seed=seed, outcome=outcome, miss_m=miss_m, log=log)  # type: ignore[arg-type]
-        results.append(result)
-    return results
+def test_logs_of_good_flights_go_with_their_recordings(tmp_path: Path) -> None:
+    for failed_logs_only, kept in ((False, {0, 1, 2}), (True, {1, 2})):
+        folder = tmp_path / f"{failed_logs_only}"
+        folder.mkdir()
+        results: CampaignResults[FlightResult] = CampaignResults(
+            range(3), failed_logs_only=failed_logs_only
+        )
+        for seed in range(3):
+            log = folder / f"flight_seed{seed}.jsonl"
+            log.touch()
+            recording_path(log).touch()
+            flown = landed(seed) if seed == 1 else replace(FLOWN, seed=seed, fell=seed == 2)
+            results.note(replace(flown, log=log))
+        logs = {folder / f"flight_seed{seed}.jsonl" for seed in kept}
+        assert set(folder.iterdir()) == logs | {recording_path(log) for log in logs}
 
 
-@pytest.mark.parametrize(
-    ("keep", "kept"),
-    [("all", range(6)), ("failed", (1, 3)), ("worst:1", (1,)), ("worst:4", (1, 3, 4, 5))],
-)
-def test_logs_that_are_not_wanted_go_with_their_recordings(
-    keep: str, kept: tuple[int, ...], tmp_path: Path
-) -> None:
-    keeper = log_keeper(keep)
-    for result in _logs(tmp_path):
-        keeper(result)
-    names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == sorted(f"flight_seed{s}{x}" for s in kept for x in (".jsonl", ".mcap"))
-
-
-@pytest.mark.parametrize("keep", ["best", "worst", "worst:0", "worst:-1", "worst:x"])
-def test_other_words_are_refused(keep: str) -> None:
-    with pytest.raises(UsageError, match="allowed are all, failed and worst:N"):
-        log_keeper(keep)
-
-
-def test_a_campaign_that_goes_on_judges_the_logs_of_its_own_folder(tmp_path: Path) -> None:
-    """Those in another folder may be another campaign's by now."""
-    own, other = tmp_path / "own", tmp_path / "other"
-    path = tmp_path / "out.jsonl"
-    results = open_results(path, HEADER, FlightResult)
-    for seed, folder in enumerate((own, own, other)):
-        folder.mkdir(exist_ok=True)
-        log = folder / f"flight_seed{seed}.jsonl"
-        log.touch()
-        results.append(replace(perched(seed, miss_m=0.001 * (seed + 1)), log=log))
-    results.close()
-    results = open_results(path, HEADER, FlightResult, resume=True)
-    kept = CampaignResults(range(4), results, log_keeper("worst:1"), own)
-    results.close()
-    assert kept.left == [3]
-    left = {log.name for log in tmp_path.rglob("flight_*.jsonl")}
-    assert left == {"flight_seed1.jsonl", "flight_seed2.jsonl"}
-
-
-def test_the_logs_of_flights_that_were_broken_off_go(tmp_path: Path) -> None:
-    logs = [tmp_path / f"flight_seed{seed}.jsonl" for seed in range(3)]
-    logs[0].touch()  # another campaign's
-    kept: CampaignResults[FlightResult] = CampaignResults(range(3), keep_log=log_keeper("failed"))
-
-    def stopped() -> None:
-        with kept.torn_logs_removed(logs):
-            for log in logs[1:]:
-                log.touch()
-                recording_path(log).touch()
-            kept.note(replace(FLOWN, seed=1, outcome="landed", miss_m=None, log=logs[1]))
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        stopped()
-    assert set(tmp_path.iterdir()) == {logs[0], logs[1], recording_path(logs[1])}
+def test_seeds_that_the_file_has_are_not_flown_again(tmp_path: Path) -> None:
+    with campaign_results(SIM, range(2), FlightResult, out=tmp_path / "out.jsonl") as results:
+        assert results.left == [0, 1]
+        results.note(replace(FLOWN, seed=1))
+    again = campaign_results(SIM, range(3), FlightResult, out=tmp_path / "out.jsonl", resume=True)
+    with again as results:
+        assert results.left == [0, 2]
+        assert [result.seed for result in results.earlier] == [1]
 
 
 # --- one result as a record --------------------------------------------------------------------
 
-SCENARIO = draw_scenario(load_profile("sim"), 17)
+SCENARIO = draw_scenario(SIM, 17)
 WHOLE = FlightResult(
     17, "perched", "hanging still", 0.1 / 3, 20.0, 1, False, False, 5.0 / 3,
     Path("logs/a.jsonl"), None, 4.0, 200.0, SCENARIO,

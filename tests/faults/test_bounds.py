@@ -66,11 +66,9 @@ def test_a_landing_goes_down_where_it_should_have_been_as_it_began() -> None:
     assert down.astray_m((2.2, 0.0)) == pytest.approx(1.0)
 
 
-def test_a_landing_from_the_take_off_is_above_the_start() -> None:
+def test_without_a_target_it_stays_above_its_start() -> None:
+    """In a landing from the take-off, and under a bare ceiling."""
     assert bound(P.APPROACH, P.LANDING, at=(0.4, 0.0)).astray_m((0.4, 0.3)) == 0.5
-
-
-def test_under_a_bare_ceiling_it_stays_above_its_start() -> None:
     bare = bound(P.SEARCH, at=(0.0, 0.0), scenario=Scenario(no_target=True, target_xy_m=(2.0, 0.0)))
     assert bare.astray_m((1.0, 0.0)) == 1.0
 
@@ -124,10 +122,8 @@ def test_a_slide_is_seen_while_it_steers_by_the_target(phase: Phase) -> None:
 def test_a_slide_of_before_is_forgotten_once_it_is_under_the_target() -> None:
     """And counts anew on the way down, where no picture steers."""
     drift = UnfeltDrift((SLIDE,), SCENARIO, by_target=False)
-    assert drift.after_m(1.0, P.SEARCH) == pytest.approx(0.5)
-    assert drift.after_m(2.0, P.ALIGN) == pytest.approx(0.5)
-    assert drift.after_m(3.0, P.ASCEND) == 0.0
-    assert drift.after_m(4.0, P.LANDING) == pytest.approx(0.5)
+    way = [(1.0, P.SEARCH), (2.0, P.ALIGN), (3.0, P.ASCEND), (4.0, P.LANDING)]
+    assert [drift.after_m(*each) for each in way] == pytest.approx([0.5, 0.5, 0.0, 0.5])
 
 
 def test_a_push_is_felt_where_something_else_than_the_target_tells_the_position() -> None:
@@ -182,19 +178,15 @@ def test_after_what_loss_it_comes_down_and_when(
     assert overdue_s(effect, profile, phase) == pytest.approx(late_s, abs=0.011)
 
 
-def overdue_s(effect: e.Effect, profile: Profile, phase: Phase, touching: bool = False) -> float:
+def overdue_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
     """How long after the fault's beginning a vehicle that hovers on is overdue."""
     made = DescentBound((effect,), profile)
     made.begin(10.0, phase)
     for k in range(2000):
         t_s = 10.0 + 0.01 * k
-        if made.is_overdue(t_s, 1.5, 0.0, touching=touching, uplink=True):
+        if made.is_overdue(t_s, 1.5, 0.0, touching=False, uplink=True):
             return t_s - 10.0
     return math.inf
-
-
-def test_what_touches_the_ceiling_is_not_overdue() -> None:
-    assert overdue_s(e.Silence(EVER, False, True), SIM, P.ALIGN, touching=True) == math.inf
 
 
 class Lost:
@@ -218,6 +210,16 @@ class Lost:
         )
 
 
+def test_what_touches_the_ceiling_before_it_has_to_come_down_is_not_overdue() -> None:
+    """And what rises to it instead of coming down is."""
+    hangs = Lost(e.Hung(EVER))
+    assert not any(hangs.is_overdue(0.1 * k, touching=True) for k in range(200))
+    rises = Lost(e.Hung(EVER))
+    assert not rises.is_overdue(2.01)
+    assert not rises.is_overdue(3.0, 2.0, touching=True)
+    assert rises.is_overdue(4.1, 2.0, touching=True)
+
+
 @pytest.mark.parametrize("effect", [e.Suspended(1.9), e.Silence(1.9, True, True)])
 def test_what_hears_nothing_is_overdue_once_it_hears_again(effect: e.Effect) -> None:
     """As a program that was suspended for 1.9 s is, or a link that was silent for so long."""
@@ -237,38 +239,23 @@ def test_a_silence_on_the_way_down_begins_it_anew() -> None:
     assert vehicle.is_overdue(6.3)
 
 
-def test_what_rises_to_the_ceiling_instead_is_overdue() -> None:
-    vehicle = Lost(e.Hung(EVER))
-    assert not vehicle.is_overdue(2.01)
-    assert not vehicle.is_overdue(3.0, 2.0, touching=True)
-    assert vehicle.is_overdue(4.1, 2.0, touching=True)
-
-
 @pytest.mark.parametrize(
-    ("height_m", "vz_mps", "late"),
+    ("height_m", "vz_mps", "lands", "late"),
     [
-        (1.5 - SUNK_M - 0.01, 0.0, False),
-        (1.5 - SUNK_M + 0.01, 0.0, True),
-        (1.45, -SINKING_MPS - 0.01, False),
-        (1.45, -SINKING_MPS + 0.01, True),
+        (1.5, 0.0, False, True),
+        (1.5 - SUNK_M - 0.01, 0.0, False, False),
+        (1.5 - SUNK_M + 0.01, 0.0, False, True),
+        (1.45, -SINKING_MPS - 0.01, False, False),
+        (1.45, -SINKING_MPS + 0.01, False, True),
+        (LOW_M, 0.0, False, False),
+        (1.5, 0.0, True, False),
+        (1.8, 0.2, True, True),
     ],
 )
-def test_what_is_on_its_way_down_is_not_overdue(height_m: float, vz_mps: float, late: bool) -> None:
+def test_what_is_on_its_way_down_is_not_overdue(
+    height_m: float, vz_mps: float, lands: bool, late: bool
+) -> None:
+    """Also in a landing of its own, whose curve starts from rest; one that climbs is none."""
     vehicle = Lost(e.Hung(EVER))
     assert not vehicle.is_overdue(2.0 + 1e-6)
-    assert vehicle.is_overdue(4.1, height_m, vz_mps) is late
-
-
-def test_what_is_low_is_not_overdue() -> None:
-    vehicle = Lost(e.Hung(EVER))
-    assert not vehicle.is_overdue(4.1, LOW_M)
-    assert not vehicle.is_overdue(9.0, LOW_M)
-
-
-@pytest.mark.parametrize("lands", [True, False])
-def test_a_landing_of_its_own_that_begins_slowly_is_not_overdue(lands: bool) -> None:
-    """Its curve starts from rest; one that climbs is none."""
-    vehicle = Lost(e.Hung(EVER))
-    assert not vehicle.is_overdue(2.0 + 1e-6)
-    assert vehicle.is_overdue(4.1, lands=lands) is not lands
-    assert vehicle.is_overdue(4.1, 1.8, 0.2, lands=lands)
+    assert vehicle.is_overdue(4.1, height_m, vz_mps, lands=lands) is late

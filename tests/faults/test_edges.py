@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,50 +26,63 @@ from perchctl.vehicle import EmergencyStop, Land, PositionSetpoint, RawThrust, S
 from perchctl.vision import Frame
 
 SETPOINT = encode(PositionSetpoint(0.0, 0.0, 1.0, 0.0))[0]
+STOP, NOTIFY = encode(StopMotors())
 
 
-# --- the radio ------------------------------------------------------------------------
+# --- the radio ----------------------------------------------------------------------------------
 
 
 def test_orders_are_told_by_their_packets() -> None:
-    said = [
+    orders = [
         [order_of(packet) for packet in packets]
         for packets in (
-            (SETPOINT,), encode(RawThrust(5000)), encode(Land(0.0, 2.0)), encode(StopMotors()),
-            encode(EmergencyStop()), UNLOCK_THRUST,
+            (SETPOINT,), encode(RawThrust(5000)), (STOP, NOTIFY), encode(EmergencyStop()),
+            UNLOCK_THRUST, encode(Land(0.0, 2.0)),
         )
     ]  # fmt: skip
-    assert said[0] == ["setpoint"]
-    assert said[1] == ["raw"]
-    assert "land" in said[2]
-    assert said[3] == ["stop", "notify"]
-    assert said[4] == ["emergency-stop"]
-    assert said[5] == ["raw", "notify"]
-    assert {order for orders in said for order in orders} == set(ORDERS)
+    assert orders[:5] == [
+        ["setpoint"], ["raw"], ["stop", "notify"], ["emergency-stop"], ["raw", "notify"],
+    ]  # fmt: skip
+    assert {order for each in orders for order in each} == set(ORDERS)
 
 
-def test_a_radio_without_faults_loses_nothing() -> None:
+def faulty(*effects: e.RadioEffect) -> FaultyRadio:
     radio = FaultyRadio()
-    assert radio.up(SETPOINT, 1.0)
-    assert radio.down("state", 1.0) == TELEMETRY_DELAY_S
+    for effect in effects:
+        radio.begin(effect, 1.0)
+    return radio
 
 
-@pytest.mark.parametrize(("up", "down"), [(True, False), (False, True), (True, True)])
-def test_silence(up: bool, down: bool) -> None:
-    radio = FaultyRadio()
-    radio.begin(e.Silence(0.5, up, down), 1.0)
-    assert radio.up(SETPOINT, 1.2) is not up
-    assert (radio.down("attitude", 1.2) is None) is down
-    assert radio.up(SETPOINT, 1.6)
-    assert radio.down("attitude", 1.6) is not None
+@pytest.mark.parametrize(
+    ("effect", "t_s", "up", "state", "attitude"),
+    [
+        (None, 1.2, True, True, True),
+        (e.Silence(0.5, True, False), 1.2, False, True, True),
+        (e.Silence(0.5, False, True), 1.2, True, False, False),
+        (e.Silence(0.5, True, True), 1.2, False, False, False),
+        (e.Silence(0.5, True, True), 1.6, True, True, True),
+        (e.BlockDead("state", 1.0), 1.5, True, False, True),
+        (e.BlockDead("state", 1.0), 2.5, True, True, True),
+        (e.Reboots(0.8), 1.7, False, False, False),
+        (e.Reboots(0.8), 1.9, True, False, False),
+        (e.Reboots(0.8), 1.9 + BLOCKS_DELETED_AFTER_S, True, False, False),
+        (e.Reboots(0.8), 2.1 + BLOCKS_DELETED_AFTER_S, True, True, True),
+    ],
+)
+def test_what_passes(
+    effect: e.RadioEffect | None, t_s: float, up: bool, state: bool, attitude: bool
+) -> None:
+    """What starts again is silent, and until its blocks are asked for sends none."""
+    radio = faulty() if effect is None else faulty(effect)
+    assert radio.up(SETPOINT, t_s) is up
+    blocks = [radio.down(block, t_s) for block in ("state", "attitude")]
+    assert blocks == [TELEMETRY_DELAY_S if passes else None for passes in (state, attitude)]
 
 
 def test_packets_of_one_order_are_lost() -> None:
-    radio = FaultyRadio()
-    radio.begin(e.PacketLost("notify", 2), 0.0)
-    stop, notify = encode(StopMotors())
-    said = [radio.up(packet, 0.1) for packet in (stop, notify, stop, notify, stop, notify)]
-    assert said == [True, False, True, False, True, True]
+    radio = faulty(e.PacketLost("notify", 2))
+    arrived = [radio.up(packet, 1.1) for packet in (STOP, NOTIFY) * 3]
+    assert arrived == [True, False, True, False, True, True]
 
 
 def test_a_packet_comes_twice() -> None:
@@ -76,49 +90,29 @@ def test_a_packet_comes_twice() -> None:
 
     class Firmware:
         def notify_setpoint_stop(self, _remain_s: float) -> None:
-            arrived.append(notify)
+            arrived.append(NOTIFY)
 
-    radio = FaultyRadio()
+    radio = faulty(e.PacketTwice("notify"))
     radio.serves(Firmware())  # type: ignore[arg-type]
-    radio.begin(e.PacketTwice("notify"), 0.0)
-    notify = encode(StopMotors())[1]
-    assert radio.up(notify, 0.1)
-    assert radio.up(notify, 0.2)
+    assert radio.up(NOTIFY, 1.1)
+    assert radio.up(NOTIFY, 1.2)
     assert len(arrived) == 1  # beside the ones that arrive by themselves
 
 
-def test_one_block_dies() -> None:
-    radio = FaultyRadio()
-    radio.begin(e.BlockDead("state", 1.0), 0.0)
-    assert radio.down("state", 0.5) is None
-    assert radio.down("attitude", 0.5) is not None
-    assert radio.down("state", 1.5) is not None
-
-
 def test_telemetry_comes_late() -> None:
-    radio = FaultyRadio()
-    radio.begin(e.TelemetryDelayed(0.7, 2.0), 0.0)
-    assert radio.down("battery", 1.0) == 0.7
-    assert radio.down("battery", 2.5) == TELEMETRY_DELAY_S
-
-
-def test_a_vehicle_that_starts_again_is_silent_until_its_blocks_are_asked_for() -> None:
-    radio = FaultyRadio()
-    radio.begin(e.Reboots(0.8), 0.0)
-    assert not radio.up(SETPOINT, 0.7)
-    assert radio.up(SETPOINT, 0.9)
-    assert radio.down("state", 0.9 + BLOCKS_DELETED_AFTER_S) is None
-    assert radio.down("state", 1.1 + BLOCKS_DELETED_AFTER_S) is not None
+    radio = faulty(e.TelemetryDelayed(0.7, 2.0))
+    assert radio.down("battery", 2.0) == 0.7
+    assert radio.down("battery", 3.5) == TELEMETRY_DELAY_S
 
 
 def test_a_cut_uplink_is_cut_for_good() -> None:
-    radio = FaultyRadio()
+    radio = faulty()
     radio.cut = True
     assert not radio.up(SETPOINT, 99.0)
     assert radio.down("state", 99.0) is not None
 
 
-# --- the camera -----------------------------------------------------------------------
+# --- the camera ---------------------------------------------------------------------------------
 
 
 class Pictures:
@@ -150,68 +144,62 @@ class Pictures:
         return None
 
 
-def test_pictures_that_come_sooner_were_late_before() -> None:
-    """By what the profile is told: their times are true until the fault begins."""
-    camera, seen = FaultyCamera(Pictures(), 1), []
-    camera.late_s = 0.2
-    for k in range(100):
-        if k == 50:
-            camera.begin(e.CameraFault("sooner", e.FOR_EVER, 0.2), 1.0)
-        if (frame := camera.poll(k * 0.02)) is not None:
-            seen.append((k * 0.02, 0.05 * frame.index))
-    late = [now_s - taken_s for now_s, taken_s in seen if 0.5 < now_s < 1.0]
-    assert late == pytest.approx([0.2] * len(late), abs=0.03)
-    soon = [now_s - taken_s for now_s, taken_s in seen if now_s > 1.0]
-    assert soon == pytest.approx([0.0] * len(soon), abs=0.03)
-    assert len(late) > 5
-    assert len(soon) > 15
-
-
-def looked(kind: str, late_s: float = 0.0) -> list[tuple[float, Frame]]:
-    """Frames polled at 50 Hz: before, during (from 1 to 2 s) and after a fault."""
+def frames_of(fault: e.CameraFault, before_s: float = 0.0) -> list[tuple[float, Frame]]:
+    """Frames polled at 50 Hz for 3 s, with a fault that begins at 1 s."""
     camera = FaultyCamera(Pictures(), 1)
+    camera.late_s = before_s
     frames = []
     for k in range(150):
         if k == 50:
-            camera.begin(e.CameraFault(kind, 1.0, late_s), 1.0)
+            camera.begin(fault, 1.0)
         if (frame := camera.poll(k * 0.02)) is not None:
             frames.append((k * 0.02, frame))
     return frames
 
 
-def during(frames: list[tuple[float, Frame]]) -> list[Frame]:
-    return [frame for t_s, frame in frames if 1.0 <= t_s < 2.0]
+def during(kind: str, late_s: float = 0.0, from_s: float = 1.0) -> list[tuple[float, Frame]]:
+    frames = frames_of(e.CameraFault(kind, 1.0, late_s))
+    return [(t_s, frame) for t_s, frame in frames if from_s <= t_s < 2.0]
+
+
+def test_pictures_that_come_sooner_were_late_before() -> None:
+    """By what the profile is told: their times are true until the fault begins."""
+    frames = frames_of(e.CameraFault("sooner", e.FOR_EVER, 0.2), before_s=0.2)
+    late = [t_s - 0.05 * frame.index for t_s, frame in frames if 0.5 < t_s < 1.0]
+    soon = [t_s - 0.05 * frame.index for t_s, frame in frames if t_s > 1.0]
+    assert late == pytest.approx([0.2] * len(late), abs=0.03)
+    assert soon == pytest.approx([0.0] * len(soon), abs=0.03)
+    assert len(late) > 5
+    assert len(soon) > 15
 
 
 @pytest.mark.parametrize(
     "kind", ["silent", "frozen", "snow", "dark", "late", "out-of-order", "mirrored"]
 )
 def test_the_camera_is_well_before_and_after(kind: str) -> None:
-    frames = looked(kind, 0.2)
-    plain = looked("none")
-    for (t_s, frame), (_, same) in zip(
-        [x for x in frames if x[0] < 1.0 or x[0] > 2.1],
-        [x for x in plain if x[0] < 1.0 or x[0] > 2.1],
-        strict=True,
-    ):
+    plain, frames = (
+        [x for x in frames_of(e.CameraFault(k, 1.0, 0.2)) if x[0] < 1.0 or x[0] > 2.1]
+        for k in ("none", kind)
+    )
+    for (t_s, frame), (_, same) in zip(frames, plain, strict=True):
         assert frame.index == same.index, t_s
         assert np.array_equal(frame.image, same.image)
 
 
 def test_what_each_camera_fault_does() -> None:
-    assert during(looked("silent")) == []
-    frozen = during(looked("frozen"))
+    assert during("silent") == []
+    frozen = [frame for _, frame in during("frozen")]
     assert len(frozen) > 15
     assert all(np.array_equal(f.image, frozen[0].image) for f in frozen)
     assert len({f.t_s for f in frozen}) == len(frozen)
-    assert {content(f.image) for f in during(looked("snow"))} == {"snow"}
-    assert {content(f.image) for f in during(looked("dark"))} == {"dark"}
-    mirrored = during(looked("mirrored"))[0].image
+    for kind in ("snow", "dark"):
+        assert {content(frame.image) for _, frame in during(kind)} == {kind}
+    mirrored = during("mirrored")[0][1].image
     assert np.array_equal(mirrored[:, -1], np.full(48, 180))
 
 
 def test_late_pictures_look_fresh_and_are_old() -> None:
-    frames = [(t_s, f) for t_s, f in looked("late", 0.2) if 1.3 < t_s < 2.0]
+    frames = during("late", 0.2, from_s=1.3)
     assert len(frames) > 8
     for t_s, frame in frames:
         assert t_s - frame.index * 0.05 > 0.199  # shown so long ago
@@ -220,91 +208,76 @@ def test_late_pictures_look_fresh_and_are_old() -> None:
 
 
 def test_pictures_out_of_order() -> None:
-    indices = [frame.index for frame in during(looked("out-of-order"))]
+    indices = [frame.index for _, frame in during("out-of-order")]
     pairs = list(zip(indices[::2], indices[1::2], strict=False))
     assert len(pairs) > 8
     assert all(newer == older + 1 for newer, older in pairs)
 
 
-# --- the program ----------------------------------------------------------------------
+# --- the program --------------------------------------------------------------------------------
 
 
 class Lockstep:
-    """A link's clock; the vehicle's beside it tells who let the time pass."""
+    """A link's clock; `by_link` has the times to which it, and not the vehicle alone, went on."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
         self.by_link: list[float] = []
-        self.vehicle: Any = self
+        self.vehicle: Any = SimpleNamespace(advance_to=lambda t_s: setattr(self, "now_s", t_s))
+        self.radio = FaultyRadio()
+        self.clock = FaultyClock(self, self.radio, 100.0)  # type: ignore[arg-type]
 
     def advance_to(self, t_s: float) -> None:
         self.by_link.append(t_s)
         self.now_s = t_s
 
 
-class Vehicle:
-    def __init__(self, link: Lockstep) -> None:
-        self._link = link
-
-    def advance_to(self, t_s: float) -> None:
-        self._link.now_s = t_s
+@pytest.fixture
+def link() -> Lockstep:
+    return Lockstep()
 
 
-def clock_of(link: Lockstep) -> tuple[FaultyClock, list[bool]]:
-    cut: list[bool] = []
-    return FaultyClock(link, lambda: cut.append(True), 100.0), cut  # type: ignore[arg-type]
-
-
-def test_killed() -> None:
-    clock, cut = clock_of(Lockstep())
-    clock.wait_until(1.0)
-    clock.begin(e.Killed(), 1.0)
+def test_killed(link: Lockstep) -> None:
+    link.clock.wait_until(1.0)
+    link.clock.begin(e.Killed(), 1.0)
     for _ in range(2):  # its rescue is dead as well
         with pytest.raises(ProgramKilled):
-            clock.wait_until(1.02)
+            link.clock.wait_until(1.02)
     with pytest.raises(ProgramKilled):  # nor does it learn what time it is
-        clock.now()
-    assert clock.killed_s == 1.02
-    assert cut == [True]
+        link.clock.now()
+    assert link.clock.killed_s == 1.02
+    assert link.radio.cut
 
 
-def test_suspended_time_passes_without_the_link() -> None:
-    link = Lockstep()
-    link.vehicle = Vehicle(link)
-    clock, _ = clock_of(link)
-    clock.begin(e.Suspended(3.0), 0.0)
-    clock.wait_until(0.02)
+def test_suspended_time_passes_without_the_link(link: Lockstep) -> None:
+    link.clock.begin(e.Suspended(3.0), 0.0)
+    link.clock.wait_until(0.02)
     assert link.now_s == pytest.approx(3.02)
     assert link.by_link == [0.02]
-    clock.wait_until(3.04)
+    link.clock.wait_until(3.04)
     assert link.now_s == pytest.approx(3.04)
 
 
-def test_hung_time_passes_with_the_link() -> None:
-    link = Lockstep()
-    clock, cut = clock_of(link)
-    clock.begin(e.Hung(2.0), 0.0)
-    clock.wait_until(0.02)
+def test_hung_time_passes_with_the_link(link: Lockstep) -> None:
+    link.clock.begin(e.Hung(2.0), 0.0)
+    link.clock.wait_until(0.02)
     assert link.by_link[-1] == link.now_s == pytest.approx(2.02)
-    clock.begin(e.Hung(e.FOR_EVER), 2.0)
+    assert not link.radio.cut
+    link.clock.begin(e.Hung(e.FOR_EVER), 2.0)
     with pytest.raises(ProgramKilled):
-        clock.wait_until(2.04)
+        link.clock.wait_until(2.04)
     assert link.now_s == pytest.approx(2.04 + LONGEST_S)
-    assert cut == [True]
+    assert link.radio.cut
 
 
-def test_slow_turns() -> None:
-    link = Lockstep()
-    clock, _ = clock_of(link)
-    clock.begin(e.Slow(0.3, 1.0), 0.0)
+def test_slow_turns(link: Lockstep) -> None:
+    link.clock.begin(e.Slow(0.3, 1.0), 0.0)
     for _ in range(8):
-        clock.wait_until(link.now_s + 0.02)
-    assert link.by_link[:4] == pytest.approx([0.3, 0.6, 0.9, 1.2])
-    assert link.by_link[4:] == pytest.approx([1.22, 1.24, 1.26, 1.28])
+        link.clock.wait_until(link.now_s + 0.02)
+    assert link.by_link == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.22, 1.24, 1.26, 1.28])
 
 
-def test_no_flight_is_endless() -> None:
-    clock, _ = clock_of(Lockstep())
+def test_no_flight_is_endless(link: Lockstep) -> None:
     with pytest.raises(ProgramKilled):
-        clock.wait_until(100.1)
-    assert clock.endless
+        link.clock.wait_until(100.1)
+    assert link.clock.endless

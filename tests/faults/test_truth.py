@@ -16,7 +16,7 @@ from perchctl.faults.effects import Effect, Reboots
 from perchctl.faults.oracle import Sample
 from perchctl.faults.truth import CUT_S, FactsRecorder, WatchedVehicle, sample_of
 from perchctl.profile import Profile, TargetConfig, load_profile
-from perchctl.sim import Scenario
+from perchctl.sim import Scenario, most_thrust_n
 
 CAMERA = load_calibration("example_640x480.yaml")
 SCENARIO = Scenario(seed=2, camera_rate_hz=0.01, no_target=True)
@@ -24,34 +24,63 @@ PROFILE: Profile = load_profile("sim")
 DT_S = 0.01
 
 
-def pressed_by(order: float, mass_kg: float) -> Sample:
-    """At a ceiling without a magnet, under a raw order, of 65,535."""
-    vehicle = WatchedVehicle(replace(SCENARIO, mass_kg=mass_kg), CAMERA, TargetConfig())
-    world, scenario, firmware = vehicle.world, vehicle.scenario, vehicle.firmware
+@pytest.fixture
+def vehicle() -> WatchedVehicle:
+    return WatchedVehicle(SCENARIO, CAMERA, TargetConfig())
+
+
+@pytest.mark.parametrize(
+    ("order", "mass_kg", "pressing"),
+    [
+        (60000.0, 0.030, True), (60000.0, 0.038, True), (60000.0, 0.042, True),
+        (50000.0, 0.042, False), (0.0, 0.042, False),
+    ],
+)  # fmt: skip
+def test_the_largest_raw_thrust_presses_at_any_mass(
+    order: float, mass_kg: float, pressing: bool
+) -> None:
+    """At a ceiling without a magnet. At 42 g 60,000 of 65,535 lift 7 % more than the weight
+    (docs/firmware.md, "Thrust budget")."""
+    heavy = WatchedVehicle(replace(SCENARIO, mass_kg=mass_kg), CAMERA, TargetConfig())
+    world, scenario, firmware = heavy.world, heavy.scenario, heavy.firmware
     world.set_pose((0.0, 0.0, scenario.ceiling_z_m - scenario.gear_body_m[2]), hold=True)
     for step in range(700):
         if step == 500:  # the motors are up to speed
             world.let_go()
         firmware.motors = firmware.driver.pwm((order,) * 4, world.battery_v)
         world.step(firmware.motors)
-    return sample_of(vehicle)
+    assert sample_of(heavy).pressing is pressing
 
 
-@pytest.mark.parametrize("mass_kg", [0.030, 0.038, 0.042])
-def test_the_largest_raw_thrust_presses_at_any_mass(mass_kg: float) -> None:
-    """At 42 g it lifts 7 % more than the weight (docs/firmware.md, "Thrust budget")."""
-    assert pressed_by(60000.0, mass_kg).pressing
+def test_a_sample_of_a_vehicle_on_the_floor(vehicle: WatchedVehicle) -> None:
+    vehicle.advance_to(1.0)
+    sample = sample_of(vehicle)
+    assert sample.floor
+    assert abs(sample.height_m) < 0.002
+    assert sample.acc_g == pytest.approx(1.0, abs=0.01)
+    assert True not in (sample.motors_on, sample.hanging, sample.locked, sample.pressing)
 
 
-def test_what_the_motors_do_not_hold_there_does_not_press() -> None:
-    assert not pressed_by(50000.0, 0.042).pressing
-    assert not pressed_by(0.0, 0.042).pressing
-
-
-def test_a_sample_knows_how_fast_it_goes_sideways() -> None:
-    vehicle = WatchedVehicle(SCENARIO, CAMERA, TargetConfig())
+def test_a_sample_knows_how_fast_it_goes_sideways(vehicle: WatchedVehicle) -> None:
     vehicle.world.set_pose((0.0, 0.0, 1.0), velocity_mps=(0.3, -0.4, 9.0))
     assert sample_of(vehicle).aside_mps == pytest.approx(0.5)
+
+
+def test_a_sample_tells_how_far_the_gear_is_from_the_target(vehicle: WatchedVehicle) -> None:
+    x_m, y_m = vehicle.world.magnet.target_xy_m
+    vehicle.world.set_pose((x_m + 0.04, y_m, 1.0))
+    gear_m = SCENARIO.gear_body_m
+    sample = sample_of(vehicle)
+    assert sample.miss_m == pytest.approx(math.hypot(0.04 + gear_m[0], gear_m[1]))
+    assert sample.below_m == pytest.approx(SCENARIO.ceiling_z_m - gear_m[2] - 1.0)
+    above = WatchedVehicle(replace(SCENARIO, target_above_ceiling_m=0.1), CAMERA, TargetConfig())
+    above.world.set_pose((x_m, y_m, SCENARIO.ceiling_z_m - gear_m[2]))
+    assert sample_of(above).below_m == pytest.approx(0.1)
+
+
+def test_the_most_that_a_battery_lifts() -> None:
+    """At 3.47 V under load four motors give about what the firmware asks of them at most."""
+    assert 0.36 < most_thrust_n(3.6) < most_thrust_n(3.9) < most_thrust_n(4.2) < 0.64
 
 
 # --- facts ------------------------------------------------------------------------------
@@ -116,12 +145,10 @@ def test_silence_that_ends_in_a_cut() -> None:
     assert not it.facts.own_landing
 
 
-@pytest.mark.parametrize(
-    "before", [{"silent_s": 0.5, "locked": False}, {"silent_s": 3.0, "locked": True}]
-)
-def test_a_lock_that_no_silence_brought_is_no_cut(before: dict[str, Any]) -> None:
-    it = Recorded().show(HOVER, 1.0, locked=before["locked"])
-    it.show(HOVER, before["silent_s"], uplink=False, locked=before["locked"])
+@pytest.mark.parametrize(("silent_s", "locked"), [(0.5, False), (3.0, True)])
+def test_a_lock_that_no_silence_brought_is_no_cut(silent_s: float, locked: bool) -> None:
+    it = Recorded().show(HOVER, 1.0, locked=locked)
+    it.show(HOVER, silent_s, uplink=False, locked=locked)
     assert it.show(HOVER, 1.0, uplink=False, locked=True).facts.cut_s is None
 
 
@@ -174,16 +201,3 @@ def test_when_nothing_lifts_it_any_more() -> None:
     it.show(HOVER, 0.5, height_m=1.2)
     assert it.facts.weak_s == pytest.approx(0.5)
     assert (it.facts.low_s, it.facts.low_m) == (pytest.approx(0.5), 1.2)
-
-
-def test_a_sample_tells_how_far_the_gear_is_from_the_target() -> None:
-    vehicle = WatchedVehicle(SCENARIO, CAMERA, TargetConfig())
-    x_m, y_m = vehicle.world.magnet.target_xy_m
-    vehicle.world.set_pose((x_m + 0.04, y_m, 1.0))
-    gear_m = SCENARIO.gear_body_m
-    sample = sample_of(vehicle)
-    assert sample.miss_m == pytest.approx(math.hypot(0.04 + gear_m[0], gear_m[1]))
-    assert sample.below_m == pytest.approx(SCENARIO.ceiling_z_m - gear_m[2] - 1.0)
-    above = WatchedVehicle(replace(SCENARIO, target_above_ceiling_m=0.1), CAMERA, TargetConfig())
-    above.world.set_pose((x_m, y_m, SCENARIO.ceiling_z_m - gear_m[2]))
-    assert sample_of(above).below_m == pytest.approx(0.1)

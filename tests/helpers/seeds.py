@@ -23,8 +23,8 @@ class Ended:
     log: Path | None = None
 
     @property
-    def badness(self) -> tuple[bool]:
-        return (self.outcome != "perched",)
+    def is_bad(self) -> bool:
+        return self.outcome != "perched"
 
 
 def ends_at_once(seed: int) -> Ended:
