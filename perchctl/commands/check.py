@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -218,36 +218,10 @@ def list_cameras(as_json: bool, known: Sequence[ConnectedCamera] | None = None) 
     if not known:
         raise NotFound(NONE)
     if as_json:
-        print(json.dumps([camera_record(camera) for camera in known]))
+        print(json.dumps([{"source": camera.source, **asdict(camera)} for camera in known]))
     else:
         print("\n".join(line for camera in known for line in camera_lines(camera)))
     return 0
-
-
-def camera_record(camera: ConnectedCamera) -> dict[str, Any]:
-    """For JSON."""
-    return {
-        "source": camera.source,
-        "name": camera.name,
-        "path": f"/dev/video{camera.number}",
-        "stable_path": camera.stable_path or None,
-        "modes": [
-            {"format": m.format, "size_px": m.size_px, "rates_hz": m.rates_hz} for m in camera.modes
-        ],
-        "controls": [_control_record(*each) for each in camera.controls],
-        "problem": camera.problem or None,
-    }
-
-
-def _control_record(control: CameraControl, value: int | None) -> dict[str, Any]:
-    record: dict[str, Any] = {
-        "name": control.name, "kind": control.kind, "value": value, "default": control.default,
-        "min": control.low, "max": control.high, "step": control.step,
-        "inactive": control.inactive,
-    }  # fmt: skip
-    if control.menu:
-        record["menu"] = {str(index): text for index, text in control.menu}
-    return record
 
 
 def camera_lines(camera: ConnectedCamera) -> list[str]:
