@@ -263,11 +263,10 @@ def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
         names = [name for name in os.listdir(folder) if name.endswith(SUFFIXES)]
     except FileNotFoundError:
         raise NotFound(
-            f"there is no folder {folder} with flight logs: name a log, or the folder with "
-            f"--log-dir"
+            f"there is no folder {folder} with flight logs: name a log, or its folder"
         ) from None
     except NotADirectoryError:
-        raise NotFound(f"{folder} is a file, not a folder: name it as FILE") from None
+        raise NotFound(f"{folder} is a file, not a folder") from None
     except OSError as error:
         raise NotFound(f"the folder {folder} cannot be read: {error.strerror}") from None
     aged = [(_changed_ns(folder / name), name) for name in names]
@@ -278,9 +277,7 @@ def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
         if _is_log(folder / name):
             logs.append(folder / name)
     if not logs:
-        raise NotFound(
-            f"the folder {folder} holds no flight log: name a log, or another folder with --log-dir"
-        )
+        raise NotFound(f"the folder {folder} holds no flight log: name a log, or another folder")
     return logs
 
 

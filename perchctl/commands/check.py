@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -195,35 +195,10 @@ def list_cameras(as_json: bool, known: Sequence[ConnectedCamera] | None = None) 
     if not known:
         raise NotFound(NONE)
     if as_json:
-        print(json.dumps([camera_record(camera) for camera in known]))
+        print(json.dumps([{"source": camera.source, **asdict(camera)} for camera in known]))
     else:
         print("\n".join(line for camera in known for line in camera_lines(camera)))
     return 0
-
-
-def camera_record(camera: ConnectedCamera) -> dict[str, Any]:
-    """For JSON."""
-    return {
-        "source": camera.source,
-        "name": camera.name,
-        "path": f"/dev/video{camera.number}",
-        "stable_path": camera.stable_path or None,
-        "controls": [
-            {
-                "name": control.name,
-                "kind": control.kind,
-                "value": value,
-                "default": control.default,
-                "min": control.low,
-                "max": control.high,
-                "step": control.step,
-                "inactive": control.inactive,
-                **({"menu": {str(k): text for k, text in control.menu}} if control.menu else {}),
-            }
-            for control, value in camera.controls
-        ],
-        "problem": camera.problem or None,
-    }
 
 
 def camera_lines(camera: ConnectedCamera) -> list[str]:

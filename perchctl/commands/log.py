@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import sys
-from collections.abc import Iterator, Sequence
-from enum import StrEnum
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,12 +25,8 @@ from perchctl.analysis import replay as replay_flight
 from perchctl.commands.command_line import (
     Command,
     ForceOption,
+    Group,
     JsonOption,
-    LogArgument,
-    LogDirOption,
-    LogProfileOption,
-    complete_log,
-    complete_profile,
     examples,
     new_app,
     reporting,
@@ -54,51 +48,38 @@ from perchctl.profile import Profile, changed_profile, load_profile
 
 FORMATS = (".png", ".pdf", ".svg")
 DRAWN_IN = "what plots are drawn in"
+EXPORTS = (".csv", ".parquet", ".mcap")
 PAGE_SUFFIXES = (".html", ".htm")
-MOST_LISTED = 10
-STDOUT = Path("-")
 
-app = new_app()
+LogArgument = Annotated[
+    Path | None,
+    typer.Argument(
+        help="A flight log, or a folder, whose newest log is taken. Default: perchctl-logs."
+    ),
+]
+DrawOption = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", help="Draw both into this file: .png, .pdf or .svg."),
+]
+
+app = new_app(Group)
 
 
-@app.callback(invoke_without_command=True)
-def _top(context: typer.Context) -> None:
-    """After a flight: show, draw, compare, export, replay or report its log.
+def _log_file(place: Path | None) -> Path:
+    """The log that is named; else the newest of the folder, which is then printed.
 
-    They work on logs of flights that were killed, of simulated ones, of an older perchctl;
-    replay needs whole turns, which logs of versions 1 and 2 do not hold. Where FILE is left out
-    it is the newest log; compare wants two.
+    Errors: NotFound.
     """
-    if context.invoked_subcommand is None:
-        print(context.get_help())
+    if place is not None and not place.is_dir():
+        return place
+    (newest,) = newest_logs(_folder(place), 1)
+    say(f"the newest log: {newest}")
+    return newest
 
 
-# --- which log, and its analysis ------------------------------------------------------------
-
-
-def _log_file(file: Path | None, profile: str | None, log_dir: Path | None) -> Path:
-    """The log that is named; else the newest of the folder, which is printed.
-
-    Errors: NotFound, InvalidValue (a profile), UsageError.
-    """
-    if file is None:
-        (newest,) = newest_logs(_log_folder(profile, log_dir), 1)
-        say(f"the newest log: {newest}")
-        return newest
-    for option, value in (("--profile", profile), ("--log-dir", log_dir)):
-        if value is not None:
-            raise UsageError(f"{option} says where the newest log is, but {file} is named: "
-                             f"leave out one of them")  # fmt: skip
-    return file
-
-
-def _log_folder(profile: str | None, log_dir: Path | None) -> Path:
-    """Where `fly` puts the logs. Errors: NotFound, InvalidValue, UsageError."""
-    if log_dir is not None:
-        if profile is not None:
-            raise UsageError("--profile and --log-dir both say where the logs are: leave out one")
-        return log_dir
-    return Path((Profile() if profile is None else load_profile(profile)).log.directory)
+def _folder(place: Path | None) -> Path:
+    """The folder that is named; else where `fly` puts the logs unless a profile says otherwise."""
+    return Path(Profile().log.directory) if place is None else place
 
 
 @contextlib.contextmanager
@@ -113,48 +94,51 @@ def _opened(path: Path) -> Iterator[FlightLog]:
         yield log
 
 
-# --- the subcommands ------------------------------------------------------------------------
-
-
 @app.command(
     cls=Command,
+    short_help="Show a flight: how it ended and why, its phases, holds, battery, frames, findings.",
     epilog=examples(
         "perchctl log show",
         "perchctl log show perchctl-logs/flight.jsonl --json",
-        "perchctl log show --list -n 20",
+        "perchctl log list -n 20",
     ),
 )
 @reporting
-def show(
-    file: LogArgument = None,
-    listed: Annotated[bool, typer.Option("--list", help="The newest logs, a line each.")] = False,
-    count: Annotated[
-        int | None, typer.Option("--count", "-n", min=1, help="How many --list shows. Default: 10.")
-    ] = None,
-    profile: LogProfileOption = None,
-    log_dir: LogDirOption = None,
-    as_json: JsonOption = False,
-) -> int:
-    """Show a flight: how it ended and why, its phases, holds, battery, frames, findings."""
-    if listed:
-        if file is not None:
-            raise UsageError(
-                f"--list is of a folder, and {file} is named: leave it out, or name the "
-                f"folder with --log-dir"
-            )
-        logs = LogList.of(_log_folder(profile, log_dir), count or MOST_LISTED)
-        if as_json:
-            print_record(logs.record())
-        else:
-            print(logs.text())
-        return 0
-    if count is not None:
-        raise UsageError("--count is of --list: add that, or leave it out")
-    with _opened(_log_file(file, profile, log_dir)) as log:
+def show(file: LogArgument = None, as_json: JsonOption = False) -> int:
+    """After a flight: show, draw, compare, export, replay or report its log.
+
+    The subcommands work on logs of flights that were killed, of simulated ones, of an older
+    perchctl; replay needs whole turns, which logs of versions 1 and 2 do not hold.
+    """
+    with _opened(_log_file(file)) as log:
         if as_json:
             print_record(show_record(FlightAnalysis(log)))
         else:
             print(show_text(FlightAnalysis(log)))
+    return 0
+
+
+@app.command(
+    "list",
+    cls=Command,
+    epilog=examples(
+        "perchctl log list", "perchctl log list logs -n 30", "perchctl log list --json"
+    ),
+)
+@reporting
+def list_logs(
+    folder: Annotated[
+        Path | None, typer.Argument(help="The folder of the logs. Default: perchctl-logs.")
+    ] = None,
+    count: Annotated[int, typer.Option("--count", "-n", min=1, help="How many logs.")] = 10,
+    as_json: JsonOption = False,
+) -> int:
+    """List the newest logs of a folder, a line each."""
+    logs = LogList.of(_folder(folder), count)
+    if as_json:
+        print_record(logs.record())
+    else:
+        print(logs.text())
     return 0
 
 
@@ -176,12 +160,10 @@ def plot(
         ),
     ] = None,
     force: ForceOption = False,
-    profile: LogProfileOption = None,
-    log_dir: LogDirOption = None,
     as_json: JsonOption = False,
 ) -> int:
     """Draw a flight: errors, detections, lost frames, height, battery, the last seconds."""
-    path = _log_file(file, profile, log_dir)
+    path = _log_file(file)
     picture = output or path_beside(path, ".png")
     with _opened(path) as log:
         check_output(picture, FORMATS, force, DRAWN_IN)
@@ -206,16 +188,9 @@ def plot(
 )
 @reporting
 def compare(
-    one: Annotated[
-        Path, typer.Argument(metavar="A", help="A flight log.", autocompletion=complete_log)
-    ],
-    other: Annotated[
-        Path, typer.Argument(metavar="B", help="Another one.", autocompletion=complete_log)
-    ],
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Draw both over each other, too: .png, .pdf or .svg."),
-    ] = None,
+    one: Annotated[Path, typer.Argument(metavar="A", help="A flight log.")],
+    other: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
+    output: DrawOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> int:
@@ -238,71 +213,37 @@ def compare(
     return 0
 
 
-class _Form(StrEnum):
-    """In which an export is written."""
-
-    CSV = "csv"
-    PARQUET = "parquet"
-    MCAP = "mcap"
-
-    @property
-    def ending(self) -> str:
-        return f".{self}"
-
-
 @app.command(
     cls=Command,
     epilog=examples(
-        "perchctl log export --csv",
+        "perchctl log export",
         "perchctl log export perchctl-logs/flight.jsonl -o flight.parquet",
-        "perchctl log export --mcap",
+        "perchctl log export -o flight.mcap",
     ),
 )
 @reporting
 def export(
     file: LogArgument = None,
-    csv: Annotated[bool, typer.Option("--csv", help="A table for any program, t_s first.")] = False,
-    parquet: Annotated[
-        bool, typer.Option("--parquet", help="The same table for pandas, polars, DuckDB.")
-    ] = False,
-    mcap: Annotated[
-        bool, typer.Option("--mcap", help="For Foxglove, rosbag2 and PlotJuggler.")
-    ] = False,
     output: Annotated[
         Path | None,
         typer.Option(
             "--output",
             "-o",
-            help="The file, whose ending names the format, too; - is stdout, for CSV. "
-            "Default: beside the log, by its name.",
+            help="The file: .csv (for any program), .parquet (for pandas, polars, DuckDB) or "
+            ".mcap (for Foxglove, rosbag2, PlotJuggler). Default: .csv beside the log.",
         ),
     ] = None,
     force: ForceOption = False,
-    profile: LogProfileOption = None,
-    log_dir: LogDirOption = None,
     as_json: JsonOption = False,
 ) -> int:
     """Write a log in a form that other programs open."""
-    asked = [form for form, is_asked in zip(_Form, (csv, parquet, mcap), strict=True) if is_asked]
-    form = _form(asked, output)
-    if output == STDOUT and (form is not _Form.CSV or as_json):
-        beside_it = "--json" if form is _Form.CSV else f"--{form}"
-        raise UsageError(f"-o - is CSV on stdout, which {beside_it} does not go with: name a file")
-    path = _log_file(file, profile, log_dir)
-    if output == STDOUT:
-        with _opened(path) as log:
-            text = log_table(log).csv()
-        sys.stdout.write(text)
-        return 0
-    beside = ("_export" if form is _Form.MCAP else "") + form.ending
-    place = output or path_beside(path, beside)
-    check_output(place, (form.ending,), force, f"what --{form} writes")
-    if form is _Form.MCAP:
-        done = _write_mcap(path, place, force)
-    else:
-        done = _write_table(path, place, form)
+    path = _log_file(file)
+    place = output or path_beside(path, ".csv")
+    check_output(place, EXPORTS, force, "what a log is exported to")
+    form = place.suffix.lower().removeprefix(".")
+    done = _write_mcap(path, place, force) if form == "mcap" else _write_table(path, place, form)
     if as_json:
-        print_record({"log": str(path), "output": str(place), "format": str(form), **done})
+        print_record({"log": str(path), "output": str(place), "format": form, **done})
         return 0
     counts = [f"{done[key]} {key}" for key in ("rows", "columns", "pictures") if key in done]
     print(f"export:    {place} ({', '.join(counts)})")
@@ -311,26 +252,10 @@ def export(
     return 0
 
 
-def _form(asked: Sequence[_Form], output: Path | None) -> _Form:
-    """What is asked for by name, or else by the output's ending. Errors: UsageError."""
-    if len(asked) > 1:
-        raise UsageError(f"--{asked[0]} and --{asked[1]} are two files: ask for one at a time")
-    if asked:
-        return asked[0]
-    if output == STDOUT:
-        return _Form.CSV
-    for form in _Form:
-        if output is not None and output.suffix.lower() == form.ending:
-            return form
-    raise UsageError(
-        "say in which form: --csv, --parquet or --mcap, or by the name, as in -o flight.csv"
-    )
-
-
-def _write_table(path: Path, place: Path, form: _Form) -> dict[str, Any]:
+def _write_table(path: Path, place: Path, form: str) -> dict[str, Any]:
     with _opened(path) as log:
         table = log_table(log)
-        if form is _Form.CSV:
+        if form == "csv":
             content = table.csv().encode("utf-8", errors="backslashreplace")
         else:
             content = table.parquet()
@@ -374,10 +299,7 @@ def replay(
     profile: Annotated[
         str | None,
         typer.Option(
-            "--profile",
-            "-p",
-            help="What if this profile had been flown, by name or path.",
-            autocompletion=complete_profile,
+            "--profile", "-p", help="What if this profile had been flown, by name or path."
         ),
     ] = None,
     pictures: Annotated[
@@ -386,10 +308,7 @@ def replay(
             "--pictures/--no-pictures", help="See the recorded pictures again, where there are any."
         ),
     ] = True,
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Draw both into it: .png, .pdf or .svg."),
-    ] = None,
+    output: DrawOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> int:
@@ -400,7 +319,7 @@ def replay(
 
     Exit codes: 0 where nothing differs, 61 where something does.
     """
-    path = _log_file(file, None, None)
+    path = _log_file(file)
     if output is not None:
         check_output(output, FORMATS, force, DRAWN_IN)
     with _opened(path) as log:
@@ -440,17 +359,15 @@ def replay(
 def report(
     files: Annotated[
         list[Path] | None,
-        typer.Argument(help="Flight logs; by default the newest.", autocompletion=complete_log),
+        typer.Argument(help="Flight logs; by default the newest of perchctl-logs."),
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="The page: .html.")] = None,
     force: ForceOption = False,
-    profile: LogProfileOption = None,
-    log_dir: LogDirOption = None,
     as_json: JsonOption = False,
 ) -> int:
     """Write one page that tells the flight, or several, in sentences and plots."""
     logs: list[Path] = []
-    for path in [_log_file(name, profile, log_dir) for name in files or (None,)]:
+    for path in map(_log_file, files or (None,)):
         if any(path == known or same_file(path, known) for known in logs):
             say(f"{path} is named twice: it is on the page once")
         else:
@@ -468,7 +385,3 @@ def report(
         print(output)
         say(page.counts_text)
     return 0
-
-
-for _command in app.registered_commands:  # in the list of subcommands the first sentence is whole
-    _command.short_help = (_command.callback.__doc__ or "").split("\n\n")[0]

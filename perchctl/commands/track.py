@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TextIO
+from typing import Annotated
 
 import typer
 
@@ -31,7 +32,6 @@ from perchctl.commands.command_line import (
     ProfileOption,
     ViewOption,
     ViewPortOption,
-    complete_source,
     examples,
     new_app,
     reporting,
@@ -40,46 +40,32 @@ from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
 from perchctl.commands.page import live_page, page_port
 from perchctl.commands.progress import count_bar
-from perchctl.display import AXES_OF_SIDE, LivePage, Sketch
+from perchctl.display import AXES_OF_SIDE
 from perchctl.errors import Interrupted, NotFound, UsageError
 from perchctl.files import check_output, same_file
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.target import PrintCheck
 from perchctl.track import (
     Notes,
-    OutputOptions,
-    Outputs,
     Tally,
-    Tracked,
     Tracker,
-    camera_pipeline,
+    csv_file,
+    overlay_file,
     sketch_of,
+    text_line,
+    text_rows,
+    track_record,
     track_state,
 )
-from perchctl.vision import Frame
+from perchctl.vision import CameraModel, Frame
 
+LIVE_RATE_HZ = 30.0
+"""Of the video that is written of a live source: about how many pictures a second it gives."""
 STILLS_HZ = 1.0
 """Of files of pictures that do not belong together: so each can be looked at, in the video too."""
 POLL_S = 0.002
-OPEN_PAGE_WITHIN_S = 60.0
-"""How long a recording waits, on a terminal, for somebody to open the page."""
-
 
 app = new_app()
-
-
-@dataclass(frozen=True)
-class TrackOptions:
-    """The command line on top of the profile, checked. `source` as `open_camera` takes it;
-    `stills`: each of its pictures for itself."""
-
-    source: str
-    profile: Profile
-    calibration: Path
-    cam: str | None
-    stills: bool
-    outputs: OutputOptions
-    page_port: int | None
 
 
 @app.command(
@@ -96,8 +82,7 @@ def track(
         str,
         typer.Argument(
             help="camera:N or its name, rtsp://..., http://..., aideck://HOST, video:FILE, "
-            "images:DIR (or a pattern), or a path.",
-            autocompletion=complete_source,
+            "images:DIR (or a pattern), or a path."
         ),
     ],
     profile: ProfileOption = "sim",
@@ -109,14 +94,13 @@ def track(
     ] = None,
     cam: CamOption = None,
     stills: Annotated[
-        bool,
+        bool | None,
         typer.Option(
-            "--stills", help="Each picture alone, no window, no filter: as files of pictures are."
+            "--stills/--video",
+            help="Each picture alone, no window, no filter, as files of pictures are tracked; or "
+            "all as one video's, files at 30 Hz.",
         ),
-    ] = False,
-    video: Annotated[
-        bool, typer.Option("--video", help="The files are one video's pictures, at 30 Hz.")
-    ] = False,
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line a frame.")] = False,
     csv: Annotated[
         Path | None, typer.Option("--csv", help="Write the results as CSV, t_s first.")
@@ -138,32 +122,10 @@ def track(
     yaw_rad is atan2(R[1,0], R[0,0]): the marker's heading in the picture's plane. sigma_m is
     along the camera's x, y, z.
     """
-    options = resolve(
-        source, profile, calibration, cam, stills, video, as_json, csv, overlay, force,
-        page_port(view, view_port),
-    )  # fmt: skip
-    track_source(options)
-    return 0
-
-
-def resolve(
-    source: str,
-    profile_name: str = "sim",
-    calibration: Path | None = None,
-    cam: str | None = None,
-    stills: bool = False,
-    video: bool = False,
-    as_json: bool = False,
-    csv: Path | None = None,
-    overlay: Path | None = None,
-    force: bool = False,
-    port: int | None = None,
-) -> TrackOptions:
-    """What can be refused before anything is opened; None is not given. Errors: NotFound,
-    InvalidValue, UsageError."""
-    profile = load_profile(profile_name)
+    flown = load_profile(profile)
     source = parse_source(source, files=True).spec
-    stills = _are_stills(source, stills, video)
+    if stills is None:  # files of pictures need not belong together
+        stills = source.startswith("images:")
     for path, suffix in ((csv, ".csv"), (overlay, ".mp4")):
         if path is not None:
             place = source.partition(":")[2]
@@ -171,59 +133,88 @@ def resolve(
                 raise UsageError(f"{path} is the source itself; write the result to another file")
             check_output(path, (suffix,), force)
     if calibration is None:
-        calibration = find_calibration(profile.camera.calibration)
-        cam = cam or profile.camera.cam
-    else:
-        calibration = find_calibration(str(calibration))
+        cam = cam or flown.camera.cam
+    file = find_calibration(str(calibration or flown.camera.calibration))
+    port = page_port(view, view_port)
     lines = as_json or not (csv or overlay or port is not None)
-    outputs = OutputOptions(lines=lines, as_json=as_json, csv=csv, overlay=overlay)
-    return TrackOptions(source, profile, calibration, cam, stills, outputs, port)
-
-
-def _are_stills(source: str, stills: bool, video: bool) -> bool:
-    """Files of pictures need not belong together, unless the user says so."""
-    if video and stills:
-        raise UsageError("--stills and --video contradict each other: give one of them")
-    if video and not source.startswith("images:"):
-        raise UsageError(
-            f"--video is for files of pictures, and {source} gives a video anyway: leave it out"
-        )
-    return stills or (source.startswith("images:") and not video)
-
-
-def track_source(
-    options: TrackOptions,
-    out: TextIO | None = None,
-    clock: Callable[[], float] = time.monotonic,
-    stopper: Stopper | None = None,
-) -> Tally:
-    """Track to the source's end. Results go to `out` (stdout), all else to stderr.
-
-    Errors: NotFound (source, no frame at all), InvalidValue (sizes, ports, files),
-    TimedOut (a silent camera), Interrupted (Ctrl-C; the files are complete).
-    """
-    start_s = clock()
+    start_s = time.monotonic()
 
     def now() -> float:
-        return clock() - start_s
+        return time.monotonic() - start_s
 
+    stop, tally, notes = Stopper(), Tally(), Notes(say)
     with contextlib.ExitStack() as stack:
-        stop = stopper or Stopper()
-        run = _Run(options, now, sys.stdout if out is None else out, stop, stack)
-        tally = run.tally
-        tally.started_s = now()
-        for frame in frames(run.input.source, now, stop, run.notes):
-            run.take(frame)
+        opened, camera = _open(source, flown, file, cam, stills, now)
+        stack.callback(opened.close)
+        recording = opened.inner if isinstance(opened, WrappedSource) else opened
+        paths: Sequence[Path] = ()
+        rate_hz = count = None
+        if isinstance(recording, Recording):
+            paths, rate_hz, count = recording.paths, recording.rate_hz, recording.count
+        prints = PrintCheck(camera, flown.target)
+        tracker = Tracker(flown, camera, live=opened.live, stills=stills)
+        add_row = stack.enter_context(csv_file(csv)) if csv else None
+        add_picture = None
+        if overlay:
+            film = overlay_file(overlay, camera, rate_hz or LIVE_RATE_HZ)
+            add_picture = stack.enter_context(film)
+        stack.enter_context(stop.installed())  # until here Ctrl-C ends at once
+        title = f"perchctl track {without_password(source)}"
+        page = stack.enter_context(live_page(camera, title, port))
+        has_bar = not opened.live and not (lines and sys.stdout.isatty())
+        advance = stack.enter_context(count_bar("frames", count, has_bar))
+        for frame in frames(opened, now, stop, notes):
+            place = str(paths[frame.index]) if paths else opened.describe()
+            check_size((frame.image.shape[1], frame.image.shape[0]), camera, place)
+            name = paths[frame.index].name if paths else frame.index
+            results = tracker.results(frame, name)
+            for tracked in results:
+                tally.add(tracked)
+                prints.add(tracked.output)
+                notes.add(tracked)
+                if lines:
+                    line = json.dumps(track_record(tracked)) if as_json else text_line(tracked)
+                    # A live result is worth nothing late.
+                    print(line, flush=opened.live)
+                if add_row is not None:
+                    add_row(tracked)
+                sketch = sketch_of(tracked, AXES_OF_SIDE * flown.target.large.side_m)
+                if add_picture is not None and tracked is results[-1]:  # of two fields, one
+                    text = tuple(f"{label} {value}" for label, value in text_rows(tracked))
+                    add_picture(tracked.t_s, replace(sketch, text=text))
+                if page is not None:
+                    page.show(frame.index, sketch)
+                    page.tell(partial(track_state, tracked))
+            advance()
         ended_s = now()
         if tally.frames == 0 and not stop.requested.is_set():
-            raise NotFound(f"{run.input.source.describe()} gave no frame at all")
-        run.outputs.close(keep=True)
+            raise NotFound(f"{opened.describe()} gave no frame at all")
     say(tally.text(ended_s))
-    if run.prints.judged:
-        say(run.prints.verdict().text)
+    if prints.judged:
+        say(prints.verdict().text)
     if stop.requested.is_set():
         raise Interrupted("Ctrl-C: stopped; what was written is complete")
-    return tally
+    return 0
+
+
+def _open(
+    source: str,
+    profile: Profile,
+    calibration: Path,
+    cam: str | None,
+    stills: bool,
+    now: Callable[[], float],
+) -> tuple[FrameSource, CameraModel]:
+    """The open source, and its camera. Errors: NotFound, InvalidValue."""
+    camera = None
+    with contextlib.suppress(SizeMissing):  # then the first picture's is taken
+        camera = load_calibration(calibration, cam=cam)
+    size_px = None if camera is None else camera.size_px
+    pictures_hz = STILLS_HZ if stills else None
+    opened = open_camera(source, now, profile.camera, size_px=size_px, pictures_hz=pictures_hz)
+    if camera is None:
+        camera = load_calibration(calibration, opened.size_px, cam)
+    return opened, camera
 
 
 def frames(
@@ -244,126 +235,3 @@ def frames(
             return
         notes.silence(source.problem(now_s))
         stop.requested.wait(POLL_S)
-
-
-@dataclass(frozen=True)
-class _Input:
-    """The open source. `paths` are those of pictures; a recording has a rate, and mostly a
-    number of frames."""
-
-    source: FrameSource
-    paths: Sequence[Path]
-    rate_hz: float | None
-    count: int | None
-
-    def frame_name(self, index: int) -> str | int:
-        """How results name a frame."""
-        return self.paths[index].name if self.paths else index
-
-    def file_name(self, index: int) -> str:
-        """How messages name the file that a frame is from."""
-        return str(self.paths[index]) if self.paths else self.source.describe()
-
-
-def _open(
-    options: TrackOptions, size_px: tuple[int, int] | None, now: Callable[[], float]
-) -> _Input:
-    config = options.profile.camera
-    pictures_hz = STILLS_HZ if options.stills else None
-    source = open_camera(options.source, now, config, size_px=size_px, pictures_hz=pictures_hz)
-    raw = source.inner if isinstance(source, WrappedSource) else source
-    if isinstance(raw, Recording):
-        return _Input(source, raw.paths, raw.rate_hz, raw.count)
-    return _Input(source, (), None, None)
-
-
-class _Run:
-    """All that one run holds open, on the stack; `take` is what happens to a frame."""
-
-    def __init__(
-        self,
-        options: TrackOptions,
-        now: Callable[[], float],
-        out: TextIO,
-        stop: Stopper,
-        stack: contextlib.ExitStack,
-    ) -> None:
-        camera = None
-        with contextlib.suppress(SizeMissing):  # then the first picture's is taken
-            camera = load_calibration(options.calibration, cam=options.cam)
-        self.input = _open(options, None if camera is None else camera.size_px, now)
-        source = self.input.source
-        stack.callback(source.close)
-        if camera is None:
-            camera = load_calibration(options.calibration, source.size_px, options.cam)
-        self.camera = camera
-        check_size(source.size_px, camera, self.input.file_name(0))
-        setup = camera_pipeline(options.profile, camera, options.stills)
-        self.tally, self.notes = Tally(), Notes(say)
-        self.prints = PrintCheck(camera, options.profile.target)
-        self.outputs = Outputs(options.outputs, self.camera, self.input.rate_hz, out)
-        stack.callback(self.outputs.close, keep=False)
-        stack.enter_context(stop.installed())  # until here Ctrl-C ends at once
-        self._tracker = Tracker(
-            setup,
-            live=source.live,
-            stills=options.stills,
-            disagreement_frames=options.profile.merge.disagreement_frames,
-            camera=options.profile.camera,
-        )
-        self._axis_m = AXES_OF_SIDE * options.profile.target.large.side_m
-        title = f"perchctl track {without_password(options.source)}"
-        page = stack.enter_context(live_page(self.camera, title, options.page_port))
-        bar = not source.live and not (options.outputs.lines and out.isatty())
-        self._advance = stack.enter_context(count_bar("frames", self.input.count, bar))
-        self._viewer = None if page is None else _Viewer(page, source.live, now, stop)
-
-    def take(self, frame: Frame) -> None:
-        """Track a frame, and hand the result to files, lines, page and tally."""
-        size_px = (frame.image.shape[1], frame.image.shape[0])
-        check_size(size_px, self.camera, self.input.file_name(frame.index))
-        name = self.input.frame_name(frame.index)
-        for tracked in self._tracker.results(frame, name):
-            picture, notes = self._tracker.picture or frame, self._tracker.notes
-            self.tally.add(tracked, notes)
-            self.prints.add(self._tracker.output)
-            self.notes.changes(name, notes)
-            sketch = sketch_of(picture, tracked, self._axis_m)
-            self.outputs.add(tracked, sketch, drawn=not self._tracker.more)
-            if self._viewer is not None:
-                self._viewer.show(picture, sketch, tracked, notes)
-        self._advance()
-
-
-class _Viewer:
-    """Shows frames on the live page. A recording starts when the page is opened, and then
-    runs as fast as it was recorded."""
-
-    def __init__(self, page: LivePage, live: bool, now: Callable[[], float], stop: Stopper) -> None:
-        self._page, self._live, self._now, self._stop = page, live, now, stop
-        self._offset_s: float | None = None
-        if not live:
-            self._wait_for_reader()
-
-    def show(self, frame: Frame, sketch: Sketch, tracked: Tracked, notes: tuple[str, ...]) -> None:
-        self._page.show(frame.index, sketch)
-        self._page.tell(partial(track_state, tracked, notes))
-        if not self._live:
-            self._keep_pace(frame.t_s)
-
-    def _wait_for_reader(self) -> None:
-        """Only where a person can be expected: on a terminal."""
-        if not sys.stderr.isatty():
-            return
-        say("starts when the page is opened (Ctrl-C ends)")
-        until_s = time.monotonic() + OPEN_PAGE_WITHIN_S
-        while not (self._stop.requested.is_set() or self._page.opened.wait(0.1)):
-            if time.monotonic() > until_s:
-                return
-
-    def _keep_pace(self, t_s: float) -> None:
-        if self._offset_s is None:
-            self._offset_s = self._now() - t_s
-        left_s = t_s + self._offset_s - self._now()
-        if left_s > 0.0:
-            self._stop.requested.wait(left_s)

@@ -60,7 +60,6 @@ class LivePage:
         self.token = secrets.token_urlsafe(16)
         self.problem: str | None = None
         self.closed = False
-        self.opened = threading.Event()
         self._on_stop = on_stop
         self._stop_requested = False
         self._clock = clock
@@ -119,15 +118,11 @@ class LivePage:
             if read_s is not None and self._clock() - read_s < READS_S:
                 self._changed.wait_for(lambda: self._card_read or self.closed, LAST_READ_S)
 
-    @property
-    def stop_requested(self) -> bool:
-        return self._stop_requested
-
     # --- for the server's threads --------------------------------------------
 
     def state(self) -> PageState:
         """What the page polls: `describe`'s keys (rows of a name, a text and, for a bar, a share
-        0..1; note, phase, battery, over, stop_did), and title, rate_hz, stop (``none``, ``ready``,
+        0..1; note, phase, battery, over), and title, rate_hz, stop (``none``, ``ready``,
         ``requested``, ``over``), age_s of these numbers (None where no others are due), card
         (`end`'s, or None)."""
         try:
@@ -217,7 +212,6 @@ class LivePage:
 
 HOSTS = ("127.0.0.1", "localhost", "::1")
 TOKEN_HEADER = "X-Perchctl-Token"
-MAX_STREAMS = 8
 LEAST_PERIOD_S = 0.04
 """Between two pictures to one reader: 25 a second are enough for eyes."""
 _CLIENT_TIMEOUT_S = 5.0
@@ -243,7 +237,6 @@ class PageServer(ThreadingHTTPServer):
     def __init__(self, page: LivePage, port: int) -> None:
         self.page = page
         self.html = _HTML.read_text(encoding="utf-8")
-        self.streams = threading.BoundedSemaphore(MAX_STREAMS)
         super().__init__(("127.0.0.1", port), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -305,19 +298,9 @@ class _Handler(BaseHTTPRequestHandler):
             f"style-src 'nonce-{nonce}'; script-src 'nonce-{nonce}'"
         )
         html = self.server.html.replace("{{nonce}}", nonce)
-        self.server.page.opened.set()
         self._send(200, "text/html; charset=utf-8", html.encode(), policy)
 
     def _send_stream(self) -> None:
-        if not self.server.streams.acquire(blocking=False):
-            self._refuse(503, f"{MAX_STREAMS} others are looking already")
-            return
-        try:
-            self._stream()
-        finally:
-            self.server.streams.release()
-
-    def _stream(self) -> None:
         self._head(200, f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
         self.end_headers()
         self.wfile.write(f"--{_BOUNDARY}\r\n".encode())

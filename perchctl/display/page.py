@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,13 @@ from perchctl.camera import FrameSource, WatchedSource
 from perchctl.display.live import LivePage, PageState
 from perchctl.display.panel import status_of, status_rows
 from perchctl.display.sketch import Sketch
-from perchctl.log import FlightSummary
-from perchctl.mission import RESCUE, Event, EventKind, Phase, Tick
+from perchctl.log import FlightSummary, summary_text
+from perchctl.mission import RESCUE, Event, EventKind, Tick
 from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput
 
+Card = dict[str, Any]
+"""Outcome, reason, and rows of a name and a text, as the page shows them at the end."""
+GOOD = "perched"
 AXES_OF_SIDE = 0.5
 """Length of the drawn axes, in sides of the large marker."""
 
@@ -34,8 +37,7 @@ class FlightPage:
         self._axis_m = AXES_OF_SIDE * large_side_m
         self._frame: Frame | None = None
         self._flying = False
-        self._events: list[Event] = []
-        self._pressed_s: float | None = None
+        self._rescue = ""
         waiting = {"phase": "WAITING", "rows": [["reason", "vehicle and camera"]]}
         page.tell(lambda: waiting, live=False)
 
@@ -54,23 +56,19 @@ class FlightPage:
             if frame is not None:
                 self._frame = None
                 self.page.show(frame.index, sketch_of(frame, tick.output, self._axis_m))
-            if self._pressed_s is None and self.page.stop_requested:
-                self._pressed_s = tick.t_s
-            did = answered(self._events, self._pressed_s)
-            self.page.tell(partial(flight_state, tick, did), live=not tick.state.phase.is_over)
+            self.page.tell(partial(flight_state, tick), live=not tick.state.phase.is_over)
         except Exception as error:
             self.page.remember(error)
 
     def event(self, event: Event) -> None:
-        self._events.append(event)
+        if event.kind is EventKind.NOTE and RESCUE in event.reason:
+            self._rescue = event.reason
 
     def end(self, card: Card) -> None:
         """The flight is over, and this is how: the last that the page shows. After an error in
         flight, with what the rescue said."""
-        notes = [e for e in self._events if e.kind is EventKind.NOTE]
-        rescue = next((e for e in reversed(notes) if RESCUE in e.reason), None)
-        if rescue is not None and not card["good"]:
-            card = card | {"rows": [["flight", rescue.reason], *card["rows"]]}
+        if self._rescue and not card["good"]:
+            card = card | {"rows": [["flight", self._rescue], *card["rows"]]}
         self.page.end(card)
 
     def _seen(self, frame: Frame) -> None:
@@ -93,9 +91,9 @@ def sketch_of(frame: Frame, output: PipelineOutput | None, axis_m: float) -> Ske
     )
 
 
-def flight_state(tick: Tick, stop_did: str = "") -> PageState:
-    """The tick for the page: phase, battery, the rows of the terminal's panel, whether the flight
-    is over, and what it did for STOP."""
+def flight_state(tick: Tick) -> PageState:
+    """The tick for the page: phase, battery, the rows of the terminal's panel, and whether the
+    flight is over."""
     status = status_of(tick)
     volts = status.battery_v
     return {
@@ -105,7 +103,6 @@ def flight_state(tick: Tick, stop_did: str = "") -> PageState:
         "rows": [list(row) for row in status_rows(status)],
         "note": f"held: {status.hold}" if status.hold else _seen_note(tick.output),
         "over": tick.state.phase.is_over,
-        "stop_did": stop_did,
     }
 
 
@@ -137,53 +134,14 @@ def flight_page(
             report(f"the live page failed: {page.problem}")
 
 
-# --- What the live page says of the operator's commands and of the flight's end -----------------
-# By the flight's own events, not by what was clicked.
-
-
-Card = dict[str, Any]
-GOOD = "perched"
-_ORDERED = {"operator-land": "landing ordered", "operator-stop": "motors cut"}
-
-
-def answered(events: Sequence[Event], pressed_s: float | None) -> str:
-    """What the flight did for STOP, or for a Ctrl-C; empty where neither came.
-
-    `pressed_s`: the turn of the loop in which STOP was there, on the loop's clock."""
-    phases = [e for e in events if e.kind is EventKind.PHASE and e.phase is not None]
-    ordered = [e for e in phases if e.row in _ORDERED]
-    if not phases or (pressed_s is None and not ordered):
-        return ""
-    start_s = phases[0].t_s
-    parts = [f"{_ORDERED[e.row]} at {e.t_s - start_s:.1f} s" for e in ordered]
-    landing = next((e for e in phases if e.phase is Phase.LANDING), None)
-    if not ordered and landing is not None:
-        parts.append(f"it lands already, since {landing.t_s - start_s:.1f} s: {landing.reason}")
-    last = phases[-1]
-    if last.phase is not None and last.phase.is_over and last.row not in _ORDERED:
-        parts.append(f"{last.phase.value} at {last.t_s - start_s:.1f} s: {last.reason}")
-    if not parts:
-        parts.append("STOP has come; the flight has not answered yet")
-    return "; ".join(parts)
+# --- How the flight ended ---------------------------------------------------------------------
 
 
 def summary_card(summary: FlightSummary, log: Path) -> Card:
     """How the flight ended, and where to look next."""
-    rows = [["cause", summary.cause]] if summary.cause not in ("", summary.outcome) else []
-    if summary.miss_m is not None:
-        rows.append(["miss", f"{summary.miss_m * 1e3:.1f} mm"])
-    if summary.contact is not None:
-        rows.append(["contact", summary.contact.text])
-    if summary.touchdown is not None and summary.touchdown.is_hard:
-        rows.append(["vehicle", summary.touchdown.text])
-    rows.append(["flight", f"{summary.duration_s:.1f} s, attempts {summary.attempts}"])
-    if summary.battery_min_v is not None:
-        rows.append(["battery", f"{summary.battery_min_v:.2f} V at its lowest"])
-    if summary.locked:
-        rows.append(["vehicle", "locked by its supervisor: inspect and restart it"])
-    if summary.log_problem is not None:
-        rows.append(["log lost", summary.log_problem])
-    return _card(summary.outcome, summary.reason, rows, log)
+    first, *lines = summary_text(summary).splitlines()
+    rows = [[part.strip() for part in line.split(":", maxsplit=1)] for line in lines]
+    return _card(summary.outcome, first.partition(": ")[2], rows, log)
 
 
 def failed_card(error: BaseException, log: Path | None) -> Card:

@@ -1,9 +1,10 @@
-from .outputs import OutputOptions as OutputOptions
-from .outputs import Outputs as Outputs
-from .result import Tracked as Tracked
+from .outputs import csv_file as csv_file
+from .outputs import overlay_file as overlay_file
+from .result import text_line as text_line
+from .result import text_rows as text_rows
+from .result import track_record as track_record
 from .tracker import Notes as Notes
 from .tracker import Tally as Tally
 from .tracker import Tracker as Tracker
-from .tracker import camera_pipeline as camera_pipeline
 from .tracker import sketch_of as sketch_of
 from .tracker import track_state as track_state

@@ -13,11 +13,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from perchctl.geometry import Array, rot_z, yaw_of
 from perchctl.vision import (
     MARKERS,
     Detection,
+    Frame,
     MarkerName,
     MarkerPose,
     PipelineOutput,
@@ -49,15 +51,19 @@ class Tracked:
     """One frame. `frame` is the file's name, or the index where there is none.
 
     `stage` is what this frame showed; a `target` at stage ``none`` is the filter's
-    prediction.
+    prediction. `image` is the picture, grey (h, w) uint8; `output` what the pipeline found in it,
+    None where it was not searched; `notes` the sentences that it deserves.
     """
 
     frame: str | int
     t_s: float
+    image: NDArray[np.uint8]
     stage: str = Stage.NONE.value
     large: Seen | None = None
     small: Seen | None = None
     target: CameraPose | None = None
+    output: PipelineOutput | None = None
+    notes: tuple[str, ...] = ()
 
     def get(self, marker: MarkerName) -> Seen | None:
         return self.large if marker == "large" else self.small
@@ -65,10 +71,11 @@ class Tracked:
 
 def tracked_of(
     frame: str | int,
-    t_s: float,
+    picture: Frame,
     output: PipelineOutput,
     filtered: bool,
     before: CameraPose | None = None,
+    notes: tuple[str, ...] = (),
 ) -> Tracked:
     """The frame's result from a pipeline whose body, gear and camera are one.
 
@@ -77,11 +84,14 @@ def tracked_of(
     """
     return Tracked(
         frame=frame,
-        t_s=t_s,
+        t_s=picture.t_s,
+        image=picture.image,
         stage=output.stage.value,
         large=_seen(output.detections.large, output),
         small=_seen(output.detections.small, output),
         target=_target(output, filtered, before),
+        output=output,
+        notes=notes,
     )
 
 
@@ -167,51 +177,44 @@ def _numbers(values: Any) -> list[float | None]:
 
 
 _AXES = ("x", "y", "z")
-_CORNERS = ("tl", "tr", "br", "bl")
+_POSE = (*(f"{a}_m" for a in _AXES), *(f"r{a}_rad" for a in _AXES))
+_CORNERS = tuple(f"{corner}_{a}_px" for corner in ("tl", "tr", "br", "bl") for a in ("x", "y"))
+_SIGMAS = (*(f"sigma_{a}_m" for a in _AXES), "sigma_yaw_rad")
 CSV_COLUMNS: tuple[str, ...] = (
     "t_s",
     "frame",
     "stage",
-    *(f"{a}_m" for a in _AXES),
-    *(f"r{a}_rad" for a in _AXES),
+    *_POSE,
     "yaw_rad",
-    *(f"sigma_{a}_m" for a in _AXES),
-    "sigma_yaw_rad",
-    *(
-        f"{marker}_{name}"
-        for marker in MARKERS
-        for name in (
-            *(f"{a}_m" for a in _AXES),
-            *(f"r{a}_rad" for a in _AXES),
-            "reprojection_px",
-            *(f"{corner}_{a}_px" for corner in _CORNERS for a in ("x", "y")),
-        )
-    ),
+    *_SIGMAS,
+    *(f"{marker}_{name}" for marker in MARKERS for name in (*_POSE, "reprojection_px", *_CORNERS)),
 )
 
 
-def csv_row(tracked: Tracked) -> list[str | int | float | None]:
-    """Values of `CSV_COLUMNS`; empty (None) where there is nothing."""
+def csv_record(tracked: Tracked) -> dict[str, str | int | float | None]:
+    """Values by `CSV_COLUMNS`, without those of what was not found."""
+    record: dict[str, str | int | float | None] = {
+        "t_s": tracked.t_s,
+        "frame": tracked.frame,
+        "stage": tracked.stage,
+    }
     target = tracked.target
-    row: list[str | int | float | None] = [tracked.t_s, tracked.frame, tracked.stage]
-    row += (
-        [None] * 10
-        if target is None
-        else [
-            *_numbers(target.tvec_m),
-            *_numbers(target.rvec_rad),
-            _number(target.yaw_rad),
-            *_numbers(target.sigma_m)[:3],
-        ]
-    )
-    row.append(None if target is None else _number(target.sigma_yaw_rad))
+    if target is not None:
+        record |= zip(_POSE, _numbers([*target.tvec_m, *target.rvec_rad]), strict=True)
+        record["yaw_rad"] = _number(target.yaw_rad)
+        sigmas = [*target.sigma_m[:3], target.sigma_yaw_rad]
+        record |= zip(_SIGMAS, _numbers(sigmas), strict=True)
     for marker in MARKERS:
         seen = tracked.get(marker)
-        pose = None if seen is None else seen.pose
-        row += [None] * 6 if pose is None else _numbers([*pose.tvec_m, *pose.rvec_rad])
-        row.append(None if pose is None else _number(pose.reprojection_px))
-        row += [None] * 8 if seen is None else _numbers(seen.corners_px.ravel())
-    return row
+        if seen is None:
+            continue
+        corners = zip(_CORNERS, _numbers(seen.corners_px.ravel()), strict=True)
+        record |= {f"{marker}_{name}": value for name, value in corners}
+        if seen.pose is not None:
+            pose = zip(_POSE, _numbers([*seen.pose.tvec_m, *seen.pose.rvec_rad]), strict=True)
+            record |= {f"{marker}_{name}": value for name, value in pose}
+            record[f"{marker}_reprojection_px"] = _number(seen.pose.reprojection_px)
+    return record
 
 
 def text_rows(tracked: Tracked) -> list[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""The live page over HTTP: picture and numbers."""
+"""The live page over HTTP: picture and numbers, who may ask for them, and what STOP accepts."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import http.client
 import json
 import socket
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 import cv2
 import numpy as np
 import pytest
 
 from perchctl.display import LivePage, Sketch
-from perchctl.display.live import MAX_STREAMS
+from perchctl.display.live import TOKEN_HEADER, is_loopback
 from perchctl.errors import InvalidValue
-from tests.helpers.live_page import CORNERS, ask
+from tests.helpers.live_page import CORNERS, Stops, ask, stop
 from tests.helpers.recording import camera
 
 
@@ -29,7 +29,7 @@ def test_the_page_needs_nothing_from_elsewhere(page: LivePage) -> None:
     assert 'name="viewport"' in html
     assert "default-src 'none'" in headers["Content-Security-Policy"]
     assert page.token not in html  # it is in the address only
-    assert page.opened.is_set()
+    assert page._server.server_address[0] == "127.0.0.1"
 
 
 def test_the_state_is_the_newest(page: LivePage) -> None:
@@ -90,24 +90,6 @@ def test_the_stream_gives_the_drawn_picture(page: LivePage) -> None:
         connection.close()
 
 
-def test_too_many_readers_are_sent_away(page: LivePage) -> None:
-    page.show(0, Sketch(np.zeros((48, 64), np.uint8)))
-    port = urlsplit(page.url).port or 0
-    readers = [
-        http.client.HTTPConnection("127.0.0.1", port, timeout=5.0) for _ in range(MAX_STREAMS)
-    ]
-    try:
-        for reader in readers:
-            reader.request("GET", "/stream")
-        answers = [reader.getresponse() for reader in readers]  # a dropped one would hang up
-        assert {answer.status for answer in answers} == {200}
-        assert ask(page.url, "/stream")[0] == 503
-        assert ask(page.url, "/state")[0] == 200
-    finally:
-        for reader in readers:
-            reader.close()
-
-
 def test_what_fails_is_remembered_and_not_raised(page: LivePage) -> None:
     def broken() -> dict[str, Any]:
         raise RuntimeError("no words")
@@ -140,3 +122,66 @@ def test_closing_ends_a_waiting_stream() -> None:
     while answer.read1(4096):
         pass
     connection.close()
+
+
+# --- who may do what --------------------------------------------------------------------
+
+
+def token_of(url: str) -> str:
+    return parse_qs(urlsplit(url).query)["token"][0]
+
+
+def test_stop_needs_the_token(page: LivePage, stops: Stops) -> None:
+    assert stop(page.url, "") == 403
+    assert stop(page.url, "wrong") == 403
+    assert stop(page.url, "w\xf6rng") == 403
+    assert ask(page.url, f"/stop?token={page.token}", "POST")[0] == 403  # a form can send that
+    assert ask(page.url, "/stop", "GET", **{TOKEN_HEADER: page.token})[0] == 404
+    assert stops.count == 0
+    for _ in range(3):  # again changes nothing
+        assert stop(page.url, token_of(page.url)) == 200
+    assert stops.count == 1
+    assert json.loads(ask(page.url, "/state")[1])["stop"] == "requested"
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", ""])
+@pytest.mark.parametrize("path", ["/", "/state", "/stream"])
+def test_a_foreign_host_is_refused(page: LivePage, host: str, path: str) -> None:
+    status, body, _ = ask(page.url, path, Host=host)
+    assert status == 403
+    assert page.token.encode() not in body
+
+
+def test_stop_refuses_a_foreign_host_and_origin(page: LivePage, stops: Stops) -> None:
+    assert stop(page.url, page.token, Host="evil.example") == 403
+    assert stop(page.url, page.token, Origin="http://evil.example") == 403
+    assert stop(page.url, page.token, Origin="null") == 403
+    assert stops.count == 0
+    assert stop(page.url, page.token, Origin="http://localhost:9", Host="localhost:9") == 200
+
+
+@pytest.mark.parametrize(
+    ("host", "local"),
+    [
+        ("127.0.0.1:80", True),
+        ("localhost", True),
+        ("LOCALHOST:8080", True),
+        ("[::1]:80", True),
+        ("user@127.0.0.1", True),
+        ("127.0.0.1@evil.example", False),
+        ("127.0.0.2", False),
+        ("[", False),
+        (None, False),
+    ],
+)
+def test_the_names_of_this_machine(host: str | None, local: bool) -> None:
+    assert is_loopback(host) is local
+
+
+def test_without_stop_there_is_none() -> None:
+    page = LivePage(camera(), "t")
+    try:
+        assert json.loads(ask(page.url, "/state")[1])["stop"] == "none"
+        assert stop(page.url, page.token) == 403
+    finally:
+        page.close()

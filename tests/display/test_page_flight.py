@@ -1,12 +1,11 @@
-"""The live page of a flight and of `track --view`."""
+"""The live page of a flight: what it shows, how old that is, what STOP does, and how it ends."""
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import threading
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,25 +13,60 @@ import cv2
 import numpy as np
 import pytest
 
+from perchctl.commands import fly
 from perchctl.commands.fly import live_page
-from perchctl.commands.track import resolve, track_source
-from perchctl.display import FlightPage, LivePage, Sketch
-from perchctl.flight import FlyOptions, OperatorSwitch
+from perchctl.display import FlightPage, LivePage, failed_card, summary_card
+from perchctl.errors import Interrupted
+from perchctl.flight import FlyOptions, OperatorSwitch, SessionResult
 from perchctl.flight.operator import AGAIN_S, HELD_S
-from perchctl.mission import Operator, Phase, PlannerState, Tick
+from perchctl.log import FlightSummary, LogWatcher
+from perchctl.mission import (
+    FlightReport,
+    Operator,
+    Outcome,
+    Phase,
+    PlannerState,
+    Tick,
+    Watcher,
+)
 from perchctl.profile import load_profile
 from perchctl.vehicle import Idle
 from perchctl.vision import Detection, Detections, Frame, MarkerPose, PipelineOutput, Stage
 from tests.helpers.live_page import CORNERS, ask, stop
 from tests.helpers.log import telemetry
-from tests.helpers.mission import note
-from tests.helpers.recording import CALIBRATION, VIEWS, camera, picture, write_pictures
+from tests.helpers.mission import entered, note
+from tests.helpers.recording import camera
 
-# --- fly --view ------------------------------------------------------------------------------
+START_S = 100.0
+OVER = [Phase.PERCHED, Phase.LANDED, Phase.ABORTED]
 
 
-def tick(t_s: float, output: PipelineOutput | None = None) -> Tick:
-    state = PlannerState(phase=Phase.ALIGN, entered_s=1.0, reason="pose is steady")
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 50.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def page(clock: Clock) -> Iterator[LivePage]:
+    served = LivePage(camera(), "perchctl test", on_stop=lambda: None, clock=clock)
+    yield served
+    served.close()
+
+
+def state_of(page: LivePage) -> dict[str, Any]:
+    return dict(json.loads(ask(page.url, "/state")[1]))
+
+
+def tick(t_s: float, phase: Phase = Phase.ALIGN, output: PipelineOutput | None = None) -> Tick:
+    state = PlannerState(phase=phase, entered_s=START_S, reason="pose is steady")
     return Tick(t_s, telemetry(t_s, 0.6), output, None, state, Idle(), 0.0, 0.01, 0.012)
 
 
@@ -68,6 +102,92 @@ class OneFrame:
         self.frame = None
 
 
+# --- what it shows ---------------------------------------------------------------------------
+
+
+def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> None:
+    flight = FlightPage(page, 0.15)
+    frame = Frame(7, 1.0, np.full((480, 640), 90, np.uint8))
+    source = flight.watched(OneFrame(frame))
+    assert state_of(page)["phase"] == "WAITING"
+    assert source.poll(1.0) is frame
+    assert source.poll(1.1) is None
+    assert source.problem(1.1) == "silent"
+    assert page.jpeg_after(0) is not None  # before the first tick too
+    flight.tick(tick(START_S + 1.5, output=seen_in(frame)))
+    state = state_of(page)
+    assert state["phase"] == "ALIGN"
+    assert state["battery"] == f"{telemetry(START_S + 1.5, 0.6).battery_v:.2f} V"
+    assert ["phase", "ALIGN  1.5 s"] in state["rows"]
+    newest = page.jpeg_after(1)
+    assert newest is not None
+    decoded = cv2.imdecode(np.frombuffer(newest[1], np.uint8), cv2.IMREAD_COLOR)
+    drawn = np.asarray(decoded).astype(int)
+    assert np.abs(drawn[150, 250:350] - 90).max() > 50
+    assert flight.problem is None
+
+
+def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
+    flight = FlightPage(page, 0.15)
+    flight.watched(OneFrame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
+    flight.tick(None)  # type: ignore[arg-type]
+    flight.event(note(0.0, "something"))
+    assert flight.problem is None
+    flight.tick(tick(1.0, output="no output"))  # type: ignore[arg-type]
+    state_of(page)
+    assert page.problem is not None
+
+
+# --- how old it is ---------------------------------------------------------------------------
+
+
+def test_the_numbers_tell_their_age(page: LivePage, clock: Clock) -> None:
+    flight = FlightPage(page, 0.15)
+    clock.now_s += 60.0
+    assert state_of(page)["age_s"] is None  # connecting may take its time
+    flight.tick(tick(START_S))
+    assert state_of(page)["age_s"] == 0.0
+    clock.now_s += 3.25  # the loop hangs, the page's threads do not
+    assert state_of(page)["age_s"] == 3.25
+    flight.tick(tick(START_S + 3.3))
+    assert state_of(page)["age_s"] == 0.0
+
+
+@pytest.mark.parametrize("phase", OVER)
+def test_after_the_flight_nothing_is_due_and_nothing_to_stop(
+    page: LivePage, clock: Clock, phase: Phase
+) -> None:
+    flight = FlightPage(page, 0.15)
+    assert stop(page.url, page.token) == 200
+    flight.tick(tick(START_S))
+    assert state_of(page)["stop"] == "requested"
+    flight.tick(tick(START_S + 1.0, phase))
+    clock.now_s += 9.0
+    state = state_of(page)
+    assert (state["age_s"], state["stop"]) == (None, "over")
+
+
+def test_the_page_looks_at_the_age_by_itself(page: LivePage) -> None:
+    """Whatever hangs, its script is the browser's: a timer, answers that are not waited for
+    without end (`AbortSignal.timeout` is of 2022, and asked for before each use), and a STOP that
+    is ready again at a program that was gone and now hangs."""
+    html = page._server.html
+    script = html.partition("<script")[2]
+    assert "setInterval(watch" in script
+    assert script.count("...within(") == 2
+    assert [line for line in script.splitlines() if "AbortSignal" in line] == [
+        "const within = (ms) => AbortSignal.timeout ? { signal: AbortSignal.timeout(ms) } : {};"
+    ]
+    assert 'showStop(silent ? known : "gone")' in script
+    assert "known = stop;" in script
+    assert html.index('id="old"') < html.index('id="live"')  # its sentence is not greyed with it
+    table = script.partition("const STOP = {")[2].partition("};")[0]
+    names = re.findall(r"^  (\w+): \[", table, re.MULTILINE)
+    assert names == ["ready", "requested", "over", "gone"]
+
+
+# --- STOP ------------------------------------------------------------------------------------
+
 OPTIONS = FlyOptions(load_profile("sim"), Path("sim.yaml"), "sim://", "sim:")
 
 
@@ -97,101 +217,113 @@ def test_without_view_no_page_is_opened(capsys: pytest.CaptureFixture[str]) -> N
     assert capsys.readouterr().err == ""
 
 
-def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> None:
+# --- how it ended ----------------------------------------------------------------------------
+
+SUMMARY = FlightSummary(
+    "perched", "hanging still with the motors off", "perched", 24.5, 2, 0.0017, 3.31
+)
+
+
+def test_the_card_tells_outcome_reason_miss_and_where_to_look(tmp_path: Path) -> None:
+    log = tmp_path / "my flights" / "flight.jsonl"
+    card = summary_card(SUMMARY, log)
+    assert (card["outcome"], card["good"]) == ("PERCHED", True)
+    assert card["reason"] == SUMMARY.reason
+    rows = dict(card["rows"])
+    assert rows["miss"] == "1.7 mm"
+    assert rows["log"] == str(log)
+    assert rows["report"] == f"perchctl log report '{log}'"
+
+
+def test_a_flight_that_never_began_has_no_log(tmp_path: Path) -> None:
+    card = failed_card(Interrupted("interrupted before take-off"), None)
+    assert (card["outcome"], card["good"], card["rows"]) == ("FAILED", False, [])
+    assert "report" in dict(failed_card(RuntimeError(), tmp_path)["rows"])
+
+
+def test_an_error_in_flight_tells_what_the_rescue_said(page: LivePage) -> None:
     flight = FlightPage(page, 0.15)
-    frame = Frame(7, 1.0, np.full((480, 640), 90, np.uint8))
-    source = flight.watched(OneFrame(frame))
-    assert json.loads(ask(page.url, "/state")[1])["phase"] == "WAITING"
-    assert source.poll(1.0) is frame
-    assert source.poll(1.1) is None
-    assert source.problem(1.1) == "silent"
-    assert page.jpeg_after(0) is not None  # before the first tick too
-    flight.tick(tick(2.5, seen_in(frame)))
-    state = json.loads(ask(page.url, "/state")[1])
-    assert state["phase"] == "ALIGN"
-    assert state["battery"] == "3.88 V"
-    assert ["phase", "ALIGN  1.5 s"] in state["rows"]
-    newest = page.jpeg_after(1)
-    assert newest is not None
-    decoded = cv2.imdecode(np.frombuffer(newest[1], np.uint8), cv2.IMREAD_COLOR)
-    drawn = np.asarray(decoded).astype(int)
-    assert np.abs(drawn[150, 250:350] - 90).max() > 50
-    assert flight.problem is None
+    flight.event(note(START_S, "RuntimeError in flight: it is down, or hangs: the motors are off"))
+    flight.event(note(START_S, "the recording has ended (no space): the flight and its log go on"))
+    flight.end(failed_card(RuntimeError("boom"), None))
+    assert state_of(page)["card"]["rows"][0][1].endswith("the motors are off")
 
 
-@pytest.mark.parametrize("phase", [Phase.PERCHED, Phase.LANDED, Phase.ABORTED])
-def test_a_flight_that_is_over_asks_for_no_landing(page: LivePage, phase: Phase) -> None:
-    flight = FlightPage(page, 0.15)
-    assert stop(page.url, page.token) == 200
-    flight.tick(tick(2.0))
-    assert json.loads(ask(page.url, "/state")[1])["stop"] == "requested"
-    last = tick(3.0)
-    flight.tick(replace(last, state=replace(last.state, phase=phase)))
-    assert json.loads(ask(page.url, "/state")[1])["stop"] == "over"
+def test_nobody_is_waited_for_where_nobody_looks(page: LivePage) -> None:
+    page.end({"outcome": "LANDED"})  # returns at once: no reader would ever wake it
+    state = state_of(page)
+    assert (state["card"], state["stop"], state["age_s"]) == ({"outcome": "LANDED"}, "over", None)
 
 
-def test_the_page_has_a_word_for_each_state_of_stop(page: LivePage) -> None:
-    html = ask(page.url)[1].decode()
-    table = html.partition("const STOP = {")[2].partition("};")[0]
-    names = re.findall(r"^  (\w+): \[", table, re.MULTILINE)
-    assert names == ["ready", "requested", "over", "gone"]
+def test_who_looks_gets_the_card_before_the_page_goes(page: LivePage) -> None:
+    state_of(page)
+    thread = threading.Thread(target=page.end, args=({"outcome": "LANDED"},))
+    thread.start()
+    while state_of(page)["card"] is None:
+        pass
+    thread.join(5.0)
+    assert not thread.is_alive()
 
 
-def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
-    flight = FlightPage(page, 0.15)
-    flight.watched(OneFrame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
-    flight.tick(None)  # type: ignore[arg-type]
-    flight.event(note(0.0, "something"))
-    assert flight.problem is None
-    flight.tick(tick(1.0, "no output"))  # type: ignore[arg-type]
-    json.loads(ask(page.url, "/state")[1])
-    assert page.problem is not None
+@pytest.fixture
+def options(tmp_path: Path) -> FlyOptions:
+    profile = load_profile("sim")
+    quiet = profile.model_copy(update={"log": profile.log.model_copy(update={"plot": False})})
+    return FlyOptions(quiet, Path("sim.yaml"), "sim://", "sim:", log_dir=tmp_path)
 
 
-# --- track --view ----------------------------------------------------------------------------
+@pytest.fixture
+def last_state(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What the page served last, once it is closed."""
+    last: dict[str, Any] = {}
+    real = LivePage.close
+
+    def close(self: LivePage) -> None:
+        last.update(self.state())
+        real(self)
+
+    monkeypatch.setattr(LivePage, "close", close)
+    return last
 
 
-class Looking(io.StringIO):
-    """Reads the page from inside the loop, once the second line has been written."""
-
-    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
-        super().__init__()
-        self.capsys = capsys
-        self.printed = ""
-        self.state: dict[str, Any] = {}
-        self.lines = 0
-
-    def write(self, text: str) -> int:
-        self.lines += text.count("\n")
-        if self.lines == 3 and not self.state:
-            self.printed = self.capsys.readouterr().err
-            url = self.printed.split("live page: ")[1].split()[0]
-            self.state = json.loads(ask(url, "/state")[1])
-        return super().write(text)
-
-
-@pytest.mark.long
-def test_track_serves_its_numbers_while_it_runs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_page_of_a_flight_ends_with_its_card(
+    options: FlyOptions, monkeypatch: pytest.MonkeyPatch, last_state: dict[str, Any]
 ) -> None:
-    pictures = write_pictures(tmp_path / "pictures")
-    out = Looking(capsys)
-    options = resolve(str(pictures), calibration=CALIBRATION, stills=True, as_json=True, port=0)
-    track_source(options, out)
-    lines = [json.loads(line) for line in out.getvalue().splitlines()]
-    assert len(lines) == len(VIEWS)
-    assert out.state["track"] == lines[1]  # the newest when the third line was written
-    assert out.state["stop"] == "none"
-    assert dict(out.state["rows"])["markers"] == lines[1]["stage"]
-    assert "the live page failed" not in capsys.readouterr().err
-    assert not [t for t in threading.enumerate() if t.name == "view"]
+    def session(_options: object, log: Watcher, display: Watcher, *more: Any) -> SessionResult:
+        _switch, page, asks = more
+        assert not asks
+        for watcher in (log, display, page):
+            watcher.event(entered(START_S, Phase.APPROACH, "start"))
+            watcher.tick(tick(START_S))
+        report = FlightReport(
+            Phase.LANDED, Outcome.TARGET_NOT_FOUND, "target not found", 0, 9.0, False
+        )
+        return SessionResult(report)
+
+    monkeypatch.setattr(fly, "_session", session)
+    assert fly.fly_and_report(options, as_json=False, port=0) == 50
+    card = last_state["card"]
+    assert card["outcome"] == "LANDED"
+    assert card["reason"].startswith("target not found")
+    (log,) = options.log_dir.glob("*.jsonl")
+    assert dict(card["rows"])["log"] == str(log)
+    assert last_state["phase"] == "ALIGN"  # what was shown last stays
 
 
-def test_an_axis_behind_the_camera_is_left_out() -> None:
-    from perchctl.display import draw_sketch
+def test_the_page_of_a_flight_that_failed_says_so(
+    options: FlyOptions, monkeypatch: pytest.MonkeyPatch, last_state: dict[str, Any]
+) -> None:
+    def session(*_: object) -> SessionResult:
+        raise Interrupted("interrupted before take-off: nothing was started")
 
-    image = picture(VIEWS["away"])
-    pose = (np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.2]), 0.075)
-    wild = (("large", np.full((4, 2), 1e9)), ("small", np.full((4, 2), np.nan)))
-    drawn = draw_sketch(Sketch(image, wild, pose), camera())
-    assert (drawn == image[..., None]).all()
+    ended: list[str] = []
+    page_end, abandon = FlightPage.end, LogWatcher.abandon
+    monkeypatch.setattr(FlightPage, "end", lambda *a: (ended.append("page"), page_end(*a)))
+    monkeypatch.setattr(LogWatcher, "abandon", lambda *a: (ended.append("log"), abandon(*a)))
+    monkeypatch.setattr(fly, "_session", session)
+    with pytest.raises(Interrupted):
+        fly.fly_and_report(options, as_json=False, port=0)
+    assert last_state["card"]["outcome"] == "FAILED"
+    assert "nothing was started" in last_state["card"]["reason"]
+    assert last_state["card"]["rows"] == []  # no tick, no log
+    assert ended == ["page", "log"]  # the log's end may wait for a disk

@@ -41,3 +41,10 @@ def test_a_line_that_is_too_long_is_written_smaller() -> None:
 
 def test_nothing_is_written_without_text() -> None:
     assert (draw_sketch(Sketch(np.full((480, 640), 110, np.uint8)), camera()) == 110).all()
+
+
+def test_an_axis_behind_the_camera_and_a_wild_corner_are_left_out() -> None:
+    image = np.full((480, 640), 110, np.uint8)
+    pose = (np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.2]), 0.075)
+    wild = (("large", np.full((4, 2), 1e9)), ("small", np.full((4, 2), np.nan)))
+    assert (draw_sketch(Sketch(image, wild, pose), camera()) == 110).all()

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -33,25 +34,30 @@ class Said:
 
 
 def run(*arguments: str) -> Said:
-    """The application in this process."""
-    result = CliRunner().invoke(app, arguments)
+    """The application in this process, at 80 columns."""
+    result = CliRunner().invoke(app, arguments, env={"COLUMNS": "80"})
     assert "Traceback" not in result.output
     return Said(result.exit_code, result.stdout, result.stderr)
 
 
-def run_apart(*arguments: str, **environment: str) -> Said:
-    """The application in a process of its own, on pipes, without a terminal."""
+def run_apart(
+    *arguments: str, before: str = "", stdout: Any = subprocess.PIPE, **environment: str
+) -> Said:
+    """The console script in a process of its own, on pipes, without a terminal; `before` is
+    Python that is run first."""
     clean = {k: v for k, v in os.environ.items() if k not in ("CFLIB_URI", "NO_COLOR")}
+    main = "import sys; sys.argv[0] = 'perchctl'\nfrom perchctl.__main__ import main"
     done = subprocess.run(
-        [sys.executable, "-m", "perchctl", *arguments],
+        [sys.executable, "-c", f"{before}\n{main}\nsys.exit(main())", *arguments],
         env=clean | {"PYTHONPATH": str(ROOT)} | environment,
         stdin=subprocess.DEVNULL,
-        capture_output=True,
+        stdout=stdout,
+        stderr=subprocess.PIPE,
         text=True,
         timeout=60,
     )
     assert "Traceback" not in done.stderr
-    return Said(done.returncode, done.stdout, done.stderr)
+    return Said(done.returncode, done.stdout or "", done.stderr)
 
 
 @pytest.fixture(autouse=True)

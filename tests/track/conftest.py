@@ -1,4 +1,4 @@
-"""Fixtures that several test files here share."""
+"""Pictures and a video that the tests of `perchctl track` share."""
 
 from __future__ import annotations
 
@@ -6,12 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.recording import (
-    moving,
-    picture,
-    write_pictures,
-    write_video,
-)
+from tests.helpers.recording import moving, picture, write_pictures, write_video
 from tests.helpers.track import MOVING
 
 

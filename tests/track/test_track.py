@@ -1,9 +1,10 @@
-"""`perchctl track`: its lines against the truth."""
+"""`perchctl track`: its results against the truth, and the sentences that pictures deserve."""
 
 from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,14 @@ import cv2
 import numpy as np
 import pytest
 
+from perchctl.commands.interrupt import Stopper
+from perchctl.commands.output import say
+from perchctl.commands.track import frames
 from perchctl.geometry import wrap_rad, yaw_of
-from perchctl.profile import TargetConfig, load_profile
-from perchctl.vision import project, square_corners
+from perchctl.profile import Profile, TargetConfig, load_profile
+from perchctl.track import Notes, Tracker
+from perchctl.vision import Frame, project, square_corners
+from tests.helpers.interlaced import Pass
 from tests.helpers.recording import (
     STAGE_OF,
     VIEWS,
@@ -21,10 +27,14 @@ from tests.helpers.recording import (
     moving,
     picture,
     true_pose,
+    write_video,
 )
-from tests.helpers.track import MOVING, track, write_ros
+from tests.helpers.target_picture import CAMERA
+from tests.helpers.track import MOVING, lines, track, write_opencv, write_ros
 
 SCENES = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "scenes"
+PAL_S = 0.04
+FIELDS = 10
 
 
 def check_vector(values: Any, length: int) -> None:
@@ -57,11 +67,14 @@ def check_schema(line: dict[str, Any]) -> None:
         assert line["target"]["sigma_yaw_rad"] > 0.0
 
 
+# --- the truth ------------------------------------------------------------------------
+
+
 def test_stills_give_one_line_a_picture_and_the_truth(pictures: Path) -> None:
-    lines = track(pictures, stills=True)
-    assert [line["frame"] for line in lines] == [f"{name}.png" for name in sorted(VIEWS)]
+    found_lines = lines(pictures)
+    assert [line["frame"] for line in found_lines] == [f"{name}.png" for name in sorted(VIEWS)]
     target = TargetConfig()
-    for line in lines:
+    for line in found_lines:
         check_schema(line)
         name = line["frame"].removesuffix(".png")
         assert line["stage"] == STAGE_OF[name]
@@ -82,36 +95,29 @@ def test_stills_give_one_line_a_picture_and_the_truth(pictures: Path) -> None:
                 assert np.abs(np.array(line[marker]["corners_px"]) - true_px).max() < limit_px
 
 
-def test_with_both_in_sight_the_target_is_the_joint_pose(pictures: Path) -> None:
-    (line,) = track(pictures / "both.png", stills=True)
-    alone = [line[name]["tvec_m"] for name in ("large", "small")]
-    assert line["target"]["tvec_m"] not in alone
-
-
-def test_with_the_papers_weights_the_target_lies_between_the_markers(pictures: Path) -> None:
-    (line,) = track(pictures / "both.png", "paper", stills=True)
+def test_both_in_sight_are_merged_as_the_profile_says(pictures: Path) -> None:
+    """By the joint pose, or by the paper's weights, which put the target between the markers."""
+    (line,) = lines(pictures / "both.png")
+    assert line["target"]["tvec_m"] not in [line[name]["tvec_m"] for name in ("large", "small")]
+    (line,) = lines(pictures / "both.png", "-p", "paper")
     large, small, merged = (np.array(line[name]["tvec_m"]) for name in ("large", "small", "target"))
     weights = load_profile("paper").merge.weights
     w = np.array([weights.x, weights.y, weights.z])
     assert merged == pytest.approx(w * large + (1.0 - w) * small, abs=1e-9)
 
 
-def test_stills_do_not_know_of_one_another(pictures: Path) -> None:
-    whole = {line["frame"]: line for line in track(pictures, stills=True)}
-    (alone,) = track(pictures / "near.png", stills=True)
-    assert whole["near.png"] | {"t_s": 0.0} == alone
-
-
 def test_a_video_is_tracked_frame_by_frame(video: Path) -> None:
-    lines = track(f"video:{video}")
-    assert [line["frame"] for line in lines] == list(range(MOVING))
-    for i, line in enumerate(lines):
+    tracked = track(f"video:{video}")
+    assert [line["frame"] for line in tracked.lines] == list(range(MOVING))
+    for i, line in enumerate(tracked.lines):
         check_schema(line)
         assert line["t_s"] == pytest.approx(i / 30.0, abs=1e-3)
         assert np.abs(np.array(line["target"]["tvec_m"]) - true_pose(moving(i))[1]).max() < 0.01
         R = np.asarray(cv2.Rodrigues(np.array(line["target"]["rvec_rad"]))[0], dtype=np.float64)
         assert line["target"]["yaw_rad"] == pytest.approx(yaw_of(R), abs=1e-9)
-    assert track(video) == lines
+    assert lines(video) == tracked.lines
+    for word in ("interlaced", "blended"):
+        assert word not in tracked.stderr
 
 
 def test_the_filter_bridges_a_lost_frame(tmp_path: Path) -> None:
@@ -119,35 +125,26 @@ def test_the_filter_bridges_a_lost_frame(tmp_path: Path) -> None:
     images[5] = picture(VIEWS["away"])
     for i, image in enumerate(images):
         cv2.imwrite(str(tmp_path / f"{i}.png"), image)
-    lost = track(tmp_path, video=True)[5]
+    lost = lines(tmp_path, "--video")[5]
     assert lost["stage"] == "none"
     assert lost["large"] is None
     assert np.abs(np.array(lost["target"]["tvec_m"]) - true_pose(moving(5))[1]).max() < 0.02
-    assert track(tmp_path)[5]["target"] is None
+    assert lines(tmp_path)[5]["target"] is None
 
 
-def test_files_of_pictures_are_stills_unless_the_user_says_otherwise(
-    pictures: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_files_of_pictures_are_stills_unless_the_user_says_otherwise(pictures: Path) -> None:
     """Filtered as one movement at 30 Hz, unrelated pictures drag each other along."""
-    both, far = (true_pose(VIEWS[name])[1] for name in ("both", "far"))
-    for source in (str(pictures), f"images:{pictures}", str(pictures / "*.png")):
-        away, first, second, _ = track(source)
-        assert away["target"] is None
-        assert np.abs(np.array(first["target"]["tvec_m"]) - both).max() < 0.0005
-        assert np.abs(np.array(second["target"]["tvec_m"]) - far).max() < 0.003
-    assert "jumps" not in capsys.readouterr().err
-    lines = track(pictures, video=True)
-    assert np.abs(np.array(lines[2]["target"]["tvec_m"]) - far).max() > 0.05
-    assert [line["t_s"] for line in lines] == pytest.approx([k / 30.0 for k in range(len(VIEWS))])
-    said = capsys.readouterr().err
-    assert "far.png: the target jumps from one picture to the next" in said
-    assert "jumps from one picture to the next in 2" in said.splitlines()[-1]
-
-
-def test_one_movement_is_no_jump(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    track(video)
-    assert "jumps" not in capsys.readouterr().err
+    stills = {line["frame"]: line for line in lines(pictures)}
+    for source in (f"images:{pictures}", str(pictures / "*.png")):
+        assert {line["frame"]: line for line in lines(source)} == stills
+    (alone,) = lines(pictures / "near.png")
+    assert stills["near.png"] | {"t_s": 0.0} == alone
+    one_video = lines(pictures, "--video")
+    far = true_pose(VIEWS["far"])[1]
+    assert np.abs(np.array(one_video[2]["target"]["tvec_m"]) - far).max() > 0.05
+    assert [line["t_s"] for line in one_video] == pytest.approx(
+        [k / 30.0 for k in range(len(VIEWS))]
+    )
 
 
 def test_rendered_scenes_with_exact_truth(tmp_path: Path) -> None:
@@ -156,13 +153,11 @@ def test_rendered_scenes_with_exact_truth(tmp_path: Path) -> None:
     truth = json.loads((SCENES / "truth.json").read_text())
     values = [v for row in truth["camera_matrix"] for v in row]
     file = write_ros(tmp_path, values, truth["dist_coeffs"])
-    lines = {
-        line["frame"]: line for line in track(SCENES / "frames", stills=True, calibration=file)
-    }
-    assert sorted(lines) == sorted(Path(f["file"]).name for f in truth["frames"])
+    found_lines = {line["frame"]: line for line in lines(SCENES / "frames", calibration=file)}
+    assert sorted(found_lines) == sorted(Path(f["file"]).name for f in truth["frames"])
     found = {"large": [0, 0], "small": [0, 0]}
     for entry in truth["frames"]:
-        line = lines[Path(entry["file"]).name]
+        line = found_lines[Path(entry["file"]).name]
         check_schema(line)
         if not entry["target_present"]:
             assert line["stage"] == "none", entry["file"]
@@ -176,3 +171,185 @@ def test_rendered_scenes_with_exact_truth(tmp_path: Path) -> None:
             assert np.abs(error_m).max() < (0.0005 if entry["tvec"][2] < 0.25 else 0.006)
     assert found["large"][0] >= 0.9 * found["large"][1]
     assert found["small"][0] >= 0.85 * found["small"][1]
+
+
+# --- interlaced and blended pictures ----------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("fields") / "camera.yaml"
+    return write_opencv(file, CAMERA.size_px, CAMERA.K, CAMERA.dist)
+
+
+def recording(folder: Path, *scenes: tuple[Pass, int]) -> Path:
+    images = [frame.image for scene, count in scenes for frame in scene.frames(count)]
+    return write_video(folder / "flight.avi", images, rate_hz=1 / PAL_S)
+
+
+def test_the_fields_of_a_video_are_tracked_one_by_one(tmp_path: Path, calibration: Path) -> None:
+    scene = Pass(0.3, (0.2, 0.05, 0.0), camera_fields="bottom")
+    overlay = tmp_path / "seen.mp4"
+    tracked = track(
+        recording(tmp_path, (scene, FIELDS)), "--overlay", overlay, calibration=calibration
+    )
+    assert [line["frame"] for line in tracked.lines[-4:]] == [8, 8, 9, 9]
+    times = [line["t_s"] for line in tracked.lines[-6:]]
+    assert np.diff(times) == pytest.approx(PAL_S / 2, abs=1e-3)
+    assert all(line["target"] is not None for line in tracked.lines)
+    # The markers go on and on, and not to and fro.
+    x = [np.mean(line["small"]["corners_px"], axis=0)[0] for line in tracked.lines[-8:]]
+    assert (np.diff(x) < 0).all() or (np.diff(x) > 0).all()
+    assert tracked.stderr.count("interlaced") == 2  # as it begins, in the summary
+    video = cv2.VideoCapture(str(overlay))
+    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == FIELDS
+
+
+def test_a_camera_that_rests_and_moves_is_named_once(tmp_path: Path, calibration: Path) -> None:
+    """At rest nothing is combed, and when it moves again that is no news."""
+    moves = Pass(0.3, (0.2, 0.05, 0.0), camera_fields="top")
+    rests = Pass(0.3, (0.0, 0.0, 0.0), 0.0, camera_fields="top")
+    file = recording(tmp_path, (moves, 4), (rests, 3), (moves, 4))
+    assert track(file, calibration=calibration).stderr.count("interlaced") == 2
+
+
+def test_interlaced_stills_have_one_result_each(tmp_path: Path, calibration: Path) -> None:
+    scene = Pass(0.3, (0.2, 0.05, 0.0), camera_fields="top")
+    truth = {}
+    for k, frame in enumerate(scene.frames(3)):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), frame.image)
+        truth[f"{k}.png"] = scene.target_m(frame.t_s)
+    tracked = track(tmp_path, calibration=calibration)
+    assert [line["frame"] for line in tracked.lines] == list(truth)
+    for line in tracked.lines:
+        assert np.abs(np.array(line["target"]["tvec_m"]) - truth[line["frame"]]).max() < 2e-4
+    assert "interlaced" in tracked.stderr
+
+
+def test_blended_fields_are_named(tmp_path: Path, calibration: Path) -> None:
+    scene = Pass(0.3, (0.25, 0.05, 0.0), camera_fields="top", camera_blended=True)
+    said = track(recording(tmp_path, (scene, FIELDS)), calibration=calibration).stderr
+    assert "blended" in said
+    assert "interlaced" not in said
+
+
+# --- pictures that cannot be right ------------------------------------------------------
+
+
+def test_a_mirrored_picture_is_named_and_can_be_turned(tmp_path: Path) -> None:
+    image, turned = picture(VIEWS["both"]), tmp_path / "turned.yaml"
+    turned.write_text("extends: sim\ncamera: {mirrored: true}\n")
+    cv2.imwrite(str(tmp_path / "m.png"), image[:, ::-1])
+    mirrored = track(tmp_path / "m.png")
+    assert mirrored.lines[0]["stage"] == "none"
+    assert "m.png: the picture is mirrored" in mirrored.stderr
+    right = track(tmp_path / "m.png", "-p", turned)
+    assert right.lines[0]["stage"] == "both"
+    assert "mirrored" not in right.stderr
+    cv2.imwrite(str(tmp_path / "m.png"), image)
+    assert "take camera.mirrored out" in track(tmp_path / "m.png", "-p", turned).stderr
+
+
+def test_pictures_that_show_nothing_are_named_and_counted(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    shots = {
+        "dark": rng.integers(0, 6, (480, 640)),
+        "snow": rng.integers(0, 256, (480, 640)),
+        "uniform": np.full((480, 640), 128),
+    }
+    for name, values in shots.items():
+        cv2.imwrite(str(tmp_path / f"{name}.png"), values.astype(np.uint8))
+    tracked = track(tmp_path)
+    assert [line["stage"] for line in tracked.lines] == ["none"] * 3
+    for words in ("dark.png: the picture is dark", "snow.png: snow", "uniform.png: an empty"):
+        assert words in tracked.stderr
+    assert "snow in 1" in tracked.stderr.splitlines()[-1]
+
+
+def test_a_video_that_stands_still_is_named(tmp_path: Path) -> None:
+    file = write_video(tmp_path / "still.mp4", [np.full((480, 640), 90, np.uint8)] * 20)
+    tracked = track(file)
+    assert [line["frame"] for line in tracked.lines] == list(range(20))
+    assert len(re.findall("the picture stands still", tracked.stderr)) == 2  # and in the summary
+
+
+def tracker(profile: Profile | None = None, live: bool = True, stills: bool = False) -> Tracker:
+    return Tracker(profile or load_profile("sim"), camera(), live=live, stills=stills)
+
+
+def test_a_live_picture_that_repeats_is_no_frame_and_then_frozen() -> None:
+    image, live = picture(VIEWS["both"]), tracker()
+    [first] = live.results(Frame(0, 0.0, image), 0)
+    assert first.stage == "both"
+    assert live.results(Frame(1, 0.03, image), 1) == []
+    [frozen] = live.results(Frame(2, 1.0, image), 2)
+    assert (frozen.stage, frozen.target) == ("none", None)
+    assert frozen.notes == ("the picture stands still",)
+
+
+def test_a_live_snow_is_no_measurement() -> None:
+    noise = np.random.default_rng(1).integers(0, 256, (480, 640)).astype(np.uint8)
+    [seen] = tracker().results(Frame(0, 0.0, noise), 0)
+    assert seen.stage == "none"
+    assert "snow" in seen.notes[0]
+
+
+def test_markers_that_contradict_are_named() -> None:
+    sim = load_profile("sim")
+    small = sim.target.small.model_copy(update={"side_m": 0.032})
+    target = sim.target.model_copy(update={"small": small})
+    doubting = tracker(sim.model_copy(update={"target": target}), live=False, stills=True)
+    [seen] = doubting.results(Frame(0, 0.0, picture((0.45, 0.0, 0.0, 0.0, 0.0, 0.3))), 0)
+    assert [note.partition(":")[0] for note in seen.notes] == ["the two markers contradict"]
+
+
+def test_a_print_error_is_named(video: Path, tmp_path: Path) -> None:
+    """The profile says a small marker 4 % smaller than the one in the picture."""
+    profile = tmp_path / "wrong.yaml"
+    profile.write_text(
+        "extends: sim\ntarget: {small: {dictionary: DICT_ARUCO_ORIGINAL, id: 5, side_m: 0.024}}\n"
+    )
+    assert "print error: the small marker is" in track(video, "-p", profile).stderr
+    assert "print good within its noise" in track(video).stderr
+
+
+class Script:
+    """A live source that gives its frames and is then gone."""
+
+    live = True
+    finished = False
+    size_px = (640, 480)
+
+    def __init__(self, count: int) -> None:
+        self.left = count
+        self.silent_first = True
+
+    def poll(self, now_s: float) -> Frame | None:
+        if self.silent_first or self.left == 0:
+            return None
+        self.left -= 1
+        return Frame(self.left, now_s, np.zeros((480, 640), np.uint8))
+
+    def problem(self, now_s: float) -> str | None:
+        if self.left == 0:
+            return "the stream has ended"
+        if math.isfinite(now_s) and self.silent_first:
+            self.silent_first = False
+            return "silent for 2 s"
+        return None
+
+    def describe(self) -> str:
+        return "http://camera"
+
+    def close(self) -> None:
+        return None
+
+
+def test_a_live_source_is_waited_for_and_its_end_is_told(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    seen = [f.index for f in frames(Script(3), lambda: 5.0, Stopper(), Notes(say))]
+    assert seen == [2, 1, 0]
+    said = capsys.readouterr().err
+    assert said.startswith("perchctl: silent for 2 s; waiting")
+    assert said.endswith("perchctl: the stream has ended\n")

@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 
 from perchctl.calibration import SizeMissing, load_calibration
-from perchctl.errors import InvalidValue, Note
-from tests.helpers.recording import (
-    VIEWS,
-    picture,
-)
-from tests.helpers.track import track, write_ros
+from perchctl.errors import InvalidValue
+from tests.helpers.recording import VIEWS, picture
+from tests.helpers.track import DISTORTION, PINHOLE, lines, track, write_opencv, write_ros
 
 KALIBR = """cam0:
   cam_overlaps: []
@@ -29,24 +26,16 @@ KALIBR = """cam0:
 
 @pytest.mark.parametrize("suffix", [".yaml", ".xml"])
 def test_the_three_forms_are_one_camera(tmp_path: Path, pictures: Path, suffix: str) -> None:
-    dist = [-0.17, 0.04, 0.0004, -0.0007, 0.0]
-    K = [380.0, 0.0, 321.5, 0.0, 380.6, 238.2, 0.0, 0.0, 1.0]
-    ros, kalibr, opencv = write_ros(tmp_path, K, dist), tmp_path / "k.yaml", tmp_path / f"o{suffix}"
+    kalibr = tmp_path / "k.yaml"
     kalibr.write_text(KALIBR)
-    storage = cv2.FileStorage(str(opencv), cv2.FILE_STORAGE_WRITE)
-    storage.write("image_width", 640)
-    storage.write("image_height", 480)
-    storage.write("camera_matrix", np.array(K).reshape(3, 3))
-    storage.write("distortion_coefficients", np.array(dist).reshape(5, 1))
-    storage.release()
+    ros = write_ros(tmp_path, PINHOLE, DISTORTION)
+    opencv = write_opencv(tmp_path / f"o{suffix}", (640, 480))
     first, *others = (
-        track(pictures / "near.png", stills=True, calibration=file)
+        lines(pictures / "near.png", calibration=file)[0]["target"]["tvec_m"]
         for file in (ros, opencv, kalibr)
     )
-    assert first[0]["target"] is not None
     for other in others:
-        got = np.array(other[0]["target"]["tvec_m"])
-        assert got == pytest.approx(np.array(first[0]["target"]["tvec_m"]), abs=1e-9)
+        assert np.array(other) == pytest.approx(np.array(first), abs=1e-9)
 
 
 def test_kalibrs_equidistant_lens_is_the_fisheye(tmp_path: Path) -> None:
@@ -81,36 +70,24 @@ def test_other_camchains_are_refused(tmp_path: Path, old: str, new: str, expecte
 
 
 def test_the_opencv_fisheye_flag_is_heeded(tmp_path: Path) -> None:
-    path = tmp_path / "fisheye.yml"
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    storage.write("image_width", 640)
-    storage.write("image_height", 480)
-    storage.write("fisheye_model", 1)
-    storage.write("camera_matrix", np.array([[380.0, 0, 320], [0, 380.0, 240], [0, 0, 1]]))
-    storage.write("distortion_coefficients", np.zeros((4, 1)))
-    storage.release()
+    path = write_opencv(tmp_path / "fisheye.yml", (640, 480), dist=np.zeros(4))
+    path.write_text(path.read_text() + "fisheye_model: 1\n")
     assert load_calibration(path).model == "fisheye"
 
 
 def test_a_missing_size_is_taken_from_the_first_picture_with_a_warning(
     tmp_path: Path, pictures: Path
 ) -> None:
-    dist = [-0.17, 0.04, 0.0004, -0.0007, 0.0]
-    K = [380.0, 0.0, 321.5, 0.0, 380.6, 238.2, 0.0, 0.0, 1.0]
-    whole = write_ros(tmp_path, K, dist)
-    known = track(pictures / "near.png", stills=True, calibration=whole)
-    ros, opencv = tmp_path / "without.yaml", tmp_path / "opencv.yml"
+    whole = write_ros(tmp_path, PINHOLE, DISTORTION)
+    known = lines(pictures / "near.png", calibration=whole)
+    ros = tmp_path / "without.yaml"
     ros.write_text(whole.read_text().replace("image_width: 640\nimage_height: 480\n", ""))
-    storage = cv2.FileStorage(str(opencv), cv2.FILE_STORAGE_WRITE)
-    storage.write("camera_matrix", np.array(K).reshape(3, 3))
-    storage.write("distortion_coefficients", np.array(dist).reshape(5, 1))
-    storage.release()
-    for file in (ros, opencv):
-        with pytest.raises(SizeMissing, match="image size is missing: add image_width"):
+    for file in (ros, write_opencv(tmp_path / "opencv.yml", None)):
+        with pytest.raises(SizeMissing, match="image size is missing"):
             load_calibration(file)
-        words = "the image size is missing; 640x480 px is taken from the first picture"
-        with pytest.warns(Note, match=words):
-            assert track(pictures / "near.png", stills=True, calibration=file) == known
+        tracked = track(pictures / "near.png", calibration=file)
+        assert tracked.lines == known
+        assert "640x480 px is taken from the first picture" in tracked.stderr
 
 
 def test_a_missing_size_is_refused_where_the_centre_is_outside_of_the_picture(
@@ -122,20 +99,15 @@ def test_a_missing_size_is_refused_where_the_centre_is_outside_of_the_picture(
         load_calibration(ros, (640, 480))
 
 
-def test_another_size_is_refused_before_anything_is_tracked(
-    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_picture_of_another_size_is_named_and_no_file_is_left(
+    number: int, tmp_path: Path
 ) -> None:
-    half = cv2.resize(picture(VIEWS["both"]), (320, 240))
-    cv2.imwrite(str(tmp_path / "0.png"), half)
-    with pytest.raises(InvalidValue, match=r"0\.png.*320x240.*640x480"):
-        track(tmp_path, csv=tmp_path / "x.csv", overlay=tmp_path / "x.mp4")
-    assert [p.name for p in tmp_path.iterdir()] == ["0.png"]
-    assert capsys.readouterr().out == ""
-
-
-def test_one_picture_of_another_size_is_named(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), picture(VIEWS["both"]))
-    cv2.imwrite(str(tmp_path / "b.png"), np.full((100, 200), 90, np.uint8))
-    with pytest.raises(InvalidValue, match=r"b\.png.*200x100.*640x480"):
-        track(tmp_path, csv=tmp_path / "x.csv")
-    assert not list(tmp_path.glob("*.csv")) + list(tmp_path.glob(".*"))
+    for k in range(2):
+        size = (320, 240) if k == number else (640, 480)
+        cv2.imwrite(str(tmp_path / f"{k}.png"), cv2.resize(picture(VIEWS["both"]), size))
+    tracked = track(tmp_path, "--csv", tmp_path / "x.csv", "--overlay", tmp_path / "x.mp4")
+    assert tracked.code == InvalidValue.exit_code
+    for words in (f"{number}.png", "320x240", "640x480"):
+        assert words in tracked.stderr
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["0.png", "1.png"]

@@ -3,37 +3,37 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
-import io
 import json
 import re
+import signal
 from pathlib import Path
+from typing import Any
 
+import av
 import cv2
+import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from perchctl.commands import app
-from perchctl.commands.interrupt import Stopper
-from perchctl.commands.track import resolve, track_source
-from perchctl.errors import Interrupted, InvalidValue, NotFound, UsageError
-from perchctl.profile import load_profile
+from perchctl.display import LivePage, Sketch
+from perchctl.errors import InvalidValue
+from perchctl.track import Tally, overlay_file
 from perchctl.track.result import CSV_COLUMNS
+from perchctl.vision import CameraModel
+from tests.helpers.commands import run
 from tests.helpers.disk import full_disk
-from tests.helpers.recording import (
-    CALIBRATION,
-    VIEWS,
-)
+from tests.helpers.live_page import ask
+from tests.helpers.recording import VIEWS
 from tests.helpers.track import MOVING, track
 
-# --- Files ----------------------------------------------------------------------------
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
 
 
-def test_csv_and_overlay_can_be_read(
-    video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_csv_and_overlay_can_be_read(video: Path, tmp_path: Path) -> None:
     table, film = tmp_path / "out.csv", tmp_path / "out.mp4"
-    lines = track(video, csv=table, overlay=film)
+    tracked = track(video, "--csv", table, "--overlay", film)
+    lines = tracked.lines
     with table.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert CSV_COLUMNS[0] == "t_s"
@@ -44,6 +44,7 @@ def test_csv_and_overlay_can_be_read(
     assert float(rows[-1]["sigma_yaw_rad"]) == last["target"]["sigma_yaw_rad"]
     assert float(rows[-1]["large_tl_x_px"]) == last["large"]["corners_px"][0][0]
     assert float(rows[-1]["small_bl_y_px"]) == last["small"]["corners_px"][3][1]
+    assert float(rows[-1]["small_rx_rad"]) == last["small"]["rvec_rad"][0]
     capture = cv2.VideoCapture(str(film))
     assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(30.0)
     read = 0
@@ -53,66 +54,79 @@ def test_csv_and_overlay_can_be_read(
         assert (spread > 60).sum() > 100  # coloured outlines on a grey picture
         read += 1
     assert read == MOVING
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["out.csv", "out.mp4"]
-    summary, prints = capsys.readouterr().err.strip().splitlines()
+    assert names(tmp_path) == ["out.csv", "out.mp4"]
+    summary, _prints = tracked.stderr.strip().splitlines()
     assert re.fullmatch(rf"perchctl: {MOVING} frames in .* large 100 %, small \d+ %", summary)
-    assert prints.startswith("perchctl: print good within its noise")
 
 
-class PressingOut(io.StringIO):
-    """Presses Ctrl-C while the third line is written."""
-
-    def __init__(self, stopper: Stopper) -> None:
-        super().__init__()
-        self.stopper = stopper
-
-    def write(self, text: str) -> int:
-        written = super().write(text)
-        if self.getvalue().count("\n") == 3 and not self.stopper.requested.is_set():
-            self.stopper.press()
-        return written
+def test_what_was_not_found_is_empty_in_the_table(pictures: Path, tmp_path: Path) -> None:
+    track(pictures / "away.png", "--csv", tmp_path / "out.csv")
+    with (tmp_path / "out.csv").open(newline="") as stream:
+        (row,) = csv.DictReader(stream)
+    given = {name: value for name, value in row.items() if value}
+    assert given == {"t_s": "0.0", "frame": "away.png", "stage": "none"}
 
 
-def test_ctrl_c_leaves_whole_files(video: Path, tmp_path: Path) -> None:
-    stopper = Stopper()
-    out = PressingOut(stopper)
-    options = resolve(
-        str(video), "sim", CALIBRATION, as_json=True,
-        csv=tmp_path / "x.csv", overlay=tmp_path / "x.mp4",
-    )  # fmt: skip
-    with pytest.raises(Interrupted) as caught:
-        track_source(options, out, stopper=stopper)
-    assert caught.value.exit_code == 130
-    assert len(out.getvalue().splitlines()) == 3
+def test_lines_for_people(pictures: Path) -> None:
+    said = run("track", str(pictures / "*.png"))
+    assert said.code == 0
+    assert len(said.stdout.splitlines()) == len(VIEWS)
+    assert "target not seen" in said.stdout
+    assert "yaw" in said.stdout
+    assert said.complaint.startswith(f"{len(VIEWS)} frames in")
+
+
+def test_the_live_page_has_the_newest_numbers(
+    pictures: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states = []
+    tell = LivePage.tell
+
+    def asked(self: LivePage, *describe: Any) -> None:
+        tell(self, *describe)
+        states.append(json.loads(ask(self.url, "/state")[1]))
+
+    monkeypatch.setattr(LivePage, "tell", asked)
+    tracked = track(pictures, "--view")
+    assert [state["track"] for state in states] == tracked.lines
+    assert [dict(state["rows"])["markers"] for state in states] == [
+        line["stage"] for line in tracked.lines
+    ]
+    assert {state["stop"] for state in states} == {"none"}
+    assert "live page: http://127.0.0.1" in tracked.stderr
+    assert "failed" not in tracked.stderr
+
+
+def test_ctrl_c_leaves_whole_files(
+    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = Tally.add
+
+    def pressing(self: Tally, *results: object) -> None:
+        count(self, *results)  # type: ignore[arg-type]
+        if self.frames == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Tally, "add", pressing)
+    tracked = track(video, "--csv", tmp_path / "x.csv", "--overlay", tmp_path / "x.mp4")
+    assert tracked.code == 130
+    *lines, failure = tracked.lines
+    assert (len(lines), failure["exit_code"]) == (3, 130)
     assert len((tmp_path / "x.csv").read_text().splitlines()) == 4
     capture = cv2.VideoCapture(str(tmp_path / "x.mp4"))
     assert sum(1 for _ in iter(lambda: capture.read()[0], False)) == 3
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["x.csv", "x.mp4"]
+    assert names(tmp_path) == ["x.csv", "x.mp4"]
 
 
 def test_a_full_disk_is_one_sentence_and_leaves_no_file(video: Path, tmp_path: Path) -> None:
     old = tmp_path / "x.csv"
     old.write_text("old")
-    sentence = r"x\.csv cannot be written: .*: free some space"
-    with full_disk(room=4_000), pytest.raises(InvalidValue, match=sentence):
-        track(video, csv=old, overlay=tmp_path / "x.mp4", force=True)
+    with full_disk(room=4_000):
+        tracked = track(video, "--csv", old, "--overlay", tmp_path / "x.mp4", "--force")
+    assert tracked.code == 30
+    assert "x.csv cannot be written" in tracked.stderr
     assert old.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["x.csv"]
-
-
-def test_a_second_ctrl_c_does_not_wait() -> None:
-    stopper = Stopper()
-    stopper.press()
-    with pytest.raises(KeyboardInterrupt):
-        stopper.press()
-
-
-# --- Bad input ------------------------------------------------------------------------
-
-
-def command(*words: str) -> tuple[int, str, str]:
-    result = CliRunner().invoke(app, ["track", *words])
-    return result.exit_code, result.stdout, result.stderr
+    assert names(tmp_path) == ["x.csv"]
 
 
 @pytest.mark.parametrize(
@@ -121,18 +135,17 @@ def command(*words: str) -> tuple[int, str, str]:
         (["nowhere.mp4"], 20, "nowhere.mp4 does not exist"),
         (["video:nowhere.mp4"], 20, "nowhere.mp4 was not found"),
         (["images:*.nothing"], 20, "names pictures"),
-        (["nonsense"], 20, "nonsense does not exist; a source is a video, picture or folder"),
-        (["nonsense:1"], 30, "allowed are camera:N"),
-        (["sim:"], 30, "needs a link of sim://; other sources are camera:N"),
-        (["PICTURES", "--calibration", "no.yaml"], 20, "no.yaml not found"),
-        (["PICTURES", "-p", "nobody"], 20, "profile 'nobody' not found"),
+        (["nonsense"], 20, "nonsense does not exist"),
+        (["nonsense:1"], 30, "camera:N"),
+        (["sim:"], 30, "camera:N"),
+        (["."], 20, "holds no pictures"),
+        (["PICTURES", "--calibration", "no.yaml"], 20, "no.yaml"),
+        (["PICTURES", "-p", "nobody"], 20, "'nobody'"),
         (["PICTURES", "--csv", "x.txt"], 30, "must end in .csv"),
         (["PICTURES", "--overlay", "x.avi"], 30, "must end in .mp4"),
-        (["PICTURES", "--csv", "/dev/null/such/x.csv"], 30, "/dev/null is a file, not a folder"),
+        (["PICTURES", "--csv", "/dev/null/such/x.csv"], 30, "not a folder"),
         (["PICTURES", "--view-port", "99999"], 2, "65535"),
-        (["PICTURES", "--video", "--stills"], 2, "contradict each other"),
-        (["camera:0", "--video"], 2, "camera:0 gives a video anyway"),
-        (["video:x.mp4", "--video"], 2, "--video is for files of pictures"),
+        (["VIDEO", "--overlay", "VIDEO"], 2, "source itself"),
     ],
 )
 def test_bad_input_is_one_sentence(
@@ -140,62 +153,94 @@ def test_bad_input_is_one_sentence(
     code: int,
     expected: str,
     pictures: Path,
+    video: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    got, out, err = command(*[str(pictures) if word == "PICTURES" else word for word in words])
-    assert got == code
-    assert out == ""
-    assert expected in err
-    if code != 2:
-        assert len(err.strip().splitlines()) == 1
+    places = {"PICTURES": str(pictures), "VIDEO": str(video)}
+    said = run("track", *(places.get(word, word) for word in words))
+    assert (said.code, said.stdout) == (code, "")
+    assert expected in said.stderr
+    if said.stderr.startswith("perchctl: "):
+        assert len(said.stderr.strip().splitlines()) == 1
     assert not list(tmp_path.iterdir())
-
-
-def test_the_source_is_not_overwritten(video: Path) -> None:
-    with pytest.raises(UsageError, match="source itself"):
-        resolve(str(video), "sim", CALIBRATION, overlay=video)
 
 
 def test_a_file_that_is_no_picture_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"no picture")
-    with pytest.raises(InvalidValue, match=r"a\.png cannot be read as a picture"):
-        track(tmp_path)
+    tracked = track(tmp_path)
+    assert tracked.code == 30
+    assert "a.png cannot be read" in tracked.stderr
 
 
-def test_no_pictures_at_all(tmp_path: Path) -> None:
-    with pytest.raises(NotFound, match="holds no pictures"):
-        track(tmp_path)
+# --- the video ------------------------------------------------------------------------
+
+RNG = np.random.default_rng(3)
 
 
-def test_the_command_prints_lines_and_a_summary(pictures: Path) -> None:
-    code, out, err = command(f"images:{pictures}", "--stills", "--json")
-    assert code == 0
-    assert len([json.loads(line) for line in out.splitlines()]) == len(VIEWS)
-    assert err.startswith(f"perchctl: {len(VIEWS)} frames in")
-    assert len(err.strip().splitlines()) == 1
-    code, out, err = command(str(pictures / "*.png"))
-    assert code == 0
-    assert len(out.splitlines()) == len(VIEWS)
-    assert "target not seen" in out or "yaw" in out
+def lens(width: int, height: int) -> CameraModel:
+    return CameraModel(
+        (width, height), np.array([[200.0, 0, width / 2], [0, 200.0, height / 2], [0, 0, 1]]),
+        np.zeros(5),
+    )  # fmt: skip
 
 
-def test_help_says_what_the_fields_are() -> None:
-    _, out, _ = command("--help")
-    text = " ".join(out.split())
-    for word in ("atan2(R[1,0], R[0,0])", "corners_px", "sigma_yaw_rad", "Kalibr"):
-        assert word in text
+def filmed(path: Path, times: list[float], size_px: tuple[int, int] = (64, 48)) -> Path:
+    """A film of grey pictures at these times, each lighter than the one before it."""
+    with overlay_file(path, lens(*size_px), 25.0) as add:
+        for k, t_s in enumerate(times):
+            add(t_s, Sketch(np.full(size_px[::-1], 30 + 30 * k, np.uint8)))
+    return path
 
 
-def test_a_print_error_is_named(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The profile says a small marker 4 % smaller than the one in the picture."""
-    profile = load_profile("sim")
-    small = profile.target.small.model_copy(update={"side_m": 0.024})
-    target = profile.target.model_copy(update={"small": small})
-    options = resolve(str(video), "sim", CALIBRATION, as_json=True)
-    wrong = options.profile.model_copy(update={"target": target})
-    track_source(dataclasses.replace(options, profile=wrong), io.StringIO())
-    said = capsys.readouterr().err
-    assert "print error: the small marker is 0.16" in said
-    assert "make-target measured --measured-large" in said
+def shown(path: Path) -> tuple[list[float], list[float], float]:
+    """When each picture is shown and how light it is, and how long all of it takes."""
+    with av.open(str(path)) as video:
+        stream = video.streams.video[0]
+        assert stream.codec_context.name == "h264"
+        assert stream.codec_context.pix_fmt == "yuv420p"
+        assert stream.duration is not None
+        assert stream.time_base is not None
+        frames = [(f.time, float(f.to_ndarray(format="gray").mean())) for f in video.decode(stream)]
+        lasts_s = float(stream.duration * stream.time_base)
+    return [t for t, _ in frames if t is not None], [light for _, light in frames], lasts_s
+
+
+def test_each_picture_is_shown_at_its_own_time(tmp_path: Path) -> None:
+    """A camera's times are irregular, and its clock begins anywhere."""
+    times = [7203.4, 7203.433, 7203.5, 7204.9, 7204.91, 7217.0]
+    starts, lights, lasts_s = shown(filmed(tmp_path / "x.mp4", times))
+    assert starts == pytest.approx(np.subtract(times, times[0]), abs=1e-4)
+    assert lights == pytest.approx([30 + 30 * k for k in range(len(times))], abs=3)
+    assert lasts_s == pytest.approx(times[-1] - times[0] + 1 / 25.0, abs=0.001)
+
+
+def test_a_time_that_does_not_rise_loses_no_picture(tmp_path: Path) -> None:
+    starts, _, _ = shown(filmed(tmp_path / "x.mp4", [1.0, 1.1, 1.1, 0.4, 1.2]))
+    assert starts == pytest.approx([0.0, 0.1, 0.1, 0.1, 0.2], abs=1e-3)
+
+
+@pytest.mark.parametrize("frames", [0, 1])
+def test_it_may_be_short_and_its_index_stands_in_front(tmp_path: Path, frames: int) -> None:
+    """An odd size is made even; a browser plays it while it is still being fetched."""
+    path = filmed(tmp_path / "x.mp4", [0.0] * frames, (65, 49))
+    assert names(tmp_path) == ["x.mp4"]
+    if frames:
+        with av.open(str(path)) as video:
+            (frame,) = video.decode(video=0)
+        assert (frame.width, frame.height) == (66, 50)
+        data = path.read_bytes()
+        assert 0 < data.index(b"moov") < data.index(b"mdat")
+
+
+@pytest.mark.parametrize("room", [0, 40, 100_000])
+def test_a_full_disk_leaves_no_video(tmp_path: Path, room: int) -> None:
+    def write() -> None:
+        with overlay_file(tmp_path / "x.mp4", lens(640, 480), 30.0) as add:
+            for k in range(4):
+                add(k / 30.0, Sketch(RNG.integers(0, 255, (480, 640)).astype(np.uint8)))
+
+    with full_disk(room), pytest.raises(InvalidValue, match=r"x\.mp4 cannot be written: File too"):
+        write()
+    assert not list(tmp_path.iterdir())
