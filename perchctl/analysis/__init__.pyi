@@ -1,9 +1,7 @@
 from .compare import Comparison as Comparison
 from .compare import profile_differences as profile_differences
 from .flight import FlightAnalysis as FlightAnalysis
-from .plot import plot_comparison as plot_comparison
 from .plot import plot_flight as plot_flight
-from .plot import plot_replay as plot_replay
 from .replay_text import replay_lines as replay_lines
 from .replay_text import replay_record as replay_record
 from .replayer import check_readable as check_readable

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from perchctl.analysis.sight import percentile
 from perchctl.geometry import Array
-from perchctl.log import FlightLog
+from perchctl.log import FlightLog, sent_values
 from perchctl.mission import (
     BatteryFit,
     EnergyState,
+    SentBy,
+    SentCommand,
     charge_at,
     fit_battery,
     update_energy,
@@ -112,6 +116,50 @@ def _old_telemetry(times_s: Array, ages_s: Array) -> tuple[tuple[float, float, f
             found.append((float(t_s), float(t_s), float(age_s)))
             inside = True
     return tuple(found)
+
+
+# --- what was sent in the loop's place ------------------------------------------------------
+
+APART_S = 2.0
+"""Commands of one sender that are farther apart are two goes."""
+_TELLS = {
+    "position": "position setpoints",
+    "thrust": "raw thrust",
+    "land": "landing ordered",
+    "stop": "motors stopped",
+    "emergency": "motors cut",
+}
+
+
+@dataclass(frozen=True)
+class Takeover:
+    """What one sender sent in one go. Times on the loop's clock; `sent`: commands by their name
+    in a tick's `cmd`, in the order of their first, and how many of each."""
+
+    by: SentBy
+    start_s: float
+    end_s: float
+    sent: tuple[tuple[str, int], ...]
+
+    @property
+    def text(self) -> str:
+        """``position setpoints (14), landing ordered (2)``"""
+        return ", ".join(f"{_TELLS[name]} ({count})" for name, count in self.sent)
+
+
+def takeovers_of(sent: Sequence[SentCommand]) -> tuple[Takeover, ...]:
+    """The goes in the order of their times."""
+    goes: list[list[SentCommand]] = []
+    for each in sorted(sent, key=lambda one: one.t_s):
+        last = goes[-1][-1] if goes else None
+        if last is None or last.by != each.by or each.t_s - last.t_s > APART_S:
+            goes.append([])
+        goes[-1].append(each)
+    counts = [Counter(str(sent_values(each)["cmd"]) for each in go) for go in goes]
+    return tuple(
+        Takeover(go[0].by, go[0].t_s, go[-1].t_s, tuple(count.items()))
+        for go, count in zip(goes, counts, strict=True)
+    )
 
 
 # --- external positions ---------------------------------------------------------------------

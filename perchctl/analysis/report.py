@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import math
 import os
-import re
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -21,8 +20,8 @@ from numpy.typing import NDArray
 import perchctl
 from perchctl.analysis.advice import Advice, advice_of
 from perchctl.analysis.edges import timings_of
-from perchctl.analysis.figures import battery_figure, flight_figures, histogram, trend
 from perchctl.analysis.flight import FlightAnalysis
+from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
 from perchctl.analysis.sight import percentile
 from perchctl.analysis.story import SEVEN, Sentence, story_of
@@ -193,7 +192,6 @@ class ReportedFlight:
                 milliseconds(vision.age_s),
                 milliseconds(vision.age_most_s),
                 _known(f"{vision.misfit_px:.2f} px"),
-                _known(f"{vision.blur_px:.1f}, {vision.blur_most_px:.1f} px"),
             )
             for vision in (*self.flight.vision_by_phase, self.flight.vision_led)
         ]
@@ -262,67 +260,28 @@ def _known(text: str) -> str:
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """No script, nothing from elsewhere: the browser holds the page to it."""
-SESSION = "flights"
 
 
 def page_of(flights: Sequence[ReportedFlight]) -> str:
     """HTML that needs nothing else. `flights` has at least one. Raises InvalidValue for a value
     that no flight writes."""
-    is_session = len(flights) > 1
-    articles = [
-        _article(told, number, SESSION if is_session else "")
-        for number, told in enumerate(flights, start=1)
-    ]
+    articles = []
+    for number, told in enumerate(flights, start=1):
+        with log_values(told.flight.log.path):
+            articles.append(_render("flight.html", told=told, flight=told.flight, number=number,
+                                    is_session=len(flights) > 1))  # fmt: skip
     return _render(
         "page.html",
         flights=flights,
         articles=articles,
-        session=_session(flights) if is_session else "",
         counts=Report(tuple(flights)).counts_text,
         policy=POLICY,
         version=perchctl.__version__,
     )
 
 
-def _article(told: ReportedFlight, number: int, back: str) -> Markup:
-    with log_values(told.flight.log.path):
-        html = _render(
-            "flight.html",
-            told=told,
-            flight=told.flight,
-            number=number,
-            back=back,
-            seven_phases=SEVEN,
-            latency_text=latency_text,
-            turn_text=turn_text,
-            flight_figures=flight_figures,
-            battery_figure=battery_figure,
-            histogram=histogram,
-        )
-    return _with_own_ids(html, f"f{number}-")
-
-
-def _session(flights: Sequence[ReportedFlight]) -> Markup:
-    each = [told.flight for told in flights]
-    misses_mm = [math.nan if f.summary.miss_m is None else 1e3 * f.summary.miss_m for f in each]
-    trends = [
-        trend("miss [mm]", misses_mm),
-        trend("aligning [s]", [told.align_s for told in flights]),
-        trend("lowest battery [V]", [flight.battery.lowest_v for flight in each]),
-        trend("used [mAh]", [flight.battery.used_mah for flight in each]),
-    ]
-    html = _render("session.html", flights=flights, session=SESSION, trends=trends)
-    return _with_own_ids(html, "session-")
-
-
-def _with_own_ids(html: str, prefix: str) -> Markup:
-    """The figures' names are this flight's: another's may be the same."""
-    own = re.sub(r'(<(?:path|clipPath|g|rect) id=")', rf"\g<1>{prefix}", html)
-    return Markup(re.sub(r'(<use href="#|url\(#)', rf"\g<1>{prefix}", own))
-
-
-def _render(name: str, **values: Any) -> str:
-    return _templates().get_template(name).render(values)
+def _render(name: str, **values: Any) -> Markup:
+    return Markup(_templates().get_template(name).render(values))
 
 
 @cache
@@ -342,8 +301,20 @@ def _templates() -> jinja2.Environment:
         share=share,
         count=count,
     )
+    templates.globals.update(
+        seven_phases=SEVEN, latency_text=latency_text, turn_text=turn_text, plot_of=plot_address
+    )
     templates.tests["finite"] = math.isfinite
     return templates
+
+
+def plot_address(flight: FlightAnalysis) -> str:
+    """The flight's plot as a `data:` address; the log has at least one tick."""
+    return _address("png", flight_png(flight))
+
+
+def _address(kind: str, image: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(image).decode('ascii')}"
 
 
 # --- What the camera saw when the mission decided: out of the recording beside the log ---------
@@ -391,7 +362,7 @@ class Shown:
 
     @property
     def address(self) -> str:
-        return "data:image/jpeg;base64," + base64.b64encode(self.jpeg).decode("ascii")
+        return _address("jpeg", self.jpeg)
 
 
 def with_pictures(flight: FlightAnalysis, recorded: Recorded) -> ReportedFlight:

@@ -66,7 +66,7 @@ def show_record(flight: FlightAnalysis) -> dict[str, Any]:
                 "end_s": _rounded(log.since(go.end_s)),
                 "commands": dict(go.sent),
             }
-            for go in log.takeovers
+            for go in flight.takeovers
         ],
         "notes": [{"t_s": _rounded(t_s), "note": note} for t_s, note in flight.notes],
     }
@@ -92,7 +92,7 @@ def show_text(flight: FlightAnalysis) -> str:
         "  at [s]  for [s]  sent by    in the loop's place",
         [
             (f"{_span(log.since(go.start_s), go.end_s - go.start_s)}{go.by:<10} ", go.text)
-            for go in log.takeovers
+            for go in flight.takeovers
         ],
     )
     lines += _table("  at [s]  note", [(f"{_rounded(at):8.2f}  ", n) for at, n in flight.notes])

@@ -10,6 +10,7 @@ from .read import FlightLog as FlightLog
 from .read import log_values as log_values
 from .read import read_ends as read_ends
 from .read import read_log as read_log
+from .read import sent_values as sent_values
 from .recorded import recorded_pictures as recorded_pictures
 from .summary import FlightSummary as FlightSummary
 from .summary import summarise_flight as summarise_flight

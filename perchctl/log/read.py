@@ -8,7 +8,7 @@ import json
 import math
 import os
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from io import BufferedReader
@@ -36,7 +36,7 @@ from perchctl.log.header import (
     flown_profile,
 )
 from perchctl.log.write import path_beside
-from perchctl.mission import SentBy, SentCommand, Turn
+from perchctl.mission import SentCommand, Turn
 from perchctl.profile import Profile
 from perchctl.vision import CameraModel
 
@@ -91,11 +91,6 @@ class FlightLog:
     def sent(self) -> list[SentCommand]:
         """What was sent in the loop's place; empty before version 4. Errors: InvalidValue."""
         return [sent_of(record) for record in self.sent_records]
-
-    @cached_property
-    def takeovers(self) -> tuple[Takeover, ...]:
-        """The same, told by each go. Errors: InvalidValue."""
-        return takeovers_of(self.sent)
 
     def column(self, key: str) -> Array:
         """A field over the ticks, shape (n,); NaN where it is missing.
@@ -347,16 +342,6 @@ def _without_kind(record: dict[str, Any]) -> dict[str, Any]:
 
 # --- turns, and what was sent in the loop's place --------------------------------------------
 
-APART_S = 2.0
-"""What is farther apart is told by itself."""
-_TELLS = {
-    "position": "position setpoints",
-    "thrust": "raw thrust",
-    "land": "landing ordered",
-    "stop": "motors stopped",
-    "emergency": "motors cut",
-}
-
 
 def turn_of(record: dict[str, Any]) -> Turn:
     """Back to the same bits. Errors: InvalidValue."""
@@ -394,39 +379,6 @@ def sent_of(record: Mapping[str, Any]) -> SentCommand:
 def sent_values(sent: SentCommand) -> dict[str, Any]:
     """By the names of a tick's fields (`perchctl.log.fields.FIELDS`), and ``by``."""
     return {"t_s": sent.t_s, "by": sent.by, **command_values(sent.command)}
-
-
-@dataclass(frozen=True)
-class Takeover:
-    """What one sender sent in one go. Times on the loop's clock; `sent`: commands by their name
-    in a tick's `cmd`, in the order of their first, and how many of each."""
-
-    by: SentBy
-    start_s: float
-    end_s: float
-    sent: tuple[tuple[str, int], ...]
-
-    @property
-    def text(self) -> str:
-        """``position setpoints (14), landing ordered (2)``"""
-        return ", ".join(f"{_TELLS[name]} ({count})" for name, count in self.sent)
-
-
-def takeovers_of(sent: Sequence[SentCommand]) -> tuple[Takeover, ...]:
-    """In order."""
-    goes: list[list[SentCommand]] = []
-    for each in sorted(sent, key=lambda one: one.t_s):
-        last = goes[-1][-1] if goes else None
-        if last is None or last.by != each.by or each.t_s - last.t_s > APART_S:
-            goes.append([])
-        goes[-1].append(each)
-    return tuple(_takeover(go) for go in goes)
-
-
-def _takeover(go: Sequence[SentCommand]) -> Takeover:
-    names = [str(command_values(each.command)["cmd"]) for each in go]
-    counted = tuple((name, names.count(name)) for name in dict.fromkeys(names))
-    return Takeover(go[0].by, go[0].t_s, go[-1].t_s, counted)
 
 
 # --- What a file is that is no flight log, or no whole one, in words ---------------------------
