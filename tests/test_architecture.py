@@ -95,7 +95,7 @@ MOST_NAMES = {
     "faults": 15,
     "flight": 42,
     "link": 26,
-    "log": 22,
+    "log": 19,
     "mission": 60,
     "perception": 15,
     "positioning": 15,

@@ -117,7 +117,6 @@ def test_two_flights_are_compared(logs: Path) -> None:
 BAD: dict[str, dict[str, object]] = {
     "exposure": {"frame_t_s": "x"},
     "timing": {"kind": "turn", "timing": {"pipeline_s": "q"}},
-    "sample": {"kind": "turn", "taken": {"samples": [{"t_s": "a"}]}},
 }
 """Records, by what in them no flight writes."""
 
@@ -127,18 +126,18 @@ BAD: dict[str, dict[str, object]] = {
     [
         (["show", "none.jsonl"], 20, "does not exist"),
         (["show", "perchctl-logs"], 20, "is a folder"),
-        (["show", "--log-dir", "nowhere"], 20, "there is no folder nowhere"),
+        (["show", "--log-dir", "nowhere"], 20, "the folder nowhere cannot be read"),
         (["show", "--log-dir", "empty"], 20, "holds no flight log"),
         (["show", "-p", "smi"], 20, "'smi'"),
-        (["show", "a.csv"], 30, "a table"),
+        (["show", "a.csv"], 30, "not a flight log"),
         (["show", "a.jsonl", "--list"], 2, "--list is of a folder"),
         (["show", "-n", "3"], 2, "--count is of --list"),
         (["show", "a.jsonl", "--log-dir", "x"], 2, "leave out one of them"),
         (["show", "-p", "sim", "--log-dir", "x"], 2, "leave out one"),
-        (["plot", "a.csv"], 30, "a table"),
+        (["plot", "a.csv"], 30, "not a flight log"),
         (["plot", "bare.jsonl"], 30, "nothing to plot"),
         (["export", "bare.jsonl", "--csv"], 30, "nothing to export"),
-        (["export", "damaged.jsonl", "--csv"], 30, "battery_v must be a number"),
+        (["export", "damaged.jsonl", "--csv"], 30, "battery_v: a number is needed"),
         (["show", "damaged.jsonl"], 30, "battery_v is not a number"),
         (["show", "odd.jsonl"], 30, "no flight writes"),
         *((["report", f"bad_{name}.jsonl"], 30, "a value that no flight writes") for name in BAD),
@@ -148,7 +147,7 @@ BAD: dict[str, dict[str, object]] = {
         (["export", "--csv", "bare.jsonl", "-o", "x.mcap"], 30, "must end in .csv"),
         (["export", "--mcap", "bare.jsonl", "-o", "-"], 2, "CSV on stdout"),
         (["export", "bare.jsonl", "-o", "-", "--json"], 2, "CSV on stdout"),
-        (["compare", "a.csv", "bare.jsonl"], 30, "a table"),
+        (["compare", "a.csv", "bare.jsonl"], 30, "not a flight log"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -36,7 +36,7 @@ from perchctl.analysis.sight import (
     within,
 )
 from perchctl.geometry import Array
-from perchctl.log import FlightLog, FlightSummary, summarise_flight
+from perchctl.log import FlightLog, FlightSummary
 from perchctl.mission import Findings
 
 SETTLED_S = 1.0
@@ -119,7 +119,7 @@ class FlightAnalysis:
     @cached_property
     def summary(self) -> FlightSummary:
         """How it ended."""
-        return summarise_flight(self.log)
+        return FlightSummary.of(self.log)
 
     @cached_property
     def t_s(self) -> Array:
@@ -226,7 +226,7 @@ class FlightAnalysis:
     @cached_property
     def takeovers(self) -> tuple[Takeover, ...]:
         """What was sent in the loop's place, each go by itself."""
-        return takeovers_of(self.log.sent)
+        return takeovers_of(self.log.sent_values)
 
     @cached_property
     def measures(self) -> Measures:

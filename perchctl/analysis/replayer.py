@@ -117,8 +117,8 @@ def replay(
     Errors: InvalidValue, NotFound (a calibration or mask that another profile names).
     """
     flown = log.flown_profile
-    whole = whole_turns(log)
-    turns, used = whole.turns, profile or flown
+    turns, gap = whole_turns(log)
+    used = profile or flown
     changed = changed_keys(flown, used)
     seen = by_telemetry = None
     if pictures is not None:
@@ -147,9 +147,9 @@ def replay(
         seen=seen,
         shown=by_telemetry,
         changed=changed,
-        gap=whole.gap,
+        gap=gap,
         notes=(
-            *notes_of(log, whole.gap, ended, changed, pictures=is_seen),
+            *notes_of(log, gap, ended, changed, pictures=is_seen),
             *_failures(decided),
         ),
     )

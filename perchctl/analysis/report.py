@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import math
 import os
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -25,7 +25,7 @@ from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
 from perchctl.analysis.sight import percentile
 from perchctl.analysis.story import SEVEN, Sentence, story_of
-from perchctl.analysis.words import count, kept_together, length, milliseconds, share
+from perchctl.analysis.words import count, length, milliseconds, share
 from perchctl.errors import PerchError
 from perchctl.files import write_files
 from perchctl.geometry import Array
@@ -41,7 +41,7 @@ TITLES = {
     UNFINISHED: "Unfinished: the log has no end",
 }
 GRADES = {"perched": "good", "landed": "warn"}
-MOST_STRETCHES, MOST_STOPS = 4, 6
+MOST_STOPS = 6
 
 
 def write_report(log_paths: Sequence[Path], output: Path) -> Report:
@@ -94,9 +94,7 @@ def reported_flight(log_path: Path) -> ReportedFlight:
     if not recording.is_file():
         return ReportedFlight(flight)
     with log_values(log_path):
-        return with_pictures(
-            flight, lambda numbers: recorded_pictures(recording, exact=False, numbers=numbers)
-        )
+        return with_pictures(flight, recording)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,41 +200,12 @@ class ReportedFlight:
         return max((float(b - a) for a, b in self.flight.frames.gaps_s), default=0.0)
 
     @property
-    def old_telemetry(self) -> str:
-        """When telemetry was old; empty where it never was."""
-        old = self.flight.link.old
-        shown = [f"at {start:.1f} s up to {milliseconds(worst)}" for start, _, worst in old]
-        first = ", ".join(shown[:MOST_STRETCHES])
-        rest = len(old) - MOST_STRETCHES
-        return first if rest <= 0 else f"{first}, and {rest} more"
-
-    @property
-    def commands(self) -> str:
-        """How many turns sent each kind of command."""
-        return ", ".join(f"{kind} {number}" for kind, number in self.flight.link.sent)
-
-    @property
     def stops(self) -> str:
         """When and why no external position was sent."""
         stops = () if self.flight.external is None else self.flight.external.stops
         return "; ".join(
             f"at {a:.1f} s for {b - a:.1f} s: {why}" for a, b, why in stops[:MOST_STOPS]
         )
-
-    @property
-    def battery_rows(self) -> list[tuple[str, ...]]:
-        """Of each phase."""
-        return [
-            (
-                phase.phase,
-                f"{phase.duration_s:.1f} s",
-                f"{phase.used_mah:.1f} mAh",
-                f"{phase.mean_thrust / 655.35:.0f} %",
-                _known(f"{phase.lowest_v:.2f} V"),
-            )
-            for phase in self.flight.battery.phases
-            if phase.duration_s > 0
-        ]
 
     @cached_property
     def timings(self) -> dict[str, Array]:
@@ -295,7 +264,6 @@ def _templates() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     templates.filters.update(
-        together=kept_together,
         length_text=length,
         milliseconds=milliseconds,
         share=share,
@@ -318,11 +286,6 @@ def _address(kind: str, image: bytes) -> str:
 
 
 # --- What the camera saw when the mission decided: out of the recording beside the log ---------
-
-
-Recorded = Callable[[Collection[int]], Iterable[tuple[int, float, NDArray[np.uint8]]]]
-"""Gives the frames of some numbers: number, time, and the picture as the pipeline had it. Raises
-PerchError where the recording cannot be read."""
 
 DECIDED = {"ESTIMATE": "found", "ASCEND": "aligned", "PERCH": "settled", "COMPLETE": "contact"}
 OLD_S = 0.2
@@ -365,12 +328,6 @@ class Shown:
         return _address("jpeg", self.jpeg)
 
 
-def with_pictures(flight: FlightAnalysis, recorded: Recorded) -> ReportedFlight:
-    """The flight with the pictures of its decisions, as far as the recording can be read."""
-    shown, problem = shown_of(decisions_of(flight), recorded)
-    return ReportedFlight(flight, shown, problem.replace(f"{flight.log.path.parent}{os.sep}", ""))
-
-
 def decisions_of(flight: FlightAnalysis) -> tuple[Decision, ...]:
     """In order: where the mission went on because of what was seen, and where sight was lost."""
     moments = [(s.start_s, DECIDED[s.phase]) for s in flight.stays if s.phase in DECIDED]
@@ -378,7 +335,8 @@ def decisions_of(flight: FlightAnalysis) -> tuple[Decision, ...]:
         moments.append((loss.start_s + min(loss.duration_s, 0.5), "lost"))
     found = []
     for t_s, name in sorted(moments):
-        record = _frame_before(flight, t_s)
+        until_then = flight.log.records[flight.index_at(t_s) :: -1]
+        record = next((r for r in until_then if r.get("frame") is not None), None)
         if record is not None:
             seen_s = flight.log.since(float(record["t_s"]))
             found.append(Decision(t_s, name, int(record["frame"]), record, seen_s))
@@ -387,33 +345,24 @@ def decisions_of(flight: FlightAnalysis) -> tuple[Decision, ...]:
     return tuple(found)
 
 
-def _frame_before(flight: FlightAnalysis, t_s: float) -> dict[str, Any] | None:
-    for record in flight.log.records[flight.index_at(t_s) :: -1]:
-        if record.get("frame") is not None:
-            return record
-    return None
-
-
-def shown_of(decisions: Iterable[Decision], recorded: Recorded) -> tuple[tuple[Shown, ...], str]:
-    """Those whose picture is in the recording, and why others could not be read, or nothing."""
+def with_pictures(flight: FlightAnalysis, recording: Path) -> ReportedFlight:
+    """The flight with the pictures of its decisions, as far as the recording can be read."""
     wanted: dict[int, list[Decision]] = {}
-    for decision in decisions:
+    for decision in decisions_of(flight):
         wanted.setdefault(decision.frame, []).append(decision)
-    found: list[Shown] = []
+    shown: list[Shown] = []
     problem = ""
     try:
-        for number, _t_s, image in recorded(wanted.keys()) if wanted else ():
-            for decision in wanted.pop(number, ()):
-                found.append(Shown(decision, _jpeg(decision, image)))
-            if not wanted:
-                break
+        for number, _, image in recorded_pictures(recording, exact=False, numbers=wanted.keys()):
+            shown += [Shown(decision, _jpeg(decision, image)) for decision in wanted[number]]
     except PerchError as error:
-        problem = str(error)
-    return tuple(sorted(found, key=lambda shown: shown.decision.t_s)), problem
+        problem = str(error).replace(f"{flight.log.path.parent}{os.sep}", "")
+    in_order = tuple(sorted(shown, key=lambda each: each.decision.t_s))
+    return ReportedFlight(flight, in_order, problem)
 
 
 def _jpeg(decision: Decision, image: NDArray[np.uint8]) -> bytes:
-    drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
+    drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     scale = min(1.0, WIDEST_PX / drawn.shape[1])
     if scale < 1.0:
         drawn = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

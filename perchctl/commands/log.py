@@ -14,8 +14,9 @@ import typer
 from perchctl.analysis import (
     Comparison,
     FlightAnalysis,
-    LogList,
     check_readable,
+    list_logs,
+    list_text,
     newest_logs,
     replay_lines,
     replay_record,
@@ -142,11 +143,12 @@ def show(
                 f"--list is of a folder, and {file} is named: leave it out, or name the "
                 f"folder with --log-dir"
             )
-        logs = LogList.of(_log_folder(profile, log_dir), count or MOST_LISTED)
+        folder = _log_folder(profile, log_dir)
+        logs = list_logs(folder, count or MOST_LISTED)
         if as_json:
-            print_record(logs.record())
+            print_record({"folder": str(folder), "logs": logs})
         else:
-            print(logs.text())
+            print(list_text(logs))
         return 0
     if count is not None:
         raise UsageError("--count is of --list: add that, or leave it out")
