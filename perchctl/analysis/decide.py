@@ -91,9 +91,8 @@ def decide(
     seen: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
 ) -> Iterator[Decided]:
     """Each turn of the planner, in order, with the observation that `seen` gives for it: by
-    default the recorded one. A turn that was decided anew is decided, but does not count; on one
-    on which the planner raised it may raise again. Where it raises on another one, that is the
-    last."""
+    default the recorded one. A turn that was decided anew is decided, but does not count. The one
+    on which the planner raises is the last, in a flight as here."""
     state: PlannerState | None = None
     tick = 0
     for turn in turns:
@@ -104,8 +103,6 @@ def decide(
             new, command = step_mission(state or start_mission(obs), obs, profile)
         except Exception as error:
             yield Decided(tick, turn, obs, state, None, type(error).__name__)
-            if turn.role == "failed":
-                continue
             return  # what came after it cannot be decided
         yield Decided(tick, turn, obs, new, command)
         if turn.role == "flown":
