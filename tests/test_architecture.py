@@ -22,7 +22,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rich": ("perchctl.commands", "perchctl.display"),
     "filterpy": ("perchctl.vision.filter",),
     "mujoco": ("perchctl.sim",),
-    "matplotlib": ("*.plot", "perchctl.analysis.figures"),
+    "matplotlib": ("*.plot",),
     "jinja2": ("perchctl.analysis.report",),
     "motioncapture": ("perchctl.positioning",),
     "mcap": ("perchctl.log.recording_file", "perchctl.log.recorded"),
@@ -85,7 +85,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # Packages with a face: the others take its names, and nothing from behind it. The number is how
 # many names it has at most.
 MOST_NAMES = {
-    "analysis": 15,
+    "analysis": 14,
     "calibration": 30,
     "camera": 28,
     "campaign": 25,
@@ -95,7 +95,7 @@ MOST_NAMES = {
     "faults": 15,
     "flight": 42,
     "link": 22,
-    "log": 21,
+    "log": 19,
     "mission": 48,
     "perception": 15,
     "positioning": 15,

@@ -87,14 +87,6 @@ def test_programs_are_told_what_an_export_lacks(logs: Path) -> None:
     assert any("without pictures" in note for note in json.loads(said.stdout)["notes"])
 
 
-def test_programs_are_told_where_a_replay_is_drawn(
-    logs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("perchctl.analysis.plot_replay", lambda _found, _path: None)
-    log = str(FLIGHTS / "stopped.jsonl.gz")
-    assert json.loads(run("log", "replay", log, "--json", "-o", "x.png").stdout)["plot"] == "x.png"
-
-
 def test_a_plot_s_name_is_its_form(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Path] = []
     monkeypatch.setattr("perchctl.analysis.plot_flight", lambda _log, path: drawn.append(path))
@@ -116,15 +108,12 @@ def test_two_flights_are_compared(logs: Path) -> None:
     assert "their profiles are the same" in run("log", "compare", OLD, NEW).stdout
     told = json.loads(run("log", "compare", OLD, NEW, "--json").stdout)
     assert told["differences"]["turns"] == -30
-    assert (told["profile"], told["plot"]) == ({}, None)
+    assert told["profile"] == {}
 
 
 BAD: dict[str, dict[str, object]] = {
     "exposure": {"frame_t_s": "x"},
-    "corners": {"large_px": "abcdefgh", "lz_m": 1.0},
-    "pose": {"lz_m": "x", "large_px": [0.0] * 8},
     "timing": {"kind": "turn", "timing": {"pipeline_s": "q"}},
-    "sample": {"kind": "turn", "taken": {"samples": [{"t_s": "a"}]}},
 }
 """Records, by what in them no flight writes."""
 

@@ -1,15 +1,14 @@
 from .compare import Comparison as Comparison
 from .compare import profile_differences as profile_differences
 from .flight import FlightAnalysis as FlightAnalysis
-from .plot import plot_comparison as plot_comparison
 from .plot import plot_flight as plot_flight
-from .plot import plot_replay as plot_replay
 from .replay_text import replay_lines as replay_lines
 from .replay_text import replay_record as replay_record
 from .replayer import check_readable as check_readable
 from .replayer import replay as replay
 from .report import write_report as write_report
-from .show import LogList as LogList
+from .show import list_logs as list_logs
+from .show import list_text as list_text
 from .show import newest_logs as newest_logs
 from .show import show_record as show_record
 from .show import show_text as show_text

@@ -3,7 +3,6 @@ where the log shows nothing."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -12,14 +11,10 @@ import numpy as np
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.sight import percentile
 from perchctl.analysis.words import count, length, milliseconds, share, times
-from perchctl.geometry import Array
 
-SWING_M, LEAST_SWINGS = 0.03, 4
-"""Farther than that to both sides of the target, one after the other."""
-WAITED_S = 4.0
 LEAST_PAIRS, SCALE_OFF = 20, 0.03
 RMS_PX = 1.0
-UNSEEN_SHARE, LEAST_UNSEEN, BLURRED_PX = 0.1, 10, 2.5
+UNSEEN_SHARE, LEAST_UNSEEN = 0.1, 10
 IN_VIEW = 0.5
 """Aside by less than half of the height: a camera that looks up has the target in view."""
 GAP_S = 0.3
@@ -44,8 +39,6 @@ def advice_of(flight: FlightAnalysis) -> tuple[Advice, ...]:
         *_print(flight),
         *_light(flight),
         *_video(flight),
-        *_gains(flight),
-        *_settling(flight),
         *_link(flight),
         *_battery(flight),
         *_external(flight),
@@ -83,41 +76,28 @@ def _print(flight: FlightAnalysis) -> Iterator[Advice]:
 
 def _light(flight: FlightAnalysis) -> Iterator[Advice]:
     unseen, frames = _unseen_in_view(flight)
-    if len(unseen) < LEAST_UNSEEN or len(unseen) < UNSEEN_SHARE * frames:
+    if unseen < LEAST_UNSEEN or unseen < UNSEEN_SHARE * frames:
         return
-    blur = flight.motion.blur_px[unseen]
-    told = f"{len(unseen)} of {frames} frames did not show the target, though it was in view"
-    blurred = int(np.count_nonzero(blur > BLURRED_PX))
-    if blurred > len(unseen) / 2:
-        yield Advice(
-            "light",
-            "more light and a shorter exposure (camera.controls), or a slower flight",
-            f"{told}; {blurred} of them were blurred by more than {BLURRED_PX:g} px",
-        )
-    elif np.isfinite(blur).any():
-        yield Advice(
-            "light",
-            "look for what darkens, dazzles or hides the target: it was not the motion",
-            f"{told}; their median blur was {percentile(blur, 50):.1f} px",
-        )
-    else:
-        flow = percentile(flight.motion.flow_pxps[unseen], 50)
-        moved = f"; it moved at {flow:.0f} px/s" if math.isfinite(flow) else ""
-        yield Advice("light", "more light, so that the exposure can be shorter", f"{told}{moved}")
+    yield Advice(
+        "light",
+        "look for what darkens, dazzles or hides the target; more light and a shorter exposure "
+        "(camera.controls) help where the flight was fast",
+        f"{unseen} of {frames} frames did not show the target, though it was overhead",
+    )
 
 
-def _unseen_in_view(flight: FlightAnalysis) -> tuple[list[int], int]:
-    """Ticks whose frame lacks a target that was overhead; and all frames with it overhead."""
+def _unseen_in_view(flight: FlightAnalysis) -> tuple[int, int]:
+    """How many frames lack a target that was overhead, of all frames with it overhead."""
     overhead = np.hypot(flight.log.column("ex_m"), flight.log.column("ey_m")) < (
         IN_VIEW * flight.log.column("ez_m")
     )
     phases = flight.log.texts("phase")
-    looked = [
-        (i, seen)
+    overhead_seen = [
+        seen
         for i, seen in zip(flight.frames.ticks, flight.frames.seen, strict=True)
         if overhead[i] and phases[i] in ("ESTIMATE", "ALIGN", "ASCEND")
     ]
-    return [int(i) for i, seen in looked if not seen], len(looked)
+    return overhead_seen.count(False), len(overhead_seen)
 
 
 def _video(flight: FlightAnalysis) -> Iterator[Advice]:
@@ -129,75 +109,6 @@ def _video(flight: FlightAnalysis) -> Iterator[Advice]:
             f"{times(len(long))} no picture came for more than {GAP_S:g} s, at most "
             f"{max(long):.1f} s",
         )
-
-
-def _gains(flight: FlightAnalysis) -> Iterator[Advice]:
-    for phase, key in (("ALIGN", "align"), ("ASCEND", "ascend")):
-        swings, widest_m, over_s = _swings(flight, phase)
-        if swings < LEAST_SWINGS:
-            continue
-        speed = flight.log.setting(f"planner.{key}.speed_mps")
-        integral = flight.log.setting("planner.integral_per_s")
-        text = f"lower planner.{key}.speed_mps"
-        text += f" (flown with {speed})" if speed is not None else ""
-        text += ", or planner.integral_per_s"
-        text += f" ({integral})" if integral is not None else ""
-        if any(a.about == "latency" for a in _latency_and_mounting(flight)):
-            text = f"put the latency right first; if it still swings, {text}"
-        yield Advice(
-            "gains",
-            text,
-            f"in {phase} it swung {swings} times across the target, by up to {length(widest_m)} "
-            f"in {over_s:.1f} s",
-        )
-
-
-def _swings(flight: FlightAnalysis, phase: str) -> tuple[int, float, float]:
-    """The most changes of side in one stay, how wide, in how long."""
-    best = (0, 0.0, 0.0)
-    for stay in flight.stays:
-        if stay.phase != phase:
-            continue
-        ticks = flight.within(stay.start_s, stay.end_s)
-        for axis in "xy":
-            swings, widest_m = swings_of(flight.log.column(f"e{axis}_m")[ticks])
-            best = max(best, (swings, widest_m, stay.duration_s))
-    return best
-
-
-def swings_of(e_m: Array) -> tuple[int, float]:
-    """How often an error went from beyond `SWING_M` on one side to beyond it on the other, and
-    how far it went after the first time."""
-    sides = np.sign(e_m[np.abs(e_m) > SWING_M])
-    changes = int(np.count_nonzero(np.diff(sides)))
-    if not changes:
-        return 0, 0.0
-    beyond = np.abs(e_m[np.abs(e_m) > SWING_M])
-    return changes, float(beyond[int(np.flatnonzero(np.diff(sides))[0]) + 1 :].max())
-
-
-def _settling(flight: FlightAnalysis) -> Iterator[Advice]:
-    standoff_m, settle_z_m, settle_xy_m = (
-        flight.log.number(f"planner.ascend.{key}")
-        for key in ("standoff_m", "settle_z_m", "settle_xy_m")
-    )
-    if standoff_m is None or settle_z_m is None or settle_xy_m is None:
-        return
-    near = (flight.log.column("ez_m") <= standoff_m + settle_z_m) & np.array(
-        [phase == "ASCEND" for phase in flight.log.texts("phase")], dtype=bool
-    )
-    spent_s = float(np.diff(flight.t_s, append=flight.end_s)[near].sum())
-    if spent_s < WAITED_S:
-        return
-    aside = np.hypot(flight.log.column("ex_m"), flight.log.column("ey_m"))[near]
-    yield Advice(
-        "gains",
-        "look for a draught or a weak position estimate; where the target forgives more, "
-        "planner.ascend.settle_xy_m can be larger",
-        f"it waited {spent_s:.1f} s at the stand-off, and was within "
-        f"{length(settle_xy_m)} of the axis for {share(float(np.mean(aside <= settle_xy_m)))} "
-        f"of that time (median {length(percentile(aside, 50))})",
-    )
 
 
 def _link(flight: FlightAnalysis) -> Iterator[Advice]:

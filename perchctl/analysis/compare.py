@@ -14,15 +14,6 @@ _NAME, _CELL = 32, 14
 _NOT_THERE = "not there"
 
 
-@dataclass(frozen=True)
-class PhaseTimes:
-    """How long, and how often, each of two flights was in a phase."""
-
-    phase: str
-    stays_s: tuple[float, float]
-    visits: tuple[int, int]
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Two flights side by side, A and B."""
@@ -30,8 +21,8 @@ class Comparison:
     flights: tuple[FlightAnalysis, FlightAnalysis]
 
     @cached_property
-    def phases(self) -> tuple[PhaseTimes, ...]:
-        """Each phase that one of them flew through."""
+    def phases(self) -> list[dict[str, Any]]:
+        """How long, and how often, each was in each phase that one of them flew through."""
         names = dict.fromkeys(stay.phase for flight in self.flights for stay in flight.stays)
         found = []
         for name in names:
@@ -39,8 +30,15 @@ class Comparison:
                 [stay.duration_s for stay in flight.stays if stay.phase == name]
                 for flight in self.flights
             )
-            found.append(PhaseTimes(name, (sum(a), sum(b)), (len(a), len(b))))
-        return tuple(found)
+            found.append({
+                "phase": name,
+                "a_s": round(sum(a), 6),
+                "b_s": round(sum(b), 6),
+                "difference_s": round(sum(b) - sum(a), 6),
+                "a_visits": len(a),
+                "b_visits": len(b),
+            })  # fmt: skip
+        return found
 
     @cached_property
     def profile(self) -> dict[str, tuple[Any, Any]]:
@@ -63,17 +61,7 @@ class Comparison:
             "a": a,
             "b": b,
             "differences": self.differences,
-            "phases": [
-                {
-                    "phase": each.phase,
-                    "a_s": round(each.stays_s[0], 6),
-                    "b_s": round(each.stays_s[1], 6),
-                    "difference_s": round(each.stays_s[1] - each.stays_s[0], 6),
-                    "a_visits": each.visits[0],
-                    "b_visits": each.visits[1],
-                }
-                for each in self.phases
-            ],
+            "phases": self.phases,
             "profile": {key: {"a": a, "b": b} for key, (a, b) in self.profile.items()},
         }
 
@@ -97,10 +85,14 @@ class Comparison:
             yield ""
             yield "time in each phase [s]"
         for each in self.phases:
-            often = "" if each.visits == (1, 1) else f" ({each.visits[0]}x, {each.visits[1]}x)"
-            a_s, b_s = each.stays_s
-            name = f"  {plain(each.phase)}{often}"
-            yield _row(name, f"{a_s:.2f}", f"{b_s:.2f}", f"{b_s - a_s:+.2f}")
+            visits = each["a_visits"], each["b_visits"]
+            often = "" if visits == (1, 1) else f" ({visits[0]}x, {visits[1]}x)"
+            yield _row(
+                f"  {plain(each['phase'])}{often}",
+                f"{each['a_s']:.2f}",
+                f"{each['b_s']:.2f}",
+                f"{each['difference_s']:+.2f}",
+            )
         yield ""
         yield "profile keys that differ, A and B" if self.profile else "their profiles are the same"
         for key, (a, b) in self.profile.items():

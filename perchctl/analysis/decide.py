@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -71,26 +71,18 @@ class Decided:
         )
 
 
-@dataclass(frozen=True)
-class Whole:
-    """The turns of a log up to where the first is missing; `gap` says which, or is empty."""
-
-    turns: Sequence[Turn]
-    gap: str = ""
-
-
-def whole_turns(log: FlightLog) -> Whole:
-    """What can be replayed of a log. Errors: InvalidValue."""
+def whole_turns(log: FlightLog) -> tuple[list[Turn], str]:
+    """What can be replayed of a log: its turns up to where the first is missing, and which that
+    is, or nothing. Errors: InvalidValue."""
     if not log.turn_records:
         raise InvalidValue(_why_no_turns(log))
     for number, turn in enumerate(log.turns):
         if turn.number != number:
-            gap = (
+            return log.turns[:number], (
                 f"turn {number} is not in the log, which has lost records: what came after it "
                 f"cannot be replayed"
             )
-            return Whole(log.turns[:number], gap)
-    return Whole(log.turns)
+    return log.turns, ""
 
 
 def decide(
@@ -99,37 +91,22 @@ def decide(
     seen: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
 ) -> Iterator[Decided]:
     """Each turn of the planner, in order, with the observation that `seen` gives for it: by
-    default the recorded one. A turn that was decided anew is decided, but does not count; on one
-    on which the planner raised it may raise again. Where it raises on another one, that is the
-    last."""
+    default the recorded one. A turn that was decided anew is decided, but does not count. The one
+    on which the planner raises is the last, in a flight as here."""
     state: PlannerState | None = None
     tick = 0
     for turn in turns:
         obs = seen(turn)
         if obs is None or turn.role == "waiting":
             continue
-        if turn.command is None:
-            yield _failed_again(tick, turn, obs, state, profile)
-            continue
         try:
             new, command = step_mission(state or start_mission(obs), obs, profile)
-        except Exception as error:  # what came after it cannot be decided
+        except Exception as error:
             yield Decided(tick, turn, obs, state, None, type(error).__name__)
-            return
+            return  # what came after it cannot be decided
         yield Decided(tick, turn, obs, new, command)
         if turn.role == "flown":
             state, tick = new, tick + 1
-
-
-def _failed_again(
-    tick: int, turn: Turn, obs: Observation, state: PlannerState | None, profile: Profile
-) -> Decided:
-    try:
-        before = state or start_mission(obs)
-        new, command = step_mission(before, obs, profile)
-    except Exception as error:
-        return Decided(tick, turn, obs, state, None, type(error).__name__)
-    return Decided(tick, turn, obs, new, command)
 
 
 def first_of(decided: Iterable[Decided], t0_s: float) -> Difference | None:

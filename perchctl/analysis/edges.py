@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +16,7 @@ from perchctl.log import FlightLog
 from perchctl.mission import (
     BatteryFit,
     EnergyState,
+    SentBy,
     charge_at,
     fit_battery,
     update_energy,
@@ -45,23 +49,17 @@ class LinkHealth:
 
     Attributes:
         fresh_hz: samples that were new in their turn; not above the loop's own rate.
-        samples_hz: all that came, NaN where the log does not hold them (before version 3).
         age_s, age_most_s, age_worst_s: of the newest sample: median, 99 of 100 below, all below.
         old: stretches in which the newest sample was older than `OLD_TELEMETRY_S`: from, to,
             worst age.
-        sent: commands by kind, how many turns each.
-        setpoints_hz: position setpoints and raw thrusts, while they were sent.
     """
 
     turns_hz: float
     fresh_hz: float
-    samples_hz: float
     age_s: float
     age_most_s: float
     age_worst_s: float
     old: tuple[tuple[float, float, float], ...]
-    sent: tuple[tuple[str, int], ...]
-    setpoints_hz: float
 
 
 def link_of(log: FlightLog) -> LinkHealth:
@@ -70,32 +68,14 @@ def link_of(log: FlightLog) -> LinkHealth:
     spent_s = max(log.end_s, 1e-9) if t_s.size > 1 else math.nan
     sampled = np.round(t_s - age, 4)
     fresh = np.count_nonzero(np.diff(sampled[np.isfinite(sampled)]) > 0)
-    kinds = [kind for kind in log.texts("cmd") if kind]
-    flying = np.array([kind in ("position", "thrust") for kind in log.texts("cmd")], dtype=bool)
-    between = np.diff(t_s)[flying[1:] & flying[:-1]]
     return LinkHealth(
         turns_hz=(t_s.size - 1) / spent_s,
         fresh_hz=fresh / spent_s,
-        samples_hz=_samples_hz(log),
         age_s=percentile(age, 50),
         age_most_s=percentile(age, 99),
         age_worst_s=percentile(age, 100),
         old=_old_telemetry(t_s, age),
-        sent=tuple((kind, kinds.count(kind)) for kind in dict.fromkeys(kinds)),
-        setpoints_hz=1.0 / float(np.mean(between)) if between.size else math.nan,
     )
-
-
-def _samples_hz(log: FlightLog) -> float:
-    """By the samples' own times, so that what came late in one go counts as it was taken."""
-    taken = [t for r in log.turn_records if isinstance(t := r.get("taken"), dict)]
-    at_s = [
-        sample["t_s"]
-        for each in taken
-        for sample in (*(each.get("samples") or ()), *(each.get("late") or ()))
-    ]
-    spent_s = max(at_s) - min(at_s) if at_s else 0.0
-    return (len(at_s) - 1) / spent_s if spent_s > 0 else math.nan
 
 
 def _old_telemetry(times_s: Array, ages_s: Array) -> tuple[tuple[float, float, float], ...]:
@@ -111,6 +91,50 @@ def _old_telemetry(times_s: Array, ages_s: Array) -> tuple[tuple[float, float, f
             found.append((float(t_s), float(t_s), float(age_s)))
             inside = True
     return tuple(found)
+
+
+# --- what was sent in the loop's place ------------------------------------------------------
+
+APART_S = 2.0
+"""Commands of one sender that are farther apart are two goes."""
+_TELLS = {
+    "position": "position setpoints",
+    "thrust": "raw thrust",
+    "land": "landing ordered",
+    "stop": "motors stopped",
+    "emergency": "motors cut",
+}
+
+
+@dataclass(frozen=True)
+class Takeover:
+    """What one sender sent in one go. Times on the loop's clock; `sent`: commands by their name
+    in a tick's `cmd`, in the order of their first, and how many of each."""
+
+    by: SentBy
+    start_s: float
+    end_s: float
+    sent: tuple[tuple[str, int], ...]
+
+    @property
+    def text(self) -> str:
+        """``position setpoints (14), landing ordered (2)``"""
+        return ", ".join(f"{_TELLS[name]} ({count})" for name, count in self.sent)
+
+
+def takeovers_of(sent: Sequence[Mapping[str, Any]]) -> tuple[Takeover, ...]:
+    """The goes in the order of their times; `sent` are a log's `sent_values`."""
+    goes: list[list[Mapping[str, Any]]] = []
+    for each in sorted(sent, key=lambda one: float(one["t_s"])):
+        last = goes[-1][-1] if goes else None
+        if last is None or last["by"] != each["by"] or each["t_s"] - last["t_s"] > APART_S:
+            goes.append([])
+        goes[-1].append(each)
+    return tuple(
+        Takeover(go[0]["by"], go[0]["t_s"], go[-1]["t_s"],
+                 tuple(Counter(each["cmd"] for each in go).items()))
+        for go in goes
+    )  # fmt: skip
 
 
 # --- external positions ---------------------------------------------------------------------
@@ -165,23 +189,13 @@ LONGEST_STEP_S = 1.0
 """A longer gap between two ticks is the log's, and not counted as flown."""
 
 
-@dataclass(frozen=True)
-class PhaseEnergy:
-    """Of all stays in a phase together. `lowest_v` is NaN without a reading."""
-
-    phase: str
-    duration_s: float
-    used_mah: float
-    mean_thrust: float
-    lowest_v: float
-
-
 @dataclass(frozen=True, eq=False)
 class BatteryUse:
     """Voltages as they were read, charge by the count of the thrust.
 
     Attributes:
         battery_mah: what the charge is counted against; `assumed` where no profile says it.
+        used_mah: the charge that was used.
         rest_v: (n,) the estimated resting voltage over the ticks, NaN where there is none.
         start_v, end_v, lowest_v: first, last and lowest reading; NaN without any.
         fit: how much the voltage falls under full thrust, and how much faster than assumed the
@@ -191,7 +205,7 @@ class BatteryUse:
 
     battery_mah: float
     assumed: bool
-    phases: tuple[PhaseEnergy, ...]
+    used_mah: float
     rest_v: Array
     start_v: float
     end_v: float
@@ -199,55 +213,34 @@ class BatteryUse:
     fit: BatteryFit | None
     left: float | None
 
-    @property
-    def used_mah(self) -> float:
-        return sum(phase.used_mah for phase in self.phases)
-
 
 def battery_of(log: FlightLog) -> BatteryUse:
-    """Fits the battery model to the whole flight; a log without ticks has no phases."""
+    """Fits the battery model to the whole flight."""
     written = log.number("vehicle.battery_mah") or 0.0
     battery_mah = written if written > 0 else USUAL_MAH
     t_s, volts = log.column("t_s"), log.column("battery_v")
     thrust = np.nan_to_num(log.column("thrust"))
     step_s = np.clip(np.diff(t_s, append=t_s[-1:]), 0.0, LONGEST_STEP_S)
     state = EnergyState()
-    count_mah, rest_v = np.zeros(t_s.shape), np.full(t_s.shape, np.nan)
+    rest_v = np.full(t_s.shape, np.nan)
     for i in range(t_s.size):
         state = update_energy(
             state, float(step_s[i]), float(volts[i]), float(thrust[i]), battery_mah
         )
-        count_mah[i] = state.used * battery_mah
         rest_v[i] = math.nan if state.rest_v is None else state.rest_v
-    step_mah = np.diff(count_mah, prepend=0.0)
-    phases = np.array(log.texts("phase"))
     known = volts[volts >= NO_BATTERY_READING_V]
     is_loaded = state.loaded_s > 0
     return BatteryUse(
         battery_mah,
         written <= 0,
-        tuple(
-            PhaseEnergy(
-                name,
-                float(step_s[phases == name].sum()),
-                float(step_mah[phases == name].sum()),
-                float(thrust[phases == name].mean()),
-                _lowest_v(volts[phases == name]),
-            )
-            for name in dict.fromkeys(log.texts("phase"))
-        ),
+        state.used * battery_mah,
         rest_v,
         float(known[0]) if known.size else math.nan,
         float(known[-1]) if known.size else math.nan,
-        _lowest_v(volts),
+        float(known.min()) if known.size else math.nan,
         fit_battery(state) if is_loaded else None,
         charge_at(state.rest_v) if is_loaded and state.rest_v is not None else None,
     )
-
-
-def _lowest_v(volts: Array) -> float:
-    known = volts[volts >= NO_BATTERY_READING_V]
-    return float(known.min()) if known.size else math.nan
 
 
 # --- the loop -------------------------------------------------------------------------------

@@ -11,36 +11,33 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from perchctl.analysis.edges import (
     BatteryUse,
     ExternalHealth,
     LinkHealth,
+    Takeover,
     battery_of,
     external_of,
     link_of,
+    takeovers_of,
 )
 from perchctl.analysis.sight import (
     LED_BY_CAMERA,
     SAME_S,
     Frames,
     Loss,
-    Motion,
     Stay,
     Vision,
     frames_of,
     losses_of,
-    motion_of,
     percentile,
     vision_of,
     within,
 )
 from perchctl.geometry import Array
-from perchctl.log import FlightLog, FlightSummary, summarise_flight
-from perchctl.mission import Findings, flight_findings
-from perchctl.profile import CameraConfig
-from perchctl.vision import Consistency
+from perchctl.log import FlightLog, FlightSummary
+from perchctl.mission import Findings
 
 SETTLED_S = 1.0
 """So long before the contact begins is looked at for how well the vehicle has settled."""
@@ -122,7 +119,7 @@ class FlightAnalysis:
     @cached_property
     def summary(self) -> FlightSummary:
         """How it ended."""
-        return summarise_flight(self.log)
+        return FlightSummary.of(self.log)
 
     @cached_property
     def t_s(self) -> Array:
@@ -186,32 +183,24 @@ class FlightAnalysis:
         return frames_of(self.log)
 
     @cached_property
-    def motion(self) -> Motion:
-        """Speed and blur at each tick."""
-        return motion_of(self.log)
-
-    @cached_property
     def losses(self) -> tuple[Loss, ...]:
         """When the target was out of sight while it was needed."""
-        return losses_of(self.log, self.frames, self.motion, self.stays)
+        return losses_of(self.log, self.frames, self.stays)
 
     @cached_property
     def vision(self) -> Vision:
         """How well the camera saw over the whole flight."""
-        return vision_of(self.log, self.frames, self.motion, WHOLE_FLIGHT)
+        return vision_of(self.log, self.frames, WHOLE_FLIGHT)
 
     @cached_property
     def vision_led(self) -> Vision:
         """How well it saw in all phases together in which the camera leads."""
-        return vision_of(self.log, self.frames, self.motion, LED_PHASES, LED_BY_CAMERA)
+        return vision_of(self.log, self.frames, LED_PHASES, LED_BY_CAMERA)
 
     @cached_property
     def vision_by_phase(self) -> tuple[Vision, ...]:
         """How well it saw in each of these phases that had a frame."""
-        each = [
-            vision_of(self.log, self.frames, self.motion, phase, (phase,))
-            for phase in LED_BY_CAMERA
-        ]
+        each = [vision_of(self.log, self.frames, phase, (phase,)) for phase in LED_BY_CAMERA]
         return tuple(vision for vision in each if vision.frames)
 
     @cached_property
@@ -229,11 +218,15 @@ class FlightAnalysis:
         """Voltages, charge and load."""
         return battery_of(self.log)
 
-    @cached_property
+    @property
     def findings(self) -> Findings | None:
-        """Latency and mounting as the flight showed them: the summary's, or in a log without its
-        end what the last ticks had worked out. None where neither is there."""
-        return self.summary.findings if self.log.summary is not None else _last_findings(self.log)
+        """Latency and mounting as the flight showed them; None where it did not."""
+        return self.summary.findings
+
+    @cached_property
+    def takeovers(self) -> tuple[Takeover, ...]:
+        """What was sent in the loop's place, each go by itself."""
+        return takeovers_of(self.log.sent_values)
 
     @cached_property
     def measures(self) -> Measures:
@@ -329,29 +322,3 @@ def _stay(
 
 def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-WORKED_OUT = (
-    "delay_s",
-    "delay_sigma_s",
-    *(f"turn_{axis}{part}_rad" for axis in "xyz" for part in ("", "_sigma")),
-)
-
-
-def _last_findings(log: FlightLog) -> Findings | None:
-    newest = next(
-        (r for r in reversed(log.records) if all(r.get(k) is not None for k in WORKED_OUT)), None
-    )
-    if newest is None:
-        return None
-    try:
-        camera = CameraConfig.model_validate(log.setting("camera"))
-    except ValidationError:  # of an older perchctl
-        return None
-    seen = Consistency(
-        delay_s=newest["delay_s"],
-        delay_sigma_s=newest["delay_sigma_s"],
-        turn_rad=tuple(newest[f"turn_{axis}_rad"] for axis in "xyz"),
-        turn_sigma_rad=tuple(newest[f"turn_{axis}_sigma_rad"] for axis in "xyz"),
-    )
-    return flight_findings(seen, camera)

@@ -21,6 +21,7 @@ CAUTION = (
     "after the first difference the world would have answered differently: from there on this is "
     "what the planner would have said to another flight's telemetry and pictures"
 )
+SHOWN_DIGITS = 6
 _MOST_KEYS = 6
 
 
@@ -137,10 +138,23 @@ def _picture_lines(replay: Replay) -> list[str]:
 def difference_text(first: Difference, what_if: bool = False) -> str:
     """``tick 512 at 10.24 s: command.z_m was 1.25, the replay has 1.26``"""
     other = "would be" if what_if else "the replay has"
-    recorded, replayed = json.dumps(first.recorded), json.dumps(first.replayed)
+    recorded, replayed = (json.dumps(_rounded(v)) for v in (first.recorded, first.replayed))
+    if recorded == replayed:  # they differ in the last bits
+        recorded, replayed = json.dumps(first.recorded), json.dumps(first.replayed)
     return (
         f"tick {first.tick} at {first.t_s:.2f} s: {first.field} was {recorded}, {other} {replayed}"
     )
+
+
+def _rounded(value: Any) -> Any:
+    """JSON's own types with every number to `SHOWN_DIGITS`."""
+    if isinstance(value, float):
+        return float(f"{value:.{SHOWN_DIGITS}g}")
+    if isinstance(value, list):
+        return [_rounded(each) for each in value]
+    if isinstance(value, dict):
+        return {key: _rounded(each) for key, each in value.items()}
+    return value
 
 
 def gate_text(gate: Gate) -> str:
@@ -157,13 +171,10 @@ def _times(times_s: Sequence[float]) -> str:
 
 def _change_line(change: Change) -> str:
     mm = ", ".join(f"{1e3 * v:.1f}" for v in (change.x_m, change.y_m, change.z_m))
-    text = (
+    return (
         f"rms:       {change.name}: {mm} mm and {math.degrees(change.yaw_rad):.2f} deg over "
         f"{change.turns} turns"
     )
-    if change.only_flown or change.only_changed:
-        text += f"; {change.only_flown} only as flown, {change.only_changed} only then"
-    return text
 
 
 # --- What another profile would have changed ------------------------------------------------
@@ -181,10 +192,8 @@ class Gate:
 
 @dataclass(frozen=True)
 class Change:
-    """By how much poses from one source, or the filter's, differ: root of the mean square.
-
-    `turns`: those with both; `only_flown`, `only_changed`: those with one.
-    """
+    """By how much poses from one source, or the filter's, differ: root of the mean square over
+    the `turns` with both."""
 
     name: str
     turns: int
@@ -192,8 +201,6 @@ class Change:
     y_m: float
     z_m: float
     yaw_rad: float
-    only_flown: int
-    only_changed: int
 
 
 def changed_gates(replay: Replay) -> list[Gate]:
@@ -237,31 +244,23 @@ def _falls(decided: Iterable[Decided], t0_s: float) -> dict[str, list[float]]:
 _Place = tuple[Array, float]
 
 
-def _of_source(seen: Sequence[Sensed], name: str) -> Iterator[tuple[_Place | None, _Place | None]]:
+def _of_source(seen: Sequence[Sensed], name: str) -> Iterator[tuple[_Place, _Place]]:
     for each in seen:
         one, other = each.turn.poses.get(name), each.poses.get(name)
-        yield (
-            None if one is None else (one.e_m, one.e_yaw_rad),
-            None if other is None else (other.e_m, other.e_yaw_rad),
-        )
+        if one is not None and other is not None:
+            yield (one.e_m, one.e_yaw_rad), (other.e_m, other.e_yaw_rad)
 
 
-def _of_filter(seen: Sequence[Sensed]) -> Iterator[tuple[_Place | None, _Place | None]]:
+def _of_filter(seen: Sequence[Sensed]) -> Iterator[tuple[_Place, _Place]]:
     for each in seen:
         if each.turn.observation is None or each.observation is None:
             continue
         one, other = each.turn.observation.target, each.observation.target
-        yield (
-            None if one is None or not one.tracked else (one.e_m, one.e_yaw_rad),
-            None if other is None or not other.tracked else (other.e_m, other.e_yaw_rad),
-        )
+        if one is not None and other is not None and one.tracked and other.tracked:
+            yield (one.e_m, one.e_yaw_rad), (other.e_m, other.e_yaw_rad)
 
 
-def _change(name: str, pairs: list[tuple[_Place | None, _Place | None]]) -> Change:
-    both = [(a, b) for a, b in pairs if a is not None and b is not None]
-    off = np.array([[*(b[0] - a[0]), wrap_rad(b[1] - a[1])] for a, b in both]).reshape(-1, 4)
-    rms = [math.sqrt(float(np.mean(column**2))) if both else 0.0 for column in off.T]
-    only_flown = sum(a is not None and b is None for a, b in pairs)
-    only_changed = sum(a is None and b is not None for a, b in pairs)
-    x_m, y_m, z_m, yaw_rad = rms
-    return Change(name, len(both), x_m, y_m, z_m, yaw_rad, only_flown, only_changed)
+def _change(name: str, pairs: list[tuple[_Place, _Place]]) -> Change:
+    off = np.array([[*(b[0] - a[0]), wrap_rad(b[1] - a[1])] for a, b in pairs]).reshape(-1, 4)
+    x_m, y_m, z_m, yaw_rad = (math.sqrt(np.mean(v**2)) if pairs else 0.0 for v in off.T)
+    return Change(name, len(pairs), x_m, y_m, z_m, yaw_rad)

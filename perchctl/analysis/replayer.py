@@ -18,9 +18,7 @@ from perchctl.analysis.decide import (
 )
 from perchctl.analysis.sense import (
     Picture,
-    PictureAnother,
     PictureMissing,
-    PicturesUnreadable,
     Sensed,
     older,
     one_thread,
@@ -39,15 +37,13 @@ from perchctl.vision import Pipeline, make_pipeline
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What the senses made of pictures, telemetry and times; or of the last two alone.
+    """What the senses made of pictures, telemetry and times; or of telemetry alone.
 
     Attributes:
         turns: each, seen again, up to where a picture is missing.
         differences: turns of which a pose, or what the planner sees, differs; `first` of them.
         frames: pictures that were looked at, of `frames_flown`.
-        ended: why it ends before the flight does, or empty.
-        another: it ends at a picture that is not the flown one.
-        unreadable: it ends where the recording cannot be read.
+        missing: what ended it before the flight; None where nothing did.
     """
 
     turns: Sequence[Sensed]
@@ -55,16 +51,24 @@ class Seen:
     first: Difference | None
     frames: int = 0
     frames_flown: int = 0
-    ended: str = ""
-    another: bool = False
-    unreadable: bool = False
+    missing: PictureMissing | None = None
+
+    @property
+    def ended(self) -> str:
+        """Why it ends before the flight does, or empty."""
+        return f"{self.missing}: what came after it cannot be seen again" if self.missing else ""
+
+    @property
+    def is_another(self) -> bool:
+        """True if it ends at a picture that is not the flown one."""
+        return self.missing is not None and self.missing.kind == "another"
 
     @property
     def same(self) -> bool:
-        """Of pictures none of which was looked at that is not known; of those that cannot be
-        read, nothing is."""
-        unseen = bool(self.ended) and not self.frames and not self.unreadable
-        return not (self.differences or self.another or unseen)
+        """True if nothing differs. A recording that cannot be read tells of no difference; of one
+        whose first picture is missing nothing is known."""
+        is_unknown = self.missing is not None and self.missing.kind == "missing" and not self.frames
+        return not (self.differences or self.is_another or is_unknown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +78,7 @@ class Replay:
     ticks: how many were flown; `differences`, how many of them were decided otherwise; `first`
         may be of one that was not sent.
     seen: by pictures; None without any.
-    shown: by telemetry and times alone; None where pictures were looked at to the end.
+    shown: by telemetry alone; None where pictures were looked at to the end.
     changed: the keys in which the profile is another than the flown one's.
     gap: which turn is the first that the log has lost, or empty.
     notes: what limits the replay, in sentences.
@@ -109,26 +113,22 @@ def replay(
     As it was flown the planner is given the recorded observations, and the pictures are compared
     for themselves; with another profile it is given what that sees in the pictures. `pipeline`
     looks at them; by default the profile's, with the flown calibration and mask. Without pictures
-    the same goes for what telemetry and times alone give.
+    the same goes for what telemetry alone gives.
     Errors: InvalidValue, NotFound (a calibration or mask that another profile names).
     """
     flown = log.flown_profile
-    whole = whole_turns(log)
-    turns, used = whole.turns, profile or flown
+    turns, gap = whole_turns(log)
+    used = profile or flown
     changed = changed_keys(flown, used)
-    seen = None
+    seen = by_telemetry = None
     if pictures is not None:
         pipeline = pipeline or pipeline_of(log, used, changed)
-        # A source takes the latency off the time at which a picture came.
-        later_s = flown.camera.start_latency_s - used.camera.start_latency_s
-        placed_s = placed_later_s(turns, flown, used)
-        seen = _seen(log, turns, used, pictures, pipeline, later_s, placed_s)
-    by_telemetry = None
-    unseen = seen is None or not (seen.frames or seen.another)
-    if unseen or (seen is not None and seen.ended):
+        seen = _seen(log, turns, flown, used, pictures, pipeline)
+    is_seen = seen is not None and (seen.frames > 0 or seen.is_another)
+    if not is_seen or (seen is not None and seen.missing is not None):
         found = list(shown(turns, flown, used))
         by_telemetry = Seen(found, *_differing(log, turns, found))
-    again, ended = by_telemetry if unseen else seen, "" if seen is None else seen.ended
+    again = seen if is_seen else by_telemetry
     observations: dict[int, Observation | None] = {}
     if again is not None and changed:
         observations = {each.turn.number: each.observation for each in again.turns}
@@ -136,6 +136,7 @@ def replay(
     decided = list(
         decide(turns, used, lambda turn: observations.get(turn.number, turn.observation))
     )
+    ended = "" if seen is None else seen.ended
     return Replay(
         log=log,
         profile=used,
@@ -146,9 +147,9 @@ def replay(
         seen=seen,
         shown=by_telemetry,
         changed=changed,
-        gap=whole.gap,
+        gap=gap,
         notes=(
-            *notes_of(log, whole.gap, ended, changed, pictures=not unseen),
+            *notes_of(log, gap, ended, changed, pictures=is_seen),
             *_failures(decided),
         ),
     )
@@ -189,18 +190,20 @@ def pipeline_of(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -
 def _seen(
     log: FlightLog,
     turns: Sequence[Turn],
+    flown: Profile,
     profile: Profile,
     pictures: Iterable[Picture],
     pipeline: Pipeline,
-    later_s: float,
-    placed_later_s: float,
 ) -> Seen:
+    # A source takes the latency off the time at which a picture came.
+    later_s = flown.camera.start_latency_s - profile.camera.start_latency_s
+    older_s = placed_later_s(turns, flown, profile)
     found: list[Sensed] = []
     missing: PictureMissing | None = None
     with one_thread():
         try:
             for each in sense(turns, profile, pipeline, pictures, later_s):
-                found.append(older(each, placed_later_s))
+                found.append(older(each, older_s))
         except PictureMissing as error:
             missing = error
     return Seen(
@@ -208,9 +211,7 @@ def _seen(
         *_differing(log, turns, found),
         frames=_frames_of(each.turn for each in found),
         frames_flown=_frames_of(turns),
-        ended=f"{missing}: what came after it cannot be seen again" if missing else "",
-        another=isinstance(missing, PictureAnother),
-        unreadable=isinstance(missing, PicturesUnreadable),
+        missing=missing,
     )
 
 
@@ -223,8 +224,10 @@ def _differing(
     if not differing:
         return 0, None
     turn, difference = differing[0]
-    first = Difference(_tick_of(turn, turns, start), turn.t_s - log.start_s, *difference)
-    return len(differing), first
+    tick = turn.number - start
+    if tick > 0:
+        tick = sum(t.role == "flown" for t in turns[start : turn.number])
+    return len(differing), Difference(tick, turn.t_s - log.start_s, *difference)
 
 
 def _failures(decided: Sequence[Decided]) -> Iterator[str]:
@@ -238,30 +241,23 @@ def _frames_of(turns: Iterable[Turn]) -> int:
     return sum(turn.taken.frame is not None and turn.taken.look for turn in turns)
 
 
-def _tick_of(turn: Turn, turns: Sequence[Turn], start: int) -> int:
-    if turn.number < start:
-        return turn.number - start
-    return sum(t.role == "flown" for t in turns[start : turn.number])
-
-
 def _unlike(sensed: Sensed) -> tuple[str, object, object] | None:
     """The first field in which what is seen is not what was seen."""
-    turn, seen = sensed.turn, sensed.observation
-    found = first_differing("poses", turn.poses, sensed.poses)
-    if found is not None or turn.observation is None or seen is None:
-        return found
-    for name in (*SENSED, "position_age_s"):
-        found = first_differing(name, getattr(turn.observation, name), getattr(seen, name))
-        if found is not None:
-            return found
-    return None
+    was, seen = sensed.turn.observation, sensed.observation
+    found = first_differing("poses", sensed.turn.poses, sensed.poses)
+    if found is None and was is not None and seen is not None:
+        names = (*SENSED, "position_age_s")
+        each = (first_differing(n, getattr(was, n), getattr(seen, n)) for n in names)
+        found = next((difference for difference in each if difference is not None), None)
+    return found
 
 
 # --- What limits a replay, in sentences --------------------------------------------------------
 
-
-ON_PICTURES = ("camera", "detector", "pose", "kalman", "merge", "target", "vehicle")
-ON_NEITHER = ("link", "simulation", "log")
+ON_PICTURES = (
+    "camera", "detector", "pose", "kalman", "merge", "target", "vehicle",
+    "safety.max_frame_age_s", "safety.camera_hold_s",
+)  # fmt: skip
 BEFORE_TAKEOFF = (
     "safety.min_rest_v", "safety.estimator_wait_s", "safety.estimator_variance_m2",
     "safety.ground_z_m", "safety.ground_tolerance_m", "safety.start_tilt_deg",
@@ -288,32 +284,24 @@ def notes_of(
     if log.truncated:
         yield "the log ends in the flight, without its summary: replayed is what is there"
     yield from (note for note in (gap, ended) if note)
-    yield from _on_keys(changed, pictures)
+    limits: dict[str, list[str]] = {}
+    for key in changed:
+        limits.setdefault(_limit_of(key, pictures), []).append(key)
+    yield from (f"{', '.join(keys)}: {text}" for text, keys in limits.items() if text)
 
 
-def _on_keys(changed: Sequence[str], pictures: bool) -> Iterator[str]:
-    def those(*sections: str) -> list[str]:
-        return [key for key in changed if key.split(".")[0] in sections]
-
-    told = (
-        (
-            [] if pictures else those(*ON_PICTURES),
-            "what it would change in the pictures cannot be shown, as there are none to look at",
-        ),
-        (
-            [] if pictures else [key for key in changed if key == "safety.max_frame_age_s"],
-            "another picture that is let pass or refused changes the camera's age; what it would "
-            "change in the target's estimate cannot be shown, as there are no pictures to look at",
-        ),
-        (
-            [key for key in those("positioning") if key not in (*ON_AGES, *BEFORE_TAKEOFF)],
+def _limit_of(key: str, pictures: bool) -> str:
+    """What a replay cannot tell of a key; empty where it tells all."""
+    section = key.split(".")[0]
+    if key in BEFORE_TAKEOFF:
+        return "it is asked before take-off only, and a replay begins with the flight"
+    if not pictures and (section in ON_PICTURES or key in ON_PICTURES):
+        return "what it would change in the pictures cannot be shown, as there are none to look at"
+    if section == "positioning" and key not in ON_AGES:
+        return (
             "which positions the vehicle would have been given, and where it would have taken "
-            "itself to be, cannot be shown: a log has only those that it was given",
-        ),
-        (
-            [key for key in changed if key in BEFORE_TAKEOFF],
-            "it is asked before take-off only, and a replay begins with the flight",
-        ),
-        (those(*ON_NEITHER), "a replay has nothing that it acts on"),
-    )
-    yield from (f"{', '.join(keys)}: {text}" for keys, text in told if keys)
+            "itself to be, cannot be shown: a log has only those that it was given"
+        )
+    if section in ("link", "simulation", "log"):
+        return "a replay has nothing that it acts on"
+    return ""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import base64
 import math
 import os
-import re
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -21,12 +20,12 @@ from numpy.typing import NDArray
 import perchctl
 from perchctl.analysis.advice import Advice, advice_of
 from perchctl.analysis.edges import timings_of
-from perchctl.analysis.figures import battery_figure, flight_figures, histogram, trend
 from perchctl.analysis.flight import FlightAnalysis
+from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
 from perchctl.analysis.sight import percentile
 from perchctl.analysis.story import SEVEN, Sentence, story_of
-from perchctl.analysis.words import count, kept_together, length, milliseconds, share
+from perchctl.analysis.words import count, length, milliseconds, share
 from perchctl.errors import PerchError
 from perchctl.files import write_files
 from perchctl.geometry import Array
@@ -42,7 +41,7 @@ TITLES = {
     UNFINISHED: "Unfinished: the log has no end",
 }
 GRADES = {"perched": "good", "landed": "warn"}
-MOST_STRETCHES, MOST_STOPS = 4, 6
+MOST_STOPS = 6
 
 
 def write_report(log_paths: Sequence[Path], output: Path) -> Report:
@@ -95,9 +94,7 @@ def reported_flight(log_path: Path) -> ReportedFlight:
     if not recording.is_file():
         return ReportedFlight(flight)
     with log_values(log_path):
-        return with_pictures(
-            flight, lambda numbers: recorded_pictures(recording, exact=False, numbers=numbers)
-        )
+        return with_pictures(flight, recording)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +190,6 @@ class ReportedFlight:
                 milliseconds(vision.age_s),
                 milliseconds(vision.age_most_s),
                 _known(f"{vision.misfit_px:.2f} px"),
-                _known(f"{vision.blur_px:.1f}, {vision.blur_most_px:.1f} px"),
             )
             for vision in (*self.flight.vision_by_phase, self.flight.vision_led)
         ]
@@ -204,41 +200,12 @@ class ReportedFlight:
         return max((float(b - a) for a, b in self.flight.frames.gaps_s), default=0.0)
 
     @property
-    def old_telemetry(self) -> str:
-        """When telemetry was old; empty where it never was."""
-        old = self.flight.link.old
-        shown = [f"at {start:.1f} s up to {milliseconds(worst)}" for start, _, worst in old]
-        first = ", ".join(shown[:MOST_STRETCHES])
-        rest = len(old) - MOST_STRETCHES
-        return first if rest <= 0 else f"{first}, and {rest} more"
-
-    @property
-    def commands(self) -> str:
-        """How many turns sent each kind of command."""
-        return ", ".join(f"{kind} {number}" for kind, number in self.flight.link.sent)
-
-    @property
     def stops(self) -> str:
         """When and why no external position was sent."""
         stops = () if self.flight.external is None else self.flight.external.stops
         return "; ".join(
             f"at {a:.1f} s for {b - a:.1f} s: {why}" for a, b, why in stops[:MOST_STOPS]
         )
-
-    @property
-    def battery_rows(self) -> list[tuple[str, ...]]:
-        """Of each phase."""
-        return [
-            (
-                phase.phase,
-                f"{phase.duration_s:.1f} s",
-                f"{phase.used_mah:.1f} mAh",
-                f"{phase.mean_thrust / 655.35:.0f} %",
-                _known(f"{phase.lowest_v:.2f} V"),
-            )
-            for phase in self.flight.battery.phases
-            if phase.duration_s > 0
-        ]
 
     @cached_property
     def timings(self) -> dict[str, Array]:
@@ -262,67 +229,28 @@ def _known(text: str) -> str:
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """No script, nothing from elsewhere: the browser holds the page to it."""
-SESSION = "flights"
 
 
 def page_of(flights: Sequence[ReportedFlight]) -> str:
     """HTML that needs nothing else. `flights` has at least one. Raises InvalidValue for a value
     that no flight writes."""
-    is_session = len(flights) > 1
-    articles = [
-        _article(told, number, SESSION if is_session else "")
-        for number, told in enumerate(flights, start=1)
-    ]
+    articles = []
+    for number, told in enumerate(flights, start=1):
+        with log_values(told.flight.log.path):
+            articles.append(_render("flight.html", told=told, flight=told.flight, number=number,
+                                    is_session=len(flights) > 1))  # fmt: skip
     return _render(
         "page.html",
         flights=flights,
         articles=articles,
-        session=_session(flights) if is_session else "",
         counts=Report(tuple(flights)).counts_text,
         policy=POLICY,
         version=perchctl.__version__,
     )
 
 
-def _article(told: ReportedFlight, number: int, back: str) -> Markup:
-    with log_values(told.flight.log.path):
-        html = _render(
-            "flight.html",
-            told=told,
-            flight=told.flight,
-            number=number,
-            back=back,
-            seven_phases=SEVEN,
-            latency_text=latency_text,
-            turn_text=turn_text,
-            flight_figures=flight_figures,
-            battery_figure=battery_figure,
-            histogram=histogram,
-        )
-    return _with_own_ids(html, f"f{number}-")
-
-
-def _session(flights: Sequence[ReportedFlight]) -> Markup:
-    each = [told.flight for told in flights]
-    misses_mm = [math.nan if f.summary.miss_m is None else 1e3 * f.summary.miss_m for f in each]
-    trends = [
-        trend("miss [mm]", misses_mm),
-        trend("aligning [s]", [told.align_s for told in flights]),
-        trend("lowest battery [V]", [flight.battery.lowest_v for flight in each]),
-        trend("used [mAh]", [flight.battery.used_mah for flight in each]),
-    ]
-    html = _render("session.html", flights=flights, session=SESSION, trends=trends)
-    return _with_own_ids(html, "session-")
-
-
-def _with_own_ids(html: str, prefix: str) -> Markup:
-    """The figures' names are this flight's: another's may be the same."""
-    own = re.sub(r'(<(?:path|clipPath|g|rect) id=")', rf"\g<1>{prefix}", html)
-    return Markup(re.sub(r'(<use href="#|url\(#)', rf"\g<1>{prefix}", own))
-
-
-def _render(name: str, **values: Any) -> str:
-    return _templates().get_template(name).render(values)
+def _render(name: str, **values: Any) -> Markup:
+    return Markup(_templates().get_template(name).render(values))
 
 
 @cache
@@ -336,22 +264,28 @@ def _templates() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     templates.filters.update(
-        together=kept_together,
         length_text=length,
         milliseconds=milliseconds,
         share=share,
         count=count,
     )
+    templates.globals.update(
+        seven_phases=SEVEN, latency_text=latency_text, turn_text=turn_text, plot_of=plot_address
+    )
     templates.tests["finite"] = math.isfinite
     return templates
 
 
+def plot_address(flight: FlightAnalysis) -> str:
+    """The flight's plot as a `data:` address; the log has at least one tick."""
+    return _address("png", flight_png(flight))
+
+
+def _address(kind: str, image: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(image).decode('ascii')}"
+
+
 # --- What the camera saw when the mission decided: out of the recording beside the log ---------
-
-
-Recorded = Callable[[Collection[int]], Iterable[tuple[int, float, NDArray[np.uint8]]]]
-"""Gives the frames of some numbers: number, time, and the picture as the pipeline had it. Raises
-PerchError where the recording cannot be read."""
 
 DECIDED = {"ESTIMATE": "found", "ASCEND": "aligned", "PERCH": "settled", "COMPLETE": "contact"}
 OLD_S = 0.2
@@ -391,13 +325,7 @@ class Shown:
 
     @property
     def address(self) -> str:
-        return "data:image/jpeg;base64," + base64.b64encode(self.jpeg).decode("ascii")
-
-
-def with_pictures(flight: FlightAnalysis, recorded: Recorded) -> ReportedFlight:
-    """The flight with the pictures of its decisions, as far as the recording can be read."""
-    shown, problem = shown_of(decisions_of(flight), recorded)
-    return ReportedFlight(flight, shown, problem.replace(f"{flight.log.path.parent}{os.sep}", ""))
+        return _address("jpeg", self.jpeg)
 
 
 def decisions_of(flight: FlightAnalysis) -> tuple[Decision, ...]:
@@ -407,7 +335,8 @@ def decisions_of(flight: FlightAnalysis) -> tuple[Decision, ...]:
         moments.append((loss.start_s + min(loss.duration_s, 0.5), "lost"))
     found = []
     for t_s, name in sorted(moments):
-        record = _frame_before(flight, t_s)
+        until_then = flight.log.records[flight.index_at(t_s) :: -1]
+        record = next((r for r in until_then if r.get("frame") is not None), None)
         if record is not None:
             seen_s = flight.log.since(float(record["t_s"]))
             found.append(Decision(t_s, name, int(record["frame"]), record, seen_s))
@@ -416,33 +345,24 @@ def decisions_of(flight: FlightAnalysis) -> tuple[Decision, ...]:
     return tuple(found)
 
 
-def _frame_before(flight: FlightAnalysis, t_s: float) -> dict[str, Any] | None:
-    for record in flight.log.records[flight.index_at(t_s) :: -1]:
-        if record.get("frame") is not None:
-            return record
-    return None
-
-
-def shown_of(decisions: Iterable[Decision], recorded: Recorded) -> tuple[tuple[Shown, ...], str]:
-    """Those whose picture is in the recording, and why others could not be read, or nothing."""
+def with_pictures(flight: FlightAnalysis, recording: Path) -> ReportedFlight:
+    """The flight with the pictures of its decisions, as far as the recording can be read."""
     wanted: dict[int, list[Decision]] = {}
-    for decision in decisions:
+    for decision in decisions_of(flight):
         wanted.setdefault(decision.frame, []).append(decision)
-    found: list[Shown] = []
+    shown: list[Shown] = []
     problem = ""
     try:
-        for number, _t_s, image in recorded(wanted.keys()) if wanted else ():
-            for decision in wanted.pop(number, ()):
-                found.append(Shown(decision, _jpeg(decision, image)))
-            if not wanted:
-                break
+        for number, _, image in recorded_pictures(recording, exact=False, numbers=wanted.keys()):
+            shown += [Shown(decision, _jpeg(decision, image)) for decision in wanted[number]]
     except PerchError as error:
-        problem = str(error)
-    return tuple(sorted(found, key=lambda shown: shown.decision.t_s)), problem
+        problem = str(error).replace(f"{flight.log.path.parent}{os.sep}", "")
+    in_order = tuple(sorted(shown, key=lambda each: each.decision.t_s))
+    return ReportedFlight(flight, in_order, problem)
 
 
 def _jpeg(decision: Decision, image: NDArray[np.uint8]) -> bytes:
-    drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
+    drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     scale = min(1.0, WIDEST_PX / drawn.shape[1])
     if scale < 1.0:
         drawn = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

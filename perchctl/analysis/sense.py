@@ -6,37 +6,37 @@ The same pictures, samples and times have to give the same poses, to the bit, on
 from __future__ import annotations
 
 import contextlib
-import math
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.flight import ENDED_TEXT, SENSED, FlightInputs, lateness_text
+from perchctl.flight import ENDED_TEXT, SENSED, FlightInputs
 from perchctl.mission import FrameSeen, Observation, PoseSeen, Turn, TurnInputs
 from perchctl.perception import History, add_late_samples, add_samples, battery_age_s
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
-from perchctl.vision import Frame, Pipeline, TargetEstimate
+from perchctl.vision import Frame, Pipeline
 
 Picture = tuple[int, float, NDArray[np.uint8]]
 """Of a frame: its number, its time as the source gave it, and the picture that was looked at."""
 
 
 class PictureMissing(Exception):
-    """The replay of pictures ends here; the message says why."""
+    """The replay of pictures ends here; the message says why.
 
+    `kind`: the picture is ``missing``; it is ``another`` than the flown one; or the recording is
+    ``unreadable``.
+    """
 
-class PictureAnother(PictureMissing):
-    """It is there, and not the one that was flown by."""
-
-
-class PicturesUnreadable(PictureMissing):
-    """What should hold them is damaged, or is no recording."""
+    def __init__(self, message: str, kind: Literal["missing", "another", "unreadable"] = "missing"):
+        super().__init__(message)
+        self.kind = kind
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,9 @@ class _Given:
         for index, t_s, image in self._pictures:
             if (index, t_s) == (seen.index, seen.t_s):
                 if seen.checksum not in (None, zlib.crc32(image.tobytes())):
-                    raise PictureAnother(f"the picture of frame {seen.index} is another one")
+                    raise PictureMissing(
+                        f"the picture of frame {seen.index} is another one", "another"
+                    )
                 return image
             if index > seen.index:
                 break
@@ -161,7 +163,7 @@ def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
     try:
         yield from pictures
     except (InvalidValue, NotFound) as error:
-        raise PicturesUnreadable(str(error)) from error
+        raise PictureMissing(str(error), "unreadable") from error
 
 
 def _observed(turn: Turn, inputs: FlightInputs) -> Observation | None:
@@ -183,32 +185,15 @@ def one_thread() -> Iterator[None]:
 
 
 # --- What the planner would be shown, from a log alone ------------------------------------------
-# The part of the inputs that needs no picture.
-# Telemetry and the frames' times are recorded, so whether the estimate jumped, how old battery and
-# camera are, and which picture came too late can be judged anew. What a picture showed cannot: the
-# target stays where it was estimated in the flight.
-
-
-@dataclass
-class _Camera:
-    """What a replay remembers of the camera from one turn to the next.
-
-    `told` is the trouble as it was recorded, `problem` as the replay has it; `alive`: the filter's
-    own word on whether it tracks, which a stale or unwatched picture hides.
-    """
-
-    young_s: list[float] = field(default_factory=list)  # turns before take-off with such a picture
-    before: Observation | None = None
-    good_s: float = -math.inf
-    problem: str | None = None
-    alive: bool = False
+# The part of the inputs that needs no picture: whether the estimate jumped, how far the heading
+# stepped, and how old the battery's reading is. What a picture showed is as it was in the flight.
 
 
 def shown(turns: Sequence[Turn], flown: Profile, profile: Profile) -> Iterator[Sensed]:
     """Each turn, in order, from the first before take-off on: `flown` is the profile that it was
-    flown by, `profile` the one whose `safety` and `positioning` count. With the same one twice
-    the observations are the recorded ones, to the bit."""
-    history, camera = History(), _Camera()
+    flown by, `profile` the one whose `safety.jump_*` and `positioning.latency_s` count. With the
+    same one twice the observations are the recorded ones, to the bit."""
+    history = History()
     later_s = placed_later_s(turns, flown, profile)
     for turn in turns:
         history = add_samples(history, list(turn.taken.samples), profile.safety)
@@ -216,12 +201,10 @@ def shown(turns: Sequence[Turn], flown: Profile, profile: Profile) -> Iterator[S
             history = add_late_samples(history, list(turn.taken.late), profile.safety)
         obs, newest = turn.observation, history.newest
         if obs is None or newest is None:
-            if _is_judged(turn) and _late(turn, 0.0, profile) is None:
-                camera.young_s.append(turn.began_s)
             yield Sensed(turn, turn.poses, None)
             continue
         again = replace(
-            _pictured(turn, obs, camera, flown, profile),
+            obs,
             telemetry=newest,
             battery_age_s=battery_age_s(history, turn.t_s),
             jumped=history.jumped,
@@ -244,70 +227,3 @@ def older(sensed: Sensed, later_s: float) -> Sensed:
         return sensed
     aged = replace(obs, position_age_s=obs.position_age_s + later_s)
     return replace(sensed, observation=aged)
-
-
-def _pictured(
-    turn: Turn, obs: Observation, camera: _Camera, flown: Profile, profile: Profile
-) -> Observation:
-    """The observation with another `max_frame_age_s` and `camera_hold_s`.
-
-    A good picture makes the camera's age 0, and nothing else does.
-    """
-    before = camera.before
-    if before is None:
-        camera.good_s = _good_before(obs, camera.young_s)
-    good = was_good = obs.camera_age_s == 0.0
-    used_s = obs.delay_s if before is None else before.delay_s
-    was_late, late = _late(turn, used_s, flown), _late(turn, used_s, profile)
-    was_late = None if was_good or obs.camera_problem != was_late else was_late
-    if late is not None and (was_good or was_late is not None):
-        good, camera.problem = False, late
-    elif was_late is not None:
-        good, camera.problem = True, None
-    elif was_good or before is None or obs.camera_problem != before.camera_problem:
-        camera.problem = obs.camera_problem
-    if good:
-        camera.good_s = turn.t_s
-    camera.before = obs
-    return replace(
-        obs,
-        target=_target(turn, obs, camera, flown, profile),
-        new_frame=obs.new_frame and good,
-        camera_age_s=turn.t_s - camera.good_s,
-        camera_problem=camera.problem,
-    )
-
-
-def _target(
-    turn: Turn, obs: Observation, camera: _Camera, flown: Profile, profile: Profile
-) -> TargetEstimate | None:
-    """As it was estimated, and tracked while pictures are fresh and looked at."""
-    target = obs.target
-    if target is None:
-        return None
-    if turn.taken.look and obs.camera_age_s <= flown.safety.camera_hold_s:
-        camera.alive = target.tracked
-    fresh = turn.t_s - camera.good_s <= profile.safety.camera_hold_s
-    tracked = camera.alive and turn.taken.look and fresh
-    return target if tracked == target.tracked else replace(target, tracked=tracked)
-
-
-def _is_judged(turn: Turn) -> bool:
-    """It has a frame that is no old one once more."""
-    taken = turn.taken
-    return taken.frame is not None and not taken.frame.repeated and taken.problem is None
-
-
-def _late(turn: Turn, used_s: float, profile: Profile) -> str | None:
-    """What is said of its frame, where that is too old; `used_s` was taken off its time."""
-    frame = turn.taken.frame
-    if frame is None or not (_is_judged(turn) and turn.taken.live):
-        return None
-    return lateness_text(turn.began_s - (frame.t_s - used_s), profile.safety)
-
-
-def _good_before(obs: Observation, young_s: Iterable[float]) -> float:
-    """When the last good picture came before take-off: one that is young enough, and no newer
-    than the one from which the recorded age counts."""
-    good_s = (t_s for t_s in young_s if obs.t_s - t_s >= obs.camera_age_s)
-    return max(good_s, default=-math.inf)

@@ -3,16 +3,15 @@ the logs of a folder, a line each."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.errors import NotFound, PerchError
-from perchctl.log import FlightLog, FlightSummary, read_ends, summarise_flight, summary_text
+from perchctl.log import FlightLog, FlightSummary, read_log, summary_text
 
 COLUMNS = 79
 _HANG = 11
@@ -66,7 +65,7 @@ def show_record(flight: FlightAnalysis) -> dict[str, Any]:
                 "end_s": _rounded(log.since(go.end_s)),
                 "commands": dict(go.sent),
             }
-            for go in log.takeovers
+            for go in flight.takeovers
         ],
         "notes": [{"t_s": _rounded(t_s), "note": note} for t_s, note in flight.notes],
     }
@@ -92,7 +91,7 @@ def show_text(flight: FlightAnalysis) -> str:
         "  at [s]  for [s]  sent by    in the loop's place",
         [
             (f"{_span(log.since(go.start_s), go.end_s - go.start_s)}{go.by:<10} ", go.text)
-            for go in log.takeovers
+            for go in flight.takeovers
         ],
     )
     lines += _table("  at [s]  note", [(f"{_rounded(at):8.2f}  ", n) for at, n in flight.notes])
@@ -126,12 +125,6 @@ def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
         yield from _named(name, text.strip())
     if log.summary is None:
         yield from _named("log lost", "its end: the program was killed, or the disk failed")
-    if log.turn_records and not log.records:
-        yield from _named(
-            "ticks",
-            f"left out of this log; its {len(log.turn_records)} turns are whole: perchctl log "
-            f"replay decides them again",
-        )
     if log.ignored_bytes:
         yield from _named("log lost", f"its tail, {log.ignored_bytes} unreadable bytes")
 
@@ -218,40 +211,9 @@ SUFFIXES = (".jsonl", ".jsonl.gz")
 _BEGIN = b'{"kind":"header","format":"perchctl-flight-log"'
 _NAME = "flight_"
 _PACKED = b"\x1f\x8b"
-
-
-@dataclass(frozen=True)
-class Listed:
-    """One log of a folder. Of a file that cannot be read `problem` says why, and the rest is
-    empty."""
-
-    path: Path
-    header: dict[str, Any]
-    summary: FlightSummary | None
-    problem: str | None = None
-
-    @property
-    def how(self) -> str:
-        """How it ended, or why it cannot be read."""
-        end = self.summary
-        if end is None:
-            return self.problem or ""
-        if end.outcome == "perched":
-            return "perched" if end.miss_m is None else f"perched, {end.miss_m * 1e3:.1f} mm"
-        return f"{end.outcome}: {end.reason}".rstrip(": ")
-
-    def record(self) -> dict[str, Any]:
-        """The same as JSON's own types."""
-        keys = ("outcome", "reason", "duration_s", "miss_m")
-        profile = self.header.get("profile")
-        return {
-            "log": str(self.path),
-            "started_utc": self.header.get("started_utc"),
-            "profile": profile.get("name") if isinstance(profile, dict) else None,
-            "seed": self.header.get("seed"),
-            **{key: getattr(self.summary, key, None) for key in keys},
-            "problem": self.problem,
-        }
+_LISTED = (
+    "log", "started_utc", "profile", "seed", "outcome", "reason", "duration_s", "miss_m", "problem",
+)  # fmt: skip
 
 
 def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
@@ -260,7 +222,8 @@ def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
     What only ends like one is not among them. Errors: NotFound.
     """
     try:
-        names = [name for name in os.listdir(folder) if name.endswith(SUFFIXES)]
+        logs = [path for path in folder.iterdir() if _is_log(path)]
+        logs.sort(key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
     except FileNotFoundError:
         raise NotFound(
             f"there is no folder {folder} with flight logs: name a log, or its folder"
@@ -269,71 +232,66 @@ def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
         raise NotFound(f"{folder} is a file, not a folder") from None
     except OSError as error:
         raise NotFound(f"the folder {folder} cannot be read: {error.strerror}") from None
-    aged = [(_changed_ns(folder / name), name) for name in names]
-    logs: list[Path] = []
-    for _, name in sorted(aged, reverse=True):
-        if most is not None and len(logs) >= most:
-            break
-        if _is_log(folder / name):
-            logs.append(folder / name)
     if not logs:
         raise NotFound(f"the folder {folder} holds no flight log: name a log, or another folder")
-    return logs
+    return logs[:most]
 
 
-@dataclass(frozen=True)
-class LogList:
-    """The newest logs of a folder, and how each ended."""
-
-    folder: Path
-    logs: tuple[Listed, ...]
-
-    @classmethod
-    def of(cls, folder: Path, most: int | None = None) -> LogList:
-        """As `newest_logs`. Errors: NotFound."""
-        return cls(folder, tuple(list_log(path) for path in newest_logs(folder, most)))
-
-    def record(self) -> dict[str, Any]:
-        """The list as JSON's own types."""
-        return {"folder": str(self.folder), "logs": [each.record() for each in self.logs]}
-
-    def text(self) -> str:
-        """A line each log, as wide as a terminal of 80 columns."""
-        width = min(44, max([3, *(len(plain(each.path.name)) for each in self.logs)]))
-        room = COLUMNS - width - 10
-        lines = [f"{'log':<{width}}  {'s':>6}  how it ended"]
-        for each in self.logs:
-            name = _cut(plain(each.path.name), width)
-            seconds = "-" if each.summary is None else f"{each.summary.duration_s:.1f}"
-            lines.append(f"{name:<{width}}  {seconds:>6}  {_cut(plain(each.how), room)}".rstrip())
-        return "\n".join(lines)
+def list_logs(folder: Path, most: int | None = None) -> list[dict[str, Any]]:
+    """The newest logs of a folder, each with how it ended, as JSON's own types. Of a file that
+    cannot be read `problem` says why, and the rest is None. Errors: NotFound."""
+    return [list_log(path) for path in newest_logs(folder, most)]
 
 
-def list_log(path: Path) -> Listed:
-    """A log's header and end. Never raises for a file that is bad."""
+def list_log(path: Path) -> dict[str, Any]:
+    """One log of a folder, by its header and end. Never raises for a file that is bad."""
+    found: dict[str, Any] = dict.fromkeys(_LISTED) | {"log": str(path)}
     try:
-        log = read_ends(path)
-        return Listed(path, log.header, summarise_flight(log))
+        log = read_log(path, ends_suffice=True)
+        end = FlightSummary.of(log)
     except PerchError as error:
-        return Listed(path, {}, None, str(error).removeprefix(f"{path}: "))
+        return found | {"problem": str(error).removeprefix(f"{path}: ")}
     except (TypeError, ValueError) as error:
-        return Listed(path, {}, None, f"it holds what is no flight's ({error})")
+        return found | {"problem": f"it holds what is no flight's ({error})"}
+    return found | {
+        "started_utc": log.header.get("started_utc"),
+        "profile": log.profile_name,
+        "seed": log.header.get("seed"),
+        "outcome": end.outcome,
+        "reason": end.reason,
+        "duration_s": end.duration_s,
+        "miss_m": end.miss_m,
+    }
+
+
+def list_text(logs: Sequence[Mapping[str, Any]]) -> str:
+    """The records of `list_logs`, a line each, as wide as a terminal of 80 columns."""
+    names = [plain(Path(each["log"]).name) for each in logs]
+    width = min(44, max([3, *map(len, names)]))
+    lines = [f"{'log':<{width}}  {'s':>6}  how it ended"]
+    for name, each in zip(names, logs, strict=True):
+        seconds = "-" if each["duration_s"] is None else f"{each['duration_s']:.1f}"
+        how = _cut(plain(_how(each)), COLUMNS - width - 10)
+        lines.append(f"{_cut(name, width):<{width}}  {seconds:>6}  {how}".rstrip())
+    return "\n".join(lines)
+
+
+def _how(listed: Mapping[str, Any]) -> str:
+    """How a flight ended, or why its log cannot be read."""
+    if listed["problem"] is not None:
+        return str(listed["problem"])
+    if listed["outcome"] == "perched":
+        miss_m = listed["miss_m"]
+        return "perched" if miss_m is None else f"perched, {miss_m * 1e3:.1f} mm"
+    return f"{listed['outcome']}: {listed['reason']}".rstrip(": ")
 
 
 def _is_log(path: Path) -> bool:
     """By its begin; by its name where that is lost, as a flight that left nothing is one, too."""
+    if not path.name.endswith(SUFFIXES) or path.is_dir():
+        return False
     if path.name.startswith(_NAME):
         return True
-    try:
-        with path.open("rb") as stream:
-            begin = stream.read(len(_BEGIN))
-    except OSError:
-        return False
+    with path.open("rb") as stream:
+        begin = stream.read(len(_BEGIN))
     return begin == _BEGIN or begin.startswith(_PACKED)
-
-
-def _changed_ns(path: Path) -> int:
-    try:
-        return path.stat().st_mtime_ns
-    except OSError:
-        return 0

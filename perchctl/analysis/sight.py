@@ -1,11 +1,10 @@
-"""What the camera saw in a flight, read off its log: frames, losses, motion in the picture."""
+"""What the camera saw in a flight, read off its log: frames, how good they were, and losses."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -119,7 +118,6 @@ class Vision:
         age_s, age_most_s: age of the picture when it was used: median, and 95 of 100 are below.
         misfit_px: by what the corners miss the pose, median. Four corners alone fit nearly any
             pose: where both markers were ever seen, only such frames count.
-        blur_px, blur_most_px: median, and 95 of 100 are below.
         strangers: frames whose pose was not taken for the target's.
     """
 
@@ -130,8 +128,6 @@ class Vision:
     age_s: float
     age_most_s: float
     misfit_px: float
-    blur_px: float
-    blur_most_px: float
     strangers: int
 
     @property
@@ -140,7 +136,7 @@ class Vision:
 
 
 def vision_of(
-    log: FlightLog, frames: Frames, motion: Motion, name: str, phases: Sequence[str] | None = None
+    log: FlightLog, frames: Frames, name: str, phases: Sequence[str] | None = None
 ) -> Vision:
     """Of the frames that came in the phases; None is all of the flight."""
     inside = [
@@ -148,10 +144,8 @@ def vision_of(
         for k, i in enumerate(frames.ticks)
         if phases is None or log.records[i].get("phase") in phases
     ]
-    ticks = frames.ticks[inside]
-    records = [log.records[i] for i in ticks]
+    records = [log.records[i] for i in frames.ticks[inside]]
     ages = np.array([r["t_s"] - r["frame_t_s"] for r in records], dtype=np.float64)
-    blur = motion.blur_px[ticks]
     between_s = np.diff(np.sort(frames.t_s[inside]))
     period_s = percentile(between_s[between_s > 0], 50)
     return Vision(
@@ -162,8 +156,6 @@ def vision_of(
         percentile(ages, 50),
         percentile(ages, 95),
         _misfit_px(records),
-        percentile(blur, 50),
-        percentile(blur, 95),
         sum(bool(r.get("lock_note")) for r in records),
     )
 
@@ -183,7 +175,7 @@ LEAST_LOSS_S = 0.3
 NEEDED_IN = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH", "RECOVER"})
 AT_THE_CEILING = frozenset({"COMPLETE", "PERCHED"})
 BEGINNING_S = 1.0
-"""The cause of a loss is looked for in its first second."""
+"""How fast the vehicle was is looked for in the first second of a loss."""
 
 
 @dataclass(frozen=True)
@@ -193,8 +185,7 @@ class Loss:
 
     Attributes:
         frames: how many came without the target; 0: no picture came at all.
-        blur_px, flow_pxps, speed_mps: the fastest motion in the picture at its beginning,
-            and the vehicle's speed then; NaN where unknown.
+        speed_mps: the vehicle's highest speed at its beginning; NaN where unknown.
         phase: the one in which it went out of sight.
     """
 
@@ -202,8 +193,6 @@ class Loss:
     end_s: float
     regained: bool
     frames: int
-    blur_px: float
-    flow_pxps: float
     speed_mps: float
     phase: str
 
@@ -212,10 +201,9 @@ class Loss:
         return self.end_s - self.start_s
 
 
-def losses_of(
-    log: FlightLog, frames: Frames, motion: Motion, stays: Sequence[Stay]
-) -> tuple[Loss, ...]:
+def losses_of(log: FlightLog, frames: Frames, stays: Sequence[Stay]) -> tuple[Loss, ...]:
     """All losses in order. A vehicle at the ceiling looks at nothing, and loses nothing."""
+    speed_mps = np.linalg.norm([log.column(f"v{axis}_mps") for axis in "xyz"], axis=0)
     starts_s = [float(t_s) for t_s in frames.seen_s]
     ends_s = [*starts_s[1:], log.end_s]
     found = []
@@ -230,7 +218,7 @@ def losses_of(
                     end_s,
                     start_s != starts_s[-1],
                     int(np.count_nonzero(unseen)),
-                    *_fastest(motion, beginning),
+                    percentile(speed_mps[beginning], 100),
                     _phase_at(stays, start_s + LEAST_LOSS_S / 2),
                 )
             )
@@ -254,15 +242,6 @@ def _end_of_loss(start_s: float, end_s: float, stays: Sequence[Stay]) -> float |
     return end_s
 
 
-def _fastest(motion: Motion, ticks: slice) -> tuple[float, float, float]:
-    """Blur, flow and speed where the flow is fastest."""
-    flow, speed = motion.flow_pxps[ticks], motion.speed_mps[ticks]
-    if not np.isfinite(flow).any():
-        return math.nan, math.nan, float(np.nanmax(speed, initial=0.0))
-    worst = int(np.nanargmax(flow))
-    return float(motion.blur_px[ticks][worst]), float(flow[worst]), float(speed[worst])
-
-
 def _phase_at(stays: Sequence[Stay], t_s: float) -> str:
     return next((s.phase for s in reversed(stays) if s.start_s <= t_s), "")
 
@@ -275,111 +254,3 @@ def within(times_s: Array, start_s: float, end_s: float) -> slice:
     """The ticks from one time to another."""
     first, last = np.searchsorted(times_s, (start_s - SAME_S / 2, end_s + SAME_S / 2))
     return slice(int(first), int(last))
-
-
-# --- How fast the target moved through the picture: what blurs a marker -------------------------
-# The blur is a path's length in the exposure, not the lens's own. It is known where the exposure
-# is: in a simulation, or where `camera.controls` set it.
-
-LOOKS_UP_DEG = 20.0
-"""A camera that is tilted more has another geometry than this one."""
-NEAREST_M = 0.05
-SMOOTHED_S = 0.06
-"""Over it a rate is taken, since a telemetry sample may stand for several turns."""
-UVC_UNIT_S = 1e-4
-EXPOSURES = ("exposure_time_absolute", "exposure_absolute")
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """Over the ticks, (n,), NaN where it is unknown.
-
-    Attributes:
-        speed_mps: of the vehicle by its own estimate.
-        flow_pxps: of the target's centre through the picture.
-        exposure_s: None where nobody knows it.
-    """
-
-    speed_mps: Array
-    flow_pxps: Array
-    exposure_s: float | None
-
-    @cached_property
-    def blur_px(self) -> Array:
-        return self.flow_pxps * (math.nan if self.exposure_s is None else self.exposure_s)
-
-
-def motion_of(log: FlightLog) -> Motion:
-    """The motion at every tick of the flight."""
-    velocity = np.stack([log.column(f"v{axis}_mps") for axis in "xyz"], axis=1)
-    speed = np.linalg.norm(velocity, axis=1)
-    focal_px = focal_px_of(log)
-    flow = np.full(speed.shape, np.nan)
-    if focal_px is not None and len(log.records) >= 2:
-        flow = focal_px * _angular_rate(log, velocity)
-    return Motion(speed, flow, exposure_s_of(log))
-
-
-def exposure_s_of(log: FlightLog) -> float | None:
-    """The time for which a picture was exposed; None where the log does not hold it."""
-    if str(log.header.get("uri", "")).startswith("sim://"):
-        return log.number("simulation.camera_exposure_s")
-    known = [units for n in EXPOSURES if (units := log.number(f"camera.controls.{n}")) is not None]
-    return known[0] * UVC_UNIT_S if known else None
-
-
-def focal_px_of(log: FlightLog) -> float | None:
-    """The camera's focal length, px: from the size of the markers where the poses place them."""
-    side_m, up_m = log.number("target.large.side_m"), _to_camera_m(log)[2]
-    if side_m is None:
-        return None
-    found = []
-    for record in log.records:
-        distances_m = [record[f"{s}z_m"] for s in "jls" if record.get(f"{s}z_m") is not None]
-        corners = record.get("large_px")
-        if distances_m and corners and len(corners) == 8:
-            x, y = np.array(corners, dtype=np.float64).reshape(4, 2).T
-            area_px2 = 0.5 * float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
-            found.append(math.sqrt(abs(area_px2)) * (distances_m[0] + up_m) / side_m)
-    return float(np.median(found)) if found else None
-
-
-def _angular_rate(log: FlightLog, velocity_mps: Array) -> Array:
-    """Of the target's direction in the camera, 1/s in the picture's plane."""
-    yaw = np.unwrap(np.nan_to_num(log.column("yaw_rad")))
-    angles = (
-        np.nan_to_num(log.column("roll_rad")),
-        np.nan_to_num(log.column("pitch_rad")),
-        yaw,
-    )
-    turns = np.stack([_rate(log.column("t_s"), angle) for angle in angles], axis=1)
-    place = np.stack([log.column(f"e{axis}_m") for axis in "xyz"], axis=1)
-    place = place + np.array(_to_camera_m(log))
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    vx, vy, vz = velocity_mps.T
-    level = np.stack([cos * vx + sin * vy, cos * vy - sin * vx, vz], axis=1)
-    moves = -level - np.cross(turns, place)
-    z = np.where(place[:, 2] > NEAREST_M, place[:, 2], np.nan)
-    flow = moves[:, :2] / z[:, None] - place[:, :2] * (moves[:, 2] / z**2)[:, None]
-    rate: Array = np.linalg.norm(flow, axis=1)
-    return rate
-
-
-def _to_camera_m(log: FlightLog) -> tuple[float, float, float]:
-    """From a place relative to the gear to one relative to the camera; NaN where the camera does
-    not look up."""
-    gear = log.setting("vehicle.gear_body_m") or (0.0, 0.0, 0.0)
-    camera = log.setting("camera.mount.position_m") or (0.0, 0.0, 0.0)
-    roll, pitch, _ = log.setting("camera.mount.rpy_deg") or (0.0, 0.0, 0.0)
-    if max(abs(roll), abs(pitch)) > LOOKS_UP_DEG:
-        return (math.nan, math.nan, math.nan)
-    x, y, z = (float(g) - float(c) for g, c in zip(gear, camera, strict=True))
-    return x, y, z
-
-
-def _rate(t_s: Array, angle_rad: Array) -> Array:
-    """Central differences over `SMOOTHED_S`."""
-    after = np.minimum(np.searchsorted(t_s, t_s + SMOOTHED_S / 2), t_s.size - 1)
-    before = np.maximum(np.searchsorted(t_s, t_s - SMOOTHED_S / 2, side="right") - 1, 0)
-    spent = t_s[after] - t_s[before]
-    return np.where(spent > 0, (angle_rad[after] - angle_rad[before]) / np.maximum(spent, 1e-9), 0)

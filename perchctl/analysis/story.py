@@ -48,7 +48,7 @@ def story_of(flight: FlightAnalysis) -> tuple[Sentence, ...]:
         return ()
     told = [
         *_steps(flight),
-        *(_told_loss(flight, loss) for loss in flight.losses),
+        *map(_told_loss, flight.losses),
         *_holds(flight),
         *_taken_over(flight),
         *_notes(flight),
@@ -217,37 +217,14 @@ def _time_before(flight: FlightAnalysis, stay: Stay, phase: str) -> float:
 # --- between them ---------------------------------------------------------------------
 
 
-def _told_loss(flight: FlightAnalysis, loss: Loss) -> Sentence:
+def _told_loss(loss: Loss) -> Sentence:
     for_s = f"for {loss.duration_s:.1f} s" if loss.regained else "and not seen again"
     if loss.frames:
         text = f"The target was lost {for_s}: {count(loss.frames, 'frame')} without it"
-        text += _motion(loss)
+        text += f", at {loss.speed_mps:.1f} m/s" if math.isfinite(loss.speed_mps) else ""
     else:
         text = f"No picture that could be used came {for_s if loss.regained else 'any more'}"
-    return Sentence(loss.start_s, f"{text}{_then(flight, loss)}", "warn")
-
-
-def _motion(loss: Loss) -> str:
-    if math.isfinite(loss.blur_px):
-        fastest = f", blur {loss.blur_px:.1f} px"
-    elif math.isfinite(loss.flow_pxps):
-        fastest = f", moving at {loss.flow_pxps:.0f} px/s in the picture"
-    else:
-        fastest = ","
-    return f"{fastest} at {loss.speed_mps:.1f} m/s" if math.isfinite(loss.speed_mps) else ""
-
-
-def _then(flight: FlightAnalysis, loss: Loss) -> str:
-    """What the mission made of it while it lasted."""
-    for stay in flight.stays:
-        if not loss.start_s < stay.start_s <= loss.end_s:
-            continue
-        if stay.phase == "RECOVER":
-            return f"; {_recover(flight, stay).rpartition(': ')[2].partition(' (')[0]}"
-        if stay.phase == "LANDING":
-            return "; landed"
-        return f"; {stay.phase} again" if stay.phase in ("SEARCH", "ALIGN") else ""
-    return ""
+    return Sentence(loss.start_s, text, "warn")
 
 
 def _holds(flight: FlightAnalysis) -> Iterator[Sentence]:
@@ -260,7 +237,7 @@ def _holds(flight: FlightAnalysis) -> Iterator[Sentence]:
 def _taken_over(flight: FlightAnalysis) -> Iterator[Sentence]:
     """What came from elsewhere than the loop. The farewell, to a vehicle that is down, is none of
     the flight's."""
-    for go in flight.log.takeovers:
+    for go in flight.takeovers:
         who = TOOK_OVER.get(go.by)
         if who is None:
             continue

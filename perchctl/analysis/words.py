@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
-
-_BEFORE_UNIT = re.compile(r"(?<=\d) (?=(?:s|ms|mm|cm|m|m/s|/s|px|deg|V|mAh)\b|%)|(?<=\+-) (?=\d)")
 
 
 def length(metres: float) -> str:
@@ -49,8 +46,3 @@ def count(number: int, noun: str) -> str:
 def times(number: int) -> str:
     """``once``, ``3 times``."""
     return "once" if number == 1 else f"{number} times"
-
-
-def kept_together(sentence: str) -> str:
-    """Each figure beside its unit, wherever the line ends."""
-    return _BEFORE_UNIT.sub("\N{NO-BREAK SPACE}", sentence)

@@ -8,11 +8,9 @@ from .header import arithmetic_fingerprint as arithmetic_fingerprint
 from .header import camera_record as camera_record
 from .read import FlightLog as FlightLog
 from .read import log_values as log_values
-from .read import read_ends as read_ends
 from .read import read_log as read_log
 from .recorded import recorded_pictures as recorded_pictures
 from .summary import FlightSummary as FlightSummary
-from .summary import summarise_flight as summarise_flight
 from .summary import summary_text as summary_text
 from .table import log_table as log_table
 from .watch import LogWatcher as LogWatcher

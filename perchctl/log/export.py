@@ -14,7 +14,7 @@ from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.files import PartFile, cannot_be_written, check_output, check_place, write_files
 from perchctl.log.disk import DiskFile
-from perchctl.log.read import FlightLog, read_log, sent_values
+from perchctl.log.read import FlightLog, read_log
 from perchctl.log.recorded import recorded_frames
 from perchctl.log.recording_file import RecordingFile
 from perchctl.log.write import LAYOUT_SUFFIX, RECORDING_SUFFIX, recording_path
@@ -98,7 +98,7 @@ def _records(log: FlightLog) -> Iterator[tuple[float, Kind, Any]]:
     in which it was."""
     found: list[tuple[float, Kind, Any]] = [
         *((float(event["t_s"]), "event", event) for event in log.events),
-        *((sent.t_s, "sent", sent_values(sent)) for sent in log.sent),
+        *((sent["t_s"], "sent", sent) for sent in log.sent_values),
         *((float(tick["t_s"]), "tick", tick) for tick in log.records),
     ]
     return iter(sorted(found, key=_time_of))

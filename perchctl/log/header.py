@@ -10,9 +10,7 @@ import base64
 import contextlib
 import math
 import platform
-import warnings
 import zlib
-from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import cache
 from typing import Any
@@ -20,16 +18,14 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 import perchctl
 from perchctl.calibration import profile_camera
 from perchctl.camera import profile_record, without_password
-from perchctl.errors import InvalidValue, Note, PerchError
-from perchctl.log.exact import from_exact, to_exact
+from perchctl.errors import PerchError
+from perchctl.log.exact import to_exact
 from perchctl.log.fields import EVENT_FIELDS, FIELDS, FORMAT, SCHEMA_VERSION
-from perchctl.profile import Profile, first_invalid_key, read_mask
-from perchctl.vision import CameraModel
+from perchctl.profile import Profile, read_mask
 
 TURN_NOTE = (
     "records of kind turn: all that a turn of the loop took in, knew and decided, not rounded; "
@@ -101,61 +97,6 @@ def computer_record() -> dict[str, Any]:
             "arithmetic": arithmetic_fingerprint(),
         }
     }
-
-
-def computer_differences(header: Mapping[str, Any]) -> str:
-    """In what the flight's differed from this one, in words; empty where it did not, or where
-    the log does not say."""
-    was, here = header.get("computer"), computer_record()["computer"]
-    if not isinstance(was, dict):
-        return ""
-    return ", ".join(
-        f"{key} {was[key]} there and {here[key]} here"
-        for key in here
-        if key in was and was[key] != here[key]
-    )
-
-
-def flown_profile(header: Mapping[str, Any]) -> Profile:
-    """The profile that was flown, but for passwords. A `Note` names each key that was flown with
-    another value than the constant that it is now. Errors: InvalidValue."""
-    values = header.get("profile")
-    for sentence in Profile.lost_values(values) if isinstance(values, dict) else ():
-        said = sentence.removesuffix("; remove it")
-        warnings.warn(f"the flight was by an older perchctl: {said}", Note, stacklevel=2)
-    try:
-        return Profile.model_validate(header.get("profile"))
-    except ValidationError as error:
-        key, text = first_invalid_key(error)
-        raise InvalidValue(
-            f"the log's profile cannot be used by this version of perchctl: {key or 'profile'}: "
-            f"{text}"
-        ) from None
-
-
-def flown_camera(header: Mapping[str, Any]) -> CameraModel | None:
-    """The calibration that was flown; None in a log that has none. Errors: InvalidValue."""
-    if header.get("camera") is None:
-        return None
-    try:
-        return from_exact(CameraModel, header["camera"])
-    except ValueError as error:
-        raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
-
-
-def flown_mask(header: Mapping[str, Any], camera: CameraModel) -> NDArray[np.bool_] | None:
-    """(height, width), True where the gear covers; None without a mask. Errors: InvalidValue."""
-    text = header.get("mask")
-    if text is None:
-        return None
-    width, height = camera.size_px
-    try:
-        # No more than the mask: what a damaged text unfolds to has no bound.
-        packed = zlib.decompressobj().decompress(base64.b64decode(text), width * height // 8 + 1)
-        bits = np.frombuffer(packed, dtype=np.uint8)
-        return np.unpackbits(bits)[: width * height].reshape(height, width).astype(bool)
-    except (ValueError, TypeError, zlib.error) as error:
-        raise InvalidValue(f"the log's header holds no mask: mask: {error}") from None
 
 
 def _packed(mask: NDArray[np.bool_]) -> str:

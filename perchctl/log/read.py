@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import gzip
-import json
 import math
 import os
+import warnings
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from io import BufferedReader
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from perchctl import __version__
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.errors import InvalidValue, Note, NotFound
 from perchctl.geometry import Array
 from perchctl.log.exact import decode_line, from_exact
 from perchctl.log.fields import (
@@ -27,25 +28,24 @@ from perchctl.log.fields import (
     FORMAT,
     READABLE_VERSIONS,
     SCHEMA_VERSION,
-    command_values,
+    sent_values,
 )
-from perchctl.log.header import (
-    computer_differences,
-    flown_camera,
-    flown_mask,
-    flown_profile,
-)
+from perchctl.log.header import computer_record
 from perchctl.log.write import path_beside
-from perchctl.mission import SentBy, SentCommand, Turn
-from perchctl.profile import Profile
+from perchctl.mission import SentCommand, Turn
+from perchctl.profile import Profile, first_invalid_key
 from perchctl.vision import CameraModel
 
 Times = TypeVar("Times", float, Array)
+Exact = TypeVar("Exact", Turn, SentCommand)
+SUFFIX = ".jsonl"
+KINDS = ("tick", "turn", "sent", "event", "summary", "recording")
+"""Of a log's records behind its header."""
 MOST_LOG_BYTES = 300_000_000
 """Of a log, unpacked: three quarters of an hour of flight at 0.115 MB/s. What a packed file of a
 megabyte unfolds to may otherwise fill the memory."""
 _GZIP = b"\x1f\x8b"
-_BEGIN_BYTES = _TAIL_BYTES = 1 << 16
+_TAIL_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,8 @@ class FlightLog:
     turn_records: list[dict[str, Any]] = field(default_factory=list)
     sent_records: list[dict[str, Any]] = field(default_factory=list)
 
+    # --- records
+
     @cached_property
     def turns(self) -> list[Turn]:
         """All turns of the loop, exact; empty in a log of version 1 or 2. Errors: InvalidValue."""
@@ -92,10 +94,10 @@ class FlightLog:
         """What was sent in the loop's place; empty before version 4. Errors: InvalidValue."""
         return [sent_of(record) for record in self.sent_records]
 
-    @cached_property
-    def takeovers(self) -> tuple[Takeover, ...]:
-        """The same, told by each go. Errors: InvalidValue."""
-        return takeovers_of(self.sent)
+    @property
+    def sent_values(self) -> list[dict[str, Any]]:
+        """The same by the names of a tick's fields, and ``by``. Errors: InvalidValue."""
+        return [sent_values(each) for each in self.sent]
 
     def column(self, key: str) -> Array:
         """A field over the ticks, shape (n,); NaN where it is missing.
@@ -112,6 +114,31 @@ class FlightLog:
         """A field over the ticks as text, empty where it is missing."""
         return [str(record.get(key) or "") for record in self.records]
 
+    @cached_property
+    def phases(self) -> tuple[PhaseSpan, ...]:
+        """The phases flown through, in order; each lasts until the next begins."""
+        spans: list[PhaseSpan] = []
+        for record in self.records:
+            t_s, phase = float(record["t_s"]), str(record.get("phase") or "")
+            if spans:
+                spans[-1] = replace(spans[-1], end_s=t_s)
+            if not spans or spans[-1].phase != phase:
+                spans.append(PhaseSpan(phase, t_s, t_s, str(record.get("reason") or "")))
+        return tuple(spans)
+
+    # --- times
+
+    @property
+    def start_s(self) -> float:
+        """The loop's time of the first flown turn, which every output takes for 0; 0 without."""
+        flown = (r for r in self.turn_records if r.get("role") == "flown")
+        first = self.records[0] if self.records else next(flown, None)
+        return 0.0 if first is None else float(first["t_s"])
+
+    def since(self, t_s: Times) -> Times:
+        """Times on the loop's clock, counted from the first flown turn as all outputs do."""
+        return t_s - self.start_s
+
     @property
     def t_s(self) -> Array:
         """Times of the ticks since the flight's first turn, shape (n,)."""
@@ -121,6 +148,8 @@ class FlightLog:
     def end_s(self) -> float:
         """Time of the last tick since the flight's first turn; 0 without any."""
         return self.since(float(self.records[-1]["t_s"])) if self.records else 0.0
+
+    # --- the setup that was flown
 
     def setting(self, key: str) -> Any:
         """The flown profile's value of a dotted key, as JSON has it; None where there is none."""
@@ -137,67 +166,81 @@ class FlightLog:
         return float(value) if math.isfinite(value) else None
 
     @property
-    def flown_profile(self) -> Profile:
-        """The profile that was flown, but for passwords. Errors: InvalidValue."""
-        return flown_profile(self.header)
-
-    @property
-    def flown_camera(self) -> CameraModel | None:
-        """The calibration that was flown; None in a log that has none. Errors: InvalidValue."""
-        return flown_camera(self.header)
-
-    def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
-        """(height, width), True where the gear covers; None without a mask. Errors:
-        InvalidValue."""
-        return flown_mask(self.header, camera)
-
-    @property
-    def computer_differences(self) -> str:
-        """In what the flight's computer differed from this one, in words; empty where it did not,
-        or where the log does not say."""
-        return computer_differences(self.header)
-
-    @property
     def profile_name(self) -> str | None:
         """The flown profile's name; None where the header holds none."""
         name = self.setting("name")
         return None if name is None else str(name)
 
     @property
-    def start_s(self) -> float:
-        """The loop's time of the first flown turn, which every output takes for 0; 0 without."""
-        flown = (r for r in self.turn_records if r.get("role") == "flown")
-        first = self.records[0] if self.records else next(flown, None)
-        return 0.0 if first is None else float(first["t_s"])
+    def flown_profile(self) -> Profile:
+        """The profile that was flown, but for passwords. A `Note` names each key that was flown
+        with another value than the constant that it is now. Errors: InvalidValue."""
+        values = self.header.get("profile")
+        for sentence in Profile.lost_values(values) if isinstance(values, dict) else ():
+            said = sentence.removesuffix("; remove it")
+            warnings.warn(f"the flight was by an older perchctl: {said}", Note, stacklevel=2)
+        try:
+            return Profile.model_validate(values)
+        except ValidationError as error:
+            key, text = first_invalid_key(error)
+            raise InvalidValue(
+                f"the log's profile cannot be used by this version of perchctl: "
+                f"{key or 'profile'}: {text}"
+            ) from None
 
-    def since(self, t_s: Times) -> Times:
-        """Times on the loop's clock, counted from the first flown turn as all outputs do."""
-        return t_s - self.start_s
+    @property
+    def flown_camera(self) -> CameraModel | None:
+        """The calibration that was flown; None in a log that has none. Errors: InvalidValue."""
+        if self.header.get("camera") is None:
+            return None
+        try:
+            return from_exact(CameraModel, self.header["camera"])
+        except ValueError as error:
+            raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
 
-    @cached_property
-    def phases(self) -> tuple[PhaseSpan, ...]:
-        """The phases flown through, in order; each lasts until the next begins."""
-        spans: list[PhaseSpan] = []
-        for record in self.records:
-            t_s, phase = float(record["t_s"]), str(record.get("phase") or "")
-            if spans and spans[-1].phase == phase:
-                last = spans[-1]
-                spans[-1] = PhaseSpan(phase, last.start_s, t_s, last.reason)
-                continue
-            if spans:
-                last = spans[-1]
-                spans[-1] = PhaseSpan(last.phase, last.start_s, t_s, last.reason)
-            spans.append(PhaseSpan(phase, t_s, t_s, str(record.get("reason") or "")))
-        return tuple(spans)
+    def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
+        """(height, width), True where the gear covers; None without a mask. Errors:
+        InvalidValue."""
+        text = self.header.get("mask")
+        if text is None:
+            return None
+        width, height = camera.size_px
+        try:
+            # No more than the mask: what a damaged text unfolds to has no bound.
+            most = width * height // 8 + 1
+            packed = zlib.decompressobj().decompress(base64.b64decode(text), most)
+            bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8))
+            return bits[: width * height].reshape(height, width).astype(bool)
+        except (ValueError, TypeError, zlib.error) as error:
+            raise InvalidValue(f"the log's header holds no mask: mask: {error}") from None
+
+    @property
+    def computer_differences(self) -> str:
+        """In what the flight's computer differed from this one, in words; empty where it did not,
+        or where the log does not say."""
+        was, here = self.header.get("computer"), computer_record()["computer"]
+        if not isinstance(was, dict):
+            return ""
+        return ", ".join(
+            f"{key} {was[key]} there and {here[key]} here"
+            for key in here
+            if key in was and was[key] != here[key]
+        )
 
 
-def read_log(path: Path | str) -> FlightLog:
-    """Read a flight log; an unreadable tail is ignored and counted.
+# --- the file -----------------------------------------------------------------------------
 
-    Raises NotFound when there is no such file, and InvalidValue, with the line,
-    when it is not a flight log or is damaged elsewhere than at its end.
+
+def read_log(path: Path | str, *, ends_suffice: bool = False) -> FlightLog:
+    """Read a flight log, packed by gzip or not; an unreadable tail is ignored and counted.
+
+    With `ends_suffice` it may hold header and summary alone, which is quick. Raises NotFound when
+    there is no such file, and InvalidValue, with the line, when it is not a flight log or is
+    damaged elsewhere than at its end.
     """
     path = Path(path)
+    if ends_suffice and (ends := _ends_of(path)) is not None:
+        return ends
     lines = _lines(path)
     header = _header(path, lines)
     good: list[dict[str, Any]] = []
@@ -232,25 +275,20 @@ def read_log(path: Path | str) -> FlightLog:
     )
 
 
-def read_ends(path: Path) -> FlightLog:
-    """A log's header and summary alone, without reading it whole, where it ends with its summary;
-    else the whole log.
-
-    Raises NotFound and InvalidValue, as `read_log`.
-    """
+def _ends_of(path: Path) -> FlightLog | None:
+    """Header and summary alone; None where the file does not end with its summary."""
     try:
         with path.open("rb") as stream:
             first = stream.readline()
             stream.seek(max(len(first), os.fstat(stream.fileno()).st_size - _TAIL_BYTES))
             last = stream.read().splitlines()[-2:]
-        header, end = decode_line(first), decode_line(last[-1])
+        header, end = _header(path, [first]), decode_line(last[-1])
         if end.get("kind") == "recording":
             end = decode_line(last[0]) | _without_kind(end)
-    except (OSError, ValueError, IndexError):
-        return read_log(path)
-    is_whole = end.get("kind") == "summary" and header.get("format") == FORMAT
-    if not is_whole or header.get("version") not in READABLE_VERSIONS:
-        return read_log(path)
+    except (OSError, ValueError, IndexError, InvalidValue):
+        return None
+    if end.get("kind") != "summary":
+        return None
     return FlightLog(path, header, [], [], end, truncated=False)
 
 
@@ -268,66 +306,61 @@ def log_values(path: Path) -> Iterator[None]:
 
 
 def _lines(path: Path) -> list[bytes]:
+    """Empty for what cannot be a log, as it may be a video of gigabytes. The end of what was
+    packed and cut is lost."""
+    lines: list[bytes] = []
+    left = MOST_LOG_BYTES + 1
     try:
-        with path.open("rb") as stream:
-            is_packed = stream.peek(len(_GZIP)).startswith(_GZIP)
-            data = _begin_or_all(gzip.GzipFile(fileobj=stream) if is_packed else stream)
+        with path.open("rb") as file:
+            is_packed = file.peek(len(_GZIP)).startswith(_GZIP)
+            stream = gzip.GzipFile(fileobj=file) if is_packed else file
+            with contextlib.suppress(gzip.BadGzipFile, EOFError, zlib.error):
+                if stream.peek(1).startswith(b"{"):
+                    while left and (line := stream.readline(left)):
+                        lines.append(line)
+                        left -= len(line)
     except FileNotFoundError:
         raise NotFound(f"flight log {path} does not exist") from None
     except IsADirectoryError:
         raise NotFound(f"flight log {path} is a folder; name one of its .jsonl files") from None
     except OSError as error:
         raise NotFound(f"flight log {path} cannot be read: {error.strerror}") from None
-    if is_packed and not data:
+    if not left:
         raise InvalidValue(
-            f"{path}: it is packed by gzip, and its begin is damaged: take the original"
+            f"{path}: it has more than {MOST_LOG_BYTES / 1e6:g} MB, and no flight's log has so "
+            f"much: take the original, or cut it off behind some line"
         )
-    if len(data) > MOST_LOG_BYTES:
-        unpacked = " unpacked" if is_packed else ""
-        raise InvalidValue(
-            f"{path}: it has more than {MOST_LOG_BYTES / 1e6:g} MB{unpacked}, and no flight's log "
-            f"that is read has so much: take the original, or cut it off behind some line"
-        )
-    return data.splitlines(keepends=True)
-
-
-def _begin_or_all(stream: BufferedReader | gzip.GzipFile) -> bytes:
-    """All that may be a log, up to one piece more than `MOST_LOG_BYTES`; the begin of what cannot
-    be one, as it may be a video of gigabytes. The end of what was packed and cut is lost."""
-    parts: list[bytes] = []
-    size, most = 0, MOST_LOG_BYTES
-    with contextlib.suppress(gzip.BadGzipFile, EOFError, zlib.error):
-        while size <= most and (part := stream.read1(_BEGIN_BYTES)):
-            if not parts and not part.startswith(b"{"):
-                most = _BEGIN_BYTES - 1
-            parts.append(part)
-            size += len(part)
-    return b"".join(parts)
+    return lines
 
 
 def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
-    if not lines:
-        raise InvalidValue(
-            f"{path}: line 1: the file is empty: nothing was recorded, or it was lost in copying"
-        )
     try:
         header = decode_line(lines[0])
-    except ValueError:
+    except (IndexError, ValueError):
         header = {}
     if header.get("kind") != "header" or header.get("format") != FORMAT:
         raise InvalidValue(
-            f"{path}: line 1: not a flight log of perchctl: {why_no_log(path, lines[0])}"
+            f"{path}: line 1: not a flight log of perchctl, or cut off in its header; "
+            f"{_remedy(path)}"
         )
     version = header.get("version")
     if version not in READABLE_VERSIONS:
-        readable = f"1 to {READABLE_VERSIONS[-1]}"
         newer = isinstance(version, int) and version > SCHEMA_VERSION
         raise InvalidValue(
-            f"{path}: line 1: schema version {version!r}, this perchctl reads {readable}; "
-            f"the log was written by perchctl {header.get('perchctl', 'of unknown version')}, "
-            f"this is {__version__}" + (": update perchctl" if newer else "")
+            f"{path}: line 1: schema version {version!r}, this perchctl reads 1 to "
+            f"{READABLE_VERSIONS[-1]}; the log was written by perchctl "
+            f"{header.get('perchctl', 'of unknown version')}, this is {__version__}"
+            + (": update perchctl" if newer else "")
         )
     return header
+
+
+def _remedy(path: Path) -> str:
+    """The log that lies beside a plot or a table of it, where there is one."""
+    log = path_beside(path, SUFFIX)
+    if log != path and log.is_file():
+        return f"its flight's log is {log}"
+    return f"logs are the {SUFFIX} files in the profile's log.directory"
 
 
 def _checked(record: dict[str, Any]) -> dict[str, Any]:
@@ -341,160 +374,36 @@ def _checked(record: dict[str, Any]) -> dict[str, Any]:
     return record
 
 
-def _without_kind(record: dict[str, Any]) -> dict[str, Any]:
+def _without_kind(record: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in record.items() if k != "kind"}
 
 
 # --- turns, and what was sent in the loop's place --------------------------------------------
 
-APART_S = 2.0
-"""What is farther apart is told by itself."""
-_TELLS = {
-    "position": "position setpoints",
-    "thrust": "raw thrust",
-    "land": "landing ordered",
-    "stop": "motors stopped",
-    "emergency": "motors cut",
-}
-
 
 def turn_of(record: dict[str, Any]) -> Turn:
-    """Back to the same bits. Errors: InvalidValue."""
-    try:
-        return from_exact(Turn, {k: v for k, v in _with_telemetry(record).items() if k != "kind"})
-    except ValueError as error:
-        raise InvalidValue(
-            f"the log's turn {record.get('number', '?')} cannot be read ({error}): the log is "
-            f"damaged, or another version of perchctl wrote it"
-        ) from None
-
-
-def _with_telemetry(record: dict[str, Any]) -> dict[str, Any]:
-    """The observation's is the newest of the turn, where it has none of its own."""
+    """The turn of a record, to the same bits. Errors: InvalidValue."""
     obs, taken = record.get("observation"), record.get("taken")
-    if not isinstance(obs, dict) or "telemetry" in obs or not isinstance(taken, dict):
-        return record
-    samples = taken.get("late") or taken.get("samples")
-    if not isinstance(samples, list) or not samples:
-        return record
-    return record | {"observation": obs | {"telemetry": samples[-1]}}
+    if isinstance(obs, dict) and "telemetry" not in obs and isinstance(taken, dict):
+        # The newest sample of the turn stands in the line once.
+        samples = taken.get("late") or taken.get("samples")
+        if isinstance(samples, list) and samples:
+            record = record | {"observation": obs | {"telemetry": samples[-1]}}
+    return _exact(Turn, record, f"the log's turn {record.get('number', '?')}")
 
 
 def sent_of(record: Mapping[str, Any]) -> SentCommand:
-    """Back to the same bits. Errors: InvalidValue."""
+    """The command of a record, to the same bits. Errors: InvalidValue."""
+    return _exact(
+        SentCommand, record, f"the log's record of what was sent at {record.get('t_s', '?')} s"
+    )
+
+
+def _exact(kind: type[Exact], record: Mapping[str, Any], name: str) -> Exact:
     try:
-        return from_exact(SentCommand, {k: v for k, v in record.items() if k != "kind"})
+        return from_exact(kind, _without_kind(record))
     except ValueError as error:
         raise InvalidValue(
-            f"the log's record of what was sent at {record.get('t_s', '?')} s cannot be read "
-            f"({error}): the log is damaged, or another version of perchctl wrote it"
+            f"{name} cannot be read ({error}): the log is damaged, or another version of "
+            f"perchctl wrote it"
         ) from None
-
-
-def sent_values(sent: SentCommand) -> dict[str, Any]:
-    """By the names of a tick's fields (`perchctl.log.fields.FIELDS`), and ``by``."""
-    return {"t_s": sent.t_s, "by": sent.by, **command_values(sent.command)}
-
-
-@dataclass(frozen=True)
-class Takeover:
-    """What one sender sent in one go. Times on the loop's clock; `sent`: commands by their name
-    in a tick's `cmd`, in the order of their first, and how many of each."""
-
-    by: SentBy
-    start_s: float
-    end_s: float
-    sent: tuple[tuple[str, int], ...]
-
-    @property
-    def text(self) -> str:
-        """``position setpoints (14), landing ordered (2)``"""
-        return ", ".join(f"{_TELLS[name]} ({count})" for name, count in self.sent)
-
-
-def takeovers_of(sent: Sequence[SentCommand]) -> tuple[Takeover, ...]:
-    """In order."""
-    goes: list[list[SentCommand]] = []
-    for each in sorted(sent, key=lambda one: one.t_s):
-        last = goes[-1][-1] if goes else None
-        if last is None or last.by != each.by or each.t_s - last.t_s > APART_S:
-            goes.append([])
-        goes[-1].append(each)
-    return tuple(_takeover(go) for go in goes)
-
-
-def _takeover(go: Sequence[SentCommand]) -> Takeover:
-    names = [str(command_values(each.command)["cmd"]) for each in go]
-    counted = tuple((name, names.count(name)) for name in dict.fromkeys(names))
-    return Takeover(go[0].by, go[0].t_s, go[-1].t_s, counted)
-
-
-# --- What a file is that is no flight log, or no whole one, in words ---------------------------
-
-
-SUFFIX = ".jsonl"
-KINDS = ("tick", "turn", "sent", "event", "summary", "recording")
-"""Of a log's records behind its header."""
-_BEGINS: tuple[tuple[bytes, str], ...] = (
-    (b"\x89PNG", "a PNG picture"),
-    (b"\xff\xd8\xff", "a JPEG picture"),
-    (b"%PDF", "a PDF document"),
-    (b"\x89MCAP", "an MCAP recording"),
-    (b"PAR1", "a Parquet table"),
-    (b"\x1f\x8b", "packed by gzip"),
-    (b"PK\x03\x04", "a ZIP archive"),
-    (b"RIFF", "a video or a picture"),
-    (b"<", "a page or a drawing"),
-)
-_HEADER = b'{"kind":"header"'
-_BOX = b"ftyp"  # MP4 and MOV, four bytes in
-_TEXT_BYTES = 512
-
-
-def why_no_log(path: Path, first_line: bytes) -> str:
-    """What the file holds in place of a flight log, and what to do: the end of a sentence."""
-    if first_line.startswith(_HEADER) and not first_line.endswith(b"\n"):
-        return f"it is cut off in its header, after {len(first_line)} bytes: take the original"
-    return f"{_kind_of(first_line)}; {_remedy(path)}"
-
-
-def _kind_of(line: bytes) -> str:
-    for begin, name in _BEGINS:
-        if line.startswith(begin):
-            return f"it is {name}"
-    if line[4:8] == _BOX:
-        return "it is a video"
-    if _is_binary(line[:_TEXT_BYTES]):
-        return "it is a binary file"
-    if not line.strip():
-        return "its first line is empty"
-    return _kind_of_text(line)
-
-
-def _kind_of_text(line: bytes) -> str:
-    try:
-        record = json.loads(line)
-    except (ValueError, RecursionError):
-        comma = b"," in line and not line.lstrip().startswith((b"{", b"["))
-        return "it is a table" if comma else "it is some other text"
-    if isinstance(record, dict) and record.get("kind") in KINDS:
-        return "its header is missing"
-    return "it is some other JSON"
-
-
-def _is_binary(data: bytes) -> bool:
-    if b"\0" in data:
-        return True
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        return error.start < len(data) - 3  # not only a letter cut in two
-    return False
-
-
-def _remedy(path: Path) -> str:
-    """The log that lies beside a plot or a table of it, where there is one."""
-    log = path_beside(path, SUFFIX)
-    if log != path and log.is_file():
-        return f"its flight's log is {log}"
-    return f"logs are the {SUFFIX} files in the profile's log.directory"

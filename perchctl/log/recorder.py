@@ -115,7 +115,7 @@ class Recorder:
             self._turn.events.append(record)
 
     def sent(self, values: Mapping[str, Any]) -> None:
-        """What was sent in the loop's place (`perchctl.log.read.sent_values`). From any thread:
+        """What was sent in the loop's place (`perchctl.log.fields.sent_values`). From any thread:
         the loop hangs, perhaps, and its turn is left alone. Never raises."""
         if self._closed or self._over:
             return

@@ -4,7 +4,8 @@ Every message is made from the records that the log holds, so that a recording m
 one made of its log say the same. The messages are Foxglove's protobuf ones, with the definitions of
 Foxglove's own package: a picture stays the bytes that it came as, which the JSON variant of the
 same schemas would make a third longer. What is perchctl's own is JSON. Frames: `world` (of the
-state estimate), `body`, `gear`, `camera` (OpenCV's axes, which are Foxglove's) and `target`.
+state estimate), `body`, `gear`, `camera` (OpenCV's axes, which are Foxglove's), `target` and
+`setpoint`.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from __future__ import annotations
 import json
 import math
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 import cv2
@@ -23,7 +24,6 @@ import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
@@ -31,11 +31,8 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Point2_pb2 import Point2
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
-from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
-from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
@@ -53,12 +50,12 @@ from perchctl.log.fields import FIELDS, field_kind
 from perchctl.profile import Profile
 from perchctl.vision import CameraModel, Frame
 
-WORLD, BODY, GEAR, CAMERA, TARGET = "world", "body", "gear", "camera", "target"
+WORLD, BODY, GEAR, CAMERA = "world", "body", "gear", "camera"
+TARGET, SETPOINT = "target", "setpoint"
 
 IMAGE, FRAME, CALIBRATION = "/camera/image", "/camera/frame", "/camera/calibration"
-CORNERS = "/camera/corners"
-TF, VEHICLE, PATH, TARGET_POSE = "/tf", "/vehicle/pose", "/vehicle/path", "/target/pose"
-SETPOINT, SCENE, LOG, TICK, SENT = "/setpoint", "/scene", "/log", "/tick", "/sent"
+CORNERS, TF, PATH = "/camera/corners", "/tf", "/vehicle/path"
+LOG, TICK, SENT = "/log", "/tick", "/sent"
 
 HEADER_NAME = "header.json"
 CHUNK_BYTES = 4_000_000
@@ -134,7 +131,7 @@ class RecordingFile:
         self._add(TICK, ns, encode(self._since_first(record))[:-1])
 
     def sent(self, values: Mapping[str, Any]) -> None:
-        """What was sent in the loop's place (`perchctl.log.read.sent_values`)."""
+        """What was sent in the loop's place (`perchctl.log.fields.sent_values`)."""
         ns = self._at(float(values["t_s"]))
         self._add(SENT, ns, encode(self._since_first(values))[:-1])
 
@@ -200,8 +197,6 @@ class RecordingFile:
             self._writer.add_attachment(ns, ns, HEADER_NAME, "application/json", text)
             if self._camera is not None:
                 self._add(CALIBRATION, ns, calibration_message(ns, self._camera))
-            if self._profile is not None:
-                self._add(SCENE, ns, scene_message(ns, self._profile))
         return self._epoch
 
     def _add(self, topic: str, ns: int, message: Message | bytes, sequence: int = 0) -> None:
@@ -249,15 +244,6 @@ def encoded(frame: Frame) -> tuple[bytes, str]:
 
 # --- perchctl's own messages, for which Foxglove has no schema: JSON ------------------------------
 
-FRAME_FIELDS = {
-    "number": ("integer", "number of the frame, as the message's sequence number and the log's"),
-    "t_s": ("number", "exposure on the loop's clock, as the source gave it"),
-    "t_arrival_s": ("number", "arrival on the loop's clock"),
-    "repeated": ("boolean", "the source gave out the picture before once more: it is not kept"),
-    "crc32": ("integer", "of the grey pixels that the pipeline saw"),
-}
-
-
 _JSON_TYPES: dict[str, dict[str, Any]] = {
     "number": {"type": "number"},
     "integer": {"type": "number"},
@@ -267,41 +253,32 @@ _JSON_TYPES: dict[str, dict[str, Any]] = {
 }
 
 
-def _property(key: str) -> dict[str, Any]:
-    return {**_JSON_TYPES[field_kind(key)], "description": FIELDS[key]}
+def _schema(
+    name: str, title: str, keys: Iterable[str], **own: tuple[str, str]
+) -> tuple[str, dict[str, Any]]:
+    """Of the log's fields `keys`, and of `own` ones by type and meaning."""
+    properties = {k: {"type": kind, "description": text} for k, (kind, text) in own.items()}
+    properties |= {k: {**_JSON_TYPES[field_kind(k)], "description": FIELDS[k]} for k in keys}
+    return name, {"type": "object", "title": title, "properties": properties}
 
 
 SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
-    TICK: (
-        "perchctl.Tick",
-        {
-            "type": "object",
-            "title": "One turn of the flight loop, as the flight log has it",
-            "properties": {key: _property(key) for key in FIELDS},
-        },
-    ),
-    SENT: (
+    TICK: _schema("perchctl.Tick", "One turn of the flight loop, as the flight log has it", FIELDS),
+    SENT: _schema(
         "perchctl.Sent",
-        {
-            "type": "object",
-            "title": "What was sent to the vehicle in the flight loop's place",
-            "properties": {
-                "t_s": _property("t_s"),
-                "by": {"type": "string", "description": "watchdog, rescue, reconnect or farewell"},
-                **{key: _property(key) for key in FIELDS if key.split("_")[0] == "cmd"},
-            },
-        },
+        "What was sent to the vehicle in the flight loop's place",
+        ("t_s", *(key for key in FIELDS if key.split("_")[0] == "cmd")),
+        by=("string", "watchdog, rescue, reconnect or farewell"),
     ),
-    FRAME: (
+    FRAME: _schema(
         "perchctl.Frame",
-        {
-            "type": "object",
-            "title": "A frame that the camera gave",
-            "properties": {
-                key: {"type": kind, "description": text}
-                for key, (kind, text) in FRAME_FIELDS.items()
-            },
-        },
+        "A frame that the camera gave",
+        (),
+        number=("integer", "number of the frame, as the message's sequence number and the log's"),
+        t_s=("number", "exposure on the loop's clock, as the source gave it"),
+        t_arrival_s=("number", "arrival on the loop's clock"),
+        repeated=("boolean", "the source gave out the picture before once more: it is not kept"),
+        crc32=("integer", "of the grey pixels that the pipeline saw"),
     ),
 }
 """By topic: name and JSON schema."""
@@ -404,62 +381,47 @@ class SpaceMessages:
         """Of a tick's record (`perchctl.log.fields.FIELDS`)."""
         t_s = float(record["t_s"])
         ns = self._epoch.ns(t_s)
-        now = stamp(ns)
-        for mount in self._mounts:
-            mount.timestamp.CopyFrom(now)
-        transforms = list(self._mounts)
-        body = _body_of(record)
+        sampled_ns = self._epoch.ns(t_s - (_number(record, "tel_age_s") or 0.0))
+        body = _transform_to(BODY, sampled_ns, record, "x_m", "y_m", "z_m", "roll_rad",
+                             "pitch_rad", "yaw_rad")  # fmt: skip
+        target = _transform_to(TARGET, ns, record, "tx_m", "ty_m", "tz_m", "tyaw_rad")
+        setpoint = _transform_to(
+            SETPOINT, ns, record, "cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad"
+        )
+        self._target = target or self._target
+        for still in (*self._mounts, self._target):
+            if still is not None:
+                still.timestamp.CopyFrom(stamp(ns))
+        moving = [each for each in (body, self._target, setpoint) if each is not None]
         if body is not None:
-            sampled_ns = self._epoch.ns(t_s - (_number(record, "tel_age_s") or 0.0))
-            transforms.append(_transform(sampled_ns, WORLD, BODY, *body))
-            pose = _pose(*body)
-            yield VEHICLE, PoseInFrame(timestamp=stamp(sampled_ns), frame_id=WORLD, pose=pose)
-            yield from self._path_with(pose, t_s, ns)
-        target = _turned(record, "tx_m", "ty_m", "tz_m", "tyaw_rad")
-        if target is not None:
-            self._target = _transform(ns, WORLD, TARGET, *target)
-            yield TARGET_POSE, _pose_in_world(ns, target)
-        elif self._target is not None:
-            self._target.timestamp.CopyFrom(now)
-        if self._target is not None:
-            transforms.append(self._target)
-        yield TF, FrameTransforms(transforms=transforms)
-        setpoint = _turned(record, "cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
-        if setpoint is not None:
-            yield SETPOINT, _pose_in_world(ns, setpoint)
+            yield from self._path_with(body, t_s, ns)
+        yield TF, FrameTransforms(transforms=[*self._mounts, *moving])
         if record.get("frame_t_s") is not None:
             yield CORNERS, corners_message(self._epoch.ns(float(record["frame_t_s"])), record)
 
-    def _path_with(self, pose: Pose, t_s: float, ns: int) -> Iterator[tuple[str, Message]]:
+    def _path_with(
+        self, body: FrameTransform, t_s: float, ns: int
+    ) -> Iterator[tuple[str, Message]]:
         if t_s - self._point_s >= PATH_STEP_S:
             self._point_s = t_s
-            self._path.poses.append(pose)
+            self._path.poses.append(Pose(position=body.translation, orientation=body.rotation))
         if t_s - self._path_s >= PATH_PERIOD_S:
             self._path_s = t_s
             self._path.timestamp.CopyFrom(stamp(ns))
             yield PATH, self._path
 
 
-Placed = tuple[Any, tuple[float, float, float, float]]
-"""A position (3,), m, and a quaternion (w, x, y, z)."""
-
-
-def _body_of(record: Mapping[str, Any]) -> Placed | None:
-    keys = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
+def _transform_to(
+    child: str, ns: int, record: Mapping[str, Any], *keys: str
+) -> FrameTransform | None:
+    """From the world, by three keys of a position and one of a heading, or three of an attitude;
+    None where one of them is missing."""
     values = [_number(record, key) for key in keys]
     if any(value is None for value in values):
         return None
-    x, y, z, roll, pitch, yaw = (float(v) for v in values if v is not None)
-    return (x, y, z), quaternion_from_rpy(roll, pitch, yaw)
-
-
-def _turned(record: Mapping[str, Any], *keys: str) -> Placed | None:
-    """Three keys of a position and one of a heading."""
-    values = [_number(record, key) for key in keys]
-    if any(value is None for value in values):
-        return None
-    x, y, z, yaw = (float(v) for v in values if v is not None)
-    return (x, y, z), quaternion_from_rpy(0.0, 0.0, yaw)
+    x, y, z, *angles = (float(v) for v in values if v is not None)
+    roll, pitch, yaw = angles if len(angles) == 3 else (0.0, 0.0, *angles)
+    return _transform(ns, WORLD, child, (x, y, z), quaternion_from_rpy(roll, pitch, yaw))
 
 
 def _number(record: Mapping[str, Any], key: str) -> float | None:
@@ -471,84 +433,13 @@ def _number(record: Mapping[str, Any], key: str) -> float | None:
 def _transform(
     ns: int, parent: str, child: str, t_m: Any, q: tuple[float, float, float, float]
 ) -> FrameTransform:
+    (x, y, z), (w, qx, qy, qz) = t_m, q
     return FrameTransform(
         timestamp=stamp(ns),
         parent_frame_id=parent,
         child_frame_id=child,
-        translation=_vector(t_m),
-        rotation=_quaternion(q),
-    )
-
-
-def _pose(t_m: Any, q: tuple[float, float, float, float]) -> Pose:
-    return Pose(position=_vector(t_m), orientation=_quaternion(q))
-
-
-def _pose_in_world(ns: int, placed: Placed) -> PoseInFrame:
-    return PoseInFrame(timestamp=stamp(ns), frame_id=WORLD, pose=_pose(*placed))
-
-
-def _vector(t_m: Any) -> Vector3:
-    x, y, z = t_m
-    return Vector3(x=x, y=y, z=z)
-
-
-def _quaternion(q: tuple[float, float, float, float]) -> Quaternion:
-    w, x, y, z = q
-    return Quaternion(w=w, x=x, y=y, z=z)
-
-
-# --- What the 3-D panel draws besides the frames: a vehicle, and the target's two markers ------
-
-Size = tuple[float, float, float]
-
-ARM_M, FLAT_M = (0.092, 0.012, 0.006), (0.03, 0.03, 0.02)
-THIN_M = 0.001
-_VEHICLE, _BLACK, _WHITE = (0.2, 0.5, 0.9, 1.0), (0.1, 0.1, 0.1, 1.0), (0.95, 0.95, 0.95, 1.0)
-_EIGHTH = (0.9238795, 0.3826834)
-"""Cosine and sine of an eighth of a turn, halved: the arms lie across the body's axes."""
-
-
-def scene_message(ns: int, profile: Profile) -> SceneUpdate:
-    """Both stay where their frames go, and until the file's end."""
-    cos, sin = _EIGHTH
-    vehicle = [
-        _cube(ARM_M, _VEHICLE, turn=(cos, sin)),
-        _cube(ARM_M, _VEHICLE, turn=(cos, -sin)),
-        _cube(FLAT_M, _VEHICLE),
-    ]
-    large_m, small_m = profile.target.large.side_m, profile.target.small.side_m
-    target = [  # each sheet a little nearer to the vehicle than the one behind it
-        _cube((1.25 * large_m, 1.25 * large_m, THIN_M), _WHITE),
-        _cube((large_m, large_m, THIN_M), _BLACK, z_m=-THIN_M),
-        _cube((1.5 * small_m, 1.5 * small_m, THIN_M), _WHITE, z_m=-2.0 * THIN_M),
-        _cube((small_m, small_m, THIN_M), _BLACK, z_m=-3.0 * THIN_M),
-    ]
-    return SceneUpdate(
-        entities=[_entity(ns, "vehicle", BODY, vehicle), _entity(ns, "target", TARGET, target)]
-    )
-
-
-def _entity(ns: int, name: str, frame: str, cubes: list[CubePrimitive]) -> SceneEntity:
-    return SceneEntity(timestamp=stamp(ns), frame_id=frame, id=name, frame_locked=True, cubes=cubes)
-
-
-def _cube(
-    size_m: Size,
-    colour: tuple[float, float, float, float],
-    *,
-    z_m: float = 0.0,
-    turn: tuple[float, float] = (1.0, 0.0),
-) -> CubePrimitive:
-    r, g, b, a = colour
-    x, y, z = size_m
-    return CubePrimitive(
-        pose=Pose(
-            position=Vector3(x=0.0, y=0.0, z=z_m),
-            orientation=Quaternion(w=turn[0], x=0.0, y=0.0, z=turn[1]),
-        ),
-        size=Vector3(x=x, y=y, z=z),
-        color=Color(r=r, g=g, b=b, a=a),
+        translation=Vector3(x=x, y=y, z=z),
+        rotation=Quaternion(w=w, x=qx, y=qy, z=qz),
     )
 
 
@@ -578,14 +469,8 @@ def epoch_of(header: Mapping[str, Any], first_s: float) -> Epoch:
     t0_s = header.get("t0_s")
     if not isinstance(t0_s, (int, float)) or not math.isfinite(t0_s):
         t0_s = first_s
-    return Epoch(_started_ns(header.get("started_utc")), float(t0_s))
-
-
-def _started_ns(text: Any) -> int:
-    try:
-        started = datetime.fromisoformat(str(text))
-    except ValueError:
-        return 0
-    aware = started if started.tzinfo else started.replace(tzinfo=UTC)
-    since = aware - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86400 + since.seconds) * NS + since.microseconds * 1000
+    try:  # whole seconds, with their time zone
+        started_ns = round(datetime.fromisoformat(header["started_utc"]).timestamp()) * NS
+    except (KeyError, TypeError, ValueError):
+        started_ns = 0
+    return Epoch(started_ns, float(t0_s))

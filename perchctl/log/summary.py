@@ -35,6 +35,15 @@ class RecordingEnd:
             told += f", {self.missing} missing"
         return f"{told} ({self.problem})" if self.problem else told
 
+    def as_record(self) -> dict[str, Any]:
+        """For the log, beside which the recording lies: its name is enough."""
+        return {
+            "recording": self.path.name,
+            "pictures": self.pictures,
+            "pictures_missing": self.missing,
+            "recording_problem": self.problem,
+        }
+
 
 @dataclass(frozen=True)
 class FlightSummary:
@@ -68,6 +77,37 @@ class FlightSummary:
     log_problem: str | None = None
     recording: RecordingEnd | None = None
 
+    @classmethod
+    def of(cls, log: FlightLog) -> FlightSummary:
+        """From the log's summary record; from its ticks where that is missing."""
+        phases = log.phases
+        battery_v = log.column("battery_v")
+        known_v = battery_v[battery_v >= NO_BATTERY_READING_V]
+        end: Mapping[str, Any] = log.summary or {
+            "outcome": "unknown",
+            "reason": _last_known(log),
+        }
+        last = log.records[-1] if log.records else {}
+        battery_min_v = float(np.min(known_v)) if known_v.size else None
+        return cls(
+            outcome=str(end.get("outcome", "unknown")),
+            reason=str(end.get("reason", "")),
+            cause=str(end.get("cause") or ""),
+            duration_s=float(end.get("duration_s") or sum(p.duration_s for p in phases)),
+            attempts=int(end.get("attempts", last.get("attempts")) or 0),
+            miss_m=end.get("miss_m"),
+            battery_min_v=end.get("battery_min_v") or battery_min_v,
+            locked=bool(end.get("locked", False)),
+            fell=bool(end.get("fell", False)),
+            phases=phases,
+            findings=_part_in(end, Findings, _FINDINGS),
+            contact=_part_in(end, ContactError, _CONTACT),
+            touchdown=_part_in(end, Touchdown, _TOUCHDOWN),
+            lost_records=int(end.get("lost_records") or 0),
+            log_problem=end.get("problem"),
+            recording=_recording_in(end, log.path),
+        )
+
     def as_record(self) -> dict[str, Any]:
         """For `FlightLogWriter.close`; the phases are in the ticks already, and what the log
         lacks is the writer's to say."""
@@ -78,23 +118,38 @@ class FlightSummary:
             "duration_s": self.duration_s,
             "attempts": self.attempts,
             "miss_m": self.miss_m,
-            **_ending(self.contact, self.touchdown),
+            **_keys_of(self.contact, _CONTACT),
+            **_keys_of(self.touchdown, _TOUCHDOWN),
             "battery_min_v": self.battery_min_v,
             "locked": self.locked,
             "fell": self.fell,
-            **_found(self.findings),
-            **({} if self.recording is None else recording_values(self.recording)),
+            **_keys_of(self.findings, _FINDINGS),
+            **({} if self.recording is None else self.recording.as_record()),
         }
 
 
-def recording_values(recording: RecordingEnd) -> dict[str, Any]:
-    """The recording lies beside the log: its name is enough."""
-    return {
-        "recording": recording.path.name,
-        "pictures": recording.pictures,
-        "pictures_missing": recording.missing,
-        "recording_problem": recording.problem,
-    }
+# A part of the summary by the record's keys and its own fields, in their order.
+_CONTACT = {"contact_aside_m": "aside_m", "contact_sigma_m": "sigma_m"}
+_TOUCHDOWN = {"touchdown_mps": "speed_mps", "touchdown_g": "peak_g"}
+_FINDINGS = {
+    "latency_s": "latency_s",
+    "latency_sigma_s": "latency_sigma_s",
+    "mount_turn_deg": "turn_deg",
+    "mount_turn_sigma_deg": "turn_sigma_deg",
+    "advice": "advice",
+}
+
+
+def _keys_of(part: Any, keys: Mapping[str, str]) -> dict[str, Any]:
+    return {} if part is None else {key: getattr(part, name) for key, name in keys.items()}
+
+
+def _part_in(end: Mapping[str, Any], kind: Any, keys: Mapping[str, str]) -> Any:
+    """The part of that kind; None where the record does not have it."""
+    known = {name: end[key] for key, name in keys.items() if end.get(key) is not None}
+    if next(iter(keys.values())) not in known:
+        return None
+    return kind(**{n: tuple(v) if isinstance(v, list) else v for n, v in known.items()})
 
 
 def _recording_in(end: Mapping[str, Any], beside: Path) -> RecordingEnd | None:
@@ -106,92 +161,6 @@ def _recording_in(end: Mapping[str, Any], beside: Path) -> RecordingEnd | None:
         int(end.get("pictures") or 0),
         int(end.get("pictures_missing") or 0),
         end.get("recording_problem"),
-    )
-
-
-def _ending(contact: ContactError | None, touchdown: Touchdown | None) -> dict[str, Any]:
-    return {
-        "contact_aside_m": None if contact is None else contact.aside_m,
-        "contact_sigma_m": None if contact is None else contact.sigma_m,
-        "touchdown_mps": None if touchdown is None else touchdown.speed_mps,
-        "touchdown_g": None if touchdown is None else touchdown.peak_g,
-    }
-
-
-def _contact_in(end: Mapping[str, Any]) -> ContactError | None:
-    if end.get("contact_aside_m") is None:
-        return None
-    return ContactError(float(end["contact_aside_m"]), float(end["contact_sigma_m"]))
-
-
-def _touchdown_in(end: Mapping[str, Any]) -> Touchdown | None:
-    if end.get("touchdown_mps") is None:
-        return None
-    return Touchdown(float(end["touchdown_mps"]), float(end["touchdown_g"]))
-
-
-def _found(findings: Findings | None) -> dict[str, Any]:
-    """What the flight showed of latency and mounting, with one standard deviation each."""
-    if findings is None:
-        return {}
-    return {
-        "latency_s": findings.latency_s,
-        "latency_sigma_s": findings.latency_sigma_s,
-        "mount_turn_deg": list(findings.turn_deg),
-        "mount_turn_sigma_deg": list(findings.turn_sigma_deg),
-        "advice": list(findings.advice),
-    }
-
-
-def _findings_in(end: Mapping[str, Any]) -> Findings | None:
-    if end.get("latency_s") is None:
-        return None
-    return Findings(
-        float(end["latency_s"]),
-        float(end["latency_sigma_s"]),
-        tuple(end["mount_turn_deg"]),
-        tuple(end["mount_turn_sigma_deg"]),
-        tuple(end.get("advice") or ()),
-    )
-
-
-def findings_lines(found: Findings) -> list[str]:
-    """With 95 % intervals, and what to change for the next flight."""
-    return [
-        f"latency:   {latency_text(found)}",
-        f"mounting:  turned by {turn_text(found)} (x, y, z)",
-        *(f"advice:    {sentence}" for sentence in found.advice),
-    ]
-
-
-def summarise_flight(log: FlightLog) -> FlightSummary:
-    """From the log's summary record; from its ticks where that is missing."""
-    phases = log.phases
-    battery_v = log.column("battery_v")
-    known_v = battery_v[battery_v >= NO_BATTERY_READING_V]
-    end: Mapping[str, Any] = log.summary or {
-        "outcome": "unknown",
-        "reason": _last_known(log),
-    }
-    last = log.records[-1] if log.records else {}
-    battery_min_v = float(np.min(known_v)) if known_v.size else None
-    return FlightSummary(
-        outcome=str(end.get("outcome", "unknown")),
-        reason=str(end.get("reason", "")),
-        cause=str(end.get("cause") or ""),
-        duration_s=float(end.get("duration_s") or sum(p.duration_s for p in phases)),
-        attempts=int(end.get("attempts", last.get("attempts")) or 0),
-        miss_m=end.get("miss_m"),
-        battery_min_v=end.get("battery_min_v") or battery_min_v,
-        locked=bool(end.get("locked", False)),
-        fell=bool(end.get("fell", False)),
-        phases=phases,
-        findings=_findings_in(end),
-        contact=_contact_in(end),
-        touchdown=_touchdown_in(end),
-        lost_records=int(end.get("lost_records") or 0),
-        log_problem=end.get("problem"),
-        recording=_recording_in(end, log.path),
     )
 
 
@@ -208,7 +177,7 @@ def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None
     if isinstance(flight, FlightLog):
         if flight.ignored_bytes:
             faults.append(f"log lost:  its tail, {flight.ignored_bytes} unreadable bytes")
-        flight = summarise_flight(flight)
+        flight = FlightSummary.of(flight)
     if flight.lost_records:
         faults.insert(0, f"log lost:  {flight.lost_records} records ({flight.log_problem})")
     elif flight.log_problem is not None:
@@ -220,13 +189,16 @@ def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None
         lines.append(f"miss:      {flight.miss_m * 1e3:.1f} mm")
     if flight.contact is not None:
         lines.append(f"contact:   {flight.contact.text}")
-    lines.append(f"flight:    {flight.duration_s:.1f} s, {_attempts(flight.attempts)}")
+    attempts = f"{flight.attempts} attempt{'' if flight.attempts == 1 else 's'}"
+    lines.append(f"flight:    {flight.duration_s:.1f} s, {attempts}")
     if flight.phases:
         lines.append(f"phases:    {phases_text(flight.phases)}")
     if flight.battery_min_v is not None:
         lines.append(f"battery:   {flight.battery_min_v:.2f} V at its lowest")
-    if flight.findings is not None:
-        lines += findings_lines(flight.findings)
+    if flight.findings is not None:  # with 95 % intervals
+        lines.append(f"latency:   {latency_text(flight.findings)}")
+        lines.append(f"mounting:  turned by {turn_text(flight.findings)} (x, y, z)")
+        lines += [f"advice:    {sentence}" for sentence in flight.findings.advice]
     if flight.locked:
         lines.append("vehicle:   locked by its supervisor: inspect and restart it")
     if flight.touchdown is not None and flight.touchdown.is_hard:
@@ -245,7 +217,3 @@ def phases_text(phases: Sequence[PhaseSpan]) -> str:
     """``APPROACH 3.1 s > SEARCH 0.4 s > ...``; terminals, which take no time, by name."""
     parts = [f"{p.phase} {p.duration_s:.1f} s" if p.duration_s > 0 else p.phase for p in phases]
     return " > ".join(parts)
-
-
-def _attempts(count: int) -> str:
-    return f"{count} attempt" if count == 1 else f"{count} attempts"

@@ -14,7 +14,7 @@ from typing import Any
 
 from perchctl.errors import InvalidValue, no_parquet
 from perchctl.log.fields import FIELDS, Kind, field_kind
-from perchctl.log.read import FlightLog
+from perchctl.log.read import FlightLog, log_values
 from perchctl.profile import key_unit
 
 _CORNERS = tuple(f"{corner}_{axis}" for corner in ("tl", "tr", "br", "bl") for axis in "xy")
@@ -61,7 +61,10 @@ class LogTable:
         text = StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([column.name for column in self.columns])
-        cells = ([_cell(value) for value in column.values] for column in self.columns)
+        cells = (
+            [int(value) if isinstance(value, bool) else value for value in column.values]
+            for column in self.columns
+        )
         writer.writerows(zip(*cells, strict=True))
         return text.getvalue()
 
@@ -90,58 +93,45 @@ class LogTable:
             "perchctl.header": json.dumps(self.log.header),
             "perchctl.summary": json.dumps(self.log.summary),
         }
-        arrays = [
-            pa.array(column.values, type=field.type)
-            for column, field in zip(self.columns, fields, strict=True)
-        ]
-        table = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=about))
+        values = {column.name: column.values for column in self.columns}
+        table = pa.table(values, schema=pa.schema(fields, metadata=about))
         content = BytesIO()
         pq.write_table(table, content, compression="zstd")
         return content.getvalue()
 
 
-def _cell(value: Any) -> Any:
-    if value is None:
-        return ""
-    return int(value) if isinstance(value, bool) else value
-
-
 def log_table(log: FlightLog) -> LogTable:
-    """`t_s` first, from 0; then the log's fields in their order, with lists flattened, what
-    happened in words, and how long the parts of the turn took.
+    """`t_s` first, from 0; then the log's fields in their order, with the markers' corners as
+    columns of their own, what happened in words, and how long the parts of the turn took.
 
     Errors: InvalidValue for a log without ticks, and for a value that is none of its field's.
     """
     if not log.records:
         raise InvalidValue(f"{log.path}: the log holds no ticks, there is nothing to export")
-    found: list[Column] = []
-    for key in dict.fromkeys((*FIELDS, *(key for record in log.records for key in record))):
-        found += _of_field(log, key)
-    return LogTable(log, [*found, _events(log), *_timings(log)])
+    with log_values(log.path):
+        columns = [column for key in FIELDS for column in _of_field(log, key)]
+        return LogTable(log, [*columns, _events(log), *_timings(log)])
 
 
 def _of_field(log: FlightLog, key: str) -> Iterator[Column]:
-    values = [record.get(key) for record in log.records]
-    meaning = FIELDS.get(key) or str(_header_fields(log).get(key, ""))
+    values, meaning, kind = [r.get(key) for r in log.records], FIELDS[key], field_kind(key)
     if key in _TIMES:
         meaning = meaning.replace("on the loop's clock", "since the flight's first turn")
-        values = [None if v is None else _since(log, key, v) for v in values]
-    if key in FIELDS and field_kind(key) == "corners":
-        yield from _corners(log, key, meaning, values)
+        values = [None if v is None else round(log.since(v), _DECIMALS) + 0.0 for v in values]
+    if kind != "corners":
+        yield Column(key, kind, meaning, [_as_kind(key, kind, value) for value in values])
         return
-    kind = _kind(key, values)
-    yield Column(key, kind, meaning, [_checked(log, key, kind, value) for value in values])
-
-
-def _corners(log: FlightLog, key: str, meaning: str, values: list[Any]) -> Iterator[Column]:
-    for value in values:
-        if value is not None and not (isinstance(value, list) and len(value) == len(_CORNERS)):
-            raise _wrong(log, key, value, f"{len(_CORNERS)} numbers")
-    marker = key.removesuffix("_px")
-    for i, corner in enumerate(_CORNERS):
-        name = f"{marker}_{corner}_px"
-        one = [None if v is None else _checked(log, key, "number", v[i]) for v in values]
+    for corner, of_corner in zip(_CORNERS, zip(*map(_corners, values), strict=True), strict=True):
+        name = f"{key.removesuffix('_px')}_{corner}_px"
+        one = [_as_kind(name, "number", value) for value in of_corner]
         yield Column(name, "number", f"{meaning}: {corner.replace('_', ' ')}", one)
+
+
+def _corners(value: Any) -> list[Any]:
+    corners = [None] * len(_CORNERS) if value is None else list(value)
+    if len(corners) != len(_CORNERS):
+        raise ValueError(f"corners must be {len(_CORNERS)} numbers, found {value!r:.40}")
+    return corners
 
 
 def _events(log: FlightLog) -> Column:
@@ -168,52 +158,22 @@ def _timings(log: FlightLog) -> Iterator[Column]:
     }
     timings = [of_turn.get(float(record["t_s"]), {}) for record in log.records]
     for key, meaning in _TIMINGS.items():
-        values = [_checked(log, key, "number", timing.get(key)) for timing in timings]
+        values = [_as_kind(key, "number", timing.get(key)) for timing in timings]
         yield Column(key, "number", meaning, values)
 
 
-def _kind(key: str, values: list[Any]) -> Kind:
-    if key in FIELDS:
-        return field_kind(key)
-    known = [value for value in values if value is not None]
-    numbers = all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in known)
-    return "number" if numbers else "text"
-
-
-def _checked(log: FlightLog, key: str, kind: Kind, value: Any) -> Any:
-    """The value as its kind has it."""
+def _as_kind(key: str, kind: Kind, value: Any) -> Any:
+    """The value as its kind has it. Raises ValueError for one of another kind."""
     if value is None:
         return None
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     match kind:
-        case "text":
-            return value if isinstance(value, str) else json.dumps(value)
-        case "flag":
-            if not isinstance(value, bool):
-                raise _wrong(log, key, value, "true or false")
+        case "text" if isinstance(value, str):
             return value
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise _wrong(log, key, value, "a number")
-    if kind == "integer":
-        if value != int(value):
-            raise _wrong(log, key, value, "a whole number")
-        return int(value)
-    return float(value)
-
-
-def _since(log: FlightLog, key: str, value: Any) -> float:
-    number: float = _checked(log, key, "number", value)
-    return round(log.since(number), _DECIMALS) + 0.0
-
-
-def _header_fields(log: FlightLog) -> dict[str, Any]:
-    fields = log.header.get("fields")
-    return fields if isinstance(fields, dict) else {}
-
-
-def _wrong(log: FlightLog, key: str, value: Any, allowed: str) -> InvalidValue:
-    found = json.dumps(value)
-    shown = found if len(found) <= 40 else f"{found[:37]}..."
-    return InvalidValue(
-        f"{log.path}: {key} must be {allowed}, found {shown}: the file is damaged, take the "
-        f"original"
-    )
+        case "flag" if isinstance(value, bool):
+            return value
+        case "number" if is_number:
+            return float(value)
+        case "integer" if is_number and value == int(value):
+            return int(value)
+    raise ValueError(f"{key}: a {kind} is needed, found {value!r:.40}")

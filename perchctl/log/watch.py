@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from perchctl.camera import FrameSource, WatchedSource
-from perchctl.log.fields import event_record, tick_record
+from perchctl.log.fields import event_record, sent_values, tick_record
 from perchctl.log.header import make_header
-from perchctl.log.read import PhaseSpan, sent_values
-from perchctl.log.summary import FlightSummary, RecordingEnd, recording_values
+from perchctl.log.read import PhaseSpan
+from perchctl.log.summary import FlightSummary, RecordingEnd
 from perchctl.log.write import RECORDING_SUFFIX, FlightLogWriter, log_path, recording_path
 from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
 from perchctl.profile import Profile
@@ -159,7 +159,7 @@ class LogWatcher:
         )
         self.writer.conclude(summary.as_record())
         recording = self._ended_recording()
-        self.writer.close(recording=None if recording is None else recording_values(recording))
+        self.writer.close(recording=None if recording is None else recording.as_record())
         lost, problem = self.writer.lost_records, self.writer.lacks
         return replace(summary, lost_records=lost, log_problem=problem, recording=recording)
 

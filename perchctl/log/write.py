@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
@@ -37,7 +37,6 @@ TURNS_SHARE = 0.8
 """Of the queue, beyond which turns are dropped: what is left is for ticks and events."""
 DEFAULT_LOOP_HZ = 50.0
 NO_ANSWER = "the disk does not answer: the flight log lacks its end"
-_Record = Mapping[str, Any] | Turn | SentCommand
 
 
 class FlightLogWriter:
@@ -111,20 +110,19 @@ class FlightLogWriter:
 
     def write(self, record: Mapping[str, Any]) -> None:
         """Append one tick record (`perchctl.log.fields.tick_record`). Never raises."""
-        self._put({"kind": "tick", **record}, _time_of(record))
+        self._put(partial(encode, {"kind": "tick", **record}), record["t_s"])
 
     def turn(self, turn: Turn) -> None:
         """Append a whole turn, exactly (`turn_line`). Never raises."""
-        self._put(turn, turn.t_s)
+        self._put(partial(turn_line, turn), turn.t_s, TURNS_SHARE)
 
     def sent(self, sent: SentCommand) -> None:
-        """Append what was sent in the loop's place, exactly; from any
-        thread. Never raises."""
-        self._put(sent, sent.t_s)
+        """Append what was sent in the loop's place, exactly; from any thread. Never raises."""
+        self._put(partial(sent_line, sent), sent.t_s)
 
     def event(self, event: Event) -> None:
         """Append an event (`perchctl.log.fields.event_record`). Never raises."""
-        self._put({"kind": "event", **event_record(event)}, event.t_s)
+        self._put(partial(encode, {"kind": "event", **event_record(event)}), event.t_s)
 
     def conclude(self, summary: Mapping[str, Any]) -> None:
         """Append the summary, and bring it to the disk: what is still to be done before `close`
@@ -157,7 +155,7 @@ class FlightLogWriter:
     def _summarise(self, summary: Mapping[str, Any]) -> None:
         lost = {"lost_records": self.lost_records, "problem": self.lacks}
         self._failed_s = None  # one last try, whatever happened before
-        self._store({"kind": "summary", **summary, **lost}, None)
+        self._store(partial(encode, {"kind": "summary", **summary, **lost}), None)
         self._sync_to_disk()
 
     def _end(
@@ -166,7 +164,7 @@ class FlightLogWriter:
         if summary is not None:
             self._summarise(summary)
         if recording is not None:
-            self._store({"kind": "recording", **recording}, None)
+            self._store(partial(encode, {"kind": "recording", **recording}), None)
         self._sync_to_disk()
         self._let_go()
 
@@ -178,21 +176,19 @@ class FlightLogWriter:
         with self._dropping:
             self._dropped += count
 
-    def _put(self, record: _Record, t_s: float | None) -> None:
+    def _put(self, line: Callable[[], bytes], t_s: float, share: float = 1.0) -> None:
         if self._closed or self._concluded:
             self._drop()
-        elif not self._writer.put(
-            partial(self._store, record, t_s), TURNS_SHARE if isinstance(record, Turn) else 1.0
-        ):
+        elif not self._writer.put(partial(self._store, line, t_s), share):
             self._drop()
             self._remember("the disk does not keep up with the flight log: records are dropped")
 
-    def _store(self, record: _Record, t_s: float | None) -> None:
+    def _store(self, line: Callable[[], bytes], t_s: float | None) -> None:
         if self._is_waiting(t_s):
             self._failed += 1
             return
         try:
-            self._file.write(_line_of(record))
+            self._file.write(line())
         except OSError as error:
             self._failed += 1
             self._failed_s = t_s
@@ -235,14 +231,9 @@ def _header_line(header: Mapping[str, Any]) -> bytes:
     return json_line(to_exact({k: v for k, v in header.items() if v is not None}))
 
 
-def _line_of(record: _Record) -> bytes:
-    match record:
-        case Turn():
-            return turn_line(record)
-        case SentCommand():
-            return json_line({"kind": "sent", **to_exact(record)})
-        case _:
-            return encode(record)
+def sent_line(sent: SentCommand) -> bytes:
+    """What was sent in the loop's place as one line of the log, exact."""
+    return json_line({"kind": "sent", **to_exact(sent)})
 
 
 def turn_line(turn: Turn) -> bytes:
@@ -252,11 +243,6 @@ def turn_line(turn: Turn) -> bytes:
     if obs is not None and samples and obs.telemetry is samples[-1]:
         del record["observation"]["telemetry"]  # it stands in the same line already
     return json_line(record)
-
-
-def _time_of(record: Mapping[str, Any]) -> float | None:
-    t_s = record.get("t_s")
-    return float(t_s) if isinstance(t_s, (int, float)) else None
 
 
 def _explain(error: OSError) -> str:

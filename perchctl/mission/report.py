@@ -189,8 +189,8 @@ def _about_latency(found: Findings, camera: CameraConfig) -> list[str]:
     least_s, most_s = USED_LATENCY_S
     measured = isinstance(camera.latency_s, str)
     used_s = min(max(found.latency_s, least_s), most_s) if measured else camera.start_latency_s
-    off_s, interval_s = found.latency_s - used_s, SURE * found.latency_sigma_s
-    if not abs(off_s) > max(LATENCY_GATE_S, interval_s):
+    off_s = found.latency_s - used_s
+    if not _is_worth_saying(off_s, LATENCY_GATE_S, found.latency_sigma_s):
         return []
     if measured:
         return [
@@ -208,7 +208,7 @@ def _about_turn(found: Findings) -> list[str]:
     off = [
         f"{turn:.1f} +- {SURE * sigma:.1f} deg about {axis}"
         for axis, turn, sigma in zip("xyz", found.turn_deg, found.turn_sigma_deg, strict=True)
-        if abs(turn) > max(TURN_GATE_DEG, SURE * sigma)
+        if _is_worth_saying(turn, TURN_GATE_DEG, sigma)
     ]
     if not off:
         return []
@@ -216,6 +216,11 @@ def _about_turn(found: Findings) -> list[str]:
         f"the camera is turned by {', '.join(off)} from what the profile says: measure it with "
         f"`perchctl calibrate mount`"
     ]
+
+
+def _is_worth_saying(off: float, gate: float, sigma: float) -> bool:
+    """True if it is beyond the gate, and its 95 % interval is narrower than it is itself."""
+    return abs(off) > max(gate, 2.0 * SURE * sigma)
 
 
 def latency_text(found: Findings) -> str:

@@ -1,10 +1,8 @@
-"""Reports of flights that were flown: perched, landed by a fault, killed. As text, and as a
-browser lays them out at 1280 and 400 px, without a network: without a browser that is skipped."""
+"""Reports of flights that were flown: perched, landed by a fault, killed."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,6 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 import cv2
 
-from perchctl.analysis import write_report
 from perchctl.analysis.report import ReportedFlight, reported_flight
 from perchctl.faults import FaultResult
 from perchctl.faults.catalogue import BY_NAME, Case
@@ -22,7 +19,6 @@ from perchctl.faults.flight import fly_with_fault
 from perchctl.log import read_log
 from perchctl.mission import Phase
 from perchctl.sim import draw_scenario
-from tests.helpers.browser import Browser, browsing, why_no_browser
 from tests.helpers.flights import SEED, short_profile
 
 pytestmark = pytest.mark.long
@@ -33,29 +29,23 @@ FAULTS: dict[str, tuple[str, Phase, Effect]] = {
     "landed": ("camera-silent", Phase.ALIGN, CameraFault("silent", FOR_EVER)),
     "killed": ("killed", Phase.ASCEND, Killed()),
 }
-NAMES = tuple(FAULTS)
-RECORDED = "perched"
 
 
 def flown(name: str, folder: Path) -> FaultResult:
-    """`perched`: snow for a while in the ascent, recorded with its pictures; `landed`: the camera
-    falls silent in the alignment, for ever; `killed`: the program is, in the ascent."""
+    """`perched`: snow for a while in the ascent; `landed`: the camera falls silent in the
+    alignment, for ever; `killed`: the program is, in the ascent."""
     cv2.setNumThreads(1)
     profile = short_profile()
     fault, phase, effect = FAULTS[name]
     case = Case(BY_NAME[fault], phase, 0.3, (effect,))
     scenario, log = draw_scenario(profile, SEED), folder / f"{name}.jsonl"
-    return fly_with_fault(profile, case, scenario, log, record=name == RECORDED)
+    return fly_with_fault(profile, case, scenario, log)
 
 
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, FaultResult]]:
     folder = tmp_path_factory.mktemp("flights")
-    results = {name: flown(name, folder) for name in NAMES}
-    for name in NAMES:
-        write_report([folder / f"{name}.jsonl"], folder / f"{name}.html")
-    write_report([folder / f"{name}.jsonl" for name in NAMES], folder / "session.html")
-    return folder, results
+    return folder, {name: flown(name, folder) for name in FAULTS}
 
 
 def told(flights: tuple[Path, dict[str, FaultResult]], name: str) -> ReportedFlight:
@@ -84,7 +74,8 @@ def test_a_silent_camera_lands_it_and_the_page_says_why(
 ) -> None:
     flight = told(flights, "landed")
     assert flight.outcome == "landed"
-    assert any("No picture" in s.text and "it landed" in s.text for s in flight.story)
+    assert any("No picture" in s.text for s in flight.story)
+    assert any("it landed" in s.text for s in flight.story)
     assert {a.about for a in flight.advice} >= {"video"}
 
 
@@ -92,54 +83,3 @@ def test_a_killed_flight_has_no_end(flights: tuple[Path, dict[str, FaultResult]]
     flight = told(flights, "killed")
     assert flight.outcome == "unfinished"
     assert "The log ends here, in ASCEND" in flight.story[-1].text
-
-
-# --- in a browser ---------------------------------------------------------------------
-
-LAID_OUT = """(() => {
-  const boxed = e => e.closest('.wide') || e.closest('svg');
-  const beyond = (e, right) => e.getBoundingClientRect().right > right + 1;
-  const all = [...document.querySelectorAll('main *')];
-  const inside = text => {
-    const word = text.getBoundingClientRect(), box = text.closest('svg').getBoundingClientRect();
-    return word.left > box.left - 1 && word.right < box.right + 1
-      && word.top > box.top - 1 && word.bottom < box.bottom + 1;
-  };
-  return {
-    window: innerWidth,
-    wide: document.documentElement.scrollWidth,
-    beyond: all.filter(e => !boxed(e) && beyond(e, innerWidth)).map(e => e.outerHTML.slice(0, 80)),
-    cut: [...document.querySelectorAll('svg text')].filter(t => !inside(t)).map(t => t.textContent),
-    figures: document.querySelectorAll('svg').length,
-    pictures: [...document.images].filter(i => i.complete && i.naturalWidth > 100).length,
-    missing: [...document.images].filter(i => !i.naturalWidth).length,
-    colour: getComputedStyle(document.body).backgroundColor,
-  };
-})()"""
-BARE = "rgba(0, 0, 0, 0)"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    if why := why_no_browser():
-        pytest.skip(why)
-    with browsing() as opened:
-        yield opened
-
-
-@pytest.mark.parametrize("width_px", [400, 1280])
-@pytest.mark.parametrize("name", [*NAMES, "session"])
-def test_nothing_is_wider_than_the_window(
-    name: str, width_px: int, flights: tuple[Path, dict[str, FaultResult]], browser: Browser
-) -> None:
-    browser.open((flights[0] / f"{name}.html").as_uri(), width_px, 900)
-    browser.until("document.readyState == 'complete'")
-    laid = browser.evaluate(LAID_OUT)
-    assert laid["window"] == width_px
-    assert laid["wide"] <= width_px
-    assert laid["beyond"] == []
-    assert laid["cut"] == []
-    assert laid["figures"] >= 6
-    assert laid["missing"] == 0
-    assert laid["pictures"] >= (4 if name in (RECORDED, "session") else 0)
-    assert laid["colour"] != BARE, "without its style"

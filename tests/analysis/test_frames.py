@@ -30,13 +30,6 @@ def regular(count: int) -> list[float]:
     return [7.0 + k * PERIOD_S for k in range(count)]
 
 
-def test_all_is_well() -> None:
-    frames = frames_of(flight(regular(30)))
-    assert frames.seen_s == pytest.approx(np.arange(30) * PERIOD_S - 0.05)
-    assert frames.unseen_s.size == 0
-    assert frames.gaps_s.shape == (0, 2)
-
-
 def test_a_gap_is_where_no_frame_came() -> None:
     times = regular(30)
     frames = frames_of(flight(times[:10] + times[16:]))

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from perchctl.analysis import FlightAnalysis
-from perchctl.analysis.sight import exposure_s_of, focal_px_of, motion_of
 from perchctl.analysis.story import Sentence, story_of
-from perchctl.log import FlightLog
 from perchctl.mission import Phase
 from tests.helpers.log import GONE_S, PLAN
 from tests.helpers.mission import note
 from tests.helpers.told import START_S, Change, entered, flown_s, made
 
-MOUNT, GEAR = [0.03, 0.0, 0.005], [0.0, 0.01, 0.03]
 FRAME_KEYS = ("large_px", "small_px", *(f"{s}{k}" for s in "lsj" for k in
               ("x_m", "y_m", "z_m", "yaw_rad", "_rms_px")))  # fmt: skip
 
@@ -55,7 +50,7 @@ def test_each_phase_has_its_sentence_at_its_time() -> None:
 def test_a_loss_says_when_how_long_and_how_many_frames() -> None:
     lost = only(story(blank_frames), "was lost")
     assert lost.t_s == pytest.approx(GONE_S[0], abs=0.05)
-    assert "lost for 0.5 s: 12 frames without it" in lost.text
+    assert "lost for 0.5 s: 12 frames without it, at 0.0 m/s" in lost.text
     assert lost.grade == "warn"
 
 
@@ -63,7 +58,7 @@ def test_without_frames_it_was_the_pictures_that_did_not_come() -> None:
     assert only(story(), "No picture").text.startswith("No picture that could be used came")
 
 
-def test_a_loss_says_what_the_vehicle_did_then() -> None:
+def test_backing_off_says_by_how_much() -> None:
     def change(record: dict[str, Any]) -> None:
         blank_frames(record)
         if 5.2 <= flown_s(record) < 6.0:
@@ -73,7 +68,6 @@ def test_a_loss_says_what_the_vehicle_did_then() -> None:
             record |= {"phase": "ESTIMATE", "reason": "steady again, trying once more"}
 
     told = story(change)
-    assert only(told, "was lost").text.endswith("; backed off 10 cm")
     assert "Target lost in ascent: backed off 10 cm" in only(told, "Target lost").text
 
 
@@ -156,54 +150,3 @@ def test_a_log_without_a_tick_has_no_story() -> None:
     log = made()
     log.records.clear()
     assert story_of(FlightAnalysis(log)) == ()
-
-
-# --- motion ---------------------------------------------------------------------------
-
-
-def under_target(speed_mps: float, turn_radps: float, height_m: float) -> FlightAnalysis:
-    """Level, the camera so far below the target, which it sees with 380 px of focal length."""
-    camera, gear = np.array(MOUNT), np.array(GEAR)
-    ex_m, ey_m, ez_m = np.array([0.0, 0.0, height_m]) + camera - gear
-    side_px = 380.0 * 0.15 / height_m
-    square = [0.0, 0.0, side_px, 0.0, side_px, side_px, 0.0, side_px]
-
-    def change(record: dict[str, Any]) -> None:
-        record |= {"vx_mps": speed_mps, "vy_mps": 0.0, "vz_mps": 0.0, "roll_rad": 0.01}
-        record |= {"yaw_rad": 0.0, "pitch_rad": turn_radps * flown_s(record)}
-        record |= {"ex_m": ex_m, "ey_m": ey_m, "ez_m": ez_m}
-        if record["large_px"] is not None:
-            record |= {"large_px": square, "lz_m": ez_m}
-
-    log = made(change)
-    log.header["profile"]["camera"]["mount"]["position_m"] = MOUNT
-    log.header["profile"]["vehicle"]["gear_body_m"] = GEAR
-    return FlightAnalysis(log)
-
-
-@pytest.mark.parametrize(("speed_mps", "turn_radps"), [(0.9, 0.0), (0.0, 0.7), (0.4, 0.5)])
-def test_blur_is_the_way_through_the_picture(speed_mps: float, turn_radps: float) -> None:
-    """Forward, and nose down: both move the target backwards in the picture."""
-    track = under_target(speed_mps, turn_radps, 1.0)
-    focal_px = focal_px_of(track.log)
-    assert focal_px == pytest.approx(380.0, rel=1e-3)
-    expected = 380.0 * (speed_mps + turn_radps)
-    assert np.median(track.motion.flow_pxps) == pytest.approx(expected, rel=0.01)
-    assert np.median(track.motion.blur_px) == pytest.approx(0.008 * expected, rel=0.01)
-
-
-def test_blur_is_unknown_where_the_exposure_is() -> None:
-    camera = {"camera": {"controls": {"exposure_time_absolute": 50}}}
-    assert exposure_s_of(bare(uri="radio://0", profile=camera)) == pytest.approx(0.005)
-    assert exposure_s_of(bare(uri="radio://0", profile={"camera": {"controls": {}}})) is None
-    assert exposure_s_of(bare()) is None
-
-
-def bare(**header: Any) -> FlightLog:
-    return FlightLog(Path("f.jsonl"), header, [], [], None, True)
-
-
-def test_a_camera_that_does_not_look_up_has_no_flow() -> None:
-    log = made()
-    log.header["profile"]["camera"]["mount"]["rpy_deg"] = [0.0, 90.0, 0.0]
-    assert not np.isfinite(motion_of(log).flow_pxps).any()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.analysis import FlightAnalysis, replay, show_record, show_text
+from perchctl.analysis import FlightAnalysis, replay, show_record
 from perchctl.log import export_mcap, json_line, log_table, read_log
 from perchctl.mission import conditions
 from tests.helpers.recorded import messages
@@ -57,16 +57,6 @@ def test_all_outputs_of_a_log_have_one_zero(path: Path, monkeypatch: pytest.Monk
         "replay": decided_otherwise.t_s,
     }
     assert said == pytest.approx(dict.fromkeys(said, at_s), abs=2e-6)
-
-
-def test_a_log_of_turns_alone_is_said_to_be_one(tmp_path: Path) -> None:
-    kept = gzip.decompress((FOLDER / "stopped.jsonl.gz").read_bytes()).splitlines(keepends=True)
-    path = tmp_path / "f.jsonl"
-    path.write_bytes(b"".join(line for line in kept if b'"kind":"summary"' not in line))
-    text = " ".join(show_text(FlightAnalysis(read_log(path))).split())
-    assert text.startswith("UNKNOWN: the log ends in ")
-    assert "left out of this log; its" in text
-    assert "perchctl log replay" in text
 
 
 def test_without_ticks_the_first_flown_turn_is_the_zero() -> None:

@@ -27,7 +27,7 @@ from perchctl.campaign.compare import FIGURES
 from perchctl.campaign.results import ENDS, rate_interval, worst_first
 from perchctl.campaign.results_file import flown_record, result_from, result_record
 from perchctl.errors import SafetyAbort
-from perchctl.log import read_log, summarise_flight, summary_text
+from perchctl.log import FlightSummary, read_log, summary_text
 from perchctl.log.write import FlightLogWriter
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
@@ -130,7 +130,7 @@ def test_words_from_a_log(tmp_path: Path) -> None:
     text = summary_text(read_log(writer.path))
     assert text.startswith("PERCHED: hanging still with the motors off\nmiss:      3.1 mm\n")
     assert "SEARCH 0.5 s > ESTIMATE 0.5 s" in text
-    unfinished = summarise_flight(cut)
+    unfinished = FlightSummary.of(cut)
     assert (unfinished.outcome, unfinished.reason) == ("unknown", "the log ends in PERCHED")
     assert unfinished.duration_s == pytest.approx(18.6, abs=0.05)
     assert unfinished.battery_min_v == pytest.approx(min(r["battery_v"] for r in records))
@@ -143,7 +143,7 @@ def test_a_battery_that_is_not_measured_has_no_minimum(tmp_path: Path) -> None:
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
     writer.write({"t_s": 0.0, "phase": "APPROACH", "battery_v": 0.0})
     writer.close()
-    assert summarise_flight(read_log(writer.path)).battery_min_v is None
+    assert FlightSummary.of(read_log(writer.path)).battery_min_v is None
 
 
 class Terminal(io.StringIO):

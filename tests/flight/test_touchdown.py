@@ -16,7 +16,6 @@ from perchctl.display import summary_card
 from perchctl.log import (
     FlightSummary,
     read_log,
-    summarise_flight,
     summary_text,
 )
 from perchctl.mission import (
@@ -270,6 +269,6 @@ def test_log_show_and_log_report_tell_both(tmp_path: Path) -> None:
     page = unescape(page_of([whole])).replace("\xa0", " ")
     assert "1.8 +- 0.6 mm off centre" in page, page
     assert f"It {SENTENCE}" in [sentence.text for sentence in whole.story]
-    card = summary_card(summarise_flight(flown), flown.path)
+    card = summary_card(FlightSummary.of(flown), flown.path)
     assert ["contact", "1.8 +- 0.6 mm off centre"] in card["rows"]
     assert ["vehicle", SENTENCE] in card["rows"]

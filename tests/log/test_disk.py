@@ -18,7 +18,6 @@ from perchctl.commands import fly
 from perchctl.errors import InvalidValue, LogIncomplete
 from perchctl.flight import FlyOptions, SessionResult
 from perchctl.log import FlightSummary, LogWatcher, read_log, summary_text, write
-from perchctl.log.disk import BackgroundWriter
 from perchctl.log.write import FlightLogWriter
 from perchctl.mission import FlightReport, Outcome, Phase, Turn, TurnInputs
 from perchctl.profile import load_profile
@@ -89,19 +88,6 @@ def test_a_full_disk_that_gets_room_again(tmp_path: Path, monkeypatch: pytest.Mo
     assert log.summary is not None
     assert log.summary["lost_records"] == lost + 1
     assert log.summary["problem"] == writer.problem
-
-
-def test_a_value_that_has_no_place_in_a_log_never_raises(tmp_path: Path) -> None:
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
-    writer.write({"t_s": 0.0, "odd": object()})
-    assert writer.formless is not None
-    assert "object" in writer.formless
-    writer.close(synthetic.SUMMARY)
-    writer.close(synthetic.SUMMARY)
-    writer.write({"t_s": 5.0})
-    log = read_log(writer.path)
-    assert log.records == []
-    assert log.summary is not None
 
 
 class Unruly(Mapping[str, Any]):
@@ -302,19 +288,6 @@ def test_a_live_log_has_every_record_in_order(tmp_path: Path) -> None:
     assert [r["t_s"] for r in read_log(writer.path).records] == pytest.approx(
         [r["t_s"] for r in written]
     )
-
-
-def test_a_job_that_raises_does_not_end_the_thread() -> None:
-    done: list[int] = []
-
-    def fails() -> None:
-        raise AttributeError("odd")
-
-    behind = BackgroundWriter(10, "test", live=True)
-    for job in (fails, lambda: done.append(1), fails):
-        assert behind.put(job)
-    assert behind.finish(lambda: done.append(2), 20.0, fails) == 0
-    assert done == [1, 2]
 
 
 def test_lockstep_writes_without_a_thread(tmp_path: Path) -> None:

@@ -104,21 +104,19 @@ def test_without_the_library_it_is_one_sentence(
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    ("key", "value"),
     [
-        ("battery_v", "low", 'battery_v must be a number, found "low"'),
-        ("measured", 1, "measured must be true or false, found 1"),
-        ("attempts", 1.5, "attempts must be a whole number, found 1.5"),
-        ("large_px", [1.0, 2.0], "large_px must be 8 numbers"),
+        ("battery_v", "low"),
+        ("measured", 1),
+        ("attempts", 1.5),
+        ("large_px", [1.0, 2.0]),
+        ("frame_t_s", "soon"),
     ],
 )
-def test_a_value_of_another_kind_is_named(
-    log: FlightLog, key: str, value: object, said: str
-) -> None:
+def test_a_value_of_another_kind_is_refused(log: FlightLog, key: str, value: object) -> None:
     wrong = replace(log, records=[log.records[0] | {key: value}])
-    with pytest.raises(InvalidValue, match="take the original") as refused:
+    with pytest.raises(InvalidValue, match="take the original"):
         log_table(wrong)
-    assert said in str(refused.value)
 
 
 def test_nothing_to_export_is_said(log: FlightLog) -> None:

@@ -12,18 +12,18 @@ from typing import Any
 import pytest
 
 from perchctl.analysis import FlightAnalysis, show_record, show_text
+from perchctl.analysis.edges import takeovers_of
 from perchctl.analysis.story import story_of
 from perchctl.flight import fly
 from perchctl.flight.watchdog import rescue
 from perchctl.link.sender import Sender
 from perchctl.log import LogWatcher, export_mcap, read_log, write
 from perchctl.log import recorder as recording_module
-from perchctl.log.read import sent_values, takeovers_of
+from perchctl.log.fields import sent_values
 from perchctl.log.recorder import Recorder
 from perchctl.log.write import FlightLogWriter
 from perchctl.mission import FlightReport, Operator, Outcome, Phase, SentCommand
 from perchctl.perception import History
-from perchctl.profile import load_profile
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.flight.test_silent_loop import HANG_AT_S, hung_rig
 from tests.helpers import log as synthetic
@@ -63,12 +63,6 @@ def test_it_comes_back_to_the_bit(log: Path) -> None:
     assert tuple(read_log(log).sent) == TOLD
 
 
-def test_a_log_of_before_has_none(tmp_path: Path) -> None:
-    path = synthetic.write(tmp_path / "f.jsonl", synthetic.header(), synthetic.SUMMARY, most=5)
-    assert read_log(path).takeovers == ()
-    assert "loop's place" not in show_text(FlightAnalysis(read_log(path)))
-
-
 def test_recording_and_export_say_it_alike(log: Path, tmp_path: Path) -> None:
     export_mcap(log, tmp_path / "out.mcap")
     own = recorded.messages(tmp_path / "f.mcap")["/sent"]
@@ -83,13 +77,13 @@ def test_recording_and_export_say_it_alike(log: Path, tmp_path: Path) -> None:
 
 
 def test_what_one_sends_in_one_go_is_told_together() -> None:
-    goes = takeovers_of(TOLD)
+    goes = takeovers_of([*map(sent_values, TOLD)])
     assert [(go.by, go.start_s, go.end_s) for go in goes] == [
         ("watchdog", 4.0, 4.7), ("rescue", 9.0, 9.0), ("farewell", 9.5, 9.5),
     ]  # fmt: skip
     assert goes[0].text == "position setpoints (2), landing ordered (1)"
     later = SentCommand(4.7 + 2.1, "watchdog", StopMotors())
-    assert len(takeovers_of((*TOLD[:3], later))) == 2
+    assert len(takeovers_of([*map(sent_values, (*TOLD[:3], later))])) == 2
 
 
 def test_show_and_story_tell_who_took_over(log: Path) -> None:
@@ -114,7 +108,7 @@ def test_a_hung_loop_s_log_says_what_the_watchdog_sent(tmp_path: Path) -> None:
     watcher.close(report)
     read = read_log(watcher.path)
     assert [(each.t_s, each.command) for each in read.sent] == link.own
-    (go,) = read.takeovers
+    (go,) = takeovers_of(read.sent_values)
     assert go.start_s == pytest.approx(HANG_AT_S + 0.3, abs=0.08)
     assert dict(go.sent)["land"] > 0
     assert not read.truncated
@@ -217,23 +211,6 @@ def test_the_summary_is_safe_before_the_recording_s_end_is_waited_for(
     disk.gate.set()
 
 
-def test_a_killed_wait_for_the_recording_costs_no_summary(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    watcher, disk = hung_recorder(tmp_path, monkeypatch)
-
-    def killed() -> Any:
-        raise KeyboardInterrupt
-
-    watcher._recorder.close = killed  # type: ignore[union-attr,method-assign]
-    with pytest.raises(KeyboardInterrupt):
-        watcher.close(REPORT)
-    log = read_log(watcher.path)
-    assert log.summary is not None
-    assert not log.truncated
-    disk.gate.set()
-
-
 def test_a_log_s_disk_that_hangs_is_waited_for_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -272,17 +249,3 @@ def test_a_disk_that_has_recovered_by_the_close_has_lost_nothing(
     log = read_log(tmp_path / "f.jsonl")
     assert log.summary is not None
     assert not log.truncated
-
-
-def test_lockstep_logs_of_one_seed_are_the_same_bytes(tmp_path: Path) -> None:
-    """With what the watchdog sent in them."""
-    logs = []
-    for name in ("a", "b"):
-        rig, _ = hung_rig(0.6)
-        watcher = LogWatcher.lockstep(tmp_path / f"{name}.jsonl", load_profile("sim"), 1)
-        parts = rig.parts()
-        report = fly(type(parts)(**{**vars(parts), "watchers": (watcher,)}))
-        watcher.close(report)
-        logs.append(watcher.path.read_bytes())
-    assert b'"kind":"sent"' in logs[0]
-    assert logs[0] == logs[1]

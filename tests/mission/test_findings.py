@@ -33,7 +33,7 @@ def test_a_drift_beyond_the_gate_is_an_advice() -> None:
 
 
 @pytest.mark.parametrize(
-    ("delay_s", "sigma_s"), [(0.018, 0.003), (-0.018, 0.003), (0.04, 0.03)]
+    ("delay_s", "sigma_s"), [(0.018, 0.003), (-0.018, 0.003), (0.04, 0.03), (0.04, 0.0105)]
 )  # fmt: skip
 def test_what_is_small_or_unsure_is_no_advice(delay_s: float, sigma_s: float) -> None:
     assert flight_findings(_seen(delay_s, sigma_s), CAMERA).advice == ()
@@ -56,6 +56,8 @@ def test_a_turn_is_named_by_its_axis() -> None:
     assert "about x" not in advice
     assert "`perchctl calibrate mount`" in advice
     assert flight_findings(_seen(turn_deg=(0.0, 0.0, 4.0), sigma_deg=3.0), CAMERA).advice == ()
+    unsure = _seen(turn_deg=(-37.8, 0.0, 0.0), sigma_deg=15.0)  # a flight of 3.5 s
+    assert flight_findings(unsure, CAMERA).advice == ()
 
 
 def test_the_summary_tells_them_with_intervals() -> None:

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 import perchctl
 from perchctl.calibration import load_calibration
 from perchctl.errors import InvalidValue, Note, NotFound, PerchError, ProfileNote
-from perchctl.log.header import flown_profile
+from perchctl.log import FlightLog
 from perchctl.places import file_names
 from perchctl.profile import Profile, changed_profile, find_calibration, load_profile
 
@@ -233,8 +233,9 @@ def test_a_profile_in_an_old_log_is_read() -> None:
     assert Profile.model_validate(values) == load_profile("sim")
     assert Profile.lost_values(values) == []
     values["planner"]["ascend"]["near_m"] = 0.5
+    log = FlightLog(Path("f.jsonl"), {"profile": values}, [], [], None, True)
     with pytest.warns(Note, match=r"planner\.ascend\.near_m"):
-        assert flown_profile({"profile": values}) == load_profile("sim")
+        assert log.flown_profile == load_profile("sim")
 
 
 def test_a_calibration_is_found_beside_the_profile_that_names_it(tmp_path: Path) -> None:

@@ -9,26 +9,19 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
-from pathlib import Path
 
 import pytest
 
 import perchctl.mission
 from perchctl.analysis import replay, replay_lines, replay_record
-from perchctl.analysis.decide import first_differing, same
 from perchctl.analysis.replayer import Replay
 from perchctl.analysis.sense import shown
-from perchctl.camera import VERDICT_TEXTS
-from perchctl.flight import SENSED
 from perchctl.log import FlightLog
 from perchctl.mission import Turn
 from perchctl.perception import history
 from perchctl.profile import PositioningConfig, Profile, SafetyConfig, changed_profile
 from perchctl.vehicle import Telemetry
-from perchctl.vision import Frame
-from tests.helpers.loop_rig import PROFILE, Camera, Rig
 from tests.replay.test_corpus import corpus
-from tests.replay.test_senses import begun, flown
 
 JUDGED = ("jumped", "turned_rad", "battery_age_s", "camera_age_s", "new_frame", "camera_problem")
 
@@ -125,86 +118,6 @@ def test_a_changed_constant_of_the_history_is_noticed(monkeypatch: pytest.Monkey
     assert "telemetry: 1 turns show the planner something else" in text
 
 
-# --- pictures' times -------------------------------------------------------------------------
-
-
-def test_another_patience_with_the_camera() -> None:
-    log = corpus("hung")
-    for setting, replayed in (
-        ("safety.camera_hold_s=0.05", False),
-        ("safety.camera_hold_s=2.9", True),
-    ):
-        found = what_if(log, setting)
-        assert found.shown is not None
-        assert found.shown.first is not None
-        assert found.shown.first.field == "target.tracked"
-        assert found.shown.first.replayed is replayed
-
-
-def test_pictures_that_would_come_too_late() -> None:
-    """The camera's age grows from the last that was not, and the planner holds by it. The other
-    way round they count again."""
-    log = corpus("perched")
-    strict = flown_by(log, "safety.max_frame_age_s=0.08")
-    refused = [
-        (was.observation, now.observation)
-        for was, now in zip(log.turns, strict.turns, strict=True)
-        if was.observation is not None and not same(was.observation, now.observation)
-    ]
-    assert len(refused) > 5
-    for was, now in refused:
-        assert was is not None
-        assert now is not None
-        assert now.camera_age_s > was.camera_age_s
-        assert now.camera_problem == "the picture is 0.1 s late"
-        assert not now.new_frame
-    found = what_if(log, "safety.max_frame_age_s=0.08")
-    assert found.shown is not None
-    assert found.shown.first is not None
-    assert found.shown.differences == len(refused)
-    assert any(note.startswith("safety.max_frame_age_s: ") for note in found.notes)
-    back = flown_by(strict, "safety.max_frame_age_s=0.4")
-    for turn, original in zip(back.turns, log.turns, strict=True):
-        one, other = turn.observation, original.observation
-        if one is not None and other is not None:
-            assert (one.camera_age_s, one.camera_problem) == (other.camera_age_s, None)
-
-
-class Unsteady(Camera):
-    """Pictures of another age each time."""
-
-    def poll(self, now_s: float) -> Frame | None:
-        return super().poll(now_s - 0.03 * (self.count % 3))
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [
-        "safety.max_frame_age_s=0.071",
-        "safety.jump_z_m=0.001",
-        "safety.jump_m=0.001",
-    ],
-)
-def test_with_pictures_it_is_judged_alike(tmp_path: Path, setting: str) -> None:
-    """What needs none is the same to the bit as by the loop's own senses, with pictures."""
-    log, pictures = flown(tmp_path, Rig(camera=Unsteady()))
-    log = begun(log)
-    other = changed_profile(PROFILE, [setting])
-    seen = replay(log, pictures, other, Rig().setup).seen
-    alone = replay(log, None, other).shown
-    assert seen is not None
-    assert alone is not None
-    assert alone.first is not None
-    assert len(seen.turns) == len(alone.turns)
-    for one, two in zip(seen.turns, alone.turns, strict=True):
-        assert (one.observation is None) == (two.observation is None)
-        for name in JUDGED if one.observation is not None else ():
-            found = first_differing(
-                name, getattr(one.observation, name), getattr(two.observation, name)
-            )
-            assert found is None, (one.turn.number, found)
-
-
 # --- positions from outside --------------------------------------------------------------------
 
 
@@ -234,10 +147,7 @@ def test_each_key_is_judged_or_said() -> None:
     """A key of `safety` or `positioning` acts on the planner, or on what it is shown, or a note
     says what a replay cannot tell of it."""
     log, text = corpus("stopped"), planner_s()
-    rerun = {
-        *(key.removeprefix("safety.") for key in STEPS),
-        "camera_hold_s",
-    }
+    rerun = {key.removeprefix("safety.") for key in STEPS}
     keys = [("safety", key) for key in SafetyConfig.model_fields]
     keys += [("positioning", key) for key in PositioningConfig.model_fields]
     for section, key in keys:
@@ -260,9 +170,3 @@ def test_what_was_asked_before_take_off_is_said() -> None:
     assert any("before take-off only" in note for note in found.notes)
     lines = replay_lines(found)
     assert any("no command would have been another" in line for line in lines)
-
-
-def test_repeated_and_late_are_told_apart() -> None:
-    """By their words: a late picture is found in a log by its own."""
-    assert not any("late" in text for text in VERDICT_TEXTS.values())
-    assert {*JUDGED} < {*SENSED}

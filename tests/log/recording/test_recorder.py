@@ -7,30 +7,22 @@ import io
 import os
 import threading
 import time
-import tracemalloc
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import lz4.frame
 import pytest
-import zstandard
-from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, Header, Message, Schema
-from mcap.writer import MCAP0_MAGIC
 
 from perchctl.errors import InvalidValue
 from perchctl.log import (
+    FlightSummary,
     LogWatcher,
     read_log,
     recorded_pictures,
     recording_file,
-    summarise_flight,
     summary_text,
 )
-from perchctl.log import recorded as reading
 from perchctl.log import recorder as recording_module
 from perchctl.log.recorder import Recorder
 from perchctl.log.write import FlightLogWriter
@@ -199,22 +191,6 @@ def test_a_disk_that_hangs_holds_up_nobody(
     assert kept[-1] == 200
 
 
-def test_pictures_that_repeat_and_their_jpegs_count_as_held(
-    hung: MemoryDisk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recording_module, "MOST_PICTURE_BYTES", 100)  # less than any picture
-    recorder = onto(hung, live=True)
-    hung.gate.clear()
-    flight = recorded.flown(4)
-    recorder.frame(replace(flight.frames[0], repeated=True))
-    recorder.tick(flight.ticks[0])
-    assert "pictures are missing" in recorder.take_remarks()[0]
-    frame = recorded.frame(0, 1.0, as_jpeg=True)
-    held = recording_module._Turn(frame=frame).held_bytes
-    assert frame.encoded is not None
-    assert held == frame.image.nbytes + len(frame.encoded)
-
-
 def test_a_queue_that_is_full_drops_turns(
     hung: MemoryDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -240,16 +216,6 @@ def test_closing_does_not_wait_for_ever(hung: MemoryDisk, monkeypatch: pytest.Mo
     assert end.missing == 10 - end.pictures > 0
     hung.gate.set()
     until(lambda: hung.closed)  # should the disk ever answer, nothing stays open
-
-
-def test_after_its_end_it_takes_nothing(tmp_path: Path) -> None:
-    recorder, flight = recorded.recorder(tmp_path / "f.mcap"), recorded.flown(6)
-    recorded.fly(recorder, flight)
-    end = recorder.close()
-    size = (tmp_path / "f.mcap").stat().st_size
-    recorded.fly(recorder, flight)
-    assert recorder.close() == end
-    assert (tmp_path / "f.mcap").stat().st_size == size
 
 
 # -- live and in lockstep -----------------------------------------------------------------------
@@ -319,63 +285,6 @@ def test_a_file_that_was_cut_gives_what_is_whole(tmp_path: Path) -> None:
     assert len(set(counts)) > 3  # chunk by chunk, about one a second
 
 
-def with_chunk(compression: str, unfolded: bytes, packed: bytes) -> bytes:
-    """An MCAP file of one chunk, as far as it is read."""
-    builder = RecordBuilder()
-    Header(profile="", library="").write(builder)
-    Chunk(compression, packed, 0, 0, zlib.crc32(unfolded), len(unfolded)).write(builder)
-    return bytes(MCAP0_MAGIC + builder.end())
-
-
-@pytest.mark.parametrize("compression", ["lz4", "zstd"])
-def test_a_chunk_that_unfolds_without_bound_is_refused(
-    compression: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bomb = bytes(40_000_000)
-    packed = lz4.frame.compress(bomb) if compression == "lz4" else zstandard.compress(bomb)
-    path = tmp_path / "bomb.mcap"
-    path.write_bytes(with_chunk(compression, bomb, packed))
-    monkeypatch.setattr(reading, "MOST_CHUNK_BYTES", 1_000_000)
-    tracemalloc.start()
-    with pytest.raises(InvalidValue, match="more than 1 MB"):
-        list(recorded_pictures(path))
-    peak_bytes = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak_bytes < 6_000_000
-
-
-@pytest.mark.parametrize("compression", ["", "lz4", "zstd"])
-def test_a_chunk_of_each_compression_is_read(compression: str, tmp_path: Path) -> None:
-    builder = RecordBuilder()
-    Schema(id=1, data=b"", encoding="", name="x").write(builder)
-    Channel(id=1, topic="/tick", message_encoding="json", metadata={}, schema_id=1).write(builder)
-    Message(channel_id=1, log_time=5, data=b"{}", publish_time=5, sequence=7).write(builder)
-    plain = builder.end()
-    packed = {"": plain, "lz4": lz4.frame.compress(plain), "zstd": zstandard.compress(plain)}
-    path = tmp_path / "one.mcap"
-    path.write_bytes(with_chunk(compression, plain, packed[compression]))
-    ((topic, message),) = reading.recording_messages(path, ("/tick",))
-    assert (topic, message.sequence, message.log_time, message.data) == ("/tick", 7, 5, b"{}")
-    path.write_bytes(with_chunk(compression, plain, packed[compression][: len(plain) // 2]))
-    assert list(reading.recording_messages(path, ("/tick",))) == [], "torn"
-
-
-def test_a_record_too_large_is_refused_and_one_behind_the_end_is_torn(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(reading, "MOST_CHUNK_BYTES", 1_000)
-    path = tmp_path / "x.mcap"
-    builder = RecordBuilder()
-    Header(profile="", library="").write(builder)
-    Attachment(log_time=0, create_time=0, name="", media_type="", data=bytes(2_000)).write(builder)
-    whole = bytes(MCAP0_MAGIC + builder.end())
-    path.write_bytes(whole)
-    with pytest.raises(InvalidValue, match="more than"):
-        list(reading.recording_messages(path, ("/tick",)))
-    path.write_bytes(whole[:-1])
-    assert list(reading.recording_messages(path, ("/tick",))) == []
-
-
 def test_a_killed_program_leaves_what_is_older_than_a_second(tmp_path: Path) -> None:
     """The system has every chunk that was flushed, without the file being closed."""
     path = tmp_path / "f.mcap"
@@ -406,7 +315,7 @@ def test_what_is_wrong_with_it_is_no_problem_of_the_log_s(tmp_path: Path) -> Non
     assert summary is not None
     assert summary.log_problem is None
     assert f"0 pictures in f.mcap ({said})" in summary_text(summary)
-    read = summarise_flight(read_log(tmp_path / "f.jsonl")).recording
+    read = FlightSummary.of(read_log(tmp_path / "f.jsonl")).recording
     assert read is not None
     assert (read.pictures, read.problem) == (0, said)
     assert read.path == tmp_path / "f.mcap"
