@@ -16,8 +16,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from perchctl.log import read_log
 from perchctl.mission.state import SEVEN_PHASES
+from perchctl.record import read_log
 from perchctl.vehicle import LOCKED
 
 TIMEOUT_S = 120.0

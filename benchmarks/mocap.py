@@ -19,7 +19,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from perchctl.log import read_log
+from perchctl.record import read_log
 
 TIMEOUT_S = 300.0
 

@@ -31,8 +31,6 @@ from numpy.typing import NDArray
 from speed import RATE_HZ, sequence
 
 from perchctl.camera import FrameSource, WrappedSource
-from perchctl.log import LogWatcher
-from perchctl.log.summary import RecordingEnd
 from perchctl.mission import (
     FrameSeen,
     Observation,
@@ -44,6 +42,8 @@ from perchctl.mission import (
     TurnTiming,
 )
 from perchctl.profile import Profile
+from perchctl.record import LogWatcher
+from perchctl.record.summary import RecordingEnd
 from perchctl.vehicle import PositionSetpoint, Telemetry
 from perchctl.vision import Frame, PipelineOutput, PipelineState, pictures, step
 

@@ -28,13 +28,13 @@ from perchctl.faults.catalogue import AIR, FROM_THE_START, Fault  # noqa: E402
 from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
 from perchctl.faults.promises import PROMISES  # noqa: E402
 from perchctl.link import Link  # noqa: E402
-from perchctl.log.fields import EVENT_FIELDS, FIELDS  # noqa: E402
 from perchctl.mission import Phase, step_mission, table  # noqa: E402
 from perchctl.mission.lander import MANOEUVRES, Evidence, Reach, Stage  # noqa: E402
 from perchctl.mission.state import BEFORE_CONTACT, FLYING_PHASES  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
 from perchctl.profile import Profile, load_profile  # noqa: E402
 from perchctl.profile.keys import UNITS, keys  # noqa: E402
+from perchctl.record.fields import EVENT_FIELDS, FIELDS  # noqa: E402
 from perchctl.vision import step  # noqa: E402
 
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))

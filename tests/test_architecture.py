@@ -25,13 +25,13 @@ HOMES: dict[str, tuple[str, ...]] = {
     "matplotlib": ("*.plot",),
     "jinja2": ("perchctl.analysis.report",),
     "motioncapture": ("perchctl.positioning",),
-    "mcap": ("perchctl.log.recording_file", "perchctl.log.recorded"),
-    "mcap_protobuf": ("perchctl.log.recording_file", "perchctl.log.recorded"),
-    "foxglove_schemas_protobuf": ("perchctl.log.recording_file", "perchctl.log.recorded"),
-    "google": ("perchctl.log.recording_file", "perchctl.log.recorded"),
+    "mcap": ("perchctl.record.recording_file", "perchctl.record.recorded"),
+    "mcap_protobuf": ("perchctl.record.recording_file", "perchctl.record.recorded"),
+    "foxglove_schemas_protobuf": ("perchctl.record.recording_file", "perchctl.record.recorded"),
+    "google": ("perchctl.record.recording_file", "perchctl.record.recorded"),
     "distributed": ("perchctl.campaign",),
     "dask": ("perchctl.campaign",),
-    "pyarrow": ("perchctl.log.table",),
+    "pyarrow": ("perchctl.record.table",),
     "av": ("perchctl.track.outputs", "perchctl.camera.network"),
 }
 
@@ -66,7 +66,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.perception",),
     ("perchctl.calibration",),
     ("perchctl.link",),
-    ("perchctl.sim", "perchctl.log"),
+    ("perchctl.sim", "perchctl.record"),
     ("perchctl.flight",),
     ("perchctl.campaign",),
     (
@@ -85,7 +85,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # Packages with a face: the others take its names, and nothing from behind it. The number is how
 # many names it has at most.
 MOST_NAMES = {
-    "analysis": 14,
+    "analysis": 15,
     "calibration": 30,
     "camera": 28,
     "campaign": 25,
@@ -95,7 +95,7 @@ MOST_NAMES = {
     "faults": 15,
     "flight": 42,
     "link": 22,
-    "log": 19,
+    "record": 19,
     "mission": 48,
     "perception": 15,
     "positioning": 15,
@@ -104,7 +104,7 @@ MOST_NAMES = {
     "target": 29,
     "track": 15,
     "vision": 30,
-    "weights": 9,
+    "weights": 15,
 }
 
 
@@ -320,7 +320,7 @@ BROKEN = {
     ),
     "perchctl.vision.merge": ("from perchctl.mission import state\n", uphill, "mission.state"),
     "perchctl.geometry": ("from .profile import Profile\n", uphill, "profile"),
-    "perchctl.sim.world": ("from perchctl.log import read\n", uphill, "log.read"),
+    "perchctl.sim.world": ("from perchctl.record import read\n", uphill, "log.read"),
     "perchctl.link.mock": ("from perchctl.sim import world\n", uphill, "sim.world"),
     "perchctl.vision.pipeline": (
         "import typing\nif typing.TYPE_CHECKING:\n    from perchctl.link.mock import X\n",
@@ -329,7 +329,7 @@ BROKEN = {
     ),
     "perchctl.commands.fly": ("from perchctl.check.row import Row\n", past_a_face, "check.row"),
     "perchctl.analysis.plot": ("import cflib.crazyflie\n", misplaced, "cflib"),
-    "perchctl.log.read": ("import matplotlib\n", misplaced, "matplotlib"),
+    "perchctl.record.read": ("import matplotlib\n", misplaced, "matplotlib"),
     "perchctl.vision.pose": ("from filterpy.kalman import KalmanFilter\n", misplaced, "filterpy"),
 }  # fmt: skip
 

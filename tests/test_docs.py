@@ -22,10 +22,10 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration import load_calibration, write_recordings
 from perchctl.commands import app
 from perchctl.flight import fly_lockstep
-from perchctl.log import decode_line
 from perchctl.mission.table import TABLE
 from perchctl.profile import Profile, load_profile
 from perchctl.profile.keys import keys
+from perchctl.record import decode_line
 from tests.helpers.boards import APRILGRID, CHARUCO, render_folder
 from tests.helpers.flights import ROOT, SEED, short_profile
 from tests.helpers.gear import write_turned_about

@@ -23,8 +23,8 @@ from perchctl.commands.fly import fly_and_report, resolve
 from perchctl.errors import EXIT_CODES, ConnectionFailed, Interrupted
 from perchctl.flight import PLAIN_SEED, SessionResult
 from perchctl.link.connection import open_connection, plain_cause
-from perchctl.log import LogWatcher
 from perchctl.mission import FlightReport, Outcome, Phase
+from perchctl.record import LogWatcher
 from perchctl.sim import SimProcess
 from perchctl.sim.crtp.server import LinkOptions
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401

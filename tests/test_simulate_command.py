@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.campaign.results_file import flown_record, result_from
-from perchctl.log import read_log
+from perchctl.record import read_log
 from tests.helpers.commands import Said, elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT, SEED, SHORT
 

@@ -26,7 +26,7 @@ MOST_LINES = {
     "faults": 3170,
     "flight": 2590,
     "link": 2690,
-    "log": 3660,
+    "record": 3660,
     "mission": 5290,
     "perception": 700,
     "positioning": 1290,

@@ -51,10 +51,6 @@ from perchctl.display.panel import (  # noqa: E402
 )
 from perchctl.flight import PLAIN_SEED  # noqa: E402
 from perchctl.geometry import Array, make_T, rotation_from_rpy  # noqa: E402
-from perchctl.log import (  # noqa: E402
-    FlightLog,
-    read_log,
-)
 from perchctl.mission import BatteryOutlook  # noqa: E402
 from perchctl.plot import (  # noqa: E402
     BLACK,
@@ -67,6 +63,10 @@ from perchctl.plot import (  # noqa: E402
     save_png,
 )
 from perchctl.profile import Profile, load_profile  # noqa: E402
+from perchctl.record import (  # noqa: E402
+    FlightLog,
+    read_log,
+)
 from perchctl.sim import (  # noqa: E402
     Renderer,
     draw_scenario,

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from perchctl.errors import InvalidValue
-from perchctl.log import FlightLog, to_exact
 from perchctl.mission import Observation, PlannerState, Turn, start_mission, step_mission
 from perchctl.profile import Profile
+from perchctl.record import FlightLog, to_exact
 from perchctl.vehicle import Command
 
 

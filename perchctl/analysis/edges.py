@@ -12,7 +12,6 @@ import numpy as np
 
 from perchctl.analysis.sight import percentile
 from perchctl.geometry import Array
-from perchctl.log import FlightLog
 from perchctl.mission import (
     BatteryFit,
     EnergyState,
@@ -21,6 +20,7 @@ from perchctl.mission import (
     fit_battery,
     update_energy,
 )
+from perchctl.record import FlightLog
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 OLD_TELEMETRY_S = 0.1

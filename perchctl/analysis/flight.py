@@ -36,8 +36,8 @@ from perchctl.analysis.sight import (
     within,
 )
 from perchctl.geometry import Array
-from perchctl.log import FlightLog, FlightSummary
 from perchctl.mission import Findings
+from perchctl.record import FlightLog, FlightSummary
 
 SETTLED_S = 1.0
 """So long before the contact begins is looked at for how well the vehicle has settled."""
@@ -110,7 +110,7 @@ class FlightAnalysis:
 
     Times count from the flight's first turn. Where a part needs a value that no flight writes it
     raises InvalidValue, TypeError, ValueError, LookupError or AttributeError, of which
-    `perchctl.log.log_values` makes one error.
+    `perchctl.record.log_values` makes one error.
     """
 
     def __init__(self, log: FlightLog) -> None:

@@ -19,7 +19,6 @@ from perchctl.analysis.sight import Frames
 from perchctl.analysis.words import times
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.log import FlightLog
 from perchctl.plot import (
     BLACK,
     BLUE,
@@ -34,6 +33,7 @@ from perchctl.plot import (
     save_figure,
     save_png,
 )
+from perchctl.record import FlightLog
 
 SHADES = ("#EEF3F8", "#FFFFFF")
 TITLE_COLUMNS = 110

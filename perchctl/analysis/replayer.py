@@ -29,9 +29,9 @@ from perchctl.analysis.sense import (
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
 from perchctl.flight import SENSED
-from perchctl.log import FlightLog
 from perchctl.mission import Observation, Turn
 from perchctl.profile import Profile
+from perchctl.record import FlightLog
 from perchctl.vision import Pipeline, make_pipeline
 
 

@@ -29,8 +29,8 @@ from perchctl.analysis.words import count, length, milliseconds, share
 from perchctl.errors import PerchError
 from perchctl.files import write_files
 from perchctl.geometry import Array
-from perchctl.log import log_values, read_log, recorded_pictures, recording_path
 from perchctl.mission import latency_text, turn_text
+from perchctl.record import log_values, read_log, recorded_pictures, recording_path
 
 UNFINISHED = "unfinished"
 TITLES = {

@@ -11,7 +11,7 @@ from typing import Any
 
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.errors import NotFound, PerchError
-from perchctl.log import FlightLog, FlightSummary, read_log, summary_text
+from perchctl.record import FlightLog, FlightSummary, read_log, summary_text
 
 COLUMNS = 79
 _HANG = 11

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.log import FlightLog
+from perchctl.record import FlightLog
 
 BLIND_PHASE = "COMPLETE"
 """Against the ceiling no frame is looked at."""

@@ -22,9 +22,9 @@ from perchctl.campaign.pool import FlightPool
 from perchctl.campaign.results import FlightEnd, FlightResult, peak_memory_mb
 from perchctl.errors import PerchError, SafetyAbort, TimedOut
 from perchctl.flight import LockstepFlight, fly_lockstep
-from perchctl.log import FlightSummary, LogWatcher
 from perchctl.mission import Event, EventKeeper, Phase
 from perchctl.profile import Profile
+from perchctl.record import FlightSummary, LogWatcher
 from perchctl.sim import Scenario, draw_scenario
 
 R = TypeVar("R")

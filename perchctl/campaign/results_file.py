@@ -22,7 +22,8 @@ import perchctl
 from perchctl.campaign.results import FlightResult
 from perchctl.errors import InvalidValue
 from perchctl.files import cannot_be_written, check_place
-from perchctl.log import (
+from perchctl.profile import Profile
+from perchctl.record import (
     camera_record,
     decode_line,
     from_exact,
@@ -31,7 +32,6 @@ from perchctl.log import (
     recording_path,
     to_exact,
 )
-from perchctl.profile import Profile
 
 
 class CampaignFlight(Protocol):

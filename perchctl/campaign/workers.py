@@ -24,8 +24,8 @@ from perchctl.calibration import profile_camera
 from perchctl.campaign.results_file import SOURCE, profile_sha256
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError
 from perchctl.files import cannot_be_written
-from perchctl.log import arithmetic_fingerprint
 from perchctl.profile import Profile, read_mask
+from perchctl.record import arithmetic_fingerprint
 
 ANSWERS_S = 60.0
 _LIBRARIES = ("numpy", "mujoco", "filterpy", "distributed")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from perchctl.commands.output import say
-from perchctl.log import path_beside, read_log
 from perchctl.profile import Profile
+from perchctl.record import path_beside, read_log
 
 
 def plot_of(log_path: Path, profile: Profile) -> Path | None:

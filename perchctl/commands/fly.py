@@ -63,7 +63,6 @@ from perchctl.flight import (
     require_comparison,
     wall_date,
 )
-from perchctl.log import FlightSummary, LogWatcher, summary_text
 from perchctl.mission import Event, EventKind, Outcome, Phase, Watcher
 from perchctl.profile import (
     Profile,
@@ -74,6 +73,7 @@ from perchctl.profile import (
     load_profile,
     read_weights,
 )
+from perchctl.record import FlightSummary, LogWatcher, summary_text
 from perchctl.target import mm_text, overhead_view
 
 EXIT_CODE_OF: dict[Outcome, int] = {

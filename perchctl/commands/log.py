@@ -35,7 +35,8 @@ from perchctl.commands.command_line import (
 from perchctl.commands.output import print_record, say
 from perchctl.errors import InvalidValue, ReplayDiffers, UsageError
 from perchctl.files import check_output, same_file, write_files
-from perchctl.log import (
+from perchctl.profile import Profile, changed_profile, load_profile
+from perchctl.record import (
     FlightLog,
     export_mcap,
     log_table,
@@ -45,7 +46,6 @@ from perchctl.log import (
     recorded_pictures,
     recording_path,
 )
-from perchctl.profile import Profile, changed_profile, load_profile
 
 FORMATS = (".png", ".pdf", ".svg")
 DRAWN_IN = "what plots are drawn in"

@@ -46,8 +46,8 @@ from perchctl.errors import (
     no_cluster,
     no_simulator,
 )
-from perchctl.log import make_log_folder, summary_text, to_plain
 from perchctl.profile import Profile, load_profile
+from perchctl.record import make_log_folder, summary_text, to_plain
 
 R = TypeVar("R", bound="_Flown")
 C = TypeVar("C", bound="campaigns.CampaignFlight")

@@ -14,8 +14,8 @@ from perchctl.camera import FrameSource, WatchedSource
 from perchctl.display.live import LivePage, PageState
 from perchctl.display.panel import status_of, status_rows
 from perchctl.display.sketch import Sketch
-from perchctl.log import FlightSummary, summary_text
 from perchctl.mission import RESCUE, Event, EventKind, Tick
+from perchctl.record import FlightSummary, summary_text
 from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput
 
 Card = dict[str, Any]

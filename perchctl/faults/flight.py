@@ -37,9 +37,9 @@ from perchctl.flight import (
 )
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link import MockLink, Packet, Port, Radio
-from perchctl.log import LogWatcher, to_exact
 from perchctl.mission import Event, FlightReport, Phase, Tick, Watcher
 from perchctl.profile import Profile
+from perchctl.record import LogWatcher, to_exact
 from perchctl.sim import Scenario, draw_capture, radio_bursts
 from perchctl.vision import make_pipeline
 

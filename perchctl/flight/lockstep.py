@@ -13,10 +13,10 @@ from perchctl.camera import FrameSource, NewestSlot, mirrored_as_profiled
 from perchctl.errors import ConnectionFailed
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.link import MockLink, Radio
-from perchctl.log import LogWatcher
 from perchctl.mission import Event, FlightReport, Operator, Phase, Tick, Watcher
 from perchctl.positioning import FeedThread, Placed, PositionFeed
 from perchctl.profile import Profile
+from perchctl.record import LogWatcher
 from perchctl.sim import (
     CaptureSettings,
     DeliveredFrame,

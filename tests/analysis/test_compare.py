@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from perchctl.analysis import Comparison, FlightAnalysis
-from perchctl.log import read_log
+from perchctl.record import read_log
 from tests.helpers import log as synthetic
 
 

@@ -16,8 +16,8 @@ from perchctl.faults import FaultResult
 from perchctl.faults.catalogue import BY_NAME, Case
 from perchctl.faults.effects import FOR_EVER, CameraFault, Effect, Killed
 from perchctl.faults.flight import fly_with_fault
-from perchctl.log import read_log
 from perchctl.mission import Phase
+from perchctl.record import read_log
 from perchctl.sim import draw_scenario
 from tests.helpers.flights import SEED, short_profile
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from perchctl.analysis.sight import frames_of
-from perchctl.log import FlightLog
+from perchctl.record import FlightLog
 
 PERIOD_S = 1.0 / 30.0
 

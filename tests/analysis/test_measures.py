@@ -17,8 +17,8 @@ from perchctl.analysis import (
 )
 from perchctl.analysis.flight import last_ascent
 from perchctl.analysis.show import COLUMNS, list_log
-from perchctl.log import FlightLog, read_log
 from perchctl.mission import Event
+from perchctl.record import FlightLog, read_log
 from tests.helpers import log as synthetic
 from tests.helpers.mission import note
 

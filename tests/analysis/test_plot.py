@@ -12,8 +12,8 @@ from perchctl.analysis import FlightAnalysis, plot_flight
 from perchctl.analysis.plot import title_of
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.log import FlightLog, read_log
-from perchctl.log.write import FlightLogWriter
+from perchctl.record import FlightLog, read_log
+from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers.disk import full_disk
 

@@ -11,9 +11,9 @@ import pytest
 
 from perchctl.analysis import FlightAnalysis
 from perchctl.analysis.report import decisions_of, reported_flight
-from perchctl.log import recorded_pictures
-from perchctl.log.recorder import Recorder
 from perchctl.profile import Profile
+from perchctl.record import recorded_pictures
+from perchctl.record.recorder import Recorder
 from perchctl.vision import Frame
 from tests.helpers import log as synthetic
 from tests.helpers.told import flown_s, made, written

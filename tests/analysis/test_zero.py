@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from perchctl.analysis import FlightAnalysis, replay, show_record
-from perchctl.log import export_mcap, json_line, log_table, read_log
 from perchctl.mission import conditions
+from perchctl.record import export_mcap, json_line, log_table, read_log
 from tests.helpers.recorded import messages
 from tests.replay.test_corpus import FOLDER
 

@@ -27,8 +27,8 @@ from perchctl.campaign.compare import FIGURES
 from perchctl.campaign.results import ENDS, rate_interval, worst_first
 from perchctl.campaign.results_file import flown_record, result_from, result_record
 from perchctl.errors import SafetyAbort
-from perchctl.log import FlightSummary, read_log, summary_text
-from perchctl.log.write import FlightLogWriter
+from perchctl.record import FlightSummary, read_log, summary_text
+from perchctl.record.write import FlightLogWriter
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 

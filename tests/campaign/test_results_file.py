@@ -30,8 +30,8 @@ from perchctl.errors import InvalidValue
 from perchctl.faults import FAULTS, FaultResult
 from perchctl.faults.catalogue import draw_case
 from perchctl.faults.flight import _parameters
-from perchctl.log.write import recording_path
 from perchctl.profile import load_profile
+from perchctl.record.write import recording_path
 from perchctl.sim import draw_scenario
 from tests.helpers.flights import SHORT
 from tests.helpers.results import landed

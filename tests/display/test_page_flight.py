@@ -19,7 +19,6 @@ from perchctl.display import FlightPage, LivePage, failed_card, summary_card
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch, SessionResult
 from perchctl.flight.operator import AGAIN_S, HELD_S
-from perchctl.log import FlightSummary, LogWatcher
 from perchctl.mission import (
     FlightReport,
     Operator,
@@ -30,6 +29,7 @@ from perchctl.mission import (
     Watcher,
 )
 from perchctl.profile import load_profile
+from perchctl.record import FlightSummary, LogWatcher
 from perchctl.vehicle import Idle
 from perchctl.vision import Detection, Detections, Frame, MarkerPose, PipelineOutput, Stage
 from tests.helpers.live_page import CORNERS, ask, stop

@@ -16,9 +16,6 @@ from rich.text import Text
 
 from perchctl.display import open_panel
 from perchctl.display.panel import FlightPanel, FlightStatus, panel, status_of, status_rows
-from perchctl.log import LogWatcher, read_log
-from perchctl.log.fields import tick_record
-from perchctl.log.write import FlightLogWriter
 from perchctl.mission import (
     BatteryOutlook,
     ExternalPositions,
@@ -27,6 +24,9 @@ from perchctl.mission import (
     Tick,
     start_mission,
 )
+from perchctl.record import LogWatcher, read_log
+from perchctl.record.fields import tick_record
+from perchctl.record.write import FlightLogWriter
 from perchctl.vehicle import ExternalPosition, PositionSetpoint
 from tests.helpers import log as synthetic
 from tests.helpers.mission import entered, held, note

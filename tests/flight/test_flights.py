@@ -21,11 +21,11 @@ from perchctl.errors import EXIT_CODES
 from perchctl.flight import PLAIN_SEED, fly_lockstep, lockstep
 from perchctl.flight.lockstep import LockstepFlight
 from perchctl.geometry import rot_z
-from perchctl.log import FlightLog, read_log
 from perchctl.mission import Event, EventKeeper, EventKind, Operator, Outcome, Phase, Tick
 from perchctl.mission.state import SEVEN_PHASES
 from perchctl.perception.online_calibration import SLEW
 from perchctl.profile import load_profile
+from perchctl.record import FlightLog, read_log
 from perchctl.sim import draw_scenario
 from perchctl.vision import TargetEstimate
 from tests.helpers.flights import SEED, SHORT, Flown, fly_short, short_profile

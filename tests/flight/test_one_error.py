@@ -15,11 +15,11 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.display.panel import status_of
 from perchctl.flight import fly_lockstep
 from perchctl.geometry import Array, rot_z, wrap_rad
-from perchctl.log.fields import tick_record
-from perchctl.log.watch import Truth
 from perchctl.mission import Phase, Tick, planner
 from perchctl.mission.context import Context
 from perchctl.perception import perception
+from perchctl.record.fields import tick_record
+from perchctl.record.watch import Truth
 from perchctl.sim import draw_scenario
 from perchctl.vision import merge
 from tests.helpers.flights import SEED, NoLog, short_profile

@@ -29,9 +29,9 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration
 from perchctl.flight.clock import SLOW
-from perchctl.log import FlightLog, read_log
 from perchctl.mission.state import SEVEN_PHASES
 from perchctl.profile import find_calibration, load_profile
+from perchctl.record import FlightLog, read_log
 from perchctl.sim import SimProcess, draw_scenario
 from perchctl.vehicle import FLYING, LOCKED
 from tests.helpers.flights import ROOT, SEED, SHORT

@@ -13,11 +13,6 @@ import pytest
 from perchctl.analysis import FlightAnalysis, show_record, show_text
 from perchctl.analysis.report import ReportedFlight, page_of
 from perchctl.display import summary_card
-from perchctl.log import (
-    FlightSummary,
-    read_log,
-    summary_text,
-)
 from perchctl.mission import (
     ContactError,
     EventKind,
@@ -33,6 +28,11 @@ from perchctl.mission.context import Context
 from perchctl.mission.imu import BLOW_MPS, Blow, Reckoning, reckoned
 from perchctl.mission.report import HARD_MPS, touchdown_of
 from perchctl.profile import load_profile
+from perchctl.record import (
+    FlightSummary,
+    read_log,
+    summary_text,
+)
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
 from tests.flight.test_silent_loop import Guarded, hanging_camera
 from tests.helpers import log

@@ -28,8 +28,8 @@ from perchctl.calibration import profile_camera
 from perchctl.flight import fly_lockstep
 from perchctl.geometry import Array, invert_T, make_T, rot_z, yaw_of
 from perchctl.link import Packet, Port
-from perchctl.log import FlightLog, read_log
 from perchctl.profile import Profile, load_profile
+from perchctl.record import FlightLog, read_log
 from perchctl.sim import Neighbour, Scenario, SimProcess, draw_scenario
 from tests.helpers.flights import ROOT, SEED, SHORT, fly_short, short_profile
 

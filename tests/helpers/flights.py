@@ -12,10 +12,10 @@ import cv2
 
 from perchctl.flight import fly_lockstep
 from perchctl.flight.lockstep import LockstepFlight
-from perchctl.log import LogWatcher
-from perchctl.log.watch import Truth
 from perchctl.mission import Event, FlightReport, Operator, Phase
 from perchctl.profile import Profile, load_profile
+from perchctl.record import LogWatcher
+from perchctl.record.watch import Truth
 from perchctl.sim import draw_capture, draw_scenario
 
 if TYPE_CHECKING:

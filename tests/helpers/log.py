@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.log.fields import tick_record
-from perchctl.log.header import make_header
-from perchctl.log.write import FlightLogWriter
 from perchctl.mission import Event, Phase, PlannerState, Tick
 from perchctl.profile import Profile
+from perchctl.record.fields import tick_record
+from perchctl.record.header import make_header
+from perchctl.record.write import FlightLogWriter
 from perchctl.vehicle import (
     Command,
     Idle,

@@ -13,11 +13,11 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from perchctl.log.fields import event_record
-from perchctl.log.recorder import Recorder
 from perchctl.mission import Event, EventKind, Phase
 from perchctl.mission.state import Severity
 from perchctl.profile import Profile
+from perchctl.record.fields import event_record
+from perchctl.record.recorder import Recorder
 from perchctl.vision import Frame
 from tests.helpers import log as synthetic
 

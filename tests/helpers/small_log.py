@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from perchctl.log.write import FlightLogWriter
+from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers.mission import note
 

@@ -8,10 +8,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from perchctl.log import FlightLog, to_plain
-from perchctl.log.fields import event_record
-from perchctl.log.write import FlightLogWriter
 from perchctl.mission import Event, EventKind, Phase
+from perchctl.record import FlightLog, to_plain
+from perchctl.record.fields import event_record
+from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
 
 Change = Callable[[dict[str, Any]], None]

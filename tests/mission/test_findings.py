@@ -6,9 +6,9 @@ import math
 
 import pytest
 
-from perchctl.log import FlightSummary, summary_text
 from perchctl.mission import flight_findings
 from perchctl.profile import CameraConfig
+from perchctl.record import FlightSummary, summary_text
 from perchctl.vision import Consistency
 
 

@@ -13,9 +13,9 @@ from pydantic import BaseModel, ValidationError
 import perchctl
 from perchctl.calibration import load_calibration
 from perchctl.errors import InvalidValue, Note, NotFound, PerchError, ProfileNote
-from perchctl.log import FlightLog
 from perchctl.places import file_names
 from perchctl.profile import Profile, changed_profile, find_calibration, load_profile
+from perchctl.record import FlightLog
 
 
 def test_shipped_profiles_are_listed_and_load() -> None:

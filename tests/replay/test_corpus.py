@@ -14,9 +14,9 @@ import pytest
 from perchctl.analysis import replay
 from perchctl.analysis.replay_text import difference_text
 from perchctl.analysis.replayer import Replay
-from perchctl.log import FlightLog, read_log
-from perchctl.log.fields import SCHEMA_VERSION
 from perchctl.mission import Phase
+from perchctl.record import FlightLog, read_log
+from perchctl.record.fields import SCHEMA_VERSION
 from tests.helpers.flights import ROOT
 
 FOLDER = ROOT / "tests" / "data" / "flights"

@@ -14,8 +14,8 @@ from perchctl.analysis.replayer import Replay
 from perchctl.campaign.flights import fly_seed
 from perchctl.faults import FAULTS
 from perchctl.faults.flight import fly_fault_seed
-from perchctl.log import read_log, recorded_pictures
 from perchctl.profile import changed_profile
+from perchctl.record import read_log, recorded_pictures
 from tests.helpers.flights import short_profile
 
 EVERY_FAULT = tuple(fault.name for fault in FAULTS)

@@ -16,11 +16,11 @@ from perchctl.analysis.decide import first_differing, same
 from perchctl.analysis.replay_text import CAUTION, changed_gates
 from perchctl.analysis.replayer import changed_keys
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
-from perchctl.log import FlightLog, json_line, read_log, to_exact
-from perchctl.log.header import make_header
-from perchctl.log.write import FlightLogWriter
 from perchctl.mission import conditions, guidance, step_mission
 from perchctl.profile import Profile, changed_profile
+from perchctl.record import FlightLog, json_line, read_log, to_exact
+from perchctl.record.header import make_header
+from perchctl.record.write import FlightLogWriter
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.commands import run
 from tests.helpers.hangs import plan_by

@@ -16,8 +16,8 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.analysis import replay
 from perchctl.calibration import load_calibration
-from perchctl.log import read_log, recorded_pictures
 from perchctl.profile import find_calibration, load_profile
+from perchctl.record import read_log, recorded_pictures
 from perchctl.sim import SimProcess, draw_scenario
 from tests.helpers.flights import ROOT, SEED, SHORT
 

@@ -2,7 +2,7 @@
 
 Which kernels numpy's BLAS, OpenCV and the C library choose is the processor's, and their sums
 differ in the last bits, which a fit of edges to pictures makes larger. So bits are demanded of a
-computer with the flight's libraries and arithmetic (`perchctl.log.header`), and closeness of
+computer with the flight's libraries and arithmetic (`perchctl.record.header`), and closeness of
 any other. Emulated by their own switches (`ELSEWHERE` and others), processors without FMA, AVX2,
 AVX, SSE4 differed by at most 5e-8 m and 4e-7 rad, and in what the filter claims by 7e-10 m and
 3e-9 rad. A constant that is off by 1e-3 shows in that claim, if it weighs anything. A threshold
@@ -24,7 +24,7 @@ import pytest
 from perchctl.analysis import replay
 from perchctl.analysis.replay_text import difference_text
 from perchctl.analysis.replayer import Replay
-from perchctl.log import recorded_pictures, to_exact
+from perchctl.record import recorded_pictures, to_exact
 from perchctl.vision import filter as the_filter
 from perchctl.vision import pose
 from perchctl.vision.markers import edge_fit
@@ -122,7 +122,7 @@ def test_a_changed_constant_of_the_pipeline_is_noticed(
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the switches are that processor's")
 def test_on_another_processor_it_is_near() -> None:
     """Its arithmetic is another, which is noticed."""
-    asked = "from perchctl.log import arithmetic_fingerprint; print(arithmetic_fingerprint())"
+    asked = "from perchctl.record import arithmetic_fingerprint; print(arithmetic_fingerprint())"
     assert _elsewhere({}, asked) != _elsewhere(ELSEWHERE, asked)
     _elsewhere(
         ELSEWHERE,

@@ -15,12 +15,12 @@ from perchctl.analysis.replayer import Replay
 from perchctl.analysis.sense import Picture
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.flight import fly
-from perchctl.log import FlightLog, LogWatcher, read_log
-from perchctl.log.header import make_header
-from perchctl.log.write import FlightLogWriter
 from perchctl.mission import Operator, Phase, Tick
 from perchctl.perception import perception
 from perchctl.profile import changed_profile
+from perchctl.record import FlightLog, LogWatcher, read_log
+from perchctl.record.header import make_header
+from perchctl.record.write import FlightLogWriter
 from perchctl.vision import Frame, Pipeline, PipelineState
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner
 from tests.helpers.loop_rig import PROFILE, Camera, Rig, SleepyClock, Vehicle

@@ -16,10 +16,10 @@ import perchctl.mission
 from perchctl.analysis import replay, replay_lines, replay_record
 from perchctl.analysis.replayer import Replay
 from perchctl.analysis.sense import shown
-from perchctl.log import FlightLog
 from perchctl.mission import Turn
 from perchctl.perception import history
 from perchctl.profile import PositioningConfig, Profile, SafetyConfig, changed_profile
+from perchctl.record import FlightLog
 from perchctl.vehicle import Telemetry
 from tests.replay.test_corpus import corpus
 

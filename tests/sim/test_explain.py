@@ -11,9 +11,9 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.display.panel import event_text
 from perchctl.flight import fly_lockstep
-from perchctl.log import read_log
 from perchctl.mission import Event, EventKeeper, EventKind, Phase
 from perchctl.mission.state import Severity
+from perchctl.record import read_log
 from perchctl.sim import EventExplainer, Scenario, draw_scenario
 from perchctl.sim.bursts import Bursts
 from perchctl.sim.explain import LOSSES

@@ -34,16 +34,16 @@ from perchctl.flight import (  # noqa: E402
     fly_lockstep,
     lockstep,
 )
-from perchctl.log import LogWatcher  # noqa: E402
-from perchctl.log.disk import DiskFile  # noqa: E402
-from perchctl.log.recorded import recorded_frames  # noqa: E402
-from perchctl.log.recording_file import RecordingFile  # noqa: E402
-from perchctl.log.write import recording_path  # noqa: E402
 from perchctl.mission import (  # noqa: E402
     FlightReport,
     Operator,
     Phase,
 )
+from perchctl.record import LogWatcher  # noqa: E402
+from perchctl.record.disk import DiskFile  # noqa: E402
+from perchctl.record.recorded import recorded_frames  # noqa: E402
+from perchctl.record.recording_file import RecordingFile  # noqa: E402
+from perchctl.record.write import recording_path  # noqa: E402
 from tests.helpers.flights import short_profile  # noqa: E402
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner  # noqa: E402
 

@@ -13,12 +13,12 @@ from typing import Any, Literal
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.files import PartFile, cannot_be_written, check_output, check_place, write_files
-from perchctl.log.disk import DiskFile
-from perchctl.log.read import FlightLog, read_log
-from perchctl.log.recorded import recorded_frames
-from perchctl.log.recording_file import RecordingFile
-from perchctl.log.write import LAYOUT_SUFFIX, RECORDING_SUFFIX, recording_path
 from perchctl.profile import Profile
+from perchctl.record.disk import DiskFile
+from perchctl.record.read import FlightLog, read_log
+from perchctl.record.recorded import recorded_frames
+from perchctl.record.recording_file import RecordingFile
+from perchctl.record.write import LAYOUT_SUFFIX, RECORDING_SUFFIX, recording_path
 from perchctl.vision import CameraModel
 
 Kind = Literal["event", "sent", "tick", "frame"]
@@ -45,7 +45,7 @@ def export_mcap(
         log: its path, or one that is read already.
         overwrite: what is there already may be replaced, the recording itself among it.
 
-    Errors: those of `perchctl.log.read.read_log`; InvalidValue for a place that cannot be
+    Errors: those of `perchctl.record.read.read_log`; InvalidValue for a place that cannot be
     written to.
     """
     log, out_path = log if isinstance(log, FlightLog) else read_log(log), Path(out_path)
@@ -73,7 +73,7 @@ def export_mcap(
         raise cannot_be_written(out_path, error) from None
     finally:
         part.drop()
-    write_files({layout_path: files("perchctl.log").joinpath("foxglove.json").read_bytes()})
+    write_files({layout_path: files("perchctl.record").joinpath("foxglove.json").read_bytes()})
     return Exported(out_path, layout_path, file.pictures, tuple(notes))
 
 

@@ -15,7 +15,9 @@ import pytest
 from mcap.reader import make_reader
 
 from perchctl.errors import InvalidValue
-from perchctl.log import (
+from perchctl.mission import FlightReport, Outcome, Phase
+from perchctl.profile import Profile
+from perchctl.record import (
     FlightSummary,
     LogWatcher,
     read_log,
@@ -23,11 +25,9 @@ from perchctl.log import (
     recording_file,
     summary_text,
 )
-from perchctl.log import recorder as recording_module
-from perchctl.log.recorder import Recorder
-from perchctl.log.write import FlightLogWriter
-from perchctl.mission import FlightReport, Outcome, Phase
-from perchctl.profile import Profile
+from perchctl.record import recorder as recording_module
+from perchctl.record.recorder import Recorder
+from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers import recorded
 from tests.helpers.disk import full_disk

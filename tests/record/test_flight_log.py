@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.log import read_log, recording_path, to_plain
-from perchctl.log.fields import FIELDS, tick_record
-from perchctl.log.write import FlightLogWriter, log_path
 from perchctl.mission import BatteryOutlook, ExternalPositions, Phase, PlannerState
+from perchctl.record import read_log, recording_path, to_plain
+from perchctl.record.fields import FIELDS, tick_record
+from perchctl.record.write import FlightLogWriter, log_path
 from perchctl.vehicle import (
     EmergencyStop,
     ExternalPosition,

@@ -1,4 +1,4 @@
-"""The flight log and its recording: written, read, compared, drawn and exported."""
+"""The flight log and its recording: written, read, summarised and exported."""
 
 import lazy_loader
 

@@ -15,10 +15,10 @@ from typing import Any
 
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
-from perchctl.log.disk import BackgroundWriter, DiskFile, Stream
-from perchctl.log.recording_file import RecordingFile, encoded, frame_record
-from perchctl.log.summary import RecordingEnd
 from perchctl.profile import Profile
+from perchctl.record.disk import BackgroundWriter, DiskFile, Stream
+from perchctl.record.recording_file import RecordingFile, encoded, frame_record
+from perchctl.record.summary import RecordingEnd
 from perchctl.vision import Frame
 
 CLOSE_TIMEOUT_S = 5.0
@@ -110,13 +110,13 @@ class Recorder:
         self._turn.frame = frame
 
     def event(self, record: Mapping[str, Any]) -> None:
-        """An event's record (`perchctl.log.fields.event_record`). Never raises."""
+        """An event's record (`perchctl.record.fields.event_record`). Never raises."""
         if not self._closed:
             self._turn.events.append(record)
 
     def sent(self, values: Mapping[str, Any]) -> None:
-        """What was sent in the loop's place (`perchctl.log.fields.sent_values`). From any thread:
-        the loop hangs, perhaps, and its turn is left alone. Never raises."""
+        """What was sent in the loop's place (`perchctl.record.fields.sent_values`). From any
+        thread: the loop hangs, perhaps, and its turn is left alone. Never raises."""
         if self._closed or self._over:
             return
         alone = _Turn(sent=values)
@@ -124,7 +124,7 @@ class Recorder:
             self._note_lag("turns are missing in it")
 
     def tick(self, record: Mapping[str, Any]) -> None:
-        """A tick's record (`perchctl.log.fields.tick_record`). Never raises."""
+        """A tick's record (`perchctl.record.fields.tick_record`). Never raises."""
         if not self._closed:
             self._turn.tick = record
             self._hand_over()

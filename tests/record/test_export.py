@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from perchctl.errors import InvalidValue, UsageError
-from perchctl.log import FlightLog, log_table, read_log
-from perchctl.log.fields import FIELDS
+from perchctl.record import FlightLog, log_table, read_log
+from perchctl.record.fields import FIELDS
 from tests.helpers import log as synthetic
 from tests.helpers.mission import held, note
 

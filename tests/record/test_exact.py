@@ -14,10 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
-from perchctl.log import decode_line, from_exact, to_exact, to_plain
-from perchctl.log.exact import encode
-from perchctl.log.read import sent_of, turn_of
-from perchctl.log.write import sent_line, turn_line
 from perchctl.mission import (
     Condition,
     ExternalPositions,
@@ -32,6 +28,10 @@ from perchctl.mission import (
     TurnInputs,
     TurnTiming,
 )
+from perchctl.record import decode_line, from_exact, to_exact, to_plain
+from perchctl.record.exact import encode
+from perchctl.record.read import sent_of, turn_of
+from perchctl.record.write import sent_line, turn_line
 from perchctl.vehicle import (
     Command,
     EmergencyStop,

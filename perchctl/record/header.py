@@ -23,9 +23,9 @@ import perchctl
 from perchctl.calibration import profile_camera
 from perchctl.camera import profile_record, without_password
 from perchctl.errors import PerchError
-from perchctl.log.exact import to_exact
-from perchctl.log.fields import EVENT_FIELDS, FIELDS, FORMAT, SCHEMA_VERSION
 from perchctl.profile import Profile, read_mask
+from perchctl.record.exact import to_exact
+from perchctl.record.fields import EVENT_FIELDS, FIELDS, FORMAT, SCHEMA_VERSION
 
 TURN_NOTE = (
     "records of kind turn: all that a turn of the loop took in, knew and decided, not rounded; "

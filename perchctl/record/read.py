@@ -22,18 +22,18 @@ from pydantic import ValidationError
 from perchctl import __version__
 from perchctl.errors import InvalidValue, Note, NotFound
 from perchctl.geometry import Array
-from perchctl.log.exact import decode_line, from_exact
-from perchctl.log.fields import (
+from perchctl.mission import SentCommand, Turn
+from perchctl.profile import Profile, first_invalid_key
+from perchctl.record.exact import decode_line, from_exact
+from perchctl.record.fields import (
     FIELDS,
     FORMAT,
     READABLE_VERSIONS,
     SCHEMA_VERSION,
     sent_values,
 )
-from perchctl.log.header import computer_record
-from perchctl.log.write import path_beside
-from perchctl.mission import SentCommand, Turn
-from perchctl.profile import Profile, first_invalid_key
+from perchctl.record.header import computer_record
+from perchctl.record.write import path_beside
 from perchctl.vision import CameraModel
 
 Times = TypeVar("Times", float, Array)

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from perchctl.errors import InvalidValue
-from perchctl.log import export_mcap, recorded_pictures
-from perchctl.log.write import FlightLogWriter
+from perchctl.record import export_mcap, recorded_pictures
+from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers import recorded
 

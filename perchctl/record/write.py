@@ -22,10 +22,10 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.errors import InvalidValue
-from perchctl.log.disk import BackgroundWriter, DiskFile
-from perchctl.log.exact import encode, json_line, to_exact
-from perchctl.log.fields import event_record
 from perchctl.mission import Event, SentCommand, Turn
+from perchctl.record.disk import BackgroundWriter, DiskFile
+from perchctl.record.exact import encode, json_line, to_exact
+from perchctl.record.fields import event_record
 
 FSYNC_PERIOD_S = 1.0
 RETRY_PERIOD_S = 1.0
@@ -109,7 +109,7 @@ class FlightLogWriter:
             raise
 
     def write(self, record: Mapping[str, Any]) -> None:
-        """Append one tick record (`perchctl.log.fields.tick_record`). Never raises."""
+        """Append one tick record (`perchctl.record.fields.tick_record`). Never raises."""
         self._put(partial(encode, {"kind": "tick", **record}), record["t_s"])
 
     def turn(self, turn: Turn) -> None:
@@ -121,7 +121,7 @@ class FlightLogWriter:
         self._put(partial(sent_line, sent), sent.t_s)
 
     def event(self, event: Event) -> None:
-        """Append an event (`perchctl.log.fields.event_record`). Never raises."""
+        """Append an event (`perchctl.record.fields.event_record`). Never raises."""
         self._put(partial(encode, {"kind": "event", **event_record(event)}), event.t_s)
 
     def conclude(self, summary: Mapping[str, Any]) -> None:

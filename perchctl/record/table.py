@@ -13,9 +13,9 @@ from io import BytesIO, StringIO
 from typing import Any
 
 from perchctl.errors import InvalidValue, no_parquet
-from perchctl.log.fields import FIELDS, Kind, field_kind
-from perchctl.log.read import FlightLog, log_values
 from perchctl.profile import key_unit
+from perchctl.record.fields import FIELDS, Kind, field_kind
+from perchctl.record.read import FlightLog, log_values
 
 _CORNERS = tuple(f"{corner}_{axis}" for corner in ("tl", "tr", "br", "bl") for axis in "xy")
 _TIMES = ("t_s", "frame_t_s")

@@ -17,10 +17,10 @@ import pytest
 from perchctl.commands import fly
 from perchctl.errors import InvalidValue, LogIncomplete
 from perchctl.flight import FlyOptions, SessionResult
-from perchctl.log import FlightSummary, LogWatcher, read_log, summary_text, write
-from perchctl.log.write import FlightLogWriter
 from perchctl.mission import FlightReport, Outcome, Phase, Turn, TurnInputs
 from perchctl.profile import load_profile
+from perchctl.record import FlightSummary, LogWatcher, read_log, summary_text, write
+from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers.mission import note
 from tests.helpers.small_log import _python, small_log
@@ -47,7 +47,7 @@ def test_a_file_that_cannot_grow_never_raises_and_stays_whole(tmp_path: Path) ->
     code = (
         "import resource, signal, sys\n"
         "from pathlib import Path\n"
-        "from perchctl.log.write import FlightLogWriter\n"
+        "from perchctl.record.write import FlightLogWriter\n"
         "from tests.helpers import log as synthetic\n"
         "from tests.helpers.mission import note\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"

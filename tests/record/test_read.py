@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.log import read_log
+from perchctl.record import read_log
 from tests.helpers import log as synthetic
 from tests.helpers.small_log import _python, small_log
 
@@ -47,7 +47,7 @@ def test_a_killed_writer_leaves_a_readable_log(tmp_path: Path) -> None:
     code = (
         "import os, sys\n"
         "from pathlib import Path\n"
-        "from perchctl.log.write import FlightLogWriter\n"
+        "from perchctl.record.write import FlightLogWriter\n"
         "from tests.helpers import log as synthetic\n"
         "from tests.helpers.mission import note\n"
         "w = FlightLogWriter.open(Path(sys.argv[1]), synthetic.header(), live=True)\n"
@@ -164,7 +164,7 @@ def test_what_unfolds_without_bound_is_read_up_to_a_limit(
 ) -> None:
     path = tmp_path / "bomb.jsonl.gz"
     path.write_bytes(gzip.compress(begin + bytes(40_000_000)))
-    monkeypatch.setattr("perchctl.log.read.MOST_LOG_BYTES", 1_000_000)
+    monkeypatch.setattr("perchctl.record.read.MOST_LOG_BYTES", 1_000_000)
     tracemalloc.start()
     try:
         with pytest.raises(InvalidValue, match="more than 1 MB"):

@@ -21,10 +21,10 @@ from perchctl.geometry import (
     rotation_from_quaternion,
     rotation_from_rpy,
 )
-from perchctl.log import recorded_pictures
-from perchctl.log.fields import sent_values
-from perchctl.log.recording_file import SCHEMAS, calibration_message
 from perchctl.mission import SentCommand
+from perchctl.record import recorded_pictures
+from perchctl.record.fields import sent_values
+from perchctl.record.recording_file import SCHEMAS, calibration_message
 from perchctl.vehicle import Land
 from perchctl.vision import CameraModel
 from tests.helpers import recorded
@@ -267,7 +267,7 @@ def test_the_header_goes_along(recording: Path) -> None:
 
 
 def test_the_layout_shows_what_is_there(found: dict[str, list[Any]]) -> None:
-    shown = json.loads(files("perchctl.log").joinpath("foxglove.json").read_bytes())
+    shown = json.loads(files("perchctl.record").joinpath("foxglove.json").read_bytes())
     topics = set(found)
     text = json.dumps(shown)
     named = {word for word in text.replace(".", '"').split('"') if word.startswith("/")}

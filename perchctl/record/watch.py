@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from perchctl.camera import FrameSource, WatchedSource
-from perchctl.log.fields import event_record, sent_values, tick_record
-from perchctl.log.header import make_header
-from perchctl.log.read import PhaseSpan
-from perchctl.log.summary import FlightSummary, RecordingEnd
-from perchctl.log.write import RECORDING_SUFFIX, FlightLogWriter, log_path, recording_path
 from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
 from perchctl.profile import Profile
+from perchctl.record.fields import event_record, sent_values, tick_record
+from perchctl.record.header import make_header
+from perchctl.record.read import PhaseSpan
+from perchctl.record.summary import FlightSummary, RecordingEnd
+from perchctl.record.write import RECORDING_SUFFIX, FlightLogWriter, log_path, recording_path
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 if TYPE_CHECKING:
-    from perchctl.log.recorder import Recorder
+    from perchctl.record.recorder import Recorder
 
 Truth = tuple[tuple[float, float, float], float]
 """The body's true position (world, m) and the gear's true miss (m)."""
@@ -74,7 +74,7 @@ class LogWatcher:
         writer = FlightLogWriter.open(path, header, live, taken, profile.link.loop_hz)
         if not record:
             return cls(writer)
-        from perchctl.log.recorder import Recorder
+        from perchctl.record.recorder import Recorder
 
         try:
             return cls(writer, Recorder.open(recording_path(writer.path), header, profile, live))

@@ -44,10 +44,10 @@ from mcap_protobuf.schema import register_schema
 
 import perchctl
 from perchctl.geometry import quaternion_from_rotation, quaternion_from_rpy
-from perchctl.log.disk import Stream
-from perchctl.log.exact import encode
-from perchctl.log.fields import FIELDS, field_kind
 from perchctl.profile import Profile
+from perchctl.record.disk import Stream
+from perchctl.record.exact import encode
+from perchctl.record.fields import FIELDS, field_kind
 from perchctl.vision import CameraModel, Frame
 
 WORLD, BODY, GEAR, CAMERA = "world", "body", "gear", "camera"
@@ -122,7 +122,7 @@ class RecordingFile:
         self._add(FRAME, ns, json.dumps(about).encode(), number)
 
     def tick(self, record: Mapping[str, Any]) -> None:
-        """A tick's record (`perchctl.log.fields.FIELDS`)."""
+        """A tick's record (`perchctl.record.fields.FIELDS`)."""
         ns = self._at(float(record["t_s"]))
         if self._first_s is None:
             self._first_s = float(record["t_s"])
@@ -131,12 +131,12 @@ class RecordingFile:
         self._add(TICK, ns, encode(self._since_first(record))[:-1])
 
     def sent(self, values: Mapping[str, Any]) -> None:
-        """What was sent in the loop's place (`perchctl.log.fields.sent_values`)."""
+        """What was sent in the loop's place (`perchctl.record.fields.sent_values`)."""
         ns = self._at(float(values["t_s"]))
         self._add(SENT, ns, encode(self._since_first(values))[:-1])
 
     def event(self, record: Mapping[str, Any]) -> None:
-        """An event's record (`perchctl.log.fields.event_record`)."""
+        """An event's record (`perchctl.record.fields.event_record`)."""
         ns = self._at(float(record["t_s"]))
         self._add(LOG, ns, log_message(ns, record))
 
@@ -378,7 +378,7 @@ class SpaceMessages:
         self._path_s = self._point_s = -math.inf
 
     def of(self, record: Mapping[str, Any]) -> Iterator[tuple[str, Message]]:
-        """Of a tick's record (`perchctl.log.fields.FIELDS`)."""
+        """Of a tick's record (`perchctl.record.fields.FIELDS`)."""
         t_s = float(record["t_s"])
         ns = self._epoch.ns(t_s)
         sampled_ns = self._epoch.ns(t_s - (_number(record, "tel_age_s") or 0.0))

@@ -17,13 +17,13 @@ from perchctl.analysis.story import story_of
 from perchctl.flight import fly
 from perchctl.flight.watchdog import rescue
 from perchctl.link.sender import Sender
-from perchctl.log import LogWatcher, export_mcap, read_log, write
-from perchctl.log import recorder as recording_module
-from perchctl.log.fields import sent_values
-from perchctl.log.recorder import Recorder
-from perchctl.log.write import FlightLogWriter
 from perchctl.mission import FlightReport, Operator, Outcome, Phase, SentCommand
 from perchctl.perception import History
+from perchctl.record import LogWatcher, export_mcap, read_log, write
+from perchctl.record import recorder as recording_module
+from perchctl.record.fields import sent_values
+from perchctl.record.recorder import Recorder
+from perchctl.record.write import FlightLogWriter
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.flight.test_silent_loop import HANG_AT_S, hung_rig
 from tests.helpers import log as synthetic

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.log.read import FlightLog, PhaseSpan
 from perchctl.mission import ContactError, Findings, Touchdown, latency_text, turn_text
+from perchctl.record.read import FlightLog, PhaseSpan
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 

@@ -20,8 +20,8 @@ from perchctl.calibration import profile_camera
 from perchctl.campaign.flights import fly_seed
 from perchctl.flight import lockstep
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rotation_from_quaternion
-from perchctl.log import read_log, recorded_pictures
 from perchctl.profile import load_profile
+from perchctl.record import read_log, recorded_pictures
 from perchctl.vision import Frame, project, square_corners
 from tests.helpers import recorded
 from tests.helpers.commands import run

@@ -22,8 +22,8 @@ from zstandard import ZstdError
 
 from perchctl.camera import decode_picture
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.log.recording_file import FRAME, IMAGE
-from perchctl.log.write import recording_path
+from perchctl.record.recording_file import FRAME, IMAGE
+from perchctl.record.write import recording_path
 
 MOST_RECORD_BYTES = 256_000_000
 """Of one record: a flight's chunks have 4 MB and one picture; a longer one is damaged."""
