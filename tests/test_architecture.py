@@ -320,7 +320,7 @@ BROKEN = {
     ),
     "perchctl.vision.merge": ("from perchctl.mission import state\n", uphill, "mission.state"),
     "perchctl.geometry": ("from .profile import Profile\n", uphill, "profile"),
-    "perchctl.sim.world": ("from perchctl.record import read\n", uphill, "log.read"),
+    "perchctl.sim.world": ("from perchctl.record import read\n", uphill, "record.read"),
     "perchctl.link.mock": ("from perchctl.sim import world\n", uphill, "sim.world"),
     "perchctl.vision.pipeline": (
         "import typing\nif typing.TYPE_CHECKING:\n    from perchctl.link.mock import X\n",

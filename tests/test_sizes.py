@@ -15,29 +15,29 @@ SOURCES = {path: path.read_text(encoding="utf-8") for path in sorted(ROOT.rglob(
 
 # Package -> lines at most; "." are the modules beside the packages.
 MOST_LINES = {
-    ".": 1210,
-    "analysis": 4510,
-    "calibration": 4890,
-    "camera": 3080,
-    "campaign": 2380,
-    "check": 2450,
-    "commands": 5870,
-    "display": 1020,
-    "faults": 3170,
-    "flight": 2590,
-    "link": 2690,
-    "record": 3660,
-    "mission": 5290,
-    "perception": 700,
-    "positioning": 1290,
-    "profile": 2360,
-    "sim": 7840,
-    "target": 2890,
-    "track": 700,
-    "vision": 8070,
-    "weights": 2180,
+    ".": 1150,
+    "analysis": 3500,
+    "calibration": 4250,
+    "camera": 2450,
+    "campaign": 1700,
+    "check": 2050,
+    "commands": 5000,
+    "display": 1000,
+    "faults": 3050,
+    "flight": 2450,
+    "link": 2600,
+    "record": 3300,
+    "mission": 4750,
+    "perception": 850,
+    "positioning": 1200,
+    "profile": 2100,
+    "sim": 6900,
+    "target": 2450,
+    "track": 600,
+    "vision": 6250,
+    "weights": 1550,
 }
-MOST_FILES = 283
+MOST_FILES = 262
 # Of the code before it was made shorter: what is shorter because its lines are fuller is not.
 CHARACTERS_A_LINE, DOCSTRING_SHARE, WITHIN = 37.8, 0.106, 0.05
 MOST_MEDIAN_LINES = 15  # of a function
