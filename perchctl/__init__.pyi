@@ -1,8 +1,8 @@
 from .analysis import plot_flight as plot_flight
 from .calibration import load_calibration as load_calibration
 from .flight import fly_lockstep as fly_lockstep
-from .record import read_log as read_log
 from .profile import load_profile as load_profile
+from .record import read_log as read_log
 from .vision import Attitude as Attitude
 from .vision import Frame as Frame
 from .vision import PipelineState as PipelineState

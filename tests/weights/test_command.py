@@ -164,7 +164,7 @@ BAD: list[tuple[str, slice, Edit, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("column", "rows", "edit", "said"), BAD, ids=lambda part: str(part)[:40])
+@pytest.mark.parametrize(("column", "rows", "edit", "said"), BAD, ids=[case[-1] for case in BAD])
 def test_bad_input_is_one_sentence(
     column: str, rows: slice, edit: Edit, said: str, tmp_path: Path
 ) -> None:
