@@ -66,9 +66,9 @@ def test_put_where_the_refusal_says_it_flies(
     problem = out_of_view(place, FEET, yaw_rad, TARGET, CAMERA)
     over = target_from((0.0, 0.0, TOP_M), yaw_rad, place, TARGET, CAMERA)
     leant_m = over.height_m * math.tan(math.radians(LEAN_DEG))
-    farther = (1.0 + leant_m / max(math.hypot(*over.aside_m), 1e-6)) * place.position_m[:2]
-    leaning = Place(np.array([*farther, z]), target_yaw)
-    # The camera is on the body's axis here: farther aside is as good as leaning.
+    # Farther aside of the camera, which is beside the body's axis, is as good as leaning.
+    away = rot_z(yaw_rad)[:2, :2] @ over.aside_m / max(math.hypot(*over.aside_m), 1e-6)
+    leaning = Place(np.array([*(place.position_m[:2] + leant_m * away), z]), target_yaw)
     swayed = target_from((0.0, 0.0, TOP_M), yaw_rad, leaning, TARGET, CAMERA)
     assert (problem is None) is (over.whole and swayed.whole)
     if problem is None:
