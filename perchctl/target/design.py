@@ -346,7 +346,8 @@ def suggest_target(
     from the large one, as every error falls with the size, and the page: a larger one only where
     the search needs it. What they do not cover is in the design's warnings.
 
-    Raises InvalidValue where the blur leaves nothing to read, or for a ceiling too low.
+    Raises InvalidValue where the blur leaves nothing to read, for a ceiling too low, or for a
+    magnet that is smaller than what the small marker needs.
     """
     search_m = _search_range_m(profile, ceiling_m)
     base, picture_px = _sized(0.150, 0.025), max(camera.size_px)
@@ -381,7 +382,7 @@ def suggest_target(
     larger = (target_of(needed_m + k * _LARGE_STEP_M) for k in range(count, 0, -1))
     held = (each for each in larger if fits(each, parse_page(page)) and takes_over(each))
     target = next(held, target_of(needed_m))
-    check_target(target, max(magnet_m, math.sqrt(2.0) * target.small.side_m))
+    check_target(target, magnet_m)
     held_by = page if fits(target, parse_page(page)) else fitting_page(target)
     return make_design(target, camera, optics, profile, ceiling_m), held_by
 

@@ -78,6 +78,7 @@ def _file(tmp_path: Path) -> tuple[Path, list[str]]:
         (2, '"gyro_radps"', '"gyro"'),
         (3, "0.02", "NaN"),
         (4, '"rotation_cam_target":[[', '"rotation_cam_target":[[2.5,'),
+        (4, '"rotation_cam_target":[[-0', '"rotation_cam_target":[[-9'),
         (4, "{", ""),
         (5, '"t_s":1.33', '"t_s":[]'),
     ],

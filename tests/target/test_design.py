@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from perchctl.errors import InvalidValue
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.target import (
     Optics,
@@ -172,9 +173,8 @@ def test_a_larger_page_or_a_smaller_magnet_gives_other_sizes(profile: Profile) -
     larger, page = suggest_target(camera, optics, profile, 0.05, 2.4, "a3")
     assert page == "a3"
     assert larger.target.large.side_m > found.target.large.side_m
-    tiny, page = suggest_target(camera_of(250.0), Optics(1.5), profile, 0.008, 4.0)
-    assert page != "a4", "the search needs more than it holds"
-    assert any("gap between the markers" in warning for warning in tiny.warnings)
+    with pytest.raises(InvalidValue, match="is not inside the magnet"):
+        suggest_target(camera_of(250.0), Optics(1.5), profile, 0.008, 4.0)
 
 
 def test_the_text_and_the_record_hold_ranges_and_errors(paper_design: TargetDesign) -> None:

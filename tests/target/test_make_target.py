@@ -149,17 +149,11 @@ def test_a_new_file_named_by_p_extends_the_real_vehicle_s_profile() -> None:
 
 
 PROFILES = {
-    "flow": "extends: sim\ntarget:\n  # measured\n  large: {dictionary: DICT_4X4_1000, id: 997, "
-    "side_m: 0.150}  # keep\n  small: {dictionary: DICT_ARUCO_ORIGINAL, id: 5, side_m: 0.025}\n",
     "known": "extends: sim\ntarget:\n  size_sigma: 0.01  # keep\n",
-    "block": "extends: sim\n# keep\ntarget:\n  large:\n    side_m: 15.0e-2\n    dictionary: "
-    "DICT_4X4_1000\n    id: 997\n",
-    "no target": "# keep\nextends: sim\nlog: {plot: false}",
     "no side": "extends: crazyflie  # keep\ntarget:\n    large:\n        id: 16\n"
     "    small: {id: 6}\n",
-    "all flow": "{extends: crazyflie, target: {large: {id: 45}}}  # keep\n",
-    "all flow, no target": "{extends: crazyflie}  # keep\n",
 }
+"""Further layouts: tests/profile/test_edit.py."""
 
 
 @pytest.mark.parametrize("name", PROFILES)
@@ -201,19 +195,6 @@ def test_a_small_profile_of_a_file_in_another_folder_finds_it() -> None:
         code=30,
     )
     assert "measured.yaml exists" in err
-
-
-def test_a_side_that_stands_elsewhere_in_the_file_is_not_changed_there() -> None:
-    text = (
-        "extends: crazyflie\nplanner:\n  search: {step_m: &side 0.15}\n"
-        "target:\n  large: {side_m: *side}\n"
-    )
-    Path("mine.yaml").write_text(text)
-    _, err = call("measured", "-p", "mine.yaml", "--measured-large", "149.6", "--force", code=30)
-    assert "write them yourself: " in err
-    assert "target.large.side_m: 0.1496" in err
-    assert Path("mine.yaml").read_text() == text
-    assert files() == {"mine.yaml"}
 
 
 def test_a_scaled_page_is_noticed() -> None:
