@@ -37,7 +37,7 @@ SLOW_FIRST = (
     "flight/test_flights.py",
     "flight/test_realtime.py",
     "test_docs.py",
-    "test_cli.py",
+    "test_fly_command.py",
     "flight/test_one_error.py",
     "target/test_make_target.py",
     "target/test_design.py",

@@ -1,286 +1,304 @@
-"""The command line's edges: help, Tab, failures as JSON, a full disk, Ctrl-C at the wrong time."""
+"""What all subcommands share: help, usage, failures as sentences and JSON, notes, what is written,
+a full disk, Ctrl-C at the wrong time."""
 
 from __future__ import annotations
 
-import gc
 import json
 import os
-import subprocess
-import sys
+import re
 import textwrap
-from dataclasses import dataclass
-from inspect import cleandoc
+import warnings
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner
+import typer
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands import app, complete
-from perchctl.commands.fly import fly_and_report, resolve
-from perchctl.errors import EXIT_CODES, ConnectionFailed
-from perchctl.flight import SessionResult
-from perchctl.link.connection import open_connection, plain_cause
-from perchctl.mission import FlightReport, Outcome, Phase
+from perchctl import __version__
+from perchctl.commands.command_line import COMMANDS, reported
+from perchctl.commands.output import confirmed
+from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote
+from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT
+from tests.helpers.recording import write_pictures
+from tests.helpers.weights_data import known
+from tests.helpers.weights_data import write as write_session
 
-COMMANDS = (
-    "make-target",
-    "calibrate",
-    "profile",
-    "fit-weights",
-    "track",
-    "fly",
-    "simulate",
-)
+HEAVY = ("cv2", "numpy", "cflib", "matplotlib", "mujoco", "pydantic", "filterpy", "scipy")
 
 
-@pytest.fixture(autouse=True)
-def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("CFLIB_URI", raising=False)
+# --- Help and usage ------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Done:
-    code: int
-    stdout: str
-    stderr: str
-
-
-def run_apart(
-    *arguments: str, before: str = "", stdout: Any = subprocess.PIPE, **environment: str
-) -> Done:
-    """The console script's own entry in a process of its own; `before` is run first."""
-    code = f"{before}\nimport sys\nfrom perchctl.__main__ import main\nsys.exit(main())"
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
-        stdin=subprocess.DEVNULL,
-        stdout=stdout,
-        stderr=subprocess.PIPE,
-        text=True,
-        timeout=60,
+def test_help_loads_nothing_heavy() -> None:
+    """It answers in under 0.3 s because of what it does not import."""
+    before = (
+        "import atexit, sys\n"
+        f"atexit.register(lambda: print([m for m in {HEAVY!r} if m in sys.modules]))"
     )
-    assert "Traceback" not in done.stderr, done.stderr
-    return Done(done.returncode, done.stdout or "", done.stderr)
+    done = run_apart("--help", before=before)
+    assert "simulate" in done.stdout
+    assert done.stdout.splitlines()[-1] == "[]"
 
 
-# --- Help --------------------------------------------------------------------------------
+def test_perchctl_alone_lists_the_commands_in_the_order_of_use() -> None:
+    alone = run()
+    assert (alone.code, alone.stderr) == (0, "")
+    assert alone.stdout == run("--help").stdout
+    listed = re.findall(rf"^  ({'|'.join(COMMANDS)})  ", alone.stdout, re.MULTILINE)
+    assert listed == list(COMMANDS)
 
 
-@pytest.mark.parametrize("command", ["", *COMMANDS])
-def test_help_is_whole_at_80_columns(command: str) -> None:
-    """Nothing is cut, no line is over, and paragraphs are filled."""
-    words = [command, "--help"] if command else ["--help"]
-    text = CliRunner().invoke(app, words, env={"COLUMNS": "80"}).stdout
-    assert "\N{HORIZONTAL ELLIPSIS}" not in text
-    assert max(map(len, text.splitlines())) <= 80
-    (about,) = [c.callback.__doc__ for c in app.registered_commands if c.name == command] or [None]
-    for paragraph in cleandoc(about or "").split("\n\n"):
-        filled = [textwrap.indent(textwrap.fill(paragraph, room), "  ") for room in (76, 78)]
-        assert any(each in text for each in filled)
-    if not command:
-        summaries = [cleandoc(c.callback.__doc__).split("\n\n")[0] for c in app.registered_commands]
-        assert all(summary in " ".join(text.split()) for summary in summaries)
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_help_is_whole_at_80_columns(name: str) -> None:
+    """It begins as the list says; nothing is cut, no line is over; each has its examples."""
+    helps = [run(name, "--help").stdout]
+    assert COMMANDS[name] in " ".join(helps[0].split())
+    listed = helps[0].partition("Subcommands; without one it is")[2]
+    helps += [run(name, each, "-h").stdout for each in re.findall(r"^  (\w+)  ", listed, re.M)]
+    for text in helps:
+        assert "\N{HORIZONTAL ELLIPSIS}" not in text
+        assert max(map(len, text.splitlines())) <= 80
+        assert "Examples:\n    perchctl " in text
 
 
-def test_help_holds_the_whole_notations_and_one_line_an_exit_code() -> None:
-    text = CliRunner().invoke(app, ["calibrate", "--help"], env={"COLUMNS": "80"}).stdout
-    assert "[default: charuco:10x7:25mm:18mm:DICT_5X5_100]" in " ".join(text.split())
-    lines = CliRunner().invoke(app, ["fly", "--help"], env={"COLUMNS": "80"}).stdout.splitlines()
+def test_fly_help_lists_every_exit_code_in_a_line() -> None:
+    text = run("fly", "--help").stdout
+    lines = text.splitlines()
     first = lines.index("  Exit codes:") + 1
     table = [line.split(maxsplit=1) for line in lines[first : first + len(EXIT_CODES)]]
     assert {int(code): meaning for code, meaning in table} == EXIT_CODES
+    assert "CFLIB_URI" in text
 
 
-def test_perchctl_alone_shows_what_there_is() -> None:
-    alone = run_apart()
-    assert alone.code == 0
-    assert alone.stderr == ""
-    for command in COMMANDS:
-        assert f"\n  {command} " in alone.stdout
+def test_the_help_of_simulate_needs_no_simulator() -> None:
+    done = run_apart("simulate", "--help", before="import sys; sys.modules['mujoco'] = None")
+    assert done.code == 0, done.stderr
+    assert "Usage: perchctl simulate" in done.stdout
 
 
-# --- Tab -----------------------------------------------------------------------------------
+def test_version() -> None:
+    assert run("--version").stdout.strip() == f"perchctl {__version__}"
 
 
-def offered(*words: str) -> list[str]:
-    """What bash is told for the last of the words."""
-    done = run_apart(
-        before="import sys; sys.argv[0] = 'perchctl'",
-        _PERCHCTL_COMPLETE="complete_bash",
-        COMP_WORDS="\n".join(["perchctl", *words]),
-        COMP_CWORD=str(len(words)),
-    )
-    assert done.stderr == ""
-    return done.stdout.split()
+@pytest.mark.parametrize("words", ["fly --bogus", "perch", "simulate -n 0", "simulate --seed -1"])
+def test_wrong_usage_is_2(words: str) -> None:
+    assert run(*words.split()).code == 2
 
 
-def test_tab_offers_profiles_and_sources(tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text("extends: sim\n")
-    (tmp_path / "notes.txt").write_text("")
-    (tmp_path / "pictures").mkdir()
-    assert offered("fly", "--profile", "") == [
-        "aideck", "crazyflie", "extreme", "fpv", "paper", "rough", "sim", "target_only",
-        "mine.yaml", "pictures/",
-    ]  # fmt: skip
-    assert offered("make-target", "-p", "cr") == ["crazyflie"]
-    assert offered("track", "im") == ["images:"]
+def test_completion_offers_subcommands_and_options() -> None:
+    def offered(*words: str) -> list[str]:
+        done = run_apart(
+            _PERCHCTL_COMPLETE="complete_bash",
+            COMP_WORDS="\n".join(["perchctl", *words]),
+            COMP_CWORD=str(len(words)),
+        )
+        assert done.stderr == ""
+        return done.stdout.split()
 
-
-def test_tab_offers_subcommands_and_what_the_main_one_takes(tmp_path: Path) -> None:
+    assert offered("sim") == ["simulate"]
     assert offered("simulate", "com") == ["compare"]
-    assert offered("profile", "") == ["show", "new", "schema"]
-    assert offered("calibrate", "im") == ["images:"]
-    assert "--faults" in offered("simulate", "--fa")
-    assert "--part" in offered("calibrate", "mount", "--pa")
+    assert offered("fly", "--pro") == ["--profile"]
+    assert "--install-completion" in run("--help").stdout
 
 
-def test_tab_offers_cameras_that_are_there_and_files_behind_a_colon(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    devices = tmp_path / "dev"
-    devices.mkdir()
-    for name in ("video10", "video2", "video-x"):
-        (devices / name).write_text("")
-    monkeypatch.setattr(complete, "_DEVICES", devices)
-    assert complete.sources("ca") == ["camera:2", "camera:10"]
-    (tmp_path / "a.mp4").write_text("")
-    assert complete.sources("video:") == ["video:a.mp4", "video:dev/"]
-    (tmp_path / "a.txt").write_text("")
-    assert complete.sources("./a") == ["./a.mp4"]
-    assert complete.sources("[") == []
-
-
-def test_completion_can_be_installed() -> None:
-    assert "--install-completion" in run_apart("--help").stdout
-    shown = run_apart("--show-completion", "bash", before="import sys; sys.argv[0] = 'perchctl'",
-                      _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")  # fmt: skip
-    assert "complete -o default -F _perchctl_completion perchctl" in shown.stdout
-
-
-# --- --json ----------------------------------------------------------------------------------
+# --- Failures ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("words", "code"),
     [
-        (["fly", "-p", "smi"], 20),
-        (["fly", "--dry-run", "--uri", "bogus"], 30),
-        (["fly", "--bogus"], 2),
-        (["simulate", "-p", "smi"], 20),
-        (["simulate", "-n", "0"], 2),
-        (["track", "none.png"], 20),
-        (["track"], 2),
-        (["calibrate"], 2),
-        (["calibrate", "images:none"], 20),
-        (["make-target", "--large", "3 miles"], 30),
-        (["fit-weights"], 2),
-        (["fit-weights", "none.csv"], 20),
+        ("fly -p smi", 20),
+        ("fly --dry-run --uri bogus", 30),
+        ("fly --bogus", 2),
+        ("simulate -p smi", 20),
+        ("simulate -n 0", 2),
+        ("track none.png", 20),
+        ("track", 2),
+        ("calibrate", 2),
+        ("calibrate images:none", 20),
+        ("make-target --large 3-miles", 30),
+        ("fit-weights", 2),
+        ("fit-weights none.csv", 20),
     ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else str(value),
 )
-def test_a_failure_is_one_object_too(words: list[str], code: int) -> None:
-    done = CliRunner().invoke(app, [*words, "--json"])
-    assert done.exit_code == code
+def test_a_failure_is_one_object_too(words: str, code: int) -> None:
+    done = run(*words.split(), "--json")
+    assert done.code == code
     told = json.loads(done.stdout)
     assert set(told) == {"error", "exit_code"}
     assert told["exit_code"] == code
     assert told["error"] in done.stderr
-    assert not CliRunner().invoke(app, words).stdout
+    assert not run(*words.split()).stdout
 
 
-@pytest.mark.filterwarnings(
-    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
+def test_what_nobody_foresaw_is_one_sentence_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail() -> None:
+        with reported():
+            raise ZeroDivisionError("oh")
+
+    monkeypatch.delenv("PERCHCTL_DEBUG", raising=False)
+    with pytest.raises(typer.Exit) as left:
+        fail()
+    assert left.value.exit_code == 1
+    assert "unforeseen ZeroDivisionError: oh" in capsys.readouterr().err
+    monkeypatch.setenv("PERCHCTL_DEBUG", "1")
+    with pytest.raises(ZeroDivisionError):
+        fail()
+
+
+def test_a_path_beyond_all_bounds_is_one_short_sentence() -> None:
+    done = run("fly", "--dry-run", "-p", f"./{'x' * 3000}.yaml")
+    assert done.code == 30
+    assert "File name too long" in done.complaint
+    assert len(done.stderr) < 400
+
+
+def test_each_note_is_one_sentence_once_and_before_a_failure(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Other warnings are left to those who show them: here to pytest, else to Python."""
+
+    def fail() -> None:
+        with reported():
+            for key in ("a", "b", "a"):
+                warnings.warn(f"mine.yaml: {key} has another name", ProfileNote, stacklevel=1)
+            warnings.warn("something else", DeprecationWarning, stacklevel=1)
+            raise InvalidValue("no good")
+
+    with (
+        pytest.warns(DeprecationWarning, match="something else") as others,
+        pytest.raises(typer.Exit),
+    ):
+        fail()
+    assert len(others) == 1
+    assert capsys.readouterr().err.splitlines() == [
+        "perchctl: mine.yaml: a has another name",
+        "perchctl: mine.yaml: b has another name",
+        "perchctl: no good",
+    ]
+    with pytest.raises(ProfileNote):
+        warnings.warn("an error again behind it", ProfileNote, stacklevel=1)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("simulate --only 3 -n 5", ["--only 3", "-n 5"]),
+        ("simulate --only 3 --jobs 2 --seed 0", ["--seed 0", "--jobs 2"]),
+        ("simulate --faults list --log-dir x", ["flies nothing", "--log-dir x"]),
+        ("simulate --resume", ["--resume", "--out"]),
+        ("calibrate pictures --view", ["no live camera", "--view"]),
+    ],
 )
-def test_the_library_s_prints_stay_off_stdout(capfd: pytest.CaptureFixture[str]) -> None:
-    """cflib tells of its sockets on stdout, where the one object belongs. (It leaves one open.)"""
-    with pytest.raises(ConnectionFailed, match="nothing listens there"):
-        open_connection("tcp://127.0.0.1:9", 5.0)
-    assert capfd.readouterr().out == ""
-    gc.collect()
+def test_options_that_would_not_be_heeded_are_refused(line: str, words: list[str]) -> None:
+    Path("pictures").mkdir()
+    said = run(*line.split())
+    assert said.code == 2
+    for word in words:
+        assert word in said.complaint
 
 
-def test_a_usb_cable_without_rights_gets_the_remedy() -> None:
-    said = plain_cause("Couldn't load link driver: Could not open usb://0\n\nTraceback ...")
-    assert "no Crazyflie is plugged in by USB" in said
-    assert 'ATTRS{idVendor}=="0483", ATTRS{idProduct}=="5740"' in said
-    assert "udevadm control --reload-rules" in said
+@pytest.mark.parametrize("name", ["d3.png", "camera", "camera.txt"])
+def test_a_calibration_is_not_named_like_its_report(name: str) -> None:
+    said = run("calibrate", "images:.", "-o", name, "--force")
+    assert said.code == InvalidValue.exit_code
+    assert "must end in .yaml" in said.complaint
 
 
-# --- After the flight --------------------------------------------------------------------------
+# --- Questions -----------------------------------------------------------------------------
 
 
-LANDED = FlightReport(Phase.LANDED, Outcome.OPERATOR, "Ctrl-C", 0, 3.0, False)
+def test_what_was_typed_before_the_question_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    pty = pytest.importorskip("pty", reason="Windows has no terminals of this kind")
+    keyboard, screen = pty.openpty()
+    os.write(keyboard, b"y\n")
+
+    class Reader:
+        """Types no as soon as the question has appeared."""
+
+        def write(self, text: str) -> int:
+            if "?" in text:
+                os.write(keyboard, b"n\n")
+            return len(text)
+
+        def flush(self) -> None:
+            return None
+
+    with open(screen, encoding="utf-8") as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        monkeypatch.setattr("sys.stderr", Reader())
+        assert not confirmed("Is it clear?")
+        os.write(keyboard, b"yes\n")
+        assert stdin.readline() == "yes\n"  # nothing of before is left
+    os.close(keyboard)
 
 
-@pytest.fixture
-def flown(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """A flight that has ended, as `fly` gets it; the list is what happened, in order."""
-    happened: list[str] = []
+# --- What is written -----------------------------------------------------------------------
 
-    def session(*_arguments: object) -> SessionResult:
-        return SessionResult(LANDED)
-
-    def tell(text: str) -> None:
-        happened.append(text)
-
-    monkeypatch.setattr("perchctl.commands.fly.fly_session", session)
-    monkeypatch.setattr("perchctl.commands.fly.tell", tell)
-    return happened
-
-
-def test_ctrl_c_in_the_drawing_leaves_the_result(
-    flown: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """It has been told before the drawing begins, and the object follows without a plot."""
-
-    def draw(*_arguments: object) -> None:
-        assert flown
-        assert flown[0].startswith("LANDED: Ctrl-C")
-        os.kill(os.getpid(), 2)  # Ctrl-C
-
-    monkeypatch.setattr("perchctl.analysis.plot_flight", draw)
-    code = fly_and_report(resolve(), True, None)
-    out, err = capsys.readouterr()
-    told = json.loads(out)
-    assert (code, told["exit_code"], told["outcome"], told["plot"]) == (130, 130, "landed", None)
-    assert told["error"] == f"{EXIT_CODES[130]}: Ctrl-C"
-    assert "the plot is not drawn" in err
+CALIBRATION = str(ROOT / "calib/example_640x480.yaml")
+WRITING = [
+    "calibrate images:. -o OUT.yaml",
+    f"calibrate convert {CALIBRATION} -o OUT.yaml",
+    "calibrate mask images:. -o OUT.png",
+    "make-target -o OUT.pdf",
+    "make-target board chessboard:9x6:20mm -o OUT.pdf",
+    "make-target measured --measured-large 150 -o OUT.yaml",
+    "track images:. --csv OUT.csv",
+    "track images:. --overlay OUT.mp4",
+    "fit-weights session.csv -o OUT.yaml",
+]
+"""Each way to write a file, which is refused before there is anything to work on."""
 
 
-def test_the_object_names_the_plot(
-    flown: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("perchctl.analysis.plot_flight", lambda *_: None)
-    fly_and_report(resolve(), True, None)
-    told = json.loads(capsys.readouterr().out)
-    assert told["plot"] == told["log"].replace(".jsonl", ".png")
-    assert flown[-1] == f"plot:      {told['plot']}"
+@pytest.mark.parametrize("line", WRITING)
+def test_one_rule_for_what_is_there_already(line: str) -> None:
+    *words, out = line.split()
+    name = out.replace("OUT", "mine")
+    Path(name).write_text("mine")
+    said = run(*words, name)
+    assert said.code == InvalidValue.exit_code
+    assert f"{name} exists already; add --force" in said.complaint
+    assert Path(name).read_text() == "mine"
+    assert "exists already" not in run(*words, name, "--force").stderr
+    Path(name).write_text("mine")
+    assert "is a file, not a folder" in run(*words, f"{name}/inside/{name}").complaint
+    assert [path.name for path in Path().iterdir()] == [name]
 
 
-def test_ctrl_c_behind_the_landing_does_not_replace_the_result(
-    flown: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Pressed while the log is closed, which may take seconds on a slow disk."""
-    from perchctl.log import LogWatcher
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"calibrate convert {CALIBRATION} -o OUT.yaml",
+        "make-target board chessboard:9x6:20mm -o OUT.pdf",
+        "make-target measured --measured-large 150 -o OUT.yaml",
+        "track images:pictures --csv OUT.csv",
+        "fit-weights session.csv -o OUT.yaml",
+    ],
+)
+def test_folders_that_are_missing_are_made(line: str) -> None:
+    write_session(known(positions=4, per=20), Path("session.csv"))
+    write_pictures(Path("pictures"))
+    *words, out = line.split()
+    place = Path(out.replace("OUT", "made/new/out"))
+    said = run(*words, str(place))
+    assert said.code == 0, said.stderr
+    assert [path.name for path in place.parent.iterdir()] == [place.name]
 
-    close = LogWatcher.close
 
-    def slow(self: LogWatcher, *arguments: Any) -> Any:
-        os.kill(os.getpid(), 2)
-        return close(self, *arguments)
-
-    monkeypatch.setattr(LogWatcher, "close", slow)
-    monkeypatch.setattr("perchctl.analysis.plot_flight", lambda *_: None)
-    assert fly_and_report(resolve(), True, None) == 130
-    assert json.loads(capsys.readouterr().out)["outcome"] == "landed"
+# --- A full disk, and Ctrl-C while it loads -------------------------------------------------
 
 
-# --- Start ----------------------------------------------------------------------------------
+@pytest.mark.long
+@pytest.mark.parametrize("words", ["--help", "fly --dry-run", "fly --dry-run --json"])
+def test_a_full_disk_behind_stdout_is_30_as_everywhere(words: str) -> None:
+    with open("/dev/full", "w") as full:
+        done = run_apart(*words.split(), stdout=full)
+    assert done.code == 30
+    assert done.complaint.startswith("the result cannot be written: No space left on device")
 
 
 PRESSED_AT = """
@@ -295,44 +313,29 @@ PRESSED_AT = """
 """
 
 
+def pressed_at(module: str) -> str:
+    return textwrap.dedent(PRESSED_AT.format(module=module))
+
+
 @pytest.mark.parametrize("module", ["typer", "numpy", "cv2", "pydantic"])
 def test_ctrl_c_while_loading_is_one_sentence(module: str) -> None:
-    before = textwrap.dedent(PRESSED_AT.format(module=module))
-    done = run_apart("fly", "--dry-run", before=before)
+    done = run_apart("fly", "--dry-run", before=pressed_at(module))
     assert (done.code, done.stdout, done.stderr) == (130, "", "perchctl: Ctrl-C\n")
 
 
 def test_ctrl_c_while_loading_is_an_object_where_one_is_wanted() -> None:
-    before = textwrap.dedent(PRESSED_AT.format(module="numpy"))
-    done = run_apart("fly", "--dry-run", "--json", before=before)
+    done = run_apart("fly", "--dry-run", "--json", before=pressed_at("numpy"))
     assert json.loads(done.stdout) == {"error": "Ctrl-C", "exit_code": 130}
+
+
+def test_ctrl_c_in_a_command_is_130(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit) as left, reported():
+        raise KeyboardInterrupt
+    assert left.value.exit_code == 130
+    assert "Ctrl-C" in capsys.readouterr().err
 
 
 def test_an_ignored_ctrl_c_stays_ignored() -> None:
     """As a shell starts what it puts into the background."""
     ignored = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-    before = ignored + textwrap.dedent(PRESSED_AT.format(module="numpy"))
-    assert run_apart("fly", "--dry-run", before=before).code == 0
-
-
-# --- A full disk --------------------------------------------------------------------------------
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "words", [["--help"], ["fly", "--dry-run"], ["fly", "--dry-run", "--json"]]
-)
-def test_a_full_disk_behind_stdout_is_30_as_everywhere(words: list[str]) -> None:
-    with open("/dev/full", "w") as full:
-        done = run_apart(*words, stdout=full)
-    assert done.code == 30
-    assert done.stderr == (
-        "perchctl: the result cannot be written: No space left on device: free some space\n"
-    )
-
-
-def test_a_path_beyond_all_bounds_is_one_short_sentence() -> None:
-    done = CliRunner().invoke(app, ["fly", "--dry-run", "-p", f"./{'x' * 3000}.yaml"])
-    assert done.exit_code == 30
-    assert "File name too long" in done.stderr
-    assert len(done.stderr) < 400
+    assert run_apart("fly", "--dry-run", before=ignored + pressed_at("numpy")).code == 0

@@ -53,7 +53,6 @@ from perchctl.commands.command_line import (
     JsonOption,
     ViewOption,
     ViewPortOption,
-    complete_source,
     examples,
     new_app,
     reporting,
@@ -82,7 +81,6 @@ SourceArgument = Annotated[
     typer.Argument(
         help="images:DIR (or a pattern), video:FILE, camera:N or its name, rtsp://..., "
         "http://..., aideck://HOST, or a path; or many picture files.",
-        autocompletion=complete_source,
     ),
 ]
 BoardOption = Annotated[

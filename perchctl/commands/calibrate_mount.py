@@ -46,8 +46,6 @@ from perchctl.commands.command_line import (
     JsonOption,
     ViewOption,
     ViewPortOption,
-    complete_profile,
-    complete_source,
     reporting,
 )
 from perchctl.commands.guide import guide
@@ -97,9 +95,7 @@ _SIMULATED = (
 def mount(
     profile: Annotated[
         str | None,
-        typer.Option(
-            "--profile", "-p", help="The vehicle's profile.", autocompletion=complete_profile
-        ),
+        typer.Option("--profile", "-p", help="The vehicle's profile."),
     ] = None,
     uri: Annotated[
         str | None,
@@ -109,9 +105,7 @@ def mount(
     ] = None,
     source: Annotated[
         str | None,
-        typer.Option(
-            "--source", help="Its camera; else the profile's.", autocompletion=complete_source
-        ),
+        typer.Option("--source", help="Its camera; else the profile's."),
     ] = None,
     part: Annotated[
         Literal["carry", "pivot", "both"] | None,

@@ -15,8 +15,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Annotated, Any, NoReturn, ParamSpec, TextIO
+from typing import Annotated, Any, NoReturn, ParamSpec
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -40,46 +39,25 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _BAD_PLACE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ENOTDIR)
 
 
-COMMANDS: dict[str, tuple[str, str]] = {
-    "make-target": (
-        "make_target",
-        "Print the target true to size, or a board; design it; write measured sizes.",
-    ),
-    "calibrate": (
-        "calibrate",
-        "Calibrate the camera, and report what its error means in mm at the target.",
-    ),
+COMMANDS: dict[str, str] = {
+    "make-target": "Print the target true to size, or a board; design it; write measured sizes.",
+    "calibrate": "Calibrate the camera, and report what its error means in mm at the target.",
     "profile": (
-        "profile",
-        "Show a profile as it is flown, every key explained, or write one of your vehicle (new).",
+        "Show a profile as it is flown, every key explained, or write one of your vehicle (new)."
     ),
     "fit-weights": (
-        "fit_weights",
-        "Fit the merge weights to poses whose truth is known, and verify that they help.",
+        "Fit the merge weights to poses whose truth is known, and verify that they help."
     ),
-    "track": (
-        "track",
-        "Find the target in a camera, video or pictures, without a vehicle.",
-    ),
+    "track": "Find the target in a camera, video or pictures, without a vehicle.",
     "check": (
-        "check",
         "Look at vehicle, camera, computer and profile on the ground, and say what is not fit to "
-        "fly.",
+        "fly."
     ),
-    "fly": (
-        "fly",
-        "Fly the seven phases: find the target, align, ascend, perch, stop the motors.",
-    ),
-    "simulate": (
-        "simulate",
-        "Fly many seeded scenarios in lockstep, faster than real time, and count.",
-    ),
-    "log": (
-        "log",
-        "After a flight: show, draw, compare, export, replay or report its log.",
-    ),
+    "fly": "Fly the seven phases: find the target, align, ascend, perch, stop the motors.",
+    "simulate": "Fly many seeded scenarios in lockstep, faster than real time, and count.",
+    "log": "After a flight: show, draw, compare, export, replay or report its log.",
 }
-"""In the order in which one uses them: the file, and the first sentence of its help."""
+"""In the order in which one uses them, with the first sentence of their help."""
 
 _SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
 
@@ -104,31 +82,16 @@ class Group(TyperGroup):
     """Subcommands, of which the first is the main one: it is done where none is named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if not args and ctx.resilient_parsing:  # a shell asks what may come
+        if ctx.resilient_parsing:  # a shell asks for what may come
             return super().parse_args(ctx, args)
         if not args or args[0] not in (*self.commands, *_SETTINGS["help_option_names"]):
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
 
-    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
-        """The subcommands, and what the main one takes: its options, or its first argument."""
-        _, main_command, inner = self._main(ctx)
-        arguments = [p for p in main_command.params if p.param_type_name == "argument"]
-        offers = [] if incomplete.startswith("-") else arguments[:1]
-        return [
-            *super().shell_complete(ctx, incomplete),
-            *(item for each in offers for item in each.shell_complete(inner, incomplete)),
-            *(main_command.shell_complete(inner, incomplete) if not offers else ()),
-        ]
-
-    def _main(self, ctx: Any) -> tuple[str, Any, typer.Context]:
-        name, main_command = next(iter(self.commands.items()))
-        inner = typer.Context(main_command, info_name=ctx.info_name, parent=ctx.parent, **_SETTINGS)
-        return name, main_command, inner
-
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """That of the main subcommand, with the others listed below it."""
-        name, main_command, inner = self._main(ctx)
+        name, main_command = next(iter(self.commands.items()))
+        inner = typer.Context(main_command, info_name=ctx.info_name, parent=ctx.parent, **_SETTINGS)
         main_command.format_usage(inner, formatter)
         main_command.format_help_text(inner, formatter)
         main_command.format_options(inner, formatter)
@@ -142,22 +105,15 @@ class Group(TyperGroup):
 class _Unloaded(TyperCommand):
     """A subcommand whose file is loaded once it is used."""
 
-    def make_context(self, *args: Any, **kwargs: Any) -> typer.Context:
-        with reported("--json" in sys.argv):
-            command = _load(self.name or "")
-        context: typer.Context = command.make_context(*args, **kwargs)
-        return context
-
-
-def _load(name: str) -> Any:
-    module = importlib.import_module(f"perchctl.commands.{COMMANDS[name][0]}")
-    command = typer.main.get_command(module.app)
-    command.name = name
-    return command
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        module = importlib.import_module(f"perchctl.commands.{(self.name or '').replace('-', '_')}")
+        command: Any = typer.main.get_command(module.app)
+        command.name = self.name
+        return command.make_context(*args, **kwargs)
 
 
 class _Commands(TyperGroup):
-    """Wrong usage is told by the object of `--json`, too."""
+    """The subcommands of `COMMANDS`; what fails in one of them becomes a sentence."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(COMMANDS)
@@ -166,17 +122,11 @@ class _Commands(TyperGroup):
         if cmd_name not in COMMANDS:
             return None
         # The whole sentence: of its own accord the list of the commands cuts it.
-        return _Unloaded(cmd_name, short_help=COMMANDS[cmd_name][1])
+        return _Unloaded(cmd_name, short_help=COMMANDS[cmd_name])
 
     def invoke(self, ctx: Any) -> Any:
-        as_json = "--json" in ctx.args
-        try:
+        with reported("--json" in ctx.args):
             return super().invoke(ctx)
-        except Exception as error:
-            tell = getattr(error, "format_message", None)
-            if as_json and tell is not None:
-                _print_failure(tell(), getattr(error, "exit_code", UsageError.exit_code))
-            raise
 
 
 def new_app(cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
@@ -199,38 +149,9 @@ def examples(*lines: str) -> str:
     return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
 
 
-# What options offer to a shell at Tab; the work behind it loads libraries.
-
-
-def complete_log(incomplete: str) -> list[str]:
-    from perchctl.commands.complete import logs
-
-    return logs(incomplete)
-
-
-def complete_positioning(incomplete: str) -> list[str]:
-    from perchctl.commands.complete import positionings
-
-    return positionings(incomplete)
-
-
-def complete_profile(incomplete: str) -> list[str]:
-    from perchctl.commands.complete import profiles
-
-    return profiles(incomplete)
-
-
-def complete_source(incomplete: str) -> list[str]:
-    from perchctl.commands.complete import sources
-
-    return sources(incomplete)
-
-
 ProfileOption = Annotated[
     str,
-    typer.Option(
-        "--profile", "-p", help="Profile by name or path.", autocompletion=complete_profile
-    ),
+    typer.Option("--profile", "-p", help="Profile by name or path."),
 ]
 UriOption = Annotated[
     str | None,
@@ -247,7 +168,6 @@ SourceOption = Annotated[
         "--source",
         help="Camera: camera:N or camera:NAME, rtsp://..., http://..., aideck://HOST, video:FILE, "
         "images:DIR, sim:.",
-        autocompletion=complete_source,
     ),
 ]
 PositioningOption = Annotated[
@@ -255,7 +175,6 @@ PositioningOption = Annotated[
     typer.Option(
         "--positioning",
         help="What measures the position: deck, mocap or target; by default the profile's.",
-        autocompletion=complete_positioning,
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
@@ -267,22 +186,6 @@ ViewPortOption = Annotated[
     int,
     typer.Option("--view-port", min=0, max=65535, help="Port of the live page; 0: any free one."),
 ]
-LogArgument = Annotated[
-    Path | None,
-    typer.Argument(help="A flight log; by default the newest.", autocompletion=complete_log),
-]
-LogProfileOption = Annotated[
-    str | None,
-    typer.Option(
-        "--profile",
-        "-p",
-        help="Whose log.directory holds the newest log; by default sim's.",
-        autocompletion=complete_profile,
-    ),
-]
-LogDirOption = Annotated[
-    Path | None, typer.Option("--log-dir", help="The folder that holds the newest log instead.")
-]
 CamOption = Annotated[
     str | None,
     typer.Option("--cam", help="Which camera of a Kalibr file of several: cam0, cam1, ..."),
@@ -291,46 +194,33 @@ CamOption = Annotated[
 
 def main() -> Any:
     """Run the command line; returns the exit code."""
-    code: Any = 0
     try:
-        try:
-            app()
-        except SystemExit as end:
-            code = end.code
-        sys.stdout.flush()
-    except KeyboardInterrupt:
-        _complain("Ctrl-C")
-        return Interrupted.exit_code
-    except BrokenPipeError:
-        _drop_stdout()
-        return PerchError.exit_code
-    except OSError as error:
-        sentence = _place_refused(error)
-        if sentence is None:
-            raise
-        _drop_stdout()
-        _complain(sentence)
-        return InvalidValue.exit_code
+        with reported():  # what fails outside of a subcommand, as the help on a full disk
+            try:
+                app()
+            finally:
+                sys.stdout.flush()
+    except SystemExit as end:
+        return end.code
+    except typer.Exit as end:
+        return end.exit_code
     finally:
         # A key that is still held down must not end what is over with a traceback.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    return code
 
 
 P = ParamSpec("P")
 
 
 def reporting(run: Callable[P, int]) -> Callable[P, None]:
-    """The function of a subcommand, which returns its exit code: it leaves with that code, and its
-    failures become sentences, and with `as_json` an object."""
+    """The function of a subcommand, which returns its exit code; the program leaves with it."""
 
     @functools.wraps(run)
     def do(*args: P.args, **kwargs: P.kwargs) -> None:
-        with reported(bool(kwargs.get("as_json"))):
-            loaded()
-            code = run(*args, **kwargs)
-            sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
-            raise typer.Exit(code)
+        loaded()
+        code = run(*args, **kwargs)
+        sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
+        raise typer.Exit(code)
 
     return do
 
@@ -352,6 +242,10 @@ def reported(as_json: bool = False) -> Iterator[None]:
         _drop_stdout()
         raise typer.Exit(PerchError.exit_code) from None
     except Exception as error:
+        if hasattr(error, "format_message"):  # wrong usage, which typer prints
+            if as_json:
+                _print_failure(error.format_message(), UsageError.exit_code)
+            raise
         if os.environ.get("PERCHCTL_DEBUG"):
             raise
         sentence = _place_refused(error)
@@ -411,16 +305,9 @@ def _notes() -> Iterator[None]:
         warnings.simplefilter("always", Note)
         show_others = warnings.showwarning
 
-        def show(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:
+        def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
             if not issubclass(category, Note):
-                show_others(message, category, filename, lineno, file, line)
+                show_others(message, category, *place, **more)
             elif str(message) not in printed:
                 printed.add(str(message))
                 _complain(str(message))

@@ -20,7 +20,6 @@ from perchctl.commands.command_line import (
     Group,
     JsonOption,
     ProfileOption,
-    complete_source,
     examples,
     new_app,
     reporting,
@@ -229,9 +228,7 @@ def collect(
     frames: Annotated[int, typer.Option("--frames", min=10, help="At each position.")] = 100,
     source: Annotated[
         str | None,
-        typer.Option(
-            "--source", help="Camera; else the profile's.", autocompletion=complete_source
-        ),
+        typer.Option("--source", help="Camera; else the profile's."),
     ] = None,
     uri: Annotated[
         str | None, _grouped("Truth", "--uri", "-u", help="Vehicle, for --truth estimate.")

@@ -214,13 +214,13 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
         perched = result.report.phase is Phase.PERCHED
         summary = log.close(result.report, result.miss_m if perched else None)
         assert summary is not None
-        tell(summary_text(summary, log.path))
+        tell(summary_text(summary, log.path), stdout=not as_json)
         if page is not None:
             page.end(summary_card(summary, log.path))
     code = exit_code(result.report.outcome, summary)
     plot = drawn(lambda: plot_of(log.path, options.profile))
     if plot is not None:
-        tell(f"plot:      {plot}")
+        tell(f"plot:      {plot}", stdout=not as_json)
     if as_json:
         print_record(flight_record(summary, code, log.path, plot))
     return code
@@ -313,129 +313,87 @@ def plan(options: FlyOptions) -> dict[str, Any]:
     }
 
 
-def plan_text(options: FlyOptions) -> str:
-    """The plan for people: what, where, and the phases with their numbers."""
-    resolved, planner = plan(options), options.profile.planner
-    search, ascend, perch = planner.search, planner.ascend, planner.perch
-    target = options.profile.target
-    merge = options.profile.merge
-    how = weights_text(options) if merge.method == "weights" else "joint solve"
-    press = (
-        f"raw thrust {perch.thrust}" if perch.mode == "raw" else f"press {perch.press_m} m above"
-    )
-    lines = [
-        f"vehicle      {resolved['uri']}" + (f", seed {options.seed}" if options.simulated else ""),
-        f"camera       {resolved['source']}, calibration {resolved['calibration_file']}"
-        + (f" {options.profile.camera.cam}" if options.profile.camera.cam else "")
-        + (f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""),
-        _positioning_line(options),
-        *_compared_lines(options),
-        f"profile      {resolved['profile_file']}: {options.profile.description}".rstrip(": "),
-        f"target       {target.large.side_m * 1e3:g} mm {target.large.dictionary}/"
-        f"{target.large.id} around {target.small.side_m * 1e3:g} mm "
-        f"{target.small.dictionary}/{target.small.id}",
-        *_place_lines(options.profile),
-        *_vehicle_lines(options.profile),
-        f"merge        {how}",
-        f"1 APPROACH   take off to {planner.takeoff_height_m:g} m",
-        f"2 SEARCH     {search.attempts} attempts of {search.wait_s:g} s, {search.step_m:g} m "
-        f"higher each, at most {search.max_height_m:g} m",
-        f"3 ESTIMATE   {planner.estimate.dwell_s:g} s of steady pose",
-        f"4 ALIGN      within {planner.align.xy_m * 1e3:g} mm and {planner.align.yaw_deg:g} deg "
-        f"for {planner.align.dwell_s:g} s",
-        f"5 ASCEND     at {ascend.speed_mps:g} m/s to {ascend.standoff_m * 1e3:g} mm under the "
-        f"target, settle within {ascend.settle_xy_m * 1e3:g} mm",
-        f"6 PERCH      {press}, at most {perch.timeout_s:g} s",
-        f"7 COMPLETE   release in {planner.complete.steps} steps, watch for "
-        f"{planner.complete.watch_s:g} s",
-        f"attempts     {planner.attempts}, perching time {planner.perching_time_s:g} s",
-        *_limit_lines(options.profile),
-        f"log          {resolved['log_directory']}"
-        + (f", with pictures up to {options.profile.log.max_mb:g} MB" if options.record else ""),
-        *_doubts(resolved["check"]),
-    ]
-    return "\n".join(lines)
-
-
-def _positioning_line(options: FlyOptions) -> str:
-    config = options.profile.positioning
-    if config.by == "target":
-        return "\n".join(
-            textwrap.wrap(
-                f"positioning  the target itself, by the camera, from the ground on: "
-                f"{_overhead(options.profile)}",
-                _WIDTH,
-                subsequent_indent=" " * _COLUMN,
-            )
-        )
-    if config.by != "mocap":
-        return "positioning  the vehicle's own deck"
-    where = "the simulated room's" if options.simulated else f"{config.system}:{config.host}"
-    return (
-        f"positioning  motion capture {where}, body {config.body!r}, {config.send} at most "
-        f"{config.rate_hz:g} Hz"
-    )
-
-
-def _overhead(profile: Profile) -> str:
-    """Where it has to be."""
-    return overhead_view(profile.target, profile_camera(profile.camera), profile.camera.mount).words
-
-
-def _compared_lines(options: FlyOptions) -> list[str]:
-    return [
-        f"{'':{_COLUMN}}{row.found}" for row in _compared(options) if row.verdict == Verdict.PASS
-    ]
-
-
 def _compared(options: FlyOptions) -> list[Row]:
     return comparison_rows(
         options.profile.positioning, options.uri, wall_date(), simulated=options.simulated
     )
 
 
-def _place_lines(profile: Profile) -> list[str]:
-    """Where the target has to be, if that is said."""
+def plan_text(options: FlyOptions) -> str:
+    """The plan for people, at 80 columns: what, where, the phases with their numbers, and what of
+    the profile was hardly meant."""
+    resolved, profile, planner = plan(options), options.profile, options.profile.planner
+    camera, large, small = profile.camera, profile.target.large, profile.target.small
+    search, align, ascend, perch = planner.search, planner.align, planner.ascend, planner.perch
+    seed = f", seed {options.seed}" if options.simulated else ""
+    cam = f" {camera.cam}" if camera.cam else ""
+    mask = f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""
+    turn = " ".join(f"{angle:g}" for angle in camera.mount.rpy_deg)
+    mirrored = ", mirrored" if camera.mirrored else ""
+    late = camera.latency_s
+    latency = late if isinstance(late, str) else f"{late * 1e3:g} ms"
+    merge = weights_text(options) if profile.merge.method == "weights" else "joint solve"
+    press = (
+        f"press {perch.press_m} m above" if perch.mode != "raw" else f"raw thrust {perch.thrust}"
+    )
+    pictures = f", with pictures up to {profile.log.max_mb:g} MB" if options.record else ""
+    text = f"""\
+vehicle      {options.uri}{seed}
+camera       {resolved["source"]}, calibration {resolved["calibration_file"]}{cam}{mask}
+positioning  {_positioning(options)}
+profile      {resolved["profile_file"]}: {profile.description}
+target       {large.side_m * 1e3:g} mm {large.dictionary}/{large.id} around \
+{small.side_m * 1e3:g} mm {small.dictionary}/{small.id}{_expected_place(profile)}
+gear         tip at {_mm(profile.vehicle.gear_body_m)} (forward, left, up)
+mounting     camera at {_mm(camera.mount.position_m)}, rpy {turn} deg{mirrored}\
+{_edges_of_the_picture(profile)}
+latency      {latency} from exposure to arrival
+merge        {merge}
+1 APPROACH   take off to {planner.takeoff_height_m:g} m
+2 SEARCH     {search.attempts} attempts of {search.wait_s:g} s, {search.step_m:g} m higher each, \
+at most {search.max_height_m:g} m
+3 ESTIMATE   {planner.estimate.dwell_s:g} s of steady pose
+4 ALIGN      within {align.xy_m * 1e3:g} mm and {align.yaw_deg:g} deg for {align.dwell_s:g} s
+5 ASCEND     at {ascend.speed_mps:g} m/s to {ascend.standoff_m * 1e3:g} mm under the target, \
+settle within {ascend.settle_xy_m * 1e3:g} mm
+6 PERCH      {press}, at most {perch.timeout_s:g} s
+7 COMPLETE   release in {planner.complete.steps} steps, watch for {planner.complete.watch_s:g} s
+attempts     {planner.attempts}, perching time {planner.perching_time_s:g} s
+fence        {profile.safety.fence_radius_m:g} m around the place of take-off
+height       at most {profile.safety.max_height_m:g} m above the ground
+battery      at least {profile.safety.min_rest_v:g} V at rest, \
+{profile.safety.min_load_v:g} V in flight; {_energy_gate(profile)}
+log          {resolved["log_directory"]}{pictures}
+"""
+    for row in resolved["check"]:
+        if row["verdict"] in (Verdict.WARN, Verdict.FAIL):
+            text += f"{row['verdict']:{_COLUMN}}{row['name']}: {row['found']}; {row['advice']}\n"
+    return "\n".join(
+        textwrap.fill(
+            line,
+            _WIDTH,
+            subsequent_indent=" " * _COLUMN,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        for line in text.splitlines()
+    )
+
+
+def _expected_place(profile: Profile) -> str:
     target = profile.target
     if target.expected_xy_m is None:
-        return []
+        return ""
     x_m, y_m = target.expected_xy_m
-    within_m = target.expected_within_m
-    return [f"{'':{_COLUMN}}within {within_m:g} m of x {x_m:g} m, y {y_m:g} m, or it is another's"]
+    return f", within {target.expected_within_m:g} m of x {x_m:g} m, y {y_m:g} m"
 
 
-def _vehicle_lines(profile: Profile) -> list[str]:
-    """Where gear and camera are, and how late the picture is."""
-    camera = profile.camera
-    edges = picture_edges(camera.mount, camera.mirrored)
-    seen = [] if edges is None else [f"picture's {edges[0]} is the front, {edges[1]} the left side"]
-    latency = camera.latency_s
-    late = f"{latency * 1e3:g} ms" if isinstance(latency, (int, float)) else str(latency)
-    return [
-        f"gear         tip at {_mm(profile.vehicle.gear_body_m)} (forward, left, up)",
-        f"mounting     camera at {_mm(camera.mount.position_m)}, rpy "
-        f"{' '.join(f'{angle:g}' for angle in camera.mount.rpy_deg)} deg"
-        + (", mirrored" if camera.mirrored else ""),
-        *(f"{'':{_COLUMN}}{line}" for line in seen),
-        f"latency      {late} from exposure to arrival",
-    ]
+def _edges_of_the_picture(profile: Profile) -> str:
+    edges = picture_edges(profile.camera.mount, profile.camera.mirrored)
+    return "" if edges is None else f": picture's {edges[0]} is the front, {edges[1]} the left side"
 
 
-def _mm(place_m: tuple[float, float, float]) -> str:
-    return f"{' '.join(mm_text(part) for part in place_m)} mm"
-
-
-def _limit_lines(profile: Profile) -> list[str]:
-    safety = profile.safety
-    return [
-        f"fence        {safety.fence_radius_m:g} m around the place of take-off",
-        f"height       at most {safety.max_height_m:g} m above the ground",
-        f"battery      at least {safety.min_rest_v:g} V at rest, {safety.min_load_v:g} V in flight",
-        f"{'':{_COLUMN}}{_gate_text(profile)}",
-    ]
-
-
-def _gate_text(profile: Profile) -> str:
+def _energy_gate(profile: Profile) -> str:
     if not profile.safety.energy_gate:
         return "attempts begin whatever it has left"
     return (
@@ -444,29 +402,32 @@ def _gate_text(profile: Profile) -> str:
     )
 
 
-def _doubts(rows_found: list[dict[str, str]]) -> list[str]:
-    """What of the profile was hardly meant, at 80 columns."""
-    lines: list[str] = []
-    for row in rows_found:
-        if row["verdict"] in (Verdict.WARN, Verdict.FAIL):
-            text = f"{row['name']}: {row['found']}; {row['advice']}"
-            lines += textwrap.wrap(
-                text, _WIDTH, initial_indent=f"{row['verdict']:{_COLUMN}}",
-                subsequent_indent=" " * _COLUMN, break_long_words=False, break_on_hyphens=False,
-            )  # fmt: skip
-    return lines
+def _positioning(options: FlyOptions) -> str:
+    profile, config = options.profile, options.profile.positioning
+    if config.by == "target":
+        view = overhead_view(profile.target, profile_camera(profile.camera), profile.camera.mount)
+        return f"the target itself, by the camera, from the ground on: {view.words}"
+    if config.by != "mocap":
+        return "the vehicle's own deck"
+    where = "the simulated room's" if options.simulated else f"{config.system}:{config.host}"
+    compared = [row.found for row in _compared(options) if row.verdict == Verdict.PASS]
+    capture = f"motion capture {where}, body {config.body!r}"
+    return "; ".join([f"{capture}, {config.send} at most {config.rate_hz:g} Hz", *compared])
+
+
+def _mm(place_m: tuple[float, float, float]) -> str:
+    return f"{' '.join(mm_text(part) for part in place_m)} mm"
 
 
 def weights_text(options: FlyOptions) -> str:
-    """Which merge weights fly, and where they are from: date, method, data."""
+    """Which merge weights fly, and the file that they are from, with its date and data."""
     merge = options.profile.merge
     numbers = ", ".join(f"{axis} {w:g}" for axis, w in merge.weights.model_dump().items())
     if merge.weights_file is None:
         return f"weights {numbers} (of the profile)"
     path = find_weights(merge.weights_file)
     fitted = read_weights(path)
-    origin = [fitted.date and f"of {fitted.date}", fitted.method]
-    if fitted.data.sha256:
-        origin.append(f"data {fitted.data.sha256[:12]}")
-    details = ", ".join(part for part in origin if part)
-    return f"weights {numbers} (from {path}{': ' + details if details else ''})"
+    return (
+        f"weights {numbers} (from {path}: {fitted.date}, {fitted.method}, data "
+        f"{fitted.data.sha256[:12]})"
+    )

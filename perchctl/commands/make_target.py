@@ -17,7 +17,6 @@ from perchctl.commands.command_line import (
     ForceOption,
     Group,
     JsonOption,
-    complete_profile,
     examples,
     new_app,
     reporting,
@@ -61,7 +60,6 @@ ProfileOption = Annotated[
         "--profile",
         "-p",
         help="Profile with the target; sim if none is named.",
-        autocompletion=complete_profile,
     ),
 ]
 PageOption = Annotated[str, typer.Option("--page", help="a4, letter, a3, or 220x240mm.")]
@@ -325,7 +323,6 @@ def measured(
             "--profile",
             "-p",
             help="Profile that gets the sizes, or with -o the one that the new one extends.",
-            autocompletion=complete_profile,
         ),
     ] = None,
     measured_large: Annotated[

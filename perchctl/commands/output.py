@@ -15,15 +15,16 @@ def say(sentence: str) -> None:
     tell(f"perchctl: {sentence}")
 
 
-def tell(text: str) -> None:
-    """Lines on stderr, where there still is one: a terminal may be closed, a pipe's other end
-    gone, and that is no reason to fail."""
+def tell(text: str, stdout: bool = False) -> None:
+    """Lines on stderr, or on stdout, where there still is one: a terminal may be closed, a pipe's
+    other end gone, and that is no reason to fail."""
+    stream = sys.stdout if stdout else sys.stderr
     try:
-        print(text, file=sys.stderr, flush=True)
+        print(text, file=stream, flush=True)
     except (OSError, ValueError):
         with contextlib.suppress(OSError, ValueError):
             # What is left in the buffer must not fail at the program's end.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def confirmed(question: str) -> bool:

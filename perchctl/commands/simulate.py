@@ -28,7 +28,6 @@ from perchctl.commands.command_line import (
     JsonOption,
     PositioningOption,
     ProfileOption,
-    complete_profile,
     examples,
     new_app,
     reporting,
@@ -233,15 +232,11 @@ def run(
 def compare(
     profile_a: Annotated[
         str,
-        typer.Argument(
-            metavar="PROFILE_A", help="A, by name or path.", autocompletion=complete_profile
-        ),
+        typer.Argument(metavar="PROFILE_A", help="A, by name or path."),
     ],
     profile_b: Annotated[
         str,
-        typer.Argument(
-            metavar="PROFILE_B", help="B, by name or path.", autocompletion=complete_profile
-        ),
+        typer.Argument(metavar="PROFILE_B", help="B, by name or path."),
     ],
     flights: FlightsOption = None,
     seed: SeedOption = None,

@@ -13,7 +13,6 @@ from pydantic import ValidationError
 from typer.testing import CliRunner, Result
 
 from perchctl.commands import app
-from perchctl.commands.complete import positionings
 from perchctl.commands.positioning import positioned
 from perchctl.errors import InvalidValue
 from perchctl.profile import PositioningConfig, Profile
@@ -74,8 +73,6 @@ def test_other_words_are_refused() -> None:
     done = fly("--positioning", "gps", "--dry-run")
     assert done.exit_code == 30
     assert "'gps' is unknown; allowed are deck, mocap, target" in done.stderr
-    assert positionings("m") == ["mocap"]
-    assert positionings("") == ["deck", "mocap", "target"]
 
 
 def test_the_target_brings_its_own_limits_and_leaves_none_behind() -> None:

@@ -1,0 +1,375 @@
+"""`perchctl fly`: its plan, one sentence and an exit code for each bad input and peer, and what
+follows the flight."""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.calibration import load_calibration
+from perchctl.commands import app
+from perchctl.commands.fly import fly_and_report, resolve
+from perchctl.errors import EXIT_CODES, ConnectionFailed, Interrupted
+from perchctl.flight import PLAIN_SEED, SessionResult
+from perchctl.link.connection import open_connection, plain_cause
+from perchctl.log import LogWatcher
+from perchctl.mission import FlightReport, Outcome, Phase
+from perchctl.sim import SimProcess
+from perchctl.sim.crtp.server import LinkOptions
+from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
+from tests.helpers.flights import ROOT, SHORT
+
+NOWHERE = "udp://127.0.0.1:9"
+RADIO = "radio://0/80/2M/E7E7E7E7E7"
+GOLDEN = Path(__file__).parent / "data" / "fly_dry_run.txt"
+
+
+@pytest.fixture
+def profile(tmp_path: Path) -> str:
+    """The short profile, impatient with peers that do not answer."""
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"extends: {SHORT}\nlink: {{connect_timeout_s: 1.0}}\n")
+    return str(path)
+
+
+def pictures(folder: Path, size_px: tuple[int, int] = (640, 480), count: int = 200) -> str:
+    """A folder of pictures that show nothing, as a source; `count` copies of one."""
+    folder.mkdir()
+    noise = np.random.default_rng(0).normal(120, 6, size_px[::-1]).astype(np.uint8)
+    cv2.imwrite(str(folder / "p0.png"), noise, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    for i in range(1, count):
+        os.link(folder / "p0.png", folder / f"p{i}.png")
+    return f"images:{folder}"
+
+
+# --- The plan ------------------------------------------------------------------------------
+
+
+def test_dry_run_tells_the_plan_and_connects_nothing(tmp_path: Path) -> None:
+    said = run("fly", "-p", SHORT, "--seed", "7", "--dry-run")
+    assert (said.code, said.stderr) == (0, "")
+    # A path may be of any length: where it wraps the lines is no part of the plan.
+    plan = " ".join(said.stdout.replace(str(ROOT), "ROOT").split())
+    assert plan == " ".join(GOLDEN.read_text(encoding="utf-8").split())
+    assert max(map(len, said.stdout.replace(str(ROOT), "").splitlines())) <= 80
+    real = run("fly", "-p", SHORT, "-u", "usb://0", "--source", "camera:0", "--dry-run")
+    assert "\nwarn         calibration file: example_640x480.yaml" in real.stdout
+    assert list(tmp_path.iterdir()) == []  # no log either
+
+
+def test_dry_run_as_json_holds_the_whole_profile() -> None:
+    plan = json.loads(run("fly", "-p", SHORT, "--dry-run", "--json").stdout)
+    assert plan["uri"] == "sim://"
+    assert plan["seed"] == PLAIN_SEED
+    assert plan["profile"]["simulation"]["camera_rate_hz"] == 20
+    assert plan["profile"]["kalman"]["n_max"] == 8
+    assert Path(plan["calibration_file"]).is_file()
+
+
+def test_the_uri_of_the_environment_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CFLIB_URI", "bogus")
+    assert run("fly", "--dry-run").code == 30
+    assert "udp://h:1" in run("fly", "--dry-run", "-u", "udp://h:1", "--source", "camera:0").stdout
+
+
+def test_a_seed_for_a_real_vehicle_is_said_to_change_nothing() -> None:
+    at = ("--uri", "usb://0", "--source", "camera:0", "--dry-run")
+    assert "--seed 7" in run("fly", "--seed", "7", *at).complaint
+    assert run("fly", *at).stderr == ""
+
+
+# --- Bad input, before anything is opened ---------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("kalman: {alfa: 0.85}", ["kalman.alfa", "unknown", "alpha"]),
+        (
+            "target: {large: {dictionary: DICT_4X4_100, id: 997, side_m: 0.15}}",
+            ["target.large", "997", "0..99", "DICT_4X4_1000"],
+        ),
+        (
+            "target: {large: {dictionary: DICT_4X4_1000, id: 1000, side_m: 0.15}}",
+            ["target.large", "1000", "0..999"],
+        ),
+    ],
+    ids=["misspelt key", "the paper's dictionary", "id outside"],
+)
+def test_a_wrong_profile(text: str, words: list[str]) -> None:
+    Path("mine.yaml").write_text(f"extends: sim\n{text}\n")
+    said = run("fly", "-p", "mine.yaml")
+    assert said.code == 30
+    for word in ("mine.yaml", *words):
+        assert word in said.complaint
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "named"),
+    [
+        ("-p smi", 20, ["'smi'", "sim"]),
+        ("-p ./none.yaml", 20, ["none.yaml", "does not exist"]),
+        ("--uri bogus", 30, ["'bogus'", "radio://0/80/2M"]),
+        ("--uri=", 30, ["radio://0/80/2M"]),
+        ("--uri udp://127.0.0.1:99999 --yes", 30, ["65535"]),
+        (f"--uri {NOWHERE}", 2, ["sim:", "--source"]),
+        (f"--uri {NOWHERE} --source sim: --yes", 2, ["sim:", "--source"]),
+        ("--source webcam", 30, ["'webcam'", "camera:N"]),
+        ("--source=", 30, ["camera:N"]),
+        ("--dry-run --source webcam", 30, ["'webcam'", "camera:N"]),
+        ("--seed -1", 30, ["-1", "negative"]),
+        (f"--uri {NOWHERE} --source camera:x --yes", 20, ["camera:x"]),
+        (f"--uri {NOWHERE} --source camera:9 --yes", 20, ["camera:9"]),
+        ("--source video:none.mp4", 20, ["none.mp4"]),
+        ("--source images:none", 20, ["none"]),
+        (f"--uri {NOWHERE} --source video:none.mp4", 2, ["recording", NOWHERE]),
+        ("-p crazyflie --source video:none.mp4 --dry-run", 2, ["recording", "--source"]),
+    ],
+)
+def test_bad_input(words: str, code: int, named: list[str]) -> None:
+    said = run("fly", *words.split())
+    assert said.code == code, said
+    for word in named:
+        assert word in said.complaint
+
+
+@pytest.mark.parametrize("folder", ["afile", "afile/logs", "/proc/none"])
+@pytest.mark.parametrize("command", ["simulate --only 1", "simulate", "fly"])
+def test_a_log_that_cannot_be_written(command: str, folder: str) -> None:
+    Path("afile").touch()
+    said = run(*command.split(), "--log-dir", folder)
+    assert said.code == 30
+    assert folder in said.complaint
+    assert "--log-dir" in said.complaint
+
+
+# --- Consent ---------------------------------------------------------------------------------
+
+
+def test_nobody_to_ask_is_no_consent() -> None:
+    said = run_apart("fly", "--uri", NOWHERE, "--source", "camera:9")
+    assert said.code == 2
+    assert "--yes" in said.complaint
+    assert NOWHERE in said.complaint
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", type("Terminal", (), {"isatty": lambda self: True})())
+
+
+@pytest.mark.usefixtures("terminal")
+def test_nobody_is_asked_before_the_camera_answers(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("builtins.input", pytest.fail)
+    with pytest.raises(SystemExit) as left:
+        app(["fly", "--uri", NOWHERE, "--source", "camera:9"])
+    assert left.value.code == 20
+    assert "clear?" not in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("terminal")
+@pytest.mark.parametrize(("answer", "flies"), [("n", False), ("", False), ("y", True)])
+def test_only_a_yes_is_consent(
+    answer: str, flies: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def flown(*_: object) -> None:
+        raise Interrupted("it would fly")
+
+    camera = load_calibration("example_640x480.yaml")
+    with SimProcess.start(camera=camera) as vehicle:
+        monkeypatch.setattr("builtins.input", lambda: answer)
+        monkeypatch.setattr("perchctl.flight.session.fly", flown)
+        with pytest.raises(SystemExit) as left:
+            app(["fly", "--uri", vehicle.uri, "--source", vehicle.stream_url])
+    assert left.value.code == (130 if flies else 2)
+    said = capsys.readouterr()
+    assert "Is the space under the target clear?" in said.err
+    assert ("not confirmed" in said.err) is not flies
+    assert ("it would fly" in said.err) is flies
+    assert said.out == ""
+
+
+# --- Bad peers ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def eyes() -> Iterator[str]:
+    """A camera that lives, as a source."""
+    with SimProcess.start(camera=load_calibration("example_640x480.yaml")) as sim:
+        yield sim.stream_url
+
+
+@pytest.mark.long
+def test_a_silent_peer(profile: str, eyes: str) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mute:
+        mute.bind(("127.0.0.1", 0))
+        uri = f"udp://127.0.0.1:{mute.getsockname()[1]}"
+        said = run("fly", "-p", profile, "--uri", uri, "--source", eyes, "--yes")
+    assert said.code == 10
+    assert uri in said.complaint
+    assert "no answer within" in said.complaint
+
+
+def test_a_radio_that_is_not_there(profile: str, eyes: str) -> None:
+    said = run("fly", "-p", profile, "--uri", RADIO, "--source", eyes, "--yes")
+    assert said.code == 10
+    for words in (RADIO, "no Crazyradio is plugged in", 'ATTRS{idVendor}=="1915"'):
+        assert words in said.stderr
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("uri", "cause"), [(RADIO, "no Crazyradio is plugged in"), (NOWHERE, "nothing listens there")]
+)
+def test_the_library_s_tracebacks_stay_away(uri: str, cause: str, profile: str, eyes: str) -> None:
+    """cflib logs them unless it is told not to: seen by a process of its own."""
+    said = run_apart("fly", "-p", profile, "--uri", uri, "--source", eyes, "--yes")
+    assert said.code == 10
+    assert cause in said.stderr
+    assert "link error callback" not in said.stderr
+
+
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
+)
+def test_the_library_s_prints_stay_off_stdout(capfd: pytest.CaptureFixture[str]) -> None:
+    """cflib tells of its sockets on stdout, where the one object belongs. (It leaves one open.)"""
+    with pytest.raises(ConnectionFailed, match="nothing listens there"):
+        open_connection("tcp://127.0.0.1:9", 5.0)
+    assert capfd.readouterr().out == ""
+    gc.collect()
+
+
+def test_a_usb_cable_without_rights_gets_the_remedy() -> None:
+    said = plain_cause("Couldn't load link driver: Could not open usb://0\n\nTraceback ...")
+    assert "no Crazyflie is plugged in by USB" in said
+    assert 'ATTRS{idVendor}=="0483", ATTRS{idProduct}=="5740"' in said
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("link", "code", "words"),
+    [
+        (
+            LinkOptions(missing_log_variables=("stateEstimate.vz",)),
+            20,
+            ["stateEstimate.vz", "update the firmware"],
+        ),
+        (LinkOptions(protocol_version=11), 10, ["protocol 11", "12", "update the firmware"]),
+    ],
+    ids=["a log variable is missing", "old protocol"],
+)
+def test_an_unfit_firmware(link: LinkOptions, code: int, words: list[str], eyes: str) -> None:
+    with SimProcess.start(link=link) as sim:
+        said = run("fly", "-p", SHORT, "--uri", sim.uri, "--source", eyes, "--yes")
+        assert max(sim.truth()["motors"]) == 0
+    assert said.code == code
+    for word in words:
+        assert word in said.complaint
+
+
+@pytest.mark.long
+def test_a_calibration_of_another_size(tmp_path: Path) -> None:
+    said = run("fly", "-p", SHORT, "--source", pictures(tmp_path / "p", (320, 240)))
+    assert said.code == 30
+    for word in ("320x240", "640x480", "calibrat"):
+        assert word in said.complaint
+
+
+@pytest.mark.long
+def test_a_recording_that_ends_before_take_off(tmp_path: Path) -> None:
+    said = run("fly", "-p", SHORT, "--source", pictures(tmp_path / "p", count=1))
+    assert said.code == 20
+    assert "ended before take-off" in said.complaint
+
+
+def test_an_unknown_parameter(eyes: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(f"extends: {SHORT}\nlink: {{parameters: {{no.such: 1}}}}\n")
+    with SimProcess.start() as grounded:
+        words = ["-p", str(tmp_path / "mine.yaml"), "--uri", grounded.uri, "--source", eyes]
+        said = run("fly", *words, "--yes")
+        assert grounded.truth()["position_m"][2] < 0.05
+    assert said.code == 20
+    assert "no.such" in said.complaint
+    assert "link.parameters" in said.complaint
+
+
+# --- After the flight --------------------------------------------------------------------------
+
+
+@pytest.fixture
+def flown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flight that has ended, as `fly` gets it, and a plot that is drawn in no time."""
+    landed = FlightReport(Phase.LANDED, Outcome.OPERATOR, "Ctrl-C", 0, 3.0, False)
+    monkeypatch.setattr("perchctl.commands.fly.fly_session", lambda *_: SessionResult(landed))
+    monkeypatch.setattr("perchctl.analysis.plot_flight", lambda *_: None)
+
+
+@pytest.mark.usefixtures("flown")
+def test_the_outcome_and_the_plot_are_told_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
+    assert fly_and_report(resolve(), as_json=False, port=None) == 130
+    out, err = capsys.readouterr()
+    lines = out.splitlines()
+    assert lines[0].startswith("LANDED: Ctrl-C")
+    (log,) = Path("perchctl-logs").glob("*.jsonl")
+    assert lines[-2:] == [f"log:       {log}", f"plot:      {log.with_suffix('.png')}"]
+    assert err == "perchctl: connecting to sim://\n"
+
+
+@pytest.mark.usefixtures("flown")
+def test_the_object_is_alone_on_stdout_and_names_the_plot(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    fly_and_report(resolve(), as_json=True, port=None)
+    out, err = capsys.readouterr()
+    told = json.loads(out)
+    assert told["plot"] == told["log"].replace(".jsonl", ".png")
+    assert "LANDED: Ctrl-C" in err
+
+
+@pytest.mark.usefixtures("flown")
+def test_ctrl_c_in_the_drawing_leaves_the_result(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It has been told before the drawing begins, and the object follows without a plot."""
+
+    def draw(*_arguments: object) -> None:
+        assert "LANDED: Ctrl-C" in capsys.readouterr().err
+        os.kill(os.getpid(), 2)  # Ctrl-C
+
+    monkeypatch.setattr("perchctl.analysis.plot_flight", draw)
+    code = fly_and_report(resolve(), True, None)
+    out, err = capsys.readouterr()
+    told = json.loads(out)
+    assert (code, told["exit_code"], told["outcome"], told["plot"]) == (130, 130, "landed", None)
+    assert told["error"] == f"{EXIT_CODES[130]}: Ctrl-C"
+    assert "the plot is not drawn" in err
+
+
+@pytest.mark.usefixtures("flown")
+def test_ctrl_c_behind_the_landing_does_not_replace_the_result(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Pressed while the log is closed, which may take seconds on a slow disk."""
+    close = LogWatcher.close
+
+    def slow(self: LogWatcher, *arguments: Any) -> Any:
+        os.kill(os.getpid(), 2)
+        return close(self, *arguments)
+
+    monkeypatch.setattr(LogWatcher, "close", slow)
+    assert fly_and_report(resolve(), True, None) == 130
+    assert json.loads(capsys.readouterr().out)["outcome"] == "landed"
