@@ -14,7 +14,6 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from tests.helpers import log as synthetic
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 
-FLIGHTS = Path(__file__).parent / "data" / "flights"
 OLD, NEW = "perchctl-logs/flight_old.jsonl", "perchctl-logs/flight_new.jsonl"
 
 
@@ -87,14 +86,6 @@ def test_programs_are_told_what_an_export_lacks(logs: Path) -> None:
     assert any("without pictures" in note for note in json.loads(said.stdout)["notes"])
 
 
-def test_programs_are_told_where_a_replay_is_drawn(
-    logs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("perchctl.analysis.plot_replay", lambda _found, _path: None)
-    log = str(FLIGHTS / "stopped.jsonl.gz")
-    assert json.loads(run("log", "replay", log, "--json", "-o", "x.png").stdout)["plot"] == "x.png"
-
-
 def test_a_plot_s_name_is_its_form(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Path] = []
     monkeypatch.setattr("perchctl.analysis.plot_flight", lambda _log, path: drawn.append(path))
@@ -116,7 +107,7 @@ def test_two_flights_are_compared(logs: Path) -> None:
     assert "their profiles are the same" in run("log", "compare", OLD, NEW).stdout
     told = json.loads(run("log", "compare", OLD, NEW, "--json").stdout)
     assert told["differences"]["turns"] == -30
-    assert (told["profile"], told["plot"]) == ({}, None)
+    assert told["profile"] == {}
 
 
 BAD: dict[str, dict[str, object]] = {
@@ -147,8 +138,6 @@ BAD: dict[str, dict[str, object]] = {
         *((["report", f"bad_{name}.jsonl"], 30, "no flight writes") for name in BAD),
         (["export", "bare.jsonl", "-o", "x.txt"], 30, "must end in .csv or .parquet or .mcap"),
         (["compare", "a.csv", "bare.jsonl"], 30, "a table"),
-        (["compare", "bare.jsonl", "bare.jsonl", "-o", "x.jpg"], 30, "must end in"),
-        (["compare", "bare.jsonl", "bare.jsonl", "-o", "x.png"], 30, "nothing to plot"),
         (["report", "bare.jsonl", "-o", "bare.jsonl"], 2, "one of the logs"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

@@ -57,10 +57,6 @@ LogArgument = Annotated[
         help="A flight log, or a folder, whose newest log is taken. Default: perchctl-logs."
     ),
 ]
-DrawOption = Annotated[
-    Path | None,
-    typer.Option("--output", "-o", help="Draw both into this file: .png, .pdf or .svg."),
-]
 
 app = new_app(Group)
 
@@ -182,7 +178,7 @@ def plot(
     cls=Command,
     epilog=examples(
         "perchctl log compare before.jsonl after.jsonl",
-        "perchctl log compare before.jsonl after.jsonl -o both.png",
+        "perchctl log compare perchctl-logs/monday.jsonl perchctl-logs/tuesday.jsonl",
         "perchctl log compare before.jsonl after.jsonl --json",
     ),
 )
@@ -190,26 +186,16 @@ def plot(
 def compare(
     one: Annotated[Path, typer.Argument(metavar="A", help="A flight log.")],
     other: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
-    output: DrawOption = None,
-    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> int:
     """Compare two flights: what differs, and in which keys their profiles do."""
-    if output is not None:
-        check_output(output, FORMATS, force, DRAWN_IN)
     with _opened(one) as log, _opened(other) as other_log:
         found = Comparison((FlightAnalysis(log), FlightAnalysis(other_log)))
         record, text = found.record(), found.text()
-    if output is not None:
-        from perchctl.analysis import plot_comparison
-
-        plot_comparison(found, output)
     if as_json:
-        print_record(record | {"plot": None if output is None else str(output)})
-        return 0
-    print(text)
-    if output is not None:
-        print(f"\nplot:      {output}")
+        print_record(record)
+    else:
+        print(text)
     return 0
 
 
@@ -282,7 +268,7 @@ def _write_mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
     epilog=examples(
         "perchctl log replay",
         "perchctl log replay --set planner.align.xy_m=0.02",
-        "perchctl log replay flight.jsonl --profile mine -o then.png",
+        "perchctl log replay flight.jsonl --profile mine --json",
     ),
 )
 @reporting
@@ -308,8 +294,6 @@ def replay(
             "--pictures/--no-pictures", help="See the recorded pictures again, where there are any."
         ),
     ] = True,
-    output: DrawOption = None,
-    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> int:
     """Decide a flight again from its log, and demand the same commands, bit by bit.
@@ -320,8 +304,6 @@ def replay(
     Exit codes: 0 where nothing differs, 61 where something does.
     """
     path = _log_file(file)
-    if output is not None:
-        check_output(output, FORMATS, force, DRAWN_IN)
     with _opened(path) as log:
         wanted = None
         if profile is not None or settings:
@@ -332,18 +314,12 @@ def replay(
     found = replay_flight(log, recorded_pictures(path) if is_recorded else None, wanted)
     if wanted is not None and not found.changed:
         say("nothing was changed: that is what was flown")
-    if output is not None:
-        from perchctl.analysis import plot_replay
-
-        plot_replay(found, output)
     if as_json:
-        print_record(replay_record(found) | {"plot": None if output is None else str(output)})
+        print_record(replay_record(found))
     else:
         for note in found.notes:
             say(note)
         print("\n".join(replay_lines(found)))
-        if output is not None:
-            print(f"plot:      {output}")
     return 0 if found.same else ReplayDiffers.exit_code
 
 
