@@ -36,20 +36,18 @@ class UsageError(PerchError):
     meaning = "wrong usage of the command line"
 
 
+def _install(extra: str) -> str:
+    return f"install it with: {sys.executable} -m pip install 'perchctl[{extra}]'"
+
+
 def no_simulator(missing: str | None = "mujoco") -> UsageError:
     """Where the extra ``sim`` is not installed, of which `missing` is a part."""
-    return UsageError(
-        f"the simulator is not installed ({missing} is missing); install it with: "
-        f"{sys.executable} -m pip install 'perchctl[sim]'"
-    )
+    return UsageError(f"the simulator is not installed ({missing} is missing); {_install('sim')}")
 
 
 def no_motion_capture(needed_by: str = "positioning by motion capture") -> UsageError:
     """Where the extra ``mocap`` is not installed."""
-    return UsageError(
-        f"{needed_by} needs the library motioncapture; install it with: "
-        f"{sys.executable} -m pip install 'perchctl[mocap]'"
-    )
+    return UsageError(f"{needed_by} needs the library motioncapture; {_install('mocap')}")
 
 
 def broken_motion_capture(why: str) -> UsageError:
@@ -62,18 +60,12 @@ def broken_motion_capture(why: str) -> UsageError:
 
 def no_parquet() -> UsageError:
     """Where the extra ``parquet`` is not installed."""
-    return UsageError(
-        f"--parquet needs the library pyarrow; install it with: "
-        f"{sys.executable} -m pip install 'perchctl[parquet]'"
-    )
+    return UsageError(f"a .parquet file needs the library pyarrow; {_install('parquet')}")
 
 
 def no_cluster(why: str = "it is missing") -> UsageError:
     """Where the extra ``cluster`` is not installed, or cannot be loaded."""
-    return UsageError(
-        f"--cluster needs the library distributed ({why}); install it with: "
-        f"{sys.executable} -m pip install 'perchctl[cluster]'"
-    )
+    return UsageError(f"--cluster needs the library distributed ({why}); {_install('cluster')}")
 
 
 class ConnectionFailed(PerchError):

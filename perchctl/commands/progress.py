@@ -17,30 +17,14 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
-    Task,
     TextColumn,
+    TimeRemainingColumn,
 )
-from rich.text import Text
 
 _REFRESH_HZ = 4
+_WHOLE_RUN_S = 1e6
+"""Over which the time left is estimated: in rich's own 30 s no flight may have ended."""
 LINE_S = 10.0
-
-
-class TimeLeft(ProgressColumn):
-    """From the first one that is done; rich's own looks at the last 30 s only, in which no
-    flight may have ended."""
-
-    def render(self, task: Task) -> Text:
-        if not task.completed or task.total is None or task.elapsed is None:
-            return Text("")
-        left_s = task.elapsed / task.completed * (task.total - task.completed)
-        return Text(f"{_clock_text(left_s)} left")
-
-
-def _clock_text(s: float) -> str:
-    minutes, seconds = divmod(round(s), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{seconds:02}"
 
 
 class Ended(Protocol):
@@ -48,48 +32,6 @@ class Ended(Protocol):
 
     @property
     def outcome(self) -> str: ...
-
-
-class _Count:
-    """What has been flown so far, and how fast."""
-
-    def __init__(
-        self,
-        total: int,
-        earlier: Iterable[Ended],
-        clock: Callable[[], float],
-    ) -> None:
-        self.total, self._clock = total, clock
-        self._ends = Counter(result.outcome for result in earlier)
-        self._before, self._began_s = self._ends.total(), clock()
-        self.said_s = self._began_s
-
-    def add(self, result: Ended) -> None:
-        self._ends[result.outcome] += 1
-
-    @property
-    def flown(self) -> int:
-        return self._ends.total()
-
-    @property
-    def ends(self) -> str:
-        return " ".join(f"{n} {end}" for end, n in self._ends.items())
-
-    @property
-    def pace(self) -> str:
-        """Flights a minute and time left; of those that were flown now."""
-        elapsed_s, now = self._clock() - self._began_s, self.flown - self._before
-        if not now or elapsed_s <= 0.0:
-            return ""
-        left_s = elapsed_s / now * max(0, self.total - self.flown)
-        return f"{60.0 * now / elapsed_s:.1f}/min {_clock_text(left_s)} left"
-
-    def line(self) -> str | None:
-        """For what is no terminal, each `LINE_S` at most; the last flight's is the result's."""
-        if self.flown >= self.total or self._clock() - self.said_s < LINE_S:
-            return None
-        self.said_s = self._clock()
-        return f"perchctl: flown {self.flown} of {self.total} {self.pace} {self.ends}"
 
 
 @contextlib.contextmanager
@@ -101,20 +43,41 @@ def progress_bar(
 ) -> Iterator[Callable[[Ended], None]]:
     """Yields the function to call with each finished flight: a line of 80 columns that changes
     on a terminal, elsewhere a new one each `LINE_S` at most. `earlier`: flown before."""
-    count = _Count(total, earlier, clock)
     stream = stream or sys.stderr
+    ends = Counter(result.outcome for result in earlier)
+    before, began_s = ends.total(), clock()
+    printed_s = began_s
     text = TextColumn("{task.description}")
     with _bar("flights", text, total=total, stream=stream, width=8) as update:
-        update(completed=count.flown, description=count.ends)
+        update(completed=before, description=_counted(ends))
 
         def advance(result: Ended) -> None:
-            count.add(result)
-            update(completed=count.flown, description=f"{count.pace} {count.ends}")
-            if not stream.isatty() and (line := count.line()) is not None:
-                with contextlib.suppress(OSError, ValueError):  # nobody reads any more
-                    print(line, file=stream, flush=True)
+            nonlocal printed_s
+            ends[result.outcome] += 1
+            flown, now_s = ends.total(), clock()
+            pace = _pace(flown - before, now_s - began_s, max(0, total - flown))
+            update(completed=flown, description=f"{pace} {_counted(ends)}")
+            if stream.isatty() or flown >= total or now_s - printed_s < LINE_S:
+                return
+            printed_s = now_s
+            with contextlib.suppress(OSError, ValueError):  # nobody reads any more
+                line = f"perchctl: flown {flown} of {total} {pace} {_counted(ends)}"
+                print(line, file=stream, flush=True)
 
         yield advance
+
+
+def _counted(ends: Counter[str]) -> str:
+    return " ".join(f"{n} {end}" for end, n in ends.items())
+
+
+def _pace(flown: int, elapsed_s: float, left: int) -> str:
+    """Flights a minute, and the time that is left at this pace."""
+    if elapsed_s <= 0.0:
+        return ""
+    minutes, seconds = divmod(round(elapsed_s / flown * left), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{60.0 * flown / elapsed_s:.1f}/min {hours}:{minutes:02}:{seconds:02} left"
 
 
 @contextlib.contextmanager
@@ -122,7 +85,8 @@ def count_bar(
     what: str, total: int | None, wanted: bool = True, stream: TextIO | None = None
 ) -> Iterator[Callable[[], None]]:
     """Yields the function to call for each one done; `total` None is an unknown number."""
-    with _bar(what, TimeLeft(), total=total, stream=stream, wanted=wanted) as update:
+    left = TimeRemainingColumn()
+    with _bar(what, left, total=total, stream=stream, wanted=wanted) as update:
         yield lambda: update(advance=1)
 
 
@@ -151,6 +115,10 @@ def _bar(
         return
     columns = (TextColumn(what), BarColumn(width), MofNCompleteColumn(), *more)
     with Progress(
-        *columns, console=console, refresh_per_second=_REFRESH_HZ, redirect_stdout=False
+        *columns,
+        console=console,
+        refresh_per_second=_REFRESH_HZ,
+        redirect_stdout=False,
+        speed_estimate_period=_WHOLE_RUN_S,
     ) as progress:
         yield partial(progress.update, progress.add_task("", total=total))

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.progress import Task, TaskID
 
 from perchctl.campaign import (
     FlightResult,
@@ -32,7 +31,7 @@ from perchctl.errors import SafetyAbort
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands.progress import TimeLeft, progress_bar
+from perchctl.commands.progress import progress_bar
 from perchctl.log import FlightSummary, read_log, summarise_flight, summary_text
 from perchctl.log.read import PhaseSpan
 from perchctl.log.write import FlightLogWriter
@@ -234,18 +233,6 @@ def test_progress_elsewhere_is_a_line_now_and_then() -> None:
         "perchctl: flown 6 of 100 30.0/min 0:03:08 left 1 landed 5 perched",
         "perchctl: flown 11 of 100 30.0/min 0:02:58 left 1 landed 10 perched",
     ]
-
-
-def test_the_time_left_is_known_from_the_first_flight_on() -> None:
-    now_s = [0.0]
-    task = Task(TaskID(0), "", 20, 0, _get_time=lambda: now_s[0])
-    task.start_time = 0.0
-    now_s[0] = 90.0
-    assert TimeLeft().render(task).plain == ""
-    task.completed = 1
-    assert TimeLeft().render(task).plain == "0:28:30 left"
-    task.completed = 20
-    assert TimeLeft().render(task).plain == "0:00:00 left"
 
 
 def test_rounding_keeps_a_micrometre() -> None:
