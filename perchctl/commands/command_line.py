@@ -39,46 +39,25 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _BAD_PLACE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ENOTDIR)
 
 
-COMMANDS: dict[str, tuple[str, str]] = {
-    "make-target": (
-        "make_target",
-        "Print the target true to size, or a board; design it; write measured sizes.",
-    ),
-    "calibrate": (
-        "calibrate",
-        "Calibrate the camera, and report what its error means in mm at the target.",
-    ),
+COMMANDS: dict[str, str] = {
+    "make-target": "Print the target true to size, or a board; design it; write measured sizes.",
+    "calibrate": "Calibrate the camera, and report what its error means in mm at the target.",
     "profile": (
-        "profile",
-        "Show a profile as it is flown, every key explained, or write one of your vehicle (new).",
+        "Show a profile as it is flown, every key explained, or write one of your vehicle (new)."
     ),
     "fit-weights": (
-        "fit_weights",
-        "Fit the merge weights to poses whose truth is known, and verify that they help.",
+        "Fit the merge weights to poses whose truth is known, and verify that they help."
     ),
-    "track": (
-        "track",
-        "Find the target in a camera, video or pictures, without a vehicle.",
-    ),
+    "track": "Find the target in a camera, video or pictures, without a vehicle.",
     "check": (
-        "check",
         "Look at vehicle, camera, computer and profile on the ground, and say what is not fit to "
-        "fly.",
+        "fly."
     ),
-    "fly": (
-        "fly",
-        "Fly the seven phases: find the target, align, ascend, perch, stop the motors.",
-    ),
-    "simulate": (
-        "simulate",
-        "Fly many seeded scenarios in lockstep, faster than real time, and count.",
-    ),
-    "log": (
-        "log",
-        "After a flight: show, draw, compare, export, replay or report its log.",
-    ),
+    "fly": "Fly the seven phases: find the target, align, ascend, perch, stop the motors.",
+    "simulate": "Fly many seeded scenarios in lockstep, faster than real time, and count.",
+    "log": "After a flight: show, draw, compare, export, replay or report its log.",
 }
-"""In the order in which one uses them: the file, and the first sentence of its help."""
+"""In the order in which one uses them, with the first sentence of their help."""
 
 _SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
 
@@ -127,7 +106,7 @@ class _Unloaded(TyperCommand):
     """A subcommand whose file is loaded once it is used."""
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
-        module = importlib.import_module(f"perchctl.commands.{COMMANDS[self.name or ''][0]}")
+        module = importlib.import_module(f"perchctl.commands.{(self.name or '').replace('-', '_')}")
         command: Any = typer.main.get_command(module.app)
         command.name = self.name
         return command.make_context(*args, **kwargs)
@@ -143,7 +122,7 @@ class _Commands(TyperGroup):
         if cmd_name not in COMMANDS:
             return None
         # The whole sentence: of its own accord the list of the commands cuts it.
-        return _Unloaded(cmd_name, short_help=COMMANDS[cmd_name][1])
+        return _Unloaded(cmd_name, short_help=COMMANDS[cmd_name])
 
     def invoke(self, ctx: Any) -> Any:
         with reported("--json" in ctx.args):
