@@ -107,7 +107,7 @@ def test_a_known_shutter_does_no_harm(motion: dict[str, Any]) -> None:
     assert (known < [0.06, 0.06, 0.1, 0.04]).all()
     assert nees < 3.0
     # What it would have been: stretched along the columns, or sheared along the rows.
-    assert (taken_for_global[2:] > 5.0 * known[2:]).any()
+    assert taken_for_global[2] > 1.0 or taken_for_global[3] > 0.2
 
 
 @pytest.mark.parametrize("motion", [ALONG, ACROSS])

@@ -56,6 +56,12 @@ def test_from_a_start_that_is_not_nothing_settles(tvec: tuple[float, float, floa
     assert found is None or found.rms_px > 1.0
 
 
+def test_the_error_is_the_root_mean_square_over_the_corners() -> None:
+    error_px = np.array([[3.0, 4.0], [0.0, 0.0], [0.0, 0.0], [0.0, 5.0]])
+    scored = Scored(TRUE.rvec, TRUE.tvec, error_px, np.zeros((8, 6)))
+    assert scored.rms_px == pytest.approx(math.sqrt(50.0 / 4.0))
+
+
 def test_a_known_tilt_is_contradicted_beyond_its_spread_alone() -> None:
     other_rvec = mirror_solution(TRUE.rvec, TRUE.tvec)
     assert other_rvec is not None

@@ -70,8 +70,7 @@ _MAX_STEP = 0.5
 _LEAST_INFORMATION = 1.0  # of an increment: none is larger
 _SHIFT_PX, _CLIPPED_SHIFT_PX = 0.15, 0.4  # by which white may have grown over black
 _LINE_PX = 0.015  # by which a whole line may be off, of lens and light
-_LEAST_ROWS = 1.3  # times the variance of edges along the rows shows that rows shake
-_ROWS_ALIKE = 16  # that a torn band has, beside rows that tremble each for itself
+_LEAST_ROWS = 2.0  # times the variance of edges along the rows shows that rows shake
 _FLOOR_PX = 0.01
 _BEND, _BEND_BLURS = 0.6, 2.0  # what the next edge, a cell away, does to one; in units of blur
 _REACH = 0.0022  # px for a cubed pixel of blur: profiles are too short for wide edges
@@ -424,7 +423,7 @@ def _covariance(found: _Round, places: _Places, outline: Outline, known: Array) 
     middle = variance * (J * w[:, None]).T @ J + by_line.T @ by_line
     row_px = _row_px(found, places)
     if row_px > 0.0:
-        row = places.at[:, 1].astype(np.intp) // _ROWS_ALIKE
+        row = places.at[:, 1].astype(np.intp)
         by_row = np.zeros((int(row.max()) + 1, 9))
         np.add.at(by_row, row, J * (w * row_px * places.normal[:, 0])[:, None])
         middle += by_row.T @ by_row

@@ -6,6 +6,7 @@ import pytest
 
 from perchctl.profile import DetectorConfig, TargetConfig
 from perchctl.vision import Detection, Detections
+from perchctl.vision.markers import blurred
 from perchctl.vision.markers.blurred import expected_in_blur, hidden_in_blur
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import make_aruco_detector
@@ -26,6 +27,21 @@ def test_blur_that_hides_the_target_from_the_plain_detector(seed: int) -> None:
     assert found.large is not None
     blind = make_aruco_detector(DetectorConfig(blurred=False), TargetConfig())
     assert detect_markers(frame(image), None, blind, CAMERA).large is None
+
+
+def test_fits_to_a_blurred_marker_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fit to a texture that resembles a marker costs as much as all else in a frame."""
+    begun: list[float] = []
+
+    def refused(*_: object, blur_px: float) -> None:
+        begun.append(blur_px)
+
+    monkeypatch.setattr(blurred, "aligned", refused)
+    image, true = blurry(24.0, 3.0, 0)
+    for turn in (None, 0, 1, 2):
+        assert expected_in_blur(image, {"large": true}, SETUP.patterns, CAMERA, turn) == {}
+    assert begun[2:] == [begun[0], begun[1], begun[0]]
+    assert begun[0] < begun[1]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,6 +26,7 @@ from perchctl.vision.lens import reach_of, undistort_px
 from perchctl.vision.markers.corners import within
 from perchctl.vision.markers.cut import MOST_AGE_S, cut_markers, is_cut, may_be_whole
 from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.markers.search import Found, search
 from tests.helpers.markers import SETUP, both, corners, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -116,6 +118,23 @@ def test_it_is_never_a_first_sight() -> None:
 def test_it_needs_a_target_that_was_measured_lately() -> None:
     assert not nothing(look("height", age_s=MOST_AGE_S - 0.01))
     assert nothing(look("height", age_s=MOST_AGE_S + 0.01))
+
+
+@pytest.mark.parametrize(("age_s", "searched"), [(MOST_AGE_S, False), (MOST_AGE_S + 0.01, True)])
+def test_nothing_is_searched_for_where_nothing_can_be_whole(
+    age_s: float, searched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So long as that is known: later the target may be anywhere."""
+    passes = []
+
+    def noting(*args: Any, **keys: Any) -> Found:
+        passes.append(args)
+        return search(*args, **keys)
+
+    monkeypatch.setattr("perchctl.vision.markers.detect.search", noting)
+    empty = np.full(SHAPE, 120, np.uint8)
+    assert nothing(look("under", empty, age_s=age_s))
+    assert bool(passes) is searched
 
 
 def test_a_target_that_was_whole_is_searched_for_wherever_it_is_expected() -> None:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
-from perchctl.vision import Detection, Detections, project, square_corners
+from perchctl.profile import DetectorConfig, TargetConfig
+from perchctl.vision import Detection, Detections, Frame, project, square_corners
 from perchctl.vision.markers.detect import detect_markers, predicted_corners, with_motion
+from perchctl.vision.markers.detector import make_aruco_detector
 from perchctl.vision.markers.search import misfit
-from tests.helpers.markers import SETUP, box, frame, paste
+from tests.helpers.markers import SETUP, blurry, box, frame, paste
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 
@@ -94,6 +98,63 @@ def test_foreign_markers_are_not_taken() -> None:
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.large is None
     assert found.small is None
+
+
+def snapshot(value: Any) -> Any:
+    """All of a value's content, for comparison: dataclasses, arrays, OpenCV's objects."""
+    if is_dataclass(value):
+        return {f.name: snapshot(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, cv2.aruco.Dictionary):
+        return snapshot((value.bytesList, value.markerSize, value.maxCorrectionBits))
+    if isinstance(value, dict):
+        return {key: snapshot(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [snapshot(each) for each in value]
+    assert value is None or isinstance(value, (bool, int, float, str)), type(value)
+    return value
+
+
+def streams() -> list[list[Frame]]:
+    """Two of different sizes, each with pictures that are followed, searched and blurred, and
+    one without a target."""
+    blurred_far, _ = blurry(26.0, 3.0, 0)
+    near = [render(*pose_of(x, 0.0, 0.4, 0.3), noise=2.0) for x in (0.0, 0.01, -0.12)]
+    far = [render(*pose_of(x, 0.02, 0.9, 1.0), noise=2.0) for x in (0.0, 0.02, 0.3)]
+    one = [*near, np.full_like(near[0], 120), blurred_far, near[0]]
+    two = [blurred_far, far[0], far[1], np.full_like(far[0], 90), far[2], far[0]]
+    return [
+        [frame(image, k) for k, image in enumerate(one)],
+        [frame(image[:420], k) for k, image in enumerate(two)],
+    ]
+
+
+def test_two_streams_through_one_setup_do_not_disturb_each_other() -> None:
+    setup = make_aruco_detector(DetectorConfig(), TargetConfig())
+    before = snapshot(setup)
+    first, second = streams()
+
+    def alone(stream: list[Frame]) -> list[Detections]:
+        last, found = None, []
+        for each in stream:
+            last = detect_markers(
+                each, last, make_aruco_detector(DetectorConfig(), TargetConfig()), CAMERA
+            )
+            found.append(last)
+        return found
+
+    lasts: list[Detections | None] = [None, None]
+    interleaved: list[list[Detections]] = [[], []]
+    for pair in zip(first, second, strict=True):
+        for k, each in enumerate(pair):
+            found = detect_markers(each, lasts[k], setup, CAMERA)
+            interleaved[k].append(found)
+            lasts[k] = found
+    for results in interleaved:
+        assert {d.full_frame for d in results if d.large is not None} == {True, False}
+    assert snapshot(interleaved) == snapshot([alone(first), alone(second)])
+    assert snapshot(setup) == before
 
 
 # --- Motion from picture to picture ------------------------------------------------------------
