@@ -105,13 +105,11 @@ def _seen(frames: list[tuple[float, Picture]], pipeline: Any) -> tuple[Any, ...]
     from perchctl.vision import pipeline as room
 
     state, output, t_s = PipelineState(), None, 0.0
-    # A checkout that keeps what it knows of the fields for itself, or in the pipeline's state.
     fields = room.FieldState() if hasattr(room, "FieldState") else None
     for index, (at_s, image) in enumerate(frames):
+        parts = (Frame(index, at_s, image),)
         if fields is not None:
-            fields, parts = room.pictures(fields, Frame(index, at_s, image), pipeline)
-        else:
-            state, parts = room.pictures(state, Frame(index, at_s, image), pipeline)
+            fields, parts = room.pictures(fields, parts[0], pipeline)
         for part in parts:
             state, output = room.step(state, part, None, pipeline)
             t_s = part.t_s

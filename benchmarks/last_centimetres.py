@@ -128,7 +128,7 @@ def ascent(case: Case, setup: Pipeline, scene: Renderer, seed: int, in_hand: boo
         assert pose.cov is not None
         squared = float(error @ np.linalg.solve(pose.cov, error)) / 4.0
         seen = output.detections.small or output.detections.large
-        cut = seen is not None and not seen.whole
+        cut = seen is not None and seen.cov_px2 is not None
         rows.append(Row(range_m, cut, tuple(error.tolist()), squared, took_s))
     return rows
 

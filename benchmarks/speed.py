@@ -26,6 +26,7 @@ from perchctl.geometry import Array
 from perchctl.vision import (
     Attitude,
     Detections,
+    FieldState,
     Frame,
     PipelineOutput,
     PipelineState,
@@ -82,7 +83,7 @@ def main() -> None:
     frames = list(sequence(120 if quick else 420))
     visible = {n: [in_view(true_corners(T, n)) for _, _, T in frames] for n in ("large", "small")}
     last: Detections | None = None
-    state = PipelineState()
+    state, stream = PipelineState(), FieldState()
     setup = setup_with()
     errors = []
 
@@ -96,14 +97,14 @@ def main() -> None:
         return {"large": seen.large, "small": seen.small}
 
     def whole(k: int, attitude: Attitude | None) -> Found:
-        nonlocal state
-        state, (frame,) = pictures(state, frames[k][0], setup)
+        nonlocal state, stream
+        stream, (frame,) = pictures(stream, frames[k][0], setup)
         state, output = step(state, frame, attitude, setup)
         return {"large": output.detections.large, "small": output.detections.small, "all": output}
 
     def afresh() -> None:
-        nonlocal last, state
-        last, state = None, PipelineState()
+        nonlocal last, state, stream
+        last, state, stream = None, PipelineState(), FieldState()
 
     rows = []
     total = {name: sum(seen) for name, seen in visible.items()}

@@ -103,7 +103,7 @@ MOST_NAMES = {
     "sim": 25,
     "target": 29,
     "track": 15,
-    "vision": 30,
+    "vision": 50,
     "weights": 15,
 }
 

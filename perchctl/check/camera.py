@@ -38,7 +38,7 @@ from perchctl.target import (
     offset_text,
     overhead_view,
 )
-from perchctl.vision import CameraModel
+from perchctl.vision import BLENDED, CameraModel
 
 RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 7.0
 """An AI-deck's program as it comes gives 8, and a simulated one perches with 7."""
@@ -169,6 +169,8 @@ def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
         found = f"{late} of {rehearsal.pictures} came after newer ones"
         return failed(found, "use another stream or receiver: these hold pictures back")
     if not rehearsal.problems:
+        if BLENDED in rehearsal.remarks:
+            return warned(BLENDED, "switch the converter's deinterlacing off")
         again = rehearsal.repeats
         repeated = f"; {again} repetitions by the receiver are not counted" if again else ""
         return passed(f"{rehearsal.pictures} good ones{repeated}")

@@ -17,7 +17,7 @@ from perchctl.flight import Clock, FlightInputs
 from perchctl.profile import Profile
 from perchctl.target import PrintCheck, PrintVerdict
 from perchctl.vehicle import Telemetry
-from perchctl.vision import Detections, Frame, Pipeline, TargetEstimate
+from perchctl.vision import MARKERS, Detections, Frame, Pipeline, TargetEstimate, refine_lines
 
 REHEARSED_S = 3.0
 WARM_FRAMES = 3
@@ -168,7 +168,7 @@ def rehearse(
     newest = senses.history.newest
     done.height_m = None if newest is None else newest.position_m[2] - profile.safety.ground_z_m
     done.print_verdict = prints.verdict() if prints.judged else None
-    done.light, done.blur = _light(done.looked), _blur(done.looked)
+    done.light, done.blur = _light(done.looked), _blur(done.looked, pipeline)
     return done
 
 
@@ -211,15 +211,19 @@ def _light(looked: Sequence[Looked]) -> Light | None:
     return Light(float(image.mean()), float(np.mean(image >= 250)))
 
 
-def _blur(looked: Sequence[Looked]) -> Blur | None:
-    """By the target's own edges, the large marker's where there is one; None where it was not
-    seen."""
-    found = [
-        next((d.blur_px for d in both if d is not None and d.blur_px is not None), None)
-        for both in ((each.detections.large, each.detections.small) for each in looked)
-    ]
-    blurs_px = [each for each in found if each is not None]
-    if not blurs_px:
-        return None
-    most_px, least_px = (float(np.median(each)) for each in zip(*blurs_px, strict=True))
-    return Blur(least_px, most_px)
+def _blur(looked: Sequence[Looked], pipeline: Pipeline) -> Blur | None:
+    """By the target's own edges; None where it was not seen."""
+    least, most = [], []
+    for each in looked:
+        for name in MARKERS:
+            seen = each.detections.get(name)
+            if seen is None:
+                continue
+            rim = pipeline.detector.patterns[name].rim
+            corners = seen.corners_px.reshape(1, 4, 2)
+            (refined,) = refine_lines(each.frame.image, corners, [rim], pipeline.camera)
+            if refined is not None:
+                least.append(refined.least_blur_px)
+                most.append(refined.blur_px)
+                break  # the large one, where there is one
+    return Blur(float(np.median(least)), float(np.median(most))) if least else None

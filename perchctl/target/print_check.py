@@ -15,7 +15,7 @@ import numpy as np
 from perchctl.geometry import Array
 from perchctl.profile import TargetConfig
 from perchctl.target.drawing import marker_corners_m
-from perchctl.vision import CameraModel, PipelineOutput, undistort
+from perchctl.vision import CameraModel, PipelineOutput, undistort_px
 
 CORNER_BIAS_PX = 0.02
 """What a refined corner errs inwards or outwards in all frames alike; no number of frames
@@ -43,8 +43,7 @@ def size_ratio(
     """The small marker's size relative to the large one's, over the ratio in the profile (1.01
     is printed 1 % too large), from one frame's corners, (4, 2) px each; and the share by which
     corners may err systematically. None where the corners span no plane."""
-    rays = undistort(np.concatenate([large_px, small_px]), camera)
-    seen = (rays @ camera.K[:2, :2].T + camera.K[:2, 2]).astype(np.float32)
+    seen = undistort_px(np.concatenate([large_px, small_px]), camera).astype(np.float32)
     sides = [
         float(np.linalg.norm(q - np.roll(q, 1, axis=0), axis=1).mean()) for q in np.split(seen, 2)
     ]

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.geometry import R_MARKER_TARGET, Array, rot_z, rpy_from_rotation
-from perchctl.profile import Mounting, Profile, TargetConfig
+from perchctl.profile import DetectorConfig, Mounting, Profile, TargetConfig
 from perchctl.vision import (
     CameraModel,
-    make_pipeline,
+    RigidPose,
+    make_aruco_detector,
     shows_enough_of_target,
     square_corners,
     undistort,
@@ -342,10 +343,7 @@ def gear_from_camera(profile: Profile) -> tuple[Array, Array]:
 def _blind(target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m: Array) -> Blind:
     """`gear_m` is the gear from the camera, body axes."""
     R, offset = R_body_cam.T, R_body_cam.T @ gear_m
-    view, patterns = (
-        FieldOfView(camera),
-        make_pipeline(Profile(target=target), camera).detector.patterns,
-    )
+    view, patterns = FieldOfView(camera), make_aruco_detector(DetectorConfig(), target).patterns
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
 
     def whole(range_m: float) -> bool:
@@ -354,9 +352,8 @@ def _blind(target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m:
     def left(range_m: float) -> bool:
         centre = R @ np.array([0.0, 0.0, range_m]) + offset
         half_m = target.large.side_m / 2.0
-        axes = R @ R_MARKER_TARGET @ _OWN_AXES
-        H = np.column_stack([axes[:, :2], centre / half_m])
-        return whole(range_m) or shows_enough_of_target(H, patterns, camera)
+        pose = RigidPose(R @ R_MARKER_TARGET @ _OWN_AXES, centre / half_m)
+        return whole(range_m) or shows_enough_of_target(pose, patterns, camera)
 
     return Blind(_lost_at_m(whole), _lost_at_m(left))
 

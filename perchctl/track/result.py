@@ -24,6 +24,7 @@ from perchctl.vision import (
     MarkerPose,
     PipelineOutput,
     Stage,
+    better_conditioned,
 )
 
 
@@ -126,8 +127,7 @@ def _behind(output: PipelineOutput, stage: Stage) -> tuple[MarkerPose | None, bo
         return poses.get(stage.value), True
     if "joint" in poses:
         return poses["joint"], True
-    surest = min((poses["large"], poses["small"]), key=lambda p: float(np.linalg.norm(p.sigma_m)))
-    return surest, False
+    return better_conditioned(poses["large"], poses["small"]), False
 
 
 def _rotation(rvec: Array) -> Array:

@@ -9,10 +9,12 @@ from dataclasses import dataclass, field
 
 from perchctl.camera import mirrored_note
 from perchctl.display import PageState, Sketch
-from perchctl.perception import INTERLACED, Perception
+from perchctl.perception import Perception
 from perchctl.profile import Profile
 from perchctl.track.result import CameraPose, Tracked, text_rows, track_record, tracked_of
 from perchctl.vision import (
+    BLENDED,
+    INTERLACED,
     MARKERS,
     CameraModel,
     Frame,
@@ -76,6 +78,8 @@ class Tracker:
             self._interlaced = interlaced = interlaced or self._interlaced
         if interlaced:
             yield INTERLACED
+        if output.detections.ghost_px > 0.0:
+            yield BLENDED
         if output.lock_note:
             yield output.lock_note
         if output.detections.mirrored:

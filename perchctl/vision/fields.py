@@ -12,13 +12,14 @@ Three things about a stream are found by measure, none is configured:
   is more like the earlier field of the second than the other way around;
 - how far they are apart: half the frames' period.
 
-While the order is not known yet (a first frame, a single picture, a picture at rest) the top
-field is measured.
+While the order is not known yet (a first frame, a single picture) both fields are measured and
+the mean is taken, which belongs to the middle moment in either order.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from statistics import mean, median
 from typing import Literal
 
@@ -27,11 +28,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.values import replace
-from perchctl.vision.types import FieldState, Frame
+from perchctl.vision.types import Frame, PictureKind
 
 FieldsMode = Literal["auto", "top", "bottom", "progressive"]
 Grey = NDArray[np.uint8]
 
+INTERLACED = "interlaced: the two fields of a frame are measured each for itself"
+BLENDED = (
+    "blended: moving edges are double, as if the camera's fields had been averaged: switch that "
+    "off in the receiver or converter"
+)
 
 _COMBED = 1.4
 # Of so many rows in a group all but the outer four are compared with their neighbours, in
@@ -42,7 +48,7 @@ _STRONG = 5.0  # of the mean difference within a field, for one to count
 _LEAST_GREY = 8.0
 _FLOOR = 0.25  # grey^2 a pixel that noise may leave of strong differences
 _EVERY = 3
-_ALIAS_PX, _ALIAS_BLURS = 0.2, 2.45
+_ALIAS_PX, _ALIAS_BLURS = 0.8, 2.45
 _TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0  # a cubic's, half way
 
 _PERIODS_S = (1 / 30, 1 / 25)  # of NTSC and PAL frames
@@ -54,6 +60,35 @@ _MAX_GAP_S = 0.25  # older pictures say nothing of the order
 _EVIDENCE = 1.0  # a sum of votes, of at most 1 each, that decides: two frames at least
 _MOST_EVIDENCE = 3.0  # so that a changed order is found in time
 _TURNED_EVIDENCE = 1.0  # against an order that was taken for known
+
+
+@dataclass(frozen=True, eq=False)
+class FieldState:
+    """What is known of a stream. `kind`: of the last frame that was looked at, `skipped` frames
+    ago. `votes`: for the
+    top field being the earlier one. `top_first`: None until it is known. `previous`: the last
+    picture, where it was combed."""
+
+    kind: PictureKind | None = None
+    skipped: int = 0
+    votes: float = 0.0
+    top_first: bool | None = None
+    periods_s: tuple[float, ...] = ()
+    last_s: float | None = None
+    previous: Grey | None = None
+
+    @property
+    def period_s(self) -> float:
+        """Of the frames: television's where it is near to that."""
+        if not self.periods_s:
+            return _PERIODS_S[1]
+        middle_s = median(self.periods_s)
+        # A receiver with a rate of its own moves them to and fro: 25 a second in 60 come 33 and
+        # 50 ms apart. Lost frames are farther apart than that.
+        period_s = mean(p for p in self.periods_s if p < _LOST * middle_s)
+        if _VIDEO_PERIODS_S[0] < period_s < _VIDEO_PERIODS_S[1]:
+            return min(_PERIODS_S, key=lambda p: abs(p - period_s))
+        return period_s
 
 
 def combing(image: Grey) -> float:
@@ -81,12 +116,9 @@ def combing(image: Grey) -> float:
     return energy[0] / (energy[1] + _FLOOR * row.size)
 
 
-def fields_of(image: Grey) -> tuple[Grey, ...]:
-    """The pictures (h, w) of single moments that a grey picture (h, w) holds: itself, or, where
-    it is combed, its top and its bottom field at full height."""
-    if combing(image) > _COMBED:
-        return field_picture(image, 0), field_picture(image, 1)
-    return (image,)
+def is_combed(image: Grey) -> bool:
+    """True where the picture, (h, w) grey, holds two fields of different times."""
+    return combing(image) > _COMBED
 
 
 def field_picture(image: Grey, first_row: int) -> Grey:
@@ -106,9 +138,8 @@ def field_picture(image: Grey, first_row: int) -> Grey:
 
 
 def interpolated_sigma_px(blur_px: float) -> float:
-    """Spread of a marker's corners across the rows of a field, by the blur of its edges in the
-    whole picture: between rows that are 2 px apart, a sharp edge is where it happens to be taken
-    for, and over a marker's edges that averages out for the most part."""
+    """Spread of an edge along the rows of a field, by its blur in the whole picture: between
+    rows that are 2 px apart, a sharp edge is where it happens to be taken for."""
     return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
 
 
@@ -118,7 +149,7 @@ def classify_fields(frame: Frame, mode: FieldsMode) -> Frame:
         return frame
     if mode == "progressive":
         return replace(frame, fields="whole")
-    combed = mode != "auto" or combing(frame.image) > _COMBED
+    combed = mode != "auto" or is_combed(frame.image)
     return replace(frame, fields="woven" if combed else "whole")
 
 
@@ -159,24 +190,11 @@ def separate_fields(
         return state, (frame,)
     top, bottom = halves(frame)
     early, late = (top, bottom) if state.top_first else (bottom, top)
-    apart_s = frame_period_s(state) / 2.0
+    apart_s = state.period_s / 2.0
     return state, (
         replace(early, t_s=frame.t_s - apart_s / 2.0),
         replace(late, t_s=frame.t_s + apart_s / 2.0),
     )
-
-
-def frame_period_s(state: FieldState) -> float:
-    """From frame to frame: television's where it is near to that."""
-    if not state.periods_s:
-        return _PERIODS_S[1]
-    middle_s = median(state.periods_s)
-    # A receiver with a rate of its own moves them to and fro: 25 a second in 60 come 33 and
-    # 50 ms apart. Lost frames are farther apart than that.
-    period_s = mean(p for p in state.periods_s if p < _LOST * middle_s)
-    if _VIDEO_PERIODS_S[0] < period_s < _VIDEO_PERIODS_S[1]:
-        return min(_PERIODS_S, key=lambda p: abs(p - period_s))
-    return period_s
 
 
 def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:

@@ -6,8 +6,6 @@ markers at its rim and blurs the rest.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import cv2
 import numpy as np
 
@@ -69,20 +67,3 @@ def _projected(points: Array, rvec: Array, tvec: Array, camera: CameraModel) -> 
     call = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
     image = np.asarray(call(points, rvec, tvec, camera.K, camera.dist)[0], dtype=np.float64)
     return image.reshape(-1, 2)
-
-
-_RIM_POINTS = 40
-_WIDEST = 1.5  # normalised: 56 degrees off the axis
-_BEYOND = 1.02
-
-
-@lru_cache(maxsize=8)
-def reach_of(camera: CameraModel) -> float:
-    """How far from the axis the picture reaches, normalised. Farther out a lens model may fold
-    back into the picture."""
-    w, h = camera.size_px
-    s = np.linspace(0.0, 1.0, _RIM_POINTS)
-    low, high = np.zeros_like(s), np.ones_like(s)
-    rim = np.concatenate([np.stack(p, 1) for p in ((s, low), (s, high), (low, s), (high, s))])
-    rays = np.nan_to_num(undistort(rim * (w - 1.0, h - 1.0), camera), nan=0.0)
-    return _BEYOND * float(np.hypot(*np.clip(rays, -_WIDEST, _WIDEST).T).max())

@@ -239,7 +239,7 @@ def _alone(track: MarkerTrack, pose: MarkerPose | None) -> Merged:
 
 UNKNOWN_READOUT_S = 0.012
 """One standard deviation of a camera's read-out time where nobody has said it."""
-FLOW_SIGMA, TURN_SIGMA = 0.05, 0.025
+FLOW_SIGMA, TURN_SIGMA = 0.05, 0.015
 """Of a motion, along and across, as shares of it: it was measured from the frame before to this
 one, and changes."""
 
@@ -266,12 +266,6 @@ def seen_at_once(
         # From frame to frame a corner that moves down is also seen later.
         flow = flow / (1.0 + flow[..., 1:] * late / (height_px - 1.0))
         moved_px = flow * _late_s(d.corners_px, late, height_px)
-        if d.refined:
-            # Edges all over the marker were fitted: of a motion that grows with the square of
-            # the way from its centre, as turning makes it, corners have a third.
-            centre_px = d.corners_px.mean(axis=0, keepdims=True)
-            at_centre = np.atleast_2d(flow).mean(axis=0) * _late_s(centre_px, late, height_px)
-            moved_px = moved_px - 2.0 / 3.0 * (moved_px.mean(axis=0) - at_centre)
         if readout_s is None:
             out.append(replace(d, common_px=moved_px))
         else:

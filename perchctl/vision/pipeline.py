@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.profile import KalmanConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
-from perchctl.vision.fields import FieldsMode, classify_fields, separate_fields
+from perchctl.vision.fields import FieldsMode, FieldState, classify_fields, separate_fields
 from perchctl.vision.filter import MAX_TRACK_GAP_S, FilterSetup, predict_track
+from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, GearMask, make_aruco_detector, make_mask
 from perchctl.vision.merge import Merged, MergePrior, MergeStrategy, make_strategy, stage_of
@@ -36,6 +37,8 @@ from perchctl.vision.tracks import (
     TrackSetup,
     expected_corners,
     make_track_setup,
+    surest_pose,
+    update_sight,
     update_tracks,
 )
 from perchctl.vision.types import (
@@ -46,7 +49,6 @@ from perchctl.vision.types import (
     PictureKind,
     PipelineOutput,
     PipelineState,
-    Sighting,
     Stage,
     TargetEstimate,
 )
@@ -82,6 +84,8 @@ def make_pipeline(
     detector = make_aruco_detector(
         profile.detector, profile.target, _mask(profile, camera, covered)
     )
+    if detector.cut:
+        prepare_cut_markers(detector.patterns, camera)
     return Pipeline(
         detector=detector,
         pose=pose,
@@ -127,12 +131,11 @@ def camera_profile(profile: Profile) -> Profile:
 
 
 def pictures(
-    state: PipelineState, frame: Frame, pipeline: Pipeline
-) -> tuple[PipelineState, tuple[Frame, ...]]:
+    state: FieldState, frame: Frame, pipeline: Pipeline
+) -> tuple[FieldState, tuple[Frame, ...]]:
     """What a stream's frame holds, each for a `step` of its own: one picture, or the two
     fields of an interlaced camera in their order of time, each with its own time."""
-    fields, found = separate_fields(state.fields, frame, pipeline.fields)
-    return replace(state, fields=fields), found
+    return separate_fields(state, frame, pipeline.fields)
 
 
 def step(
@@ -189,10 +192,10 @@ def _followed(
     disagreeing = state.disagreeing_frames
     if both and taken:
         disagreeing = disagreeing + 1 if measured.contradicting else 0
-    surest = measured.surest
+    surest = surest_pose(measured)
     sees = surest is not None and taken
     if surest is not None and sees:
-        sighting = Sighting(surest, attitude)
+        sighting = update_sight(sighting, surest, attitude, pipeline.pose)
     target = _at_frame(followed, state.target, t_s, attitude, in_world, pipeline)
     new = PipelineState(
         tracks=followed.tracks,
@@ -204,7 +207,6 @@ def _followed(
         sighting=sighting if sees or followed.tracks else None,
         disagreeing_frames=disagreeing,
         empty_frames=0 if anything else state.empty_frames + 1,
-        fields=state.fields,
         lock=followed.lock,
         stranger=followed.stranger,
     )

@@ -21,11 +21,14 @@ import numpy as np
 
 from perchctl.geometry import R_MARKER_TARGET, Array, finite, yaw_of
 from perchctl.profile import PoseConfig, TargetConfig
+from perchctl.values import replace
 from perchctl.vision.lens import undistort_px
 from perchctl.vision.types import MARKERS, Attitude, CameraModel, Detection, MarkerName, MarkerPose
 
 _ATTITUDE_TILT_RAD = math.radians(6.0)  # mounting, estimate and ceiling together
 _PREVIOUS_TILT_RAD = math.radians(10.0)  # between two frames
+_CURLED_CHI2 = 3.0  # of both markers' corners on a flat sheet, a degree of freedom
+_EXPLAINED = 0.5  # of that is left where the sheet's curl is what it comes from
 _Source = Literal["large", "small", "joint"]
 
 __all__ = [
@@ -135,7 +138,18 @@ def estimate_pose(
     if solution is None:
         return None
     source = "joint" if len(detections) > 1 else detections[0].marker
-    return _level_pose(source, t_s, solution, points, R_level_body, setup)
+    pose = _level_pose(source, t_s, solution, points, R_level_body, setup)
+    if source != "joint" or pose.chi2 < _CURLED_CHI2 or setup.curl_per_m == 0.0:
+        return pose
+    if any(d.lying_sigma_px > 0.0 for d in detections):
+        return pose  # sides between interpolated rows look curled
+    # No flat sheet has both markers where they are. One that curls may, or the corners err.
+    points = replace(points, curled=True)
+    settled = _continued(points, solution, prior, setup.config)
+    if settled is None:
+        return pose
+    bent = _level_pose(source, t_s, settled, points, R_level_body, setup)
+    return replace(bent, chi2=pose.chi2) if bent.chi2 < _EXPLAINED * pose.chi2 else pose
 
 
 def _points(detections: Sequence[Detection], setup: PoseSetup) -> Points | None:
@@ -331,12 +345,16 @@ def gauss_newton(points: Points, start: PoseCandidate) -> Scored | None:
     for _ in range(_MAX_STEPS):
         scored = _scored(candidate, points)
         A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
-        cost = float(error.dot(error))
+        B, weighed = A, error
+        if points.curled:
+            weight = weight_with(_curl(points, scored))
+            B, weighed = weight @ A, weight @ error
+        cost = float(error.dot(weighed))
         if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
             return None
-        g = A.T.dot(error)
+        g = B.T.dot(error)
         # OpenCV's is three times as fast on matrices of this size.
-        regular, solved = cv2.solve(A.T.dot(A), g[:, None], flags=cv2.DECOMP_CHOLESKY)
+        regular, solved = cv2.solve(B.T.dot(A), g[:, None], flags=cv2.DECOMP_CHOLESKY)
         if not regular:
             return None
         step = solved[:, 0]
@@ -364,20 +382,33 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
     standard deviation of the sheet's curl moves them, (6,).
 
     The covariance is that of the corners' noise, grown as far as the residuals show that they
-    spread more than they claim, and what common shifts do to the pose; not the curl.
+    spread more than they claim, and what common shifts do to the pose, and a twist; not the curl.
     """
     W = points.whitening
     A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
     freedom = len(error) - 6
-    regular, inverse = cv2.invert(A.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
+    curl = _curl(points, scored)
+    weight = weight_with(curl) if points.curled else None
+    B, weighed = (A, error) if weight is None else (weight @ A, weight @ error)
+    regular, inverse = cv2.invert(B.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
     if not regular:
         return np.full((6, 6), np.inf), math.inf, np.zeros(6)
-    gain = inverse.dot(A.T)
-    chi2 = float(error.dot(error))
+    gain = inverse.dot(B.T)
+    chi2 = float(error.dot(weighed))
     growth = max((_TRUST + chi2) / (_TRUST + freedom), 0.7)
-    common = gain.dot(points.common)
-    curled = gain.dot(W.dot(moved_by(points.lift, scored.rvec, scored.jacobian)))
-    return inverse * growth + np.multiply.outer(common, common), chi2 / freedom, curled
+    common = gain.dot(points.shift)
+    noise = inverse if weight is None else gain @ gain.T
+    cov = noise * growth + common.dot(common.T)
+    curled, twisted = gain.dot(curl).T
+    if weight is not None:
+        cov += np.multiply.outer(twisted, twisted)
+    return cov, chi2 / freedom, curled
+
+
+def _curl(points: Points, scored: Scored) -> Array:
+    lift = np.zeros((len(points.whitening), 2)) if points.lift is None else points.lift
+    curl: Array = points.whitening.dot(moved_by(lift, scored.rvec, scored.jacobian))
+    return curl
 
 
 def mirror_solution(rvec: Array, tvec: Array) -> Array | None:
@@ -468,57 +499,123 @@ def _likeliest(scored: list[Scored], points: Points, prior: TiltPrior) -> Scored
     return min(scored, key=cost)
 
 
-# --- A sheet that is not flat: what its curl does to corners -----------------------------------
+# --- A sheet that is not flat: what its curl does to corners, and what they are worth then -----
+# Corners that curl has moved err together, and those far from the centre err most: a joint pose of
+# both markers rests on the small one as far as the large one may be off.
 
 
 def lift_of(object_m: Array, curl_per_m: float) -> Array:
-    """How far corners (n, 3) are out of the sheet's plane at one standard deviation of its curl,
-    (2n,) m, for x and y of each."""
+    """How far corners (n, 3) are out of the sheet's plane at one standard deviation of each kind
+    of curl, (2n, 2) m, for x and y of each: the whole rim to one side, or two corners of it to
+    one and two to the other. A sheet rolled about any axis is as much of one as of the other."""
     x, y = object_m[:, 0], object_m[:, 1]
-    lift: Array = curl_per_m * (x * x + y * y)
-    return lift.repeat(2)
+    lift: Array = curl_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
+    return lift.repeat(2, axis=0)
 
 
 def moved_by(lift: Array, rvec: Array, jacobian: Array) -> Array:
-    """By how much `lift` moves the corners in the picture, (2n,), where a change of (rvec,
+    """By how much `lift` moves the corners in the picture, (2n, 2), where a change of (rvec,
     tvec) moves them by `jacobian` (2n, 6)."""
     normal_cam = cv2.Rodrigues(rvec)[0][:, 2]
     # A corner out of the sheet's plane is where a target moved along its normal would have it.
-    moved: Array = jacobian[:, 3:].dot(normal_cam) * lift
+    moved: Array = jacobian[:, 3:].dot(normal_cam)[:, None] * lift
     return moved
 
 
+def weight_with(curl: Array) -> Array:
+    """The inverse covariance (2n, 2n) of errors of unit spread that have `curl` (2n, k), one
+    standard deviation each, among them."""
+    inner = np.linalg.inv(np.eye(curl.shape[1]) + curl.T @ curl)
+    weight: Array = np.eye(len(curl)) - curl @ inner @ curl.T
+    return weight
+
+
 # --- Corners as a pose is solved from them: where they are, and what each is worth -------------
+# Corners that are intersections of fitted lines do not err on their own: a line is off
+# by an offset and a tilt, and moves the corners at both of its ends. Its two ends have
+# errors across it of variance s^2 with a correlation of -1/2, so half the line's offset
+# is known to s/2 and its tilt to s sqrt(3)/2. `whitening` turns corner errors into these
+# independent ones. A shift of all edges by the same number of pixels (clipped white, ink)
+# is left out of the fit, where small markers' own faults would feed it, but not out of the
+# covariance.
+
+
+_EACH = np.eye(8)
+_TILT = np.array(1.0 / math.sqrt(3.0))
+_BEFORE = np.array([3, 0, 1, 2])
+_START = np.arange(4)  # side k runs from corner k ...
+_END = np.array([1, 2, 3, 0])  # ... to corner k + 1
+_ROWS = np.concatenate([2 * np.tile(_START, 4), 2 * np.tile(_START, 4) + 1])
+_COLUMNS = np.concatenate([2 * _START, 2 * _START + 1, 2 * _END, 2 * _END + 1] * 2)
+_SIDES = 8 * _ROWS + _COLUMNS  # in an (8, 8) matrix
 
 
 @dataclass(frozen=True, eq=False)
 class Points:
     """object_m (n, 3) and image_px (n, 2) of a pinhole K; sigma_px (n,); whitening
-    (2n, 2n) makes errors independent and of unit spread; common (2n,): one standard deviation
-    of what moves the corners together, whitened; lift (2n,) of a sheet that curls."""
+    (2n, 2n) makes errors independent and of unit spread; shift (2n, k): one standard deviation
+    each of what moves corners together, whitened: the shift that all edges share, the
+    detections' `common_px`, and what shakes the rows of each; lift (2n, 2) of a sheet that
+    curls, and whether corners are weighed by it."""
 
     object_m: Array
     image_px: Array
     sigma_px: Array
     whitening: Array
-    common: Array
+    shift: Array
     K: Array
-    lift: Array
+    lift: Array | None = None
+    curled: bool = False
 
 
 def make_points(
-    detections: Sequence[Detection], object_m: Array, image_px: Array, K: Array, lift: Array
+    detections: Sequence[Detection],
+    object_m: Array,
+    image_px: Array,
+    K: Array,
+    lift: Array | None = None,
 ) -> Points:
-    """The detections' corners, `image_px` (n, 2) as a pinhole sees them."""
-    n = len(image_px)
-    W, common = np.zeros((2 * n, 2 * n)), np.zeros(2 * n)
+    n, m = len(image_px), len(detections)
+    W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
+    corners_px = image_px.reshape(m, 4, 2)
+    normals = _outward_normals(corners_px)
+    # A corner moves a pixel along the normals of both of its sides.
+    moved = (normals + normals.take(_BEFORE, axis=1)).reshape(m, 8)
     for i, d in enumerate(detections):
-        rows = slice(8 * i, 8 * i + 8)
-        W[rows, rows] = np.eye(8) / d.sigma_px if d.cov_px2 is None else _whitened(d.cov_px2)
+        rows, corners = slice(8 * i, 8 * i + 8), corners_px[i]
+        shift[rows, 0] = d.shift_sigma_px * moved[i]
+        if d.cov_px2 is not None:
+            W[rows, rows] = _whitened(d.cov_px2)
+        elif d.refined:
+            spread_px = d.sigma_px if d.lying_sigma_px == 0.0 else _lying_px(d, corners)
+            own = np.zeros(64)
+            own[_SIDES] = _of_lines(normals[i], spread_px)
+            W[rows, rows] = own.reshape(8, 8)
+        else:
+            W[rows, rows] = _EACH / d.sigma_px
         if d.common_px is not None:
-            common[rows] = d.common_px.ravel()
+            shift[rows, 1] = d.common_px.ravel()
+        if d.row_sigma_px > 0.0:
+            # As of a line: half to all of its rows alike, and a slant.
+            down = corners[:, 1] - corners[:, 1].mean()
+            down /= max(float(np.abs(down).max()), 1e-9)
+            along_x = slice(8 * i, 8 * i + 8, 2)
+            shift[along_x, 2 + 2 * i] = 0.5 * d.row_sigma_px
+            shift[along_x, 3 + 2 * i] = 0.5 * math.sqrt(3.0) * d.row_sigma_px * down
     sigma_px = np.array([d.sigma_px for d in detections]).repeat(4)
-    return Points(object_m, image_px, sigma_px, W, W.dot(common), K, lift)
+    return Points(object_m, image_px, sigma_px, W, W.dot(shift), K, lift)
+
+
+def _outward_normals(corners: Array) -> Array:
+    """Unit normals (m, 4, 2) of the sides of m squares, whichever way round these are."""
+    side = corners.take(_END, axis=1) - corners
+    x, y = side[..., 0], side[..., 1]
+    length = np.maximum(np.hypot(x, y), 1e-9)
+    length = np.copysign(length, (x[:, 0] * y[:, 1] - y[:, 0] * x[:, 1])[:, None])
+    normals = np.empty_like(side)
+    np.divide(y, length, out=normals[..., 0])
+    np.divide(x, -length, out=normals[..., 1])
+    return normals
 
 
 def _whitened(cov_px2: Array) -> Array:
@@ -527,3 +624,20 @@ def _whitened(cov_px2: Array) -> Array:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(cov_px2)), dtype=np.float64)
     except np.linalg.LinAlgError:
         return np.diag(1.0 / np.sqrt(np.maximum(np.diagonal(cov_px2), 1e-6)))
+
+
+def _lying_px(d: Detection, corners: Array) -> Array:
+    """Spread of the sides, (4,): the more of a side lies along the rows, the worse. Over
+    several rows errors of interpolation cancel out."""
+    way = corners.take(_END, axis=0) - corners
+    lying = np.abs(way[:, 0]) / np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
+    rows = 0.5 * math.pi * np.abs(way[:, 1])
+    return np.asarray(np.hypot(d.sigma_px, d.lying_sigma_px * lying / np.hypot(1.0, rows)))
+
+
+def _of_lines(normals: Array, sigma_px: float | Array) -> Array:
+    """Whitening of the corners of four fitted lines with normals (4, 2), by the offset and the
+    tilt of each, at `_SIDES`; `sigma_px` of all or of each, (4,)."""
+    across = (normals.T / sigma_px).ravel()
+    tilt = across * _TILT
+    return np.concatenate([across, across, -tilt, tilt])

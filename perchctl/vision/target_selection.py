@@ -18,6 +18,10 @@ from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, pose_
 from perchctl.vision.pose import PoseSetup, estimate_pose, level_rotation
 from perchctl.vision.types import Attitude, Detection, MarkerName, MarkerPose
 
+OTHER_TARGET_TEXT = (
+    "a target is in view that is too far from target.expected_xy_m to be the own one: it is not "
+    "followed"
+)
 _SIGMA_PX = 1.0  # of corners as a search finds them
 
 

@@ -22,7 +22,8 @@ from perchctl.vision.filter import (
     start_track,
     step_track,
 )
-from perchctl.vision.lens import project, reach_of
+from perchctl.vision.lens import project
+from perchctl.vision.markers.cut import lattice_of
 from perchctl.vision.pose import PoseCandidate, PoseSetup, rotation_matrix, rotation_vector
 from perchctl.vision.target_selection import NOWHERE, OwnTargetPlace, measurement, refusal
 from perchctl.vision.types import (
@@ -147,11 +148,17 @@ def _sight(
     measured: MeasuredMarkers, fed: Mapping[str, Measurement], t_s: float, in_world: bool
 ) -> Sight:
     """What the gate has to judge: the surest pose of those that would be fed."""
-    pose = measured.surest
+    pose = surest_pose(measured)
     assert pose is not None
     name = next(n for n, each in measured.fed.items() if each is pose)
     whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
     return Sight(t_s, pose, fed[name], in_world, whole)
+
+
+def surest_pose(measured: MeasuredMarkers) -> MarkerPose | None:
+    """Of the poses that are fed, or else of all."""
+    poses = measured.fed or measured.poses
+    return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
 
 
 def _stepped(
@@ -427,9 +434,14 @@ def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
 
 
 # --- Where the target should be in the next picture --------------------------------------------
-# The target stands still, so the vehicle's own motion predicts its place in the picture. Positions
-# step by millimetres with each fix from outside, which are many pixels near the target: where the
-# state estimate has a speed, speed times time is the motion.
+# The target stands still, so the vehicle's own motion predicts its place in the picture. The state
+# estimate gives that motion twice: as the difference of two positions, and as speed times time.
+# Positions step by millimetres with each fix from outside, which are many pixels near the target;
+# the noise of a speed adds up. Which is better depends on what the estimate rests on. It is learned
+# from the target's own pictures: each prediction is weighted by how little it was off of late.
+
+
+_FORGOTTEN = 0.1  # of what was learned, with each picture
 
 
 def expected_corners(
@@ -447,8 +459,12 @@ def expected_corners(
     if attitude is None or then is None:
         return None, PoseCandidate(pose.rvec_rad, pose.tvec_m)
     R_then, R_now = _R_world_cam(then, setup), _R_world_cam(attitude, setup)
+    by_place, by_speed = sight.off_rad2
+    share = by_place / (by_place + by_speed) if by_place + by_speed > 0.0 else 0.5
+    stepped_m, flown_m = _moves(then, attitude, setup)
+    moved_m = stepped_m + share * (flown_m - stepped_m)
     R = R_now.T.dot(R_then)
-    tvec = R.dot(pose.tvec_m) - R_now.T.dot(_moved_m(then, attitude, setup))
+    tvec = R.dot(pose.tvec_m) - R_now.T.dot(moved_m)
     if tvec[2] <= 0.0:
         return None, None
     rvec = rotation_vector(R.dot(rotation_matrix(pose.rvec_rad)))
@@ -459,24 +475,45 @@ def expected_corners(
     return {"large": corners[:4], "small": corners[4:]}, moved
 
 
+def update_sight(
+    before: Sighting | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
+) -> Sighting:
+    """The target seen once more; with what that says of the vehicle's own account of its way."""
+    if before is None:
+        return Sighting(pose, attitude)
+    then, passed_s = before.attitude, pose.t_s - before.pose.t_s
+    if attitude is None or then is None or not 0.0 < passed_s <= MAX_TRACK_GAP_S:
+        return Sighting(pose, attitude, before.off_rad2)
+    R = _R_world_cam(attitude, setup)
+    seen_m = _R_world_cam(then, setup).dot(before.pose.tvec_m) - R.dot(pose.tvec_m)
+    # Across the view: along it a far target's own distance is vague.
+    off = [R.T.dot(way_m - seen_m)[:2] / pose.tvec_m[2] for way_m in _moves(then, attitude, setup)]
+    by_place, by_speed = (
+        old + _FORGOTTEN * (float(new.dot(new)) - old)
+        for old, new in zip(before.off_rad2, off, strict=True)
+    )
+    return Sighting(pose, attitude, (by_place, by_speed))
+
+
 def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
     """Whether a place (3,) in the world of the state estimate lies in the picture."""
     R = _R_world_cam(attitude, setup)
     way_m = R.T @ (place_m - attitude.position_m - _ahead_m(attitude, setup))
     # Farther off the axis a lens model may fold back into the picture.
-    if way_m[2] <= 0.0 or np.hypot(*way_m[:2]) > reach_of(setup.camera) * way_m[2]:
+    if way_m[2] <= 0.0 or np.hypot(*way_m[:2]) > lattice_of(setup.camera).reach * way_m[2]:
         return False
     (at_px,) = project(np.zeros((1, 3)), np.zeros(3), way_m, setup.camera)
     return bool((at_px > 0.0).all() and (at_px < np.subtract(setup.camera.size_px, 1)).all())
 
 
-def _moved_m(then: Attitude, now: Attitude, setup: PoseSetup) -> Array:
-    """The camera's way in the world, (3,)."""
+def _moves(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
+    """The camera's way in the world (3,) m, by the state estimate's places and by its speeds."""
     turned_m = _ahead_m(now, setup) - _ahead_m(then, setup)
+    stepped_m = turned_m + np.subtract(now.position_m, then.position_m)
     if now.velocity_mps is None or then.velocity_mps is None:
-        return turned_m + np.subtract(now.position_m, then.position_m)
+        return stepped_m, stepped_m
     half_s = 0.5 * (now.t_s - then.t_s)
-    return turned_m + half_s * np.add(now.velocity_mps, then.velocity_mps)
+    return stepped_m, turned_m + half_s * np.add(now.velocity_mps, then.velocity_mps)
 
 
 def _R_world_cam(attitude: Attitude, setup: PoseSetup) -> Array:

@@ -72,48 +72,35 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class FieldState:
-    """What is known of the fields of a stream.
-
-    Attributes:
-        kind: of the last frame that was looked at, `skipped` frames ago.
-        votes: for the top field being the earlier one.
-        top_first: None until it is known.
-        periods_s: between the last frames; last_s: the time of the last one.
-        previous: the last picture, where it was combed.
-    """
-
-    kind: PictureKind | None = None
-    skipped: int = 0
-    votes: float = 0.0
-    top_first: bool | None = None
-    periods_s: tuple[float, ...] = ()
-    last_s: float | None = None
-    previous: NDArray[np.uint8] | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class Detection:
     """One marker's corners in the image: (4, 2) px, TL TR BR BL as cv2.aruco
     orders them; pixel (0, 0) is the centre of the top-left pixel.
 
-    `sigma_px` is the spread of the corners, from what the fit leaves over, or a default where
-    nothing could be fitted. `refined`: the edges or the drawing were fitted. `whole`: all of the
-    marker was seen; else some corners may lie outside of the picture. `cov_px2` is their
-    covariance (8, 8), in pixels of a pinhole, x and y of each corner by turns; None where all
-    spread by `sigma_px`. `common_px` (4, 2) is one sigma of what moved all corners together.
-    `blur_px` is of the edges, a standard deviation, in the softer and in the sharper direction;
-    None where it was not measured.
+    `sigma_px` is the spread of the corners, from the line fit's residuals, or a
+    default where no line could be fitted. Corners that follow from a part of the drawing may
+    lie outside of the picture; they have a covariance `cov_px2` (8, 8), in pixels of a pinhole,
+    x and y of each corner by turns.
     """
 
     marker: MarkerName
     corners_px: Array
     sigma_px: float
     refined: bool
-    whole: bool = True
+    shift_sigma_px: float = 0.0  # of what moved all of a picture's edges alike, outwards
+    common_px: Array | None = None  # (4, 2): one sigma of what moved all corners together
     cov_px2: Array | None = None
-    common_px: Array | None = None
-    blur_px: tuple[float, float] | None = None
+    row_sigma_px: float = 0.0  # of corners in rows that shake along themselves, as analogue ones
+    lying_sigma_px: float = 0.0  # of a side along the rows, of which every second is interpolated
+
+
+@dataclass(frozen=True)
+class EdgeShift:
+    """By how many pixels white had grown over black in a picture, the spread of that
+    estimate, and how many pictures ago it was made."""
+
+    shift_px: float
+    sigma_px: float
+    age: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +114,9 @@ class Detections:
     targets: int = 0  # whole targets, both markers, that a search saw
     velocity_px_s: Array | None = None  # of the markers in the picture, (2,)
     flow_px_s: dict[MarkerName, Array] = field(default_factory=dict)  # of each corner, (4, 2)
+    edge_shift: EdgeShift | None = None
+    ghost_px: float = 0.0  # between the double edges of two blended fields; 0: single edges
+    ghost_age: int = 0  # pictures since these were looked for
 
     def get(self, marker: MarkerName) -> Detection | None:
         return self.large if marker == "large" else self.small
@@ -260,10 +250,15 @@ class TargetEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A pose of the target and the vehicle's attitude at that time, if it was known."""
+    """A pose of the target and the vehicle's attitude at that time, if it was known.
+
+    `off_rad2` is by how much, seen from the camera, the vehicle's own account of its way was wrong
+    of late: mean squares, of its places' steps and of its speeds times the time.
+    """
 
     pose: MarkerPose
     attitude: Attitude | None
+    off_rad2: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,12 +311,6 @@ class MeasuredMarkers:
     fed: dict[str, MarkerPose] = field(default_factory=dict)
     contradicting: bool = False
 
-    @property
-    def surest(self) -> MarkerPose | None:
-        """The surest of the poses that are fed, or else of all; None without one."""
-        poses = self.fed or self.poses
-        return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
-
 
 @dataclass(frozen=True, eq=False)
 class PipelineState:
@@ -336,7 +325,6 @@ class PipelineState:
     sighting: Sighting | None = None  # the last
     disagreeing_frames: int = 0
     empty_frames: int = 0  # in a row, without either marker
-    fields: FieldState = FieldState()  # of the stream
     lock: Lock | None = None
     stranger: Stranger | None = None
 
@@ -353,18 +341,3 @@ class PipelineOutput:
     fields: PictureKind = "whole"  # what the picture was
     lock_note: str = ""  # why this frame's pose was not taken, or taken at another place
     refused: bool = False  # this frame showed another vehicle's target, by its place
-
-
-@dataclass(frozen=True)
-class Consistency:
-    """What the flight shows beyond the profile, each with one standard deviation.
-
-    `delay_s`: by how much the pictures are later. `turn_rad`: the camera's turn about body x, y
-    and z. The attitude's constant error, which moves the target just as a mounting's roll and
-    pitch do, is in their `turn_sigma_rad`.
-    """
-
-    delay_s: float
-    delay_sigma_s: float
-    turn_rad: tuple[float, float, float]
-    turn_sigma_rad: tuple[float, float, float]

@@ -12,7 +12,7 @@ from perchctl.calibration.board.capture import sharpness
 from perchctl.calibration.board.detect import find_board
 from perchctl.camera import Grey
 from perchctl.geometry import Array
-from perchctl.vision import CameraModel, fields_of, project
+from perchctl.vision import CameraModel, is_combed, project
 from tests.helpers.boards import CHARUCO, BoardRenderer, draw_camera, draw_poses
 
 FIELDS_S = 0.02
@@ -43,7 +43,7 @@ def views(camera: CameraModel) -> list[BoardView]:
     found, combed = [], 0
     for i, pose in enumerate(draw_poses(rng, camera, CHARUCO, 12)):
         picture, poses = woven(renderer, pose, rng)
-        combed += len(fields_of(picture)) == 2
+        combed += is_combed(picture)
         view = find_board(picture, CHARUCO, f"view {i}")
         assert isinstance(view, BoardView), view
         there = [project(CHARUCO.corners_m(), p[:3], p[3:], camera)[view.ids] for p in poses]
@@ -78,5 +78,5 @@ def test_a_comb_is_nosharpness(camera: CameraModel) -> None:
     still = renderer.render(pose, rng, noise=2.0)
     combed = still.copy()
     combed[1::2] = np.roll(still, 3, axis=1)[1::2]
-    assert len(fields_of(combed)) == 2
+    assert is_combed(combed)
     assert sharpness(combed) < 1.2 * sharpness(still)

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig, aruco_dictionary
-from perchctl.vision import MARKERS, Frame, MarkerName, project, square_corners
+from perchctl.vision import MARKERS, Frame, MarkerName, make_aruco_detector, project, square_corners
 from perchctl.vision.markers.corners import RefinedCorners
 from perchctl.vision.markers.detect import follow, follow_partly
-from perchctl.vision.markers.detector import make_aruco_detector
 from perchctl.vision.markers.pattern import Pattern
 from tests.helpers.target_picture import CAMERA, pose_of, render
 

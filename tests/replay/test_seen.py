@@ -31,7 +31,7 @@ from perchctl.vision.markers import edge_fit
 from tests.helpers.flights import ROOT
 from tests.replay.test_corpus import ANEW, FOLDER, corpus
 
-PICTURES = 35
+PICTURES = 37
 NEAR = {"sigma_m": 3e-9, "sigma_yaw_rad": 1.2e-8, "e_yaw_rad": 1e-6, "world_yaw_rad": 1e-6}
 """What single precision leaves open; of a marker that is cut off, 1.05e-8 rad of 1.4e-3."""
 NEAR_M = 2e-7
@@ -102,8 +102,8 @@ def test_they_show_all_that_matters() -> None:
 @pytest.mark.parametrize(
     ("module", "name"),
     [
-        (edge_fit, "_TAILS"),  # the fit of edges
-        (edge_fit, "_LINE_PX"),
+        (edge_fit, "_SHIFT_PRIOR_PX"),  # the fit of edges
+        (edge_fit, "MIN_LINE_SIGMA_PX"),
         (pose, "_TRUST"),  # the pose
         (the_filter, "_PUSH_S"),
     ],

@@ -15,25 +15,19 @@ import pytest
 from perchctl.geometry import Array
 from perchctl.vision import (
     CameraModel,
+    FieldState,
     Frame,
     PictureKind,
     Pipeline,
     PipelineState,
     estimate_pose,
-    fields_of,
+    field_picture,
+    is_combed,
     pictures,
     step,
 )
-from perchctl.vision.fields import (
-    FieldsMode,
-    classify_fields,
-    combing,
-    field_picture,
-    halves,
-    separate_fields,
-)
-from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.types import FieldState
+from perchctl.vision.fields import FieldsMode, classify_fields, combing, halves, separate_fields
+from perchctl.vision.markers.detect import detect_markers, with_ghosts
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -77,7 +71,7 @@ def test_only_the_rows_of_a_field_are_in_its_picture() -> None:
 @pytest.mark.parametrize("below_m", [0.1, 0.3, 1.0])
 def test_two_moments_in_one_picture_are_seen(below_m: float, first: str) -> None:
     _, frames = woven_frames(2, first, below_m=below_m, camera_noise_sigma=8.0)
-    assert all(len(fields_of(frame.image)) == 2 for frame in frames)
+    assert all(is_combed(frame.image) for frame in frames)
 
 
 @pytest.mark.parametrize("analogue", [0.0, 0.3, 0.6, 0.9])
@@ -86,7 +80,7 @@ def test_a_whole_picture_is_never_taken_for_two(below_m: float, analogue: float)
     for noise in (0.0, 7.0):
         scene = Pass(below_m, camera_noise_sigma=noise, extra={"analogue": analogue})
         for frame in scene.frames(3):
-            assert fields_of(frame.image) == (frame.image,)
+            assert not is_combed(frame.image)
 
 
 def test_noise_and_snow_and_nothing_are_not_combed() -> None:
@@ -94,7 +88,7 @@ def test_noise_and_snow_and_nothing_are_not_combed() -> None:
     snow = rng.integers(0, 256, (480, 640)).astype(np.uint8)
     noise = np.clip(120 + rng.normal(0, 12, (480, 640)), 0, 255).astype(np.uint8)
     for image in (snow, noise, np.full((480, 640), 90, np.uint8), snow[:6]):
-        assert len(fields_of(image)) == 1
+        assert not is_combed(image)
 
 
 @pytest.mark.parametrize("folder", ["scenes", "hard/progressive", "hard/true", "hard/false"])
@@ -208,9 +202,9 @@ def test_what_was_looked_at_is_not_looked_at_again() -> None:
 
 def measured(scene: Pass, frames: list[Frame], setup: Pipeline) -> tuple[list[Array], int]:
     """Errors, mm, of the poses at their pictures' own times, and the number of pictures."""
-    state, errors, count = PipelineState(), [], 0
+    state, fields, errors, count = PipelineState(), FieldState(), [], 0
     for frame in frames:
-        state, parts = pictures(state, frame, setup)
+        fields, parts = pictures(fields, frame, setup)
         for part in parts:
             count += 1
             state, output = step(state, part, None, setup)
@@ -243,24 +237,23 @@ def test_as_whole_pictures_they_would_be_lost(build: Build) -> None:
     assert len(together) < 0.5 * len(frames)
 
 
-@pytest.mark.parametrize(("first", "early_s"), [("top", 0.01), ("bottom", -0.01)])
-def test_of_a_single_woven_picture_the_top_field_is_measured(
-    build: Build, first: str, early_s: float
-) -> None:
-    """In which order the fields were taken, one picture does not show."""
-    scene, (frame,) = woven_frames(1, first)
-    _, output = step(PipelineState(), frame, None, build())
-    assert output.fields == "woven"
-    pose = output.poses["joint"]
-    assert np.abs(pose.tvec_m - scene.target_m(frame.t_s - early_s)).max() < 1e-4
+def test_a_single_woven_picture_gives_the_middle_moment(build: Build) -> None:
+    """In either order, of which one picture knows nothing."""
+    for first in ("top", "bottom"):
+        scene, (frame,) = woven_frames(1, first)
+        _, output = step(PipelineState(), frame, None, build())
+        assert output.fields == "woven"
+        pose = output.poses["joint"]
+        assert np.abs(pose.tvec_m - scene.target_m(frame.t_s)).max() < 1e-4
 
 
 def test_whole_pictures_go_on_as_ever(build: Build) -> None:
     scene = Pass()
     setup = build()
     state = plain = PipelineState()
+    fields = FieldState()
     for frame in scene.frames(4):
-        state, (part,) = pictures(state, frame, setup)
+        fields, (part,) = pictures(fields, frame, setup)
         assert part.image is frame.image
         assert part.t_s == frame.t_s
         state, one = step(state, part, None, setup)
@@ -277,19 +270,65 @@ def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
     """Between rows that are 2 px apart a sharp edge is taken for too high or too low."""
     setup = build()
     first_row = 0 if kind == "top" else 1
-    squares = []
+    squares: dict[str, list[float]] = {"claimed": [], "as elsewhere": []}
     for k in range(12):
         T = pose_of(0.0, 0.0005 * k, 0.4)
         image = render(*T, noise=2.0, seed=k)
         field = Frame(0, 0.0, field_picture(image, first_row), fields=kind)
         seen = detect_markers(field, None, setup.detector, CAMERA).large
         assert seen is not None
-        pose = estimate_pose([seen], 0.0, None, setup.pose)
-        assert pose is not None
-        assert pose.cov is not None
-        e = pose.tvec_m - T[1]
-        squares.append(float(e @ np.linalg.solve(pose.cov[:3, :3], e)) / 3.0)
-    assert 0.2 < np.mean(squares) < 2.0
+        assert seen.lying_sigma_px > 0.0
+        for name, d in (("claimed", seen), ("as elsewhere", replace(seen, lying_sigma_px=0.0))):
+            pose = estimate_pose([d], 0.0, None, setup.pose)
+            assert pose is not None
+            assert pose.cov is not None
+            e = pose.tvec_m - T[1]
+            squares[name].append(float(e @ np.linalg.solve(pose.cov[:3, :3], e)) / 3.0)
+    assert 0.2 < np.mean(squares["claimed"]) < 2.0
+    assert np.mean(squares["as elsewhere"]) > 3.0
+
+
+# --- Blended -----------------------------------------------------------------------------
+
+
+def ghosts(setup: Pipeline, scene: Pass) -> list[tuple[float, float]]:
+    """The double edges' distance and the corners' spread, by picture."""
+    state, found = PipelineState(), []
+    for frame in scene.frames(6):
+        state, output = step(state, frame, None, setup)
+        if (seen := output.detections.large or output.detections.small) is not None:
+            found.append((output.detections.ghost_px, seen.sigma_px))
+    return found
+
+
+@pytest.mark.parametrize(
+    "below_m", [0.3, *(pytest.param(z_m, marks=pytest.mark.long) for z_m in (0.15, 0.5))]
+)
+def test_blended_fields_are_named_and_not_trusted(build: Build, below_m: float) -> None:
+    speed = 0.75 * below_m  # 6 px between the fields
+    scene = Pass(below_m, (speed, 0.2 * speed, 0.0), camera_fields="top", camera_blended=True)
+    found = ghosts(build(), scene)
+    assert len(found) >= 4
+    assert all(4.0 < px < 8.0 for px, _ in found)
+    assert all(sigma > 0.2 * px for px, sigma in found)
+
+
+@pytest.mark.parametrize("exposure_s", [0.0, 0.008, 0.02])
+@pytest.mark.parametrize(
+    "below_m", [0.3, *(pytest.param(z_m, marks=pytest.mark.long) for z_m in (0.1, 0.5, 1.2))]
+)
+def test_motion_and_its_blur_are_not_blended_fields(
+    build: Build, below_m: float, exposure_s: float
+) -> None:
+    scene = Pass(
+        below_m, (0.8 * below_m, 0.3 * below_m, 0.0),
+        camera_exposure_s=exposure_s, camera_noise_sigma=12.0,
+    )  # fmt: skip
+    state, setup = PipelineState(), build()
+    for frame in scene.frames(5):
+        state, output = step(state, frame, None, setup)
+        seen = replace(output.detections, velocity_px_s=None)
+        assert with_ghosts(seen, None, frame.image).ghost_px == 0.0
 
 
 # --- Shared pictures ---------------------------------------------------------------------------

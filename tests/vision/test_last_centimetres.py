@@ -59,7 +59,7 @@ def errors_m(rows: list[tuple[float, PipelineOutput]], along: str) -> Array:
 def test_an_ascent_is_measured_to_the_end(build: Any, along: str) -> None:
     rows = ascent(build, along, with_attitude=along != "under")
     assert all(o.target is not None and o.target.measured for _, o in rows)
-    cut = [(z, o) for z, o in rows if not o.detections.small.whole]  # type: ignore[union-attr]
+    cut = [(z, o) for z, o in rows if o.detections.small.cov_px2 is not None]  # type: ignore[union-attr]
     assert len(cut) >= 2
     assert np.abs(errors_m(cut, along)).max() < 1e-4
     # Of the corners' own noise alone: no print is wrong here.

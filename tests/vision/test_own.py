@@ -18,6 +18,8 @@ from perchctl.sim import Neighbour, Renderer, Scenario
 from perchctl.vision import (
     Attitude,
     CameraModel,
+    Detection,
+    Detections,
     Frame,
     Pipeline,
     PipelineOutput,
@@ -25,6 +27,7 @@ from perchctl.vision import (
     make_pipeline,
     step,
 )
+from perchctl.vision.markers.detect import between
 from perchctl.vision.markers.search import choose
 
 K = np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]])
@@ -222,3 +225,14 @@ def test_a_lone_look_alike_goes_before_a_whole_target_until_it_is_out_of_sight()
     # Not a look-alike of another size: that goes on from nothing.
     other = {"large": [box(100, 100, 20), *whole["large"]], "small": whole["small"]}
     assert choose(other, lone, 1 / 6)["large"] is whole["large"][0]
+
+
+def test_nothing_is_between_two_targets() -> None:
+    """A frame's two fields, of which each shows another one."""
+    fields = [
+        Detections(0, 0.0, large=Detection("large", box(x, 100, 60), 0.1, refined=True))
+        for x in (100.0, 400.0)
+    ]
+    mean = between(*fields)
+    assert mean.large is not None
+    assert mean.large.corners_px[:, 0].mean() == pytest.approx(100.0)

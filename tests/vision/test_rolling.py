@@ -12,6 +12,7 @@ from perchctl.profile import Profile
 from perchctl.vision import (
     Detection,
     Detections,
+    FieldState,
     PipelineState,
     make_pipeline,
     pictures,
@@ -77,9 +78,9 @@ def measured(scene: Pass, readout_s: float | None) -> tuple[Array, float]:
         "target": {"size_sigma": 0.0, "curl_per_m": 0.0},
     }
     setup = make_pipeline(Profile.model_validate(values), CAMERA)
-    state, errors, nees = PipelineState(), [], []
+    state, fields, errors, nees = PipelineState(), FieldState(), [], []
     for k, frame in enumerate(scene.frames(12)):
-        state, parts = pictures(state, frame, setup)
+        fields, parts = pictures(fields, frame, setup)
         for part in parts:
             state, output = step(state, part, None, setup)
             if k < 4:

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import wrap_rad
 from perchctl.profile import MergeConfig, WeightsConfig
-from perchctl.vision import MarkerPose, Stage
+from perchctl.vision import MarkerPose, Stage, better_conditioned
 from perchctl.vision.merge import (
-    better_conditioned,
     choose_stage,
     disagree,
     merge_pair,

@@ -56,19 +56,29 @@ def marker(
     noise_px: float = 0.0,
     rng: np.random.Generator | None = None,
     sigma_px: float = 0.02,
-    correlated: bool = False,
+    by_lines: bool = False,
 ) -> Detection:
-    """Corners that err on their own, or with a covariance that is claimed."""
+    """Corners that err on their own, or as intersections of lines that do."""
     corners = project(square_corners(SIDES[name]), rvec, tvec, CAMERA)
-    cov_px2 = None
-    if correlated:
-        mixed = 0.7 * np.eye(8) + np.random.default_rng(1).normal(0.0, 0.25, (8, 8))
-        cov_px2 = sigma_px**2 * mixed @ mixed.T
-    if rng is not None and cov_px2 is not None:
-        corners = corners + rng.multivariate_normal(np.zeros(8), cov_px2).reshape(4, 2)
+    if rng is not None and by_lines:
+        corners = corners + line_errors(corners, noise_px, rng)
     elif rng is not None:
         corners = corners + rng.normal(0.0, noise_px, corners.shape)
-    return Detection(name, corners, sigma_px, True, cov_px2=cov_px2)  # type: ignore[arg-type]
+    return Detection(name, corners, sigma_px, by_lines)  # type: ignore[arg-type]
+
+
+def line_errors(corners: Array, noise_px: float, rng: np.random.Generator) -> Array:
+    """What corners (4, 2) move by where each side errs by offset and tilt, as a line fitted
+    to many points does: `noise_px` at its ends."""
+    side = np.roll(corners, -1, axis=0) - corners
+    normal = np.stack([side[:, 1], -side[:, 0]], axis=1) / np.linalg.norm(side, axis=1)[:, None]
+    offset = rng.normal(0.0, noise_px / 2.0, 4)
+    tilt = rng.normal(0.0, noise_px * math.sqrt(3.0) / 2.0, 4)
+    moved = []
+    for i in range(4):
+        across = np.stack([normal[i - 1], normal[i]])
+        moved.append(np.linalg.solve(across, [offset[i - 1] + tilt[i - 1], offset[i] - tilt[i]]))
+    return np.array(moved)
 
 
 def must(pose: MarkerPose | None) -> MarkerPose:
@@ -214,16 +224,16 @@ def test_the_position_is_usable_even_with_the_wrong_tilt() -> None:
         assert abs(pose.e_m[2] - expected[2]) < 0.02
 
 
-@pytest.mark.parametrize("correlated", [False, True])
+@pytest.mark.parametrize("by_lines", [False, True])
 @pytest.mark.parametrize("seen", [["large"], ["small"], ["large", "small"]])
-def test_sigma_is_the_spread_that_noise_makes(seen: list[str], correlated: bool) -> None:
+def test_sigma_is_the_spread_that_noise_makes(seen: list[str], by_lines: bool) -> None:
     rng = np.random.default_rng(5)
     rvec, tvec = pose_of(0.01, 0.02, 0.3, 0.4, 0.12, -0.16)
     attitude = Attitude(0.0, 0.12, -0.16, 0.0)
     poses = [
         must(
             estimate_pose(
-                [marker(n, rvec, tvec, 0.1, rng, 0.1, correlated) for n in seen],
+                [marker(n, rvec, tvec, 0.1, rng, 0.1, by_lines) for n in seen],
                 0.0,
                 attitude,
                 PLAIN,
@@ -257,6 +267,18 @@ def test_the_covariance_is_that_of_the_errors(seen: list[str]) -> None:
         error = np.append(pose.e_m - true, wrap_rad(pose.e_yaw_rad - values[3]))
         squares.append(error @ np.linalg.solve(pose.cov, error))
     assert 0.8 < np.mean(squares) / 4.0 < 1.2
+
+
+def test_a_shift_of_all_edges_counts_for_the_distance_alone() -> None:
+    rvec, tvec = pose_of(0.0, 0.0, 0.4, 0.3)
+    plain = marker("large", rvec, tvec)
+    shifted = Detection("large", plain.corners_px, plain.sigma_px, True, 0.1)
+    sure, unsure = (must(estimate_pose([d], 0.0, None, PLAIN)) for d in (plain, shifted))
+    side_px = 0.150 / 0.4 * 400.0
+    assert unsure.sigma_m[2] == pytest.approx(0.4 * 0.2 / side_px, rel=0.1)
+    assert unsure.sigma_m[2] > 3.0 * sure.sigma_m[2]
+    assert np.allclose(unsure.sigma_m[:2], sure.sigma_m[:2], rtol=0.3)
+    assert unsure.sigma_yaw_rad < 1.5 * sure.sigma_yaw_rad
 
 
 def test_both_markers_together_are_surer_than_either() -> None:

@@ -74,6 +74,43 @@ def test_the_claim_is_what_a_curl_of_one_standard_deviation_does(seen: list[str]
         assert np.linalg.norm(moved) == pytest.approx(0.03 * 2 * 0.075**2, rel=0.05)
 
 
+def test_a_sheet_that_shows_its_curl_moves_the_pose_less() -> None:
+    """The small marker in its middle is moved least; on a sheet that counts as flat the large
+    one, far surer, outweighs it."""
+    place = (0.03, -0.02, 0.2, 0.4, 0.05, -0.04)
+    off_m, claims_m = [], []
+    for claimed in (0.0, 0.03):
+        setup = setup_of(size_sigma=0.0, curl_per_m=claimed)
+        true, curled = (
+            solved(["large", "small"], setup, place, curl_per_m=c, rng=np.random.default_rng(2))
+            for c in (0.0, 0.18)
+        )
+        off_m.append(float(np.linalg.norm(curled.e_m - true.e_m)))
+        claims_m.append(float(np.linalg.norm(curled.sigma_m)))
+    assert off_m[0] > 1e-3
+    assert off_m[1] < 0.5 * off_m[0]
+    assert off_m[1] < 3.0 * claims_m[1]
+
+
+def test_corners_that_err_are_no_curl() -> None:
+    """A small marker that is no square tells nothing of the sheet."""
+    rvec, tvec = pose_of(0.0, 0.0, 0.2, 0.4, 0.0, 0.0)
+    detections = []
+    for name, side_m in SIDES.items():
+        px = project(square_corners(side_m), rvec, tvec, CAMERA)
+        if name == "small":
+            px = px + np.array([[0.5, 0.4], [-0.4, 0.3], [0.4, -0.3], [-0.3, -0.4]])
+        detections.append(Detection(name, px, 0.02, True))  # type: ignore[arg-type]
+    flat, curling = (
+        estimate_pose(detections, 0.0, None, setup_of(size_sigma=0.0, curl_per_m=c))
+        for c in (0.0, 0.03)
+    )
+    assert flat is not None
+    assert curling is not None
+    assert flat.chi2 > 10.0
+    assert np.allclose(flat.e_m, curling.e_m, atol=1e-9)
+
+
 @pytest.mark.parametrize(("scale", "most"), [(1.02, 16.0), (1.005, 4.0)])
 def test_a_wrong_size_is_within_its_claim(scale: float, most: float) -> None:
     """Squared errors in units of the claim: of 2 %, four standard deviations, at most 16 over

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import Array
-from perchctl.vision import Detection, project, square_corners
-from perchctl.vision.lens import undistort_px
+from perchctl.vision import Detection, project, square_corners, undistort_px
 from perchctl.vision.pose import (
     Points,
     PoseCandidate,
@@ -28,12 +27,7 @@ def points(noise_px: float = 0.0) -> Points:
     corners = project(square_corners(0.15), TRUE.rvec, TRUE.tvec, CAMERA)
     corners = corners + np.random.default_rng(0).normal(0.0, 1.0, (4, 2)) * noise_px
     detection = Detection("large", corners, 0.05, False)
-    return points_of(detection)
-
-
-def points_of(detection: Detection) -> Points:
-    seen = undistort_px(detection.corners_px, CAMERA)
-    return make_points([detection], square_corners(0.15), seen, CAMERA.K, np.zeros(8))
+    return make_points([detection], square_corners(0.15), undistort_px(corners, CAMERA), CAMERA.K)
 
 
 def normal(candidate: PoseCandidate) -> Array:
@@ -78,5 +72,5 @@ def test_corners_with_a_covariance_of_their_own_count_as_it_says() -> None:
     half = np.random.default_rng(1).normal(0.0, 0.1, (8, 8))
     cov_px2 = half @ half.T + 0.01 * np.eye(8)
     detection = Detection("large", corners, 0.05, True, cov_px2=cov_px2)
-    made = points_of(detection)
+    made = make_points([detection], square_corners(0.15), undistort_px(corners, CAMERA), CAMERA.K)
     assert np.allclose(made.whitening @ cov_px2 @ made.whitening.T, np.eye(8), atol=1e-9)

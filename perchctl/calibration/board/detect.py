@@ -13,7 +13,7 @@ from perchctl.calibration.board.tags import find_tags
 from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.target import TAG_BORDER_CELLS, Board, tag_cells
-from perchctl.vision import fields_of
+from perchctl.vision import field_picture, is_combed
 
 MIN_CORNERS = 6
 """Fewer give a pose, but nothing about the lens."""
@@ -77,8 +77,9 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     Of an interlaced picture, whose fields show a moving board in two places, the view is the
     mean of both fields' corners: where the board was half way between them.
     """
-    views = [_whole(each, board, name) for each in fields_of(image)]
-    return views[0] if len(views) == 1 else _half_way(*views)
+    if is_combed(image):
+        return _half_way(*(_whole(field_picture(image, row), board, name) for row in (0, 1)))
+    return _whole(image, board, name)
 
 
 def _half_way(a: BoardView | str, b: BoardView | str) -> BoardView | str:

@@ -14,6 +14,7 @@ from perchctl.profile import Profile
 from perchctl.vision import (
     MARKERS,
     CameraModel,
+    FieldState,
     Frame,
     MarkerPose,
     PipelineOutput,
@@ -39,6 +40,7 @@ class Eye:
         self._pipeline = make_pipeline(bare, camera)
         self._live = live
         self._state = PipelineState()
+        self._fields = FieldState()
         self._health = HealthState()
         self.mirrored = 0
         self.outlines: tuple[tuple[str, Array], ...] = ()
@@ -54,7 +56,7 @@ class Eye:
             self.trouble = judged.text
             if judged.kind in ("frozen", "snow"):
                 return []
-        self._state, found = pictures(self._state, frame, self._pipeline)
+        self._fields, found = pictures(self._fields, frame, self._pipeline)
         seen = []
         for picture in found:
             self._state, output = step(self._state, picture, None, self._pipeline)

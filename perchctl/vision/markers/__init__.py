@@ -2,12 +2,12 @@
 
 In the order of the imports, each module needing only those before it:
 
-corners          a marker's square and its corners
-pattern          how a marker looks: its cells, its drawing, and the edges of that
+corners          a marker's square, its corners, and by how much white has grown over black
+pattern          how a marker looks, its drawing, and whether the picture shows its cells
 detector         dictionaries, patterns and the mask of the vehicle's gear, made once
-cells            whether the picture shows a marker's cells
-edge_fit         a marker's square by its edges, whole or what is seen of them
 photometric_fit  a marker's drawing laid over the picture, with its light and blur
+edge_fit         the edges of markers' sides, and corners from the lines through them
+partial          markers of which a part is hidden
 cut              the target where the picture cuts both of its markers
 blurred          markers that blur hides
 search           markers anywhere

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.cells import resemblance, resemblances
 from perchctl.vision.markers.corners import (
     RefinedCorners,
     doubled_area,
@@ -28,7 +27,7 @@ from perchctl.vision.markers.corners import (
 )
 from perchctl.vision.markers.detector import DetectorSetup, loose_detector
 from perchctl.vision.markers.edge_fit import CLIPPED_GREY, CLIPPED_SHARE, CLIPPED_SIGMA_PX
-from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern
+from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, resemblance, resemblances
 from perchctl.vision.markers.photometric_fit import Alignment, align
 from perchctl.vision.types import MARKERS, CameraModel, MarkerName
 
@@ -173,9 +172,6 @@ def _template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np.float3
 # --- A marker measured by its drawing, and taken only if the picture looks like it beyond doubt
 
 
-ACROSS_PX = 0.37
-"""Sigma. Edges have a pixel's own width and that of reading it in their blur, the drawing has not:
-0.81 px where it settles at 0.72, of far markers in flight."""
 _MIN_SIGMA_PX = 0.015
 _BLUR_SIGMA = 0.012  # of the blur: no picture is its drawing with an even blur
 _MIN_PATTERN, _MIN_LIKENESS = 0.9, 0.9
@@ -216,18 +212,10 @@ def aligned(
         or not _same_square(start_px, found.corners_px)
     ):
         return None
-    floor_px = math.hypot(_MIN_SIGMA_PX, _BLUR_SIGMA * found.blur_px)
+    sigma_px = math.hypot(max(found.sigma_px, _MIN_SIGMA_PX), _BLUR_SIGMA * found.blur_px)
     if _is_clipped(image, found.corners_px):
-        floor_px = math.hypot(floor_px, CLIPPED_SIGMA_PX)
-    sigma_px = math.hypot(found.sigma_px, floor_px)
-    blur_px = math.hypot(found.blur_px, ACROSS_PX)
-    return RefinedCorners(
-        found.corners_px,
-        sigma_px,
-        refined=True,
-        blur_px=(blur_px, blur_px),
-        cov_px2=found.cov_px2 + floor_px**2 * np.eye(8),
-    )
+        sigma_px = math.hypot(sigma_px, CLIPPED_SIGMA_PX)
+    return RefinedCorners(found.corners_px, sigma_px, True)
 
 
 def _is_clipped(image: NDArray[np.uint8], corners_px: Array) -> bool:

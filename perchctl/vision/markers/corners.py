@@ -1,5 +1,5 @@
 """A marker's square in the picture: its sides, its area, and the squares that share its centre;
-and its corners as they were measured.
+its corners as they were refined; and by how much white has grown over black.
 
 The unit square is a marker in its own coordinates: corners at (-1, -1), (1, -1), (1, 1),
 (-1, 1) in the order of `Detection.corners_px`.
@@ -17,12 +17,16 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision.lens import distort, undistort
-from perchctl.vision.types import CameraModel, MarkerName
+from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 UNIT: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 NEXT, BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])  # corner i's neighbours
 _UNIT32 = UNIT.astype(np.float32)
 _UNIT1: Array = np.column_stack([UNIT, np.ones(4)])
+_INCREMENTS: Array = np.array(
+    [[[u, v, 1, 0, 0, 0, -u * u, -u * v], [0, 0, 0, u, v, 1, -u * v, -v * v]] for u, v in UNIT]
+)
+"""Of each corner, how far an increment's terms move it in the marker's own coordinates."""
 
 
 def from_unit(corners: Array) -> Array:
@@ -39,29 +43,17 @@ def to_unit(corners: Array) -> Array:
 
 def mapped(H: Array, points: Array) -> Array:
     """Points (..., 2) through a homography."""
-    if points.size == 0:
-        return points
     images = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H)
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
 
-def corner_jacobian(H: Array, half: float = 1.0) -> Array:
-    """Change (8, 8) of the four corners that H (3, 3) makes of the square of that half side with
-    the terms of an increment P, H (1 + P): its rows one after the other, without the last term."""
-    q = (_UNIT1 * (half, half, 1.0)).dot(H.T)
+def corner_jacobian(H: Array) -> Array:
+    """Change (8, 8) of the four corners that H (3, 3) makes of the unit square with the terms of
+    an increment P, H (1 + P): its rows one after the other, without the last term."""
+    q = _UNIT1.dot(H.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (H[:2, :2] - x[:, :, None] * H[2, :2]) / d
-    return np.asarray((A @ increments(half * UNIT)).reshape(8, 8))
-
-
-def increments(points: Array) -> Array:
-    """Of points (n, 2) in a marker's own coordinates, how far the terms of an increment move
-    them, (n, 2, 8)."""
-    u, v = points[:, 0], points[:, 1]
-    one, nothing = np.ones_like(u), np.zeros_like(u)
-    x = [u, v, one, nothing, nothing, nothing, -u * u, -u * v]
-    y = [nothing, nothing, nothing, u, v, one, -u * v, -v * v]
-    return np.stack([x, y]).transpose(2, 0, 1)
+    return np.asarray((A @ _INCREMENTS).reshape(8, 8))
 
 
 def side_lengths_px(corners_px: Array) -> Array:
@@ -119,7 +111,7 @@ def completed(
 
 
 # --- A marker's corners as they were refined, and each by its own neighbourhood ----------------
-# That is the way where no edges can be fitted (`perchctl.vision.markers.edge_fit`): such a
+# That is the way where no lines can be fitted (`perchctl.vision.markers.edge_fit`): such a
 # corner is pulled inwards (0.15 to 0.55 px), which makes the target look far.
 
 
@@ -130,24 +122,21 @@ NESTED_SIGMA_PX = 0.6  # a place taken over from the other marker measures nothi
 
 @dataclass(frozen=True, eq=False)
 class RefinedCorners:
-    """A marker's corners as they were measured.
-
-    Attributes:
-        corners_px: (4, 2).
-        sigma_px: their spread.
-        refined: the edges or the drawing were fitted.
-        blur_px: of the edges, in the softer and in the sharper direction; None: not measured.
-        cov_px2: covariance (8, 8) in pixels of a pinhole, x and y of each corner by turns; None
-            where all spread by `sigma_px`.
-        whole: all of the marker was seen.
-    """
+    """corners_px (4, 2), their spread, whether lines or the drawing were fitted, the spread
+    of a shift that is common to all sides (outwards), the edges' blur, in px, the shift
+    that was taken out, where the corners follow from a part of the drawing their covariance
+    (8, 8) in pixels of a pinhole, x and y of each corner by turns, the spread by rows that
+    shake along themselves, and the blur of the sharpest side."""
 
     corners_px: Array
     sigma_px: float
     refined: bool
-    blur_px: tuple[float, float] | None = None
+    shift_sigma_px: float = 0.0
+    blur_px: float = 0.0
+    edge_shift: EdgeShift | None = None
     cov_px2: Array | None = None
-    whole: bool = True
+    row_sigma_px: float = 0.0
+    least_blur_px: float = math.inf
 
 
 def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
@@ -163,3 +152,92 @@ def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedC
     if not np.isfinite(moved_px) or moved_px > half + 1.0:
         return RefinedCorners(raw_px, RAW_SIGMA_PX, False)
     return RefinedCorners(moved, SUBPIX_SIGMA_PX, False)
+
+
+# --- By how much white has grown over black in a picture: from the width of a border -----------
+
+
+_SHIFT_FLOOR_PX = 0.01
+_MAX_SHIFT_PX = 1.0
+_MAX_BLUR_CELLS = 0.45  # beyond it the two edges of a border are one
+_MIN_PROFILES = 3.0  # in total weight, of a side that counts
+_PICTURES = 5  # for which a measured shift holds
+_OUT: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])  # of each side
+
+
+@dataclass(frozen=True, eq=False)
+class Border:
+    """A marker's border as it was measured, one cell wide.
+
+    corners (4, 2): of its outer edge as fitted, normalised. points (4, n, 2) and weight
+    (4, n): of its inner edge. blur_px, depth_px (4,): of the inner edge, and the border's
+    width. cells: along a side; cell_px: their mean width. tolerance: of a printed edge's
+    place, in cells. bow_px: how far the outer edge's ends lie further out than its middle.
+    """
+
+    corners: Array
+    points: Array
+    weight: Array
+    blur_px: Array
+    depth_px: Array
+    cells: int
+    cell_px: float
+    tolerance: float
+    bow_px: float = 0.0
+
+
+def edge_shift(border: Border, prior_px: float) -> EdgeShift:
+    """How far white has grown over black; `prior_px` is how far edges are shifted before
+    anything is measured.
+
+    Outer edges that moved in by d shrink the marker's own scale; the inner edges, at
+    the part r of it, moved out by d: they appear d (1 + r) too far out.
+    """
+    r = 1.0 - 2.0 / border.cells
+    own = mapped(to_unit(border.corners), border.points)
+    far = np.matmul(own, _OUT[:, :, None])[..., 0] - r
+    far_px = far * (border.depth_px / (1.0 - r * r))[:, None]
+    w = border.weight * (border.blur_px < _MAX_BLUR_CELLS * border.depth_px)[:, None]
+    w *= np.abs(far_px) < _MAX_SHIFT_PX
+    mass = w.sum(axis=1)
+    some = mass > _MIN_PROFILES
+    if not some.any():
+        return EdgeShift(0.0, prior_px)
+    # A sheet that curls, or a lens that is known badly, moves places by the square of their way
+    # from the centre: outer edges farther than inner ones, and their ends farther than middles.
+    bent_px = 8.0 * r / (3.0 * border.cells) * border.bow_px
+    shift, variance = _mean_of_sides(far_px + bent_px, w, mass, some, bent_px)
+    # What no averaging takes away: the neighbours' blur and the print.
+    variance += (2.0 * math.exp(-border.cell_px / 2.2)) ** 2 + (
+        border.tolerance * border.cell_px
+    ) ** 2
+    prior = prior_px**2
+    return EdgeShift(
+        shift_px=shift * prior / (prior + variance),
+        sigma_px=(1.0 / variance + 1.0 / prior) ** -0.5,
+    )
+
+
+def known_from(earlier: EdgeShift | None) -> EdgeShift | None:
+    """What an earlier picture's shift still gives a picture later, None once it is too old:
+    light, lens and ink change slowly."""
+    if earlier is None or earlier.age + 1 >= _PICTURES:
+        return None
+    return EdgeShift(earlier.shift_px, earlier.sigma_px, earlier.age + 1)
+
+
+def _mean_of_sides(
+    far_px: Array, w: Array, mass: Array, some: NDArray[np.bool_], each_px: float
+) -> tuple[float, float]:
+    """Mean over the sides that count and its variance, px and px^2; `each_px` is by how much
+    one may be off beside its noise."""
+    share = w / np.maximum(mass, 1e-9)[:, None]
+    mean = (share * far_px).sum(axis=1)
+    scatter = (share * (far_px - mean[:, None]) ** 2).sum(axis=1)
+    least = _SHIFT_FLOOR_PX**2 + each_px**2
+    information = some / (2.0 * scatter / np.maximum(mass, 1.0) + least)
+    total = float(information.sum())
+    shift = float(information @ mean) / total
+    # Sides that disagree are worth less.
+    chi2 = float(information @ (mean - shift) ** 2) / max(int(np.count_nonzero(some)) - 1, 1)
+    return shift, max(chi2, 1.0) / total

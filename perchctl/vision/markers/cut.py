@@ -1,48 +1,52 @@
 """The target so near, or so far aside, that no marker is wholly in the picture.
 
-What is left of the drawing of both markers is fitted from where the target is expected, and one
-marker's corners follow, of which some are outside of the picture: with the covariance of what was
-seen, since some directions may be hardly known. What the edges do not show of the tilt is taken
-from the prediction, with that one's spread. A part of a drawing looks like many things. So it is
-never a first sight of the target, and it counts only if nearly all edges and cells that should be
-in view are.
-
-Lengths are in units of the large marker's half side.
+What is left of the drawing is aligned from where the target is expected, and one marker's
+corners follow, of which some are outside of the picture: with the covariance of what was seen,
+since some directions may be hardly known. A part of a drawing looks like many things. So it is
+never a first sight of the target, and it counts only if the picture looks like the drawing all
+over and nearly all edges that should be in view are.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.geometry import Array, finite
+from perchctl.geometry import Array
 from perchctl.vision.lens import distort, undistort
-from perchctl.vision.markers.cells import visible_cells
-from perchctl.vision.markers.corners import UNIT, RefinedCorners, increments, mapped, within
+from perchctl.vision.markers.corners import UNIT, RefinedCorners, mapped, within
 from perchctl.vision.markers.detector import Covered, hides
-from perchctl.vision.markers.edge_fit import EdgeFit, corners_of, fit_edges, foreseen
-from perchctl.vision.markers.pattern import Pattern, outline_of_both
+from perchctl.vision.markers.edge_fit import MIDDLES, sample
+from perchctl.vision.markers.pattern import Drawing, Pattern, drawn
+from perchctl.vision.markers.photometric_fit import likeness, make_grid
 from perchctl.vision.types import CameraModel, Detections, MarkerName
 
 MOST_AGE_S = 0.5
 """Since the target was last measured; after that what shows a part of it is no evidence."""
 _EDGE_PX = 40  # from the picture's edge, where a marker may just have been cut
 _LEAST_CELL_PX = 8.0  # of the small marker; smaller, and the large one is in view
-_OFF_PX = 60.0  # by which the prediction may be off: an ascent moves the picture by many pixels
+_MIN_GLANCE = 0.6  # correlation where the prediction was moved to
+_GOOD_GLANCE = 0.95  # then no other size is tried
+_GROWTHS = (1.0, 0.94, 1.06)
+_MIN_LIKENESS, _MIN_GAIN = 0.9, 20.0
 _MIN_SHOWN = 0.75  # of the places in view
 _MOST_RESIDUAL_PX = 1.2
 _MOST_SPREAD = 0.04  # of the centre, in half sides
-_SMALL_PLACES = 12  # that make it the small marker that was seen
-_LEAST_CELLS, _MOST_WRONG = 6, 0.1  # of the cells in view
-_INVERTED = 1e-3  # normalised; the lens model holds where its inverse is one
 _FLOOR_PX = 0.02
-_TILT_RAD, _TURN_RAD, _PLACE = math.radians(2.0), math.radians(20.0), 1.0  # of a prediction
-_SIGMA: Array = np.array([_TILT_RAD, _TILT_RAD, _TURN_RAD, _PLACE, _PLACE, _PLACE])
-_NOT_RIGID = 1e-3  # of an increment: what no turn and no move explains, the lens's errors
+_SMALL_PLACES = 12  # that make it the small marker that was seen
+_INVERTED = 1e-3  # normalised; the lens model holds where its inverse is one
+
+
+def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
+    """Makes what `cut_markers` keeps of a target and a camera before it is in a hurry."""
+    drawing = patterns["large"].drawing
+    outline_of(drawing), texture_of(drawing), lattice_of(camera)
 
 
 def is_cut(
@@ -92,75 +96,93 @@ def cut_markers(
     vehicle's own gear covers the picture.
     """
     drawing = patterns["large"].drawing
-    start = _start(expected, drawing.ratio, camera)
-    if start is None or drawing.centre is None:
+    ratio, centre = drawing.ratio, drawing.centre
+    start = _start(expected, ratio, camera)
+    if start is None or centre is None:
         return {}
-    if 2.0 * drawing.ratio / len(drawing.centre) * camera.K[0, 0] / start[2, 2] < _LEAST_CELL_PX:
+    if 2.0 * ratio / len(centre) * camera.K[0, 0] / start.t[2] < _LEAST_CELL_PX:
         return {}
-    found = fit_edges(
-        image, start, outline_of_both(drawing), camera, hidden, _rigid_prior(start), _OFF_PX
-    )
+    covered = None if hidden is None else hidden.astype(np.uint8)
+    view = overview_of(image, camera, covered)
+    outline, texture = outline_of(drawing), texture_of(drawing)
+    near = _moved_near(start, texture, view)
+    if near is None:
+        return {}
+    found = fitted(image, near, outline, _print_sigma(patterns), camera, covered)
     if found is None or not _trusted(found):
         return {}
-    if not _cells_agree(image, found.H, patterns, camera, hidden):
+    like, gain = looks_like(found.pose.H, texture, view)
+    if like < _MIN_LIKENESS or gain < _MIN_GAIN:
         return {}
-    return _stands_for(found, patterns, camera)
+    name = _stands_for(found)
+    corners = _corners(found, ratio if name == "small" else 1.0, camera)
+    return {} if corners is None else {name: corners}
 
 
 def shows_enough_of_target(
-    H: Array, patterns: Mapping[MarkerName, Pattern], camera: CameraModel
+    pose: RigidPose, patterns: Mapping[MarkerName, Pattern], camera: CameraModel
 ) -> bool:
-    """Whether what a picture shows of a target that is seen through H (3, 3), from the large
-    marker's own coordinates to normalised ones, is enough to measure it."""
-    outline = outline_of_both(patterns["large"].drawing)
-    found = foreseen(H, outline, camera, _rigid_prior(H))
-    return found is not None and _trusted(found) and bool(_stands_for(found, patterns, camera))
+    """Whether what a picture taken in that pose shows of the target is enough to measure it."""
+    drawing = patterns["large"].drawing
+    found = foreseen(pose, outline_of(drawing), _print_sigma(patterns), camera)
+    if found is None or not _trusted(found):
+        return False
+    half = drawing.ratio if _stands_for(found) == "small" else 1.0
+    return _corners(found, half, camera) is not None
 
 
-def _start(expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel) -> Array | None:
-    """The homography (3, 3) of a rigid target that goes with expected corners. The small marker's
-    are nearer to the picture, where the lens is known; its own are preferred."""
+def _print_sigma(patterns: Mapping[MarkerName, Pattern]) -> Array:
+    """By how much the line at each place of the outline may be printed off its place (n,)."""
+    outline = outline_of(patterns["large"].drawing)
+    small, large = (patterns[name].rim.tolerance for name in ("small", "large"))
+    return np.where(outline.small, small, large) * outline.cell
+
+
+def _stands_for(found: Visible) -> MarkerName:
+    return "small" if found.small >= _SMALL_PLACES else "large"
+
+
+def _start(
+    expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
+) -> RigidPose | None:
+    """The pose that goes with expected corners. The small marker's are nearer to the picture,
+    where the lens is known; its own are preferred."""
     name: MarkerName = "small" if "small" in expected else "large"
     rays = undistort(expected[name], camera)
-    if not finite(rays):
+    if not np.isfinite(rays).all():
         return None
     half = ratio if name == "small" else 1.0
     H = cv2.getPerspectiveTransform((half * UNIT).astype(np.float32), rays.astype(np.float32))
+    if not np.isfinite(H).all():
+        return None
     scale = 0.5 * float(np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
-    if not np.isfinite(H).all() or scale < 1e-9:
+    if scale < 1e-9:
         return None
     H = np.asarray(H, dtype=np.float64) / math.copysign(scale, H[2, 2])
     if H[2, 2] <= 0.0:
         return None
     U, _, V = np.linalg.svd(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]))
-    R = U @ V
-    return np.column_stack([R[:, :2], H[:, 2]]) if np.linalg.det(R) > 0.0 else None
+    R = np.asarray(U @ V, dtype=np.float64)
+    return RigidPose(R, np.asarray(H[:, 2])) if np.linalg.det(R) > 0.0 else None
 
 
-def _rigid_prior(H: Array) -> Array:
-    """Information (8, 8) about the increment of a homography (3, 3) with the columns of a
-    rotation and a translation: that of a turn about the drawing's centre and a move."""
-    columns = [H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]
-    changes = []
-    for axis in np.eye(3):
-        changes.append(np.column_stack([np.cross(axis, columns[0]), np.cross(axis, columns[1]),
-                                        np.zeros(3)]))  # fmt: skip
-    for axis in np.eye(3):
-        changes.append(np.column_stack([np.zeros((3, 2)), axis]))
-    inverse = np.linalg.inv(H)
-    J = np.empty((8, 6))
-    for k, change in enumerate(changes):
-        P = inverse @ change
-        # H (1 + P) has no scale: its last term is 0.
-        J[:, k] = (P - P[2, 2] * np.eye(3)).ravel()[:8]
-    cov = (J * _SIGMA**2) @ J.T + _NOT_RIGID**2 * np.eye(8)
-    return np.asarray(np.linalg.inv(cov))
+def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose | None:
+    """The prediction moved to where the picture goes best with the drawing, None if it does
+    nowhere near."""
+    best, pose = _MIN_GLANCE, None
+    for growth in _GROWTHS:
+        t = start.t * (1.0, 1.0, 1.0 / growth)
+        drift, glance = drift_of(RigidPose(start.R, t).H, texture, view)
+        if glance > best:
+            best, pose = glance, RigidPose(start.R, t + np.append(drift * t[2], 0.0))
+        if best > _GOOD_GLANCE:
+            break
+    return pose
 
 
-def _trusted(found: EdgeFit) -> bool:
+def _trusted(found: Visible) -> bool:
     """Whether nearly all edges in view are there, and tell enough of where the target is."""
-    J = increments(np.zeros((1, 2)))[0]
-    spread = math.sqrt(max(float(np.linalg.eigvalsh(J @ found.cov @ J.T)[-1]), 0.0))
+    spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
     return (
         found.shown >= _MIN_SHOWN * found.in_view
         and found.residual_px < _MOST_RESIDUAL_PX
@@ -168,33 +190,539 @@ def _trusted(found: EdgeFit) -> bool:
     )
 
 
-def _cells_agree(
+def _corners(found: Visible, half: float, camera: CameraModel) -> RefinedCorners | None:
+    """Of the marker of that half side; None where the lens model does not reach as far."""
+    found_at = corners_of(found.pose, half, camera)
+    if found_at is None:
+        return None
+    x, J = found_at
+    corners_px = distort(x, camera)
+    if not np.abs(undistort(corners_px, camera) - x).max() < _INVERTED:
+        return None
+    cov_px2 = J @ found.cov @ J.T + _FLOOR_PX**2 * np.eye(8)
+    sigma_px = math.sqrt(float(np.trace(cov_px2)) / 8.0)
+    return RefinedCorners(corners_px, sigma_px, True, cov_px2=cov_px2)
+
+
+# --- A picture at a glance: small, through a pinhole, beside what a drawing would look like there
+# It tells how far a prediction is off, and whether the picture looks like the drawing, where
+# too little of a marker is in view for its corners.
+
+
+Grey = NDArray[np.float32]
+
+_NODES = 80  # across the picture, about
+_FINE = 2  # samples for a node, in both directions
+_WIDEST = 1.5  # normalised: 56 degrees off the axis
+_RIM_POINTS = 40
+_REACHED = 1.02
+_SEARCHED = 6  # nodes to each side
+_LEAST_NODES = 200  # that show paper
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Nodes of a pinhole's picture, `step` apart in normalised coordinates, the first at
+    `first`; how far from the axis the picture `reaches`, beyond which a lens model may fold
+    back; where the samples that make up a node are read in the reduced picture, which has
+    `size` (width, height); and the nodes that are in the picture (rows, columns)."""
+
+    first: Array
+    step: float
+    reach: float
+    x: Grey
+    y: Grey
+    size: tuple[int, int]
+    inside: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Overview:
+    """Grey values at a lattice's nodes (rows, columns), and which of them are the picture's and
+    not covered."""
+
+    lattice: Lattice
+    grey: Grey
+    seen: NDArray[np.bool_]
+
+
+@lru_cache(maxsize=8)
+def lattice_of(camera: CameraModel) -> Lattice:
+    w, h = camera.size_px
+    s = np.linspace(0.0, 1.0, _RIM_POINTS)
+    low, high = np.zeros_like(s), np.ones_like(s)
+    rim = np.concatenate([np.stack(p, 1) for p in ((s, low), (s, high), (low, s), (high, s))])
+    rays = undistort(rim * (w - 1.0, h - 1.0), camera)
+    rays = np.clip(np.nan_to_num(rays, nan=0.0), -_WIDEST, _WIDEST)
+    reach = _REACHED * float(np.hypot(*rays.T).max())
+    step = w / (_NODES * float(camera.K[0, 0]))
+    nodes = np.maximum(np.ceil(np.ptp(rays, axis=0) / step).astype(int), 1)
+    fine = [rays.min(axis=0)[k] + step * ((np.arange(_FINE * nodes[k]) + 0.5) / _FINE)
+            for k in (0, 1)]  # fmt: skip
+    x, y = np.meshgrid(*fine)
+    at = distort(np.stack([x.ravel(), y.ravel()], axis=1), camera)
+    inside = np.isfinite(at).all(axis=1) & (np.hypot(x, y).ravel() < reach)
+    inside &= (at > 0.0).all(axis=1) & (at < (w - 1, h - 1)).all(axis=1)
+    at = np.where(inside[:, None], at, -1e3)
+    every = max(round(w / (_FINE * _NODES)), 1)
+    size = (max(w // every, 1), max(h // every, 1))
+    reduced = ((at + 0.5) * (size[0] / w, size[1] / h) - 0.5).astype(np.float32)
+    shape = (int(nodes[1]), _FINE, int(nodes[0]), _FINE)
+    flat = x.shape
+    return Lattice(
+        first=rays.min(axis=0) + step / 2.0,
+        step=step,
+        reach=reach,
+        x=np.ascontiguousarray(reduced[:, 0].reshape(flat)),
+        y=np.ascontiguousarray(reduced[:, 1].reshape(flat)),
+        size=size,
+        inside=inside.reshape(shape).all(axis=(1, 3)),
+    )
+
+
+def overview_of(
+    image: NDArray[np.uint8], camera: CameraModel, mask: NDArray[np.uint8] | None = None
+) -> Overview:
+    """Of a picture; what `mask` (its shape, 0: free) covers is not seen."""
+    lattice = lattice_of(camera)
+    seen = lattice.inside
+    if mask is not None:
+        covered = (mask != 0).astype(np.float32)
+        seen = seen & (_looked_up(covered, lattice) < 1e-3)
+    return Overview(lattice, _looked_up(image, lattice), seen)
+
+
+def _looked_up(picture: NDArray[np.uint8] | Grey, lattice: Lattice) -> Grey:
+    small = cv2.resize(picture, lattice.size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    fine = cv2.remap(small, lattice.x, lattice.y, cv2.INTER_LINEAR)
+    return _coarse(np.asarray(fine, np.float32))
+
+
+def _coarse(fine: Grey) -> Grey:
+    rows, columns = (n // _FINE for n in fine.shape)
+    return np.asarray(cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
+    """Whiteness of the drawing at the lattice's nodes and `margin` more all around; H (3, 3)
+    maps own coordinates to normalised ones."""
+    step = lattice.step / _FINE
+    start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
+    G = np.array([[1.0 / step, 0.0, -start[0] / step], [0.0, 1.0 / step, -start[1] / step],
+                  [0.0, 0.0, 1.0]])  # fmt: skip
+    M = G @ H @ np.linalg.inv(texture.T)
+    rows, columns = lattice.inside.shape
+    size = (_FINE * (columns + 2 * margin), _FINE * (rows + 2 * margin))
+    fine = cv2.warpPerspective(
+        texture.white,
+        M,
+        size,
+        flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=1.0,
+    )
+    return _coarse(np.asarray(fine, np.float32))
+
+
+def drift_of(H: Array, texture: Texture, view: Overview) -> tuple[Array, float]:
+    """How far the picture is from the drawing through H, (2,) normalised, to a node; and the
+    correlation there."""
+    lattice = view.lattice
+    wide = drawn_over(H, texture, lattice, _SEARCHED)
+    mask = view.seen.astype(np.float32)
+    score = cv2.matchTemplate(wide, view.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
+    score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
+    row, column = np.unravel_index(int(score.argmax()), score.shape)
+    drift = (_SEARCHED - np.array([column, row], dtype=np.float64)) * lattice.step
+    return drift, float(score[row, column])
+
+
+def looks_like(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
+    """Likeness of the picture with the drawing through H in its best light, where there is
+    paper; and that light's gain, grey levels from black to white."""
+    lattice = view.lattice
+    rows, columns = np.nonzero(view.seen)
+    at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
+    on = np.abs(mapped(np.asarray(np.linalg.inv(H), np.float64), at)).max(axis=1) < PAPER
+    if np.count_nonzero(on) < _LEAST_NODES:
+        return 0.0, 0.0
+    white = drawn_over(H, texture, lattice)[rows[on], columns[on]].astype(np.float64)
+    grey = view.grey[rows[on], columns[on]].astype(np.float64)
+    x, y = (at[on] - at[on].mean(axis=0)).T
+    A = np.stack([np.ones_like(x), x, y, white, white * x, white * y], axis=1)
+    light = np.linalg.solve(A.T @ A + 1e-6 * np.eye(6), A.T @ grey)
+    gain = float(light[3])
+    if not math.isfinite(gain):
+        return 0.0, 0.0
+    return likeness(grey, grey - A @ light), gain
+
+
+# --- The drawing of the whole target: its edges between black and white, and its picture -------
+# Both markers share a centre and a plane, so their cells make one drawing, in the large marker's
+# own coordinates (see `perchctl.vision.markers.corners`).
+
+
+PAPER = 1.25  # half sides of the large marker that are surely paper
+_LARGE_PLACES, _SMALL_CELL_PLACES = 24, 6  # along a cell's side
+_FROM_END = 0.15  # of a cell's side, where the next cell's corner blurs the edge
+_HIDDEN = 1.2  # half sides of the marker in the centre, within which the large one is not seen
+_TEXELS = 320
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """Places along the edges: at (n, 2); normal (n, 2) from black to white; the line that each
+    lies on (n,), since a line is printed as a whole; the width of the cells beside it (n,); and
+    whether it is the small marker's (n,)."""
+
+    at: Array
+    normal: Array
+    line: NDArray[np.intp]
+    cell: Array
+    small: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """How white the paper is, float32 (m, m), 0 to 1, and T (3, 3), which maps own coordinates
+    to its pixels."""
+
+    white: NDArray[np.float32]
+    T: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Edge:
+    """One cell's side, as of an `Outline`; `line` is a name."""
+
+    at: Array
+    normal: tuple[float, float]
+    line: tuple[float, int, int]
+    cell: float
+
+
+@lru_cache(maxsize=8)
+def outline_of(drawing: Drawing) -> Outline:
+    """Of a large marker with the small one in its centre."""
+    hidden = _HIDDEN * drawing.ratio
+    edges = [
+        edge
+        for edge in _edges(drawing.cells, 1.0, _LARGE_PLACES)
+        if np.abs(edge.at).max(axis=1).min() > hidden
+    ]
+    large = len(edges)
+    if drawing.centre is not None:
+        edges += _edges(drawing.centre, drawing.ratio, _SMALL_CELL_PLACES)
+    names = {edge.line: k for k, edge in enumerate(edges)}
+    places = np.array([len(edge.at) for edge in edges])
+    return Outline(
+        at=np.concatenate([edge.at for edge in edges]),
+        normal=np.repeat([edge.normal for edge in edges], places, axis=0),
+        line=np.repeat([names[edge.line] for edge in edges], places),
+        cell=np.repeat([edge.cell for edge in edges], places),
+        small=np.repeat(np.arange(len(edges)) >= large, places),
+    )
+
+
+@lru_cache(maxsize=8)
+def texture_of(drawing: Drawing) -> Texture:
+    """A picture of the drawing up to `PAPER`, beyond which it is white."""
+    axis = make_grid(_TEXELS, PAPER).axis
+    wide = drawn(drawing, axis, PAPER / _TEXELS)
+    more = (len(wide) - _TEXELS) // 2
+    scale = _TEXELS / (2.0 * PAPER)
+    first = PAPER * scale - 0.5 + more
+    T = np.array([[scale, 0.0, first], [0.0, scale, first], [0.0, 0.0, 1.0]])
+    return Texture(np.clip(wide, 0.0, 1.0), T)
+
+
+def _edges(cells: Array, half: float, places: int) -> Iterator[_Edge]:
+    """The sides at which a marker's cells (or the paper around it) differ."""
+    width = 2.0 * half / len(cells)
+    s = _FROM_END + (1.0 - 2.0 * _FROM_END) * (np.arange(places) + 0.5) / places
+    for across in (0, 1):
+        rows = cells if across == 0 else cells.T
+        padded = np.pad(rows, 1, constant_values=1.0)[1:-1]
+        step = padded[:, 1:] - padded[:, :-1]
+        for i, j in np.argwhere(step != 0.0).tolist():
+            at = np.empty((places, 2))
+            at[:, across] = width * j - half
+            at[:, 1 - across] = width * (i + s) - half
+            towards = float(np.sign(step[i, j]))
+            normal = (towards, 0.0) if across == 0 else (0.0, towards)
+            yield _Edge(at, normal, (half, across, j), width)
+
+
+# --- The target's pose from the edges that are in view, where its markers are cut by the picture
+# The drawing of both markers is laid over the picture: at
+# places along its edges the edge of the picture is looked for across them, and Gauss-Newton
+# turns and moves the drawing until both agree. Its unknowns are those of a rigid body, not those
+# of a homography: a part of a drawing does not show eight of them. What it does not show of the
+# tilt is taken from the prediction, with that one's spread.
+#
+# Lengths are in units of the large marker's half side.
+
+
+# Of the profiles, by rounds. An ascent blurs edges near the picture's rim by several pixels.
+_REACH_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
+_REACH_CELLS, _LEAST_REACH_PX = 0.4, 3.0
+_STILL_PX, _SETTLED_PX = 0.02, 0.5  # no other round follows; without this it is no fit
+_LEAST_CONTRAST, _LEAST_SHARE = 8.0, 0.35  # grey levels; of the median
+_LEAST_PLACES = 24
+_TUKEY, _LEAST_SCALE_PX = 3.5, 0.15
+_TAILS = 1.3  # what robust weights take away from a residual's square
+_LENS_PX = 0.02  # by which a whole line may be off, of lens and light
+_TILT_RAD, _TURN_RAD, _PLACE = math.radians(2.0), math.radians(20.0), 1.0  # of a prediction
+_SHIFT_PX = 0.15  # by which white may have grown over black
+_PRIOR: Array = np.array([_TILT_RAD, _TILT_RAD, _TURN_RAD, _PLACE, _PLACE, _PLACE]) ** -2.0
+
+
+@dataclass(frozen=True, eq=False)
+class RigidPose:
+    """R (3, 3) and t (3,) of the drawing in the camera."""
+
+    R: Array
+    t: Array
+
+    @property
+    def H(self) -> Array:
+        """Own coordinates to normalised ones, (3, 3)."""
+        return np.column_stack([self.R[:, 0], self.R[:, 1], self.t])
+
+
+@dataclass(frozen=True, eq=False)
+class Visible:
+    """A pose with its covariance (6, 6) of turn and move; how many places along edges were in
+    view, how many showed their edge, how many of these are the small marker's; and the spread
+    of a single place."""
+
+    pose: RigidPose
+    cov: Array
+    in_view: int
+    shown: int
+    small: int
+    residual_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Of an outline, in the picture: at (n, 2) px and unit normal (n, 2) from black to white,
+    changes J (n, 6) along it with turn and move, px for a unit across (n,), and which of the
+    outline's they are (n,)."""
+
+    at: Array
+    normal: Array
+    J: Array
+    px: Array
+    index: NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """The step of all unknowns (7,), the inverse of their normal matrix, the places' weights
+    (n,) and changes J (n, 7), and the variance of one place, px^2."""
+
+    step: Array
+    inverse: Array
+    weight: Array
+    J: Array
+    variance: float
+
+
+def fitted(
     image: NDArray[np.uint8],
-    H: Array,
-    patterns: Mapping[MarkerName, Pattern],
+    start: RigidPose,
+    outline: Outline,
+    print_sigma: Array,
     camera: CameraModel,
-    hidden: Covered | None,
-) -> bool:
-    """Whether the cells of both markers that are in view have their colours."""
-    ratio = patterns["large"].drawing.ratio
-    markers = [(H, patterns["large"]), (H @ np.diag([ratio, ratio, 1.0]), patterns["small"])]
-    cells = visible_cells(image, markers, camera, hidden)
-    if cells is None:
-        return False
-    known, wrong = np.count_nonzero(cells.known), np.count_nonzero(cells.wrong)
-    return bool(known >= _LEAST_CELLS and wrong <= _MOST_WRONG * known)
+    mask: NDArray[np.uint8] | None = None,
+) -> Visible | None:
+    """The pose in which the outline's edges are the picture's, from one a few pixels off.
+
+    `print_sigma` (n,) is by how much each place's line may be printed off its place. None
+    where too few edges are in view, or the fit breaks down.
+    """
+    pose, total, found, moved_px = start, np.zeros(6), None, math.inf
+    for reach_px in _REACH_PX:
+        places = _in_view(pose, outline, reach_px, image.shape, camera, mask)
+        if len(places.index) < _LEAST_PLACES:
+            return None
+        half_px = np.minimum(reach_px, _REACH_CELLS * outline.cell[places.index] * places.px)
+        offset_px, shows = _offsets(image, places, half_px)
+        if np.count_nonzero(shows) < _LEAST_PLACES:
+            return None
+        found = _solved(places, offset_px, shows, total)
+        if found is None:
+            return None
+        pose, total = _moved(pose, found.step[:6]), total + found.step[:6]
+        moved_px = float(np.abs(places.J @ found.step[:6]).max())
+        if moved_px < _STILL_PX:
+            break
+    if found is None or moved_px > _SETTLED_PX or pose.t[2] <= 0.0:
+        return None
+    return _visible(pose, found, places, outline, print_sigma)
 
 
-def _stands_for(
-    found: EdgeFit, patterns: Mapping[MarkerName, Pattern], camera: CameraModel
-) -> dict[MarkerName, RefinedCorners]:
-    """The marker whose edges were seen; none where the lens model does not reach as far."""
-    name: MarkerName = "small" if found.small >= _SMALL_PLACES else "large"
-    half = patterns["large"].drawing.ratio if name == "small" else 1.0
-    corners = corners_of(found, half, patterns[name], camera, whole=False)
-    if corners is None:
-        return {}
-    rays = mapped(found.H, half * UNIT)
-    if not np.abs(undistort(distort(rays, camera), camera) - rays).max() < _INVERTED:
-        return {}
-    return {name: corners}
+def foreseen(
+    pose: RigidPose, outline: Outline, print_sigma: Array, camera: CameraModel
+) -> Visible | None:
+    """What `fitted` would make of a picture without a flaw, taken in that pose."""
+    places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
+    n = len(places.index)
+    if n < _LEAST_PLACES:
+        return None
+    found = _solved(places, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(6))
+    return None if found is None else _visible(pose, found, places, outline, print_sigma)
+
+
+def _in_view(
+    pose: RigidPose,
+    outline: Outline,
+    reach_px: float,
+    shape: tuple[int, ...],
+    camera: CameraModel,
+    mask: NDArray[np.uint8] | None,
+) -> _Places:
+    """The places at which a whole profile is in the picture, and not covered."""
+    h, w = shape[:2]
+    X = np.column_stack([outline.at, np.zeros(len(outline.at))]) @ pose.R.T + pose.t
+    ahead = X[:, 2] > 0.05
+    x = X[:, :2] / np.where(ahead, X[:, 2], 1.0)[:, None]
+    near = np.flatnonzero(ahead & (np.hypot(*x.T) < lattice_of(camera).reach))
+    at = distort(x[near], camera)
+    room = reach_px + 1.0
+    inside = ((at >= room) & (at <= np.array([w - 1.0, h - 1.0]) - room)).all(axis=1)
+    near, at = near[inside], at[inside]
+    X, x = X[near], x[near]
+    # The lens's own change, (n, 2, 2), by small steps.
+    small = 1e-4
+    D = np.stack(
+        [(distort(x + step, camera) - at) / small for step in (np.array([small, 0.0]),
+                                                               np.array([0.0, small]))],
+        axis=2,
+    )  # fmt: skip
+    # A point's change with turn (about the drawing's centre) and move: dx / d(X), (n, 2, 3).
+    P = np.zeros((len(x), 2, 3))
+    P[:, 0, 0] = P[:, 1, 1] = 1.0 / X[:, 2]
+    P[:, :, 2] = -x / X[:, 2:]
+    A = D @ P
+    across = outline.normal[near]
+    along = np.stack([-across[:, 1], across[:, 0]], axis=1)
+    tangent = np.einsum("nij,nj->ni", A, along @ pose.R[:, :2].T)
+    towards = np.einsum("nij,nj->ni", A, across @ pose.R[:, :2].T)
+    normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
+    normal /= np.maximum(np.hypot(*normal.T), 1e-12)[:, None]
+    px = (normal * towards).sum(axis=1)
+    normal *= np.sign(px)[:, None]
+    move = np.einsum("ni,nij->nj", normal, A)
+    turn = np.cross(X - pose.t, move)  # (w x r) . m = w . (r x m)
+    free = np.ones(len(near), dtype=np.bool_)
+    if mask is not None:
+        for way in (-1.0, -0.5, 0.0, 0.5, 1.0):
+            x_px, y_px = np.rint(at + way * reach_px * normal).astype(np.intp).T
+            free &= mask[y_px, x_px] == 0
+    return _Places(
+        at=at[free],
+        normal=normal[free],
+        J=np.concatenate([turn, move], axis=1)[free],
+        px=np.abs(px)[free],
+        index=near[free],
+    )
+
+
+def _offsets(
+    image: NDArray[np.uint8], places: _Places, half_px: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """How far along its normal each place's edge is in the picture, (n,) px, and whether there
+    is one from dark to bright."""
+    half_px = np.maximum(half_px, _LEAST_REACH_PX)
+    grey = sample(image, places.at[:, None], places.normal[:, None], half_px)[:, 0]
+    gradient = np.diff(grey, axis=1).astype(np.float64)
+    u = half_px[:, None] * MIDDLES.astype(np.float64)
+    mass = gradient * np.exp(-0.5 * (u / (0.5 * half_px[:, None])) ** 2)
+    total = mass.sum(axis=1)
+    contrast = grey[:, -1].astype(np.float64) - grey[:, 0]
+    least = max(_LEAST_CONTRAST, _LEAST_SHARE * float(np.median(contrast)))
+    shows = (contrast > least) & (total > 0.25 * least)
+    offset_px = (mass * u).sum(axis=1) / np.where(shows, total, 1.0)
+    return np.clip(offset_px, -half_px, half_px), shows
+
+
+def _solved(
+    places: _Places, offset_px: Array, shows: NDArray[np.bool_], total: Array
+) -> _Round | None:
+    """A robust step of turn, move and the common shift of edges (white over black)."""
+    J = np.concatenate([places.J, -np.ones((len(offset_px), 1))], axis=1)
+    prior = np.append(_PRIOR, _SHIFT_PX**-2.0)
+    pull = np.append(-_PRIOR * total, 0.0)
+    weight = shows.astype(np.float64)
+    variance = 1.0
+    step = np.zeros(7)
+    for _ in range(4):
+        error = offset_px - J @ step
+        size = np.abs(error)
+        scale = max(1.4826 * float(np.median(size[shows])), _LEAST_SCALE_PX)
+        weight = np.maximum(1.0 - (size / (_TUKEY * scale)) ** 2, 0.0) ** 2 * shows
+        mass = float(weight.sum())
+        if mass < 0.5 * _LEAST_PLACES:
+            return None
+        variance = max(_TAILS * float(weight @ error**2) / mass, 1e-3)
+        N = (J * weight[:, None]).T @ J / variance + np.diag(prior)
+        try:
+            inverse = np.linalg.inv(N)
+        except np.linalg.LinAlgError:
+            return None
+        step = inverse @ (J.T @ (weight * offset_px) / variance + pull)
+        if not np.isfinite(step).all():
+            return None
+    return _Round(step, inverse, weight, J, variance)
+
+
+def _moved(pose: RigidPose, step: Array) -> RigidPose:
+    turn = np.asarray(cv2.Rodrigues(step[:3])[0], dtype=np.float64)
+    return RigidPose(turn @ pose.R, pose.t + step[3:])
+
+
+def _covariance(found: _Round, places: _Places, outline: Outline, print_sigma: Array) -> Array:
+    """Of turn and move (6, 6): of each place's own noise, of what moves a line as a whole, and
+    of the prediction."""
+    J, w, variance = found.J, found.weight, found.variance
+    line = outline.line[places.index]
+    common_px = np.hypot(print_sigma[places.index] * places.px, _LENS_PX)
+    by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
+    np.add.at(by_line, line, J * (w * common_px)[:, None])
+    middle = variance * (J * (w**2)[:, None]).T @ J + by_line.T @ by_line
+    prior = np.diag(np.append(_PRIOR, _SHIFT_PX**-2.0))
+    cov = found.inverse @ (middle / variance**2 + prior) @ found.inverse
+    return np.asarray(cov[:6, :6])
+
+
+def _visible(
+    pose: RigidPose, found: _Round, places: _Places, outline: Outline, print_sigma: Array
+) -> Visible:
+    shown = found.weight > 0.0
+    return Visible(
+        pose=pose,
+        cov=_covariance(found, places, outline, print_sigma),
+        in_view=len(shown),
+        shown=int(np.count_nonzero(shown)),
+        small=int(np.count_nonzero(shown & outline.small[places.index])),
+        residual_px=math.sqrt(found.variance),
+    )
+
+
+def corners_of(pose: RigidPose, half: float, camera: CameraModel) -> tuple[Array, Array] | None:
+    """Corners (4, 2) of the square of that half side, normalised, and their changes (8, 6) with
+    turn and move, pixels of a pinhole; None where one is beside or behind the camera."""
+    r = np.column_stack([half * UNIT, np.zeros(4)]) @ pose.R.T
+    X = r + pose.t
+    if X[:, 2].min() <= 0.0:
+        return None
+    x = X[:, :2] / X[:, 2:]
+    J = np.zeros((8, 6))
+    for k in range(4):
+        P = np.array([[1.0, 0.0, -x[k, 0]], [0.0, 1.0, -x[k, 1]]]) / X[k, 2]
+        P = camera.K[:2, :2] @ P
+        J[2 * k : 2 * k + 2, :3] = np.cross(r[k], P)
+        J[2 * k : 2 * k + 2, 3:] = P
+    return x, J

@@ -6,31 +6,32 @@
 4. where blur may hide them (`blurred`).
 
 A marker of which the picture's edge, light that glares, or the vehicle's own gear (`detector`)
-hides a part is measured by what is seen of it (`edge_fit`). Each step takes place within the same
+hides a part is measured by what is seen of it (`partial`). Each step takes place within the same
 frame, and only where the one before saw too little.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.values import replace
 from perchctl.vision.fields import halves, interpolated_sigma_px
-from perchctl.vision.markers.blurred import ACROSS_PX, aligned, expected_in_blur, hidden_in_blur
-from perchctl.vision.markers.cells import KnownBy, cells_agree, resembles
+from perchctl.vision.markers.blurred import aligned, expected_in_blur, hidden_in_blur
 from perchctl.vision.markers.corners import (
     NESTED_SIGMA_PX,
-    RAW_SIGMA_PX,
+    NEXT,
     RefinedCorners,
     completed,
+    doubled_area,
+    known_from,
     mean_side_px,
     nested,
-    refine_each,
     shortest_side_px,
     side_lengths_px,
     within,
@@ -43,8 +44,15 @@ from perchctl.vision.markers.cut import (
     measured_lately,
 )
 from perchctl.vision.markers.detector import Covered, DetectorSetup, filled, hidden_in, hides
-from perchctl.vision.markers.edge_fit import ROOM_PX, refine_by_edges
-from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern
+from perchctl.vision.markers.edge_fit import refine, refine_lines
+from perchctl.vision.markers.partial import ROOM_PX, KnownBy, seen_partly, wholly_seen
+from perchctl.vision.markers.pattern import (
+    LEAST_SIDE_PX,
+    Pattern,
+    cells_agree,
+    cells_mostly_agree,
+    resembles,
+)
 from perchctl.vision.markers.search import Found, Look, search, search_halved
 from perchctl.vision.target_selection import TargetSelector
 from perchctl.vision.types import (
@@ -52,6 +60,7 @@ from perchctl.vision.types import (
     CameraModel,
     Detection,
     Detections,
+    EdgeShift,
     Frame,
     MarkerName,
     PictureKind,
@@ -77,8 +86,8 @@ def detect_markers(
     predictions of the corners (4, 2) px, from the target's pose and the vehicle's motion.
     `empty_frames` is how many frames in a row have shown nothing: in a stream the searches take
     turns by it, since all of them in one frame take longer than a frame may. None searches by
-    all. `own` chooses among several targets where none is expected. Of a frame of two fields
-    whose order is not known the top one is taken.
+    all. `own` chooses among several targets where none is expected. In a frame of two fields each
+    is looked at, and the result is the mean: where the markers were at the frame's own time.
     """
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     look = _look(empty_frames, bool(expected), setup)
@@ -87,14 +96,20 @@ def detect_markers(
     )
     lately = measured_lately(previous, frame.t_s)
     was_cut = setup.cut and cut_lately(previous, frame.t_s, frame.image.shape)
-    picture = halves(frame)[0] if frame.fields == "woven" else frame
-    hidden = hidden_in(picture, setup.mask)
-    if hidden is not None:
-        picture = replace(picture, image=filled(picture.image, hidden), encoded=None)
-    found = _search_picture(
-        picture, hidden, expected, setup, camera, look, lately, was_cut, turn, own
-    )
-    return with_motion(found, previous)
+    shift = known_from(None if previous is None else previous.edge_shift)
+
+    def looked(picture: Frame) -> Detections:
+        hidden = hidden_in(picture, setup.mask)
+        if hidden is not None:
+            picture = replace(picture, image=filled(picture.image, hidden), encoded=None)
+        return _looked(
+            picture, hidden, expected, setup, camera, shift, look, lately, was_cut, turn, own
+        )
+
+    if frame.fields == "woven":
+        return with_motion(between(*(looked(field) for field in halves(frame))), previous)
+    result = with_motion(looked(frame), previous)
+    return with_ghosts(result, previous, frame.image) if frame.fields == "whole" else result
 
 
 def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Look:
@@ -118,12 +133,13 @@ def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Loo
     return "blurred" if empty_frames and empty_frames % setup.blurred_every == 0 else "sharp"
 
 
-def _search_picture(
+def _looked(
     frame: Frame,
     hidden: Covered | None,
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
     camera: CameraModel,
+    shift: EdgeShift | None,
     look: Look,
     lately: bool,
     was_cut: bool,
@@ -138,7 +154,7 @@ def _search_picture(
     both = completed(expected, setup.ratio, camera)
     seen: _Seen = {}
     if look != "fits" and setup.window and both and setup.by_lines:
-        seen, found = _followed(image, hidden, both, setup, camera)
+        seen, found = _followed(image, hidden, both, setup, camera, shift)
     if not seen and lately and setup.cut and is_cut(both, image.shape, hidden):
         seen = cut_markers(image, expected, setup.patterns, camera, hidden)
     findable = not was_cut or may_be_whole(both, image.shape)
@@ -158,6 +174,7 @@ def _search_picture(
         full_frame=found.full_frame,
         mirrored=found.mirrored and not seen,
         targets=found.targets,
+        edge_shift=next((r.edge_shift for r in seen.values() if r.edge_shift is not None), None),
     )
 
 
@@ -167,19 +184,20 @@ def _followed(
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
     camera: CameraModel,
+    shift: EdgeShift | None,
 ) -> tuple[_Seen, Found]:
     """What is where both are expected, or nearby: where no side was met, a near target has most
     often moved on further than a side is looked for, and a look around costs less than to fit
     what may be seen of it in the old place."""
     patterns, nothing = setup.patterns, Found({}, mirrored=False, full_frame=False)
-    seen = follow(image, expected, patterns, camera, hidden)
+    seen = follow(image, expected, patterns, camera, shift, hidden)
     if not seen:
         found = search_halved(image, expected, setup)
         again = {} if found is None else _refined(image, hidden, found, setup, camera)
         if found is not None and again:
             return again, found
-    seen = follow_partly(image, expected, seen, patterns, camera, hidden)
-    if any(edges_suffice(r, patterns[name]) for name, r in seen.items()):
+    seen = follow_partly(image, expected, seen, patterns, camera, shift, hidden)
+    if any(lines_suffice(r, patterns[name]) for name, r in seen.items()):
         return seen, nothing
     return improved(image, seen, patterns, camera, hidden=hidden), nothing
 
@@ -209,25 +227,15 @@ def _refined(
     camera: CameraModel,
 ) -> _Seen:
     """What the search found, by the profile's refinement."""
-    seen = {
-        name: _refine(image, found.corners_px[name], setup.patterns[name], camera, setup.refinement)
-        for name in MARKERS
-        if name in found.corners_px
-    }
+    names = [name for name in MARKERS if name in found.corners_px]
+    raw = np.array([found.corners_px[name] for name in names]).reshape(-1, 4, 2)
+    rims = [setup.patterns[name].rim for name in names]
+    refined = refine(image, raw, rims, camera, setup.refinement)
+    seen = dict(zip(names, refined, strict=True))
     if not setup.by_lines:
         return seen
     seen = _whole_or_partly(image, hidden, seen, setup, camera)
     return improved(image, seen, setup.patterns, camera, searched=True, hidden=hidden)
-
-
-def _refine(
-    image: NDArray[np.uint8], raw_px: Array, pattern: Pattern, camera: CameraModel, method: str
-) -> RefinedCorners:
-    """One marker's corners as a search found them, (4, 2), made better by the method."""
-    if method == "none":
-        return RefinedCorners(raw_px, RAW_SIGMA_PX, False)
-    refined = refine_by_edges(image, raw_px, pattern, camera) if method == "line" else None
-    return refined or refine_each(image, raw_px, pattern.cells)
 
 
 def _whole_or_partly(
@@ -237,7 +245,7 @@ def _whole_or_partly(
     setup: DetectorSetup,
     camera: CameraModel,
 ) -> _Seen:
-    """What the search found, those that are not wholly seen by what is seen of them. A
+    """What the search found, those without four lines for sides by what of these is seen. A
     search takes the picture's edge for the side of a marker that is cut off there."""
     fitted = dict(seen)
     for name, r in seen.items():
@@ -276,14 +284,12 @@ def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Det
     r = seen.get(name)
     if r is None:
         return None
-    sigma_px, cov_px2 = r.sigma_px, r.cov_px2
-    if fields in ("top", "bottom"):
-        lying_px = interpolated_sigma_px(0.0 if r.blur_px is None else r.blur_px[1])
-        sigma_px = math.hypot(sigma_px, lying_px)
-        cov_px2 = None if cov_px2 is None else cov_px2 + np.diag(4 * [0.0, lying_px**2])
+    interpolated = fields in ("top", "bottom")
     return Detection(
-        name, r.corners_px, sigma_px, r.refined, r.whole, cov_px2=cov_px2, blur_px=r.blur_px
-    )
+        name, r.corners_px, r.sigma_px, r.refined, r.shift_sigma_px,
+        cov_px2=r.cov_px2, row_sigma_px=r.row_sigma_px,
+        lying_sigma_px=interpolated_sigma_px(r.least_blur_px) if interpolated else 0.0,
+    )  # fmt: skip
 
 
 # --- How the markers move from picture to picture, and where that leads them -------------------
@@ -337,14 +343,16 @@ _REACH = 0.3  # of the side
 # Where the other marker shows that it must be there, it may be vague.
 _MAX_SIGMA_ALONE, _MAX_SIGMA = 0.06, 0.12  # of the side
 _BLUR_PX = 1.5  # to start with, where it is not known
+_ACROSS_PX = 0.37
+"""Sigma. Sides have a pixel's own width and that of reading it in their blur, the drawing has not:
+0.81 px where it settles at 0.72, of far markers in flight."""
 _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
-def edges_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
-    """Whether no photometric fit could give better corners."""
-    cell_px = mean_side_px(seen.corners_px) / pattern.cells
-    blur_px = 0.0 if seen.blur_px is None else seen.blur_px[0]
-    return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * blur_px)
+def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
+    """Whether no drawing could give better corners."""
+    cell_px = mean_side_px(seen.corners_px) / pattern.rim.cells
+    return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * seen.blur_px)
 
 
 def improved(
@@ -386,9 +394,9 @@ def improved(
 
 def _blur_px(seen: RefinedCorners | None) -> float:
     """That of the sides, where lines were fitted: the fit of the drawing gets there sooner."""
-    if seen is None or seen.blur_px is None:
+    if seen is None or not seen.refined or seen.blur_px <= 0.0:
         return _BLUR_PX
-    return min(math.sqrt(max(seen.blur_px[0] ** 2 - ACROSS_PX**2, 0.0)), _BLUR_PX)
+    return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _BLUR_PX)
 
 
 def _start(
@@ -401,10 +409,10 @@ def _start(
     use."""
     this, other = seen.get(name), seen.get(_OTHER[name])
     if this is not None:
-        if not this.whole:
+        if this.cov_px2 is not None:
             return None  # what hides a part of it would spoil the drawing, too
         # Small cells matter only where no larger ones were measured.
-        enough = edges_suffice(this, patterns[name]) or (name == "small" and other is not None)
+        enough = lines_suffice(this, patterns[name]) or (name == "small" and other is not None)
         return None if this.refined and enough else this.corners_px
     if name == "small" and other is not None and other.refined:
         return nested(other.corners_px, patterns["large"].drawing.ratio, camera)
@@ -412,12 +420,12 @@ def _start(
 
 
 # --- Markers where they are expected: no search, only verification -----------------------------
-# Edges are fitted from the predicted corners, and every cell is read through the result's
+# Sides are fitted at the predicted corners, and every cell is read through the result's
 # homography: a strict check (all cells right, none nearly wrong) at a tenth of the price of
 # a search.
 
 
-_LEAST_CELL_PX = 2.5  # for edges
+_LEAST_CELL_PX = 2.5  # for lines
 _ANCHOR = 0.12  # of the small marker's side
 
 
@@ -426,26 +434,30 @@ def follow(
     expected: Mapping[MarkerName, Array],
     patterns: Mapping[MarkerName, Pattern],
     camera: CameraModel,
-    hidden: Covered | None = None,
+    shift: EdgeShift | None = None,
+    hidden: NDArray[np.bool_] | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """The expected markers (corners (4, 2) px) that are verified by all edges and cells;
-    `hidden` (h, w) is where there is something else."""
-    seen: _Seen = {}
-    for name in MARKERS:
-        if (
-            name not in expected
-            or not within(expected[name], image.shape, ROOM_PX)
-            or not shortest_side_px(expected[name]) > _LEAST_CELL_PX * patterns[name].cells
-        ):
-            continue
-        found = refine_by_edges(image, expected[name], patterns[name], camera)
-        if (
-            found is not None
-            and wholly_seen(found, image.shape, hidden)
-            and cells_agree(image, found.corners_px, patterns[name], camera)
-        ):
-            seen[name] = found
-    return seen
+    """The expected markers (corners (4, 2) px) that are verified by all sides and cells; `shift`
+    is what was measured of the edges in an earlier picture, `hidden` (h, w) where there is
+    something else."""
+    names = [
+        name
+        for name in MARKERS
+        if name in expected
+        and within(expected[name], image.shape, ROOM_PX)
+        and shortest_side_px(expected[name]) > _LEAST_CELL_PX * patterns[name].rim.cells
+    ]
+    if not names:
+        return {}
+    raw = np.array([expected[name] for name in names])
+    fitted = refine_lines(image, raw, [patterns[name].rim for name in names], camera, shift)
+    return {
+        name: result
+        for name, result in zip(names, fitted, strict=True)
+        if result is not None
+        and wholly_seen(result, image.shape, hidden)
+        and cells_agree(image, result.corners_px, patterns[name])
+    }
 
 
 def follow_partly(
@@ -454,7 +466,8 @@ def follow_partly(
     seen: Mapping[MarkerName, RefinedCorners],
     patterns: Mapping[MarkerName, Pattern],
     camera: CameraModel,
-    hidden: Covered | None = None,
+    shift: EdgeShift | None = None,
+    hidden: NDArray[np.bool_] | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
     """With those that `follow` did not verify, by what is seen of them. Where the small marker
     was met, the large one is looked for around it instead of where it was expected."""
@@ -465,39 +478,18 @@ def follow_partly(
         )
     for name in MARKERS:
         if name in places and name not in seen:
-            partly = seen_partly(image, places[name], patterns[name], camera, "track", hidden)
+            partly = seen_partly(
+                image, places[name], patterns[name], camera, "track", hidden, shift
+            )
             if partly is not None:
                 seen[name] = partly
     large = seen.get("large")
     if large is not None and "small" not in seen:
-        # Too small for edges, but where it must be: enough to know that it is there.
+        # Too small for lines, but where it must be: enough to know that it is there.
         small_px = nested(large.corners_px, patterns["large"].drawing.ratio, camera)
         if mean_side_px(small_px) > LEAST_SIDE_PX and resembles(image, small_px, patterns["small"]):
             seen["small"] = RefinedCorners(small_px, NESTED_SIGMA_PX, False)
     return seen
-
-
-def seen_partly(
-    image: NDArray[np.uint8],
-    start_px: Array,
-    pattern: Pattern,
-    camera: CameraModel,
-    known_by: KnownBy,
-    hidden: Covered | None = None,
-) -> RefinedCorners | None:
-    """The marker near to corners `start_px` (4, 2), by what is seen of it, if its cells are."""
-    found = refine_by_edges(image, start_px, pattern, camera, hidden, partly=True)
-    if found is None:
-        return None
-    agree = cells_agree(image, found.corners_px, pattern, camera, known_by, hidden)
-    return found if agree else None
-
-
-def wholly_seen(found: RefinedCorners, shape: tuple[int, ...], hidden: Covered | None) -> bool:
-    """Whether nothing of the marker is hidden, and the picture's edge too far away to take
-    anything from the sides' blur."""
-    room_px = ROOM_PX + (0.0 if found.blur_px is None else found.blur_px[0])
-    return within(found.corners_px, shape, room_px) and not hides(hidden, found.corners_px)
 
 
 def around(
@@ -505,24 +497,30 @@ def around(
     small: RefinedCorners,
     patterns: Mapping[MarkerName, Pattern],
     camera: CameraModel,
-    hidden: Covered | None = None,
+    hidden: NDArray[np.bool_] | None = None,
 ) -> RefinedCorners | None:
     """The large marker around a small one that was found: something may cover a part of
-    it, and it may be cut off by the picture's edge, so long as its edges are where they
+    it, and it may be cut off by the picture's edge, so long as its sides are lines where they
     are seen and most cells show."""
     pattern = patterns["large"]
     start = nested(small.corners_px, 1.0 / pattern.drawing.ratio, camera)
     if not np.isfinite(start).all():
         return None
+    found: RefinedCorners | None = None
     if within(start, image.shape, ROOM_PX):
-        found = refine_by_edges(image, start, pattern, camera)
+        # A small marker gives a rough place; the first fit is where to look closely.
+        found = refine_lines(image, start[None], [pattern.rim], camera)[0]
+        if found is not None:
+            found = refine_lines(image, found.corners_px[None], [pattern.rim], camera)[0]
         if (
             found is not None
             and wholly_seen(found, image.shape, hidden)
             and _centred(found, small, pattern, camera)
-            and cells_agree(image, found.corners_px, pattern, camera, "other")
+            and cells_mostly_agree(image, found.corners_px, pattern)
         ):
             return found
+    if found is not None:
+        start = found.corners_px
     partly = seen_partly(image, start, pattern, camera, "other", hidden)
     return partly if partly and _centred(partly, small, pattern, camera) else None
 
@@ -534,3 +532,174 @@ def _centred(
     centre = nested(large.corners_px, pattern.drawing.ratio, camera)
     off_px = float(np.abs(centre - small.corners_px).max())
     return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
+
+
+# --- The markers of two fields, at the moment half way between them ----------------------------
+
+
+_MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
+
+
+def between(a: Detections, b: Detections) -> Detections:
+    """The mean of both fields' corners, which is right for either order of the fields.
+
+    A marker that only one field shows is left out where the other marker is in both: the
+    two would belong to different moments. Nothing lies between two different targets.
+    """
+    both = {
+        name: _middle(one, other)
+        for name in MARKERS
+        if (one := a.get(name)) is not None
+        and (other := b.get(name)) is not None
+        and _is_one(one.corners_px, other.corners_px)
+    }
+    if not both:
+        alone = a if a.large is not None or a.small is not None else b
+        return replace(alone, mirrored=alone.mirrored or b.mirrored)
+    return replace(a, large=both.get("large"), small=both.get("small"), mirrored=False)
+
+
+def _is_one(a_px: Array, b_px: Array) -> bool:
+    """Whether a marker can have moved from one place to the other between the fields."""
+    moved_px = float(np.linalg.norm(a_px.mean(axis=0) - b_px.mean(axis=0)))
+    return moved_px < _MOST_SIDES * mean_side_px(a_px)
+
+
+def _middle(a: Detection, b: Detection) -> Detection:
+    """Each field has its own noise, so the mean is surer than either."""
+    return Detection(
+        a.marker,
+        (a.corners_px + b.corners_px) / 2.0,
+        ((a.sigma_px**2 + b.sigma_px**2) / 4.0) ** 0.5,
+        a.refined and b.refined,
+        max(a.shift_sigma_px, b.shift_sigma_px),
+        cov_px2=_mean_cov_px2(a, b),
+        row_sigma_px=((a.row_sigma_px**2 + b.row_sigma_px**2) / 4.0) ** 0.5,
+        lying_sigma_px=((a.lying_sigma_px**2 + b.lying_sigma_px**2) / 4.0) ** 0.5,
+    )
+
+
+def _mean_cov_px2(a: Detection, b: Detection) -> Array | None:
+    """None where in both the corners spread alike."""
+    if a.cov_px2 is None and b.cov_px2 is None:
+        return None
+    one, other = (d.sigma_px**2 * np.eye(8) if d.cov_px2 is None else d.cov_px2 for d in (a, b))
+    return np.asarray((one + other) / 4.0)
+
+
+# --- Double edges: what a converter leaves that averages the two fields of a moving picture ----
+# Both fields are then in every row, and cannot be taken apart again. A side of a marker shows it:
+# the grey levels across it rise in two equal steps with a plateau between, where blur
+# of any kind makes one.
+
+
+SLOW_PX_S = 80.0
+"""Markers that move no faster have fields too near to each other to be told apart."""
+_EVERY = 4
+_PLACES: Array = np.linspace(0.12, 0.88, 32)
+_STEP_PX = 0.5
+_REACH_CELLS, _MOST_REACH_PX = 0.9, 16.0
+_LEAST_REACH_PX, _ROOM_PX = 4.0, 8.0
+_LEAST_PX = 2.5  # between the steps
+_VALLEY = 0.55  # of the lower peak
+_ALIKE = 0.55  # the lower peak in terms of the higher
+_LEAST_SLOPE = 3.0  # grey levels a pixel
+_CELLS = {"large": 6.0, "small": 7.0}  # of a side; with a little less all goes as well
+
+
+def with_ghosts(
+    now: Detections, previous: Detections | None, image: NDArray[np.uint8]
+) -> Detections:
+    """`now` with `ghost_px`, and the corners' spread widened by it, where a marker that moves,
+    or of which that is not known, has double edges. Where the picture before had none, as in
+    most streams, it is looked for in every fourth."""
+    velocity = now.velocity_px_s
+    if velocity is not None and float(np.hypot(*velocity)) < SLOW_PX_S:
+        return now
+    if velocity is not None and previous is not None and previous.ghost_px == 0.0:
+        age = previous.ghost_age + 1
+        if age < _EVERY:
+            return replace(now, ghost_age=age)
+    seen = [d for name in MARKERS if (d := now.get(name)) is not None]
+    shows = _shows_best(seen)
+    ghost_px = 0.0 if shows is None else double_edge_px(image, shows)
+    if ghost_px == 0.0:
+        return now
+    wider = {d.marker: _wider(d, ghost_px / 4.0) for d in seen}
+    return replace(now, large=wider.get("large"), small=wider.get("small"), ghost_px=ghost_px)
+
+
+def _shows_best(seen: Sequence[Detection]) -> Detection | None:
+    """The smallest marker with room enough beside its sides: larger ones bend more, and may
+    be outside of the picture, where sides show nothing."""
+    whole = [d for d in seen if d.cov_px2 is None]
+    small = whole[-1:] if whole and _reach_px(whole[-1]) >= _ROOM_PX else whole[:1]
+    return small[0] if small else None
+
+
+def _reach_px(marker: Detection) -> float:
+    """How far from the sides the next edges are not yet seen."""
+    cell_px = float(side_lengths_px(marker.corners_px).min()) / _CELLS[marker.marker]
+    return min(_REACH_CELLS * cell_px, _MOST_REACH_PX)
+
+
+def _wider(d: Detection, sigma_px: float) -> Detection:
+    """The middle of both steps is where the edge was at the middle moment, but an edge fit may
+    hold to one of them."""
+    cov_px2 = None if d.cov_px2 is None else d.cov_px2 + sigma_px**2 * np.eye(8)
+    return replace(d, sigma_px=float(np.hypot(d.sigma_px, sigma_px)), cov_px2=cov_px2)
+
+
+def double_edge_px(image: NDArray[np.uint8], marker: Detection) -> float:
+    """How far the two steps of a marker's sides are apart, the mean over opposite sides and
+    the greater of the two directions; 0 where the sides are single."""
+    profiles = _profiles(image, marker)
+    if profiles is None:
+        return 0.0
+    apart = _apart_px(profiles)
+    pairs = [(apart[k], apart[k + 2]) for k in (0, 1)]
+    both = [(a + b) / 2.0 for a, b in pairs if min(a, b) > 0.6 * max(a, b) > 0.0]
+    return max(both, default=0.0)
+
+
+def _profiles(image: NDArray[np.uint8], marker: Detection) -> Array | None:
+    """Mean grey across each side from the inside outwards, `_STEP_PX` apart, (4, n); None of a
+    marker that is too small."""
+    reach_px = _reach_px(marker)
+    if reach_px < _LEAST_REACH_PX:
+        return None
+    corners = marker.corners_px
+    sides_px = side_lengths_px(corners)
+    way = corners[NEXT] - corners
+    turn = 1.0 if doubled_area(corners[None])[0] > 0.0 else -1.0
+    out_x, out_y = turn * way[:, 1] / sides_px, -turn * way[:, 0] / sides_px
+    u = np.arange(-reach_px, reach_px + 1e-9, _STEP_PX)
+    foot = corners[:, None] + _PLACES[:, None] * way[:, None]
+    shape = (4, len(_PLACES), len(u))
+    x, y = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    np.add(foot[:, :, None, 0], (out_x[:, None] * u)[:, None], out=x, casting="same_kind")
+    np.add(foot[:, :, None, 1], (out_y[:, None] * u)[:, None], out=y, casting="same_kind")
+    flat = (4 * len(_PLACES), len(u))
+    grey = cv2.remap(image, x.reshape(flat), y.reshape(flat), cv2.INTER_LINEAR)
+    return np.asarray(grey.reshape(shape).sum(axis=1, dtype=np.int32) / float(len(_PLACES)))
+
+
+def _apart_px(profiles: Array) -> list[float]:
+    """The distance of two equal steps in each of the profiles (m, n), 0 where there is one."""
+    rise = np.diff(profiles, axis=1) / _STEP_PX
+    slope = 0.25 * rise[:, :-2] + 0.5 * rise[:, 1:-1] + 0.25 * rise[:, 2:]
+    middle = slope[:, 1:-1]
+    peak = (middle > slope[:, :-2]) & (middle >= slope[:, 2:]) & (middle >= _LEAST_SLOPE)
+    return [_between_px(s, np.flatnonzero(p) + 1) for s, p in zip(slope, peak, strict=True)]
+
+
+def _between_px(slope: Array, peaks: NDArray[np.intp]) -> float:
+    """The distance of the two highest peaks, if they are about equal, with a valley between."""
+    if len(peaks) < 2:
+        return 0.0
+    low, high = np.sort(slope[peaks])[-2:]
+    if low < _ALIKE * high:
+        return 0.0
+    a, b = np.sort(peaks[np.argsort(slope[peaks])[-2:]])
+    apart_px = float(b - a) * _STEP_PX
+    return apart_px if apart_px >= _LEAST_PX and slope[a:b].min() < _VALLEY * low else 0.0

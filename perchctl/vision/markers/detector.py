@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
-from perchctl.vision.markers.pattern import Pattern, drawing_of, pattern_of
+from perchctl.vision.markers.pattern import Pattern, Rim, drawing_of, pattern_of, rim_of_bits
 from perchctl.vision.types import Frame, MarkerName
 
 MIRROR_INDEX = 1
+_PRINT_M = 1e-6  # of an edge: over its hundreds of dots what each errs by averages out
 _MIN_PERIMETER_PX = 19.2  # OpenCV's default rate, 0.03, of 640 px
 _LOOSE_PERIMETER_RATE = 0.05
 _LOOSE_ACCURACY_RATE = 0.1
@@ -76,8 +77,10 @@ def make_aruco_detector(
             _dictionary(small_bits, config.correction_bits_small),
         ),
         patterns={
-            "large": pattern_of(drawing_of(large_bits, small_bits, ratio)),
-            "small": pattern_of(drawing_of(small_bits)),
+            "large": pattern_of(
+                _rim(large_bits, target.large.side_m), drawing_of(large_bits, small_bits, ratio)
+            ),
+            "small": pattern_of(_rim(small_bits, target.small.side_m), drawing_of(small_bits)),
         },
         ratio=ratio,
         refinement=config.refinement,
@@ -113,6 +116,10 @@ def loose_detector(setup: DetectorSetup) -> Any:
     parameters.adaptiveThreshWinSizeStep = _LOOSE_THRESHOLDS.most_px - _LOOSE_THRESHOLDS.least_px
     parameters.minMarkerPerimeterRate = _LOOSE_PERIMETER_RATE
     return cv2.aruco.ArucoDetector(list(setup.dictionaries), parameters)
+
+
+def _rim(bits: NDArray[np.uint8], side_m: float) -> Rim:
+    return rim_of_bits(bits, _PRINT_M * (len(bits) + 2) / side_m)
 
 
 def _bits(marker: MarkerConfig) -> NDArray[np.uint8]:

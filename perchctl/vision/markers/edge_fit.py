@@ -1,531 +1,829 @@
-"""A marker's square by the edges of its drawing, to a hundredth of a pixel.
+"""Corners to a hundredth of a pixel: lines fitted to a marker's sides, intersected.
 
-The cells of a marker and the paper around it meet in hundreds of places. At each of them the edge
-of the picture is looked for across the drawing's own, along a profile through the lens, and
-Gauss-Newton moves the square until both agree. A blur that is equal on both flanks of an edge
-does not move it. White that is clipped, glares or went through a gamma curve moves all edges
-from white towards black, by the same number of pixels: that shift is an unknown, too.
+A side is hundreds of gradient samples instead of one point, and a blur that is equal on
+both of its flanks does not move it. So each side's edge points are undistorted, a line is fitted
+to them by total least squares in normalised coordinates, and neighbours are intersected.
 
-One fit serves a marker that is wholly seen, one of which the picture's edge, glare or the
-vehicle's gear hides a part, and the whole target where the picture cuts both of its markers
-(`perchctl.vision.markers.cut`). What is not seen follows from what is, and the covariance says
-how well.
+White that is clipped, glares or went through a gamma curve does move edges: all of
+them, from white towards black, by the same number of pixels. The inner edge of a
+marker's border moves the opposite way, so the border's width, known to be one cell,
+gives the shift, and it is taken out.
 
-The increment p of the homography H in a round is H (1 + P), with P's terms in the order of its
-rows and its last one 0. Coordinates are the marker's own, see `perchctl.vision.markers.corners`.
+Where a residual shows that the sides are not lines (blur, occlusion, false
+candidates), each corner is refined on its own (`perchctl.vision.markers.corners`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array, finite
-from perchctl.vision.lens import distort, reach_of, undistort
+from perchctl.vision.lens import distort, undistort
 from perchctl.vision.markers.corners import (
+    BEFORE,
+    NEXT,
+    RAW_SIGMA_PX,
     UNIT,
+    Border,
     RefinedCorners,
-    corner_jacobian,
+    doubled_area,
+    edge_shift,
     from_unit,
     mapped,
-    mean_side_px,
+    refine_each,
+    side_lengths_px,
 )
-from perchctl.vision.markers.detector import Covered
-from perchctl.vision.markers.pattern import Outline, Pattern
-from perchctl.vision.types import CameraModel
+from perchctl.vision.markers.pattern import Rim
+from perchctl.vision.types import CameraModel, EdgeShift
 
-ROOM_PX = 2.0
-"""To the picture's edge, where blur would need what is beyond it."""
-INNER_CELL_PX = 5.0
-"""Smaller cells blend: of these only the border's outer edge is fitted."""
-CLIPPED_GREY = 248.0
-CLIPPED_SIGMA_PX = 0.1  # where white is clipped, edges move, not all alike
-CLIPPED_SHARE = 0.05  # of the profiles
-
-_STEPS = 16  # gradient samples in each profile
-_OFFSETS = np.linspace(-1.0, 1.0, _STEPS + 1).astype(np.float32)
-_MIDDLES: Array = 0.5 * (_OFFSETS[1:] + _OFFSETS[:-1]).astype(np.float64)
-_REACH_CELLS, _LEAST_REACH_PX = 0.45, 1.75
-_FIRST_REACH_CELLS = 0.85  # of the border, beside which the next edge is a cell away
-_REACH_PX, _REACH_BLURS = 7.0, 4.0
-_CLOSER = 3.0  # times, from round to round, a start that may be far off
-_MOST_BLUR = 0.8  # of the window, squared
-_WINDOW = 0.45  # sigma, of a profile's reach
-_ROUNDS = 8
-_STILL_PX, _SETTLED_PX = (
-    0.05,
-    0.5,
-)  # no other round follows: it would move a tenth; without this no fit
-_LEAST_CONTRAST, _LEAST_SHARE = 8.0, 0.35  # grey levels; of the upper quarter's
-_LEAST_PLACES = 20
-_NOISE = 0.25  # of a profile's steepest rise
-_TUKEY, _LEAST_SCALE_PX = 3.5, 0.06
-_TAILS = 1.3  # what robust weights take away from a residual's square
-_MAX_STEP = 0.5
-_LEAST_INFORMATION = 1.0  # of an increment: none is larger
-_SHIFT_PX, _CLIPPED_SHIFT_PX = 0.15, 0.4  # by which white may have grown over black
-_LINE_PX = 0.015  # by which a whole line may be off, of lens and light
-_LEAST_ROWS = 2.0  # times the variance of edges along the rows shows that rows shake
-_FLOOR_PX = 0.01
-_BEND, _BEND_BLURS = 0.6, 2.0  # what the next edge, a cell away, does to one; in units of blur
-_REACH = 0.0022  # px for a cubed pixel of blur: profiles are too short for wide edges
+# --- Grey profiles across the sides of markers -------------------------------------------------
+# They are sampled along each side's image through the lens, so that distortion does not
+# bend the side away from the samples. All rows (a row is one side of one marker) run
+# through the same arrays.
 
 
-@dataclass(frozen=True, eq=False)
-class EdgeFit:
-    """A square H (3, 3), own coordinates to normalised ones, and what it rests on.
+PROFILES = 24  # across each side
+STEPS = 16  # gradient samples in each profile
+Floats = NDArray[np.float32]
 
-    Attributes:
-        cov: covariance (8, 8) of its increment.
-        in_view, shown, small: how many places along edges were in view, how many of these
-            showed their edge, and how many of those are the small marker's.
-        residual_px: spread of a single place.
-        blur_px: of the edges, a standard deviation: of the softer and of the sharper direction.
-        clipped: share of the profiles that end in clipped white.
-    """
-
-    H: Array
-    cov: Array
-    in_view: int
-    shown: int
-    small: int
-    residual_px: float
-    blur_px: tuple[float, float]
-    clipped: float
+ALONG: Array = np.linspace(-1.0, 1.0, PROFILES)  # a side, between its margins
+_OFFSETS: Floats = np.linspace(-1.0, 1.0, STEPS + 1).astype(np.float32)
+_ALONG_PROFILE: Floats = np.stack([np.ones_like(_OFFSETS), _OFFSETS])
+MIDDLES: Floats = (_OFFSETS[1:] + _OFFSETS[:-1]) * np.float32(0.5)  # of the gradients
+# Values and slopes at the profiles from a polynomial through the nodes.
+_NODES: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
+_INVERSE: Array = np.linalg.inv(_NODES[:, None] ** np.arange(5.0))
+_VALUES: Array = (ALONG[:, None] ** np.arange(5)) @ _INVERSE
+_SLOPES: Array = (np.arange(1, 5) * ALONG[:, None] ** np.arange(4)) @ _INVERSE[1:]
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
-    """What a round looks at: the picture, where it is `hidden`, and the outline through the
-    square H (3, 3) and its edges' shift so far; how far the profiles reach, and the blur."""
-
-    image: NDArray[np.uint8]
-    camera: CameraModel
-    hidden: Covered | None
-    outline: Outline
-    H: Array
-    shift_px: float
-    reach_px: float
-    blur_px: float
-
-    @cached_property
-    def cells_px(self) -> Array:
-        """Width of the cell at each of the outline's places, if all of them were as far away as
-        the centre, (n,)."""
-        return self.outline.cell * _scale_px(self.H, self.camera)
+_TO_THE_LEFT = np.array(-1j)
 
 
-@dataclass(frozen=True, eq=False)
-class _Places:
-    """Of an outline, in the picture: at (n, 2) px and unit normal (n, 2) from black to white,
-    changes J (n, 8) along it with the increment, width of a cell there (n,) px, what each is
-    worth (n,), and which of the outline's they are (n,)."""
-
-    at: Array
-    normal: Array
-    J: Array
-    cell_px: Array
-    worth: Array
-    index: NDArray[np.intp]
+def places(lengths_px: Array) -> Array:
+    """How far along its side (rows,) of that length each profile is: (rows, n) in 0..1;
+    the ends keep clear of the neighbouring sides' blur."""
+    margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
+    return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
 
-@dataclass(frozen=True, eq=False)
-class _Edges:
-    """offset_px (n,): each place's edge along its normal; which show one, (n,); the blur's
-    square of each direction (2,), px^2, and the share of profiles that end in clipped white."""
+def side_profiles(starts: Array, ends: Array, s: Array, camera: CameraModel) -> tuple[Array, Array]:
+    """Where the profiles cross the sides, in the picture, and the unit normals there,
+    to the left of the way from start to end as the picture is seen (outwards for a
+    marker whose corners run clockwise): each (rows, n, 2).
 
-    offset_px: Array
-    shows: NDArray[np.bool_]
-    blur2: Array
-    clipped: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Round:
-    """The step of all unknowns (9,), the inverse of their normal matrix, the places' weights
-    (n,), changes J (n, 9) and errors left (n,) px, and the variance of one place, px^2."""
-
-    step: Array
-    inverse: Array
-    weight: Array
-    J: Array
-    error: Array
-    variance: float
-
-
-def fit_edges(
-    image: NDArray[np.uint8],
-    start: Array,
-    outline: Outline,
-    camera: CameraModel,
-    hidden: Covered | None = None,
-    prior: Array | None = None,
-    off_px: float = _REACH_PX,
-) -> EdgeFit | None:
-    """The square whose edges are the picture's, from one a few pixels off.
+    A side's image through the lens is smooth: a few nodes define all of it.
 
     Args:
-        start: own coordinates to normalised ones, (3, 3).
-        hidden: (h, w), where pixels show something else.
-        prior: information (8, 8) about the sum of all increments; None: nothing is known.
-        off_px: how far the start may be off.
-
-    None where too few edges are in view, or the fit breaks down.
+        starts, ends: of the sides in normalised coordinates, (rows, 2).
+        s: places of the profiles along them, (rows, n), as of `places`.
     """
-    H, total, shift_px, blur_px = start, np.zeros(8), 0.0, math.inf
-    known = np.zeros((8, 8)) if prior is None else prior
-    for k in range(_ROUNDS):
-        reach_px = max(off_px / _CLOSER**k, _REACH_PX)
-        view = _View(image, camera, hidden, outline, H, shift_px, reach_px, blur_px)
-        # Where the next edge is nearer than the start may be off, the border leads.
-        leads = k == 0 and off_px > _REACH_CELLS * float(view.cells_px.min())
-        seen = (_look(view, leads=True) if leads else None) or _look(view, leads=False)
-        if seen is None:
-            return None
-        places, edges = seen
-        blur_px = math.sqrt(float(edges.blur2.max()))
-        found = _solved(places, edges, known, total, shift_px, first=k == 0)
-        if found is None:
-            return None
-        p = found.step[:8]
-        H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
-        H /= H[2, 2]
-        total, shift_px = total + p, shift_px + float(found.step[8])
-        moved_px = float(np.abs(places.J @ p).max())
-        still = moved_px < _STILL_PX and k > 0 and reach_px == _REACH_PX
-        if still or (k == _ROUNDS - 1 and moved_px < _SETTLED_PX):
-            return _fit(H, found, edges, places, outline, known)
-    return None
+    first, last = s[:, :1], s[:, -1:]
+    at = (0.5 * (first + last) + (0.5 * (last - first)) * _NODES)[..., None]
+    points = starts[:, None] + at * (ends - starts)[:, None]
+    nodes = distort(points.reshape(-1, 2), camera).reshape(points.shape)
+    origin = np.matmul(_VALUES, nodes)
+    # As complex numbers x + iy a quarter turn is one product.
+    tangent = np.matmul(_SLOPES, nodes).view(np.complex128)
+    normal = tangent * (_TO_THE_LEFT / np.maximum(np.abs(tangent), 1e-12))
+    return origin, normal.view(np.float64)
 
 
-def _look(view: _View, leads: bool) -> tuple[_Places, _Edges] | None:
-    """The edges at the places in view, all of them or the border's that `leads`; None where too
-    few are shown."""
-    places = _in_view(view, leads)
-    if len(places.index) < _LEAST_PLACES:
-        return None
-    # Not to the next edge, nor beyond the blur.
-    cells = _FIRST_REACH_CELLS if leads else _REACH_CELLS
-    half_px = np.minimum(view.reach_px, cells * places.cell_px)
-    if view.reach_px == _REACH_PX:
-        half_px = np.minimum(half_px, _REACH_BLURS * view.blur_px)
-    half_px = np.maximum(half_px, _LEAST_REACH_PX)
-    edges = (_rises if leads else _offsets)(view, places, half_px)
-    return (places, edges) if np.count_nonzero(edges.shows) >= _LEAST_PLACES else None
-
-
-def _fit(
-    H: Array, found: _Round, edges: _Edges, places: _Places, outline: Outline, known: Array
-) -> EdgeFit:
-    shown = found.weight > 0.0
-    blurs_px = np.sqrt(edges.blur2)
-    return EdgeFit(
-        H=H,
-        cov=_covariance(found, places, outline, known),
-        in_view=len(shown),
-        shown=int(np.count_nonzero(shown)),
-        small=int(np.count_nonzero(shown & outline.small[places.index])),
-        residual_px=math.sqrt(found.variance),
-        blur_px=(float(blurs_px.max()), float(blurs_px.min())),
-        clipped=edges.clipped,
-    )
-
-
-def foreseen(H: Array, outline: Outline, camera: CameraModel, prior: Array) -> EdgeFit | None:
-    """What `fit_edges` would make of a picture without a flaw of that square."""
-    blank = np.zeros(camera.size_px[::-1], np.uint8)
-    places = _in_view(_View(blank, camera, None, outline, H, 0.0, _REACH_PX, 1.0), leads=False)
-    n = len(places.index)
-    if n < _LEAST_PLACES:
-        return None
-    edges = _Edges(np.zeros(n), np.ones(n, np.bool_), np.ones(2), 0.0)
-    found = _solved(places, edges, prior, np.zeros(8), 0.0, first=True)
-    return None if found is None else _fit(H, found, edges, places, outline, prior)
-
-
-def _in_view(view: _View, leads: bool) -> _Places:
-    """The places at which a whole profile is in the picture, and not hidden; only the border's
-    where it `leads`, or where cells are small."""
-    H, outline, camera, hidden = view.H, view.outline, view.camera, view.hidden
-    (h, w), reach_px = view.image.shape, view.reach_px
-    at = outline.at @ H[:, :2].T + H[:, 2]
-    d = at[:, 2]
-    chosen = d > 0.05 * H[2, 2]
-    rays = at[:, :2] / np.where(chosen, d, 1.0)[:, None]
-    chosen &= np.hypot(rays[:, 0], rays[:, 1]) < reach_of(camera)
-    chosen &= outline.border if leads else outline.border | (view.cells_px > INNER_CELL_PX * d)
-    index = np.flatnonzero(chosen)
-    rays, d, across = rays[index], d[index], outline.normal[index]
-    # How a place moves with its own coordinates, as if the lens did not bend: that is enough for
-    # the way to look and for a step that is followed by another.
-    by_u, by_v = ((H[:2, k] - rays * H[2, k]) * _focal(camera) / d[:, None] for k in (0, 1))
-    tangent = by_v * across[:, :1] - by_u * across[:, 1:]
-    length = np.maximum(np.hypot(tangent[:, 0], tangent[:, 1]), 1e-12)
-    normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1) / length[:, None]
-    px = (normal * (by_u * across[:, :1] + by_v * across[:, 1:])).sum(axis=1)
-    normal *= np.sign(px)[:, None]
-    px = np.abs(px)
-    at = distort(rays, camera)
-    # From far off a place counts that is in the picture, later one that is with all its profile.
-    room_px = np.minimum(reach_px, _FIRST_REACH_CELLS * outline.cell[index] * px)
-    room_px = np.where(reach_px > _REACH_PX, ROOM_PX, room_px)
-    room = room_px[:, None] * np.abs(normal) + 1.0
-    free = ((at >= room) & (at <= np.array([w - 1.0, h - 1.0]) - room)).all(axis=1)
-    if hidden is not None:
-        for way in (-1.0, -0.5, 0.0, 0.5, 1.0):
-            x, y = np.rint(at + way * reach_px * normal).T
-            x, y = np.clip(x, 0, w - 1).astype(np.intp), np.clip(y, 0, h - 1).astype(np.intp)
-            free &= ~hidden[y, x]
-    index, px = index[free], px[free]
-    return _Places(
-        at=at[free],
-        normal=normal[free],
-        J=outline.J[index] * px[:, None],
-        cell_px=outline.cell[index] * px,
-        # Profiles nearer to each other than a pixel measure the same.
-        worth=np.minimum(1.0, outline.spacing[index] * length[free]),
-        index=index,
-    )
-
-
-def _focal(camera: CameraModel) -> Array:
-    return np.array([camera.K[0, 0], camera.K[1, 1]])
-
-
-def _rises(view: _View, places: _Places, half_px: Array) -> _Edges:
-    """Where the edges are, roughly, by the middle of all that rises along profiles that reach far:
-    what falls there is the next edge."""
-    grey = _sample(view.image, places.at, places.normal, half_px)
-    rise = np.maximum(np.diff(grey, axis=1).astype(np.float64), 0.0)
-    rise *= rise > _NOISE * rise.max(axis=1, keepdims=True)
-    total = rise.sum(axis=1)
-    shows = total > _least_contrast(total)
-    total = np.where(shows, total, 1.0)
-    u = half_px[:, None] * _MIDDLES
-    offset_px = (rise * u).sum(axis=1) / total
-    spread2 = (rise * (u - offset_px[:, None]) ** 2).sum(axis=1) / total
-    blur2 = _median(spread2[shows]) if shows.any() else 1.0
-    return _Edges(offset_px, shows, np.array([blur2, blur2]), 0.0)
-
-
-def _least_contrast(contrast: Array) -> float:
-    """What an edge must have of the grey levels of those that have most."""
-    quarter = 3 * len(contrast) // 4
-    return max(_LEAST_CONTRAST, _LEAST_SHARE * float(np.partition(contrast, quarter)[quarter]))
-
-
-def _offsets(view: _View, places: _Places, half_px: Array) -> _Edges:
-    """Where the edges are, by the centroid of the gradient under a window around the place where
-    the square and the shift so far have them."""
-    shifted = places.at - view.shift_px * places.normal
-    grey = _sample(view.image, shifted, places.normal, half_px)
-    gradient = np.diff(grey, axis=1).astype(np.float64)
-    u = half_px[:, None] * _MIDDLES
-    window2 = (_WINDOW * half_px) ** 2
-    mass = gradient * np.exp(-0.5 * u * u / window2[:, None])
-    total = mass.sum(axis=1)
-    contrast = grey[:, -1].astype(np.float64) - grey[:, 0]
-    least = _least_contrast(contrast)
-    shows = (contrast > least) & (total > 0.25 * least)
-    total = np.where(shows, total, 1.0)
-    centroid = (mass * u).sum(axis=1) / total
-    moment = (mass * (u - centroid[:, None]) ** 2).sum(axis=1) / total
-    # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
-    moment = np.clip(moment, 0.01, _MOST_BLUR * window2)
-    each2 = moment * window2 / (window2 - moment)
-    lying = np.abs(places.normal[:, 1]) > np.abs(places.normal[:, 0])
-    both = [each2[shows & way] for way in (lying, ~lying)]
-    blur2 = np.array([_median(each) if len(each) else 1.0 for each in both])
-    # The window pulls the centroid towards its own middle: undo that.
-    pull = 1.0 + np.where(lying, blur2[0], blur2[1]) / window2
-    offset_px = np.clip(centroid * pull, -half_px, half_px) - view.shift_px
-    return _Edges(offset_px, shows, blur2, float(np.mean(grey[:, -1] > CLIPPED_GREY)))
-
-
-def _sample(
-    image: NDArray[np.uint8], at: Array, normal: Array, half_px: Array
-) -> NDArray[np.float32]:
-    """Grey values along profiles, (n, steps + 1): bilinear, the picture's rim repeated outside.
+def sample(image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Array) -> Floats:
+    """Grey values along the profiles, (rows, n, steps + 1): bilinear, the picture's rim
+    repeated outside.
 
     On float pictures OpenCV 5 interpolates at the exact position; on bytes, other
     releases round it to 1/32 px, which is as large as the spread that is aimed at.
     """
     h, w = image.shape
     reach = float(half_px.max()) + 2.0
-    (x0, y0), (x1, y1) = at.min(axis=0).tolist(), at.max(axis=0).tolist()
+    flat = origin.reshape(-1, 2)
+    (x0, y0), (x1, y1) = flat.min(axis=0).tolist(), flat.max(axis=0).tolist()
     left, top = min(max(int(x0 - reach), 0), w - 2), min(max(int(y0 - reach), 0), h - 2)
     right, bottom = min(int(x1 + reach) + 1, w), min(int(y1 + reach) + 1, h)
-    patch = image[top : max(bottom, top + 2), left : max(right, left + 2)].astype(np.float32)
-    way = (half_px[:, None] * normal).astype(np.float32)
-    x = (at[:, :1] - left).astype(np.float32) + way[:, :1] * _OFFSETS
-    y = (at[:, 1:] - top).astype(np.float32) + way[:, 1:] * _OFFSETS
+    right, bottom = max(right, left + 2), max(bottom, top + 2)
+    patch = image[top:bottom, left:right].astype(np.float32)
+    rows, n = origin.shape[:2]
+    lines = np.empty((2, rows, n, 2), dtype=np.float32)  # of x and y: where, and which way
+    np.subtract(origin[..., 0], left, out=lines[0, ..., 0], casting="same_kind")
+    np.subtract(origin[..., 1], top, out=lines[1, ..., 0], casting="same_kind")
+    np.multiply(normal[..., 0], half_px[:, None], out=lines[0, ..., 1], casting="same_kind")
+    np.multiply(normal[..., 1], half_px[:, None], out=lines[1, ..., 1], casting="same_kind")
+    x, y = (lines.reshape(-1, 2) @ _ALONG_PROFILE).reshape(2, rows, n * (STEPS + 1))
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(grey, dtype=np.float32)
+    return np.asarray(grey, dtype=np.float32).reshape(rows, n, STEPS + 1)
 
 
-def _solved(
-    places: _Places, edges: _Edges, known: Array, total: Array, shift_px: float, first: bool
-) -> _Round | None:
-    """A robust step of the square and of the common shift of edges (white over black)."""
-    offset_px, shows = edges.offset_px + shift_px, edges.shows
-    J = np.concatenate([places.J, -np.ones((len(offset_px), 1))], axis=1)
-    prior, pull = np.zeros((9, 9)), np.zeros(9)
-    prior[:8, :8], pull[:8] = known, -known @ total
-    shift_prior = _shift_prior(edges)
-    prior[8, 8], pull[8] = shift_prior, -shift_prior * shift_px
-    prior[range(8), range(8)] += _LEAST_INFORMATION
-    worth = places.worth * shows
-    weight, error = worth, offset_px
-    # At first errors show where the square is, not which places are wrong.
-    for robust in (not first, True):
-        if robust:
-            size = np.abs(error)
-            scale = max(1.4826 * _median(size[shows]), _LEAST_SCALE_PX)
-            weight = worth * np.maximum(1.0 - (size / (_TUKEY * scale)) ** 2, 0.0) ** 2
-        mass = float(weight.sum())
-        if mass < 0.5 * _LEAST_PLACES * float(worth.max()):
-            return None
-        variance = max(_TAILS * float(weight @ error**2) / mass, 1e-4)
-        weighed = (J * weight[:, None]).T
-        try:
-            inverse = np.linalg.inv(weighed @ J / variance + prior)
-        except np.linalg.LinAlgError:
-            return None
-        step = inverse @ (weighed @ offset_px / variance + pull)
-        error = offset_px - J @ step
-    if not (finite(step) and np.abs(step[:8]).max() < _MAX_STEP):
-        return None
-    return _Round(step, inverse, weight, J, error, variance)
+# --- Corners to a hundredth of a pixel: lines fitted to a marker's sides, intersected ---
 
 
-def _median(values: Array) -> float:
-    middle = len(values) // 2
-    return float(np.partition(values, middle)[middle])
+MIN_LINE_SIGMA_PX = 0.015
 
-
-def _shift_prior(edges: _Edges) -> float:
-    sigma_px = _CLIPPED_SHIFT_PX if edges.clipped > CLIPPED_SHARE else _SHIFT_PX
-    return 1.0 / sigma_px**2
-
-
-def _covariance(found: _Round, places: _Places, outline: Outline, known: Array) -> Array:
-    """Of the increment (8, 8): of each place's own noise, of what moves a line as a whole, and
-    of what was known before."""
-    J, w, variance = found.J, found.weight, found.variance
-    line = outline.line[places.index]
-    by_line = np.zeros((int(line.max()) + 1, 9))
-    np.add.at(by_line, line, J * (w * _LINE_PX)[:, None])
-    middle = variance * (J * w[:, None]).T @ J + by_line.T @ by_line
-    row_px = _row_px(found, places)
-    if row_px > 0.0:
-        row = places.at[:, 1].astype(np.intp)
-        by_row = np.zeros((int(row.max()) + 1, 9))
-        np.add.at(by_row, row, J * (w * row_px * places.normal[:, 0])[:, None])
-        middle += by_row.T @ by_row
-    prior = np.zeros((9, 9))
-    prior[:8, :8], prior[8, 8] = known, _SHIFT_PX**-2.0
-    cov = found.inverse @ (middle / variance**2 + prior) @ found.inverse
-    return np.asarray(cov[:8, :8])
-
-
-def _row_px(found: _Round, places: _Places) -> float:
-    """Spread of what shakes a picture's rows, each along itself, as an analogue link does: it
-    moves the edges across a row, all of them alike, and those along it not. 0 where the errors of
-    both do not show it."""
-    upright, squared = places.normal[:, 0] ** 2, found.error**2
-    across, along = (
-        float(w @ squared) / max(float(w.sum()), 1e-9)
-        for w in (found.weight * upright, found.weight * (1.0 - upright))
-    )
-    return math.sqrt(across - along) if across > _LEAST_ROWS * max(along, 1e-6) else 0.0
-
-
-def _scale_px(H: Array, camera: CameraModel) -> float:
-    """Pixels for a unit at the centre of a square H (3, 3)."""
-    scale = 0.5 * (math.hypot(*H[:2, 0]) + math.hypot(*H[:2, 1])) / abs(float(H[2, 2]))
-    return scale * float(camera.K[0, 0])
-
-
-# --- One marker by its edges -------------------------------------------------------------------
-
-
+_MIN_CELL_PX = 1.0  # smaller cells blend into one grey
 _MAX_RESIDUAL_PX = 0.6
-_MIN_SHOWN, _MIN_SHOWN_PARTLY = 0.75, 0.6  # of the places in view
-_MIN_CELL_PX, _LEAST_PARTLY_CELL_PX = 1.5, 4.0
-_MAX_SIGMA = 0.02  # of the side: vaguer corners are no measurement
-_MOST_OFF_PX = 20.0  # of a part of a marker from its start: no edges lead a fit farther
+_MIN_INLIERS = 0.5
+_TAILS = 1.7  # what robust weights take away from a residual's square, and from the samples
+_BEND, _BEND_BLURS = 0.6, 2.0  # what the next edge, a cell away, does to one; in units of blur
+_REACH = 0.0022  # px for a cubed pixel of blur: profiles are too short for wide edges
+CLIPPED_SIGMA_PX = 0.1  # where white is clipped, edges move, not all alike
+CLIPPED_SHARE = 0.05  # of the profiles
+_WIDE_BLUR_PX, _CENTRED_PX = 2.2, 0.5  # profiles cut off an edge that is wide and not central
+_NEAR_END_PX = 4.0  # of 7: an edge 6 px off, cut off there, was seen up to 0.3 px beside its place
+_LEAST_ROWS = 2.0  # times the other sides' variance shows that rows shake
+_LEAST_ASPECT = 0.05  # variance of the sides' slants (0 to 1), to tell them apart
+_MIN_CONTRAST = 6.0  # grey levels between the flanks
+_SHIFT_PRIOR_PX = 0.15  # what glare and gamma do to edges
+_CLIPPED_PRIOR_PX = 0.4  # what clipping does
+CLIPPED_GREY = 248.0
+_ONES: Array = np.ones(PROFILES)
+_ONES32: Floats = np.ones(PROFILES, dtype=np.float32)
+_QUARTERS: Array = np.full(4, 0.25)
+_PARABOLA: Array = ALONG**2 - (ALONG**2).mean()
+_BOWED = 3.0  # standard deviations
 
 
-def refine_by_edges(
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """Lines (4m, 3) as (nx, ny, c) with n.x = c and |n| = 1, normalised, and the weighted
+    RMS distance of their points, px (4m,)."""
+
+    lines: Array
+    residual_px: Array
+
+
+def refine(
     image: NDArray[np.uint8],
-    start_px: Array,
-    pattern: Pattern,
+    corners_px: Array,
+    rims: Sequence[Rim],
     camera: CameraModel,
-    hidden: Covered | None = None,
-    partly: bool = False,
-) -> RefinedCorners | None:
-    """The marker near to corners `start_px` (4, 2); with `partly` some of it may be outside of
-    the picture, or `hidden` (h, w).
+    method: str,
+) -> list[RefinedCorners]:
+    """Refine the corners of m markers.
 
-    None where these are no edges of such a marker, or what is seen of them does not determine
-    its corners. Nothing is said about its cells.
+    Args:
+        image: grey picture (h, w).
+        corners_px: raw corners (m, 4, 2), in order around each marker.
+        rims: for each marker what lies inside of its border.
+        method: ``line``, ``subpix`` or ``none`` (the profile's `detector.refinement`).
     """
-    start = undistort(start_px, camera)
-    cell_px = mean_side_px(start_px) / pattern.cells
-    if not finite(start) or not cell_px > (_LEAST_PARTLY_CELL_PX if partly else _MIN_CELL_PX):
-        return None
-    found = fit_edges(image, from_unit(start), pattern.outline, camera, hidden if partly else None)
-    least = _MIN_SHOWN_PARTLY if partly else _MIN_SHOWN
-    if (
-        found is None
-        or found.residual_px > _MAX_RESIDUAL_PX
-        or found.shown < least * found.in_view
-        or found.blur_px[0] > 0.9 * max(cell_px, 1.5)
-    ):
-        return None
-    refined = corners_of(found, 1.0, pattern, camera, whole=not partly)
-    if refined is None:
-        return None
-    off_px = float(np.hypot(*(refined.corners_px - start_px).T).max())
-    if partly:
-        assert refined.cov_px2 is not None
-        vaguest_px = math.sqrt(float(np.diagonal(refined.cov_px2).max()))
-        near = off_px < _MOST_OFF_PX and vaguest_px < _MAX_SIGMA * mean_side_px(start_px)
-    else:
-        near = off_px < max(1.6, 0.6 * cell_px)
-    return refined if near else None
+    corners_px = np.asarray(corners_px, dtype=np.float64).reshape(-1, 4, 2)
+    if method == "none":
+        return [RefinedCorners(raw, RAW_SIGMA_PX, False) for raw in corners_px]
+    by_lines: list[RefinedCorners | None] = [None] * len(corners_px)
+    if method == "line" and len(corners_px):
+        by_lines = refine_lines(image, corners_px, rims, camera)
+    return [
+        result if result is not None else refine_each(image, raw, rim.cells)
+        for result, raw, rim in zip(by_lines, corners_px, rims, strict=True)
+    ]
 
 
-def corners_of(
-    found: EdgeFit, half: float, pattern: Pattern, camera: CameraModel, whole: bool
-) -> RefinedCorners | None:
-    """The corners of the marker of that half side, with their covariance in pixels of a
-    pinhole; None where one is beside or behind the camera."""
-    if (found.H[2, :2] @ (half * UNIT).T + found.H[2, 2]).min() <= 0.0:
+def refine_lines(
+    image: NDArray[np.uint8],
+    raw_px: Array,
+    rims: Sequence[Rim],
+    camera: CameraModel,
+    known: EdgeShift | None = None,
+) -> list[RefinedCorners | None]:
+    """The line fit alone, for m markers (m, 4, 2); None where its residual, inliers,
+    contrast, blur or movement show that these are not a marker's sides. The shift of all
+    edges is measured unless it is known. Wide edges, and those near to the profiles' ends, are
+    looked at twice, the second time with the profiles centred on them."""
+    found = _refined_once(image, raw_px, rims, camera, known)
+    centred = raw_px.copy()
+    for i, each in enumerate(found):
+        if each is None:
+            continue
+        off_px = float(np.abs(each.corners_px - raw_px[i]).max())
+        if off_px > (_CENTRED_PX if each.blur_px > _WIDE_BLUR_PX else _NEAR_END_PX):
+            centred[i] = each.corners_px
+    if (centred == raw_px).all():
+        return found
+    again = _refined_once(image, centred, rims, camera, known)
+    return [second or first for first, second in zip(found, again, strict=True)]
+
+
+def _refined_once(
+    image: NDArray[np.uint8],
+    raw_px: Array,
+    rims: Sequence[Rim],
+    camera: CameraModel,
+    known: EdgeShift | None,
+) -> list[RefinedCorners | None]:
+    nothing: list[RefinedCorners | None] = [None] * len(raw_px)
+    markers = markers_of(raw_px, rims, camera)
+    if markers is None:
+        return nothing
+    measured = measure(image, markers, camera, with_inner=known is None)
+    sides = measured.sides
+    clipped = _clipped(sides) > CLIPPED_SHARE
+    if known is not None and clipped.any():
+        # How far clipping moves edges changes with the light.
+        return _refined_once(image, raw_px, rims, camera, None)
+    fit = _fit_lines(markers, sides)
+    shift = known
+    if shift is None:
+        corners = _intersect(fit.lines)
+        if not finite(corners):
+            return nothing
+        shift = _measured_shift(markers, measured, fit, corners)
+    applied = shift if shift is not None else EdgeShift(0.0, _shift_prior_px(sides))
+    corners = _intersect(_moved_outwards(markers, fit, applied.shift_px))
+    if not finite(corners):
+        return nothing
+    corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
+    accepted = _accepted(markers, sides, fit, corners_px)
+    ends_px2 = _ends_px2(markers, sides, fit).tolist()
+    blurs_px, normals_x = sides.blur_px.tolist(), fit.lines[:, 0].tolist()
+    found = nothing
+    for i, rim in enumerate(rims):
+        if not accepted[i]:
+            continue
+        four = slice(4 * i, 4 * i + 4)
+        ends, blurs = ends_px2[four], blurs_px[four]
+        cell_px, blur_px = float(markers.cell_px[i]), sum(blurs) / 4.0
+        found[i] = RefinedCorners(
+            corners_px=corners_px[i],
+            sigma_px=_sigma_px(cell_px, blur_px, sum(ends) / 4.0, bool(clipped[i]), rim.tolerance),
+            refined=True,
+            shift_sigma_px=applied.sigma_px,
+            blur_px=max(blurs),
+            edge_shift=shift,
+            row_sigma_px=_row_px(normals_x[four], ends),
+            least_blur_px=min(blurs),
+        )
+    return found
+
+
+def _fit_lines(markers: Markers, sides: Samples) -> _Lines:
+    """Total least squares on the points of each side."""
+    w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
+    x, y = sides.points[..., 0], sides.points[..., 1]
+    cx, cy = (w * x).dot(_ONES), (w * y).dot(_ONES)
+    dx, dy = x - cx[:, None], y - cy[:, None]
+    wx = w * dx
+    sxx, sxy, syy = (wx * dx).dot(_ONES), (wx * dy).dot(_ONES), (w * dy * dy).dot(_ONES)
+    direction = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)
+    nx, ny = -np.sin(direction), np.cos(direction)
+    residual2 = nx * nx * sxx + 2.0 * nx * ny * sxy + ny * ny * syy
+    lines = np.empty((len(w), 3))
+    lines[:, 0], lines[:, 1], lines[:, 2] = nx, ny, nx * cx + ny * cy
+    return _Lines(lines, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_unit)
+
+
+def _intersect(lines: Array) -> Array:
+    """Corner i of each marker, where side i - 1 meets side i: (m, 4, 2)."""
+    sides = lines.reshape(-1, 4, 3)
+    before = sides.take(BEFORE, axis=1)
+    ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
+    bx, by, bc = sides[..., 0], sides[..., 1], sides[..., 2]
+    det = ax * by - ay * bx
+    det = np.where(np.abs(det) < 1e-9, np.nan, det)
+    corners = np.empty((len(sides), 4, 2))
+    corners[..., 0] = (ac * by - ay * bc) / det
+    corners[..., 1] = (ax * bc - ac * bx) / det
+    return corners
+
+
+def _shift_prior_px(sides: Samples) -> float:
+    """How far edges are shifted before that is measured: by white as the camera sees it
+    beyond the sides."""
+    clipped = float(sides.grey[:, :, -1].mean()) > CLIPPED_GREY
+    return _CLIPPED_PRIOR_PX if clipped else _SHIFT_PRIOR_PX
+
+
+def _measured_shift(
+    markers: Markers, measured: Measured, fit: _Lines, corners: Array
+) -> EdgeShift | None:
+    """None where no inner edge was sampled."""
+    inner, k = measured.inner, measured.inner_of
+    if inner is None:
         return None
-    corners_px = distort(mapped(found.H, half * UNIT), camera)
-    J = corner_jacobian(camera.K @ found.H, half)
-    blur_px = max(found.blur_px[0], 1e-3)
-    cell_px = 2.0 * half * _scale_px(found.H, camera) / pattern.cells
-    bend_px = 0.0
-    if cell_px < INNER_CELL_PX * 2.0:
-        bend_px = _BEND * blur_px * math.exp(-cell_px / (_BEND_BLURS * blur_px))
-    clipped_px = CLIPPED_SIGMA_PX if found.clipped > CLIPPED_SHARE else 0.0
-    floor_px = math.hypot(_FLOOR_PX, bend_px, _REACH * blur_px**3, clipped_px)
-    cov_px2 = J @ found.cov @ J.T + floor_px**2 * np.eye(8)
-    variance_px2 = float(np.trace(cov_px2)) / 8.0
-    if not (finite(corners_px) and finite(cov_px2) and variance_px2 > 0.0):
-        return None
-    return RefinedCorners(
-        corners_px=corners_px,
-        sigma_px=math.sqrt(variance_px2),
-        refined=True,
-        blur_px=found.blur_px,
-        cov_px2=cov_px2,
-        whole=whole,
+    border = Border(
+        corners=corners[k],
+        points=inner.points,
+        weight=inner.weight,
+        blur_px=inner.blur_px,
+        depth_px=markers.depth_px[k],
+        cells=markers.rims[k].cells,
+        cell_px=float(markers.cell_px[k]),
+        tolerance=markers.rims[k].tolerance,
+        bow_px=_bow_px(markers, measured.sides, fit, k),
     )
+    return edge_shift(border, _shift_prior_px(measured.sides))
+
+
+def _bow_px(markers: Markers, sides: Samples, fit: _Lines, k: int) -> float:
+    """How far the ends of marker k's sides lie further out than their middles, the mean of
+    its sides, as far as noise does not explain it."""
+    of_k = slice(4 * k, 4 * k + 4)
+    lines, points = fit.lines[of_k], sides.points[of_k]
+    away = np.matmul(points, lines[:, :2, None])[..., 0] - lines[:, 2:]
+    scale = _outwards(markers, fit)[of_k] * markers.px_per_unit[of_k]
+    mass = np.maximum(sides.weight[of_k] @ (_PARABOLA * _PARABOLA), 1e-9)
+    bow_px = scale * ((sides.weight[of_k] * away) @ _PARABOLA) / mass
+    mean_px = float(bow_px @ _QUARTERS)
+    noise_px = 0.25 * math.sqrt(float((fit.residual_px[of_k] ** 2 / mass).sum()))
+    return mean_px if abs(mean_px) > _BOWED * noise_px else 0.0
+
+
+def _moved_outwards(markers: Markers, fit: _Lines, shift_px: float) -> Array:
+    """The lines (4m, 3) moved out of their markers."""
+    if shift_px == 0.0:
+        return fit.lines
+    lines = fit.lines.copy()
+    lines[:, 2] += _outwards(markers, fit) * (shift_px / markers.px_per_unit)
+    return lines
+
+
+def _outwards(markers: Markers, fit: _Lines) -> Array:
+    """+1 where a line's normal, which may point either way, points out of its marker, else
+    -1, (4m,)."""
+    corners = markers.corners
+    out = (corners - (_QUARTERS @ corners)[:, None]).reshape(-1, 2)
+    return np.asarray(np.sign(fit.lines[:, 0] * out[:, 0] + fit.lines[:, 1] * out[:, 1]))
+
+
+def _accepted(markers: Markers, sides: Samples, fit: _Lines, corners_px: Array) -> list[bool]:
+    """Which of the m markers have lines for sides, near to where they were expected."""
+    inliers = (sides.weight > 0.0).dot(_ONES32)
+    # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
+    contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).dot(_ONES32)
+    sharp = sides.blur_px < 0.9 * sides.near_px
+    good = [
+        residual < _MAX_RESIDUAL_PX
+        and count >= _MIN_INLIERS * PROFILES
+        and grey > _MIN_CONTRAST * PROFILES
+        and is_sharp
+        for residual, count, grey, is_sharp in zip(
+            fit.residual_px.tolist(), inliers.tolist(), contrast.tolist(), sharp.tolist(),
+            strict=True,
+        )
+    ]  # fmt: skip
+    return [
+        cell_px > _MIN_CELL_PX
+        and all(good[4 * i : 4 * i + 4])
+        # False for NaN.
+        and all(math.dist(a, b) < max(1.6, 0.6 * cell_px) for a, b in zip(*both, strict=True))
+        for i, (cell_px, *both) in enumerate(
+            zip(markers.cell_px.tolist(), corners_px.tolist(), markers.raw_px.tolist(), strict=True)
+        )
+    ]
+
+
+def _clipped(sides: Samples) -> Array:
+    """Share of the profiles of the m markers that end in clipped white, (m,)."""
+    ends = sides.grey[:, :, -1]
+    if ends.max() <= CLIPPED_GREY:
+        return np.zeros(len(ends) // 4)
+    glaring = np.count_nonzero(ends > CLIPPED_GREY, axis=1) / PROFILES
+    return np.asarray(glaring.reshape(-1, 4) @ _QUARTERS)
+
+
+def _ends_px2(markers: Markers, sides: Samples, fit: _Lines) -> Array:
+    """Variance of the ends of the sides, (4m,): a line fitted to n samples spreads twice as far
+    there as in its middle."""
+    independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
+    residual_px = fit.residual_px
+    return np.asarray(4.0 * _TAILS * residual_px * residual_px / independent)
+
+
+def _sigma_px(
+    cell_px: float, blur_px: float, noise_px2: float, clipped: bool, tolerance: float
+) -> float:
+    """Spread of a marker's corners; `noise_px2` is the variance of its sides' ends, and
+    `tolerance` that of the print, in cells."""
+    blur_px = max(blur_px, 1e-3)
+    # Cells of few pixels let the inner pattern's blur reach the border's edge.
+    bend_px = _BEND * blur_px * math.exp(-cell_px / (_BEND_BLURS * blur_px))
+    reach_px = _REACH * blur_px**3
+    clipped_px = CLIPPED_SIGMA_PX if clipped else 0.0
+    # Edges are not where they were meant to be printed.
+    print_px = tolerance * cell_px
+    noise_px = max(math.sqrt(noise_px2), MIN_LINE_SIGMA_PX)
+    return math.hypot(noise_px, bend_px, reach_px, clipped_px, print_px)
+
+
+def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
+    """Spread of a marker's corners by what shakes a picture's rows, each along itself: it moves
+    upright sides, both of a marker's alike, and lying ones not. As the residuals of its four
+    sides show it; 0 where the marker stands on a corner and nothing shows."""
+    upright = [x * x for x in normals_x]
+    mean = sum(upright) / 4.0
+    aspect = sum((each - mean) ** 2 for each in upright) / 4.0
+    if aspect <= _LEAST_ASPECT:
+        return 0.0
+    both = zip(ends_px2, upright, strict=True)
+    slope = sum(end * (each - mean) for end, each in both) / 4.0 / aspect
+    still = sum(ends_px2) / 4.0 - slope * mean
+    return math.sqrt(slope) if slope > (_LEAST_ROWS - 1.0) * max(still, 0.0) else 0.0
+
+
+# --- The sides of markers, measured: the edge's place on profiles across each of them ----------
+# A row is one side of one marker: rows 4 i to 4 i + 3 belong to marker i. After all of
+# them the inner edges of one marker's border may follow.
+
+
+_MIN_SHIFT_CELL_PX = 6.0  # of a border whose inner edge is measured too
+_SIDES = np.arange(4)[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Markers:
+    """What is to be measured: raw_px (m, 4, 2), the same normalised, the lengths of their
+    sides and the width of the cells behind each of them (m, 4), the number and mean width
+    of a marker's cells (m,), +1 or -1 as its corners run (m,), and pixels for a unit of
+    normalised coordinates along each side (4m,)."""
+
+    raw_px: Array
+    rims: Sequence[Rim]
+    corners: Array
+    sides_px: Array
+    depth_px: Array
+    cells: Array
+    cell_px: Array
+    turn: Array
+    px_per_unit: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """The sides across which profiles are sampled: every marker's, and after them perhaps
+    the inner edges of the border of marker number `best`. starts, ends (rows, 2)
+    normalised; lengths_px, depth_px (rows,); of: the marker of each; sign: +1 where white
+    is to the left of the way from start to end."""
+
+    starts: Array
+    ends: Array
+    lengths_px: Array
+    depth_px: Array
+    of: NDArray[np.intp]
+    sign: Array
+    best: int
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """grey (rows, n, steps + 1), near_px (rows,) the windows' reach in it, the edges' points
+    (rows, n, 2), normalised, their weight (rows, n) and their blur (rows,)."""
+
+    grey: Floats
+    near_px: Array
+    points: Array
+    weight: Array
+    blur_px: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """All markers' sides, and the inner edges of the border of marker number `inner_of`."""
+
+    sides: Samples
+    inner: Samples | None
+    inner_of: int
+
+
+def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Markers | None:
+    """None where one of the markers is no square at all."""
+    sides_px = side_lengths_px(raw_px)
+    cells = np.array([rim.cells for rim in rims], dtype=np.float64)
+    corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
+    turn = np.sign(doubled_area(raw_px))
+    is_square = turn.all() and sides_px.min() > 1e-6
+    if not (is_square and finite(corners)):
+        return None
+    along = corners.take(NEXT, axis=1) - corners
+    across_px = sides_px.take(BEFORE, axis=1) + sides_px.take(NEXT, axis=1)
+    return Markers(
+        raw_px=raw_px,
+        rims=rims,
+        corners=corners,
+        sides_px=sides_px,
+        # The inner row lies one cell further in, along the neighbouring sides.
+        depth_px=0.5 * across_px / cells[:, None],
+        cells=cells,
+        cell_px=sides_px @ _QUARTERS / cells,
+        turn=turn,
+        px_per_unit=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
+    )
+
+
+def _rows(markers: Markers, with_inner: bool) -> _Rows:
+    """Every marker's sides; then the inner edge of the border with the largest cells,
+    which shows best by how much all edges are shifted."""
+    starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
+    of = np.arange(len(starts)).repeat(4)
+    best = int(markers.cell_px.argmax())
+    with_inner = with_inner and float(markers.cell_px[best]) > _MIN_SHIFT_CELL_PX
+    if with_inner:
+        r = 1.0 - 2.0 / float(markers.cells[best])
+        inner = mapped(from_unit(markers.corners[best]), r * UNIT)[None]
+        starts = np.concatenate([starts, inner])
+        lengths_px = np.concatenate([lengths_px, r * lengths_px[best : best + 1]])
+        depth_px = np.concatenate([depth_px, depth_px[best : best + 1]])
+        of = np.append(of, (best, best, best, best))
+    # Normals point out of a marker whose corners run clockwise; dark must come first.
+    sign = markers.turn[of]
+    if with_inner:
+        sign[-4:] *= -1.0
+    return _Rows(
+        starts=starts.reshape(-1, 2),
+        ends=starts.take(NEXT, axis=1).reshape(-1, 2),
+        lengths_px=lengths_px.ravel(),
+        depth_px=depth_px.ravel(),
+        of=of,
+        sign=sign,
+        best=best,
+    )
+
+
+def measure(
+    image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
+) -> Measured:
+    """The edges' places on profiles across all sides, and across the inner edges of the
+    border with the largest cells, on request and if these are large enough."""
+    rows = _rows(markers, with_inner)
+    s = places(rows.lengths_px)
+    origin, normal = side_profiles(rows.starts, rows.ends, s, camera)
+    normal *= rows.sign[:, None, None]
+    cell_px = markers.cell_px
+    near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)[rows.of]
+    half_px = np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)[rows.of]
+    grey = sample(image, origin, normal, half_px)
+    edges = locate(grey, half_px, near_px, _surroundings(s, markers.rims, rows))
+    points = undistort((origin + edges.offset_px[..., None] * normal).reshape(-1, 2), camera)
+    points = points.reshape(-1, PROFILES, 2)
+    if not finite(points):
+        points = np.nan_to_num(points)
+
+    def part(chosen: slice) -> Samples:
+        return Samples(
+            grey=grey[chosen],
+            near_px=near_px[chosen],
+            points=points[chosen],
+            weight=edges.weight[chosen],
+            blur_px=edges.blur_px[chosen],
+        )
+
+    n = 4 * len(markers.raw_px)
+    inner = part(slice(n, None)) if len(rows.of) > n else None
+    return Measured(part(slice(0, n)), inner, rows.best)
+
+
+def _surroundings(s: Array, rims: Sequence[Rim], rows: _Rows) -> Surroundings:
+    """Which profiles at places `s` have a neighbouring edge, and which have an edge."""
+    inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
+    possible = np.ones(s.shape, np.bool_)
+    for i, rim in enumerate(rims):
+        four = slice(4 * i, 4 * i + 4)
+        inside[four] = rim.white[_SIDES, (s[four] * rim.cells).astype(np.intp)]
+    if len(s) > 4 * len(rims):
+        rim = rims[rows.best]
+        at = 1.0 + s[-4:] * (rim.cells - 2)  # in cells from the border's corner
+        # Near a black cell of the rim, or with one behind, blur bends the edge.
+        free = rim.open[_SIDES, (at - 0.3).astype(np.intp)]
+        free = free * rim.open[_SIDES, (at + 0.3).astype(np.intp)]
+        possible[-4:] = free > 0.0
+        outside[-4:] = 1.0
+    return Surroundings(rows.depth_px, inside, outside, possible)
+
+
+# --- Edges between black and white to a hundredth of a pixel, on grey profiles across them -----
+# The edge in each profile is the gradient's windowed centroid; this is repeated with the
+# window centred on the side's own line (narrow, hence calm in noise). A blur that is equal
+# on both flanks of an edge does not move its centroid.
+#
+# All that a row (one side of one marker) shares is (rows,), what differs from profile to
+# profile (rows, n). Single precision suffices.
+
+
+def _single(value: float) -> Floats:
+    """A number as arrays meet it soonest: beside one of numpy's scalars they take twice as long."""
+    return np.array(value, dtype=np.float32)
+
+
+_ALONG32 = ALONG.astype(np.float32)
+_ZERO, _ONE, _TINY = _single(0.0), _single(1.0), _single(1e-9)
+_QUARTER_OF, _MINUS_HALF = _single(0.25), _single(-0.5)
+_WINDOW2, _MOST_SHARE = _single(2.25), _single(0.9)
+_LEAST_MOMENT2, _MOST_MOMENT = _single(0.01), _single(0.8)
+_PER_NEAR = _single(1.0 / 0.6)  # of the wide window's spread
+_TUKEY = _single(3.5 * 1.4826)
+_POWERS: Floats = (ALONG[:, None] ** np.arange(3)).astype(np.float32)
+_STEP_ONES: Floats = np.ones(STEPS, dtype=np.float32)
+_LEAST_SHARE = _single(0.3)  # of the row's mean gradient, for a profile to count
+_TUKEY_FLOOR_PX = _single(3.5 * 0.05)  # of the scatter that is taken for noise
+_ONE_ROUND_PX = 0.2  # a wide window that is off by less needs only one narrow round
+_SETTLED_PX = 0.06
+_ROUNDS = 3
+_LEAST_WINDOW2 = _single(0.81)  # square of its sigma, px^2
+_FAR = _single(1e6)
+_QUARTER = PROFILES // 4
+_QUARTER_ONES: Floats = np.ones(_QUARTER, dtype=np.float32)
+# The line through values in the middles of both halves of the profiles, (2, n).
+_SLOPE: Floats = _ALONG32 * _single(0.5 / float(ALONG[PROFILES // 2 :].mean()))
+_THROUGH_HALVES: Floats = np.stack([_single(0.5) - _SLOPE, _single(0.5) + _SLOPE])
+_HIGH_LOW: Floats = np.where(np.arange(PROFILES) % 2, _FAR, -_FAR).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What lies beside the edges.
+
+    depth_px: width of a cell, (rows,). inside, outside: 1 where a falling edge of the same
+    height lies one cell further in or out, (rows, n). possible: False where there is no
+    edge to be found, (rows, n).
+    """
+
+    depth_px: Array
+    inside: Floats
+    outside: Floats
+    possible: NDArray[np.bool_]
+
+    def only(self, kept: NDArray[np.intp]) -> Surroundings:
+        """Of some of the rows."""
+        return Surroundings(
+            self.depth_px[kept], self.inside[kept], self.outside[kept], self.possible[kept]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """offset_px: an edge's place along the profile's normal, (rows, n). weight: of the
+    profiles, 0 for outliers, (rows, n). blur_px: of each row, a standard deviation, (rows,).
+    """
+
+    offset_px: Array
+    weight: Array
+    blur_px: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Gradients:
+    """The profiles' gradients at places `u` (rows, steps) and what every window over them
+    needs: its reach `near`, the cells' width, the square of its largest sigma, the
+    flanks with a neighbouring edge (`both`, `side`: outside less inside), the
+    profiles that `can` show an edge, and `part`, which makes of a row's sum the least
+    value that counts."""
+
+    gradient: Floats
+    u: Floats
+    near: Floats
+    depth: Floats
+    most2: Floats
+    both: Floats
+    side: Floats
+    can: Floats
+    part: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class _Centroids:
+    """Where the window saw the edges, px, which of them count, and the blur's square."""
+
+    edge: Floats
+    usable: NDArray[np.bool_]
+    blur2: Floats
+
+
+def locate(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> Edges:
+    """The place of an edge that rises along the profile.
+
+    Args:
+        grey: (rows, n, steps + 1), the profile from -half_px to +half_px.
+        half_px, near_px: reach of the profiles and of the windows, (rows,).
+    """
+    gradients = _gradients(grey, half_px, near_px, around)
+    seen = _wide(gradients)
+    line = weight = _halves_line(seen.edge, seen.usable)
+    moved_px = np.inf
+    for k in range(_ROUNDS):
+        if k == 1 and moved_px < _ONE_ROUND_PX:
+            continue
+        seen = _narrow(gradients, line, seen.blur2)
+        rounds = 2 if k == _ROUNDS - 1 else 1
+        centre, weight = _robust_line(seen.edge, seen.usable, rounds)
+        moved_px, line = float(np.abs(centre - line).max()), centre
+        if moved_px < _SETTLED_PX:
+            break
+    return Edges(
+        offset_px=seen.edge.astype(np.float64),
+        weight=weight.astype(np.float64),
+        blur_px=np.sqrt(seen.blur2).astype(np.float64),
+    )
+
+
+def _gradients(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> _Gradients:
+    inside, outside, can = around.inside, around.outside, around.possible.astype(np.float32)
+    near, depth = near_px.astype(np.float32), around.depth_px.astype(np.float32)
+    return _Gradients(
+        gradient=grey[:, :, 1:] - grey[:, :, :-1],
+        u=half_px.astype(np.float32)[:, None] * MIDDLES,
+        near=near,
+        depth=depth,
+        most2=_QUARTER_OF * near * near,
+        both=inside + outside,
+        side=outside - inside,
+        can=can,
+        # Multiplies a sum over a row's profiles: a part of the mean over those possible.
+        part=_LEAST_SHARE / np.maximum(can.dot(_ONES32), _ONE),
+    )
+
+
+def _wide(g: _Gradients) -> _Centroids:
+    """By one window around the middle of all profiles; the blur is not measured yet."""
+    spread = g.u * (_PER_NEAR / g.near)[:, None]
+    spread *= spread
+    window = np.empty((*g.u.shape, 2), dtype=np.float32)
+    np.exp(_MINUS_HALF * spread, out=window[..., 0])
+    np.multiply(window[..., 0], g.u, out=window[..., 1])
+    moments: Floats = np.maximum(g.gradient, _ZERO) @ window
+    total = moments[..., 0] * g.can
+    usable = total > (total.dot(_ONES32) * g.part)[:, None]
+    edge = np.divide(moments[..., 1], np.where(usable, total, _ONE))
+    return _Centroids(edge, usable, np.ones(len(g.near), dtype=np.float32))
+
+
+def _narrow(g: _Gradients, line: Floats, blur2: Floats) -> _Centroids:
+    """By a window around the row's line (rows, n), as wide as its blur so far demands."""
+    relative = g.u[:, None, :] - line[:, :, None]
+    # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
+    w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), g.most2)
+    squared = relative * relative
+    mass = squared * (_MINUS_HALF / w2)[:, None, None]
+    np.exp(mass, out=mass)
+    mass *= g.gradient
+    total = (mass @ _STEP_ONES) * g.can
+    usable = total > np.maximum(total.dot(_ONES32) * g.part, _TINY)[:, None]
+    # A neighbour seen through the window has this share, at this place, with this
+    # spread; the one outside lies at the same distance on the other flank.
+    wide2 = w2 + blur2
+    place = g.depth * w2 / wide2
+    lost = np.exp(_MINUS_HALF * g.depth * g.depth / wide2)
+    share = np.minimum(g.both * lost[:, None], _MOST_SHARE)
+    total = np.where(usable, total / (_ONE - share), _ONE)
+    relative *= mass
+    first = relative @ _STEP_ONES + total * g.side * (lost * place)[:, None]
+    mass *= squared
+    second = mass @ _STEP_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
+    moment = (second * usable).dot(_ONES32)
+    moment /= np.maximum((total * usable).dot(_ONES32), _TINY)
+    moment = np.minimum(np.maximum(moment, _LEAST_MOMENT2), _MOST_MOMENT * w2)
+    found2 = moment * w2 / (w2 - moment)
+    # The window pulls the centroid towards its own middle: undo that.
+    centroid = first / total * (_ONE + found2 / w2)[:, None]
+    limit = g.near[:, None]
+    return _Centroids(line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2)
+
+
+def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
+    """Straight lines (rows, n) through the middles of the two halves of each row: where a
+    window is put, whatever a quarter of either half shows. A half that shows nothing is
+    taken to lie where the other does."""
+    halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
+    halves.sort(axis=2)
+    first = _QUARTER // 2
+    middle = halves[:, :, first : first + _QUARTER]
+    # Left out before the sum: beside the others' size an edge's place is rounded away.
+    shown = np.abs(middle) < _FAR
+    count = shown @ _QUARTER_ONES
+    mean = (middle * shown) @ _QUARTER_ONES / np.maximum(count, _ONE)
+    return np.asarray(np.where(count, mean, mean[:, ::-1]) @ _THROUGH_HALVES)
+
+
+def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:
+    """Straight lines edge(s) a row with Tukey's weights; returns (line, weight)."""
+    line = median(edge, usable)[:, None]
+    for _ in range(rounds):
+        size = np.abs(edge - line)
+        size /= np.maximum(_TUKEY * median(size, usable), _TUKEY_FLOOR_PX)[:, None]
+        size *= size
+        weight = np.maximum(_ONE - size, _ZERO)
+        weight *= weight
+        weight *= usable
+        w = weight.dot(_POWERS)
+        e = (weight * edge).dot(_POWERS)
+        w0, w1 = np.maximum(w[:, 0], _TINY), w[:, 1]
+        mean, middle = e[:, 0] / w0, w1 / w0
+        slope = (e[:, 1] - mean * w1) / np.maximum(w[:, 2] - middle * w1, _TINY)
+        line = slope[:, None] * (_ALONG32 - middle[:, None])
+        line += mean[:, None]
+    return line, weight
+
+
+def median(values: Floats, usable: NDArray[np.bool_]) -> Floats:
+    """Each row's median over its usable values, to a rank, (rows,); 0 without any.
+
+    The others are set high and low by turns, which keeps the middle where it is.
+    """
+    values = np.where(usable, values, _HIGH_LOW)
+    values.partition(PROFILES // 2, axis=1)
+    found = values[:, PROFILES // 2]
+    return np.asarray(np.where(np.abs(found) < _FAR, found, _ZERO))

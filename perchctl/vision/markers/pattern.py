@@ -1,28 +1,52 @@
-"""How a marker looks: its cells, its drawing on a grid, and the edges of that."""
+"""How a marker looks: the rim of its border, its cells, its drawing; and whether the picture
+shows these cells at given corners.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.corners import increments
+from perchctl.vision.markers.corners import from_unit, mapped, within
 
 LEAST_SIDE_PX = 7.0  # below it a marker is a spot
+MIN_CONTRAST = 10.0  # grey levels
+CELL_MARGIN = 0.1  # of the contrast that a cell must keep from the threshold
+MOST_CELLS = 0.8
+_MIN_RESEMBLANCE = 0.6
 _COVERED = 1.25  # half sides of a marker in the centre that may hide cells
 _SPOTS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]])
+
+
+@dataclass(frozen=True, eq=False)
+class Rim:
+    """What lies inside of a marker's border, side by side in the order of the corners,
+    the cells at both ends being the border's own: (4, n) each.
+
+    white: the row next to the border; open: where a white cell follows behind a
+    white one; tolerance: of a printed edge's place, in cells.
+    """
+
+    white: Array
+    open: Array
+    tolerance: float = 0.0
+
+    @property
+    def cells(self) -> int:
+        return int(self.white.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
     """How one marker looks.
 
-    drawing: all of it. outline: the edges between its cells. spots (n, 2): points in its own
+    rim: inside of its border. drawing: all of it. spots (n, 2): points in its own
     coordinates (see `perchctl.vision.markers.corners`) at which its cells are read; owner
     (n,): the cell of each; white (cells,): what they must be; soft (4, n):
     what blur of half a cell makes of them at the spots, without mean and of unit length,
@@ -30,8 +54,8 @@ class Pattern:
     border.
     """
 
+    rim: Rim
     drawing: Drawing
-    outline: Outline
     spots: Array
     owner: NDArray[np.intp]
     spots_per_cell: Array
@@ -39,13 +63,28 @@ class Pattern:
     white: NDArray[np.bool_]
     inner: NDArray[np.bool_]
 
-    @property
-    def cells(self) -> int:
-        """Along a side, with the border's."""
-        return len(self.drawing.cells)
+
+def rim_of_bits(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
+    """The rim of a marker with the inner bits (n, n), 1 = white.
+
+    At small sizes the rim's blur reaches the border's outer edge and would push it out.
+    """
+    n = len(bits)
+
+    def ring(depth: int) -> Array:
+        if 2 * depth >= n:
+            return np.ones((4, n))
+        last = n - 1 - depth
+        return np.asarray(
+            (bits[depth], bits[:, last], bits[last, ::-1], bits[::-1, depth]), dtype=np.float64
+        )
+
+    white = np.pad(ring(0), ((0, 0), (1, 1)))
+    second = np.pad(ring(1), ((0, 0), (1, 1)))
+    return Rim(white, white * second, tolerance)
 
 
-def pattern_of(drawing: Drawing) -> Pattern:
+def pattern_of(rim: Rim, drawing: Drawing) -> Pattern:
     """Spots in every cell, but for those that another marker in the centre covers."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
@@ -63,8 +102,8 @@ def pattern_of(drawing: Drawing) -> Pattern:
         at = np.stack([-at[:, 1], at[:, 0]], axis=1)
     own = np.searchsorted(kept, owner[free]).astype(np.intp)
     return Pattern(
+        rim=rim,
         drawing=drawing,
-        outline=outline_of(drawing),
         spots=np.ascontiguousarray(spots[free]),
         owner=own,
         spots_per_cell=np.bincount(own).astype(np.float64),
@@ -72,6 +111,95 @@ def pattern_of(drawing: Drawing) -> Pattern:
         white=drawing.cells.ravel()[kept] > 0.5,
         inner=np.abs(centres).max(axis=1)[kept] < 1.0 - 2.0 / n,
     )
+
+
+def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
+    """Whether every cell of the marker at these corners has its colour, clearly."""
+    means = _cell_means(image, corners_px, pattern)
+    if means is None:
+        return False
+    white, black = means[pattern.white], means[~pattern.white]
+    # The light may differ across the marker: white and black are the medians.
+    high = float(np.partition(white, len(white) // 2)[len(white) // 2])
+    low = float(np.partition(black, len(black) // 2)[len(black) // 2])
+    contrast = high - low
+    middle, margin = 0.5 * (high + low), CELL_MARGIN * contrast
+    return bool(
+        contrast >= MIN_CONTRAST and white.min() > middle + margin and black.max() < middle - margin
+    )
+
+
+def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
+    """Whether nearly all cells have their colour, the others being covered."""
+    means = _cell_means(image, corners_px, pattern)
+    if means is None:
+        return False
+    high, low = np.median(means[pattern.white]), np.median(means[~pattern.white])
+    right = (means > 0.5 * (high + low)) == pattern.white
+    return bool(high - low >= MIN_CONTRAST and right.mean() > MOST_CELLS)
+
+
+def resembles(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
+    """Whether the grey values in the cells go with the pattern, blurred as they may be."""
+    return float(resemblance(image, corners_px, pattern)[0]) > _MIN_RESEMBLANCE
+
+
+def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
+    """Correlation of the cells' grey values with the pattern for corners (4, 2) rolled on
+    by 0 to 3, as `np.roll` does; (4,), 0 without contrast."""
+    grey = _read(image, corners_px, pattern)
+    return np.zeros(4) if grey is None else _likeness(grey[None], pattern)[0]
+
+
+def resemblances(image: NDArray[np.uint8], squares: Array, pattern: Pattern) -> Array:
+    """`resemblance` of many at a time: homographies (m, 3, 3) of the unit square to (m, 4)."""
+    like = np.zeros((len(squares), 4))
+    inside, grey = _read_many(image, squares, pattern)
+    like[inside] = _likeness(grey, pattern)
+    return like
+
+
+def _likeness(grey: Array, pattern: Pattern) -> Array:
+    """Correlation (m, 4) of grey values (m, k) at the spots, 0 without contrast."""
+    grey = grey - grey.sum(axis=1, keepdims=True) / grey.shape[1]
+    spread = np.sqrt((grey * grey).sum(axis=1))[:, None]
+    like = grey @ pattern.soft.T / np.maximum(spread, 1e-9)
+    # Black and white each on about half of the spots are 2 spreads apart.
+    contrast = spread >= 0.5 * MIN_CONTRAST * math.sqrt(grey.shape[1])
+    return np.asarray(like * contrast)
+
+
+def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
+    """Mean grey value of each cell that is read, None where one is outside of the picture."""
+    grey = _read(image, corners_px, pattern)
+    if grey is None:
+        return None
+    return np.asarray(np.bincount(pattern.owner, weights=grey) / pattern.spots_per_cell)
+
+
+def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
+    """Grey values (k,) at the pattern's k spots, None where one is outside of the picture."""
+    at = mapped(from_unit(corners_px), pattern.spots)
+    # Spots are inside of the corners.
+    if not (within(corners_px, image.shape) or within(at, image.shape)):
+        return None
+    nearest = (at + 0.5).astype(np.intp)
+    return image[nearest[:, 1], nearest[:, 0]].astype(np.float64)
+
+
+def _read_many(
+    image: NDArray[np.uint8], H: Array, pattern: Pattern
+) -> tuple[NDArray[np.bool_], Array]:
+    """Which of m squares (m, 3, 3) have all spots in the picture, and the grey values
+    (n, k) at the k spots of those."""
+    h, w = image.shape
+    at = pattern.spots @ H[:, :2, :2].transpose(0, 2, 1) + H[:, None, :2, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at /= pattern.spots @ H[:, 2, :2, None] + H[:, 2, 2, None, None]
+        low, high = at.min(axis=1), at.max(axis=1)
+        inside = (low >= 0.0).all(axis=1) & (high <= (w - 1, h - 1)).all(axis=1)
+    nearest = (at[inside] + 0.5).astype(np.intp)
+    return inside, image[nearest[..., 1], nearest[..., 0]].astype(np.float64)
 
 
 def _softened(drawing: Drawing, spots: Array) -> Array:
@@ -181,100 +309,3 @@ def softened(sharp: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     """Nodes, those all around among them, blurred by so many."""
     soft = cv2.GaussianBlur(sharp, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(soft, np.float32)
-
-
-# --- The edges of a drawing between black and white --------------------------------------------
-
-
-_LARGE_PLACES, _SMALL_PLACES = 6, 4  # along a cell's side
-_FROM_END = 0.2  # of a cell's side, where the next cell's corner blurs the edge
-_HIDDEN = 1.2  # half sides of the marker in the centre, within which the large one is not seen
-
-
-@dataclass(frozen=True, eq=False)
-class Outline:
-    """Places along the edges between black and white, in the drawing's own coordinates.
-
-    Attributes:
-        at: (n, 2).
-        normal: (n, 2), from black to white.
-        line: the line that each lies on (n,).
-        cell: the width of the cells beside it (n,).
-        spacing: from place to place (n,).
-        border: whether it is the outer edge of the border (n,).
-        small: whether it is that of the small marker in the centre of a large one (n,).
-    """
-
-    at: Array
-    normal: Array
-    line: NDArray[np.intp]
-    cell: Array
-    spacing: Array
-    border: NDArray[np.bool_]
-    small: NDArray[np.bool_]
-
-    @cached_property
-    def J(self) -> Array:
-        """Changes (n, 8) across the edges with the terms of an increment (see
-        `perchctl.vision.markers.corners`)."""
-        return np.asarray(np.einsum("ni,nij->nj", self.normal, increments(self.at)))
-
-
-def outline_of(drawing: Drawing) -> Outline:
-    """Of one marker. What another one in its centre hides is left out."""
-    places = _SMALL_PLACES if drawing.centre is None else _LARGE_PLACES
-    whole = _outline(drawing.cells, 1.0, places)
-    return _only(whole, np.abs(whole.at).max(axis=1) > _HIDDEN * drawing.ratio)
-
-
-@lru_cache(maxsize=8)
-def outline_of_both(drawing: Drawing) -> Outline:
-    """Of a large marker and of the small one in its centre, in the large one's coordinates."""
-    large = outline_of(drawing)
-    if drawing.centre is None:
-        return large
-    small = _outline(drawing.centre, drawing.ratio, _SMALL_PLACES)
-    return Outline(
-        at=np.concatenate([large.at, small.at]),
-        normal=np.concatenate([large.normal, small.normal]),
-        line=np.concatenate([large.line, small.line + large.line.max() + 1]),
-        cell=np.concatenate([large.cell, small.cell]),
-        spacing=np.concatenate([large.spacing, small.spacing]),
-        border=np.concatenate([large.border, small.border]),
-        small=np.repeat([False, True], [len(large.at), len(small.at)]),
-    )
-
-
-def _only(outline: Outline, kept: NDArray[np.bool_]) -> Outline:
-    return Outline(*(getattr(outline, each.name)[kept] for each in fields(outline)))
-
-
-def _outline(cells: Array, half: float, places: int) -> Outline:
-    """The sides at which a marker's cells (or the paper around it) differ."""
-    n = len(cells)
-    width = 2.0 * half / n
-    s = _FROM_END + (1.0 - 2.0 * _FROM_END) * (np.arange(places) + 0.5) / places
-    at, normal, line, border = [], [], [], []
-    for across in (0, 1):
-        rows = cells if across == 0 else cells.T
-        step = np.diff(np.pad(rows, 1, constant_values=1.0)[1:-1], axis=1)
-        for i, j in np.argwhere(step != 0.0).tolist():
-            edge = np.empty((places, 2))
-            edge[:, across] = width * j - half
-            edge[:, 1 - across] = width * (i + s) - half
-            way = np.zeros(2)
-            way[across] = np.sign(step[i, j])
-            at.append(edge)
-            normal.append(np.tile(way, (places, 1)))
-            line.append(np.full(places, (n + 1) * across + j))
-            border.append(np.full(places, j in (0, n)))
-    count = places * len(at)
-    return Outline(
-        at=np.concatenate(at),
-        normal=np.concatenate(normal),
-        line=np.concatenate(line),
-        cell=np.full(count, width),
-        spacing=np.full(count, width * float(s[1] - s[0])),
-        border=np.concatenate(border),
-        small=np.zeros(count, np.bool_),
-    )

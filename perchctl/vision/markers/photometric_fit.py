@@ -18,6 +18,7 @@ from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
+from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
@@ -64,21 +65,13 @@ _PRIOR: Array = (
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A drawing as it lies in the picture.
-
-    Attributes:
-        corners_px: (4, 2).
-        sigma_px, cov_px2: their spread, and their covariance (8, 8) in pixels of a pinhole.
-        likeness: correlation with the drawing.
-        pattern: correlation with the drawing of what a black square of the same size would
-            leave over; strength: the height of the pattern's bits over the border's.
-        worst_cell: the largest mean departure of a cell, in units of the gain.
-        flip, flip_sigma: as `CellsSeen` has them.
-    """
+    """corners_px (4, 2) and their spread; `likeness` is the correlation with the
+    drawing, `pattern` that of what a black square of the same size would leave over,
+    `strength` the height of the pattern's bits over the border's, `worst_cell` the
+    largest mean departure of a cell, in units of the gain."""
 
     corners_px: Array
     sigma_px: float
-    cov_px2: Array
     likeness: float
     pattern: float
     strength: float
@@ -301,11 +294,9 @@ def _alignment(fit: _Fit, equations: _Equations, scene: _Scene, start_px: Array)
         light.gain,
     )
     J = corner_jacobian(fit.H)
-    cov_px2 = J @ covariance @ J.T
     return Alignment(
         corners_px=corners_px,
-        sigma_px=math.sqrt(max(float(np.trace(cov_px2)) / 8.0, 0.0)),
-        cov_px2=cov_px2,
+        sigma_px=math.sqrt(max(float(np.trace(J @ covariance @ J.T)) / 8.0, 0.0)),
         likeness=likeness(equations.grey, error),
         pattern=pattern.correlation,
         strength=pattern.strength,
@@ -471,6 +462,9 @@ def lit_jacobian(drawing: Rendered, light: Light) -> Array:
 # --- A grid over a marker in its own coordinates, and the picture read at its nodes ------------
 
 
+_FEW = 9  # a side
+
+
 @dataclass(frozen=True, eq=False)
 class Grid:
     """n by n nodes, `axis` (n,) in both directions; u, v and 1 of each node, (3, n * n)."""
@@ -502,8 +496,12 @@ class Patch:
 def make_grid(n: int, reach: float) -> Grid:
     """Nodes in the middle of n by n equal parts of the square from -reach to reach."""
     axis = reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
+    return Grid(n, axis, _crossings(axis))
+
+
+def _crossings(axis: Array) -> Array:
     u, v = np.meshgrid(axis, axis)
-    return Grid(n, axis, np.stack([u.ravel(), v.ravel(), np.ones(u.size)]))
+    return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
 
 
 def projected(H: Array, uv1: Array) -> Array:
@@ -522,9 +520,24 @@ def through_lens(pin_px: Array, camera: CameraModel) -> Array:
 
 
 def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
-    """How far the lens moves each node that is seen through H, (2, n * n)."""
-    pin = projected(H, grid.uv1)
-    return through_lens(pin, camera) - pin
+    """How far the lens moves each node that is seen through H, (2, n * n). A lens moves
+    neighbours alike: it is computed for a few nodes, and the rest by the polynomial through
+    these."""
+    uv1, between = _few(grid)
+    pin = projected(H, uv1)
+    shift = (through_lens(pin, camera) - pin).reshape(2, _FEW, _FEW)
+    return np.asarray((between @ shift @ between.T).reshape(2, -1))
+
+
+@lru_cache(maxsize=64)
+def _few(grid: Grid) -> tuple[Array, Array]:
+    """Chebyshev's nodes over the grid (3, _FEW^2), and the weights (n, _FEW) that a row's nodes
+    give to its values there."""
+    reach = float(grid.axis[-1])
+    x = chebyshev.chebpts2(_FEW)
+    degree = _FEW - 1
+    through = np.linalg.inv(chebyshev.chebvander(x, degree))
+    return _crossings(reach * x), chebyshev.chebvander(grid.axis / reach, degree) @ through
 
 
 def patch_around(image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array) -> Patch | None:

@@ -51,7 +51,7 @@ KINDS = (b"header", b"turn", b"sent", b"event", b"summary")
 KEPT = tuple(b'{"kind":"' + kind + b'"' for kind in KINDS)
 
 
-PICTURES = 35
+PICTURES = 37
 """So many are kept: from the first before take-off until only the small marker is in view."""
 SMALL = {"link.telemetry_period_s": 0.02, "link.loop_hz": 25}
 """Half the turns, and half the samples."""
@@ -71,7 +71,7 @@ def _seen(log: Path) -> None:
     }
     profile = short_profile(SMALL | changes)
     watcher = LogWatcher.lockstep(log, profile, 4, record=True)
-    flight = fly_lockstep(profile, 4, watcher)
+    flight = fly_lockstep(profile, 4, watcher, operator_at={Phase.PERCH: Operator.STOP})
     watcher.close(flight.report, flight.perched_miss_m, flight.fell)
 
 

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 
 from perchctl.profile import DetectorConfig, TargetConfig
-from perchctl.vision import Detection, Detections
+from perchctl.vision import Detection, Detections, make_aruco_detector
 from perchctl.vision.markers import blurred
 from perchctl.vision.markers.blurred import expected_in_blur, hidden_in_blur
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import make_aruco_detector
 from tests.helpers.markers import SETUP, blurry, frame
 from tests.helpers.target_picture import CAMERA
 

@@ -1,5 +1,3 @@
-"""Whether the picture shows a marker's cells, read at spots or told apart through blur."""
-
 from __future__ import annotations
 
 import cv2
@@ -9,68 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.geometry import Array
-from perchctl.vision import MARKERS, CameraModel
+from perchctl.vision import CameraModel
 from perchctl.vision.markers.blurred import told_apart
-from perchctl.vision.markers.cells import cells_agree, resemblance
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.photometric_fit import Alignment, align
-from tests.helpers.markers import POSE, SETUP, corners, frame
-from tests.helpers.target_picture import CAMERA, render
-
-
-def test_every_single_cell_counts() -> None:
-    image = render(*POSE)
-    pattern = SETUP.patterns["large"]
-    assert cells_agree(image, corners("large"), pattern, CAMERA)
-    H = cv2.getPerspectiveTransform(
-        np.array([[0, 0], [6, 0], [6, 6], [0, 6]], dtype=np.float32),
-        corners("large").astype(np.float32),
-    )
-    central = {(r, c) for r in (2, 3) for c in (2, 3)}
-    for row in range(6):
-        for column in range(6):
-            if (row, column) in central:
-                continue  # the small marker covers part of these
-            spoilt = image.copy()
-            cell = np.array([[column, row], [column + 1, row], [column + 1, row + 1],
-                             [column, row + 1]], dtype=np.float64)  # fmt: skip
-            quad = cv2.perspectiveTransform(cell[:, None], H)[:, 0]
-            grey = int(image[tuple(np.rint(quad.mean(axis=0)[::-1]).astype(int))])
-            cv2.fillConvexPoly(spoilt, np.rint(quad).astype(np.int32), 30 if grey > 120 else 205)
-            assert not cells_agree(spoilt, corners("large"), pattern, CAMERA), (row, column)
-
-
-def test_resemblance_gives_the_turn_of_a_marker() -> None:
-    image = cv2.GaussianBlur(render(*POSE), (0, 0), 2.0)
-    for name in MARKERS:
-        for k in range(4):
-            rolled = np.roll(corners(name), -k, axis=0)
-            likeness = resemblance(np.asarray(image), rolled, SETUP.patterns[name])
-            assert int(np.argmax(likeness)) == k
-            assert likeness[k] > 0.8
-
-
-def test_some_covered_cells_are_allowed_for_where_the_place_is_known() -> None:
-    pattern, quad = SETUP.patterns["large"], corners("large")
-    image = render(*POSE)
-    x, y = np.rint(0.92 * quad[1] + 0.08 * quad[3]).astype(int)
-    image[y - 14 : y + 15, x - 14 : x + 15] = 200
-    assert not cells_agree(image, quad, pattern, CAMERA)
-    assert cells_agree(image, quad, pattern, CAMERA, "other")
-    assert not cells_agree(image, quad + 30.0, pattern, CAMERA, "other")
-
-
-def test_cells_outside_of_the_picture_or_without_contrast_agree_with_nothing() -> None:
-    pattern, image = SETUP.patterns["large"], render(*POSE)
-    flat = np.full_like(image, 120)
-    for picture, quad in ((image, corners("large") + 500.0), (flat, corners("large"))):
-        assert not cells_agree(picture, quad, pattern, CAMERA)
-        assert not cells_agree(picture, quad, pattern, CAMERA, "other")
-        assert np.array_equal(resemblance(picture, quad, pattern), np.zeros(4))
-
-
-# --- Told apart through blur ---------------------------------------------------------------------
-
+from tests.helpers.markers import SETUP, frame
 
 PLAIN = CameraModel((160, 120), np.array([[200.0, 0, 80], [0, 200.0, 60], [0, 0, 1]]), np.zeros(5))
 CELLS: Array = SETUP.patterns["small"].drawing.cells
@@ -80,8 +21,8 @@ DOTS = 12
 
 def seen(cells: Array, cell_px: float, blur_px: float, noise: float, seed: int) -> Alignment:
     """The small marker's drawing laid over a picture of these cells."""
-    image, at = picture(cells, cell_px, blur_px, noise, seed)
-    found = align(image, at, SETUP.patterns["small"].drawing, PLAIN, blur_px)
+    image, corners = picture(cells, cell_px, blur_px, noise, seed)
+    found = align(image, corners, SETUP.patterns["small"].drawing, PLAIN, blur_px)
     assert found is not None
     return found
 
@@ -99,8 +40,8 @@ def picture(
     first, size = 2.0 * cell_px, len(cells) * cell_px
     unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     # A dot's middle is half a dot from its edge.
-    at = unit * size + first + (shift, shift - 20.0) - 0.5 * scale
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8), at
+    corners = unit * size + first + (shift, shift - 20.0) - 0.5 * scale
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8), corners
 
 
 @given(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import cv2
@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from perchctl.profile import DetectorConfig, TargetConfig
-from perchctl.vision import Detection, Detections, Frame, project, square_corners
-from perchctl.vision.markers.detect import detect_markers, predicted_corners, with_motion
-from perchctl.vision.markers.detector import make_aruco_detector
-from perchctl.vision.markers.search import misfit
-from tests.helpers.markers import SETUP, blurry, box, frame, paste
+from perchctl.vision import Detections, Frame, make_aruco_detector, project, square_corners
+from perchctl.vision.markers.blurred import hidden_in_blur
+from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.markers.search import misfit, search
+from tests.helpers.markers import SETUP, blurry, both, box, frame, paste
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 
@@ -100,6 +100,37 @@ def test_foreign_markers_are_not_taken() -> None:
     assert found.small is None
 
 
+def grown(grey: np.ndarray, clipped: bool) -> np.ndarray:
+    """White that has grown over black: by a tone curve, or by all that is lost above white."""
+    tone = grey * 1.7 if clipped else 240.0 * (grey / 205.0) ** 0.5
+    return np.clip(tone, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("clipped", "wanted"),
+    [
+        (False, [0, 1, 2, 3, 4, 0, 1]),
+        # By how much depends on the place's own light, that is not in the picture any more.
+        (True, [0] * 7),
+    ],
+)
+def test_a_measured_shift_of_all_edges_holds_for_some_more_pictures(
+    clipped: bool, wanted: list[int]
+) -> None:
+    pose = pose_of(0.02, 0.01, 0.5, 0.6)
+    bright = grown(render(*pose, blur_px=0.9).astype(np.float64), clipped)
+    true = project(square_corners(0.150), *pose, CAMERA)
+    before, ages = None, []
+    for k in range(7):
+        before = detect_markers(frame(bright, k), before, SETUP, CAMERA)
+        assert before.edge_shift is not None
+        assert before.edge_shift.shift_px > 0.1
+        assert before.large is not None
+        assert np.abs(before.large.corners_px - true).max() < 0.08
+        ages.append(before.edge_shift.age)
+    assert ages == wanted
+
+
 def snapshot(value: Any) -> Any:
     """All of a value's content, for comparison: dataclasses, arrays, OpenCV's objects."""
     if is_dataclass(value):
@@ -157,27 +188,12 @@ def test_two_streams_through_one_setup_do_not_disturb_each_other() -> None:
     assert snapshot(setup) == before
 
 
-# --- Motion from picture to picture ------------------------------------------------------------
-
-
-def seen(large: tuple[float, float], t_s: float = 0.0) -> Detections:
-    return Detections(0, t_s, Detection("large", box(*large, 80.0), 0.1, True))
-
-
-def test_corners_move_on_as_they_moved() -> None:
-    moving = replace(seen((300, 200)), velocity_px_s=np.array([600.0, -300.0]))
-    expected = predicted_corners(moving, 0.1)
-    assert np.allclose(expected["large"].mean(axis=0), [360.0, 170.0])
-    stale = predicted_corners(moving, 0.9)
-    assert np.allclose(stale["large"].mean(axis=0), [300.0, 200.0])
-    assert predicted_corners(None, 0.1) == {}
-
-
-def test_motion_is_that_between_two_pictures() -> None:
-    first = seen((300, 200))
-    second = with_motion(seen((306, 197), 0.05), first)
-    assert np.allclose(predicted_corners(second, 0.1)["large"].mean(axis=0), [312.0, 194.0])
-    for earlier in (None, Detections(0, 0.0), replace(first, t_s=-1.0), replace(first, t_s=0.05)):
-        still = with_motion(seen((306, 197), 0.05), earlier)
-        assert still.velocity_px_s is None
-        assert still.flow_px_s == {}
+def test_searches_of_every_kind_leave_the_setup_as_it_was() -> None:
+    setup = make_aruco_detector(DetectorConfig(), TargetConfig())
+    before = snapshot(setup)
+    for image in (render(*pose_of(0.0, 0.0, 0.4)), blurry(26.0, 3.0, 0)[0]):
+        search(image, {}, setup)
+        search(image, both(pose_of(0.0, 0.0, 0.4)), setup)
+        search(image, {"small": box(300.0, 240.0, 20.0)}, setup)
+        hidden_in_blur(image, setup, CAMERA)
+    assert snapshot(setup) == before

@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
+from perchctl.vision import make_aruco_detector
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import MIRROR_INDEX, make_aruco_detector
+from perchctl.vision.markers.detector import MIRROR_INDEX
 from tests.helpers.markers import frame
 from tests.helpers.target_picture import CAMERA
 

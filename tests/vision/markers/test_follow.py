@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
-from perchctl.vision.markers.cells import KnownBy
+from perchctl.vision import make_aruco_detector
 from perchctl.vision.markers.corners import RefinedCorners
-from perchctl.vision.markers.detect import around, detect_markers, follow, seen_partly
-from perchctl.vision.markers.detector import make_aruco_detector
+from perchctl.vision.markers.detect import around, detect_markers, follow
+from perchctl.vision.markers.partial import KnownBy, seen_partly
 from tests.helpers.markers import POSE, SETUP, both, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 

@@ -9,18 +9,22 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import Array, rotation_from_rpy
-from perchctl.perception.online_calibration import (
+from perchctl.profile import Profile
+from perchctl.vision import (
     ATTITUDE_STEP_S,
-    STAMPS_S,
+    Attitude,
+    CameraModel,
+    Consistency,
     ConsistencySums,
-    Moment,
+    MarkerPose,
+    PoseSetup,
     add_moment,
     consistency_moment,
+    rotation_vector,
     solve_consistency,
 )
-from perchctl.profile import Profile
-from perchctl.vision import Attitude, CameraModel, Consistency, MarkerPose, PoseSetup
-from perchctl.vision.pose import make_pose_setup, rotation_vector
+from perchctl.vision.consistency import STAMPS_S, Moment
+from perchctl.vision.pose import make_pose_setup
 
 PROFILE = Profile()
 CAMERA = CameraModel((640, 480), np.diag([380.0, 380.0, 1.0]), np.zeros(5))

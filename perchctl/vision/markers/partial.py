@@ -1,0 +1,526 @@
+"""A marker of which a part cannot be seen: the picture ends in it, light glares on it, or the
+vehicle's own gear is before it.
+
+Four lines need all four sides. Here the whole square is fitted at once, to the edges where they
+are seen: its sides, and the inner edges of its border, which stand in for a side that is gone.
+What is not seen follows from what is, and the corners' covariance says how well.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.geometry import Array
+from perchctl.values import replace
+from perchctl.vision.lens import distort, pinhole_px, undistort, undistort_px
+from perchctl.vision.markers.corners import (
+    BEFORE,
+    NEXT,
+    UNIT,
+    RefinedCorners,
+    corner_jacobian,
+    doubled_area,
+    from_unit,
+    mapped,
+    mean_side_px,
+    side_lengths_px,
+    within,
+)
+from perchctl.vision.markers.detector import hides
+from perchctl.vision.markers.edge_fit import (
+    PROFILES,
+    STEPS,
+    Floats,
+    Surroundings,
+    locate,
+    places,
+    sample,
+    side_profiles,
+)
+from perchctl.vision.markers.pattern import CELL_MARGIN, MIN_CONTRAST, MOST_CELLS, Pattern
+from perchctl.vision.types import CameraModel, EdgeShift
+
+LEAST_CELL_PX = 4.0  # smaller cells leave no part of a side that would show anything
+_ROUNDS, _STILL_PX = 5, 0.05
+_MAX_RESIDUAL_PX = 0.6
+_MAX_BLUR = 0.9  # of the window
+_MAX_SIGMA = 0.02  # of the side: vaguer corners are no measurement
+_MIN_SIGMA_PX, _LEAST_SHIFT_SIGMA_PX = 0.015, 0.01
+_SHIFT_PRIOR_PX, _CLIPPED_PRIOR_PX, _CLIPPED_GREY = 0.15, 0.4, 248.0
+_TAILS = 1.3  # what robust weights take away from a residual's square
+_MAX_STEP = 0.5
+_MOST_OFF_PX = 20.0  # from its start, three windows on: no edges lead a fit farther
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A round's square H (3, 3), unit to pinhole px, how far it moved, the edges that it rests
+    on, by how much they are off then, px (rows, n), and the normal matrix (9, 9)."""
+
+    H: Array
+    moved_px: float
+    seen: SeenEdges
+    left_px: Array
+    N: Array
+
+
+def fit_partly(
+    image: NDArray[np.uint8],
+    start_px: Array,
+    pattern: Pattern,
+    camera: CameraModel,
+    hidden: NDArray[np.bool_] | None = None,
+    known: EdgeShift | None = None,
+) -> RefinedCorners | None:
+    """The marker near to corners `start_px` (4, 2), which may be outside of the picture.
+
+    `hidden` (h, w) is where pixels show something else. None where what is seen does not
+    determine the corners. Nothing is said about the marker's cells.
+    """
+    if not _large_enough(start_px, pattern):
+        return None
+    start = undistort_px(start_px, camera)
+    if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
+        return None
+    H = from_unit(start)
+    fit: _Fit | None = None
+    for k in range(_ROUNDS):
+        seen = look(image, H, pattern, camera, hidden)
+        fit = None if seen is None else _stepped(H, seen, known)
+        if fit is None:
+            return None
+        H = fit.H
+        if k > 0 and fit.moved_px < _STILL_PX:
+            break
+    return None if fit is None else _corners(fit, pattern, camera)
+
+
+def seen_partly(
+    image: NDArray[np.uint8],
+    start_px: Array,
+    pattern: Pattern,
+    camera: CameraModel,
+    known_by: KnownBy,
+    hidden: NDArray[np.bool_] | None = None,
+    known: EdgeShift | None = None,
+) -> RefinedCorners | None:
+    """`fit_partly`, if the cells that are seen are the marker's."""
+    if not _large_enough(start_px, pattern):
+        return None
+    if not may_show_enough(start_px, image.shape, pattern, camera, known_by, _MOST_OFF_PX):
+        return None
+    found = fit_partly(image, start_px, pattern, camera, hidden, known)
+    if found is None:
+        return None
+    agree = visible_cells_agree(image, found.corners_px, pattern, camera, hidden, known_by)
+    return found if agree else None
+
+
+def _large_enough(start_px: Array, pattern: Pattern) -> bool:
+    return mean_side_px(start_px) / pattern.rim.cells >= LEAST_CELL_PX
+
+
+def wholly_seen(
+    found: RefinedCorners, shape: tuple[int, ...], hidden: NDArray[np.bool_] | None
+) -> bool:
+    """Whether nothing of the marker is hidden, and the picture's edge too far away to take
+    anything from the sides' blur."""
+    return within(found.corners_px, shape, ROOM_PX + found.blur_px) and not hides(
+        hidden, found.corners_px
+    )
+
+
+def _prior_px(seen: SeenEdges) -> float:
+    return _CLIPPED_PRIOR_PX if seen.white > _CLIPPED_GREY else _SHIFT_PRIOR_PX
+
+
+def _stepped(H: Array, seen: SeenEdges, known: EdgeShift | None) -> _Fit | None:
+    """The square H one round on; None where the fit breaks down."""
+    A, N, g = _equations(seen, known or EdgeShift(0.0, _prior_px(seen)))
+    try:
+        step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return None
+    p = step[:8]
+    if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_STEP):
+        return None
+    H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
+    moved_px = float(np.abs(p[:6]).max() * seen.scale_px.mean())
+    return _Fit(H / H[2, 2], moved_px, seen, seen.far_px - (step @ A).reshape(seen.far_px.shape), N)
+
+
+def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
+    """Changes (9, rows * n) of the edges with the square's increment, in the terms of
+    `corner_jacobian`, and with the shift of all edges, px; and their normal equations (9, 9),
+    (9,), per px^2 of an edge's spread."""
+    u, v = seen.own[..., 0], seen.own[..., 1]
+    nx, ny = OUT[seen.side].T[..., None] * seen.scale_px[:, None]
+    A = np.empty((9, *u.shape))
+    A[0], A[1], A[2] = nx * u, nx * v, nx
+    A[3], A[4], A[5] = ny * u, ny * v, ny
+    across = A[0] + A[4]
+    A[6], A[7] = -u * across, -v * across
+    # The model's edge moves with the square, the seen one by the shift.
+    A[8] = -seen.inwards[:, None]
+    A = A.reshape(9, -1)
+    weighted = A * (seen.weight * _worth(seen)[:, None]).ravel()
+    N, g = weighted.dot(A.T), weighted.dot(seen.far_px.ravel())
+    # An edge's spread is about a tenth of a pixel while it is not known.
+    certain = (0.1 / prior.sigma_px) ** 2
+    N[8, 8] += certain
+    g[8] += certain * prior.shift_px
+    N[range(8), range(8)] += 1e-6
+    return A, N, g
+
+
+def _worth(seen: SeenEdges) -> Array:
+    """Profiles nearer to each other than a pixel measure the same, (rows,)."""
+    length_px = 2.0 * seen.scale_px * seen.at
+    return np.minimum(1.0, length_px / PROFILES)
+
+
+def _corners(fit: _Fit, pattern: Pattern, camera: CameraModel) -> RefinedCorners | None:
+    """Corners and covariance after the last round; None where they are not determined."""
+    seen, N = fit.seen, fit.N
+    spread = _spread(seen, fit.left_px)
+    if spread is None:
+        return None
+    residual2, growth = spread
+    pinhole = mapped(fit.H, UNIT)
+    corners_px = distort(mapped(np.asarray(np.linalg.inv(camera.K)), pinhole), camera)
+    side_px = mean_side_px(pinhole)
+    cell_px = side_px / pattern.rim.cells
+    noise2 = max(_TAILS * residual2 * growth, _MIN_SIGMA_PX**2)
+    # Of the square alone; what the shift of all edges leaves open is `shift_sigma_px`.
+    J = corner_jacobian(fit.H)
+    cov_px2: Array = J @ np.linalg.inv(N[:8, :8]) @ J.T * noise2
+    floor2 = _MIN_SIGMA_PX**2 + (pattern.rim.tolerance * cell_px) ** 2
+    cov_px2 = cov_px2 + np.eye(8) * (floor2 + 0.25 * np.exp(cell_px * (-2.0 / 1.8)))
+    vaguest_px = math.sqrt(float(np.diagonal(cov_px2).max()))
+    if not (vaguest_px < _MAX_SIGMA * side_px and np.isfinite(corners_px).all()):
+        return None
+    shift_sigma_px = math.sqrt(noise2 * float(np.linalg.inv(N)[8, 8]))
+    return RefinedCorners(
+        corners_px=corners_px,
+        sigma_px=math.sqrt(float(np.trace(cov_px2)) / 8.0),
+        refined=True,
+        shift_sigma_px=min(max(shift_sigma_px, _LEAST_SHIFT_SIGMA_PX), _prior_px(seen)),
+        cov_px2=cov_px2,
+    )
+
+
+def _spread(seen: SeenEdges, left: Array) -> tuple[float, float] | None:
+    """Mean square of what the fit leaves over within rows, px^2, and by how much rows contradict
+    each other beyond it; None where these are no edges of a square."""
+    w = seen.weight
+    mass = w.sum(axis=1)
+    used = mass > 0.0
+    if not used.any() or (seen.blur[used] > _MAX_BLUR).any():
+        return None
+    if float((w * left**2).sum() / w.sum()) > _MAX_RESIDUAL_PX**2:
+        return None
+    mean = (w * left).sum(axis=1) / np.maximum(mass, 1e-9)
+    scatter = float((w * (left - mean[:, None]) ** 2).sum() / w.sum())
+    chi2 = float((mean**2 * mass).sum()) / max(scatter, _MIN_SIGMA_PX**2)
+    freedom = max(2.0 * np.count_nonzero(used) - 9.0, 1.0)
+    return scatter, max(chi2 / freedom, 1.0)
+
+
+# --- Which marker it is, by the cells that are seen of it --------------------------------------
+
+
+KnownBy = Literal["bits", "track", "other"]
+"""By what it is known which marker it is: by its cells alone, by its place in the picture before,
+or by the target's other marker."""
+_LEAST_KNOWN = 0.6  # of all cells
+_GLARE, _BRIGHTEST_GREY = 0.25, 250.0  # over white, of the contrast; as bright as can be
+_UNKNOWN_BITS: dict[KnownBy, int] = {"bits": 1, "track": 4}  # other codewords differ in two
+_INVERTED_PX = 0.5  # the lens model holds where its inverse is one
+
+
+def visible_cells_agree(
+    image: NDArray[np.uint8],
+    corners_px: Array,
+    pattern: Pattern,
+    camera: CameraModel,
+    hidden: NDArray[np.bool_] | None,
+    known_by: KnownBy,
+) -> bool:
+    """Whether the cells that are seen have their colour: not those beyond the picture's edge,
+    behind what is `hidden` (h, w), or in light that glares. How many that must be depends on
+    what else says which marker it is."""
+    h, w = image.shape
+    at = _spots_px(corners_px, pattern, camera)
+    near = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
+    seen = _within(at, image.shape, 0.0)
+    if hidden is not None:
+        seen &= ~hidden[near[:, 1], near[:, 0]]
+    grey = image[near[:, 1], near[:, 0]].astype(np.float64)
+    white_spots = pattern.white[pattern.owner]
+    if not ((seen & white_spots).any() and (seen & ~white_spots).any()):
+        return False
+    high = float(np.median(grey[seen & white_spots]))
+    low = float(np.median(grey[seen & ~white_spots]))
+    contrast = high - low
+    if contrast < MIN_CONTRAST:
+        return False
+    seen &= grey <= high + _GLARE * contrast
+    if high < _BRIGHTEST_GREY - _GLARE * contrast:
+        seen &= grey < _BRIGHTEST_GREY
+    count = np.bincount(pattern.owner, weights=seen)
+    means = np.bincount(pattern.owner, weights=grey * seen) / np.maximum(count, 1.0)
+    known = count >= 0.5 * pattern.spots_per_cell
+    share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.white, 1.0, -1.0)
+    wrong = np.count_nonzero(known & (share < CELL_MARGIN))
+    most_wrong = 0
+    if known_by == "other":
+        most_wrong = math.floor((1.0 - MOST_CELLS) * np.count_nonzero(known & pattern.inner))
+    return bool(wrong <= most_wrong) and _enough(known, pattern, known_by)
+
+
+def may_show_enough(
+    start_px: Array,
+    shape: tuple[int, ...],
+    pattern: Pattern,
+    camera: CameraModel,
+    known_by: KnownBy,
+    off_px: float,
+) -> bool:
+    """Whether so many cells may be in the picture as `visible_cells_agree` asks for, of a marker
+    that is within `off_px` of corners (4, 2)."""
+    seen = _within(_spots_px(start_px, pattern, camera), shape, off_px)
+    count = np.bincount(pattern.owner, weights=seen)
+    return _enough(count >= 0.5 * pattern.spots_per_cell, pattern, known_by)
+
+
+def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
+    """The spots of a marker at corners (4, 2) as the lens shows them, (n, 2); NaN where it does
+    not reach. A marker that fills the picture is no square in it: its middle is a third of a cell
+    from where its corners alone put it."""
+    rays = undistort(corners_px, camera)
+    if not np.isfinite(rays).all():
+        return np.full((len(pattern.spots), 2), np.nan)
+    spots = mapped(from_unit(rays), pattern.spots)
+    at = distort(spots, camera)
+    near = np.abs(undistort(at, camera) - spots).max(axis=1) * camera.K[0, 0] < _INVERTED_PX
+    return np.where(near[:, None], at, np.nan)
+
+
+def _within(at_px: Array, shape: tuple[int, ...], room_px: float) -> NDArray[np.bool_]:
+    """Which points (n, 2) are in the picture, or no farther outside."""
+    h, w = shape[:2]
+    inside = (at_px >= -room_px) & (at_px <= (w - 1 + room_px, h - 1 + room_px))
+    return np.asarray(inside.all(axis=1))
+
+
+def _enough(known: NDArray[np.bool_], pattern: Pattern, known_by: KnownBy) -> bool:
+    """Whether the known cells (cells,) tell which marker it is."""
+    most_unknown = len(known) if known_by == "other" else _UNKNOWN_BITS[known_by]
+    return bool(
+        np.count_nonzero(pattern.inner & ~known) <= most_unknown
+        and np.count_nonzero(known) >= _LEAST_KNOWN * len(known)
+    )
+
+
+# --- The edges of a marker where they are seen: on profiles across its sides, and across the inner
+# edges of its border, that are in the picture, not hidden, and neither glaring nor shaded.
+
+
+ROOM_PX = 2.0
+"""To the picture's edge, where blur would need what is beyond it."""
+OUT: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+"""Of each side, in the marker's own coordinates."""
+_INNER_CELL_PX = 6.0  # of a border whose inner edge is seen apart from the outer one
+_TOO_BRIGHT, _TOO_DARK = 0.2, 0.5  # of the contrast: of black inside, of white outside
+_LEAST_CONTRAST = 10.0
+_MIN_WEIGHT = 3.0  # of a side's profiles
+_LEAST_EDGES = 4  # a square has eight unknowns, and an edge fixes two
+_FAR_PX = 1e6
+_SEARCH_STEPS: Array = np.linspace(-1.0, 1.0, STEPS // 2 + 1)[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """The marker's sides and perhaps the inner edges of its border: starts, ends (rows, 2)
+    normalised; of each row (rows,) the side that it belongs to, its distance from the centre in
+    half sides, its length, pixels for a half side across it, and +1 where white is to the left of
+    the way from start to end; the mean width of a cell."""
+
+    starts: Array
+    ends: Array
+    side: NDArray[np.intp]
+    at: Array
+    lengths_px: Array
+    scale_px: Array
+    cell_px: float
+    sign: Array
+
+    def only(self, kept: NDArray[np.intp]) -> _Rows:
+        """Some of them."""
+        return _Rows(
+            starts=self.starts[kept],
+            ends=self.ends[kept],
+            side=self.side[kept],
+            at=self.at[kept],
+            lengths_px=self.lengths_px[kept],
+            scale_px=self.scale_px[kept],
+            cell_px=self.cell_px,
+            sign=self.sign[kept],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Lit:
+    """Which profiles (rows, n) show an edge as it should be, and how white the paper is."""
+
+    good: NDArray[np.bool_]
+    white: float
+
+
+@dataclass(frozen=True, eq=False)
+class SeenEdges:
+    """Edges of one round: of each profile (rows, n) its place in the marker's own coordinates
+    (rows, n, 2), how far outwards it is from where the square has it, and its weight; of
+    each row (rows,) what `_Rows` has of it, +1 where white grown over black moves it in, and
+    its blur in terms of the window; and how white the paper is."""
+
+    own: Array
+    far_px: Array
+    weight: Array
+    side: NDArray[np.intp]
+    at: Array
+    scale_px: Array
+    inwards: Array
+    blur: Array
+    white: float
+
+
+def look(
+    image: NDArray[np.uint8],
+    H: Array,
+    pattern: Pattern,
+    camera: CameraModel,
+    hidden: NDArray[np.bool_] | None,
+) -> SeenEdges | None:
+    """The edges near to where the square H has them; None where too few are seen. Sides of
+    which nothing is seen are left out."""
+    rows = _rows(H, pattern, camera)
+    if rows is None:
+        return None
+    s = places(rows.lengths_px)
+    origin, normal = side_profiles(rows.starts, rows.ends, s, camera)
+    if not (np.abs(origin) < _FAR_PX).all():
+        return None  # a lens model throws what is far outside anywhere, to no number too
+    normal *= rows.sign[:, None, None]
+    near_px = np.full(len(rows.at), min(max(0.85 * rows.cell_px, 1.5), 7.0))
+    half_px = np.full(len(rows.at), min(max(1.5 * rows.cell_px, 1.75), 7.0))
+    around = _surroundings(s, pattern, 2.0 * rows.scale_px / pattern.rim.cells)
+    free = around.possible & _in_view(image.shape, hidden, origin, normal, near_px)
+    kept = np.flatnonzero(np.count_nonzero(free, axis=1) >= _MIN_WEIGHT)
+    if len(kept) < _LEAST_EDGES:
+        return None
+    rows, around = rows.only(kept), around.only(kept)
+    origin, normal, free = origin[kept], normal[kept], free[kept]
+    near_px, half_px = near_px[kept], half_px[kept]
+    grey = sample(image, origin, normal, half_px)
+    lit = _unspoilt(grey, free, near_px, half_px)
+    if lit is None:
+        return None
+    edges = locate(grey, half_px, near_px, replace(around, possible=lit.good))
+    weight = np.where(lit.good, edges.weight, 0.0)
+    weight[weight.sum(axis=1) < _MIN_WEIGHT] = 0.0
+    found = undistort((origin + edges.offset_px[..., None] * normal).reshape(-1, 2), camera)
+    own = mapped(np.asarray(np.linalg.inv(H)), pinhole_px(found, camera)).reshape(origin.shape)
+    if not np.isfinite(own).all():
+        return None
+    far = np.einsum("rni,ri->rn", own, OUT[rows.side]) - rows.at[:, None]
+    return SeenEdges(
+        own=own,
+        far_px=far * rows.scale_px[:, None],
+        weight=weight,
+        side=rows.side,
+        at=rows.at,
+        scale_px=rows.scale_px,
+        inwards=np.where(rows.at < 1.0, -1.0, 1.0),
+        blur=edges.blur_px / near_px,
+        white=lit.white,
+    )
+
+
+def _rows(H: Array, pattern: Pattern, camera: CameraModel) -> _Rows | None:
+    """Of the square H, unit to pinhole px; None where that is none."""
+    corners, cells = mapped(H, UNIT), pattern.rim.cells
+    sides_px = side_lengths_px(corners)
+    if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
+        return None
+    cell_px = float(sides_px.mean()) / cells
+    rings = (1.0, 1.0 - 2.0 / cells) if cell_px > _INNER_CELL_PX else (1.0,)
+    at = np.repeat(rings, 4)
+    side = np.arange(len(at)) % 4
+    to_rays: Array = np.linalg.inv(camera.K) @ H
+    starts = np.stack([mapped(to_rays, r * UNIT) for r in rings])
+    across_px = 0.5 * (sides_px[BEFORE] + sides_px[NEXT])
+    turn = float(np.sign(doubled_area(corners[None])[0]))
+    return _Rows(
+        starts=starts.reshape(-1, 2),
+        ends=starts[:, NEXT].reshape(-1, 2),
+        side=side,
+        at=at,
+        lengths_px=sides_px[side] * at,
+        scale_px=0.5 * across_px[side],
+        cell_px=cell_px,
+        sign=turn * np.where(at < 1.0, -1.0, 1.0),
+    )
+
+
+def _surroundings(s: Array, pattern: Pattern, depth_px: Array) -> Surroundings:
+    """Which profiles at places `s` (rows, n) have a neighbouring edge, and which have one."""
+    rim, four = pattern.rim, np.arange(4)[:, None]
+    inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
+    possible = np.ones(s.shape, np.bool_)
+    inside[:4] = rim.white[four, (s[:4] * rim.cells).astype(np.intp)]
+    if len(s) > 4:
+        along = 1.0 + s[4:] * (rim.cells - 2)  # in cells from the border's corner
+        free = rim.open[four, (along - 0.3).astype(np.intp)]
+        possible[4:] = free * rim.open[four, (along + 0.3).astype(np.intp)] > 0.0
+        outside[4:] = 1.0
+    return Surroundings(depth_px, inside, outside, possible)
+
+
+def _in_view(
+    shape: tuple[int, ...],
+    hidden: NDArray[np.bool_] | None,
+    origin: Array,
+    normal: Array,
+    near_px: Array,
+) -> NDArray[np.bool_]:
+    """Which profiles (rows, n) are in the picture, and not hidden, as far as they count."""
+    h, w = shape[:2]
+    # A profile is as far in the picture as both its ends are.
+    reach, last = near_px[:, None, None] * np.abs(normal), (w - 1 - ROOM_PX, h - 1 - ROOM_PX)
+    x_and_y = (origin - reach >= ROOM_PX) & (origin + reach <= last)
+    seen = x_and_y[..., 0] & x_and_y[..., 1]
+    if hidden is not None and seen.any():
+        at = origin[:, :, None] + near_px[:, None, None, None] * _SEARCH_STEPS * normal[:, :, None]
+        pixel = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
+        seen &= ~hidden[pixel[..., 1], pixel[..., 0]].any(axis=2)
+    return np.asarray(seen)
+
+
+def _unspoilt(grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array) -> _Lit | None:
+    """Which of the free profiles (rows, n) begin black and end white, as most do; None without
+    contrast. Light that glares makes black bright; what lies on the paper makes white dark."""
+    # At half the window from the edge, blur has ended and no neighbour begins.
+    off = max(1, round(0.5 * STEPS * float((0.6 * near_px / half_px)[0])))
+    dark, bright = grey[:, :, STEPS // 2 - off], grey[:, :, STEPS // 2 + off]
+    black, white = (float(np.median(each[free])) for each in (dark, bright))
+    contrast = white - black
+    if contrast < _LEAST_CONTRAST:
+        return None
+    good = (dark < black + _TOO_BRIGHT * contrast) & (bright > white - _TOO_DARK * contrast)
+    return _Lit(free & good, white)

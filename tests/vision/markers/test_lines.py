@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from perchctl.geometry import Array
+from perchctl.vision import project, square_corners
+from perchctl.vision.markers.corners import RAW_SIGMA_PX, SUBPIX_SIGMA_PX
+from perchctl.vision.markers.edge_fit import refine
+from perchctl.vision.markers.pattern import rim_of_bits
+from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
+
+RIMS = {6: bits_of("DICT_4X4_1000", 997), 7: bits_of("DICT_ARUCO_ORIGINAL", 5)}
+RIMS = {cells: rim_of_bits(bits) for cells, bits in RIMS.items()}
+POSES = [
+    (0.0, 0.0, 0.24, 0.0, 0.0, 0.0),
+    (0.02, -0.01, 0.24, 0.5, 0.05, -0.08),
+    (-0.03, 0.02, 0.30, 2.9, 0.1, 0.1),
+    (0.05, 0.04, 0.45, -1.2, -0.15, 0.05),
+    (0.10, -0.05, 0.60, 1.0, 0.0, 0.2),
+]
+
+
+def true_corners(rvec: Array, tvec: Array, side_m: float) -> Array:
+    return project(square_corners(side_m), rvec, tvec, CAMERA)
+
+
+def inwards(corners: Array, amount: float) -> Array:
+    centre = corners.mean(axis=0)
+    out = corners - centre
+    return corners - amount * out / np.linalg.norm(out, axis=1, keepdims=True)
+
+
+def errors(noise: float, blur_px: float, method: str, cells: int, side_m: float) -> Array:
+    """(radial bias, error) of each corner over all poses, raw corners 0.5 px inwards."""
+    rows = []
+    for index, values in enumerate(POSES):
+        rvec, tvec = pose_of(*values)
+        image = render(rvec, tvec, noise=noise, blur_px=blur_px, seed=index)
+        true = true_corners(rvec, tvec, side_m)
+        raw = inwards(true, 0.5) + np.random.default_rng(index).normal(0.0, 0.3, (4, 2))
+        result = refine(image, raw[None], [RIMS[cells]], CAMERA, method)[0]
+        assert result.refined == (method == "line")
+        out = true - true.mean(axis=0)
+        out /= np.linalg.norm(out, axis=1, keepdims=True)
+        error = result.corners_px - true
+        rows += [[(error[i] * out[i]).sum(), *error[i]] for i in range(4)]
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(("cells", "side_m"), [(6, 0.150), (7, 0.025)])
+@pytest.mark.parametrize("blur_px", [0.6, 1.2])
+def test_lines_find_corners_without_bias(cells: int, side_m: float, blur_px: float) -> None:
+    poses = errors(0.0, blur_px, "line", cells, side_m)
+    poses = poses if side_m > 0.1 else poses[:12]  # beyond 30 cm its cells are 4 px and less
+    assert abs(poses[:, 0].mean()) < 0.02
+    assert np.sqrt((poses[:, 1:] ** 2).mean()) < 0.03
+
+
+def test_lines_are_calm_in_noise() -> None:
+    poses = errors(10.0, 0.7, "line", 6, 0.150)
+    assert abs(poses[:, 0].mean()) < 0.03
+    assert np.sqrt((poses[:, 1:] ** 2).mean()) < 0.08
+
+
+@pytest.mark.parametrize("off_px", [4.0, 6.0, 6.5])
+def test_sides_near_the_ends_of_their_profiles_are_where_they_are(off_px: float) -> None:
+    """As where a vehicle in motion has its target expected, in the last decimetres."""
+    fitted = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        rvec, tvec = pose_of(*rng.uniform(-0.01, 0.01, 2), 0.18, rng.uniform(-3.1, 3.1))
+        image = render(rvec, tvec, noise=3.0, blur_px=0.8, seed=seed)
+        true = true_corners(rvec, tvec, 0.150)
+        turn = rng.uniform(-np.pi, np.pi)
+        raw = true + off_px * np.array([np.cos(turn), np.sin(turn)])
+        result = refine(image, raw[None], [RIMS[6]], CAMERA, "line")[0]
+        if result.refined:
+            fitted += 1
+            assert np.abs(result.corners_px - true).max() < 0.1
+    assert fitted >= 6
+
+
+def test_lines_beat_subpix_tenfold_in_bias() -> None:
+    subpix = abs(errors(0.0, 0.7, "subpix", 6, 0.150)[:, 0].mean())
+    line = abs(errors(0.0, 0.7, "line", 6, 0.150)[:, 0].mean())
+    assert subpix > 0.05
+    assert line < subpix / 10.0
+
+
+@pytest.mark.parametrize("curl", [-0.02, 0.02])
+def test_a_sheet_that_curls_shifts_no_edges(curl: float) -> None:
+    """It narrows or widens the large marker's border as glare would. The small marker is hardly
+    moved, and not by what that border shows."""
+    rvec, tvec = pose_of(0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
+    image = render(rvec, tvec, blur_px=0.8)
+    large, small = (true_corners(rvec, tvec, side_m) for side_m in (0.150, 0.025))
+    centre = small.mean(axis=0)
+    reach_px = float(np.linalg.norm(large - centre, axis=1).mean())
+    way = np.stack(np.meshgrid(*(np.arange(n) for n in image.shape[::-1])), axis=2) - centre
+    squared = (way**2).sum(axis=2, keepdims=True) / reach_px**2
+    at = (centre + way * (1.0 - curl * squared)).astype(np.float32)
+    curled = np.asarray(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC), np.uint8)
+    found = refine(curled, np.stack([large, small]), [RIMS[6], RIMS[7]], CAMERA, "line")[1]
+    out = (small - centre) / np.linalg.norm(small - centre, axis=1, keepdims=True)
+    assert found.refined
+    assert abs(float(((found.corners_px - small) * out).sum(axis=1).mean())) < 0.08
+
+
+def test_sigma_follows_the_noise() -> None:
+    rvec, tvec = pose_of(*POSES[1])
+    true = true_corners(rvec, tvec, 0.150)
+
+    def sigma(noise: float) -> float:
+        image = render(rvec, tvec, noise=noise)
+        return refine(image, true[None], [RIMS[6]], CAMERA, "line")[0].sigma_px
+
+    clean, noisy, noisier = sigma(0.0), sigma(8.0), sigma(20.0)
+    assert clean < 0.03
+    assert clean < noisy < noisier < 0.4
+
+
+def spoilt(image: Array, light: str) -> Array:
+    if light == "gamma":
+        return np.rint(255.0 * (image / 255.0) ** 0.5).astype(np.uint8)
+    return np.clip(image * 1.7, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("light", ["gamma", "clipped"])
+def test_a_shift_that_all_edges_share_is_taken_out(light: str) -> None:
+    """White that grows over black: the border's width shows by how much."""
+    biases, raw_biases = [], []
+    closed = {n: replace(rim, open=np.zeros_like(rim.open)) for n, rim in RIMS.items()}
+    for values in POSES:
+        rvec, tvec = pose_of(*values)
+        image = spoilt(render(rvec, tvec, blur_px=0.9), light)
+        true = true_corners(rvec, tvec, 0.150)
+        out = true - true.mean(axis=0)
+        out /= np.linalg.norm(out, axis=1, keepdims=True)
+        for rims, rows in ((RIMS, biases), (closed, raw_biases)):
+            result = refine(image, true[None], [rims[6]], CAMERA, "line")[0]
+            assert result.refined
+            rows.append(((result.corners_px - true) * out).sum(axis=1).mean())
+            assert abs(rows[-1]) < 4.0 * np.hypot(result.shift_sigma_px, result.sigma_px)
+    assert abs(np.mean(raw_biases)) > 0.12
+    assert abs(np.mean(biases)) < 0.03
+
+
+def test_an_occluded_part_of_a_side_is_left_out() -> None:
+    rvec, tvec = pose_of(*POSES[3])
+    image = render(rvec, tvec)
+    true = true_corners(rvec, tvec, 0.150)
+    spot = (0.7 * true[0] + 0.3 * true[1]).astype(int)
+    image[spot[1] - 5 : spot[1] + 6, spot[0] - 9 : spot[0] + 10] = 220
+    result = refine(image, true[None] + 0.4, [RIMS[6]], CAMERA, "line")[0]
+    assert result.refined
+    assert np.abs(result.corners_px - true).max() < 0.1
+
+
+def test_what_is_no_square_falls_back_to_the_raw_corners() -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8)
+    raw = np.array([[200.0, 200.0], [260.0, 205.0], [255.0, 262.0], [198.0, 258.0]])
+    result = refine(noise, raw[None], [RIMS[6]], CAMERA, "line")[0]
+    assert not result.refined
+    assert np.linalg.norm(result.corners_px - raw, axis=1).max() < 6.5
+    assert result.sigma_px in (RAW_SIGMA_PX, SUBPIX_SIGMA_PX)
+
+
+@pytest.mark.parametrize("blur_px", [3.0, 6.0, 12.0])
+def test_in_strong_blur_the_result_is_never_worse_than_subpix(blur_px: float) -> None:
+    rvec, tvec = pose_of(0.0, 0.0, 0.6, 0.3)
+    image = render(rvec, tvec, blur_px=blur_px)
+    true = true_corners(rvec, tvec, 0.150)
+
+    def worst(method: str) -> float:
+        result = refine(image, inwards(true, 1.0)[None], [RIMS[6]], CAMERA, method)[0]
+        return float(np.abs(result.corners_px - true).max())
+
+    assert worst("line") <= worst("subpix") + 1e-9
+
+
+def test_a_flat_picture_keeps_the_corners() -> None:
+    flat = np.full((480, 640), 128, dtype=np.uint8)
+    raw = np.array([[200.0, 200.0], [260.0, 205.0], [255.0, 262.0], [198.0, 258.0]])
+    result = refine(flat, raw[None], [RIMS[6]], CAMERA, "line")[0]
+    assert not result.refined
+    assert np.allclose(result.corners_px, raw)
+
+
+def test_corners_at_the_rim_of_the_picture_stay_finite() -> None:
+    raw = np.array([[0.0, 0.0], [40.0, 0.0], [40.0, 40.0], [0.0, 40.0]])
+    image = np.random.default_rng(1).integers(0, 255, (480, 640)).astype(np.uint8)
+    for offset in ((0.0, 0.0), (599.0, 439.0)):
+        result = refine(image, raw[None] + offset, [RIMS[7]], CAMERA, "line")[0]
+        assert np.isfinite(result.corners_px).all()
+
+
+def test_none_leaves_the_corners_alone_and_both_markers_go_together() -> None:
+    rvec, tvec = pose_of(*POSES[0])
+    image = render(rvec, tvec)
+    raw = np.stack([true_corners(rvec, tvec, s) + 0.3 for s in (0.150, 0.025)])
+    for result, before in zip(
+        refine(image, raw, [RIMS[6], RIMS[7]], CAMERA, "none"), raw, strict=True
+    ):
+        assert np.array_equal(result.corners_px, before)
+        assert not result.refined
+    together = refine(image, raw, [RIMS[6], RIMS[7]], CAMERA, "line")
+    alone = [refine(image, raw[i : i + 1], [RIMS[6 + i]], CAMERA, "line")[0] for i in (0, 1)]
+    near = [refine(image, raw[i : i + 1] - 0.29, [RIMS[6 + i]], CAMERA, "line")[0] for i in (0, 1)]
+    for a, b in zip(
+        refine(image, raw - 0.29, [RIMS[6], RIMS[7]], CAMERA, "line"), near, strict=True
+    ):
+        assert np.allclose(a.corners_px, b.corners_px, atol=1e-6)
+    for a, b in zip(together, alone, strict=True):
+        # All sides take as many rounds as the one that needs most.
+        assert np.abs(a.corners_px - b.corners_px).max() < 0.03
+    assert refine(image, np.empty((0, 4, 2)), [], CAMERA, "line") == []
