@@ -106,9 +106,12 @@ class DeviceSource(LiveSource):
         opener: Opener = open_driver,
         retry_s: float = RETRY_S,
         reopen_every_s: float = REOPEN_EVERY_S,
+        find: Callable[[], int] | None = None,
     ) -> None:
+        """`find` gives the camera's number once it is back; without it that is the same one."""
         super().__init__(f"camera:{number}", latency_s, clock)
         self._number = number
+        self._find = find
         self._asked = asked
         self._open_number = opened
         self._opener = opener
@@ -206,6 +209,8 @@ class DeviceSource(LiveSource):
         self._why_silent = lost
         while not self._stop.wait(self._reopen_every_s):
             try:
+                if self._find is not None:
+                    self._number = self._find()
                 self._capture = self._prepared()
                 self._reopened = True
                 return
@@ -386,6 +391,33 @@ def camera_number(
         )
     there = f"there are {listed(known)}" if known else "this computer has no camera"
     raise NotFound(f"camera:{wanted} was not found; {there}; plug in the receiver or camera")
+
+
+def finder_of(
+    number: int, opener: Opener = open_driver, devices: Path = DEVICES, names: Path = NAMES
+) -> Callable[[], int]:
+    """A function that finds the camera of that number again after it was unplugged: by its
+    lasting path, else by its name, as the system may give it another number.
+
+    Errors of that function: NotFound.
+    """
+    before = next((c for c in find_cameras(opener, devices, names) if c.number == number), None)
+
+    def find() -> int:
+        if before is None or not (before.stable_path or before.name):
+            return number
+        known = find_cameras(opener, devices, names)
+        back = [c.number for c in known if c.stable_path and c.stable_path == before.stable_path]
+        if not back and not before.stable_path:
+            back = [c.number for c in known if c.name == before.name]
+        if number in back:
+            return number
+        if len(back) == 1:
+            return back[0]
+        there = f"there are {listed(known, paths=True)}" if known else "no camera is there"
+        raise NotFound(f"{before} is not back; {there}")
+
+    return find
 
 
 def _fitting(wanted: str, known: Sequence[ConnectedCamera]) -> list[ConnectedCamera]:

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from perchctl.camera.aideck import FORM, AiDeckSource, aideck_address
 from perchctl.camera.credentials import without_password
-from perchctl.camera.device import DeviceSource, asked_of, camera_number
+from perchctl.camera.device import DeviceSource, asked_of, camera_number, finder_of
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.network import MjpegSource, RtspSource, StreamSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource, mirrored_as_profiled
@@ -143,7 +143,8 @@ def _live(
     """A camera or stream whose first frame is still to come."""
     if name.scheme == "camera":
         asked = asked_of(config, size_px)
-        return DeviceSource(camera_number(name.place), latency_s, asked, clock)
+        number = camera_number(name.place)
+        return DeviceSource(number, latency_s, asked, clock, find=finder_of(number))
     stream: StreamSource | None = None
     if name.scheme == "aideck":
         stream = AiDeckSource(*aideck_address(name.spec), latency_s, clock)

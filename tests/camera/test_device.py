@@ -20,6 +20,7 @@ from perchctl.camera.device import (
     DeviceSource,
     asked_of,
     camera_number,
+    finder_of,
     set_controls,
     set_up,
 )
@@ -139,6 +140,33 @@ def test_no_camera_at_all(dev: Callable[..., Path], monkeypatch: pytest.MonkeyPa
 def test_a_driver_that_is_not_there_is_an_os_error() -> None:
     with pytest.raises(OSError, match=r"video97|V4L2"), open_driver(97):
         pass
+
+
+def test_a_camera_that_was_unplugged_is_found_by_path_or_name(dev: Callable[..., Path]) -> None:
+    devices = dev(0, 1, 2, usb_grabber=1)
+    own, twin, other = FakeDevice("USB Video"), FakeDevice("USB Video"), FakeDevice("Webcam")
+    opener = Opener({0: other, 1: own, 2: twin})
+    by_path = finder_of(1, opener, devices, devices)
+    by_name = finder_of(2, opener, devices, devices)
+    by_number = finder_of(7, opener, devices, devices)
+    assert (by_path(), by_name(), by_number()) == (1, 2, 7)
+
+    link = devices / "v4l" / "by-id" / "usb_grabber"
+    link.unlink()
+    for name in ("video1", "video2"):
+        (devices / name).unlink()
+    for find in (by_path, by_name):
+        with pytest.raises(NotFound, match=r"USB Video.*not back"):
+            find()
+
+    (devices / "video5").touch()
+    link.symlink_to(devices / "video5")
+    opener.devices = {0: other, 5: own}
+    assert by_path() == 5
+    assert by_name() == 5, "the only one of its name"
+    (devices / "video1").touch()
+    opener.devices[1] = other
+    assert by_path() == 5, "another camera has its number now"
 
 
 def test_the_list_for_people_and_for_programs(

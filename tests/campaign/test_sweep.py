@@ -35,14 +35,10 @@ def test_each_value_is_a_cell_and_the_profiles_own_is_one_of_them() -> None:
     assert without.profiles[-1] == SIM
 
 
-def test_values_may_be_lists_and_worlds() -> None:
-    """A world's values are those of its keys: a profile that has them written out keeps none."""
+def test_values_may_be_lists() -> None:
     lists = make_sweep(SIM, "simulation.mass_kg=[0.04, 0.04],[0.05,0.05]")
     assert lists.texts[:2] == ("[0.04, 0.04]", "[0.05,0.05]")
     assert lists.profiles[1].simulation.mass_kg == (0.05, 0.05)
-    worlds = make_sweep(SIM, "simulation.set=nominal,rough,extreme")
-    weights = [profile.simulation.mass_kg for profile in worlds.profiles]
-    assert weights == [(0.038, 0.042), (0.042, 0.045), (0.044, 0.045)]
 
 
 @pytest.mark.parametrize(
