@@ -112,7 +112,7 @@ def refusal(path: Path, content: bytes) -> str:
         b'{"part":"carry"}\n',
         b'{"kind":"tick","t_s":0.0}\n',
         b"\x1f\x8b\x08\x00" + b"\xff" * 50,
-        gzip.compress(b"\x00\x01" * 900),
+        gzip.compress(b"\x00\x01" * 900, mtime=0),
     ],
 )
 def test_what_is_no_log_is_refused_and_the_log_beside_it_named(
