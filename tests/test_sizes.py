@@ -18,7 +18,7 @@ MOST_LINES = {
     ".": 1150,
     "analysis": 3500,
     "calibration": 4250,
-    "camera": 2500,
+    "camera": 2700,
     "campaign": 1700,
     "check": 2050,
     "commands": 5000,

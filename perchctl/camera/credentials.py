@@ -1,9 +1,15 @@
-"""Names and passwords of streams' URLs: no message and no record shows them."""
+"""Name and password of a stream's URL: shown nowhere, sent as the server asks for them."""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import re
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
+from urllib.parse import SplitResult, unquote
 
 from perchctl.profile import Profile
 
@@ -13,6 +19,9 @@ _URL_AMID = re.compile(rf"({_START})(\S*)", re.IGNORECASE)
 _SECRET = re.compile(
     r"""((?:password|passwd|pwd|pass|user-pw)=)(?:"[^"]*"|'[^']*'|[^&#\s]*)""", re.IGNORECASE
 )
+_HASHES = {"MD5": hashlib.md5, "SHA-256": hashlib.sha256}
+_PART = re.compile(r'(\w+)\s*=\s*(?:"((?:[^"\\]|\\.)*)"|([^\s,]+))')
+_SCHEMES = re.compile(r"(?:^|,)\s*(Basic|Digest)\b", re.IGNORECASE)
 
 
 def without_password(text: str) -> str:
@@ -44,3 +53,114 @@ def without_passwords(profile: Profile) -> Profile:
 def profile_record(profile: Profile) -> dict[str, Any]:
     """Every key of the profile, as for JSON, to be kept and shown: without a password."""
     return without_passwords(profile).model_dump(mode="json")
+
+
+@dataclass(frozen=True)
+class Credentials:
+    """None of both where the URL has none."""
+
+    name: str = ""
+    password: str = ""
+
+    def __repr__(self) -> str:
+        return "Credentials(...)"
+
+
+def credentials_of(parts: SplitResult) -> Credentials | None:
+    if parts.username is None:
+        return None
+    return Credentials(unquote(parts.username), unquote(parts.password or ""))
+
+
+@dataclass(frozen=True)
+class Challenge:
+    """What the server asks for (RFC 7616 and 7617). `count`: how often it was answered."""
+
+    digest: bool
+    realm: str = ""
+    nonce: str = ""
+    opaque: str = ""
+    algorithm: str = ""
+    qop: str = ""
+    count: int = 0
+
+    def asks_the_same(self, other: Challenge) -> bool:
+        """So that the same answer would be refused again."""
+        return (self.digest, self.realm, self.nonce) == (other.digest, other.realm, other.nonce)
+
+
+def challenge_of(headers: Sequence[str]) -> Challenge | None:
+    """Of the WWW-Authenticate headers: digest before basic, as it does not show the password.
+    None where there is none that can be answered."""
+    found: list[Challenge] = []
+    for header in headers:
+        starts = list(_SCHEMES.finditer(header))
+        for k, start in enumerate(starts, start=1):
+            end = starts[k].start() if k < len(starts) else len(header)
+            values = _values(header[start.end() : end])
+            if start.group(1).lower() == "basic":
+                found.append(Challenge(False, values.get("realm", "")))
+                continue
+            names = ("realm", "nonce", "opaque", "algorithm", "qop")
+            each = Challenge(True, *[values.get(name, "") for name in names])  # type: ignore[arg-type]
+            if _hash_name(each) in _HASHES and _qop(each) is not None:
+                found.append(each)
+    return max(found, key=lambda c: (c.digest, _hash_name(c) == "SHA-256"), default=None)
+
+
+def _values(text: str) -> dict[str, str]:
+    return {
+        key.lower(): re.sub(r"\\(.)", r"\1", quoted) if quoted or not plain else plain
+        for key, quoted, plain in _PART.findall(text)
+    }
+
+
+def _hash_name(challenge: Challenge) -> str:
+    return (challenge.algorithm or "MD5").upper().removesuffix("-SESS")
+
+
+def _qop(challenge: Challenge) -> str | None:
+    """``auth``, nothing for the old way, None where only what is not known is offered."""
+    offered = [word.strip().lower() for word in challenge.qop.split(",") if word.strip()]
+    return "" if not offered else "auth" if "auth" in offered else None
+
+
+def answer(
+    challenge: Challenge, who: Credentials, method: str, path: str, cnonce: str | None = None
+) -> str:
+    """The Authorization header. `challenge.count` must not come twice with one nonce.
+
+    `cnonce` is drawn; given, it makes the answer the same each time.
+    """
+    if not challenge.digest:
+        secret = f"{who.name}:{who.password}".encode()
+        return "Basic " + base64.b64encode(secret).decode("ascii")
+    hashed, qop = _HASHES[_hash_name(challenge)], _qop(challenge)
+    cnonce = cnonce or secrets.token_hex(8)
+
+    def h(*words: str) -> str:
+        return hashed(":".join(words).encode()).hexdigest()
+
+    first = h(who.name, challenge.realm, who.password)
+    if challenge.algorithm.upper().endswith("-SESS"):
+        first = h(first, challenge.nonce, cnonce)
+    count = f"{challenge.count + 1:08x}"
+    middle = (challenge.nonce, count, cnonce, qop) if qop else (challenge.nonce,)
+    values = {
+        "username": who.name, "realm": challenge.realm, "nonce": challenge.nonce, "uri": path,
+        "response": h(first, *middle, h(method, path)),
+    }  # fmt: skip
+    if challenge.opaque:
+        values["opaque"] = challenge.opaque
+    if qop:
+        values["cnonce"] = cnonce
+    parts = [f'{key}="{_escaped(value)}"' for key, value in values.items()]
+    if challenge.algorithm:
+        parts.append(f"algorithm={challenge.algorithm}")
+    if qop:
+        parts += [f"qop={qop}", f"nc={count}"]
+    return "Digest " + ", ".join(parts)
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"')

@@ -7,18 +7,23 @@ next one's first bytes, a whole period late (41 ms instead of 0.2 ms at 25 Hz).
 
 from __future__ import annotations
 
-import base64
+import contextlib
 import http.client
 import math
 import socket
 import ssl
-import urllib.error
-import urllib.request
 from collections import deque
+from dataclasses import replace
 from typing import Any
-from urllib.parse import SplitResult, unquote, urlsplit, urlunsplit
+from urllib.parse import SplitResult, urljoin, urlsplit, urlunsplit
 
-from perchctl.camera.credentials import without_password
+from perchctl.camera.credentials import (
+    Challenge,
+    answer,
+    challenge_of,
+    credentials_of,
+    without_password,
+)
 from perchctl.camera.health import Grey
 from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, grey_pixels, size_in
 from perchctl.camera.source import Clock, LiveSource, one_line
@@ -32,17 +37,18 @@ class StreamSource(LiveSource):
     `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when the server
     answers that there is no such stream before the first picture came (`not_found`).
 
-    It connects from `begin` until `close`. A subclass has `_connection`, which looks at `_stop`
-    and lets no read wait for longer than `read_timeout_s`. `damaged` counts the pictures that
-    were dropped.
+    It connects from `begin` until `close`. A subclass has `_connection`, and sets `_socket` in it.
+    `damaged` counts the pictures that were dropped.
     """
 
+    connect_timeout_s = 3.0
     read_timeout_s = 2.0
     reconnect_wait_s = 0.3
 
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
         super().__init__(without_password(url), latency_s, clock)
         self._url = url
+        self._socket: socket.socket | None = None
         self.not_found = False
         self.connections = 0
         self.damaged = 0
@@ -50,6 +56,18 @@ class StreamSource(LiveSource):
     def begin(self) -> None:
         """Connect, and read in a thread."""
         self._start(self._run)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._wake()
+        super().close()
+
+    def _wake(self) -> None:
+        """End a read that waits for bytes."""
+        current = self._socket
+        if current is not None:
+            with contextlib.suppress(OSError):
+                current.shutdown(socket.SHUT_RDWR)
 
     def _connection(self) -> str:
         """Read one connection until it ends; return why it ended. It may raise any Exception."""
@@ -89,6 +107,9 @@ def _reason(error: Exception) -> str:
 
 
 READ_BYTES = 65536
+MAX_REDIRECTS = 3
+MOST_REQUESTS = 3
+"""One that is answered by what to answer to, once more where that was too old."""
 
 _HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*", "Connection": "close"}
 
@@ -101,28 +122,75 @@ class MjpegSource(StreamSource):
     a proxy for the internet is not for it.
     """
 
+    _challenge: Challenge | None = None
+
     def _connection(self) -> str:
-        parts = urlsplit(self._url)
-        address = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
-        opener = urllib.request.build_opener(
-            urllib.request.ProxyHandler({}), _Redirects(), _Login(parts)
-        )
-        request = urllib.request.Request(address, headers=_HEADERS)
         try:
-            with opener.open(request, timeout=self.read_timeout_s) as response:
-                self._read(response)
-                return "the stream ended"
-        except urllib.error.HTTPError as error:
-            gone = error.code in (301, 302, 303, 307, 308, 401, 403, 404, 410)
-            self.not_found = gone and self._count == 0
-            return f"the server answers {error.code} {error.reason}{_hint(error, parts)}"
-        except urllib.error.URLError as error:
-            if isinstance(error.reason, ssl.SSLCertVerificationError):
-                self.not_found = self._count == 0
-                return _untrusted(error.reason)
-            if isinstance(error.reason, Exception):
-                raise error.reason from None
-            raise
+            return self._connect(self._url, MAX_REDIRECTS)
+        except ssl.SSLCertVerificationError as error:
+            self.not_found = self._count == 0
+            return _untrusted(error)
+
+    def _connect(self, url: str, redirects: int) -> str:
+        """One connection until it ends; why it ended."""
+        parts = urlsplit(url)
+        kind = (
+            http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
+        )
+        timeout_s = self.read_timeout_s if self._count else self.connect_timeout_s
+        connection = kind(parts.hostname or "", parts.port, timeout=timeout_s)
+        try:
+            connection.connect()
+            self._socket = connection.sock
+            if self._stop.is_set():
+                return "closed"
+            response = self._answered(connection, parts)
+            location = response.getheader("Location")
+            if response.status in (301, 302, 303, 307, 308) and location and redirects > 0:
+                target = redirected(url, location)
+                if why := _unsafe(url, target):
+                    self.not_found = self._count == 0
+                    return why
+                return self._connect(target, redirects - 1)
+            if response.status != 200:
+                gone = response.status in (401, 403, 404, 410)
+                self.not_found = gone and self._count == 0
+                hint = _hint(response, parts)
+                return f"the server answers {response.status} {response.reason}{hint}"
+            self._socket.settimeout(self.read_timeout_s)
+            self._read(response)
+            return "the stream ended"
+        finally:
+            self._socket = None
+            connection.close()
+
+    def _answered(
+        self, connection: http.client.HTTPConnection, parts: SplitResult
+    ) -> http.client.HTTPResponse:
+        """The response; with name and password once the server has asked for them, or has
+        refused the nameless without asking (403)."""
+        path = urlunsplit(("", "", parts.path or "/", parts.query, ""))
+        who = credentials_of(parts)
+        for _ in range(MOST_REQUESTS):
+            headers = dict(_HEADERS)
+            if who is not None and self._challenge is not None:
+                headers["Authorization"] = answer(self._challenge, who, "GET", path)
+                self._challenge = replace(self._challenge, count=self._challenge.count + 1)
+            connection.request("GET", path, headers=headers)
+            response = connection.getresponse()
+            asked = _challenge(response)
+            # After an answer 403 is the last word: nobody asked for less than a digest then.
+            asks = response.status == 401 or (response.status == 403 and self._challenge is None)
+            if not asks or who is None or asked is None:
+                break
+            # A nonce of an earlier connection may be too old: a new one is answered once more.
+            if self._challenge is not None and asked.asks_the_same(self._challenge):
+                break
+            self._challenge = asked
+            connection.close()
+            connection.connect()
+            self._socket = connection.sock
+        return response
 
     def _read(self, response: http.client.HTTPResponse) -> None:
         splitter = JpegSplitter()
@@ -155,56 +223,44 @@ class MjpegSource(StreamSource):
         return grey_pixels(picture)
 
 
-class _Redirects(urllib.request.HTTPRedirectHandler):
-    """Follows no redirect from https to http: pictures and password would go unencrypted."""
-
-    def redirect_request(
-        self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
-    ) -> urllib.request.Request | None:
-        if req.type == "https" and urlsplit(newurl).scheme != "https":
-            where = without_password(newurl)
-            why = f"redirects from https to {where}, which is not encrypted; name it if you accept"
-            raise urllib.error.HTTPError(newurl, code, why, headers, fp)
-        return super().redirect_request(req, fp, code, msg, headers, newurl)
+def redirected(url: str, location: str) -> str:
+    """Where to go: name and password go along to the same host only, and never from https to
+    another scheme."""
+    before, after = urlsplit(url), urlsplit(urljoin(url, location))
+    same = (before.hostname, before.port) == (after.hostname, after.port)
+    kept = same and after.scheme in (before.scheme, "https")
+    if kept and after.username is None and before.username is not None:
+        after = after._replace(netloc=f"{before.netloc.rpartition('@')[0]}@{after.netloc}")
+    return urlunsplit(after)
 
 
-class _Login(urllib.request.HTTPDigestAuthHandler):
-    """Answers with the URL's name and password, once, where that very server asks for them; by
-    digest if it offers one, which does not show the password."""
-
-    def __init__(self, parts: SplitResult) -> None:
-        self._who = (unquote(parts.username or ""), unquote(parts.password or ""))
-        self._host = parts.netloc.rpartition("@")[2]
-        known = urllib.request.HTTPPasswordMgrWithDefaultRealm()
-        if parts.username is not None:
-            known.add_password(None, f"{parts.scheme}://{self._host}/", *self._who)
-        super().__init__(known)
-
-    def http_error_401(
-        self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any
-    ) -> Any:
-        if req.has_header("Authorization") or req.host != self._host or not any(self._who):
-            return None
-        asked = headers.get_all("WWW-Authenticate") or ["Basic"]
-        for challenge in asked:
-            if challenge.lower().startswith("digest "):
-                return self.retry_http_digest_auth(req, challenge)
-        if not any(challenge.lower().startswith("basic") for challenge in asked):
-            return None
-        basic = base64.b64encode(":".join(self._who).encode()).decode("ascii")
-        req.add_unredirected_header("Authorization", f"Basic {basic}")
-        return self.parent.open(req, timeout=req.timeout)
+def _unsafe(url: str, target: str) -> str:
+    """Why a redirect is not followed; an empty string if it is."""
+    scheme, shown = urlsplit(target).scheme, without_password(target)
+    if scheme == "http" and urlsplit(url).scheme == "https":
+        return (
+            f"the server redirects from https to {shown}, where pictures and password are not "
+            f"encrypted; name that address in camera.source if you accept that"
+        )
+    if scheme not in ("http", "https"):
+        return f"the server redirects to {shown}; name that address in camera.source"
+    return ""
 
 
-def _hint(error: urllib.error.HTTPError, parts: SplitResult) -> str:
-    if error.code != 401:
+def _challenge(response: http.client.HTTPResponse) -> Challenge | None:
+    """What the server asks for; one that does not say so gets the simplest."""
+    headers = response.headers.get_all("WWW-Authenticate")
+    return challenge_of(headers) if headers else Challenge(digest=False)
+
+
+def _hint(response: http.client.HTTPResponse, parts: SplitResult) -> str:
+    if response.status != 401:
         return ""
     if parts.username is None:
         return "; it wants a name and a password, as in http://NAME:PASSWORD@HOST/PATH"
-    return (
-        "; check the name and the password in the URL (@ is %40 there, : is %3A); basic and "
-        "digest (MD5) are known here"
-    )
+    if _challenge(response) is None:
+        return ", and asks for no basic or digest authentication; others are not known here"
+    return "; check the name and the password in the URL (@ is %40 there, : is %3A)"
 
 
 def _untrusted(error: ssl.SSLCertVerificationError) -> str:
@@ -218,6 +274,8 @@ def _untrusted(error: ssl.SSLCertVerificationError) -> str:
 # FFmpeg says neither.
 
 
+RTSP_PORT = 554
+MOST_ANSWER_BYTES = 65536
 MAX_DAMAGED = 100
 """Packets in a row that cannot be decoded before it connects anew."""
 WINDOW_S = 10.0
@@ -279,6 +337,13 @@ class RtspSource(StreamSource):
         import av  # late: most flights have another camera
         import av.error
 
+        # Before the first picture is before the flight: later it would cost pictures.
+        if self._count == 0 and (target := redirect_of(self._url, self.connect_timeout_s)):
+            self.not_found = True
+            return (
+                f"the server redirects to {without_password(target)}, which would get the name "
+                f"and password; name that address in camera.source"
+            )
         try:
             timeouts_s = (self.connect_timeout_s, self.read_timeout_s)
             with av.open(self._url, options=_OPTIONS, timeout=timeouts_s) as stream:
@@ -314,6 +379,41 @@ class RtspSource(StreamSource):
             for image, time_s in frames:
                 self._put(image, waited_s=waiting.of(time_s, self._clock()))
         return "the stream ended"
+
+
+def redirect_of(url: str, timeout_s: float) -> str:
+    """The other host or port to which the server redirects a URL with name and password; an empty
+    string if there is none. FFmpeg would follow, and take name and password along."""
+    parts = urlsplit(url)
+    who = credentials_of(parts)
+    if who is None or parts.hostname is None:
+        return ""
+    asked = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
+    challenge: Challenge | None = None
+    failures = (OSError, ValueError, IndexError, http.client.HTTPException)
+    with (
+        contextlib.suppress(*failures),  # FFmpeg will say why
+        socket.create_connection((parts.hostname, parts.port or RTSP_PORT), timeout_s) as server,
+        server.makefile("rb") as answers,
+    ):
+        # Once more with name and password, if they are asked for.
+        for number, method in enumerate(("OPTIONS", "DESCRIBE", "DESCRIBE"), start=1):
+            request = f"{method} {asked} RTSP/1.0\r\nCSeq: {number}\r\n"
+            if challenge is not None:
+                request += f"Authorization: {answer(challenge, who, method, asked)}\r\n"
+            server.sendall(f"{request}\r\n".encode())
+            status = int(answers.readline(MOST_ANSWER_BYTES).split()[1])
+            headers = http.client.parse_headers(answers)
+            answers.read(min(int(headers.get("Content-Length", 0)), MOST_ANSWER_BYTES))
+            if 300 <= status < 400:
+                target = urlsplit(headers.get("Location", ""))
+                same = (target.hostname, target.port or RTSP_PORT) == (
+                    parts.hostname, parts.port or RTSP_PORT
+                )  # fmt: skip
+                return "" if same else urlunsplit(target)
+            if status == 401 and challenge is None:
+                challenge = challenge_of(headers.get_all("WWW-Authenticate") or [])
+    return ""
 
 
 def unresolved(url: str) -> str:

@@ -44,6 +44,7 @@ CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M = 1.0, 0.2
 the vehicle back to the ceiling, beside the target's centre."""
 CATCH_LEAST_S, CATCH_LIMIT_S = 0.1, 2.0
 CARRIED_RATIO = 0.85  # of the hover thrust: what still has so much sinks slowly by itself
+MOST_BRAKED_MPS = 1.0  # no blow that the vehicle survives leaves more
 POSITION_GAIN_PER_S = 2.0  # the firmware's `posCtlPid.xKp` and `yKp`
 CAUGHT_MPS = -0.1  # by then the thrust is above the weight, and rises on
 
@@ -314,11 +315,10 @@ def _braked_place_m(c: Context) -> tuple[float, float]:
     """The setpoint that takes out a sideways speed which the estimate misses: the position mode
     asks for `POSITION_GAIN_PER_S` times the way to it."""
     tel, reckoned_mps = c.obs.telemetry, c.state.reckoning.velocity_mps
-    x_m, y_m = (
-        tel.position_m[i] - (reckoned_mps[i] - tel.velocity_mps[i]) / POSITION_GAIN_PER_S
-        for i in range(2)
-    )
-    return x_m, y_m
+    missed_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
+    x_mps, y_mps = (max(-MOST_BRAKED_MPS, min(MOST_BRAKED_MPS, mps)) for mps in missed_mps)
+    x_m, y_m, _ = tel.position_m
+    return x_m - x_mps / POSITION_GAIN_PER_S, y_m - y_mps / POSITION_GAIN_PER_S
 
 
 def left_contact(c: Context, below_m: float) -> Context:

@@ -32,9 +32,9 @@ SINK_MEMORY_S, OFFSET_MEMORY_S = 1.5, 3.0
 IMPACT_G = -0.3  # what brakes a climb harder is an impact on the ceiling, and no way down
 BLOW_MPS, BLOW_S = 0.22, 0.1  # gained upwards in that time, more than any thrust gives: the floor
 BEFORE_BLOW_S, BOUNCES_S = 0.05, 0.5  # a blow shows so much later; what follows belongs to it
-STEADY_MPS, STEADY_ASIDE_MPS = 0.06, 0.15
-"""Speeds so near to each other are one speed. Sideways ones drift: 0.01 rad of wrong attitude adds
-0.1 m/s each second."""
+STEADY_MPS, STEADY_ASIDE_MPS, ASIDE_MEMORY_S = 0.06, 0.15, 0.15
+"""Speeds so near to each other are one speed. Sideways the mean of the last moment is what it is
+near to: 0.01 rad of wrong attitude adds 0.1 m/s each second, and a blow all of it at once."""
 REST_MEMORY_S = 0.5  # at rest on the ground the offsets are learned in so long
 SPEED_MEMORY_S, BIAS_MEMORY_S = 3.0, 4.0
 """In so long the reckoned speed is drawn to a believed estimate's, and what is left of the offsets,
@@ -121,7 +121,7 @@ class ImuMotion:
     steady_s: float = math.inf  # since when the vertical speed has stayed what it is
     steady_mps: float = 0.0
     steady_aside_s: float = math.inf  # the same of the sideways speed
-    steady_aside_mps: tuple[float, float] = (0.0, 0.0)
+    steady_aside_mps: tuple[float, float] = (0.0, 0.0)  # the mean of the last moment
     light_since_s: float = math.inf
     sink_mps: float = 0.0
     offset_mps2: float = 0.0
@@ -188,9 +188,11 @@ def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> 
     steady_s, steady_mps = motion.steady_s, motion.steady_mps
     if abs(z - steady_mps) > STEADY_MPS:
         steady_s, steady_mps = new.t_s, z
-    steady_aside_s, steady_aside_mps = motion.steady_aside_s, motion.steady_aside_mps
+    steady_aside_s, (mean_x, mean_y) = motion.steady_aside_s, motion.steady_aside_mps
+    keeps = math.exp(-dt_s / ASIDE_MEMORY_S)
+    steady_aside_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
     if math.dist((x, y), steady_aside_mps) > STEADY_ASIDE_MPS:
-        steady_aside_s, steady_aside_mps = new.t_s, (x, y)
+        steady_aside_s = new.t_s
     now = Blow(new.t_s, new.velocity_mps[2], z, new.acc_z_g)
     aside_g = _aside_g(motion.aside_g, new, offset_g, dt_s)
     last_moment = (*(m for m in motion.last_moment if new.t_s - m.t_s <= BEFORE_BLOW_S), now)

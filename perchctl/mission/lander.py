@@ -450,12 +450,13 @@ def _reckon(c: Context) -> PlannerState:
     new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray)
     if c.located and not c.by_sight and state.last is not None:
         new = stepped(new, state.last, obs.telemetry)
-    moved_s = max(obs.imu.steady_s, obs.imu.steady_aside_s)
-    rests = obs.t_s - moved_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
+    rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
     if state.contact_z_m is not None and new.below_m < REACH_M and rests:
         # Pressed or hanging it stands still, whatever speed the impact left to the estimate. On
         # its way to the target a gust moves it, and a blow knocks it off the magnet.
-        new = replace(new, velocity_mps=(0.0, 0.0, 0.0))
+        blown = obs.t_s - obs.imu.steady_aside_s < AT_REST_S
+        x_mps, y_mps, _ = new.velocity_mps
+        new = replace(new, velocity_mps=(x_mps, y_mps, 0.0) if blown else (0.0, 0.0, 0.0))
     felt, late = obs.felt, latency_changed(c)
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
         # Late pictures have led the estimate's height astray, too.

@@ -128,7 +128,8 @@ def load_comparison(config: PositioningConfig, vehicle: str) -> ComparisonRecord
         if not path.is_file():  # one that is a pipe would be waited for
             raise OSError("it is no file")
         file = _File.model_validate_json(path.read_bytes())
-        file.at.astimezone(UTC)
+        if not 1 < file.at.year < 9999:
+            raise OverflowError
         if file.set_up == _set_up(config, vehicle):
             return Comparison(file.at, file.passed, _one_line(file.found))
         why = "is of another set-up"

@@ -157,7 +157,7 @@ def without_constants(
             del result[key]
             constant = getattr(model, key)
             now = f"{dotted} is no longer a key: it is {constant} for every profile"
-            if value == (list(constant) if isinstance(value, list) else constant):
+            if value == (list(constant) if isinstance(constant, tuple) else constant):
                 notes.append(f"{now}; remove it")
             else:
                 lost.append(f"{now}, and {value} here; remove it")

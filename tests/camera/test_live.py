@@ -63,6 +63,7 @@ class Server:
         self.paths: list[str] = []
         self.authorization: list[str | None] = []
         self.challenges: list[str] = []
+        self.refusal = 401
         self.nonce = "n1"
         outer = self
 
@@ -75,10 +76,10 @@ class Server:
                 outer.paths.append(self.path)
                 given = self.headers["Authorization"]
                 outer.authorization.append(given)
-                if outer.challenges and not (
+                if (outer.challenges or outer.refusal == 403) and not (
                     given and (given.startswith("Basic") or f'nonce="{outer.nonce}"' in given)
                 ):
-                    self.send_response(401)
+                    self.send_response(outer.refusal)
                     for challenge in outer.challenges:
                         self.send_header("WWW-Authenticate", challenge)
                     self.end_headers()

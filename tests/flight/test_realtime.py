@@ -171,7 +171,12 @@ def flying_until(phase: str, sim: SimProcess, folder: Path) -> Iterator[subproce
         "--uri", sim.uri, "--source", sim.stream_url, "--yes", "--log-dir", str(folder)
     )
     with subprocess.Popen(
-        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     ) as process:
         guard = threading.Timer(FLIGHT_LIMIT_S, process.kill)
         guard.start()
@@ -195,10 +200,9 @@ def test_ctrl_c_in_flight_lands(tmp_path: Path) -> None:
         with vehicle(folder) as own, flying_until("ALIGN", own.sim, folder) as process:
             assert own.sim.truth()["position_m"][2] > 0.3
             process.send_signal(signal.SIGINT)
-            assert process.stderr is not None
-            rest = process.stderr.read()
-            code = process.wait(FLIGHT_LIMIT_S)
-            return code, rest, own.sim.truth(), read_log(the_log(folder)), own.is_late()
+            output, rest = process.communicate(timeout=FLIGHT_LIMIT_S)
+            code = process.returncode
+            return code, output + rest, own.sim.truth(), read_log(the_log(folder)), own.is_late()
 
     folder = tmp_path / "first"
     folder.mkdir()
