@@ -13,29 +13,30 @@ import perchctl
 ROOT = Path(perchctl.__file__).resolve().parent
 SOURCES = {path: path.read_text(encoding="utf-8") for path in sorted(ROOT.rglob("*.py"))}
 
-# Package -> lines at most; "." are the modules beside the packages.
+# Package -> lines at most; "." are the modules beside the packages. What needs more raises the
+# bound in its own change, and says why there.
 MOST_LINES = {
-    ".": 1150,
-    "analysis": 3500,
-    "calibration": 4250,
-    "camera": 2700,
-    "campaign": 1700,
-    "check": 2050,
-    "commands": 5000,
+    ".": 1200,
+    "analysis": 3600,
+    "calibration": 4400,
+    "camera": 2800,
+    "campaign": 1750,
+    "check": 2100,
+    "commands": 5150,
     "display": 1000,
-    "faults": 3050,
-    "flight": 2450,
-    "link": 2600,
-    "record": 3300,
-    "mission": 4750,
+    "faults": 3150,
+    "flight": 2500,
+    "link": 2700,
+    "record": 3400,
+    "mission": 4900,
     "perception": 650,
-    "positioning": 1200,
-    "profile": 2100,
-    "sim": 6900,
-    "target": 2450,
+    "positioning": 1250,
+    "profile": 2150,
+    "sim": 7100,
+    "target": 2500,
     "track": 600,
-    "vision": 8100,
-    "weights": 1550,
+    "vision": 8350,
+    "weights": 1600,
 }
 MOST_FILES = 262
 # Of the code before it was made shorter: what is shorter because its lines are fuller is not.

@@ -53,7 +53,7 @@ class Turns:
         return bool(self._watchers)
 
     def begin(self, now_s: float) -> None:
-        """A turn begins."""
+        """Note when a turn of the loop begins."""
         self._began_s, self._laps_s = now_s, []
         self.lap()
 

@@ -300,7 +300,7 @@ def _opened(uri: str, timeout_s: float) -> Connection:
 
 
 def ready_cflib() -> None:
-    """Its drivers known, and silent."""
+    """Register cflib's radio drivers, and silence its log output."""
     import cflib.crtp
 
     _hush_cflib()

@@ -239,7 +239,7 @@ class PlannerState:
     jump_s: float | None = None
     astray: bool = False  # positions from outside lead elsewhere: they prove nothing any more
     stale_s: float | None = None  # when there was no position from outside last
-    last: Telemetry | None = None  # of the turn before
+    last: Telemetry | None = None  # the newest sample that was decided on
     energy: EnergyState = field(default_factory=EnergyState)  # fitted to the battery
     battery: BatteryOutlook = field(default_factory=BatteryOutlook)  # what that is enough for
     reckoning: Reckoning = field(default_factory=Reckoning)  # speed and place by the accelerometer

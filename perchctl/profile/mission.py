@@ -66,7 +66,9 @@ class AscendConfig(Section):
     """Settled: heading."""
     settle_speed_mps: ClassVar[float] = 0.04
     """Settled: speed."""
-    settle_dwell_s: float = key(0.3, "for which all must hold", ge=0, le=10)
+    settle_dwell_s: float = key(
+        0.3, "settled: for which position, heading and speed must all hold", ge=0, le=10
+    )
     settle_timeout_s: ClassVar[float] = 10.0  # at the stand-off
     fresh_s: float = key(
         0.25, "a target older than this, beyond the latency, is not fresh", gt=0, le=2

@@ -378,7 +378,7 @@ class SpaceMessages:
         self._path_s = self._point_s = -math.inf
 
     def of(self, record: Mapping[str, Any]) -> Iterator[tuple[str, Message]]:
-        """Of a tick's record (`perchctl.record.fields.FIELDS`)."""
+        """The recording's messages for one tick's record (`perchctl.record.fields.FIELDS`)."""
         t_s = float(record["t_s"])
         ns = self._epoch.ns(t_s)
         sampled_ns = self._epoch.ns(t_s - (_number(record, "tel_age_s") or 0.0))
