@@ -19,7 +19,6 @@ from .criteria import world_problem as world_problem
 from .inputs import ENDED_TEXT as ENDED_TEXT
 from .inputs import SENSED as SENSED
 from .inputs import FlightInputs as FlightInputs
-from .inputs import lateness_text as lateness_text
 from .lockstep import LockstepFlight as LockstepFlight
 from .lockstep import feed_lockstep as feed_lockstep
 from .lockstep import fly_lockstep as fly_lockstep

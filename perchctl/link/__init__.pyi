@@ -1,5 +1,4 @@
 from .cflib_link import CflibLink as CflibLink
-from .cflib_link import EstimateLink as EstimateLink
 from .crtp import Packet as Packet
 from .crtp import Port as Port
 from .external_position import check_estimator_parameters as check_estimator_parameters

@@ -29,7 +29,6 @@ from .report import Findings as Findings
 from .report import FlightReport as FlightReport
 from .report import Rest as Rest
 from .report import Touchdown as Touchdown
-from .report import flight_findings as flight_findings
 from .report import flight_report as flight_report
 from .report import latency_text as latency_text
 from .report import rest_of as rest_of

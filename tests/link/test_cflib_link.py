@@ -19,8 +19,8 @@ from tests.helpers.waiting import until
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
-from perchctl.link import CflibLink, EstimateLink
-from perchctl.link.cflib_link import LANDING_WAIT_S, SILENCE_S
+from perchctl.link import CflibLink
+from perchctl.link.cflib_link import LANDING_WAIT_S, SILENCE_S, EstimateLink
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
 from perchctl.sim import Scenario, SimProcess

@@ -11,7 +11,8 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed
-from perchctl.link import CflibLink, EstimateLink, MockLink
+from perchctl.link import CflibLink, MockLink
+from perchctl.link.cflib_link import EstimateLink
 from perchctl.link.connection import Connection
 from perchctl.sim import SimProcess, SimulatedVehicle
 from perchctl.vehicle import FLYING, FRESH_S, LOCKED, EmergencyStop, Land, is_cut, may_fly

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from perchctl.mission import flight_findings
+from perchctl.mission.report import flight_findings
 from perchctl.profile import CameraConfig
 from perchctl.record import FlightSummary, summary_text
 from perchctl.vision import Consistency
