@@ -33,6 +33,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     ),
     "judging pictures": (
         "perchctl.perception.perception:assess_frame",
+        "perchctl.camera.source:same_bytes",
         "perchctl.camera.source:repeated",
     ),
     "physics, firmware": ("perchctl.sim.vehicle:SimulatedVehicle.advance_to",),

@@ -96,7 +96,7 @@ MOST_NAMES = {
     "flight": 41,
     "link": 21,
     "record": 19,
-    "mission": 47,
+    "mission": 48,
     "perception": 15,
     "positioning": 15,
     "profile": 38,

@@ -353,8 +353,10 @@ def with_pictures(flight: FlightAnalysis, recording: Path) -> ReportedFlight:
     shown: list[Shown] = []
     problem = ""
     try:
-        for number, _, image in recorded_pictures(recording, exact=False, numbers=wanted.keys()):
-            shown += [Shown(decision, _jpeg(decision, image)) for decision in wanted[number]]
+        pictures = recorded_pictures(recording, exact=False, numbers=wanted.keys())
+        while wanted and (picture := next(pictures, None)) is not None:
+            decisions = wanted.pop(picture.number)
+            shown += [Shown(decision, _jpeg(decision, picture.image)) for decision in decisions]
     except PerchError as error:
         problem = str(error).replace(f"{flight.log.path.parent}{os.sep}", "")
     in_order = tuple(sorted(shown, key=lambda each: each.decision.t_s))

@@ -222,8 +222,7 @@ def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
     What only ends like one is not among them. Errors: NotFound.
     """
     try:
-        logs = [path for path in folder.iterdir() if _is_log(path)]
-        logs.sort(key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
+        paths = list(folder.iterdir())
     except FileNotFoundError:
         raise NotFound(
             f"there is no folder {folder} with flight logs: name a log, or its folder"
@@ -232,6 +231,7 @@ def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
         raise NotFound(f"{folder} is a file, not a folder") from None
     except OSError as error:
         raise NotFound(f"the folder {folder} cannot be read: {error.strerror}") from None
+    logs = sorted(filter(_is_log, paths), key=_age_key, reverse=True)
     if not logs:
         raise NotFound(f"the folder {folder} holds no flight log: name a log, or another folder")
     return logs[:most]
@@ -292,6 +292,16 @@ def _is_log(path: Path) -> bool:
         return False
     if path.name.startswith(_NAME):
         return True
-    with path.open("rb") as stream:
-        begin = stream.read(len(_BEGIN))
+    try:
+        with path.open("rb") as stream:
+            begin = stream.read(len(_BEGIN))
+    except OSError:  # another file of the folder: one that is gone by now, or may not be read
+        return False
     return begin == _BEGIN or begin.startswith(_PACKED)
+
+
+def _age_key(path: Path) -> tuple[int, str]:
+    try:
+        return path.stat().st_mtime_ns, path.name
+    except OSError:
+        return 0, path.name

@@ -12,7 +12,7 @@ from perchctl.analysis.edges import runs_of
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.sight import Loss, Stay
 from perchctl.analysis.words import count, length
-from perchctl.mission import Phase
+from perchctl.mission import SEVEN_PHASES, Phase
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 HELD_LEAST_S = 0.1
@@ -30,7 +30,7 @@ ACTS = {
     "stop": "it stopped the motors",
     "emergency": "it cut the motors",
 }
-SEVEN = tuple(phase.value for phase in Phase if phase.is_flying and phase is not Phase.RECOVER)
+SEVEN = tuple(phase.value for phase in SEVEN_PHASES)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import cv2
 
 from perchctl.campaign.pool import FlightPool
 from perchctl.campaign.results import FlightEnd, FlightResult, peak_memory_mb
-from perchctl.errors import PerchError, SafetyAbort, TimedOut
+from perchctl.errors import InvalidValue, PerchError, SafetyAbort, TimedOut
 from perchctl.flight import LockstepFlight, fly_lockstep
 from perchctl.mission import Event, EventKeeper, Phase
 from perchctl.profile import Profile
@@ -233,6 +233,11 @@ def _result(future: Future[R], seed: K) -> R:
         return future.result()
     except PerchError:
         raise
+    except ImportError as error:
+        raise InvalidValue(
+            f"a worker cannot load what flies ({type(error).__name__}: {error}): install this "
+            f"computer's perchctl there, with the extras sim and cluster"
+        ) from error
     except Exception as error:
         if os.environ.get("PERCHCTL_DEBUG"):
             raise

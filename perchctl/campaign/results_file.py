@@ -186,13 +186,17 @@ SOURCE = source_sha256(_ROOT)
 """As it was loaded: a program that runs on while its files change is not the new one."""
 
 
+_DESCRIBE = ("describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*")
+"""The commit, whatever tags it has."""
+
+
 def commit_of(root: Path) -> str | None:
     """The commit of the checkout whose top is `root`; None where it is none, or git cannot say."""
     if not (root / ".git").exists():
         return None
     try:
         return subprocess.run(
-            ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40"],
+            ["git", "-C", str(root), *_DESCRIBE],
             capture_output=True, check=True, timeout=_GIT_S, stdin=subprocess.DEVNULL, text=True,
         ).stdout.strip()  # fmt: skip
     except (OSError, subprocess.SubprocessError):
@@ -308,7 +312,17 @@ def _read_line(
     for key, other in _MUST_AGREE.items():
         if record.get(key) != now[key]:
             raise InvalidValue(
-                f"{path} was flown with {other} ({record.get(key)!s:.80}; this campaign has "
-                f"{now[key]!s:.80}): name the same, or another file"
+                f"{path} was flown with {other} ({_shown(record, key)}; this campaign has "
+                f"{_shown(now, key)}): name the same, or another file"
             )
     return str(record.get("source"))
+
+
+def _shown(header: dict[str, Any], key: str) -> str:
+    """A header's value for people: a profile by its name and the begin of its digest."""
+    value = header.get(key)
+    if key == "profile_sha256":
+        return f"{header.get('profile')} {value!s:.8}"
+    if key == "faults":
+        return ", ".join(map(str, value)) if value else "no faults"
+    return f"{value!s:.80}"

@@ -1,6 +1,6 @@
 """From a profile's ranges and a seed to one flight's `Scenario`.
 
-What harder worlds draw beyond the nominal one comes in groups, each from a random stream of its
+What harder worlds draw beyond that of `sim` comes in groups, each from a random stream of its
 own, so that no other value of a seed moves.
 """
 
@@ -167,7 +167,7 @@ def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
 
 
 def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
-    """Fields of the scenario. Where the ranges are those of the nominal world, its defaults."""
+    """Fields of the scenario. Where the ranges are those of `sim`, its defaults."""
     air, cell, tilt, flow, radio, capture = (
         _Draws(seed, group) for group in (_AIR, _CELL, _TILT, _FLOW, _RADIO, _CAPTURE)
     )

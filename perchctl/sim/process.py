@@ -123,12 +123,12 @@ REQUESTS = (
     "truth", "set_pose", "carry", "let_go", "set_battery", "push", "silence", "capture_fault",
     "reboot", "replace_vehicle",
 )  # fmt: skip
-"""Methods of the child's `VehicleHost` that a `SimProcess` has, too."""
+"""Methods of the child's `VehicleHost` and its `World` that a `SimProcess` has, too."""
 
 
 class SimProcess:
     """Handle of a running simulated vehicle; a context manager. It has the methods `REQUESTS` of
-    `perchctl.sim.host.VehicleHost`.
+    `perchctl.sim.host.VehicleHost` and its `World`.
 
     `uri` is for cflib, `stream_url` for a network camera ("" without a camera), `capture` the
     motion capture's kind and address for `motioncapture` (None without one). `shared_time`

@@ -129,13 +129,16 @@ def test_the_newest_is_by_its_last_record_and_bad_ones_are_named(tmp_path: Path)
     empty = tmp_path / "flight_empty.jsonl"
     empty.write_bytes(b"")
     (tmp_path / "hand.jsonl").write_text('{"part": "carry"}\n')
+    (tmp_path / "gone.jsonl").symlink_to(tmp_path / "nowhere.jsonl")
+    (tmp_path / "flight_gone.jsonl").symlink_to(tmp_path / "nowhere.jsonl")
     for age, path in enumerate((empty, killed, old)):
         os.utime(path, (1000 - age, 1000 - age))
-    assert newest_logs(tmp_path) == [empty, killed, old]
+    assert newest_logs(tmp_path) == [empty, killed, old, tmp_path / "flight_gone.jsonl"]
     assert newest_logs(tmp_path, 1) == [empty]
     lines = list_text(list_logs(tmp_path)).splitlines()
     assert [line.split()[0] for line in lines] == [
         "log", "flight_empty.jsonl", "killed.jsonl", "flight_old.jsonl",
+        "flight_gone.jsonl",
     ]  # fmt: skip
     assert "not a flight log" in lines[1]
     assert "unknown: the log ends in APPROACH" in lines[2]

@@ -29,7 +29,7 @@ from perchctl.commands.simulate import (
     stop_once,
     with_problem,
 )
-from perchctl.errors import Interrupted, PerchError
+from perchctl.errors import Interrupted, InvalidValue, PerchError
 from tests.helpers.ended import ended
 from tests.helpers.jobs import campaign
 from tests.helpers.seeds import (
@@ -39,6 +39,7 @@ from tests.helpers.seeds import (
     fails_later,
     is_killed_later,
     is_lost,
+    lacks_a_module,
     no_form,
 )
 
@@ -174,6 +175,14 @@ def test_a_flight_that_fails_loses_none_of_the_others(
     said = capsys.readouterr().err
     assert words in said
     assert said.endswith("; 1 of 3 flights were flown\n")
+
+
+def test_a_worker_that_lacks_a_module_is_no_fault_of_the_program() -> None:
+    with (
+        flight_processes(1) as pool,
+        pytest.raises(InvalidValue, match=r"cannot load.*'mujoco'.*install"),
+    ):
+        fly_all(lacks_a_module, [0], pool)
 
 
 def test_a_lost_flight_is_flown_again_and_counted_once(tmp_path: Path) -> None:

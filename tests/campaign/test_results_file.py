@@ -101,8 +101,11 @@ def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        ({"profile_sha256": "9876543210"}, "another profile .0123456789; this campaign has 98765"),
-        ({"faults": ["killed"]}, "other faults .None; this campaign has .'killed'"),
+        (
+            {"profile_sha256": "9876543210"},
+            "another profile .* 01234567; this campaign has .* 987654",
+        ),
+        ({"faults": ["killed"]}, "other faults .no faults; this campaign has killed"),
         ({"source": "ffffffffff"}, "another program .its source is 0a0b0c0d, and here it is ffff"),
     ],
 )

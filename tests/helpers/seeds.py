@@ -39,6 +39,10 @@ def ends_first_only(seed: int) -> Ended:
     return ends_at_once(seed)
 
 
+def lacks_a_module(seed: int) -> Ended:
+    raise ModuleNotFoundError("No module named 'mujoco'")
+
+
 def fails_later(seed: int) -> Ended:
     if seed:
         raise ZeroDivisionError("no such luck")

@@ -23,8 +23,6 @@ from perchctl.record import FlightLog
 from perchctl.vehicle import Telemetry
 from tests.replay.test_corpus import corpus
 
-JUDGED = ("jumped", "turned_rad", "battery_age_s", "camera_age_s", "new_frame", "camera_problem")
-
 
 def what_if(log: FlightLog, *settings: str) -> Replay:
     return replay(log, None, changed_profile(log.flown_profile, settings))

@@ -26,7 +26,6 @@ class Status(IntEnum):
     E2BIG = 7
     ENOEXEC = 8
     ENOMEM = 12
-    EACCES = 13
     EEXIST = 17
 
 
