@@ -439,7 +439,13 @@ def _measured_board(notation: str, measured: str | None) -> Board:
     board = parse_board(notation)
     if measured is None:
         return board
-    board = parse_board(f"{board.notation()}:measured={measured.removesuffix('mm')}mm")
+    meant = board.notation().partition(":measured=")[0]
+    try:
+        board = parse_board(f"{meant}:measured={measured.removesuffix('mm')}mm")
+    except InvalidValue:
+        raise InvalidValue(
+            f"--measured {measured}: needed is WIDTHxHEIGHT in mm, as in 249.3x174.9"
+        ) from None
     for name, meant_m, scale in zip(("width", "height"), board.size_m, board.scale, strict=True):
         off = f"{100 * (scale - 1):+.2f} % against {mm_text(meant_m)} mm"
         say(f"{name}: {mm_text(scale * meant_m)} mm, {off}")
@@ -523,20 +529,21 @@ class _Keeper:
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
         self._kept = 0
+        self._failed = False
 
     def keep(self, picture: Grey) -> None:
         """Never raises: pictures that cannot be kept are still calibrated from."""
-        if self._folder is None:
+        if self._folder is None or self._failed:
             return
         png = cv2.imencode(".png", picture)[1].tobytes()
         try:
             write_files({self._folder / f"view_{self._kept + 1:03d}.png": png})
             self._kept += 1
         except InvalidValue as error:
-            self._folder = None
+            self._failed = True
             say(f"pictures are no longer kept: {error}")
 
     def report(self) -> None:
         """Says where the pictures are."""
-        if self._kept and self._folder is not None:
+        if self._kept:
             say(f"kept {self._kept} pictures: images:{self._folder} takes them again")

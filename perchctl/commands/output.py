@@ -21,7 +21,9 @@ def tell(text: str, stdout: bool = False) -> None:
     stream = sys.stdout if stdout else sys.stderr
     try:
         print(text, file=stream, flush=True)
-    except (OSError, ValueError):
+    except (OSError, ValueError) as error:
+        if stdout and isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
+            say(f"the result cannot be written: {error.strerror}; free some space")
         with contextlib.suppress(OSError, ValueError):
             # What is left in the buffer must not fail at the program's end.
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

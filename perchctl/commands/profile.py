@@ -122,6 +122,7 @@ class Question:
     default: Callable[[Answers], str]
     parse: Callable[[str, Answers], Any]
     hint: Callable[[Answers], str] = lambda _: ""
+    after: str = ""  # the name of the question whose answer decides what is allowed
 
 
 def answered(
@@ -139,7 +140,12 @@ def answered(
         try:
             answers[question.name] = question.parse(given[question.name].strip(), answers)
         except PerchError as error:
-            raise type(error)(f"{question.option}: {error}") from None
+            follows = ""
+            if question.after and question.after not in given:
+                (other,) = (each for each in QUESTIONS if each.name == question.after)
+                default = answers[question.after]
+                follows = f" (this follows from {other.option} {default}: give that, too)"
+            raise type(error)(f"{question.option}: {error}{follows}") from None
     return answers
 
 
@@ -162,7 +168,7 @@ def _asked(question: Question, answers: Answers) -> Any:
                 "there is nobody to ask, and nothing was written: answer by options, or add "
                 "--defaults for what is not answered"
             ) from None
-        except PerchError as error:
+        except (PerchError, UnicodeDecodeError) as error:
             tell(f"  {error}")
 
 
@@ -251,6 +257,7 @@ QUESTIONS: tuple[Question, ...] = (
     Question(
         "source", "--source", "The camera: camera:N (a receiver at /dev/videoN), http://..., aideck://HOST",
         lambda answers: "sim:" if answers["uri"].startswith(SIMULATED) else "camera:0", _source,
+        after="uri",
     ),
     Question(
         "calibration", "--calibration",
@@ -275,6 +282,7 @@ QUESTIONS: tuple[Question, ...] = (
         lambda answers: " ({}, or {} if the camera mirrors its picture)".format(
             *edges_beside(answers["front"])
         ),
+        "front",
     ),
     Question(
         "camera", "--camera-at",
@@ -291,7 +299,7 @@ QUESTIONS: tuple[Question, ...] = (
     ),
     Question(
         "small", "--small", "Side of the small one, mm",
-        lambda answers: f"{max(4.0, answers['large'] / 6.0):.4g}", _small,
+        lambda answers: f"{max(4.0, answers['large'] / 6.0):.4g}", _small, after="large",
     ),
     Question(
         "ceiling", "--ceiling", "Height of the ceiling over the floor, m",
@@ -351,6 +359,8 @@ def new(
     check_output(output, (".yaml", ".yml"), force, "what a profile is")
     given = {question.name: context.params[question.name] for question in QUESTIONS}
     given = {name: text for name, text in given.items() if text is not None}
+    if given.get("source") == "sim:":  # no other vehicle flies by those pictures
+        given.setdefault("uri", SIMULATED)
     answers = answered(given, _by_default)  # all options are checked before anything is asked
     if not defaults and len(given) < len(QUESTIONS):
         tell(f"A new profile: {output}. Enter takes what stands in brackets.")

@@ -163,6 +163,7 @@ def track(
         page = stack.enter_context(live_page(camera, title, port))
         has_bar = not opened.live and not (lines and sys.stdout.isatty())
         advance = stack.enter_context(count_bar("frames", count, has_bar))
+        first: tuple[float, float] | None = None  # times of the first frame and of now
         for frame in frames(opened, now, stop, notes):
             place = str(paths[frame.index]) if paths else opened.describe()
             check_size((frame.image.shape[1], frame.image.shape[0]), camera, place)
@@ -186,6 +187,9 @@ def track(
                     page.show(frame.index, sketch)
                     page.tell(partial(track_state, tracked))
             advance()
+            if page is not None and not opened.live:  # a recording is watched at its own pace
+                first = first or (frame.t_s, now())
+                stop.requested.wait(max(0.0, frame.t_s - first[0] - (now() - first[1])))
         ended_s = now()
         if tally.frames == 0 and not stop.requested.is_set():
             raise NotFound(f"{opened.describe()} gave no frame at all")

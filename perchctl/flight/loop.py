@@ -149,7 +149,7 @@ RESCUED = {
     Finding.HANGS: "the vehicle hangs on the magnet, its motors are off",
     Finding.HELD: "something holds the vehicle away from the target; the motors are off",
     Finding.UNKNOWN: "the motors are off; it is not known whether the vehicle hangs or stands",
-    None: "a landing was flown, but could not be confirmed: keep away from the vehicle",
+    None: "how it ended could not be confirmed: keep away from the vehicle",
 }
 
 

@@ -67,7 +67,7 @@ class OperatorSwitch:
             self._last_s = now_s
 
     def leave(self) -> None:
-        """On a signal, in the main thread."""
+        """Raises `Interrupted` on a signal before the loop listens; called in the main thread."""
         if not self.listening:
             raise Interrupted("interrupted before take-off: nothing was started")
 

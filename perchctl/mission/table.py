@@ -138,7 +138,7 @@ def is_astray(c: Context) -> bool:
 
 
 def _swings(c: Context) -> bool:
-    """Up and down, by a motion capture that is late."""
+    """True if it sinks fast in a phase that walks it: a motion capture that is late swings it."""
     by_capture = c.profile.positioning.by == "mocap"
     return by_capture and c.state.phase in WALKED and c.climb_mps < -SWINGS_MPS
 

@@ -345,10 +345,17 @@ def _bounded(setup: CaptureSetup) -> Iterator[None]:
 
 
 def _by_address(setup: CaptureSetup) -> dict[str, str]:
-    """OptiTrack's reader knows addresses only. Errors: OSError, UnicodeError."""
+    """OptiTrack's reader knows addresses only. Errors: ConnectionFailed."""
     if setup.kind != "optitrack":
         return setup.options
-    return setup.options | {"hostname": socket.gethostbyname(setup.options["hostname"])}
+    host = setup.options["hostname"]
+    try:
+        return setup.options | {"hostname": socket.gethostbyname(host)}
+    except (OSError, UnicodeError) as error:
+        raise ConnectionFailed(
+            f"the host name {host!r} cannot be resolved ({error}): correct positioning.host, or "
+            f"give the address, as in 192.168.1.2"
+        ) from None
 
 
 def _pass_on(client: Any, channel: Channel, partial: bool) -> None:

@@ -57,7 +57,7 @@ class Comparison:
     found: str
 
     def objection(self, now: datetime) -> tuple[str, str] | None:
-        """As above: it did not pass, is older than `VALID_S`, or is of the future."""
+        """Objects to one that did not pass, is older than `VALID_S`, or lies in the future."""
         when = _told(self.at, now)
         if not self.passed:
             return f"{self.found} (found by check --lift on {when})", f"mend that, then {AGAIN}"
@@ -73,7 +73,7 @@ class Comparison:
         return None
 
     def text(self, now: datetime) -> str:
-        """Of a comparison that passed."""
+        """Says when the comparison passed, and what it found."""
         return f"compared by hand on {_told(self.at, now)}"
 
 
@@ -82,7 +82,7 @@ ComparisonRecord = Comparison | NoComparison
 
 
 def _told(at: datetime, now: datetime) -> str:
-    """Of another year with the year, in the time zone of `now`."""
+    """Gives day and time in the time zone of `now`, with the year if it is another one."""
     there = at.astimezone(now.tzinfo)
     year = f" {there.year}" if there.year != now.year else ""
     return f"{there.day} {_MONTHS[there.month - 1]}{year} {there:%H:%M}"
@@ -128,12 +128,11 @@ def load_comparison(config: PositioningConfig, vehicle: str) -> ComparisonRecord
         if not path.is_file():  # one that is a pipe would be waited for
             raise OSError("it is no file")
         file = _File.model_validate_json(path.read_bytes())
-        if not 1 < file.at.year < 9999:
-            raise OverflowError
-        if file.set_up == _set_up(config, vehicle):
-            return Comparison(file.at, file.passed, _one_line(file.found))
-        why = "is of another set-up"
-    except (ValidationError, OverflowError):  # the latter: a year that no time zone can tell
+        if 1 < file.at.year < 9999:  # any time zone can tell it
+            if file.set_up == _set_up(config, vehicle):
+                return Comparison(file.at, file.passed, _one_line(file.found))
+            why = "is of another set-up"
+    except ValidationError:
         pass
     except OSError as error:
         why = f"cannot be read ({error.strerror or error})"

@@ -270,6 +270,8 @@ def kalibr_notation(path: Path) -> str:
     """
     try:
         keys = parse_yaml(path.read_text(encoding="utf-8"))
+        if not isinstance(keys, dict):
+            raise ValueError("it holds no keys and values")
         if keys["target_type"] == "aprilgrid":
             counts, side_mm = f"{keys['tagCols']}x{keys['tagRows']}", 1e3 * float(keys["tagSize"])
             return f"aprilgrid:{counts}:{side_mm:.9g}mm:{float(keys['tagSpacing']):g}"

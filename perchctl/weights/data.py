@@ -247,21 +247,27 @@ def _refuse_repeated(parts: Sequence[Measurements], test: Measurements | None) -
     """Raises InvalidValue where a row is there twice: it would narrow the intervals and is no more
     evidence, and one that was fitted to is no test.
 
-    Without times, rows of one file may well be equal: rounded, of a camera at rest.
+    Without times, rows of one position may well be equal: rounded, of a camera at rest.
     """
-    if len({part.sha256 for part in parts}) < len(parts):
-        raise InvalidValue(f"{parts[-1].name}: the same file twice is no more evidence")
-    timed = [part for part in parts if np.ptp(part.t_s) > 0.0]
-    if not timed:
-        return
-    rows = np.concatenate(
-        [np.nan_to_num(np.column_stack([p.t_s, p.large, p.small, p.actual])) for p in timed]
-    )
-    owner = np.repeat(np.arange(len(timed)), [len(part) for part in timed])
-    order = np.lexsort(rows.T)
-    same = (np.diff(rows[order], axis=0) == 0.0).all(axis=1)
-    if same.any():
-        row = int(order[1:][same][0])
-        part = timed[int(owner[row])]
-        why = "the test's rows were fitted to" if part is test else "it is no more evidence"
-        raise InvalidValue(f"{part.name}: the row of t_s {rows[row, 0]:g} is there twice: {why}")
+    first: dict[bytes, tuple[Measurements, int]] = {}
+    for part in parts:
+        timeless = float(np.ptp(part.t_s)) == 0.0
+        poses = [np.nan_to_num(pose) for pose in (part.large, part.small, part.actual)]
+        values = np.column_stack([part.t_s, *poses]) + 0.0  # no zero with a minus
+        content, size = values.tobytes(), values.itemsize * values.shape[1]
+        for row in range(len(part)):
+            key = content[row * size : (row + 1) * size]
+            before, old_row = first.setdefault(key, (part, row))
+            if before is part and old_row == row:
+                continue
+            if before is part and timeless and part.position[row] == part.position[old_row]:
+                continue
+            why = (
+                "--test judges by other data than was fitted to"
+                if part is test and before is not test
+                else "the same rows twice are no more evidence; take out what is there twice"
+            )
+            raise InvalidValue(
+                f"{part.name}: its row {row + 1} stands in row {old_row + 1} of {before.name} too: "
+                f"{why}"
+            )

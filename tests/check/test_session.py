@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,11 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import CheckScope, Verdict, camera, check, session
+from perchctl.check import CheckScope, Verdict, camera, check, session, vehicle
 from perchctl.commands.check import exit_code
 from perchctl.errors import UsageError, broken_motion_capture
-from perchctl.link import ScanResult, find_vehicles
-from perchctl.profile import PositioningConfig, Profile
+from perchctl.link import ProbeLink, ScanResult, find_vehicles
+from perchctl.profile import LinkConfig, PositioningConfig, Profile
 from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options, wait_for
 from tests.helpers.flights import short_profile
@@ -104,6 +105,28 @@ def test_a_link_that_is_lost_on_the_way_is_told() -> None:
     assert rows["packets"].verdict is Verdict.FAIL
     assert "the link was lost" in rows["packets"].found
     assert rows["decks"].verdict is rows["battery"].verdict is Verdict.SKIPPED
+
+
+@pytest.mark.long
+def test_a_vehicle_that_falls_silent_after_its_rows_is_told() -> None:
+    """The rows before were true when they were asked for; at the end they are not."""
+    with SimProcess.start() as sim:
+        probe = ProbeLink(sim.uri, LinkConfig(connect_timeout_s=30.0), time.monotonic)
+        probe.connect()
+        try:
+            asked = session.VehicleSession(probe, sim.uri, Profile(), None, CheckScope(**QUICK))
+            rows = []
+            for row in asked.answering_rows():
+                rows.append(row)
+                if row.name == vehicle.LIFTED:
+                    sim.silence(60.0)
+                    while probe.lost() is None and probe.age_s() <= vehicle.GONE_S:
+                        wait_for(sim, 0.1)
+        finally:
+            probe.close()
+    assert rows[-1].name == "link"
+    assert rows[-1].verdict is Verdict.FAIL
+    assert "the vehicle is gone" in rows[-1].found
 
 
 class Answerer:

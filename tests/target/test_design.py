@@ -18,12 +18,11 @@ from perchctl.errors import InvalidValue
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.target import (
     Optics,
-    TargetDesign,
     check_target,
     make_design,
     suggest_target,
 )
-from perchctl.target.design import Ranges, pose_bound
+from perchctl.target.design import Ranges, TargetDesign, pose_bound
 from perchctl.target.drawing import marker_corners_m
 from perchctl.target.page import parse_page
 from perchctl.target.sheets import fits

@@ -163,13 +163,16 @@ def read_recordings(path: Path) -> tuple[MountingRecording, ...]:
             record = json.loads(line)
             if "part" in record:
                 parts.append((_head(record), [], []))
+            elif not parts:
+                raise ValueError("the file does not begin with a part")
             elif "rotation_cam_target" in record:
                 parts[-1][2].append(_pose(record))
             else:
                 parts[-1][1].append(_attitude(record))
-        except (IndexError, KeyError, TypeError, ValueError, RecursionError) as error:
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            why = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
             raise InvalidValue(
-                f"{path}, line {number} is no line of a recording of calibrate mount: {error}"
+                f"{path}, line {number} is no line of a recording of calibrate mount: {why}"
             ) from None
     if not parts:
         raise InvalidValue(f"{path} is empty: name a recording of calibrate mount")
