@@ -40,7 +40,7 @@ TEXT = {path: path.read_text(encoding="utf-8") for path in PAGES}
 README = TEXT[ROOT / "README.md"]
 FAULTS = TEXT[DOCS / "faults.md"]
 
-MOST_LINES = 200
+MOST_LINES = 90
 MOST_PICTURE_BYTES = 1_500_000
 
 CAMCHAIN = """cam0:
@@ -325,10 +325,10 @@ def test_the_extended_profile_loads(tmp_path: Path) -> None:
     assert load_profile(str(tmp_path / "mine.yaml")).simulation.camera_drop_rate == 0.33
 
 
-def test_every_command_is_in_the_readme() -> None:
+def test_every_command_is_on_its_page() -> None:
     command: Any = typer.main.get_command(app)
     for name in command.commands:
-        assert f"| `perchctl {name}` |" in README
+        assert f"| `perchctl {name}` |" in TEXT[DOCS / "commands.md"]
 
 
 def test_every_room_is_described() -> None:
