@@ -55,7 +55,7 @@ QUICK = """extends: sim
 planner: {perching_time_s: 0.3}
 """
 """A flight that lands again before it has left the floor; whole ones are flown in tests/flight."""
-TOOLS = ("pytest", "ruff ", "mypy")
+TOOLS = ("pytest", "ruff ", "mypy", "sphinx-build ")
 """`.ci/run` runs these; a test does not run the tests."""
 AIDECK = "aideck://192.168.4.1"
 WITHOUT_A_CAMERA = {
@@ -248,7 +248,7 @@ def test_there_are_commands_to_run() -> None:
     lines = command_lines()
     assert len(lines) > 20
     assert {line.split()[0] for line in lines} <= {
-        "perchctl", "python", "pytest", "ruff", "mypy", "dask",
+        "perchctl", "python", "pytest", "ruff", "mypy", "dask", "sphinx-build",
     }  # fmt: skip
 
 

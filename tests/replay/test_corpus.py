@@ -1,6 +1,7 @@
 """The regression corpus: flights of an earlier day, decided again by today's planner.
 
-A planner that is meant to decide otherwise gets the corpus anew: CONTRIBUTING.md, "Change the planner".
+A planner that is meant to decide otherwise gets the corpus anew: CONTRIBUTING.md, "Change the
+planner".
 """
 
 from __future__ import annotations
