@@ -1,8 +1,4 @@
-"""Sphinx's settings for the site of these pages, with search and the API's reference.
-
-    pip install '.[docs]'
-    sphinx-build -W docs site
-"""
+"""Sphinx's settings for the site of these pages: ``sphinx-build -W docs site``."""
 
 from __future__ import annotations
 
