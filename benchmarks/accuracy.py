@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from common import (
     CAMERA,
+    SIDES_M,
     Picture,
     arguments,
     camera_pose,
@@ -36,6 +37,7 @@ from perchctl.vision import (
     Pipeline,
     PipelineOutput,
     PipelineState,
+    square_corners,
     step,
 )
 
@@ -108,6 +110,51 @@ def report(title: str, views: Iterator[View], camera: CameraModel) -> None:
         f"{np.mean(everything) / 4.0:.2f} a degree of freedom (median of chi2: 0.84), "
         f"{np.median(everything) / 4.0:.2f} in the median"
     )
+
+
+def corner_methods() -> dict[str, int]:
+    """OpenCV's ways to refine a marker's corners, by name."""
+    return {
+        "OpenCV": cv2.aruco.CORNER_REFINE_NONE,
+        "OpenCV, sub-pixel": cv2.aruco.CORNER_REFINE_SUBPIX,
+        "AprilTag, by OpenCV": cv2.aruco.CORNER_REFINE_APRILTAG,
+    }
+
+
+def others(title: str, views: Iterator[View], camera: CameraModel) -> None:
+    """Other detectors on the same pictures; both markers' corners are solved as one pose."""
+    ours = setup_with(camera)
+    errors: dict[tuple[str, str], list[Array]] = defaultdict(list)
+    pictures: dict[str, int] = defaultdict(int)
+    for view in views:
+        reach = "near" if view.tvec[2] < NEAR_M else "far"
+        pictures[reach] += 1
+        pose = best_pose(look(ours, view.image))
+        if pose is not None:
+            errors["perchctl", reach].append(error_of(pose.e_m, pose.e_yaw_rad, view))
+        for name, method in corner_methods().items():
+            found = plain_detect(view.image, method)
+            if not found:
+                continue
+            corners_m = np.vstack([square_corners(SIDES_M[marker]) for marker in found])
+            corners_px = np.vstack(list(found.values()))
+            _, rvec, tvec = cv2.solvePnP(
+                corners_m, corners_px, camera.K, camera.dist, flags=cv2.SOLVEPNP_SQPNP
+            )
+            rvec, tvec = cv2.solvePnPRefineLM(
+                corners_m, corners_px, camera.K, camera.dist, rvec, tvec
+            )
+            R = cv2.Rodrigues(rvec)[0]
+            yaw_rad = math.atan2(R[1, 0], R[0, 0])
+            errors[name, reach].append(error_of(np.ravel(tvec), yaw_rad, view))
+    rows = []
+    for (name, reach), found_errors in sorted(errors.items(), key=lambda item: item[0][::-1]):
+        E = np.array(found_errors) * [1e3, 1e3, 1e3, math.degrees(1.0)]
+        found_of = f"{len(E)}/{pictures[reach]}"
+        medians = " ".join(f"{np.median(np.abs(column)):.2g}" for column in E.T)
+        rows.append((f"{name}, {reach}", found_of, *(rms(column) for column in E.T), medians))
+    head = ("", "found", "x mm", "y mm", "z mm", "yaw deg", "medians")
+    table(title, head, rows)
 
 
 def rendered(count: int) -> Iterator[View]:
@@ -184,12 +231,15 @@ def found_in_scenes() -> None:
 
 def main() -> None:
     quick = arguments(__doc__ or "").quick
-    report("Rendered scenes, RMS", rendered(25 if quick else 150), CAMERA)
+    count = 25 if quick else 150
+    report("Rendered scenes, RMS", rendered(count), CAMERA)
+    others("Other detectors, rendered scenes, RMS", rendered(count), CAMERA)
     content = scenes()
     if content is None:
         print("\nThe path-traced scenes are absent (../shared/data/scenes).")
         return
     report("Path-traced scenes, RMS", path_traced(), content["camera"])
+    others("Other detectors, path-traced scenes, RMS", path_traced(), content["camera"])
     found_in_scenes()
 
 

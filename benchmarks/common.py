@@ -120,19 +120,24 @@ def in_view(corners_px: Array, camera: CameraModel = CAMERA) -> bool:
 
 
 @cache
-def plain_detectors() -> tuple[Any, Any]:
-    """Two detectors of the whole dictionaries with OpenCV's defaults: the paper's way."""
-    return (
-        cv2.aruco.ArucoDetector(aruco_dictionary(TARGET.large.dictionary)),
-        cv2.aruco.ArucoDetector(aruco_dictionary(TARGET.small.dictionary)),
+def plain_detectors(refinement: int = cv2.aruco.CORNER_REFINE_NONE) -> tuple[Any, Any]:
+    """Two detectors of the whole dictionaries, with OpenCV's defaults the paper's way."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = refinement
+    large, small = (
+        cv2.aruco.ArucoDetector(aruco_dictionary(marker.dictionary), parameters)
+        for marker in (TARGET.large, TARGET.small)
     )
+    return large, small
 
 
-def plain_detect(image: Picture) -> dict[str, Array]:
+def plain_detect(
+    image: Picture, refinement: int = cv2.aruco.CORNER_REFINE_NONE
+) -> dict[str, Array]:
     """The target's markers by both plain detectors: corners (4, 2) by name."""
     found = {}
     for name, config, detector in zip(
-        ("large", "small"), (TARGET.large, TARGET.small), plain_detectors(), strict=True
+        ("large", "small"), (TARGET.large, TARGET.small), plain_detectors(refinement), strict=True
     ):
         corners, ids, _ = detector.detectMarkers(image)
         if ids is None:

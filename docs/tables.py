@@ -42,9 +42,9 @@ PART = re.compile(r"(<!-- begin ([\w-]+) -->\n).*?(<!-- end \2 -->)", re.DOTALL)
 
 SEE = {  # of a key: where a page says more
     "camera.mount.rpy_deg": "[Camera mount](conventions.md#camera-mount)",
-    "camera.latency_s": "[latency](#latency)",
-    "camera.mask": "[own gear](#own-gear)",
-    "camera.controls": "[exposure](cameras.md#exposure)",
+    "camera.latency_s": "[latency](cameras.md#latency)",
+    "camera.mask": "[what the vehicle covers](calibration.md#what-the-vehicle-covers)",
+    "camera.controls": "[exposure](cameras.md#format-and-exposure)",
 }
 
 

@@ -22,7 +22,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rich": ("perchctl.commands", "perchctl.display"),
     "filterpy": ("perchctl.vision.filter",),
     "mujoco": ("perchctl.sim",),
-    "matplotlib": ("*.plot",),
+    "matplotlib": ("*.plot", "perchctl.analysis.film"),
     "jinja2": ("perchctl.analysis.report",),
     "motioncapture": ("perchctl.positioning",),
     "mcap": ("perchctl.record.recording_file", "perchctl.record.recorded"),
@@ -32,7 +32,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "distributed": ("perchctl.campaign",),
     "dask": ("perchctl.campaign",),
     "pyarrow": ("perchctl.record.table",),
-    "av": ("perchctl.track.outputs", "perchctl.camera.network"),
+    "av": ("perchctl.track.outputs", "perchctl.camera.network", "perchctl.analysis.film"),
 }
 
 # Time is an argument here.

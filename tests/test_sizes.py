@@ -17,7 +17,7 @@ SOURCES = {path: path.read_text(encoding="utf-8") for path in sorted(ROOT.rglob(
 # bound in its own change, and says why there.
 MOST_LINES = {
     ".": 1200,
-    "analysis": 3600,
+    "analysis": 3950,
     "calibration": 4400,
     "camera": 2800,
     "campaign": 1750,
@@ -38,7 +38,7 @@ MOST_LINES = {
     "vision": 8350,
     "weights": 1600,
 }
-MOST_FILES = 262
+MOST_FILES = 263
 # Of the code before it was made shorter: what is shorter because its lines are fuller is not.
 CHARACTERS_A_LINE, DOCSTRING_SHARE, WITHIN = 37.8, 0.106, 0.05
 MOST_MEDIAN_LINES = 15  # of a function

@@ -42,7 +42,6 @@ from perchctl.calibration import profile_camera  # noqa: E402
 from perchctl.display import (  # noqa: E402
     LivePage,
     Sketch,
-    draw_sketch,
 )
 from perchctl.display.panel import (  # noqa: E402
     FlightStatus,
@@ -50,7 +49,7 @@ from perchctl.display.panel import (  # noqa: E402
     status_rows,
 )
 from perchctl.flight import PLAIN_SEED  # noqa: E402
-from perchctl.geometry import Array, make_T, rotation_from_rpy  # noqa: E402
+from perchctl.geometry import make_T, rotation_from_rpy  # noqa: E402
 from perchctl.mission import BatteryOutlook  # noqa: E402
 from perchctl.plot import (  # noqa: E402
     BLACK,
@@ -60,7 +59,6 @@ from perchctl.plot import (  # noqa: E402
     ORANGE,
     VERMILLION,
     new_figure,
-    save_png,
 )
 from perchctl.profile import Profile, load_profile  # noqa: E402
 from perchctl.record import (  # noqa: E402
@@ -74,8 +72,8 @@ from perchctl.sim import (  # noqa: E402
 from perchctl.vision import Frame, PipelineState, make_pipeline, step  # noqa: E402  # noqa: E402
 
 PAGE_PX, REPORT_PX = (1100, 560), (1200, 1250)
-NEAR_WIDTH_M = 0.2
-"""Of the side view where the vehicle is at the ceiling."""
+FILM = ("--rate", "6", "--width", "640")
+"""Small enough for the README: at most 3 MB."""
 
 
 @dataclass(frozen=True)
@@ -108,11 +106,6 @@ class Flight:
         """The tick at that time, s after the first."""
         after = self.log.column("t_s") >= self.log.start_s + t_s - 1e-6
         return int(np.argmax(after)) if after.any() else len(self.log.records) - 1
-
-    def entered_s(self, phase: str, last: bool = True) -> float | None:
-        """When a phase was entered, s after the first tick; None if it never was."""
-        spans = [span for span in self.log.phases if span.phase == phase]
-        return spans[-1 if last else 0].start_s - self.log.start_s if spans else None
 
     def frame(self, index: int) -> Frame:
         """What the camera sees at that tick: rendered anew, from the logged truth."""
@@ -191,22 +184,11 @@ def flight(flown: Flight, file: Path) -> None:
     plot_flight(flown.log, file)
 
 
-def strip(flown: Flight, file: Path) -> None:
-    """Six moments: what the camera sees, and the vehicle from the side, to scale; for the
-    last three, nearer."""
-    moments = _moments(flown)
-    figure = new_figure(13.0, 6.6, dpi=100)
-    axes = figure.subplots(2, len(moments), height_ratios=(0.75, 2.1), squeeze=False)
-    for i, (title, index) in enumerate(moments):
-        picture, side = axes[0][i], axes[1][i]
-        seen = draw_sketch(flown.sketch(flown.frame(index)), flown.camera)
-        picture.imshow(cv2.cvtColor(seen, cv2.COLOR_BGR2RGB))
-        picture.set_title(title, fontsize=10)
-        picture.set_axis_off()
-        near = flown.status(index).phase in ("PERCH", "COMPLETE", "PERCHED")
-        _side_view(side, flown, index, near)
-        side.set_ylabel("height [m]" if i == 0 else "", fontsize=9)
-    save_png(figure, file)
+def film(flown: Flight, file: Path) -> None:
+    """The flight as a film, which the README shows."""
+    _perchctl(
+        "log", "film", str(flown.log.path.resolve()), "-o", str(file.resolve()), "--force", *FILM
+    )
 
 
 def terminal(flown: Flight, file: Path) -> None:
@@ -409,7 +391,7 @@ PICTURES: dict[str, Callable[[Flight, Path], None]] = {
     "wiring.svg": wiring_drawing,
     "target.png": target,
     "flight.png": flight,
-    "strip.png": strip,
+    "film.gif": film,
     "panel.svg": terminal,
     "calibration.png": calibration,
     "page.png": page,
@@ -418,21 +400,6 @@ PICTURES: dict[str, Callable[[Flight, Path], None]] = {
 
 
 # --- what they share ------------------------------------------------------------------
-
-
-def _moments(flown: Flight) -> list[tuple[str, int]]:
-    """Titles and ticks of the strip; phases that were not flown are left out."""
-    end_s = flown.log.phases[-1].start_s - flown.log.start_s
-    perch_s, complete_s = flown.entered_s("PERCH"), flown.entered_s("COMPLETE")
-    times = (
-        ("SEARCH", flown.entered_s("SEARCH", last=False)),
-        ("ALIGN", _within(flown, "ALIGN", 0.4)),
-        ("ASCEND", _within(flown, "ASCEND", 0.35)),
-        ("PERCH: settled below", perch_s),
-        ("COMPLETE: in contact", complete_s),
-        ("PERCHED: motors off", end_s if complete_s is not None else None),
-    )
-    return [(f"{name}\n{t_s:.1f} s", flown.index_at(t_s)) for name, t_s in times if t_s is not None]
 
 
 def _within(flown: Flight, phase: str, share: float) -> float | None:
@@ -447,48 +414,6 @@ def _shown(flown: Flight) -> int:
     """The tick of the displays' pictures: in the ascent, or else at the end."""
     t_s = _within(flown, "ASCEND", 0.35)
     return len(flown.log.records) - 1 if t_s is None else flown.index_at(t_s)
-
-
-def _side_view(ax: Axes, flown: Flight, index: int, near: bool) -> None:
-    """Ceiling, target and vehicle in the upright plane through start and target, in m;
-    `near` shows the last centimetres of it."""
-    way, ceiling_m = _along(flown), flown.scenario.ceiling_z_m
-    left, right = min(way.min(), 0.0) - 0.25, max(way.max(), 0.0) + 0.25
-    height_m, above_m = ceiling_m + 0.05, 0.08
-    if near:
-        share = NEAR_WIDTH_M / (right - left)
-        left, right = -NEAR_WIDTH_M / 2.0, NEAR_WIDTH_M / 2.0
-        height_m, above_m = share * (height_m + above_m) - share * above_m, share * above_m
-    ax.set_xlim(left, right)
-    ax.set_ylim(ceiling_m - height_m, ceiling_m + above_m)
-    ax.set_aspect("equal")
-    ax.tick_params(labelsize=8)
-    ax.add_patch(Rectangle((left, ceiling_m), right - left, above_m, color="#D5D5D5", zorder=0))
-    ax.axhline(0.0, color=GREY, linewidth=1.5)
-    upto = slice(0, index + 1)
-    ax.plot(way[upto], flown.log.column("true_z_m")[upto], color=ORANGE, linewidth=1.2)
-    half_m, thick_m = flown.profile.target.large.side_m / 2.0, 0.004 if near else 0.02
-    ax.add_patch(Rectangle((-half_m, ceiling_m), 2 * half_m, thick_m, color=BLACK))
-    ax.add_patch(Rectangle((-0.025, ceiling_m + thick_m), 0.05, thick_m, color=VERMILLION))
-    _vehicle(ax, flown, way[index], flown.log.records[index])
-
-
-def _along(flown: Flight) -> Array:
-    """Horizontal place of each tick on the way from the start to the target, m."""
-    target_xy = np.array(flown.scenario.target_xy_m)
-    xy = np.stack([flown.log.column("true_x_m"), flown.log.column("true_y_m")], axis=1)
-    to_target = target_xy - xy[0]
-    direction = to_target / max(float(np.linalg.norm(to_target)), 1e-6)
-    return np.asarray((xy - target_xy) @ direction)
-
-
-def _vehicle(ax: Axes, flown: Flight, s_m: float, record: dict[str, Any]) -> None:
-    """Board, battery, motors, propellers and gear of a Crazyflie, true to size."""
-    z, gear_m = record["true_z_m"], flown.profile.vehicle.gear_body_m[2]
-    spins = (record["thrust"] or 0) > 0
-    parts = _body_parts(gear_m, spins)
-    for x, up, width, height, colour in parts:
-        ax.add_patch(Rectangle((s_m + x, z + up), width, height, color=colour, zorder=3))
 
 
 def _page_state(status: FlightStatus) -> dict[str, Any]:

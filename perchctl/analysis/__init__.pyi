@@ -1,5 +1,6 @@
 from .compare import Comparison as Comparison
 from .compare import profile_differences as profile_differences
+from .film import write_film as write_film
 from .flight import FlightAnalysis as FlightAnalysis
 from .plot import plot_flight as plot_flight
 from .replay_text import replay_lines as replay_lines

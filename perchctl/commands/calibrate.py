@@ -439,13 +439,10 @@ def _measured_board(notation: str, measured: str | None) -> Board:
     board = parse_board(notation)
     if measured is None:
         return board
-    meant = board.notation().partition(":measured=")[0]
-    try:
-        board = parse_board(f"{meant}:measured={measured.removesuffix('mm')}mm")
-    except InvalidValue:
-        raise InvalidValue(
-            f"--measured {measured}: needed is WIDTHxHEIGHT in mm, as in 249.3x174.9"
-        ) from None
+    sides = measured.removesuffix("mm")
+    if not re.fullmatch(r"[\d.]+x[\d.]+", sides):
+        raise InvalidValue(f"--measured {measured}: not WIDTHxHEIGHT in mm, as in 249.3x174.9")
+    board = parse_board(f"{board.notation().partition(':measured=')[0]}:measured={sides}mm")
     for name, meant_m, scale in zip(("width", "height"), board.size_m, board.scale, strict=True):
         off = f"{100 * (scale - 1):+.2f} % against {mm_text(meant_m)} mm"
         say(f"{name}: {mm_text(scale * meant_m)} mm, {off}")

@@ -48,6 +48,7 @@ from perchctl.record import (
 )
 
 FORMATS = (".png", ".pdf", ".svg")
+FILMS = (".mp4", ".gif")
 DRAWN_IN = "what plots are drawn in"
 EXPORTS = (".csv", ".parquet", ".mcap")
 PAGE_SUFFIXES = (".html", ".htm")
@@ -361,4 +362,53 @@ def report(
     else:
         print(output)
         say(page.counts_text)
+    return 0
+
+
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl log film",
+        "perchctl log film flight.jsonl -o flight.mp4",
+        "perchctl log film flight.jsonl -o flight.gif --rate 6 --width 640",
+    ),
+)
+@reporting
+def film(
+    file: LogArgument = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="The film: .mp4 or .gif. Default: .mp4 beside the log."
+        ),
+    ] = None,
+    rate_hz: Annotated[
+        float, typer.Option("--rate", min=1.0, max=60.0, help="Pictures a second.")
+    ] = 15.0,
+    width_px: Annotated[
+        int, typer.Option("--width", min=320, max=1920, help="Width of the film, in pixels.")
+    ] = 960,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Make a film of a flight: the camera's picture, a side view to scale, error and thrust.
+
+    The camera's picture needs the recording beside the log (fly --record).
+    """
+    path = _log_file(file)
+    place = output or path_beside(path, ".mp4")
+    check_output(place, FILMS, force, "what films are made in")
+    is_recorded = recording_path(path).is_file()
+    if not is_recorded:
+        say(f"there is no recording beside {path}: the film has no camera picture")
+    with _opened(path) as log:
+        flight = FlightAnalysis(log)
+        pictures = recorded_pictures(path, exact=False) if is_recorded else None
+        from perchctl.analysis import write_film
+
+        count = write_film(flight, pictures, place, rate_hz, width_px)
+    if as_json:
+        print_record({"log": str(path), "film": str(place), "pictures": count})
+    else:
+        print(f"film:      {place}")
     return 0

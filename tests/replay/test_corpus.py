@@ -1,6 +1,7 @@
 """The regression corpus: flights of an earlier day, decided again by today's planner.
 
-A planner that is meant to decide otherwise gets the corpus anew: docs/replay.md, "The corpus".
+A planner that is meant to decide otherwise gets the corpus anew: CONTRIBUTING.md, "Change the
+planner".
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ NAMES = sorted(path.name.removesuffix(".jsonl.gz") for path in FOLDER.glob("*.js
 MOST_BYTES, MOST_BYTES_SEEN = 1_500_000, 1_000_000
 LAST_BITS = 1e-9
 """By so much sums may differ on a computer with other libraries; what is decided may not."""
-ANEW = "if that was meant: python tests/data/flights/make.py (docs/replay.md, The corpus)"
+ANEW = "if that was meant: python tests/data/flights/make.py (CONTRIBUTING.md, Change the planner)"
 
 
 @cache

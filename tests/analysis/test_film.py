@@ -1,0 +1,90 @@
+"""A film of a flight shows what its log and its recording hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.analysis import FlightAnalysis, write_film
+from perchctl.analysis.film import LAST_S, PHASE_WORDS, _Ways
+from perchctl.errors import InvalidValue
+from perchctl.flight import fly_lockstep
+from perchctl.mission import Phase
+from perchctl.record import LogWatcher, read_log, recorded_pictures
+from tests.helpers.commands import run
+from tests.helpers.flights import SEED, short_profile
+
+WIDTH_PX = 320
+
+
+def test_each_phase_has_its_words() -> None:
+    assert set(PHASE_WORDS) == {phase.value for phase in Phase}
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of a flight with its recording."""
+    path = tmp_path_factory.mktemp("film") / "flight.jsonl"
+    profile = short_profile()
+    log = LogWatcher.lockstep(path, profile, SEED, record=True)
+    flight = fly_lockstep(profile, SEED, log)
+    log.close(flight.report, flight.perched_miss_m, flight.fell)
+    return path
+
+
+def pictures_of(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as video:
+        return [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+
+
+@pytest.mark.long
+def test_it_lasts_as_long_as_the_flight_and_shows_the_recorded_pictures(
+    flown: Path, tmp_path: Path
+) -> None:
+    flight = FlightAnalysis(read_log(flown))
+    films = []
+    for name, recorded in (("with", recorded_pictures(flown)), ("without", None)):
+        path = tmp_path / f"{name}.mp4"
+        count = write_film(flight, recorded, path, rate_hz=2.0, width_px=WIDTH_PX)
+        films.append(pictures_of(path))
+        assert len(films[-1]) == count == pytest.approx(2.0 * (flight.end_s + LAST_S), abs=2)
+        assert films[-1][0].shape == (WIDTH_PX * 9 // 16, WIDTH_PX, 3)
+    middle = len(films[0]) // 2
+    left = np.s_[30:110, 30:140]  # where the camera's picture is
+    seen, black = (film[middle][left].mean() for film in films)
+    assert seen > black + 30.0
+    # The near view changes while it presses, what stands still does not.
+    near, corner = np.s_[20:110, 230:310], np.s_[120:, :10]
+    assert np.abs(films[0][0][near].astype(int) - films[0][-1][near]).max() > 50
+    assert np.abs(films[0][0][corner].astype(int) - films[0][-1][corner]).max() < 50
+
+
+@pytest.mark.long
+def test_the_gear_of_a_vehicle_that_hangs_is_at_the_target(flown: Path) -> None:
+    flight = FlightAnalysis(read_log(flown))
+    ways = _Ways(flight)
+    assert flight.summary.outcome == "perched"
+    tip_m = ways.place_m[-1] + ways.body_m(-1)[1]
+    assert ways.target_z_m is not None
+    assert tip_m == pytest.approx((0.0, ways.target_z_m), abs=0.03)
+    assert ways.place_m[0, 1] == pytest.approx(0.0, abs=0.05)
+    assert ways.span_m[0] <= 0.0 <= ways.span_m[1]
+
+
+@pytest.mark.long
+def test_the_command_makes_a_gif_and_refuses_what_is_none(flown: Path, tmp_path: Path) -> None:
+    out = tmp_path / "flight.gif"
+    words = ("log", "film", str(flown), "--rate", "1", "--width", str(WIDTH_PX), "-o")
+    done = run(*words, str(out))
+    assert done.code == 0
+    with Image.open(out) as image:
+        assert image.n_frames > 3
+        assert image.size == (WIDTH_PX, WIDTH_PX * 9 // 16)
+    assert run(*words, str(tmp_path / "flight.avi")).code == InvalidValue.exit_code
+    assert run(*words, str(out)).code == InvalidValue.exit_code  # it exists
