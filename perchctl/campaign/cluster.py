@@ -34,13 +34,13 @@ from perchctl.profile import Profile
 R = TypeVar("R")
 
 ANSWER_S = 10.0
-"""A scheduler may take so long to answer."""
+"""The scheduler must answer within this time."""
 HANGS_S = 60.0
-"""One that has answered before, and so long does not, is lost."""
+"""A scheduler that does not answer for this long is lost."""
 WORKERS_S = 20.0
-"""It may take so long until it has a worker."""
+"""The first worker must register within this time."""
 NOBODY_S = 120.0
-"""For so long a campaign waits without any worker."""
+"""A campaign waits this long without any worker."""
 _POLL_S = 0.25
 _CLOSE_S = 1.0
 _NO_PAGES = "127.0.0.1:0"
@@ -49,7 +49,8 @@ _QUIET = ("distributed", "tornado", "asyncio")
 
 
 class ClusterPool(FlightPool):
-    """`notes`: what is worth saying once it has started, a sentence each."""
+    """A pool of flights on the workers of a dask cluster. `notes`: remarks about the workers, a
+    sentence each."""
 
     lost = (BrokenExecutor, KilledWorker)
 
@@ -62,15 +63,15 @@ class ClusterPool(FlightPool):
         self.notes = verify_cluster(client, address, required)
 
     def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
-        """The future fails with `KilledWorker`, or is cancelled, if the flight was lost, and with
-        InvalidValue if the worker must not fly."""
+        """Hand a flight to a worker. Its future fails with `KilledWorker`, or is cancelled, if
+        the flight was lost, and with InvalidValue if the worker must not fly."""
         order = pickle.dumps((fn, args, kwargs))
         future: Future[R] = self._executor.submit(fly_verified, order, self._required)
         return future
 
     def places(self, nobody_s: float = NOBODY_S) -> int:
-        """The number of workers. Errors: ConnectionFailed if the scheduler is gone, or there has
-        been no worker for `nobody_s`."""
+        """Return the number of workers. Errors: ConnectionFailed if the scheduler is gone, or
+        there has been no worker for `nobody_s`."""
         client = self._client
         try:
             if client.status != "running":
@@ -153,7 +154,7 @@ def _local_scheduler(address: str, loop: Any) -> Iterator[str]:
 
 @contextlib.contextmanager
 def _connected(address: str, loop: Any) -> Iterator[Any]:
-    """A client of the scheduler. Errors: UsageError, ConnectionFailed."""
+    """Yield a client of the scheduler. Errors: UsageError, ConnectionFailed."""
     problem: PerchError | None = None
     try:
         client = Client(address, loop=loop, set_as_default=False, timeout=ANSWER_S)

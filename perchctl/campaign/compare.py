@@ -24,7 +24,7 @@ from perchctl.profile import Profile
 
 @dataclass(frozen=True)
 class VariantResult:
-    """The flight of a seed by the profile of that `number`."""
+    """The result of one seed, flown by the profile of that `number`."""
 
     number: int
     result: FlightResult
@@ -40,7 +40,7 @@ class VariantResult:
 
 @dataclass(frozen=True)
 class _Variant:
-    """One flight that is to be flown: of a seed, by the profile of that number."""
+    """One flight to be flown: a seed and the number of its profile."""
 
     seed: int
     number: int
@@ -55,7 +55,7 @@ def fly_variants(
     executor: Executor | None = None,
     on_result: Callable[[VariantResult], None] = lambda result: None,
 ) -> list[VariantResult]:
-    """Fly each seed by all profiles before the next seed, as `fly_all` does."""
+    """Fly each seed by all profiles before the next seed; arguments and errors as of `fly_all`."""
     variants = [_Variant(seed, number) for seed in seeds for number in range(len(profiles))]
     return fly_all(partial(_fly, tuple(profiles)), variants, executor, on_result)
 
@@ -65,7 +65,7 @@ def _fly(profiles: tuple[Profile, ...], variant: _Variant) -> VariantResult:
 
 
 def whole_seeds(results: Iterable[VariantResult], profiles: int) -> list[tuple[FlightResult, ...]]:
-    """The seeds that were flown by all profiles, in order: of each seed one result a profile."""
+    """Return, in the order of the seeds, the results of each seed that all profiles have flown."""
     by_seed: dict[int, dict[int, FlightResult]] = {}
     for each in results:
         by_seed.setdefault(each.seed, {})[each.number] = each.result
@@ -77,7 +77,7 @@ def whole_seeds(results: Iterable[VariantResult], profiles: int) -> list[tuple[F
 
 
 def compare_variants(results: Iterable[VariantResult]) -> Comparison:
-    """The comparison of two profiles, by the seeds that both have flown."""
+    """Return the comparison of two profiles by the seeds that both have flown."""
     return compare_pairs([(a, b) for a, b in whole_seeds(results, 2)])
 
 
@@ -97,17 +97,17 @@ None where nothing is proven:
   A's) with its `interval` (None for fewer than `FEWEST_PAIRS`), and `better`.
 """
 FEWEST_PAIRS = 20
-"""An interval of fewer would promise too much: differences have no normal law, and only the mean
-of many is near one."""
+"""Fewer pairs get no interval: differences are not normally distributed, and only the mean of
+many nearly is."""
 _SAME = 1e-9
-"""Values that differ by less of themselves do so by rounding."""
+"""Values whose relative difference is below this differ by rounding only."""
 NOT_PROVEN = "no difference proven"
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of a flight of which less is better. `of` gives it in SI, None where a flight has
-    none; `scale` makes it `unit`."""
+    """A figure of a flight that is better when smaller. `of` returns it in SI units, None if the
+    flight has none; `scale` converts it to `unit`."""
 
     name: str
     key: str
@@ -131,7 +131,8 @@ def _flown(result: FlightResult, value: float) -> float | None:
 def compare_pairs(
     pairs: Sequence[Pair], figures: Sequence[Figure] = FIGURES, times_asked: int = 1
 ) -> Comparison:
-    """The comparison of two flights a seed. `times_asked`: comparisons that are made together."""
+    """Return the comparison of two flights per seed. `times_asked`: the number of comparisons
+    that share the 5 %."""
     questions = times_asked * (1 + len(figures))
     level = 1.0 - (1.0 - LEVEL) / questions
     return {
@@ -180,7 +181,7 @@ def _difference(figure: Figure, pairs: Sequence[Pair], level: float) -> dict[str
 
 
 def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
-    """Student's interval of the mean."""
+    """Return Student's confidence interval of the mean."""
     if np.ptp(values) <= _SAME * np.max(np.abs(values)):
         return float(values[0]), float(values[0])
     found = ttest_1samp(values, 0.0).confidence_interval(level)
@@ -191,7 +192,7 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, floa
 
 
 def comparison_text(names: tuple[str, str], found: Comparison) -> str:
-    """The comparison as a table, and what is proven."""
+    """Return the comparison as a table, followed by what is proven."""
     flights, identical = found["flights"], found["identical"]
     figures = [figure for figure in FIGURES if figure.key in found]
     head = ("", f"A: {names[0]}", f"B: {names[1]}", "B less A", "")

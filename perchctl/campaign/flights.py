@@ -29,7 +29,7 @@ from perchctl.sim import Scenario, draw_scenario
 
 R = TypeVar("R")
 K = TypeVar("K", bound=Hashable)
-"""A seed, or another key of one flight among many; its text names the flight to people."""
+"""A seed, or another key of one flight; its text names the flight in messages."""
 
 OUTCOMES: dict[Phase, FlightEnd] = {
     Phase.PERCHED: "perched",
@@ -37,7 +37,7 @@ OUTCOMES: dict[Phase, FlightEnd] = {
     Phase.ABORTED: "aborted",
 }
 FLOWN_AGAIN = 2
-"""Times that a flight may be lost with the process that flew it, and is flown again."""
+"""How often a flight that was lost with its process is flown again."""
 _POLL_S = 0.25
 
 
@@ -46,7 +46,7 @@ _POLL_S = 0.25
 
 @dataclass(frozen=True)
 class LoggedFlight:
-    """One flight with its summary, its log, and its events in order."""
+    """One flight with its summary, its log file and its events in order."""
 
     seed: int
     outcome: FlightEnd
@@ -56,9 +56,8 @@ class LoggedFlight:
 
 
 def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R:
-    """The result of `fly`, a dataclass, called with the seed's scenario on one core; completed by
-    the time of a core that it took, the peak of the memory and the scenario. What the flight held
-    is freed."""
+    """Call `fly` with the seed's scenario on one core, and return its result (a dataclass) with
+    the CPU time, the peak memory and the scenario filled in. The flight's memory is freed."""
     cv2.setNumThreads(1)  # a job is one core, so that the rates are rates a core
     cpu_began_s = time.process_time()
     scenario = draw_scenario(profile, seed)
@@ -70,9 +69,8 @@ def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R
 
 
 def _give_back_memory() -> None:
-    """Free what a flight leaves behind. Its objects refer to each other, so Python frees them when
-    it next looks through everything, which may be many flights later; and the C library keeps
-    what it gets back in pieces."""
+    """Free the memory of a flight. Its objects refer to each other, so Python would free them
+    many flights later; and the C library keeps small pieces that it gets back."""
     gc.collect()
     if not gc.get_freeze_count():
         # What is left are the program's own modules and what it keeps for all flights: nothing
@@ -85,10 +83,10 @@ def _give_back_memory() -> None:
 def fly_seed(
     profile: Profile, seed: int, log_path: Path | None = None, record: bool = False
 ) -> FlightResult:
-    """Fly one seed of the profile's scenario. It is a function of its own so that any executor can
-    carry it to another process or machine. `record`: with the pictures beside the log. A flight
-    that is refused before take-off is a result, too, and leaves no log.
-    Errors: NotFound, InvalidValue (calibration, log)."""
+    """Fly one seed of the profile's scenario. Any executor can carry this function to another
+    process or machine. `record` writes the pictures beside the log. A flight that is refused
+    before take-off is a result, too, and leaves no log. Errors: NotFound, InvalidValue
+    (calibration, log)."""
     return fly_measured(profile, seed, lambda _: _fly(profile, seed, log_path, record))
 
 
@@ -118,7 +116,8 @@ def _fly(profile: Profile, seed: int, log_path: Path | None, record: bool) -> Fl
 
 
 def fly_logged(profile: Profile, folder: Path, seed: int, record: bool = False) -> LoggedFlight:
-    """Fly one seed to look at it closely. Errors: NotFound, InvalidValue (calibration, log)."""
+    """Fly one seed and return it with log, summary and events. Errors: NotFound, InvalidValue
+    (calibration, log)."""
     cv2.setNumThreads(1)
     log = LogWatcher.lockstep(seed_log_path(seed, folder), profile, seed, record)
     events = EventKeeper()
@@ -137,7 +136,7 @@ def _outcome(flight: LockstepFlight) -> FlightEnd:
 
 
 def seed_log_path(seed: int, log_dir: Path) -> Path:
-    """The file for a seed's log."""
+    """Return the path of a seed's log in `log_dir`."""
     return log_dir / f"flight_seed{seed}.jsonl"
 
 
@@ -152,12 +151,12 @@ def run_campaign(
     log_dir: Path | None = None,
     record: bool = False,
 ) -> list[FlightResult]:
-    """Fly all seeds, as `fly_all` does; results in the order of the seeds."""
+    """Fly all seeds by `fly_all`, and return the results in the order of the seeds."""
     return fly_all(partial(fly_in_folder, profile, log_dir, record), seeds, executor, on_result)
 
 
 def fly_in_folder(profile: Profile, log_dir: Path | None, record: bool, seed: int) -> FlightResult:
-    """`fly_seed` with the log in a folder, if one is given."""
+    """Fly a seed as `fly_seed` does, with its log in a folder if one is given."""
     log_path = None if log_dir is None else seed_log_path(seed, log_dir)
     return fly_seed(profile, seed, log_path, record)
 

@@ -35,13 +35,13 @@ class FlightPool(Executor):
     lost: tuple[type[BaseException], ...] = (BrokenExecutor,)
 
     def places(self) -> int:
-        """Flights that it takes at a time, now. Errors: PerchError if nobody is left to fly."""
+        """Return how many flights it takes at a time. Errors: PerchError if no process is left."""
         raise NotImplementedError
 
 
 class FlightProcesses(FlightPool):
-    """`count` processes, each started with its first flight. They never see a signal, and all of
-    them end when the parent is killed."""
+    """A pool of `count` processes, each started with its first flight. They ignore signals, and
+    end when the parent is killed."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -53,7 +53,8 @@ class FlightProcesses(FlightPool):
         return self._count
 
     def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
-        """The future fails with `BrokenExecutor` if the process that flew was lost."""
+        """Hand a flight to a free process. Its future fails with `BrokenExecutor` if the process
+        was lost."""
         if self._idle:
             process = self._idle.pop()
         else:
@@ -65,7 +66,7 @@ class FlightProcesses(FlightPool):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes once they have flown what was handed to them."""
+        """End the processes after the flights that they were given."""
         for process in self._all:
             process.shutdown(wait, cancel_futures=cancel_futures)
 
@@ -90,7 +91,7 @@ def flight_processes(jobs: int) -> Iterator[FlightPool]:
 
 @contextlib.contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Ctrl-C and SIGTERM wait until the end of the block; threads and processes that are started
+    """Hold back Ctrl-C and SIGTERM until the end of the block; threads and processes started
     within it never see them."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
@@ -102,8 +103,8 @@ def defer_interrupts() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _handlers_deferred() -> Iterator[None]:
-    """A mask belongs to one thread: another thread, of a library, may take the signal, and Python
-    then handles it in the main thread all the same."""
+    """Replace Python's handlers meanwhile: a signal mask belongs to one thread, so a library's
+    thread may take the signal, and Python would still handle it in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -19,7 +19,7 @@ from perchctl.sim import Scenario
 FlightEnd = Literal["perched", "landed", "aborted", "refused"]
 ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
 WORST = 5
-"""So many of the bad flights are named."""
+"""The number of bad flights that the table names."""
 _SEVERITY: tuple[FlightEnd, ...] = ("perched", "refused", "landed", "aborted")
 
 
@@ -95,14 +95,13 @@ def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
 
 
 def peak_mb(results: Iterable[Any]) -> float:
-    """The most memory that any process of the campaign ever held (1e6 bytes): this one, and those
-    that flew."""
+    """Return the largest memory, in 1e6 bytes, that this process or one that flew has held."""
     peaks = (float(r.peak_memory_mb) for r in results)
     return round(max([peak_memory_mb(), *peaks]), 1)
 
 
 def peak_memory_mb() -> float:
-    """The most memory that this process ever held (1e6 bytes)."""
+    """Return the largest memory, in 1e6 bytes, that this process has held."""
     # Linux hands a program the peak of the one that started it; its own stands elsewhere.
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
@@ -113,14 +112,14 @@ def peak_memory_mb() -> float:
 
 
 def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
-    """The bad flights: aborted before landed before refused before perched, then by seed."""
+    """Return the bad flights: aborted before landed before refused before perched, then by seed."""
     bad = [r for r in results if r.is_bad]
     return sorted(bad, key=lambda r: (-_SEVERITY.index(r.outcome), r.seed))
 
 
 def none_took_off(results: Sequence[FlightResult]) -> SafetyAbort | None:
-    """The error of a campaign whose flights were all refused, which no seed brings about; None
-    for any other."""
+    """Return the error of a campaign whose flights were all refused, which no seed can cause;
+    None for any other."""
     if not results or any(r.outcome != "refused" for r in results):
         return None
     first = min(results, key=lambda r: r.seed)
@@ -132,7 +131,7 @@ def _rounded(value: Any) -> float:
 
 
 def campaign_table(results: Sequence[FlightResult]) -> str:
-    """The campaign's figures and its worst flights as plain text."""
+    """Return the campaign's figures and its worst flights as plain text."""
     figures = campaign_summary(results)
     lines = [f"{name:<18}{text}" for name, text in _rows(figures, results)]
     bad = worst_first(results)
@@ -149,7 +148,7 @@ def campaign_table(results: Sequence[FlightResult]) -> str:
 
 
 def align_columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Rows of cells as lines of columns; the first row is the head."""
+    """Return rows of cells as lines with aligned columns; the first row is the head."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [
         "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -165,7 +164,7 @@ def _cells(r: FlightResult) -> tuple[str, ...]:
 
 
 def _rows(figures: Mapping[str, Any], results: Sequence[FlightResult]) -> list[tuple[str, str]]:
-    """Name and text of each figure of `campaign_summary`."""
+    """Return the name and the text of each figure of `campaign_summary`."""
     flights = figures["flights"]
     rows = [("flights", str(flights))]
     for end in ENDS:
@@ -198,8 +197,8 @@ LEVEL = 0.95
 
 
 def rate_interval(k: int, n: int, level: float = LEVEL) -> tuple[float, float]:
-    """Where the true rate is after `k` of `n`: the exact interval of Clopper and Pearson (1934),
-    which holds it in at least `level` of all campaigns; half of the rest is on either side."""
+    """Return the exact two-sided confidence interval of a rate after `k` of `n` (Clopper and
+    Pearson, 1934): it contains the true rate in at least `level` of all campaigns."""
     side = 0.5 * (1.0 - level)
     low = float(betaincinv(k, n - k + 1, side)) if k else 0.0
     high = float(betaincinv(k + 1, n - k, 1.0 - side)) if k < n else 1.0
@@ -207,7 +206,8 @@ def rate_interval(k: int, n: int, level: float = LEVEL) -> tuple[float, float]:
 
 
 def rate_text(k: int, n: int) -> str:
-    """``97 of 100 (91.5 to 99.4 %)``, ``100 of 100 (>= 96.4 %)``, ``0 of 100 (<= 3.6 %)``."""
+    """Return a rate with its interval: ``97 of 100 (91.5 to 99.4 %)``, ``100 of 100 (>= 96.4
+    %)``."""
     if n == 0:
         return "0 of 0"
     low, high = (100.0 * bound for bound in rate_interval(k, n))
@@ -219,7 +219,7 @@ def rate_text(k: int, n: int) -> str:
 
 
 def rate_record(k: int, n: int) -> dict[str, float | list[float]]:
-    """For JSON: `rate` and its `interval`; empty where nothing was seen."""
+    """Return a rate and its interval for JSON; empty if `n` is 0."""
     if n == 0:
         return {}
     return {"rate": round(k / n, 6), "interval": [round(b, 6) for b in rate_interval(k, n)]}

@@ -35,7 +35,7 @@ from perchctl.record import (
 
 
 class CampaignFlight(Protocol):
-    """A flight's result, in any kind of campaign."""
+    """The result of a flight, of any kind of campaign."""
 
     @property
     def seed(self) -> int: ...
@@ -57,8 +57,8 @@ R = TypeVar("R", bound=CampaignFlight)
 
 
 class CampaignResults(Generic[R]):
-    """The results of a campaign's `seeds`: `earlier`, those that its file holds, and those that
-    come. `left`: the seeds that are still to be flown."""
+    """The results of a campaign's seeds: `earlier` were read from its file, `left` are the seeds
+    still to be flown."""
 
     def __init__(
         self,
@@ -72,8 +72,7 @@ class CampaignResults(Generic[R]):
         self._file, self._failed_logs_only = file, failed_logs_only
 
     def note(self, result: R) -> None:
-        """Write the result of a flight that has just ended, and keep or remove its log, with the
-        recording beside it."""
+        """Write the result of a flight, and keep or remove its log and recording."""
         if self._file is not None:
             self._file.append(result)
         if self._failed_logs_only and result.log is not None and not result.is_bad:
@@ -111,20 +110,20 @@ def campaign_results(
 
 
 TIMINGS = ("realtime_factor", "wall_s", "cpu_s", "peak_memory_mb")
-"""What another computer, or the same one an hour later, measures otherwise."""
+"""The fields that differ between computers, or from hour to hour."""
 _NOT_FLOWN = ("timings", "log", "log_problem")
 
 
 def result_record(result: Any) -> dict[str, Any]:
-    """The record of a flight's result: JSON's own types, floats exact. What is None by default is
-    left out; what was measured of the computer is in `timings`."""
+    """Return a flight's result as a record of JSON types with exact floats. Fields that are None
+    by default are left out; `timings` holds what was measured of the computer."""
     record: dict[str, Any] = to_exact(result)
     timings = {name: record.pop(name) for name in TIMINGS if name in record}
     return {**record, "timings": timings}
 
 
 def result_from(record: Mapping[str, Any], kind: type[R] = FlightResult) -> R:  # type: ignore[assignment]
-    """The result whose `result_record` this is. Raises ValueError for any other record."""
+    """Return the result of a `result_record`. Raises ValueError for any other record."""
     timings = record.get("timings", {})
     if not isinstance(timings, Mapping):
         raise ValueError("timings: an object is needed")
@@ -132,7 +131,7 @@ def result_from(record: Mapping[str, Any], kind: type[R] = FlightResult) -> R:  
 
 
 def flown_record(result: Any) -> dict[str, Any]:
-    """The record without timings and log: the same for the same flight, on whatever computer."""
+    """Return the record without timings and log, which equal flights share on all computers."""
     return {k: v for k, v in result_record(result).items() if k not in _NOT_FLOWN}
 
 
@@ -167,14 +166,14 @@ def campaign_header(profile: Profile, faults: Sequence[str] | None = None) -> di
 
 
 def profile_sha256(profile: Profile) -> str:
-    """The hash of all values of a profile that may change a flight."""
+    """Return the SHA-256 of all values of a profile that may change a flight."""
     values = profile.model_dump(mode="json", exclude={"name", "description"})
     text = json.dumps([values, camera_record(profile)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def source_sha256(root: Path) -> str:
-    """The hash of all modules below `root`, by name and text."""
+    """Return the SHA-256 of all modules below `root`, by name and text."""
     whole = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         whole.update(f"{path.relative_to(root).as_posix()}\n".encode())
@@ -183,15 +182,15 @@ def source_sha256(root: Path) -> str:
 
 
 SOURCE = source_sha256(_ROOT)
-"""As it was loaded: a program that runs on while its files change is not the new one."""
+"""The source as it was loaded; later changes of the files do not count."""
 
 
 _DESCRIBE = ("describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*")
-"""The commit, whatever tags it has."""
+"""Arguments of git that give the commit, whatever tags it has."""
 
 
 def commit_of(root: Path) -> str | None:
-    """The commit of the checkout whose top is `root`; None where it is none, or git cannot say."""
+    """Return the commit of the checkout at `root`; None if it is none, or git cannot say."""
     if not (root / ".git").exists():
         return None
     try:
@@ -207,14 +206,15 @@ def commit_of(root: Path) -> str | None:
 
 
 class ResultsFile(Generic[R]):
-    """A file of results, open for appending. `earlier`: the flights that it held, by seed."""
+    """A file of results, open for appending. `earlier` has the flights that it held, by seed."""
 
     def __init__(self, path: Path, fd: int) -> None:
         self.earlier: dict[int, R] = {}
         self._path, self._fd = path, fd
 
     def append(self, result: R) -> None:
-        """Write one line, which is on the disk when this returns. Errors: InvalidValue."""
+        """Write a result as one line, which is on the disk when this returns. Errors:
+        InvalidValue."""
         self.write({"kind": "flight", **result_record(result)})
 
     def write(self, record: dict[str, Any]) -> None:
@@ -231,7 +231,7 @@ class ResultsFile(Generic[R]):
             raise cannot_be_written(self._path, error) from None
 
     def close(self) -> None:
-        """Close the file, which another campaign may go on with then."""
+        """Close the file, and release it for another campaign."""
         os.close(self._fd)
 
 
@@ -242,9 +242,9 @@ def open_results(
     resume: bool = False,
     force: bool = False,
 ) -> ResultsFile[R]:
-    """A new file, or one that the campaign goes on with. Without `resume` an existing file is
-    refused, and with `force` replaced. With `resume` it has to be of the same profile and faults;
-    if another perchctl wrote it, it goes on by `force` only. Errors: InvalidValue."""
+    """Open a new file, or one that the campaign continues. Without `resume` an existing file is
+    refused, and with `force` replaced. With `resume` it must have the same profile and faults;
+    one that another perchctl wrote needs `force`, too. Errors: InvalidValue."""
     if path.is_file() and not (force or resume):
         raise InvalidValue(
             f"{path} exists already; add --resume to go on with it, --force to replace it, or name "
@@ -297,8 +297,8 @@ def open_results(
 def _read_line(
     path: Path, line: bytes, now: dict[str, Any], kind: type[R], flights: dict[int, R]
 ) -> str | None:
-    """Add the flight of a line; of a header return the program's source. Raises ValueError for any
-    other line, and InvalidValue for the header of another campaign."""
+    """Add the flight of a line to `flights`, or return the program's source that a header names.
+    Raises ValueError for any other line, and InvalidValue for the header of another campaign."""
     record = decode_line(line)
     what = record.pop("kind", None)
     if what == "flight":
@@ -319,7 +319,7 @@ def _read_line(
 
 
 def _shown(header: dict[str, Any], key: str) -> str:
-    """A header's value for people: a profile by its name and the begin of its digest."""
+    """Return a header's value for messages: a profile by its name and the start of its hash."""
     value = header.get(key)
     if key == "profile_sha256":
         return f"{header.get('profile')} {value!s:.8}"

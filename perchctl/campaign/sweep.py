@@ -25,8 +25,8 @@ from perchctl.profile import Profile, changed_profile, profile_value, scalar_tex
 
 @dataclass(frozen=True)
 class Sweep:
-    """The profiles with each value of a key, `texts`, of which number `own` is the profile's own:
-    the last one where it is none of those that were asked for."""
+    """The profiles of a sweep, one for each value of a key. `texts` are the values; number `own`
+    is the profile's own, added at the end if the sweep does not name it."""
 
     key: str
     texts: tuple[str, ...]
@@ -97,7 +97,8 @@ def make_sweep(profile: Profile, sweep: str) -> Sweep:
 
 
 def _figures(results: Sequence[FlightResult]) -> dict[str, Any]:
-    """Figures of one value's flights; misses are those of the perched ones, None without any."""
+    """Return the figures of one value's flights; `miss` is taken over the perched ones, None
+    without any."""
     misses = [miss for r in results if (miss := MISS.of(r)) is not None]
     good = sum(not r.is_bad for r in results)
     median_m, p95_m = np.percentile(misses, (50, 95)).round(6).tolist() if misses else (None, None)

@@ -29,8 +29,8 @@ from perchctl.record import arithmetic_fingerprint
 
 ANSWERS_S = 60.0
 _LIBRARIES = ("numpy", "mujoco", "filterpy", "distributed")
-"""Beside OpenCV, which comes under several names: what computes a flight's figures, and what
-carries them, of which two versions may not understand each other."""
+"""The libraries that compute a flight's figures or carry them between computers; OpenCV has
+several package names and is compared apart."""
 _SHORT = 8
 
 
@@ -80,7 +80,7 @@ def worker_requirements(
 
 
 def libraries() -> dict[str, str]:
-    """The version of each library by its name; of Python only what its bug fixes share."""
+    """Return the version of each library by its name; of Python the minor version."""
     found = {"python": ".".join(platform.python_version_tuple()[:2]), "opencv": cv2.__version__}
     for name in _LIBRARIES:
         try:
@@ -95,8 +95,8 @@ def libraries() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class WorkerReport:
-    """What a worker found of itself. `problem`: why it must not fly, one clause; None if it may.
-    `host`: its computer. `arithmetic`: how it calculates."""
+    """A worker's verification of itself. `problem`: why it must not fly, one clause, or None.
+    `host`: its computer. `arithmetic`: the fingerprint of its floating-point results."""
 
     host: str
     problem: str | None
@@ -104,11 +104,11 @@ class WorkerReport:
 
 
 _reports: dict[str, WorkerReport] = {}
-"""Of this worker, by campaign."""
+"""The reports of this worker, by campaign."""
 
 
 def fly_verified(order: bytes, required: WorkerRequirements) -> Any:
-    """Fly the pickled function with its arguments; a worker that came later is verified now.
+    """Call the pickled function with its arguments, after verifying a worker that is new.
     Errors: InvalidValue if this worker must not fly; whatever the flight raises."""
     worker = get_worker()
     report = _reports.get(required.campaign) or report_fitness(required, worker)
@@ -119,13 +119,13 @@ def fly_verified(order: bytes, required: WorkerRequirements) -> Any:
 
 
 def report_fitness(required: WorkerRequirements, dask_worker: Any) -> WorkerReport:
-    """The report of this worker; dask gives `dask_worker`."""
+    """Verify this worker and return its report; dask passes `dask_worker`."""
     report = _reports[required.campaign] = fitness(required, dask_worker.state.nthreads)
     return report
 
 
 def fitness(required: WorkerRequirements, threads: int) -> WorkerReport:
-    """The report of a process that flies so many flights at a time."""
+    """Return the report of a process with that number of threads."""
     problem = (
         _other_program(required)
         or _many_threads(threads)
@@ -178,7 +178,8 @@ def _other_data(required: WorkerRequirements) -> str | None:
 
 
 def _other_folder(mark: Path | None, text: str) -> str | None:
-    """The folder is shared where the mark in it reads as it was written here."""
+    """Return why the log folder is not usable here, or None: the campaign's mark must be
+    readable in it."""
     if mark is None:
         return None
     shared = "name one in --log-dir that all computers have at this path"

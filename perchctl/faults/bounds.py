@@ -40,14 +40,12 @@ LOW_M = 0.3
 
 
 class PlaceBound:
-    """Where the vehicle should be, horizontally, phase by phase:
+    """The horizontal places where the vehicle may be, by phase: above its start (or
+    `planner.approach_xy_m`) during take-off; on the way between there and a target in search,
+    estimate, alignment and recovery; under a target in ascent, press and completion; and from the
+    landing on where it should have been when the landing began.
 
-    - take-off: above its start (or `planner.approach_xy_m`);
-    - search, estimate, alignment, recovery: on the way between there and any target;
-    - ascent, press, completion: under a target;
-    - landing, and whatever comes after: where it should have been when the landing began.
-
-    Targets are all that look like the own one: nothing tells them apart.
+    Each target that looks like the own one counts: nothing on board can tell them apart.
     """
 
     def __init__(self, scenario: Scenario, profile: Profile) -> None:
@@ -58,12 +56,12 @@ class PlaceBound:
         self._down_at: Place | None = None
 
     def target_at(self, place: Place) -> None:
-        """A target hangs there, too, or by now."""
+        """Add a place at which a target hangs."""
         if place not in self._targets:
             self._targets.append(place)
 
     def enter(self, phase: Phase | None, place: Place) -> None:
-        """The program's phase, and where the vehicle truly is: the first time, its start."""
+        """Note the program's phase and the vehicle's true place; the first one is its start."""
         if self._phase is None:
             self._starts.insert(0, place)
         if phase in TERMINALS and self._down_at is None:
@@ -71,11 +69,11 @@ class PlaceBound:
         self._phase = phase or Phase.APPROACH
 
     def astray_m(self, place: Place) -> float:
-        """How far a vehicle at `place` is from where it should be."""
+        """Return the distance of `place` from the nearest place where the vehicle may be."""
         return min(math.dist(spot, place) for spot in self._nearest(place))
 
     def _nearest(self, place: Place) -> list[Place]:
-        """The nearest spot of each way that it may be on."""
+        """Return the nearest point of each line that the vehicle may be on."""
         if self._down_at is not None:
             return [self._down_at]
         if self._phase in (None, Phase.APPROACH):
@@ -88,7 +86,7 @@ class PlaceBound:
 
 
 def _nearest_between(a: Place, b: Place, place: Place) -> Place:
-    """The spot of the line from `a` to `b` that is nearest to `place`."""
+    """Return the point of the line from `a` to `b` that is nearest to `place`."""
     dx, dy = b[0] - a[0], b[1] - a[1]
     long_m2 = dx * dx + dy * dy
     if long_m2 == 0.0:
@@ -99,7 +97,7 @@ def _nearest_between(a: Place, b: Place, place: Place) -> Place:
 
 
 def targets_of(scenario: Scenario) -> list[Place]:
-    """The own target and those that look like it; none under a bare ceiling."""
+    """Return the places of the own target and of those that look like it; none if there is none."""
     if scenario.no_target:
         return []
     x_m, y_m = scenario.target_xy_m
@@ -113,10 +111,10 @@ def targets_of(scenario: Scenario) -> list[Place]:
 
 
 class UnfeltDrift:
-    """How far the vehicle may have been led or pushed aside without anything on board that could
-    know: by a slide of the estimate while it does not steer by a target that it sees, and, where
-    the target is the positioning system and out of view, by a force as long as it acts. A step of
-    the estimate is none of these: it can be seen."""
+    """The distance by which a fault may move the vehicle sideways unnoticed by everything on
+    board: a drift of the estimate while it does not steer by a visible target, and, with the
+    target as positioning system and out of view, a force while it acts. A step of the estimate
+    is not counted, since it can be noticed."""
 
     def __init__(self, effects: Sequence[e.Effect], scenario: Scenario, *, by_target: bool) -> None:
         slides = [effect for effect in effects if isinstance(effect, e.EstimateError)]
@@ -128,7 +126,8 @@ class UnfeltDrift:
         self._slid_m = self._fault_s = 0.0
 
     def after_m(self, fault_s: float, phase: Phase | None) -> float:
-        """By now, `fault_s` after the fault's beginning: asked again and again as time passes."""
+        """Return the distance so far, `fault_s` after the fault began; call it with rising
+        times."""
         before_s, self._fault_s = self._fault_s, fault_s
         if phase in UNDER_TARGET:
             self._slid_m = 0.0
@@ -141,9 +140,8 @@ class UnfeltDrift:
 
 
 class DescentBound:
-    """By when the vehicle should be on its way down: at once where the operator asks for it or the
-    loop ends by an exception, else where what the fault takes away is lost for longer than the
-    profile waits for it."""
+    """The time by which the vehicle should descend: at once if the operator asks for it or an
+    exception ends the loop, else as soon as the fault has lasted longer than the profile waits."""
 
     def __init__(self, effects: Sequence[e.Effect], profile: Profile) -> None:
         self._effects, self._profile = effects, profile
@@ -151,7 +149,7 @@ class DescentBound:
         self._from_m: float | None = None  # its height when the way down was due
 
     def begin(self, t_s: float, phase: Phase | None) -> None:
-        """The fault begins, in a phase of the program."""
+        """Note that the fault begins, and the program's phase."""
         limits_s = [self._limit_s(effect, phase or Phase.APPROACH) for effect in self._effects]
         self._due_s = t_s + min(limits_s, default=math.inf)
 
@@ -165,10 +163,10 @@ class DescentBound:
         uplink: bool,
         lands: bool = False,
     ) -> bool:
-        """Whether it should have come down by now and has not. What touches the ceiling before it
-        has to come down may hang there, which takes its time to find out; and what hears nothing
-        obeys nothing until it hears again. `lands`: it flies its own landing, whose curve starts
-        from rest, and anew with each of the three orders; a landing that climbs is none."""
+        """Return True if the vehicle should have come down by now and has not. One that touches
+        the ceiling in time may hang there, and one without `uplink` cannot obey until it hears
+        again. `lands`: it flies its own landing, whose trajectory starts from rest with each of
+        the three orders; a landing that climbs does not count."""
         if touching and t_s < self._due_s + REACTION_S:
             self._due_s = math.inf
         if not uplink:
@@ -183,7 +181,8 @@ class DescentBound:
         return late and not (comes_down or begins)
 
     def _limit_s(self, effect: e.Effect, phase: Phase) -> float:
-        """After how long it lands for this; never where it need not."""
+        """Return the time after which this effect makes the program land; infinite if it need
+        not."""
         safety, positioning = self._profile.safety, self._profile.positioning
         lasts_s, limits_s = 0.0, [math.inf]
         match effect:

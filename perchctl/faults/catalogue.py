@@ -31,44 +31,44 @@ LONGEST_S, EVER_SHARE = 30.0, 0.25
 
 
 class Draw:
-    """The random numbers of one case, and the scenario that it is drawn for."""
+    """The random numbers of one case, drawn for one scenario."""
 
     def __init__(self, rng: np.random.Generator, scenario: Scenario) -> None:
         self._rng = rng
         self.mass_kg = scenario.mass_kg
 
     def between(self, low: float, high: float) -> float:
-        """A number from a range, uniform."""
+        """Draw a number uniformly from a range."""
         return round(float(self._rng.uniform(low, high)), 4)
 
     def log_between(self, low: float, high: float) -> float:
-        """A number from a range, log-uniform."""
+        """Draw a number log-uniformly from a range."""
         return round(float(math.exp(self._rng.uniform(math.log(low), math.log(high)))), 4)
 
     def lasting_s(self, low: float = 0.1) -> float:
-        """From `low` to `LONGEST_S`, log-uniform; one in four for ever."""
+        """Draw a duration log-uniformly from `low` to `LONGEST_S`; one in four lasts for ever."""
         for_s = self.log_between(low, LONGEST_S)
         return e.FOR_EVER if self.chance(EVER_SHARE) else for_s
 
     def chance(self, share: float) -> bool:
-        """True in that share of all draws."""
+        """Return True in that share of all draws."""
         return bool(self._rng.uniform() < share)
 
     def sign(self) -> float:
-        """1 or -1, as often."""
+        """Return 1 or -1 with equal chances."""
         return 1.0 if self.chance(0.5) else -1.0
 
     def one_of(self, choices: tuple[T, ...]) -> T:
-        """One of several, each as often."""
+        """Return one of several choices with equal chances."""
         return choices[int(self._rng.integers(len(choices)))]
 
     def direction(self) -> tuple[float, float]:
-        """A horizontal unit vector."""
+        """Return a horizontal unit vector of random direction."""
         angle = float(self._rng.uniform(-math.pi, math.pi))
         return math.cos(angle), math.sin(angle)
 
     def packet_lost(self, order: str) -> e.PacketLost:
-        """One packet of an order is lost, or two."""
+        """Return the loss of one packet of an order, or of two."""
         return e.PacketLost(order, 1 if self.chance(0.6) else 2)
 
 
@@ -76,7 +76,7 @@ DrawEffects = Callable[[Draw], e.Effect | tuple[e.Effect, ...]]
 
 
 def _together(*parts: DrawEffects) -> DrawEffects:
-    """Faults that begin in the same moment."""
+    """Draw several faults that begin at the same moment."""
     return lambda draw: tuple(effect for part in parts for effect in _effects(part(draw)))
 
 
@@ -92,7 +92,7 @@ def _silence(*, up: bool, down: bool) -> DrawEffects:
 
 
 def _lost(order: str, *presses_s: float) -> DrawEffects:
-    """The packet of an order, which the operator's presses bring about."""
+    """Draw the loss of an order's packets, with the operator's presses that cause the order."""
     operator = (e.Operator(presses_s),) if presses_s else ()
     return lambda draw: (draw.packet_lost(order), *operator)
 
@@ -121,7 +121,7 @@ def _external_ends(draw: Draw) -> e.Effect:
 
 
 def _external_occluded(draw: Draw) -> e.Effect:
-    """For 0.3 s, as somebody walks by, or longer."""
+    """Draw an occlusion of 0.3 s, as when somebody walks by, or a longer one."""
     for_s = 0.3 if draw.chance(0.5) else draw.lasting_s(0.5)
     return e.ExternalPositions("occluded", for_s)
 
@@ -132,7 +132,7 @@ def _external_late(draw: Draw) -> e.Effect:
 
 
 def _frozen(*names: str) -> DrawEffects:
-    """Log variables whose values stand still while their packets go on coming."""
+    """Draw a freeze of log variables: their packets still arrive, their values do not change."""
     return lambda draw: e.LogReads(names, None, draw.lasting_s())
 
 
@@ -170,7 +170,7 @@ def _reading_low(draw: Draw) -> e.Effect:
 
 
 def _kick(draw: Draw) -> e.Effect:
-    """A blow of 40 ms that changes the speed by up to 1 m/s, mostly sideways."""
+    """Draw a blow of 40 ms that changes the speed by up to 1 m/s, mostly sideways."""
     x, y = draw.direction()
     z = draw.between(-0.5, 0.5)
     force_n = draw.mass_kg * draw.between(0.2, 1.0) / 0.04
@@ -178,7 +178,7 @@ def _kick(draw: Draw) -> e.Effect:
 
 
 def _gust(draw: Draw) -> e.Effect:
-    """Half a second to one, with up to a fifth of the weight, mostly sideways."""
+    """Draw a gust of 0.5 to 1 s with up to a fifth of the weight, mostly sideways."""
     x, y = draw.direction()
     z = draw.between(-0.3, 0.3)
     force_n = draw.mass_kg * GRAVITY_MPS2 * draw.between(0.05, 0.2)
@@ -219,7 +219,7 @@ def _hung(draw: Draw) -> e.Effect:
 
 
 def _hung_and_packet_lost(draw: Draw) -> tuple[e.Effect, ...]:
-    """The loop is stuck, and the first packets of what is sent in its place are lost."""
+    """Draw a stuck loop, with the loss of the first packets that the watchdog sends."""
     order = draw.one_of(("raw", "stop", "land"))
     return (_hung(draw), draw.packet_lost(order))
 
@@ -248,14 +248,14 @@ USUAL_S: dict[Phase, float] = {
     P.RECOVER: 1.5,
     P.LANDING: 5.0,
 }
-"""For how long a phase usually lasts: a fault begins somewhere within."""
+"""The usual duration of each phase; a fault begins somewhere within it."""
 LANDED_FROM = (P.SEARCH, P.ALIGN, P.ASCEND, P.PERCH, P.COMPLETE)
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault. `rows` are those of docs/faults.md, none for what has no row of its own there;
-    `promise`: the key of what the README promises for it (`perchctl.faults.promises`)."""
+    """One entry of the catalogue. `rows` are its rows in docs/faults.md; `promise` is the key of
+    the promise that holds for it (`perchctl.faults.promises`)."""
 
     name: str
     rows: tuple[int, ...]
@@ -459,9 +459,9 @@ BY_NAME = {fault.name: fault for fault in FAULTS}
 
 @dataclass(frozen=True)
 class Case:
-    """One fault in one flight. `landed_from`: the phase in which the operator lands first,
-    `landed_after_s` into it, so that LANDING comes. `first_hold`: the part of the weight that the
-    first contact holds, so that RECOVER comes."""
+    """One fault of one flight. To reach LANDING, the operator lands `landed_after_s` into the
+    phase `landed_from`. To reach RECOVER, the first contact holds only the part `first_hold` of
+    the weight."""
 
     fault: Fault
     phase: Phase
@@ -473,7 +473,7 @@ class Case:
 
 
 def select_faults(names: str) -> tuple[Fault, ...]:
-    """Faults by `all` or names with commas between them. Errors: UsageError."""
+    """Return the faults named by `all` or by names between commas. Errors: UsageError."""
     if names == "all":
         return FAULTS
     found = []
@@ -487,7 +487,7 @@ def select_faults(names: str) -> tuple[Fault, ...]:
 
 
 def draw_case(seed: int, scenario: Scenario, faults: Sequence[Fault] = FAULTS) -> Case:
-    """The seed's case out of a selection: the same for the same arguments."""
+    """Return the case of a seed, drawn from a selection; equal arguments give equal cases."""
     rng = np.random.default_rng([seed, STREAM])
     fault = faults[int(rng.integers(len(faults)))]
     phase = fault.phases[int(rng.integers(len(fault.phases)))]
@@ -495,7 +495,7 @@ def draw_case(seed: int, scenario: Scenario, faults: Sequence[Fault] = FAULTS) -
 
 
 def case_of(fault: Fault, phase: Phase, rng: np.random.Generator, scenario: Scenario) -> Case:
-    """A fault in a given phase, all else drawn."""
+    """Return a case of the given fault and phase with everything else drawn."""
     draw = Draw(rng, scenario)
     moment_s = draw.between(0.0, USUAL_S[phase])
     effects = _effects(fault.draw(draw))

@@ -16,8 +16,8 @@ Claim = Literal[
     "hangs on the target", "held off the target", "hangs", "stands", "hangs or stands",
     "motors off", "locked", "ended by the supervisor", "tilted", "not seen down",
 ]  # fmt: skip
-"""All that say hanging or standing say that the motors are off, too; `not seen down` says that
-nothing the program has heard shows the vehicle at rest with its motors off."""
+"""A claim of hanging or standing includes that the motors are off. `not seen down` claims that
+no telemetry has shown the vehicle at rest with its motors off."""
 
 
 def _claims(*claims: Claim) -> frozenset[Claim]:
@@ -38,7 +38,7 @@ ROW_CLAIMS: dict[str, frozenset[Claim]] = {
     "hangs-or-stands": _claims("hangs or stands"),
     "landing-timeout": _claims("not seen down"),
 }
-"""What the sentence of each row that ends a flight says of the vehicle."""
+"""The claims in the sentence of each transition that ends a flight."""
 PHASE_CLAIMS = {Phase.PERCHED: _claims("hangs"), Phase.LANDED: _claims("stands")}
 OUTCOME_CLAIMS: dict[Outcome, frozenset[Claim]] = {
     Outcome.PERCHED: _claims("hangs on the target"),
@@ -48,11 +48,11 @@ OUTCOME_CLAIMS: dict[Outcome, frozenset[Claim]] = {
     Outcome.EMERGENCY: _claims("motors off"),
     Outcome.OPERATOR: _claims("hangs or stands"),
 }
-"""What the meaning of each outcome's exit code says (`perchctl.errors.EXIT_CODES`)."""
+"""The claims in the meaning of each outcome's exit code (`perchctl.errors.EXIT_CODES`)."""
 NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
 HELD_ELSEWHERE = "held-elsewhere"
-"""The rows of a flight whose end the program does not know: whether the vehicle hangs or stands,
-and whether it came down at all."""
+"""The transitions of flights whose end the program does not know: whether the vehicle hangs or
+stands, and whether it came down at all."""
 RESCUE_CLAIMS: dict[Finding | None, frozenset[Claim]] = {
     Finding.STANDS: _claims("stands"),
     Finding.HANGS: _claims("hangs"),
@@ -60,18 +60,18 @@ RESCUE_CLAIMS: dict[Finding | None, frozenset[Claim]] = {
     Finding.UNKNOWN: _claims("hangs or stands"),
     None: _claims("not seen down"),
 }
-"""What the note of a rescue says, by what the rescue found."""
+"""The claims in the note of a rescue, by its finding."""
 REFUSAL_CLAIMS = _claims("stands")
-"""A refusal says that nothing was started."""
+"""A refusal claims that no motor was started."""
 
 
 def last_row(report: FlightReport) -> str:
-    """The row that ended the flight; empty where none did."""
+    """Return the name of the transition that ended the flight; empty without one."""
     return report.history[-1].row if report.history else ""
 
 
 def claims_of(report: FlightReport) -> frozenset[Claim]:
-    """All that a report says of the vehicle."""
+    """Return all claims that a report makes about the vehicle."""
     return frozenset().union(
         ROW_CLAIMS.get(last_row(report), frozenset()),
         PHASE_CLAIMS.get(report.phase, frozenset()),
@@ -81,7 +81,7 @@ def claims_of(report: FlightReport) -> frozenset[Claim]:
 
 
 def claims_of_rescue(event: Event) -> frozenset[Claim]:
-    """What the note of a rescue says; nothing where the event is none."""
+    """Return the claims of a rescue's note; none for any other event."""
     if event.kind is not EventKind.NOTE or RESCUE not in event.reason:
         return _claims()
     found = next(found for found, text in RESCUED.items() if event.reason.endswith(text))

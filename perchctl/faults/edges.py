@@ -25,11 +25,11 @@ from perchctl.vision import Frame
 
 
 ORDERS = ("setpoint", "raw", "land", "notify", "stop", "emergency-stop")
-"""The packets that faults can name."""
+"""The kinds of packets that a fault can name."""
 
 
 def order_of(packet: Packet) -> str:
-    """Which of `ORDERS` a packet is, or the empty string."""
+    """Return the kind of a packet, one of `ORDERS`, or the empty string."""
     kind = packet.data[0] if packet.data else None
     match packet.port, packet.channel, kind:
         case Port.COMMANDER, 0, _:
@@ -48,8 +48,8 @@ def order_of(packet: Packet) -> str:
 
 
 class FaultyRadio(Radio):
-    """Loses what `air` does, and nothing else until effects are begun. `cut` ends the uplink for
-    good."""
+    """A radio that loses the packets that `air` loses, and more as effects begin. `cut` ends the
+    uplink for good."""
 
     def __init__(self, air: Radio | None = None) -> None:
         self._air = air or Radio()
@@ -60,11 +60,11 @@ class FaultyRadio(Radio):
         self._service: CommandService | None = None
 
     def serves(self, firmware: Firmware) -> None:
-        """Where the second copy of a packet goes."""
+        """Name the firmware that receives the second copy of a packet."""
         self._service = CommandService(firmware)
 
     def begin(self, effect: e.RadioEffect, now_s: float) -> None:
-        """The fault begins."""
+        """Begin an effect."""
         match effect:
             case e.PacketLost(order, count):
                 self._left[order] = count
@@ -120,8 +120,7 @@ LOST = 0.2
 
 
 class FaultyCamera:
-    """A frame source around the simulated camera's: its frames until a fault begins, and again
-    after the fault's time; in between they are spoilt."""
+    """A frame source that passes on the simulated camera's frames, spoilt while a fault lasts."""
 
     finished = False
 
@@ -195,7 +194,7 @@ class FaultyCamera:
         return np.clip(self._rng.normal(mean, sigma, image.shape), 0, 255).astype(np.uint8)
 
     def _late(self, frame: Frame | None, late_s: float, now_s: float) -> Frame | None:
-        """Queued on its way: it looks as if it had just been taken."""
+        """Return the frame that was queued for so long; its times look as if it were new."""
         if frame is not None:
             self._queue.append(frame)
         old = None
@@ -206,7 +205,7 @@ class FaultyCamera:
         return replace(old, t_s=old.t_s + late_s, t_arrival_s=old.t_arrival_s + late_s)
 
     def _swapped(self, frame: Frame | None) -> Frame | None:
-        """Two at a time, the newer one first."""
+        """Return the frames in pairs, the newer one of each first."""
         if self._overtaken is not None:
             older, self._overtaken = self._overtaken, None
             if frame is not None:
@@ -225,20 +224,22 @@ class FaultyCamera:
 
 
 LONGEST_S = 60.0
-"""`FOR_EVER` of a program that hangs: then somebody kills it."""
+"""The user kills a hung program after this time."""
 
 
 class ProgramKilled(BaseException):
-    """The program is gone; no `except Exception` of it sees that."""
+    """Ends the program under test; its `except Exception` clauses do not catch it."""
 
 
 class PlantedError(Exception):
-    """An exception that a fault raises: unforeseen by the program, but not by the campaign."""
+    """The exception that a fault raises in the loop: unforeseen by the program, planned by the
+    campaign."""
 
 
 class FaultyClock:
-    """The vehicle's own time. Faults happen where the loop waits for its next turn. A program that
-    is killed sends nothing by the `radio` any more. `stop_s`: no flight goes on for longer."""
+    """The flight's clock in simulated time. Effects on the program happen where the loop waits
+    for its next tick. A killed program sends nothing more through `radio`. A flight that takes
+    longer than `stop_s` is ended."""
 
     def __init__(self, link: MockLink, radio: FaultyRadio, stop_s: float) -> None:
         self._link, self._radio, self._stop_s = link, radio, stop_s
@@ -250,7 +251,7 @@ class FaultyClock:
         self.killed_s: float | None = None
 
     def begin(self, effect: e.ProgramEffect, now_s: float) -> None:
-        """The fault begins: where the loop next waits, or with its next turns."""
+        """Begin an effect: where the loop waits next, or with its next ticks."""
         if isinstance(effect, e.Slow):
             self._slow, self._slow_until_s = effect, now_s + effect.for_s
         else:

@@ -12,12 +12,12 @@ FOR_EVER = 1e6
 
 @dataclass(frozen=True)
 class RadioEffect:
-    """What befalls the radio (`perchctl.faults.edges.FaultyRadio`)."""
+    """An effect on the radio (`perchctl.faults.edges.FaultyRadio`)."""
 
 
 @dataclass(frozen=True)
 class ProgramEffect:
-    """What befalls the program's loop (`perchctl.faults.edges.FaultyClock`)."""
+    """An effect on the program's loop (`perchctl.faults.edges.FaultyClock`)."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class PacketTwice(RadioEffect):
 
 @dataclass(frozen=True)
 class BlockDead(RadioEffect):
-    """One log block comes no more."""
+    """One log block stops arriving."""
 
     block: str
     for_s: float
@@ -60,8 +60,9 @@ class TelemetryDelayed(RadioEffect):
 
 @dataclass(frozen=True)
 class CameraFault:
-    """`kind`: silent, frozen, snow, dark, covered, lossy, late, out-of-order, mirrored, or sooner:
-    late before, as the profile says, and no more; `late_s` of late and sooner."""
+    """The camera's pictures are spoilt. `kind` is silent, frozen, snow, dark, covered, lossy,
+    late, out-of-order, mirrored or sooner (pictures that were late, as the profile expects, no
+    longer are). `late_s` belongs to late and sooner."""
 
     kind: str
     for_s: float
@@ -70,7 +71,7 @@ class CameraFault:
 
 @dataclass(frozen=True)
 class EstimateError:
-    """Added to the vehicle's state estimate: a step, and a drift."""
+    """A step and a drift are added to the vehicle's state estimate."""
 
     step_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_deg: float = 0.0
@@ -80,8 +81,8 @@ class EstimateError:
 
 @dataclass(frozen=True)
 class ExternalPositions:
-    """The vehicle has no deck but a motion capture; what goes wrong in it is `how`: frozen,
-    silent, occluded, swapped, millimetres, mirrored, or late by `late_s`."""
+    """A vehicle without a deck flies by a motion capture that fails. `how` is frozen, silent,
+    occluded, swapped, millimetres, mirrored, or late by `late_s`."""
 
     how: str
     for_s: float
@@ -90,9 +91,8 @@ class ExternalPositions:
 
 @dataclass(frozen=True)
 class DeckSilent:
-    """The vehicle has an IMU and a deck that measures absolute positions; the positions end. What
-    they corrected until then is an accelerometer that reads `acc_z_mps2` too much along z, since
-    turning motors shake it."""
+    """The absolute positions of the vehicle's deck stop. Until then they corrected an
+    accelerometer that reads `acc_z_mps2` too much along z, because the motors shake it."""
 
     for_s: float
     acc_z_mps2: float
@@ -100,7 +100,7 @@ class DeckSilent:
 
 @dataclass(frozen=True)
 class LogReads:
-    """A log variable reads this value (None: the one of the moment) whatever is true."""
+    """Log variables report `value` (None: their value of that moment) whatever is true."""
 
     names: tuple[str, ...]
     value: float | None
@@ -109,7 +109,7 @@ class LogReads:
 
 @dataclass(frozen=True)
 class BatterySags:
-    """The resting voltage falls at this rate by so much."""
+    """The battery's resting voltage falls by `by_v` at this rate."""
 
     rate_vps: float
     by_v: float
@@ -117,8 +117,8 @@ class BatterySags:
 
 @dataclass(frozen=True)
 class Reboots(RadioEffect):
-    """The voltage breaks down and the vehicle starts again: its motors stop, for `boots_s` it hears
-    nothing, and its log blocks are gone until the link starts them again."""
+    """The vehicle reboots after a voltage drop: its motors stop, it receives nothing for
+    `boots_s`, and its log blocks are gone until the link starts them again."""
 
     boots_s: float
 
@@ -131,14 +131,14 @@ class MotorWeak:
 
 @dataclass(frozen=True)
 class ThrustChanged:
-    """All motors give this part of what they gave: another air, another set of propellers."""
+    """All motors give this part of their thrust, as with other propellers."""
 
     to: float
 
 
 @dataclass(frozen=True)
 class Push:
-    """A force on the vehicle, world axes."""
+    """A force in world axes acts on the vehicle."""
 
     force_n: tuple[float, float, float]
     for_s: float
@@ -146,21 +146,21 @@ class Push:
 
 @dataclass(frozen=True)
 class MagnetHolds:
-    """From the start the magnet carries this part of the weight."""
+    """The magnet holds this part of the weight from the start."""
 
     of_weight: float
 
 
 @dataclass(frozen=True)
 class MagnetLetsGo:
-    """So long after the contact, for good."""
+    """The magnet lets go for good, so long after the contact."""
 
     after_s: float
 
 
 @dataclass(frozen=True)
 class Room:
-    """What is different from the start; None is as drawn."""
+    """The room differs from the scenario from the start; None keeps the drawn value."""
 
     ceiling_z_m: float | None = None
     no_target: bool = False
@@ -176,7 +176,7 @@ class TargetMoves:
 
 @dataclass(frozen=True)
 class Operator:
-    """Ctrl-C at these times; or a closed terminal (`hang_up`)."""
+    """The operator presses Ctrl-C at these times, or closes the terminal (`hang_up`)."""
 
     presses_s: tuple[float, ...]
     hang_up: bool = False
@@ -184,12 +184,12 @@ class Operator:
 
 @dataclass(frozen=True)
 class Killed(ProgramEffect):
-    """The program is gone at once, and sends nothing more."""
+    """The program is killed and sends nothing more."""
 
 
 @dataclass(frozen=True)
 class Suspended(ProgramEffect):
-    """Not a line of the program runs."""
+    """The whole program is suspended."""
 
     for_s: float
 
@@ -203,7 +203,7 @@ class Hung(ProgramEffect):
 
 @dataclass(frozen=True)
 class Slow(ProgramEffect):
-    """Each turn of the loop takes so long."""
+    """Each tick of the loop takes `turn_s`."""
 
     turn_s: float
     for_s: float
@@ -211,7 +211,7 @@ class Slow(ProgramEffect):
 
 @dataclass(frozen=True)
 class Raises(ProgramEffect):
-    """An exception that the program does not foresee, in the loop's thread."""
+    """An exception that the program does not foresee is raised in the loop's thread."""
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,9 @@ PUSHED_OFF_S = 0.2
 
 @dataclass(frozen=True)
 class ExpectedOutcome:
-    """`flags` are no fault of the program between the time that `cause` gives (None: it never
-    came) and `within_s` later. `chosen`: the user, the firmware, the battery or who kills a program
-    decides it, so that no program could make it rare."""
+    """An outcome that no program could avoid: `flags` raised from the time of `cause` (None: it
+    never came) until `within_s` later do not count. `chosen`: the user, the firmware or the
+    battery decides it, so that no program could make it rare."""
 
     name: str
     cause: Callable[[Facts], float | None]
@@ -35,7 +35,7 @@ class ExpectedOutcome:
     chosen: bool = False
 
     def covers(self, flag: Flag, t_s: float, facts: Facts) -> bool:
-        """Whether a flag raised then is a consequence of the cause."""
+        """Return True if a flag raised at `t_s` is a consequence of the cause."""
         cause_s = self.cause(facts)
         return cause_s is not None and flag in self.flags and 0.0 <= t_s - cause_s <= self.within_s
 
@@ -43,7 +43,7 @@ class ExpectedOutcome:
 def unexpected(
     flags: Mapping[Flag, float], outcomes: Iterable[ExpectedOutcome], facts: Facts
 ) -> tuple[Flag, ...]:
-    """The flags that count: those that no expected outcome covers."""
+    """Return the flags that no expected outcome covers: those that count."""
     listed = tuple(outcomes)
     return tuple(
         flag

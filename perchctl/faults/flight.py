@@ -51,13 +51,13 @@ END_OF: dict[Phase, End] = {
 }
 LONGEST_FLIGHT_S = 240.0
 PROBE = Packet(Port.LINK, 0, b"")
-"""A packet that orders nothing: it arrives when any would."""
+"""A packet without effect, which arrives whenever any packet would."""
 
 
 @dataclass
 class _Ended:
-    """How the program ended; `report` is None when it was killed or raised. `crashed`: by an
-    exception that no fault planted."""
+    """The end of the program under test. `report` is None if it was killed or raised; `crashed`
+    is True after an exception that no fault planted."""
 
     end: End
     report: FlightReport | None = None
@@ -66,7 +66,7 @@ class _Ended:
 
 
 class FaultyFlight:
-    """One flight, assembled; `fly` once."""
+    """One flight with a fault and its judge, ready for a single call of `fly`."""
 
     problem: str | None = None
 
@@ -131,11 +131,11 @@ class FaultyFlight:
         return None
 
     def event(self, event: Event) -> None:
-        """What a rescue tells of the vehicle is held against the truth."""
+        """Give the claims of a rescue's note to the oracle."""
         self._oracle.claims(claims_of_rescue(event), event.t_s)
 
     def _program(self) -> _Ended:
-        """The program's life: connect, fly, close, whatever happens."""
+        """Run the program under test: connect, fly, close, whatever happens."""
         self._link.connect()
         if self._case.fault.phases is FROM_THE_START:
             self._injector.begin_now()
@@ -175,7 +175,7 @@ class FaultyFlight:
             self._vehicle.camera = None  # most of the time would go into pictures of the wait
 
     def _sample(self, t_s: float) -> Sample:
-        """The truth of the vehicle, and how it stands to where it should be."""
+        """Return the true state of the vehicle, with its distance from where it should be."""
         sample, world = sample_of(self._vehicle), self._vehicle.world
         begin_s, phase = self._injector.begin_s, self._injector.flown
         place = (sample.x_m, sample.y_m)
@@ -264,7 +264,8 @@ def fly_with_fault(
     log: Path | None = None,
     record: bool = False,
 ) -> FaultResult:
-    """Fly a case to its end and judge it. Errors: NotFound, InvalidValue (calibration, log)."""
+    """Fly a case to its end and judge it by the truth. Errors: NotFound, InvalidValue
+    (calibration, log)."""
     flown_by = _flown_by(profile, case)
     watcher = None if log is None else LogWatcher.lockstep(log, flown_by, scenario.seed, record)
     return FaultyFlight(profile, case, scenario, watcher).fly()
@@ -277,7 +278,7 @@ def fly_fault_seed(
     log: Path | None = None,
     record: bool = False,
 ) -> FaultResult:
-    """The seed's scenario with the seed's fault out of those named."""
+    """Fly the seed's scenario with the seed's fault, drawn from those named."""
 
     def fly_drawn(scenario: Scenario) -> FaultResult:
         case = draw_case(seed, scenario, [BY_NAME[name] for name in faults])
@@ -289,7 +290,7 @@ def fly_fault_seed(
 def fly_fault_in_folder(
     profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
 ) -> FaultResult:
-    """`fly_fault_seed` with the log in a folder, if one is given."""
+    """Fly a seed as `fly_fault_seed` does, with its log in a folder if one is given."""
     log = None if log_dir is None else seed_log_path(seed, log_dir)
     return fly_fault_seed(profile, seed, faults, log, record)
 
@@ -302,13 +303,13 @@ def _scenario_of(case: Case, scenario: Scenario) -> Scenario:
 
 
 def _sooner_s(effects: Sequence[e.Effect]) -> float:
-    """By how much the pictures will come sooner than the profile is told."""
+    """Return the time by which the pictures will come sooner than the profile expects."""
     found = [f.late_s for f in effects if isinstance(f, e.CameraFault) and f.kind == "sooner"]
     return max(found, default=0.0)
 
 
 def _flown_by(profile: Profile, case: Case) -> Profile:
-    """The profile as the case needs it."""
+    """Return the profile with the positioning and the camera latency that the case needs."""
     if any(isinstance(effect, e.ExternalPositions) for effect in case.effects):
         profile = with_positioning("mocap", profile)
     if any(isinstance(effect, e.DeckSilent) for effect in case.effects):

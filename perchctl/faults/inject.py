@@ -32,7 +32,7 @@ CAPTURE_FAULTS = {
 
 
 def changed_scenario(scenario: Scenario, effects: tuple[e.Effect, ...]) -> Scenario:
-    """The scenario as the effects have it from the start."""
+    """Return the scenario with the effects that hold from the start."""
     weight_n = scenario.mass_kg * GRAVITY_MPS2
     for effect in effects:
         match effect:
@@ -68,7 +68,7 @@ def _other_room(scenario: Scenario, room: e.Room) -> Scenario:
 
 @dataclass
 class Edges:
-    """Where faults come in; what they do to the operator's switch and the log's disk."""
+    """The parts of a flight that faults act on."""
 
     vehicle: WatchedVehicle
     radio: FaultyRadio
@@ -80,7 +80,7 @@ class Edges:
 
 
 class Disk:
-    """A watcher in the log's place whose disk can be full."""
+    """A watcher that stands for a log whose disk can be full."""
 
     def __init__(self) -> None:
         self.problem: str | None = None
@@ -93,10 +93,8 @@ class Disk:
 
 
 class Injector:
-    """Begins the effects `moment_s` into `phase`, or when the phase is left before.
-
-    As a watcher of the loop it sees the phases pass; `begin_s` is None until then.
-    """
+    """Begins the effects `moment_s` into `phase`, or when the phase ends earlier; `begin_s` is
+    None until then. It follows the phases as a watcher of the loop."""
 
     problem: str | None = None
 
@@ -137,7 +135,7 @@ class Injector:
             self._begin(self._edges.vehicle.t_s)
 
     def each(self, t_s: float) -> None:
-        """What goes on with simulated time."""
+        """Act as simulated time passes: begin what is due, and continue what lasts."""
         if self.begin_s is None and self._due_s is not None and t_s >= self._due_s:
             self._begin(t_s)
         while self._later and self._later[0][0] <= t_s:
@@ -155,7 +153,7 @@ class Injector:
             self._at(t_s + after_s, partial(setattr, world.magnet, "let_go", True))
 
     def begin_now(self) -> None:
-        """Before the flight: for what is so from the start."""
+        """Begin the effects before the flight."""
         self._begin(self._edges.vehicle.t_s)
 
     def _begin(self, t_s: float) -> None:
@@ -169,7 +167,7 @@ class Injector:
         self._later.sort(key=lambda entry: entry[0])
 
     def _set(self, owner: object, name: str, value: object, after: object, end_s: float) -> None:
-        """Set an attribute from now on, and to what it is `after` at `end_s`."""
+        """Set an attribute now, and set it to `after` at `end_s`."""
         setattr(owner, name, value)
         self._at(end_s, partial(setattr, owner, name, after))
 
@@ -232,7 +230,7 @@ class Injector:
                 pass  # from the start: `changed_scenario`
 
     def _measure(self, noise: random.Random) -> None:
-        """A position by the vehicle's own deck, of which the program knows nothing."""
+        """Give the estimator a position measured by the vehicle's own deck."""
         world, firmware = self._edges.vehicle.world, self._edges.vehicle.firmware
         sigma_m = firmware.scenario.estimate_noise_m
         x_m, y_m, z_m = (p + noise.gauss(0.0, sigma_m) for p in (world.x_m, world.y_m, world.z_m))

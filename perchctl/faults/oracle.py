@@ -40,39 +40,40 @@ Flag = Literal[
 FLAGS: tuple[Flag, ...] = get_args(Flag)
 
 LOW_M = 0.1
-"""Below this height nothing falls."""
+"""Below this height nothing counts as a fall."""
 OFF_S = 0.1
 FREE_FALL_G, FREE_FALL_S = 0.2, 0.15
 TOUCHDOWN_MPS, TOUCHDOWN_ASIDE_MPS = 0.8, 0.5
 UNPOWERED_G = 0.5
 FAST_MPS = 0.45
-"""Sinking faster than any order: falling, until slower again."""
+"""A sink rate faster than any order: a fall, until it is slower again."""
 CAUGHT_MPS, SLOW_AGAIN_S = 0.05, 0.3
 FROM_HANGING_S = 1.0
 PRESSED_S, RELEASED_S = 4.0, 0.2
-"""What bounces off the ceiling for less than `RELEASED_S` presses on."""
+"""A vehicle that bounces off the ceiling for less than `RELEASED_S` still presses."""
 ASTRAY_M, TOO_HIGH_M = 1.0, 0.3
 ALONE_S = 5.0
 TILT_WITHIN_DEG = 10.0
-"""A claim that it tilted beyond the limit is believed from so much less on: the program knows the
-tilt by an estimate."""
+"""A claim of excess tilt is accepted from this much below the limit, since the program knows
+only an estimate."""
 CLAIM_S = 0.5
-"""A claim has to become true within this time (motors are cut 25 ms after the order)."""
+"""A claim must become true within this time (motors are cut 25 ms after the order)."""
 SAY_OFF: frozenset[Claim] = frozenset(
     {"held off the target", "hangs", "stands", "hangs or stands", "motors off"}
 )
 SEEN_S = 6.0
-"""What has been at rest and heard for so long has been seen: a supervisor's word that does not
-agree is taken for old after 5 s."""
+"""A vehicle at rest whose telemetry arrived for this long must have been seen; the program
+treats a contradicting supervisor as stale after 5 s."""
 STOP_S = 0.5
-"""So long after the second Ctrl-C the motors are off."""
+"""The motors must be off this long after the second Ctrl-C."""
 SECOND_AFTER_S, SILENCE_S, HAMMERED_S = 0.5, 0.3, 2.0
-"""A press is the second Ctrl-C (docs/faults.md, 16) so long after the first, and after so long
-without any: what comes faster may be one key held down, unless it goes on for so long."""
+"""A press counts as the second Ctrl-C (docs/faults.md, 16) this long after the first and after
+this long without any; faster presses may be one key held down, until they have gone on for the
+third time."""
 
 
 class Sample(NamedTuple):
-    """The truth of one moment, SI; height over the floor where the vehicle would stand at 0."""
+    """The true state of the vehicle at one moment in SI units; a standing vehicle has height 0."""
 
     t_s: float
     x_m: float
@@ -99,7 +100,8 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class Limits:
-    """Of the profile that is flown: `safety`, and how far from its axis the target is met."""
+    """The limits of the profile: two of `safety`, and the radius within which a contact is on
+    the target."""
 
     max_height_m: float
     max_tilt_deg: float = 55.0
@@ -128,15 +130,16 @@ class Verdict:
 
 
 def drop_limit_m(hold_ratio: float) -> float:
-    """The height that a slip may cost until it is caught."""
+    """Return the height that a slip may cost until it is caught, by the magnet's hold over the
+    weight."""
     if hold_ratio <= 0.3:
         return 0.15
     return 0.6 if hold_ratio <= 0.75 else 1.0
 
 
 def second_press_s(presses_s: Sequence[float]) -> float | None:
-    """When the operator asked for the emergency stop; None: never. The oracle's own reading of
-    the law: it does not take the program's switch at its word."""
+    """Return when the operator's presses amounted to an emergency stop; None if never. The
+    oracle applies the rule itself rather than trust the program's switch."""
     run_s = presses_s[0] if presses_s else 0.0
     for before_s, press_s in pairwise(presses_s):
         if press_s - before_s >= SILENCE_S:
@@ -149,24 +152,25 @@ def second_press_s(presses_s: Sequence[float]) -> float | None:
 
 
 class _Lasting:
-    """Whether a condition has held for a time, without a break."""
+    """Tells whether a condition has held for a time without a break."""
 
     def __init__(self, for_s: float) -> None:
         self._for_s, self._since_s = for_s, math.inf
 
     def see(self, holds: bool, t_s: float) -> bool:
-        """Whether it has, with this moment."""
+        """Note the condition at this moment, and return True if it has held for long enough."""
         self._since_s = min(self._since_s, t_s) if holds else math.inf
         return self.holds(t_s)
 
     def holds(self, t_s: float) -> bool:
-        """Whether it had until the last moment, and goes on."""
+        """Return True if it will have held for long enough at `t_s`, should it go on."""
         return t_s - self._since_s >= self._for_s - 1e-9
 
 
 @dataclass
 class _Fall:
-    """`slip_ratio`: the magnet's hold over the weight; None for what is no slip."""
+    """A fall in progress. `slip_ratio`: the magnet's hold over the weight, None if it is no
+    slip."""
 
     top_m: float
     slip_ratio: float | None = None
@@ -174,7 +178,8 @@ class _Fall:
 
 
 class Oracle:
-    """Samples in, at most 20 ms apart; `verdict` is what was found."""
+    """The judge of a flight: takes samples at most 20 ms apart and collects its findings in
+    `verdict`."""
 
     def __init__(self, limits: Limits) -> None:
         self.verdict = Verdict()
@@ -202,16 +207,16 @@ class Oracle:
         self._end_s = math.inf
 
     def claims(self, claims: frozenset[Claim], t_s: float) -> None:
-        """What the program said, and when."""
+        """Note claims that the program made at `t_s`."""
         self._claims |= dict.fromkeys(claims, t_s)
 
     def pressed(self, t_s: float) -> None:
-        """The operator pressed Ctrl-C."""
+        """Note that the operator pressed Ctrl-C."""
         self._presses_s.append(t_s)
 
     def ended(self, t_s: float, *, crashed: bool = False, endless: bool = False) -> None:
-        """The program is gone from here on: `crashed` by an exception that nobody planted,
-        `endless` since it was ended from outside."""
+        """Note that the program ended: `crashed` by an exception that no fault planted,
+        `endless` if it had to be ended from outside."""
         self._end_s = t_s
         if crashed:
             self._raise("crashed", t_s)
@@ -220,11 +225,11 @@ class Oracle:
 
     @property
     def stop_s(self) -> float | None:
-        """When the operator asked for the emergency stop."""
+        """The time at which the operator asked for the emergency stop, or None."""
         return second_press_s(self._presses_s)
 
     def see(self, s: Sample) -> None:
-        """The next sample."""
+        """Judge the next sample."""
         self.newest = s
         if s.hanging:
             self._hung = s
@@ -243,7 +248,7 @@ class Oracle:
 
     @property
     def in_the_air(self) -> bool:
-        """Whether it flies or falls."""
+        """True if the vehicle flies or falls."""
         s = self.newest
         return s is not None and _airborne(s) and not (s.hanging and not s.motors_on)
 
@@ -251,7 +256,7 @@ class Oracle:
         self.verdict.flags.setdefault(flag, t_s)
 
     def _from_hanging(self, s: Sample) -> bool:
-        """Whether it hung a moment ago: let go, and about to be caught."""
+        """Return True if it hung a moment ago, so that it may still be caught."""
         return self._hung is not None and s.t_s - self._hung.t_s <= FROM_HANGING_S
 
     def _watch_unpowered(self, s: Sample) -> None:
@@ -262,7 +267,8 @@ class Oracle:
             self._raise("fell", s.t_s)
 
     def _watch_fall(self, s: Sample) -> None:
-        """A fall begins where it sinks faster than ordered, and ends caught or on the floor."""
+        """Follow falls: one begins as it sinks faster than ordered, and ends caught or on the
+        floor."""
         if _airborne(s) and not s.hanging and (not s.motors_on or s.acc_g < UNPOWERED_G):
             self._weak_s = s.t_s
         sinking = -s.vz_mps
@@ -288,7 +294,7 @@ class Oracle:
             self._calm_height_m = s.height_m
 
     def _watch_touchdown(self, s: Sample) -> None:
-        """By the speed of the sample before, which the floor has not braked yet."""
+        """Judge a touchdown by the sample before it, whose speed the floor has not yet reduced."""
         before = self._before
         if before is None or before.floor or not s.floor:
             return
@@ -320,7 +326,8 @@ class Oracle:
             self._raise("flies_on", s.t_s)
 
     def _watch_claims(self, s: Sample) -> None:
-        """Motors that were off as was said must not turn again: somebody reaches for them."""
+        """Hold open claims against the truth. Motors that were claimed off must not turn again:
+        somebody reaches for them."""
         if self._said_off and s.motors_on:
             self._raise("lied", s.t_s)
         at_rest = not s.motors_on and (s.hanging or not _airborne(s))
@@ -360,8 +367,8 @@ class Oracle:
                 return not self._seen_down.holds(s.t_s)
 
     def _watch_stop(self, s: Sample) -> None:
-        """Only while packets pass: what cannot be heard is not disobeyed. Motors that are off by
-        then stay off."""
+        """Judge obedience to the emergency stop, but only while packets arrive. Motors that are
+        off by then must stay off."""
         if not s.uplink:
             self._muted_s = s.t_s
         stop_s = self.stop_s
@@ -371,7 +378,8 @@ class Oracle:
             self._raise("stop_not_obeyed", s.t_s)
 
     def _watch_lock(self, s: Sample) -> None:
-        """What comes after the lock, as the tumble of what was cut in the air, is no reason."""
+        """Judge a lock by what came before it; a tumble after the motors were cut is no reason
+        for it."""
         if s.ended_by_vehicle or s.up_z < self._tilted_up_z:
             self._may_lock = True
         if s.locked and not self._may_lock:

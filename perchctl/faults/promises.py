@@ -16,9 +16,9 @@ CUT: frozenset[End] = frozenset({"perched", "landed", "aborted"})
 
 @dataclass(frozen=True)
 class Promise:
-    """`ends`: how a flight with a fault of this promise may end; `unseen`: also aborted, where the
-    landing was ordered and nobody saw it, or it is held where its estimate, which may have moved,
-    has no target; `names`: its last sentence says so, unless it perched."""
+    """One row of the README's table. `ends`: the ends that a flight with such a fault may have.
+    `unseen`: it may also end with an unconfirmed landing, or held away from the target by an
+    estimate that moved. `names`: a word that its last sentence contains unless it perched."""
 
     what: str
     happens: str
@@ -27,7 +27,7 @@ class Promise:
     names: str = ""
 
     def is_kept(self, result: FaultResult) -> bool:
-        """Whether the flight ended as promised, and nothing avoidable went wrong in it."""
+        """Return True if the flight ended as promised and nothing avoidable went wrong."""
         if result.counted:
             return False
         if result.end == "refused":  # nothing took off

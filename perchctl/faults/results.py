@@ -18,8 +18,8 @@ from perchctl.faults.oracle import FLAGS, Flag
 from perchctl.sim import Scenario
 
 End = Literal["perched", "landed", "aborted", "refused", "failed", "gone"]
-"""`refused`: never took off; `failed`: an exception ended the flight, behind its rescue; `gone`:
-the program ended before its flight."""
+"""`refused`: it never took off; `failed`: an exception ended the flight, after the rescue;
+`gone`: the program ended before its flight."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class FaultResult:
 
     @property
     def is_bad(self) -> bool:
-        """True if a flag counts."""
+        """True if a flag counts against the program."""
         return bool(self.counted)
 
 
@@ -87,21 +87,23 @@ ENDS: tuple[End, ...] = get_args(End)
 WORST = 20
 PHASES = tuple(phase.value for phase in AIR)
 SLIPS = {"to 0.3": (0.0, 0.3), "to 0.75": (0.3, 0.75), "above": (0.75, math.inf)}
-"""What the magnet held, over the weight, where it let go."""
+"""Classes of slips by the magnet's hold over the weight."""
 HEADS = ("appr", "srch", "est", "align", "asc", "perch", "compl", "recov", "land")
-"""The phases' heads, as narrow as their columns."""
+"""The column heads of the phases."""
 RARE = {outcome.name for outcome in EXPECTED_OUTCOMES if not outcome.chosen}
 """The expected outcomes that neither the user nor the firmware chose."""
 
 
 def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
-    """Ready for JSON. The flags are counted outside the unavoidable; `unavoidable` is the
-    number of flights in which one was expected, `expected_outcomes` the share of flights in which
-    the cause of each came, `rare_outcomes` that of all that nobody chose; `wrong` the share of
-    flights with a flag, `not_known` of those that ended without the program's knowing whether the
-    vehicle hangs or stands, `unconfirmed` of those whose landing it did not see; `drop_m` the
-    deepest slips from a magnet that held up to so much of the weight, `touchdown` the hardest
-    ones outside of expected outcomes."""
+    """Return a campaign's figures as a record for JSON.
+
+    Each flag is counted where no expected outcome covers it. `unavoidable` is the number of flights
+    with a covered flag; `expected_outcomes` gives the share of flights with each cause,
+    `rare_outcomes` the share with one that nobody chose; `wrong` is the share of flights with a
+    flag that counts, `not_known` of those whose program did not know whether the vehicle hangs or
+    stands, `unconfirmed` of those whose landing it did not see. `drop_m` has the deepest slip by
+    the magnet's hold, `touchdown` the hardest one without an expected outcome.
+    """
     counts, expected = _counts(results), _expected(results)
     own = [r for r in results if not r.expected]
     return {
@@ -124,7 +126,7 @@ def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
 
 
 def _counts(results: Sequence[FaultResult]) -> dict[str, int]:
-    """The flights with each of what is told as a share of all."""
+    """Return the numbers of flights that the table gives as shares."""
     return {
         "wrong": sum(r.is_bad for r in results),
         "rare_outcomes": sum(bool(RARE & set(r.expected)) for r in results),
@@ -134,7 +136,7 @@ def _counts(results: Sequence[FaultResult]) -> dict[str, int]:
 
 
 def _expected(results: Iterable[FaultResult]) -> dict[str, int]:
-    """In how many flights the cause of each expected outcome came."""
+    """Return in how many flights the cause of each expected outcome came."""
     names = Counter(name for r in results for name in r.expected)
     return {outcome.name: names[outcome.name] for outcome in EXPECTED_OUTCOMES}
 
@@ -145,13 +147,13 @@ def _deepest_m(results: Iterable[FaultResult], above: float, to: float) -> float
 
 
 def worst_first(results: Iterable[FaultResult]) -> list[FaultResult]:
-    """Flights with flags of their own, the gravest first."""
+    """Return the flights with a flag that counts, the gravest first."""
     bad = [r for r in results if r.is_bad]
     return sorted(bad, key=lambda r: (min(map(FLAGS.index, r.counted)), -len(r.counted), r.seed))
 
 
 def fault_table(results: Sequence[FaultResult]) -> str:
-    """The figures, faults against phases, and the worst flights, as plain text."""
+    """Return the figures, a table of faults by phases, and the worst flights as plain text."""
     figures, counts = fault_summary(results), _counts(results)
     flown = {r.fault for r in results}
     lines = align_columns(
@@ -197,7 +199,7 @@ def fault_table(results: Sequence[FaultResult]) -> str:
 
 
 def _is_unavoidable(result: FaultResult) -> bool:
-    """Whether something went wrong that could not be avoided."""
+    """Return True if the flight has a flag that an expected outcome covers."""
     return len(result.counted) < len(result.flags)
 
 

@@ -25,13 +25,14 @@ from perchctl.vision import CameraModel
 
 SAMPLE_S = 0.01
 FULL_THRUST = 60000.0
-"""The largest raw order, of 65,535 (docs/firmware.md, "Raw thrust"): it lifts whatever can fly."""
+"""The largest raw thrust order (docs/firmware.md, "Raw thrust"): it lifts every vehicle that can
+fly."""
 PRESSING_RATIO = 1.02
-"""Rotors that lift more than this part of the weight press where something is in the way."""
+"""Rotors that lift more than this part of the weight press against whatever is in the way."""
 
 
 class WatchedVehicle(SimulatedVehicle):
-    """Calls `each` once every `SAMPLE_S`, whoever lets its time pass."""
+    """A simulated vehicle that calls `each` every `SAMPLE_S` of its time."""
 
     def __init__(
         self,
@@ -53,7 +54,8 @@ class WatchedVehicle(SimulatedVehicle):
 
 
 def sample_of(vehicle: SimulatedVehicle) -> Sample:
-    """What is true now of the vehicle; the rest of a sample is what it is held to."""
+    """Return the true state of the vehicle now; the fields that depend on the fault stay at
+    their defaults."""
     world, firmware = vehicle.world, vehicle.firmware
     weight_n = vehicle.scenario.mass_kg * GRAVITY_MPS2
     _, qx, qy, _ = world.quaternion
@@ -92,15 +94,15 @@ def sample_of(vehicle: SimulatedVehicle) -> Sample:
 
 
 LEAST_LIFT = 1.02
-"""Over the weight: with less nothing is held in the air."""
+"""The lift over the weight that keeps a vehicle in the air."""
 CUT_S = 1.9
-"""Silence for longer ends in the firmware's cut (2.0 s after the last setpoint)."""
+"""A longer silence ends in the firmware's cut (2.0 s after the last setpoint)."""
 LOCKS_S = 0.1
-"""The lock shows that much later than the cut: what arrives meanwhile prevents nothing."""
+"""The lock shows this long after the cut; what arrives meanwhile prevents nothing."""
 TOPPLES_S, TOPPLED_UP_Z = 0.3, 0.5
-"""Motors that stand still take longer than that to turn fast enough for any control."""
+"""Motors that stood still take longer than this to regain control."""
 WATCH_WITHIN_S = 0.1
-"""The weight hangs before the program's telemetry shows it."""
+"""The telemetry shows a hanging vehicle up to this late."""
 
 
 @dataclass
@@ -141,7 +143,7 @@ class Facts:
 
 
 class FactsRecorder:
-    """Looks at the true vehicle with each sample, and keeps when what happened, in `facts`."""
+    """Follows the true vehicle sample by sample, and notes in `facts` when things happened."""
 
     def __init__(
         self, vehicle: WatchedVehicle, profile: Profile, effects: tuple[Effect, ...] = ()
@@ -159,7 +161,7 @@ class FactsRecorder:
         self._flew: bool | None = None  # as the fault began
 
     def see(self, s: Sample, *, begun: bool) -> None:
-        """The next sample; `begun`: the fault has."""
+        """Note the next sample; `begun`: the fault has begun."""
         self._note_silence(s)
         self._note_hanging(s)
         if begun:
@@ -205,7 +207,8 @@ class FactsRecorder:
             self._hangs_s = s.t_s
 
     def _note_power(self, s: Sample) -> None:
-        """What is lifted at most: four times what the weakest motor gives."""
+        """Note when the vehicle can no longer lift its weight: at most four times what the
+        weakest motor gives."""
         vehicle, world = self._vehicle, self._vehicle.world
         weakest = min(world.powertrain.strength or (1.0,))
         lift_n = min(4.0 * MOTOR_FORCE_N, weakest * most_thrust_n(world.battery_rest_v))
@@ -218,7 +221,7 @@ class FactsRecorder:
     def complete(
         self, *, begin_s: float | None, killed_s: float | None, stop_s: float | None
     ) -> Facts:
-        """The facts after the last sample, with what is known from elsewhere."""
+        """Return the facts after the last sample, completed by times known elsewhere."""
         facts = self.facts
         facts.begin_s, facts.killed_s, facts.stop_s = begin_s, killed_s, stop_s
         if self._flew and any(isinstance(effect, Reboots) for effect in facts.effects):
