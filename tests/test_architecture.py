@@ -32,7 +32,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "distributed": ("perchctl.campaign",),
     "dask": ("perchctl.campaign",),
     "pyarrow": ("perchctl.record.table",),
-    "av": ("perchctl.track.outputs", "perchctl.camera.network"),
+    "av": ("perchctl.commands.track_output", "perchctl.camera.network"),
 }
 
 # Time is an argument here.
@@ -76,7 +76,6 @@ LAYERS: tuple[tuple[str, ...], ...] = (
         "perchctl.analysis",
     ),
     ("perchctl.display",),
-    ("perchctl.track",),
     ("perchctl.commands",),
     ("perchctl.__main__",),
 )
@@ -102,7 +101,6 @@ MOST_NAMES = {
     "profile": 38,
     "sim": 25,
     "target": 28,
-    "track": 15,
     "vision": 50,
     "weights": 15,
 }

@@ -22,7 +22,7 @@ MOST_LINES = {
     "camera": 2800,
     "campaign": 1750,
     "check": 2100,
-    "commands": 5150,
+    "commands": 5400,
     "display": 1000,
     "faults": 3150,
     "flight": 2500,
@@ -34,7 +34,6 @@ MOST_LINES = {
     "profile": 2150,
     "sim": 7100,
     "target": 2500,
-    "track": 600,
     "vision": 8350,
     "weights": 1600,
 }

@@ -44,14 +44,11 @@ from perchctl.display import (  # noqa: E402
     Sketch,
     draw_sketch,
 )
-from perchctl.display.panel import (  # noqa: E402
-    FlightStatus,
-    panel,
-    status_rows,
-)
+from perchctl.display.page import flight_state  # noqa: E402
+from perchctl.display.panel import panel  # noqa: E402
 from perchctl.flight import PLAIN_SEED  # noqa: E402
 from perchctl.geometry import Array, make_T, rotation_from_rpy  # noqa: E402
-from perchctl.mission import BatteryOutlook  # noqa: E402
+from perchctl.mission import BatteryOutlook, Phase, PlannerState, Tick  # noqa: E402
 from perchctl.plot import (  # noqa: E402
     BLACK,
     BLUE,
@@ -71,7 +68,15 @@ from perchctl.sim import (  # noqa: E402
     Renderer,
     draw_scenario,
 )
-from perchctl.vision import Frame, PipelineState, make_pipeline, step  # noqa: E402  # noqa: E402
+from perchctl.vehicle import Idle, Telemetry  # noqa: E402
+from perchctl.vision import (  # noqa: E402
+    Frame,
+    PipelineState,
+    Stage,
+    TargetEstimate,
+    make_pipeline,
+    step,
+)
 
 PAGE_PX, REPORT_PX = (1100, 560), (1200, 1250)
 NEAR_WIDTH_M = 0.2
@@ -136,32 +141,29 @@ class Flight:
             None if pose is None else (pose.rvec_rad, pose.tvec_m, axis_m),
         )
 
-    def status(self, index: int) -> FlightStatus:
+    def tick(self, index: int) -> Tick:
         """What the displays showed at that tick."""
         r, first = self.log.records[index], self.log.records[0]
         span = next(s for s in reversed(self.log.phases) if s.start_s <= r["t_s"])
-        return FlightStatus(
-            t_s=r["t_s"],
-            phase=r["phase"],
-            in_phase_s=r["t_s"] - span.start_s,
-            e_m=None if r["ex_m"] is None else (r["ex_m"], r["ey_m"], r["ez_m"]),
-            e_yaw_rad=r["eyaw_rad"],
-            tracked=bool(r["tracked"]),
-            stage=r["stage"] or "none",
-            height_m=r["z_m"] - first["z_m"],
-            battery_v=r["battery_v"],
-            link_age_s=r["tel_age_s"],
-            camera_age_s=r["cam_age_s"],
-            loop_late_s=r["late_s"],
-            attempts=r["attempts"],
-            reason=r["reason"],
-            battery=BatteryOutlook(
-                r["battery_left_s"],
-                r["battery_attempts"],
-                r["battery_used_mah"],
-                r["battery_rest_v"],
-            ),
+        t_s, still = r["t_s"], (0.0, 0.0, 0.0)
+        place = (r["x_m"], r["y_m"], r["z_m"])
+        telemetry = Telemetry(t_s, place, still, *still, 1.0, 0.0, r["battery_v"], 0)
+        target = None
+        if r["ex_m"] is not None:
+            e_m, tracked = np.array([r["ex_m"], r["ey_m"], r["ez_m"]]), bool(r["tracked"])
+            target = TargetEstimate(
+                t_s, t_s, t_s, Stage(r["stage"] or "none"), tracked, tracked, 0, e_m,
+                r["eyaw_rad"], np.zeros(3), np.zeros(3), 0.0,
+            )  # fmt: skip
+        battery = BatteryOutlook(
+            r["battery_left_s"], r["battery_attempts"], r["battery_used_mah"], r["battery_rest_v"]
         )
+        state = PlannerState(
+            phase=Phase(r["phase"]), entered_s=span.start_s, reason=r["reason"],
+            attempts=r["attempts"], ground_m=(0.0, 0.0, first["z_m"]), battery=battery,
+        )  # fmt: skip
+        ages = (r["late_s"], r["cam_age_s"], r["tel_age_s"])
+        return Tick(t_s, telemetry, None, target, state, Idle(), *ages)
 
 
 # --- the pictures ---------------------------------------------------------------------
@@ -203,7 +205,7 @@ def strip(flown: Flight, file: Path) -> None:
         picture.imshow(cv2.cvtColor(seen, cv2.COLOR_BGR2RGB))
         picture.set_title(title, fontsize=10)
         picture.set_axis_off()
-        near = flown.status(index).phase in ("PERCH", "COMPLETE", "PERCHED")
+        near = flown.tick(index).state.phase.value in ("PERCH", "COMPLETE", "PERCHED")
         _side_view(side, flown, index, near)
         side.set_ylabel("height [m]" if i == 0 else "", fontsize=9)
     save_png(figure, file)
@@ -219,7 +221,7 @@ def terminal(flown: Flight, file: Path) -> None:
             break
         text = f"[{span.start_s - flown.log.start_s:7.2f} s] {span.phase}: {span.reason}"
         console.print(Text(text), soft_wrap=True)
-    console.print(panel(flown.status(index)))
+    console.print(panel(flown.tick(index)))
     svg = console.export_svg(title="perchctl", unique_id="perchctl")
     # Fonts from another server would be fetched by each reader.
     svg = re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)
@@ -242,7 +244,7 @@ def calibration(_: Flight, file: Path) -> None:
 def page(flown: Flight, file: Path) -> None:
     """The live page of the flight, in a browser without a window."""
     index = _shown(flown)
-    status, picture = flown.status(index), flown.sketch(flown.frame(index))
+    tick, picture = flown.tick(index), flown.sketch(flown.frame(index))
     live = LivePage(flown.camera, "perchctl fly sim://", on_stop=lambda: None)
     closing = threading.Event()
 
@@ -253,7 +255,7 @@ def page(flown: Flight, file: Path) -> None:
             number += 1
             live.show(number, picture)
 
-    live.tell(lambda: _page_state(status), live=False)
+    live.tell(lambda: flight_state(tick), live=False)
     feeder = threading.Thread(target=feed, daemon=True)
     feeder.start()
     try:
@@ -489,16 +491,6 @@ def _vehicle(ax: Axes, flown: Flight, s_m: float, record: dict[str, Any]) -> Non
     parts = _body_parts(gear_m, spins)
     for x, up, width, height, colour in parts:
         ax.add_patch(Rectangle((s_m + x, z + up), width, height, color=colour, zorder=3))
-
-
-def _page_state(status: FlightStatus) -> dict[str, Any]:
-    return {
-        "phase": status.phase,
-        "battery": f"{status.battery_v:.2f} V",
-        "battery_v": status.battery_v,
-        "rows": [list(row) for row in status_rows(status)],
-        "note": "",
-    }
 
 
 def _photograph(

@@ -57,11 +57,11 @@ from perchctl.commands.command_line import (
     new_app,
     reporting,
 )
-from perchctl.commands.guide import guide
+from perchctl.commands.guide import guide, page_port
 from perchctl.commands.interrupt import Stopper, drawn
 from perchctl.commands.output import print_record, say
-from perchctl.commands.page import live_page, page_port
 from perchctl.commands.progress import search_bar
+from perchctl.display import live_page
 from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files
 from perchctl.target import NOTABLE_SCALE_ERROR, Board, mm_text, parse_board
@@ -506,7 +506,7 @@ def captured_views(
         stop = stack.enter_context(Stopper().installed())
         # The page draws the picture and its corners, but no axes: any camera serves.
         any_camera = CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
-        page = stack.enter_context(live_page(any_camera, "perchctl calibrate", port))
+        page = stack.enter_context(live_page(any_camera, "perchctl calibrate", port, say))
         show = stack.enter_context(guide(page))
         say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
 

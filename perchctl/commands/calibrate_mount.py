@@ -48,12 +48,11 @@ from perchctl.commands.command_line import (
     ViewPortOption,
     reporting,
 )
-from perchctl.commands.guide import guide
+from perchctl.commands.guide import guide, page_port
 from perchctl.commands.interrupt import Stopper, unheeded
 from perchctl.commands.output import print_record, say, tell
-from perchctl.commands.page import live_page, page_port
 from perchctl.commands.progress import count_bar
-from perchctl.display import LivePage
+from perchctl.display import LivePage, live_page
 from perchctl.errors import (
     Interrupted,
     InvalidValue,
@@ -362,7 +361,7 @@ def _recorded(
         sensors = VehicleSensors()
         if uri is not None:
             sensors = stack.enter_context(_vehicle(uri, profile, now))
-        page = stack.enter_context(live_page(camera, "perchctl calibrate mount", port))
+        page = stack.enter_context(live_page(camera, "perchctl calibrate mount", port, say))
         stack.callback(_keep, tapes, log, again)
         for part in parts:
             _await_person(part)

@@ -7,6 +7,7 @@ import dataclasses
 import sys
 import textwrap
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,15 +32,15 @@ from perchctl.commands.command_line import (
     reporting,
 )
 from perchctl.commands.flight_plot import plot_of
+from perchctl.commands.guide import page_port
 from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
 from perchctl.commands.output import confirmed, print_record, say, tell
-from perchctl.commands.page import page_port
 from perchctl.commands.picture_edges import picture_edges
 from perchctl.commands.positioning import positioned
 from perchctl.display import (
     FlightPage,
     failed_card,
-    flight_page,
+    live_page,
     open_panel,
     summary_card,
 )
@@ -201,7 +202,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
     # Once it has landed nothing is left to stop, but much to tell.
     with unheeded(), contextlib.ExitStack() as stack:
         try:
-            page = stack.enter_context(live_page(options, port, switch))
+            page = stack.enter_context(flight_page(options, port, switch))
             result = _session(options, log, panel, switch, page, asks)
         except BaseException as error:
             # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
@@ -265,22 +266,19 @@ def _session(
         return fly_session(options, watchers, switch, watched, log.remarks, ask)
 
 
-def live_page(
+@contextlib.contextmanager
+def flight_page(
     options: FlyOptions, port: int | None, switch: OperatorSwitch
-) -> contextlib.AbstractContextManager[FlightPage | None]:
-    """The page of `--view`, with STOP wired to the switch; None without it.
+) -> Iterator[FlightPage | None]:
+    """Yield the page of `--view`, whose STOP lands by the switch; None without it.
 
     Errors: InvalidValue for a port in use."""
     if port is None:
-        return contextlib.nullcontext()
-    return flight_page(
-        profile_camera(options.profile.camera),
-        f"perchctl fly {options.uri}",
-        options.profile.target.large.side_m,
-        port,
-        switch.land,
-        say,
-    )
+        yield None
+        return
+    profile, title = options.profile, f"perchctl fly {options.uri}"
+    with live_page(profile_camera(profile.camera), title, port, say, switch.land) as page:
+        yield None if page is None else FlightPage(page, profile.target.large.side_m)
 
 
 # --- What `perchctl fly --dry-run` shows: the flight as it is resolved, before anything is opened

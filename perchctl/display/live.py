@@ -6,6 +6,7 @@ the page's threads, and what fails there is remembered in `problem`, never raise
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 import json
 import secrets
@@ -13,7 +14,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -202,6 +203,29 @@ class LivePage:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join(2.0)
+
+
+@contextlib.contextmanager
+def live_page(
+    camera: CameraModel,
+    title: str,
+    port: int | None,
+    report: Callable[[str], None],
+    on_stop: Callable[[], None] | None = None,
+) -> Iterator[LivePage | None]:
+    """Yield a page for the block, or None without a port (0: any free one); `report` prints its
+    address, and at the end its problem. `on_stop`: as in `LivePage`. Errors: InvalidValue."""
+    if port is None:
+        yield None
+        return
+    page = LivePage(camera, title, port, on_stop)
+    report(f"live page{' with a STOP button' if on_stop else ''}: {page.url}")
+    try:
+        yield page
+    finally:
+        page.close()
+        if page.problem is not None:
+            report(f"the live page failed: {page.problem}")
 
 
 # --- HTTP of the live page: on loopback only, and only under loopback's names ------------------

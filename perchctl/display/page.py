@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import shlex
-from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from perchctl.camera import FrameSource, WatchedSource
 from perchctl.display.live import LivePage, PageState
-from perchctl.display.panel import status_of, status_rows
+from perchctl.display.panel import status_rows
 from perchctl.display.sketch import Sketch
 from perchctl.mission import RESCUE, Event, EventKind, Tick
 from perchctl.record import FlightSummary, summary_text
-from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput
+from perchctl.vision import MARKERS, Frame, PipelineOutput
 
 Card = dict[str, Any]
 """Outcome, reason, and rows of a name and a text, as the page shows them at the end."""
@@ -92,46 +90,19 @@ def sketch_of(frame: Frame, output: PipelineOutput | None, axis_m: float) -> Ske
 
 
 def flight_state(tick: Tick) -> PageState:
-    """The tick for the page: phase, battery, the rows of the terminal's panel, and whether the
-    flight is over."""
-    status = status_of(tick)
-    volts = status.battery_v
+    """Return what the page shows of a tick: phase, battery, the rows of the terminal's panel, and
+    whether the flight is over."""
+    state, volts = tick.state, tick.telemetry.battery_v
+    mirrored = tick.output is not None and tick.output.detections.mirrored
+    seen = "the picture is mirrored (camera.mirrored in the profile)" if mirrored else ""
     return {
-        "phase": status.phase,
+        "phase": state.phase.value,
         "battery": f"{volts:.2f} V" if math.isfinite(volts) else "battery unknown",
         "battery_v": volts if math.isfinite(volts) else None,
-        "rows": [list(row) for row in status_rows(status)],
-        "note": f"held: {status.hold}" if status.hold else _seen_note(tick.output),
-        "over": tick.state.phase.is_over,
+        "rows": [list(row) for row in status_rows(tick)],
+        "note": f"held: {state.hold}" if state.hold else seen,
+        "over": state.phase.is_over,
     }
-
-
-def _seen_note(output: PipelineOutput | None) -> str:
-    mirrored = output is not None and output.detections.mirrored
-    return "the picture is mirrored (camera.mirrored in the profile)" if mirrored else ""
-
-
-@contextlib.contextmanager
-def flight_page(
-    camera: CameraModel,
-    title: str,
-    large_side_m: float,
-    port: int,
-    land: Callable[[], None],
-    report: Callable[[str], None],
-) -> Iterator[FlightPage]:
-    """A page for one flight. Raises InvalidValue for a port in use.
-
-    `land` is called by STOP; `report` prints a line.
-    """
-    page = LivePage(camera, title, port, on_stop=land)
-    report(f"live page with a STOP button: {page.url}")
-    try:
-        yield FlightPage(page, large_side_m)
-    finally:
-        page.close()
-        if page.problem is not None:
-            report(f"the live page failed: {page.problem}")
 
 
 # --- How the flight ended ---------------------------------------------------------------------

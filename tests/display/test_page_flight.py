@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from perchctl.commands import fly
-from perchctl.commands.fly import live_page
+from perchctl.commands.fly import flight_page
 from perchctl.display import FlightPage, LivePage, failed_card, summary_card
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch, SessionResult
@@ -194,7 +194,7 @@ OPTIONS = FlyOptions(load_profile("sim"), Path("sim.yaml"), "sim://", "sim:")
 def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) -> None:
     now_s = [100.0]
     switch = OperatorSwitch(listening=True, clock=lambda: now_s[0])
-    with live_page(OPTIONS, 0, switch) as flight:
+    with flight_page(OPTIONS, 0, switch) as flight:
         assert flight is not None
         assert flight.page.url in capsys.readouterr().err
         assert switch.read() is Operator.NONE
@@ -212,7 +212,7 @@ def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_without_view_no_page_is_opened(capsys: pytest.CaptureFixture[str]) -> None:
-    with live_page(OPTIONS, None, OperatorSwitch()) as flight:
+    with flight_page(OPTIONS, None, OperatorSwitch()) as flight:
         assert flight is None
     assert capsys.readouterr().err == ""
 

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 import pytest
 
+from perchctl.commands.track import TrackSummary
+from perchctl.commands.track_output import CSV_COLUMNS, overlay_file
 from perchctl.display import LivePage, Sketch
 from perchctl.errors import InvalidValue
-from perchctl.track import Tally, overlay_file
-from perchctl.track.result import CSV_COLUMNS
 from perchctl.vision import CameraModel
 from tests.helpers.commands import run
 from tests.helpers.disk import full_disk
@@ -100,14 +100,14 @@ def test_the_live_page_has_the_newest_numbers(
 def test_ctrl_c_leaves_whole_files(
     video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    count = Tally.add
+    count = TrackSummary.add
 
-    def pressing(self: Tally, *results: object) -> None:
-        count(self, *results)  # type: ignore[arg-type]
+    def pressing(self: TrackSummary, *results: Any) -> None:
+        count(self, *results)
         if self.frames == 3:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(Tally, "add", pressing)
+    monkeypatch.setattr(TrackSummary, "add", pressing)
     tracked = track(video, "--csv", tmp_path / "x.csv", "--overlay", tmp_path / "x.mp4")
     assert tracked.code == 130
     *lines, failure = tracked.lines
@@ -234,7 +234,7 @@ def test_it_may_be_short_and_its_index_stands_in_front(tmp_path: Path, frames: i
         assert 0 < data.index(b"moov") < data.index(b"mdat")
 
 
-@pytest.mark.parametrize("room", [0, 40, 100_000])
+@pytest.mark.parametrize("room", [0, 100_000])
 def test_a_full_disk_leaves_no_video(tmp_path: Path, room: int) -> None:
     def write() -> None:
         with overlay_file(tmp_path / "x.mp4", lens(640, 480), 30.0) as add:
