@@ -47,15 +47,13 @@ from perchctl.camera import (
 from perchctl.commands.calibrate_mount import mount
 from perchctl.commands.command_line import (
     CamOption,
-    Command,
     ForceOption,
     Group,
     JsonOption,
     ViewOption,
     ViewPortOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
 from perchctl.commands.guide import guide, page_port
 from perchctl.commands.interrupt import Stopper, drawn
@@ -122,15 +120,12 @@ OutputOption = Annotated[
 app = new_app(Group)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl calibrate images:board",
-        "perchctl calibrate camera:0 --view",
-        "perchctl calibrate left*.jpg --board chessboard:9x6:25mm",
-    ),
+@command(
+    app,
+    "perchctl calibrate images:board",
+    "perchctl calibrate camera:0 --view",
+    "perchctl calibrate left*.jpg --board chessboard:9x6:25mm",
 )
-@reporting
 def camera(
     source: SourceArgument,
     board: BoardOption = DEFAULT_BOARD,
@@ -187,25 +182,20 @@ def camera(
     return 0
 
 
-app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl calibrate mount -p mine.yaml -u radio://0/80/2M/E7E7E7E7E7",
-        "perchctl calibrate mount -p mine.yaml --from mounting.jsonl --write",
-        "perchctl calibrate mount --truth sim --seed 3",
-    ),
+command(
+    app,
+    "perchctl calibrate mount -p mine.yaml -u radio://0/80/2M/E7E7E7E7E7",
+    "perchctl calibrate mount -p mine.yaml --from mounting.jsonl --write",
+    "perchctl calibrate mount -p mine.yaml --part pivot --source camera:0",
 )(mount)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl calibrate mask images:turned",
-        "perchctl calibrate mask camera:0 -o gear.png",
-        "perchctl calibrate mask video:turned.mp4 -o gear.png --force",
-    ),
+@command(
+    app,
+    "perchctl calibrate mask images:turned",
+    "perchctl calibrate mask camera:0 -o gear.png",
+    "perchctl calibrate mask video:turned.mp4 -o gear.png --force",
 )
-@reporting
 def mask(
     source: SourceArgument,
     output: Annotated[
@@ -239,15 +229,12 @@ def mask(
     return 0
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl calibrate check camera.yaml images:board",
-        "perchctl calibrate check camera.yaml camera:0 --view",
-        "perchctl calibrate check camchain.yaml images:april --cam cam0",
-    ),
+@command(
+    app,
+    "perchctl calibrate check camera.yaml images:board",
+    "perchctl calibrate check camera.yaml camera:0 --view",
+    "perchctl calibrate check camchain.yaml images:april --cam cam0",
 )
-@reporting
 def check(
     calibration: Annotated[Path, typer.Argument(help="The calibration file to judge.")],
     source: SourceArgument,
@@ -283,15 +270,12 @@ def check(
     return 0 if result.passed else PerchError.exit_code
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl calibrate convert opencv.yaml",
-        "perchctl calibrate convert camchain.yaml --cam cam0 -o mine.yaml",
-        "perchctl calibrate convert ost.yaml --name fpv",
-    ),
+@command(
+    app,
+    "perchctl calibrate convert opencv.yaml",
+    "perchctl calibrate convert camchain.yaml --cam cam0 -o mine.yaml",
+    "perchctl calibrate convert ost.yaml --name fpv",
 )
-@reporting
 def convert(
     calibration: Annotated[Path, typer.Argument(help="A file of OpenCV, Kalibr or ROS.")],
     output: OutputOption = None,

@@ -15,13 +15,11 @@ from perchctl.camera import ConnectedCamera, find_cameras
 from perchctl.check import CheckScope, Row, Verdict, scan_rows
 from perchctl.check import check as check_rows
 from perchctl.commands.command_line import (
-    Command,
     ProfileOption,
     SourceOption,
     UriOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
 from perchctl.commands.fly import resolve
 from perchctl.commands.interrupt import interruptible, unheeded
@@ -44,15 +42,12 @@ EXIT_CODE_OF = {"address": ConnectionFailed.exit_code, "camera": NotFound.exit_c
 app = new_app()
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl check -p my_vehicle.yaml",
-        "perchctl check -p my_vehicle.yaml --lift",
-        "perchctl check --scan",
-    ),
+@command(
+    app,
+    "perchctl check -p my_vehicle.yaml",
+    "perchctl check -p my_vehicle.yaml --lift",
+    "perchctl check --scan",
 )
-@reporting
 def check(
     profile: ProfileOption = "sim",
     uri: UriOption = None,

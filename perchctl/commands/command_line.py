@@ -144,9 +144,30 @@ def new_app(cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
 app = new_app(_Commands)
 
 
-def examples(*lines: str) -> str:
-    """The end of a subcommand's help; \\b keeps the lines as they are."""
-    return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
+P = ParamSpec("P")
+
+
+def command(
+    group: typer.Typer, *examples: str, ending: str = "", **settings: Any
+) -> Callable[[Callable[P, int | None]], Callable[P, None]]:
+    """Return the decorator that makes a function a subcommand of `group`, whose help ends with the
+    examples and `ending`. The function returns the exit code, None for 0; the program leaves
+    with it. `settings` are typer's."""
+    # \b keeps the lines as they are.
+    lines = "\n".join(["\b", "Examples:", *(f"  {line}" for line in examples)])
+    epilog = f"{lines}\n\n{ending}"
+
+    def add(run: Callable[P, int | None]) -> Callable[P, None]:
+        @functools.wraps(run)
+        def do(*args: P.args, **kwargs: P.kwargs) -> None:
+            loaded()
+            code = run(*args, **kwargs)
+            sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
+            raise typer.Exit(code or 0)
+
+        return group.command(cls=Command, epilog=epilog, **settings)(do)
+
+    return add
 
 
 ProfileOption = Annotated[
@@ -207,22 +228,6 @@ def main() -> Any:
     finally:
         # A key that is still held down must not end what is over with a traceback.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-P = ParamSpec("P")
-
-
-def reporting(run: Callable[P, int]) -> Callable[P, None]:
-    """The function of a subcommand, which returns its exit code; the program leaves with it."""
-
-    @functools.wraps(run)
-    def do(*args: P.args, **kwargs: P.kwargs) -> None:
-        loaded()
-        code = run(*args, **kwargs)
-        sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
-        raise typer.Exit(code)
-
-    return do
 
 
 @contextlib.contextmanager

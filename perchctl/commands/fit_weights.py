@@ -15,14 +15,12 @@ import typer
 from perchctl.calibration import profile_camera
 from perchctl.camera import open_camera
 from perchctl.commands.command_line import (
-    Command,
     ForceOption,
     Group,
     JsonOption,
     ProfileOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
 from perchctl.commands.output import print_record, say
 from perchctl.commands.progress import count_bar
@@ -46,15 +44,12 @@ from perchctl.weights import (
 app = new_app(Group)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl fit-weights session.csv -p sim",
-        "perchctl fit-weights session.csv --test other.csv",
-        "perchctl fit-weights session.csv -o weights.yaml --method lms",
-    ),
+@command(
+    app,
+    "perchctl fit-weights session.csv -p sim",
+    "perchctl fit-weights session.csv --test other.csv",
+    "perchctl fit-weights session.csv -o weights.yaml --method lms",
 )
-@reporting
 def fit(
     data: Annotated[
         list[Path] | None, typer.Argument(help="CSV files, as fit-weights collect writes them.")
@@ -165,15 +160,12 @@ def _profile_file(profile: Profile) -> Path | None:
 # --- collect -----------------------------------------------------------------------------------
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl fit-weights collect session.csv -p sim --truth sim",
-        "perchctl fit-weights collect session.csv -p my_vehicle.yaml",
-        "perchctl fit-weights collect session.csv -p lab.yaml --truth mocap",
-    ),
+@command(
+    app,
+    "perchctl fit-weights collect session.csv -p sim --truth sim",
+    "perchctl fit-weights collect session.csv -p my_vehicle.yaml",
+    "perchctl fit-weights collect session.csv -p lab.yaml --truth mocap",
 )
-@reporting
 def collect(
     session: Annotated[Path, typer.Argument(help="The CSV; an unfinished one goes on.")],
     profile: ProfileOption = "sim",

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -20,23 +20,19 @@ from perchctl.camera import profile_record, without_password
 from perchctl.check import Row, Verdict, comparison_rows, profile_rows, warnings_before_flight
 from perchctl.commands.command_line import (
     EXIT_TABLE,
-    Command,
     PositioningOption,
     ProfileOption,
     SourceOption,
     UriOption,
     ViewOption,
     ViewPortOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
-from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.guide import page_port
 from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
 from perchctl.commands.output import confirmed, print_record, say, tell
 from perchctl.commands.picture_edges import picture_edges
-from perchctl.commands.positioning import positioned
 from perchctl.display import (
     FlightPage,
     failed_card,
@@ -49,6 +45,7 @@ from perchctl.errors import (
     AttemptsUsedUp,
     EmergencyStopped,
     Interrupted,
+    InvalidValue,
     LogIncomplete,
     SafetyAbort,
     TargetNotFound,
@@ -66,6 +63,7 @@ from perchctl.flight import (
 )
 from perchctl.mission import Event, EventKind, Outcome, Phase, Watcher
 from perchctl.profile import (
+    PositioningConfig,
     Profile,
     find_calibration,
     find_mask,
@@ -74,7 +72,7 @@ from perchctl.profile import (
     load_profile,
     read_weights,
 )
-from perchctl.record import FlightSummary, LogWatcher, summary_text
+from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log, summary_text
 from perchctl.target import mm_text, overhead_view
 
 EXIT_CODE_OF: dict[Outcome, int] = {
@@ -85,22 +83,18 @@ EXIT_CODE_OF: dict[Outcome, int] = {
     Outcome.EMERGENCY: EmergencyStopped.exit_code,
     Outcome.OPERATOR: Interrupted.exit_code,
 }
-
+POSITIONINGS: tuple[str, ...] = get_args(PositioningConfig.model_fields["by"].annotation)
 
 app = new_app()
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl fly",
-        "perchctl fly -p my_vehicle.yaml --dry-run",
-        "perchctl fly -p my_vehicle.yaml --uri radio://0/80/2M/E7E7E7E7E7 --view",
-    )
-    + "\n\n"
-    + EXIT_TABLE,
+@command(
+    app,
+    "perchctl fly",
+    "perchctl fly -p my_vehicle.yaml --dry-run",
+    "perchctl fly -p my_vehicle.yaml --uri radio://0/80/2M/E7E7E7E7E7 --view",
+    ending=EXIT_TABLE,
 )
-@reporting
 def fly(
     profile: ProfileOption = "sim",
     uri: UriOption = None,
@@ -178,6 +172,25 @@ def resolve(
     return options
 
 
+def positioned(profile: Profile, by: str | None) -> Profile:
+    """Return the profile with `--positioning`; None: as the profile has it. Errors:
+    InvalidValue."""
+    if by is None:
+        return profile
+    if by not in POSITIONINGS:
+        raise InvalidValue(
+            f"--positioning {by!r} is unknown; allowed are {', '.join(POSITIONINGS)}"
+        )
+    own = profile.positioning
+    if by == own.by:
+        return profile
+    if by == "mocap" and own.by == "deck":
+        config = own.model_copy(update={"by": by})
+    else:  # what belongs to another kind would be of no use, and puzzle
+        config = PositioningConfig.model_validate({"by": by, "decks": own.decks})
+    return profile.model_copy(update={"positioning": config})
+
+
 def ask_before_arming(uri: str) -> None:
     """Raises UsageError without a yes from the terminal."""
     if not confirmed(f"About to arm and fly {uri}. Is the space under the target clear?"):
@@ -225,6 +238,22 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
     if as_json:
         print_record(flight_record(summary, code, log.path, plot))
     return code
+
+
+def plot_of(log_path: Path, profile: Profile) -> Path | None:
+    """Draw the flight beside its log if the profile asks for it, and return the picture's path.
+    A plot that fails is a warning: the flight is over."""
+    if not profile.log.plot:
+        return None
+    from perchctl.analysis import plot_flight
+
+    picture = path_beside(log_path, ".png")
+    try:
+        plot_flight(read_log(log_path), picture)
+    except Exception as error:
+        say(f"the plot could not be drawn: {error}")
+        return None
+    return picture
 
 
 def flight_record(

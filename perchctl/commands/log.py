@@ -24,13 +24,11 @@ from perchctl.analysis import (
 from perchctl.analysis import list_logs as listed_logs
 from perchctl.analysis import replay as replay_flight
 from perchctl.commands.command_line import (
-    Command,
     ForceOption,
     Group,
     JsonOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
 from perchctl.commands.output import print_record, say
 from perchctl.errors import InvalidValue, ReplayDiffers, UsageError
@@ -90,16 +88,13 @@ def _opened(path: Path) -> Iterator[FlightLog]:
         yield log
 
 
-@app.command(
-    cls=Command,
+@command(
+    app,
+    "perchctl log show",
+    "perchctl log show perchctl-logs/flight.jsonl --json",
+    "perchctl log list -n 20",
     short_help="Show a flight: how it ended and why, its phases, holds, battery, frames, findings.",
-    epilog=examples(
-        "perchctl log show",
-        "perchctl log show perchctl-logs/flight.jsonl --json",
-        "perchctl log list -n 20",
-    ),
 )
-@reporting
 def show(file: LogArgument = None, as_json: JsonOption = False) -> int:
     """After a flight: show, draw, compare, export, replay or report its log.
 
@@ -114,14 +109,13 @@ def show(file: LogArgument = None, as_json: JsonOption = False) -> int:
     return 0
 
 
-@app.command(
-    "list",
-    cls=Command,
-    epilog=examples(
-        "perchctl log list", "perchctl log list logs -n 30", "perchctl log list --json"
-    ),
+@command(
+    app,
+    "perchctl log list",
+    "perchctl log list logs -n 30",
+    "perchctl log list --json",
+    name="list",
 )
-@reporting
 def list_logs(
     folder: Annotated[
         Path | None, typer.Argument(help="The folder of the logs. Default: perchctl-logs.")
@@ -139,15 +133,12 @@ def list_logs(
     return 0
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl log plot",
-        "perchctl log plot perchctl-logs/flight.jsonl",
-        "perchctl log plot -o flight.pdf --force",
-    ),
+@command(
+    app,
+    "perchctl log plot",
+    "perchctl log plot perchctl-logs/flight.jsonl",
+    "perchctl log plot -o flight.pdf --force",
 )
-@reporting
 def plot(
     file: LogArgument = None,
     output: Annotated[
@@ -175,15 +166,12 @@ def plot(
     return 0
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl log compare before.jsonl after.jsonl",
-        "perchctl log compare perchctl-logs/monday.jsonl perchctl-logs/tuesday.jsonl",
-        "perchctl log compare before.jsonl after.jsonl --json",
-    ),
+@command(
+    app,
+    "perchctl log compare before.jsonl after.jsonl",
+    "perchctl log compare perchctl-logs/monday.jsonl perchctl-logs/tuesday.jsonl",
+    "perchctl log compare before.jsonl after.jsonl --json",
 )
-@reporting
 def compare(
     one: Annotated[Path, typer.Argument(metavar="A", help="A flight log.")],
     other: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
@@ -200,15 +188,12 @@ def compare(
     return 0
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl log export",
-        "perchctl log export perchctl-logs/flight.jsonl -o flight.parquet",
-        "perchctl log export -o flight.mcap",
-    ),
+@command(
+    app,
+    "perchctl log export",
+    "perchctl log export perchctl-logs/flight.jsonl -o flight.parquet",
+    "perchctl log export -o flight.mcap",
 )
-@reporting
 def export(
     file: LogArgument = None,
     output: Annotated[
@@ -264,15 +249,12 @@ def _write_mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
     return {"layout": str(done.layout), "pictures": done.pictures, "notes": list(done.notes)}
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl log replay",
-        "perchctl log replay --set planner.align.xy_m=0.02",
-        "perchctl log replay flight.jsonl --profile mine --json",
-    ),
+@command(
+    app,
+    "perchctl log replay",
+    "perchctl log replay --set planner.align.xy_m=0.02",
+    "perchctl log replay flight.jsonl --profile mine --json",
 )
-@reporting
 def replay(
     file: LogArgument = None,
     settings: Annotated[
@@ -324,15 +306,12 @@ def replay(
     return 0 if found.same else ReplayDiffers.exit_code
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl log report",
-        "perchctl log report perchctl-logs/*.jsonl -o session.html",
-        "perchctl log report flight.jsonl --force",
-    ),
+@command(
+    app,
+    "perchctl log report",
+    "perchctl log report perchctl-logs/*.jsonl -o session.html",
+    "perchctl log report flight.jsonl --force",
 )
-@reporting
 def report(
     files: Annotated[
         list[Path] | None,

@@ -13,13 +13,11 @@ import typer
 from perchctl.calibration import load_calibration, profile_camera
 from perchctl.commands.command_line import (
     CamOption,
-    Command,
     ForceOption,
     Group,
     JsonOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
 from perchctl.commands.output import print_record
 from perchctl.errors import InvalidValue, PerchError, UsageError
@@ -134,16 +132,13 @@ NoiseOption = Annotated[
 app = new_app(Group)
 
 
-@app.command(
-    cls=Command,
+@command(
+    app,
+    "perchctl make-target -p crazyflie -o target.pdf",
+    "perchctl make-target --large 120mm --small 20mm --page letter",
+    "perchctl make-target --large 355mm --small 35mm --page 442x470mm --tile a3",
     short_help="Print the target true to size, front and back.",
-    epilog=examples(
-        "perchctl make-target -p crazyflie -o target.pdf",
-        "perchctl make-target --large 120mm --small 20mm --page letter",
-        "perchctl make-target --large 355mm --small 35mm --page 442x470mm --tile a3",
-    ),
 )
-@reporting
 def sheet(
     profile: ProfileOption = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="PDF to write.")] = Path(
@@ -181,15 +176,12 @@ def sheet(
     return _write({output: pdf}, lines, record, force, as_json)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl make-target board charuco:10x7:25mm:18mm:DICT_5X5_100",
-        "perchctl make-target board chessboard:9x6:25mm --page letter -o chess.pdf",
-        "perchctl make-target board aprilgrid:6x6:22mm:0.3 -o april.pdf",
-    ),
+@command(
+    app,
+    "perchctl make-target board charuco:10x7:25mm:18mm:DICT_5X5_100",
+    "perchctl make-target board chessboard:9x6:25mm --page letter -o chess.pdf",
+    "perchctl make-target board aprilgrid:6x6:22mm:0.3 -o april.pdf",
 )
-@reporting
 def board(
     notation: Annotated[
         str,
@@ -220,15 +212,12 @@ def board(
     return _write({output: board_pdf(printed, page, tile)}, lines, record, force, as_json)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl make-target design",
-        "perchctl make-target design example_640x480.yaml --ceiling 2.4 --blur 2.0",
-        "perchctl make-target design -p my_vehicle.yaml --large 120mm --small 20mm",
-    ),
+@command(
+    app,
+    "perchctl make-target design",
+    "perchctl make-target design example_640x480.yaml --ceiling 2.4 --blur 2.0",
+    "perchctl make-target design -p my_vehicle.yaml --large 120mm --small 20mm",
 )
-@reporting
 def design(
     camera: CameraArgument = None,
     profile: ProfileOption = None,
@@ -253,15 +242,12 @@ def design(
     return _write({}, [found.text(name)], record, False, as_json)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl make-target suggest --ceiling 2.4",
-        "perchctl make-target suggest example_640x480.yaml --ceiling 2.4 --blur 2.0",
-        "perchctl make-target suggest -p target_only --ceiling 3.6 --page a3",
-    ),
+@command(
+    app,
+    "perchctl make-target suggest --ceiling 2.4",
+    "perchctl make-target suggest example_640x480.yaml --ceiling 2.4 --blur 2.0",
+    "perchctl make-target suggest -p target_only --ceiling 3.6 --page a3",
 )
-@reporting
 def suggest(
     camera: CameraArgument = None,
     profile: ProfileOption = None,
@@ -288,15 +274,12 @@ def suggest(
     return _write({}, [command, "", found.text(name)], record | found.record(), False, as_json)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl make-target measured -p mine.yaml --measured-large 149.6 --force",
-        "perchctl make-target measured -p mine.yaml --measured-small 24.9 --force",
-        "perchctl make-target measured -p new.yaml --measured-large 119.8",
-    ),
+@command(
+    app,
+    "perchctl make-target measured -p mine.yaml --measured-large 149.6 --force",
+    "perchctl make-target measured -p mine.yaml --measured-small 24.9 --force",
+    "perchctl make-target measured -p new.yaml --measured-large 119.8",
 )
-@reporting
 def measured(
     profile: Annotated[
         str | None,

@@ -26,14 +26,12 @@ from perchctl.camera import (
 )
 from perchctl.check import Verdict, profile_rows
 from perchctl.commands.command_line import (
-    Command,
     ForceOption,
     Group,
     JsonOption,
     ProfileOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
 from perchctl.commands.output import print_record, say, tell
 from perchctl.commands.picture_edges import (
@@ -58,16 +56,13 @@ from perchctl.profile import (
 app = new_app(Group)
 
 
-@app.command(
-    cls=Command,
+@command(
+    app,
+    "perchctl profile -p crazyflie",
+    "perchctl profile new -o my_vehicle.yaml",
+    "perchctl profile schema > perchctl.schema.json",
     short_help="Show a profile as it is flown, every key explained.",
-    epilog=examples(
-        "perchctl profile -p crazyflie",
-        "perchctl profile new -o my_vehicle.yaml",
-        "perchctl profile schema > perchctl.schema.json",
-    ),
 )
-@reporting
 def show(profile: ProfileOption = "sim", as_json: JsonOption = False) -> int:
     """Show a profile as it is flown, every key explained, or write one of your vehicle (new).
 
@@ -319,15 +314,12 @@ def _option(name: str) -> Any:
     return typer.Option(*names, help=question.text)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl profile new -o my_vehicle.yaml",
-        "perchctl profile new -u radio://0/80/2M/E7E7E7E7E7 --source camera:0",
-        "perchctl profile new --ceiling 3.1 --defaults",
-    ),
+@command(
+    app,
+    "perchctl profile new -o my_vehicle.yaml",
+    "perchctl profile new -u radio://0/80/2M/E7E7E7E7E7 --source camera:0",
+    "perchctl profile new --ceiling 3.1 --defaults",
 )
-@reporting
 def new(
     context: typer.Context,
     output: Annotated[Path, typer.Option("--output", "-o", help="Profile to write.")] = Path(
@@ -483,15 +475,12 @@ def _calibration_name(calibration: Path | None, output: Path, source: str) -> st
     return os.path.relpath(calibration, folder) if within else str(calibration)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl profile schema > perchctl.schema.json",
-        "perchctl profile schema | python -m json.tool",
-        "perchctl profile schema | grep -A 6 latency_s",
-    ),
+@command(
+    app,
+    "perchctl profile schema > perchctl.schema.json",
+    "perchctl profile schema | python -m json.tool",
+    "perchctl profile schema | grep -A 6 latency_s",
 )
-@reporting
 def schema() -> int:
     """Print the JSON schema of a profile's file, by which an editor completes and explains keys."""
     print(json.dumps(editor_schema(), indent=2))

@@ -22,20 +22,17 @@ from perchctl import campaign as campaigns
 from perchctl import faults as fault_campaigns
 from perchctl.analysis import profile_differences
 from perchctl.commands.command_line import (
-    Command,
     ForceOption,
     Group,
     JsonOption,
     PositioningOption,
     ProfileOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
-from perchctl.commands.flight_plot import plot_of
+from perchctl.commands.fly import plot_of, positioned
 from perchctl.commands.interrupt import signals_to
 from perchctl.commands.output import print_record, say
-from perchctl.commands.positioning import positioned
 from perchctl.commands.progress import progress_bar
 from perchctl.display import timed_event_text
 from perchctl.errors import (
@@ -87,15 +84,12 @@ ClusterOption = Annotated[
 app = new_app(Group)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl simulate -n 100 --jobs 4",
-        "perchctl simulate --only 17 --log-dir logs",
-        "perchctl simulate --faults all -n 1000 --jobs 4 --out flown.jsonl",
-    ),
+@command(
+    app,
+    "perchctl simulate -n 100 --jobs 4",
+    "perchctl simulate --only 17 --log-dir logs",
+    "perchctl simulate --faults all -n 1000 --jobs 4 --out flown.jsonl",
 )
-@reporting
 def run(
     flights: FlightsOption = None,
     seed: SeedOption = None,
@@ -185,7 +179,6 @@ def run(
     names = None
     if faults is not None:
         names = tuple(fault.name for fault in fault_campaigns.select_faults(faults))
-    folder = log_dir or Path(flown.log.directory)
     executor = executor_of(jobs, cluster, [flown], log_dir)
 
     def fly_campaign(
@@ -205,11 +198,26 @@ def run(
                 len(seeds), executor, kept.earlier, kept.note, objection,
             )  # fmt: skip
 
+    folder = log_dir or Path(flown.log.directory)
+
+    def fly_only(fly: Callable[[int], R], report: Callable[..., None]) -> int:
+        return fly_each(
+            lambda executor, note: campaigns.fly_all(fly, [only], executor, note),
+            partial(report, flown, as_json),
+            1,
+            executor,
+        )
+
     with signals_to(stop_once()):
         if only is not None and names is not None:
-            return _fly_fault(flown, only, names, folder, record, as_json)
+            return fly_only(
+                partial(fault_campaigns.fly_fault_in_folder, flown, names, folder, record),
+                _report_fault,
+            )
         if only is not None:
-            return _fly_only(flown, only, folder, record, as_json)
+            return fly_only(
+                partial(campaigns.fly_logged, flown, folder, record=record), _report_flight
+            )
         if names is not None:
             return fly_campaign(
                 fault_campaigns.FaultResult,
@@ -226,15 +234,12 @@ def run(
         )
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl simulate compare sim paper -n 60 --jobs 4",
-        "perchctl simulate compare mine.yaml changed.yaml -n 200 --jobs 4",
-        "perchctl simulate compare sim rough --positioning mocap --json",
-    ),
+@command(
+    app,
+    "perchctl simulate compare sim paper -n 60 --jobs 4",
+    "perchctl simulate compare mine.yaml changed.yaml -n 200 --jobs 4",
+    "perchctl simulate compare sim rough --positioning mocap --json",
 )
-@reporting
 def compare(
     profile_a: Annotated[
         str,
@@ -274,15 +279,12 @@ def compare(
     return _fly_by_each(profiles, _seeds(flights, seed), jobs, cluster, report)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl simulate sweep planner.align.xy_m=0.02,0.04,0.08 -n 30",
-        "perchctl simulate sweep planner.integral_per_s=0,0.4 -n 30 --jobs 4",
-        "perchctl simulate sweep planner.ascend.speed_mps=0.1,0.2 --json",
-    ),
+@command(
+    app,
+    "perchctl simulate sweep planner.align.xy_m=0.02,0.04,0.08 -n 30",
+    "perchctl simulate sweep planner.integral_per_s=0,0.4 -n 30 --jobs 4",
+    "perchctl simulate sweep planner.ascend.speed_mps=0.1,0.2 --json",
 )
-@reporting
 def sweep(
     values: Annotated[
         str,
@@ -357,8 +359,8 @@ ExecutorOf = Callable[[int], AbstractContextManager[Executor]]
 def executor_of(
     jobs: int | None, cluster: str | None, profiles: Sequence[Profile], log_dir: Path | None = None
 ) -> ExecutorOf:
-    """Processes of this computer, or the workers of a cluster. `profiles`: with the files that
-    flights read; `log_dir`: where they write. Errors: UsageError."""
+    """Return who flies: processes of this computer, or the workers of a cluster. `profiles`: with
+    the files that flights read; `log_dir`: where they write. Errors: UsageError."""
     if cluster is None:
         return lambda flights: campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:
@@ -445,7 +447,7 @@ def fly_each(
 def stop_once(
     clock: Callable[[], float] = time.monotonic, leave: Callable[[int], object] = os._exit
 ) -> Callable[[int, FrameType | None], None]:
-    """A handler: the first signal raises KeyboardInterrupt, a further one ends the program
+    """Return a handler: the first signal raises KeyboardInterrupt, a further one ends the program
     where it is."""
     first_s: list[float] = []
 
@@ -463,7 +465,7 @@ def stop_once(
 
 
 def with_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[str, Any]:
-    """The one object of `--json`, with why not all were flown."""
+    """Return the one object of `--json`, with why not all were flown."""
     if problem is None:
         return dict(record)
     return {**record, "error": str(problem), "exit_code": problem.exit_code}
@@ -488,7 +490,7 @@ def _report(
 def say_where_logs_are(
     results: Sequence[campaigns.CampaignFlight], log_dir: Path | None, keep: str | None = None
 ) -> None:
-    """Where the logs are, and what they lack, on stderr."""
+    """Print on stderr where the logs are, and what they lack."""
     if log_dir is None or not results:
         return
     kept = "the logs that are kept" if keep else "the flights' logs"
@@ -498,60 +500,43 @@ def say_where_logs_are(
         say(f"{len(problems)} of {len(results)} logs are incomplete: {problems[0]}")
 
 
-def _fly_only(profile: Profile, seed: int, folder: Path, record: bool, as_json: bool) -> int:
-    """Fly one seed, and tell it as `perchctl fly` tells a flight."""
-
-    def report(flights: list[campaigns.LoggedFlight], _problem: PerchError | None) -> None:
-        (flight,) = flights
-        if not as_json:
-            start_s = flight.events[0].t_s
-            for event in flight.events:
-                print(timed_event_text(event, start_s))
-            print(summary_text(flight.summary, flight.log), flush=True)
-        plot = _plot(flight.log, profile)
-        if as_json:
-            lacks = {
-                "lost_records": flight.summary.lost_records,
-                "log_problem": flight.summary.log_problem,
-            }
-            files = {"log": str(flight.log), "plot": None if plot is None else str(plot)}
-            print_record({"seed": flight.seed} | flight.summary.as_record() | lacks | files)
-        elif plot is not None:
-            print(f"plot:      {plot}")
-
-    fly = partial(campaigns.fly_logged, profile, folder, record=record)
-    return fly_each(
-        lambda executor, note: campaigns.fly_all(fly, [seed], executor, note),
-        report,
-        1,
-        executor_of(None, None, [profile]),
-    )
+def _report_flight(
+    profile: Profile, as_json: bool, flights: list[campaigns.LoggedFlight], _: PerchError | None
+) -> None:
+    """Print the one flight as `perchctl fly` prints one."""
+    (flight,) = flights
+    summary = flight.summary
+    if not as_json:
+        start_s = flight.events[0].t_s
+        for event in flight.events:
+            print(timed_event_text(event, start_s))
+        print(summary_text(summary, flight.log), flush=True)
+    plot = _plot(flight.log, profile)
+    if as_json:
+        lacks = {"lost_records": summary.lost_records, "log_problem": summary.log_problem}
+        files = {"log": str(flight.log), "plot": None if plot is None else str(plot)}
+        print_record({"seed": flight.seed} | summary.as_record() | lacks | files)
+    elif plot is not None:
+        print(f"plot:      {plot}")
 
 
-def _fly_fault(
-    profile: Profile, seed: int, faults: tuple[str, ...], folder: Path, record: bool, as_json: bool
-) -> int:
-    """Fly one seed with its fault, and print all that is known of the flight."""
-
-    def report(results: list[fault_campaigns.FaultResult], _problem: PerchError | None) -> None:
-        (result,) = results
-        known = asdict(result)
-        if not as_json:
-            print("\n".join(f"{name:<18} {value}" for name, value in known.items()), flush=True)
-        assert result.log is not None
-        plot = _plot(result.log, profile)
-        if as_json:
-            print_record(to_plain({**known, "plot": plot}))
-        elif plot is not None:
-            print(f"{'plot':<18} {plot}")
-
-    fly = partial(fault_campaigns.fly_fault_in_folder, profile, faults, folder, record)
-    return fly_each(
-        lambda executor, note: campaigns.fly_all(fly, [seed], executor, note),
-        report,
-        1,
-        executor_of(None, None, [profile]),
-    )
+def _report_fault(
+    profile: Profile,
+    as_json: bool,
+    results: list[fault_campaigns.FaultResult],
+    _: PerchError | None,
+) -> None:
+    """Print all that is known of the one flight with its fault."""
+    (result,) = results
+    known = asdict(result)
+    if not as_json:
+        print("\n".join(f"{name:<18} {value}" for name, value in known.items()), flush=True)
+    assert result.log is not None
+    plot = _plot(result.log, profile)
+    if as_json:
+        print_record(to_plain({**known, "plot": plot}))
+    elif plot is not None:
+        print(f"{'plot':<18} {plot}")
 
 
 def _plot(log: Path, profile: Profile) -> Path | None:
@@ -561,14 +546,9 @@ def _plot(log: Path, profile: Profile) -> Path | None:
 
 
 def _list_faults(as_json: bool) -> int:
+    faults = {fault.name: fault.what for fault in fault_campaigns.FAULTS}
     if as_json:
-        print_record({"faults": {fault.name: fault.what for fault in fault_campaigns.FAULTS}})
+        print_record({"faults": faults})
     else:
-        print(
-            "\n".join(
-                campaigns.align_columns(
-                    [(fault.name, fault.what) for fault in fault_campaigns.FAULTS]
-                )
-            )
-        )
+        print("\n".join(campaigns.align_columns(list(faults.items()))))
     return 0

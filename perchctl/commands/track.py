@@ -30,14 +30,12 @@ from perchctl.camera import (
 )
 from perchctl.commands.command_line import (
     CamOption,
-    Command,
     ForceOption,
     ProfileOption,
     ViewOption,
     ViewPortOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
 from perchctl.commands.guide import page_port
 from perchctl.commands.interrupt import Stopper
@@ -84,15 +82,12 @@ _DISAGREE = "the two markers contradict: check the print's sizes and the calibra
 app = new_app()
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl track camera:0 --view",
-        "perchctl track video:flight.mp4 --overlay seen.mp4 --csv poses.csv",
-        "perchctl track 'images:pictures/*.png' --json",
-    ),
+@command(
+    app,
+    "perchctl track camera:0 --view",
+    "perchctl track video:flight.mp4 --overlay seen.mp4 --csv poses.csv",
+    "perchctl track 'images:pictures/*.png' --json",
 )
-@reporting
 def track(
     source: Annotated[
         str,

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from perchctl.campaign.results_file import flown_record
 from perchctl.commands import app
-from perchctl.commands.positioning import POSITIONINGS, positioned
+from perchctl.commands.fly import POSITIONINGS, positioned
 from perchctl.errors import SafetyAbort
 from perchctl.faults import FAULTS, FaultResult, fault_summary, fault_table
 from perchctl.faults import flight as faulty

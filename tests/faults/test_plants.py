@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands.positioning import POSITIONINGS, positioned
+from perchctl.commands.fly import POSITIONINGS, positioned
 from perchctl.faults import flight as faulty
 from perchctl.faults.flight import fly_fault_seed
 from perchctl.faults.oracle import Flag

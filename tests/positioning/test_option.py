@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from typer.testing import CliRunner, Result
 
 from perchctl.commands import app
-from perchctl.commands.positioning import positioned
+from perchctl.commands.fly import positioned
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.profile.positioning import MOST_LATENCY_S
 
