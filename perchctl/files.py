@@ -24,15 +24,15 @@ FORMAT = "the format that is written"
 
 
 def check_output(path: Path, suffixes: Sequence[str], force: bool, content: str = FORMAT) -> None:
-    """As `check_place`, and the name must end in one of `suffixes` (the case does not matter),
-    which the message says is `content`. Raises InvalidValue."""
+    """Raise InvalidValue if the name does not end in one of `suffixes` (the case does not matter),
+    which the message says is `content`, or if `check_place` does."""
     if path.suffix.lower() not in suffixes:
         raise InvalidValue(f"{path} must end in {' or '.join(suffixes)}, which is {content}")
     check_place(path, force)
 
 
 def check_place(path: Path, force: bool) -> None:
-    """Whether a file can be put there; to be called before any long work.
+    """Check that a file can be put there; to be called before any long work.
 
     Args:
         force: an existing file may be replaced.
@@ -54,14 +54,14 @@ def check_place(path: Path, force: bool) -> None:
 
 
 def same_file(one: Path, other: Path) -> bool:
-    """Whether both exist and are one and the same."""
+    """Return True if both exist and are one and the same."""
     return one.exists() and other.exists() and one.samefile(other)
 
 
 def cannot_be_written(
     path: Path, error: OSError, more: str = ": free some space, or choose another place"
 ) -> InvalidValue:
-    """The operating system's refusal as one sentence."""
+    """Return the operating system's refusal as an error of one sentence."""
     return InvalidValue(f"{path} cannot be written: {error.strerror or error}{more}")
 
 

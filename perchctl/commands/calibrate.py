@@ -57,7 +57,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.guide import guide, page_port
 from perchctl.commands.interrupt import Stopper, drawn
-from perchctl.commands.output import print_record, say
+from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import search_bar
 from perchctl.display import live_page
 from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
@@ -145,7 +145,7 @@ def camera(
             rich_help_panel=DETAILS,
         ),
     ] = "auto",
-) -> int:
+) -> None:
     """Calibrate the camera, and report what its error means in mm at the target.
 
     A view is rejected when its RMS is above 2.5 times the median view's, a corner when it is off
@@ -159,7 +159,8 @@ def camera(
     layout = _measured_board(board, measured)
 
     def kept_in(size_px: tuple[int, int]) -> Path:
-        """The folder for a live camera's pictures; raises before a person has worked for them."""
+        """Return the folder for a live camera's pictures; raises before a person has worked for
+        them."""
         file = _file(output, name, size_px)
         _check_output(file, force)
         return _free_folder(file)
@@ -175,11 +176,7 @@ def camera(
         say(line)
     report = drawn(lambda: _draw(result, file.with_suffix(".png")))
     say(f"wrote {file}" + ("" if report is None else f" and {report}"))
-    if as_json:
-        print_record(result.record(file, report))
-    else:
-        print(file)
-    return 0
+    print_result(result.record(file, report) if as_json else file)
 
 
 command(
@@ -204,7 +201,7 @@ def mask(
     force: ForceOption = False,
     size: SizeOption = None,
     as_json: JsonOption = False,
-) -> int:
+) -> None:
     """Learn what the vehicle itself covers of the picture, while it is turned about."""
     pictures = _source(source, size)
     check_output(output, (".png",), force, "a mask's format")
@@ -223,10 +220,9 @@ def mask(
     if as_json:
         height, width = gear.covered.shape
         record = {"file": str(output), "covered": round(gear.share, 4)}
-        print_record(record | {"pictures": gear.pictures, "size_px": [width, height]})
+        print_result(record | {"pictures": gear.pictures, "size_px": [width, height]})
     else:
         print(output)
-    return 0
 
 
 @command(
@@ -263,10 +259,7 @@ def check(
     for item in result.rejections:
         say(f"left out {item.view}: {item.reason}")
     say(f"{'PASS' if result.passed else 'FAIL'}: {calibration}: {result.reason}")
-    if as_json:
-        print_record(result.record(calibration))
-    else:
-        print("pass" if result.passed else "fail")
+    print_result(result.record(calibration) if as_json else "pass" if result.passed else "fail")
     return 0 if result.passed else PerchError.exit_code
 
 
@@ -283,7 +276,7 @@ def convert(
     cam: CamOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
-) -> int:
+) -> None:
     """Write another program's calibration as perchctl's file."""
     _check_name(name)
     model = load_calibration(calibration, cam=cam)
@@ -294,11 +287,7 @@ def convert(
     notes = {"date": _now(), "converted_from": calibration.name}
     write_files({file: camera_text(model, name, notes).encode()})
     say(f"wrote {file} ({model.model}, {model.size_px[0]}x{model.size_px[1]} px)")
-    if as_json:
-        print_record(camera_record(model) | {"file": str(file)})
-    else:
-        print(file)
-    return 0
+    print_result(camera_record(model) | {"file": str(file)} if as_json else file)
 
 
 # -- files --------------------------------------------------------------------
@@ -319,7 +308,7 @@ def _check_output(file: Path, force: bool) -> None:
 
 
 def _free_folder(file: Path) -> Path:
-    """The first folder for pictures beside the file that does not exist yet."""
+    """Return the first folder for pictures beside the file that does not exist yet."""
     names = (f"{file.stem}_pictures{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
     return next(folder for name in names if not (folder := file.with_name(name)).exists())
 
@@ -347,28 +336,28 @@ class Source:
     size_px: tuple[int, int] | None = None  # asked of a camera of this computer
 
     def __str__(self) -> str:
-        """How messages name it."""
+        """Return the name of the source in messages."""
         if self.files:
             return f"{self.files[0]} and {len(self.files) - 1} more"
         return without_password(self.spec)
 
     @property
     def scheme(self) -> str:
-        """``images``, ``video``, or a live source's."""
+        """The part before the colon: ``images``, ``video``, or a live source's."""
         return self.spec.partition(":")[0]
 
     @property
     def place(self) -> str:
-        """What stands behind the scheme: a path, for ``images`` and ``video``."""
+        """The part behind the colon: a path, for ``images`` and ``video``."""
         return str(Path(self.spec.partition(":")[2]).expanduser())
 
     def open(self) -> FrameSource:
-        """Its frames, of a live source too. Errors: those of `open_camera`."""
+        """Open the source. Errors: those of `open_camera`."""
         return open_camera(self.files or self.spec, time.monotonic, size_px=self.size_px)
 
 
 def _source(words: Sequence[str], size: str | None, view: bool = False) -> Source:
-    """The source that the command line names; several words are picture files, which is what
+    """Return the source that the command line names; several words are picture files, which is what
     a shell makes of ``left*.jpg``. Raises NotFound, InvalidValue, UsageError."""
     if len(words) == 1:
         source = Source(parse_source(words[0], files=True).spec)
@@ -393,7 +382,7 @@ def _check_picture(file: Path) -> None:
 
 
 def sized(source: Source, text: str | None) -> Source:
-    """The source with `--size`. Raises InvalidValue, UsageError."""
+    """Return the source with `--size`. Raises InvalidValue, UsageError."""
     if text is None:
         return source
     found = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text)
@@ -405,7 +394,7 @@ def sized(source: Source, text: str | None) -> Source:
 
 
 def _watched(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]:
-    """The pictures of a recording, or of a live camera for `MASK_S`."""
+    """Yield the pictures of a recording, or of a live camera for `MASK_S`."""
     start_s = time.monotonic()
     for now_s, frame in polled(source, time.monotonic, time.sleep):
         if stopped() or (source.live and now_s - start_s > MASK_S):
@@ -418,8 +407,8 @@ def _watched(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]
 
 
 def _measured_board(notation: str, measured: str | None) -> Board:
-    """The board, with its black area's measured sides compared with those that it was meant to
-    have. Raises NotFound, InvalidValue."""
+    """Return the board with the measured sides of its black area, after a comparison with those
+    that it was meant to have. Raises NotFound, InvalidValue."""
     board = parse_board(notation)
     if measured is None:
         return board
@@ -444,7 +433,7 @@ def _find_views(
     kept_in: Callable[[tuple[int, int]], Path | None],
     port: int | None,
 ) -> tuple[list[BoardView], list[Rejection]]:
-    """The views, at least one, and the pictures without a board.
+    """Return the views, at least one, and the pictures without a board.
 
     Args:
         kept_in: the folder for a live camera's pictures (None: they are not kept), by their size;
@@ -475,7 +464,7 @@ def _find_views(
 def captured_views(
     source: FrameSource, board: Board, folder: Path | None, port: int | None
 ) -> list[BoardView]:
-    """Views of a live camera, taken until all is covered or Ctrl-C ends it.
+    """Return views of a live camera, taken until all is covered or Ctrl-C ends it.
 
     Args:
         folder: gets their pictures, each as it is taken; None: they are not kept.
@@ -516,7 +505,8 @@ class _Keeper:
         self._failed = False
 
     def keep(self, picture: Grey) -> None:
-        """Never raises: pictures that cannot be kept are still calibrated from."""
+        """Write the picture. Never raises: pictures that cannot be kept are still calibrated
+        from."""
         if self._folder is None or self._failed:
             return
         png = cv2.imencode(".png", picture)[1].tobytes()
@@ -528,6 +518,6 @@ class _Keeper:
             say(f"pictures are no longer kept: {error}")
 
     def report(self) -> None:
-        """Says where the pictures are."""
+        """Print where the pictures are."""
         if self._kept:
             say(f"kept {self._kept} pictures: images:{self._folder} takes them again")

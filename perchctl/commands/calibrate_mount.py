@@ -46,7 +46,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.guide import guide, page_port
 from perchctl.commands.interrupt import Stopper, unheeded
-from perchctl.commands.output import print_record, say, tell
+from perchctl.commands.output import print_result, say, tell
 from perchctl.display import LivePage, live_page
 from perchctl.errors import (
     Interrupted,
@@ -168,7 +168,7 @@ def mount(
         "profile": written and str(written),
         "profile_before": before and str(before),
     }
-    print_record(record | ({} if problem is None else {"error": str(problem), "exit_code": code}))
+    print_result(record | ({} if problem is None else {"error": str(problem), "exit_code": code}))
     return code
 
 
@@ -234,7 +234,7 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecordin
 
 
 def _check_seen_by(recordings: Sequence[MountingRecording], now: str) -> None:
-    """Raises InvalidValue if the poses rest on other sizes or another lens than the profile's."""
+    """Raise InvalidValue if the poses rest on other sizes or another lens than the profile's."""
     for recording in recordings:
         if not recording.seen_by:
             say(f"the {recording.part} does not say by which sizes and lens it was seen: unchecked")

@@ -100,7 +100,7 @@ def check(
 
 
 def _scanned(uri: str | None) -> Iterator[Row]:
-    """The scan as an iterator, so that Ctrl-C may end it."""
+    """Yield the rows of the scan, so that Ctrl-C may end it."""
     yield from scan_rows(uri)
 
 
@@ -130,7 +130,7 @@ def report(rows: Iterable[Row], as_json: bool) -> int:
 
 
 def exit_code(rows: Sequence[Row]) -> int:
-    """Of the first failing row; 0 when nothing fails."""
+    """Return the exit code of the first failing row; 0 if nothing fails."""
     for row in rows:
         if row.verdict is Verdict.FAIL:
             return EXIT_CODE_OF.get(row.name, SafetyAbort.exit_code)
@@ -138,7 +138,7 @@ def exit_code(rows: Sequence[Row]) -> int:
 
 
 def table(rows: Sequence[Row], finished: bool = True) -> str:
-    """At 80 columns: verdict, name, what was found, and below it what to do.
+    """Return the rows at 80 columns: verdict, name, what was found, and below it what to do.
 
     Rows that were skipped for one and the same reason share a line. Of a check that did not come
     to its end nothing good is said.
@@ -197,7 +197,7 @@ def list_cameras(as_json: bool, known: Sequence[ConnectedCamera] | None = None) 
 
 
 def camera_lines(camera: ConnectedCamera) -> list[str]:
-    """For people."""
+    """Return the lines that describe a camera to people."""
     lines = [f"{camera.source}  {camera.name or '(no name)'}"]
     if camera.stable_path:
         lines.append(f"  {camera.stable_path}")

@@ -79,7 +79,7 @@ class Command(TyperCommand):
 
 
 class Group(TyperGroup):
-    """Subcommands, of which the first is the main one: it is done where none is named."""
+    """A group of subcommands, of which the first is the main one: it runs if none is named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if ctx.resilient_parsing:  # a shell asks for what may come
@@ -89,7 +89,7 @@ class Group(TyperGroup):
         return super().parse_args(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """That of the main subcommand, with the others listed below it."""
+        """Write the help of the main subcommand, with the others listed below it."""
         name, main_command = next(iter(self.commands.items()))
         inner = typer.Context(main_command, info_name=ctx.info_name, parent=ctx.parent, **_SETTINGS)
         main_command.format_usage(inner, formatter)
@@ -130,7 +130,7 @@ class _Commands(TyperGroup):
 
 
 def new_app(cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
-    """The application of a subcommand, or with `cls=Group` of a group of them."""
+    """Return the application of a subcommand, or with `cls=Group` of a group of them."""
     # Without rich's panels: they cut what is longer than a cell, and leave a narrow one for it.
     return typer.Typer(
         cls=cls,
@@ -232,8 +232,8 @@ def main() -> Any:
 
 @contextlib.contextmanager
 def reported(as_json: bool = False) -> Iterator[None]:
-    """Turns every failure into one sentence on stderr, an object on stdout where one is
-    wanted, and its exit code, and each note on the profile into one sentence."""
+    """Turn every failure of the block into one sentence on stderr, if wanted an object on stdout,
+    and its exit code, and each note on the profile into one sentence."""
     try:
         with _notes():
             yield
@@ -281,14 +281,14 @@ def _print_failure(sentence: str, code: int) -> None:
 
 
 def _drop_stdout() -> None:
-    """What is left in the buffer must not fail again at the program's end."""
+    """Discard what stdout still holds, so that it does not fail again at the program's end."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _place_refused(error: Exception) -> str | None:
-    """The operating system's refusal of a place, of which nobody closer has told; a full disk
-    has the same exit code everywhere."""
+    """Return the sentence for a place that the operating system refused, if no caller has written
+    one; a full disk has the same exit code everywhere."""
     if not isinstance(error, OSError):
         return None
     if error.errno in _NO_ROOM:
@@ -303,7 +303,7 @@ def _place_refused(error: Exception) -> str | None:
 
 @contextlib.contextmanager
 def _notes() -> Iterator[None]:
-    """Prints each different `Note` once; other warnings go where they went before."""
+    """Print each different `Note` of the block once; other warnings go where they went before."""
     printed: set[str] = set()
 
     with warnings.catch_warnings():

@@ -31,7 +31,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.guide import page_port
 from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
-from perchctl.commands.output import confirmed, print_record, say, tell
+from perchctl.commands.output import confirmed, print_result, say, tell
 from perchctl.commands.picture_edges import picture_edges
 from perchctl.display import (
     FlightPage,
@@ -130,10 +130,7 @@ def fly(
     """
     options = resolve(profile, uri, source, positioning, seed, log_dir, record)
     if dry_run:
-        if as_json:
-            print_record(plan(options))
-        else:
-            print(plan_text(options))
+        print_result(plan(options) if as_json else plan_text(options))
         return 0
     for warning in warnings_before_flight(options):
         say(f"check: {warning}")
@@ -153,8 +150,8 @@ def resolve(
     log_dir: Path | None = None,
     record: bool | None = None,
 ) -> FlyOptions:
-    """The command line on top of the profile; None is not given. Errors: NotFound, InvalidValue,
-    UsageError."""
+    """Return the command line's options on top of the profile; None is not given. Errors: NotFound,
+    InvalidValue, UsageError."""
     profile = positioned(load_profile(profile_name), positioning)
     options = FlyOptions(
         profile=profile,
@@ -192,14 +189,14 @@ def positioned(profile: Profile, by: str | None) -> Profile:
 
 
 def ask_before_arming(uri: str) -> None:
-    """Raises UsageError without a yes from the terminal."""
+    """Raise UsageError without a yes from the terminal."""
     if not confirmed(f"About to arm and fly {uri}. Is the space under the target clear?"):
         raise UsageError("not confirmed: nothing was started")
 
 
 def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: bool = False) -> int:
-    """Fly, log, plot, report how it ended; returns the exit code. `port` of the live page; `asks`:
-    somebody at the terminal has to say yes before it arms."""
+    """Fly, log, plot and report how the flight ended; return the exit code. `port` is the live
+    page's; with `asks` somebody at the terminal has to say yes before it arms."""
     simulated_seed = options.seed if options.simulated else None
     log = LogWatcher.real_time(
         options.log_dir, options.profile, options.uri, options.source, simulated_seed,
@@ -236,7 +233,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
     if plot is not None:
         tell(f"plot:      {plot}", stdout=not as_json)
     if as_json:
-        print_record(flight_record(summary, code, log.path, plot))
+        print_result(flight_record(summary, code, log.path, plot))
     return code
 
 
@@ -259,7 +256,7 @@ def plot_of(log_path: Path, profile: Profile) -> Path | None:
 def flight_record(
     summary: FlightSummary, code: int, log: Path, plot: Path | None
 ) -> dict[str, Any]:
-    """The one object of `--json`; `error` is None where the flight and its log are good."""
+    """Return the one object of `--json`; `error` is None if the flight and its log are good."""
     return summary.as_record() | {
         "lost_records": summary.lost_records,
         "log_problem": summary.log_problem,
@@ -271,7 +268,8 @@ def flight_record(
 
 
 def exit_code(outcome: Outcome, summary: FlightSummary) -> int:
-    """Of the flight; of its log where the flight was good and the log is not."""
+    """Return the exit code of the flight, or that of its log if the flight was good and the log is
+    not."""
     code = EXIT_CODE_OF[outcome]
     return LogIncomplete.exit_code if code == 0 and summary.log_problem is not None else code
 
@@ -284,7 +282,7 @@ def _session(
     page: FlightPage | None,
     asks: bool,
 ) -> SessionResult:
-    """The session with the signals on its switch, and with the live page where there is one."""
+    """Fly the session with the signals on its switch, and with the live page if there is one."""
     watchers: tuple[Watcher, ...] = (log, display)
     watched = log.watched
     if page is not None:
@@ -317,7 +315,7 @@ _COLUMN, _WIDTH = 13, 80
 
 
 def plan(options: FlyOptions) -> dict[str, Any]:
-    """What would be flown, fully resolved; nothing is connected."""
+    """Return what would be flown, fully resolved; nothing is connected."""
     calibration = find_calibration(options.profile.camera.calibration)
     mask = options.profile.camera.mask
     return {
@@ -347,8 +345,8 @@ def _compared(options: FlyOptions) -> list[Row]:
 
 
 def plan_text(options: FlyOptions) -> str:
-    """The plan for people, at 80 columns: what, where, the phases with their numbers, and what of
-    the profile was hardly meant."""
+    """Return the plan for people, at 80 columns: what, where, the phases with their numbers, and
+    which values of the profile are implausible."""
     resolved, profile, planner = plan(options), options.profile, options.profile.planner
     camera, large, small = profile.camera, profile.target.large, profile.target.small
     search, align, ascend, perch = planner.search, planner.align, planner.ascend, planner.perch
@@ -447,7 +445,7 @@ def _mm(place_m: tuple[float, float, float]) -> str:
 
 
 def weights_text(options: FlyOptions) -> str:
-    """Which merge weights fly, and the file that they are from, with its date and data."""
+    """Return which merge weights fly, and the file that they are from, with its date and data."""
     merge = options.profile.merge
     numbers = ", ".join(f"{axis} {w:g}" for axis, w in merge.weights.model_dump().items())
     if merge.weights_file is None:

@@ -32,7 +32,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.fly import plot_of, positioned
 from perchctl.commands.interrupt import signals_to
-from perchctl.commands.output import print_record, say
+from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import progress_bar
 from perchctl.display import timed_event_text
 from perchctl.errors import (
@@ -200,9 +200,9 @@ def run(
 
     folder = log_dir or Path(flown.log.directory)
 
-    def fly_only(fly: Callable[[int], R], report: Callable[..., None]) -> int:
+    def fly_only(seed: int, fly: Callable[[int], R], report: Callable[..., None]) -> int:
         return fly_each(
-            lambda executor, note: campaigns.fly_all(fly, [only], executor, note),
+            lambda executor, note: campaigns.fly_all(fly, [seed], executor, note),
             partial(report, flown, as_json),
             1,
             executor,
@@ -211,13 +211,13 @@ def run(
     with signals_to(stop_once()):
         if only is not None and names is not None:
             return fly_only(
+                only,
                 partial(fault_campaigns.fly_fault_in_folder, flown, names, folder, record),
                 _report_fault,
             )
         if only is not None:
-            return fly_only(
-                partial(campaigns.fly_logged, flown, folder, record=record), _report_flight
-            )
+            fly = partial(campaigns.fly_logged, flown, folder, record=record)
+            return fly_only(only, fly, _report_flight)
         if names is not None:
             return fly_campaign(
                 fault_campaigns.FaultResult,
@@ -268,7 +268,7 @@ def compare(
         if as_json:
             differences = {key: {"a": a, "b": b} for key, (a, b) in keys.items()}
             record = {"a": profile_a, "b": profile_b, **found, "profile": differences}
-            print_record(with_problem(record, problem))
+            print_result(with_problem(record, problem))
             return
         print(campaigns.comparison_text(names, found))
         for key, (a, b) in keys.items():
@@ -306,10 +306,7 @@ def sweep(
 
     def report(results: list[campaigns.VariantResult], problem: PerchError | None) -> None:
         record = asked.record(results)
-        if as_json:
-            print_record(with_problem(record, problem))
-        else:
-            print(asked.text(record), flush=True)
+        print_result(with_problem(record, problem) if as_json else asked.text(record))
 
     return _fly_by_each(asked.profiles, seeds, jobs, cluster, report)
 
@@ -331,7 +328,7 @@ def _fly_by_each(
 
 
 def _require_simulator() -> None:
-    """Raises UsageError where the extra ``sim`` is not installed."""
+    """Raise UsageError if the extra ``sim`` is not installed."""
     if find_spec("mujoco") is None:
         raise no_simulator()
 
@@ -480,10 +477,7 @@ def _report(
     results: list[C],
     problem: PerchError | None,
 ) -> None:
-    if as_json:
-        print_record(with_problem(summary(results), problem))
-    else:
-        print(table(results), flush=True)
+    print_result(with_problem(summary(results), problem) if as_json else table(results))
     say_where_logs_are(results, log_dir, keep)
 
 
@@ -515,7 +509,7 @@ def _report_flight(
     if as_json:
         lacks = {"lost_records": summary.lost_records, "log_problem": summary.log_problem}
         files = {"log": str(flight.log), "plot": None if plot is None else str(plot)}
-        print_record({"seed": flight.seed} | summary.as_record() | lacks | files)
+        print_result({"seed": flight.seed} | summary.as_record() | lacks | files)
     elif plot is not None:
         print(f"plot:      {plot}")
 
@@ -534,7 +528,7 @@ def _report_fault(
     assert result.log is not None
     plot = _plot(result.log, profile)
     if as_json:
-        print_record(to_plain({**known, "plot": plot}))
+        print_result(to_plain({**known, "plot": plot}))
     elif plot is not None:
         print(f"{'plot':<18} {plot}")
 
@@ -547,8 +541,6 @@ def _plot(log: Path, profile: Profile) -> Path | None:
 
 def _list_faults(as_json: bool) -> int:
     faults = {fault.name: fault.what for fault in fault_campaigns.FAULTS}
-    if as_json:
-        print_record({"faults": faults})
-    else:
-        print("\n".join(campaigns.align_columns(list(faults.items()))))
+    table = "\n".join(campaigns.align_columns(list(faults.items())))
+    print_result({"faults": faults} if as_json else table)
     return 0

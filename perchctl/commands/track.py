@@ -122,7 +122,7 @@ def track(
     force: ForceOption = False,
     view: ViewOption = False,
     view_port: ViewPortOption = 0,
-) -> int:
+) -> None:
     """Find the target in a camera, video or pictures, without a vehicle.
 
     Poses are in the OpenCV camera frame with cv2.aruco's marker axes: X_cam = R(rvec) X_marker +
@@ -208,7 +208,6 @@ def track(
         say(prints.verdict().text)
     if stop.requested.is_set():
         raise Interrupted("Ctrl-C: stopped; what was written is complete")
-    return 0
 
 
 def _open(
@@ -219,7 +218,7 @@ def _open(
     stills: bool,
     now: Callable[[], float],
 ) -> tuple[FrameSource, CameraModel]:
-    """The open source, and its camera. Errors: NotFound, InvalidValue."""
+    """Return the open source, and its camera. Errors: NotFound, InvalidValue."""
     camera = None
     with contextlib.suppress(SizeMissing):  # then the first picture's is taken
         camera = load_calibration(calibration, cam=cam)

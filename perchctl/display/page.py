@@ -44,7 +44,7 @@ class FlightPage:
         return None
 
     def watched(self, source: FrameSource) -> FrameSource:
-        """The same source; each frame it gives is remembered for the page."""
+        """Return the same source; each frame it gives is remembered for the page."""
         return WatchedSource(source, self._seen)
 
     def tick(self, tick: Tick) -> None:
@@ -63,8 +63,8 @@ class FlightPage:
             self._rescue = event.reason
 
     def end(self, card: Card) -> None:
-        """The flight is over, and this is how: the last that the page shows. After an error in
-        flight, with what the rescue said."""
+        """Show how the flight ended, as the last that the page shows; after an error in flight also
+        what the rescue reported."""
         if self._rescue and not card["good"]:
             card = card | {"rows": [["flight", self._rescue], *card["rows"]]}
         self.page.end(card)
@@ -76,7 +76,7 @@ class FlightPage:
 
 
 def sketch_of(frame: Frame, output: PipelineOutput | None, axis_m: float) -> Sketch:
-    """The frame with what the pipeline found in it; bare where it was not looked at."""
+    """Return the frame with what the pipeline found in it; bare if it was not searched."""
     if output is None or output.detections.frame_index != frame.index:
         return Sketch(frame.image)
     found = ((name, output.detections.get(name)) for name in MARKERS)
@@ -109,14 +109,15 @@ def flight_state(tick: Tick) -> PageState:
 
 
 def summary_card(summary: FlightSummary, log: Path) -> Card:
-    """How the flight ended, and where to look next."""
+    """Return the card that says how the flight ended, and where to look next."""
     first, *lines = summary_text(summary).splitlines()
     rows = [[part.strip() for part in line.split(":", maxsplit=1)] for line in lines]
     return _card(summary.outcome, first.partition(": ")[2], rows, log)
 
 
 def failed_card(error: BaseException, log: Path | None) -> Card:
-    """Of a flight that ended in an error, or that never began; `log` where there is one."""
+    """Return the card of a flight that ended in an error, or that never began; `log` if there is
+    one."""
     return _card("failed", str(error) or type(error).__name__, [], log)
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import re
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -41,22 +41,15 @@ START_S = 100.0
 OVER = [Phase.PERCHED, Phase.LANDED, Phase.ABORTED]
 
 
-class Clock:
-    def __init__(self) -> None:
-        self.now_s = 50.0
-
-    def __call__(self) -> float:
-        return self.now_s
+@pytest.fixture
+def clock() -> list[float]:
+    """The page's time, s."""
+    return [50.0]
 
 
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def page(clock: Clock) -> Iterator[LivePage]:
-    served = LivePage(camera(), "perchctl test", on_stop=lambda: None, clock=clock)
+def page(clock: list[float]) -> Iterator[LivePage]:
+    served = LivePage(camera(), "perchctl test", on_stop=lambda: None, clock=lambda: clock[0])
     yield served
     served.close()
 
@@ -80,26 +73,14 @@ def seen_in(frame: Frame) -> PipelineOutput:
     return PipelineOutput(detections, {"large": pose}, None, Stage.LARGE)
 
 
-class OneFrame:
-    live = True
-    finished = False
-    size_px = (640, 480)
-
-    def __init__(self, frame: Frame) -> None:
-        self.frame: Frame | None = frame
-
-    def poll(self, now_s: float) -> Frame | None:
-        frame, self.frame = self.frame, None
-        return frame
-
-    def problem(self, now_s: float) -> str | None:
-        return "silent"
-
-    def describe(self) -> str:
-        return "one frame"
-
-    def close(self) -> None:
-        self.frame = None
+def one_frame(frame: Frame) -> Any:
+    """A live source that gives this frame and is then silent."""
+    left = [frame]
+    return SimpleNamespace(
+        live=True, finished=False, size_px=(640, 480), close=left.clear,
+        poll=lambda now_s: left.pop() if left else None, problem=lambda now_s: "silent",
+        describe=lambda: "one frame",
+    )  # fmt: skip
 
 
 # --- what it shows ---------------------------------------------------------------------------
@@ -108,7 +89,7 @@ class OneFrame:
 def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> None:
     flight = FlightPage(page, 0.15)
     frame = Frame(7, 1.0, np.full((480, 640), 90, np.uint8))
-    source = flight.watched(OneFrame(frame))
+    source = flight.watched(one_frame(frame))
     assert state_of(page)["phase"] == "WAITING"
     assert source.poll(1.0) is frame
     assert source.poll(1.1) is None
@@ -129,7 +110,7 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
 
 def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
     flight = FlightPage(page, 0.15)
-    flight.watched(OneFrame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
+    flight.watched(one_frame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
     flight.tick(None)  # type: ignore[arg-type]
     flight.event(note(0.0, "something"))
     assert flight.problem is None
@@ -141,13 +122,13 @@ def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
 # --- how old it is ---------------------------------------------------------------------------
 
 
-def test_the_numbers_tell_their_age(page: LivePage, clock: Clock) -> None:
+def test_the_numbers_tell_their_age(page: LivePage, clock: list[float]) -> None:
     flight = FlightPage(page, 0.15)
-    clock.now_s += 60.0
+    clock[0] += 60.0
     assert state_of(page)["age_s"] is None  # connecting may take its time
     flight.tick(tick(START_S))
     assert state_of(page)["age_s"] == 0.0
-    clock.now_s += 3.25  # the loop hangs, the page's threads do not
+    clock[0] += 3.25  # the loop hangs, the page's threads do not
     assert state_of(page)["age_s"] == 3.25
     flight.tick(tick(START_S + 3.3))
     assert state_of(page)["age_s"] == 0.0
@@ -155,14 +136,14 @@ def test_the_numbers_tell_their_age(page: LivePage, clock: Clock) -> None:
 
 @pytest.mark.parametrize("phase", OVER)
 def test_after_the_flight_nothing_is_due_and_nothing_to_stop(
-    page: LivePage, clock: Clock, phase: Phase
+    page: LivePage, clock: list[float], phase: Phase
 ) -> None:
     flight = FlightPage(page, 0.15)
     assert stop(page.url, page.token) == 200
     flight.tick(tick(START_S))
     assert state_of(page)["stop"] == "requested"
     flight.tick(tick(START_S + 1.0, phase))
-    clock.now_s += 9.0
+    clock[0] += 9.0
     state = state_of(page)
     assert (state["age_s"], state["stop"]) == (None, "over")
 
@@ -171,19 +152,11 @@ def test_the_page_looks_at_the_age_by_itself(page: LivePage) -> None:
     """Whatever hangs, its script is the browser's: a timer, answers that are not waited for
     without end (`AbortSignal.timeout` is of 2022, and asked for before each use), and a STOP that
     is ready again at a program that was gone and now hangs."""
-    html = page._server.html
-    script = html.partition("<script")[2]
-    assert "setInterval(watch" in script
+    script = page._server.html.partition("<script")[2]
+    for part in ("setInterval(watch", "AbortSignal.timeout ?", "known = stop;"):
+        assert part in script
     assert script.count("...within(") == 2
-    assert [line for line in script.splitlines() if "AbortSignal" in line] == [
-        "const within = (ms) => AbortSignal.timeout ? { signal: AbortSignal.timeout(ms) } : {};"
-    ]
     assert 'showStop(silent ? known : "gone")' in script
-    assert "known = stop;" in script
-    assert html.index('id="old"') < html.index('id="live"')  # its sentence is not greyed with it
-    table = script.partition("const STOP = {")[2].partition("};")[0]
-    names = re.findall(r"^  (\w+): \[", table, re.MULTILINE)
-    assert names == ["ready", "requested", "over", "gone"]
 
 
 # --- STOP ------------------------------------------------------------------------------------
@@ -235,13 +208,12 @@ def test_the_card_tells_outcome_reason_miss_and_where_to_look(tmp_path: Path) ->
     assert rows["report"] == f"perchctl log report '{log}'"
 
 
-def test_a_flight_that_never_began_has_no_log(tmp_path: Path) -> None:
+def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
+    page: LivePage, tmp_path: Path
+) -> None:
     card = failed_card(Interrupted("interrupted before take-off"), None)
     assert (card["outcome"], card["good"], card["rows"]) == ("FAILED", False, [])
     assert "report" in dict(failed_card(RuntimeError(), tmp_path)["rows"])
-
-
-def test_an_error_in_flight_tells_what_the_rescue_said(page: LivePage) -> None:
     flight = FlightPage(page, 0.15)
     flight.event(note(START_S, "RuntimeError in flight: it is down, or hangs: the motors are off"))
     flight.event(note(START_S, "the recording has ended (no space): the flight and its log go on"))
