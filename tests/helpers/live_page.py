@@ -1,4 +1,4 @@
-"""What the tests of the live page share: a page, its STOP, and asking it."""
+"""What the tests of the live page share: asking it, and its STOP."""
 
 from __future__ import annotations
 
@@ -10,14 +10,6 @@ import numpy as np
 from perchctl.display.live import TOKEN_HEADER
 
 CORNERS = np.array([[200.0, 150.0], [400.0, 150.0], [400.0, 350.0], [200.0, 350.0]])
-
-
-class Stops:
-    def __init__(self) -> None:
-        self.count = 0
-
-    def __call__(self) -> None:
-        self.count += 1
 
 
 def ask(
