@@ -28,7 +28,7 @@ def _is_main() -> bool:
     return threading is None or threading.current_thread() is threading.main_thread()
 
 
-def loaded() -> None:
+def restore_ctrl_c() -> None:
     """Make Ctrl-C a KeyboardInterrupt again from now on."""
     if signal.getsignal(signal.SIGINT) is _leave:
         signal.signal(signal.SIGINT, signal.default_int_handler)

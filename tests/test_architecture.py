@@ -276,18 +276,6 @@ def test_a_face_has_few_names_and_each_says_what_it_is(package: str) -> None:
             assert thing.__doc__, name
 
 
-def test_only_the_command_line_loads_typer_and_nothing_heavy() -> None:
-    """`perchctl --help` stays quick: a subcommand loads libraries when it runs."""
-    allowed = ("perchctl.errors", "perchctl.startup")
-    heavy = ("numpy", "cv2", "cflib", "matplotlib", "mujoco", "filterpy", "pydantic", "scipy")
-    for i in IMPORTS:
-        if not i.at_load or not is_under(i.importer, ("perchctl.commands.command_line",)):
-            continue
-        assert i.imported.split(".")[0] not in heavy, str(i)
-        if i.imported.startswith("perchctl."):
-            assert is_under(i.imported, allowed), str(i)
-
-
 BROKEN = [
     ("mission.planner", "def f():\n    import time\n", clocks, "time"),
     ("vision.merge", "from perchctl.mission import state", uphill, "mission.state"),

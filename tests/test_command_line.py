@@ -16,8 +16,8 @@ import typer
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl import __version__
-from perchctl.commands.command_line import COMMANDS, reported
-from perchctl.commands.output import confirmed
+from perchctl.commands.command_line import COMMANDS, report_failures
+from perchctl.commands.output import ask_to_confirm
 from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT
@@ -132,7 +132,7 @@ def test_what_nobody_foresaw_is_one_sentence_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail() -> None:
-        with reported():
+        with report_failures():
             raise ZeroDivisionError("oh")
 
     monkeypatch.delenv("PERCHCTL_DEBUG", raising=False)
@@ -158,7 +158,7 @@ def test_each_note_is_one_sentence_once_and_before_a_failure(
     """Other warnings are left to those who show them: here to pytest, else to Python."""
 
     def fail() -> None:
-        with reported():
+        with report_failures():
             for key in ("a", "b", "a"):
                 warnings.warn(f"mine.yaml: {key} has another name", ProfileNote, stacklevel=1)
             warnings.warn("something else", DeprecationWarning, stacklevel=1)
@@ -219,7 +219,7 @@ def test_what_was_typed_before_the_question_is_no_answer(monkeypatch: pytest.Mon
     with open(screen, encoding="utf-8") as stdin:
         monkeypatch.setattr("sys.stdin", stdin)
         monkeypatch.setattr("sys.stderr", Reader())
-        assert not confirmed("Is it clear?")
+        assert not ask_to_confirm("Is it clear?")
         os.write(keyboard, b"yes\n")
         assert stdin.readline() == "yes\n"  # nothing of before is left
     os.close(keyboard)
@@ -313,7 +313,7 @@ def test_ctrl_c_while_loading_is_an_object_where_one_is_wanted() -> None:
 
 
 def test_ctrl_c_in_a_command_is_130(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(typer.Exit) as left, reported():
+    with pytest.raises(typer.Exit) as left, report_failures():
         raise KeyboardInterrupt
     assert left.value.exit_code == 130
     assert "Ctrl-C" in capsys.readouterr().err

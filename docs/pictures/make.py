@@ -255,7 +255,7 @@ def page(flown: Flight, file: Path) -> None:
             number += 1
             live.show(number, picture)
 
-    live.tell(lambda: flight_state(tick), live=False)
+    live.set_state(lambda: flight_state(tick), live=False)
     feeder = threading.Thread(target=feed, daemon=True)
     feeder.start()
     try:

@@ -56,7 +56,7 @@ from perchctl.commands.command_line import (
     new_app,
 )
 from perchctl.commands.guide import guide, page_port
-from perchctl.commands.interrupt import Stopper, drawn
+from perchctl.commands.interrupt import Stopper, draw_unless_interrupted
 from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import search_bar
 from perchctl.display import live_page
@@ -174,7 +174,7 @@ def camera(
     write_files({file: result.text(name, _now()).encode()})
     for line in result.lines():
         say(line)
-    report = drawn(lambda: _draw(result, file.with_suffix(".png")))
+    report = draw_unless_interrupted(lambda: _draw(result, file.with_suffix(".png")))
     say(f"wrote {file}" + ("" if report is None else f" and {report}"))
     print_result(result.record(file, report) if as_json else file)
 
@@ -211,7 +211,7 @@ def mask(
         stop = stack.enter_context(Stopper().installed())
         if frames.live:
             say(f"turn the vehicle about for {MASK_S:g} s (Ctrl-C ends and writes the mask)")
-        gear = learn_gear(_watched(frames, stop.requested.is_set))
+        gear = learn_gear(_mask_pictures(frames, stop.requested.is_set))
     write_files({output: gear.png()})
     say(
         f"wrote {output}: the vehicle covers {100 * gear.share:.1f} % of the picture, by "
@@ -368,7 +368,7 @@ def _source(words: Sequence[str], size: str | None, view: bool = False) -> Sourc
         source = Source("images:", files)
     if view and not parse_source(source.spec).live:
         raise UsageError(f"{source} is no live camera: --view does not apply; leave it out")
-    return sized(source, size)
+    return with_size(source, size)
 
 
 def _check_picture(file: Path) -> None:
@@ -381,7 +381,7 @@ def _check_picture(file: Path) -> None:
         )
 
 
-def sized(source: Source, text: str | None) -> Source:
+def with_size(source: Source, text: str | None) -> Source:
     """Return the source with `--size`. Raises InvalidValue, UsageError."""
     if text is None:
         return source
@@ -393,7 +393,7 @@ def sized(source: Source, text: str | None) -> Source:
     return replace(source, size_px=(int(found[1]), int(found[2])))
 
 
-def _watched(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]:
+def _mask_pictures(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]:
     """Yield the pictures of a recording, or of a live camera for `MASK_S`."""
     start_s = time.monotonic()
     for now_s, frame in polled(source, time.monotonic, time.sleep):
@@ -444,7 +444,7 @@ def _find_views(
         frames = source.open()
         with contextlib.closing(frames):
             assert frames.size_px is not None  # the first frame is there
-            return captured_views(frames, board, kept_in(frames.size_px), port), []
+            return capture_live_views(frames, board, kept_in(frames.size_px), port), []
     with search_bar("searching the board") as progress:
         if source.scheme == "images":
             files = image_files(source.files or source.place)
@@ -461,7 +461,7 @@ def _find_views(
     return views, missing
 
 
-def captured_views(
+def capture_live_views(
     source: FrameSource, board: Board, folder: Path | None, port: int | None
 ) -> list[BoardView]:
     """Return views of a live camera, taken until all is covered or Ctrl-C ends it.
@@ -473,9 +473,27 @@ def captured_views(
     Raises:
         InvalidValue: no view was taken. Those of `capture_views`.
     """
-    keeper = _Keeper(folder)
+    kept: list[Path] = []
+
+    def keep(picture: Grey) -> None:
+        """Write the picture; those that cannot be kept are still calibrated from."""
+        nonlocal folder
+        if folder is None:
+            return
+        path = folder / f"view_{len(kept) + 1:03d}.png"
+        try:
+            write_files({path: cv2.imencode(".png", picture)[1].tobytes()})
+            kept.append(path)
+        except InvalidValue as error:
+            folder = None
+            say(f"pictures are no longer kept: {error}")
+
+    def report_kept() -> None:
+        if kept:
+            say(f"kept {len(kept)} pictures: images:{kept[0].parent} takes them again")
+
     with contextlib.ExitStack() as stack:
-        stack.callback(keeper.report)
+        stack.callback(report_kept)
         stop = stack.enter_context(Stopper().installed())
         # The page draws the picture and its corners, but no axes: any camera serves.
         any_camera = CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
@@ -485,7 +503,7 @@ def captured_views(
 
         def seen(moment: Moment) -> None:
             if moment.taken:
-                keeper.keep(moment.image)
+                keep(moment.image)
             show(moment)
 
         views = capture_views(source, board, seen, stopped=stop.requested.is_set)
@@ -494,30 +512,3 @@ def captured_views(
             f"no view of the board {board.notation()} was taken from {source.describe()}"
         )
     return views
-
-
-class _Keeper:
-    """Writes each picture as it is taken."""
-
-    def __init__(self, folder: Path | None) -> None:
-        self._folder = folder
-        self._kept = 0
-        self._failed = False
-
-    def keep(self, picture: Grey) -> None:
-        """Write the picture. Never raises: pictures that cannot be kept are still calibrated
-        from."""
-        if self._folder is None or self._failed:
-            return
-        png = cv2.imencode(".png", picture)[1].tobytes()
-        try:
-            write_files({self._folder / f"view_{self._kept + 1:03d}.png": png})
-            self._kept += 1
-        except InvalidValue as error:
-            self._failed = True
-            say(f"pictures are no longer kept: {error}")
-
-    def report(self) -> None:
-        """Print where the pictures are."""
-        if self._kept:
-            say(f"kept {self._kept} pictures: images:{self._folder} takes them again")

@@ -33,7 +33,6 @@ from perchctl.calibration import (
     write_recordings,
 )
 from perchctl.camera import (
-    FrameSource,
     check_size,
     open_camera,
     parse_source,
@@ -45,9 +44,9 @@ from perchctl.commands.command_line import (
     ViewPortOption,
 )
 from perchctl.commands.guide import guide, page_port
-from perchctl.commands.interrupt import Stopper, unheeded
-from perchctl.commands.output import print_result, say, tell
-from perchctl.display import LivePage, live_page
+from perchctl.commands.interrupt import Stopper, ignore_signals
+from perchctl.commands.output import print_lines, print_result, say
+from perchctl.display import live_page
 from perchctl.errors import (
     Interrupted,
     InvalidValue,
@@ -142,11 +141,11 @@ def mount(
         parts: tuple[MountingPart, ...] = ("carry", "pivot") if part is None else (part,)
         frames, link_uri = _live_sources(source, uri, vehicle, parts)
         log = _recording_place(output, find_profile(profile).stem, force)
-        recordings = _recorded(vehicle, camera, frames, link_uri, parts, log, port)
+        recordings = _record_live(vehicle, camera, frames, link_uri, parts, log, port)
         logs = [log] if log.exists() else []
-    measured = solved(vehicle, recordings)
+    measured = solve_mounting(vehicle, recordings)
     for line in measured.lines():
-        tell(line)
+        print_lines(line)
     written, before, problem = None, None, None
     if into is not None:
         try:
@@ -248,7 +247,7 @@ def _check_seen_by(recordings: Sequence[MountingRecording], now: str) -> None:
 # -- a live recording -------------------------------------------------------------
 
 
-def _recorded(
+def _record_live(
     profile: Profile,
     camera: CameraModel,
     source: str,
@@ -283,10 +282,20 @@ def _recorded(
         page = stack.enter_context(live_page(camera, "perchctl calibrate mount", port, say))
         stack.callback(_keep, tapes, log)
         for part in parts:
-            _await_person(part)
-            tapes.append(MountingTape(part, pose_basis(profile, camera)))
+            say(HOW[part])
+            if sys.stdin.isatty():  # Ctrl-C ends at once here
+                print("press Enter when it is held so: ", end="", file=sys.stderr, flush=True)
+                sys.stdin.readline()
+            tape = MountingTape(part, pose_basis(profile, camera))
+            tapes.append(tape)
             eye = Eye(profile, camera, frames.live)
-            _record(tapes[-1], frames, eye, sensors, page, now)
+            if frames.live:
+                frames.poll(now())  # from before
+            with Stopper().installed() as stop, guide(page) as show:
+                stopped = stop.requested.is_set
+                capture(tape, frames, eye, sensors, show, now, stopped=stopped)
+            if stopped():
+                raise Interrupted("Ctrl-C: nothing was measured")
     return tuple(tape.recording() for tape in tapes)
 
 
@@ -310,39 +319,13 @@ def _vehicle(uri: str, profile: Profile, now: Callable[[], float]) -> Iterator[V
         yield VehicleSensors(link.samples, problem)
 
 
-def _await_person(part: MountingPart) -> None:
-    """Wait for Enter, if somebody can press it. Ctrl-C ends at once here."""
-    say(HOW[part])
-    if not sys.stdin.isatty():
-        return
-    print("press Enter when it is held so: ", end="", file=sys.stderr, flush=True)
-    sys.stdin.readline()
-
-
-def _record(
-    tape: MountingTape,
-    source: FrameSource,
-    eye: Eye,
-    sensors: VehicleSensors,
-    page: LivePage | None,
-    now: Callable[[], float],
-) -> None:
-    """Record one part. Raises Interrupted, and what `capture` does."""
-    if source.live:
-        source.poll(now())  # from before
-    with Stopper().installed() as stop, guide(page) as show:
-        capture(tape, source, eye, sensors, show, now, stopped=stop.requested.is_set)
-    if stop.requested.is_set():
-        raise Interrupted("Ctrl-C: nothing was measured")
-
-
 def _keep(tapes: Sequence[MountingTape], log: Path) -> None:
     """Write the recording. Never raises: if it cannot be kept, it is measured from all the
     same."""
     if not any(tapes):
         return
     try:
-        with unheeded():
+        with ignore_signals():
             write_recordings(log, [tape.recording() for tape in tapes if tape])
     except InvalidValue as error:
         say(f"the recording is not kept: {error}")
@@ -353,7 +336,7 @@ def _keep(tapes: Sequence[MountingTape], log: Path) -> None:
 # -- the result -------------------------------------------------------------------
 
 
-def solved(profile: Profile, recordings: Sequence[MountingRecording]) -> MountingReport:
+def solve_mounting(profile: Profile, recordings: Sequence[MountingRecording]) -> MountingReport:
     """Return the measured mounting, of each part there is. Errors: InvalidValue."""
     by_part = {recording.part: recording for recording in recordings}
     carry, pivot = by_part.get("carry"), by_part.get("pivot")

@@ -22,7 +22,7 @@ from perchctl.commands.command_line import (
     new_app,
 )
 from perchctl.commands.fly import resolve
-from perchctl.commands.interrupt import interruptible, unheeded
+from perchctl.commands.interrupt import ignore_signals, interruptible
 from perchctl.commands.output import say
 from perchctl.errors import (
     ConnectionFailed,
@@ -118,7 +118,7 @@ def report(rows: Iterable[Row], as_json: bool) -> int:
         if found and not as_json:
             print(table(found, finished=False))
         raise
-    with unheeded():
+    with ignore_signals():
         if as_json:
             print(json.dumps([asdict(row) for row in found]))
         elif found:

@@ -29,7 +29,7 @@ from perchctl.errors import (
     PerchError,
     UsageError,
 )
-from perchctl.startup import failure_record, loaded
+from perchctl.startup import failure_record, restore_ctrl_c
 
 # \b keeps the lines of a paragraph as they are.
 EXIT_TABLE = "\b\nExit codes:\n" + "\n".join(
@@ -125,7 +125,7 @@ class _Commands(TyperGroup):
         return _Unloaded(cmd_name, short_help=COMMANDS[cmd_name])
 
     def invoke(self, ctx: Any) -> Any:
-        with reported("--json" in ctx.args):
+        with report_failures("--json" in ctx.args):
             return super().invoke(ctx)
 
 
@@ -160,7 +160,7 @@ def command(
     def add(run: Callable[P, int | None]) -> Callable[P, None]:
         @functools.wraps(run)
         def do(*args: P.args, **kwargs: P.kwargs) -> None:
-            loaded()
+            restore_ctrl_c()
             code = run(*args, **kwargs)
             sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
             raise typer.Exit(code or 0)
@@ -216,7 +216,7 @@ CamOption = Annotated[
 def main() -> Any:
     """Run the command line; returns the exit code."""
     try:
-        with reported():  # what fails outside of a subcommand, as the help on a full disk
+        with report_failures():  # what fails outside of a subcommand, as the help on a full disk
             try:
                 app()
             finally:
@@ -231,7 +231,7 @@ def main() -> Any:
 
 
 @contextlib.contextmanager
-def reported(as_json: bool = False) -> Iterator[None]:
+def report_failures(as_json: bool = False) -> Iterator[None]:
     """Turn every failure of the block into one sentence on stderr, if wanted an object on stdout,
     and its exit code, and each note on the profile into one sentence."""
     try:

@@ -30,8 +30,8 @@ from perchctl.commands.command_line import (
     new_app,
 )
 from perchctl.commands.guide import page_port
-from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
-from perchctl.commands.output import confirmed, print_result, say, tell
+from perchctl.commands.interrupt import draw_unless_interrupted, ignore_signals, signals_to_operator
+from perchctl.commands.output import ask_to_confirm, print_lines, print_result, say
 from perchctl.commands.picture_edges import picture_edges
 from perchctl.display import (
     FlightPage,
@@ -152,7 +152,7 @@ def resolve(
 ) -> FlyOptions:
     """Return the command line's options on top of the profile; None is not given. Errors: NotFound,
     InvalidValue, UsageError."""
-    profile = positioned(load_profile(profile_name), positioning)
+    profile = with_positioning(load_profile(profile_name), positioning)
     options = FlyOptions(
         profile=profile,
         profile_path=find_profile(profile_name),
@@ -169,7 +169,7 @@ def resolve(
     return options
 
 
-def positioned(profile: Profile, by: str | None) -> Profile:
+def with_positioning(profile: Profile, by: str | None) -> Profile:
     """Return the profile with `--positioning`; None: as the profile has it. Errors:
     InvalidValue."""
     if by is None:
@@ -190,7 +190,7 @@ def positioned(profile: Profile, by: str | None) -> Profile:
 
 def ask_before_arming(uri: str) -> None:
     """Raise UsageError without a yes from the terminal."""
-    if not confirmed(f"About to arm and fly {uri}. Is the space under the target clear?"):
+    if not ask_to_confirm(f"About to arm and fly {uri}. Is the space under the target clear?"):
         raise UsageError("not confirmed: nothing was started")
 
 
@@ -210,7 +210,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
     say(f"connecting to {options.uri}{merges}")
     switch, page = OperatorSwitch(), None
     # Once it has landed nothing is left to stop, but much to tell.
-    with unheeded(), contextlib.ExitStack() as stack:
+    with ignore_signals(), contextlib.ExitStack() as stack:
         try:
             page = stack.enter_context(flight_page(options, port, switch))
             result = _session(options, log, panel, switch, page, asks)
@@ -225,13 +225,13 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
         perched = result.report.phase is Phase.PERCHED
         summary = log.close(result.report, result.miss_m if perched else None)
         assert summary is not None
-        tell(summary_text(summary, log.path), stdout=not as_json)
+        print_lines(summary_text(summary, log.path), stdout=not as_json)
         if page is not None:
             page.end(summary_card(summary, log.path))
     code = exit_code(result.report.outcome, summary)
-    plot = drawn(lambda: plot_of(log.path, options.profile))
+    plot = draw_unless_interrupted(lambda: plot_of(log.path, options.profile))
     if plot is not None:
-        tell(f"plot:      {plot}", stdout=not as_json)
+        print_lines(f"plot:      {plot}", stdout=not as_json)
     if as_json:
         print_result(flight_record(summary, code, log.path, plot))
     return code

@@ -50,7 +50,7 @@ def guide(
             if page is not None:
                 sketch = Sketch(moment.image, moment.outlines, None, (moment.advice,))
                 page.show(moment.index, sketch)
-                page.tell(lambda: page_state(moment))
+                page.set_state(lambda: page_state(moment))
 
         yield show
 

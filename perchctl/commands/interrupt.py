@@ -95,7 +95,7 @@ def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str
             threading.Thread(target=report, args=(_NO_SUSPENDING,), daemon=True).start()
 
 
-def drawn(draw: Callable[[], Path | None]) -> Path | None:
+def draw_unless_interrupted(draw: Callable[[], Path | None]) -> Path | None:
     """Return what `draw` does, the path of a picture or None; None too if Ctrl-C or SIGTERM ends
     it: a picture comes after the result, and does not take its place."""
     try:
@@ -118,7 +118,7 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> None:
 
 
 @contextlib.contextmanager
-def unheeded() -> Iterator[None]:
+def ignore_signals() -> Iterator[None]:
     """Ignore Ctrl-C and SIGTERM during the block, but for what an inner block makes of them."""
     with signals_to(lambda _signal, _frame: None):
         yield

@@ -16,6 +16,7 @@ from perchctl.commands.command_line import (
     ForceOption,
     Group,
     JsonOption,
+    ProfileOption,
     command,
     new_app,
 )
@@ -47,20 +48,11 @@ from perchctl.target import (
 )
 from perchctl.vision import CameraModel
 
-DEFAULT_PROFILE = "sim"
 TILE = "a3"
 """Sheets that are proposed for a page that is larger than the named ones."""
 SIDE_LIMITS_M = (0.004, 2.0)
 ANOTHER = "Another target than the profile's"
 
-ProfileOption = Annotated[
-    str | None,
-    typer.Option(
-        "--profile",
-        "-p",
-        help="Profile with the target; sim if none is named.",
-    ),
-]
 PageOption = Annotated[str, typer.Option("--page", help="a4, letter, a3, or 220x240mm.")]
 TileOption = Annotated[
     str | None,
@@ -116,16 +108,6 @@ BlurOption = Annotated[
         "--blur", min=0.0, max=20.0, callback=_finite, help="Sigma of the picture's blur, px."
     ),
 ]
-NoiseOption = Annotated[
-    float,
-    typer.Option(
-        "--noise",
-        min=0.0,
-        max=60.0,
-        callback=_finite,
-        help="Sigma of the picture's noise, grey levels of 255.",
-    ),
-]
 
 app = new_app(Group)
 
@@ -138,7 +120,7 @@ app = new_app(Group)
     short_help="Print the target true to size, front and back.",
 )
 def sheet(
-    profile: ProfileOption = None,
+    profile: ProfileOption = "sim",
     output: Annotated[Path, typer.Option("--output", "-o", help="PDF to write.")] = Path(
         "target.pdf"
     ),
@@ -158,7 +140,7 @@ def sheet(
 
     sheet writes a PDF of the profile's target, front and back, checked before it is written.
     """
-    config = load_profile(profile or DEFAULT_PROFILE)
+    config = load_profile(profile)
     target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
     magnet_m = parse_length(magnet, "--magnet")
     check_target(target, magnet_m)
@@ -218,10 +200,9 @@ def board(
 )
 def design(
     camera: CameraArgument = None,
-    profile: ProfileOption = None,
+    profile: ProfileOption = "sim",
     ceiling: CeilingOption = None,
     blur: BlurOption = 1.0,
-    noise: NoiseOption = 5.0,
     cam: CamOption = None,
     as_json: JsonOption = False,
     large: LargeOption = None,
@@ -232,10 +213,10 @@ def design(
     small_dict: SmallDictOption = None,
 ) -> None:
     """Compute from where to where a camera sees each marker, how exactly, and where a gap is."""
-    config = load_profile(profile or DEFAULT_PROFILE)
+    config = load_profile(profile)
     name, model = _camera(config, camera, cam)
     target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
-    found = make_design(target, model, Optics(blur, noise), config, ceiling)
+    found = make_design(target, model, Optics(blur), config, ceiling)
     record = found.record() | {"target": target.model_dump(mode="json")}
     _write({}, [found.text(name)], record, False, as_json)
 
@@ -248,20 +229,19 @@ def design(
 )
 def suggest(
     camera: CameraArgument = None,
-    profile: ProfileOption = None,
+    profile: ProfileOption = "sim",
     ceiling: CeilingOption = None,
     page: PageOption = "a4",
     magnet: MagnetOption = "50mm",
     blur: BlurOption = 1.0,
-    noise: NoiseOption = 5.0,
     cam: CamOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Propose sizes and ids for a camera, the largest that the page holds and that are seen."""
-    config = load_profile(profile or DEFAULT_PROFILE)
+    config = load_profile(profile)
     name, model = _camera(config, camera, cam)
     magnet_m = parse_length(magnet, "--magnet")
-    found, held_by = suggest_target(model, Optics(blur, noise), config, magnet_m, ceiling, page)
+    found, held_by = suggest_target(model, Optics(blur), config, magnet_m, ceiling, page)
     large, small = found.target.large, found.target.small
     command = (
         f"perchctl make-target --large {large.side_m * 1e3:g}mm --large-id {large.id} "
@@ -276,7 +256,7 @@ def suggest(
     app,
     "perchctl make-target measured -p mine.yaml --measured-large 149.6 --force",
     "perchctl make-target measured -p mine.yaml --measured-small 24.9 --force",
-    "perchctl make-target measured -p mine.yaml --measured-large 119.8 --large 120mm --force",
+    "perchctl make-target measured -p b.yaml --measured-large 151 --force --json",
 )
 def measured(
     profile: Annotated[

@@ -13,10 +13,10 @@ from typing import Any
 
 def say(sentence: str) -> None:
     """Print one sentence on stderr, as stdout is for the result. Never raises."""
-    tell(f"perchctl: {sentence}")
+    print_lines(f"perchctl: {sentence}")
 
 
-def tell(text: str, stdout: bool = False) -> None:
+def print_lines(text: str, stdout: bool = False) -> None:
     """Print lines on stderr, or on stdout, if there still is one: a closed terminal, or a pipe
     without a reader, is no reason to fail."""
     stream = sys.stdout if stdout else sys.stderr
@@ -30,7 +30,7 @@ def tell(text: str, stdout: bool = False) -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def confirmed(question: str) -> bool:
+def ask_to_confirm(question: str) -> bool:
     """Return True if somebody at the terminal says yes now: what was typed before the question
     appeared is no answer to it."""
     with contextlib.suppress(ImportError, OSError, ValueError, AttributeError):

@@ -32,7 +32,7 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.output import print_result, say, tell
+from perchctl.commands.output import print_lines, print_result, say
 from perchctl.commands.picture_edges import (
     PICTURE_EDGES,
     edges_beside,
@@ -118,7 +118,7 @@ class Question:
     hint: Callable[[Answers], str] = lambda _: ""
 
 
-def answered(
+def collect_answers(
     given: Mapping[str, str], open_question: Callable[[Question, Answers], Any]
 ) -> dict[str, Any]:
     """Return the answers to all questions: by the options that are `given`, or else by
@@ -142,7 +142,7 @@ def _by_default(question: Question, answers: Answers) -> Any:
     return question.parse(question.default(answers), answers)
 
 
-def _asked(question: Question, answers: Answers) -> Any:
+def _ask_person(question: Question, answers: Answers) -> Any:
     """Return what somebody types, asked for again until it is valid. Raises UsageError if the
     input has ended."""
     default = question.default(answers)
@@ -158,7 +158,7 @@ def _asked(question: Question, answers: Answers) -> Any:
                 "--defaults for what is not answered"
             ) from None
         except (PerchError, UnicodeDecodeError) as error:
-            tell(f"  {error}")
+            print_lines(f"  {error}")
 
 
 def _uri(text: str, _answers: Answers) -> str:
@@ -345,10 +345,12 @@ def new(
     given = {name: text for name, text in given.items() if text is not None}
     if given.get("source") == "sim:":  # no other vehicle flies by those pictures
         given.setdefault("uri", SIMULATED)
-    answers = answered(given, _by_default)  # all options are checked before anything is asked
+    answers = collect_answers(
+        given, _by_default
+    )  # all options are checked before anything is asked
     if not defaults and len(given) < len(QUESTIONS):
-        tell(f"A new profile: {output}. Enter takes what stands in brackets.")
-        answers = answered(given, _asked)
+        print_lines(f"A new profile: {output}. Enter takes what stands in brackets.")
+        answers = collect_answers(given, _ask_person)
     write_new_profile(output, answers)
 
 

@@ -13,7 +13,7 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Protocol, TypeVar
+from typing import Annotated, Any, Literal, Protocol, TypeVar
 
 import typer
 
@@ -30,7 +30,7 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.fly import plot_of, positioned
+from perchctl.commands.fly import plot_of, with_positioning
 from perchctl.commands.interrupt import signals_to
 from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import progress_bar
@@ -125,10 +125,9 @@ def run(
         ),
     ] = False,
     keep: Annotated[
-        str | None,
+        Literal["all", "failed"] | None,
         typer.Option(
             "--keep",
-            metavar="all|failed",
             help="Of the logs in --log-dir; all by default.",
             rich_help_panel="Files",
         ),
@@ -164,13 +163,11 @@ def run(
             f"{'--record' if record else '--keep'} concerns the logs of the flights: name their "
             f"folder with --log-dir"
         )
-    if keep not in (None, "all", "failed"):
-        raise UsageError(f"--keep {keep}: allowed are all and failed")
     if resume and out is None:
         raise UsageError("--resume goes on with a file of results: name it with --out")
     if out is not None and out.suffix != ".jsonl":
         raise InvalidValue(f"{out} must end in .jsonl: a result is one line of JSON")
-    flown = positioned(load_profile(profile), positioning)
+    flown = with_positioning(load_profile(profile), positioning)
     if only is not None and log_dir is not None:
         make_log_folder(log_dir)
     if cluster is not None and log_dir is not None:
@@ -259,7 +256,7 @@ def compare(
     """Fly each seed by two profiles: what differs, and what of it is proven."""
     _require_simulator()
     names = (profile_a, profile_b)
-    profiles = [positioned(load_profile(name), positioning) for name in names]
+    profiles = [with_positioning(load_profile(name), positioning) for name in names]
     keys = profile_differences(*(p.model_dump(mode="json") for p in profiles))
     keys = {key: values for key, values in keys.items() if key not in _NO_DIFFERENCE}
 
@@ -300,7 +297,7 @@ def sweep(
 ) -> int:
     """Fly the same seeds with several values of a profile's key: which is the best."""
     _require_simulator()
-    asked = campaigns.make_sweep(positioned(load_profile(profile), positioning), values)
+    asked = campaigns.make_sweep(with_positioning(load_profile(profile), positioning), values)
     seeds, cells = _seeds(flights, seed), len(asked.profiles)
     say(f"{cells} cells of {len(seeds)} seeds are {cells * len(seeds)} flights")
 

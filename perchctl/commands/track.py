@@ -195,7 +195,7 @@ def track(
                     add_picture(tracked.t_s, replace(sketch, text=text))
                 if page is not None:
                     page.show(frame.index, sketch)
-                    page.tell(partial(track_state, tracked))
+                    page.set_state(partial(track_state, tracked))
             advance()
             if page is not None and not opened.live:  # a recording is watched at its own pace
                 first = first or (frame.t_s, now())

@@ -72,7 +72,7 @@ class LivePage:
         self._times: deque[float] = deque(maxlen=_RATE_FRAMES)
         self._jpeg: tuple[int, bytes] | None = None
         self._describe: Callable[[], PageState] = dict
-        self._told_s: float | None = None  # None: nothing is due
+        self._state_s: float | None = None  # None: nothing is due
         self._read_s: float | None = None
         self._card: PageState | None = None
         self._card_read = False
@@ -104,17 +104,17 @@ class LivePage:
             self._number += 1
             self._changed.notify_all()
 
-    def tell(self, describe: Callable[[], PageState], *, live: bool = True) -> None:
+    def set_state(self, describe: Callable[[], PageState], *, live: bool = True) -> None:
         """Show these numbers from now on; they are formatted only when a reader polls. While they
         are `live`, others are due at once, and the page says when they stay away."""
         self._describe = describe
-        self._told_s = self._clock() if live else None
+        self._state_s = self._clock() if live else None
 
     def end(self, card: PageState) -> None:
         """Show how it ended: the last picture and numbers stay, with this card. Waits, bounded,
         until a reader that is there has it."""
         with self._changed:
-            self._card, self._told_s = card, None
+            self._card, self._state_s = card, None
             read_s = self._read_s
             if read_s is not None and self._clock() - read_s < READS_S:
                 self._changed.wait_for(lambda: self._card_read or self.closed, LAST_READ_S)
@@ -138,8 +138,8 @@ class LivePage:
         else:
             stop = "requested" if self._stop_requested else "ready"
         fixed = {"title": self.title, "rate_hz": round(self.rate_hz(), 1), "stop": stop}
-        told_s, card = self._told_s, self._card
-        fixed["age_s"] = None if told_s is None else round(max(0.0, self._clock() - told_s), 2)
+        state_s, card = self._state_s, self._card
+        fixed["age_s"] = None if state_s is None else round(max(0.0, self._clock() - state_s), 2)
         fixed["card"] = card
         self._read_s = self._clock()
         return described | fixed | {"page_problem": self.problem}

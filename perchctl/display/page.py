@@ -37,7 +37,7 @@ class FlightPage:
         self._flying = False
         self._rescue = ""
         waiting = {"phase": "WAITING", "rows": [["reason", "vehicle and camera"]]}
-        page.tell(lambda: waiting, live=False)
+        page.set_state(lambda: waiting, live=False)
 
     @property
     def problem(self) -> str | None:
@@ -54,7 +54,7 @@ class FlightPage:
             if frame is not None:
                 self._frame = None
                 self.page.show(frame.index, sketch_of(frame, tick.output, self._axis_m))
-            self.page.tell(partial(flight_state, tick), live=not tick.state.phase.is_over)
+            self.page.set_state(partial(flight_state, tick), live=not tick.state.phase.is_over)
         except Exception as error:
             self.page.remember(error)
 

@@ -241,13 +241,13 @@ def test_a_profile_that_was_changed_meanwhile_is_not_written_to(
     printed all the same, also where the profile (None) is gone."""
     mine, text = Path("mine.yaml"), f"extends: crazyflie\n{changed}\n"
     mine.write_text("extends: crazyflie\n", encoding="utf-8")
-    solved = calibrate_mount.solved
+    solved = calibrate_mount.solve_mounting
 
     def long_work(*given: Any) -> MountingReport:
         mine.unlink() if changed is None else mine.write_text(text, encoding="utf-8")
         return solved(*given)
 
-    monkeypatch.setattr(calibrate_mount, "solved", long_work)
+    monkeypatch.setattr(calibrate_mount, "solve_mounting", long_work)
     words = ["-p", "mine.yaml", "--from", str(logs["both"]), "--part", "pivot", "--write"]
     result = mount(*words)
     assert result.exit_code == code, result.stderr

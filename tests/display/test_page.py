@@ -31,8 +31,8 @@ def test_the_page_needs_nothing_from_elsewhere(page: LivePage) -> None:
 
 
 def test_the_state_is_the_newest(page: LivePage) -> None:
-    page.tell(lambda: {"rows": [["a", "1"]], "note": ""})
-    page.tell(lambda: {"rows": [["a", "2"]], "note": "mirrored"})
+    page.set_state(lambda: {"rows": [["a", "1"]], "note": ""})
+    page.set_state(lambda: {"rows": [["a", "2"]], "note": "mirrored"})
     state = json.loads(ask(page.url, "/state")[1])
     assert state["rows"] == [["a", "2"]]
     assert state["note"] == "mirrored"
@@ -101,7 +101,7 @@ def test_what_fails_is_remembered_and_not_raised(page: LivePage) -> None:
     def broken() -> dict[str, Any]:
         raise RuntimeError("no words")
 
-    page.tell(broken)
+    page.set_state(broken)
     assert json.loads(ask(page.url, "/state")[1])["page_problem"] == "RuntimeError: no words"
     page.show(0, Sketch(np.zeros((2, 2, 2), np.uint8)))  # cannot be drawn
     assert b"image/jpeg" not in ask(page.url, "/stream")[1]

@@ -28,7 +28,7 @@ def test_stop_hangs_on_the_window_whatever_the_rows_say(width_px: int, browser: 
     """A row that wraps must not move it from under a finger."""
     page = LivePage(camera(), "perchctl fly sim://", on_stop=lambda: None)
     told = [["held", "word " * 300]]
-    page.tell(lambda: {"phase": "ASCEND", "rows": told, "note": "note " * 40}, live=False)
+    page.set_state(lambda: {"phase": "ASCEND", "rows": told, "note": "note " * 40}, live=False)
     try:
         browser.open(page.url, width_px, HEIGHT_PX)
         browser.until("document.body.innerText.includes('word word')")
@@ -52,13 +52,13 @@ def test_a_page_without_news_says_so_and_a_flight_that_is_over_shows_its_card(
     browser: Browser,
 ) -> None:
     page = LivePage(camera(), "perchctl fly sim://", on_stop=lambda: None)
-    page.tell(lambda: {"phase": "ASCEND", "rows": []})  # and never again
+    page.set_state(lambda: {"phase": "ASCEND", "rows": []})  # and never again
     card = {"outcome": "PERCHED", "good": True, "reason": "hanging", "rows": [["miss", "2 mm"]]}
     try:
         browser.open(page.url, 400, HEIGHT_PX)
         browser.until("document.body.classList.contains('old')")
         assert coloured_px(browser.photograph(), OLD_BGR) > 4_000  # the whole line
-        page.tell(lambda: {"phase": "PERCHED", "rows": [], "over": True}, live=False)
+        page.set_state(lambda: {"phase": "PERCHED", "rows": [], "over": True}, live=False)
         page.end(card)
         browser.until("!document.getElementById('card').hidden")
         shot = browser.photograph()

@@ -24,16 +24,12 @@ from perchctl.mission import (
     Operator,
     Outcome,
     Phase,
-    PlannerState,
-    Tick,
     Watcher,
 )
 from perchctl.profile import load_profile
 from perchctl.record import FlightSummary, LogWatcher
-from perchctl.vehicle import Idle
 from perchctl.vision import Detection, Detections, Frame, MarkerPose, PipelineOutput, Stage
-from tests.helpers.live_page import CORNERS, ask, stop
-from tests.helpers.log import telemetry
+from tests.helpers.live_page import CORNERS, ask, stop, tick
 from tests.helpers.mission import entered, note
 from tests.helpers.recording import camera
 
@@ -56,11 +52,6 @@ def page(clock: list[float]) -> Iterator[LivePage]:
 
 def state_of(page: LivePage) -> dict[str, Any]:
     return dict(json.loads(ask(page.url, "/state")[1]))
-
-
-def tick(t_s: float, phase: Phase = Phase.ALIGN, output: PipelineOutput | None = None) -> Tick:
-    state = PlannerState(phase=phase, entered_s=START_S, reason="pose is steady")
-    return Tick(t_s, telemetry(t_s, 0.6), output, None, state, Idle(), 0.0, 0.01, 0.012)
 
 
 def seen_in(frame: Frame) -> PipelineOutput:
@@ -95,10 +86,10 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
     assert source.poll(1.1) is None
     assert source.problem(1.1) == "silent"
     assert page.jpeg_after(0) is not None  # before the first tick too
-    flight.tick(tick(START_S + 1.5, output=seen_in(frame)))
+    flight.tick(tick(START_S + 1.5, entered_s=START_S, output=seen_in(frame)))
     state = state_of(page)
     assert state["phase"] == "ALIGN"
-    assert state["battery"] == f"{telemetry(START_S + 1.5, 0.6).battery_v:.2f} V"
+    assert state["battery"] == "3.71 V"
     assert ["phase", "ALIGN  1.5 s"] in state["rows"]
     newest = page.jpeg_after(1)
     assert newest is not None
@@ -114,7 +105,7 @@ def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
     flight.tick(None)  # type: ignore[arg-type]
     flight.event(note(0.0, "something"))
     assert flight.problem is None
-    flight.tick(tick(1.0, output="no output"))  # type: ignore[arg-type]
+    flight.tick(tick(1.0, output="no output"))
     state_of(page)
     assert page.problem is not None
 
@@ -142,7 +133,7 @@ def test_after_the_flight_nothing_is_due_and_nothing_to_stop(
     assert stop(page.url, page.token) == 200
     flight.tick(tick(START_S))
     assert state_of(page)["stop"] == "requested"
-    flight.tick(tick(START_S + 1.0, phase))
+    flight.tick(tick(START_S + 1.0, phase.value))
     clock[0] += 9.0
     state = state_of(page)
     assert (state["age_s"], state["stop"]) == (None, "over")

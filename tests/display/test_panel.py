@@ -10,51 +10,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from rich.console import Console
 from rich.text import Text
 
 from perchctl.display import open_panel
 from perchctl.display.panel import FlightPanel, PlainSurface, panel, status_rows
-from perchctl.mission import BatteryOutlook, ExternalPositions, Phase, PlannerState, Tick
+from perchctl.mission import BatteryOutlook, ExternalPositions, Phase, Tick
 from perchctl.record import LogWatcher, read_log
 from perchctl.record.fields import tick_record
 from perchctl.record.write import FlightLogWriter
-from perchctl.vehicle import ExternalPosition, PositionSetpoint
+from perchctl.vehicle import ExternalPosition
 from tests.helpers import log as synthetic
+from tests.helpers.live_page import tick
 from tests.helpers.mission import entered, held, note
-
-
-def tick(
-    t_s: float = 101.0, phase: str = "ALIGN", reason: str = "pose is steady", hold: str = "",
-    entered_s: float = 99.75, e_m: tuple[float, ...] | None = (-0.123, 0.045, 1.234),
-    e_yaw_rad: float = math.radians(-166.2), tracked: bool = True, battery_v: float = 3.714,
-    battery: BatteryOutlook | None = None, **changes: Any,
-) -> Tick:  # fmt: skip
-    """A moment of a flight."""
-    seen = None
-    if e_m is not None:
-        seen = replace(
-            synthetic.target(t_s, 1.0), e_m=np.array(e_m), e_yaw_rad=e_yaw_rad, tracked=tracked
-        )
-    state = PlannerState(
-        phase=Phase(phase), entered_s=entered_s, reason=reason, hold=hold, attempts=1,
-        ground_m=(0.0, 0.0, 0.1), battery=battery or BatteryOutlook(),
-    )  # fmt: skip
-    values: dict[str, Any] = {
-        "t_s": t_s,
-        "telemetry": replace(synthetic.telemetry(t_s, 0.92), battery_v=battery_v),
-        "output": None,
-        "target": seen,
-        "state": state,
-        "command": PositionSetpoint(1.0, 2.0, 0.5, 0.0),
-        "loop_late_s": 0.001,
-        "camera_age_s": 0.05,
-        "telemetry_age_s": 0.012,
-    }
-    return Tick(**(values | changes))
-
 
 ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 COLOUR = re.compile(r"\x1b\[[0-9;]*3[0-9]m")
@@ -255,6 +224,8 @@ def test_the_rows_of_a_moment() -> None:
     assert rows["markers"] == "both   attempts 1"
     assert rows["height"].startswith("0.82 m")
     assert rows["ages"] == "link 12 ms   camera 50 ms   loop late 1 ms"
+    rows = dict(status_rows(tick(tracked=False, e_yaw_rad=math.nan)))
+    assert rows["error"].endswith("yaw - deg   (not seen)")
     rows = dict(status_rows(tick(e_m=None, camera_age_s=math.inf)))
     assert (rows["error"], rows["markers"]) == ("no target seen yet", "none   attempts 1")
     assert rows["ages"].startswith("link 12 ms   camera none")

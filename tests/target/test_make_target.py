@@ -97,7 +97,7 @@ def test_a_refusal_is_one_sentence_and_leaves_nothing(
 
 
 @pytest.mark.parametrize("words", [
-    ("design", "--blur", "-1"), ("design", "--noise", "nan"), ("suggest", "--ceiling", "nan"),
+    ("design", "--blur", "-1"), ("suggest", "--ceiling", "nan"),
     ("sheet", "--ceiling", "2.4"), ("board", "chessboard:9x6:25mm", "--large", "15cm"),
     ("suggest", "--small", "2cm"), ("measured", "--tile", "a4"), ("board",),
 ])  # fmt: skip

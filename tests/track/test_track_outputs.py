@@ -72,13 +72,13 @@ def test_the_live_page_has_the_newest_numbers(
     pictures: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     states = []
-    tell = LivePage.tell
+    tell = LivePage.set_state
 
     def asked(self: LivePage, *describe: Any) -> None:
         tell(self, *describe)
         states.append(json.loads(ask(self.url, "/state")[1]))
 
-    monkeypatch.setattr(LivePage, "tell", asked)
+    monkeypatch.setattr(LivePage, "set_state", asked)
     tracked = track(pictures, "--view")
     assert [state["track"] for state in states] == tracked.lines
     assert [dict(state["rows"])["markers"] for state in states] == [
