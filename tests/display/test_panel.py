@@ -24,6 +24,7 @@ from perchctl.vehicle import ExternalPosition
 from tests.helpers import log as synthetic
 from tests.helpers.live_page import tick
 from tests.helpers.mission import entered, held, note
+from tests.helpers.waiting import until
 
 ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 COLOUR = re.compile(r"\x1b\[[0-9;]*3[0-9]m")
@@ -95,6 +96,7 @@ def test_a_new_phase_is_shown_without_waiting_and_the_last_one_stays(last: str) 
     reporter = FlightPanel(surface)
     reporter.tick(tick(100.0, "ASCEND"))
     reporter.event(entered(100.02, Phase(last), "over"))
+    until(lambda: len(surface.lines) == 2)  # the display sleeps again
     reporter.tick(tick(100.02, last))
     assert shown.wait(5.0)
     reporter.close()
