@@ -291,7 +291,6 @@ def measured(
     config = load_profile(profile)
     if not force:
         raise InvalidValue(f"{path} exists already; add --force to write the sizes into it")
-    check_place(path, force)
     nominal = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
     sides_m = {
         name: parse_length(text, f"--measured-{name}", bare_unit="mm")

@@ -285,6 +285,17 @@ def test_a_live_picture_that_repeats_is_no_frame_and_then_frozen() -> None:
     assert "snow" in snow.notes[0]
 
 
+@pytest.mark.parametrize("stills", [False, True])
+def test_a_video_is_filtered_and_a_still_is_as_measured(stills: bool) -> None:
+    following = tracker(live=False, stills=stills)
+    for i in range(3):
+        [seen] = following.results(Frame(i, i / 30.0, picture(moving(i), i)), i)
+    assert seen.output is not None
+    assert seen.target is not None
+    measured_m = seen.output.poses["joint"].tvec_m
+    assert np.array_equal(seen.target.tvec_m, measured_m) is stills
+
+
 def test_markers_that_contradict_are_named() -> None:
     sim = load_profile("sim")
     small = sim.target.small.model_copy(update={"side_m": 0.032})
