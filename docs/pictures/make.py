@@ -151,9 +151,10 @@ class Flight:
         target = None
         if r["ex_m"] is not None:
             e_m, tracked = np.array([r["ex_m"], r["ey_m"], r["ez_m"]]), bool(r["tracked"])
+            yaw_rad = np.nan if r["eyaw_rad"] is None else r["eyaw_rad"]
             target = TargetEstimate(
                 t_s, t_s, t_s, Stage(r["stage"] or "none"), tracked, tracked, 0, e_m,
-                r["eyaw_rad"], np.zeros(3), np.zeros(3), 0.0,
+                yaw_rad, np.zeros(3), np.zeros(3), 0.0,
             )  # fmt: skip
         battery = BatteryOutlook(
             r["battery_left_s"], r["battery_attempts"], r["battery_used_mah"], r["battery_rest_v"]
