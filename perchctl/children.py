@@ -31,7 +31,8 @@ _PREFACE = "import sys; sys.path.append(sys.argv[1]); "
 
 
 class Channel:
-    """One end. `receive` raises EOFError when the other end is gone."""
+    """One end of a connection between two processes, which carries pickled messages; `receive`
+    raises EOFError when the other end is gone."""
 
     def __init__(self, connection: socket.socket) -> None:
         self.socket = connection
@@ -42,7 +43,8 @@ class Channel:
         self.socket.sendall(struct.pack("<I", len(raw)) + raw)
 
     def receive(self, timeout_s: float | None = None) -> Any:
-        """Raises TimeoutError after `timeout_s` without a byte."""
+        """Return the next message. Raises TimeoutError after `timeout_s` without a byte, EOFError
+        when the other end is gone."""
         self.socket.settimeout(timeout_s)
         (length,) = struct.unpack("<I", self._exactly(4))
         return pickle.loads(self._exactly(length))
@@ -74,7 +76,8 @@ def listen() -> socket.socket:
 def accept(
     listener: socket.socket, token: str, timeout_s: float, still_there: Callable[[], bool]
 ) -> Channel | None:
-    """The child's connection; None when it does not come in time or has ended."""
+    """Return the connection of the child that knows the `token`; None if it does not come in time
+    or `still_there` says that it has ended."""
     end_s = time.monotonic() + timeout_s
     while time.monotonic() < end_s and still_there():
         try:
@@ -118,14 +121,14 @@ def spawn(code: str, output: int | IO[bytes]) -> subprocess.Popen[bytes]:
 
 
 def introduce(child: subprocess.Popen[bytes], listener: socket.socket, token: str) -> None:
-    """Tell the child where to connect, and with what."""
+    """Tell the child on its standard input where to connect, and with which token."""
     assert child.stdin is not None
     with contextlib.suppress(OSError), child.stdin:
         child.stdin.write(f"{listener.getsockname()[1]} {token}\n".encode())
 
 
 def connect_back() -> Channel:
-    """In the child: the connection to the parent that has introduced itself."""
+    """Return the child's connection to the parent that has introduced itself."""
     port, token = sys.stdin.readline().split()
     connection = socket.create_connection(("127.0.0.1", int(port)), timeout=10.0)
     connection.sendall(token.encode())
@@ -133,10 +136,9 @@ def connect_back() -> Channel:
 
 
 def end_with_parent(last: Callable[[], object] = lambda: None) -> None:
-    """In a process of `multiprocessing`: end as soon as its parent is gone, killed or not; work
-    that nobody waits for would go on. `last` is done before. It is here since this module loads at
-    once: asked for by one that loads the whole program, a process of a busy computer would first
-    do that."""
+    """End this process of `multiprocessing` as soon as its parent is gone, killed or not, since
+    nobody waits for its work; `last` is called before. The function is here since this module loads
+    at once: a busy computer takes long to load the whole program."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -150,7 +152,7 @@ def end_with_parent(last: Callable[[], object] = lambda: None) -> None:
 
 
 def end(child: subprocess.Popen[bytes], timeout_s: float) -> None:
-    """Wait until it has ended; kill it after `timeout_s`."""
+    """Wait until the child has ended; kill it after `timeout_s`."""
     try:
         child.wait(timeout_s)
     except subprocess.TimeoutExpired:
@@ -159,7 +161,7 @@ def end(child: subprocess.Popen[bytes], timeout_s: float) -> None:
 
 
 def last_line(output: IO[bytes]) -> str:
-    """The last line that a child has printed, with a colon before it, for a message."""
+    """Return the last line that a child has printed, with a colon before it, for a message."""
     if output.closed:
         return ""
     output.seek(0)

@@ -14,8 +14,8 @@ MOST_DECIMALS = 9
 
 
 def distinct_figures(found: float, limit: float, decimals: int) -> tuple[str, str]:
-    """A number that was found and its limit, for a message: `decimals` or as many as the limit
-    has, and more where both would look the same."""
+    """Return texts of a number that was found and of its limit, for a message: with `decimals` or
+    as many as the limit has, and with more if both would look the same."""
     own = -int(Decimal(f"{limit:g}").as_tuple().exponent)
     for count in range(min(max(decimals, own), MOST_DECIMALS), MOST_DECIMALS + 1):
         texts = f"{found:.{count}f}", f"{limit:.{count}f}"
@@ -41,17 +41,17 @@ def _install(extra: str) -> str:
 
 
 def no_simulator(missing: str | None = "mujoco") -> UsageError:
-    """Where the extra ``sim`` is not installed, of which `missing` is a part."""
+    """Return the error for a missing extra ``sim``, of which `missing` is a part."""
     return UsageError(f"the simulator is not installed ({missing} is missing); {_install('sim')}")
 
 
 def no_motion_capture(needed_by: str = "positioning by motion capture") -> UsageError:
-    """Where the extra ``mocap`` is not installed."""
+    """Return the error for a missing extra ``mocap``."""
     return UsageError(f"{needed_by} needs the library motioncapture; {_install('mocap')}")
 
 
 def broken_motion_capture(why: str) -> UsageError:
-    """Where the extra ``mocap`` is installed, and cannot be loaded."""
+    """Return the error for an extra ``mocap`` that is installed, and cannot be loaded."""
     return UsageError(
         f"the library motioncapture cannot be loaded: {why}; reinstall it with: "
         f"{sys.executable} -m pip install --force-reinstall 'perchctl[mocap]'"
@@ -59,12 +59,12 @@ def broken_motion_capture(why: str) -> UsageError:
 
 
 def no_parquet() -> UsageError:
-    """Where the extra ``parquet`` is not installed."""
+    """Return the error for a missing extra ``parquet``."""
     return UsageError(f"a .parquet file needs the library pyarrow; {_install('parquet')}")
 
 
 def no_cluster(why: str = "it is missing") -> UsageError:
-    """Where the extra ``cluster`` is not installed, or cannot be loaded."""
+    """Return the error for an extra ``cluster`` that is missing, or cannot be loaded."""
     return UsageError(f"--cluster needs the library distributed ({why}); {_install('cluster')}")
 
 
@@ -128,11 +128,11 @@ class Note(UserWarning):
 
 
 class CameraNote(Note):
-    """A camera was opened, and does not do all that it was asked."""
+    """Says that a camera was opened, and does not do all that it was asked."""
 
 
 class ProfileNote(Note):
-    """A profile was read, but one of its keys has another name by now, or is not used."""
+    """Says that a profile was read, but one of its keys has another name by now, or is not used."""
 
 
 ERROR_CLASSES: tuple[type[PerchError], ...] = (

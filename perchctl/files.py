@@ -13,8 +13,9 @@ from __future__ import annotations
 import os
 import secrets
 import stat
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 from perchctl.errors import InvalidValue
@@ -23,15 +24,15 @@ FORMAT = "the format that is written"
 
 
 def check_output(path: Path, suffixes: Sequence[str], force: bool, content: str = FORMAT) -> None:
-    """As `check_place`, and the name must end in one of `suffixes` (the case does not matter),
-    which the message says is `content`. Raises InvalidValue."""
+    """Raise InvalidValue if the name does not end in one of `suffixes` (the case does not matter),
+    which the message says is `content`, or if `check_place` does."""
     if path.suffix.lower() not in suffixes:
         raise InvalidValue(f"{path} must end in {' or '.join(suffixes)}, which is {content}")
     check_place(path, force)
 
 
 def check_place(path: Path, force: bool) -> None:
-    """Whether a file can be put there; to be called before any long work.
+    """Check that a file can be put there; to be called before any long work.
 
     Args:
         force: an existing file may be replaced.
@@ -53,68 +54,63 @@ def check_place(path: Path, force: bool) -> None:
 
 
 def same_file(one: Path, other: Path) -> bool:
-    """Whether both exist and are one and the same."""
+    """Return True if both exist and are one and the same."""
     return one.exists() and other.exists() and one.samefile(other)
 
 
 def cannot_be_written(
     path: Path, error: OSError, more: str = ": free some space, or choose another place"
 ) -> InvalidValue:
-    """The operating system's refusal as one sentence."""
+    """Return the operating system's refusal as an error of one sentence."""
     return InvalidValue(f"{path} cannot be written: {error.strerror or error}{more}")
 
 
-class PartFile:
-    """A file under a temporary name, until it is whole; its folder is made.
+@contextmanager
+def whole_file(path: Path, mode: int | None = None) -> Iterator[Path]:
+    """Yield a temporary path for the block to write a file to. As the block ends, the file is
+    brought to the disk and gets its place; after an error nothing is left.
 
-    `part` is the path to write to. It has the suffix of `path`, by which some libraries
-    choose the format. A file that is replaced keeps its permissions; a new one gets `mode`,
-    by default the system's. All methods raise OSError.
+    The temporary path has the suffix of `path`, by which some libraries choose the format; its
+    folder is made. A file that is replaced keeps its permissions; a new one gets `mode`, by
+    default the system's. Raises InvalidValue if the system refuses one of these steps.
     """
-
-    def __init__(self, path: Path, mode: int | None = None) -> None:
-        self.path = path
-        self._mode = mode_of(path) if path.exists() else mode
-        self.part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
-        self._made = [folder for folder in path.parents if not folder.exists()]
-        path.parent.mkdir(parents=True, exist_ok=True)
-
-    def write(self, data: bytes) -> None:
-        """The whole content at once."""
-        # Until it is whole nobody else reads what may not be for them.
-        mode = 0o666 if self._mode is None else 0o600
-        with open(self.part, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as stream:
-            stream.write(data)
-        self.sync()
-
-    def sync(self) -> None:
-        """Bring what was written to the disk."""
-        with self.part.open("r+b") as stream:
-            os.fsync(stream.fileno())
-
-    def keep(self) -> None:
-        """Put the file in its place."""
-        if self._mode is not None:
-            with suppress(OSError):  # some file systems have none to set
-                self.part.chmod(self._mode)
-        os.replace(self.part, self.path)
-        self._made.clear()
-
-    def drop(self) -> None:
-        """Remove the temporary file, if there is one, and the folders that were made for it."""
-        self.part.unlink(missing_ok=True)
+    part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
+    made = [folder for folder in path.parents if not folder.exists()]
+    try:
+        with _refusals_of(path):
+            mode = mode_of(path) if path.exists() else mode
+            path.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        with _refusals_of(path):
+            with part.open("r+b") as stream:
+                os.fsync(stream.fileno())
+            if mode is not None:
+                with suppress(OSError):  # some file systems have none to set
+                    part.chmod(mode)
+            os.replace(part, path)
+    except BaseException:
+        part.unlink(missing_ok=True)
         with suppress(OSError):  # something else was put into one
-            for folder in self._made:
+            for folder in made:
                 folder.rmdir()
+        raise
+
+
+@contextmanager
+def _refusals_of(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise cannot_be_written(path, error) from None
 
 
 def mode_of(path: Path) -> int:
-    """A file's permissions. Raises OSError."""
+    """Return a file's permissions. Raises OSError."""
     return stat.S_IMODE(path.stat().st_mode)
 
 
 def write_files(files: Mapping[Path, bytes], mode: int | None = None) -> None:
-    """Write all files, or none: the first is renamed when the last is on the disk.
+    """Write all files, or none: the first is renamed when the last is written.
 
     Args:
         mode: permissions of those that are new, by default the system's; one that is replaced
@@ -125,18 +121,13 @@ def write_files(files: Mapping[Path, bytes], mode: int | None = None) -> None:
     """
     for path in files:
         check_place(path, force=True)
-    parts: list[PartFile] = []
-    path = Path()
-    try:
-        with ExitStack() as undo:
-            for path, data in files.items():
-                parts.append(PartFile(path, mode))
-                undo.callback(parts[-1].drop)
-                parts[-1].write(data)
-            for part in parts:
-                path = part.path
-                part.keep()
-            undo.pop_all()
-    except OSError as error:
-        more = "; nothing was written: free some space, or choose another place"
-        raise cannot_be_written(path, error, more) from None
+    with ExitStack() as stack:
+        for path, data in files.items():
+            # Until it is whole, nobody else reads what may not be for them.
+            at_first = 0o666 if mode is None and not path.exists() else 0o600
+            part = stack.enter_context(whole_file(path, mode))
+            opener = partial(os.open, mode=at_first)
+            with _refusals_of(path), open(part, "xb", opener=opener) as stream:
+                stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())

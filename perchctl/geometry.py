@@ -32,24 +32,24 @@ R_MARKER_TARGET: Array = np.diag([1.0, -1.0, -1.0])
 
 
 def finite(values: Array) -> bool:
-    """Whether all values are (none so great that their squares' sum is not)."""
+    """Return True if all values are finite (and none so great that their squares' sum is not)."""
     flat = values.ravel()
     return math.isfinite(flat.dot(flat))
 
 
 def wrap_rad(angle_rad: float) -> float:
-    """The same angle in (-pi, pi]."""
+    """Return the same angle in (-pi, pi]."""
     return -((-angle_rad + math.pi) % (2.0 * math.pi) - math.pi)
 
 
 def rot_z(yaw_rad: float) -> Array:
-    """Rotation about z, shape (3, 3)."""
+    """Return the rotation about z, shape (3, 3)."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def rotation_from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
-    """``Rz(yaw) Ry(pitch) Rx(roll)``, shape (3, 3)."""
+    """Return ``Rz(yaw) Ry(pitch) Rx(roll)``, shape (3, 3)."""
     cr, sr = math.cos(roll_rad), math.sin(roll_rad)
     cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
     cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -63,7 +63,7 @@ def rotation_from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Arra
 
 
 def rpy_from_rotation(R: Array) -> tuple[float, float, float]:
-    """Inverse of `rotation_from_rpy` away from pitch = +-90 deg."""
+    """Return roll, pitch and yaw: the inverse of `rotation_from_rpy` away from pitch = +-90 deg."""
     return (
         math.atan2(R[2, 1], R[2, 2]),
         math.asin(max(-1.0, min(1.0, -float(R[2, 0])))),
@@ -72,12 +72,12 @@ def rpy_from_rotation(R: Array) -> tuple[float, float, float]:
 
 
 def yaw_of(R: Array) -> float:
-    """Heading of the rotated x axis in the xy plane, in (-pi, pi]."""
+    """Return the heading of the rotated x axis in the xy plane, in (-pi, pi]."""
     return math.atan2(R[1, 0], R[0, 0])
 
 
 def rotation_from_quaternion(quaternion: tuple[float, float, float, float]) -> Array:
-    """Of a unit quaternion (w, x, y, z), shape (3, 3)."""
+    """Return the rotation of a unit quaternion (w, x, y, z), shape (3, 3)."""
     w, x, y, z = quaternion
     return np.array(
         [
@@ -89,7 +89,8 @@ def rotation_from_quaternion(quaternion: tuple[float, float, float, float]) -> A
 
 
 def quaternion_from_rotation(R: Array) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z) with w >= 0: the inverse of `rotation_from_quaternion`.
+    """Return the unit quaternion (w, x, y, z) with w >= 0: the inverse of
+    `rotation_from_quaternion`.
 
     Row `k` of the products below is the quaternion times four times its own part `k`; the
     longest row is the one that no cancellation has spoilt.
@@ -114,7 +115,8 @@ def quaternion_from_rotation(R: Array) -> tuple[float, float, float, float]:
 def quaternion_from_rpy(
     roll_rad: float, pitch_rad: float, yaw_rad: float
 ) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z) of `rotation_from_rpy`, without a matrix on the way."""
+    """Return the unit quaternion (w, x, y, z) of `rotation_from_rpy`, without a matrix on the
+    way."""
     cr, sr = math.cos(0.5 * roll_rad), math.sin(0.5 * roll_rad)
     cp, sp = math.cos(0.5 * pitch_rad), math.sin(0.5 * pitch_rad)
     cy, sy = math.cos(0.5 * yaw_rad), math.sin(0.5 * yaw_rad)
@@ -127,7 +129,7 @@ def quaternion_from_rpy(
 
 
 def make_T(R: Array, t_m: Array | tuple[float, float, float]) -> Array:
-    """Homogeneous matrix of a rotation (3, 3) and a translation (3,)."""
+    """Return the homogeneous matrix of a rotation (3, 3) and a translation (3,)."""
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = t_m
@@ -135,7 +137,7 @@ def make_T(R: Array, t_m: Array | tuple[float, float, float]) -> Array:
 
 
 def invert_T(T_a_b: Array) -> Array:
-    """``T_b_a`` of a rigid ``T_a_b``."""
+    """Return ``T_b_a`` of a rigid ``T_a_b``."""
     R = T_a_b[:3, :3]
     T_b_a = np.eye(4)
     T_b_a[:3, :3] = R.T
@@ -144,7 +146,7 @@ def invert_T(T_a_b: Array) -> Array:
 
 
 def circular_mean(weights: Array, angles_rad: Array) -> float:
-    """Weighted mean of angles on the circle, in (-pi, pi]; weights sum to one.
+    """Return the weighted mean of angles on the circle, in (-pi, pi]; weights sum to one.
 
     Linear in the difference from the first angle, so that it equals the plain
     weighted sum wherever no wrap is crossed (the paper's equation 8).

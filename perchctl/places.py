@@ -11,13 +11,14 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def data_folder(kind: str) -> Path:
-    """Shipped `profiles` or `calib`: inside an installed wheel, or in the checkout."""
+    """Return the folder of shipped `profiles` or `calib`: inside an installed wheel, or in the
+    checkout."""
     shipped = _PACKAGE / "_data" / kind
     return shipped if shipped.is_dir() else _PACKAGE.parent / kind
 
 
 def data_file(kind: str, name: str) -> Path | None:
-    """A shipped or user file by name (with or without .yaml), or None."""
+    """Return a shipped or user file by name (with or without .yaml), or None."""
     for folder in (user_config_folder() / kind, data_folder(kind)):
         for candidate in (folder / name, folder / f"{name}.yaml"):
             if candidate.is_file():
@@ -26,28 +27,29 @@ def data_file(kind: str, name: str) -> Path | None:
 
 
 def file_names(kind: str) -> list[str]:
-    """Names of the files of that kind that can be named without a path."""
+    """Return the names of the files of that kind that can be named without a path."""
     folders = (data_folder(kind), user_config_folder() / kind)
     return sorted({p.stem for f in folders if f.is_dir() for p in f.glob("*.yaml")})
 
 
 def user_config_folder() -> Path:
-    """For the user's own profiles and calibrations, by the XDG rules."""
+    """Return the folder of the user's own profiles and calibrations, by the XDG rules."""
     return Path(platformdirs.user_config_dir("perchctl", appauthor=False))
 
 
 def user_runtime_folder() -> Path:
-    """For what lives no longer than a session. Nothing is made, and nothing may be there."""
+    """Return the folder for what lives no longer than a session. It is not made, and may not
+    exist."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # where the system names none, another is taken
         return Path(platformdirs.user_runtime_dir("perchctl", appauthor=False))
 
 
 def user_cache_folder() -> Path:
-    """For what can be made anew, by the XDG rules."""
+    """Return the folder for what can be made anew, by the XDG rules."""
     return Path(platformdirs.user_cache_dir("perchctl", appauthor=False))
 
 
 def user_state_folder() -> Path:
-    """For what was found out, and is not made anew by itself."""
+    """Return the folder for results that are not made anew by themselves."""
     return Path(platformdirs.user_state_dir("perchctl", appauthor=False))

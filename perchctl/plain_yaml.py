@@ -16,7 +16,7 @@ _MOST_SHOWN = 60
 
 
 def parse_yaml(text: str) -> Any:
-    """The value that the text holds, None for an empty one.
+    """Return the value that the text holds, None for an empty one.
 
     Raises ValueError, with a sentence, for what is not YAML, holds a key twice or unfolds
     to more than `MOST_VALUES`.
@@ -40,8 +40,8 @@ def parse_yaml(text: str) -> Any:
 
 
 def split_values(text: str) -> list[str]:
-    """The texts of values that commas stand between, as in a list: a value may be a list itself.
-    Raises ValueError as `parse_yaml` does."""
+    """Return the texts of values that commas stand between, as in a list: a value may be a list
+    itself. Raises ValueError as `parse_yaml` does."""
     row = f"[{text}]"
     parse_yaml(row)
     node = yaml.compose(row, yaml.SafeLoader)
@@ -50,12 +50,13 @@ def split_values(text: str) -> list[str]:
 
 
 def clip_text(text: str, most: int = _MOST_SHOWN) -> str:
-    """The text, or its beginning where it is longer than anybody reads."""
+    """Return the text, or its beginning if it is longer than anybody reads."""
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def _count(node: yaml.Node, counts: dict[int, int]) -> int:
-    """Keys and values below a node. Raises ValueError for too many, and for a key twice."""
+    """Return the number of keys and values below a node. Raises ValueError for too many, and for a
+    key twice."""
     if isinstance(node, yaml.ScalarNode):
         return 1
     if (known := counts.get(id(node))) is not None:

@@ -30,7 +30,7 @@ FORMATS = tuple(_METADATA)
 
 
 def new_figure(width_in: float, height_in: float, dpi: float = DPI) -> Figure:
-    """An empty figure whose panels do not overlap."""
+    """Return an empty figure whose panels do not overlap."""
     figure = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained")
     FigureCanvasAgg(figure)
     return figure

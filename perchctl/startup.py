@@ -17,25 +17,25 @@ SENTENCE = "Ctrl-C"
 
 
 def leave_at_ctrl_c() -> None:
-    """From now on, unless Ctrl-C is ignored or somebody else's already."""
+    """Leave at Ctrl-C from now on, unless it is ignored or somebody else's already."""
     if _is_main() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
 
 
 def _is_main() -> bool:
-    """Whether this is the thread that may have signals."""
+    """Return True if this is the thread that may have signals."""
     threading = sys.modules.get("threading")
     return threading is None or threading.current_thread() is threading.main_thread()
 
 
-def loaded() -> None:
-    """From now on Ctrl-C is a KeyboardInterrupt again."""
+def restore_ctrl_c() -> None:
+    """Make Ctrl-C a KeyboardInterrupt again from now on."""
     if signal.getsignal(signal.SIGINT) is _leave:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def failure_record(sentence: str, code: int) -> str:
-    """What `--json` prints in place of a result."""
+    """Return what `--json` prints in place of a result."""
     import json
 
     return json.dumps({"error": sentence, "exit_code": code})

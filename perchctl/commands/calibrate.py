@@ -47,21 +47,19 @@ from perchctl.camera import (
 from perchctl.commands.calibrate_mount import mount
 from perchctl.commands.command_line import (
     CamOption,
-    Command,
     ForceOption,
     Group,
     JsonOption,
     ViewOption,
     ViewPortOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
-from perchctl.commands.guide import guide
-from perchctl.commands.interrupt import Stopper, drawn
-from perchctl.commands.output import print_record, say
-from perchctl.commands.page import live_page, page_port
+from perchctl.commands.guide import guide, page_port
+from perchctl.commands.interrupt import Stopper, draw_unless_interrupted
+from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import search_bar
+from perchctl.display import live_page
 from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files
 from perchctl.target import NOTABLE_SCALE_ERROR, Board, mm_text, parse_board
@@ -122,15 +120,12 @@ OutputOption = Annotated[
 app = new_app(Group)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl calibrate images:board",
-        "perchctl calibrate camera:0 --view",
-        "perchctl calibrate left*.jpg --board chessboard:9x6:25mm",
-    ),
+@command(
+    app,
+    "perchctl calibrate images:board",
+    "perchctl calibrate camera:0 --view",
+    "perchctl calibrate left*.jpg --board chessboard:9x6:25mm",
 )
-@reporting
 def camera(
     source: SourceArgument,
     board: BoardOption = DEFAULT_BOARD,
@@ -150,7 +145,7 @@ def camera(
             rich_help_panel=DETAILS,
         ),
     ] = "auto",
-) -> int:
+) -> None:
     """Calibrate the camera, and report what its error means in mm at the target.
 
     A view is rejected when its RMS is above 2.5 times the median view's, a corner when it is off
@@ -164,7 +159,8 @@ def camera(
     layout = _measured_board(board, measured)
 
     def kept_in(size_px: tuple[int, int]) -> Path:
-        """The folder for a live camera's pictures; raises before a person has worked for them."""
+        """Return the folder for a live camera's pictures; raises before a person has worked for
+        them."""
         file = _file(output, name, size_px)
         _check_output(file, force)
         return _free_folder(file)
@@ -178,34 +174,25 @@ def camera(
     write_files({file: result.text(name, _now()).encode()})
     for line in result.lines():
         say(line)
-    report = drawn(lambda: _draw(result, file.with_suffix(".png")))
+    report = draw_unless_interrupted(lambda: _draw(result, file.with_suffix(".png")))
     say(f"wrote {file}" + ("" if report is None else f" and {report}"))
-    if as_json:
-        print_record(result.record(file, report))
-    else:
-        print(file)
-    return 0
+    print_result(result.record(file, report) if as_json else file)
 
 
-app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl calibrate mount -p mine.yaml -u radio://0/80/2M/E7E7E7E7E7",
-        "perchctl calibrate mount -p mine.yaml --from mounting.jsonl --write",
-        "perchctl calibrate mount --truth sim --seed 3",
-    ),
+command(
+    app,
+    "perchctl calibrate mount -p mine.yaml -u radio://0/80/2M/E7E7E7E7E7",
+    "perchctl calibrate mount -p mine.yaml --from mounting.jsonl --write",
+    "perchctl calibrate mount -p mine.yaml --part pivot --source camera:0",
 )(mount)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl calibrate mask images:turned",
-        "perchctl calibrate mask camera:0 -o gear.png",
-        "perchctl calibrate mask video:turned.mp4 -o gear.png --force",
-    ),
+@command(
+    app,
+    "perchctl calibrate mask images:turned",
+    "perchctl calibrate mask camera:0 -o gear.png",
+    "perchctl calibrate mask video:turned.mp4 -o gear.png --force",
 )
-@reporting
 def mask(
     source: SourceArgument,
     output: Annotated[
@@ -214,7 +201,7 @@ def mask(
     force: ForceOption = False,
     size: SizeOption = None,
     as_json: JsonOption = False,
-) -> int:
+) -> None:
     """Learn what the vehicle itself covers of the picture, while it is turned about."""
     pictures = _source(source, size)
     check_output(output, (".png",), force, "a mask's format")
@@ -224,7 +211,7 @@ def mask(
         stop = stack.enter_context(Stopper().installed())
         if frames.live:
             say(f"turn the vehicle about for {MASK_S:g} s (Ctrl-C ends and writes the mask)")
-        gear = learn_gear(_watched(frames, stop.requested.is_set))
+        gear = learn_gear(_mask_pictures(frames, stop.requested.is_set))
     write_files({output: gear.png()})
     say(
         f"wrote {output}: the vehicle covers {100 * gear.share:.1f} % of the picture, by "
@@ -233,21 +220,17 @@ def mask(
     if as_json:
         height, width = gear.covered.shape
         record = {"file": str(output), "covered": round(gear.share, 4)}
-        print_record(record | {"pictures": gear.pictures, "size_px": [width, height]})
+        print_result(record | {"pictures": gear.pictures, "size_px": [width, height]})
     else:
         print(output)
-    return 0
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl calibrate check camera.yaml images:board",
-        "perchctl calibrate check camera.yaml camera:0 --view",
-        "perchctl calibrate check camchain.yaml images:april --cam cam0",
-    ),
+@command(
+    app,
+    "perchctl calibrate check camera.yaml images:board",
+    "perchctl calibrate check camera.yaml camera:0 --view",
+    "perchctl calibrate check camchain.yaml images:april --cam cam0",
 )
-@reporting
 def check(
     calibration: Annotated[Path, typer.Argument(help="The calibration file to judge.")],
     source: SourceArgument,
@@ -276,22 +259,16 @@ def check(
     for item in result.rejections:
         say(f"left out {item.view}: {item.reason}")
     say(f"{'PASS' if result.passed else 'FAIL'}: {calibration}: {result.reason}")
-    if as_json:
-        print_record(result.record(calibration))
-    else:
-        print("pass" if result.passed else "fail")
+    print_result(result.record(calibration) if as_json else "pass" if result.passed else "fail")
     return 0 if result.passed else PerchError.exit_code
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl calibrate convert opencv.yaml",
-        "perchctl calibrate convert camchain.yaml --cam cam0 -o mine.yaml",
-        "perchctl calibrate convert ost.yaml --name fpv",
-    ),
+@command(
+    app,
+    "perchctl calibrate convert opencv.yaml",
+    "perchctl calibrate convert camchain.yaml --cam cam0 -o mine.yaml",
+    "perchctl calibrate convert ost.yaml --name fpv",
 )
-@reporting
 def convert(
     calibration: Annotated[Path, typer.Argument(help="A file of OpenCV, Kalibr or ROS.")],
     output: OutputOption = None,
@@ -299,7 +276,7 @@ def convert(
     cam: CamOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
-) -> int:
+) -> None:
     """Write another program's calibration as perchctl's file."""
     _check_name(name)
     model = load_calibration(calibration, cam=cam)
@@ -310,11 +287,7 @@ def convert(
     notes = {"date": _now(), "converted_from": calibration.name}
     write_files({file: camera_text(model, name, notes).encode()})
     say(f"wrote {file} ({model.model}, {model.size_px[0]}x{model.size_px[1]} px)")
-    if as_json:
-        print_record(camera_record(model) | {"file": str(file)})
-    else:
-        print(file)
-    return 0
+    print_result(camera_record(model) | {"file": str(file)} if as_json else file)
 
 
 # -- files --------------------------------------------------------------------
@@ -335,7 +308,7 @@ def _check_output(file: Path, force: bool) -> None:
 
 
 def _free_folder(file: Path) -> Path:
-    """The first folder for pictures beside the file that does not exist yet."""
+    """Return the first folder for pictures beside the file that does not exist yet."""
     names = (f"{file.stem}_pictures{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
     return next(folder for name in names if not (folder := file.with_name(name)).exists())
 
@@ -363,28 +336,28 @@ class Source:
     size_px: tuple[int, int] | None = None  # asked of a camera of this computer
 
     def __str__(self) -> str:
-        """How messages name it."""
+        """Return the name of the source in messages."""
         if self.files:
             return f"{self.files[0]} and {len(self.files) - 1} more"
         return without_password(self.spec)
 
     @property
     def scheme(self) -> str:
-        """``images``, ``video``, or a live source's."""
+        """The part before the colon: ``images``, ``video``, or a live source's."""
         return self.spec.partition(":")[0]
 
     @property
     def place(self) -> str:
-        """What stands behind the scheme: a path, for ``images`` and ``video``."""
+        """The part behind the colon: a path, for ``images`` and ``video``."""
         return str(Path(self.spec.partition(":")[2]).expanduser())
 
     def open(self) -> FrameSource:
-        """Its frames, of a live source too. Errors: those of `open_camera`."""
+        """Open the source. Errors: those of `open_camera`."""
         return open_camera(self.files or self.spec, time.monotonic, size_px=self.size_px)
 
 
 def _source(words: Sequence[str], size: str | None, view: bool = False) -> Source:
-    """The source that the command line names; several words are picture files, which is what
+    """Return the source that the command line names; several words are picture files, which is what
     a shell makes of ``left*.jpg``. Raises NotFound, InvalidValue, UsageError."""
     if len(words) == 1:
         source = Source(parse_source(words[0], files=True).spec)
@@ -395,7 +368,7 @@ def _source(words: Sequence[str], size: str | None, view: bool = False) -> Sourc
         source = Source("images:", files)
     if view and not parse_source(source.spec).live:
         raise UsageError(f"{source} is no live camera: --view does not apply; leave it out")
-    return sized(source, size)
+    return with_size(source, size)
 
 
 def _check_picture(file: Path) -> None:
@@ -408,8 +381,8 @@ def _check_picture(file: Path) -> None:
         )
 
 
-def sized(source: Source, text: str | None) -> Source:
-    """The source with `--size`. Raises InvalidValue, UsageError."""
+def with_size(source: Source, text: str | None) -> Source:
+    """Return the source with `--size`. Raises InvalidValue, UsageError."""
     if text is None:
         return source
     found = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text)
@@ -420,8 +393,8 @@ def sized(source: Source, text: str | None) -> Source:
     return replace(source, size_px=(int(found[1]), int(found[2])))
 
 
-def _watched(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]:
-    """The pictures of a recording, or of a live camera for `MASK_S`."""
+def _mask_pictures(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]:
+    """Yield the pictures of a recording, or of a live camera for `MASK_S`."""
     start_s = time.monotonic()
     for now_s, frame in polled(source, time.monotonic, time.sleep):
         if stopped() or (source.live and now_s - start_s > MASK_S):
@@ -434,8 +407,8 @@ def _watched(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]
 
 
 def _measured_board(notation: str, measured: str | None) -> Board:
-    """The board, with its black area's measured sides compared with those that it was meant to
-    have. Raises NotFound, InvalidValue."""
+    """Return the board with the measured sides of its black area, after a comparison with those
+    that it was meant to have. Raises NotFound, InvalidValue."""
     board = parse_board(notation)
     if measured is None:
         return board
@@ -457,7 +430,7 @@ def _find_views(
     kept_in: Callable[[tuple[int, int]], Path | None],
     port: int | None,
 ) -> tuple[list[BoardView], list[Rejection]]:
-    """The views, at least one, and the pictures without a board.
+    """Return the views, at least one, and the pictures without a board.
 
     Args:
         kept_in: the folder for a live camera's pictures (None: they are not kept), by their size;
@@ -468,7 +441,7 @@ def _find_views(
         frames = source.open()
         with contextlib.closing(frames):
             assert frames.size_px is not None  # the first frame is there
-            return captured_views(frames, board, kept_in(frames.size_px), port), []
+            return capture_live_views(frames, board, kept_in(frames.size_px), port), []
     with search_bar("searching the board") as progress:
         if source.scheme == "images":
             files = image_files(source.files or source.place)
@@ -485,10 +458,10 @@ def _find_views(
     return views, missing
 
 
-def captured_views(
+def capture_live_views(
     source: FrameSource, board: Board, folder: Path | None, port: int | None
 ) -> list[BoardView]:
-    """Views of a live camera, taken until all is covered or Ctrl-C ends it.
+    """Return views of a live camera, taken until all is covered or Ctrl-C ends it.
 
     Args:
         folder: gets their pictures, each as it is taken; None: they are not kept.
@@ -497,19 +470,37 @@ def captured_views(
     Raises:
         InvalidValue: no view was taken. Those of `capture_views`.
     """
-    keeper = _Keeper(folder)
+    kept: list[Path] = []
+
+    def keep(picture: Grey) -> None:
+        """Write the picture; those that cannot be kept are still calibrated from."""
+        nonlocal folder
+        if folder is None:
+            return
+        path = folder / f"view_{len(kept) + 1:03d}.png"
+        try:
+            write_files({path: cv2.imencode(".png", picture)[1].tobytes()})
+            kept.append(path)
+        except InvalidValue as error:
+            folder = None
+            say(f"pictures are no longer kept: {error}")
+
+    def report_kept() -> None:
+        if kept:
+            say(f"kept {len(kept)} pictures: images:{kept[0].parent} takes them again")
+
     with contextlib.ExitStack() as stack:
-        stack.callback(keeper.report)
+        stack.callback(report_kept)
         stop = stack.enter_context(Stopper().installed())
         # The page draws the picture and its corners, but no axes: any camera serves.
         any_camera = CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
-        page = stack.enter_context(live_page(any_camera, "perchctl calibrate", port))
+        page = stack.enter_context(live_page(any_camera, "perchctl calibrate", port, say))
         show = stack.enter_context(guide(page))
         say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
 
         def seen(moment: Moment) -> None:
             if moment.taken:
-                keeper.keep(moment.image)
+                keep(moment.image)
             show(moment)
 
         views = capture_views(source, board, seen, stopped=stop.requested.is_set)
@@ -518,29 +509,3 @@ def captured_views(
             f"no view of the board {board.notation()} was taken from {source.describe()}"
         )
     return views
-
-
-class _Keeper:
-    """Writes each picture as it is taken."""
-
-    def __init__(self, folder: Path | None) -> None:
-        self._folder = folder
-        self._kept = 0
-        self._failed = False
-
-    def keep(self, picture: Grey) -> None:
-        """Never raises: pictures that cannot be kept are still calibrated from."""
-        if self._folder is None or self._failed:
-            return
-        png = cv2.imencode(".png", picture)[1].tobytes()
-        try:
-            write_files({self._folder / f"view_{self._kept + 1:03d}.png": png})
-            self._kept += 1
-        except InvalidValue as error:
-            self._failed = True
-            say(f"pictures are no longer kept: {error}")
-
-    def report(self) -> None:
-        """Says where the pictures are."""
-        if self._kept:
-            say(f"kept {self._kept} pictures: images:{self._folder} takes them again")

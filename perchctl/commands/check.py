@@ -15,16 +15,14 @@ from perchctl.camera import ConnectedCamera, find_cameras
 from perchctl.check import CheckScope, Row, Verdict, scan_rows
 from perchctl.check import check as check_rows
 from perchctl.commands.command_line import (
-    Command,
     ProfileOption,
     SourceOption,
     UriOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
 from perchctl.commands.fly import resolve
-from perchctl.commands.interrupt import interruptible, unheeded
+from perchctl.commands.interrupt import ignore_signals, interruptible
 from perchctl.commands.output import say
 from perchctl.errors import (
     ConnectionFailed,
@@ -44,15 +42,12 @@ EXIT_CODE_OF = {"address": ConnectionFailed.exit_code, "camera": NotFound.exit_c
 app = new_app()
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl check -p my_vehicle.yaml",
-        "perchctl check -p my_vehicle.yaml --lift",
-        "perchctl check --scan",
-    ),
+@command(
+    app,
+    "perchctl check -p my_vehicle.yaml",
+    "perchctl check -p my_vehicle.yaml --lift",
+    "perchctl check --scan",
 )
-@reporting
 def check(
     profile: ProfileOption = "sim",
     uri: UriOption = None,
@@ -105,7 +100,7 @@ def check(
 
 
 def _scanned(uri: str | None) -> Iterator[Row]:
-    """The scan as an iterator, so that Ctrl-C may end it."""
+    """Yield the rows of the scan, so that Ctrl-C may end it."""
     yield from scan_rows(uri)
 
 
@@ -123,7 +118,7 @@ def report(rows: Iterable[Row], as_json: bool) -> int:
         if found and not as_json:
             print(table(found, finished=False))
         raise
-    with unheeded():
+    with ignore_signals():
         if as_json:
             print(json.dumps([asdict(row) for row in found]))
         elif found:
@@ -135,7 +130,7 @@ def report(rows: Iterable[Row], as_json: bool) -> int:
 
 
 def exit_code(rows: Sequence[Row]) -> int:
-    """Of the first failing row; 0 when nothing fails."""
+    """Return the exit code of the first failing row; 0 if nothing fails."""
     for row in rows:
         if row.verdict is Verdict.FAIL:
             return EXIT_CODE_OF.get(row.name, SafetyAbort.exit_code)
@@ -143,7 +138,7 @@ def exit_code(rows: Sequence[Row]) -> int:
 
 
 def table(rows: Sequence[Row], finished: bool = True) -> str:
-    """At 80 columns: verdict, name, what was found, and below it what to do.
+    """Return the rows at 80 columns: verdict, name, what was found, and below it what to do.
 
     Rows that were skipped for one and the same reason share a line. Of a check that did not come
     to its end nothing good is said.
@@ -202,7 +197,7 @@ def list_cameras(as_json: bool, known: Sequence[ConnectedCamera] | None = None) 
 
 
 def camera_lines(camera: ConnectedCamera) -> list[str]:
-    """For people."""
+    """Return the lines that describe a camera to people."""
     lines = [f"{camera.source}  {camera.name or '(no name)'}"]
     if camera.stable_path:
         lines.append(f"  {camera.stable_path}")

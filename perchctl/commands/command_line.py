@@ -29,7 +29,7 @@ from perchctl.errors import (
     PerchError,
     UsageError,
 )
-from perchctl.startup import failure_record, loaded
+from perchctl.startup import failure_record, restore_ctrl_c
 
 # \b keeps the lines of a paragraph as they are.
 EXIT_TABLE = "\b\nExit codes:\n" + "\n".join(
@@ -79,7 +79,7 @@ class Command(TyperCommand):
 
 
 class Group(TyperGroup):
-    """Subcommands, of which the first is the main one: it is done where none is named."""
+    """A group of subcommands, of which the first is the main one: it runs if none is named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if ctx.resilient_parsing:  # a shell asks for what may come
@@ -89,7 +89,7 @@ class Group(TyperGroup):
         return super().parse_args(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """That of the main subcommand, with the others listed below it."""
+        """Write the help of the main subcommand, with the others listed below it."""
         name, main_command = next(iter(self.commands.items()))
         inner = typer.Context(main_command, info_name=ctx.info_name, parent=ctx.parent, **_SETTINGS)
         main_command.format_usage(inner, formatter)
@@ -125,12 +125,12 @@ class _Commands(TyperGroup):
         return _Unloaded(cmd_name, short_help=COMMANDS[cmd_name])
 
     def invoke(self, ctx: Any) -> Any:
-        with reported("--json" in ctx.args):
+        with report_failures("--json" in ctx.args):
             return super().invoke(ctx)
 
 
 def new_app(cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
-    """The application of a subcommand, or with `cls=Group` of a group of them."""
+    """Return the application of a subcommand, or with `cls=Group` of a group of them."""
     # Without rich's panels: they cut what is longer than a cell, and leave a narrow one for it.
     return typer.Typer(
         cls=cls,
@@ -144,9 +144,30 @@ def new_app(cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
 app = new_app(_Commands)
 
 
-def examples(*lines: str) -> str:
-    """The end of a subcommand's help; \\b keeps the lines as they are."""
-    return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
+P = ParamSpec("P")
+
+
+def command(
+    group: typer.Typer, *examples: str, ending: str = "", **settings: Any
+) -> Callable[[Callable[P, int | None]], Callable[P, None]]:
+    """Return the decorator that makes a function a subcommand of `group`, whose help ends with the
+    examples and `ending`. The function returns the exit code, None for 0; the program leaves
+    with it. `settings` are typer's."""
+    # \b keeps the lines as they are.
+    lines = "\n".join(["\b", "Examples:", *(f"  {line}" for line in examples)])
+    epilog = f"{lines}\n\n{ending}"
+
+    def add(run: Callable[P, int | None]) -> Callable[P, None]:
+        @functools.wraps(run)
+        def do(*args: P.args, **kwargs: P.kwargs) -> None:
+            restore_ctrl_c()
+            code = run(*args, **kwargs)
+            sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
+            raise typer.Exit(code or 0)
+
+        return group.command(cls=Command, epilog=epilog, **settings)(do)
+
+    return add
 
 
 ProfileOption = Annotated[
@@ -195,7 +216,7 @@ CamOption = Annotated[
 def main() -> Any:
     """Run the command line; returns the exit code."""
     try:
-        with reported():  # what fails outside of a subcommand, as the help on a full disk
+        with report_failures():  # what fails outside of a subcommand, as the help on a full disk
             try:
                 app()
             finally:
@@ -209,26 +230,10 @@ def main() -> Any:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-P = ParamSpec("P")
-
-
-def reporting(run: Callable[P, int]) -> Callable[P, None]:
-    """The function of a subcommand, which returns its exit code; the program leaves with it."""
-
-    @functools.wraps(run)
-    def do(*args: P.args, **kwargs: P.kwargs) -> None:
-        loaded()
-        code = run(*args, **kwargs)
-        sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
-        raise typer.Exit(code)
-
-    return do
-
-
 @contextlib.contextmanager
-def reported(as_json: bool = False) -> Iterator[None]:
-    """Turns every failure into one sentence on stderr, an object on stdout where one is
-    wanted, and its exit code, and each note on the profile into one sentence."""
+def report_failures(as_json: bool = False) -> Iterator[None]:
+    """Turn every failure of the block into one sentence on stderr, if wanted an object on stdout,
+    and its exit code, and each note on the profile into one sentence."""
     try:
         with _notes():
             yield
@@ -276,14 +281,14 @@ def _print_failure(sentence: str, code: int) -> None:
 
 
 def _drop_stdout() -> None:
-    """What is left in the buffer must not fail again at the program's end."""
+    """Discard what stdout still holds, so that it does not fail again at the program's end."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _place_refused(error: Exception) -> str | None:
-    """The operating system's refusal of a place, of which nobody closer has told; a full disk
-    has the same exit code everywhere."""
+    """Return the sentence for a place that the operating system refused, if no caller has written
+    one; a full disk has the same exit code everywhere."""
     if not isinstance(error, OSError):
         return None
     if error.errno in _NO_ROOM:
@@ -298,7 +303,7 @@ def _place_refused(error: Exception) -> str | None:
 
 @contextlib.contextmanager
 def _notes() -> Iterator[None]:
-    """Prints each different `Note` once; other warnings go where they went before."""
+    """Print each different `Note` of the block once; other warnings go where they went before."""
     printed: set[str] = set()
 
     with warnings.catch_warnings():

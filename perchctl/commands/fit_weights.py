@@ -15,16 +15,14 @@ import typer
 from perchctl.calibration import profile_camera
 from perchctl.camera import open_camera
 from perchctl.commands.command_line import (
-    Command,
     ForceOption,
     Group,
     JsonOption,
     ProfileOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
-from perchctl.commands.output import print_record, say
+from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import count_bar
 from perchctl.errors import NotFound, PerchError, UsageError, no_simulator
 from perchctl.files import check_output, same_file
@@ -46,15 +44,12 @@ from perchctl.weights import (
 app = new_app(Group)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl fit-weights session.csv -p sim",
-        "perchctl fit-weights session.csv --test other.csv",
-        "perchctl fit-weights session.csv -o weights.yaml --method lms",
-    ),
+@command(
+    app,
+    "perchctl fit-weights session.csv -p sim",
+    "perchctl fit-weights session.csv --test other.csv",
+    "perchctl fit-weights session.csv -o weights.yaml --method lms",
 )
-@reporting
 def fit(
     data: Annotated[
         list[Path] | None, typer.Argument(help="CSV files, as fit-weights collect writes them.")
@@ -116,15 +111,16 @@ def fit(
     code = 0 if problem is None else problem.exit_code
     if as_json:
         failure = {} if problem is None else {"error": str(problem), "exit_code": code}
-        print_record(weights_record(result) | {"weights_file": file and str(file)} | failure)
+        print_result(weights_record(result) | {"weights_file": file and str(file)} | failure)
     return code
 
 
 def _place_for_weights(
     profile: Profile, output: Path | None, recommended: bool, anyway: bool, force: bool
 ) -> Path | None:
-    """Where the weights are to be written: `-o`, else the profile's file; None, with a sentence,
-    where they are not. Raises PerchError where `-o` names a file, and they are not recommended."""
+    """Return where the weights are to be written: `-o`, else the profile's file; None, after a
+    sentence, if they are not written. Raises PerchError if `-o` names a file and the weights are
+    not recommended."""
     place = output or _profile_file(profile)
     if place is None:
         say(
@@ -149,7 +145,7 @@ def _place_for_weights(
 
 
 def _profile_file(profile: Profile) -> Path | None:
-    """Where the profile's weights file is, or shall be."""
+    """Return the path of the profile's weights file, which may not exist yet."""
     name = profile.merge.weights_file
     if name is None:
         return None
@@ -165,15 +161,12 @@ def _profile_file(profile: Profile) -> Path | None:
 # --- collect -----------------------------------------------------------------------------------
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl fit-weights collect session.csv -p sim --truth sim",
-        "perchctl fit-weights collect session.csv -p my_vehicle.yaml",
-        "perchctl fit-weights collect session.csv -p lab.yaml --truth mocap",
-    ),
+@command(
+    app,
+    "perchctl fit-weights collect session.csv -p sim --truth sim",
+    "perchctl fit-weights collect session.csv -p my_vehicle.yaml",
+    "perchctl fit-weights collect session.csv -p lab.yaml --truth mocap",
 )
-@reporting
 def collect(
     session: Annotated[Path, typer.Argument(help="The CSV; an unfinished one goes on.")],
     profile: ProfileOption = "sim",
@@ -191,7 +184,7 @@ def collect(
         str, typer.Option("--target-body", help="Rigid body of the target, for --truth mocap.")
     ] = "target",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the places of --truth sim.")] = 0,
-) -> int:
+) -> None:
     """Collect the data of a fit: poses of both markers at places whose actual pose is known.
 
     A person places the camera, and gives the actual pose; with --truth mocap the profile's motion
@@ -207,7 +200,6 @@ def collect(
         with closing(poses):
             _collect_with_person(session, config, camera, positions, frames, poses, source)
     say(f"{session} is complete: perchctl fit-weights {session} -p {profile} fits the weights")
-    return 0
 
 
 def _open_session(path: Path, frames: int) -> SessionFile:
@@ -261,7 +253,7 @@ def _collect_with_person(
 
 
 def _open_capture(profile: Profile, target_body: str) -> MocapTruth:
-    """The profile's motion capture, connected. Errors: UsageError, those of connecting."""
+    """Return the profile's motion capture, connected. Errors: UsageError, those of connecting."""
     if profile.positioning.by != "mocap":
         raise UsageError(
             "--truth mocap needs a profile with its motion capture, as in "
@@ -272,7 +264,8 @@ def _open_capture(profile: Profile, target_body: str) -> MocapTruth:
 
 
 def _ask(question: str) -> str:
-    """On stderr, as stdout is for the result. Raises EOFError at the end of the input."""
+    """Ask on stderr, as stdout is for the result, and return the answer. Raises EOFError at the end
+    of the input."""
     print(question, end="", file=sys.stderr, flush=True)
     line = sys.stdin.readline()
     if not line:

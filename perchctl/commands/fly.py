@@ -7,10 +7,11 @@ import dataclasses
 import sys
 import textwrap
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -19,27 +20,23 @@ from perchctl.camera import profile_record, without_password
 from perchctl.check import Row, Verdict, comparison_rows, profile_rows, warnings_before_flight
 from perchctl.commands.command_line import (
     EXIT_TABLE,
-    Command,
     PositioningOption,
     ProfileOption,
     SourceOption,
     UriOption,
     ViewOption,
     ViewPortOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
-from perchctl.commands.flight_plot import plot_of
-from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
-from perchctl.commands.output import confirmed, print_record, say, tell
-from perchctl.commands.page import page_port
+from perchctl.commands.guide import page_port
+from perchctl.commands.interrupt import draw_unless_interrupted, ignore_signals, signals_to_operator
+from perchctl.commands.output import ask_to_confirm, print_lines, print_result, say
 from perchctl.commands.picture_edges import picture_edges
-from perchctl.commands.positioning import positioned
 from perchctl.display import (
     FlightPage,
     failed_card,
-    flight_page,
+    live_page,
     open_panel,
     summary_card,
 )
@@ -48,6 +45,7 @@ from perchctl.errors import (
     AttemptsUsedUp,
     EmergencyStopped,
     Interrupted,
+    InvalidValue,
     LogIncomplete,
     SafetyAbort,
     TargetNotFound,
@@ -65,6 +63,7 @@ from perchctl.flight import (
 )
 from perchctl.mission import Event, EventKind, Outcome, Phase, Watcher
 from perchctl.profile import (
+    PositioningConfig,
     Profile,
     find_calibration,
     find_mask,
@@ -73,7 +72,7 @@ from perchctl.profile import (
     load_profile,
     read_weights,
 )
-from perchctl.record import FlightSummary, LogWatcher, summary_text
+from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log, summary_text
 from perchctl.target import mm_text, overhead_view
 
 EXIT_CODE_OF: dict[Outcome, int] = {
@@ -84,22 +83,18 @@ EXIT_CODE_OF: dict[Outcome, int] = {
     Outcome.EMERGENCY: EmergencyStopped.exit_code,
     Outcome.OPERATOR: Interrupted.exit_code,
 }
-
+POSITIONINGS: tuple[str, ...] = get_args(PositioningConfig.model_fields["by"].annotation)
 
 app = new_app()
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl fly",
-        "perchctl fly -p my_vehicle.yaml --dry-run",
-        "perchctl fly -p my_vehicle.yaml --uri radio://0/80/2M/E7E7E7E7E7 --view",
-    )
-    + "\n\n"
-    + EXIT_TABLE,
+@command(
+    app,
+    "perchctl fly",
+    "perchctl fly -p my_vehicle.yaml --dry-run",
+    "perchctl fly -p my_vehicle.yaml --uri radio://0/80/2M/E7E7E7E7E7 --view",
+    ending=EXIT_TABLE,
 )
-@reporting
 def fly(
     profile: ProfileOption = "sim",
     uri: UriOption = None,
@@ -135,10 +130,7 @@ def fly(
     """
     options = resolve(profile, uri, source, positioning, seed, log_dir, record)
     if dry_run:
-        if as_json:
-            print_record(plan(options))
-        else:
-            print(plan_text(options))
+        print_result(plan(options) if as_json else plan_text(options))
         return 0
     for warning in warnings_before_flight(options):
         say(f"check: {warning}")
@@ -158,9 +150,9 @@ def resolve(
     log_dir: Path | None = None,
     record: bool | None = None,
 ) -> FlyOptions:
-    """The command line on top of the profile; None is not given. Errors: NotFound, InvalidValue,
-    UsageError."""
-    profile = positioned(load_profile(profile_name), positioning)
+    """Return the command line's options on top of the profile; None is not given. Errors: NotFound,
+    InvalidValue, UsageError."""
+    profile = with_positioning(load_profile(profile_name), positioning)
     options = FlyOptions(
         profile=profile,
         profile_path=find_profile(profile_name),
@@ -177,15 +169,34 @@ def resolve(
     return options
 
 
+def with_positioning(profile: Profile, by: str | None) -> Profile:
+    """Return the profile with `--positioning`; None: as the profile has it. Errors:
+    InvalidValue."""
+    if by is None:
+        return profile
+    if by not in POSITIONINGS:
+        raise InvalidValue(
+            f"--positioning {by!r} is unknown; allowed are {', '.join(POSITIONINGS)}"
+        )
+    own = profile.positioning
+    if by == own.by:
+        return profile
+    if by == "mocap" and own.by == "deck":
+        config = own.model_copy(update={"by": by})
+    else:  # what belongs to another kind would be of no use, and puzzle
+        config = PositioningConfig.model_validate({"by": by, "decks": own.decks})
+    return profile.model_copy(update={"positioning": config})
+
+
 def ask_before_arming(uri: str) -> None:
-    """Raises UsageError without a yes from the terminal."""
-    if not confirmed(f"About to arm and fly {uri}. Is the space under the target clear?"):
+    """Raise UsageError without a yes from the terminal."""
+    if not ask_to_confirm(f"About to arm and fly {uri}. Is the space under the target clear?"):
         raise UsageError("not confirmed: nothing was started")
 
 
 def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: bool = False) -> int:
-    """Fly, log, plot, report how it ended; returns the exit code. `port` of the live page; `asks`:
-    somebody at the terminal has to say yes before it arms."""
+    """Fly, log, plot and report how the flight ended; return the exit code. `port` is the live
+    page's; with `asks` somebody at the terminal has to say yes before it arms."""
     simulated_seed = options.seed if options.simulated else None
     log = LogWatcher.real_time(
         options.log_dir, options.profile, options.uri, options.source, simulated_seed,
@@ -199,9 +210,9 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
     say(f"connecting to {options.uri}{merges}")
     switch, page = OperatorSwitch(), None
     # Once it has landed nothing is left to stop, but much to tell.
-    with unheeded(), contextlib.ExitStack() as stack:
+    with ignore_signals(), contextlib.ExitStack() as stack:
         try:
-            page = stack.enter_context(live_page(options, port, switch))
+            page = stack.enter_context(flight_page(options, port, switch))
             result = _session(options, log, panel, switch, page, asks)
         except BaseException as error:
             # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
@@ -214,22 +225,38 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
         perched = result.report.phase is Phase.PERCHED
         summary = log.close(result.report, result.miss_m if perched else None)
         assert summary is not None
-        tell(summary_text(summary, log.path), stdout=not as_json)
+        print_lines(summary_text(summary, log.path), stdout=not as_json)
         if page is not None:
             page.end(summary_card(summary, log.path))
     code = exit_code(result.report.outcome, summary)
-    plot = drawn(lambda: plot_of(log.path, options.profile))
+    plot = draw_unless_interrupted(lambda: plot_of(log.path, options.profile))
     if plot is not None:
-        tell(f"plot:      {plot}", stdout=not as_json)
+        print_lines(f"plot:      {plot}", stdout=not as_json)
     if as_json:
-        print_record(flight_record(summary, code, log.path, plot))
+        print_result(flight_record(summary, code, log.path, plot))
     return code
+
+
+def plot_of(log_path: Path, profile: Profile) -> Path | None:
+    """Draw the flight beside its log if the profile asks for it, and return the picture's path.
+    A plot that fails is a warning: the flight is over."""
+    if not profile.log.plot:
+        return None
+    from perchctl.analysis import plot_flight
+
+    picture = path_beside(log_path, ".png")
+    try:
+        plot_flight(read_log(log_path), picture)
+    except Exception as error:
+        say(f"the plot could not be drawn: {error}")
+        return None
+    return picture
 
 
 def flight_record(
     summary: FlightSummary, code: int, log: Path, plot: Path | None
 ) -> dict[str, Any]:
-    """The one object of `--json`; `error` is None where the flight and its log are good."""
+    """Return the one object of `--json`; `error` is None if the flight and its log are good."""
     return summary.as_record() | {
         "lost_records": summary.lost_records,
         "log_problem": summary.log_problem,
@@ -241,7 +268,8 @@ def flight_record(
 
 
 def exit_code(outcome: Outcome, summary: FlightSummary) -> int:
-    """Of the flight; of its log where the flight was good and the log is not."""
+    """Return the exit code of the flight, or that of its log if the flight was good and the log is
+    not."""
     code = EXIT_CODE_OF[outcome]
     return LogIncomplete.exit_code if code == 0 and summary.log_problem is not None else code
 
@@ -254,7 +282,7 @@ def _session(
     page: FlightPage | None,
     asks: bool,
 ) -> SessionResult:
-    """The session with the signals on its switch, and with the live page where there is one."""
+    """Fly the session with the signals on its switch, and with the live page if there is one."""
     watchers: tuple[Watcher, ...] = (log, display)
     watched = log.watched
     if page is not None:
@@ -265,22 +293,19 @@ def _session(
         return fly_session(options, watchers, switch, watched, log.remarks, ask)
 
 
-def live_page(
+@contextlib.contextmanager
+def flight_page(
     options: FlyOptions, port: int | None, switch: OperatorSwitch
-) -> contextlib.AbstractContextManager[FlightPage | None]:
-    """The page of `--view`, with STOP wired to the switch; None without it.
+) -> Iterator[FlightPage | None]:
+    """Yield the page of `--view`, whose STOP lands by the switch; None without it.
 
     Errors: InvalidValue for a port in use."""
     if port is None:
-        return contextlib.nullcontext()
-    return flight_page(
-        profile_camera(options.profile.camera),
-        f"perchctl fly {options.uri}",
-        options.profile.target.large.side_m,
-        port,
-        switch.land,
-        say,
-    )
+        yield None
+        return
+    profile, title = options.profile, f"perchctl fly {options.uri}"
+    with live_page(profile_camera(profile.camera), title, port, say, switch.land) as page:
+        yield None if page is None else FlightPage(page, profile.target.large.side_m)
 
 
 # --- What `perchctl fly --dry-run` shows: the flight as it is resolved, before anything is opened
@@ -290,7 +315,7 @@ _COLUMN, _WIDTH = 13, 80
 
 
 def plan(options: FlyOptions) -> dict[str, Any]:
-    """What would be flown, fully resolved; nothing is connected."""
+    """Return what would be flown, fully resolved; nothing is connected."""
     calibration = find_calibration(options.profile.camera.calibration)
     mask = options.profile.camera.mask
     return {
@@ -320,8 +345,8 @@ def _compared(options: FlyOptions) -> list[Row]:
 
 
 def plan_text(options: FlyOptions) -> str:
-    """The plan for people, at 80 columns: what, where, the phases with their numbers, and what of
-    the profile was hardly meant."""
+    """Return the plan for people, at 80 columns: what, where, the phases with their numbers, and
+    which values of the profile are implausible."""
     resolved, profile, planner = plan(options), options.profile, options.profile.planner
     camera, large, small = profile.camera, profile.target.large, profile.target.small
     search, align, ascend, perch = planner.search, planner.align, planner.ascend, planner.perch
@@ -420,7 +445,7 @@ def _mm(place_m: tuple[float, float, float]) -> str:
 
 
 def weights_text(options: FlyOptions) -> str:
-    """Which merge weights fly, and the file that they are from, with its date and data."""
+    """Return which merge weights fly, and the file that they are from, with its date and data."""
     merge = options.profile.merge
     numbers = ", ".join(f"{axis} {w:g}" for axis, w in merge.weights.model_dump().items())
     if merge.weights_file is None:

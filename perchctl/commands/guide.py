@@ -1,4 +1,4 @@
-"""What a person sees while a command guides them: rows with bars on the terminal and the page."""
+"""The live page of a command, and how a person is guided: rows with bars on terminal and page."""
 
 from __future__ import annotations
 
@@ -19,11 +19,16 @@ _BAR_WIDTH = 30
 _REFRESH_HZ = 8
 
 
+def page_port(view: bool, port: int) -> int | None:
+    """Return the port for `--view` and `--view-port` (0: any free one); None for no page."""
+    return port if view or port > 0 else None
+
+
 @contextlib.contextmanager
 def guide(
     page: LivePage | None, stream: TextIO | None = None
 ) -> Iterator[Callable[[Moment], None]]:
-    """Yields the function that shows a moment: as a table on a terminal, in a pipe as a line
+    """Yield the function that shows a moment: as a table on a terminal, in a pipe as a line
     whenever that changes, and on the page if there is one."""
     console = Console(file=stream or sys.stderr)
     with contextlib.ExitStack() as stack:
@@ -45,7 +50,7 @@ def guide(
             if page is not None:
                 sketch = Sketch(moment.image, moment.outlines, None, (moment.advice,))
                 page.show(moment.index, sketch)
-                page.tell(lambda: page_state(moment))
+                page.set_state(lambda: page_state(moment))
 
         yield show
 
@@ -65,6 +70,6 @@ def _table(moment: Moment) -> Table:
 
 
 def page_state(moment: Moment) -> dict[str, Any]:
-    """The page's rows (the shares as numbers, for bars) and its headline."""
+    """Return the page's rows (the shares as numbers, for bars) and its headline."""
     rows = [[value for value in row if value is not None] for row in moment.rows]
     return {"rows": rows, "phase": moment.advice}

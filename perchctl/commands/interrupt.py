@@ -19,7 +19,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def _known(*names: str) -> tuple[signal.Signals, ...]:
-    """Those that the operating system has."""
+    """Return those signals that the operating system has."""
     return tuple(signal.Signals[name] for name in names if name in signal.Signals.__members__)
 
 
@@ -32,7 +32,7 @@ _NO_SUSPENDING = "Ctrl-Z does not suspend a flight: landing"
 
 @contextlib.contextmanager
 def signals_to(handler: Handler) -> Iterator[None]:
-    """Hands SIGINT and SIGTERM to `handler` for the duration (main thread only)."""
+    """Hand SIGINT and SIGTERM to `handler` during the block (main thread only)."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -46,7 +46,7 @@ def signals_to(handler: Handler) -> Iterator[None]:
 
 @contextlib.contextmanager
 def signals_to_operator(switch: OperatorSwitch, report: Callable[[str], None]) -> Iterator[None]:
-    """For a flight: Ctrl-C presses the switch, `LANDING_SIGNALS` land (main thread only).
+    """Let Ctrl-C press the switch during a flight, and `LANDING_SIGNALS` land (main thread only).
 
     A thread of its own reads the signals from a socket that the interpreter writes to at
     once, so they count while the main thread hangs in a library. A hang-up that is ignored
@@ -95,9 +95,9 @@ def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str
             threading.Thread(target=report, args=(_NO_SUSPENDING,), daemon=True).start()
 
 
-def drawn(draw: Callable[[], Path | None]) -> Path | None:
-    """What `draw` returns, the path of a picture or None; None too where Ctrl-C or SIGTERM
-    ends it: a picture comes after the result, and does not take its place."""
+def draw_unless_interrupted(draw: Callable[[], Path | None]) -> Path | None:
+    """Return what `draw` does, the path of a picture or None; None too if Ctrl-C or SIGTERM ends
+    it: a picture comes after the result, and does not take its place."""
     try:
         with interruptible():
             return draw()
@@ -108,7 +108,7 @@ def drawn(draw: Callable[[], Path | None]) -> Path | None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Ctrl-C and SIGTERM are a KeyboardInterrupt."""
+    """Make Ctrl-C and SIGTERM a KeyboardInterrupt during the block."""
     with signals_to(_interrupt):
         yield
 
@@ -118,14 +118,14 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> None:
 
 
 @contextlib.contextmanager
-def unheeded() -> Iterator[None]:
-    """Ctrl-C and SIGTERM do nothing, but for what a block within makes of them."""
+def ignore_signals() -> Iterator[None]:
+    """Ignore Ctrl-C and SIGTERM during the block, but for what an inner block makes of them."""
     with signals_to(lambda _signal, _frame: None):
         yield
 
 
 class Stopper:
-    """Ctrl-C as a request to end after this frame; a second one ends at once."""
+    """Takes Ctrl-C as a request to end after this frame; a second one ends at once."""
 
     def __init__(self) -> None:
         self.requested = threading.Event()

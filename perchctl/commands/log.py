@@ -24,15 +24,13 @@ from perchctl.analysis import (
 from perchctl.analysis import list_logs as listed_logs
 from perchctl.analysis import replay as replay_flight
 from perchctl.commands.command_line import (
-    Command,
     ForceOption,
     Group,
     JsonOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
-from perchctl.commands.output import print_record, say
+from perchctl.commands.output import print_result, say
 from perchctl.errors import InvalidValue, ReplayDiffers, UsageError
 from perchctl.files import check_output, same_file, write_files
 from perchctl.profile import Profile, changed_profile, load_profile
@@ -63,7 +61,7 @@ app = new_app(Group)
 
 
 def _log_file(place: Path | None) -> Path:
-    """The log that is named; else the newest of the folder, which is then printed.
+    """Return the log that is named; else the newest of the folder, which is then printed.
 
     Errors: NotFound.
     """
@@ -75,14 +73,16 @@ def _log_file(place: Path | None) -> Path:
 
 
 def _folder(place: Path | None) -> Path:
-    """The folder that is named; else where `fly` puts the logs unless a profile says otherwise."""
+    """Return the folder that is named; else where `fly` puts the logs unless a profile says
+    otherwise."""
     return Path(Profile().log.directory) if place is None else place
 
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[FlightLog]:
-    """The log; within, a value in it that no flight writes is an error of the file. So what reads
-    values stands within, and what decides and draws after it, where a fault is the program's.
+    """Yield the log; within the block a value that no flight writes is an error of the file. So
+    what reads values stands in the block, and what decides and draws behind it, where a fault is
+    the program's.
 
     Errors: NotFound, InvalidValue.
     """
@@ -91,64 +91,50 @@ def _opened(path: Path) -> Iterator[FlightLog]:
         yield log
 
 
-@app.command(
-    cls=Command,
+@command(
+    app,
+    "perchctl log show",
+    "perchctl log show perchctl-logs/flight.jsonl --json",
+    "perchctl log list -n 20",
     short_help="Show a flight: how it ended and why, its phases, holds, battery, frames, findings.",
-    epilog=examples(
-        "perchctl log show",
-        "perchctl log show perchctl-logs/flight.jsonl --json",
-        "perchctl log list -n 20",
-    ),
 )
-@reporting
-def show(file: LogArgument = None, as_json: JsonOption = False) -> int:
+def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
     """After a flight: show, draw, compare, export, replay or report its log.
 
     The subcommands work on logs of flights that were killed, of simulated ones, of an older
     perchctl; replay needs whole turns, which logs of versions 1 and 2 do not hold.
     """
     with _opened(_log_file(file)) as log:
-        if as_json:
-            print_record(show_record(FlightAnalysis(log)))
-        else:
-            print(show_text(FlightAnalysis(log)))
-    return 0
+        analysis = FlightAnalysis(log)
+        print_result(show_record(analysis) if as_json else show_text(analysis))
 
 
-@app.command(
-    "list",
-    cls=Command,
-    epilog=examples(
-        "perchctl log list", "perchctl log list logs -n 30", "perchctl log list --json"
-    ),
+@command(
+    app,
+    "perchctl log list",
+    "perchctl log list logs -n 30",
+    "perchctl log list --json",
+    name="list",
 )
-@reporting
 def list_logs(
     folder: Annotated[
         Path | None, typer.Argument(help="The folder of the logs. Default: perchctl-logs.")
     ] = None,
     count: Annotated[int, typer.Option("--count", "-n", min=1, help="How many logs.")] = 10,
     as_json: JsonOption = False,
-) -> int:
+) -> None:
     """List the newest logs of a folder, a line each."""
     place = _folder(folder)
     logs = listed_logs(place, count)
-    if as_json:
-        print_record({"folder": str(place), "logs": logs})
-    else:
-        print(list_text(logs))
-    return 0
+    print_result({"folder": str(place), "logs": logs} if as_json else list_text(logs))
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl log plot",
-        "perchctl log plot perchctl-logs/flight.jsonl",
-        "perchctl log plot -o flight.pdf --force",
-    ),
+@command(
+    app,
+    "perchctl log plot",
+    "perchctl log plot perchctl-logs/flight.jsonl",
+    "perchctl log plot -o flight.pdf --force",
 )
-@reporting
 def plot(
     file: LogArgument = None,
     output: Annotated[
@@ -159,7 +145,7 @@ def plot(
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
-) -> int:
+) -> None:
     """Draw a flight: errors, detections, lost frames, height, battery, the last seconds."""
     path = _log_file(file)
     picture = output or path_beside(path, ".png")
@@ -169,47 +155,34 @@ def plot(
     from perchctl.analysis import plot_flight
 
     plot_flight(log, picture)
-    if as_json:
-        print_record({"log": str(path), "plot": str(picture), "outcome": outcome})
-    else:
-        print(f"plot:      {picture}")
-    return 0
+    record = {"log": str(path), "plot": str(picture), "outcome": outcome}
+    print_result(record if as_json else f"plot:      {picture}")
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl log compare before.jsonl after.jsonl",
-        "perchctl log compare perchctl-logs/monday.jsonl perchctl-logs/tuesday.jsonl",
-        "perchctl log compare before.jsonl after.jsonl --json",
-    ),
+@command(
+    app,
+    "perchctl log compare before.jsonl after.jsonl",
+    "perchctl log compare perchctl-logs/monday.jsonl perchctl-logs/tuesday.jsonl",
+    "perchctl log compare before.jsonl after.jsonl --json",
 )
-@reporting
 def compare(
     one: Annotated[Path, typer.Argument(metavar="A", help="A flight log.")],
     other: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
     as_json: JsonOption = False,
-) -> int:
+) -> None:
     """Compare two flights: what differs, and in which keys their profiles do."""
     with _opened(one) as log, _opened(other) as other_log:
         found = Comparison((FlightAnalysis(log), FlightAnalysis(other_log)))
         record, text = found.record(), found.text()
-    if as_json:
-        print_record(record)
-    else:
-        print(text)
-    return 0
+    print_result(record if as_json else text)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl log export",
-        "perchctl log export perchctl-logs/flight.jsonl -o flight.parquet",
-        "perchctl log export -o flight.mcap",
-    ),
+@command(
+    app,
+    "perchctl log export",
+    "perchctl log export perchctl-logs/flight.jsonl -o flight.parquet",
+    "perchctl log export -o flight.mcap",
 )
-@reporting
 def export(
     file: LogArgument = None,
     output: Annotated[
@@ -231,7 +204,7 @@ def export(
     form = place.suffix.lower().removeprefix(".")
     done = _write_mcap(path, place, force) if form == "mcap" else _write_table(path, place, form)
     if as_json:
-        print_record({"log": str(path), "output": str(place), "format": form, **done})
+        print_result({"log": str(path), "output": str(place), "format": form, **done})
         return 0
     counts = [f"{done[key]} {key}" for key in ("rows", "columns", "pictures") if key in done]
     print(f"export:    {place} ({', '.join(counts)})")
@@ -265,15 +238,12 @@ def _write_mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
     return {"layout": str(done.layout), "pictures": done.pictures, "notes": list(done.notes)}
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl log replay",
-        "perchctl log replay --set planner.align.xy_m=0.02",
-        "perchctl log replay flight.jsonl --profile mine --json",
-    ),
+@command(
+    app,
+    "perchctl log replay",
+    "perchctl log replay --set planner.align.xy_m=0.02",
+    "perchctl log replay flight.jsonl --profile mine --json",
 )
-@reporting
 def replay(
     file: LogArgument = None,
     settings: Annotated[
@@ -317,7 +287,7 @@ def replay(
     if wanted is not None and not found.changed:
         say("nothing was changed: that is what was flown")
     if as_json:
-        print_record(replay_record(found))
+        print_result(replay_record(found))
     else:
         for note in found.notes:
             say(note)
@@ -325,15 +295,12 @@ def replay(
     return 0 if found.same else ReplayDiffers.exit_code
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl log report",
-        "perchctl log report perchctl-logs/*.jsonl -o session.html",
-        "perchctl log report flight.jsonl --force",
-    ),
+@command(
+    app,
+    "perchctl log report",
+    "perchctl log report perchctl-logs/*.jsonl -o session.html",
+    "perchctl log report flight.jsonl --force",
 )
-@reporting
 def report(
     files: Annotated[
         list[Path] | None,
@@ -342,7 +309,7 @@ def report(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="The page: .html.")] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
-) -> int:
+) -> None:
     """Write one page that tells the flight, or several, in sentences and plots."""
     logs: list[Path] = []
     for path in map(_log_file, files or (None,)):
@@ -358,22 +325,18 @@ def report(
     page = write_report(logs, output)
     if as_json:
         size = output.stat().st_size
-        print_record({"report": str(output), "bytes": size, "flights": page.record()})
+        print_result({"report": str(output), "bytes": size, "flights": page.record()})
     else:
         print(output)
         say(page.counts_text)
-    return 0
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl log film",
-        "perchctl log film flight.jsonl -o flight.mp4",
-        "perchctl log film flight.jsonl -o flight.gif --rate 6 --width 640",
-    ),
+@command(
+    app,
+    "perchctl log film",
+    "perchctl log film flight.jsonl -o flight.mp4",
+    "perchctl log film flight.jsonl -o flight.gif --rate 6 --width 640",
 )
-@reporting
 def film(
     file: LogArgument = None,
     output: Annotated[
@@ -390,7 +353,7 @@ def film(
     ] = 960,
     force: ForceOption = False,
     as_json: JsonOption = False,
-) -> int:
+) -> None:
     """Make a film of a flight: the camera's picture, a side view to scale, error and thrust.
 
     The camera's picture needs the recording beside the log (fly --record).
@@ -408,7 +371,6 @@ def film(
 
         count = write_film(flight, pictures, place, rate_hz, width_px)
     if as_json:
-        print_record({"log": str(path), "film": str(place), "pictures": count})
+        print_result({"log": str(path), "film": str(place), "pictures": count})
     else:
         print(f"film:      {place}")
-    return 0

@@ -13,15 +13,14 @@ import typer
 from perchctl.calibration import load_calibration, profile_camera
 from perchctl.commands.command_line import (
     CamOption,
-    Command,
     ForceOption,
     Group,
     JsonOption,
-    examples,
+    ProfileOption,
+    command,
     new_app,
-    reporting,
 )
-from perchctl.commands.output import print_record
+from perchctl.commands.output import print_result
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_place, write_files
 from perchctl.profile import (
@@ -49,22 +48,11 @@ from perchctl.target import (
 )
 from perchctl.vision import CameraModel
 
-DEFAULT_PROFILE = "sim"
-BASE_FOR_NEW = "crazyflie"
-"""What a new profile extends where -p names a file that does not exist yet."""
 TILE = "a3"
 """Sheets that are proposed for a page that is larger than the named ones."""
 SIDE_LIMITS_M = (0.004, 2.0)
 ANOTHER = "Another target than the profile's"
 
-ProfileOption = Annotated[
-    str | None,
-    typer.Option(
-        "--profile",
-        "-p",
-        help="Profile with the target; sim if none is named.",
-    ),
-]
 PageOption = Annotated[str, typer.Option("--page", help="a4, letter, a3, or 220x240mm.")]
 TileOption = Annotated[
     str | None,
@@ -120,32 +108,19 @@ BlurOption = Annotated[
         "--blur", min=0.0, max=20.0, callback=_finite, help="Sigma of the picture's blur, px."
     ),
 ]
-NoiseOption = Annotated[
-    float,
-    typer.Option(
-        "--noise",
-        min=0.0,
-        max=60.0,
-        callback=_finite,
-        help="Sigma of the picture's noise, grey levels of 255.",
-    ),
-]
 
 app = new_app(Group)
 
 
-@app.command(
-    cls=Command,
+@command(
+    app,
+    "perchctl make-target -p crazyflie -o target.pdf",
+    "perchctl make-target --large 120mm --small 20mm --page letter",
+    "perchctl make-target --large 355mm --small 35mm --page 442x470mm --tile a3",
     short_help="Print the target true to size, front and back.",
-    epilog=examples(
-        "perchctl make-target -p crazyflie -o target.pdf",
-        "perchctl make-target --large 120mm --small 20mm --page letter",
-        "perchctl make-target --large 355mm --small 35mm --page 442x470mm --tile a3",
-    ),
 )
-@reporting
 def sheet(
-    profile: ProfileOption = None,
+    profile: ProfileOption = "sim",
     output: Annotated[Path, typer.Option("--output", "-o", help="PDF to write.")] = Path(
         "target.pdf"
     ),
@@ -160,12 +135,12 @@ def sheet(
     small: SmallOption = None,
     small_id: SmallIdOption = None,
     small_dict: SmallDictOption = None,
-) -> int:
+) -> None:
     """Print the target true to size, or a board; design it; write measured sizes.
 
     sheet writes a PDF of the profile's target, front and back, checked before it is written.
     """
-    config = load_profile(profile or DEFAULT_PROFILE)
+    config = load_profile(profile)
     target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
     magnet_m = parse_length(magnet, "--magnet")
     check_target(target, magnet_m)
@@ -178,18 +153,15 @@ def sheet(
         *_mounting(config, target),
     ]
     record = {"target": target.model_dump(mode="json")}
-    return _write({output: pdf}, lines, record, force, as_json)
+    _write({output: pdf}, lines, record, force, as_json)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl make-target board charuco:10x7:25mm:18mm:DICT_5X5_100",
-        "perchctl make-target board chessboard:9x6:25mm --page letter -o chess.pdf",
-        "perchctl make-target board aprilgrid:6x6:22mm:0.3 -o april.pdf",
-    ),
+@command(
+    app,
+    "perchctl make-target board charuco:10x7:25mm:18mm:DICT_5X5_100",
+    "perchctl make-target board chessboard:9x6:25mm --page letter -o chess.pdf",
+    "perchctl make-target board aprilgrid:6x6:22mm:0.3 -o april.pdf",
 )
-@reporting
 def board(
     notation: Annotated[
         str,
@@ -206,7 +178,7 @@ def board(
     tile: TileOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
-) -> int:
+) -> None:
     """Print a calibration board, in the notation that calibrate reads."""
     printed = parse_board(notation)
     if printed.scale != (1.0, 1.0):
@@ -217,24 +189,20 @@ def board(
         "print at 100 %, glue it on something flat, and measure both rulers: 100 mm each",
     ]
     record = {"board": printed.notation()}
-    return _write({output: board_pdf(printed, page, tile)}, lines, record, force, as_json)
+    _write({output: board_pdf(printed, page, tile)}, lines, record, force, as_json)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl make-target design",
-        "perchctl make-target design example_640x480.yaml --ceiling 2.4 --blur 2.0",
-        "perchctl make-target design -p my_vehicle.yaml --large 120mm --small 20mm",
-    ),
+@command(
+    app,
+    "perchctl make-target design",
+    "perchctl make-target design example_640x480.yaml --ceiling 2.4 --blur 2.0",
+    "perchctl make-target design -p my_vehicle.yaml --large 120mm --small 20mm",
 )
-@reporting
 def design(
     camera: CameraArgument = None,
-    profile: ProfileOption = None,
+    profile: ProfileOption = "sim",
     ceiling: CeilingOption = None,
     blur: BlurOption = 1.0,
-    noise: NoiseOption = 5.0,
     cam: CamOption = None,
     as_json: JsonOption = False,
     large: LargeOption = None,
@@ -243,41 +211,37 @@ def design(
     small: SmallOption = None,
     small_id: SmallIdOption = None,
     small_dict: SmallDictOption = None,
-) -> int:
+) -> None:
     """Compute from where to where a camera sees each marker, how exactly, and where a gap is."""
-    config = load_profile(profile or DEFAULT_PROFILE)
+    config = load_profile(profile)
     name, model = _camera(config, camera, cam)
     target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
-    found = make_design(target, model, Optics(blur, noise), config, ceiling)
+    found = make_design(target, model, Optics(blur), config, ceiling)
     record = found.record() | {"target": target.model_dump(mode="json")}
-    return _write({}, [found.text(name)], record, False, as_json)
+    _write({}, [found.text(name)], record, False, as_json)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl make-target suggest --ceiling 2.4",
-        "perchctl make-target suggest example_640x480.yaml --ceiling 2.4 --blur 2.0",
-        "perchctl make-target suggest -p target_only --ceiling 3.6 --page a3",
-    ),
+@command(
+    app,
+    "perchctl make-target suggest --ceiling 2.4",
+    "perchctl make-target suggest example_640x480.yaml --ceiling 2.4 --blur 2.0",
+    "perchctl make-target suggest -p target_only --ceiling 3.6 --page a3",
 )
-@reporting
 def suggest(
     camera: CameraArgument = None,
-    profile: ProfileOption = None,
+    profile: ProfileOption = "sim",
     ceiling: CeilingOption = None,
     page: PageOption = "a4",
     magnet: MagnetOption = "50mm",
     blur: BlurOption = 1.0,
-    noise: NoiseOption = 5.0,
     cam: CamOption = None,
     as_json: JsonOption = False,
-) -> int:
+) -> None:
     """Propose sizes and ids for a camera, the largest that the page holds and that are seen."""
-    config = load_profile(profile or DEFAULT_PROFILE)
+    config = load_profile(profile)
     name, model = _camera(config, camera, cam)
     magnet_m = parse_length(magnet, "--magnet")
-    found, held_by = suggest_target(model, Optics(blur, noise), config, magnet_m, ceiling, page)
+    found, held_by = suggest_target(model, Optics(blur), config, magnet_m, ceiling, page)
     large, small = found.target.large, found.target.small
     command = (
         f"perchctl make-target --large {large.side_m * 1e3:g}mm --large-id {large.id} "
@@ -285,27 +249,19 @@ def suggest(
         f"--small-dict {small.dictionary} --page {held_by}"
     ) + ("" if held_by in PAGES_MM else f" --tile {TILE}")
     record = {"command": command, "target": found.target.model_dump(mode="json")}
-    return _write({}, [command, "", found.text(name)], record | found.record(), False, as_json)
+    _write({}, [command, "", found.text(name)], record | found.record(), False, as_json)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl make-target measured -p mine.yaml --measured-large 149.6 --force",
-        "perchctl make-target measured -p mine.yaml --measured-small 24.9 --force",
-        "perchctl make-target measured -p new.yaml --measured-large 119.8",
-    ),
+@command(
+    app,
+    "perchctl make-target measured -p mine.yaml --measured-large 149.6 --force",
+    "perchctl make-target measured -p mine.yaml --measured-small 24.9 --force",
+    "perchctl make-target measured -p b.yaml --measured-large 151 --force --json",
 )
-@reporting
 def measured(
     profile: Annotated[
-        str | None,
-        typer.Option(
-            "--profile",
-            "-p",
-            help="Profile that gets the sizes, or with -o the one that the new one extends.",
-        ),
-    ] = None,
+        str, typer.Option("--profile", "-p", help="The profile's file, which gets the sizes.")
+    ],
     measured_large: Annotated[
         str | None,
         typer.Option("--measured-large", help="Side of the large black square as printed, mm."),
@@ -313,10 +269,6 @@ def measured(
     measured_small: Annotated[
         str | None,
         typer.Option("--measured-small", help="Side of the small black square as printed, mm."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="A small new profile that extends the one of -p."),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -326,19 +278,19 @@ def measured(
     small: SmallOption = None,
     small_id: SmallIdOption = None,
     small_dict: SmallDictOption = None,
-) -> int:
+) -> None:
     """Write the sizes that were measured on the print into the profile that flies."""
     if measured_large is None and measured_small is None:
         raise UsageError("give --measured-large and --measured-small, in mm: nothing was measured")
-    base, path = _profile_to_write(profile, output)
-    changed = path.exists() and output is None
-    if changed and not force:
-        raise InvalidValue(
-            f"{path} exists already; add --force to write the sizes into it, "
-            f"or -o NEW.yaml for a small profile that extends it"
+    if "/" not in profile and not profile.endswith((".yaml", ".yml")):
+        raise UsageError(
+            f"name the file of the profile that gets the sizes, as in -p my_vehicle.yaml, not "
+            f"{profile}; perchctl profile new makes one"
         )
-    check_place(path, force)
-    config = load_profile(base)
+    path = Path(profile).expanduser()
+    config = load_profile(profile)
+    if not force:
+        raise InvalidValue(f"{path} exists already; add --force to write the sizes into it")
     nominal = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
     sides_m = {
         name: parse_length(text, f"--measured-{name}", bare_unit="mm")
@@ -346,26 +298,23 @@ def measured(
         if text is not None
     }
     found = measured_target(nominal, sides_m)
-    files: dict[Path, bytes] = {}
-    before: Path | None = None
-    if not changed:
-        files[path] = found.profile_text(_named_from(base, path)).encode()
-    else:
-        values = _changed_values(found.target, config.target)
-        before = write_profile_values(path, values) if values else None
-    lines = [*found.notes, f"{'changed' if changed else 'wrote'} {path}: fly -p {path}"]
+    values = _changed_values(found.target, config.target)
+    before = write_profile_values(path, values) if values else None
+    lines = [*found.notes, f"changed {path}: fly -p {path}"]
     if before is not None:
         lines.append(f"as it was before it is {before}")
     record = {
+        "files": [str(path)],
         "target": found.target.model_dump(mode="json"),
         "notes": list(found.notes),
         "profile_before": before and str(before),
     }
-    return _write(files, lines, {"files": [str(path)]} | record, force, as_json)
+    print_result(record if as_json else "\n".join(lines))
 
 
 def _changed_values(new: TargetConfig, old: TargetConfig) -> dict[str, float | int | str]:
-    """By the keys of a profile. A marker is written whole: no base may have it."""
+    """Return what has changed by the keys of a profile. A marker is written whole, since no base
+    may have it."""
     values: dict[str, float | int | str] = {}
     for name in ("large", "small"):
         marker: MarkerConfig = getattr(new, name)
@@ -378,35 +327,6 @@ def _changed_values(new: TargetConfig, old: TargetConfig) -> dict[str, float | i
     return values
 
 
-def _profile_to_write(name: str | None, output: Path | None) -> tuple[str, Path]:
-    """The profile that the sizes start from, and the file that gets them."""
-    if output is not None:
-        if output.suffix.lower() not in (".yaml", ".yml"):
-            raise UsageError(f"-o {output}: measured sizes go into a profile, a .yaml file")
-        return name or BASE_FOR_NEW, output
-    if name is None or not _is_path(name):
-        shown = name or BASE_FOR_NEW
-        raise UsageError(
-            f"name the profile that gets the sizes: -p my_vehicle.yaml, or -p {shown} "
-            f"-o my_vehicle.yaml for a small new one that extends {shown}"
-        )
-    path = Path(name).expanduser()
-    return (name if path.exists() else BASE_FOR_NEW), path
-
-
-def _named_from(base: str, path: Path) -> str:
-    """How the new profile at `path` names its base: a file by its path from there."""
-    if not _is_path(base):
-        return base
-    file = Path(base).expanduser().resolve()
-    return file.name if file.parent == path.resolve().parent else str(file)
-
-
-def _is_path(profile: str) -> bool:
-    """Whether a profile is named by its file, not by its name alone."""
-    return "/" in profile or profile.endswith((".yaml", ".yml"))
-
-
 # --- What several of them do -------------------------------------------------------------------
 
 
@@ -415,7 +335,7 @@ Marker = tuple[str | None, int | None, str | None]
 
 
 def _chosen(profile: Profile, large: Marker, small: Marker) -> TargetConfig:
-    """The profile's target with the options on top."""
+    """Return the profile's target with the options on top."""
     markers = {}
     for name, (side, marker_id, dictionary) in (("large", large), ("small", small)):
         old: MarkerConfig = getattr(profile.target, name)
@@ -443,13 +363,13 @@ def _chosen(profile: Profile, large: Marker, small: Marker) -> TargetConfig:
 
 
 def _camera(profile: Profile, name: str | None, cam: str | None) -> tuple[str, CameraModel]:
-    """The calibration's file, and the camera."""
+    """Return the calibration's file, and the camera."""
     path = find_calibration(name or profile.camera.calibration)
     return str(path), load_calibration(path, cam=cam)
 
 
 def _origin(profile: Profile, target: TargetConfig) -> tuple[str, datetime.date | None]:
-    """Where the sizes come from, and their date. Options on top of a profile make it another
+    """Return where the sizes are from, and their date. Options on top of a profile make it another
     target, with no date."""
     if target == profile.target:
         return f"profile {profile.name}", profile.date
@@ -457,7 +377,7 @@ def _origin(profile: Profile, target: TargetConfig) -> tuple[str, datetime.date 
 
 
 def _mounting(profile: Profile, target: TargetConfig) -> list[str]:
-    """What the profile's camera sees of that target to the end; nothing without a
+    """Return lines on what the profile's camera sees of that target to the end; none without a
     calibration, as a sheet needs none."""
     try:
         camera = profile_camera(profile.camera)
@@ -478,13 +398,9 @@ def _write(
     record: dict[str, Any],
     force: bool,
     as_json: bool,
-) -> int:
+) -> None:
     """Write all files, then print what was done."""
     for path in files:
         check_place(path, force)
     write_files(files)
-    if as_json:
-        print_record({"files": [str(path) for path in files]} | record)
-    else:
-        print("\n".join(lines))
-    return 0
+    print_result({"files": [str(path) for path in files]} | record if as_json else "\n".join(lines))

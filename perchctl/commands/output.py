@@ -6,18 +6,19 @@ import contextlib
 import json
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 
 def say(sentence: str) -> None:
-    """One sentence on stderr, as stdout is for the result. Never raises."""
-    tell(f"perchctl: {sentence}")
+    """Print one sentence on stderr, as stdout is for the result. Never raises."""
+    print_lines(f"perchctl: {sentence}")
 
 
-def tell(text: str, stdout: bool = False) -> None:
-    """Lines on stderr, or on stdout, where there still is one: a terminal may be closed, a pipe's
-    other end gone, and that is no reason to fail."""
+def print_lines(text: str, stdout: bool = False) -> None:
+    """Print lines on stderr, or on stdout, if there still is one: a closed terminal, or a pipe
+    without a reader, is no reason to fail."""
     stream = sys.stdout if stdout else sys.stderr
     try:
         print(text, file=stream, flush=True)
@@ -29,9 +30,9 @@ def tell(text: str, stdout: bool = False) -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def confirmed(question: str) -> bool:
-    """Whether somebody at the terminal says yes, now: what was typed before the question appeared
-    is no answer to it."""
+def ask_to_confirm(question: str) -> bool:
+    """Return True if somebody at the terminal says yes now: what was typed before the question
+    appeared is no answer to it."""
     with contextlib.suppress(ImportError, OSError, ValueError, AttributeError):
         import termios  # which Windows lacks
 
@@ -45,6 +46,6 @@ def confirmed(question: str) -> bool:
     return answer.strip().lower() in ("y", "yes")
 
 
-def print_record(record: Mapping[str, Any]) -> None:
-    """The one JSON object of `--json` on stdout."""
-    print(json.dumps(record))
+def print_result(result: Mapping[str, Any] | Sequence[Any] | str | Path) -> None:
+    """Print a command's result on stdout: a text or a path as it is, all else as JSON."""
+    print(result if isinstance(result, str | Path) else json.dumps(result), flush=True)

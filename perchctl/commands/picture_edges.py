@@ -23,7 +23,8 @@ UPRIGHT = math.cos(math.radians(30.0))
 
 
 def edges_beside(front: str) -> tuple[str, str]:
-    """Where the vehicle's left side can be: first in a picture that is not mirrored."""
+    """Return at which edges the vehicle's left side can be: first that of a picture that is not
+    mirrored."""
     x, y = PICTURE_EDGES[front]
     plain = next(edge for edge, place in PICTURE_EDGES.items() if place == (-y, x))
     mirrored = next(edge for edge, place in PICTURE_EDGES.items() if place == (y, -x))
@@ -31,8 +32,8 @@ def edges_beside(front: str) -> tuple[str, str]:
 
 
 def mount_from_edges(front: str, left: str) -> tuple[float, bool]:
-    """The last of `camera.mount.rpy_deg` for a camera that looks up, and whether its picture is
-    mirrored. `left` is one of `edges_beside(front)`."""
+    """Return the last of `camera.mount.rpy_deg` for a camera that looks up, and whether its picture
+    is mirrored. `left` is one of `edges_beside(front)`."""
     x, y = PICTURE_EDGES[front]
     mirrored = left == edges_beside(front)[1]
     if mirrored:
@@ -43,8 +44,8 @@ def mount_from_edges(front: str, left: str) -> tuple[float, bool]:
 
 
 def picture_edges(mount: Mounting, mirrored: bool) -> tuple[str, str] | None:
-    """Front and left side in the picture as the camera gives it; None for a camera that does not
-    look up, or is turned by about an eighth of a circle."""
+    """Return the edges of the vehicle's front and left side in the picture as the camera gives it;
+    None for a camera that does not look up, or is turned by about an eighth of a circle."""
     R_cam_body = mount.T_body_cam[:3, :3].T
     if R_cam_body[2, 2] < UPRIGHT:
         return None

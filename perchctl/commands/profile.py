@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from pydantic import ValidationError
 
 from perchctl.calibration import load_calibration
 from perchctl.camera import (
@@ -26,16 +25,14 @@ from perchctl.camera import (
 )
 from perchctl.check import Verdict, profile_rows
 from perchctl.commands.command_line import (
-    Command,
     ForceOption,
     Group,
     JsonOption,
     ProfileOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
-from perchctl.commands.output import print_record, say, tell
+from perchctl.commands.output import print_lines, print_result, say
 from perchctl.commands.picture_edges import (
     PICTURE_EDGES,
     edges_beside,
@@ -46,10 +43,10 @@ from perchctl.files import check_output, write_files
 from perchctl.link import check_uri
 from perchctl.profile import (
     Profile,
+    changed_profile,
     editor_schema,
     find_calibration,
     find_profile,
-    first_invalid_key,
     load_profile,
     profile_text,
     profile_value,
@@ -58,16 +55,13 @@ from perchctl.profile import (
 app = new_app(Group)
 
 
-@app.command(
-    cls=Command,
+@command(
+    app,
+    "perchctl profile -p crazyflie",
+    "perchctl profile new -o my_vehicle.yaml",
+    "perchctl profile schema > perchctl.schema.json",
     short_help="Show a profile as it is flown, every key explained.",
-    epilog=examples(
-        "perchctl profile -p crazyflie",
-        "perchctl profile new -o my_vehicle.yaml",
-        "perchctl profile schema > perchctl.schema.json",
-    ),
 )
-@reporting
 def show(profile: ProfileOption = "sim", as_json: JsonOption = False) -> int:
     """Show a profile as it is flown, every key explained, or write one of your vehicle (new).
 
@@ -80,7 +74,7 @@ def show(profile: ProfileOption = "sim", as_json: JsonOption = False) -> int:
             "profile": profile_record(loaded),
             "check": [dataclasses.asdict(row) for row in profile_rows(loaded)],
         }
-        print_record(record)
+        print_result(record)
         return 0
     print(profile_text(without_passwords(loaded)), end="")
     _say_doubts(loaded)
@@ -122,13 +116,13 @@ class Question:
     default: Callable[[Answers], str]
     parse: Callable[[str, Answers], Any]
     hint: Callable[[Answers], str] = lambda _: ""
-    after: str = ""  # the name of the question whose answer decides what is allowed
 
 
-def answered(
+def collect_answers(
     given: Mapping[str, str], open_question: Callable[[Question, Answers], Any]
 ) -> dict[str, Any]:
-    """The answers to all questions: by the options that are `given`, or else by `open_question`.
+    """Return the answers to all questions: by the options that are `given`, or else by
+    `open_question`.
 
     Raises InvalidValue and NotFound, each with the option's name.
     """
@@ -140,12 +134,7 @@ def answered(
         try:
             answers[question.name] = question.parse(given[question.name].strip(), answers)
         except PerchError as error:
-            follows = ""
-            if question.after and question.after not in given:
-                (other,) = (each for each in QUESTIONS if each.name == question.after)
-                default = answers[question.after]
-                follows = f" (this follows from {other.option} {default}: give that, too)"
-            raise type(error)(f"{question.option}: {error}{follows}") from None
+            raise type(error)(f"{question.option}: {error}") from None
     return answers
 
 
@@ -153,9 +142,9 @@ def _by_default(question: Question, answers: Answers) -> Any:
     return question.parse(question.default(answers), answers)
 
 
-def _asked(question: Question, answers: Answers) -> Any:
-    """What somebody types, asked for again until it is valid. Raises UsageError where the input
-    has ended."""
+def _ask_person(question: Question, answers: Answers) -> Any:
+    """Return what somebody types, asked for again until it is valid. Raises UsageError if the
+    input has ended."""
     default = question.default(answers)
     while True:
         # On stderr: stdout is for the result.
@@ -169,7 +158,7 @@ def _asked(question: Question, answers: Answers) -> Any:
                 "--defaults for what is not answered"
             ) from None
         except (PerchError, UnicodeDecodeError) as error:
-            tell(f"  {error}")
+            print_lines(f"  {error}")
 
 
 def _uri(text: str, _answers: Answers) -> str:
@@ -194,7 +183,7 @@ def _is_aideck(source: str) -> bool:
 
 
 def _calibration(text: str, _answers: Answers) -> Path | None:
-    """The file; None for none yet."""
+    """Return the file; None for none yet."""
     if text == NONE_YET:
         return None
     path = find_calibration(text)
@@ -209,7 +198,7 @@ def _one_of(text: str, choices: tuple[str, ...]) -> str:
 
 
 def _numbers(text: str, unit: str, count: int = 1) -> tuple[float, ...]:
-    """That many numbers, with spaces or commas between, and the unit or none behind each."""
+    """Return that many numbers, with spaces or commas between, and the unit or none behind each."""
     words = re.sub(rf"(?<=[\d.])\s*{unit}(?![a-zA-Z])", " ", text).replace(",", " ").split()
     if len(words) != count or not all(map(_NUMBER.fullmatch, words)):
         wanted = "a number" if count == 1 else f"{count} numbers"
@@ -225,7 +214,7 @@ def _within(text: str, unit: str, low: float, high: float) -> float:
 
 
 def _place(text: str, _answers: Answers) -> tuple[float, ...]:
-    """Metres from millimetres."""
+    """Return metres from three numbers in millimetres."""
     values = _numbers(text, "mm", 3)
     if any(values) and all(abs(value) < 1 for value in values):
         raise InvalidValue(f"found {text!r}: these look like metres; the question is in mm")
@@ -245,7 +234,7 @@ def _small(text: str, answers: Answers) -> float:
 
 
 def _thousandth(value: float) -> float:
-    """0.0249 of 24.9, not 0.024899999999999999."""
+    """Return 0.0249 for 24.9, not 0.024899999999999999."""
     return float(f"{value / 1e3:.12g}")
 
 
@@ -257,7 +246,6 @@ QUESTIONS: tuple[Question, ...] = (
     Question(
         "source", "--source", "The camera: camera:N (a receiver at /dev/videoN), http://..., aideck://HOST",
         lambda answers: "sim:" if answers["uri"].startswith(SIMULATED) else "camera:0", _source,
-        after="uri",
     ),
     Question(
         "calibration", "--calibration",
@@ -282,7 +270,6 @@ QUESTIONS: tuple[Question, ...] = (
         lambda answers: " ({}, or {} if the camera mirrors its picture)".format(
             *edges_beside(answers["front"])
         ),
-        "front",
     ),
     Question(
         "camera", "--camera-at",
@@ -299,7 +286,7 @@ QUESTIONS: tuple[Question, ...] = (
     ),
     Question(
         "small", "--small", "Side of the small one, mm",
-        lambda answers: f"{max(4.0, answers['large'] / 6.0):.4g}", _small, after="large",
+        lambda answers: f"{max(4.0, answers['large'] / 6.0):.4g}", _small,
     ),
     Question(
         "ceiling", "--ceiling", "Height of the ceiling over the floor, m",
@@ -313,21 +300,18 @@ QUESTIONS: tuple[Question, ...] = (
 
 
 def _option(name: str) -> Any:
-    """The option that answers a question beforehand."""
+    """Return the option that answers a question beforehand."""
     (question,) = (question for question in QUESTIONS if question.name == name)
     names = [question.option, "-u"] if name == "uri" else [question.option]
     return typer.Option(*names, help=question.text)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl profile new -o my_vehicle.yaml",
-        "perchctl profile new -u radio://0/80/2M/E7E7E7E7E7 --source camera:0",
-        "perchctl profile new --ceiling 3.1 --defaults",
-    ),
+@command(
+    app,
+    "perchctl profile new -o my_vehicle.yaml",
+    "perchctl profile new -u radio://0/80/2M/E7E7E7E7E7 --source camera:0",
+    "perchctl profile new --ceiling 3.1 --defaults",
 )
-@reporting
 def new(
     context: typer.Context,
     output: Annotated[Path, typer.Option("--output", "-o", help="Profile to write.")] = Path(
@@ -349,7 +333,7 @@ def new(
         bool, typer.Option("--defaults", help="Ask nothing: defaults for what is not given.")
     ] = False,
     force: ForceOption = False,
-) -> int:
+) -> None:
     """Write a profile of your vehicle, every key commented, in a short dialogue.
 
     Options answer questions beforehand; with all of them, or --defaults, nothing is asked. The
@@ -361,12 +345,13 @@ def new(
     given = {name: text for name, text in given.items() if text is not None}
     if given.get("source") == "sim:":  # no other vehicle flies by those pictures
         given.setdefault("uri", SIMULATED)
-    answers = answered(given, _by_default)  # all options are checked before anything is asked
+    answers = collect_answers(
+        given, _by_default
+    )  # all options are checked before anything is asked
     if not defaults and len(given) < len(QUESTIONS):
-        tell(f"A new profile: {output}. Enter takes what stands in brackets.")
-        answers = answered(given, _asked)
+        print_lines(f"A new profile: {output}. Enter takes what stands in brackets.")
+        answers = collect_answers(given, _ask_person)
     write_new_profile(output, answers)
-    return 0
 
 
 # --- A new profile: its keys --------------------------------------------------------------------
@@ -401,7 +386,11 @@ def write_new_profile(output: Path, answers: Answers) -> None:
     """Write the profile into `output`, and report what is doubtful. Raises InvalidValue."""
     keys = profile_keys(answers, output)
     shown = shlex.quote(str(output))
-    text = HEAD.format(name=shown) + profile_text(_validated(keys, output), keys)
+    settings = [
+        f"{key}={json.dumps(value)}" for key, value in {"name": output.stem, **keys}.items()
+    ]
+    profile = changed_profile(Profile(), settings, str(output))
+    text = HEAD.format(name=shown) + profile_text(profile, keys)
     write_files({output: text.encode()})
     if keys["camera.mirrored"]:
         say(
@@ -414,7 +403,7 @@ def write_new_profile(output: Path, answers: Answers) -> None:
 
 
 def profile_keys(answer: Answers, output: Path) -> dict[str, Any]:
-    """The keys of the new profile by their dotted paths."""
+    """Return the keys of the new profile by their dotted paths."""
     uri, source, default = answer["uri"], answer["source"], Profile()
     turn_deg, mirrored = mount_from_edges(answer["front"], answer["left"])
     ceiling_m = answer["ceiling"]
@@ -456,24 +445,9 @@ def profile_keys(answer: Answers, output: Path) -> dict[str, Any]:
     return keys
 
 
-def _validated(keys: Mapping[str, Any], output: Path) -> Profile:
-    """The profile with these keys. Raises InvalidValue for what no answer allows alone."""
-    values: dict[str, Any] = {"name": output.stem}
-    for path, value in keys.items():
-        *sections, key = path.split(".")
-        place = values
-        for section in sections:
-            place = place.setdefault(section, {})
-        place[key] = value
-    try:
-        return Profile.model_validate(values)
-    except ValidationError as error:
-        invalid, why = first_invalid_key(error)
-        raise InvalidValue(f"{invalid}: {why}" if invalid else why) from None
-
-
 def _calibration_name(calibration: Path | None, output: Path, source: str) -> str:
-    """The calibration as the profile at `output` names it: beside it, or by the whole path."""
+    """Return the calibration as the profile at `output` names it: beside it, or by the whole
+    path."""
     if calibration is None:
         return AIDECKS_EXAMPLE if _is_aideck(source) else EXAMPLE
     if calibration == find_calibration(EXAMPLE).resolve():
@@ -483,16 +457,12 @@ def _calibration_name(calibration: Path | None, output: Path, source: str) -> st
     return os.path.relpath(calibration, folder) if within else str(calibration)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl profile schema > perchctl.schema.json",
-        "perchctl profile schema | python -m json.tool",
-        "perchctl profile schema | grep -A 6 latency_s",
-    ),
+@command(
+    app,
+    "perchctl profile schema > perchctl.schema.json",
+    "perchctl profile schema | python -m json.tool",
+    "perchctl profile schema | grep -A 6 latency_s",
 )
-@reporting
-def schema() -> int:
+def schema() -> None:
     """Print the JSON schema of a profile's file, by which an editor completes and explains keys."""
     print(json.dumps(editor_schema(), indent=2))
-    return 0

@@ -13,7 +13,7 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Protocol, TypeVar
+from typing import Annotated, Any, Literal, Protocol, TypeVar
 
 import typer
 
@@ -22,20 +22,17 @@ from perchctl import campaign as campaigns
 from perchctl import faults as fault_campaigns
 from perchctl.analysis import profile_differences
 from perchctl.commands.command_line import (
-    Command,
     ForceOption,
     Group,
     JsonOption,
     PositioningOption,
     ProfileOption,
-    examples,
+    command,
     new_app,
-    reporting,
 )
-from perchctl.commands.flight_plot import plot_of
+from perchctl.commands.fly import plot_of, with_positioning
 from perchctl.commands.interrupt import signals_to
-from perchctl.commands.output import print_record, say
-from perchctl.commands.positioning import positioned
+from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import progress_bar
 from perchctl.display import timed_event_text
 from perchctl.errors import (
@@ -87,15 +84,12 @@ ClusterOption = Annotated[
 app = new_app(Group)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl simulate -n 100 --jobs 4",
-        "perchctl simulate --only 17 --log-dir logs",
-        "perchctl simulate --faults all -n 1000 --jobs 4 --out flown.jsonl",
-    ),
+@command(
+    app,
+    "perchctl simulate -n 100 --jobs 4",
+    "perchctl simulate --only 17 --log-dir logs",
+    "perchctl simulate --faults all -n 1000 --jobs 4 --out flown.jsonl",
 )
-@reporting
 def run(
     flights: FlightsOption = None,
     seed: SeedOption = None,
@@ -131,10 +125,9 @@ def run(
         ),
     ] = False,
     keep: Annotated[
-        str | None,
+        Literal["all", "failed"] | None,
         typer.Option(
             "--keep",
-            metavar="all|failed",
             help="Of the logs in --log-dir; all by default.",
             rich_help_panel="Files",
         ),
@@ -170,13 +163,11 @@ def run(
             f"{'--record' if record else '--keep'} concerns the logs of the flights: name their "
             f"folder with --log-dir"
         )
-    if keep not in (None, "all", "failed"):
-        raise UsageError(f"--keep {keep}: allowed are all and failed")
     if resume and out is None:
         raise UsageError("--resume goes on with a file of results: name it with --out")
     if out is not None and out.suffix != ".jsonl":
         raise InvalidValue(f"{out} must end in .jsonl: a result is one line of JSON")
-    flown = positioned(load_profile(profile), positioning)
+    flown = with_positioning(load_profile(profile), positioning)
     if only is not None and log_dir is not None:
         make_log_folder(log_dir)
     if cluster is not None and log_dir is not None:
@@ -185,7 +176,6 @@ def run(
     names = None
     if faults is not None:
         names = tuple(fault.name for fault in fault_campaigns.select_faults(faults))
-    folder = log_dir or Path(flown.log.directory)
     executor = executor_of(jobs, cluster, [flown], log_dir)
 
     def fly_campaign(
@@ -205,11 +195,26 @@ def run(
                 len(seeds), executor, kept.earlier, kept.note, objection,
             )  # fmt: skip
 
+    folder = log_dir or Path(flown.log.directory)
+
+    def fly_only(seed: int, fly: Callable[[int], R], report: Callable[..., None]) -> int:
+        return fly_each(
+            lambda executor, note: campaigns.fly_all(fly, [seed], executor, note),
+            partial(report, flown, as_json),
+            1,
+            executor,
+        )
+
     with signals_to(stop_once()):
         if only is not None and names is not None:
-            return _fly_fault(flown, only, names, folder, record, as_json)
+            return fly_only(
+                only,
+                partial(fault_campaigns.fly_fault_in_folder, flown, names, folder, record),
+                _report_fault,
+            )
         if only is not None:
-            return _fly_only(flown, only, folder, record, as_json)
+            fly = partial(campaigns.fly_logged, flown, folder, record=record)
+            return fly_only(only, fly, _report_flight)
         if names is not None:
             return fly_campaign(
                 fault_campaigns.FaultResult,
@@ -226,15 +231,12 @@ def run(
         )
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl simulate compare sim paper -n 60 --jobs 4",
-        "perchctl simulate compare mine.yaml changed.yaml -n 200 --jobs 4",
-        "perchctl simulate compare sim rough --positioning mocap --json",
-    ),
+@command(
+    app,
+    "perchctl simulate compare sim paper -n 60 --jobs 4",
+    "perchctl simulate compare mine.yaml changed.yaml -n 200 --jobs 4",
+    "perchctl simulate compare sim rough --positioning mocap --json",
 )
-@reporting
 def compare(
     profile_a: Annotated[
         str,
@@ -254,7 +256,7 @@ def compare(
     """Fly each seed by two profiles: what differs, and what of it is proven."""
     _require_simulator()
     names = (profile_a, profile_b)
-    profiles = [positioned(load_profile(name), positioning) for name in names]
+    profiles = [with_positioning(load_profile(name), positioning) for name in names]
     keys = profile_differences(*(p.model_dump(mode="json") for p in profiles))
     keys = {key: values for key, values in keys.items() if key not in _NO_DIFFERENCE}
 
@@ -263,7 +265,7 @@ def compare(
         if as_json:
             differences = {key: {"a": a, "b": b} for key, (a, b) in keys.items()}
             record = {"a": profile_a, "b": profile_b, **found, "profile": differences}
-            print_record(with_problem(record, problem))
+            print_result(with_problem(record, problem))
             return
         print(campaigns.comparison_text(names, found))
         for key, (a, b) in keys.items():
@@ -274,15 +276,12 @@ def compare(
     return _fly_by_each(profiles, _seeds(flights, seed), jobs, cluster, report)
 
 
-@app.command(
-    cls=Command,
-    epilog=examples(
-        "perchctl simulate sweep planner.align.xy_m=0.02,0.04,0.08 -n 30",
-        "perchctl simulate sweep planner.integral_per_s=0,0.4 -n 30 --jobs 4",
-        "perchctl simulate sweep planner.ascend.speed_mps=0.1,0.2 --json",
-    ),
+@command(
+    app,
+    "perchctl simulate sweep planner.align.xy_m=0.02,0.04,0.08 -n 30",
+    "perchctl simulate sweep planner.integral_per_s=0,0.4 -n 30 --jobs 4",
+    "perchctl simulate sweep planner.ascend.speed_mps=0.1,0.2 --json",
 )
-@reporting
 def sweep(
     values: Annotated[
         str,
@@ -298,16 +297,13 @@ def sweep(
 ) -> int:
     """Fly the same seeds with several values of a profile's key: which is the best."""
     _require_simulator()
-    asked = campaigns.make_sweep(positioned(load_profile(profile), positioning), values)
+    asked = campaigns.make_sweep(with_positioning(load_profile(profile), positioning), values)
     seeds, cells = _seeds(flights, seed), len(asked.profiles)
     say(f"{cells} cells of {len(seeds)} seeds are {cells * len(seeds)} flights")
 
     def report(results: list[campaigns.VariantResult], problem: PerchError | None) -> None:
         record = asked.record(results)
-        if as_json:
-            print_record(with_problem(record, problem))
-        else:
-            print(asked.text(record), flush=True)
+        print_result(with_problem(record, problem) if as_json else asked.text(record))
 
     return _fly_by_each(asked.profiles, seeds, jobs, cluster, report)
 
@@ -329,7 +325,7 @@ def _fly_by_each(
 
 
 def _require_simulator() -> None:
-    """Raises UsageError where the extra ``sim`` is not installed."""
+    """Raise UsageError if the extra ``sim`` is not installed."""
     if find_spec("mujoco") is None:
         raise no_simulator()
 
@@ -357,8 +353,8 @@ ExecutorOf = Callable[[int], AbstractContextManager[Executor]]
 def executor_of(
     jobs: int | None, cluster: str | None, profiles: Sequence[Profile], log_dir: Path | None = None
 ) -> ExecutorOf:
-    """Processes of this computer, or the workers of a cluster. `profiles`: with the files that
-    flights read; `log_dir`: where they write. Errors: UsageError."""
+    """Return who flies: processes of this computer, or the workers of a cluster. `profiles`: with
+    the files that flights read; `log_dir`: where they write. Errors: UsageError."""
     if cluster is None:
         return lambda flights: campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:
@@ -445,7 +441,7 @@ def fly_each(
 def stop_once(
     clock: Callable[[], float] = time.monotonic, leave: Callable[[int], object] = os._exit
 ) -> Callable[[int, FrameType | None], None]:
-    """A handler: the first signal raises KeyboardInterrupt, a further one ends the program
+    """Return a handler: the first signal raises KeyboardInterrupt, a further one ends the program
     where it is."""
     first_s: list[float] = []
 
@@ -463,7 +459,7 @@ def stop_once(
 
 
 def with_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[str, Any]:
-    """The one object of `--json`, with why not all were flown."""
+    """Return the one object of `--json`, with why not all were flown."""
     if problem is None:
         return dict(record)
     return {**record, "error": str(problem), "exit_code": problem.exit_code}
@@ -478,17 +474,14 @@ def _report(
     results: list[C],
     problem: PerchError | None,
 ) -> None:
-    if as_json:
-        print_record(with_problem(summary(results), problem))
-    else:
-        print(table(results), flush=True)
+    print_result(with_problem(summary(results), problem) if as_json else table(results))
     say_where_logs_are(results, log_dir, keep)
 
 
 def say_where_logs_are(
     results: Sequence[campaigns.CampaignFlight], log_dir: Path | None, keep: str | None = None
 ) -> None:
-    """Where the logs are, and what they lack, on stderr."""
+    """Print on stderr where the logs are, and what they lack."""
     if log_dir is None or not results:
         return
     kept = "the logs that are kept" if keep else "the flights' logs"
@@ -498,60 +491,43 @@ def say_where_logs_are(
         say(f"{len(problems)} of {len(results)} logs are incomplete: {problems[0]}")
 
 
-def _fly_only(profile: Profile, seed: int, folder: Path, record: bool, as_json: bool) -> int:
-    """Fly one seed, and tell it as `perchctl fly` tells a flight."""
-
-    def report(flights: list[campaigns.LoggedFlight], _problem: PerchError | None) -> None:
-        (flight,) = flights
-        if not as_json:
-            start_s = flight.events[0].t_s
-            for event in flight.events:
-                print(timed_event_text(event, start_s))
-            print(summary_text(flight.summary, flight.log), flush=True)
-        plot = _plot(flight.log, profile)
-        if as_json:
-            lacks = {
-                "lost_records": flight.summary.lost_records,
-                "log_problem": flight.summary.log_problem,
-            }
-            files = {"log": str(flight.log), "plot": None if plot is None else str(plot)}
-            print_record({"seed": flight.seed} | flight.summary.as_record() | lacks | files)
-        elif plot is not None:
-            print(f"plot:      {plot}")
-
-    fly = partial(campaigns.fly_logged, profile, folder, record=record)
-    return fly_each(
-        lambda executor, note: campaigns.fly_all(fly, [seed], executor, note),
-        report,
-        1,
-        executor_of(None, None, [profile]),
-    )
+def _report_flight(
+    profile: Profile, as_json: bool, flights: list[campaigns.LoggedFlight], _: PerchError | None
+) -> None:
+    """Print the one flight as `perchctl fly` prints one."""
+    (flight,) = flights
+    summary = flight.summary
+    if not as_json:
+        start_s = flight.events[0].t_s
+        for event in flight.events:
+            print(timed_event_text(event, start_s))
+        print(summary_text(summary, flight.log), flush=True)
+    plot = _plot(flight.log, profile)
+    if as_json:
+        lacks = {"lost_records": summary.lost_records, "log_problem": summary.log_problem}
+        files = {"log": str(flight.log), "plot": None if plot is None else str(plot)}
+        print_result({"seed": flight.seed} | summary.as_record() | lacks | files)
+    elif plot is not None:
+        print(f"plot:      {plot}")
 
 
-def _fly_fault(
-    profile: Profile, seed: int, faults: tuple[str, ...], folder: Path, record: bool, as_json: bool
-) -> int:
-    """Fly one seed with its fault, and print all that is known of the flight."""
-
-    def report(results: list[fault_campaigns.FaultResult], _problem: PerchError | None) -> None:
-        (result,) = results
-        known = asdict(result)
-        if not as_json:
-            print("\n".join(f"{name:<18} {value}" for name, value in known.items()), flush=True)
-        assert result.log is not None
-        plot = _plot(result.log, profile)
-        if as_json:
-            print_record(to_plain({**known, "plot": plot}))
-        elif plot is not None:
-            print(f"{'plot':<18} {plot}")
-
-    fly = partial(fault_campaigns.fly_fault_in_folder, profile, faults, folder, record)
-    return fly_each(
-        lambda executor, note: campaigns.fly_all(fly, [seed], executor, note),
-        report,
-        1,
-        executor_of(None, None, [profile]),
-    )
+def _report_fault(
+    profile: Profile,
+    as_json: bool,
+    results: list[fault_campaigns.FaultResult],
+    _: PerchError | None,
+) -> None:
+    """Print all that is known of the one flight with its fault."""
+    (result,) = results
+    known = asdict(result)
+    if not as_json:
+        print("\n".join(f"{name:<18} {value}" for name, value in known.items()), flush=True)
+    assert result.log is not None
+    plot = _plot(result.log, profile)
+    if as_json:
+        print_result(to_plain({**known, "plot": plot}))
+    elif plot is not None:
+        print(f"{'plot':<18} {plot}")
 
 
 def _plot(log: Path, profile: Profile) -> Path | None:
@@ -561,14 +537,7 @@ def _plot(log: Path, profile: Profile) -> Path | None:
 
 
 def _list_faults(as_json: bool) -> int:
-    if as_json:
-        print_record({"faults": {fault.name: fault.what for fault in fault_campaigns.FAULTS}})
-    else:
-        print(
-            "\n".join(
-                campaigns.align_columns(
-                    [(fault.name, fault.what) for fault in fault_campaigns.FAULTS]
-                )
-            )
-        )
+    faults = {fault.name: fault.what for fault in fault_campaigns.FAULTS}
+    table = "\n".join(campaigns.align_columns(list(faults.items())))
+    print_result({"faults": faults} if as_json else table)
     return 0

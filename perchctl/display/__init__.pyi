@@ -1,9 +1,9 @@
 from .live import LivePage as LivePage
 from .live import PageState as PageState
+from .live import live_page as live_page
 from .page import AXES_OF_SIDE as AXES_OF_SIDE
 from .page import FlightPage as FlightPage
 from .page import failed_card as failed_card
-from .page import flight_page as flight_page
 from .page import summary_card as summary_card
 from .panel import open_panel as open_panel
 from .panel import timed_event_text as timed_event_text

@@ -6,6 +6,7 @@ the page's threads, and what fails there is remembered in `problem`, never raise
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 import json
 import secrets
@@ -13,7 +14,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -71,7 +72,7 @@ class LivePage:
         self._times: deque[float] = deque(maxlen=_RATE_FRAMES)
         self._jpeg: tuple[int, bytes] | None = None
         self._describe: Callable[[], PageState] = dict
-        self._told_s: float | None = None  # None: nothing is due
+        self._state_s: float | None = None  # None: nothing is due
         self._read_s: float | None = None
         self._card: PageState | None = None
         self._card_read = False
@@ -95,7 +96,7 @@ class LivePage:
     # --- for the loop: neither waits nor raises ------------------------------
 
     def show(self, frame: int, sketch: Sketch) -> None:
-        """The newest picture; the same `frame` again replaces it."""
+        """Show this picture from now on; the same `frame` again replaces it."""
         with self._changed:
             if frame != self._frame:
                 self._times.append(self._clock())
@@ -103,17 +104,17 @@ class LivePage:
             self._number += 1
             self._changed.notify_all()
 
-    def tell(self, describe: Callable[[], PageState], *, live: bool = True) -> None:
-        """The newest numbers; formatted only when a reader polls. While they are `live`, others
-        are due at once, and the page says when they stay away."""
+    def set_state(self, describe: Callable[[], PageState], *, live: bool = True) -> None:
+        """Show these numbers from now on; they are formatted only when a reader polls. While they
+        are `live`, others are due at once, and the page says when they stay away."""
         self._describe = describe
-        self._told_s = self._clock() if live else None
+        self._state_s = self._clock() if live else None
 
     def end(self, card: PageState) -> None:
-        """How it ended: what it shows now stays, with this card. Waits, bounded, until a reader
-        that is there has it."""
+        """Show how it ended: the last picture and numbers stay, with this card. Waits, bounded,
+        until a reader that is there has it."""
         with self._changed:
-            self._card, self._told_s = card, None
+            self._card, self._state_s = card, None
             read_s = self._read_s
             if read_s is not None and self._clock() - read_s < READS_S:
                 self._changed.wait_for(lambda: self._card_read or self.closed, LAST_READ_S)
@@ -137,21 +138,21 @@ class LivePage:
         else:
             stop = "requested" if self._stop_requested else "ready"
         fixed = {"title": self.title, "rate_hz": round(self.rate_hz(), 1), "stop": stop}
-        told_s, card = self._told_s, self._card
-        fixed["age_s"] = None if told_s is None else round(max(0.0, self._clock() - told_s), 2)
+        state_s, card = self._state_s, self._card
+        fixed["age_s"] = None if state_s is None else round(max(0.0, self._clock() - state_s), 2)
         fixed["card"] = card
         self._read_s = self._clock()
         return described | fixed | {"page_problem": self.problem}
 
     def was_read(self, state: PageState) -> None:
-        """That state has reached a reader."""
+        """Note that this state has reached a reader."""
         if state.get("card") is not None:
             with self._changed:
                 self._card_read = True
                 self._changed.notify_all()
 
     def rate_hz(self) -> float:
-        """Frames a second, 0 once none has come for a second."""
+        """Return the frames a second, 0 if none has come for a second."""
         with self._changed:
             times, now_s = list(self._times), self._clock()
         if len(times) < 2 or now_s - times[-1] > _RATE_STALE_S or times[-1] <= times[0]:
@@ -159,7 +160,8 @@ class LivePage:
         return (len(times) - 1) / (times[-1] - times[0])
 
     def jpeg_after(self, number: int) -> tuple[int, bytes] | None:
-        """The newest picture if newer than `number`, drawn. None when none came for a while."""
+        """Return the newest picture, drawn, if it is newer than `number`. None if none came for a
+        while."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._number > number, WAIT_S)
             newest, sketch = self._number, self._sketch
@@ -176,7 +178,7 @@ class LivePage:
             return self._jpeg
 
     def pause(self, seconds: float) -> bool:
-        """Wait, less when the page closes; True when it has."""
+        """Wait, less when the page closes; return True when it has."""
         with self._changed:
             return self._changed.wait_for(lambda: self.closed, seconds)
 
@@ -185,7 +187,7 @@ class LivePage:
         return self._on_stop is not None and hmac.compare_digest(given, own)
 
     def stop(self) -> None:
-        """The STOP button; pressing it again changes nothing."""
+        """Press the STOP button; pressing it again changes nothing."""
         with self._changed:
             first, self._stop_requested = not self._stop_requested, True
         if first and self._on_stop is not None:
@@ -204,6 +206,29 @@ class LivePage:
         self._thread.join(2.0)
 
 
+@contextlib.contextmanager
+def live_page(
+    camera: CameraModel,
+    title: str,
+    port: int | None,
+    report: Callable[[str], None],
+    on_stop: Callable[[], None] | None = None,
+) -> Iterator[LivePage | None]:
+    """Yield a page for the block, or None without a port (0: any free one); `report` prints its
+    address, and at the end its problem. `on_stop`: as in `LivePage`. Errors: InvalidValue."""
+    if port is None:
+        yield None
+        return
+    page = LivePage(camera, title, port, on_stop)
+    report(f"live page{' with a STOP button' if on_stop else ''}: {page.url}")
+    try:
+        yield page
+    finally:
+        page.close()
+        if page.problem is not None:
+            report(f"the live page failed: {page.problem}")
+
+
 # --- HTTP of the live page: on loopback only, and only under loopback's names ------------------
 # A site in the same browser can send requests to 127.0.0.1 too. So the Host header must
 # name this machine (a rebound DNS name does not), STOP needs the token of the printed
@@ -220,7 +245,7 @@ _HTML = Path(__file__).with_name("page.html")
 
 
 def is_loopback(host: str | None) -> bool:
-    """Whether a Host header names this machine, whatever the port (it may be forwarded)."""
+    """Return True if a Host header names this machine, whatever the port (it may be forwarded)."""
     if not host:
         return False
     try:
@@ -240,7 +265,7 @@ class PageServer(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", port), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A reader that goes away is no error; others are kept in the page's `problem`."""
+        """Keep an error in the page's `problem`, but for a reader that goes away."""
         error = sys.exception()
         if error is not None and not isinstance(error, OSError):
             self.page.remember(error)
@@ -280,7 +305,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(200, "application/json", b'{"stop": "requested"}')
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Requests are not worth a line on the terminal."""
+        """Print nothing: requests are not worth a line on the terminal."""
 
     def _from_here(self) -> bool:
         origin = self.headers.get("Origin")

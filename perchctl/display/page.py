@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import shlex
-from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from perchctl.camera import FrameSource, WatchedSource
 from perchctl.display.live import LivePage, PageState
-from perchctl.display.panel import status_of, status_rows
+from perchctl.display.panel import status_rows
 from perchctl.display.sketch import Sketch
 from perchctl.mission import RESCUE, Event, EventKind, Tick
 from perchctl.record import FlightSummary, summary_text
-from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput
+from perchctl.vision import MARKERS, Frame, PipelineOutput
 
 Card = dict[str, Any]
 """Outcome, reason, and rows of a name and a text, as the page shows them at the end."""
@@ -39,14 +37,14 @@ class FlightPage:
         self._flying = False
         self._rescue = ""
         waiting = {"phase": "WAITING", "rows": [["reason", "vehicle and camera"]]}
-        page.tell(lambda: waiting, live=False)
+        page.set_state(lambda: waiting, live=False)
 
     @property
     def problem(self) -> str | None:
         return None
 
     def watched(self, source: FrameSource) -> FrameSource:
-        """The same source; each frame it gives is remembered for the page."""
+        """Return the same source; each frame it gives is remembered for the page."""
         return WatchedSource(source, self._seen)
 
     def tick(self, tick: Tick) -> None:
@@ -56,7 +54,7 @@ class FlightPage:
             if frame is not None:
                 self._frame = None
                 self.page.show(frame.index, sketch_of(frame, tick.output, self._axis_m))
-            self.page.tell(partial(flight_state, tick), live=not tick.state.phase.is_over)
+            self.page.set_state(partial(flight_state, tick), live=not tick.state.phase.is_over)
         except Exception as error:
             self.page.remember(error)
 
@@ -65,8 +63,8 @@ class FlightPage:
             self._rescue = event.reason
 
     def end(self, card: Card) -> None:
-        """The flight is over, and this is how: the last that the page shows. After an error in
-        flight, with what the rescue said."""
+        """Show how the flight ended, as the last that the page shows; after an error in flight also
+        what the rescue reported."""
         if self._rescue and not card["good"]:
             card = card | {"rows": [["flight", self._rescue], *card["rows"]]}
         self.page.end(card)
@@ -78,7 +76,7 @@ class FlightPage:
 
 
 def sketch_of(frame: Frame, output: PipelineOutput | None, axis_m: float) -> Sketch:
-    """The frame with what the pipeline found in it; bare where it was not looked at."""
+    """Return the frame with what the pipeline found in it; bare if it was not searched."""
     if output is None or output.detections.frame_index != frame.index:
         return Sketch(frame.image)
     found = ((name, output.detections.get(name)) for name in MARKERS)
@@ -92,60 +90,34 @@ def sketch_of(frame: Frame, output: PipelineOutput | None, axis_m: float) -> Ske
 
 
 def flight_state(tick: Tick) -> PageState:
-    """The tick for the page: phase, battery, the rows of the terminal's panel, and whether the
-    flight is over."""
-    status = status_of(tick)
-    volts = status.battery_v
+    """Return what the page shows of a tick: phase, battery, the rows of the terminal's panel, and
+    whether the flight is over."""
+    state, volts = tick.state, tick.telemetry.battery_v
+    mirrored = tick.output is not None and tick.output.detections.mirrored
+    seen = "the picture is mirrored (camera.mirrored in the profile)" if mirrored else ""
     return {
-        "phase": status.phase,
+        "phase": state.phase.value,
         "battery": f"{volts:.2f} V" if math.isfinite(volts) else "battery unknown",
         "battery_v": volts if math.isfinite(volts) else None,
-        "rows": [list(row) for row in status_rows(status)],
-        "note": f"held: {status.hold}" if status.hold else _seen_note(tick.output),
-        "over": tick.state.phase.is_over,
+        "rows": [list(row) for row in status_rows(tick)],
+        "note": f"held: {state.hold}" if state.hold else seen,
+        "over": state.phase.is_over,
     }
-
-
-def _seen_note(output: PipelineOutput | None) -> str:
-    mirrored = output is not None and output.detections.mirrored
-    return "the picture is mirrored (camera.mirrored in the profile)" if mirrored else ""
-
-
-@contextlib.contextmanager
-def flight_page(
-    camera: CameraModel,
-    title: str,
-    large_side_m: float,
-    port: int,
-    land: Callable[[], None],
-    report: Callable[[str], None],
-) -> Iterator[FlightPage]:
-    """A page for one flight. Raises InvalidValue for a port in use.
-
-    `land` is called by STOP; `report` prints a line.
-    """
-    page = LivePage(camera, title, port, on_stop=land)
-    report(f"live page with a STOP button: {page.url}")
-    try:
-        yield FlightPage(page, large_side_m)
-    finally:
-        page.close()
-        if page.problem is not None:
-            report(f"the live page failed: {page.problem}")
 
 
 # --- How the flight ended ---------------------------------------------------------------------
 
 
 def summary_card(summary: FlightSummary, log: Path) -> Card:
-    """How the flight ended, and where to look next."""
+    """Return the card that says how the flight ended, and where to look next."""
     first, *lines = summary_text(summary).splitlines()
     rows = [[part.strip() for part in line.split(":", maxsplit=1)] for line in lines]
     return _card(summary.outcome, first.partition(": ")[2], rows, log)
 
 
 def failed_card(error: BaseException, log: Path | None) -> Card:
-    """Of a flight that ended in an error, or that never began; `log` where there is one."""
+    """Return the card of a flight that ended in an error, or that never began; `log` if there is
+    one."""
     return _card("failed", str(error) or type(error).__name__, [], log)
 
 

@@ -38,7 +38,7 @@ class Sketch:
 
 
 def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
-    """The picture in colour (blue, green, red), (h, w, 3) uint8."""
+    """Return the picture in colour (blue, green, red), (h, w, 3) uint8."""
     picture = np.asarray(cv2.cvtColor(sketch.image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     for name, corners in sketch.outlines:
         if not np.isfinite(corners).all() or np.abs(corners).max() > _FAR_PX:
@@ -74,7 +74,7 @@ def _draw_axes(
 
 
 def _draw_text(picture: NDArray[np.uint8], lines: tuple[str, ...]) -> None:
-    """White letters with a dark rim, in the lower left corner.
+    """Draw white letters with a dark rim into the lower left corner.
 
     The rim is grown from the letters: the font's glyphs are wider where they are thicker, and
     the same text drawn thick would not lie under the thin one.
@@ -99,5 +99,5 @@ def _draw_text(picture: NDArray[np.uint8], lines: tuple[str, ...]) -> None:
 
 
 def _fixed(points_px: Array) -> NDArray[np.int32]:
-    """Pixels as OpenCV's drawing takes them with `shift`."""
+    """Return pixels as OpenCV's drawing takes them with `shift`."""
     return np.rint(points_px * (1 << _SUBPIXEL_BITS)).astype(np.int32)

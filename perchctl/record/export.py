@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue, NotFound, PerchError
-from perchctl.files import PartFile, cannot_be_written, check_output, check_place, write_files
+from perchctl.files import cannot_be_written, check_output, check_place, whole_file, write_files
 from perchctl.profile import Profile
 from perchctl.record.disk import DiskFile
 from perchctl.record.read import FlightLog, read_log
@@ -54,25 +54,22 @@ def export_mcap(
     check_place(layout_path, overwrite)
     notes: list[str] = []
     profile, camera = _setup(log, notes)
-    part = PartFile(out_path)
     try:
-        file = RecordingFile(DiskFile.new(part.part), log.header, profile, camera)
-        for _, kind, what in heapq.merge(_records(log), _frames(log, notes), key=_time_of):
-            match kind:
-                case "tick":
-                    file.tick(what)
-                case "event":
-                    file.event(what)
-                case "sent":
-                    file.sent(what)
-                case "frame":
-                    file.frame(*what)
-        file.finish()
-        part.keep()
+        with whole_file(out_path) as part:
+            file = RecordingFile(DiskFile.new(part), log.header, profile, camera)
+            for _, kind, what in heapq.merge(_records(log), _frames(log, notes), key=_time_of):
+                match kind:
+                    case "tick":
+                        file.tick(what)
+                    case "event":
+                        file.event(what)
+                    case "sent":
+                        file.sent(what)
+                    case "frame":
+                        file.frame(*what)
+            file.finish()
     except OSError as error:
         raise cannot_be_written(out_path, error) from None
-    finally:
-        part.drop()
     write_files({layout_path: files("perchctl.record").joinpath("foxglove.json").read_bytes()})
     return Exported(out_path, layout_path, file.pictures, tuple(notes))
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import yaml
-
 from perchctl.errors import InvalidValue
 from perchctl.profile import MarkerConfig, TargetConfig
 from perchctl.target.drawing import mm_text
@@ -25,19 +23,6 @@ class Measured:
 
     target: TargetConfig
     notes: tuple[str, ...]
-
-    def profile_text(self, base: str) -> str:
-        """A small profile that extends `base` and holds the target."""
-        name = yaml.safe_dump(base, width=1000).splitlines()[0]
-        lines = [f"extends: {name}", "", "target:", "  # sides of the black squares, measured"]
-        lines += [
-            f"  {which}: {{dictionary: {marker.dictionary}, id: {marker.id}, "
-            f"side_m: {marker.side_m:g}}}"
-            for which, marker in (("large", self.target.large), ("small", self.target.small))
-        ]
-        if self.target.size_sigma != TargetConfig().size_sigma:
-            lines.append(f"  size_sigma: {self.target.size_sigma:g}")
-        return "\n".join(lines) + "\n"
 
 
 def measured_target(nominal: TargetConfig, sides_m: Mapping[str, float]) -> Measured:

@@ -89,7 +89,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     assert said.exit_code == 130, said.stderr
     log = Path("calib/mounting_mine.jsonl")
     assert f"kept the recording: {log}" in said.stderr
-    assert f"perchctl calibrate mount -p mine.yaml --from {log}" in said.stderr
+    assert f"--from {log}" in said.stderr
     (recording,) = read_recordings(log)
     assert len(recording.poses) >= 10
     newest = recording.attitudes[-1]

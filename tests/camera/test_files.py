@@ -24,7 +24,7 @@ from perchctl.camera import (
 )
 from perchctl.camera.files import ImagesSource
 from perchctl.camera.source import to_grey
-from perchctl.commands.calibrate import Source, sized
+from perchctl.commands.calibrate import Source, with_size
 from perchctl.errors import InvalidValue, NotFound, UsageError
 from perchctl.profile import CameraConfig, Profile
 from perchctl.vision import CameraModel, Frame
@@ -300,10 +300,10 @@ def test_a_port_that_is_none_is_named(url: str, found: str) -> None:
 
 
 def test_the_size_of_a_calibration_is_asked_of_a_camera_of_this_computer_only() -> None:
-    assert sized(Source("camera:0"), "720x576").size_px == (720, 576)
-    assert sized(Source("http://host/a"), None).size_px is None
+    assert with_size(Source("camera:0"), "720x576").size_px == (720, 576)
+    assert with_size(Source("http://host/a"), None).size_px is None
     for text in ("720", "720x", "0x0", "720 x 576"):
         with pytest.raises(InvalidValue, match="WIDTHxHEIGHT, as in 720x576"):
-            sized(Source("camera:0"), text)
+            with_size(Source("camera:0"), text)
     with pytest.raises(UsageError, match="http://host/a has its own: leave it out"):
-        sized(Source("http://me:secret@host/a"), "720x576")
+        with_size(Source("http://me:secret@host/a"), "720x576")

@@ -7,17 +7,17 @@ from collections.abc import Iterator
 import pytest
 
 from perchctl.display import LivePage
-from tests.helpers.live_page import Stops
 from tests.helpers.recording import camera
 
 
 @pytest.fixture
-def stops() -> Stops:
-    return Stops()
+def stops() -> list[str]:
+    """One entry for each time that STOP has been pressed."""
+    return []
 
 
 @pytest.fixture
-def page(stops: Stops) -> Iterator[LivePage]:
-    served = LivePage(camera(), "perchctl test", on_stop=stops)
+def page(stops: list[str]) -> Iterator[LivePage]:
+    served = LivePage(camera(), "perchctl test", on_stop=lambda: stops.append("STOP"))
     yield served
     served.close()

@@ -28,7 +28,7 @@ def test_stop_hangs_on_the_window_whatever_the_rows_say(width_px: int, browser: 
     """A row that wraps must not move it from under a finger."""
     page = LivePage(camera(), "perchctl fly sim://", on_stop=lambda: None)
     told = [["held", "word " * 300]]
-    page.tell(lambda: {"phase": "ASCEND", "rows": told, "note": "note " * 40}, live=False)
+    page.set_state(lambda: {"phase": "ASCEND", "rows": told, "note": "note " * 40}, live=False)
     try:
         browser.open(page.url, width_px, HEIGHT_PX)
         browser.until("document.body.innerText.includes('word word')")
@@ -48,24 +48,18 @@ def coloured_px(shot: np.ndarray, bgr: tuple[int, int, int]) -> int:
     return int((shot == bgr).all(axis=2).sum())
 
 
-def test_a_page_without_news_says_so_by_itself(browser: Browser) -> None:
+def test_a_page_without_news_says_so_and_a_flight_that_is_over_shows_its_card(
+    browser: Browser,
+) -> None:
     page = LivePage(camera(), "perchctl fly sim://", on_stop=lambda: None)
-    page.tell(lambda: {"phase": "ASCEND", "rows": []})  # and never again
-    try:
-        browser.open(page.url, 1280, HEIGHT_PX)
-        browser.until("document.body.classList.contains('old')")
-        shot = browser.photograph()
-    finally:
-        page.close()
-    assert coloured_px(shot, OLD_BGR) > 10_000  # the whole line
-
-
-def test_a_flight_that_is_over_shows_its_card(browser: Browser) -> None:
-    page = LivePage(camera(), "perchctl fly sim://", on_stop=lambda: None)
-    page.tell(lambda: {"phase": "PERCHED", "rows": [], "over": True}, live=False)
-    page.end({"outcome": "PERCHED", "good": True, "reason": "hanging", "rows": [["miss", "2 mm"]]})
+    page.set_state(lambda: {"phase": "ASCEND", "rows": []})  # and never again
+    card = {"outcome": "PERCHED", "good": True, "reason": "hanging", "rows": [["miss", "2 mm"]]}
     try:
         browser.open(page.url, 400, HEIGHT_PX)
+        browser.until("document.body.classList.contains('old')")
+        assert coloured_px(browser.photograph(), OLD_BGR) > 4_000  # the whole line
+        page.set_state(lambda: {"phase": "PERCHED", "rows": [], "over": True}, live=False)
+        page.end(card)
         browser.until("!document.getElementById('card').hidden")
         shot = browser.photograph()
         assert browser.evaluate("document.documentElement.scrollWidth") <= 400

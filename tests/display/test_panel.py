@@ -15,38 +15,17 @@ from rich.console import Console
 from rich.text import Text
 
 from perchctl.display import open_panel
-from perchctl.display.panel import FlightPanel, FlightStatus, panel, status_of, status_rows
-from perchctl.mission import (
-    BatteryOutlook,
-    ExternalPositions,
-    Observation,
-    Phase,
-    Tick,
-    start_mission,
-)
+from perchctl.display.panel import FlightPanel, PlainSurface, panel, status_rows
+from perchctl.mission import BatteryOutlook, ExternalPositions, Phase, Tick
 from perchctl.record import LogWatcher, read_log
 from perchctl.record.fields import tick_record
 from perchctl.record.write import FlightLogWriter
-from perchctl.vehicle import ExternalPosition, PositionSetpoint
+from perchctl.vehicle import ExternalPosition
 from tests.helpers import log as synthetic
+from tests.helpers.live_page import tick
 from tests.helpers.mission import entered, held, note
+from tests.helpers.waiting import until
 
-STATUS = FlightStatus(
-    t_s=101.0,
-    phase="ALIGN",
-    in_phase_s=1.25,
-    e_m=(-0.123, 0.045, 1.234),
-    e_yaw_rad=math.radians(-166.2),
-    tracked=True,
-    stage="both",
-    height_m=0.82,
-    battery_v=3.714,
-    link_age_s=0.012,
-    camera_age_s=0.05,
-    loop_late_s=0.001,
-    attempts=1,
-    reason="pose is steady",
-)
 ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 COLOUR = re.compile(r"\x1b\[[0-9;]*3[0-9]m")
 
@@ -56,19 +35,20 @@ class Terminal(io.StringIO):
         return True
 
 
-class Recorder:
+class Recorder(PlainSurface):
     """A surface that remembers."""
 
     def __init__(self) -> None:
+        super().__init__(io.StringIO())
         self.lines: list[str] = []
-        self.shown: list[FlightStatus] = []
+        self.shown: list[Tick] = []
         self.closed = 0
 
     def line(self, text: str) -> None:
         self.lines.append(text)
 
-    def show(self, status: FlightStatus) -> None:
-        self.shown.append(status)
+    def show(self, tick: Tick) -> None:
+        self.shown.append(tick)
 
     def close(self) -> None:
         self.closed += 1
@@ -79,8 +59,8 @@ def test_one_line_an_event_where_there_is_no_terminal() -> None:
     reporter = open_panel(stream=stream)
     reporter.event(entered(100.0, Phase.SEARCH, "hovering in the perching area"))
     for i in range(50):
-        reporter.update(replace(STATUS, t_s=100.0 + 0.02 * i, phase="SEARCH"))
-    reporter.update(STATUS)  # a change that no event told
+        reporter.tick(tick(100.0 + 0.02 * i, "SEARCH"))
+    reporter.tick(tick())  # a change that no event told
     reporter.event(held(102.5, "no picture for 0.6 s"))
     reporter.close()
     assert stream.getvalue().splitlines() == [
@@ -94,7 +74,7 @@ def test_no_more_than_ten_pictures_a_second() -> None:
     surface = Recorder()
     reporter = FlightPanel(surface)
     for i in range(500):  # ten seconds of the loop
-        reporter.update(replace(STATUS, t_s=100.0 + 0.02 * i))
+        reporter.tick(tick(100.0 + 0.02 * i))
     reporter.close()
     assert 1 <= len(surface.shown) <= 101
     assert surface.shown[-1].t_s > 109.8
@@ -102,32 +82,25 @@ def test_no_more_than_ten_pictures_a_second() -> None:
 
 
 @pytest.mark.parametrize("last", ["PERCHED", "LANDED", "ABORTED"])
-def test_the_panel_ends_with_the_flight_s_last_moment(last: str) -> None:
+def test_a_new_phase_is_shown_without_waiting_and_the_last_one_stays(last: str) -> None:
     """The loop tells the event first, and then the tick, which may be the last one."""
-    surface = Recorder()
-    reporter = FlightPanel(surface)
-    reporter.update(replace(STATUS, t_s=100.0, phase="ASCEND"))
-    reporter.event(entered(100.02, Phase(last), "over"))
-    reporter.update(replace(STATUS, t_s=100.02, phase=last))
-    reporter.close()
-    assert surface.shown[-1].phase == last
-
-
-def test_a_new_phase_is_shown_without_waiting() -> None:
     shown = threading.Event()
 
     class Watched(Recorder):
-        def show(self, status: FlightStatus) -> None:
-            super().show(status)
-            if status.phase == "ABORTED":
+        def show(self, tick: Tick) -> None:
+            super().show(tick)
+            if tick.state.phase.value == last:
                 shown.set()
 
-    reporter = FlightPanel(Watched())
-    reporter.update(replace(STATUS, t_s=100.0, phase="ASCEND"))
-    reporter.event(entered(100.02, Phase.ABORTED, "Ctrl-C twice"))
-    reporter.update(replace(STATUS, t_s=100.02, phase="ABORTED"))
+    surface = Watched()
+    reporter = FlightPanel(surface)
+    reporter.tick(tick(100.0, "ASCEND"))
+    reporter.event(entered(100.02, Phase(last), "over"))
+    until(lambda: len(surface.lines) == 2)  # the display sleeps again
+    reporter.tick(tick(100.02, last))
     assert shown.wait(5.0)
     reporter.close()
+    assert surface.shown[-1].state.phase.value == last
 
 
 def test_the_panel_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,7 +110,7 @@ def test_the_panel_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = Terminal()
     reporter = open_panel(stream=stream)
     reporter.event(note(100.0, "link: radio://0/80/2M/E7E7E7E7E7 [ok] https://a.b"))
-    reporter.update(replace(STATUS, phase="LANDING"))
+    reporter.tick(tick(phase="LANDING"))
     reporter.close()
     assert reporter.failure is None
     text = ESCAPE.sub("", stream.getvalue())
@@ -155,7 +128,7 @@ def test_no_colour_where_none_is_wanted(name: str, monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv(name, "1" if name == "NO_COLOR" else "dumb")
     stream = Terminal()
     reporter = open_panel(stream=stream)
-    reporter.update(replace(STATUS, phase="ABORTED", hold="no picture"))
+    reporter.tick(tick(phase="ABORTED", hold="no picture"))
     reporter.close()
     assert "ABORTED" in stream.getvalue()
     assert not COLOUR.search(stream.getvalue())
@@ -164,23 +137,24 @@ def test_no_colour_where_none_is_wanted(name: str, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    "status",
+    "changes",
     [
-        STATUS,
-        replace(STATUS, e_m=None, e_yaw_rad=None, camera_age_s=math.inf, link_age_s=12.0),
-        replace(STATUS, reason="why " * 100, hold="[bold]held[/bold] " * 20),
-        replace(STATUS, e_m=(-99.9, 99.9, 99.9), e_yaw_rad=-math.pi, in_phase_s=999.9),
-        replace(STATUS, e_m=(-99.9, 99.9, 99.9), e_yaw_rad=-math.pi, tracked=False),
+        {},
+        {"e_m": None, "camera_age_s": math.inf, "telemetry_age_s": 12.0},
+        {"reason": "why " * 100, "hold": "[bold]held[/bold] " * 20},
+        {"e_m": (-99.9, 99.9, 99.9), "e_yaw_rad": -math.pi, "entered_s": -899.0},
+        {"e_m": (-99.9, 99.9, 99.9), "e_yaw_rad": math.nan, "tracked": False},
     ],
 )
-def test_the_panel_fits_into_80_columns(status: FlightStatus) -> None:
+def test_the_panel_fits_into_80_columns(changes: dict[str, Any]) -> None:
+    shown = tick(**changes)
     console = Console(width=80, file=io.StringIO(), highlight=False, markup=False)
     with console.capture() as capture:
-        console.print(panel(status))
+        console.print(panel(shown))
     lines = capture.get().splitlines()
     assert len(lines) == 8
     assert max(Text(line.rstrip()).cell_len for line in lines) + len("^C") <= 80
-    for name, _ in status_rows(status):
+    for name, _ in status_rows(shown):
         assert sum(f" {name} " in line for line in lines) == 1, name
 
 
@@ -196,7 +170,7 @@ def test_a_display_that_fails_falls_silent_once() -> None:
     reporter.close()
     assert reporter.failure == "the display fell silent: BrokenPipeError: gone"
     reporter.event(entered(1.0, Phase.ALIGN, "y"))
-    reporter.update(STATUS)
+    reporter.tick(tick())
     reporter.close()
     assert len(surface.lines) == 1
 
@@ -214,7 +188,7 @@ def test_a_terminal_that_stands_still_does_not_stop_the_loop() -> None:
     reporter = FlightPanel(surface)
     for i in range(5000):
         reporter.event(note(0.02 * i, f"event {i}"))
-        reporter.update(replace(STATUS, t_s=0.02 * i))
+        reporter.tick(tick(0.02 * i))
     assert surface.lines == []
     gate.set()
     reporter.close()
@@ -222,30 +196,14 @@ def test_a_terminal_that_stands_still_does_not_stop_the_loop() -> None:
     assert len(surface.lines) <= 1001
 
 
-def tick(**changes: Any) -> Tick:
-    telemetry = synthetic.telemetry(99.99, 0.3)
-    state = start_mission(Observation(t_s=98.0, telemetry=synthetic.telemetry(98.0, 0.1)))
-    values: dict[str, Any] = {
-        "t_s": 100.0,
-        "telemetry": telemetry,
-        "output": None,
-        "target": synthetic.target(1.0, 1.0),
-        "state": state,
-        "command": PositionSetpoint(1.0, 2.0, 0.5, 0.0),
-        "loop_late_s": 0.002,
-        "camera_age_s": math.inf,
-        "telemetry_age_s": 0.01,
-    }
-    return Tick(**(values | changes))
-
-
 def test_what_the_loop_knows_reaches_log_and_display(tmp_path: Path) -> None:
     log = LogWatcher(FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header()))
     surface = Recorder()
     display = FlightPanel(surface)
+    flown = tick(100.0, "APPROACH", camera_age_s=math.inf)
     for watcher in (log, display):
         watcher.event(entered(100.0, Phase.APPROACH, "start"))
-        watcher.tick(tick())
+        watcher.tick(flown)
         watcher.event(held(100.1, "no picture"))
     assert (log.problem, display.problem) == (None, None)
     log.close()
@@ -256,18 +214,23 @@ def test_what_the_loop_knows_reaches_log_and_display(tmp_path: Path) -> None:
     assert [e["severity"] for e in back.events] == ["continue", "hold"]
     record = back.records[0]
     assert (record["phase"], record["cmd"], record["cmd_z_m"]) == ("APPROACH", "position", 0.5)
-    assert (record["tel_age_s"], record["cam_age_s"]) == (0.01, None)
-    status = surface.shown[0]
-    assert status.height_m == pytest.approx(0.2)
-    assert status.in_phase_s == pytest.approx(2.0)
-    assert status.stage == "both"
+    assert (record["tel_age_s"], record["cam_age_s"]) == (0.012, None)
+    assert surface.shown == [flown]
     assert surface.lines[0] == "[   0.00 s] APPROACH: start"
 
 
-def test_a_status_without_a_target() -> None:
-    status = status_of(tick(target=None))
-    assert (status.e_m, status.e_yaw_rad, status.stage) == (None, None, "none")
-    assert dict(status_rows(status))["ages"].startswith("link 10 ms   camera none")
+def test_the_rows_of_a_moment() -> None:
+    rows = dict(status_rows(tick()))
+    assert rows["phase"] == "ALIGN  1.2 s"
+    assert rows["error"] == "x -12.3  y +4.5  z +123.4 cm   yaw -166.2 deg"
+    assert rows["markers"] == "both   attempts 1"
+    assert rows["height"].startswith("0.82 m")
+    assert rows["ages"] == "link 12 ms   camera 50 ms   loop late 1 ms"
+    rows = dict(status_rows(tick(tracked=False, e_yaw_rad=math.nan)))
+    assert rows["error"].endswith("yaw - deg   (not seen)")
+    rows = dict(status_rows(tick(e_m=None, camera_age_s=math.inf)))
+    assert (rows["error"], rows["markers"]) == ("no target seen yet", "none   attempts 1")
+    assert rows["ages"].startswith("link 12 ms   camera none")
 
 
 @pytest.mark.parametrize(
@@ -279,15 +242,12 @@ def test_a_status_without_a_target() -> None:
         (3.71, BatteryOutlook(60.0), "3.71 V, 60 s left"),
         (3.71, BatteryOutlook(150.0), "3.71 V, 2 min left"),
         (3.71, BatteryOutlook(), "3.71 V"),
-        (3.71, None, "3.71 V"),
         (0.0, BatteryOutlook(), "unknown"),
         (math.nan, BatteryOutlook(), "unknown"),
     ],
 )
-def test_what_the_battery_is_enough_for(
-    volts: float, battery: BatteryOutlook | None, text: str
-) -> None:
-    rows = dict(status_rows(replace(STATUS, battery_v=volts, battery=battery)))
+def test_what_the_battery_is_enough_for(volts: float, battery: BatteryOutlook, text: str) -> None:
+    rows = dict(status_rows(tick(battery_v=volts, battery=battery)))
     assert rows["height"] == f"0.82 m   battery {text}"
     assert len(rows["height"]) < 70
 
@@ -300,12 +260,11 @@ WELL = ExternalPositions(0.012, None, 300, 99.6, PLACE)
 
 
 def test_positions_from_outside_have_their_line() -> None:
-    assert "outside" not in dict(status_rows(STATUS))
-    assert status_of(tick()).outside is None
-    rows = dict(status_rows(status_of(tick(outside=WELL))))
+    assert "outside" not in dict(status_rows(tick()))
+    rows = dict(status_rows(tick(outside=WELL)))
     assert rows["outside"] == "position 100 Hz   12 ms"
     wrong = replace(WELL, age_s=math.inf, problem="the rigid body 'cf2' is not seen")
-    assert dict(status_rows(replace(STATUS, outside=wrong)))["outside"] == wrong.problem
+    assert dict(status_rows(tick(outside=wrong)))["outside"] == wrong.problem
 
 
 def test_the_log_has_what_was_sent() -> None:

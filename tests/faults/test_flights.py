@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from perchctl.campaign.results_file import flown_record
 from perchctl.commands import app
-from perchctl.commands.positioning import POSITIONINGS, positioned
+from perchctl.commands.fly import POSITIONINGS, with_positioning
 from perchctl.errors import SafetyAbort
 from perchctl.faults import FAULTS, FaultResult, fault_summary, fault_table
 from perchctl.faults import flight as faulty
@@ -51,7 +51,7 @@ GUARD = {
 
 @cache
 def profile(by: str = "deck") -> Profile:
-    return positioned(load_profile(SHORT), by)
+    return with_positioning(load_profile(SHORT), by)
 
 
 def promise_of(name: str) -> Promise:

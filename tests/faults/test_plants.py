@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands.positioning import POSITIONINGS, positioned
+from perchctl.commands.fly import POSITIONINGS, with_positioning
 from perchctl.faults import flight as faulty
 from perchctl.faults.flight import fly_fault_seed
 from perchctl.faults.oracle import Flag
@@ -157,7 +157,7 @@ GUARD = {(plant.name, POSITIONINGS[i % len(POSITIONINGS)]) for i, plant in enume
 )  # fmt: skip
 def test_the_campaign_notices(plant: Plant, by: str) -> None:
     cv2.setNumThreads(1)
-    profile = positioned(load_profile(SHORT), by)
+    profile = with_positioning(load_profile(SHORT), by)
 
     def is_flagged(seed: int, *, planted: bool) -> bool:
         with Patch.context() as patch:

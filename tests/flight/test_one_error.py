@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.display.panel import status_of
+from perchctl.display.panel import status_rows
 from perchctl.flight import fly_lockstep
 from perchctl.geometry import Array, rot_z, wrap_rad
 from perchctl.mission import Phase, Tick, planner
@@ -82,7 +82,7 @@ def flight() -> Iterator[tuple[list[tuple[Tick, Truth]], Counted]]:
         assert flown.report.phase is Phase.PERCHED
         for tick, _ in looker.ticks:  # whatever looks at a tick solves nothing
             tick_record(tick)
-            status_of(tick)
+            status_rows(tick)
         yield looker.ticks, counted
 
 
@@ -93,15 +93,16 @@ def test_the_log_and_the_panel_hold_the_planner_s_error(
     assert len(ticks) == len(counted.contexts)
     seen = 0
     for (tick, _), context in zip(ticks, counted.contexts, strict=True):
-        record, status = tick_record(tick), status_of(tick)
+        record, shown = tick_record(tick), dict(status_rows(tick))["error"]
         target = context.obs.target
         if target is None:
-            assert (record["ex_m"], status.e_m) == (None, None)
+            assert (record["ex_m"], shown) == (None, "no target seen yet")
             continue
         seen += 1
         assert [record[f"e{axis}_m"] for axis in "xyz"] == target.e_m.tolist()
-        assert status.e_m == tuple(target.e_m.tolist())
-        assert record["eyaw_rad"] == status.e_yaw_rad == context.error_yaw_rad
+        x, y, z = (f"{100 * v:+.1f}" for v in target.e_m)
+        assert shown.startswith(f"x {x}  y {y}  z {z} cm")
+        assert record["eyaw_rad"] == context.error_yaw_rad
         assert math.hypot(record["ex_m"], record["ey_m"]) == context.error_xy_m
         assert record["ez_m"] == context.error_z_m
         assert target.t_s == tick.t_s  # at the present, not at the frame's time

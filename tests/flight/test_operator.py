@@ -251,12 +251,12 @@ def test_a_terminal_that_is_gone_is_no_failure() -> None:
     """Writes to stderr fail with EIO or EPIPE: nothing is raised, and the exit code stays."""
     code = (
         "import os, sys\n"
-        "from perchctl.commands.output import say, tell\n"
+        "from perchctl.commands.output import print_lines, say\n"
         "from perchctl.display import open_panel\n"
         "from perchctl.mission.records import Event, EventKind\n"
         "say('one'); panel = open_panel(stream=sys.stderr)\n"
         "panel.event(Event(0.0, EventKind.NOTE, 'two'))\n"
-        "panel.close(); tell('three')\n"
+        "panel.close(); print_lines('three')\n"
         "sys.exit(7)\n"
     )
     read, write = os.pipe()

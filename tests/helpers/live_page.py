@@ -1,23 +1,51 @@
-"""What the tests of the live page share: a page, its STOP, and asking it."""
+"""What the tests of the displays share: a moment of a flight, asking the page, and its STOP."""
 
 from __future__ import annotations
 
 import http.client
+import math
+from dataclasses import replace
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 
 from perchctl.display.live import TOKEN_HEADER
+from perchctl.mission import BatteryOutlook, Phase, PlannerState, Tick
+from perchctl.vehicle import PositionSetpoint
+from tests.helpers import log as synthetic
 
 CORNERS = np.array([[200.0, 150.0], [400.0, 150.0], [400.0, 350.0], [200.0, 350.0]])
 
 
-class Stops:
-    def __init__(self) -> None:
-        self.count = 0
-
-    def __call__(self) -> None:
-        self.count += 1
+def tick(
+    t_s: float = 101.0, phase: str = "ALIGN", reason: str = "pose is steady", hold: str = "",
+    entered_s: float = 99.75, e_m: tuple[float, ...] | None = (-0.123, 0.045, 1.234),
+    e_yaw_rad: float = math.radians(-166.2), tracked: bool = True, battery_v: float = 3.714,
+    battery: BatteryOutlook | None = None, **changes: Any,
+) -> Tick:  # fmt: skip
+    """A moment of a flight."""
+    seen = None
+    if e_m is not None:
+        seen = replace(
+            synthetic.target(t_s, 1.0), e_m=np.array(e_m), e_yaw_rad=e_yaw_rad, tracked=tracked
+        )
+    state = PlannerState(
+        phase=Phase(phase), entered_s=entered_s, reason=reason, hold=hold, attempts=1,
+        ground_m=(0.0, 0.0, 0.1), battery=battery or BatteryOutlook(),
+    )  # fmt: skip
+    values: dict[str, Any] = {
+        "t_s": t_s,
+        "telemetry": replace(synthetic.telemetry(t_s, 0.92), battery_v=battery_v),
+        "output": None,
+        "target": seen,
+        "state": state,
+        "command": PositionSetpoint(1.0, 2.0, 0.5, 0.0),
+        "loop_late_s": 0.001,
+        "camera_age_s": 0.05,
+        "telemetry_age_s": 0.012,
+    }
+    return Tick(**(values | changes))
 
 
 def ask(

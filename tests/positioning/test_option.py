@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from typer.testing import CliRunner, Result
 
 from perchctl.commands import app
-from perchctl.commands.positioning import positioned
+from perchctl.commands.fly import with_positioning
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.profile.positioning import MOST_LATENCY_S
 
@@ -74,10 +74,10 @@ def test_the_target_brings_its_own_limits_and_leaves_none_behind() -> None:
     own = PositioningConfig.model_validate({"by": "target"})
     deck, mocap = Profile(), Profile.model_validate({"positioning": {"by": "mocap", "host": "lab"}})
     for profile in (deck, mocap):
-        assert positioned(profile, "target").positioning == own
-    back = positioned(positioned(deck, "target"), "mocap").positioning
+        assert with_positioning(profile, "target").positioning == own
+    back = with_positioning(with_positioning(deck, "target"), "mocap").positioning
     assert back == PositioningConfig.model_validate({"by": "mocap"})
-    assert positioned(mocap, "mocap").positioning.host == "lab"
+    assert with_positioning(mocap, "mocap").positioning.host == "lab"
     text = fly("-p", "target_only", "--dry-run").stdout
     assert "positioning  the target itself" in text
     assert "at most 3.2 m above the camera" in " ".join(text.split())

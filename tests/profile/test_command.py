@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 from perchctl.check import Verdict, profile_rows
 from perchctl.commands import app
 from perchctl.commands.picture_edges import PICTURE_EDGES, edges_beside, picture_edges
-from perchctl.commands.profile import QUESTIONS, Answers, Question, answered, profile_keys
+from perchctl.commands.profile import QUESTIONS, Answers, Question, collect_answers, profile_keys
 from perchctl.files import mode_of
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.profile.keys import keys
@@ -88,7 +88,7 @@ def test_the_file_loads_and_equals_what_was_answered(said: dict[str, str]) -> No
     assert mine.planner.search.max_height_m <= ceiling_m - 0.49
     assert mine.safety.fence_radius_m == float(said["fence"])
     found, default = ({key.path: key.default for key in keys(p)} for p in (mine, type(mine)()))
-    other = default.keys() - profile_keys(answered(said, unasked), output).keys() - {"name"}
+    other = default.keys() - profile_keys(collect_answers(said, unasked), output).keys() - {"name"}
     assert {path: found[path] for path in other} == {path: default[path] for path in other}
 
 

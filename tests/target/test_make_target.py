@@ -81,13 +81,8 @@ REFUSALS = [
     (["design", "nothing.yaml"], 20, "not found"),
     (["suggest", CAMERA, "--ceiling", "1"], 30, "below the highest search position"),
     (["measured", "-p", "m.yaml"], 2, "nothing was measured"),
-    (["measured", "--measured-large", "149.6"], 2, "name the profile"),
-    (["measured", "--measured-large", "149.6", "-p", "crazyflie"], 2,
-     "-p crazyflie -o my_vehicle.yaml"),
-    (["measured", "--measured-large", "0.1496", "-p", "m.yaml"], 30,
-     "measure the black square, in mm"),
-    (["measured", "--measured-large", "150in", "-p", "m.yaml"], 30, "unit 'in'"),
-    (["measured", "--measured-large", "149.6", "-o", "m.pdf"], 2, "a .yaml file"),
+    (["measured", "--measured-large", "149.6", "-p", "crazyflie"], 2, "-p my_vehicle.yaml"),
+    (["measured", "--measured-large", "149.6", "-p", "m.yaml"], 20, "m.yaml does not exist"),
 ]  # fmt: skip
 
 
@@ -102,7 +97,7 @@ def test_a_refusal_is_one_sentence_and_leaves_nothing(
 
 
 @pytest.mark.parametrize("words", [
-    ("design", "--blur", "-1"), ("design", "--noise", "nan"), ("suggest", "--ceiling", "nan"),
+    ("design", "--blur", "-1"), ("suggest", "--ceiling", "nan"),
     ("sheet", "--ceiling", "2.4"), ("board", "chessboard:9x6:25mm", "--large", "15cm"),
     ("suggest", "--small", "2cm"), ("measured", "--tile", "a4"), ("board",),
 ])  # fmt: skip
@@ -128,24 +123,14 @@ def test_a_full_disk_leaves_nothing() -> None:
 MEASURED = ("--measured-large", "149.6", "--measured-small", "24.9mm")
 
 
-def test_measured_sizes_make_a_small_profile() -> None:
-    out, _ = call("measured", "-p", "crazyflie", *MEASURED, "-o", "mine.yaml")
-    assert "-0.27 %" in out
-    assert "small against large: -0.13 %" in out
-    found = load_profile("./mine.yaml")
-    assert found.target.large.side_m == 0.1496
-    assert found.target.small.side_m == 0.0249
-    assert found.target.size_sigma == 0.001
-    assert found.vehicle == load_profile("crazyflie").vehicle
-    assert Path("mine.yaml").read_text().startswith("extends: crazyflie\n")
-
-
-def test_a_new_file_named_by_p_extends_the_real_vehicle_s_profile() -> None:
-    out, _ = call("measured", "-p", "new.yaml", "--measured-small", "25.1")
-    assert "measure both markers" in out
-    assert load_profile("./new.yaml").target.size_sigma == 0.005
-    assert load_profile("./new.yaml").target.small.side_m == 0.0251
-    assert load_profile("./new.yaml").link == load_profile("crazyflie").link
+@pytest.mark.parametrize(
+    ("size", "said"), [("0.1496", "measure the black square, in mm"), ("150in", "unit 'in'")]
+)
+def test_a_size_that_cannot_be_the_marker_s_is_refused(size: str, said: str) -> None:
+    Path("m.yaml").write_text("extends: crazyflie\n")
+    _, err = call("measured", "--measured-large", size, "-p", "m.yaml", "--force", code=30)
+    assert said in err
+    assert Path("m.yaml").read_text() == "extends: crazyflie\n"
 
 
 PROFILES = {
@@ -179,29 +164,15 @@ def test_an_existing_profile_is_changed_in_place_with_force_only(name: str) -> N
     assert files() == {"mine.yaml", "mine.yaml.bak"}, "nothing changed, and nothing is kept twice"
 
 
-def test_a_small_profile_of_a_file_in_another_folder_finds_it() -> None:
-    Path("base").mkdir()
-    Path("base/mine.yaml").write_text("extends: crazyflie\nlog: {plot: false}\n")
-    call("measured", "-p", "base/mine.yaml", "--measured-large", "149.6", "-o", "measured.yaml")
-    assert load_profile("./measured.yaml").log.plot is False
-    _, err = call(
-        "measured",
-        "-p",
-        "base/mine.yaml",
-        "--measured-large",
-        "150",
-        "-o",
-        "measured.yaml",
-        code=30,
-    )
-    assert "measured.yaml exists" in err
-
-
-def test_a_scaled_page_is_noticed() -> None:
-    out, _ = call(
-        "measured", "-p", "m.yaml", "--measured-large", "145.5", "--measured-small", "24.25"
-    )
+def test_a_scaled_page_and_a_marker_that_was_not_measured_are_noticed() -> None:
+    Path("m.yaml").write_text("extends: crazyflie\n")
+    out, _ = call("measured", "-p", "m.yaml", "--measured-small", "25.1", "--force")
+    assert "measure both markers" in out
+    assert load_profile("./m.yaml").target.size_sigma == 0.005
+    words = ("--measured-large", "145.5", "--measured-small", "24.25", "--force")
+    out, _ = call("measured", "-p", "m.yaml", *words)
     assert "was the page scaled" in out
+    assert "small against large: " in out
 
 
 @pytest.mark.long

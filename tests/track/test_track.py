@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
+from perchctl.calibration import SizeMissing, load_calibration
 from perchctl.commands.interrupt import Stopper
-from perchctl.commands.output import say
-from perchctl.commands.track import frames
+from perchctl.commands.track import Tracker, TrackSummary, frames
+from perchctl.errors import InvalidValue
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.profile import Profile, TargetConfig, load_profile
-from perchctl.track import Notes, Tracker
 from perchctl.vision import Frame, project, square_corners
 from tests.helpers.interlaced import Pass
 from tests.helpers.recording import (
@@ -30,41 +29,40 @@ from tests.helpers.recording import (
     write_video,
 )
 from tests.helpers.target_picture import CAMERA
-from tests.helpers.track import MOVING, lines, track, write_opencv, write_ros
+from tests.helpers.track import (
+    DISTORTION,
+    MOVING,
+    PINHOLE,
+    lines,
+    track,
+    write_opencv,
+    write_ros,
+)
 
 SCENES = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "scenes"
 PAL_S = 0.04
 FIELDS = 10
 
 
-def check_vector(values: Any, length: int) -> None:
-    assert isinstance(values, list)
-    assert len(values) == length
-    assert all(isinstance(v, float) for v in values)
+SHAPES = {
+    "large": {"corners_px": (4, 2), "rvec_rad": (3,), "tvec_m": (3,), "reprojection_px": ()},
+    "target": {
+        "rvec_rad": (3,), "tvec_m": (3,), "yaw_rad": (), "sigma_m": (3,), "sigma_yaw_rad": (),
+    },
+}  # fmt: skip
+SHAPES["small"] = SHAPES["large"]
 
 
 def check_schema(line: dict[str, Any]) -> None:
     assert list(line) == ["frame", "t_s", "stage", "large", "small", "target"]
-    assert line["stage"] in ("large", "both", "small", "none")
     seen = {"large": (1, 0), "small": (0, 1), "both": (1, 1), "none": (0, 0)}[line["stage"]]
     assert (line["large"] is not None, line["small"] is not None) == seen
-    for name in ("large", "small"):
-        if line[name] is None:
-            continue
-        assert list(line[name]) == ["corners_px", "rvec_rad", "tvec_m", "reprojection_px"]
-        assert len(line[name]["corners_px"]) == 4
-        for corner in line[name]["corners_px"]:
-            check_vector(corner, 2)
-        check_vector(line[name]["rvec_rad"], 3)
-        check_vector(line[name]["tvec_m"], 3)
-        assert 0.0 <= line[name]["reprojection_px"] < 3.0
+    for name, shapes in SHAPES.items():
+        if line[name] is not None:
+            assert {key: np.shape(value) for key, value in line[name].items()} == shapes
+            assert all(np.isfinite(value).all() for value in line[name].values())
     if line["target"] is not None:
-        keys = ["rvec_rad", "tvec_m", "yaw_rad", "sigma_m", "sigma_yaw_rad"]
-        assert list(line["target"]) == keys
-        for key in ("rvec_rad", "tvec_m", "sigma_m"):
-            check_vector(line["target"][key], 3)
-        assert min(line["target"]["sigma_m"]) > 0.0
-        assert line["target"]["sigma_yaw_rad"] > 0.0
+        assert min(*line["target"]["sigma_m"], line["target"]["sigma_yaw_rad"]) > 0.0
 
 
 # --- the truth ------------------------------------------------------------------------
@@ -264,13 +262,9 @@ def test_pictures_that_show_nothing_are_named_and_counted(tmp_path: Path) -> Non
     for words in ("dark.png: the picture is dark", "snow.png: snow", "uniform.png: an empty"):
         assert words in tracked.stderr
     assert "snow in 1" in tracked.stderr.splitlines()[-1]
-
-
-def test_a_video_that_stands_still_is_named(tmp_path: Path) -> None:
-    file = write_video(tmp_path / "still.mp4", [np.full((480, 640), 90, np.uint8)] * 20)
-    tracked = track(file)
-    assert [line["frame"] for line in tracked.lines] == list(range(20))
-    assert len(re.findall("the picture stands still", tracked.stderr)) == 2  # and in the summary
+    still = track(write_video(tmp_path / "still.mp4", [np.full((480, 640), 90, np.uint8)] * 20))
+    assert [line["frame"] for line in still.lines] == list(range(20))
+    assert still.stderr.count("the picture stands still") == 2  # and in the summary
 
 
 def tracker(profile: Profile | None = None, live: bool = True, stills: bool = False) -> Tracker:
@@ -285,13 +279,21 @@ def test_a_live_picture_that_repeats_is_no_frame_and_then_frozen() -> None:
     [frozen] = live.results(Frame(2, 1.0, image), 2)
     assert (frozen.stage, frozen.target) == ("none", None)
     assert frozen.notes == ("the picture stands still",)
-
-
-def test_a_live_snow_is_no_measurement() -> None:
     noise = np.random.default_rng(1).integers(0, 256, (480, 640)).astype(np.uint8)
-    [seen] = tracker().results(Frame(0, 0.0, noise), 0)
-    assert seen.stage == "none"
-    assert "snow" in seen.notes[0]
+    [snow] = live.results(Frame(3, 1.1, noise), 3)
+    assert (snow.stage, snow.output) == ("none", None)
+    assert "snow" in snow.notes[0]
+
+
+@pytest.mark.parametrize("stills", [False, True])
+def test_a_video_is_filtered_and_a_still_is_as_measured(stills: bool) -> None:
+    following = tracker(live=False, stills=stills)
+    for i in range(3):
+        [seen] = following.results(Frame(i, i / 30.0, picture(moving(i), i)), i)
+    assert seen.output is not None
+    assert seen.target is not None
+    measured_m = seen.output.poses["joint"].tvec_m
+    assert np.array_equal(seen.target.tvec_m, measured_m) is stills
 
 
 def test_markers_that_contradict_are_named() -> None:
@@ -348,8 +350,82 @@ class Script:
 def test_a_live_source_is_waited_for_and_its_end_is_told(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    seen = [f.index for f in frames(Script(3), lambda: 5.0, Stopper(), Notes(say))]
+    seen = [f.index for f in frames(Script(3), lambda: 5.0, Stopper(), TrackSummary())]
     assert seen == [2, 1, 0]
     said = capsys.readouterr().err
     assert said.startswith("perchctl: silent for 2 s; waiting")
     assert said.endswith("perchctl: the stream has ended\n")
+
+
+# --- whose calibration ------------------------------------------------------------------
+
+KALIBR = """cam0:
+  cam_overlaps: []
+  camera_model: pinhole
+  distortion_coeffs: [-0.17, 0.04, 0.0004, -0.0007]
+  distortion_model: radtan
+  intrinsics: [380.0, 380.6, 321.5, 238.2]
+  resolution: [640, 480]
+  rostopic: /camera/image_raw
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("radtan", "fov", "'fov' is not supported"),
+        ("pinhole", "omni", "'omni' is not supported"),
+        ("intrinsics: [380.0, 380.6, 321.5, 238.2]", "intrinsics: [380.0, 1.0]", "fu, fv, pu, pv"),
+        ("  resolution: [640, 480]\n", "", "key resolution is missing"),
+        ("resolution: [640, 480]", "resolution: 640", "not a number"),
+        ("intrinsics: [380.0,", "intrinsics: [wide,", "not a number"),
+        ("rostopic: /camera/image_raw\n", "x: 1\ncam1: {}\n", "holds 2 cameras"),
+        (KALIBR, "cam0: 3\n", "cam0 must hold keys"),
+        ("-0.0007]", "-0.0007, 0.0, 0.0]", "found 6"),
+    ],
+)
+def test_other_camchains_are_refused(tmp_path: Path, old: str, new: str, expected: str) -> None:
+    assert old in KALIBR
+    path = tmp_path / "camchain.yaml"
+    path.write_text(KALIBR.replace(old, new))
+    with pytest.raises(InvalidValue, match=expected):
+        load_calibration(path)
+
+
+def test_the_opencv_fisheye_flag_is_heeded(tmp_path: Path) -> None:
+    path = write_opencv(tmp_path / "fisheye.yml", (640, 480), dist=np.zeros(4))
+    path.write_text(path.read_text() + "fisheye_model: 1\n")
+    assert load_calibration(path).model == "fisheye"
+
+
+def test_a_missing_size_is_taken_from_the_first_picture_with_a_warning(
+    tmp_path: Path, pictures: Path
+) -> None:
+    whole = write_ros(tmp_path, PINHOLE, DISTORTION)
+    known = lines(pictures / "near.png", calibration=whole)
+    ros = tmp_path / "without.yaml"
+    ros.write_text(whole.read_text().replace("image_width: 640\nimage_height: 480\n", ""))
+    for file in (ros, write_opencv(tmp_path / "opencv.yml", None)):
+        with pytest.raises(SizeMissing, match="image size is missing"):
+            load_calibration(file)
+        tracked = track(pictures / "near.png", calibration=file)
+        assert tracked.lines == known
+        assert "640x480 px is taken from the first picture" in tracked.stderr
+    ros = write_ros(tmp_path, [760.0, 0.0, 643.0, 0.0, 761.0, 476.0, 0.0, 0.0, 1.0], [0.0] * 5)
+    ros.write_text(ros.read_text().replace("image_width: 640\nimage_height: 480\n", ""))
+    with pytest.raises(InvalidValue, match="does not fit a 640x480 picture"):  # by its centre
+        load_calibration(ros, (640, 480))
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_picture_of_another_size_is_named_and_no_file_is_left(
+    number: int, tmp_path: Path
+) -> None:
+    for k in range(2):
+        size = (320, 240) if k == number else (640, 480)
+        cv2.imwrite(str(tmp_path / f"{k}.png"), cv2.resize(picture(VIEWS["both"]), size))
+    tracked = track(tmp_path, "--csv", tmp_path / "x.csv", "--overlay", tmp_path / "x.mp4")
+    assert tracked.code == InvalidValue.exit_code
+    for words in (f"{number}.png", "320x240", "640x480"):
+        assert words in tracked.stderr
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["0.png", "1.png"]
