@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.errors import InvalidValue
-from perchctl.files import PartFile, cannot_be_written
+from perchctl.files import cannot_be_written, whole_file
 from perchctl.geometry import Array, rot_z, rotation_from_rpy
 from perchctl.plot import (
     BLACK,
@@ -356,14 +356,8 @@ def _writer(path: Path, rate_hz: float) -> Iterator[Callable[[Rgb], None]]:
     """
     form = _gif if path.suffix.lower() == ".gif" else _mp4
     try:
-        file = PartFile(path)
-        try:
-            with form(file.part, rate_hz) as add:
-                yield add
-            file.sync()
-            file.keep()
-        finally:
-            file.drop()
+        with whole_file(path) as part, form(part, rate_hz) as add:
+            yield add
     except OSError as error:
         raise cannot_be_written(path, error) from None
 
