@@ -18,7 +18,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl import __version__
 from perchctl.commands.command_line import COMMANDS, report_failures
 from perchctl.commands.output import ask_to_confirm
-from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote
+from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote, UsageError
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT
 from tests.helpers.recording import write_pictures
@@ -323,3 +323,25 @@ def test_an_ignored_ctrl_c_stays_ignored() -> None:
     """As a shell starts what it puts into the background."""
     ignored = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
     assert run_apart("fly", "--dry-run", before=ignored + pressed_at("numpy")).code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (("fyl",), "perchctl fly?"),
+        (("log", "shwo"), "perchctl log show?"),
+        (("calibrate", "monut", "-p", "x.yaml"), "perchctl calibrate mount?"),
+    ],
+)
+def test_a_misspelt_command_is_named(words: tuple[str, ...], meant: str) -> None:
+    said = run(*words)
+    assert said.code == UsageError.exit_code
+    assert f"did you mean {meant}" in said.stderr
+
+
+def test_what_is_like_no_command_is_the_main_ones_argument(tmp_path: Path) -> None:
+    """A file may have a command's name, misspelt or not."""
+    file = tmp_path / "shwo"
+    file.write_text("no log")
+    assert "did you mean" not in run("log", str(file)).stderr
+    assert "does not exist" in run("log", "flight_17.jsonl").stderr

@@ -7,6 +7,7 @@ only as it is used, so that the help is quick, and may import whatever it needs 
 from __future__ import annotations
 
 import contextlib
+import difflib
 import errno
 import functools
 import importlib
@@ -59,6 +60,8 @@ COMMANDS: dict[str, str] = {
 }
 """In the order in which one uses them, with the first sentence of their help."""
 
+_CLOSE = 0.6
+"""The least likeness of a misspelt command to the one that was meant."""
 _SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
 
 
@@ -85,6 +88,8 @@ class Group(TyperGroup):
         if ctx.resilient_parsing:  # a shell asks for what may come
             return super().parse_args(ctx, args)
         if not args or args[0] not in (*self.commands, *_SETTINGS["help_option_names"]):
+            if args and not os.path.exists(args[0]):
+                _refuse_misspelt(args[0], list(self.commands), f"{ctx.command_path} ")
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
 
@@ -124,9 +129,22 @@ class _Commands(TyperGroup):
         # The whole sentence: of its own accord the list of the commands cuts it.
         return _Unloaded(cmd_name, short_help=COMMANDS[cmd_name])
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] not in COMMANDS:
+            _refuse_misspelt(args[0], list(COMMANDS), "perchctl ")
+        return super().resolve_command(ctx, args)
+
     def invoke(self, ctx: Any) -> Any:
         with report_failures("--json" in ctx.args):
             return super().invoke(ctx)
+
+
+def _refuse_misspelt(word: str, names: list[str], path: str) -> None:
+    """Raises UsageError if a word looks like one of the commands below `path`, misspelt."""
+    if close := difflib.get_close_matches(word, names, 1, _CLOSE):
+        raise UsageError(
+            f"{path}{word} is no command; did you mean {path}{close[0]}? ({path}--help lists all)"
+        )
 
 
 def new_app(cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
