@@ -49,7 +49,7 @@ class SourceName:
 
 
 def parse_source(text: str, *, files: bool = False) -> SourceName:
-    """The source that a text names: a scheme, in small or capital letters, and what is behind it.
+    """Return the source that a text names: a scheme in small or capital letters, and its place.
 
     `files`: a bare path names a video, a picture, a pattern or a folder of pictures. Nothing is
     opened. Errors: InvalidValue for an unknown scheme or an AI-deck's address that is none;
@@ -77,7 +77,7 @@ def parse_source(text: str, *, files: bool = False) -> SourceName:
 
 
 def note(sentence: str) -> None:
-    """Warn: the command line prints it, and a program that uses the package may catch it."""
+    """Warn with a sentence, which the command line prints and a program may catch."""
     warnings.warn(sentence, CameraNote, stacklevel=3)
 
 
@@ -128,8 +128,6 @@ def open_camera(
         else:
             live = _live(name, latency_s, size_px, clock, config)
             opened = _started(live, timeout_s, tell)
-            if isinstance(live, StreamSource):
-                _tell_unasked(name, config, tell)
     return opened if config is None else mirrored_as_profiled(opened, config)
 
 
@@ -140,7 +138,7 @@ def _live(
     clock: Clock,
     config: CameraConfig | None,
 ) -> LiveSource:
-    """A camera or stream whose first frame is still to come."""
+    """Open a camera or stream whose first frame is still to come."""
     if name.scheme == "camera":
         asked = asked_of(config, size_px)
         number = camera_number(name.place)
@@ -167,7 +165,7 @@ _USUAL_PORT = {"http": 80, "https": 443, "rtsp": 554}
 
 
 def _check_address(name: SourceName) -> None:
-    """Raises InvalidValue where a stream's URL has no host or no port that can be."""
+    """Raise InvalidValue where a stream's URL has no host, or a port that cannot be."""
     port: int | str | None = None
     try:
         parts = urlsplit(name.spec)
@@ -192,21 +190,8 @@ def _check_address(name: SourceName) -> None:
         )
 
 
-def _tell_unasked(
-    name: SourceName, config: CameraConfig | None, tell: Callable[[str], None]
-) -> None:
-    """What the profile asks of a driver, and no network camera has."""
-    keys = {} if config is None else {"format": config.format, "controls": config.controls}
-    given = [f"camera.{key}" for key, value in keys.items() if value]
-    if given:
-        verb = "is" if len(given) == 1 else "are"
-        tell(
-            f"{' and '.join(given)} {verb} not used with {name}: only camera: sources have a "
-            f"driver to ask; set that in the camera itself"
-        )
-
-
 def _started(source: LiveSource, timeout_s: float, tell: Callable[[str], None]) -> FrameSource:
+    """Wait for the first frame. Raises NotFound or TimedOut without one, with the source closed."""
     if source.wait_first(timeout_s):
         for sentence in source.remarks():
             tell(sentence)

@@ -7,7 +7,6 @@ import threading
 from collections.abc import Iterator
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
 
 import av
 import av.error
@@ -20,12 +19,11 @@ from perchctl.camera.network import (
     MAX_FAILED_CONNECTIONS,
     WINDOW_S,
     RtspSource,
-    Waiting,
+    TransferDelay,
     unresolved,
 )
 from perchctl.camera.source import LiveSource
 from perchctl.errors import NotFound, TimedOut
-from perchctl.profile import CameraConfig
 from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
 from tests.helpers.rtsp import RtspServer, Step
 from tests.helpers.waiting import until
@@ -233,25 +231,6 @@ def test_a_host_that_is_not_known_is_named(monkeypatch: pytest.MonkeyPatch) -> N
     assert told.startswith("the host name 'lab' cannot be resolved (Name or service not known):")
 
 
-def test_what_only_a_driver_can_do_is_said_of_a_stream(server: RtspServer) -> None:
-    never = threading.Event()
-    wishes: list[tuple[dict[str, Any], str | None]] = [
-        ({}, None),
-        ({"format": "MJPG"}, "camera.format is not used with rtsp://127.0.0.1"),
-        ({"controls": {"gain": 1}, "format": "MJPG"}, "camera.format and camera.controls are not"),
-    ]
-    for asked, words in wishes:
-        server.scripts.put([*seconds(5, 60, 100), never])
-        told: list[str] = []
-        source = open_camera(
-            server.url("me:secret@"), Clock(), CameraConfig(**asked), timeout_s=WAIT_S,
-            tell=told.append,
-        )  # fmt: skip
-        source.close()
-        assert [words in sentence for sentence in told] == ([] if words is None else [True])
-        assert "secret" not in "".join(told)
-
-
 def test_closing_does_not_wait_for_a_stalled_stream(server: RtspServer) -> None:
     never = threading.Event()
     server.scripts.put([*seconds(20, 60, 80), never])
@@ -264,40 +243,37 @@ def test_closing_does_not_wait_for_a_stalled_stream(server: RtspServer) -> None:
 
 
 def test_what_piled_up_is_known_to_be_old() -> None:
-    waiting = Waiting()
+    waiting = TransferDelay()
     for k in range(50):
-        assert waiting.of(k / 25, 100.0 + k / 25) == pytest.approx(0.0, abs=1e-9)
-    heap = [waiting.of(k / 25, 102.4) for k in range(50, 60)]
+        assert waiting.waited_s(k / 25, 100.0 + k / 25) == pytest.approx(0.0, abs=1e-9)
+    heap = [waiting.waited_s(k / 25, 102.4) for k in range(50, 60)]
     assert heap == pytest.approx([2.4 - k / 25 for k in range(50, 60)], abs=0.02)
-    assert waiting.of(60 / 25, 102.41) == pytest.approx(0.01, abs=0.01)
-    assert waiting.of(None, 103.0) == 0.0
+    assert waiting.waited_s(60 / 25, 102.41) == pytest.approx(0.01, abs=0.01)
+    assert waiting.waited_s(None, 103.0) == 0.0
 
 
-def test_a_clock_of_the_camera_that_runs_slow_makes_nothing_old() -> None:
-    waiting, latest = Waiting(), 0.0
-    for k in range(25 * 600):
-        latest = waiting.of(k / 25 * (1 - 1e-4), k / 25)
-    assert latest <= 1e-4 * WINDOW_S + 1e-6
-
-
-def test_nor_does_one_that_is_slow_by_two_percent() -> None:
-    waiting = Waiting()
-    assert max(waiting.of(k / 25 * 0.98, k / 25) for k in range(25 * 60)) < 0.05
+@pytest.mark.parametrize(("slow", "for_s", "most_s"), [
+    (1e-4, 600, 1e-4 * WINDOW_S + 1e-6), (0.02, 60, 0.05),
+])  # fmt: skip
+def test_a_clock_of_the_camera_that_runs_slow_makes_nothing_old(
+    slow: float, for_s: int, most_s: float
+) -> None:
+    waiting = TransferDelay()
+    assert max(waiting.waited_s(k / 25 * (1 - slow), k / 25) for k in range(25 * for_s)) <= most_s
 
 
 def test_a_heap_that_comes_slowly_is_old_to_its_end() -> None:
     """1.9 s without a picture, then those of that time at twice the rate."""
-    waiting = Waiting()
+    waiting = TransferDelay()
     for k in range(100):
-        waiting.of(k / 25, k / 25)
+        waiting.waited_s(k / 25, k / 25)
     for k in range(80):
         arrival_s = 3.96 + 1.9 + k / 50
-        known_s = waiting.of(4.0 + k / 25, arrival_s)
+        known_s = waiting.waited_s(4.0 + k / 25, arrival_s)
         assert known_s == pytest.approx(max(arrival_s - (4.0 + k / 25), 0.0), abs=0.25)
 
 
 def test_a_clock_of_the_camera_that_is_set_back_makes_nothing_old() -> None:
-    waiting = Waiting()
-    assert [waiting.of(t, 100.0 + k / 25) for k, t in enumerate((50.0, 50.04, 3.0, 3.04))] == [
-        pytest.approx(0.0, abs=1e-9)
-    ] * 4
+    waiting, times_s = TransferDelay(), (50.0, 50.04, 3.0, 3.04)
+    waits_s = [waiting.waited_s(t_s, 100.0 + k / 25) for k, t_s in enumerate(times_s)]
+    assert waits_s == pytest.approx([0.0] * 4, abs=1e-9)
