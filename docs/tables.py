@@ -44,7 +44,6 @@ SEE = {  # of a key: where a page says more
     "camera.mount.rpy_deg": "[Camera mount](conventions.md#camera-mount)",
     "camera.latency_s": "[latency](#latency)",
     "camera.mask": "[own gear](#own-gear)",
-    "camera.controls": "[exposure](cameras.md#exposure)",
 }
 
 

@@ -98,8 +98,8 @@ def open_camera(
         source: a text that `parse_source` takes, or picture files one by one. ``sim:`` belongs
             to the simulated vehicle, whose stream's address the caller gives instead.
         clock: the loop's clock, s.
-        config: the profile's camera. Its latency is taken off live frames' times, its format,
-            rate and controls are asked of ``camera:``, and mirrored pictures are turned right.
+        config: the profile's camera. Its latency is taken off live frames' times, its format
+            and rate are asked of ``camera:``, and mirrored pictures are turned right.
         size_px: wanted width and height (requested of ``camera:`` only).
         latency_s: from exposure to arrival, instead of the profile's (0 without one).
         pictures_hz: pictures count as taken at this rate (``images:`` only; 30 by default).
@@ -108,7 +108,7 @@ def open_camera(
 
     Raises:
         NotFound: no such camera, file or stream. InvalidValue: unknown scheme,
-        unreadable content, a control or format that the camera lacks. TimedOut: no
+        unreadable content. TimedOut: no
         first frame in time.
     """
     if latency_s is None:

@@ -119,7 +119,7 @@ def _rate(rehearsal: Rehearsal, profile: Profile) -> Finding:
     finding = by_limits(-hz, -RATE_WARN_HZ, -RATE_FAIL_HZ, f"{hz:.0f} Hz", advice)
     wanted_hz = profile.camera.rate_hz
     if finding.verdict == "pass" and wanted_hz is not None and hz < 0.8 * wanted_hz:
-        advice = "a shorter exposure (camera.controls), or another camera.format"
+        advice = "a shorter exposure (v4l2-ctl), or another camera.format"
         return warned(f"{finding.found}, asked for {wanted_hz:g}", advice)
     return finding
 

@@ -114,22 +114,22 @@ def key_unit(path: str) -> str:
 # --- Keys that have become constants of their section, or are gone -----------------------------
 
 GONE = frozenset(
-    f"simulation.{key}"
-    for key in (
-        "bare_floor_aside_m",
-        "bare_floor_m",
-        "draught_towards_deg",
-        "drift_xyz_mps",
-        "estimate_tilt_bias_xy_deg",
-        "gloss",
-        "gust_every_s",
-        "gust_mps",
-        "lamp_aside_m",
-        "lamp_z_m",
-        "mount_error_rpy_deg",
-        "mount_error_xyz_m",
-        "target_tilt_towards_deg",
-        "target_xy_m",
+    (
+        "camera.controls",
+        "simulation.bare_floor_aside_m",
+        "simulation.bare_floor_m",
+        "simulation.draught_towards_deg",
+        "simulation.drift_xyz_mps",
+        "simulation.estimate_tilt_bias_xy_deg",
+        "simulation.gloss",
+        "simulation.gust_every_s",
+        "simulation.gust_mps",
+        "simulation.lamp_aside_m",
+        "simulation.lamp_z_m",
+        "simulation.mount_error_rpy_deg",
+        "simulation.mount_error_xyz_m",
+        "simulation.target_tilt_towards_deg",
+        "simulation.target_xy_m",
     )
 )
 """Nothing depends on them any more: left out, so that a flight's log is still read."""

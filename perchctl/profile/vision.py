@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -101,10 +100,6 @@ class CameraConfig(Section):
     rate_hz: float | None = key(
         None, "asked of `camera:` sources; none: the driver's own", gt=0, le=500
     )
-    controls: dict[str, int | str] = Field(
-        default_factory=dict,
-        description="of `camera:` sources, as V4L2 names them, set before the first picture",
-    )
 
     @field_validator("latency_s", mode="before")
     @classmethod
@@ -127,28 +122,6 @@ class CameraConfig(Section):
             f"found {clip_text(repr(name))}; allowed is a format's name of three or four capitals "
             f"or digits, as in MJPG or YUYV"
         )
-
-    @field_validator("controls", mode="before")
-    @classmethod
-    def _names_with_values(cls, controls: Any) -> Any:
-        """One sentence for whatever stands there; which names and values there are only the
-        driver knows."""
-        needed = (
-            "needed are names with a whole number or a menu's text each, as in controls: "
-            "{gain: 20}; "
-            "perchctl check --cameras lists them"
-        )
-        if not isinstance(controls, Mapping):
-            raise ValueError(f"found {clip_text(repr(controls))}; {needed}")
-        for name, value in controls.items():
-            whole = isinstance(value, str) or (
-                isinstance(value, (int, float)) and float(value).is_integer()
-            )
-            if not isinstance(name, str) or isinstance(value, bool) or not whole:
-                found = f"{clip_text(str(name))}: {clip_text(repr(value))}"
-                hint = "; write 1 for on and 0 for off" if isinstance(value, bool) else ""
-                raise ValueError(f"found {found}; {needed}{hint}")
-        return controls
 
     @property
     def start_latency_s(self) -> float:

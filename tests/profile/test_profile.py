@@ -80,13 +80,6 @@ def _refusal(tmp_path: Path, text: str) -> str:
            ["camera.latency_s", f"found {found};", "0 to 1 (seconds)", "the word measured"])
           for value, found in [("80", "80"), ("-0.1", "-0.1"), ("auto", "'auto'"),
                                ("null", "None"), (".nan", "nan")]),
-        *((f"camera: {{controls: {value}}}",
-           ["camera.controls", f"found {found}", "names with a whole number", "check --cameras"])
-          for value, found in [("80", "80"), ("[gain, 3]", "['gain', 3]"),
-                               ("{gain: 1.5}", "gain: 1.5"), ("{gain: {a: 1}}", "gain: {'a': 1}"),
-                               ("{3: 1}", "3: 1"), ("{gain: null}", "gain: None"),
-                               ("{auto: off}", "auto: False"), ("null", "None")]),
-        ("camera: {controls: {auto: on}}", ["write 1 for on and 0 for off"]),
         *((f"camera: {{format: {value}}}",
            ["camera.format", f"found {found};", "three or four capitals"])
           for value, found in [("4", "4"), ("mjpeg", "'mjpeg'"), ("[MJPG]", "['MJPG']")]),
