@@ -98,7 +98,7 @@ def challenge_of(headers: Sequence[str]) -> Challenge | None:
                 found.append(Challenge(False, values.get("realm", "")))
                 continue
             names = ("realm", "nonce", "opaque", "algorithm", "qop")
-            each = Challenge(True, *[values.get(name, "") for name in names])  # type: ignore[arg-type]
+            each = Challenge(True, *[values.get(name, "") for name in names])
             if _hash_name(each) in _HASHES and _qop(each) is not None:
                 found.append(each)
     return max(found, key=lambda c: (c.digest, _hash_name(c) == "SHA-256"), default=None)

@@ -89,21 +89,6 @@ class Vehicle:
         return self.measured_by.placed_by(profile.positioning.decks)
 
 
-GONE_S = 1.0
-"""Without telemetry for so long, one that had sent some is switched off or restarting."""
-
-
-def gone(link: ProbeLink) -> str:
-    """Why the vehicle is not there any more, or empty.
-
-    Silence tells, too: a radio keeps its link to a vehicle that is off, cflib to one that restarts.
-    """
-    if lost := link.lost():
-        return f"the link was lost: {lost}"
-    age_s = link.age_s()
-    return f"no telemetry came for {age_s:.1f} s" if GONE_S < age_s < math.inf else ""
-
-
 def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
     """Ask a connected vehicle, and listen to it for so long."""
     measured_by = link.measured_by()

@@ -39,7 +39,7 @@ from perchctl.errors import (
     no_motion_capture,
 )
 from perchctl.positioning.feed import BodyPose, CaptureFrame
-from perchctl.profile import CAPTURE_SYSTEMS, PositioningConfig, host_fault
+from perchctl.profile import PositioningConfig
 
 SILENT_S = 0.3
 KEPT = 64
@@ -57,20 +57,13 @@ _SHARED_CLOCK = sys.platform == "linux"
 
 def check_reachable(config: PositioningConfig) -> None:
     """Raise InvalidValue or UsageError for what can be refused before anything is opened."""
-    if config.system not in CAPTURE_SYSTEMS:
-        raise InvalidValue(
-            f"motion capture {config.system!r} is unknown; allowed are {', '.join(CAPTURE_SYSTEMS)}"
-        )
     if not config.host.strip():
         raise InvalidValue(
-            f"positioning.host, the computer of the motion capture, is not given: write it into "
-            f"the profile, as in positioning: {{by: mocap, system: vicon, host: 192.168.1.2, body: "
-            f"crazyflie}}; system is one of {', '.join(CAPTURE_SYSTEMS)}, body the vehicle's rigid "
-            f"body there"
+            "positioning.host, the computer of the motion capture, is not given: write it into "
+            "the profile, as in positioning: {{by: mocap, system: vicon, host: 192.168.1.2, body: "
+            "crazyflie}; system is one of vicon, optitrack, qualisys, vrpn, body the vehicle's "
+            "rigid body there"
         )
-    fault = host_fault(config.host)  # of an option; a profile's is refused when it is read
-    if fault is not None:
-        raise InvalidValue(f"motion capture: {fault}")
     if find_spec("motioncapture") is None:
         raise no_motion_capture()
 

@@ -29,7 +29,7 @@ def key(default: Any, meaning: str, **constraints: Any) -> Any:
 
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
-    """The pair, lowest first. Raises ValueError where it is not."""
+    """Return the pair. Raises ValueError where the lowest is not first."""
     if pair[0] > pair[1]:
         raise ValueError(f"the lower bound {pair[0]} is above the upper bound {pair[1]}")
     return pair
@@ -105,7 +105,7 @@ UNITS_OF = {
 
 
 def key_unit(path: str) -> str:
-    """By the last of a key's words; empty where it has no unit."""
+    """Return a key's unit by the last of its words; empty where it has none."""
     name = path.rpartition(".")[2]
     endings = (name.split("_", n)[-1] for n in range(1, name.count("_") + 1))
     return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")
@@ -140,9 +140,12 @@ WORLD = "simulation.set"
 def without_constants(
     values: dict[str, Any], model: type[BaseModel], path: str = ""
 ) -> tuple[dict[str, Any], list[str], list[str]]:
-    """The values of a profile without keys that are gone or constants by now: class variables of
-    `model`, or of a model within it. Also a note for each of these, and a sentence for each whose
-    value would be lost, as it is another one than the constant."""
+    """Return the values of a profile without keys that are gone or constants by now.
+
+    Constants are class variables of `model`, or of a model within it. Return also a note for each
+    of these keys, and a sentence for each whose value would be lost, as it is another one than the
+    constant.
+    """
     result, notes, lost = dict(values), list[str](), list[str]()
     for key, value in values.items():
         kind = model.model_fields[key].annotation if key in model.model_fields else None

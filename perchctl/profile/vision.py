@@ -228,7 +228,7 @@ class DetectorConfig(Section):
     cut: bool = key(
         True, "measure by what is left of the drawing where the picture cuts both markers"
     )
-    correction_bits_large: int = key(0, "wrong cells that are corrected", ge=0, le=3)
+    correction_bits_large: ClassVar[int] = 0  # wrong cells that are corrected
     correction_bits_small: int = key(1, "wrong cells that are corrected", ge=0, le=3)
 
 
@@ -309,7 +309,7 @@ class MergeConfig(Section):
     z3_m: float = key(0.12, "nearest range of the whole large marker", gt=0)
     disagreement_m: ClassVar[float] = 0.03
     """Farther apart than this the markers contradict."""
-    disagreement_frames: int = key(15, "so many in a row, and it lands", ge=1)
+    disagreement_frames: ClassVar[int] = 15  # so many in a row, and it lands
 
     @model_validator(mode="after")
     def _ranges_in_order(self) -> MergeConfig:
