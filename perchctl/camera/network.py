@@ -308,8 +308,7 @@ class RtspSource(StreamSource):
                 return self._read(stream)
         except (av.error.FFmpegError, OSError, ValueError) as error:
             self.not_found = self._count == 0 and isinstance(error, _gone(av.error))
-            # Asking is unbounded: only before the first picture, which is before the flight.
-            return (self._count == 0 and unresolved(self._url)) or _ffmpeg_reason(error)
+            return _ffmpeg_reason(error)
 
     def _read(self, stream: Any) -> str:
         """Read one connection until it ends, and return why. Raises PyAV's errors."""
@@ -374,18 +373,6 @@ def redirect_of(url: str, timeout_s: float) -> str:
     return ""
 
 
-def unresolved(url: str) -> str:
-    """Say why the host's name cannot be resolved, which FFmpeg calls an input/output error; an
-    empty string if it can. It may take as long as the system's resolver."""
-    host = urlsplit(url).hostname or ""
-    try:
-        socket.getaddrinfo(host, None)
-    except (OSError, UnicodeError) as error:  # the latter: a name that can be none
-        why = getattr(error, "strerror", None) or "it is no host's name"
-        return f"the host name {host!r} cannot be resolved ({why}): correct it, or give the address"
-    return ""
-
-
 def _gone(errors: Any) -> tuple[type[Exception], ...]:
     """Return the errors of PyAV that another attempt would not mend."""
     return (
@@ -410,6 +397,7 @@ _REASONS = {
     "HTTPForbiddenError": "this name may not see the stream (403)",
     "HTTPNotFoundError": "there is no such stream (404); look for the path in its manual",
     "ConnectionRefusedError": "connection refused",
+    "OSError": "the host cannot be reached, or its name is unknown: correct it",
     "ExitError": "no answer in time",
     "InvalidDataError": "no answer in time, or none of RTSP",
     "TimeoutError": "no answer in time",

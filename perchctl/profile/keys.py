@@ -29,13 +29,6 @@ class Key:
     default: Any
 
     @property
-    def section(self) -> str:
-        """The headings that people read: the first word, and the planner's phases."""
-        words = self.path.split(".")
-        deep = words[0] == "planner" and len(words) > 2
-        return ".".join(words[: 2 if deep else 1]) if len(words) > 1 else ""
-
-    @property
     def unit(self) -> str:
         return key_unit(self.path)
 

@@ -256,17 +256,6 @@ def test_a_picture_that_says_to_be_too_large_is_not_decoded(
         read_grey(path)
 
 
-def test_a_video_that_says_to_be_too_large_is_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "flight.avi"
-    write_video(path, 1, 25.0)
-    VideoSource(path).close()
-    monkeypatch.setattr(files, "MOST_FILE_PX", 64 * 48 - 1)
-    with pytest.raises(InvalidValue, match="64x48 px"):
-        VideoSource(path)
-
-
 @pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8", None])
 def test_what_is_no_picture_is_named(tmp_path: Path, data: bytes | None) -> None:
     path = tmp_path / "a.jpg"
