@@ -190,7 +190,8 @@ class MjpegSource(StreamSource):
             self.damaged = earlier + splitter.damaged
 
     def _decoded(self, picture: bytes) -> Grey | None:
-        """The JPEG's pixels; None if it is damaged, or says a size above `MOST_STREAM_PX`."""
+        """Return the JPEG's pixels; None if it is damaged, or says a size above
+        `MOST_STREAM_PX`."""
         size_px = size_in(picture)
         if size_px is None:
             return None

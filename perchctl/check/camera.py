@@ -64,7 +64,7 @@ _ADVICE = {
 
 
 def refused_rows(error: PerchError, devices: list[str], profile: Profile) -> list[Row]:
-    """The rows of a camera that gives no picture."""
+    """Return the rows of a camera that gives no picture."""
     found, semicolon, advice = str(error).rpartition("; ")
     if not semicolon:
         found, advice = str(error), _SEE
@@ -76,7 +76,7 @@ def refused_rows(error: PerchError, devices: list[str], profile: Profile) -> lis
 
 
 def opened_finding(described: str, devices: list[str], remarks: Sequence[str] = ()) -> Finding:
-    """Of a camera that opens; `remarks`: what it does not do as it was asked."""
+    """Judge a camera that opens; `remarks`: what it does not do as it was asked."""
     found = f"{described} gives pictures"
     if remarks:
         return warned(f"{found}; {'; '.join(remarks)}", "see perchctl check --cameras")
@@ -96,7 +96,7 @@ def size_finding(size_px: tuple[int, int] | None, wanted_px: tuple[int, int]) ->
 
 
 def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> list[Row]:
-    """What the pictures show."""
+    """Judge what the pictures of a rehearsal show."""
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture came in the rehearsal"
         first, *rest = names_of(profile)
@@ -125,7 +125,7 @@ def _rate(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 
 def _lost(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    """By the gaps between pictures that arrived one after another."""
+    """Judge the lost frames by the gaps between pictures that arrived one after another."""
     if not rehearsal.live:
         return skipped("a recording")
     if rehearsal.silent_s > profile.safety.camera_hold_s:
@@ -147,7 +147,8 @@ def _lost(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 
 def _age(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    """When it has been looked at; of its way from the sensor only the profile knows."""
+    """Judge how old pictures are when they have been searched; only the profile knows the way from
+    the sensor."""
     if not rehearsal.live or not rehearsal.ages_s:
         return skipped("none was looked at" if rehearsal.live else "a recording")
     age_s, limit_s = percentile(rehearsal.ages_s, 0.95), profile.safety.max_frame_age_s
@@ -163,7 +164,8 @@ def percentile(values: list[float], share: float) -> float:
 
 
 def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    """Frozen, snow, uniform, dark, late: what the flight takes for no measurement."""
+    """Judge the pictures that a flight takes for no measurement: frozen, snow, uniform, dark,
+    late."""
     late = sum(t < t0 for (_, t0), (_, t) in pairwise(rehearsal.arrivals))
     if late:
         found = f"{late} of {rehearsal.pictures} came after newer ones"
@@ -260,7 +262,7 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
 
 
 def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
-    """From where the vehicle stands, and on its way up: what `fly` refuses fails."""
+    """Judge the view from where the vehicle stands, and on its way up: what `fly` refuses fails."""
     if not rehearsal.found:
         where = overhead_view(profile.target, camera, profile.camera.mount).words
         return failed("no, and fly refuses", f"put the vehicle under the target: {where}")
@@ -293,5 +295,5 @@ SIGHT: dict[str, Callable[[Rehearsal, Profile, CameraModel], Finding]] = {
 
 
 def names_of(profile: Profile) -> tuple[str, ...]:
-    """The rows of the pictures, in their order."""
+    """Return the names of the pictures' rows, in their order."""
     return (*PICTURES, *(SIGHT if profile.positioning.by == "target" else ()))

@@ -13,8 +13,8 @@ from perchctl.profile import Profile
 
 
 def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
-    """Of the rehearsal: the time for a picture against that between two, and the turns that begin
-    later than half a period."""
+    """Judge the loop by a rehearsal: the time for a picture against that between two, and the turns
+    that begin later than half a period."""
     if rehearsal is None or len(rehearsal.work_s) < LEAST_RATED:
         return skipped("no pictures to rehearse with")
     if not rehearsal.live:
@@ -38,7 +38,7 @@ def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
 
 
 def disk_finding(folder: Path) -> Finding:
-    """Of the disk that the log's folder is on, or will be."""
+    """Judge the free space of the disk that the log's folder is on, or will be."""
     try:
         usage = shutil.disk_usage(_existing(folder))
     except OSError as error:
@@ -52,7 +52,7 @@ def disk_finding(folder: Path) -> Finding:
 
 
 def log_folder_finding(folder: Path) -> Finding:
-    """Nothing is made there."""
+    """Judge whether logs can be written to the folder, without making it."""
     there = _existing(folder)
     advice = "name another with --log-dir, or set log.directory"
     if not os.path.isdir(there):
@@ -63,6 +63,6 @@ def log_folder_finding(folder: Path) -> Finding:
 
 
 def _existing(folder: Path) -> Path:
-    """The folder, or the nearest above it that exists."""
+    """Return the folder, or the nearest above it that exists."""
     whole = folder.absolute()
     return folder if folder.exists() else next(p for p in whole.parents if p.exists())

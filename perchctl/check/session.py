@@ -48,14 +48,15 @@ class CheckScope:
 
 
 def scan_rows(uri: str | None) -> list[Row]:
-    """`--scan`: what answers, at the usual address and at that of `uri`. Errors: InvalidValue."""
+    """Return what answers, at the usual address and at that of `uri`, for `--scan`. Errors:
+    InvalidValue."""
     if uri is not None:
         check_uri(uri)
     return vehicle.answering_rows(find_vehicles(uri or ""))
 
 
 def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
-    """Rows as they are found. Errors, before anything is opened: InvalidValue, NotFound (the
+    """Yield rows as they are found. Errors, before anything is opened: InvalidValue, NotFound (the
     profile's files), UsageError (a library that is missing, or does not load)."""
     check_options(options)
     calibrated = profile_camera(options.profile.camera)
@@ -145,7 +146,7 @@ class VehicleSession:
         yield from self._compared_rows()
 
     def answering_rows(self) -> Iterator[Row]:
-        """Of a vehicle that is connected."""
+        """Yield the rows of a connected vehicle."""
         self.scope.tell(f"listening to the vehicle for {self.scope.listen_s:g} s")
         seen = vehicle.look(self.probe, self.uri, self.scope.listen_s)
         if lost := self.probe.lost():
@@ -161,7 +162,7 @@ class VehicleSession:
         yield from self._lift_rows()
 
     def _room_rows(self, take: TakeTelemetry) -> list[Row]:
-        """Of the motion capture; none with decks."""
+        """Return the rows of the motion capture; none with decks."""
         config = self.profile.positioning
         if self.room is None:
             return []
@@ -179,7 +180,7 @@ class VehicleSession:
         )
 
     def _lift_rows(self) -> Iterator[Row]:
-        """What somebody has to lift the vehicle for."""
+        """Yield the rows for which somebody has to lift the vehicle."""
         compared = self._compared_rows()
         if self.scope.lift:
             lifted = self._lift_finding()
@@ -193,7 +194,8 @@ class VehicleSession:
         yield from compared
 
     def _lift_finding(self) -> Finding:
-        """By the vehicle's own position, or by a motion capture against its attitude."""
+        """Judge a lift by the vehicle's own position, or by a motion capture against its
+        attitude."""
         config, room, within_s = self.profile.positioning, self.room, self.scope.lift_s
         if config.by == "target":
             return skipped("only in flight it gets its position, by the target")

@@ -23,8 +23,8 @@ BodyVector3 = tuple[_OnBody, _OnBody, _OnBody]
 
 
 def key(default: Any, meaning: str, **constraints: Any) -> Any:
-    """A key of a section: pydantic's `Field`, with the meaning that people read about it. The
-    default ... means that the key must be given."""
+    """Return a key of a section: pydantic's `Field`, with the meaning that people read about it.
+    The default ... means that the key must be given."""
     return Field(default, description=meaning, **constraints)
 
 
@@ -49,7 +49,7 @@ class Section(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _no_truth_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """YAML's yes, no, on and off would be read as 1 and 0."""
+        """Refuse YAML's yes, no, on and off, which would be read as 1 and 0."""
         kind = cls.model_fields[info.field_name or ""].annotation
         if _is_of_numbers(kind) and _holds_truth(value):
             raise ValueError(

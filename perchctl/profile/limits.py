@@ -36,12 +36,12 @@ class Limit:
         return tuple(_KEY.findall(self.relation))
 
     def holds(self, profile: Any) -> bool:
-        """True where the profile's values fulfil the relation."""
+        """Return whether the profile's values fulfil the relation."""
         # The relations are those of this module, and name keys and numbers only.
         return bool(eval(_KEY.sub(_read, self.relation), {"profile": profile}))
 
     def sentence(self, profile: Any) -> str:
-        """The relation with the value of each key, and what happens as it does not hold."""
+        """Return the relation with the value of each key, and what happens as it does not hold."""
 
         def shown(found: re.Match[str]) -> str:
             value = eval(_read(found), {"profile": profile})
@@ -51,7 +51,7 @@ class Limit:
 
 
 def _read(found: re.Match[str]) -> str:
-    """The key of a profile as an expression; of a latency that is measured its beginning."""
+    """Return the key of a profile as an expression; of a latency that is measured its beginning."""
     key = found[0]
     return f"profile.{'camera.start_latency_s' if key == 'camera.latency_s' else key}"
 

@@ -156,7 +156,7 @@ class LandingConfig(Section):
 
     @property
     def overdue_s(self) -> float:
-        """For so long the landing goes by setpoints; then the vehicle lands by itself."""
+        """The time for which the landing goes by setpoints; then the vehicle lands by itself."""
         return OVERDUE_SHARE * self.timeout_s
 
 

@@ -69,7 +69,7 @@ class PositioningConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _one_word(cls, values: Any) -> Any:
-        """`positioning: mocap` names what measures, and leaves the rest as it is."""
+        """Read `positioning: mocap` as what measures, with the rest as it is."""
         values = {"by": values} if isinstance(values, str) else values
         if isinstance(values, dict) and values.get("by") == "target":
             return {**BY_TARGET, **values}
@@ -85,8 +85,8 @@ class PositioningConfig(Section):
 
     @model_validator(mode="after")
     def _meant(self) -> PositioningConfig:
-        """Keys of a capture without `by` would fly by the decks, without a word. (A log's
-        profile has every key, and so `by`, too.)"""
+        """Refuse keys of a capture without `by`, which would fly by the decks, without a word. (A
+        log's profile has every key, and so `by`, too.)"""
         keys = [key for key in type(self).model_fields if key != "decks"]
         of_capture = [key for key in keys if key in self.model_fields_set]
         if "by" in of_capture:

@@ -51,8 +51,8 @@ class Mounting(Section):
 
 
 def _eighths(angle: float) -> int:
-    """The number of eighths of a circle that the angle is in radians, rounded to two decimals
-    or more; 0 where it is no such angle."""
+    """Return the number of eighths of a circle that the angle is in radians, rounded to two
+    decimals or more; 0 where it is no such angle."""
     return next(
         (k for k in range(1, 9) for d in range(2, 17) if angle == round(k * math.pi / 4, d)), 0
     )
@@ -104,7 +104,7 @@ class CameraConfig(Section):
     @field_validator("latency_s", mode="before")
     @classmethod
     def _a_time_or_measured(cls, latency_s: Any) -> Any:
-        """One sentence for both kinds of value."""
+        """Refuse other values than a time or ``measured`` in one sentence."""
         number = isinstance(latency_s, (int, float)) and not isinstance(latency_s, bool)
         if latency_s == "measured" or (number and 0.0 <= latency_s <= MOST_LATENCY_S):
             return latency_s
@@ -125,7 +125,7 @@ class CameraConfig(Section):
 
     @property
     def start_latency_s(self) -> float:
-        """What is taken off a picture's time of arrival until a flight has measured it."""
+        """The time taken off a picture's arrival until a flight has measured it."""
         return START_LATENCY_S if isinstance(self.latency_s, str) else self.latency_s
 
 
