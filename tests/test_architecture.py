@@ -99,7 +99,7 @@ MOST_NAMES = {
     "mission": 48,
     "perception": 15,
     "positioning": 15,
-    "profile": 38,
+    "profile": 36,
     "sim": 25,
     "target": 28,
     "track": 15,

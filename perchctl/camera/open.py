@@ -166,27 +166,16 @@ _USUAL_PORT = {"http": 80, "https": 443, "rtsp": 554}
 
 def _check_address(name: SourceName) -> None:
     """Raise InvalidValue where a stream's URL has no host, or a port that cannot be."""
-    port: int | str | None = None
     try:
         parts = urlsplit(name.spec)
-        host = parts.hostname if name.place.startswith("//") else None
-        try:
-            port = parts.port
-        except ValueError:
-            port = parts.netloc.rpartition(":")[2]
-            host = None if "@" in name.spec else host  # part of a password, it may be
+        is_right = name.place.startswith("//") and bool(parts.hostname) and parts.port != 0
     except ValueError:
-        host = None
-    if not host:
+        is_right = False
+    if not is_right:
         raise InvalidValue(
-            f"camera source {str(name)!r} lacks a host that can be read, as in "
-            f"{name.scheme}://192.168.1.20/stream; in a name or password @ is %40, : is %3A, "
-            f"/ is %2F"
-        )
-    if port == 0 or isinstance(port, str):
-        raise InvalidValue(
-            f"camera source {str(name)!r} has port {port}; allowed are 1 to 65535, as in "
-            f"{name.scheme}://{host}:{_USUAL_PORT[name.scheme]}/stream, or none for the usual one"
+            f"camera source {str(name)!r} has no host or no port that can be read, as in "
+            f"{name.scheme}://192.168.1.20:{_USUAL_PORT[name.scheme]}/stream; a port is 1 to "
+            f"65535; in a name or password @ is %40, : is %3A, / is %2F"
         )
 
 

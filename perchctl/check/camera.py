@@ -23,6 +23,7 @@ from perchctl.check.row import (
     skip_all,
     skipped,
     warned,
+    worst,
 )
 from perchctl.errors import PerchError
 from perchctl.flight import (
@@ -297,3 +298,31 @@ SIGHT: dict[str, Callable[[Rehearsal, Profile, CameraModel], Finding]] = {
 def names_of(profile: Profile) -> tuple[str, ...]:
     """Return the names of the pictures' rows, in their order."""
     return (*PICTURES, *(SIGHT if profile.positioning.by == "target" else ()))
+
+
+# --- The computer that looks at the pictures ----------------------------------------------------
+
+
+def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
+    """Judge the loop by a rehearsal: the time for a picture against that between two, and the turns
+    that begin later than half a period."""
+    if rehearsal is None or len(rehearsal.work_s) < LEAST_RATED:
+        return skipped("no pictures to rehearse with")
+    if not rehearsal.live:
+        return skipped("a recording comes as fast as it is read")
+    work_s = percentile(rehearsal.work_s, 0.95)
+    turn_s = 1.0 / profile.link.loop_hz
+    period_s = rehearsal.frame_period_s or turn_s
+    late = sum(late_s > turn_s / 2.0 for late_s in rehearsal.late_s) / len(rehearsal.late_s)
+    latest_s = max(rehearsal.late_s)
+    found = (
+        f"{1e3 * work_s:.0f} ms a picture of {1e3 * period_s:.0f}, "
+        f"{100.0 * late:.0f} % of the turns late, at most {1e3 * latest_s:.0f} ms"
+    )
+    advice = "close other programs, use a smaller picture, or a faster computer"
+    if latest_s > profile.safety.loop_late_hold_s:
+        return failed(found, advice)
+    return worst(
+        by_limits(work_s / period_s, 0.7, 1.0, found, advice),
+        by_limits(late, 0.05, 0.3, found, advice),
+    )

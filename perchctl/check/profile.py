@@ -7,13 +7,14 @@ and was hardly meant. `fly` asks the same, with the computer's disk, before it c
 from __future__ import annotations
 
 import math
+import os
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import without_password
-from perchctl.check.computer import disk_finding
 from perchctl.check.row import (
     Finding,
     Row,
@@ -21,8 +22,10 @@ from perchctl.check.row import (
     Verdict,
     ask,
     ask_all,
+    by_limits,
     failed,
     passed,
+    skipped,
     warned,
 )
 from perchctl.errors import PerchError, SafetyAbort
@@ -201,3 +204,37 @@ def _latency(plan: _Plan) -> Finding:
         f"that is 30 ms wrong makes the vehicle swing under the target",
         "set camera.latency_s: measured",
     )
+
+
+# --- The computer's disk ------------------------------------------------------------------------
+
+
+def disk_finding(folder: Path) -> Finding:
+    """Judge the free space of the disk that the log's folder is on, or will be."""
+    try:
+        usage = shutil.disk_usage(_existing(folder))
+    except OSError as error:
+        return skipped(f"not known ({error.strerror or error})")
+    if not usage.total:
+        return skipped(f"{_existing(folder)} is on none")
+    free = usage.free
+    found = f"{free / 1e9:.1f} GB free" if free >= 1e9 else f"{free / 1e6:.0f} MB free"
+    advice = "free some space: a flight's log has some 5 MB a minute"
+    return by_limits(-free, -500e6, -50e6, found, advice)
+
+
+def log_folder_finding(folder: Path) -> Finding:
+    """Judge whether logs can be written to the folder, without making it."""
+    there = _existing(folder)
+    advice = "name another with --log-dir, or set log.directory"
+    if not os.path.isdir(there):
+        return failed(f"{there} is a file", advice)
+    if not os.access(there, os.W_OK | os.X_OK):
+        return failed(f"no right to write in {there}", advice)
+    return passed(f"{folder} can be written" + ("" if there == folder else " (new)"))
+
+
+def _existing(folder: Path) -> Path:
+    """Return the folder, or the nearest above it that exists."""
+    whole = folder.absolute()
+    return folder if folder.exists() else next(p for p in whole.parents if p.exists())

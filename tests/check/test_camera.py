@@ -19,7 +19,8 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import VERDICT_TEXTS, mirrored_note
-from perchctl.check import Row, Verdict, camera, computer
+from perchctl.check import Row, Verdict, camera
+from perchctl.check import profile as of_profile
 from perchctl.check.rehearsal import Blur, Light, Rehearsal, rehearse
 from perchctl.check.row import Finding, ask
 from perchctl.errors import NotFound
@@ -83,7 +84,7 @@ def rehearsed(
 def rows_of(done: Rehearsal, profile: Profile = PROFILE) -> dict[str, Row]:
     found = camera.picture_rows(done, profile, CAMERA)
     assert [row.name for row in found] == list(camera.names_of(profile))
-    loop = ask("loop", computer.loop_finding, done, profile)
+    loop = ask("loop", camera.loop_finding, done, profile)
     return {row.name: row for row in [*found, loop]}
 
 
@@ -278,11 +279,11 @@ def test_a_rehearsal_needs_no_vehicle() -> None:
 
 def test_the_log_s_folder_is_not_made_and_a_file_in_its_place_fails(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "b"
-    assert computer.log_folder_finding(folder).verdict is Verdict.PASS
-    assert computer.disk_finding(folder).verdict is not Verdict.SKIPPED
+    assert of_profile.log_folder_finding(folder).verdict is Verdict.PASS
+    assert of_profile.disk_finding(folder).verdict is not Verdict.SKIPPED
     assert not (tmp_path / "a").exists()
     (tmp_path / "taken").write_text("")
-    row = computer.log_folder_finding(tmp_path / "taken")
+    row = of_profile.log_folder_finding(tmp_path / "taken")
     assert (row.verdict, "is a file" in row.found) == (Verdict.FAIL, True)
 
 
@@ -293,5 +294,5 @@ def test_a_full_disk_makes_its_row(
     free: int, verdict: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = SimpleNamespace(free=free, total=10**12)
-    monkeypatch.setattr(computer.shutil, "disk_usage", lambda path: usage)
-    assert computer.disk_finding(tmp_path).verdict == verdict
+    monkeypatch.setattr(of_profile.shutil, "disk_usage", lambda path: usage)
+    assert of_profile.disk_finding(tmp_path).verdict == verdict

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from perchctl.check import Verdict, capture
+from perchctl.check import Verdict, capture, vehicle
 from perchctl.check.row import Finding
 from perchctl.geometry import (
     Array,
@@ -27,6 +28,7 @@ from perchctl.sim.world import Stop, Way
 from perchctl.vehicle import Telemetry
 from tests.helpers.capture import TURNS, UPRIGHT, named_up
 from tests.helpers.carried import lifted_and_turned
+from tests.helpers.checks import said
 from tests.helpers.mission import telemetry
 
 CONFIG = PositioningConfig(by="mocap", host="lab", body="cf2")
@@ -230,3 +232,38 @@ def test_without_moments_of_both_nothing_is_said() -> None:
     sample = telemetry(0.0)
     assert capture.paired([sample, replace(sample, t_s=1.0)], []) is None
     assert capture.paired([], []) is None
+
+
+# --- Without a motion capture: the position that the vehicle reports --------------------------
+
+
+class Scripted:
+    """A link whose vehicle reports one height after another, and moves by so much."""
+
+    def __init__(self, heights_m: Sequence[float], moves_g: float) -> None:
+        self.heights_m, self.moves_g = list(heights_m), moves_g
+
+    def telemetry(self) -> list[Telemetry]:
+        if not self.heights_m:
+            return []
+        place_m = (0.0, 0.0, self.heights_m.pop(0))
+        return [said(position_m=place_m, acc_z_g=1.0 + self.moves_g)]
+
+
+@pytest.mark.parametrize(("heights_m", "moves_g", "verdict", "words", "most_s"), [
+    ([0.01, 0.3, 0.4, 0.01, *[0.0] * 50], 0.2, "pass", "rose by 0.39 m", 0.5),
+    ([0.01] * 30, 0.0, "skipped", "not moved", 3.0),
+    ([0.01] * 30, 0.3, "fail", "it moved, and the position", 3.0),
+    ([0.01, 0.1, 0.01], 0.2, "skipped", "not enough to tell", 3.0),
+    ([0.0, 0.4, 0.25], 0.2, "warn", "then +0.25 m", 3.0),
+    ([], 0.0, "skipped", "no telemetry", 3.0),
+])  # fmt: skip
+def test_a_lift_makes_its_row_and_ends_once_the_vehicle_is_back(
+    heights_m: list[float], moves_g: float, verdict: str, words: str, most_s: float
+) -> None:
+    waits: list[float] = []
+    link = Scripted(heights_m, moves_g)
+    finding = vehicle.lift_finding(vehicle.watch_lift(link, waits.append, 3.0))  # type: ignore[arg-type]
+    assert finding.verdict == verdict, finding
+    assert words in finding.found
+    assert sum(waits) == pytest.approx(most_s, abs=0.11)
