@@ -397,9 +397,11 @@ def device(
     clock: Clock | None = None,
     reopen_every_s: float = 0.001,
 ) -> DeviceSource:
+    """Camera 2, which is camera 5 when it comes back."""
     source = DeviceSource(
-        2, 0.05, Asked(), clock or Clock(), open_number, retry_s=0.0, reopen_every_s=reopen_every_s
-    )
+        2, 0.05, Asked(), clock or Clock(), open_number, retry_s=0.0,
+        reopen_every_s=reopen_every_s, find=lambda: 5,
+    )  # fmt: skip
     opened.append(source)
     return source
 
@@ -440,7 +442,8 @@ def test_a_device_that_comes_back_is_opened_again(opened: list[LiveSource]) -> N
     until(lambda: len(bus.numbers) > 3)
     assert first.released.is_set()
     clock.t_s = 102.0
-    assert "camera:2 was not found" in str(source.problem(102.0))
+    assert "camera:5 was not found" in str(source.problem(102.0))
+    assert bus.numbers[:2] == [2, 5]
     assert source.problem(float("-inf")) is None, "it is not the end"
     bus.capture = again = Capture(grey(160))
     frame = next_frame(source)
