@@ -60,7 +60,7 @@ def check_reachable(config: PositioningConfig) -> None:
     if not config.host.strip():
         raise InvalidValue(
             "positioning.host, the computer of the motion capture, is not given: write it into "
-            "the profile, as in positioning: {{by: mocap, system: vicon, host: 192.168.1.2, body: "
+            "the profile, as in positioning: {by: mocap, system: vicon, host: 192.168.1.2, body: "
             "crazyflie}; system is one of vicon, optitrack, qualisys, vrpn, body the vehicle's "
             "rigid body there"
         )

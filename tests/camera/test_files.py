@@ -254,7 +254,7 @@ def test_a_picture_that_says_to_be_too_large_is_not_decoded(
         read_grey(path)
 
 
-@pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8", None])
+@pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8", b"\xff\xd8no", None])
 def test_what_is_no_picture_is_named(tmp_path: Path, data: bytes | None) -> None:
     path = tmp_path / "a.jpg"
     if data is not None:
