@@ -112,8 +112,8 @@ class DeviceSource(LiveSource):
         said = []
         if asked.format is not None and self._format not in ("", asked.format):
             said.append(f"{got} {asked.format} (camera.format) and gives {self._format}")
-        if asked.size_px is not None and self._size_px not in (None, asked.size_px):
-            wanted, given = ("{}x{} px".format(*size) for size in (asked.size_px, self._size_px))
+        if asked.size_px is not None and self.size_px not in (None, asked.size_px):
+            wanted, given = ("{}x{} px".format(*size) for size in (asked.size_px, self.size_px))
             said.append(f"{got} {wanted}, the calibration's, and gives {given}")
         if asked.rate_hz is not None and self._rate_hz > 0.0:
             off_hz = abs(asked.rate_hz - self._rate_hz)

@@ -42,15 +42,11 @@ class Recording:
         if self._ahead is None:
             raise InvalidValue(f"{name} holds no readable frame; is it a picture or video file?")
         image = self._ahead[0]
-        self._size_px = (image.shape[1], image.shape[0])
+        self.size_px = (image.shape[1], image.shape[0])
 
     @property
     def finished(self) -> bool:
         return self._ahead is None
-
-    @property
-    def size_px(self) -> tuple[int, int] | None:
-        return self._size_px
 
     def poll(self, now_s: float) -> Frame | None:
         """Return the next frame, with the recording's own time; None at the end."""
@@ -66,7 +62,7 @@ class Recording:
         return None
 
     def describe(self) -> str:
-        return "{} ({}x{} px)".format(self._name, *self._size_px)
+        return "{} ({}x{} px)".format(self._name, *self.size_px)
 
     def close(self) -> None:
         self._ahead = None

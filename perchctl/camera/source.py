@@ -142,11 +142,7 @@ class LiveSource:
         self._arrived = 0  # pictures, a receiver's repetitions too
         self._failure: str | None = None
         self._why_silent = ""
-        self._size_px: tuple[int, int] | None = None
-
-    @property
-    def size_px(self) -> tuple[int, int] | None:
-        return self._size_px
+        self.size_px: tuple[int, int] | None = None
 
     def poll(self, now_s: float) -> Frame | None:
         with self._lock:
@@ -163,7 +159,7 @@ class LiveSource:
         return None
 
     def describe(self) -> str:
-        size = "no frame yet" if self._size_px is None else "{}x{} px".format(*self._size_px)
+        size = "no frame yet" if self.size_px is None else "{}x{} px".format(*self.size_px)
         return f"{self._name} ({size})"
 
     def wait_first(self, timeout_s: float) -> bool:
@@ -221,7 +217,7 @@ class LiveSource:
             self._last_arrival_s = arrival_s
             self._arrived += 1
             self._why_silent = ""
-            self._size_px = (grey.shape[1], grey.shape[0])
+            self.size_px = (grey.shape[1], grey.shape[0])
         self._first.set()
 
     def _fail(self, sentence: str) -> None:
@@ -284,15 +280,12 @@ class WatchedSource(WrappedSource):
 # about a target that is seen mirrored all the same.
 
 
-MIRRORED_TEXT = "the picture is mirrored"
-
-
 def mirrored_note(config: CameraConfig) -> str:
-    """Return `MIRRORED_TEXT`, a colon, and what to do about it with this profile."""
+    """Say that the picture is mirrored, and behind a colon what to do with this profile."""
+    advice = "switch that off in the camera, or set camera.mirrored in the profile"
     if config.mirrored:
         advice = "the camera does not mirror, so take camera.mirrored out of the profile"
-        return f"{MIRRORED_TEXT}: {advice}"
-    return f"{MIRRORED_TEXT}: switch that off in the camera, or set camera.mirrored in the profile"
+    return f"the picture is mirrored: {advice}"
 
 
 def unmirror_frame(frame: Frame) -> Frame:

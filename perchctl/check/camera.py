@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from statistics import mean, median
 
-from perchctl.camera import MIRRORED_TEXT, VERDICT_TEXTS, mirrored_note
+from perchctl.camera import VERDICT_TEXTS, mirrored_note
 from perchctl.check.rehearsal import Rehearsal
 from perchctl.check.row import (
     Finding,
@@ -180,7 +180,7 @@ def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
     text, count = rehearsal.problems.most_common(1)[0]
     share = sum(rehearsal.problems.values()) / rehearsal.pictures
     found = f"{count} of {rehearsal.pictures}: {text}"
-    advice = "see mirrored" if text.startswith(MIRRORED_TEXT) else _ADVICE.get(text, _SEE)
+    advice = "see mirrored" if text == mirrored_note(profile.camera) else _ADVICE.get(text, _SEE)
     return by_limits(share, 0.05, 0.5, found, advice)
 
 
