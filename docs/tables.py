@@ -44,18 +44,24 @@ SEE = {  # of a key: where a page says more
     "camera.mount.rpy_deg": "[Camera mount](conventions.md#camera-mount)",
     "camera.latency_s": "[latency](cameras.md#latency)",
     "camera.mask": "[what the vehicle covers](calibration.md#what-the-vehicle-covers)",
-    "camera.controls": "[exposure](cameras.md#format-and-exposure)",
 }
+
+
+def _section(path: str) -> str:
+    """Return the heading of a key: its first word, and the planner's phase."""
+    words = path.split(".")
+    deep = words[0] == "planner" and len(words) > 2
+    return ".".join(words[: 2 if deep else 1]) if len(words) > 1 else ""
 
 
 def profile_keys() -> str:
     """A table for each section."""
     sections: dict[str, list[str]] = {}
     for key in keys(Profile()):
-        name = key.path.removeprefix(f"{key.section}.")
+        name = key.path.removeprefix(f"{_section(key.path)}.")
         meaning = key.meaning + (f" ({SEE[key.path]})" if key.path in SEE else "")
         cells = (f"`{name}`", key.unit, _shown(key.default), key.allowed, meaning)
-        sections.setdefault(key.section, []).append(f"| {' | '.join(cells)} |")
+        sections.setdefault(_section(key.path), []).append(f"| {' | '.join(cells)} |")
     head = ["", "| key | unit | default | allowed | meaning |", "|---|---|---|---|---|"]
     lines: list[str] = []
     for section, rows in sections.items():

@@ -88,7 +88,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 MOST_NAMES = {
     "analysis": 15,
     "calibration": 30,
-    "camera": 28,
+    "camera": 27,
     "campaign": 25,
     "check": 15,
     "commands": 15,
@@ -100,7 +100,7 @@ MOST_NAMES = {
     "mission": 48,
     "perception": 15,
     "positioning": 15,
-    "profile": 38,
+    "profile": 36,
     "sim": 25,
     "target": 28,
     "vision": 50,

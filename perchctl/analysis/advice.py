@@ -81,7 +81,7 @@ def _light(flight: FlightAnalysis) -> Iterator[Advice]:
     yield Advice(
         "light",
         "look for what darkens, dazzles or hides the target; more light and a shorter exposure "
-        "(camera.controls) help where the flight was fast",
+        "(v4l2-ctl) help where the flight was fast",
         f"{unseen} of {frames} frames did not show the target, though it was overhead",
     )
 

@@ -17,7 +17,6 @@ from .health import HealthVerdict as HealthVerdict
 from .health import assess_frame as assess_frame
 from .open import open_camera as open_camera
 from .open import parse_source as parse_source
-from .source import MIRRORED_TEXT as MIRRORED_TEXT
 from .source import FrameSource as FrameSource
 from .source import NewestSlot as NewestSlot
 from .source import WatchedSource as WatchedSource

@@ -33,7 +33,7 @@ _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|[0-9A-Fa-f:]+
 
 
 def aideck_address(spec: str) -> tuple[str, int]:
-    """Host and port of ``aideck://HOST[:PORT]``. Errors: InvalidValue."""
+    """Return host and port of ``aideck://HOST[:PORT]``. Raises InvalidValue."""
     wrong = InvalidValue(
         f"camera source {without_password(spec)!r} is no AI-deck's address; write {FORM}, as in "
         f"aideck://192.168.4.1"
@@ -77,16 +77,20 @@ class AiDeckSource(StreamSource):
             return self._read(connection)
 
     def _read(self, connection: socket.socket) -> str:
-        """Until the stream ends; why it did."""
+        """Read until the stream ends, and return why it ended."""
         splitter = CpxSplitter()
         earlier, last_s = self.damaged, self._clock()
         while not self._stop.is_set():
             data = connection.recv(_READ_BYTES)
             now_s = self._clock()
             self.bytes_seen += len(data)
+            try:
+                pictures = splitter.feed(data, now_s)
+            except Damaged:
+                return "its packets broke off" if splitter.pictures else _nothing(splitter)
             if not data:
                 return "the stream ended" if splitter.pictures else _nothing(splitter)
-            for picture in reversed(splitter.feed(data, now_s)):
+            for picture in reversed(pictures):
                 image = decoded(picture)
                 if image is not None:
                     last_s = now_s
@@ -103,6 +107,7 @@ class AiDeckSource(StreamSource):
 
 
 def _nothing(splitter: CpxSplitter) -> str:
+    """Say why a connection brought no picture."""
     if splitter.bytes_seen == 0:
         return "the deck took the connection and sent nothing; switch the Crazyflie off and on"
     return (
@@ -112,8 +117,8 @@ def _nothing(splitter: CpxSplitter) -> str:
 
 
 def decoded(picture: CpxPicture) -> NDArray[np.uint8] | None:
-    """Grey (height, width); None if a JPEG cannot be decoded, or says another size than the
-    deck's header, which allows `MOST_SIDE_PX`."""
+    """Return the grey picture (height, width); None if a JPEG cannot be decoded, or says another
+    size than the deck's header, which allows `MOST_SIDE_PX`."""
     shape = (picture.height, picture.width)
     if not picture.is_jpeg:
         return np.frombuffer(picture.data, np.uint8).reshape(shape)
@@ -141,23 +146,23 @@ _KERNEL = np.array([0.25, 0.5, 0.25], np.float32)
 
 
 def has_mosaic(image: NDArray[np.uint8]) -> bool:
-    """Whether the pixels (height, width) of the four places of a two by two pattern differ."""
+    """Return whether the pixels of the four places of a two by two pattern differ in brightness."""
     means = [float(image[row::2, column::2].mean()) for row in (0, 1) for column in (0, 1)]
     return max(means) - min(means) > max(LEAST_SHARE * sum(means) / 4.0, LEAST_LEVELS)
 
 
 def without_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Grey of each pixel with its neighbours, a quarter red, a half green, a quarter blue.
+    """Return each pixel's grey with its neighbours: a quarter red, half green, a quarter blue.
 
     The weights 1 2 1 along rows and columns cancel whatever repeats every two pixels, so it holds
     for each order of the filters, and for a picture that was flipped or is a JPEG; OpenCV's own
-    conversions err by half as much again after a JPEG, and have to be told the order.
+    conversions err by half as much again after a JPEG, and need the order.
     """
     return np.asarray(cv2.sepFilter2D(image, cv2.CV_8U, _KERNEL, _KERNEL), np.uint8)
 
 
 class MosaicFilter:
-    """Takes the mosaic out of a stream's pictures, where one is found and from then on."""
+    """Takes the mosaic out of a stream's pictures, from the first picture that shows one."""
 
     def __init__(self) -> None:
         self._in_a_row = 0
@@ -168,16 +173,16 @@ class MosaicFilter:
         return without_mosaic(image) if self._in_a_row else image
 
 
-# --- An AI-deck's pictures, cut out of the bytes of its TCP stream ------------------------------
+# --- An AI-deck's pictures, joined from the packets of its TCP stream ---------------------------
 # The stream is packets of Bitcraze's CPX: 16 bits of length, which counts what follows them, then
 # one byte of routing, one of function, and the data. A picture is a packet with its header,
 # ``<BHHBBI``: magic 0xBC, width, height, depth, format, size; then packets of chunks until `size`
-# bytes have come. Nothing has a checksum. cflib's own reader of these packets blocks for ever when
-# the deck goes away and cannot find its way back after a broken length, so it is not used.
+# bytes have come. The deck may lose packets, and TCP loses no byte. cflib's own reader of these
+# packets blocks for ever when the deck goes away, so it is not used.
 
 
 MAX_PACKET_BYTES = 1022
-"""That a length may count: the deck's buffers hold no more (its MTU)."""
+"""Largest length of a packet: the deck's buffers hold no more (its MTU)."""
 MOST_SIDE_PX = 1024
 STALLED_S = 2.0
 """A picture that takes longer from its first byte to its last is dropped."""
@@ -188,11 +193,6 @@ _MAGIC, _RAW, _JPEG = 0xBC, 0, 1
 _HOST, _SENDERS, _APP = 3, (1, 2, 4), 5
 _FUNCTIONS = (1, 2, 3, 4, _APP, 14, 15)
 _NOT_RESERVED = 0x7F
-_START_BYTES = _PACKET.size + _HEADER.size
-_START = re.compile(
-    re.escape(struct.pack("<H", 2 + _HEADER.size)) + rb"[\x00-\x7f]\x05\xbc", re.DOTALL
-)
-_MOST_OTHER_BYTES = 65536  # of other functions' packets amid one picture
 
 
 @dataclass(frozen=True)
@@ -218,123 +218,93 @@ class _Header:
 
 
 class CpxSplitter:
-    """Cuts the bytes into whole pictures.
+    """Joins packets into whole pictures.
 
-    A picture counts only if its packets follow one another without a break: each a packet that
-    the deck may send, chunks of one length but for the last, no other picture's header amid them,
-    `size` bytes to the byte, and a JPEG whose structure ends there. Otherwise it is dropped
-    (`damaged`), and the search for the next header goes on right behind its own, so a wrong
-    length costs no picture but the one that it is in. Other functions' packets are passed over.
-    What is held is bounded by one picture's size.
+    A picture counts only if its packets are complete: no other picture's header amid them, raw
+    chunks of one length but for the last, `size` bytes to the byte, and a JPEG whose structure
+    ends there. Otherwise it is dropped (`damaged`). The packets of other functions are passed
+    over. At most one picture and one packet are held.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self._dropped_bytes = 0  # that have left the buffer, so that a place keeps its number
-        self._came: list[tuple[int, float]] = []  # up to which place, at what time
+        self._buffered_s = 0.0  # when the buffer's first byte came
         self._header: _Header | None = None
-        self._at = 0
+        self._began_s = 0.0
         self._chunks: list[bytes] = []
-        self._have = 0
-        self._other_bytes = 0
         self.damaged = 0
         self.bytes_seen = 0
         self.pictures = 0
 
     def feed(self, data: bytes, t_s: float) -> list[CpxPicture]:
-        """Append bytes that came at `t_s`; the pictures now complete, oldest first."""
-        self._buffer += data
+        """Append bytes that came at `t_s`, and return the pictures now complete, oldest first.
+
+        Raises Damaged where the bytes are no packet, after which only a new connection helps.
+        """
         self.bytes_seen += len(data)
-        self._came.append((self.bytes_seen, t_s))
+        if not self._buffer:
+            self._buffered_s = t_s
+        self._buffer += data
         pictures: list[CpxPicture] = []
-        while self._header is not None or self._find_header():
-            try:
-                picture = self._walk(t_s)
-            except Damaged:
-                self._drop(1)
-                self.damaged += 1
-                continue
-            if picture is None:
+        at = 0
+        while len(self._buffer) >= at + _PACKET.size:
+            length, routing, function = _PACKET.unpack_from(self._buffer, at)
+            if not _is_packet(length, routing, function):
+                raise Damaged(at)
+            end = at + 2 + length
+            if len(self._buffer) < end:
                 break
-            self.pictures += 1
-            pictures.append(picture)
+            if function == _APP:
+                payload = bytes(self._buffer[at + _PACKET.size : end])
+                picture = self._joined(payload, t_s, self._buffered_s if at == 0 else t_s)
+                if picture is not None:
+                    pictures.append(picture)
+            at = end
+        if at:
+            self._buffered_s = t_s
+            del self._buffer[:at]
+        self.pictures += len(pictures)
         return pictures
 
-    def _find_header(self) -> bool:
-        start = 0
-        while (found := _START.search(self._buffer, start)) is not None:
-            start = found.start()
-            if len(self._buffer) - start < _START_BYTES:
-                self._drop(start)
-                return False
-            self._header = _header_of(self._buffer, start)
-            if self._header is not None:
-                self._drop(start, keep_header=True)
-                self._at = _START_BYTES
-                return True
-            start += 1
-        self._drop(max(len(self._buffer) - _START_BYTES, 0))
-        return False
-
-    def _walk(self, t_s: float) -> CpxPicture | None:
-        """On through the packets of the picture at the buffer's start; None while it is not
-        whole. Raises Damaged."""
+    def _joined(self, payload: bytes, t_s: float, came_s: float) -> CpxPicture | None:
+        """Add a packet whose first byte came at `came_s`; return the picture that it completes."""
+        new_header = _header_of(payload)
+        if new_header is not None:
+            self.damaged += self._header is not None
+            self._header, self._began_s, self._chunks = new_header, came_s, []
+            return None
         header = self._header
-        assert header is not None
-        began_s = self._came_at(self._dropped_bytes)
-        if t_s - began_s > STALLED_S:
-            raise Damaged
-        while self._have < header.size:
-            if len(self._buffer) < self._at + _PACKET.size:
-                return None
-            length, routing, function = _PACKET.unpack_from(self._buffer, self._at)
-            if not _is_packet(length, routing, function):
-                raise Damaged
-            begin, end = self._at + _PACKET.size, self._at + 2 + length
-            if function != _APP or length == _PACKET.size - 2:  # an empty one leads nowhere
-                self._other_bytes += 2 + length
-                if self._other_bytes > _MOST_OTHER_BYTES:
-                    raise Damaged
-            elif len(self._buffer) >= end:
-                if _header_of(self._buffer, self._at) is not None:
-                    raise Damaged
-                self._take(bytes(self._buffer[begin:end]), header)
-            if len(self._buffer) < end:
-                return None
-            self._at = end
-        picture = b"".join(self._chunks)
-        if header.is_jpeg and (picture[:2] != b"\xff\xd8" or jpeg_end(picture) != len(picture)):
-            raise Damaged
-        self._drop(self._at)
-        return CpxPicture(began_s, header.width, header.height, header.is_jpeg, picture)
-
-    def _take(self, chunk: bytes, header: _Header) -> None:
-        self._have += len(chunk)
-        if self._have > header.size:
-            raise Damaged
-        is_last = self._have == header.size
-        first = len(self._chunks[0]) if self._chunks else len(chunk)
-        # A JPEG is sent in three parts, and its structure shows where one is missing.
-        if chunk and not header.is_jpeg and len(chunk) != first and not is_last:
-            raise Damaged
-        if chunk:
-            self._chunks.append(chunk)
-
-    def _drop(self, count: int, keep_header: bool = False) -> None:
-        del self._buffer[:count]
-        self._dropped_bytes += count
-        while len(self._came) > 1 and self._came[0][0] <= self._dropped_bytes:
-            del self._came[0]
-        if not keep_header:
+        if header is None or not payload:
+            return None
+        self._chunks.append(payload)
+        have = sum(map(len, self._chunks))
+        if have == header.size:
             self._header = None
-        self._chunks, self._have, self._other_bytes = [], 0, 0
+            picture = b"".join(self._chunks)
+            if t_s - self._began_s <= STALLED_S and (not header.is_jpeg or _is_jpeg(picture)):
+                return CpxPicture(
+                    self._began_s, header.width, header.height, header.is_jpeg, picture
+                )
+            self.damaged += 1
+        elif have > header.size or (
+            # A JPEG is sent in three parts, and its structure shows where one is missing.
+            not header.is_jpeg and len(payload) != len(self._chunks[0])
+        ):
+            self._header = None
+            self.damaged += 1
+        return None
 
-    def _came_at(self, place: int) -> float:
-        return next((t_s for until, t_s in self._came if place < until), self._came[-1][1])
+
+def _is_jpeg(data: bytes) -> bool:
+    """Return whether the bytes are one JPEG from its start to its end."""
+    try:
+        return data.startswith(b"\xff\xd8") and jpeg_end(data) == len(data)
+    except Damaged:
+        return False
 
 
 def _is_packet(length: int, routing: int, function: int) -> bool:
-    """One that the deck may send to a computer."""
+    """Return whether the deck may send such a packet to a computer."""
     return (
         _PACKET.size - 2 <= length <= MAX_PACKET_BYTES
         and routing == routing & _NOT_RESERVED
@@ -344,22 +314,16 @@ def _is_packet(length: int, routing: int, function: int) -> bool:
     )
 
 
-def _header_of(data: bytes | bytearray, at: int) -> _Header | None:
-    """The picture's header in the packet at that place; None where it is none."""
-    if len(data) < at + _START_BYTES:
+def _header_of(payload: bytes) -> _Header | None:
+    """Return the picture's header that a packet holds; None where it holds none."""
+    if len(payload) != _HEADER.size:
         return None
-    length, routing, function = _PACKET.unpack_from(data, at)
-    if length != 2 + _HEADER.size or function != _APP or not _is_packet(length, routing, function):
-        return None
-    magic, width, height, depth, kind, size = _HEADER.unpack_from(data, at + _PACKET.size)
-    if magic != _MAGIC or depth != 1 or not _is_size(width, height):
+    magic, width, height, depth, kind, size = _HEADER.unpack(payload)
+    sides_fit = 0 < width <= MOST_SIDE_PX and 0 < height <= MOST_SIDE_PX
+    if magic != _MAGIC or depth != 1 or not sides_fit:
         return None
     if kind == _RAW and size == width * height:
         return _Header(width, height, False, size)
     if kind == _JPEG and 4 <= size <= 2 * width * height + 2048:
         return _Header(width, height, True, size)
     return None
-
-
-def _is_size(width: int, height: int) -> bool:
-    return 0 < width <= MOST_SIDE_PX and 0 < height <= MOST_SIDE_PX

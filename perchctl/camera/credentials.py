@@ -25,7 +25,7 @@ _SCHEMES = re.compile(r"(?:^|,)\s*(Basic|Digest)\b", re.IGNORECASE)
 
 
 def without_password(text: str) -> str:
-    """The text without the names and passwords of URLs in it, and without what stands behind
+    """Return the text without the names and passwords of its URLs, and without what stands behind
     ``password=`` and its like; other text as it is. In doubt it leaves out too much."""
     if start := _URL.match(text):  # all of it is one URL, spaces in the password too
         text = start.group() + _without_name(text[start.end() :])
@@ -35,7 +35,7 @@ def without_password(text: str) -> str:
 
 
 def _without_name(rest: str) -> str:
-    """Of a URL's part behind its scheme."""
+    """Remove name and password from a URL's part behind its scheme."""
     host, slash, path = rest.partition("/")
     if "@" in host:
         return f"{host.rpartition('@')[2]}{slash}{path}"
@@ -44,20 +44,20 @@ def _without_name(rest: str) -> str:
 
 
 def without_passwords(profile: Profile) -> Profile:
-    """The profile as it may be shown; it opens no camera that wants a password."""
+    """Return the profile as it may be shown; it opens no camera that wants a password."""
     camera = profile.camera.model_copy(update={"source": without_password(profile.camera.source)})
     described = without_password(profile.description)
     return profile.model_copy(update={"camera": camera, "description": described})
 
 
 def profile_record(profile: Profile) -> dict[str, Any]:
-    """Every key of the profile, as for JSON, to be kept and shown: without a password."""
+    """Return every key of the profile, for JSON that is kept and shown, without a password."""
     return without_passwords(profile).model_dump(mode="json")
 
 
 @dataclass(frozen=True)
 class Credentials:
-    """None of both where the URL has none."""
+    """Name and password of a URL."""
 
     name: str = ""
     password: str = ""
@@ -67,6 +67,7 @@ class Credentials:
 
 
 def credentials_of(parts: SplitResult) -> Credentials | None:
+    """Return a URL's name and password; None where it has no name."""
     if parts.username is None:
         return None
     return Credentials(unquote(parts.username), unquote(parts.password or ""))
@@ -74,7 +75,7 @@ def credentials_of(parts: SplitResult) -> Credentials | None:
 
 @dataclass(frozen=True)
 class Challenge:
-    """What the server asks for (RFC 7616 and 7617). `count`: how often it was answered."""
+    """What the server asks for (RFC 7616 and 7617)."""
 
     digest: bool
     realm: str = ""
@@ -82,16 +83,11 @@ class Challenge:
     opaque: str = ""
     algorithm: str = ""
     qop: str = ""
-    count: int = 0
-
-    def asks_the_same(self, other: Challenge) -> bool:
-        """So that the same answer would be refused again."""
-        return (self.digest, self.realm, self.nonce) == (other.digest, other.realm, other.nonce)
 
 
 def challenge_of(headers: Sequence[str]) -> Challenge | None:
-    """Of the WWW-Authenticate headers: digest before basic, as it does not show the password.
-    None where there is none that can be answered."""
+    """Return the best challenge of the WWW-Authenticate headers: digest before basic, as it does
+    not show the password. None where none can be answered."""
     found: list[Challenge] = []
     for header in headers:
         starts = list(_SCHEMES.finditer(header))
@@ -102,7 +98,7 @@ def challenge_of(headers: Sequence[str]) -> Challenge | None:
                 found.append(Challenge(False, values.get("realm", "")))
                 continue
             names = ("realm", "nonce", "opaque", "algorithm", "qop")
-            each = Challenge(True, *[values.get(name, "") for name in names])  # type: ignore[arg-type]
+            each = Challenge(True, *[values.get(name, "") for name in names])
             if _hash_name(each) in _HASHES and _qop(each) is not None:
                 found.append(each)
     return max(found, key=lambda c: (c.digest, _hash_name(c) == "SHA-256"), default=None)
@@ -116,11 +112,11 @@ def _values(text: str) -> dict[str, str]:
 
 
 def _hash_name(challenge: Challenge) -> str:
-    return (challenge.algorithm or "MD5").upper().removesuffix("-SESS")
+    return (challenge.algorithm or "MD5").upper()
 
 
 def _qop(challenge: Challenge) -> str | None:
-    """``auth``, nothing for the old way, None where only what is not known is offered."""
+    """Return ``auth``, an empty string for the old way, or None if only other ways are offered."""
     offered = [word.strip().lower() for word in challenge.qop.split(",") if word.strip()]
     return "" if not offered else "auth" if "auth" in offered else None
 
@@ -128,7 +124,7 @@ def _qop(challenge: Challenge) -> str | None:
 def answer(
     challenge: Challenge, who: Credentials, method: str, path: str, cnonce: str | None = None
 ) -> str:
-    """The Authorization header. `challenge.count` must not come twice with one nonce.
+    """Return the Authorization header for one request with a fresh nonce.
 
     `cnonce` is drawn; given, it makes the answer the same each time.
     """
@@ -142,9 +138,7 @@ def answer(
         return hashed(":".join(words).encode()).hexdigest()
 
     first = h(who.name, challenge.realm, who.password)
-    if challenge.algorithm.upper().endswith("-SESS"):
-        first = h(first, challenge.nonce, cnonce)
-    count = f"{challenge.count + 1:08x}"
+    count = "00000001"
     middle = (challenge.nonce, count, cnonce, qop) if qop else (challenge.nonce,)
     values = {
         "username": who.name, "realm": challenge.realm, "nonce": challenge.nonce, "uri": path,

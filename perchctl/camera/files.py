@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.camera.credentials import without_password
-from perchctl.camera.jpeg import grey_pixels, size_in
+from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_end, size_in
 from perchctl.camera.source import to_grey
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.vision import Frame
@@ -42,18 +42,14 @@ class Recording:
         if self._ahead is None:
             raise InvalidValue(f"{name} holds no readable frame; is it a picture or video file?")
         image = self._ahead[0]
-        self._size_px = (image.shape[1], image.shape[0])
+        self.size_px = (image.shape[1], image.shape[0])
 
     @property
     def finished(self) -> bool:
         return self._ahead is None
 
-    @property
-    def size_px(self) -> tuple[int, int] | None:
-        return self._size_px
-
     def poll(self, now_s: float) -> Frame | None:
-        """The next frame, with the recording's own time; None at the end."""
+        """Return the next frame, with the recording's own time; None at the end."""
         if self._ahead is None:
             return None
         image, t_s = self._ahead
@@ -66,7 +62,7 @@ class Recording:
         return None
 
     def describe(self) -> str:
-        return "{} ({}x{} px)".format(self._name, *self._size_px)
+        return "{} ({}x{} px)".format(self._name, *self.size_px)
 
     def close(self) -> None:
         self._ahead = None
@@ -91,13 +87,6 @@ class VideoSource(Recording):
         self._period_s = 1.0 / rate_hz
         self._last_s = -self._period_s
         name = f"video:{without_password(str(path))}"
-        width, height = (
-            int(self._capture.get(key))
-            for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-        )
-        if too_large := _too_large((width, height)):
-            self._capture.release()
-            raise InvalidValue(f"{name} {too_large}")
         super().__init__(name, latency_s, rate_hz, round(count) if count > 0 else None)
 
     def _read(self) -> tuple[NDArray[np.uint8], float] | None:
@@ -150,7 +139,7 @@ class BrokenPicture(InvalidValue):
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """A picture file as grey; raises BrokenPicture if it is none, is cut off or too large."""
+    """Return a picture file as grey; raises BrokenPicture if it is none, cut off or too large."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -162,15 +151,16 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8]:
-    """The grey picture of a file's bytes.
+    """Return the grey picture of a file's bytes.
 
     Raises ValueError with what stands behind the file's name: it is cut off, a JPEG or PNG of
     more than `MOST_FILE_PX`, or none that OpenCV reads.
     """
     if is_cut_off(data):
         raise ValueError("is cut off")
-    if too_large := _too_large(_said_size_px(data)):
-        raise ValueError(too_large)
+    width, height = _said_size_px(data)
+    if width * height > MOST_FILE_PX:
+        raise ValueError(f"says {width}x{height} px, and at most {MOST_FILE_PX:,} pixels are read")
     image = grey_pixels(data)
     if image is None:
         raise ValueError("cannot be read as a picture")
@@ -178,36 +168,25 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
 
 
 def _said_size_px(data: bytes) -> tuple[int, int]:
-    """Width and height that a JPEG or PNG says in front of its pixels; zeros of another file."""
+    """Return width and height that a JPEG or PNG says before its pixels; zeros of another file."""
     if data.startswith(b"\x89PNG"):
         return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
     return (data.startswith(b"\xff\xd8") and size_in(data)) or (0, 0)
 
 
-def _too_large(size_px: tuple[int, int]) -> str:
-    """What to say of a picture of that size; an empty string if it can be read."""
-    width, height = size_px
-    if width * height <= MOST_FILE_PX:
-        return ""
-    return f"says {width}x{height} px, and at most {MOST_FILE_PX:,} pixels are read"
-
-
 def is_cut_off(data: bytes) -> bool:
-    """Whether a JPEG or PNG has no end. Decoders fill the rest with grey and tell it on
-    stderr, without the file's name."""
+    """Return whether a JPEG or PNG has no end: decoders fill the rest with grey, and say so on
+    stderr without the file's name."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data
-    if not data.startswith(b"\xff\xd8"):
+    try:
+        return data.startswith(b"\xff\xd8") and jpeg_end(data) is None
+    except Damaged:
         return False
-    # Segments before the picture's data: one of them may hold a whole small JPEG.
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
-        at += 2 + int.from_bytes(data[at + 2 : at + 4])
-    return data.find(b"\xff\xd9", at) < 0
 
 
 def image_files(where: str | Sequence[Path]) -> list[Path]:
-    """Picture files of a folder or glob (or those given, each once), naturally sorted;
+    """Return the picture files of a folder or glob (or those given, each once), naturally sorted;
     raises NotFound if there are none."""
     if not isinstance(where, str):
         return sorted(set(where), key=_natural)

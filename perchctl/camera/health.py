@@ -83,7 +83,7 @@ def assess_frame(
 
 
 def content(image: NDArray[np.uint8]) -> Kind:
-    """What the picture shows, from every eighth line (and the second after it)."""
+    """Return what the picture shows, judged by every eighth line and the second after it."""
     height = image.shape[0]
     first = image[: max(height - 2, 1) : 8]
     mean, sigma = (float(each[0, 0]) for each in cv2.meanStdDev(first))
@@ -102,7 +102,7 @@ def content(image: NDArray[np.uint8]) -> Kind:
 
 
 def _mean_square(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
-    """Of the pixels' differences."""
+    """Return the mean square of the pixels' differences."""
     return float(cv2.norm(one, other, cv2.NORM_L2SQR)) / one.size
 
 
@@ -116,7 +116,8 @@ Grey = NDArray[np.uint8]
 
 
 def same_bytes(one: Grey, other: Grey) -> bool:
-    """Whether both are one picture to the last bit. A row that differs tells at once."""
+    """Return whether both are one picture to the last bit. A row that differs ends the
+    comparison."""
     middle = len(one) // 2
     return (
         one.shape == other.shape

@@ -49,7 +49,7 @@ class JpegWalk:
         self._in_scan = False
 
     def moved(self, by: int) -> None:
-        """So many bytes in front of the picture were taken away."""
+        """Shift all places after so many bytes in front of the picture were taken away."""
         self.start -= by
         self._at -= by
 
@@ -148,12 +148,13 @@ class JpegSplitter:
 
 
 def jpeg_end(data: bytes | bytearray) -> int | None:
-    """Length of the JPEG at the start of `data`; None if it is incomplete. Raises Damaged."""
+    """Return the length of the JPEG at the start of `data`; None if it is incomplete. Raises
+    Damaged."""
     return JpegWalk().end(data, len(data))
 
 
 def size_in(data: bytes | bytearray) -> tuple[int, int] | None:
-    """Width and height that a JPEG says in front of its pixels; None if it says none."""
+    """Return width and height that a JPEG says in front of its pixels; None if it says none."""
     at = 2
     # As the decoder: what is no marker is passed over.
     while (marker := _MARKER.search(data, at)) is not None:
@@ -173,8 +174,8 @@ def size_in(data: bytes | bytearray) -> tuple[int, int] | None:
 
 
 def grey_pixels(data: bytes | bytearray) -> NDArray[np.uint8] | None:
-    """Grey picture of any file's bytes; None if OpenCV makes none of them. Never raises for
-    what the bytes are."""
+    """Return the grey picture of any file's bytes; None if OpenCV cannot decode them. Whatever the
+    bytes are, it raises nothing."""
     if not data:
         return None  # of an empty array OpenCV makes an error
     try:

@@ -13,7 +13,6 @@ import math
 import socket
 import ssl
 from collections import deque
-from dataclasses import replace
 from typing import Any
 from urllib.parse import SplitResult, urljoin, urlsplit, urlunsplit
 
@@ -107,59 +106,46 @@ def _reason(error: Exception) -> str:
 
 
 READ_BYTES = 65536
-MAX_REDIRECTS = 3
-MOST_REQUESTS = 3
-"""One that is answered by what to answer to, once more where that was too old."""
 
 _HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*", "Connection": "close"}
+_REDIRECTS = (301, 302, 303, 307, 308)
 
 
 class MjpegSource(StreamSource):
     """A Motion-JPEG stream (multipart/x-mixed-replace, or bare JPEGs one after another).
 
-    Given up at once, too, where the server wants another name and password. They are sent
-    as it asks for them, digest or basic, and to no other host. Goes straight to the camera:
-    a proxy for the internet is not for it.
+    It gives up at once, too, where the server wants another name and password, or redirects to
+    another address. Name and password are sent once the server asks for them, digest or basic.
+    It goes straight to the camera: a proxy for the internet is not for it.
     """
 
-    _challenge: Challenge | None = None
-
     def _connection(self) -> str:
-        try:
-            return self._connect(self._url, MAX_REDIRECTS)
-        except ssl.SSLCertVerificationError as error:
-            self.not_found = self._count == 0
-            return _untrusted(error)
-
-    def _connect(self, url: str, redirects: int) -> str:
-        """One connection until it ends; why it ended."""
-        parts = urlsplit(url)
+        parts = urlsplit(self._url)
         kind = (
             http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
         )
         timeout_s = self.read_timeout_s if self._count else self.connect_timeout_s
         connection = kind(parts.hostname or "", parts.port, timeout=timeout_s)
         try:
-            connection.connect()
-            self._socket = connection.sock
+            response = self._answered(connection, parts)
             if self._stop.is_set():
                 return "closed"
-            response = self._answered(connection, parts)
-            location = response.getheader("Location")
-            if response.status in (301, 302, 303, 307, 308) and location and redirects > 0:
-                target = redirected(url, location)
-                if why := _unsafe(url, target):
-                    self.not_found = self._count == 0
-                    return why
-                return self._connect(target, redirects - 1)
-            if response.status != 200:
-                gone = response.status in (401, 403, 404, 410)
-                self.not_found = gone and self._count == 0
-                hint = _hint(response, parts)
-                return f"the server answers {response.status} {response.reason}{hint}"
-            self._socket.settimeout(self.read_timeout_s)
+            refusal = _refusal(response, parts)
+            if response.status in (401, 403, 404, 410, *_REDIRECTS):
+                self.not_found = self._count == 0
+            if refusal:
+                return refusal
+            if self._socket is not None:
+                self._socket.settimeout(self.read_timeout_s)
             self._read(response)
             return "the stream ended"
+        except ssl.SSLCertVerificationError as error:
+            self.not_found = self._count == 0
+            return (
+                f"its certificate is not trusted ({error.verify_message or 'not verified'}); name "
+                f"a file with that certificate in the environment variable SSL_CERT_FILE, or use "
+                f"http://"
+            )
         finally:
             self._socket = None
             connection.close()
@@ -167,30 +153,25 @@ class MjpegSource(StreamSource):
     def _answered(
         self, connection: http.client.HTTPConnection, parts: SplitResult
     ) -> http.client.HTTPResponse:
-        """The response; with name and password once the server has asked for them, or has
+        """Return the response, with name and password once the server has asked for them, or has
         refused the nameless without asking (403)."""
         path = urlunsplit(("", "", parts.path or "/", parts.query, ""))
-        who = credentials_of(parts)
-        for _ in range(MOST_REQUESTS):
-            headers = dict(_HEADERS)
-            if who is not None and self._challenge is not None:
-                headers["Authorization"] = answer(self._challenge, who, "GET", path)
-                self._challenge = replace(self._challenge, count=self._challenge.count + 1)
-            connection.request("GET", path, headers=headers)
-            response = connection.getresponse()
-            asked = _challenge(response)
-            # After an answer 403 is the last word: nobody asked for less than a digest then.
-            asks = response.status == 401 or (response.status == 403 and self._challenge is None)
-            if not asks or who is None or asked is None:
-                break
-            # A nonce of an earlier connection may be too old: a new one is answered once more.
-            if self._challenge is not None and asked.asks_the_same(self._challenge):
-                break
-            self._challenge = asked
-            connection.close()
+        headers = dict(_HEADERS)
+        while True:
             connection.connect()
             self._socket = connection.sock
-        return response
+            connection.request("GET", path, headers=headers)
+            response = connection.getresponse()
+            who, challenge = credentials_of(parts), _challenge(response)
+            if (
+                response.status not in (401, 403)
+                or who is None
+                or challenge is None
+                or "Authorization" in headers
+            ):
+                return response
+            headers["Authorization"] = answer(challenge, who, "GET", path)
+            connection.close()
 
     def _read(self, response: http.client.HTTPResponse) -> None:
         splitter = JpegSplitter()
@@ -209,7 +190,8 @@ class MjpegSource(StreamSource):
             self.damaged = earlier + splitter.damaged
 
     def _decoded(self, picture: bytes) -> Grey | None:
-        """The JPEG's pixels; None if it is damaged, or says a size above `MOST_STREAM_PX`."""
+        """Return the JPEG's pixels; None if it is damaged, or says a size above
+        `MOST_STREAM_PX`."""
         size_px = size_in(picture)
         if size_px is None:
             return None
@@ -223,51 +205,28 @@ class MjpegSource(StreamSource):
         return grey_pixels(picture)
 
 
-def redirected(url: str, location: str) -> str:
-    """Where to go: name and password go along to the same host only, and never from https to
-    another scheme."""
-    before, after = urlsplit(url), urlsplit(urljoin(url, location))
-    same = (before.hostname, before.port) == (after.hostname, after.port)
-    kept = same and after.scheme in (before.scheme, "https")
-    if kept and after.username is None and before.username is not None:
-        after = after._replace(netloc=f"{before.netloc.rpartition('@')[0]}@{after.netloc}")
-    return urlunsplit(after)
-
-
-def _unsafe(url: str, target: str) -> str:
-    """Why a redirect is not followed; an empty string if it is."""
-    scheme, shown = urlsplit(target).scheme, without_password(target)
-    if scheme == "http" and urlsplit(url).scheme == "https":
-        return (
-            f"the server redirects from https to {shown}, where pictures and password are not "
-            f"encrypted; name that address in camera.source if you accept that"
-        )
-    if scheme not in ("http", "https"):
-        return f"the server redirects to {shown}; name that address in camera.source"
-    return ""
-
-
 def _challenge(response: http.client.HTTPResponse) -> Challenge | None:
-    """What the server asks for; one that does not say so gets the simplest."""
+    """Return what the server asks for; one that does not name it gets the simplest."""
     headers = response.headers.get_all("WWW-Authenticate")
     return challenge_of(headers) if headers else Challenge(digest=False)
 
 
-def _hint(response: http.client.HTTPResponse, parts: SplitResult) -> str:
-    if response.status != 401:
+def _refusal(response: http.client.HTTPResponse, parts: SplitResult) -> str:
+    """Say why an answer holds no stream; an empty string if it holds one."""
+    if response.status == 200:
         return ""
-    if parts.username is None:
-        return "; it wants a name and a password, as in http://NAME:PASSWORD@HOST/PATH"
-    if _challenge(response) is None:
-        return ", and asks for no basic or digest authentication; others are not known here"
-    return "; check the name and the password in the URL (@ is %40 there, : is %3A)"
-
-
-def _untrusted(error: ssl.SSLCertVerificationError) -> str:
-    return (
-        f"its certificate is not trusted ({error.verify_message or 'not verified'}); name a file "
-        f"with that certificate in the environment variable SSL_CERT_FILE, or use http://"
-    )
+    location = response.getheader("Location")
+    if response.status in _REDIRECTS and location:
+        shown = without_password(urljoin(parts.geturl(), location))
+        return f"the server redirects to {shown}; name that address in camera.source"
+    hint = ""
+    if response.status == 401 and parts.username is None:
+        hint = "; it wants a name and a password, as in http://NAME:PASSWORD@HOST/PATH"
+    elif response.status == 401 and _challenge(response) is None:
+        hint = ", and asks for no basic or digest authentication; others are not known here"
+    elif response.status == 401:
+        hint = "; check the name and the password in the URL (@ is %40 there, : is %3A)"
+    return f"the server answers {response.status} {response.reason}{hint}"
 
 
 # --- RTSP, decoded by PyAV: its open and read end in time, and say why they failed; OpenCV's
@@ -296,21 +255,21 @@ _OPTIONS = {
 }
 
 
-class Waiting:
-    """How long a picture was under way beyond the fastest of the last ten seconds; pure.
+class TransferDelay:
+    """Tells how long a picture was under way beyond the fastest of the last ten seconds.
 
-    The camera's own time of a picture tells it. What piles up behind a radio that stalls
-    comes in a heap, and would look as if it had just been taken. Where the camera's time goes
-    backwards, as when its clock is set back, it starts anew, and one set forward makes the next
-    picture the fastest.
+    Pure. The camera's own time of a picture shows the delay. What piles up behind a radio that
+    stalls comes in a heap, and would look as if it had just been taken. Where the camera's time
+    goes backwards, as when its clock is set back, it starts anew, and one set forward makes the
+    next picture the fastest.
     """
 
     def __init__(self) -> None:
         self._camera_s = -math.inf
         self._ways: deque[tuple[float, float]] = deque()  # arrival, and `way_s`
 
-    def of(self, camera_s: float | None, arrival_s: float) -> float:
-        """s; 0 where the camera gives no time."""
+    def waited_s(self, camera_s: float | None, arrival_s: float) -> float:
+        """Return the delay beyond the fastest picture's, s; 0 where the camera gives no time."""
         if camera_s is None:
             return 0.0
         if camera_s < self._camera_s:
@@ -350,11 +309,10 @@ class RtspSource(StreamSource):
                 return self._read(stream)
         except (av.error.FFmpegError, OSError, ValueError) as error:
             self.not_found = self._count == 0 and isinstance(error, _gone(av.error))
-            # Asking is unbounded: only before the first picture, which is before the flight.
-            return (self._count == 0 and unresolved(self._url)) or _ffmpeg_reason(error)
+            return _ffmpeg_reason(error)
 
     def _read(self, stream: Any) -> str:
-        """One connection until it ends; why it ended. Errors: those of PyAV."""
+        """Read one connection until it ends, and return why. Raises PyAV's errors."""
         import av.error
 
         if not stream.streams.video:
@@ -363,7 +321,7 @@ class RtspSource(StreamSource):
         # A thread for each frame would hold back as many frames as there are threads.
         video.thread_type = "NONE"
         video.codec_context.options = {"max_pixels": str(MOST_STREAM_PX)}
-        waiting, damaged = Waiting(), 0
+        delay, damaged = TransferDelay(), 0
         for packet in stream.demux(video):
             if self._stop.is_set():
                 return "closed"
@@ -377,13 +335,13 @@ class RtspSource(StreamSource):
                 continue
             damaged = 0
             for image, time_s in frames:
-                self._put(image, waited_s=waiting.of(time_s, self._clock()))
+                self._put(image, waited_s=delay.waited_s(time_s, self._clock()))
         return "the stream ended"
 
 
 def redirect_of(url: str, timeout_s: float) -> str:
-    """The other host or port to which the server redirects a URL with name and password; an empty
-    string if there is none. FFmpeg would follow, and take name and password along."""
+    """Return the other host or port to which the server redirects a URL with name and password; an
+    empty string if there is none. FFmpeg would follow, and take name and password along."""
     parts = urlsplit(url)
     who = credentials_of(parts)
     if who is None or parts.hostname is None:
@@ -416,20 +374,8 @@ def redirect_of(url: str, timeout_s: float) -> str:
     return ""
 
 
-def unresolved(url: str) -> str:
-    """Why the host's name is none, which FFmpeg calls an input/output error; else nothing. May
-    take as long as the system's own asking."""
-    host = urlsplit(url).hostname or ""
-    try:
-        socket.getaddrinfo(host, None)
-    except (OSError, UnicodeError) as error:  # the latter: a name that can be none
-        why = getattr(error, "strerror", None) or "it is no host's name"
-        return f"the host name {host!r} cannot be resolved ({why}): correct it, or give the address"
-    return ""
-
-
 def _gone(errors: Any) -> tuple[type[Exception], ...]:
-    """What trying again would not mend."""
+    """Return the errors of PyAV that another attempt would not mend."""
     return (
         errors.HTTPUnauthorizedError,
         errors.HTTPForbiddenError,
@@ -441,7 +387,7 @@ def _gone(errors: Any) -> tuple[type[Exception], ...]:
 
 
 def _ffmpeg_reason(error: Exception) -> str:
-    """Without the URL that FFmpeg's own texts have in them, the password too."""
+    """Say what went wrong without FFmpeg's own texts, which hold the URL with its password."""
     name = type(error).__name__
     return _REASONS.get(name) or str(getattr(error, "strerror", None) or name)
 
@@ -452,6 +398,7 @@ _REASONS = {
     "HTTPForbiddenError": "this name may not see the stream (403)",
     "HTTPNotFoundError": "there is no such stream (404); look for the path in its manual",
     "ConnectionRefusedError": "connection refused",
+    "OSError": "the host cannot be reached, or its name is unknown: correct it",
     "ExitError": "no answer in time",
     "InvalidDataError": "no answer in time, or none of RTSP",
     "TimeoutError": "no answer in time",

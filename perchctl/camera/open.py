@@ -49,7 +49,7 @@ class SourceName:
 
 
 def parse_source(text: str, *, files: bool = False) -> SourceName:
-    """The source that a text names: a scheme, in small or capital letters, and what is behind it.
+    """Return the source that a text names: a scheme in small or capital letters, and its place.
 
     `files`: a bare path names a video, a picture, a pattern or a folder of pictures. Nothing is
     opened. Errors: InvalidValue for an unknown scheme or an AI-deck's address that is none;
@@ -77,7 +77,7 @@ def parse_source(text: str, *, files: bool = False) -> SourceName:
 
 
 def note(sentence: str) -> None:
-    """Warn: the command line prints it, and a program that uses the package may catch it."""
+    """Warn with a sentence, which the command line prints and a program may catch."""
     warnings.warn(sentence, CameraNote, stacklevel=3)
 
 
@@ -98,8 +98,8 @@ def open_camera(
         source: a text that `parse_source` takes, or picture files one by one. ``sim:`` belongs
             to the simulated vehicle, whose stream's address the caller gives instead.
         clock: the loop's clock, s.
-        config: the profile's camera. Its latency is taken off live frames' times, its format,
-            rate and controls are asked of ``camera:``, and mirrored pictures are turned right.
+        config: the profile's camera. Its latency is taken off live frames' times, its format
+            and rate are asked of ``camera:``, and mirrored pictures are turned right.
         size_px: wanted width and height (requested of ``camera:`` only).
         latency_s: from exposure to arrival, instead of the profile's (0 without one).
         pictures_hz: pictures count as taken at this rate (``images:`` only; 30 by default).
@@ -108,7 +108,7 @@ def open_camera(
 
     Raises:
         NotFound: no such camera, file or stream. InvalidValue: unknown scheme,
-        unreadable content, a control or format that the camera lacks. TimedOut: no
+        unreadable content. TimedOut: no
         first frame in time.
     """
     if latency_s is None:
@@ -128,8 +128,6 @@ def open_camera(
         else:
             live = _live(name, latency_s, size_px, clock, config)
             opened = _started(live, timeout_s, tell)
-            if isinstance(live, StreamSource):
-                _tell_unasked(name, config, tell)
     return opened if config is None else mirrored_as_profiled(opened, config)
 
 
@@ -140,7 +138,7 @@ def _live(
     clock: Clock,
     config: CameraConfig | None,
 ) -> LiveSource:
-    """A camera or stream whose first frame is still to come."""
+    """Open a camera or stream whose first frame is still to come."""
     if name.scheme == "camera":
         asked = asked_of(config, size_px)
         number = camera_number(name.place)
@@ -167,46 +165,22 @@ _USUAL_PORT = {"http": 80, "https": 443, "rtsp": 554}
 
 
 def _check_address(name: SourceName) -> None:
-    """Raises InvalidValue where a stream's URL has no host or no port that can be."""
-    port: int | str | None = None
+    """Raise InvalidValue where a stream's URL has no host, or a port that cannot be."""
     try:
         parts = urlsplit(name.spec)
-        host = parts.hostname if name.place.startswith("//") else None
-        try:
-            port = parts.port
-        except ValueError:
-            port = parts.netloc.rpartition(":")[2]
-            host = None if "@" in name.spec else host  # part of a password, it may be
+        is_right = name.place.startswith("//") and bool(parts.hostname) and parts.port != 0
     except ValueError:
-        host = None
-    if not host:
+        is_right = False
+    if not is_right:
         raise InvalidValue(
-            f"camera source {str(name)!r} lacks a host that can be read, as in "
-            f"{name.scheme}://192.168.1.20/stream; in a name or password @ is %40, : is %3A, "
-            f"/ is %2F"
-        )
-    if port == 0 or isinstance(port, str):
-        raise InvalidValue(
-            f"camera source {str(name)!r} has port {port}; allowed are 1 to 65535, as in "
-            f"{name.scheme}://{host}:{_USUAL_PORT[name.scheme]}/stream, or none for the usual one"
-        )
-
-
-def _tell_unasked(
-    name: SourceName, config: CameraConfig | None, tell: Callable[[str], None]
-) -> None:
-    """What the profile asks of a driver, and no network camera has."""
-    keys = {} if config is None else {"format": config.format, "controls": config.controls}
-    given = [f"camera.{key}" for key, value in keys.items() if value]
-    if given:
-        verb = "is" if len(given) == 1 else "are"
-        tell(
-            f"{' and '.join(given)} {verb} not used with {name}: only camera: sources have a "
-            f"driver to ask; set that in the camera itself"
+            f"camera source {str(name)!r} has no host or no port that can be read, as in "
+            f"{name.scheme}://192.168.1.20:{_USUAL_PORT[name.scheme]}/stream; a port is 1 to "
+            f"65535; in a name or password @ is %40, : is %3A, / is %2F"
         )
 
 
 def _started(source: LiveSource, timeout_s: float, tell: Callable[[str], None]) -> FrameSource:
+    """Wait for the first frame. Raises NotFound or TimedOut without one, with the source closed."""
     if source.wait_first(timeout_s):
         for sentence in source.remarks():
             tell(sentence)

@@ -33,7 +33,7 @@ class NewestSlot:
     def put(
         self, image: Grey, t_s: float, t_arrival_s: float, encoded: bytes | None = None
     ) -> None:
-        """Times of exposure and of arrival; `encoded` as `Frame` has it."""
+        """Keep a picture with its times of exposure and of arrival; `encoded` as `Frame` has it."""
         if self._last is None or not same_bytes(self._last, image):
             self._last = image
             self._frame = Frame(self.count, t_s, image, t_arrival_s, encoded=encoded)
@@ -42,7 +42,7 @@ class NewestSlot:
             self._frame = Frame(self.count - 1, t_s, image, t_arrival_s, repeated=True)
 
     def take(self) -> Frame | None:
-        """Once."""
+        """Return the kept frame once; None if no picture came since."""
         frame, self._frame = self._frame, None
         return frame
 
@@ -67,17 +67,17 @@ class FrameSource(Protocol):
 
     @property
     def finished(self) -> bool:
-        """No frame will come any more (recordings; a live source never finishes)."""
+        """True if no frame will come any more; a live source never finishes."""
 
     @property
     def size_px(self) -> tuple[int, int] | None:
         """Width and height of the frames, once the first has come."""
 
     def poll(self, now_s: float) -> Frame | None:
-        """The newest frame, or None if there is none since the last call."""
+        """Return the newest frame, or None if there is none since the last call."""
 
     def problem(self, now_s: float) -> str | None:
-        """One sentence if the source is gone, else None."""
+        """Return one sentence if the source is gone, else None."""
 
     def describe(self) -> str: ...
 
@@ -85,7 +85,7 @@ class FrameSource(Protocol):
 
 
 def to_grey(image: Any) -> Grey:
-    """Grey, 8 bit, contiguous; from an array of grey, BGR or BGRA, 8 or 16 bits."""
+    """Return a contiguous 8-bit grey picture of an array of grey, BGR or BGRA, 8 or 16 bits."""
     if image.dtype == np.uint16:
         image = (image >> 8).astype(np.uint8)
     if image.ndim == 3 and image.shape[2] == 1:
@@ -112,7 +112,7 @@ def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str
 
 
 def one_line(error: Exception) -> str:
-    """An error that was not foreseen, for a sentence: its class, and its text without passwords."""
+    """Describe an unforeseen error within a sentence: its class, and its text without passwords."""
     text = " ".join(without_password(str(error)).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
@@ -142,11 +142,7 @@ class LiveSource:
         self._arrived = 0  # pictures, a receiver's repetitions too
         self._failure: str | None = None
         self._why_silent = ""
-        self._size_px: tuple[int, int] | None = None
-
-    @property
-    def size_px(self) -> tuple[int, int] | None:
-        return self._size_px
+        self.size_px: tuple[int, int] | None = None
 
     def poll(self, now_s: float) -> Frame | None:
         with self._lock:
@@ -163,7 +159,7 @@ class LiveSource:
         return None
 
     def describe(self) -> str:
-        size = "no frame yet" if self._size_px is None else "{}x{} px".format(*self._size_px)
+        size = "no frame yet" if self.size_px is None else "{}x{} px".format(*self.size_px)
         return f"{self._name} ({size})"
 
     def wait_first(self, timeout_s: float) -> bool:
@@ -172,12 +168,12 @@ class LiveSource:
         return self._count > 0
 
     def remarks(self) -> list[str]:
-        """What is worth telling once the first frame has come, a sentence each."""
+        """Return a sentence for each thing worth telling once the first frame has come."""
         return []
 
     @property
     def _count(self) -> int:
-        """Pictures so far, each once."""
+        """The number of pictures so far, each counted once."""
         return self._slot.count
 
     def close(self) -> None:
@@ -192,7 +188,7 @@ class LiveSource:
         self._thread.start()
 
     def _grabbing(self, target: Callable[[], None]) -> None:
-        """The whole life of the grabbing thread: it does not end unnoticed."""
+        """Run the grabbing thread's whole life, so that it does not end unnoticed."""
         ended = "its thread has ended"
         try:
             target()
@@ -209,10 +205,10 @@ class LiveSource:
         began_s: float | None = None,
         encoded: bytes | None = None,
     ) -> None:
-        """`waited_s`: for how long it was under way beyond the usual, where that is known.
-        `began_s`: when the picture began to arrive, where that is known and tells more of its
-        exposure than its end does: the latency is counted from there. `encoded`: as `Frame`
-        has it."""
+        """Keep a picture that has arrived now. `waited_s`: how long it was under way beyond the
+        usual. `began_s`: when the picture began to arrive, where that is known and tells more of
+        its exposure than its end does: the latency is counted from there. `encoded`: as `Frame` has
+        it."""
         arrival_s = self._clock()
         t_s = (arrival_s if began_s is None else began_s) - self._latency_s - waited_s
         grey = to_grey(image)
@@ -221,7 +217,7 @@ class LiveSource:
             self._last_arrival_s = arrival_s
             self._arrived += 1
             self._why_silent = ""
-            self._size_px = (grey.shape[1], grey.shape[0])
+            self.size_px = (grey.shape[1], grey.shape[0])
         self._first.set()
 
     def _fail(self, sentence: str) -> None:
@@ -284,24 +280,21 @@ class WatchedSource(WrappedSource):
 # about a target that is seen mirrored all the same.
 
 
-MIRRORED_TEXT = "the picture is mirrored"
-
-
 def mirrored_note(config: CameraConfig) -> str:
-    """`MIRRORED_TEXT`, a colon, and what to do about it with this profile."""
+    """Say that the picture is mirrored, and behind a colon what to do with this profile."""
+    advice = "switch that off in the camera, or set camera.mirrored in the profile"
     if config.mirrored:
         advice = "the camera does not mirror, so take camera.mirrored out of the profile"
-        return f"{MIRRORED_TEXT}: {advice}"
-    return f"{MIRRORED_TEXT}: switch that off in the camera, or set camera.mirrored in the profile"
+    return f"the picture is mirrored: {advice}"
 
 
 def unmirror_frame(frame: Frame) -> Frame:
-    """The frame flipped left to right; it is no longer the JPEG that came."""
+    """Return the frame flipped left to right; it is no longer the JPEG that came."""
     return replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]), encoded=None)
 
 
 def mirrored_as_profiled(source: FrameSource, config: CameraConfig) -> FrameSource:
-    """The source, with each picture turned right if `camera.mirrored` is set."""
+    """Return the source, with each picture turned right if `camera.mirrored` is set."""
     return UnmirroredSource(source) if config.mirrored else source
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from statistics import mean, median
 
-from perchctl.camera import MIRRORED_TEXT, VERDICT_TEXTS, mirrored_note
+from perchctl.camera import VERDICT_TEXTS, mirrored_note
 from perchctl.check.rehearsal import Rehearsal
 from perchctl.check.row import (
     Finding,
@@ -23,6 +23,7 @@ from perchctl.check.row import (
     skip_all,
     skipped,
     warned,
+    worst,
 )
 from perchctl.errors import PerchError
 from perchctl.flight import (
@@ -64,7 +65,7 @@ _ADVICE = {
 
 
 def refused_rows(error: PerchError, devices: list[str], profile: Profile) -> list[Row]:
-    """The rows of a camera that gives no picture."""
+    """Return the rows of a camera that gives no picture."""
     found, semicolon, advice = str(error).rpartition("; ")
     if not semicolon:
         found, advice = str(error), _SEE
@@ -76,7 +77,7 @@ def refused_rows(error: PerchError, devices: list[str], profile: Profile) -> lis
 
 
 def opened_finding(described: str, devices: list[str], remarks: Sequence[str] = ()) -> Finding:
-    """Of a camera that opens; `remarks`: what it does not do as it was asked."""
+    """Judge a camera that opens; `remarks`: what it does not do as it was asked."""
     found = f"{described} gives pictures"
     if remarks:
         return warned(f"{found}; {'; '.join(remarks)}", "see perchctl check --cameras")
@@ -96,7 +97,7 @@ def size_finding(size_px: tuple[int, int] | None, wanted_px: tuple[int, int]) ->
 
 
 def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> list[Row]:
-    """What the pictures show."""
+    """Judge what the pictures of a rehearsal show."""
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture came in the rehearsal"
         first, *rest = names_of(profile)
@@ -119,13 +120,13 @@ def _rate(rehearsal: Rehearsal, profile: Profile) -> Finding:
     finding = by_limits(-hz, -RATE_WARN_HZ, -RATE_FAIL_HZ, f"{hz:.0f} Hz", advice)
     wanted_hz = profile.camera.rate_hz
     if finding.verdict == "pass" and wanted_hz is not None and hz < 0.8 * wanted_hz:
-        advice = "a shorter exposure (camera.controls), or another camera.format"
+        advice = "a shorter exposure (v4l2-ctl), or another camera.format"
         return warned(f"{finding.found}, asked for {wanted_hz:g}", advice)
     return finding
 
 
 def _lost(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    """By the gaps between pictures that arrived one after another."""
+    """Judge the lost frames by the gaps between pictures that arrived one after another."""
     if not rehearsal.live:
         return skipped("a recording")
     if rehearsal.silent_s > profile.safety.camera_hold_s:
@@ -147,7 +148,8 @@ def _lost(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 
 def _age(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    """When it has been looked at; of its way from the sensor only the profile knows."""
+    """Judge how old pictures are when they have been searched; only the profile knows the way from
+    the sensor."""
     if not rehearsal.live or not rehearsal.ages_s:
         return skipped("none was looked at" if rehearsal.live else "a recording")
     age_s, limit_s = percentile(rehearsal.ages_s, 0.95), profile.safety.max_frame_age_s
@@ -163,7 +165,8 @@ def percentile(values: list[float], share: float) -> float:
 
 
 def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    """Frozen, snow, uniform, dark, late: what the flight takes for no measurement."""
+    """Judge the pictures that a flight takes for no measurement: frozen, snow, uniform, dark,
+    late."""
     late = sum(t < t0 for (_, t0), (_, t) in pairwise(rehearsal.arrivals))
     if late:
         found = f"{late} of {rehearsal.pictures} came after newer ones"
@@ -177,7 +180,7 @@ def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
     text, count = rehearsal.problems.most_common(1)[0]
     share = sum(rehearsal.problems.values()) / rehearsal.pictures
     found = f"{count} of {rehearsal.pictures}: {text}"
-    advice = "see mirrored" if text.startswith(MIRRORED_TEXT) else _ADVICE.get(text, _SEE)
+    advice = "see mirrored" if text == mirrored_note(profile.camera) else _ADVICE.get(text, _SEE)
     return by_limits(share, 0.05, 0.5, found, advice)
 
 
@@ -260,7 +263,7 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
 
 
 def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
-    """From where the vehicle stands, and on its way up: what `fly` refuses fails."""
+    """Judge the view from where the vehicle stands, and on its way up: what `fly` refuses fails."""
     if not rehearsal.found:
         where = overhead_view(profile.target, camera, profile.camera.mount).words
         return failed("no, and fly refuses", f"put the vehicle under the target: {where}")
@@ -293,5 +296,33 @@ SIGHT: dict[str, Callable[[Rehearsal, Profile, CameraModel], Finding]] = {
 
 
 def names_of(profile: Profile) -> tuple[str, ...]:
-    """The rows of the pictures, in their order."""
+    """Return the names of the pictures' rows, in their order."""
     return (*PICTURES, *(SIGHT if profile.positioning.by == "target" else ()))
+
+
+# --- The computer that looks at the pictures ----------------------------------------------------
+
+
+def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
+    """Judge the loop by a rehearsal: the time for a picture against that between two, and the turns
+    that begin later than half a period."""
+    if rehearsal is None or len(rehearsal.work_s) < LEAST_RATED:
+        return skipped("no pictures to rehearse with")
+    if not rehearsal.live:
+        return skipped("a recording comes as fast as it is read")
+    work_s = percentile(rehearsal.work_s, 0.95)
+    turn_s = 1.0 / profile.link.loop_hz
+    period_s = rehearsal.frame_period_s or turn_s
+    late = sum(late_s > turn_s / 2.0 for late_s in rehearsal.late_s) / len(rehearsal.late_s)
+    latest_s = max(rehearsal.late_s)
+    found = (
+        f"{1e3 * work_s:.0f} ms a picture of {1e3 * period_s:.0f}, "
+        f"{100.0 * late:.0f} % of the turns late, at most {1e3 * latest_s:.0f} ms"
+    )
+    advice = "close other programs, use a smaller picture, or a faster computer"
+    if latest_s > profile.safety.loop_late_hold_s:
+        return failed(found, advice)
+    return worst(
+        by_limits(work_s / period_s, 0.7, 1.0, found, advice),
+        by_limits(late, 0.05, 0.3, found, advice),
+    )

@@ -11,7 +11,7 @@ world, B the rigid body's axes, where they should be none:
 
 A turn between two moments, as a vector, is ``A w`` in the capture's world where the vehicle has
 ``w``, and ``B^T v`` in the body's axes where it has ``v``: two rotations between sets of vectors,
-each solved by least squares (Kabsch, by the singular value decomposition). A's turn about the
+each solved by least squares (`Rotation.align_vectors`). A's turn about the
 vertical is the capture's own affair, since the vehicle's heading is set by it; its tilt is
 another axis up. B is a body whose axes were not defined along the vehicle's.
 """
@@ -81,7 +81,7 @@ class Listened:
     problem: str | None = None
 
     def places(self, config: PositioningConfig) -> list[Placed]:
-        """Of the vehicle's body, at the moments of exposure, oldest first."""
+        """Return the vehicle's body at the moments of exposure, oldest first."""
         return [
             Placed.of(frame.bodies[config.body], config, frame.t_s - config.latency_s)
             for frame in self.frames
@@ -97,7 +97,7 @@ def listen(
     for_s: float = CAPTURE_S,
     is_enough: Callable[[Listened], bool] = lambda so_far: False,
 ) -> Listened:
-    """For so long, or until it is enough; that is asked every half second."""
+    """Hear both for so long, or until it is enough; that is asked every half second."""
     began_s = asked_s = clock()
     telemetry: list[Telemetry] = []
     frames: list[CaptureFrame] = []
@@ -120,13 +120,14 @@ def listen(
 
 
 def refused_rows(why: str, config: PositioningConfig) -> list[Row]:
-    """The rows of a capture that could not be opened, or sends nothing."""
+    """Return the rows of a capture that could not be opened, or sends nothing."""
     advice = "does it stream, is positioning.host right, does a firewall stop it?"
     names = ("body", *CAPTURE)
     return [Row("capture", *failed(why, advice)), *skip_all(names, f"no {config.label}")]
 
 
 def capture_rows(heard: Listened, profile: Profile) -> list[Row]:
+    """Judge what came of a capture while the vehicle stood still."""
     config = profile.positioning
     if not heard.frames:
         return refused_rows(heard.problem or f"{config.label} sends no frame", config)
@@ -142,8 +143,11 @@ def capture_rows(heard: Listened, profile: Profile) -> list[Row]:
 
 
 def _body(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
-    """How often it is seen, and how well, at rest. Between two frames at 20 Hz a vehicle falls by
-    12 mm. The noise is that of the worst axis, about the middle: a few wild ones do not make it."""
+    """Judge how often the body is seen, and how well, at rest.
+
+    Between two frames at 20 Hz a vehicle falls by 12 mm. The noise is that of the worst axis, about
+    the middle: a few wild ones do not make it.
+    """
     config = profile.positioning
     at = np.array([place.position_m for place in places])
     if len(at) > 2 and not np.ptp(at, axis=0).any():
@@ -177,7 +181,7 @@ def _body(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
 
 
 def _place(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
-    """By what `fly` asks of it."""
+    """Judge the body's place by the criteria of `fly`."""
     newest = heard.telemetry[-1] if heard.telemetry else None
     place = places[-1].external(pose=True)
     if newest is None:
@@ -219,7 +223,7 @@ LIFTED_M = 0.12
 REACH_M = 5.0
 """A hand lifts no farther: what moved farther is given in another unit."""
 STRANGER = 0.4
-"""Of a turn: what A and B leave unexplained, on the average."""
+"""Share of a turn, on the average, that A and B leave unexplained for another body."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,28 +238,27 @@ class Moved:
 
     @property
     def ways_m(self) -> Array:
-        """Of the places from the first, (n, 3)."""
+        """The ways of the places from the first, (n, 3)."""
         return np.asarray(self.place_m - self.place_m[0])
 
 
 @dataclass(frozen=True, eq=False)
 class Turns:
-    """What the turns say.
+    """A and B of the module's text, and the share of a turn that they leave unexplained."""
 
-    Attributes:
-        up: the vertical in the capture's world, (3,), None where all turns were about one other
-            axis.
-        body: the rigid body's axes in the vehicle's, None where all turns were about one axis.
-        unexplained: of a turn, on the average, 0 to 1 and more.
-    """
-
-    up: Array | None
-    body: Rotation | None
+    world: Rotation
+    body: Rotation
     unexplained: float
+
+    @property
+    def up(self) -> Array:
+        """The vertical in the capture's world, (3,)."""
+        return np.asarray(self.world.as_matrix()[:, 2])
 
 
 def paired(telemetry: Sequence[Telemetry], places: Sequence[Placed]) -> Moved | None:
-    """The attitude of each place's moment, every `EVERY_S`; None of less than three."""
+    """Pair each place with the vehicle's attitude of its moment, every `EVERY_S`; None of fewer
+    than three pairs."""
     if len(telemetry) < 2:
         return None
     history = History(tuple(telemetry))
@@ -283,7 +286,8 @@ def paired(telemetry: Sequence[Telemetry], places: Sequence[Placed]) -> Moved | 
 
 
 def turns_of(moved: Moved) -> Turns | None:
-    """A and B by all pairs of moments between which it was turned; None of no such pair."""
+    """Solve A and B by all pairs of moments between which it was turned; None where it was turned
+    about fewer than two axes."""
     i, j = np.triu_indices(len(moved.own), 1)
     size = (moved.own[j] * moved.own[i].inv()).magnitude()
     kept = (size >= LEAST_STEP_RAD) & (size <= MOST_STEP_RAD)
@@ -292,29 +296,24 @@ def turns_of(moved: Moved) -> Turns | None:
     i, j, size = i[kept], j[kept], size[kept]
     world_own, world_seen = ((R[j] * R[i].inv()).as_rotvec() for R in (moved.own, moved.seen))
     body_own, body_seen = ((R[i].inv() * R[j]).as_rotvec() for R in (moved.own, moved.seen))
-    A, many, axis = _rotation_between(world_own, world_seen)
-    B_T, many_body, _ = _rotation_between(body_own, body_seen)
-    unexplained = float(np.mean(np.linalg.norm(world_seen - world_own @ A.T, axis=1) / size))
-    about_z = abs(float(axis[2])) > math.cos(math.radians(UPRIGHT_DEG))
-    up = A[:, 2] if many else A @ axis * math.copysign(1.0, axis[2]) if about_z else None
-    return Turns(up, Rotation.from_matrix(B_T.T) if many_body else None, unexplained)
+    if not _has_many_axes(world_own) or not _has_many_axes(body_own):
+        return None
+    world, _ = Rotation.align_vectors(world_seen, world_own)
+    body, _ = Rotation.align_vectors(body_own, body_seen)
+    left = np.linalg.norm(world_seen - world.apply(world_own), axis=1)
+    return Turns(world, body, float(np.mean(left / size)))
 
 
-def _rotation_between(before: Array, after: Array) -> tuple[Array, bool, Array]:
-    """The rotation that takes (n, 3) to (n, 3), whether the vectors span more than one axis,
-    and the axis that they have most of."""
-    u, _, vt = np.linalg.svd(after.T @ before)
-    sign = np.sign(np.linalg.det(u @ vt))
-    axis = np.linalg.eigh(before.T @ before)[1][:, 2]  # the largest comes last
-    aside_rad = np.linalg.norm(before - np.outer(before @ axis, axis), axis=1)
-    many = bool(np.quantile(aside_rad, MANY_SHARE) > LEAST_STEP_RAD)
-    return u @ np.diag([1.0, 1.0, sign]) @ vt, many, axis
+def _has_many_axes(turns: Array) -> bool:
+    """Return whether turns, as vectors (n, 3), are about more than one axis."""
+    axis = np.linalg.eigh(turns.T @ turns)[1][:, 2]  # the largest comes last
+    aside_rad = np.linalg.norm(turns - np.outer(turns @ axis, axis), axis=1)
+    return bool(np.quantile(aside_rad, MANY_SHARE) > LEAST_STEP_RAD)
 
 
 def is_enough(moved: Moved | None) -> bool:
-    """Lifted, turned and tilted, and put back: more would tell no more."""
-    turns = None if moved is None else turns_of(moved)
-    if moved is None or turns is None or turns.up is None or turns.body is None:
+    """Return whether it was lifted, turned, tilted and put back: more would tell no more."""
+    if moved is None or turns_of(moved) is None:
         return False
     far_m = np.linalg.norm(moved.ways_m, axis=1)
     is_back = far_m[-1] < STILL_M and _turned_rad(moved.own)[-1] < MOVED_RAD
@@ -322,12 +321,12 @@ def is_enough(moved: Moved | None) -> bool:
 
 
 def _turned_rad(attitudes: Rotation) -> Array:
-    """Each attitude's turn from the first, (n,)."""
+    """Return each attitude's turn from the first, (n,)."""
     return np.asarray((attitudes[0].inv() * attitudes).magnitude())
 
 
 def hand_finding(moved: Moved | None, config: PositioningConfig) -> Finding:
-    """The comparison of vehicle and capture: the gravest that was found."""
+    """Compare vehicle and capture, and return the gravest finding."""
     if moved is None:
         return skipped("no moments at which both vehicle and capture said something", HOW_TO_TURN)
     own_rad, seen_rad = (float(_turned_rad(R).max()) for R in (moved.own, moved.seen))
@@ -335,8 +334,7 @@ def hand_finding(moved: Moved | None, config: PositioningConfig) -> Finding:
     body = f"rigid body {config.body!r}"
     others = "it is another body's: correct positioning.body"
     moves = own_rad > MOVED_RAD or moved.moved_g > MOVED_G
-    follows = seen_rad > STILL_RAD or way_m > STILL_M
-    if moves and not follows:
+    if moves and seen_rad <= STILL_RAD and way_m <= STILL_M:
         return failed(f"the vehicle moves, and the {body} stands still", others)
     if not moves and (way_m > MOVED_M or seen_rad > MOVED_RAD):
         return failed(f"the {body} moves, and the vehicle stands still", others)
@@ -346,71 +344,45 @@ def hand_finding(moved: Moved | None, config: PositioningConfig) -> Finding:
         found = f"the {body} moved by {way_m:.0f} m: these look like millimetres"
         return failed(found, "set the unit of the capture's stream to metres")
     turns = turns_of(moved)
-    if turns is not None and turns.unexplained > STRANGER:
+    if turns is None:
+        turned_deg = math.degrees(own_rad)
+        return warned(f"turned by {turned_deg:.0f} deg, about too few axes to tell", HOW_TO_TURN)
+    if turns.unexplained > STRANGER:
         advice = (
             "it is another body's, or its markers are too few or too symmetric to tell its turns"
         )
         return failed(f"the {body} does not turn as the vehicle does", advice)
-    up = None if turns is None else turns.up
-    risen = _rise(moved.ways_m, up)
-    wrong = (None if up is None else _wrong_up(up, risen)) or _sideways(risen)
-    if wrong is not None:
-        return wrong
-    if turns is None or turns.up is None or turns.body is None:
-        turned_deg = math.degrees(own_rad)
-        found = f"turned by {turned_deg:.0f} deg, about too few axes to tell all"
-        return warned(found, HOW_TO_TURN)
-    return _body_finding(turns.body, risen, config)
+    return _world_finding(turns, moved) or _body_finding(turns, moved, config)
 
 
-def _rise(ways_m: Array, up: Array | None) -> Array | None:
-    """The place at its farthest, (3,) from the first; where the vertical is known, at its
-    farthest along that. None where it was not lifted."""
-    far_m = np.linalg.norm(ways_m, axis=1)
-    far = ways_m[int(np.argmax(far_m if up is None else np.abs(ways_m @ up)))]
-    if float(np.linalg.norm(far)) < LIFTED_M:
-        far = ways_m[int(np.argmax(far_m))]
-    return far if float(np.linalg.norm(far)) >= LIFTED_M else None
+def _risen_m(turns: Turns, moved: Moved) -> float:
+    """Return the largest way along the capture's vertical; negative where it goes down."""
+    heights_m = moved.ways_m @ turns.up
+    return float(heights_m[int(np.argmax(np.abs(heights_m)))])
 
 
-def _wrong_up(up: Array, risen: Array | None) -> Finding | None:
-    """Of the vertical in the capture's world, (3,)."""
-    off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
-    axis = nearest_axis(up)
+def _world_finding(turns: Turns, moved: Moved) -> Finding | None:
+    """Return what is wrong with the capture's world: tilted, its axes swapped, or mirrored."""
+    off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.up[2])))))
+    axis = nearest_axis(turns.up)
     if off_deg > UPRIGHT_DEG and axis is None:
-        found = f"the capture's world is tilted by {off_deg:.0f} deg: up is {_xyz(up)}"
+        found = f"the capture's world is tilted by {off_deg:.0f} deg"
         return failed(found, "calibrate its volume anew, with z up")
     if off_deg > UPRIGHT_DEG:
         advice = "set its world to z up, and define the rigid body anew with the vehicle level"
         return failed(f"swapped axes: up is {axis} in the motion capture", advice)
-    if risen is not None and risen[2] < 0.0 and abs(risen[2]) == max(abs(risen)):
+    if _risen_m(turns, moved) < -LIFTED_M:
         advice = "its axes are left-handed: calibrate its volume anew, with z up"
         return failed("mirrored: lifted, the body goes down in the capture", advice)
     return None
 
 
-def _xyz(vector: Array) -> str:
-    return " ".join(f"{float(v):.2f}" for v in vector)
-
-
-def _sideways(risen: Array | None) -> Finding | None:
-    """Of a body that rose along another axis than z."""
-    axis = "z" if risen is None else nearest_axis(risen / np.linalg.norm(risen))
-    if risen is None or axis == "z":
-        return None
-    along = f"along its {axis}" if axis else f"by x {risen[0]:.2f}, y {risen[1]:.2f} m"
-    return failed(
-        f"swapped axes: lifted, the body goes {along} in the motion capture",
-        "set its world to z up; if you carried it aside, once more, straight up",
-    )
-
-
-def _body_finding(body: Rotation, risen: Array | None, config: PositioningConfig) -> Finding:
-    """`body`: what is left of the body's turn, beyond the profile's."""
-    off_deg = math.degrees(float(body.magnitude()))
+def _body_finding(turns: Turns, moved: Moved, config: PositioningConfig) -> Finding:
+    """Judge what is left of the body's turn beyond the profile's, and whether it was lifted."""
+    off_deg = math.degrees(float(turns.body.magnitude()))
     if off_deg > BODY_WARN_DEG:
         profiled = rotation_from_rpy(*(math.radians(a) for a in config.body_rpy_deg))
-        rpy = rpy_from_rotation(body.as_matrix() @ profiled)
+        rpy = rpy_from_rotation(turns.body.as_matrix() @ profiled)
         wanted = ", ".join(f"{math.degrees(angle):.0f}" for angle in rpy)
         verdict = failed if off_deg > BODY_FAIL_DEG else warned
         return verdict(
@@ -419,9 +391,10 @@ def _body_finding(body: Rotation, risen: Array | None, config: PositioningConfig
             f"along x",
         )
     found = f"turns as the vehicle does, within {off_deg:.0f} deg"
-    if risen is None:
-        return warned(f"{found}; it was not lifted", HOW_TO_TURN)
-    return passed(f"{found}; rose by {risen[2]:.2f} m")
+    risen_m = _risen_m(turns, moved)
+    if risen_m < LIFTED_M:
+        return warned(f"{found}; it was not lifted along the capture's z", HOW_TO_TURN)
+    return passed(f"{found}; rose by {risen_m:.2f} m")
 
 
 # --- What the hand found, written down for `fly` ------------------------------------------------
@@ -432,15 +405,16 @@ COMPARED = "compared"
 def comparison_rows(
     config: PositioningConfig, uri: str, now: datetime, *, simulated: bool
 ) -> list[Row]:
-    """Whether `fly` finds a comparison by hand of this motion capture: one row, none with decks,
-    nor for the simulator's own vehicle, whose room is right as it is built."""
+    """Say in one row whether `fly` finds a comparison by hand of this motion capture; no row with
+    decks, nor for the simulator's own vehicle, whose room is right as it is built."""
     if config.by != "mocap" or simulated:
         return []
     return [_record_row(load_comparison(config, vehicle_uri(uri)), now)]
 
 
 def save_row(lifted: Finding, config: PositioningConfig, uri: str, now: datetime) -> Row:
-    """Write down what the hand found, and the row of it. A lift that showed nothing is none."""
+    """Write down what the hand found, and return its row. A lift that showed nothing is not
+    written."""
     vehicle = vehicle_uri(uri)
     if lifted.verdict is Verdict.SKIPPED:
         return _record_row(load_comparison(config, vehicle), now)

@@ -7,13 +7,14 @@ and was hardly meant. `fly` asks the same, with the computer's disk, before it c
 from __future__ import annotations
 
 import math
+import os
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import without_password
-from perchctl.check.computer import disk_finding
 from perchctl.check.row import (
     Finding,
     Row,
@@ -21,8 +22,10 @@ from perchctl.check.row import (
     Verdict,
     ask,
     ask_all,
+    by_limits,
     failed,
     passed,
+    skipped,
     warned,
 )
 from perchctl.errors import PerchError, SafetyAbort
@@ -39,7 +42,7 @@ LOOKS_UP = math.cos(math.radians(45.0))
 
 
 def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
-    """A row for each question, in the order in which they matter.
+    """Return a row for each question, in the order in which they matter.
 
     `source` takes the place of the profile's. Opens no link and no camera; reads the calibration's
     file. Raises nothing.
@@ -54,7 +57,8 @@ def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
 
 
 def quick_rows(options: FlyOptions) -> list[Row]:
-    """What costs no time: the computer's disk and the profile. Opens no link and no camera."""
+    """Return the rows that cost no time, of the computer's disk and the profile. It opens no link
+    and no camera."""
     return [
         ask("disk", disk_finding, options.log_dir),
         *profile_rows(options.profile, source=options.source),
@@ -62,8 +66,8 @@ def quick_rows(options: FlyOptions) -> list[Row]:
 
 
 def warnings_before_flight(options: FlyOptions) -> list[str]:
-    """A sentence for each row that warns. Errors: SafetyAbort for the first that fails; of the
-    calibration's file InvalidValue, NotFound."""
+    """Return a sentence for each row that warns. Errors: SafetyAbort for the first that fails; of
+    the calibration's file InvalidValue, NotFound."""
     profile_camera(options.profile.camera)
     rows = quick_rows(options)
     for row in rows:
@@ -107,7 +111,8 @@ def _calibration(plan: _Plan) -> Finding:
 
 
 def _is_shipped_example(path: Path) -> bool:
-    """By what is in it: a copy under another name fits no other lens."""
+    """Return whether a calibration is a shipped example by what is in it: a copy under another name
+    fits no other lens."""
     try:
         text = path.read_bytes()
         return any(text == file.read_bytes() for file in data_folder("calib").glob("example_*"))
@@ -116,7 +121,8 @@ def _is_shipped_example(path: Path) -> bool:
 
 
 def _camera_place(plan: _Plan) -> Finding:
-    """The profile refuses what lies off the vehicle; no camera is where the gear's tip is."""
+    """Judge the camera's place: no camera is where the gear's tip is. (The profile refuses what
+    lies off the vehicle.)"""
     place_m = plan.profile.camera.mount.position_m
     found = f"{' '.join(mm_text(part) for part in place_m)} mm (forward, left, up)"
     if math.dist(place_m, plan.profile.vehicle.gear_body_m) < APART_M:
@@ -159,7 +165,7 @@ JUDGES: dict[str, Callable[[_Plan], Finding]] = {
 
 
 def _limits(name: str, profile: Profile) -> Finding:
-    """One finding for all limits of a kind."""
+    """Return one finding for all limits of a kind."""
     limits = DOUBTFUL[name]
     if profile.planner.perch.mode == "position":
         limits = tuple(limit for limit in limits if "planner.perch.thrust" not in limit.keys)
@@ -172,7 +178,7 @@ def _limits(name: str, profile: Profile) -> Finding:
 
 
 def _way(plan: _Plan) -> Finding:
-    """Whether the fence leaves room for the way to the target."""
+    """Judge whether the fence leaves room for the way to the target."""
     profile, safety = plan.profile, plan.profile.safety
     found = f"fence {safety.fence_radius_m:g} m"
     away_m = math.hypot(*(profile.planner.approach_xy_m or (0.0, 0.0)))
@@ -188,7 +194,8 @@ def _way(plan: _Plan) -> Finding:
 
 
 def _latency(plan: _Plan) -> Finding:
-    """A time that was written down is true for one camera, receiver and computer."""
+    """Judge the latency: a time that was written down is true for one camera, receiver and
+    computer."""
     latency_s = plan.profile.camera.latency_s
     if isinstance(latency_s, str):
         return passed("measured by each flight")
@@ -197,3 +204,37 @@ def _latency(plan: _Plan) -> Finding:
         f"that is 30 ms wrong makes the vehicle swing under the target",
         "set camera.latency_s: measured",
     )
+
+
+# --- The computer's disk ------------------------------------------------------------------------
+
+
+def disk_finding(folder: Path) -> Finding:
+    """Judge the free space of the disk that the log's folder is on, or will be."""
+    try:
+        usage = shutil.disk_usage(_existing(folder))
+    except OSError as error:
+        return skipped(f"not known ({error.strerror or error})")
+    if not usage.total:
+        return skipped(f"{_existing(folder)} is on none")
+    free = usage.free
+    found = f"{free / 1e9:.1f} GB free" if free >= 1e9 else f"{free / 1e6:.0f} MB free"
+    advice = "free some space: a flight's log has some 5 MB a minute"
+    return by_limits(-free, -500e6, -50e6, found, advice)
+
+
+def log_folder_finding(folder: Path) -> Finding:
+    """Judge whether logs can be written to the folder, without making it."""
+    there = _existing(folder)
+    advice = "name another with --log-dir, or set log.directory"
+    if not os.path.isdir(there):
+        return failed(f"{there} is a file", advice)
+    if not os.access(there, os.W_OK | os.X_OK):
+        return failed(f"no right to write in {there}", advice)
+    return passed(f"{folder} can be written" + ("" if there == folder else " (new)"))
+
+
+def _existing(folder: Path) -> Path:
+    """Return the folder, or the nearest above it that exists."""
+    whole = folder.absolute()
+    return folder if folder.exists() else next(p for p in whole.parents if p.exists())

@@ -90,7 +90,7 @@ class Rehearsal:
 
     @property
     def frame_period_s(self) -> float | None:
-        """Between two pictures; None of too few, or of a recording."""
+        """The time between two pictures; None of too few, or of a recording."""
         if not self.live or len(self.arrivals) < 2:
             return None
         (first, begin_s), (last, end_s) = self.arrivals[0], self.arrivals[-1]
@@ -123,7 +123,7 @@ class _TelemetryOnly:
 
 
 def telemetry_for(take: TakeTelemetry, profile: Profile) -> _TelemetryOnly:
-    """The link's telemetry as a rehearsal uses it."""
+    """Return the link's telemetry as a rehearsal uses it."""
     by_target = profile.positioning.by == "target"
     return _TelemetryOnly(take, (0.0, 0.0, profile.safety.ground_z_m) if by_target else None)
 
@@ -204,7 +204,7 @@ def _note(
 
 
 def _light(looked: Sequence[Looked]) -> Light | None:
-    """Of the newest picture."""
+    """Measure the light of the newest picture."""
     if not looked:
         return None
     image = looked[-1].frame.image[::2, ::2]
@@ -212,7 +212,7 @@ def _light(looked: Sequence[Looked]) -> Light | None:
 
 
 def _blur(looked: Sequence[Looked], pipeline: Pipeline) -> Blur | None:
-    """By the target's own edges; None where it was not seen."""
+    """Measure the blur by the target's own edges; None where it was not seen."""
     least, most = [], []
     for each in looked:
         for name in MARKERS:

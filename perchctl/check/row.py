@@ -54,7 +54,7 @@ P = ParamSpec("P")
 
 
 def ask(name: str, judge: Callable[P, Finding], *args: P.args, **kwargs: P.kwargs) -> Row:
-    """The row of that name: what `judge` finds, skipped where it raises `Unknown`."""
+    """Return the row of that name: what `judge` finds, skipped where it raises `Unknown`."""
     try:
         return Row(name, *judge(*args, **kwargs))
     except Unknown as unknown:
@@ -64,46 +64,50 @@ def ask(name: str, judge: Callable[P, Finding], *args: P.args, **kwargs: P.kwarg
 def ask_all(
     judges: Mapping[str, Callable[P, Finding]], *args: P.args, **kwargs: P.kwargs
 ) -> list[Row]:
-    """A row for each judge, by its name, in the mapping's order."""
+    """Return a row for each judge, by its name, in the mapping's order."""
     return [ask(name, judge, *args, **kwargs) for name, judge in judges.items()]
 
 
 def skip_all(names: Iterable[str], why: str, advice: str = "") -> list[Row]:
-    """A skipped row for each name, all for one reason."""
+    """Return a skipped row for each name, all for one reason."""
     return [Row(name, *skipped(why, advice)) for name in names]
 
 
 def passed(found: str) -> Finding:
+    """Return a pass."""
     return Finding(Verdict.PASS, found)
 
 
 def warned(found: str, advice: str) -> Finding:
+    """Return a warning, with what to do."""
     return Finding(Verdict.WARN, found, advice)
 
 
 def failed(found: str, advice: str) -> Finding:
+    """Return a fail, with what to do."""
     return Finding(Verdict.FAIL, found, advice)
 
 
 def skipped(why: str, advice: str = "") -> Finding:
+    """Return a question that could not be answered, with why."""
     return Finding(Verdict.SKIPPED, why, advice)
 
 
 def by_problem(problem: Problem | None, found: str) -> Finding:
-    """By a criterion that `fly` has, too: fails with its problem, or passes with `found`."""
+    """Judge by a criterion of `fly`: fail with its problem, or pass with `found`."""
     return passed(found) if problem is None else failed(problem.found, problem.advice)
 
 
 def by_limits(
     value: float, warn_above: float, fail_above: float, found: str, advice: str
 ) -> Finding:
-    """By a figure that is the better the smaller it is; one that is no number fails."""
+    """Judge by a figure that is the better the smaller it is; one that is no number fails."""
     if value <= warn_above:
         return passed(found)
     return (warned if value <= fail_above else failed)(found, advice)
 
 
 def worst(*findings: Finding) -> Finding:
-    """The gravest of them, the first of several."""
+    """Return the gravest finding, the first of several."""
     order = (Verdict.PASS, Verdict.SKIPPED, Verdict.WARN, Verdict.FAIL)
     return max(findings, key=lambda finding: order.index(finding.verdict))

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from perchctl.calibration import profile_camera
 from perchctl.camera import FrameSource, find_cameras, open_camera, without_password
 from perchctl.check import camera, capture, vehicle
-from perchctl.check.computer import log_folder_finding, loop_finding
-from perchctl.check.profile import quick_rows
+from perchctl.check.profile import log_folder_finding, quick_rows
 from perchctl.check.rehearsal import REHEARSED_S, Rehearsal, TakeTelemetry, rehearse
 from perchctl.check.row import Finding, Row, ask, failed, passed, skip_all, skipped
 from perchctl.errors import ConnectionFailed, PerchError, UsageError
@@ -48,14 +47,15 @@ class CheckScope:
 
 
 def scan_rows(uri: str | None) -> list[Row]:
-    """`--scan`: what answers, at the usual address and at that of `uri`. Errors: InvalidValue."""
+    """Return what answers, at the usual address and at that of `uri`, for `--scan`. Errors:
+    InvalidValue."""
     if uri is not None:
         check_uri(uri)
     return vehicle.answering_rows(find_vehicles(uri or ""))
 
 
 def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
-    """Rows as they are found. Errors, before anything is opened: InvalidValue, NotFound (the
+    """Yield rows as they are found. Errors, before anything is opened: InvalidValue, NotFound (the
     profile's files), UsageError (a library that is missing, or does not load)."""
     check_options(options)
     calibrated = profile_camera(options.profile.camera)
@@ -87,7 +87,7 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
                 "camera", *camera.opened_finding(shown, list(map(str, find_cameras())), remarks)
             )
             rehearsal = yield from _camera_rows(take, source, pipeline, options.profile, scope)
-    yield ask("loop", loop_finding, rehearsal, options.profile)
+    yield ask("loop", camera.loop_finding, rehearsal, options.profile)
     yield ask("log folder", log_folder_finding, options.log_dir)
     yield from quick_rows(options)
 
@@ -145,7 +145,7 @@ class VehicleSession:
         yield from self._compared_rows()
 
     def answering_rows(self) -> Iterator[Row]:
-        """Of a vehicle that is connected."""
+        """Yield the rows of a connected vehicle."""
         self.scope.tell(f"listening to the vehicle for {self.scope.listen_s:g} s")
         seen = vehicle.look(self.probe, self.uri, self.scope.listen_s)
         if lost := self.probe.lost():
@@ -159,12 +159,9 @@ class VehicleSession:
             yield ask(name, judge, seen, self.profile)
         yield from self._room_rows(self.probe.telemetry)
         yield from self._lift_rows()
-        if why := vehicle.gone(self.probe):  # the rows above may be of before
-            advice = "look at its battery and plug, restart it"
-            yield Row("link", *failed(f"the vehicle is gone: {why}", advice))
 
     def _room_rows(self, take: TakeTelemetry) -> list[Row]:
-        """Of the motion capture; none with decks."""
+        """Return the rows of the motion capture; none with decks."""
         config = self.profile.positioning
         if self.room is None:
             return []
@@ -182,7 +179,7 @@ class VehicleSession:
         )
 
     def _lift_rows(self) -> Iterator[Row]:
-        """What somebody has to lift the vehicle for."""
+        """Yield the rows for which somebody has to lift the vehicle."""
         compared = self._compared_rows()
         if self.scope.lift:
             lifted = self._lift_finding()
@@ -196,7 +193,8 @@ class VehicleSession:
         yield from compared
 
     def _lift_finding(self) -> Finding:
-        """By the vehicle's own position, or by a motion capture against its attitude."""
+        """Judge a lift by the vehicle's own position, or by a motion capture against its
+        attitude."""
         config, room, within_s = self.profile.positioning, self.room, self.scope.lift_s
         if config.by == "target":
             return skipped("only in flight it gets its position, by the target")

@@ -89,21 +89,6 @@ class Vehicle:
         return self.measured_by.placed_by(profile.positioning.decks)
 
 
-GONE_S = 1.0
-"""Without telemetry for so long, one that had sent some is switched off or restarting."""
-
-
-def gone(link: ProbeLink) -> str:
-    """Why the vehicle is not there any more, or empty.
-
-    Silence tells, too: a radio keeps its link to a vehicle that is off, cflib to one that restarts.
-    """
-    if lost := link.lost():
-        return f"the link was lost: {lost}"
-    age_s = link.age_s()
-    return f"no telemetry came for {age_s:.1f} s" if GONE_S < age_s < math.inf else ""
-
-
 def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
     """Ask a connected vehicle, and listen to it for so long."""
     measured_by = link.measured_by()
@@ -131,7 +116,8 @@ def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
 
 
 def moved_m(samples: Sequence[Telemetry]) -> float:
-    """From the middle of the first tenth to that of the last; NaN for what is no number."""
+    """Return the way from the middle of the first tenth to that of the last; NaN for what is no
+    number."""
     if not samples:
         return 0.0
     tenth = max(1, len(samples) // 10)
@@ -146,7 +132,8 @@ def moved_m(samples: Sequence[Telemetry]) -> float:
 
 
 def _packets(vehicle: Vehicle, profile: Profile) -> Finding:
-    """From 10 % on one lost notify has locked a vehicle that hung well."""
+    """Judge the link by its echoes. From 10 % on one lost notify has locked a vehicle that hung
+    well."""
     echoes, quality, p95_s = vehicle.echoes, vehicle.quality, vehicle.echoes.p95_s
     if p95_s is None:
         return failed("no packet came back", "restart the vehicle, bring the radio nearer")
@@ -284,7 +271,8 @@ def _still(vehicle: Vehicle, profile: Profile) -> Finding:
 
 
 def _parameters(vehicle: Vehicle, profile: Profile) -> Finding:
-    """`fly` sets them; those that the firmware lacks it refuses."""
+    """Judge the firmware's parameters: `fly` sets those that differ, and refuses those that the
+    firmware lacks."""
     wanted, present = profile.link.parameters, vehicle.parameters
     unknown = [name for name in wanted if name not in present]
     if unknown:
@@ -345,7 +333,7 @@ MOVED_G = 0.05
 
 
 def watch_lift(link: ProbeLink, wait: Wait, within_s: float = LIFT_S) -> list[Telemetry]:
-    """What the vehicle reports until it was lifted and is back, or for so long."""
+    """Return what the vehicle reports until it was lifted and is back, or for so long."""
     seen: list[Telemetry] = []
     for _ in range(max(1, round(within_s / 0.1))):
         wait(0.1)
@@ -357,13 +345,13 @@ def watch_lift(link: ProbeLink, wait: Wait, within_s: float = LIFT_S) -> list[Te
 
 
 def _rise_m(seen: Sequence[Telemetry]) -> tuple[float, float]:
-    """How high the position rose, and where it is at the end, both from where it was."""
+    """Return how high the position rose, and where it is at the end, both from where it was."""
     heights_m = [t.position_m[2] for t in seen] or [0.0]
     return max(heights_m) - heights_m[0], heights_m[-1] - heights_m[0]
 
 
 def lift_finding(seen: Sequence[Telemetry]) -> Finding:
-    """Whether the position followed the hand."""
+    """Judge whether the position followed the hand."""
     if not seen:
         return skipped("no telemetry")
     rise_m, back_m = _rise_m(seen)
@@ -385,7 +373,7 @@ def lift_finding(seen: Sequence[Telemetry]) -> Finding:
 
 
 def answering_rows(answering: ScanResult) -> list[Row]:
-    """One for the radio, one for each vehicle."""
+    """Return one row for the radio, and one for each vehicle that answers."""
     radio = passed("scanned: channels 0 to 125 at 250K, 1M, 2M")
     if answering.radio:
         radio = skipped(answering.radio, UDEV_HELP)
@@ -398,7 +386,7 @@ def answering_rows(answering: ScanResult) -> list[Row]:
 
 
 def advice_for_silent(uri: str, answering: ScanResult) -> str:
-    """What to do about a vehicle that does not answer, given those that do."""
+    """Say what to do about a vehicle that does not answer, given those that do."""
     there = [each for each in answering.uris if each != uri]
     if there:
         return f"these answer: {', '.join(there)}; give one with -u, or set link.uri"

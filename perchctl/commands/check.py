@@ -66,7 +66,7 @@ def check(
         bool,
         typer.Option(
             "--cameras",
-            help="Only list this computer's cameras: number, name, path, controls.",
+            help="Only list this computer's cameras: number, name, path.",
         ),
     ] = False,
     lift: Annotated[
@@ -177,7 +177,7 @@ def _wrapped(text: str, first: str, others: str) -> list[str]:
     )
 
 
-# --- `perchctl check --cameras`: what this computer's cameras are called, and what they can ----
+# --- `perchctl check --cameras`: what this computer's cameras are called -------------------
 
 
 NONE = "this computer has no camera: plug in the receiver or camera (Linux lists /dev/videoN)"
@@ -186,7 +186,7 @@ NONE = "this computer has no camera: plug in the receiver or camera (Linux lists
 def list_cameras(as_json: bool, known: Sequence[ConnectedCamera] | None = None) -> int:
     """Print them; returns the exit code. Nothing is set, and no picture taken. `known` takes the
     place of this computer's. Errors: NotFound where there are none."""
-    known = find_cameras(asked=True) if known is None else known
+    known = find_cameras() if known is None else known
     if not known:
         raise NotFound(NONE)
     if as_json:
@@ -202,9 +202,5 @@ def camera_lines(camera: ConnectedCamera) -> list[str]:
     if camera.stable_path:
         lines.append(f"  {camera.stable_path}")
     if camera.problem:
-        lines.append(f"  {camera.problem}; close other programs that use it, or get the right to")
-    for control, value in camera.controls:
-        now = "?" if value is None else str(value)
-        held = ", held by an automatic one" if control.inactive else ""
-        lines.append(f"  {control.name} = {now}  ({control.allowed}{held})")
+        lines.append(f"  {camera.problem}; get the right to it, as by the group video")
     return lines

@@ -89,7 +89,7 @@ class Group(TyperGroup):
             return super().parse_args(ctx, args)
         if not args or args[0] not in (*self.commands, *_SETTINGS["help_option_names"]):
             if args and not os.path.exists(args[0]):
-                _refuse_misspelt(args[0], list(self.commands), f"{ctx.command_path} ")
+                _refuse_misspelt(args[0], list(self.commands), f"perchctl {ctx.info_name} ")
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
 

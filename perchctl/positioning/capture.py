@@ -39,7 +39,7 @@ from perchctl.errors import (
     no_motion_capture,
 )
 from perchctl.positioning.feed import BodyPose, CaptureFrame
-from perchctl.profile import CAPTURE_SYSTEMS, PositioningConfig, host_fault
+from perchctl.profile import PositioningConfig
 
 SILENT_S = 0.3
 KEPT = 64
@@ -56,27 +56,21 @@ _SHARED_CLOCK = sys.platform == "linux"
 
 
 def check_reachable(config: PositioningConfig) -> None:
-    """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
-    if config.system not in CAPTURE_SYSTEMS:
-        raise InvalidValue(
-            f"motion capture {config.system!r} is unknown; allowed are {', '.join(CAPTURE_SYSTEMS)}"
-        )
+    """Raise InvalidValue or UsageError for what can be refused before anything is opened."""
     if not config.host.strip():
         raise InvalidValue(
-            f"positioning.host, the computer of the motion capture, is not given: write it into "
-            f"the profile, as in positioning: {{by: mocap, system: vicon, host: 192.168.1.2, body: "
-            f"crazyflie}}; system is one of {', '.join(CAPTURE_SYSTEMS)}, body the vehicle's rigid "
-            f"body there"
+            "positioning.host, the computer of the motion capture, is not given: write it into "
+            "the profile, as in positioning: {by: mocap, system: vicon, host: 192.168.1.2, body: "
+            "crazyflie}; system is one of vicon, optitrack, qualisys, vrpn, body the vehicle's "
+            "rigid body there"
         )
-    fault = host_fault(config.host)  # of an option; a profile's is refused when it is read
-    if fault is not None:
-        raise InvalidValue(f"motion capture: {fault}")
     if find_spec("motioncapture") is None:
         raise no_motion_capture()
 
 
 def setup_of(config: PositioningConfig) -> CaptureSetup:
-    """Vicon and VRPN take a port with the name; the others want it apart."""
+    """Return what the child connects to: Vicon and VRPN take a port with the name, the others want
+    it apart."""
     host, options = config.host.strip(), {}
     name, colon, port = host.rpartition(":")
     if colon and config.system in _PORT_OPTION and port.isdecimal():
@@ -92,7 +86,7 @@ def setup_of(config: PositioningConfig) -> CaptureSetup:
 def open_capture(
     config: PositioningConfig, clock: Callable[[], float] = time.monotonic
 ) -> MotionCapture:
-    """Connected, and its first frame has come.
+    """Return the motion capture once it is connected and its first frame has come.
 
     Errors: InvalidValue, UsageError without a library that loads, ConnectionFailed
     without an answer in `config.connect_timeout_s`.
@@ -120,7 +114,7 @@ class MotionCapture:
         self._settled = threading.Event()
         self._connected, self._closed = False, False
         self._ended: str | None = None
-        self._not_loaded: str | None = None
+        self._is_loaded, self._failure = True, ""
         self._last_line = ""
         self._printing = threading.Thread(target=self._read_output, daemon=True)
         self._printing.start()
@@ -132,8 +126,11 @@ class MotionCapture:
     def start(
         cls, setup: CaptureSetup, who: str, body: str, clock: Callable[[], float] = time.monotonic
     ) -> MotionCapture:
-        """`who`: for sentences. `body`: a frame in which it is goes before one in which it is
-        not. Errors: ConnectionFailed, UsageError for a library that does not load."""
+        """Start the child and wait for the first frame. `who` names the capture in sentences; a
+        frame that shows `body` goes before one that does not.
+
+        Errors: ConnectionFailed, UsageError for a library that does not load.
+        """
         token = new_token()
         with listen() as listener:
             child = spawn(_CHILD, subprocess.PIPE)
@@ -148,7 +145,7 @@ class MotionCapture:
         return capture
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """The newest of those since the last call that has the body in it; without one, the
+        """Return the newest frame since the last call that shows the body; without one, the
         newest."""
         frames = self.frames()
         return next((f for f in reversed(frames) if self._body in f.bodies), None) or (
@@ -156,7 +153,7 @@ class MotionCapture:
         )
 
     def frames(self) -> list[CaptureFrame]:
-        """All since the last call or poll, oldest first."""
+        """Return all frames since the last call or poll, oldest first."""
         return [self._frames.popleft() for _ in range(len(self._frames))]
 
     def problem(self, now_s: float) -> str | None:
@@ -169,7 +166,7 @@ class MotionCapture:
         return f"{self._who} has sent {what} for {silent_s:.1f} s"
 
     def close(self) -> None:
-        """Ends the child, wherever in its library it is. Bounded."""
+        """End the child, wherever in its library it is, in bounded time."""
         self._closed = True
         if self._child.poll() is None:
             self._child.kill()
@@ -195,8 +192,8 @@ class MotionCapture:
                 f"no {self._who}: {'connected, but no frame' if connected else 'no answer'} within "
                 f"{setup.timeout_s:g} s (does it stream, is the address right?){self._words()}"
             )
-        if self._not_loaded is not None:
-            raise broken_motion_capture(self._not_loaded)
+        if self._ended is not None and not self._is_loaded:
+            raise broken_motion_capture(self._failure)
         if self._ended is not None:
             raise ConnectionFailed(self._ended)
 
@@ -217,9 +214,8 @@ class MotionCapture:
                     self._settled.set()
                 case Connected():
                     self._connected = True
-                case NotLoaded(text):
-                    self._not_loaded = self._ended = text
-                case Failed(text):
+                case Failed(text, is_loaded):
+                    self._is_loaded, self._failure = is_loaded, text
                     self._ended = self._gone("" if self._framed_s is None else " failed", text)
         if self._ended is None and not self._closed:
             end(self._child, _END_TIMEOUT_S)
@@ -231,7 +227,7 @@ class MotionCapture:
         return f"{'no ' if self._framed_s is None else ''}{self._who}{how}: {why}"
 
     def _read_output(self) -> None:
-        """All of it, so that the child never waits; its last line is kept for a message."""
+        """Read all output, so that the child never waits; keep its last line for a message."""
         output = self._child.stdout
         assert output is not None
         for raw in iter(lambda: output.readline(LONGEST_LINE), b""):
@@ -283,16 +279,10 @@ class Arrived:
 
 @dataclass(frozen=True)
 class Failed:
-    """The library has given up, with its words."""
+    """The library has given up, with its words; with `is_loaded` False Python cannot import it."""
 
     text: str
-
-
-@dataclass(frozen=True)
-class NotLoaded:
-    """The library is there, and Python cannot import it."""
-
-    text: str
+    is_loaded: bool = True
 
 
 class Connected:
@@ -304,37 +294,24 @@ def serve_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = connect_back()
     setup = channel.receive(START_TIMEOUT_S)
+    is_loaded = False
     try:
         with _bounded(setup):
-            connect = _loaded()
-            client = connect(setup.kind, _by_address(setup))
+            import motioncapture
+
+            is_loaded = True
+            client = motioncapture.connect(setup.kind, _by_address(setup))
         channel.send(Connected())
         threading.Thread(target=_end_with, args=(channel,), daemon=True).start()
         _pass_on(client, channel, setup.partial)
-    except _LoadingFailed as error:
-        with contextlib.suppress(OSError):
-            channel.send(NotLoaded(str(error)))
-    except Exception as error:  # whatever the library raises
+    except Exception as error:  # whatever the library, or the loading of its own modules, raises
         with contextlib.suppress(OSError):  # the parent may be gone, and have caused it
-            channel.send(Failed(str(error) or type(error).__name__))
-
-
-class _LoadingFailed(Exception):
-    pass
-
-
-def _loaded() -> Callable[[str, dict[str, str]], Any]:
-    try:
-        import motioncapture
-    except Exception as error:  # whatever its own modules and shared libraries raise
-        raise _LoadingFailed(str(error) or type(error).__name__) from None
-    connect: Callable[[str, dict[str, str]], Any] = motioncapture.connect
-    return connect
+            channel.send(Failed(str(error) or type(error).__name__, is_loaded))
 
 
 @contextlib.contextmanager
 def _bounded(setup: CaptureSetup) -> Iterator[None]:
-    """By a thread of the interpreter that needs no turn of Python's: it ends the process, also
+    """End the process if the block takes too long, by a thread that needs no turn of Python's, also
     when the parent has been killed meanwhile."""
     with open(os.devnull, "w") as nowhere:
         faulthandler.dump_traceback_later(setup.timeout_s + AFTER_PARENT_S, exit=True, file=nowhere)
@@ -345,7 +322,8 @@ def _bounded(setup: CaptureSetup) -> Iterator[None]:
 
 
 def _by_address(setup: CaptureSetup) -> dict[str, str]:
-    """OptiTrack's reader knows addresses only. Errors: ConnectionFailed."""
+    """Return the options, with an address for OptiTrack's reader, which knows no names. Errors:
+    ConnectionFailed."""
     if setup.kind != "optitrack":
         return setup.options
     host = setup.options["hostname"]
@@ -359,8 +337,11 @@ def _by_address(setup: CaptureSetup) -> dict[str, str]:
 
 
 def _pass_on(client: Any, channel: Channel, partial: bool) -> None:
-    """After a pause the library may hand out what has waited in its queue: the first frame, and
-    each that then comes without any waiting, is of an unknown age, and not passed on."""
+    """Send frames as they come, but none of an unknown age.
+
+    After a pause the library may hand out what has waited in its queue: the first frame, and each
+    that then comes without any waiting, is not passed on.
+    """
     sent_s, behind = -1.0, False
     while True:
         asked_s = time.monotonic()
@@ -382,7 +363,7 @@ def _body(body: Any) -> Body:
 
 
 def _end_with(channel: Channel) -> None:
-    """The parent never speaks again: what is read is its end. The library may be anywhere."""
+    """End the process with the parent, which never speaks again; the library may be anywhere."""
     channel.socket.settimeout(None)  # its setup was waited for with a limit; a flight has none
     with contextlib.suppress(OSError):
         channel.socket.recv(1)

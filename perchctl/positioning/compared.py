@@ -40,8 +40,8 @@ class NoComparison:
     advice: str = f"{AGAIN}, once"
 
     def objection(self, now: datetime) -> tuple[str, str] | None:
-        """Why no flight may rely on it: what was found, and what to do. None where it passed, and
-        not long ago. `now` has a time zone, in which dates are told."""
+        """Say why no flight may rely on it: what was found, and what to do. None where it passed,
+        and not long ago. `now` has a time zone, in which dates are shown."""
         return self.found, self.advice
 
 
@@ -57,8 +57,8 @@ class Comparison:
     found: str
 
     def objection(self, now: datetime) -> tuple[str, str] | None:
-        """Objects to one that did not pass, is older than `VALID_S`, or lies in the future."""
-        when = _told(self.at, now)
+        """Object to one that did not pass, is older than `VALID_S`, or lies in the future."""
+        when = _date_text(self.at, now)
         if not self.passed:
             return f"{self.found} (found by check --lift on {when})", f"mend that, then {AGAIN}"
         age_s = (now - self.at).total_seconds()
@@ -73,16 +73,16 @@ class Comparison:
         return None
 
     def text(self, now: datetime) -> str:
-        """Says when the comparison passed, and what it found."""
-        return f"compared by hand on {_told(self.at, now)}"
+        """Say when the comparison passed."""
+        return f"compared by hand on {_date_text(self.at, now)}"
 
 
 ComparisonRecord = Comparison | NoComparison
 """What is known of a vehicle's comparison with its motion capture."""
 
 
-def _told(at: datetime, now: datetime) -> str:
-    """Gives day and time in the time zone of `now`, with the year if it is another one."""
+def _date_text(at: datetime, now: datetime) -> str:
+    """Return day and time in the time zone of `now`, with the year if it is another one."""
     there = at.astimezone(now.tzinfo)
     year = f" {there.year}" if there.year != now.year else ""
     return f"{there.day} {_MONTHS[there.month - 1]}{year} {there:%H:%M}"
@@ -113,13 +113,14 @@ def _set_up(config: PositioningConfig, vehicle: str) -> dict[str, Any]:
 
 
 def path_of(config: PositioningConfig, vehicle: str) -> Path:
-    """The file of a vehicle's comparison. `vehicle`: as `perchctl.link.vehicle_uri` has it."""
+    """Return the file of a vehicle's comparison. `vehicle`: as `perchctl.link.vehicle_uri` has
+    it."""
     of = json.dumps(_set_up(config, vehicle)).encode()
     return user_state_folder() / "compared" / f"{hashlib.sha256(of).hexdigest()[:16]}.json"
 
 
 def load_comparison(config: PositioningConfig, vehicle: str) -> ComparisonRecord:
-    """What is known of this vehicle in this set-up."""
+    """Return what is known of this vehicle in this set-up."""
     path = path_of(config, vehicle)
     why = "is damaged"
     try:
@@ -164,5 +165,5 @@ def save_comparison(config: PositioningConfig, vehicle: str, record: Comparison)
 
 
 def _one_line(text: str) -> str:
-    """What a terminal shows as one."""
+    """Return the text as a terminal shows it in one line."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:MOST_FOUND]

@@ -89,7 +89,7 @@ class FeedStatus:
 
     @property
     def is_unseen(self) -> bool:
-        """Whether none is sent since the target is not in the picture."""
+        """True if none is sent since the target is not in the picture."""
         return self.problem == UNSEEN
 
 
@@ -103,12 +103,12 @@ class SendingRate:
         self._times_s: deque[float] = deque()  # of the last `RATE_OVER_S`, and the newest
 
     def is_due(self, now_s: float) -> bool:
-        """True if a position may be sent now."""
+        """Return whether a position may be sent now."""
         return now_s >= self._due_s - 1e-6
 
     def sent(self, now_s: float) -> None:
-        """One was sent. A turn that comes late must not slow the next ones down, and none makes
-        up for it."""
+        """Note that one was sent. A turn that comes late must not slow the next ones down, and none
+        makes up for it."""
         self._due_s = max(self._due_s + self.period_s, now_s)
         self.count += 1
         self._times_s.append(now_s)
@@ -116,11 +116,11 @@ class SendingRate:
             self._times_s.popleft()
 
     def silent_s(self, now_s: float) -> float:
-        """Seconds since the newest was sent; infinite before the first."""
+        """Return the seconds since the newest was sent; infinite before the first."""
         return now_s - self._times_s[-1] if self._times_s else math.inf
 
     def hz(self, now_s: float) -> float:
-        """How many were sent in the last second."""
+        """Return how many were sent in the last second."""
         return sum(now_s - t_s < RATE_OVER_S for t_s in self._times_s) / RATE_OVER_S
 
 
@@ -159,7 +159,7 @@ class PositionFeed:
             self._turned_s, self._problem = now_s, problem
 
     def place(self) -> Placed | None:
-        """The newest that was handed to the link, with its attitude also where only the
+        """Return the newest that was handed to the link, with its attitude also where only the
         position was sent."""
         return self._placed
 
@@ -209,7 +209,7 @@ class PositionFeed:
 
 
 class StandingFeed:
-    """A vehicle that stands at the origin: what its estimator is told while it is reset, where the
+    """Sends the origin for a vehicle that stands there while its estimator is reset, where the
     target is the positioning system and has not been measured yet.
 
     `turn` by a `FeedThread`; `status` and `place` from any thread."""
@@ -237,12 +237,12 @@ class StandingFeed:
             return FeedStatus(age_s, self._problem, self._count, self._place)
 
     def place(self) -> Placed:
-        """Level, with its front along x: so the world is defined."""
+        """Return the origin, level, with the front along x: so the world is defined."""
         return Placed(self._sent_s, np.array(self._place.position_m), np.eye(3))
 
 
 class Turned(Protocol):
-    """What is told the time, and raises nothing."""
+    """A feed that a thread turns; `turn` raises nothing."""
 
     def turn(self, now_s: float) -> None: ...
 
@@ -267,7 +267,7 @@ class FeedThread:
         self._thread.start()
 
     def close(self) -> None:
-        """No position is sent any more."""
+        """Stop turning: no position is sent any more."""
         self._ended.set()
         if self._thread.ident is not None:
             self._thread.join(END_TIMEOUT_S)
@@ -311,7 +311,7 @@ class Placed:
 
     @classmethod
     def of(cls, pose: BodyPose, config: PositioningConfig, t_s: float = 0.0) -> Placed:
-        """Of the vehicle's body, from the rigid body's axes as the capture system has defined
+        """Return the vehicle's body, from the rigid body's axes as the capture system has defined
         them: ``T_world_body = T_world_rigid @ inv(T_body_rigid)``."""
         roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
         length = math.sqrt(sum(part * part for part in pose.quaternion))
@@ -340,7 +340,7 @@ class Judge:
         """Why the newest frame with news was not believed; None if it was."""
 
     def judge(self, frame: CaptureFrame, now_s: float) -> Placed | None:
-        """The vehicle's place if the frame has one that may be sent, its time that of the
+        """Return the vehicle's place if the frame has one that may be sent, its time that of the
         exposure; otherwise `problem` says why, or there was no news in it."""
         arrived_s = min(frame.t_s, now_s)  # nothing arrives later than now
         if not math.isfinite(arrived_s) or arrived_s <= self._arrived_s:
@@ -419,7 +419,7 @@ def _is_pose(pose: BodyPose) -> bool:
 
 
 def _jump(a: Placed, b: Placed) -> str | None:
-    """What is too far from `a` to `b`, None if a vehicle can have gone so."""
+    """Say what is too far from `a` to `b`; None if a vehicle can have gone so."""
     dt_s = b.t_s - a.t_s
     first_s = min(dt_s, AT_FASTEST_S)
     far_m = NOISE_M + FASTEST_MPS * first_s + HELD_MPS * (dt_s - first_s)

@@ -48,19 +48,20 @@ NOWHERE = Place(np.zeros(3), 0.0)
 
 
 def target_place(pose: MarkerPose, attitude: Attitude, setup: PoseSetup) -> Place:
-    """The target's, where the body is at `attitude`, which has its position."""
+    """Return the target's place, seen by a body at `attitude`, which has its position."""
     return Place(*to_world(pose.e_m, pose.e_yaw_rad, attitude, setup))
 
 
 def body_place(pose: MarkerPose, attitude: Attitude, target: Place, setup: PoseSetup) -> Place:
-    """The body's, where the target stands still. Of `attitude` roll and pitch count alone."""
+    """Return the body's place under a target that stands still. Of `attitude` roll and pitch count
+    alone."""
     yaw_rad = wrap_rad(target.yaw_rad - pose.e_yaw_rad)
     way_m = pose.e_m + level_rotation(attitude).dot(setup.gear_body_m)
     return Place(target.position_m - rot_z(yaw_rad).dot(way_m), yaw_rad)
 
 
 class SightFeed:
-    """No thread and no clock: the flight loop tells it what each turn gave.
+    """Sends places by sights; it has no thread and no clock, and the flight loop calls it.
 
     `target` is None until it was seen from the ground. `off`: by how much the body is beside its
     estimate by the sights, learned slowly, so that the noise of neither side steers: an
@@ -80,17 +81,17 @@ class SightFeed:
         self._refusal = ""
 
     def stand(self, now_s: float) -> None:
-        """At rest on the ground, before the target's place is known."""
+        """Send the origin, at rest on the ground, until the target's place is known."""
         if self.target is None:
             self.known(self._origin_m, now_s)
 
     def known(self, position_m: tuple[float, float, float], now_s: float) -> None:
-        """The place is known without a picture: standing, pressed or hanging."""
+        """Send a place that is known without a picture: standing, pressed or hanging."""
         self._hand_over(ExternalPosition(position_m), now_s, now_s)
 
     def touching(self, yaw_rad: float) -> tuple[float, float, float] | None:
-        """The body's position, m, with the gear in the target's centre, level, where its estimate
-        has that heading; None before the target's place is known."""
+        """Return the body's position, m, with the gear in the target's centre, level, where its
+        estimate has that heading; None before the target's place is known."""
         if self.target is None:
             return None
         way_m = rot_z(yaw_rad + self.off.yaw_rad).dot(self._setup.gear_body_m)
@@ -98,8 +99,9 @@ class SightFeed:
         return float(x), float(y), float(z)
 
     def steered(self, seen: TargetEstimate, now: Attitude) -> TargetEstimate:
-        """What is seen, with the place where the target stands: it stands still, and the body is
-        beside its estimate now as it was of late (`off`). Until its place is known, as seen."""
+        """Return what is seen, with the place where the target stands: it stands still, and the
+        body is beside its estimate now as it was of late (`off`). Until its place is known, as
+        seen."""
         if self.target is None:
             return seen
         world_m = self.target.position_m - self.off.position_m
@@ -112,7 +114,7 @@ class SightFeed:
     def see(
         self, pose: MarkerPose, then: Attitude, now: Attitude, now_s: float, *, at_rest: bool
     ) -> None:
-        """A pose that this turn's picture gave; `then`: the vehicle's attitude and estimated
+        """Take a pose that this turn's picture gave; `then`: the vehicle's attitude and estimated
         position at its exposure."""
         if pose.t_s <= self._seen_s:
             return
@@ -138,7 +140,8 @@ class SightFeed:
         self._hand_over(ExternalPosition((x, y, z), quaternion), pose.t_s, now_s)
 
     def status(self, now_s: float) -> FeedStatus:
-        """`problem` also while the target has not been seen from the ground."""
+        """Return the state; it has a problem also while the target has not been seen from the
+        ground."""
         age_s = now_s - self._placed_s
         stale = age_s > self._config.hold_s
         problem = self._refusal or UNSEEN if stale or self.target is None else None
@@ -154,7 +157,7 @@ class SightFeed:
     def _refused(
         self, pose: MarkerPose, place: Place, then: Attitude, silent_s: float, now_s: float
     ) -> str:
-        """Why a sight is not believed, or the empty string."""
+        """Say why a sight is not believed; an empty string if it is."""
         age_s, sigma_m = now_s - pose.t_s, float(np.max(pose.sigma_m))
         if not age_s <= OLDEST_S:
             return f"the picture is {age_s:.2f} s old"
@@ -186,8 +189,8 @@ class SightFeed:
         )
 
     def _hand_over(self, place: ExternalPosition, placed_s: float, now_s: float) -> None:
-        """`placed_s`: when the body was there. What comes too soon waits for nothing: the next
-        one is newer."""
+        """Send a place; `placed_s`: when the body was there. What comes too soon waits for nothing:
+        the next one is newer."""
         if self._rate.is_due(now_s) and self._send(place) is not False:
             self._rate.sent(now_s)
             self._placed_s, self._pose = placed_s, place

@@ -2,7 +2,7 @@
 
 schema: the whole; vision, mission, positioning and simulation hold the sections, each key with
 its bounds. limits: keys that must fit each other.
-load: reading, `extends`, the weights file. named_files: calibration and mask. edit: changes, in
+load: reading, `extends`, the files of weights, calibration and mask. edit: changes, in
 memory and in the file. keys: each with its unit, bounds and meaning, as a commented file, and as
 a schema for editors. base: what all sections share, and keys that have become constants.
 dictionaries: ArUco's.

@@ -23,13 +23,13 @@ BodyVector3 = tuple[_OnBody, _OnBody, _OnBody]
 
 
 def key(default: Any, meaning: str, **constraints: Any) -> Any:
-    """A key of a section: pydantic's `Field`, with the meaning that people read about it. The
-    default ... means that the key must be given."""
+    """Return a key of a section: pydantic's `Field`, with the meaning that people read about it.
+    The default ... means that the key must be given."""
     return Field(default, description=meaning, **constraints)
 
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
-    """The pair, lowest first. Raises ValueError where it is not."""
+    """Return the pair. Raises ValueError where the lowest is not first."""
     if pair[0] > pair[1]:
         raise ValueError(f"the lower bound {pair[0]} is above the upper bound {pair[1]}")
     return pair
@@ -49,7 +49,7 @@ class Section(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _no_truth_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """YAML's yes, no, on and off would be read as 1 and 0."""
+        """Refuse YAML's yes, no, on and off, which would be read as 1 and 0."""
         kind = cls.model_fields[info.field_name or ""].annotation
         if _is_of_numbers(kind) and _holds_truth(value):
             raise ValueError(
@@ -105,7 +105,7 @@ UNITS_OF = {
 
 
 def key_unit(path: str) -> str:
-    """By the last of a key's words; empty where it has no unit."""
+    """Return a key's unit by the last of its words; empty where it has none."""
     name = path.rpartition(".")[2]
     endings = (name.split("_", n)[-1] for n in range(1, name.count("_") + 1))
     return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")
@@ -114,22 +114,22 @@ def key_unit(path: str) -> str:
 # --- Keys that have become constants of their section, or are gone -----------------------------
 
 GONE = frozenset(
-    f"simulation.{key}"
-    for key in (
-        "bare_floor_aside_m",
-        "bare_floor_m",
-        "draught_towards_deg",
-        "drift_xyz_mps",
-        "estimate_tilt_bias_xy_deg",
-        "gloss",
-        "gust_every_s",
-        "gust_mps",
-        "lamp_aside_m",
-        "lamp_z_m",
-        "mount_error_rpy_deg",
-        "mount_error_xyz_m",
-        "target_tilt_towards_deg",
-        "target_xy_m",
+    (
+        "camera.controls",
+        "simulation.bare_floor_aside_m",
+        "simulation.bare_floor_m",
+        "simulation.draught_towards_deg",
+        "simulation.drift_xyz_mps",
+        "simulation.estimate_tilt_bias_xy_deg",
+        "simulation.gloss",
+        "simulation.gust_every_s",
+        "simulation.gust_mps",
+        "simulation.lamp_aside_m",
+        "simulation.lamp_z_m",
+        "simulation.mount_error_rpy_deg",
+        "simulation.mount_error_xyz_m",
+        "simulation.target_tilt_towards_deg",
+        "simulation.target_xy_m",
     )
 )
 """Nothing depends on them any more: left out, so that a flight's log is still read."""
@@ -140,9 +140,12 @@ WORLD = "simulation.set"
 def without_constants(
     values: dict[str, Any], model: type[BaseModel], path: str = ""
 ) -> tuple[dict[str, Any], list[str], list[str]]:
-    """The values of a profile without keys that are gone or constants by now: class variables of
-    `model`, or of a model within it. Also a note for each of these, and a sentence for each whose
-    value would be lost, as it is another one than the constant."""
+    """Return the values of a profile without keys that are gone or constants by now.
+
+    Constants are class variables of `model`, or of a model within it. Return also a note for each
+    of these keys, and a sentence for each whose value would be lost, as it is another one than the
+    constant.
+    """
     result, notes, lost = dict(values), list[str](), list[str]()
     for key, value in values.items():
         kind = model.model_fields[key].annotation if key in model.model_fields else None

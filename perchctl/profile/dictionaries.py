@@ -11,13 +11,13 @@ import cv2
 
 @cache
 def dictionary_names() -> tuple[str, ...]:
-    """All predefined dictionaries of the installed OpenCV, sorted."""
+    """Return all predefined dictionaries of the installed OpenCV, sorted."""
     return tuple(sorted(n for n in dir(cv2.aruco) if re.fullmatch(r"DICT_[A-Z0-9_]+", n)))
 
 
 @cache
 def aruco_dictionary(name: str) -> Any:
-    """The cv2.aruco dictionary of that name; ValueError names the choices."""
+    """Return the cv2.aruco dictionary of that name. Raises ValueError with the choices."""
     if name not in dictionary_names():
         raise ValueError(
             f"dictionary {name!r} is unknown; allowed are {', '.join(dictionary_names())}"
@@ -26,13 +26,13 @@ def aruco_dictionary(name: str) -> Any:
 
 
 def dictionary_size(name: str) -> int:
-    """How many ids the dictionary holds (0 .. count - 1)."""
+    """Return how many ids the dictionary holds (0 .. count - 1)."""
     return int(aruco_dictionary(name).bytesList.shape[0])
 
 
 def is_one_pattern(name: str, marker_id: int, other: str, other_id: int) -> bool:
-    """Whether both are the same black and white cells, at any turn: ``DICT_4X4_50`` holds the
-    first ids of ``DICT_4X4_1000``."""
+    """Return whether both are the same black and white cells, at any turn: ``DICT_4X4_50`` holds
+    the first ids of ``DICT_4X4_1000``."""
     one, two = aruco_dictionary(name), aruco_dictionary(other)
     if one.markerSize != two.markerSize:
         return False

@@ -30,8 +30,8 @@ from perchctl.profile.schema import Profile
 
 
 def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
-    """The profile with each ``key=value``, such as ``planner.align.xy_m=0.03``; the value as in a
-    profile's file. `option` is where they were given.
+    """Return the profile with each ``key=value``, such as ``planner.align.xy_m=0.03``; the value as
+    in a profile's file. `option` is where they were given.
 
     Raises:
         UsageError: a setting has another form.
@@ -55,7 +55,7 @@ def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--
 
 
 def _parsed(setting: str, option: str) -> tuple[str, str]:
-    """Key and value."""
+    """Split a setting into key and value. Raises UsageError."""
     key, equals, text = setting.partition("=")
     if not equals or not key.strip():
         raise UsageError(
@@ -66,7 +66,7 @@ def _parsed(setting: str, option: str) -> tuple[str, str]:
 
 
 def profile_value(profile: Profile, dotted: str) -> Any:
-    """What the profile has at that key, in JSON's types; None where it has none."""
+    """Return what the profile has at that key, in JSON's types; None where it has none."""
     value: Any = profile.model_dump(mode="json")
     for name in dotted.split("."):
         value = value.get(name) if isinstance(value, dict) else None
@@ -74,7 +74,7 @@ def profile_value(profile: Profile, dotted: str) -> Any:
 
 
 def _put(values: dict[str, Any], dotted: str, value: Any) -> None:
-    """The key has to be there; below a mapping that a profile may fill, such as
+    """Set a key that has to be there; below a mapping that a profile may fill, such as
     `link.parameters`, any key is. What is unknown there, the schema says."""
     *sections, key = dotted.split(".")
     for section in sections:
@@ -95,7 +95,7 @@ _BOM = "\ufeff"
 
 
 def writable_profile(name: str) -> Path:
-    """The file of a profile that belongs to the user, behind any links.
+    """Return the file of a profile that belongs to the user, behind any links.
 
     Raises:
         NotFound: no such profile.
@@ -147,7 +147,7 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
 
 
 def with_values(text: str, values: Mapping[str, Value]) -> str:
-    """The text of a profile with the values under their dotted keys, as in ``camera.latency_s``.
+    """Return a profile's text with the values under their dotted keys, as in ``camera.latency_s``.
 
     Comments, order and quotes stay. A list of as many numbers keeps its layout; a key that is
     missing is put at its section's end, a section at the file's.
@@ -185,7 +185,7 @@ def with_values(text: str, values: Mapping[str, Value]) -> str:
 
 
 def _as_null(representer: Any, nothing: None) -> Any:
-    """As most people write it; by itself ruamel leaves the value out."""
+    """Write null as most people do; by itself ruamel leaves the value out."""
     return representer.represent_scalar("tag:yaml.org,2002:null", "null")
 
 
@@ -197,7 +197,7 @@ def _values_of(text: str) -> dict[str, Any]:
 
 
 def _flow(value: Value) -> str:
-    """In YAML: with a point and without an exponent, which would be read as text."""
+    """Return a value in YAML: with a point and without an exponent, which would be read as text."""
     if isinstance(value, tuple):
         return f"[{', '.join(map(_flow, value))}]"
     if not isinstance(value, float):

@@ -29,13 +29,6 @@ class Key:
     default: Any
 
     @property
-    def section(self) -> str:
-        """The headings that people read: the first word, and the planner's phases."""
-        words = self.path.split(".")
-        deep = words[0] == "planner" and len(words) > 2
-        return ".".join(words[: 2 if deep else 1]) if len(words) > 1 else ""
-
-    @property
     def unit(self) -> str:
         return key_unit(self.path)
 
@@ -46,12 +39,12 @@ class Key:
 
     @property
     def allowed(self) -> str:
-        """Bounds or choices, in words."""
+        """The bounds or choices, in words."""
         return _allowed(self.schema)
 
 
 def keys(section: BaseModel, prefix: str = "") -> Iterator[Key]:
-    """Every leaf below a section of a profile with its value there, in the schema's order."""
+    """Yield every leaf below a section of a profile with its value, in the schema's order."""
     properties = _schema(type(section))["properties"]
     for name in type(section).model_fields:
         value = getattr(section, name)
@@ -73,7 +66,7 @@ def _allowed(schema: dict[str, Any]) -> str:
 
 
 def _allowed_of(kind: dict[str, Any]) -> str:
-    """Of one of a key's kinds."""
+    """Describe what is allowed of one of a key's kinds."""
     choices = kind.get("enum", [kind["const"]] if "const" in kind else [])
     if choices:
         return ", ".join(f"`{choice}`" for choice in choices)
@@ -95,7 +88,7 @@ def _allowed_of(kind: dict[str, Any]) -> str:
 
 
 def _span(number: dict[str, Any]) -> str:
-    """The bounds of a number; empty without any."""
+    """Describe the bounds of a number; empty without any."""
     above, below = number.get("exclusiveMinimum"), number.get("exclusiveMaximum")
     least, most = number.get("minimum"), number.get("maximum")
     if least is None and above is None:
@@ -114,7 +107,7 @@ _WIDTH = 80
 
 
 def profile_text(profile: Profile, paths: Collection[str] | None = None) -> str:
-    """Keys of a profile, each under a comment with its meaning, unit and what is allowed.
+    """Write the keys of a profile, each under a comment with its meaning, unit and what is allowed.
 
     Read back, the keys have the same values. `paths` are the dotted paths of the keys that are
     written, by default all.
@@ -151,14 +144,14 @@ def _comment(key: Key) -> str:
 
 
 def scalar_text(value: Any) -> str:
-    """The value in YAML, on one line."""
+    """Return the value in YAML, on one line."""
     plain = list(value) if isinstance(value, tuple) else value
     text: str = yaml.safe_dump([plain], default_flow_style=True, width=10**9, allow_unicode=True)
     return text.strip()[1:-1]
 
 
 def editor_schema() -> dict[str, Any]:
-    """The JSON schema of a profile's file: types, bounds, defaults, meanings and units."""
+    """Return the JSON schema of a profile's file: types, bounds, defaults, meanings and units."""
     schema = Profile.model_json_schema()
     for section in (schema, *schema["$defs"].values()):
         section.pop("title", None)

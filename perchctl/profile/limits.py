@@ -36,12 +36,12 @@ class Limit:
         return tuple(_KEY.findall(self.relation))
 
     def holds(self, profile: Any) -> bool:
-        """True where the profile's values fulfil the relation."""
+        """Return whether the profile's values fulfil the relation."""
         # The relations are those of this module, and name keys and numbers only.
         return bool(eval(_KEY.sub(_read, self.relation), {"profile": profile}))
 
     def sentence(self, profile: Any) -> str:
-        """The relation with the value of each key, and what happens as it does not hold."""
+        """Return the relation with the value of each key, and what happens as it does not hold."""
 
         def shown(found: re.Match[str]) -> str:
             value = eval(_read(found), {"profile": profile})
@@ -51,149 +51,119 @@ class Limit:
 
 
 def _read(found: re.Match[str]) -> str:
-    """The key of a profile as an expression; of a latency that is measured its beginning."""
+    """Return the key of a profile as an expression; of a latency that is measured its beginning."""
     key = found[0]
     return f"profile.{'camera.start_latency_s' if key == 'camera.latency_s' else key}"
 
 
-IMPOSSIBLE: tuple[Limit, ...] = (
-    Limit(
-        "planner.search.max_height_m <= safety.max_height_m",
-        "the search would climb to where it has to land",
+_IMPOSSIBLE = {
+    "planner.search.max_height_m <= safety.max_height_m": (
+        "the search would climb to where it has to land"
     ),
-    Limit(
-        "planner.takeoff_height_m <= planner.search.max_height_m",
-        "the take-off would end above where the search ends",
+    "planner.takeoff_height_m <= planner.search.max_height_m": (
+        "the take-off would end above where the search ends"
     ),
-    Limit(
-        f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
-        " < planner.approach_timeout_s",
-        "the take-off takes longer than it is waited for",
+    f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
+    " < planner.approach_timeout_s": ("the take-off takes longer than it is waited for"),
+    "camera.latency_s < safety.max_frame_age_s": "every picture would be too old to measure by",
+    "link.telemetry_period_s < safety.proof_age_s": (
+        "telemetry would be too old to prove a contact or a landing"
     ),
-    Limit(
-        "camera.latency_s < safety.max_frame_age_s", "every picture would be too old to measure by"
+    "link.telemetry_period_s < safety.telemetry_hold_s": (
+        "telemetry would always be old, and the vehicle held"
     ),
-    Limit(
-        "link.telemetry_period_s < safety.proof_age_s",
-        "telemetry would be too old to prove a contact or a landing",
+    "link.telemetry_period_s < safety.telemetry_land_s": (
+        "telemetry would always be old, and the vehicle landed"
     ),
-    Limit(
-        "link.telemetry_period_s < safety.telemetry_hold_s",
-        "telemetry would always be old, and the vehicle held",
+    "planner.estimate.dwell_s < planner.estimate.timeout_s": "no pose could be steady in time",
+    "planner.align.dwell_s < planner.align.timeout_s": "nothing could be aligned in time",
+    "planner.ascend.settle_dwell_s < planner.ascend.settle_timeout_s": (
+        "it could not settle in time"
     ),
-    Limit(
-        "link.telemetry_period_s < safety.telemetry_land_s",
-        "telemetry would always be old, and the vehicle landed",
+    "planner.ascend.settle_dwell_s < planner.ascend.timeout_s": "it could not settle in time",
+    "planner.perch.contact_dwell_s < planner.perch.timeout_s": (
+        "no contact could be proven in time"
     ),
-    Limit(
-        "planner.estimate.dwell_s < planner.estimate.timeout_s", "no pose could be steady in time"
+    "planner.complete.hold_dwell_s + planner.complete.ramp_s + planner.complete.hang_s"
+    " < planner.complete.release_timeout_s": ("the thrust could not be released in time"),
+    "planner.recover.dwell_s < planner.recover.timeout_s": (
+        "after a miss it could not become steady in time"
     ),
-    Limit("planner.align.dwell_s < planner.align.timeout_s", "nothing could be aligned in time"),
-    Limit(
-        "planner.ascend.settle_dwell_s < planner.ascend.settle_timeout_s",
-        "it could not settle in time",
-    ),
-    Limit(
-        "planner.ascend.settle_dwell_s < planner.ascend.timeout_s", "it could not settle in time"
-    ),
-    Limit(
-        "planner.perch.contact_dwell_s < planner.perch.timeout_s",
-        "no contact could be proven in time",
-    ),
-    Limit(
-        "planner.complete.hold_dwell_s + planner.complete.ramp_s + planner.complete.hang_s"
-        " < planner.complete.release_timeout_s",
-        "the thrust could not be released in time",
-    ),
-    Limit(
-        "planner.recover.dwell_s < planner.recover.timeout_s",
-        "after a miss it could not become steady in time",
-    ),
-)
-"""Every flight with such a profile comes to nothing."""
+}
+"""A relation, and what happens to every flight with a profile that breaks it."""
 
-DOUBTFUL: dict[str, tuple[Limit, ...]] = {
-    "heights": (
+_DOUBTFUL = {
+    "heights": {
         # A climb passes its setpoint by 0.1 m (docs/firmware.md, "Position take-off").
-        Limit(
-            "0.1 + planner.search.max_height_m <= safety.max_height_m",
-            "a climb overshoots by as much, and lands for it",
+        "0.1 + planner.search.max_height_m <= safety.max_height_m": (
+            "a climb overshoots by as much, and lands for it"
         ),
-        Limit(
-            "safety.ground_tolerance_m <= 0.45",
-            "a vehicle that hangs would be taken for one on the ground",
+        "safety.ground_tolerance_m <= 0.45": (
+            "a vehicle that hangs would be taken for one on the ground"
         ),
-    ),
-    "fence": (Limit("0.3 <= safety.fence_radius_m", "a draught carries it so far"),),
-    "battery limits": (
-        Limit("safety.min_load_v < safety.min_rest_v", "it would land as soon as it lifts"),
+    },
+    "fence": {
+        "0.3 <= safety.fence_radius_m": "a draught carries it so far",
+    },
+    "battery limits": {
+        "safety.min_load_v < safety.min_rest_v": "it would land as soon as it lifts",
         # What a full battery has left under a light vehicle (docs/firmware.md, "Thrust to PWM").
-        Limit(
-            "safety.min_load_v < 3.7",
-            "hovering takes a full battery down to it: it would land as soon as it lifts",
+        "safety.min_load_v < 3.7": (
+            "hovering takes a full battery down to it: it would land as soon as it lifts"
         ),
-        Limit("safety.min_rest_v < 4.35", "no battery rests so high: no flight would begin"),
-        Limit(
-            "10 <= safety.battery_stale_s",
-            "a reading may well stand still for so long",
+        "safety.min_rest_v < 4.35": "no battery rests so high: no flight would begin",
+        "10 <= safety.battery_stale_s": "a reading may well stand still for so long",
+    },
+    "time limits": {
+        f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
+        " + planner.estimate.dwell_s + planner.align.dwell_s + planner.ascend.settle_dwell_s"
+        " + planner.perch.contact_dwell_s < planner.perching_time_s": (
+            "the perching time is over before a contact"
         ),
-    ),
-    "time limits": (
-        Limit(
-            f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
-            " + planner.estimate.dwell_s + planner.align.dwell_s + planner.ascend.settle_dwell_s"
-            " + planner.perch.contact_dwell_s < planner.perching_time_s",
-            "the perching time is over before a contact",
+        "planner.search.attempts * planner.search.wait_s < planner.perching_time_s": (
+            "the perching time is over before the search"
         ),
-        Limit(
-            "planner.search.attempts * planner.search.wait_s < planner.perching_time_s",
-            "the perching time is over before the search",
+        f"safety.max_height_m / planner.landing.speed_mps / {OVERDUE_SHARE:g}"
+        " < planner.landing.timeout_s": (
+            "from there it is not down by setpoints when half of that is over, and is left to "
+            "its own landing"
         ),
-        Limit(
-            f"safety.max_height_m / planner.landing.speed_mps / {OVERDUE_SHARE:g}"
-            " < planner.landing.timeout_s",
-            "from there it is not down by setpoints when half of that is over, and is left to its "
-            "own landing",
+        "safety.camera_hold_s < safety.camera_land_s": "it lands before it was held",
+        "safety.telemetry_hold_s < safety.telemetry_land_s": "it lands before it was held",
+        "safety.loop_late_hold_s < safety.loop_late_land_s": "it lands before it was held",
+    },
+    "thresholds": {
+        f"planner.align.xy_m <= {AscendConfig.cone_base_m:g}": (
+            "near the target it goes back and forth between ALIGN and ASCEND"
         ),
-        Limit("safety.camera_hold_s < safety.camera_land_s", "it lands before it was held"),
-        Limit("safety.telemetry_hold_s < safety.telemetry_land_s", "it lands before it was held"),
-        Limit("safety.loop_late_hold_s < safety.loop_late_land_s", "it lands before it was held"),
-    ),
-    "thresholds": (
-        Limit(
-            f"planner.align.xy_m <= {AscendConfig.cone_base_m:g}",
-            "near the target it goes back and forth between ALIGN and ASCEND",
+        "planner.perch.contact_z_m < planner.ascend.standoff_m": (
+            "where it settles it is as near as at a contact already"
         ),
-        Limit(
-            "planner.perch.contact_z_m < planner.ascend.standoff_m",
-            "where it settles it is as near as at a contact already",
-        ),
-        Limit(
-            "planner.ascend.near_speed_mps <= planner.ascend.speed_mps",
-            "it climbs faster near the target than far from it",
+        "planner.ascend.near_speed_mps <= planner.ascend.speed_mps": (
+            "it climbs faster near the target than far from it"
         ),
         # The hover thrust of 30 g (docs/firmware.md, "Thrust to PWM").
-        Limit("40200 <= planner.perch.thrust", "so little raw thrust does not press"),
-        Limit(
-            "safety.start_tilt_deg < safety.max_tilt_deg",
-            "it may start at a tilt that cuts the motors",
+        "40200 <= planner.perch.thrust": "so little raw thrust does not press",
+        "safety.start_tilt_deg < safety.max_tilt_deg": (
+            "it may start at a tilt that cuts the motors"
         ),
-        Limit(
-            "20 <= safety.max_tilt_deg",
-            "a gust tilts it so far, and cuts the motors",
+        "20 <= safety.max_tilt_deg": "a gust tilts it so far, and cuts the motors",
+        "safety.jump_deg < safety.heading_lost_deg": (
+            "each jump of the heading would take it down by thrust alone"
         ),
-        Limit(
-            "safety.jump_deg < safety.heading_lost_deg",
-            "each jump of the heading would take it down by thrust alone",
+        "safety.estimator_variance_m2 <= safety.flight_variance_m2": (
+            "it may start with an estimate that it lands for"
         ),
-        Limit(
-            "safety.estimator_variance_m2 <= safety.flight_variance_m2",
-            "it may start with an estimate that it lands for",
+        "link.telemetry_period_s + link.telemetry_period_s <= safety.proof_age_s": (
+            "one lost packet, and nothing is proven"
         ),
-        Limit(
-            "link.telemetry_period_s + link.telemetry_period_s <= safety.proof_age_s",
-            "one lost packet, and nothing is proven",
-        ),
-    ),
+    },
+}
+"""Relations by the name of their row in the check, and what a broken one hardly allows."""
+
+IMPOSSIBLE = tuple(Limit(*each) for each in _IMPOSSIBLE.items())
+"""Every flight with a profile that breaks one comes to nothing."""
+DOUBTFUL = {
+    name: tuple(Limit(*each) for each in relations.items()) for name, relations in _DOUBTFUL.items()
 }
 """What is allowed and hardly works together, by the name of its row in the check."""

@@ -10,10 +10,13 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from perchctl.errors import InvalidValue, NotFound, ProfileNote
-from perchctl.places import data_file, file_names
+from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_figures
+from perchctl.places import data_file, data_folder, file_names
 from perchctl.plain_yaml import clip_text, parse_yaml
 from perchctl.profile.base import without_constants
 from perchctl.profile.schema import Profile
@@ -28,12 +31,12 @@ _NAMED_FILES = (
 
 
 def is_profile_path(name: str) -> bool:
-    """Whether a profile is named by its file, not by its name alone."""
+    """Return whether a profile is named by its file, not by its name alone."""
     return "/" in name or name.endswith((".yaml", ".yml"))
 
 
 def find_profile(name: str) -> Path:
-    """The file of a profile given by path or by name; NotFound names the choices."""
+    """Return the file of a profile given by path or name; NotFound names the choices."""
     if is_profile_path(name):
         path = Path(name).expanduser()
         if path.is_file():
@@ -47,9 +50,13 @@ def find_profile(name: str) -> Path:
 
 
 def load_profile(name: str, *, with_weights: bool = True) -> Profile:
-    """Read, resolve `extends` and check a profile; the weights of its `merge.weights_file`
-    take the place of `merge.weights` unless told otherwise. A key that is a
-    constant by now is left out, with a `ProfileNote` as warning. Errors: NotFound, InvalidValue."""
+    """Read, resolve `extends` and check a profile.
+
+    With `with_weights` the weights of its `merge.weights_file` take the place of `merge.weights`. A
+    key that is a constant by now is left out, with a `ProfileNote` as warning.
+
+    Errors: NotFound, InvalidValue.
+    """
     path = find_profile(name)
     profile = _checked(path, _read_yaml(path))
     if profile.merge.weights_file is None or not with_weights:
@@ -60,15 +67,14 @@ def load_profile(name: str, *, with_weights: bool = True) -> Profile:
 
 
 def check_profile(path: Path, text: str) -> None:
-    """Whether the profile at `path` would load with another text. Errors: NotFound,
-    InvalidValue."""
+    """Raise NotFound or InvalidValue if the profile at `path` would not load with another text."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ProfileNote)  # said when it was loaded
         _checked(path, _values_of(text, path))
 
 
 def _checked(path: Path, own: dict[str, Any]) -> Profile:
-    """A profile by what its own file holds."""
+    """Return the profile of what its own file holds."""
     values = _resolved(path, own, seen=())
     values.setdefault("name", path.stem)
     try:
@@ -111,8 +117,8 @@ class FittedWeights(BaseModel):
 
 
 def find_weights(name: str) -> Path:
-    """The weights file that a loaded profile names: a whole path, or a name in the user's
-    folder."""
+    """Return the weights file that a loaded profile names: a whole path, or a name in the user's
+    folder. Raises NotFound."""
     given = Path(name)
     found = given if given.is_file() else data_file("weights", name)
     if found is None:
@@ -132,6 +138,69 @@ def read_weights(path: Path) -> FittedWeights:
         raise InvalidValue(_one_sentence(path, error)) from None
 
 
+# --- The camera's calibration and mask -----------------------------------------------------------
+
+
+def find_calibration(name: str) -> Path:
+    """Return a calibration file by its path, or by its name in `calib/`. (A loaded profile names
+    its own by the whole path.)"""
+    given = Path(name).expanduser()
+    if given.is_file():
+        return given
+    found = data_file("calib", name)
+    if found is None:
+        raise NotFound(
+            f"calibration file {name} not found; give a path, or one of "
+            + (", ".join(file_names("calib")) or f"none ({data_folder('calib')} is empty)")
+        )
+    return found
+
+
+MOST_COVERED = 0.75
+"""Of the picture; with more of it covered there is no room for a target."""
+_WHITE = 127
+
+
+def find_mask(name: str) -> Path:
+    """Return the file of a mask, which a loaded profile names by the whole path."""
+    path = Path(name)
+    if not path.is_file():
+        raise NotFound(
+            f"camera.mask: {name} does not exist; "
+            f"perchctl calibrate mask SOURCE -o {path.name} makes one, or remove the key"
+        )
+    return path
+
+
+def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return where the vehicle covers a picture of that width and height: booleans (height, width),
+    true where the file is white. Errors: NotFound, InvalidValue."""
+    path = find_mask(name)
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise InvalidValue(f"camera.mask: {path} cannot be read as a picture")
+    height, width = image.shape[:2]
+    if (width, height) != size_px:
+        raise InvalidValue(
+            f"camera.mask: {path} has {width}x{height} px, but the calibration was made at "
+            f"{size_px[0]}x{size_px[1]} px: the mask must be of the camera's own pictures"
+        )
+    covered = np.asarray(image > _WHITE)
+    share = float(covered.mean())
+    if share > MOST_COVERED:
+        covers, allowed = distinct_figures(100.0 * share, 100.0 * MOST_COVERED, 0)
+        raise InvalidValue(
+            f"camera.mask: {path} covers {covers} % of the picture, at most {allowed} % are "
+            f"allowed: white is what the vehicle covers, black is free"
+        )
+    if share == 0.0:
+        raise InvalidValue(
+            f"camera.mask: {path} covers nothing: white is what the vehicle covers; "
+            f"remove the key if that is nothing"
+        )
+    return covered
+
+
 # --- Reading ------------------------------------------------------------------------------------
 
 
@@ -140,7 +209,7 @@ def _choices() -> str:
 
 
 def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[str, Any]:
-    """What the file at `path` holds itself, on top of what it extends."""
+    """Return what the file at `path` holds itself, on top of what it extends."""
     if path in seen:
         raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
     values = _without_constants(own, path)
@@ -177,8 +246,8 @@ def _without_constants(values: dict[str, Any], path: Path) -> dict[str, Any]:
 def _place_beside(
     values: dict[str, Any], path: Path, section: str, key: str, kind: str | None
 ) -> None:
-    """A file named by a profile is meant from that profile's folder, whichever other extends
-    it and wherever perchctl is called. A name of `kind` may be one from the data folders."""
+    """Place a named file in its profile's folder, whichever other profile extends it and wherever
+    perchctl is called. A name of `kind` may be one from the data folders."""
     part = values.get(section)
     name = part.get(key) if isinstance(part, dict) else None
     if not isinstance(name, str):
@@ -230,8 +299,7 @@ def _one_sentence(path: Path, error: ValidationError) -> str:
 
 
 def first_invalid_key(error: ValidationError) -> tuple[str, str]:
-    """The key of the first fault that was found, empty where it is of no single one, and what is
-    wrong."""
+    """Return the key of the first fault, empty where it is of no single one, and what is wrong."""
     first = error.errors(include_url=False)[0]
     key = clip_text(".".join(str(part) for part in first["loc"]))
     if first["type"] == "extra_forbidden":

@@ -156,7 +156,7 @@ class LandingConfig(Section):
 
     @property
     def overdue_s(self) -> float:
-        """For so long the landing goes by setpoints; then the vehicle lands by itself."""
+        """The time for which the landing goes by setpoints; then the vehicle lands by itself."""
         return OVERDUE_SHARE * self.timeout_s
 
 
@@ -204,13 +204,12 @@ class SafetyConfig(Section):
     jump_m: float = key(0.25, "a step of the estimate beyond its speed: a jump", gt=0, le=5)
     jump_z_m: float = key(0.15, "a step of its height", gt=0, le=5)
     jump_deg: float = key(15.0, "a step of its heading", gt=0, le=180)
-    heading_lost_deg: float = key(
-        40.0, "step of the heading: down at once, level, by raw thrust", gt=0, le=180
-    )
+    heading_lost_deg: ClassVar[float] = 40.0
+    """Step of the heading from which it goes down at once, level, by raw thrust."""
     jump_mps: float = key(1.0, "a step of its velocity", gt=0, le=10)
-    flight_variance_m2: float = key(0.05, "of the position in flight: above it, held", gt=0, le=10)
+    flight_variance_m2: ClassVar[float] = 0.05  # of the position in flight: above it, held
     variance_land_s: ClassVar[float] = 1.0  # above it for so long: landed
-    jump_hold_s: float = key(0.5, "held, then landed", ge=0, le=0.5)
+    jump_hold_s: ClassVar[float] = 0.5  # held after a jump, then landed
     max_height_m: float = key(3.0, "above the ground: lands when higher", gt=0, le=20)
     fence_radius_m: float = key(
         2.0, "of the fence around the place of take-off: lands outside", gt=0, le=50

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator, model_validator
 
@@ -14,18 +14,7 @@ SPARE_S = 0.02
 MOST_LATENCY_S = 0.04
 """The vehicle takes each position for the one of now. 40 ms late it perches within 2 mm, 50 ms late
 it may swing for a minute and be landed (tests/flight/test_capture_flights.py)."""
-CAPTURE_SYSTEMS = ("vicon", "optitrack", "qualisys", "vrpn")
-
-
 _HOST = re.compile(r"[^\s:/?#@]+(?::([0-9]{1,5}))?")
-
-
-def host_fault(host: str) -> str | None:
-    """What is wrong with the name of a capture's computer; nothing where none is given."""
-    found = _HOST.fullmatch(host.strip())
-    if not host.strip() or (found and (found[1] is None or 1 <= int(found[1]) <= 65535)):
-        return None
-    return f"host is NAME or NAME:PORT (1 to 65535), found {host!r}"
 
 
 BY_TARGET = {"rate_hz": 30.0, "position_sigma_m": 0.02, "hold_s": 0.5, "land_s": 1.5}
@@ -61,9 +50,7 @@ class PositioningConfig(Section):
     position_sigma_m: float = key(
         0.005, "what the vehicle takes it for: `locSrv.extPosStdDev`", gt=0, le=0.2
     )
-    attitude_sigma_rad: float = key(
-        0.05, "what the vehicle takes it for: `locSrv.extQuatStdDev`", gt=0, le=1
-    )
+    attitude_sigma_rad: ClassVar[float] = 0.05  # what the vehicle takes it for
     hold_s: float = key(0.15, "without a fresh position it is held in place", gt=0, le=0.5)
     land_s: float = key(0.7, "without a fresh position it is landed", gt=0, le=2)
     connect_timeout_s: float = key(5.0, "for the first frame", gt=0, le=60)
@@ -74,7 +61,7 @@ class PositioningConfig(Section):
 
     @property
     def label(self) -> str:
-        """For a sentence: which motion capture, or what else knows where the vehicle is."""
+        """Name in a sentence the motion capture, or what else knows where the vehicle is."""
         if self.by == "target":
             return "the sight of the target"
         return f"motion capture at {self.system}:{self.host}"
@@ -82,7 +69,7 @@ class PositioningConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _one_word(cls, values: Any) -> Any:
-        """`positioning: mocap` names what measures, and leaves the rest as it is."""
+        """Read `positioning: mocap` as what measures, with the rest as it is."""
         values = {"by": values} if isinstance(values, str) else values
         if isinstance(values, dict) and values.get("by") == "target":
             return {**BY_TARGET, **values}
@@ -91,15 +78,15 @@ class PositioningConfig(Section):
     @field_validator("host")
     @classmethod
     def _is_host(cls, host: str) -> str:
-        fault = host_fault(host)
-        if fault is not None:
-            raise ValueError(fault)
+        found = _HOST.fullmatch(host.strip())
+        if host.strip() and not (found and (found[1] is None or 1 <= int(found[1]) <= 65535)):
+            raise ValueError(f"host is NAME or NAME:PORT (1 to 65535), found {host!r}")
         return host
 
     @model_validator(mode="after")
     def _meant(self) -> PositioningConfig:
-        """Keys of a capture without `by` would fly by the decks, without a word. (A log's
-        profile has every key, and so `by`, too.)"""
+        """Refuse keys of a capture without `by`, which would fly by the decks, without a word. (A
+        log's profile has every key, and so `by`, too.)"""
         keys = [key for key in type(self).model_fields if key != "decks"]
         of_capture = [key for key in keys if key in self.model_fields_set]
         if "by" in of_capture:

@@ -71,13 +71,14 @@ class Profile(Section):
 
     @classmethod
     def lost_values(cls, values: dict[str, Any]) -> list[str]:
-        """A sentence for each key of the values that is a constant now, and had another value."""
+        """Return a sentence for each key of the values that is a constant now, and had another
+        value."""
         return without_constants(values, cls)[2]
 
     @model_validator(mode="before")
     @classmethod
     def _without_constants(cls, values: Any) -> Any:
-        """Logs of earlier versions hold profiles with keys that are constants by now."""
+        """Leave out keys that are constants by now, which logs of earlier versions hold."""
         return without_constants(values, cls)[0] if isinstance(values, dict) else values
 
     @model_validator(mode="after")

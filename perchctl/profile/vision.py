@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -52,8 +51,8 @@ class Mounting(Section):
 
 
 def _eighths(angle: float) -> int:
-    """The number of eighths of a circle that the angle is in radians, rounded to two decimals
-    or more; 0 where it is no such angle."""
+    """Return the number of eighths of a circle that the angle is in radians, rounded to two
+    decimals or more; 0 where it is no such angle."""
     return next(
         (k for k in range(1, 9) for d in range(2, 17) if angle == round(k * math.pi / 4, d)), 0
     )
@@ -101,15 +100,11 @@ class CameraConfig(Section):
     rate_hz: float | None = key(
         None, "asked of `camera:` sources; none: the driver's own", gt=0, le=500
     )
-    controls: dict[str, int | str] = Field(
-        default_factory=dict,
-        description="of `camera:` sources, as V4L2 names them, set before the first picture",
-    )
 
     @field_validator("latency_s", mode="before")
     @classmethod
     def _a_time_or_measured(cls, latency_s: Any) -> Any:
-        """One sentence for both kinds of value."""
+        """Refuse other values than a time or ``measured`` in one sentence."""
         number = isinstance(latency_s, (int, float)) and not isinstance(latency_s, bool)
         if latency_s == "measured" or (number and 0.0 <= latency_s <= MOST_LATENCY_S):
             return latency_s
@@ -128,31 +123,9 @@ class CameraConfig(Section):
             f"or digits, as in MJPG or YUYV"
         )
 
-    @field_validator("controls", mode="before")
-    @classmethod
-    def _names_with_values(cls, controls: Any) -> Any:
-        """One sentence for whatever stands there; which names and values there are only the
-        driver knows."""
-        needed = (
-            "needed are names with a whole number or a menu's text each, as in controls: "
-            "{gain: 20}; "
-            "perchctl check --cameras lists them"
-        )
-        if not isinstance(controls, Mapping):
-            raise ValueError(f"found {clip_text(repr(controls))}; {needed}")
-        for name, value in controls.items():
-            whole = isinstance(value, str) or (
-                isinstance(value, (int, float)) and float(value).is_integer()
-            )
-            if not isinstance(name, str) or isinstance(value, bool) or not whole:
-                found = f"{clip_text(str(name))}: {clip_text(repr(value))}"
-                hint = "; write 1 for on and 0 for off" if isinstance(value, bool) else ""
-                raise ValueError(f"found {found}; {needed}{hint}")
-        return controls
-
     @property
     def start_latency_s(self) -> float:
-        """What is taken off a picture's time of arrival until a flight has measured it."""
+        """The time taken off a picture's arrival until a flight has measured it."""
         return START_LATENCY_S if isinstance(self.latency_s, str) else self.latency_s
 
 
@@ -255,7 +228,7 @@ class DetectorConfig(Section):
     cut: bool = key(
         True, "measure by what is left of the drawing where the picture cuts both markers"
     )
-    correction_bits_large: int = key(0, "wrong cells that are corrected", ge=0, le=3)
+    correction_bits_large: ClassVar[int] = 0  # wrong cells that are corrected
     correction_bits_small: int = key(1, "wrong cells that are corrected", ge=0, le=3)
 
 
@@ -336,7 +309,7 @@ class MergeConfig(Section):
     z3_m: float = key(0.12, "nearest range of the whole large marker", gt=0)
     disagreement_m: ClassVar[float] = 0.03
     """Farther apart than this the markers contradict."""
-    disagreement_frames: int = key(15, "so many in a row, and it lands", ge=1)
+    disagreement_frames: ClassVar[int] = 15  # so many in a row, and it lands
 
     @model_validator(mode="after")
     def _ranges_in_order(self) -> MergeConfig:

@@ -22,7 +22,6 @@ from perchctl.camera import (
     read_grey,
     without_password,
 )
-from perchctl.camera.files import ImagesSource
 from perchctl.camera.source import to_grey
 from perchctl.commands.calibrate import Source, with_size
 from perchctl.errors import InvalidValue, NotFound, UsageError
@@ -76,25 +75,17 @@ def test_the_profile_s_latency_counts_unless_another_is_given(
     assert frame.t_arrival_s - frame.t_s == pytest.approx(counts_s)
 
 
-def test_images_by_pattern_and_single(tmp_path: Path) -> None:
-    write_images(tmp_path, 12)
-    assert len(drain(open_camera(f"images:{tmp_path}/shot_1*.png", clock))) == 3
-    assert len(drain(ImagesSource(str(tmp_path / "shot_5.png")))) == 1
-
-
-def test_images_that_are_not_there(tmp_path: Path) -> None:
+def test_images_by_pattern_and_single_and_those_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(NotFound, match="neither a folder nor a pattern"):
         open_camera(f"images:{tmp_path}/nowhere", clock)
     with pytest.raises(NotFound, match="holds no pictures"):
         open_camera(f"images:{tmp_path}", clock)
-
-
-def test_a_broken_image_is_named(tmp_path: Path) -> None:
-    write_images(tmp_path, 2)
+    write_images(tmp_path, 12)
+    assert len(drain(open_camera(f"images:{tmp_path}/shot_1*.png", clock))) == 3
+    assert len(drain(open_camera(f"images:{tmp_path}/shot_5.png", clock))) == 1
     (tmp_path / "shot_1.png").write_bytes(b"not a picture")
-    source = ImagesSource(str(tmp_path))
     with pytest.raises(InvalidValue, match=r"shot_1\.png"):
-        drain(source)
+        drain(open_camera(f"images:{tmp_path}", clock))
 
 
 def write_video(path: Path, count: int, rate_hz: float) -> None:
@@ -179,10 +170,7 @@ def test_no_message_and_no_record_shows_a_password(tmp_path: Path) -> None:
     assert "secret" not in str(profile_record(profile))
 
 
-def test_an_unknown_scheme_is_told_from_a_missing_file_and_known_ones_in_any_case() -> None:
-    for spec in ("rtmp://host/live", "ftp://host/a.mp4"):
-        with pytest.raises(InvalidValue, match=r"is unknown; allowed are .*aideck"):
-            open_camera(spec, clock)
+def test_a_scheme_is_known_in_any_case() -> None:
     for spec in ("RTSP://host/s", "Http://host/s", "AIDECK://192.168.4.1", "Camera:0"):
         source = parse_source(spec)
         assert source.scheme == spec.partition(":")[0].lower()
@@ -191,23 +179,28 @@ def test_an_unknown_scheme_is_told_from_a_missing_file_and_known_ones_in_any_cas
     assert not parse_source("VIDEO:x.mp4").live
 
 
+@pytest.mark.parametrize(("spec", "words"), [
+    *((spec, r"allowed are camera:N, .*video:FILE, images:DIR.*aideck") for spec in (
+        "rtmp://host/live", "ftp://host/a.mp4", "webcam:0", "ftp://x", "video:", "images:", "http://",
+    )),
+    ("sim:", "sim://"),
+    *((f"{url}/a", r"no host or no port .*(rtsp|http)://192.* 1 to 65535") for url in (
+        "rtsp://me:sec/ret@host", "http://:80", "rtsp:host", "rtsp://lab:99999", "rtsp://lab:0",
+        "http://lab:abc", "rtsp://lab:-1", "http://me:sec:ret@lab:abc",
+    )),
+])  # fmt: skip
+def test_what_names_no_source_says_what_is_allowed(spec: str, words: str) -> None:
+    with pytest.raises(InvalidValue, match=words) as refused:
+        open_camera(spec, clock)
+    assert "sec" not in str(refused.value)
+
+
 def test_videos_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(NotFound, match=r"flight\.avi was not found"):
         VideoSource(tmp_path / "flight.avi")
     (tmp_path / "flight.avi").write_bytes(b"no video at all")
     with pytest.raises(InvalidValue, match="no readable frame"):
         VideoSource(tmp_path / "flight.avi")
-
-
-@pytest.mark.parametrize("spec", ["webcam:0", "ftp://x", "video:", "images:", "http://"])
-def test_unknown_schemes_say_what_is_allowed(spec: str) -> None:
-    with pytest.raises(InvalidValue, match=r"allowed are camera:N, .*video:FILE, images:DIR"):
-        open_camera(spec, clock)
-
-
-def test_the_simulated_camera_belongs_to_the_simulated_vehicle() -> None:
-    with pytest.raises(InvalidValue, match="sim://"):
-        open_camera("sim:", clock)
 
 
 def test_the_wrong_size_names_both() -> None:
@@ -261,42 +254,13 @@ def test_a_picture_that_says_to_be_too_large_is_not_decoded(
         read_grey(path)
 
 
-def test_a_video_that_says_to_be_too_large_is_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "flight.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, (64, 48))
-    writer.write(np.zeros((48, 64, 3), np.uint8))
-    writer.release()
-    VideoSource(path).close()
-    monkeypatch.setattr(files, "MOST_FILE_PX", 64 * 48 - 1)
-    with pytest.raises(InvalidValue, match="64x48 px"):
-        VideoSource(path)
-
-
-@pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8", None])
+@pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8", b"\xff\xd8no", None])
 def test_what_is_no_picture_is_named(tmp_path: Path, data: bytes | None) -> None:
     path = tmp_path / "a.jpg"
     if data is not None:
         path.write_bytes(data)
     with pytest.raises(BrokenPicture, match=r"a\.jpg (cannot be read|is cut off)"):
         read_grey(path)
-
-
-@pytest.mark.parametrize("url", ["rtsp://me:sec/ret@host/a", "http://:80/a", "rtsp:host/a"])
-def test_a_url_without_a_host_is_refused_and_its_password_not_shown(url: str) -> None:
-    with pytest.raises(InvalidValue, match=r"lacks a host .*(rtsp|http)://192") as e:
-        open_camera(url, clock)
-    assert "sec" not in str(e.value)
-
-
-@pytest.mark.parametrize(("url", "found"), [
-    ("rtsp://lab:99999/a", "99999"), ("rtsp://lab:0/a", "0"), ("http://lab:abc/a", "abc"),
-    ("rtsp://lab:-1/a", "-1"),
-])  # fmt: skip
-def test_a_port_that_is_none_is_named(url: str, found: str) -> None:
-    with pytest.raises(InvalidValue, match=rf"has port {found}; allowed are 1 to 65535, as in"):
-        open_camera(url, clock)
 
 
 def test_the_size_of_a_calibration_is_asked_of_a_camera_of_this_computer_only() -> None:

@@ -1,16 +1,17 @@
-"""Live sources: the device behind a stand-in, Motion-JPEG from a local server."""
+"""Live sources: Motion-JPEG from a local server, and a camera of the computer behind a stand-in."""
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import ssl
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,56 +55,42 @@ Script = list[bytes | threading.Event]
 
 
 class Server:
-    """Serves one script a connection: bytes to send, events to wait for, then the end."""
+    """Serves one script a connection: bytes to send, events to wait for, then the end.
+
+    Who does not answer one of its `challenges` by name or by the right nonce is refused.
+    """
 
     def __init__(self) -> None:
         self.scripts: queue.Queue[Script] = queue.Queue()
-        self.status = 200
-        self.redirect_first = ""
-        self.paths: list[str] = []
+        self.status, self.refusal, self.redirect = 200, 401, ""
+        self.nonce = "n1"
         self.authorization: list[str | None] = []
         self.challenges: list[str] = []
-        self.refusal = 401
-        self.nonce = "n1"
         outer = self
 
         class Handler(BaseHTTPRequestHandler):
-            extra: ClassVar[dict[str, str]] = {
-                "Content-Type": "multipart/x-mixed-replace; boundary=frame"
-            }
-
             def do_GET(self) -> None:
-                outer.paths.append(self.path)
                 given = self.headers["Authorization"]
                 outer.authorization.append(given)
-                if (outer.challenges or outer.refusal == 403) and not (
-                    given and (given.startswith("Basic") or f'nonce="{outer.nonce}"' in given)
-                ):
+                asked = outer.challenges or outer.refusal == 403
+                known = given and (given.startswith("Basic") or f'nonce="{outer.nonce}"' in given)
+                if asked and not known:
                     self.send_response(outer.refusal)
                     for challenge in outer.challenges:
                         self.send_header("WWW-Authenticate", challenge)
                     self.end_headers()
                     return
-                try:
-                    script = outer.scripts.get_nowait()
-                except queue.Empty:
-                    script = []
-                if outer.redirect_first and len(outer.paths) == 1:
-                    self.send_response(302)
-                    self.send_header("Location", outer.redirect_first)
-                else:
-                    self.send_response(outer.status)
-                for name, value in self.extra.items():
-                    self.send_header(name, value)
+                self.send_response(302 if outer.redirect else outer.status)
+                if outer.redirect:
+                    self.send_header("Location", outer.redirect)
                 self.end_headers()
-                for step in script:
-                    if isinstance(step, threading.Event):
-                        step.wait(WAIT_S)
-                    else:
-                        try:
+                script = [] if outer.scripts.empty() else outer.scripts.get()
+                with contextlib.suppress(OSError):
+                    for step in script:
+                        if isinstance(step, threading.Event):
+                            step.wait(WAIT_S)
+                        else:
                             self.wfile.write(step)
-                        except OSError:
-                            return
 
             def log_message(self, format: str, *args: Any) -> None:
                 pass
@@ -139,64 +126,42 @@ def stream(server: Server, clock: Clock, opened: list[LiveSource], **options: fl
     return begun(source, opened, reconnect_wait_s=0.0, **options)
 
 
-def test_frames_are_stamped_at_arrival_less_the_latency(
+def test_the_newest_frame_is_stamped_at_arrival_less_the_latency_and_given_once(
     server: Server, opened: list[LiveSource]
 ) -> None:
-    clock, go = Clock(), threading.Event()
-    server.scripts.put([part(jpeg(60)), go, part(jpeg(160)), threading.Event()])
+    clock, go, picture = Clock(), threading.Event(), jpeg(60)
+    newer = [part(jpeg(100)) + part(jpeg(160)), threading.Event()]
+    server.scripts.put([part(picture), go, *newer])
     source = stream(server, clock, opened)
     first = next_frame(source)
-    assert (first.index, level(first)) == (0, 60)
-    assert first.t_arrival_s == 100.0
+    assert (first.index, level(first), first.t_arrival_s) == (0, 60, 100.0)
     assert first.t_s == pytest.approx(99.93)
+    assert first.encoded == picture
+    as_sent = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(as_sent, first.image)
     assert source.size_px == (64, 48)
     assert source.poll(0.0) is None, "each frame once"
-    clock.t_s = 101.0
+    assert source.problem(100.0 + SILENT_AFTER_S) is None
+    clock.t_s = 102.5
+    assert "no frame for 2.5 s" in str(source.problem(clock.t_s))
     go.set()
     second = next_frame(source)
-    assert (second.index, level(second), second.t_arrival_s) == (1, 160, 101.0)
-
-
-def test_a_frame_has_the_jpeg_that_it_came_as(server: Server, opened: list[LiveSource]) -> None:
-    picture = jpeg(90)
-    server.scripts.put([part(picture), threading.Event()])
-    frame = next_frame(stream(server, Clock(), opened))
-    assert frame.encoded == picture
-    decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE)
-    np.testing.assert_array_equal(decoded, frame.image)
-
-
-def test_the_newest_frame_wins(server: Server, opened: list[LiveSource]) -> None:
-    server.scripts.put([part(jpeg(60)), part(jpeg(100)), part(jpeg(160)), threading.Event()])
-    source = stream(server, Clock(), opened)
-    seen = []
-
-    def last_came() -> bool:
-        frame = source.poll(0.0)
-        if frame is not None:
-            seen.append(level(frame))
-        return 160 in seen
-
-    until(last_came)
-    assert seen == sorted(seen)
+    while level(second) != 160:
+        second = next_frame(source)
+    assert second.t_arrival_s == 102.5
     assert source.poll(0.0) is None
+    assert source.problem(clock.t_s) is None
 
 
-def test_a_truncated_picture_is_skipped(server: Server, opened: list[LiveSource]) -> None:
-    torn = jpeg(60)[:300]
-    whole = part(jpeg(160))
-    server.scripts.put([part(torn), whole, whole, threading.Event()])
-    source = stream(server, Clock(), opened)
-    assert level(next_frame(source)) == 160
-    until(lambda: source.damaged >= 1)
+SIZES = [(40_000, 40_000), (32_000, 32_000), (0, 64)]
 
 
-@pytest.mark.parametrize("size", [(40_000, 40_000), (32_000, 32_000), (0, 64)])
-def test_damaged_size_bytes_cost_their_own_picture_alone(
-    size: tuple[int, int], server: Server, opened: list[LiveSource]
+@pytest.mark.parametrize("damaged", [jpeg(60)[:300], *(resized(jpeg(60), *px) for px in SIZES)])
+def test_a_damaged_picture_costs_no_connection(
+    damaged: bytes, server: Server, opened: list[LiveSource]
 ) -> None:
-    go = threading.Event()
-    server.scripts.put([part(resized(jpeg(60), *size)), go, part(jpeg(160)), threading.Event()])
+    go, whole = threading.Event(), part(jpeg(160))
+    server.scripts.put([part(damaged) + whole[:60], go, whole[60:], threading.Event()])
     source = stream(server, Clock(), opened)
     until(lambda: source.damaged == 1)
     go.set()
@@ -265,25 +230,20 @@ def test_a_thread_that_ends_is_the_camera_s_problem(
     assert "secret" not in problem
 
 
-def test_it_reconnects_when_the_stream_ends(server: Server, opened: list[LiveSource]) -> None:
-    clock = Clock()
+def test_it_reconnects_when_the_stream_ends_and_gives_up_after_five_in_vain(
+    server: Server, opened: list[LiveSource]
+) -> None:
     gate = threading.Event()
-    server.scripts.put([part(jpeg(60)), gate])
-    server.scripts.put([part(jpeg(160)), threading.Event()])
-    source = stream(server, clock, opened)
-    assert level(next_frame(source)) == 60
-    gate.set()
-    frame = next_frame(source)
-    assert (level(frame), frame.index) == (160, 1)
-    assert source.connections == 2
-    assert source.problem(clock.t_s) is None
-
-
-def test_reconnects_are_bounded(server: Server, opened: list[LiveSource]) -> None:
     server.scripts.put([part(jpeg(60))])
+    server.scripts.put([part(jpeg(160)), gate])
     source = stream(server, Clock(), opened)
+    until(lambda: source._count == 2)
+    frame = next_frame(source)
+    assert (level(frame), frame.index, source.connections) == (160, 1, 2)
+    assert source.problem(100.0) is None
+    gate.set()
     until(lambda: "gave no picture" in (source.problem(100.0) or ""))
-    assert source.connections == 1 + MAX_FAILED_CONNECTIONS
+    assert source.connections == 2 + MAX_FAILED_CONNECTIONS
     assert "5 attempts: the stream ended" in str(source.problem(100.0))
 
 
@@ -296,28 +256,6 @@ def test_a_server_of_one_picture_a_connection_is_kept_though_they_are_equal(
     source = stream(server, Clock(), opened)
     until(lambda: source._arrived == 1 + 2 * MAX_FAILED_CONNECTIONS)
     assert source.problem(100.0) is None
-
-
-def test_silence_is_a_problem_and_ends_with_the_next_frame(
-    server: Server, opened: list[LiveSource]
-) -> None:
-    clock, go = Clock(), threading.Event()
-    server.scripts.put([part(jpeg(60)), go, part(jpeg(160)), threading.Event()])
-    source = stream(server, clock, opened)
-    next_frame(source)
-    assert source.problem(100.0 + SILENT_AFTER_S) is None
-    clock.t_s = 102.5
-    assert "no frame for 2.5 s" in str(source.problem(clock.t_s))
-    go.set()
-    next_frame(source)
-    assert source.problem(clock.t_s) is None
-
-
-def test_a_path_the_server_does_not_have_is_not_found(server: Server) -> None:
-    server.status = 404
-    with pytest.raises(NotFound, match="404"):
-        open_camera(server.url, Clock(), timeout_s=WAIT_S)
-    assert len(server.paths) == 1
 
 
 def test_nobody_listens(server: Server, opened: list[LiveSource]) -> None:
@@ -345,81 +283,102 @@ def test_no_first_frame_in_time(server: Server) -> None:
     quiet.set()
 
 
+# -- certificates, redirects, names and passwords --------------------------------------
+
+DIGEST = ['Basic realm="camera"', 'Digest realm="camera", nonce="n1", qop="auth,auth-int"']
+
+
+def test_a_certificate_that_nobody_vouches_for(
+    server: Server, opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pem = Path(__file__).parents[1] / "helpers" / "loopback.pem"  # for 127.0.0.1 and 100 years
+    server.encrypt(pem)
+    url = server.url.replace("http://", "https://me:secret@")
+    with pytest.raises(NotFound, match=r"is not trusted \(self.signed.*SSL_CERT_FILE") as caught:
+        open_camera(url, Clock(), timeout_s=WAIT_S)
+    assert "secret" not in str(caught.value)
+    monkeypatch.setenv("SSL_CERT_FILE", str(pem))
+    server.scripts.put([part(jpeg(60)), threading.Event()])
+    source = begun(MjpegSource(url, 0.0, Clock()), opened)
+    assert level(next_frame(source)) == 60
+
+
+@pytest.mark.parametrize(("refusal", "challenges", "answered"), [
+    (401, ['Basic realm="camera"'], "Basic bWU6cEBzcw=="),
+    (403, [], "Basic bWU6cEBzcw=="),
+    (401, DIGEST, 'Digest username="me", realm="camera"'),
+])  # fmt: skip
+def test_name_and_password_are_sent_once_they_are_asked_for_digest_first(
+    refusal: int, challenges: list[str], answered: str, server: Server, opened: list[LiveSource]
+) -> None:
+    server.refusal, server.challenges = refusal, challenges
+    server.scripts.put([part(jpeg(60))])
+    server.scripts.put([part(jpeg(100)), threading.Event()])
+    url = server.url.replace("http://", "http://me:p%40ss@")
+    source = begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.0)
+    until(lambda: source._count == 2)
+    assert [str(given)[: len(answered)] for given in server.authorization] == ["None", answered] * 2
+    assert "p%40ss" not in source.describe()
+
+
+@pytest.mark.parametrize(("changes", "who", "requests", "words"), [
+    ({"status": 404}, "", 1, "404"),
+    ({"status": 403}, "", 1, "403"),
+    ({"status": 403}, "me:wrong@", 2, "403"),
+    ({"challenges": DIGEST}, "", 1, "wants a name and a password, as in http://NAME:PASSWORD"),
+    ({"challenges": DIGEST}, "me:wrong@", 2, "check the name and the password in the URL"),
+    ({"challenges": ["Negotiate"]}, "me:wrong@", 1, "no basic or digest authentication"),
+    *(({"redirect": to}, "me:wrong@", 1, "redirects to .*name that address in camera.source")
+      for to in ("/elsewhere.mjpg", "http://me:wrong@127.0.0.1:1/x", "rtsp://127.0.0.1/live")),
+])  # fmt: skip
+def test_what_trying_again_would_not_mend_is_said_at_once(
+    changes: dict[str, Any], who: str, requests: int, words: str, server: Server
+) -> None:
+    """Nothing follows a redirect: nobody can ask for the password in the camera's place."""
+    server.nonce = "none of mine"
+    for name, value in changes.items():
+        setattr(server, name, value)
+    with pytest.raises(NotFound, match=words) as caught:
+        open_camera(server.url.replace("http://", f"http://{who}"), Clock(), timeout_s=WAIT_S)
+    assert len(server.authorization) == requests
+    assert "wrong" not in str(caught.value)
+    if "redirect" in changes:
+        assert changes["redirect"].rpartition("/")[2] in str(caught.value)
+
+
 # -- the device -----------------------------------------------------------------
-
-
-class Capture:
-    """Stands for cv2.VideoCapture; gives queued pictures, fails at None and at the end, and
-    raises a queued error."""
-
-    def __init__(self) -> None:
-        self.pictures: queue.Queue[np.ndarray[Any, Any] | Exception | None] = queue.Queue()
-        self.unplugged = False
-        self.released = threading.Event()
-        self.reads = 0
-
-    def read(self) -> tuple[bool, Any]:
-        self.reads += 1
-        if self.unplugged:
-            return False, None
-        try:
-            image = self.pictures.get(timeout=0.01)
-        except queue.Empty:
-            return False, None
-        if isinstance(image, Exception):
-            raise image
-        return image is not None, image
-
-    def release(self) -> None:
-        self.released.set()
-
-
-def test_a_device_delivers_grey_frames_and_is_released(opened: list[LiveSource]) -> None:
-    capture = Capture()
-    for value in (60, 160):
-        capture.pictures.put(np.full((48, 64, 3), value, np.uint8))
-    source = DeviceSource(2, 0.05, Asked((64, 48)), Clock(), lambda n, asked: capture)
-    opened.append(source)
-    assert source.wait_first(WAIT_S)
-    seen = [next_frame(source)]
-    if level(seen[0]) == 60:
-        seen.append(next_frame(source))
-    assert level(seen[-1]) == 160
-    assert seen[-1].image.shape == (48, 64)
-    assert seen[-1].t_s == pytest.approx(99.95)
-    assert source.describe() == "camera:2 (64x48 px)"
-    source.close()
-    assert capture.released.wait(WAIT_S)
 
 
 def grey(value: int) -> np.ndarray[Any, Any]:
     return np.full((48, 64), value, np.uint8)
 
 
-def test_a_device_s_damaged_picture_is_dropped(opened: list[LiveSource]) -> None:
-    capture = Capture()
-    for each in (grey(60), cv2.error("damaged"), grey(160)):
-        capture.pictures.put(each)
-    source = DeviceSource(0, 0.0, Asked(), Clock(), lambda n, asked: capture, retry_s=0.0)
-    opened.append(source)
-    until(lambda: source._count == 2)
-    assert not capture.released.is_set()
-    assert source.problem(100.0) is None
+class Capture:
+    """Stands for cv2.VideoCapture; gives pictures, raises errors among them, and fails at the end
+    and while it is unplugged."""
 
+    def __init__(self, *pictures: np.ndarray[Any, Any] | Exception) -> None:
+        self.pictures = [*pictures]
+        self.unplugged = False
+        self.released = threading.Event()
+        self.reads = 0
 
-def test_a_device_that_never_gives_a_picture_fails(opened: list[LiveSource]) -> None:
-    capture = Capture()
-    capture.unplugged = True
-    source = DeviceSource(0, 0.0, Asked(), Clock(), lambda n, asked: capture, retry_s=0.0)
-    opened.append(source)
-    assert not source.wait_first(WAIT_S)
-    assert "stopped delivering" in str(source.problem(float("-inf")))
-    assert capture.reads == LOST_AFTER_FAILURES
-    assert capture.released.wait(WAIT_S)
+    def read(self) -> tuple[bool, Any]:
+        self.reads += 1
+        if self.unplugged or not self.pictures:
+            threading.Event().wait(0.01 * (not self.unplugged))
+            return False, None
+        image = self.pictures.pop(0)
+        if isinstance(image, Exception):
+            raise image
+        return True, image
+
+    def release(self) -> None:
+        self.released.set()
 
 
 class Bus:
-    """Where a camera is plugged in and out; `opened` counts the attempts to open one."""
+    """Where a camera is plugged in and out; `numbers` has one for each attempt to open it."""
 
     def __init__(self, capture: Capture) -> None:
         self.capture: Capture | None = capture
@@ -432,22 +391,61 @@ class Bus:
         return self.capture
 
 
-def test_a_device_that_comes_back_is_opened_again(opened: list[LiveSource]) -> None:
-    first, clock = Capture(), Clock()
-    first.pictures.put(grey(60))
-    bus = Bus(first)
-    source = DeviceSource(0, 0.0, Asked(), clock, bus.open, retry_s=0.0, reopen_every_s=0.001)
+def device(
+    opened: list[LiveSource],
+    open_number: Callable[[int, Asked], Capture],
+    clock: Clock | None = None,
+    reopen_every_s: float = 0.001,
+) -> DeviceSource:
+    """Camera 2, which is camera 5 when it comes back."""
+    source = DeviceSource(
+        2, 0.05, Asked(), clock or Clock(), open_number, retry_s=0.0,
+        reopen_every_s=reopen_every_s, find=lambda: 5,
+    )  # fmt: skip
     opened.append(source)
+    return source
+
+
+def test_a_device_delivers_grey_frames_drops_a_damaged_one_and_is_released(
+    opened: list[LiveSource],
+) -> None:
+    colour = np.full((48, 64, 3), 160, np.uint8)
+    capture = Capture(grey(60), cv2.error("damaged"), colour)
+    source = device(opened, Bus(capture).open)
+    until(lambda: source._count == 2)
+    frame = next_frame(source)
+    assert (level(frame), frame.image.shape) == (160, (48, 64))
+    assert frame.t_s == pytest.approx(99.95)
+    assert source.describe() == "camera:2 (64x48 px)"
+    assert source.problem(100.0) is None
+    assert not capture.released.is_set()
+    source.close()
+    assert capture.released.wait(WAIT_S)
+
+
+def test_a_device_that_never_gives_a_picture_fails(opened: list[LiveSource]) -> None:
+    capture = Capture()
+    capture.unplugged = True
+    source = device(opened, Bus(capture).open)
+    assert not source.wait_first(WAIT_S)
+    assert "stopped delivering" in str(source.problem(float("-inf")))
+    assert capture.reads == LOST_AFTER_FAILURES
+    assert capture.released.wait(WAIT_S)
+
+
+def test_a_device_that_comes_back_is_opened_again(opened: list[LiveSource]) -> None:
+    first, clock = Capture(grey(60)), Clock()
+    bus = Bus(first)
+    source = device(opened, bus.open, clock)
     assert level(next_frame(source)) == 60
     bus.capture, first.unplugged = None, True
     until(lambda: len(bus.numbers) > 3)
     assert first.released.is_set()
     clock.t_s = 102.0
-    assert "camera:0 was not found" in str(source.problem(102.0))
+    assert "camera:5 was not found" in str(source.problem(102.0))
+    assert bus.numbers[:2] == [2, 5]
     assert source.problem(float("-inf")) is None, "it is not the end"
-    again = Capture()
-    again.pictures.put(grey(160))
-    bus.capture = again
+    bus.capture = again = Capture(grey(160))
     frame = next_frame(source)
     assert (level(frame), frame.index, frame.t_arrival_s) == (160, 1, 102.0)
     assert source.problem(102.0) is None
@@ -455,11 +453,8 @@ def test_a_device_that_comes_back_is_opened_again(opened: list[LiveSource]) -> N
 
 
 def test_attempts_to_open_a_lost_device_are_bounded_in_rate(opened: list[LiveSource]) -> None:
-    capture = Capture()
-    capture.pictures.put(grey(60))
-    bus = Bus(capture)
-    source = DeviceSource(0, 0.0, Asked(), Clock(), bus.open, retry_s=0.0, reopen_every_s=0.1)
-    opened.append(source)
+    bus = Bus(capture := Capture(grey(60)))
+    source = device(opened, bus.open, reopen_every_s=0.1)
     assert source.wait_first(WAIT_S)
     bus.capture, capture.unplugged = None, True
     until(lambda: len(bus.numbers) == 2)
@@ -469,17 +464,14 @@ def test_attempts_to_open_a_lost_device_are_bounded_in_rate(opened: list[LiveSou
 
 
 def test_a_device_that_flaps_is_never_given_up(opened: list[LiveSource]) -> None:
-    captures = []
+    captures: list[Capture] = []
 
     def one_picture(number: int, asked: Asked) -> Capture:
-        captures.append(Capture())
-        captures[-1].pictures.put(grey(len(captures)))
+        captures.append(Capture(grey(len(captures))))
         return captures[-1]
 
-    source = DeviceSource(0, 0.0, Asked(), Clock(), one_picture, retry_s=0.0, reopen_every_s=0.0)
-    opened.append(source)
-    until(lambda: len(captures) > 3)
-    until(lambda: source._count > 3)
+    source = device(opened, one_picture, reopen_every_s=0.0)
+    until(lambda: len(captures) > 3 and source._count > 3)
     assert all(each.released.is_set() for each in captures[:-2])
 
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -18,9 +19,10 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import VERDICT_TEXTS, mirrored_note
-from perchctl.check import Row, Verdict, camera, computer
+from perchctl.check import Row, Verdict, camera
+from perchctl.check import profile as of_profile
 from perchctl.check.rehearsal import Blur, Light, Rehearsal, rehearse
-from perchctl.check.row import ask
+from perchctl.check.row import Finding, ask
 from perchctl.errors import NotFound
 from perchctl.faults.edges import FaultyCamera
 from perchctl.faults.effects import FOR_EVER, CameraFault
@@ -82,7 +84,7 @@ def rehearsed(
 def rows_of(done: Rehearsal, profile: Profile = PROFILE) -> dict[str, Row]:
     found = camera.picture_rows(done, profile, CAMERA)
     assert [row.name for row in found] == list(camera.names_of(profile))
-    loop = ask("loop", computer.loop_finding, done, profile)
+    loop = ask("loop", camera.loop_finding, done, profile)
     return {row.name: row for row in [*found, loop]}
 
 
@@ -153,14 +155,11 @@ def test_a_fault_of_the_simulated_camera_makes_its_row(
     assert good()[1][name].verdict is Verdict.PASS
 
 
-def test_what_a_target_would_tell_is_not_known_without_one() -> None:
+def test_what_a_target_would_show_is_not_known_without_one() -> None:
     for name in ("target", "focus", "mirrored", "print"):
         assert shown("bare")[1][name].verdict is Verdict.SKIPPED, name
-
-
-def test_a_print_is_judged_by_both_markers_only() -> None:
     far = rehearsed(away_m=FAR_FOR_BOTH_M, duration_s=0.2)
-    assert rows_of(far)["print"].verdict is Verdict.SKIPPED
+    assert rows_of(far)["print"].verdict is Verdict.SKIPPED, "both markers are needed"
 
 
 def test_a_camera_that_falls_silent_at_once_fails_and_nothing_passes() -> None:
@@ -239,18 +238,18 @@ def test_a_rate_below_the_wanted_one_warns() -> None:
     assert "asked for 60" in rows["frame rate"].found
 
 
-def test_what_the_camera_does_not_do_as_asked_is_told() -> None:
-    row = camera.opened_finding("camera:0", ["camera:0 (USB Video)"], ["it gives YUYV"])
-    assert (row.verdict, "YUYV" in row.found) == (Verdict.WARN, True)
-    assert camera.opened_finding("camera:0", []).verdict is Verdict.PASS
-
-
-def test_pictures_of_another_size_are_not_looked_at() -> None:
-    finding = camera.size_finding((320, 240), (640, 480))
-    assert finding.verdict is Verdict.FAIL
-    assert "320x240" in finding.found
-    assert camera.size_finding((640, 480), (640, 480)).verdict is Verdict.PASS
-    assert camera.size_finding(None, (640, 480)).verdict is Verdict.SKIPPED
+@pytest.mark.parametrize(("finding", "verdict", "words"), [
+    (camera.opened_finding("camera:0", ["camera:0 (USB)"], ["it gives YUYV"]), "warn", "YUYV"),
+    (camera.opened_finding("camera:0", []), "pass", "camera:0"),
+    (camera.size_finding((320, 240), (640, 480)), "fail", "320x240"),
+    (camera.size_finding((640, 480), (640, 480)), "pass", "640x480"),
+    (camera.size_finding(None, (640, 480)), "skipped", ""),
+])  # fmt: skip
+def test_what_a_camera_delivers_otherwise_makes_its_row(
+    finding: Finding, verdict: str, words: str
+) -> None:
+    assert finding.verdict == verdict
+    assert words in finding.found
 
 
 def test_a_missing_camera_names_those_that_are_there() -> None:
@@ -278,26 +277,22 @@ def test_a_rehearsal_needs_no_vehicle() -> None:
     assert done.height_m is None
 
 
-def test_the_log_s_folder_is_not_made(tmp_path: Path) -> None:
+def test_the_log_s_folder_is_not_made_and_a_file_in_its_place_fails(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "b"
-    assert computer.log_folder_finding(folder).verdict is Verdict.PASS
-    assert computer.disk_finding(folder).verdict is not Verdict.SKIPPED
+    assert of_profile.log_folder_finding(folder).verdict is Verdict.PASS
+    assert of_profile.disk_finding(folder).verdict is not Verdict.SKIPPED
     assert not (tmp_path / "a").exists()
-
-
-def test_a_log_folder_that_is_a_file_fails(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")
-    row = computer.log_folder_finding(tmp_path / "taken")
-    assert row.verdict is Verdict.FAIL
-    assert "is a file" in row.found
+    row = of_profile.log_folder_finding(tmp_path / "taken")
+    assert (row.verdict, "is a file" in row.found) == (Verdict.FAIL, True)
 
 
 @pytest.mark.parametrize(("free", "verdict"), [
     (10_000_000, "fail"), (200_000_000, "warn"), (5_000_000_000, "pass"),
 ])  # fmt: skip
-def test_a_full_disk_is_told(
+def test_a_full_disk_makes_its_row(
     free: int, verdict: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    usage = type("Usage", (), {"free": free, "total": 10**12})
-    monkeypatch.setattr(computer.shutil, "disk_usage", lambda path: usage)
-    assert computer.disk_finding(tmp_path).verdict == verdict
+    usage = SimpleNamespace(free=free, total=10**12)
+    monkeypatch.setattr(of_profile.shutil, "disk_usage", lambda path: usage)
+    assert of_profile.disk_finding(tmp_path).verdict == verdict

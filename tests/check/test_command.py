@@ -143,7 +143,7 @@ def test_a_flight_is_refused_for_what_the_profile_or_the_disk_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = type("Usage", (), {"free": 1_000_000, "total": 10**12})
-    monkeypatch.setattr("perchctl.check.computer.shutil.disk_usage", lambda path: usage)
+    monkeypatch.setattr("perchctl.check.profile.shutil.disk_usage", lambda path: usage)
     said = CliRunner().invoke(app, ["fly", "-u", NOWHERE, "--source", "camera:97", "--yes"])
     assert said.exit_code == 52
     assert "disk: 1 MB free" in said.stderr

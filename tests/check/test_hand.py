@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,15 +13,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from perchctl.check import Verdict, capture
+from perchctl.check import Verdict, capture, vehicle
 from perchctl.check.row import Finding
-from perchctl.geometry import Array, rot_z, rotation_from_rpy
+from perchctl.geometry import (
+    Array,
+    quaternion_from_rotation,
+    rot_z,
+    rotation_from_rpy,
+    rpy_from_rotation,
+)
 from perchctl.positioning import BodyPose, Placed
 from perchctl.profile import PositioningConfig
 from perchctl.sim.world import Stop, Way
 from perchctl.vehicle import Telemetry
 from tests.helpers.capture import TURNS, UPRIGHT, named_up
 from tests.helpers.carried import lifted_and_turned
+from tests.helpers.checks import said
 from tests.helpers.mission import telemetry
 
 CONFIG = PositioningConfig(by="mocap", host="lab", body="cf2")
@@ -58,9 +66,6 @@ def recorded(
 ) -> Finding:
     """The finding on what a capture says that has the vehicle as ``world R body``, and of what the
     vehicle says itself, from a heading of its own: both with noise, the capture late."""
-    from perchctl.geometry import quaternion_from_rotation
-    from perchctl.positioning import Placed
-
     rng = np.random.default_rng(seed)
     heading = rng.uniform(-math.pi, math.pi)
     origin = np.array([0.4, -0.2, 0.01])
@@ -68,7 +73,7 @@ def recorded(
     places: list[Placed] = []
     for t_s in np.arange(0.0, LASTS_S, 0.025):
         _, R = motion(t_s, *own)
-        roll, pitch, yaw = (float(a) for a in _rpy(rot_z(heading) @ R))
+        roll, pitch, yaw = (float(a) for a in rpy_from_rotation(rot_z(heading) @ R))
         noise = rng.normal(0.0, 0.004, 4)
         shake = 0.1 * (own[0] > 0) * bump(t_s, 1.0, 2.0)
         samples.append(telemetry(
@@ -82,12 +87,6 @@ def recorded(
         pose = BodyPose(tuple(place), quaternion_from_rotation(R_seen))
         places.append(Placed.of(pose, config, float(t_s)))
     return capture.hand_finding(capture.paired(samples, places), config)
-
-
-def _rpy(R: Array) -> tuple[float, float, float]:
-    from perchctl.geometry import rpy_from_rotation
-
-    return rpy_from_rotation(R)
 
 
 def test_a_true_capture_passes() -> None:
@@ -141,24 +140,19 @@ def test_the_heading_of_the_capture_is_its_own_affair(turn: Array) -> None:
     assert recorded(4, turn).verdict is Verdict.PASS
 
 
-@given(st.floats(0.3, 0.5), st.integers(0, 9))
-@settings(max_examples=5, deadline=None)
-def test_millimetres_are_named(lift: float, seed: int) -> None:
-    row = recorded(seed, scale=1000.0, own=(lift / 0.3, 1.0, 1.0))
-    assert row.verdict is Verdict.FAIL
-    assert "millimetres" in row.found
-
-
-@pytest.mark.parametrize(("own", "seen", "words"), [
-    ((1.0, 1.0, 1.0), (0.0, 0.0, 0.0), "the vehicle moves, and the rigid body 'cf2' stands"),
-    ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), "the rigid body 'cf2' moves, and the vehicle stands"),
-    ((1.0, 1.0, 1.0), (1.0, -1.0, 0.6), "does not turn as the vehicle does"),
-    ((1.0, 1.0, 1.0), (1.0, 0.0, 0.0), "does not turn as the vehicle does"),
+@pytest.mark.parametrize(("own", "seen", "scale", "words"), [
+    ((1.0, 1.0, 1.0), (0.0, 0.0, 0.0), 1.0, "the vehicle moves, and the rigid body 'cf2' stands"),
+    ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 1.0, "the rigid body 'cf2' moves, and the vehicle stands"),
+    ((1.0, 1.0, 1.0), (1.0, -1.0, 0.6), 1.0, "does not turn as the vehicle does"),
+    ((1.0, 1.0, 1.0), (1.0, 0.0, 0.0), 1.0, "does not turn as the vehicle does"),
+    ((1.0, 1.0, 1.0), None, 1000.0, "millimetres"),
+    ((1.7, 1.0, 1.0), None, 1000.0, "millimetres"),
 ])  # fmt: skip
-def test_another_body_is_named(
-    own: tuple[float, float, float], seen: tuple[float, float, float], words: str
-) -> None:
-    row = recorded(5, own=own, seen=seen)
+def test_another_body_or_unit_is_named(
+    own: tuple[float, float, float], seen: tuple[float, float, float] | None, scale: float,
+    words: str,
+) -> None:  # fmt: skip
+    row = recorded(5, own=own, seen=seen, scale=scale)
     assert row.verdict is Verdict.FAIL
     assert words in row.found
 
@@ -172,28 +166,35 @@ def test_a_mirrored_world_is_named(axis: int) -> None:
     assert re.search("mirrored|swapped axes", row.found)
 
 
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+@pytest.mark.parametrize("world", [I3, Y_UP], ids=["as it is", "y up"])
 @pytest.mark.parametrize(("own", "verdict", "words"), [
     ((0.0, 0.0, 0.0), "skipped", "not moved"),
     ((1.0, 0.0, 0.0), "warn", "too few axes"),
     ((1.0, 1.0, 0.0), "warn", "too few axes"),
-    ((0.0, 1.0, 1.0), "warn", "not lifted"),
 ])  # fmt: skip
 def test_what_too_small_a_motion_cannot_tell_is_no_pass(
-    own: tuple[float, float, float], verdict: str, words: str
+    own: tuple[float, float, float], verdict: str, words: str, world: Array
 ) -> None:
-    row = recorded(7, own=own)
+    row = recorded(7, world, world.T, own=own)
     assert row.verdict == verdict, row
     assert words in row.found
     assert row.advice == capture.HOW_TO_TURN
 
 
-@pytest.mark.parametrize("own", [(1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
-def test_a_lift_or_a_turn_alone_finds_another_axis_up(own: tuple[float, float, float]) -> None:
-    y_up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    row = recorded(8, y_up, y_up.T, own=own)
-    assert row.verdict is Verdict.FAIL
-    assert "swapped axes" in row.found
-    assert "y" in row.found
+def test_a_turn_without_a_lift_is_no_pass() -> None:
+    """Nor is a lift along another axis, though the turns are right."""
+    for row in (recorded(7, own=(0.0, 1.0, 1.0)), recorded(7, mirror=Y_UP)):
+        assert (row.verdict, "not lifted" in row.found) == (Verdict.WARN, True), row
+
+
+def truly_moved(way: Way, from_s: float, to_s: float) -> capture.Moved:
+    """Vehicle and capture agree on that way."""
+    moments = [way.at(float(t_s)) for t_s in np.arange(from_s, to_s, capture.EVERY_S)]
+    R = Rotation.from_matrix([moment.R for moment in moments])
+    return capture.Moved(R, R, np.array([moment.position_m for moment in moments]), 0.2)
 
 
 @given(tilt_deg=st.floats(20.0, 40.0), before_s=st.floats(0.2, 5.0), after_s=st.floats(0.2, 20.0))
@@ -208,9 +209,7 @@ def test_what_is_asked_for_is_enough_however_long_it_stands(
         replace(stop, rpy_rad=(share * stop.rpy_rad[0], share * stop.rpy_rad[1], stop.rpy_rad[2]))
         for stop in lifted_and_turned(home)
     ])  # fmt: skip
-    moments = [way.at(float(t_s)) for t_s in np.arange(-before_s, 7.5 + after_s, capture.EVERY_S)]
-    R = Rotation.from_matrix([moment.R for moment in moments])
-    moved = capture.Moved(R, R, np.array([moment.position_m for moment in moments]), 0.2)
+    moved = truly_moved(way, -before_s, 7.5 + after_s)
     assert capture.is_enough(moved)
     assert capture.hand_finding(moved, CONFIG).verdict is Verdict.PASS
 
@@ -223,9 +222,7 @@ def test_a_hand_that_wobbles_has_tilted_nothing(wobble_deg: float, stands_s: flo
         Stop(1.0, up), Stop(0.8, up, (wobble, -wobble, turn / 2.0)),
         Stop(0.8, up, (-wobble, wobble, turn)), Stop(1.5, up), Stop(1.0, (0.0, 0.0, 0.0)),
     ])  # fmt: skip
-    moments = [way.at(float(t_s)) for t_s in np.arange(-0.5, 5.1 + stands_s, capture.EVERY_S)]
-    R = Rotation.from_matrix([moment.R for moment in moments])
-    moved = capture.Moved(R, R, np.array([moment.position_m for moment in moments]), 0.2)
+    moved = truly_moved(way, -0.5, 5.1 + stands_s)
     assert not capture.is_enough(moved)
     assert "too few axes" in capture.hand_finding(moved, CONFIG).found
 
@@ -235,3 +232,38 @@ def test_without_moments_of_both_nothing_is_said() -> None:
     sample = telemetry(0.0)
     assert capture.paired([sample, replace(sample, t_s=1.0)], []) is None
     assert capture.paired([], []) is None
+
+
+# --- Without a motion capture: the position that the vehicle reports --------------------------
+
+
+class Scripted:
+    """A link whose vehicle reports one height after another, and moves by so much."""
+
+    def __init__(self, heights_m: Sequence[float], moves_g: float) -> None:
+        self.heights_m, self.moves_g = list(heights_m), moves_g
+
+    def telemetry(self) -> list[Telemetry]:
+        if not self.heights_m:
+            return []
+        place_m = (0.0, 0.0, self.heights_m.pop(0))
+        return [said(position_m=place_m, acc_z_g=1.0 + self.moves_g)]
+
+
+@pytest.mark.parametrize(("heights_m", "moves_g", "verdict", "words", "most_s"), [
+    ([0.01, 0.3, 0.4, 0.01, *[0.0] * 50], 0.2, "pass", "rose by 0.39 m", 0.5),
+    ([0.01] * 30, 0.0, "skipped", "not moved", 3.0),
+    ([0.01] * 30, 0.3, "fail", "it moved, and the position", 3.0),
+    ([0.01, 0.1, 0.01], 0.2, "skipped", "not enough to tell", 3.0),
+    ([0.0, 0.4, 0.25], 0.2, "warn", "then +0.25 m", 3.0),
+    ([], 0.0, "skipped", "no telemetry", 3.0),
+])  # fmt: skip
+def test_a_lift_makes_its_row_and_ends_once_the_vehicle_is_back(
+    heights_m: list[float], moves_g: float, verdict: str, words: str, most_s: float
+) -> None:
+    waits: list[float] = []
+    link = Scripted(heights_m, moves_g)
+    finding = vehicle.lift_finding(vehicle.watch_lift(link, waits.append, 3.0))  # type: ignore[arg-type]
+    assert finding.verdict == verdict, finding
+    assert words in finding.found
+    assert sum(waits) == pytest.approx(most_s, abs=0.11)

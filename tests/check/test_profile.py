@@ -34,7 +34,7 @@ CASES: tuple[tuple[str, Mapping[str, Any], str], ...] = (
     ("thresholds", {"planner.perch.mode": "raw", "planner.perch.thrust": 30000}, "30000"),
     ("thresholds", {"safety.start_tilt_deg": 30, "safety.max_tilt_deg": 30}, "cuts the motors"),
     ("thresholds", {"safety.max_tilt_deg": 15}, "a gust"),
-    ("thresholds", {"safety.heading_lost_deg": 15}, "by thrust alone"),
+    ("thresholds", {"safety.jump_deg": 45}, "by thrust alone"),
     ("thresholds", {"safety.estimator_variance_m2": 0.1}, "that it lands for"),
     ("thresholds", {"link.telemetry_period_s": 0.06}, "one lost packet"),
     ("way", {"planner.approach_xy_m": [1.5, 1.5]}, "2.12 m"),

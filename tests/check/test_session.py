@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,11 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import CheckScope, Verdict, camera, check, session, vehicle
+from perchctl.check import CheckScope, Verdict, camera, check, session
 from perchctl.commands.check import exit_code
 from perchctl.errors import UsageError, broken_motion_capture
-from perchctl.link import ProbeLink, ScanResult, find_vehicles
-from perchctl.profile import LinkConfig, PositioningConfig, Profile
+from perchctl.link import ScanResult, find_vehicles
+from perchctl.profile import PositioningConfig, Profile
 from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options, wait_for
 from tests.helpers.flights import short_profile
@@ -107,63 +107,35 @@ def test_a_link_that_is_lost_on_the_way_is_told() -> None:
     assert rows["decks"].verdict is rows["battery"].verdict is Verdict.SKIPPED
 
 
-@pytest.mark.long
-def test_a_vehicle_that_falls_silent_after_its_rows_is_told() -> None:
-    """The rows before were true when they were asked for; at the end they are not."""
-    with SimProcess.start() as sim:
-        probe = ProbeLink(sim.uri, LinkConfig(connect_timeout_s=30.0), time.monotonic)
-        probe.connect()
-        try:
-            asked = session.VehicleSession(probe, sim.uri, Profile(), None, CheckScope(**QUICK))
-            rows = []
-            for row in asked.answering_rows():
-                rows.append(row)
-                if row.name == vehicle.LIFTED:
-                    sim.silence(60.0)
-                    while probe.lost() is None and probe.age_s() <= vehicle.GONE_S:
-                        wait_for(sim, 0.1)
-        finally:
-            probe.close()
-    assert rows[-1].name == "link"
-    assert rows[-1].verdict is Verdict.FAIL
-    assert "the vehicle is gone" in rows[-1].found
+def answerer() -> tuple[socket.socket, str]:
+    """Something that answers a scan on one of the ports that cflib asks, and its address."""
+    answering = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
+    def answer() -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                datagram, address = answering.recvfrom(64)
+                answering.sendto(datagram, address)
 
-class Answerer:
-    """Something that answers a scan on one of the ports that cflib asks."""
-
-    def __init__(self) -> None:
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        for port in range(19859, 19849, -1):
-            try:
-                self.socket.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            self.uri = f"udp://127.0.0.1:{port}"
-            threading.Thread(target=self._run, daemon=True).start()
-            return
-        pytest.skip("all ports of the scan are taken")
-
-    def _run(self) -> None:
-        while True:
-            try:
-                datagram, address = self.socket.recvfrom(64)
-                self.socket.sendto(datagram, address)
-            except OSError:
-                return
+    for port in range(19859, 19849, -1):
+        with contextlib.suppress(OSError):
+            answering.bind(("127.0.0.1", port))
+            threading.Thread(target=answer, daemon=True).start()
+            return answering, f"udp://127.0.0.1:{port}"
+    pytest.skip("all ports of the scan are taken")
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_scan_names_what_answers() -> None:
     """cflib leaves the sockets of its scan open."""
-    answerer = Answerer()
+    answering, uri = answerer()
     try:
         found = find_vehicles("radio://0/80/2M/E7E7E7E701")
         rows = {row.found: row for row in session.scan_rows(None)}
     finally:
-        answerer.socket.close()
-    assert answerer.uri in found.uris
-    assert rows[f"{answerer.uri} answers"].verdict is Verdict.PASS
+        answering.close()
+    assert uri in found.uris
+    assert rows[f"{uri} answers"].verdict is Verdict.PASS
     radio = next(row for row in rows.values() if row.name == "radio")
     if found.radio:  # where there is none, it is said
         assert radio.verdict is Verdict.SKIPPED

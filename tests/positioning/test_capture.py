@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import pytest
@@ -74,15 +75,12 @@ def test_frames_come_with_the_time_of_their_arrival(faulty: Callable[..., Motion
     assert frame.bodies["cf"].position_m[0] > 1.0
 
 
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [
-        ("refuses", "no motion capture at vicon:refuses: Error connecting QTM"),
-        ("aborts", "its reader ended with code 134: what(): Network is unreachable"),
-        ("hangs", "no answer within 0.3 s"),
-        ("silent", "connected, but no frame within 0.3 s"),
-    ],
-)
+@pytest.mark.parametrize(("fault", "words"), [
+    ("refuses", "no motion capture at vicon:refuses: Error connecting QTM"),
+    ("aborts", "its reader ended with code 134: what(): Network is unreachable"),
+    ("hangs", "no answer within 0.3 s"),
+    ("silent", "connected, but no frame within 0.3 s"),
+])  # fmt: skip
 def test_none_is_one_sentence_in_bounded_time(
     faulty: Callable[..., MotionCapture], fault: str, words: str
 ) -> None:
@@ -113,24 +111,22 @@ def test_vrpn_answers_by_bodies_alone(faulty: Callable[..., MotionCapture]) -> N
     assert faulty("empty", system="vicon").problem(time.monotonic()) is None
 
 
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [
-        (
-            "dies",
-            "motion capture at vicon:dies: its reader ended with code 7: the camera burnt",
-        ),
-        ("raises", "motion capture at vicon:raises failed: subject table changed"),
-        ("stalls", "motion capture at vicon:stalls has sent no frame for 0."),
-    ],
-)
-def test_what_ends_on_the_way_is_named(
+@pytest.mark.parametrize(("fault", "words"), [
+    ("dies", "vicon:dies: its reader ended with code 7: the camera burnt"),
+    ("raises", "vicon:raises failed: subject table changed"),
+    ("stalls", "vicon:stalls has sent no frame for 0."),
+])  # fmt: skip
+def test_what_ends_on_the_way_is_named_and_closing_ends_the_process(
     faulty: Callable[..., MotionCapture], fault: str, words: str
 ) -> None:
     capture = faulty(fault)
-    until(lambda: words in problem(capture))
+    until(lambda: f"motion capture at {words}" in problem(capture))
     capture.poll(time.monotonic())
     assert capture.poll(time.monotonic()) is None
+    capture.close()
+    capture.close()
+    assert capture._child.poll() is not None
+    assert not capture._reading.is_alive()
 
 
 def test_a_flood_of_frames_fills_nothing(faulty: Callable[..., MotionCapture]) -> None:
@@ -163,14 +159,6 @@ def test_bodies_that_come_one_by_one_do_not_hide_each_other(
     frame = capture.poll(time.monotonic())
     assert frame is not None
     assert set(frame.bodies) == {"cf"}
-
-
-def test_closing_ends_the_process_wherever_it_is(faulty: Callable[..., MotionCapture]) -> None:
-    capture = faulty("stalls")
-    capture.close()
-    capture.close()
-    assert capture._child.poll() is not None
-    assert not capture._reading.is_alive()
 
 
 @pytest.mark.long
@@ -227,16 +215,18 @@ def test_without_a_host_or_the_library_nothing_is_opened(monkeypatch: pytest.Mon
     assert isinstance(caught.value, PerchError)
 
 
-def test_a_port_goes_where_the_library_wants_it() -> None:
-    def options(system: str, host: str) -> dict[str, str]:
-        config = PositioningConfig.model_validate({"by": "mocap", "system": system, "host": host})
-        return setup_of(config).options
-
-    assert options("qualisys", "lab:22223") == {"hostname": "lab", "port": "22223"}
-    assert options("optitrack", "10.0.0.2:1511") == {"hostname": "10.0.0.2", "port_command": "1511"}
-    assert options("vrpn", "lab:3884") == {"hostname": "lab:3884"}
-    assert options("vicon", "lab:801") == {"hostname": "lab:801"}
-    assert options("qualisys", "lab") == {"hostname": "lab"}
+@pytest.mark.parametrize(("system", "host", "options"), [
+    ("qualisys", "lab:22223", {"hostname": "lab", "port": "22223"}),
+    ("optitrack", "10.0.0.2:1511", {"hostname": "10.0.0.2", "port_command": "1511"}),
+    ("vrpn", "lab:3884", {"hostname": "lab:3884"}),
+    ("vicon", "lab:801", {"hostname": "lab:801"}),
+    ("qualisys", "lab", {"hostname": "lab"}),
+])  # fmt: skip
+def test_a_port_goes_where_the_library_wants_it(
+    system: str, host: str, options: dict[str, str]
+) -> None:
+    config = PositioningConfig.model_validate({"by": "mocap", "system": system, "host": host})
+    assert setup_of(config).options == options
 
 
 def test_the_real_library_through_its_process() -> None:
@@ -286,42 +276,13 @@ def test_a_reader_outlives_the_time_in_which_it_was_set_up(monkeypatch: pytest.M
     own.close()
 
 
-class Parent:
-    """Gives the setup, and takes what is said."""
-
-    def __init__(self, setup: capture.CaptureSetup, gone: bool = False) -> None:
-        self.setup, self.gone, self.said = setup, gone, list[Any]()
-
-    def receive(self, timeout_s: float) -> capture.CaptureSetup:
-        return self.setup
-
-    def send(self, message: Any) -> None:
-        if self.gone:
-            raise BrokenPipeError
-        self.said.append(message)
-
-
-def test_a_host_that_cannot_be_resolved_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_host_that_cannot_be_resolved_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def resolve(name: str) -> str:
         raise socket.gaierror(-2, "Name or service not known")
 
-    parent = Parent(capture.CaptureSetup("optitrack", {"hostname": "lab"}))
-    monkeypatch.setattr(capture, "connect_back", lambda: parent)
-    monkeypatch.setattr(capture, "_loaded", lambda: None)
-    monkeypatch.setattr(capture.signal, "signal", lambda *_: None)
     monkeypatch.setattr(capture.socket, "gethostbyname", resolve)
-    capture.serve_parent()
-    (said,) = parent.said
-    assert isinstance(said, capture.Failed)
-    assert "Name or service not known" in said.text
-
-
-def test_a_parent_that_is_gone_is_left_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
-    parent = Parent(capture.CaptureSetup("vicon", {"hostname": "lab"}), gone=True)
-    monkeypatch.setattr(capture, "connect_back", lambda: parent)
-    monkeypatch.setattr(capture, "_loaded", lambda: lambda kind, options: None)
-    monkeypatch.setattr(capture.signal, "signal", lambda *_: None)
-    capture.serve_parent()
+    with pytest.raises(ConnectionFailed, match=r"'lab' cannot be resolved.*service not known"):
+        capture._by_address(CaptureSetup("optitrack", {"hostname": "lab"}))
 
 
 class Clock:
@@ -347,24 +308,16 @@ class Client:
         self.clock.t_s += wait_s
 
 
-class Sent:
-    def __init__(self) -> None:
-        self.frames: list[capture.Arrived] = []
-
-    def send(self, frame: capture.Arrived) -> None:
-        self.frames.append(frame)
-
-
 def test_what_waited_in_the_library_s_queue_is_not_passed_on_as_new(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """After a pause come the frames of the pause, one upon the other, the oldest first."""
-    clock, sent = Clock(), Sent()
+    clock, sent = Clock(), list[capture.Arrived]()
     monkeypatch.setattr(capture, "time", clock)
     steady, queued = [0.01] * 3, [0.5, 1e-5, 1e-5, 1e-5]
+    channel: Any = SimpleNamespace(send=sent.append)
     with pytest.raises(RuntimeError):
-        capture._pass_on(Client(clock, steady + queued + steady), sent, False)  # type: ignore[arg-type]
-    times_s = [frame.t_s for frame in sent.frames]
+        capture._pass_on(Client(clock, steady + queued + steady), channel, False)
     begun_s = 100.0 + sum(steady) + sum(queued)
-    assert len(times_s) == 2 * len(steady)
-    assert not [t_s for t_s in times_s if 100.0 + sum(steady) + 1e-6 < t_s <= begun_s + 1e-6]
+    assert len(sent) == 2 * len(steady)
+    assert not [f.t_s for f in sent if 100.0 + sum(steady) + 1e-6 < f.t_s <= begun_s + 1e-6]

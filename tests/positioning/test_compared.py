@@ -25,8 +25,7 @@ from tests.helpers.capture import compared as was_compared
 
 CONFIG = PositioningConfig(by="mocap", host="lab", body="cf2")
 NOW = datetime(2026, 11, 22, 15, 0, tzinfo=timezone(timedelta(hours=2)))
-URI, OTHER_URI = "udp://127.0.0.1:1", "udp://127.0.0.1:2"
-VEHICLE, OTHER = "udp/127.0.0.1:1", "udp/127.0.0.1:2"
+URI, VEHICLE = "udp://127.0.0.1:1", "udp/127.0.0.1:1"
 SWAPPED = "swapped axes: up is y in the motion capture"
 DAY_S = 24 * 3600.0
 YEAR_1 = "0001-01-01T00:00:00+05:00"  # which no other time zone can tell
@@ -102,62 +101,44 @@ def test_what_is_no_record_is_told_as_such(data: bytes) -> None:
     assert is_unreadable(compared.load_comparison(CONFIG, VEHICLE))
 
 
-@pytest.mark.parametrize("change", OTHERS)
-def test_another_set_up_was_never_compared(change: dict[str, Any], folder: Path) -> None:
+@pytest.mark.parametrize(("change", "vehicle"), [
+    *((change, VEHICLE) for change in OTHERS), ({}, "udp/127.0.0.1:2"),
+])  # fmt: skip
+def test_another_set_up_or_vehicle_was_never_compared(
+    change: dict[str, Any], vehicle: str, folder: Path
+) -> None:
     was_compared(CONFIG, URI)
     other = CONFIG.model_copy(update=change)
-    assert compared.load_comparison(other, VEHICLE) == NEVER
+    assert compared.load_comparison(other, vehicle) == NEVER
     # Nor by a file that was copied to its place.
-    mine, theirs = (compared.path_of(c, VEHICLE) for c in (CONFIG, other))
+    mine, theirs = compared.path_of(CONFIG, VEHICLE), compared.path_of(other, vehicle)
     theirs.write_bytes(mine.read_bytes())
-    assert is_unreadable(compared.load_comparison(other, VEHICLE))
+    assert is_unreadable(compared.load_comparison(other, vehicle))
 
 
-def test_another_vehicle_s_record_lets_none_fly() -> None:
-    """Two vehicles with the same body's name by turns."""
-    was_compared(CONFIG, OTHER_URI)
-    with pytest.raises(SafetyAbort, match="never compared with this vehicle"):
-        session.require_comparison(CONFIG, URI, simulated=False)
-    session.require_comparison(CONFIG, OTHER_URI, simulated=False)
-    # Nor by a file that was copied to its place.
-    mine, theirs = (compared.path_of(CONFIG, v) for v in (VEHICLE, OTHER))
-    mine.write_bytes(theirs.read_bytes())
-    assert is_unreadable(compared.load_comparison(CONFIG, VEHICLE))
-
-
-def test_a_vehicle_found_by_another_dongle_is_the_same() -> None:
+def test_what_says_nothing_of_the_axes_and_another_dongle_are_no_other_set_up() -> None:
     was_compared(CONFIG, "radio://0/80/2M/E7E7E7E701")
-    session.require_comparison(CONFIG, "radio://1/80/2M/e7e7e7e701", simulated=False)
-    with pytest.raises(SafetyAbort, match="never compared"):
-        session.require_comparison(CONFIG, "radio://0/80/2M/E7E7E7E702", simulated=False)
-
-
-def test_what_says_nothing_of_the_axes_is_no_other_set_up() -> None:
-    was_compared(CONFIG, URI)
     same = CONFIG.model_copy(update={"rate_hz": 50.0, "send": "pose", "hold_s": 0.2})
-    assert isinstance(compared.load_comparison(same, VEHICLE), Comparison)
-
-
-def spoil(how: str) -> None:
-    path = compared.path_of(CONFIG, VEHICLE)
-    if how == "folder":
-        path.unlink()
-        path.mkdir()
-    else:
-        text = {
-            "empty": "", "cut": path.read_text()[:40],
-            "no zone": path.read_text().replace("+00:00", ""),
-            "deep": "[" * 50_000,
-            "year 1": json.dumps(json.loads(path.read_text()) | {"at": YEAR_1}),
-        }[how]  # fmt: skip
-        path.write_text(text, encoding="utf-8")
+    session.require_comparison(same, "radio://1/80/2M/e7e7e7e701", simulated=False)
+    with pytest.raises(SafetyAbort, match="never compared with this vehicle"):
+        session.require_comparison(CONFIG, "radio://0/80/2M/E7E7E7E702", simulated=False)
 
 
 @pytest.mark.parametrize("how", ["empty", "cut", "no zone", "deep", "year 1", "folder"])
 def test_a_damaged_record_refuses_in_one_sentence(how: str) -> None:
     was_compared(CONFIG, URI)
     session.require_comparison(CONFIG, URI, simulated=False)
-    spoil(how)
+    path = compared.path_of(CONFIG, VEHICLE)
+    whole = path.read_text(encoding="utf-8")
+    path.unlink()
+    if how == "folder":
+        path.mkdir()
+    else:
+        text = {
+            "empty": "", "cut": whole[:40], "no zone": whole.replace("+00:00", ""),
+            "deep": "[" * 50_000, "year 1": json.dumps(json.loads(whole) | {"at": YEAR_1}),
+        }[how]  # fmt: skip
+        path.write_text(text, encoding="utf-8")
     with pytest.raises(SafetyAbort, match=r"is not known: .*remove that file") as refused:
         session.require_comparison(CONFIG, URI, simulated=False)
     assert "\n" not in str(refused.value)
@@ -181,35 +162,29 @@ def test_what_did_not_pass_ends_an_older_pass(lifted: Any) -> None:
 
 
 def test_a_lift_that_told_nothing_leaves_the_record_as_it_is() -> None:
-    row = save_row(skipped("not moved"), CONFIG, URI, session.wall_date())
-    assert "was never compared" in row.found
-    was_compared(CONFIG, URI)
-    row = save_row(skipped("not moved"), CONFIG, URI, session.wall_date())
-    assert row.verdict is Verdict.PASS
+    for verdict in (Verdict.WARN, Verdict.PASS):
+        row = save_row(skipped("not moved"), CONFIG, URI, session.wall_date())
+        assert row.verdict is verdict
+        was_compared(CONFIG, URI)
 
 
-def test_a_record_that_cannot_be_written_warns(folder: Path) -> None:
-    folder.write_text("in the way", encoding="utf-8")
-    row = save_row(passed("fine"), CONFIG, URI, session.wall_date())
-    assert row.verdict is Verdict.WARN
-    assert "not written" in row.found
-    with pytest.raises(SafetyAbort):
-        session.require_comparison(CONFIG, URI, simulated=False)
-
-
-@pytest.mark.parametrize("removable", [True, False])
+@pytest.mark.parametrize(("lifted", "removable", "verdict"), [
+    (passed("fine"), True, Verdict.WARN), (failed(SWAPPED, ""), True, Verdict.WARN),
+    (failed(SWAPPED, ""), False, Verdict.FAIL),
+])  # fmt: skip
 def test_an_unwritten_finding_leaves_no_older_pass_unsaid(
-    removable: bool, monkeypatch: pytest.MonkeyPatch
+    lifted: Any, removable: bool, verdict: Verdict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    was_compared(CONFIG, URI)
+    if lifted.verdict is Verdict.FAIL:
+        was_compared(CONFIG, URI)
     monkeypatch.setattr(compared, "write_files", full)
     if not removable:
         monkeypatch.setattr(Path, "unlink", full)
-    row = save_row(failed(SWAPPED, ""), CONFIG, URI, session.wall_date())
-    assert row.verdict is (Verdict.WARN if removable else Verdict.FAIL)
+    row = save_row(lifted, CONFIG, URI, session.wall_date())
+    assert row.verdict is verdict
     assert "No space left" in row.found
     if removable:
         with pytest.raises(SafetyAbort, match="never compared"):

@@ -42,8 +42,10 @@ def test_the_option_wins_over_the_profile(tmp_path: Path) -> None:
     ("{host: lab, body: cf2}", "host, body are given, but by is deck: write by: mocap"),
     ("{system: vicon}", "system is given, but by is deck: write by: mocap"),
     ("{by: deck, host: lab}", "host is given, but by is deck: write by: mocap"),
+    *((f"{{by: mocap, host: '{host}'}}", f"host is NAME or NAME:PORT (1 to 65535), found '{host}'")
+      for host in ("http://lab", "lab:0", "lab:70000", "lab:x", "lab/1", "a b")),
 ])  # fmt: skip
-def test_keys_of_a_capture_are_not_silently_the_deck(
+def test_a_section_that_cannot_be_meant_is_refused(
     tmp_path: Path, section: str, words: str
 ) -> None:
     profile = tmp_path / "lab.yaml"
@@ -63,12 +65,6 @@ def test_the_deck_over_a_capture_leaves_a_record_that_can_be_read_again(tmp_path
     assert "positioning  the vehicle's own deck\n" in text
 
 
-def test_other_words_are_refused() -> None:
-    done = fly("--positioning", "gps", "--dry-run")
-    assert done.exit_code == 30
-    assert "'gps' is unknown; allowed are deck, mocap, target" in done.stderr
-
-
 def test_the_target_brings_its_own_limits_and_leaves_none_behind() -> None:
     """Its places come late and with gaps; a capture's, or a deck's, flight keeps its own."""
     own = PositioningConfig.model_validate({"by": "target"})
@@ -84,22 +80,16 @@ def test_the_target_brings_its_own_limits_and_leaves_none_behind() -> None:
     json.loads(fly("-p", "target_only", "--dry-run", "--json").stdout)
 
 
-def test_a_real_vehicle_needs_the_computer_of_its_capture() -> None:
-    done = fly("--positioning", "mocap", *REAL)
+@pytest.mark.parametrize(("words", "complaints"), [
+    (("gps", "--dry-run"), ("'gps' is unknown; allowed are deck, mocap, target",)),
+    (("mocap", *REAL), ("positioning.host", "one of vicon, optitrack, qualisys, vrpn", "body")),
+])  # fmt: skip
+def test_other_words_and_a_capture_without_a_computer_are_refused(
+    words: tuple[str, ...], complaints: tuple[str, ...]
+) -> None:
+    done = fly("--positioning", *words)
     assert done.exit_code == 30
-    for words in ("positioning.host", "one of vicon, optitrack, qualisys, vrpn", "body"):
-        assert words in done.stderr
-    assert "(vicon)" not in done.stderr
-
-
-@pytest.mark.parametrize("host", ["http://lab", "lab:0", "lab:70000", "lab:x", "lab/1", "a b"])
-def test_a_host_that_is_none_is_refused_in_the_profile(tmp_path: Path, host: str) -> None:
-    profile = tmp_path / "lab.yaml"
-    text = f"extends: sim\npositioning: {{by: mocap, host: '{host}'}}\n"
-    profile.write_text(text, encoding="utf-8")
-    done = fly("-p", str(profile), "--dry-run")
-    assert done.exit_code == 30
-    assert f"host is NAME or NAME:PORT (1 to 65535), found '{host}'" in done.stderr
+    assert all(each in done.stderr for each in complaints)
 
 
 def test_the_library_that_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -130,10 +130,10 @@ def test_a_vehicle_that_is_carried_about_measures_no_place() -> None:
 
 def test_a_false_sight_among_good_ones_does_not_move_the_place() -> None:
     it = feed(Sent())
-    wrong = seen(Place(TARGET.position_m + 0.5, 1.0), attitude(0.0))
-    it.see(wrong, attitude(0.0), attitude(0.0), 0.0, at_rest=True)
-    for i in range(1, GROUND_FRAMES):
-        shown(it, attitude(i * FRAME_S), i * FRAME_S)
+    for i in range(GROUND_FRAMES):
+        place = TARGET if i else Place(TARGET.position_m + 0.5, 1.0)
+        at = attitude(i * FRAME_S)
+        shown(it, at, i * FRAME_S, pose=seen(place, at))
     assert it.target is not None
     np.testing.assert_allclose(it.target.position_m, TARGET.position_m, atol=1e-9)
 
@@ -170,14 +170,6 @@ def test_the_same_exposure_or_an_older_one_is_sent_no_second_time(again_s: float
     assert it.status(5.2).age_s == pytest.approx(0.2)
 
 
-def test_an_old_picture_is_no_place_of_now() -> None:
-    sent = Sent()
-    it = flying(sent)
-    shown(it, attitude(5.0, (0.0, 0.0, 1.0)), 5.0 + OLDEST_S + 0.01)
-    assert not sent.places
-    assert "old" in (it.status(6.0).problem or "")
-
-
 @given(off_m=st.floats(0.0, 3.0), silent_s=st.floats(0.05, 3.0))
 def test_what_estimate_and_blindness_cannot_explain_is_not_sent(
     off_m: float, silent_s: float
@@ -196,13 +188,17 @@ def test_what_estimate_and_blindness_cannot_explain_is_not_sent(
         assert "beside its estimate" in (it.status(t_s + 1.0).problem or "")
 
 
-def test_a_vague_or_endless_pose_is_not_sent() -> None:
+@pytest.mark.parametrize(("late_s", "sigma_m", "words"), [
+    (OLDEST_S + 0.01, 0.002, "old"), (0.05, 0.2, "unsure"), (0.05, math.nan, "unsure"),
+])  # fmt: skip
+def test_an_old_vague_or_endless_pose_is_not_sent(
+    late_s: float, sigma_m: float, words: str
+) -> None:
     sent = Sent()
-    it = flying(sent)
-    for i, sigma_m in enumerate((0.2, math.nan)):
-        pose = seen(TARGET, attitude(5.0 + i, (0.0, 0.0, 1.0)), sigma_m)
-        shown(it, attitude(5.0 + i, (0.0, 0.0, 1.0)), 5.05 + i, pose=pose)
+    it, at = flying(sent), attitude(5.0, (0.0, 0.0, 1.0))
+    shown(it, at, 5.0 + late_s, pose=seen(TARGET, at, sigma_m))
     assert not sent.places
+    assert words in (it.status(6.0).problem or "")
 
 
 def test_no_more_are_sent_than_the_rate_allows_and_none_waits() -> None:

@@ -77,7 +77,10 @@ def test_an_alias_is_not_written_through() -> None:
 
 def test_the_old_file_is_kept_beside_and_never_lost(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
-    path.write_text("extends: crazyflie\ncamera:\n  latency_s: 0.1  # a guess\n", encoding="utf-8")
+    path.write_text(
+        "extends: crazyflie\ncamera:\n  latency_s: 0.1  # a guess\n",
+        encoding="utf-8",
+    )
     first = path.read_text(encoding="utf-8")
     asides = [write_profile_values(path, {"camera.latency_s": number}) for number in (0.09, 0.08)]
     assert [aside.name for aside in asides] == ["mine.yaml.bak", "mine.yaml.bak2"]
@@ -96,13 +99,10 @@ def test_what_cannot_be_written_says_the_numbers(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["mine.yaml"]
 
 
-@pytest.mark.parametrize(
-    ("values", "fault"),
-    [
-        ({"camera.latency_s": 0.16}, r"camera\.latency_s.*safety\.max_frame_age_s"),
-        ({"vehicle.gear_body_m": (0.0, 0.0, 0.31)}, r"vehicle\.gear_body_m.*0\.31"),
-    ],
-)
+@pytest.mark.parametrize(("values", "fault"), [
+    ({"camera.latency_s": 0.16}, r"camera\.latency_s.*safety\.max_frame_age_s"),
+    ({"vehicle.gear_body_m": (0.0, 0.0, 0.31)}, r"vehicle\.gear_body_m.*0\.31"),
+])  # fmt: skip
 def test_a_profile_that_would_not_load_is_left_as_it_was(
     tmp_path: Path, values: dict[str, float], fault: str
 ) -> None:
@@ -117,38 +117,28 @@ def test_a_profile_that_would_not_load_is_left_as_it_was(
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
-def test_what_is_asked_before_the_writing_says_no_old_key_again(tmp_path: Path) -> None:
-    """The tests make a warning an error."""
-    path = tmp_path / "mine.yaml"
-    path.write_text("extends: sim\nplanner: {ascend: {near_m: 0.35}}\n", encoding="utf-8")
-    write_profile_values(path, {"camera.latency_s": 0.09})
-
-
 def test_permissions_stay_and_the_old_text_is_for_the_same_eyes(tmp_path: Path) -> None:
+    """An old key is not said again: the tests make a warning an error."""
     path = tmp_path / "mine.yaml"
     for mode in (0o600, 0o664):
-        path.write_text("extends: crazyflie\n", encoding="utf-8")
+        path.write_text("extends: sim\nplanner: {ascend: {near_m: 0.35}}\n", encoding="utf-8")
         path.chmod(mode)
         aside = write_profile_values(path, {"camera.latency_s": 0.09})
         assert (mode_of(path), mode_of(aside)) == (mode, mode)
 
 
-def test_a_read_only_profile_is_not_written_to(
+def test_a_read_only_or_a_shipped_profile_is_not_written_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "mine.yaml"
+    path, link = tmp_path / "own.yaml", tmp_path / "mine.yaml"
     path.write_text("extends: crazyflie\n", encoding="utf-8")
-    assert writable_profile(str(path)) == path
-    monkeypatch.setattr("os.access", lambda place, _mode: Path(place) != path)  # root may always
-    with pytest.raises(InvalidValue, match=r"mine\.yaml is read-only.*chmod u\+w .*-p"):
-        writable_profile(str(path))
-
-
-def test_a_shipped_profile_is_not_written_to(tmp_path: Path) -> None:
-    link = tmp_path / "mine.yaml"
     link.symlink_to(data_folder("profiles") / "sim.yaml")
     for name in ("sim", str(data_folder("profiles") / "crazyflie.yaml"), str(link)):
         with pytest.raises(InvalidValue, match=r"shipped.*cp .*yaml my_.*-p my_"):
             writable_profile(name)
     with pytest.raises(NotFound):
         writable_profile("no_such")
+    assert writable_profile(str(path)) == path
+    monkeypatch.setattr("os.access", lambda place, _mode: Path(place) != path)  # root may always
+    with pytest.raises(InvalidValue, match=r"own\.yaml is read-only.*chmod u\+w .*-p"):
+        writable_profile(str(path))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import BaseModel, ValidationError
@@ -14,7 +16,13 @@ import perchctl
 from perchctl.calibration import load_calibration
 from perchctl.errors import InvalidValue, Note, NotFound, PerchError, ProfileNote
 from perchctl.places import file_names
-from perchctl.profile import Profile, changed_profile, find_calibration, load_profile
+from perchctl.profile import (
+    Profile,
+    SimulationConfig,
+    changed_profile,
+    find_calibration,
+    load_profile,
+)
 from perchctl.record import FlightLog
 
 
@@ -80,13 +88,6 @@ def _refusal(tmp_path: Path, text: str) -> str:
            ["camera.latency_s", f"found {found};", "0 to 1 (seconds)", "the word measured"])
           for value, found in [("80", "80"), ("-0.1", "-0.1"), ("auto", "'auto'"),
                                ("null", "None"), (".nan", "nan")]),
-        *((f"camera: {{controls: {value}}}",
-           ["camera.controls", f"found {found}", "names with a whole number", "check --cameras"])
-          for value, found in [("80", "80"), ("[gain, 3]", "['gain', 3]"),
-                               ("{gain: 1.5}", "gain: 1.5"), ("{gain: {a: 1}}", "gain: {'a': 1}"),
-                               ("{3: 1}", "3: 1"), ("{gain: null}", "gain: None"),
-                               ("{auto: off}", "auto: False"), ("null", "None")]),
-        ("camera: {controls: {auto: on}}", ["write 1 for on and 0 for off"]),
         *((f"camera: {{format: {value}}}",
            ["camera.format", f"found {found};", "three or four capitals"])
           for value, found in [("4", "4"), ("mjpeg", "'mjpeg'"), ("[MJPG]", "['MJPG']")]),
@@ -135,17 +136,19 @@ def test_a_latency_is_a_time_or_measured(tmp_path: Path) -> None:
     assert load_profile(str(path)).camera.start_latency_s == 0.05
 
 
-@pytest.mark.parametrize("angles", ["[0.3, -1.57, 90.2]", "[0, 0, 1.56]", "[0, 180, -45]"])
-def test_a_measured_turn_is_not_taken_for_radians(tmp_path: Path, angles: str) -> None:
-    (tmp_path / "mine.yaml").write_text(f"camera: {{mount: {{rpy_deg: {angles}}}}}")
-    load_profile(str(tmp_path / "mine.yaml"))
-
-
-def test_truths_are_read_where_a_key_is_one(tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text("camera: {mirrored: yes}\nlog: {plot: off}\n")
+@pytest.mark.parametrize("text", [
+    *(f"camera: {{mount: {{rpy_deg: {angles}}}}}"  # measured, and no radians
+      for angles in ("[0.3, -1.57, 90.2]", "[0, 0, 1.56]", "[0, 180, -45]")),
+    "vehicle: {gear_body_m: &here [0.01, 0, 0.02]}\ncamera: {mount: {position_m: *here}}\n",
+    "camera: {mirrored: yes}\nlog: {plot: off}\n",
+])  # fmt: skip
+def test_what_could_be_mistaken_is_taken(tmp_path: Path, text: str) -> None:
+    (tmp_path / "mine.yaml").write_text(text)
     mine = load_profile(str(tmp_path / "mine.yaml"))
-    assert mine.camera.mirrored
-    assert not mine.log.plot
+    if "here" in text:
+        assert mine.vehicle.gear_body_m == mine.camera.mount.position_m == (0.01, 0, 0.02)
+    if "yes" in text:
+        assert (mine.camera.mirrored, mine.log.plot) == (True, False)
 
 
 def bomb(levels: int) -> str:
@@ -173,13 +176,6 @@ def test_no_fault_is_longer_than_a_few_lines(tmp_path: Path, text: str) -> None:
     assert len(str(caught.value)) < 500 + 2 * len(str(tmp_path))
 
 
-def test_a_few_aliases_are_what_they_are(tmp_path: Path) -> None:
-    text = "vehicle: {gear_body_m: &here [0.01, 0, 0.02]}\ncamera: {mount: {position_m: *here}}\n"
-    (tmp_path / "mine.yaml").write_text(text)
-    mine = load_profile(str(tmp_path / "mine.yaml"))
-    assert mine.vehicle.gear_body_m == mine.camera.mount.position_m == (0.01, 0, 0.02)
-
-
 def test_missing_profile_names_the_choices(tmp_path: Path) -> None:
     with pytest.raises(NotFound, match="sim"):
         load_profile("smi")
@@ -187,17 +183,13 @@ def test_missing_profile_names_the_choices(tmp_path: Path) -> None:
         load_profile(str(tmp_path / "none.yaml"))
 
 
-def test_extends_takes_the_rest_from_another_profile(tmp_path: Path) -> None:
+def test_extends_takes_the_rest_from_another_profile_but_not_in_a_circle(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("extends: paper\nkalman: {n_max: 5}\n")
     mine, paper = load_profile(str(path)), load_profile("paper")
-    assert mine.kalman.n_max == 5
-    assert mine.kalman.alpha == paper.kalman.alpha
+    assert (mine.kalman.n_max, mine.kalman.alpha) == (5, paper.kalman.alpha)
     assert mine.merge == paper.merge
     assert mine.name == "mine"
-
-
-def test_extends_in_a_circle_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("extends: b.yaml\n")
     (tmp_path / "b.yaml").write_text("extends: a.yaml\n")
     with pytest.raises(InvalidValue, match="comes back"):
@@ -209,28 +201,45 @@ def test_a_profile_round_trips_through_its_own_dump() -> None:
     assert Profile.model_validate(profile.model_dump(mode="json")) == profile
 
 
-@pytest.mark.parametrize("ids", [[1000, 5], [997, -1]])
-def test_a_neighbour_s_ids_are_of_the_own_dictionaries(ids: list[int]) -> None:
-    with pytest.raises(ValidationError, match="neighbour_ids"):
-        Profile.model_validate({"simulation": {"neighbour_ids": ids}})
+# --- keys and logs of earlier versions, and the harder worlds ----------------------------
 
 
-def test_a_key_that_is_a_constant_by_now_is_said_and_another_value_refused(tmp_path: Path) -> None:
-    path = tmp_path / "old.yaml"
-    path.write_text("extends: sim\nplanner: {ascend: {near_m: 0.35}}\n")
-    with pytest.warns(ProfileNote, match=r"planner\.ascend\.near_m .* it is 0\.35"):
-        assert load_profile(str(path)).planner.ascend.near_m == 0.35
-    path.write_text("extends: sim\nplanner: {ascend: {near_m: 0.5}}\n")
-    with pytest.raises(InvalidValue, match=r"near_m.*0\.35.*and 0\.5 here"):
-        load_profile(str(path))
-    with pytest.raises(InvalidValue, match=r"--set: planner\.ascend\.near_m is no longer"):
-        changed_profile(load_profile("sim"), ["planner.ascend.near_m=0.5"])
+@pytest.mark.parametrize(("text", "words"), [
+    ("planner: {ascend: {near_m: 0.35}}", r"planner\.ascend\.near_m .* it is 0\.35"),
+    ("simulation: {set: nominal, gloss: [0.2, 0.8]}", "no longer used"),
+    ("camera: {controls: {gain: 20}}", r"camera\.controls is no longer used"),
+])  # fmt: skip
+def test_a_key_that_is_a_constant_or_gone_is_named(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "old.yaml").write_text(f"extends: sim\nname: sim\n{text}\n")
+    with pytest.warns(ProfileNote, match=words):
+        old = load_profile(str(tmp_path / "old.yaml"))
+    assert old == load_profile("sim")
+
+
+@pytest.mark.parametrize(("key", "value", "words"), [
+    ("planner.ascend.near_m", "0.5", r"near_m.*0\.35.*and 0\.5 here"),
+    ("simulation.set", "rough", r"simulation\.set.*extend the profile rough"),
+])  # fmt: skip
+def test_another_value_of_a_constant_is_refused(
+    tmp_path: Path, key: str, value: str, words: str
+) -> None:
+    *sections, name = key.split(".")
+    opened, closed = "".join(f"{section}: {{" for section in sections), "}" * len(sections)
+    (tmp_path / "old.yaml").write_text(f"extends: sim\n{opened}{name}: {value}{closed}\n")
+    with pytest.raises(InvalidValue, match=words):
+        load_profile(str(tmp_path / "old.yaml"))
+    with pytest.raises(InvalidValue, match=rf"--set: {re.escape(key)} is no longer"):
+        changed_profile(load_profile("sim"), [f"{key}={value}"])
 
 
 def test_a_profile_in_an_old_log_is_read() -> None:
+    """It holds every key, also of the world in which was flown."""
+    values = load_profile("extreme").model_dump(mode="json")
+    values["simulation"] |= {"set": "extreme", "gust_mps": [0.2, 0.6], "drift_xyz_mps": None}
+    values["simulation"] |= {"camera_burst_start_s": [4.0, 22.0]}
+    assert Profile.model_validate(values) == load_profile("extreme")
     values = load_profile("sim").model_dump(mode="json")
     values["planner"]["ascend"]["near_m"] = 0.35
-    assert Profile.model_validate(values) == load_profile("sim")
     assert Profile.lost_values(values) == []
     values["planner"]["ascend"]["near_m"] = 0.5
     log = FlightLog(Path("f.jsonl"), {"profile": values}, [], [], None, True)
@@ -238,14 +247,29 @@ def test_a_profile_in_an_old_log_is_read() -> None:
         assert log.flown_profile == load_profile("sim")
 
 
-def test_a_calibration_is_found_beside_the_profile_that_names_it(tmp_path: Path) -> None:
-    text = find_calibration("example_640x480").read_text(encoding="utf-8")
-    (tmp_path / "base").mkdir()
-    (tmp_path / "base" / "lens.yaml").write_text(text, encoding="utf-8")
-    (tmp_path / "base" / "base.yaml").write_text("camera: {calibration: lens.yaml}\n")
-    (tmp_path / "mine.yaml").write_text("extends: base/base.yaml\n")
-    mine = load_profile(str(tmp_path / "mine.yaml"))
-    assert Path(mine.camera.calibration) == (tmp_path / "base" / "lens.yaml").resolve()
+@pytest.mark.parametrize("name", ["rough", "extreme"])
+def test_a_harder_world_is_sim_in_all_else(name: str) -> None:
+    """It settles less exactly there."""
+    sim, world = load_profile("sim"), load_profile(name)
+    assert world.simulation != sim.simulation == SimulationConfig()
+    assert world.planner.ascend.settle_xy_m > sim.planner.ascend.settle_xy_m
+    own = ("name", "description", "simulation", "planner")
+    assert sim == world.model_copy(update={key: getattr(sim, key) for key in own})
+    ascend = world.planner.ascend.model_copy(update={"settle_xy_m": sim.planner.ascend.settle_xy_m})
+    assert world.planner.model_copy(update={"ascend": ascend}) == sim.planner
+
+
+@pytest.mark.parametrize("values", [
+    {"neighbour_ids": [1000, 5]}, {"neighbour_ids": [997, -1]}, {"flow_noise_radps": (-0.1, 0.2)},
+    {"radio_loss": (0.0, 0.9)}, {"radio_burst_s": (0.0, 0.1)}, {"target_tilt_deg": (3.0, 1.0)},
+    {"cell_charge": (0.0, 1.0)}, {"flow_reach_m": 0.0},
+], ids=str)  # fmt: skip
+def test_a_world_that_cannot_be_is_refused(values: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match=next(iter(values))):
+        Profile.model_validate({"simulation": values})
+
+
+# --- the files that a profile names ------------------------------------------------------
 
 
 def test_a_profile_s_paths_are_from_its_folder_and_from_nowhere_else(
@@ -269,6 +293,8 @@ def test_a_profile_s_paths_are_from_its_folder_and_from_nowhere_else(
     assert heir.merge.weights_file == str(there / "w.yaml")
     with pytest.raises(NotFound, match=r"there/lens/mine\.yaml not found"):
         find_calibration(heir.camera.calibration)
+    (there / "lens" / "mine.yaml").write_text(text, encoding="utf-8")
+    assert find_calibration(load_profile("heir.yaml", with_weights=False).camera.calibration)
     (here / "none.yaml").write_text("extends: base.yaml\n")
     monkeypatch.chdir(there)
     with pytest.raises(NotFound, match=r"here/none\.yaml: extends: profile file"):
@@ -321,24 +347,3 @@ def test_each_key_is_read_by_something(section: str, key: str) -> None:
     read = attributes_read()
     names = (section, *ALIASES.get(section, ()))
     assert any((name, key) in read for name in names), f"nothing reads {section}.{key}"
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("image_width: 640\n", "camera_matrix"),
-        ("image_width: 640\ncamera_matrix: {data: [380, 0, 320, 0, 380, 240, 0, 0, 1]}\n"
-         "distortion_coefficients: {data: [0, 0, 0, 0, 0]}\n", "size is missing.*image_height"),
-        ("nothing\n", "camera_info"),
-        ("image_width: 640\nimage_height: 480\ncamera_matrix: {data: [1, 2]}\n"
-         "distortion_coefficients: {data: [0, 0, 0, 0, 0]}\n", "9 numbers"),
-        ("image_width: 320\nimage_height: 240\n"
-         "camera_matrix: {data: [380, 0, 640, 0, 380, 120, 0, 0, 1]}\n"
-         "distortion_coefficients: {data: [0, 0, 0, 0, 0]}\n", "320x240"),
-    ],
-)  # fmt: skip
-def test_bad_calibrations_are_refused(tmp_path: Path, text: str, expected: str) -> None:
-    path = tmp_path / "camera.yaml"
-    path.write_text(text)
-    with pytest.raises(InvalidValue, match=expected):
-        load_calibration(path)
