@@ -159,6 +159,9 @@ class VehicleSession:
             yield ask(name, judge, seen, self.profile)
         yield from self._room_rows(self.probe.telemetry)
         yield from self._lift_rows()
+        if why := vehicle.gone(self.probe):  # the rows above may be of before
+            advice = "look at its battery and plug, restart it"
+            yield Row("link", *failed(f"the vehicle is gone: {why}", advice))
 
     def _room_rows(self, take: TakeTelemetry) -> list[Row]:
         """Return the rows of the motion capture; none with decks."""

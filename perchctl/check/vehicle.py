@@ -89,6 +89,21 @@ class Vehicle:
         return self.measured_by.placed_by(profile.positioning.decks)
 
 
+GONE_S = 1.0
+"""A vehicle that has sent telemetry, and none for this long, is switched off or restarting."""
+
+
+def gone(link: ProbeLink) -> str:
+    """Return why the vehicle is not there any more, or an empty text.
+
+    Silence counts, too: a radio keeps its link to a vehicle that is off, cflib to one that restarts.
+    """
+    if lost := link.lost():
+        return f"the link was lost: {lost}"
+    age_s = link.age_s()
+    return f"no telemetry came for {age_s:.1f} s" if GONE_S < age_s < math.inf else ""
+
+
 def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
     """Ask a connected vehicle, and listen to it for so long."""
     measured_by = link.measured_by()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,11 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import CheckScope, Verdict, camera, check, session
+from perchctl.check import CheckScope, Verdict, camera, check, session, vehicle
 from perchctl.commands.check import exit_code
 from perchctl.errors import UsageError, broken_motion_capture
-from perchctl.link import ScanResult, find_vehicles
-from perchctl.profile import PositioningConfig, Profile
+from perchctl.link import ProbeLink, ScanResult, find_vehicles
+from perchctl.profile import LinkConfig, PositioningConfig, Profile
 from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options, wait_for
 from tests.helpers.flights import short_profile
