@@ -112,7 +112,7 @@ class Flight:
     def entered_s(self, phase: str, last: bool = True) -> float | None:
         """When a phase was entered, s after the first tick; None if it never was."""
         spans = [span for span in self.log.phases if span.phase == phase]
-        return spans[-1 if last else 0].start_s - self.log.start_s if spans else None
+        return spans[-1 if last else 0].start_s if spans else None
 
     def frame(self, index: int) -> Frame:
         """What the camera sees at that tick: rendered anew, from the logged truth."""
@@ -139,11 +139,12 @@ class Flight:
     def status(self, index: int) -> FlightStatus:
         """What the displays showed at that tick."""
         r, first = self.log.records[index], self.log.records[0]
-        span = next(s for s in reversed(self.log.phases) if s.start_s <= r["t_s"])
+        t_s = self.log.since(float(r["t_s"]))
+        span = next(s for s in reversed(self.log.phases) if s.start_s <= t_s)
         return FlightStatus(
             t_s=r["t_s"],
             phase=r["phase"],
-            in_phase_s=r["t_s"] - span.start_s,
+            in_phase_s=t_s - span.start_s,
             e_m=None if r["ex_m"] is None else (r["ex_m"], r["ey_m"], r["ez_m"]),
             e_yaw_rad=r["eyaw_rad"],
             tracked=bool(r["tracked"]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -33,23 +33,21 @@ from perchctl.commands.command_line import (
     reporting,
 )
 from perchctl.commands.output import print_record, say
-from perchctl.errors import InvalidValue, ReplayDiffers, UsageError
+from perchctl.errors import ReplayDiffers, UsageError
 from perchctl.files import check_output, same_file, write_files
 from perchctl.profile import Profile, changed_profile, load_profile
 from perchctl.record import (
     FlightLog,
-    export_mcap,
     log_table,
     log_values,
     path_beside,
     read_log,
     recorded_pictures,
-    recording_path,
 )
 
 FORMATS = (".png", ".pdf", ".svg")
 DRAWN_IN = "what plots are drawn in"
-EXPORTS = (".csv", ".parquet", ".mcap")
+EXPORTS = (".csv",)
 PAGE_SUFFIXES = (".html", ".htm")
 
 LogArgument = Annotated[
@@ -204,8 +202,8 @@ def compare(
     cls=Command,
     epilog=examples(
         "perchctl log export",
-        "perchctl log export perchctl-logs/flight.jsonl -o flight.parquet",
-        "perchctl log export -o flight.mcap",
+        "perchctl log export perchctl-logs/flight.jsonl -o flight.csv",
+        "perchctl log export --force --json",
     ),
 )
 @reporting
@@ -213,55 +211,25 @@ def export(
     file: LogArgument = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="The file: .csv (for any program), .parquet (for pandas, polars, DuckDB) or "
-            ".mcap (for Foxglove, rosbag2, PlotJuggler). Default: .csv beside the log.",
-        ),
+        typer.Option("--output", "-o", help="The file: .csv. Default: beside the log."),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Write a log in a form that other programs open."""
+    """Write a log as a table that other programs open."""
     path = _log_file(file)
     place = output or path_beside(path, ".csv")
     check_output(place, EXPORTS, force, "what a log is exported to")
-    form = place.suffix.lower().removeprefix(".")
-    done = _write_mcap(path, place, force) if form == "mcap" else _write_table(path, place, form)
-    if as_json:
-        print_record({"log": str(path), "output": str(place), "format": form, **done})
-        return 0
-    counts = [f"{done[key]} {key}" for key in ("rows", "columns", "pictures") if key in done]
-    print(f"export:    {place} ({', '.join(counts)})")
-    if "layout" in done:
-        print(f"layout:    {done['layout']}, for Foxglove")
-    return 0
-
-
-def _write_table(path: Path, place: Path, form: str) -> dict[str, Any]:
     with _opened(path) as log:
         table = log_table(log)
-        if form == "csv":
-            content = table.csv().encode("utf-8", errors="backslashreplace")
-        else:
-            content = table.parquet()
-    write_files({place: content})
-    return {"rows": table.rows, "columns": len(table.columns)}
-
-
-def _write_mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
-    own = recording_path(path)
-    if same_file(place, own):
-        raise InvalidValue(
-            f"{own} is the flight's own recording, with its pictures: open that, or name another "
-            f"file with -o"
-        )
-    with _opened(path) as log:
-        done = export_mcap(log, place, force)
-    for note in done.notes:
-        say(note)
-    return {"layout": str(done.layout), "pictures": done.pictures, "notes": list(done.notes)}
+    write_files({place: table.csv().encode("utf-8", errors="backslashreplace")})
+    rows, columns = len(table.rows), len(table.columns)
+    if as_json:
+        found = {"log": str(path), "output": str(place), "format": "csv"}
+        print_record(found | {"rows": rows, "columns": columns})
+    else:
+        print(f"export:    {place} ({rows} rows, {columns} columns)")
+    return 0
 
 
 @app.command(
@@ -311,7 +279,7 @@ def replay(
             base = log.flown_profile if profile is None else load_profile(profile)
             wanted = changed_profile(base, settings or ())
         check_readable(log)
-    is_recorded = pictures and recording_path(path).is_file()
+    is_recorded = pictures and path_beside(path, ".mcap").is_file()
     found = replay_flight(log, recorded_pictures(path) if is_recorded else None, wanted)
     if wanted is not None and not found.changed:
         say("nothing was changed: that is what was flown")

@@ -47,7 +47,7 @@ def test_settled_is_the_last_second_before_the_last_contact() -> None:
         tick(6.0, "PERCH", 9.0),
     ]
     log = log_of(records)
-    contact = last_ascent(FlightAnalysis(log).stays)
+    contact = last_ascent(log.phases)
     assert contact is not None
     assert contact.start_s == 4.0
     found = FlightAnalysis(log).measures

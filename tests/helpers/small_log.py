@@ -21,7 +21,7 @@ def small_log(path: Path, ticks: int = 5) -> Path:
     return writer.path
 
 
-def _python(code: str, path: Path) -> subprocess.CompletedProcess[str]:
+def run_python(code: str, path: Path) -> subprocess.CompletedProcess[str]:
     """Run the code in a process of its own, with the path as its argument."""
     root = Path(__file__).resolve().parents[2]
     command = [sys.executable, "-c", code, str(path)]
