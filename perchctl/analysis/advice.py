@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.analysis.flight import FlightAnalysis
+from perchctl.analysis.flight import FlightAnalysis, runs_of
 from perchctl.analysis.sight import percentile
 from perchctl.analysis.words import count, length, milliseconds, share, times
 from perchctl.vehicle import NO_BATTERY_READING_V
@@ -151,21 +151,18 @@ def _battery(flight: FlightAnalysis) -> Iterator[Advice]:
 
 
 def _external(flight: FlightAnalysis) -> Iterator[Advice]:
-    external = flight.external
-    if external is None:
-        return
-    if external.stops:
-        longest = max(external.stops, key=lambda stop: stop[1] - stop[0])
+    stops, apart_m = runs_of(flight.log, "pos_note"), flight.measures.external_apart_p95_m
+    if stops:
+        start_s, end_s, why = max(stops, key=lambda stop: stop[1] - stop[0])
         yield Advice(
             "positioning",
             "look where the markers are hidden from the cameras",
-            f"{times(len(external.stops))} no position was sent, at most for "
-            f"{longest[1] - longest[0]:.1f} s: {longest[2]}",
+            f"{times(len(stops))} no position was sent, at most for {end_s - start_s:.1f} s: {why}",
         )
-    if external.apart_most_m > APART_M:
+    if apart_m is not None and apart_m > APART_M:
         yield Advice(
             "positioning",
             "compare both by hand (`perchctl check --lift`)",
-            f"the vehicle's estimate was {length(external.apart_most_m)} from the positions from "
-            f"outside in 1 turn of 20",
+            f"the vehicle's estimate was {length(apart_m)} from the positions from outside in 1 "
+            f"turn of 20",
         )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -12,12 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.analysis.edges import (
-    ExternalHealth,
-    Takeover,
-    external_of,
-    takeovers_of,
-)
 from perchctl.analysis.sight import (
     SAME_S,
     Frames,
@@ -28,7 +23,7 @@ from perchctl.analysis.sight import (
     within,
 )
 from perchctl.geometry import Array
-from perchctl.mission import Findings
+from perchctl.mission import Findings, SentBy
 from perchctl.record import FlightLog, FlightSummary, PhaseSpan
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -178,11 +173,6 @@ class FlightAnalysis:
         """When the target was out of sight while it was needed."""
         return losses_of(self.log, self.frames)
 
-    @cached_property
-    def external(self) -> ExternalHealth | None:
-        """External positions; None where the vehicle's decks measured its position."""
-        return external_of(self.log)
-
     @property
     def findings(self) -> Findings | None:
         """Latency and mounting as the flight showed them; None where it did not."""
@@ -197,7 +187,7 @@ class FlightAnalysis:
     def measures(self) -> Measures:
         """The numbers by which flights are shown and compared."""
         end, log, frames = self.summary, self.log, self.frames
-        findings, external = end.findings, self.external
+        findings = end.findings
         volts, used_mah = log.column("battery_v"), log.column("battery_used_mah")
         volts = volts[volts >= NO_BATTERY_READING_V]
         used_mah = used_mah[np.isfinite(used_mah)]
@@ -226,10 +216,22 @@ class FlightAnalysis:
             turns=len(log.records),
             late_p99_s=_known(percentile(log.column("late_s"), 99)),
             telemetry_age_p99_s=_known(percentile(log.column("tel_age_s"), 99)),
-            external_sent=None if external is None else external.sent,
-            external_age_p99_s=None if external is None else _known(external.age_most_s),
-            external_apart_p95_m=None if external is None else _known(external.apart_most_m),
+            **self._external(),
         )
+
+    def _external(self) -> dict[str, Any]:
+        """Compute the numbers of external positions; empty where the decks measured it."""
+        log, sent = self.log, self.log.column("pos_sent")
+        if not np.isfinite(sent).any():
+            return {}
+        offsets_m = [log.column(f"pos_{axis}_m") - log.column(f"{axis}_m") for axis in "xyz"]
+        stopped = np.array([bool(text) for text in log.texts("pos_note")])
+        apart_m = np.where(stopped, np.nan, np.linalg.norm(offsets_m, axis=0))
+        return {
+            "external_sent": int(np.nanmax(sent)),
+            "external_age_p99_s": _known(percentile(log.column("pos_age_s"), 99)),
+            "external_apart_p95_m": _known(percentile(apart_m, 95)),
+        }
 
     def _settled(self) -> tuple[float | None, float | None]:
         """Compute the RMS errors before the last contact: horizontal (m) and heading (rad)."""
@@ -282,3 +284,61 @@ def last_ascent(spans: Sequence[PhaseSpan]) -> PhaseSpan | None:
 
 def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def runs_of(log: FlightLog, key: str) -> list[tuple[float, float, str]]:
+    """Find the stretches over which a text field stayed the same: from, to, text. Empty texts make
+    no stretch."""
+    found: list[tuple[float, float, str]] = []
+    began_s, text = 0.0, ""
+    for t_s, now in zip((*log.t_s, log.end_s), (*log.texts(key), None), strict=True):
+        if now == text:
+            continue
+        if text:
+            found.append((began_s, float(t_s), text))
+        began_s, text = float(t_s), now or ""
+    return found
+
+
+# --- what was sent in the loop's place ------------------------------------------------------
+
+APART_S = 2.0
+"""Commands of one sender that are farther apart are two goes."""
+_TELLS = {
+    "position": "position setpoints",
+    "thrust": "raw thrust",
+    "land": "landing ordered",
+    "stop": "motors stopped",
+    "emergency": "motors cut",
+}
+
+
+@dataclass(frozen=True)
+class Takeover:
+    """What one sender sent in one go. Times are on the loop's clock; `sent` counts the commands by
+    their name in a tick's `cmd`, in the order of their first."""
+
+    by: SentBy
+    start_s: float
+    end_s: float
+    sent: tuple[tuple[str, int], ...]
+
+    @property
+    def text(self) -> str:
+        """``position setpoints (14), landing ordered (2)``"""
+        return ", ".join(f"{_TELLS[name]} ({count})" for name, count in self.sent)
+
+
+def takeovers_of(sent: Sequence[Mapping[str, Any]]) -> tuple[Takeover, ...]:
+    """Group what was sent by sender and time, oldest first; `sent` are a log's `sent_values`."""
+    goes: list[list[Mapping[str, Any]]] = []
+    for each in sorted(sent, key=lambda one: float(one["t_s"])):
+        last = goes[-1][-1] if goes else None
+        if last is None or last["by"] != each["by"] or each["t_s"] - last["t_s"] > APART_S:
+            goes.append([])
+        goes[-1].append(each)
+    return tuple(
+        Takeover(go[0]["by"], go[0]["t_s"], go[-1]["t_s"],
+                 tuple(Counter(each["cmd"] for each in go).items()))
+        for go in goes
+    )  # fmt: skip

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.analysis.edges import runs_of
-from perchctl.analysis.flight import FlightAnalysis
+from perchctl.analysis.flight import FlightAnalysis, runs_of
 from perchctl.analysis.sight import Loss
 from perchctl.analysis.words import count, length
 from perchctl.mission import SEVEN_PHASES, Phase
@@ -215,7 +214,7 @@ def _taken_over(flight: FlightAnalysis) -> Iterator[Sentence]:
 
 
 def _unpositioned(flight: FlightAnalysis) -> Iterator[Sentence]:
-    for start_s, end_s, why in () if flight.external is None else flight.external.stops:
+    for start_s, end_s, why in runs_of(flight.log, "pos_note"):
         text = f"No external position was sent for {end_s - start_s:.1f} s: {why}"
         yield Sentence(start_s, text, "warn")
 

@@ -184,27 +184,12 @@ def test_the_command_writes_beside_the_log_and_replaces_nothing(tmp_path: Path) 
     html = log.with_suffix(".html").read_text(encoding="utf-8")
     assert "deep" not in html  # no folder of the computer is on it
     assert (said.code, said.stdout.strip()) == (0, str(log.with_suffix(".html")))
-    assert "already" in run("log", "report", str(log)).complaint
+    again = run("log", "report", str(log))
+    assert again.code == 30
+    assert "already" in again.complaint
+    assert run("log", "report", str(log), "-o", "page.pdf").code == 30
     other = written(tmp_path / "other.jsonl")
     said = run("log", "report", str(log), str(other), "-o", "both.html", "--json")
     answer = json.loads(said.stdout)
     assert answer["report"] == "both.html"
     assert [flight["outcome"] for flight in answer["flights"]] == ["perched", "perched"]
-
-
-@words_only
-@pytest.mark.parametrize(
-    ("words", "code", "sentence"),
-    [
-        (("nowhere.jsonl",), 20, "does not exist"),
-        (("flight.jsonl", "-o", "flight.jsonl", "--force"), 2, "one of the logs"),
-        (("flight.jsonl", "-o", "page.pdf"), 30, "must end in .html"),
-    ],
-)
-def test_the_command_refuses(
-    tmp_path: Path, words: tuple[str, ...], code: int, sentence: str
-) -> None:
-    written(tmp_path / "flight.jsonl")
-    said = run("log", "report", *words)
-    assert said.code == code
-    assert sentence in said.complaint

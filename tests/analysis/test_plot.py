@@ -15,7 +15,6 @@ from perchctl.analysis.plot import title_of
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.record import FlightLog
-from tests.helpers.disk import full_disk
 from tests.helpers.told import made
 
 pytestmark = pytest.mark.long
@@ -104,11 +103,3 @@ def test_nothing_to_plot(log: FlightLog, tmp_path: Path) -> None:
     (tmp_path / "no").write_text("in the way")
     with pytest.raises(InvalidValue, match=r"no is a file, not a folder"):
         plot_flight(log, tmp_path / "no" / "folder.png")
-
-
-def test_a_full_disk_leaves_the_old_plot(log: FlightLog, tmp_path: Path) -> None:
-    png = tmp_path / "f.png"
-    png.write_bytes(b"old")
-    with full_disk(room=4_000), pytest.raises(InvalidValue, match="cannot be written"):
-        plot_flight(log, png)
-    assert [p.read_bytes() for p in tmp_path.glob("*.png")] == [b"old"]

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from perchctl.analysis import FlightAnalysis, show_record, show_text
-from perchctl.analysis.edges import takeovers_of
+from perchctl.analysis.flight import takeovers_of
 from perchctl.analysis.story import story_of
 from perchctl.flight import fly
 from perchctl.flight.watchdog import rescue
