@@ -171,17 +171,8 @@ def _last_known(log: FlightLog) -> str:
     return f"the log ends in {phases[-1]}" if phases else "the log holds no flight"
 
 
-def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None) -> str:
+def summary_text(flight: FlightSummary, log_path: Path | None = None) -> str:
     """Return a few lines about a flight, without colour and without a line break at the end."""
-    faults = []
-    if isinstance(flight, FlightLog):
-        if flight.ignored_bytes:
-            faults.append(f"log lost:  its tail, {flight.ignored_bytes} unreadable bytes")
-        flight = FlightSummary.of(flight)
-    if flight.lost_records:
-        faults.insert(0, f"log lost:  {flight.lost_records} records ({flight.log_problem})")
-    elif flight.log_problem is not None:
-        faults.insert(0, f"log lost:  perhaps its last records ({flight.log_problem})")
     lines = [f"{flight.outcome.upper()}: {flight.reason}".rstrip(": ")]
     if flight.cause and flight.cause != flight.outcome:
         lines[0] += f" [{flight.cause}]"
@@ -205,7 +196,10 @@ def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None
         lines.append(f"vehicle:   {flight.touchdown.text}")
     if flight.fell:
         lines.append("vehicle:   fell")
-    lines += faults
+    if flight.lost_records:
+        lines.append(f"log lost:  {flight.lost_records} records ({flight.log_problem})")
+    elif flight.log_problem is not None:
+        lines.append(f"log lost:  perhaps its last records ({flight.log_problem})")
     if flight.recording is not None:
         lines.append(f"recording: {flight.recording.text}")
     if log_path is not None:

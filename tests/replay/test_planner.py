@@ -170,6 +170,18 @@ def test_a_turn_that_was_not_sent_is_no_tick_of_either_count() -> None:
     assert any("what was not sent" in line for line in replay_lines(found))
 
 
+@pytest.mark.parametrize(("field", "value"), [("row", "fence"), ("held", True), ("attempts", 9)])
+def test_each_part_of_a_decision_is_compared(field: str, value: object) -> None:
+    log = replace(corpus("stopped"))
+    turns = list(log.turns)
+    at = next(turn.number for turn in turns if turn.role == "flown") + 20
+    turns[at] = replace(turns[at], **{field: value})
+    log.__dict__["turns"] = turns
+    first = replay(log).first
+    assert first is not None
+    assert (first.tick, first.field, first.recorded) == (20, field, value)
+
+
 def test_a_lost_record_ends_the_replay_and_another_version_is_said(tmp_path: Path) -> None:
     """What the planner remembered of a lost turn is not known."""
     lines = lines_of()
