@@ -22,7 +22,10 @@ pytestmark = pytest.mark.long
 
 @pytest.fixture(scope="module")
 def log() -> FlightLog:
-    return made(lambda record: record.update(true_miss_m=0.004))
+    def change(record: dict[str, Any]) -> None:
+        record |= {"true_miss_m": 0.004, "battery_rest_v": record["battery_v"] + 0.05}
+
+    return made(change)
 
 
 def picture(log: FlightLog, path: Path) -> Array:

@@ -19,26 +19,29 @@ from perchctl.errors import InvalidValue, LogIncomplete
 from perchctl.flight import FlyOptions, SessionResult
 from perchctl.mission import FlightReport, Outcome, Phase, Turn, TurnInputs
 from perchctl.profile import changed_profile, load_profile
-from perchctl.record import LogWatcher, read_log, write
+from perchctl.record import LogWatcher, exact, read_log, write
 from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers.mission import note
 from tests.helpers.small_log import run_python
 
 
-class FullDisk:
-    """`os.write` on a disk with `room` bytes left."""
+class Disk:
+    """`os.write` on a disk with `room` bytes left, which hangs while its gate is closed."""
 
-    def __init__(self, room: int) -> None:
+    def __init__(self, room: int = 10**9) -> None:
         self.room = room
-        self.real = os.write
+        self.gate = threading.Event()
+        self.gate.set()
+        self._real = os.write
 
     def __call__(self, fd: int, data: Any) -> int:
+        self.gate.wait(10.0)
         if self.room == 0:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         part = bytes(data[: self.room])
         self.room -= len(part)
-        return self.real(fd, part)
+        return self._real(fd, part)
 
 
 def test_a_file_that_cannot_grow_never_raises_and_stays_whole(tmp_path: Path) -> None:
@@ -70,7 +73,7 @@ def test_a_file_that_cannot_grow_never_raises_and_stays_whole(tmp_path: Path) ->
 
 def test_a_full_disk_that_gets_room_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
-    disk = FullDisk(room=100)
+    disk = Disk(room=100)
     monkeypatch.setattr(os, "write", disk)
     for i in range(10):
         writer.write({"t_s": 0.02 * i, "phase": "SEARCH"})
@@ -90,32 +93,23 @@ def test_a_full_disk_that_gets_room_again(tmp_path: Path, monkeypatch: pytest.Mo
     assert log.summary["problem"] == writer.problem
 
 
-class Unruly(Mapping[str, Any]):
-    """A record that fails as its line is made."""
-
-    def __init__(self, error: type[Exception]) -> None:
-        self._error = error
-
-    def __getitem__(self, key: str) -> Any:
-        raise self._error("odd")
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(["t_s"])
-
-    def __len__(self) -> int:
-        return 1
-
-
 @pytest.mark.parametrize("live", [False, True])
 @pytest.mark.parametrize("error", [TypeError, MemoryError])
 def test_a_record_without_a_form_costs_itself_alone(
-    tmp_path: Path, error: type[Exception], live: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception], live: bool
 ) -> None:
     """The disk is well: nothing lands, what comes behind is written, and the end tells it."""
+
+    def encode(record: Mapping[str, Any]) -> bytes:
+        if record.get("odd"):
+            raise error("odd")
+        return exact.encode(record)
+
+    monkeypatch.setattr(write, "encode", encode)
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=live)
     log = LogWatcher(writer)
     for i in range(4):
-        writer.write({"t_s": 0.02 * i, "odd": Unruly(error)} if i == 1 else {"t_s": 0.02 * i})
+        writer.write({"t_s": 0.02 * i, "odd": i == 1})
     report = FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False)
     summary = log.close(report)
     assert log.problem is None
@@ -172,7 +166,7 @@ def test_a_log_that_cannot_begin_leaves_nothing(
         monkeypatch.setattr(write, "BackgroundWriter", no_thread)
     header = synthetic.header() | ({"odd": object()} if failing == "header" else {})
     if failing == "disk":
-        monkeypatch.setattr(os, "write", FullDisk(room=50))
+        monkeypatch.setattr(os, "write", Disk(room=50))
     errors = {"disk": InvalidValue, "header": TypeError, "thread": RuntimeError}
     with pytest.raises(errors[failing]):
         FlightLogWriter.open(tmp_path / "f.jsonl", header, live=True)
@@ -184,32 +178,25 @@ def test_a_log_that_cannot_begin_leaves_nothing(
 # --- a disk that hangs -------------------------------------------------------------------------
 
 
-class HungDisk:
-    """`os.write` that returns when it is let go."""
-
-    def __init__(self) -> None:
-        self.gate = threading.Event()
-        self._real = os.write
-
-    def __call__(self, fd: int, data: Any) -> int:
-        self.gate.wait(10.0)
-        return self._real(fd, data)
-
-
-@pytest.fixture
-def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[HungDisk]:
-    hung = HungDisk()
+@pytest.fixture(params=[50.0])
+def hung(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[FlightLogWriter, Disk]]:
+    """A log in real time with room for half a second, and its disk, which hangs."""
     monkeypatch.setattr(write, "CLOSE_TIMEOUT_S", 0.2)
-    monkeypatch.setattr(write, "BEHIND_S", 0.5)  # 50 records
-    yield hung
-    hung.gate.set()
-
-
-def test_a_disk_that_hangs_holds_up_nobody(
-    tmp_path: Path, disk: HungDisk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
+    monkeypatch.setattr(write, "BEHIND_S", 0.5)
+    writer = FlightLogWriter.open(
+        tmp_path / "f.jsonl", synthetic.header(), live=True, loop_hz=request.param
+    )
+    disk = Disk()
+    disk.gate.clear()
     monkeypatch.setattr(os, "write", disk)
+    yield writer, disk
+    disk.gate.set()
+
+
+def test_a_disk_that_hangs_holds_up_nobody(hung: tuple[FlightLogWriter, Disk]) -> None:
+    writer, disk = hung
     began_s = time.monotonic()
     for i in range(80):
         writer.write({"t_s": 0.02 * i})
@@ -226,11 +213,8 @@ def test_a_disk_that_hangs_holds_up_nobody(
     assert log.summary["problem"] == writer.problem
 
 
-def test_closing_does_not_wait_for_ever(
-    tmp_path: Path, disk: HungDisk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
-    monkeypatch.setattr(os, "write", disk)
+def test_closing_does_not_wait_for_ever(hung: tuple[FlightLogWriter, Disk]) -> None:
+    writer, disk = hung
     for i in range(10):
         writer.write({"t_s": 0.02 * i})
     began_s = time.monotonic()
@@ -247,14 +231,11 @@ def test_closing_does_not_wait_for_ever(
         os.fstat(held)
 
 
-@pytest.mark.parametrize("loop_hz", [50.0, 200.0])
+@pytest.mark.parametrize(("hung", "loop_hz"), [(50.0, 50.0), (200.0, 200.0)], indirect=["hung"])
 def test_half_a_minute_may_wait_and_turns_give_way_to_ticks_and_events(
-    tmp_path: Path, disk: HungDisk, monkeypatch: pytest.MonkeyPatch, loop_hz: float
+    hung: tuple[FlightLogWriter, Disk], loop_hz: float
 ) -> None:
-    writer = FlightLogWriter.open(
-        tmp_path / "f.jsonl", synthetic.header(), live=True, loop_hz=loop_hz
-    )
-    monkeypatch.setattr(os, "write", disk)
+    writer, _ = hung
     places = round(0.5 * 2 * loop_hz)
     for i in range(places):
         writer.turn(Turn(i, "flown", i / loop_hz, i / loop_hz, TurnInputs()))
