@@ -22,8 +22,8 @@ from perchctl.profile import changed_profile, load_profile
 from perchctl.record import LogWatcher, exact, read_log, write
 from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
+from tests.helpers.log import run_python
 from tests.helpers.mission import note
-from tests.helpers.small_log import run_python
 
 
 class Disk:

@@ -14,7 +14,7 @@ import pytest
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.record import read_log
 from tests.helpers import log as synthetic
-from tests.helpers.small_log import run_python, small_log
+from tests.helpers.log import run_python, small_log
 
 
 def test_any_cut_of_the_file_is_readable_behind_its_header(tmp_path: Path) -> None:

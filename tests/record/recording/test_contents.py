@@ -15,10 +15,8 @@ from mcap.reader import make_reader
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import (
-    Array,
     make_T,
     rot_z,
-    rotation_from_quaternion,
     rotation_from_rpy,
 )
 from perchctl.mission import SentCommand
@@ -151,23 +149,13 @@ def test_messages_have_the_wall_s_time(recording: Path, found: dict[str, list[An
     assert [t_ns - begun_ns for t_ns in times] == pytest.approx(told, abs=1)
 
 
-def _transforms(message: Any) -> dict[str, Array]:
-    """By ``parent child``."""
-    found = {}
-    for each in message.transforms:
-        q, t = each.rotation, each.translation
-        R = rotation_from_quaternion((q.w, q.x, q.y, q.z))
-        found[f"{each.parent_frame_id} {each.child_frame_id}"] = make_T(R, (t.x, t.y, t.z))
-    return found
-
-
 def test_the_transforms_lead_from_the_world_to_camera_gear_and_target(
     found: dict[str, list[Any]],
 ) -> None:
     said = found["/tf"]
     mount = recorded.PROFILE.camera.mount.T_body_cam
     for n in (0, 60, len(FLIGHT.ticks) - 1):
-        tick, T = FLIGHT.ticks[n], _transforms(said[n])
+        tick, T = FLIGHT.ticks[n], recorded.transforms(said[n])
         R = rotation_from_rpy(tick["roll_rad"], tick["pitch_rad"], tick["yaw_rad"])
         T_world_body = make_T(R, (tick["x_m"], tick["y_m"], tick["z_m"]))
         np.testing.assert_allclose(T["world body"], T_world_body, atol=1e-12)
@@ -209,7 +197,7 @@ def test_values_that_are_no_numbers_make_no_transform(tmp_path: Path) -> None:
     recorder.tick({**FLIGHT.ticks[0], "x_m": float("nan"), "cmd_z_m": float("inf")})
     recorder.close()
     found = recorded.messages(tmp_path / "f.mcap")
-    assert set(_transforms(found["/tf"][0])) == {"body camera", "body gear"}
+    assert set(recorded.transforms(found["/tf"][0])) == {"body camera", "body gear"}
 
 
 def test_the_calibration_is_the_flights(found: dict[str, list[Any]]) -> None:
