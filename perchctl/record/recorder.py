@@ -71,7 +71,7 @@ class Recorder:
         self._closed = False
         # Of the thread that writes.
         self._file = RecordingFile(stream, header, profile)
-        self._over = False
+        self._over = self._full = False
         self._done_bytes = 0
         self._flushed_s: float | None = None
         self._flushed_pictures = 0
@@ -172,14 +172,14 @@ class Recorder:
     def _written(self, turn: _Turn) -> None:
         file = self._file
         if turn.frame is not None:
-            kept = None if turn.frame.repeated else encoded(turn.frame)
-            full = kept is not None and file.size_bytes + len(kept[0]) > self._most_bytes
-            file.frame(frame_record(turn.frame), None if full else kept)
-            if full:
+            kept = None if self._full or turn.frame.repeated else encoded(turn.frame)
+            if kept is not None and file.size_bytes + len(kept[0]) > self._most_bytes:
+                self._full, kept = True, None
                 self._remember(
                     f"the recording is full (log.max_mb in the profile, "
                     f"{self._most_bytes / 1e6:g}): it goes on without pictures"
                 )
+            file.frame(frame_record(turn.frame), kept)
         for event in turn.events:
             file.event(event)
         if turn.sent is not None:
