@@ -58,11 +58,6 @@ def broken_motion_capture(why: str) -> UsageError:
     )
 
 
-def no_parquet() -> UsageError:
-    """Return the error for a missing extra ``parquet``."""
-    return UsageError(f"a .parquet file needs the library pyarrow; {_install('parquet')}")
-
-
 def no_cluster(why: str = "it is missing") -> UsageError:
     """Return the error for an extra ``cluster`` that is missing, or cannot be loaded."""
     return UsageError(f"--cluster needs the library distributed ({why}); {_install('cluster')}")

@@ -33,7 +33,6 @@ HOMES: dict[str, tuple[str, ...]] = {
     "google": ("perchctl.record.recording_file", "perchctl.record.recorded"),
     "distributed": ("perchctl.campaign",),
     "dask": ("perchctl.campaign",),
-    "pyarrow": ("perchctl.record.table",),
     "av": ("perchctl.commands.track_output", "perchctl.camera.network", "perchctl.analysis.film"),
 }
 
@@ -96,7 +95,7 @@ MOST_NAMES = {
     "faults": 15,
     "flight": 41,
     "link": 21,
-    "record": 19,
+    "record": 18,
     "mission": 48,
     "perception": 15,
     "positioning": 15,

@@ -221,8 +221,6 @@ def test_every_command_line_runs(
     shutil.copytree(place, tmp_path, dirs_exist_ok=True)
     if "collect" in words:
         (tmp_path / "session.csv").unlink()
-    if any(word.endswith(".parquet") for word in words):
-        pytest.importorskip("pyarrow", reason="Parquet needs the extra [parquet]")
     if "short.jsonl" in words:
         shutil.copyfile(request.getfixturevalue("short_log"), tmp_path / "short.jsonl")
     if words[:2] == ["perchctl", "log"]:

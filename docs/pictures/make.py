@@ -137,7 +137,8 @@ class Flight:
     def tick(self, index: int) -> Tick:
         """What the displays showed at that tick."""
         r, first = self.log.records[index], self.log.records[0]
-        span = next(s for s in reversed(self.log.phases) if s.start_s <= r["t_s"])
+        since_s = self.log.since(float(r["t_s"]))
+        span = next(s for s in reversed(self.log.phases) if s.start_s <= since_s)
         t_s, still = r["t_s"], (0.0, 0.0, 0.0)
         place = (r["x_m"], r["y_m"], r["z_m"])
         telemetry = Telemetry(t_s, place, still, *still, 1.0, 0.0, r["battery_v"], 0)
@@ -153,7 +154,7 @@ class Flight:
             r["battery_left_s"], r["battery_attempts"], r["battery_used_mah"], r["battery_rest_v"]
         )
         state = PlannerState(
-            phase=Phase(r["phase"]), entered_s=span.start_s, reason=r["reason"],
+            phase=Phase(r["phase"]), entered_s=t_s - (since_s - span.start_s), reason=r["reason"],
             attempts=r["attempts"], ground_m=(0.0, 0.0, first["z_m"]), battery=battery,
         )  # fmt: skip
         ages = (r["late_s"], r["cam_age_s"], r["tel_age_s"])

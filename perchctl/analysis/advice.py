@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.analysis.flight import FlightAnalysis
+from perchctl.analysis.flight import FlightAnalysis, runs_of
 from perchctl.analysis.sight import percentile
 from perchctl.analysis.words import count, length, milliseconds, share, times
+from perchctl.vehicle import NO_BATTERY_READING_V
 
 LEAST_PAIRS, SCALE_OFF = 20, 0.03
 RMS_PX = 1.0
@@ -18,13 +19,14 @@ UNSEEN_SHARE, LEAST_UNSEEN = 0.1, 10
 IN_VIEW = 0.5
 """Aside by less than half of the height: a camera that looks up has the target in view."""
 GAP_S = 0.3
-SPARE_V, WORN_SAG_V, WORN_HUNGER, LEAST_USED = 0.15, 0.95, 1.8, 0.15
+SPARE_V = 0.15
 APART_M = 0.05
 
 
 @dataclass(frozen=True)
 class Advice:
-    """`about`: one word; `evidence`: the figures, in a sentence without its end."""
+    """What to change, with its reason: `about` is one word, `evidence` has the figures, a sentence
+    without its end."""
 
     about: str
     text: str
@@ -32,8 +34,8 @@ class Advice:
 
 
 def advice_of(flight: FlightAnalysis) -> tuple[Advice, ...]:
-    """All advice in the order in which to heed it."""
-    found = [
+    """Collect the advice for the next flight, in the order in which to heed it."""
+    return (
         *_latency_and_mounting(flight),
         *_computer(flight),  # what it delays looks like a video that fails
         *_print(flight),
@@ -42,8 +44,7 @@ def advice_of(flight: FlightAnalysis) -> tuple[Advice, ...]:
         *_link(flight),
         *_battery(flight),
         *_external(flight),
-    ]
-    return tuple(found)
+    )
 
 
 def _latency_and_mounting(flight: FlightAnalysis) -> Iterator[Advice]:
@@ -65,12 +66,12 @@ def _print(flight: FlightAnalysis) -> Iterator[Advice]:
             f"the large marker seems {share(abs(off))} {farther} than the small one, median of "
             f"{known.size} frames with both",
         )
-    if flight.vision_led.misfit_px > RMS_PX:
+    if flight.frames.misfit_px > RMS_PX:
         yield Advice(
             "print",
             "look whether the sheet is flat, and check the camera's calibration",
-            f"the corners miss the pose by {flight.vision_led.misfit_px:.1f} px, median over "
-            f"{count(flight.vision_led.with_target, 'frame')}",
+            f"the corners miss the pose by {flight.frames.misfit_px:.1f} px, median over "
+            f"{count(len(flight.frames.seen_s), 'frame')}",
         )
 
 
@@ -87,7 +88,7 @@ def _light(flight: FlightAnalysis) -> Iterator[Advice]:
 
 
 def _unseen_in_view(flight: FlightAnalysis) -> tuple[int, int]:
-    """How many frames lack a target that was overhead, of all frames with it overhead."""
+    """Count the frames that lack a target that was overhead, and all frames with it overhead."""
     overhead = np.hypot(flight.log.column("ex_m"), flight.log.column("ey_m")) < (
         IN_VIEW * flight.log.column("ez_m")
     )
@@ -113,13 +114,15 @@ def _video(flight: FlightAnalysis) -> Iterator[Advice]:
 
 def _link(flight: FlightAnalysis) -> Iterator[Advice]:
     hold_s = flight.log.number("safety.telemetry_hold_s") or GAP_S
-    long = [gap for gap in flight.link.old if gap[2] > hold_s]
-    if long:
+    age_s = np.nan_to_num(flight.log.column("tel_age_s"))
+    old = age_s > hold_s
+    if old.any():
+        starts = int(np.count_nonzero(old & ~np.append(False, old[:-1])))
         yield Advice(
             "link",
             "another radio channel, or an antenna with a free view",
-            f"telemetry was older than {milliseconds(hold_s)} {times(len(long))}, at "
-            f"most {milliseconds(max(gap[2] for gap in long))}",
+            f"telemetry was older than {milliseconds(hold_s)} {times(starts)}, at most "
+            f"{milliseconds(float(age_s.max()))}",
         )
 
 
@@ -136,40 +139,30 @@ def _computer(flight: FlightAnalysis) -> Iterator[Advice]:
 
 
 def _battery(flight: FlightAnalysis) -> Iterator[Advice]:
-    least_v, battery = flight.log.number("safety.min_load_v"), flight.battery
-    if least_v is not None and battery.lowest_v < least_v + SPARE_V:
+    least_v, volts = flight.log.number("safety.min_load_v"), flight.log.column("battery_v")
+    lowest_v = percentile(volts[volts >= NO_BATTERY_READING_V], 0)
+    if least_v is not None and lowest_v < least_v + SPARE_V:
         yield Advice(
             "battery",
-            "start with a full battery",
-            f"it came down to {battery.lowest_v:.2f} V, and at {least_v:.2f} V a flight is ended",
-        )
-    fit = battery.fit
-    is_used = battery.used_mah > LEAST_USED * battery.battery_mah  # or its hunger is a guess
-    if fit is not None and (fit.sag_v > WORN_SAG_V or (is_used and fit.hunger > WORN_HUNGER)):
-        yield Advice(
-            "battery",
-            "take another battery: this one is worn, or its contacts are",
-            f"it falls by {fit.sag_v:.2f} V under full thrust, and empties {fit.hunger:.1f} times "
-            f"as fast as one of {battery.battery_mah:.0f} mAh should",
+            "start with a full battery; where it was full, take another one: this one is worn, or "
+            "its contacts are",
+            f"it came down to {lowest_v:.2f} V, and at {least_v:.2f} V a flight is ended",
         )
 
 
 def _external(flight: FlightAnalysis) -> Iterator[Advice]:
-    external = flight.external
-    if external is None:
-        return
-    if external.stops:
-        longest = max(external.stops, key=lambda stop: stop[1] - stop[0])
+    stops, apart_m = runs_of(flight.log, "pos_note"), flight.measures.external_apart_p95_m
+    if stops:
+        start_s, end_s, why = max(stops, key=lambda stop: stop[1] - stop[0])
         yield Advice(
             "positioning",
             "look where the markers are hidden from the cameras",
-            f"{times(len(external.stops))} no position was sent, at most for "
-            f"{longest[1] - longest[0]:.1f} s: {longest[2]}",
+            f"{times(len(stops))} no position was sent, at most for {end_s - start_s:.1f} s: {why}",
         )
-    if external.apart_most_m > APART_M:
+    if apart_m is not None and apart_m > APART_M:
         yield Advice(
             "positioning",
             "compare both by hand (`perchctl check --lift`)",
-            f"the vehicle's estimate was {length(external.apart_most_m)} from the positions from "
-            f"outside in 1 turn of 20",
+            f"the vehicle's estimate was {length(apart_m)} from the positions from outside in 1 "
+            f"turn of 20",
         )

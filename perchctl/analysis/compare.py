@@ -22,12 +22,12 @@ class Comparison:
 
     @cached_property
     def phases(self) -> list[dict[str, Any]]:
-        """How long, and how often, each was in each phase that one of them flew through."""
-        names = dict.fromkeys(stay.phase for flight in self.flights for stay in flight.stays)
+        """How long, and how often, each flight was in each phase that one of them flew through."""
+        names = dict.fromkeys(stay.phase for flight in self.flights for stay in flight.log.phases)
         found = []
         for name in names:
             a, b = (
-                [stay.duration_s for stay in flight.stays if stay.phase == name]
+                [stay.duration_s for stay in flight.log.phases if stay.phase == name]
                 for flight in self.flights
             )
             found.append({
@@ -55,7 +55,7 @@ class Comparison:
         }
 
     def record(self) -> dict[str, Any]:
-        """The comparison for programs: SI; a difference is B's value less A's."""
+        """Return the comparison for programs: SI; a difference is B's value less A's."""
         a, b = (_flight_record(flight) for flight in self.flights)
         return {
             "a": a,
@@ -66,7 +66,7 @@ class Comparison:
         }
 
     def text(self) -> str:
-        """The comparison as a table, for people."""
+        """Return the comparison as a table, for people."""
         return "\n".join(self._lines())
 
     def _lines(self) -> Iterator[str]:
@@ -129,7 +129,8 @@ def _value(value: Any) -> str:
 
 
 def profile_differences(one: Any, other: Any) -> dict[str, tuple[Any, Any]]:
-    """The dotted keys of two profiles, as JSON has them, that have different values."""
+    """Return the dotted keys of two profiles, as JSON has them, that have different values, each
+    with both."""
     a, b = _flat(one), _flat(other)
     return {
         key: (a.get(key, _NOT_THERE), b.get(key, _NOT_THERE))
@@ -139,7 +140,7 @@ def profile_differences(one: Any, other: Any) -> dict[str, tuple[Any, Any]]:
 
 
 def _flat(values: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested keys as dotted paths; an empty mapping is a value."""
+    """Return nested keys as dotted paths; an empty mapping is a value."""
     if not isinstance(values, Mapping):
         return {}
     found: dict[str, Any] = {}

@@ -25,8 +25,8 @@ from perchctl.vehicle import Command
 @dataclass(frozen=True, eq=False)
 class Decided:
     """One turn, decided again: `state` and `command` are the replay's, what was flown is in
-    `turn`. `tick` counts the turns that were flown, from 0. `error`: the name of what the planner
-    raised: then the state is the one before, None at the first turn, and there is no command."""
+    `turn`. `tick` counts the turns that were flown, from 0. `error` names what the planner raised:
+    then the state is the one before, None at the first turn, and there is no command."""
 
     tick: int
     turn: Turn
@@ -41,8 +41,8 @@ class Decided:
 
     @cached_property
     def difference(self) -> tuple[str, Any, Any] | None:
-        """The first field in which it does. Of a turn on which the planner raised that is what it
-        raised; a log of before version 4 does not tell whether it did, and has none."""
+        """The first field in which the turn differs; None without one. Where the planner raised,
+        that is what it raised; a log before version 4 does not hold that, and has no difference."""
         turn, state = self.turn, self.state
         if turn.role == "failed" or self.error is not None:
             return first_differing("error", turn.error, self.error)
@@ -72,8 +72,8 @@ class Decided:
 
 
 def whole_turns(log: FlightLog) -> tuple[list[Turn], str]:
-    """What can be replayed of a log: its turns up to where the first is missing, and which that
-    is, or nothing. Errors: InvalidValue."""
+    """Return what can be replayed of a log: its turns up to the first that is missing, and a
+    sentence about that one, empty where none is. Errors: InvalidValue."""
     if not log.turn_records:
         raise InvalidValue(_why_no_turns(log))
     for number, turn in enumerate(log.turns):
@@ -90,7 +90,7 @@ def decide(
     profile: Profile,
     seen: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
 ) -> Iterator[Decided]:
-    """Each turn of the planner, in order, with the observation that `seen` gives for it: by
+    """Decide each turn of the planner in order, with the observation that `seen` gives for it: by
     default the recorded one. A turn that was decided anew is decided, but does not count. The one
     on which the planner raises is the last, in a flight as here."""
     state: PlannerState | None = None
@@ -110,7 +110,7 @@ def decide(
 
 
 def first_of(decided: Iterable[Decided], t0_s: float) -> Difference | None:
-    """The first turn that was decided otherwise than it was flown."""
+    """Return the first turn that was decided otherwise than it was flown; None without one."""
     for each in decided:
         found = each.difference
         if found is not None:
@@ -133,7 +133,7 @@ def _why_no_turns(log: FlightLog) -> str:
 
 @dataclass(frozen=True)
 class Difference:
-    """The first of a replay.
+    """The first difference of a replay from its flight.
 
     `tick` counts the turns from take-off from 0, as the log's ticks do; of a turn before that
     it is negative. `t_s`: since the log began. `recorded`, `replayed`: as JSON has them.
@@ -147,7 +147,8 @@ class Difference:
 
 
 def first_differing(name: str, one: Any, other: Any) -> tuple[str, Any, Any] | None:
-    """The field's whole name, and both values in their exact form; None where nothing differs."""
+    """Return the first differing field's whole name, and both values in their exact form; None
+    where nothing differs."""
     if same(one, other):
         return None
     parts: list[tuple[str, Any, Any]] = []
@@ -165,7 +166,8 @@ def first_differing(name: str, one: Any, other: Any) -> tuple[str, Any, Any] | N
 
 
 def same(one: Any, other: Any) -> bool:
-    """To the bit: 0.0 is not -0.0, and NaN is NaN. Two commands without a field are two."""
+    """True if both are the same to the bit: 0.0 is not -0.0, and NaN is NaN. Two kinds of command
+    without a field are two."""
     if dataclasses.is_dataclass(one) and type(one) is not type(other):
         return False
     return json.dumps(to_exact(one)) == json.dumps(to_exact(other))

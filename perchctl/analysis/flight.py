@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -12,43 +13,28 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.analysis.edges import (
-    BatteryUse,
-    ExternalHealth,
-    LinkHealth,
-    Takeover,
-    battery_of,
-    external_of,
-    link_of,
-    takeovers_of,
-)
 from perchctl.analysis.sight import (
-    LED_BY_CAMERA,
     SAME_S,
     Frames,
     Loss,
-    Stay,
-    Vision,
     frames_of,
     losses_of,
     percentile,
-    vision_of,
     within,
 )
 from perchctl.geometry import Array
-from perchctl.mission import Findings
-from perchctl.record import FlightLog, FlightSummary
+from perchctl.mission import Findings, SentBy
+from perchctl.record import FlightLog, FlightSummary, PhaseSpan
+from perchctl.vehicle import NO_BATTERY_READING_V
 
 SETTLED_S = 1.0
 """So long before the contact begins is looked at for how well the vehicle has settled."""
-WHOLE_FLIGHT = "whole flight"
-LED_PHASES = "in these phases"
 _NUMBER = re.compile(r"[0-9.]+")
 
 
 @dataclass(frozen=True)
 class Hold:
-    """The vehicle was held in place; times since the flight's first turn."""
+    """A stretch in which the vehicle was held in place; times since the flight's first turn."""
 
     start_s: float
     end_s: float
@@ -61,15 +47,15 @@ class Hold:
 
 
 def _number(label: str, unit: str = "", scale: float = 1.0, digits: int = 0) -> Any:
-    """A number that may be unknown, and how people read it: `label`, and so many `digits` of
-    `scale` times it in `unit`."""
+    """Declare a number that may be unknown, and how people read it: `label`, and so many `digits`
+    of `scale` times it in `unit`."""
     shown = {"label": label, "unit": unit, "scale": scale, "digits": digits}
     return field(default=None, metadata=shown)
 
 
 @dataclass(frozen=True)
 class Measures:
-    """The numbers by which flights are compared; None is not known.
+    """The numbers of a flight, as they are shown, compared and reported; None is not known.
 
     The settled errors are the RMS over the last `SETTLED_S` of the ascent from which the last
     contact was begun: horizontal distance of gear and target, and heading.
@@ -85,24 +71,38 @@ class Measures:
     battery_start_v: float | None = _number("battery, first", "V", digits=2)
     battery_min_v: float | None = _number("battery, lowest", "V", digits=2)
     battery_end_v: float | None = _number("battery, last", "V", digits=2)
+    battery_used_mah: float | None = _number("battery, used by the thrust", "mAh")
     frames: int | None = _number("frames")
     frames_unseen: int | None = _number("frames without target")
     frame_rate_hz: float | None = _number("frames, median rate", "Hz", digits=1)
     frame_age_s: float | None = _number("frames, median age", "ms", 1e3, 0)
     frame_gaps: int | None = _number("gaps without a frame")
     frame_gaps_s: float | None = _number("time in such gaps", "s", digits=2)
+    frame_gap_longest_s: float | None = _number("longest such gap", "s", digits=2)
     corner_rms_px: float | None = _number("corners' misfit, median", "px", digits=2)
     turns: int | None = _number("turns of the loop")
     late_p99_s: float | None = _number("turn late, 99 %", "ms", 1e3, 1)
     telemetry_age_p99_s: float | None = _number("telemetry's age, 99 %", "ms", 1e3, 0)
+    external_sent: int | None = _number("external positions sent")
+    external_age_p99_s: float | None = _number("their age, 99 %", "ms", 1e3, 0)
+    external_apart_p95_m: float | None = _number("off the own estimate, 95 %", "mm", 1e3, 1)
 
     def text(self, name: str) -> str:
-        """A number as people read it, without its unit; ``-`` where it is not known."""
+        """Return a number as people read it, without its unit; ``-`` where it is not known."""
         (of,) = [f for f in fields(self) if f.name == name]
         value = getattr(self, name)
         if value is None:
             return "-"
         return f"{value * of.metadata['scale']:.{of.metadata['digits']}f}"
+
+    @property
+    def rows(self) -> list[tuple[str, str]]:
+        """Each number that is known: its label and its text with the unit."""
+        return [
+            (f.metadata["label"], f"{self.text(f.name)} {f.metadata['unit']}".rstrip())
+            for f in fields(self)
+            if getattr(self, f.name) is not None
+        ]
 
 
 class FlightAnalysis:
@@ -131,21 +131,7 @@ class FlightAnalysis:
         """Time of the last tick."""
         return self.log.end_s
 
-    # --- phases and holds
-
-    @cached_property
-    def stays(self) -> tuple[Stay, ...]:
-        """The phases in the order in which they were entered, with the rows that led there where
-        the log has its events; also an end that no tick followed."""
-        since, events = self.log.since, [e for e in self.log.events if e.get("event") == "phase"]
-        entered = [(span.phase, since(span.start_s), since(span.end_s), span.reason)
-                   for span in self.log.phases]  # fmt: skip
-        known = {round(start_s, 2) for _, start_s, _, _ in entered}
-        for event in events:
-            at_s = since(float(event["t_s"]))
-            if entered and at_s > entered[-1][2] - SAME_S and round(at_s, 2) not in known:
-                entered.append((str(event.get("phase") or ""), at_s, at_s, ""))
-        return tuple(_stay(*each, events, since) for each in entered)
+    # --- holds and notes
 
     @cached_property
     def holds(self) -> tuple[Hold, ...]:
@@ -185,38 +171,7 @@ class FlightAnalysis:
     @cached_property
     def losses(self) -> tuple[Loss, ...]:
         """When the target was out of sight while it was needed."""
-        return losses_of(self.log, self.frames, self.stays)
-
-    @cached_property
-    def vision(self) -> Vision:
-        """How well the camera saw over the whole flight."""
-        return vision_of(self.log, self.frames, WHOLE_FLIGHT)
-
-    @cached_property
-    def vision_led(self) -> Vision:
-        """How well it saw in all phases together in which the camera leads."""
-        return vision_of(self.log, self.frames, LED_PHASES, LED_BY_CAMERA)
-
-    @cached_property
-    def vision_by_phase(self) -> tuple[Vision, ...]:
-        """How well it saw in each of these phases that had a frame."""
-        each = [vision_of(self.log, self.frames, phase, (phase,)) for phase in LED_BY_CAMERA]
-        return tuple(vision for vision in each if vision.frames)
-
-    @cached_property
-    def link(self) -> LinkHealth:
-        """Telemetry and setpoints."""
-        return link_of(self.log)
-
-    @cached_property
-    def external(self) -> ExternalHealth | None:
-        """External positions; None where the vehicle's decks measured its position."""
-        return external_of(self.log)
-
-    @cached_property
-    def battery(self) -> BatteryUse:
-        """Voltages, charge and load."""
-        return battery_of(self.log)
+        return losses_of(self.log, self.frames)
 
     @property
     def findings(self) -> Findings | None:
@@ -230,35 +185,57 @@ class FlightAnalysis:
 
     @cached_property
     def measures(self) -> Measures:
-        """The numbers by which flights are compared."""
-        end, log, vision, battery = self.summary, self.log, self.vision, self.battery
+        """The numbers by which flights are shown and compared."""
+        end, log, frames = self.summary, self.log, self.frames
+        findings = end.findings
+        volts, used_mah = log.column("battery_v"), log.column("battery_used_mah")
+        volts = volts[volts >= NO_BATTERY_READING_V]
+        used_mah = used_mah[np.isfinite(used_mah)]
         xy_m, yaw_rad = self._settled()
+        gaps_s = np.diff(frames.gaps_s, axis=1)
         return Measures(
             duration_s=end.duration_s if log.records or end.duration_s else None,
             attempts=end.attempts,
             miss_m=end.miss_m,
             settled_xy_rms_m=xy_m,
             settled_yaw_rms_rad=yaw_rad,
-            latency_s=None if end.findings is None else end.findings.latency_s,
-            latency_sigma_s=None if end.findings is None else end.findings.latency_sigma_s,
-            battery_start_v=_known(battery.start_v),
+            latency_s=None if findings is None else findings.latency_s,
+            latency_sigma_s=None if findings is None else findings.latency_sigma_s,
+            battery_start_v=float(volts[0]) if volts.size else None,
             battery_min_v=end.battery_min_v,
-            battery_end_v=_known(battery.end_v),
-            frames=vision.frames,
-            frames_unseen=vision.frames - vision.with_target,
-            frame_rate_hz=_known(vision.rate_hz),
-            frame_age_s=_known(vision.age_s),
-            frame_gaps=len(self.frames.gaps_s),
-            frame_gaps_s=float(np.sum(np.diff(self.frames.gaps_s, axis=1))),
-            corner_rms_px=_known(vision.misfit_px),
+            battery_end_v=float(volts[-1]) if volts.size else None,
+            battery_used_mah=float(used_mah[-1]) if used_mah.size else None,
+            frames=len(frames.t_s),
+            frames_unseen=len(frames.unseen_s),
+            frame_rate_hz=_known(frames.rate_hz),
+            frame_age_s=_known(frames.age_s),
+            frame_gaps=len(gaps_s),
+            frame_gaps_s=float(np.sum(gaps_s)),
+            frame_gap_longest_s=float(np.max(gaps_s)) if gaps_s.size else None,
+            corner_rms_px=_known(frames.misfit_px),
             turns=len(log.records),
             late_p99_s=_known(percentile(log.column("late_s"), 99)),
-            telemetry_age_p99_s=_known(self.link.age_most_s),
+            telemetry_age_p99_s=_known(percentile(log.column("tel_age_s"), 99)),
+            **self._external(),
         )
 
+    def _external(self) -> dict[str, Any]:
+        """Compute the numbers of external positions; empty where the decks measured it."""
+        log, sent = self.log, self.log.column("pos_sent")
+        if not np.isfinite(sent).any():
+            return {}
+        offsets_m = [log.column(f"pos_{axis}_m") - log.column(f"{axis}_m") for axis in "xyz"]
+        stopped = np.array([bool(text) for text in log.texts("pos_note")])
+        apart_m = np.where(stopped, np.nan, np.linalg.norm(offsets_m, axis=0))
+        return {
+            "external_sent": int(np.nanmax(sent)),
+            "external_age_p99_s": _known(percentile(log.column("pos_age_s"), 99)),
+            "external_apart_p95_m": _known(percentile(apart_m, 95)),
+        }
+
     def _settled(self) -> tuple[float | None, float | None]:
-        """Horizontal and heading error before the last contact."""
-        ascent = last_ascent(self.stays)
+        """Compute the RMS errors before the last contact: horizontal (m) and heading (rad)."""
+        ascent = last_ascent(self.log.phases)
         if ascent is None:
             return None, None
         start_s = max(ascent.start_s, ascent.end_s - SETTLED_S) - SAME_S / 2
@@ -275,50 +252,93 @@ class FlightAnalysis:
     # --- single ticks
 
     def tracked(self, key: str) -> Array:
-        """A field over the ticks, (n,), NaN where the target is only remembered."""
+        """Return a field over the ticks, (n,), NaN where the target is only remembered."""
         remembered = [record.get("tracked") is False for record in self.log.records]
         return np.where(remembered, np.nan, self.log.column(key))
 
     def index_at(self, t_s: float) -> int:
-        """Index of the newest tick at that time."""
+        """Return the index of the newest tick at that time."""
         return max(0, int(np.searchsorted(self.t_s, t_s + SAME_S / 2, side="right")) - 1)
 
     def at(self, t_s: float, key: str) -> float:
-        """A field at that time; NaN where it is missing or no number."""
+        """Return a field at that time; NaN where it is missing or no number."""
         value = self.log.records[self.index_at(t_s)].get(key) if self.log.records else None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return math.nan
         return float(value)
 
     def height_m(self, t_s: float) -> float:
-        """Height above the place of the first tick."""
+        """Return the height at that time above the place of the first tick."""
         return self.at(t_s, "z_m") - self.at(0.0, "z_m")
 
     def within(self, start_s: float, end_s: float) -> slice:
-        """The ticks from one time to another."""
+        """Return the ticks from one time to another as a slice."""
         return within(self.t_s, start_s, end_s)
 
 
-def last_ascent(stays: Sequence[Stay]) -> Stay | None:
-    """The ascent from which the last contact was begun; None without a contact."""
-    ascents = [a for a, b in pairwise(stays) if (a.phase, b.phase) == ("ASCEND", "PERCH")]
+def last_ascent(spans: Sequence[PhaseSpan]) -> PhaseSpan | None:
+    """Return the ascent from which the last contact was begun; None without a contact."""
+    ascents = [a for a, b in pairwise(spans) if (a.phase, b.phase) == ("ASCEND", "PERCH")]
     return ascents[-1] if ascents else None
-
-
-def _stay(
-    phase: str, start_s: float, end_s: float, reason: str, events: Sequence[Any], since: Any
-) -> Stay:
-    event: Any = next(
-        (
-            event
-            for event in events
-            if event.get("phase") == phase and abs(since(float(event["t_s"])) - start_s) < SAME_S
-        ),
-        {},
-    )
-    words = [str(event.get(key) or "") for key in ("reason", "row", "severity", "simulated")]
-    return Stay(phase, start_s, end_s, reason or words[0], *words[1:])
 
 
 def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def runs_of(log: FlightLog, key: str) -> list[tuple[float, float, str]]:
+    """Find the stretches over which a text field stayed the same: from, to, text. Empty texts make
+    no stretch."""
+    found: list[tuple[float, float, str]] = []
+    began_s, text = 0.0, ""
+    for t_s, now in zip((*log.t_s, log.end_s), (*log.texts(key), None), strict=True):
+        if now == text:
+            continue
+        if text:
+            found.append((began_s, float(t_s), text))
+        began_s, text = float(t_s), now or ""
+    return found
+
+
+# --- what was sent in the loop's place ------------------------------------------------------
+
+APART_S = 2.0
+"""Commands of one sender that are farther apart are two goes."""
+_TELLS = {
+    "position": "position setpoints",
+    "thrust": "raw thrust",
+    "land": "landing ordered",
+    "stop": "motors stopped",
+    "emergency": "motors cut",
+}
+
+
+@dataclass(frozen=True)
+class Takeover:
+    """What one sender sent in one go. Times are on the loop's clock; `sent` counts the commands by
+    their name in a tick's `cmd`, in the order of their first."""
+
+    by: SentBy
+    start_s: float
+    end_s: float
+    sent: tuple[tuple[str, int], ...]
+
+    @property
+    def text(self) -> str:
+        """``position setpoints (14), landing ordered (2)``"""
+        return ", ".join(f"{_TELLS[name]} ({count})" for name, count in self.sent)
+
+
+def takeovers_of(sent: Sequence[Mapping[str, Any]]) -> tuple[Takeover, ...]:
+    """Group what was sent by sender and time, oldest first; `sent` are a log's `sent_values`."""
+    goes: list[list[Mapping[str, Any]]] = []
+    for each in sorted(sent, key=lambda one: float(one["t_s"])):
+        last = goes[-1][-1] if goes else None
+        if last is None or last["by"] != each["by"] or each["t_s"] - last["t_s"] > APART_S:
+            goes.append([])
+        goes[-1].append(each)
+    return tuple(
+        Takeover(go[0]["by"], go[0]["t_s"], go[-1]["t_s"],
+                 tuple(Counter(each["cmd"] for each in go).items()))
+        for go in goes
+    )  # fmt: skip

@@ -65,16 +65,16 @@ def plot_flight(log: FlightLog, path: Path | str) -> None:
 
 
 def flight_png(flight: FlightAnalysis) -> bytes:
-    """The same picture as a PNG; the log has at least one tick."""
+    """Return the picture of a flight as a PNG; the log has at least one tick."""
     content = BytesIO()
     save_png(flight_figure(flight), content)
     return content.getvalue()
 
 
 def flight_figure(flight: FlightAnalysis) -> Figure:
-    """Errors, detections against the filtered track (as the paper's figure 6), where frames were
-    lost, height, thrust and battery, over the named phases; and the last seconds with the target
-    in millimetres."""
+    """Draw errors, detections against the filtered track (as the paper's figure 6), where frames
+    were lost, height, thrust and battery, over the named phases; and the last seconds with the
+    target in millimetres."""
     figure = new_figure(11.0, 17.0)
     *axes, last_ax = figure.subplots(9, 1, height_ratios=(1.7, 1, 1, 1, 1, 0.25, 1.1, 1.1, 2.0))
     _draw_errors(axes[0], flight)
@@ -85,7 +85,7 @@ def flight_figure(flight: FlightAnalysis) -> Figure:
     _draw_height(axes[6], flight)
     _draw_power(axes[7], flight)
     shown_s = _draw_last_seconds(last_ax, flight)
-    spans = [(stay.phase, stay.start_s, stay.end_s) for stay in flight.stays]
+    spans = [(stay.phase, stay.start_s, stay.end_s) for stay in flight.log.phases]
     whole_s = (float(flight.t_s[0]), float(max(flight.t_s[-1], flight.t_s[0] + 1e-3)))
     for ax in axes:
         ax.set_xlim(whole_s)
@@ -104,7 +104,7 @@ def flight_figure(flight: FlightAnalysis) -> Figure:
 
 
 def title_of(flight: FlightAnalysis) -> str:
-    """Profile, seed, outcome, and the miss where it is known."""
+    """Return profile, seed, outcome, and the miss where it is known, as one line."""
     end, seed = flight.summary, flight.log.header.get("seed")
     name = f"profile {flight.log.profile_name or '?'}"
     parts = [name + ("" if seed is None else f", seed {seed}"), end.outcome]
@@ -197,8 +197,8 @@ def _draw_power(ax: Axes, flight: FlightAnalysis) -> None:
     volts = flight.log.column("battery_v")
     volts = np.where(volts > 0, volts, np.nan)
     ax.plot(flight.t_s, volts, color=BLACK, linewidth=1.2, label="read")
-    ax.plot(flight.t_s, flight.battery.rest_v, color=GREEN, linewidth=1.2, linestyle="--",
-            label="at rest, est.")  # fmt: skip
+    rest_v = flight.log.column("battery_rest_v")
+    ax.plot(flight.t_s, rest_v, color=GREEN, linewidth=1.2, linestyle="--", label="at rest, est.")
     ax.set_ylabel("battery [V]")
     thrust_ax = ax.twinx()
     thrust = flight.log.column("thrust") * FULL_THRUST_PERCENT

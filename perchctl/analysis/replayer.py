@@ -20,11 +20,8 @@ from perchctl.analysis.sense import (
     Picture,
     PictureMissing,
     Sensed,
-    older,
     one_thread,
-    placed_later_s,
     sense,
-    shown,
 )
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
@@ -37,7 +34,7 @@ from perchctl.vision import Pipeline, make_pipeline
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What the senses made of pictures, telemetry and times; or of telemetry alone.
+    """What the senses made of the recorded pictures, telemetry and times.
 
     Attributes:
         turns: each, seen again, up to where a picture is missing.
@@ -73,15 +70,16 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Attributes:
-    decided: each turn of the planner, decided again.
-    ticks: how many were flown; `differences`, how many of them were decided otherwise; `first`
-        may be of one that was not sent.
-    seen: by pictures; None without any.
-    shown: by telemetry alone; None where pictures were looked at to the end.
-    changed: the keys in which the profile is another than the flown one's.
-    gap: which turn is the first that the log has lost, or empty.
-    notes: what limits the replay, in sentences.
+    """A log decided again, and seen again where there are pictures.
+
+    Attributes:
+        decided: each turn of the planner, decided again.
+        ticks: how many were flown; `differences`, how many of them were decided otherwise; `first`
+            may be of one that was not sent.
+        seen: what the pictures show; None without any.
+        changed: the keys in which the profile is another than the flown one's.
+        gap: which turn is the first that the log has lost, or empty.
+        notes: what limits the replay, in sentences.
     """
 
     log: FlightLog
@@ -91,15 +89,14 @@ class Replay:
     differences: int
     first: Difference | None
     seen: Seen | None = None
-    shown: Seen | None = None
     changed: tuple[str, ...] = ()
     gap: str = ""
     notes: tuple[str, ...] = ()
 
     @property
     def same(self) -> bool:
-        shown = self.shown is None or self.shown.first is None
-        return self.first is None and shown and (self.seen is None or self.seen.same)
+        """True if no decision and nothing that was seen differs."""
+        return self.first is None and (self.seen is None or self.seen.same)
 
 
 def replay(
@@ -108,31 +105,26 @@ def replay(
     profile: Profile | None = None,
     pipeline: Pipeline | None = None,
 ) -> Replay:
-    """The flight again, by its own profile; or, with `profile`, what that would have changed.
+    """Replay the flight by its own profile; or, with `profile`, by another one.
 
     As it was flown the planner is given the recorded observations, and the pictures are compared
     for themselves; with another profile it is given what that sees in the pictures. `pipeline`
-    looks at them; by default the profile's, with the flown calibration and mask. Without pictures
-    the same goes for what telemetry alone gives.
+    looks at them; by default the profile's, with the flown calibration and mask.
     Errors: InvalidValue, NotFound (a calibration or mask that another profile names).
     """
     flown = log.flown_profile
     turns, gap = whole_turns(log)
     used = profile or flown
     changed = changed_keys(flown, used)
-    seen = by_telemetry = None
+    seen = None
     if pictures is not None:
         pipeline = pipeline or pipeline_of(log, used, changed)
         seen = _seen(log, turns, flown, used, pictures, pipeline)
     is_seen = seen is not None and (seen.frames > 0 or seen.is_another)
-    if not is_seen or (seen is not None and seen.missing is not None):
-        found = list(shown(turns, flown, used))
-        by_telemetry = Seen(found, *_differing(log, turns, found))
-    again = seen if is_seen else by_telemetry
     observations: dict[int, Observation | None] = {}
-    if again is not None and changed:
-        observations = {each.turn.number: each.observation for each in again.turns}
-        turns = turns[: len(again.turns)]
+    if is_seen and seen is not None and changed:
+        observations = {each.turn.number: each.observation for each in seen.turns}
+        turns = turns[: len(seen.turns)]
     decided = list(
         decide(turns, used, lambda turn: observations.get(turn.number, turn.observation))
     )
@@ -145,7 +137,6 @@ def replay(
         differences=sum(each.differs for each in decided if each.turn.role == "flown"),
         first=first_of(decided, log.start_s),
         seen=seen,
-        shown=by_telemetry,
         changed=changed,
         gap=gap,
         notes=(
@@ -168,14 +159,15 @@ def check_readable(log: FlightLog) -> None:
 
 
 def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:
-    """The dotted keys in which two profiles differ, but for what only names or describes."""
+    """Return the dotted keys in which two profiles differ, but for those that only name or
+    describe them."""
     found = profile_differences(one.model_dump(mode="json"), other.model_dump(mode="json"))
     return tuple(key for key in found if key not in ("name", "description", "date"))
 
 
 def pipeline_of(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -> Pipeline:
-    """The flown calibration and mask, unless others are named by now. Errors: InvalidValue,
-    NotFound."""
+    """Return the pipeline with the flown calibration and mask, unless the changed keys name others.
+    Errors: InvalidValue, NotFound."""
     camera = log.flown_camera
     if camera is None or {"camera.calibration", "camera.cam"} & {*changed}:
         camera = profile_camera(profile.camera)
@@ -197,13 +189,12 @@ def _seen(
 ) -> Seen:
     # A source takes the latency off the time at which a picture came.
     later_s = flown.camera.start_latency_s - profile.camera.start_latency_s
-    older_s = placed_later_s(turns, flown, profile)
     found: list[Sensed] = []
     missing: PictureMissing | None = None
     with one_thread():
         try:
             for each in sense(turns, profile, pipeline, pictures, later_s):
-                found.append(older(each, older_s))
+                found.append(each)
         except PictureMissing as error:
             missing = error
     return Seen(
@@ -218,7 +209,7 @@ def _seen(
 def _differing(
     log: FlightLog, turns: Sequence[Turn], found: Iterable[Sensed]
 ) -> tuple[int, Difference | None]:
-    """In how many turns it is not what was seen, and the first."""
+    """Count the turns in which something else is seen than was, and find the first."""
     start = next((t.number for t in turns if t.role != "waiting"), len(turns))
     differing = [(each.turn, d) for each in found if (d := _unlike(each)) is not None]
     if not differing:
@@ -242,12 +233,11 @@ def _frames_of(turns: Iterable[Turn]) -> int:
 
 
 def _unlike(sensed: Sensed) -> tuple[str, object, object] | None:
-    """The first field in which what is seen is not what was seen."""
+    """Return the first field in which what is seen is not what was seen; None without one."""
     was, seen = sensed.turn.observation, sensed.observation
     found = first_differing("poses", sensed.turn.poses, sensed.poses)
     if found is None and was is not None and seen is not None:
-        names = (*SENSED, "position_age_s")
-        each = (first_differing(n, getattr(was, n), getattr(seen, n)) for n in names)
+        each = (first_differing(n, getattr(was, n), getattr(seen, n)) for n in SENSED)
         found = next((difference for difference in each if difference is not None), None)
     return found
 
@@ -263,7 +253,9 @@ BEFORE_TAKEOFF = (
     "safety.ground_z_m", "safety.ground_tolerance_m", "safety.start_tilt_deg",
     "positioning.connect_timeout_s",
 )  # fmt: skip
-ON_AGES = ("positioning.hold_s", "positioning.land_s", "positioning.latency_s")
+ON_TELEMETRY = ("safety.jump_m", "safety.jump_z_m", "safety.jump_deg", "safety.jump_mps")
+"""They act on what the loop makes of telemetry, which is made anew with pictures only."""
+ON_AGES = ("positioning.hold_s", "positioning.land_s")
 """Of `positioning` these act on the positions' ages, which are recorded; the others on which
 positions the vehicle is given."""
 
@@ -271,7 +263,8 @@ positions the vehicle is given."""
 def notes_of(
     log: FlightLog, gap: str, ended: str, changed: Sequence[str], *, pictures: bool
 ) -> Iterator[str]:
-    """`ended`: why the pictures do so before the flight; `pictures`: some were looked at."""
+    """Yield what limits a replay, a sentence each. `ended` says why the pictures end before the
+    flight; `pictures` is True if some were looked at."""
     made_by = log.header.get("perchctl")
     if made_by != perchctl.__version__:
         yield (
@@ -291,12 +284,14 @@ def notes_of(
 
 
 def _limit_of(key: str, pictures: bool) -> str:
-    """What a replay cannot tell of a key; empty where it tells all."""
+    """Return what a replay cannot tell of a key; empty where it tells all."""
     section = key.split(".")[0]
     if key in BEFORE_TAKEOFF:
         return "it is asked before take-off only, and a replay begins with the flight"
     if not pictures and (section in ON_PICTURES or key in ON_PICTURES):
         return "what it would change in the pictures cannot be shown, as there are none to look at"
+    if not pictures and key in ON_TELEMETRY:
+        return "what it would change in the telemetry is shown by a replay with pictures only"
     if section == "positioning" and key not in ON_AGES:
         return (
             "which positions the vehicle would have been given, and where it would have taken "

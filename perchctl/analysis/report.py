@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,18 +18,15 @@ from numpy.typing import NDArray
 
 import perchctl
 from perchctl.analysis.advice import Advice, advice_of
-from perchctl.analysis.edges import timings_of
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
-from perchctl.analysis.sight import percentile
 from perchctl.analysis.story import SEVEN, Sentence, story_of
-from perchctl.analysis.words import count, length, milliseconds, share
+from perchctl.analysis.words import count, length
 from perchctl.errors import PerchError
 from perchctl.files import write_files
-from perchctl.geometry import Array
 from perchctl.mission import latency_text, turn_text
-from perchctl.record import log_values, read_log, recorded_pictures, recording_path
+from perchctl.record import log_values, path_beside, read_log, recorded_pictures
 
 UNFINISHED = "unfinished"
 TITLES = {
@@ -41,11 +37,10 @@ TITLES = {
     UNFINISHED: "Unfinished: the log has no end",
 }
 GRADES = {"perched": "good", "landed": "warn"}
-MOST_STOPS = 6
 
 
 def write_report(log_paths: Sequence[Path], output: Path) -> Report:
-    """Writes the page, whole or not at all; returns what is on it.
+    """Write the page, whole or not at all; return what is on it.
 
     Raises NotFound and InvalidValue, as `read_log` and `write_files`.
     """
@@ -76,7 +71,7 @@ class Report:
                 "log": str(told.flight.log.path),
                 "outcome": told.outcome,
                 "miss_m": told.flight.summary.miss_m,
-                "used_mah": round(told.flight.battery.used_mah, 1),
+                "used_mah": told.flight.measures.battery_used_mah,
                 "pictures": None if told.pictures is None else len(told.pictures),
                 "advice": [f"{a.about}: {a.text} ({a.evidence})" for a in told.advice],
             }
@@ -85,12 +80,12 @@ class Report:
 
 
 def reported_flight(log_path: Path) -> ReportedFlight:
-    """One flight, with what was recorded beside its log. A recording that cannot be read costs
-    the pictures only.
+    """Read one flight, with what was recorded beside its log. A recording that cannot be read
+    costs the pictures only.
 
     Raises NotFound and InvalidValue for the log, as `read_log`.
     """
-    flight, recording = FlightAnalysis(read_log(log_path)), recording_path(log_path)
+    flight, recording = FlightAnalysis(read_log(log_path)), path_beside(log_path, ".mcap")
     if not recording.is_file():
         return ReportedFlight(flight)
     with log_values(log_path):
@@ -118,12 +113,12 @@ class ReportedFlight:
 
     @property
     def outcome(self) -> str:
-        """`UNFINISHED` for a log without its end."""
+        """How the flight ended; `UNFINISHED` for a log without its end."""
         return UNFINISHED if self.flight.log.summary is None else self.flight.summary.outcome
 
     @property
     def grade(self) -> str:
-        """How good that is: good, warn or bad."""
+        """How good the outcome is: good, warn or bad."""
         return GRADES.get(self.outcome, "bad")
 
     @property
@@ -135,7 +130,8 @@ class ReportedFlight:
 
     @property
     def name(self) -> str:
-        """The log's, without its folder: a page that is sent on does not tell of a computer."""
+        """The log's file name, without its folder: a page that is sent on does not name those of a
+        computer."""
         return self.flight.log.path.name
 
     @property
@@ -145,17 +141,11 @@ class ReportedFlight:
 
     @property
     def when(self) -> str:
-        """In UTC; a simulated flight in lockstep has no date."""
+        """When the flight began, in UTC; a simulated flight in lockstep has no date."""
         header = self.flight.log.header
         if header.get("started_utc"):
             return utc_text(header["started_utc"])
         return "simulated, without a date" if header.get("lockstep") else "not known"
-
-    @property
-    def align_s(self) -> float:
-        """In ALIGN altogether, NaN where it never came to that."""
-        stays = [stay.duration_s for stay in self.flight.stays if stay.phase == "ALIGN"]
-        return sum(stays) if stays else math.nan
 
     @property
     def faults(self) -> list[str]:
@@ -178,52 +168,6 @@ class ReportedFlight:
             found.append(f"The log may lack its last records: {end.log_problem}.")
         return found
 
-    @property
-    def vision_rows(self) -> list[tuple[str, ...]]:
-        """Of each phase in which the camera leads, and of all of them together."""
-        return [
-            (
-                vision.phase,
-                str(vision.frames),
-                share(vision.share),
-                _known(f"{vision.rate_hz:.1f} /s"),
-                milliseconds(vision.age_s),
-                milliseconds(vision.age_most_s),
-                _known(f"{vision.misfit_px:.2f} px"),
-            )
-            for vision in (*self.flight.vision_by_phase, self.flight.vision_led)
-        ]
-
-    @property
-    def longest_gap_s(self) -> float:
-        """The longest time without a picture; 0 without any gap."""
-        return max((float(b - a) for a, b in self.flight.frames.gaps_s), default=0.0)
-
-    @property
-    def stops(self) -> str:
-        """When and why no external position was sent."""
-        stops = () if self.flight.external is None else self.flight.external.stops
-        return "; ".join(
-            f"at {a:.1f} s for {b - a:.1f} s: {why}" for a, b, why in stops[:MOST_STOPS]
-        )
-
-    @cached_property
-    def timings(self) -> dict[str, Array]:
-        """What each turn took, s, by name."""
-        return timings_of(self.flight.log)
-
-    @property
-    def timing_rows(self) -> list[tuple[str, ...]]:
-        """Median, 99 of 100 below, and the longest."""
-        return [
-            (name, *(milliseconds(percentile(values, percent)) for percent in (50, 99, 100)))
-            for name, values in self.timings.items()
-        ]
-
-
-def _known(text: str) -> str:
-    return "-" if "nan" in text else text
-
 
 # --- the page ---------------------------------------------------------------------------
 
@@ -232,8 +176,8 @@ POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 def page_of(flights: Sequence[ReportedFlight]) -> str:
-    """HTML that needs nothing else. `flights` has at least one. Raises InvalidValue for a value
-    that no flight writes."""
+    """Return the page of at least one flight as HTML that needs no other file. Raises InvalidValue
+    for a value that no flight writes."""
     articles = []
     for number, told in enumerate(flights, start=1):
         with log_values(told.flight.log.path):
@@ -255,7 +199,7 @@ def _render(name: str, **values: Any) -> Markup:
 
 @cache
 def _templates() -> jinja2.Environment:
-    """Text is escaped, always; only what the templates and the figures hold is not."""
+    """Return the environment that escapes all text but that of the templates themselves."""
     templates = jinja2.Environment(
         loader=jinja2.PackageLoader("perchctl.analysis"),
         autoescape=True,
@@ -263,21 +207,15 @@ def _templates() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    templates.filters.update(
-        length_text=length,
-        milliseconds=milliseconds,
-        share=share,
-        count=count,
-    )
+    templates.filters["count"] = count
     templates.globals.update(
         seven_phases=SEVEN, latency_text=latency_text, turn_text=turn_text, plot_of=plot_address
     )
-    templates.tests["finite"] = math.isfinite
     return templates
 
 
 def plot_address(flight: FlightAnalysis) -> str:
-    """The flight's plot as a `data:` address; the log has at least one tick."""
+    """Return the flight's plot as a `data:` address; the log has at least one tick."""
     return _address("png", flight_png(flight))
 
 
@@ -329,8 +267,9 @@ class Shown:
 
 
 def decisions_of(flight: FlightAnalysis) -> tuple[Decision, ...]:
-    """In order: where the mission went on because of what was seen, and where sight was lost."""
-    moments = [(s.start_s, DECIDED[s.phase]) for s in flight.stays if s.phase in DECIDED]
+    """Find in order where the mission went on because of what was seen, and where sight was
+    lost."""
+    moments = [(s.start_s, DECIDED[s.phase]) for s in flight.log.phases if s.phase in DECIDED]
     for loss in flight.losses:
         moments.append((loss.start_s + min(loss.duration_s, 0.5), "lost"))
     found = []
@@ -346,7 +285,8 @@ def decisions_of(flight: FlightAnalysis) -> tuple[Decision, ...]:
 
 
 def with_pictures(flight: FlightAnalysis, recording: Path) -> ReportedFlight:
-    """The flight with the pictures of its decisions, as far as the recording can be read."""
+    """Return the flight with the pictures of its decisions, as far as the recording can be
+    read."""
     wanted: dict[int, list[Decision]] = {}
     for decision in decisions_of(flight):
         wanted.setdefault(decision.frame, []).append(decision)

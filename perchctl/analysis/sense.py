@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.flight import ENDED_TEXT, SENSED, FlightInputs
 from perchctl.mission import FrameSeen, Observation, PoseSeen, Turn, TurnInputs
-from perchctl.perception import History, add_late_samples, add_samples, battery_age_s
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
 from perchctl.vision import Frame, Pipeline
@@ -110,8 +109,8 @@ class _Given:
         return image
 
     def _again(self, seen: FrameSeen) -> NDArray[np.uint8]:
-        """One that the source repeated, which is not recorded: nothing is measured in it, but
-        whether its bytes are the same tells a frozen picture."""
+        """Return a picture that the source repeated, which is not recorded: nothing is measured in
+        it, but whether its bytes are the same shows a frozen camera."""
         if self._shown is None:
             raise PictureMissing(f"the picture that frame {seen.index} repeats was not recorded")
         checksum, image = self._shown
@@ -141,8 +140,8 @@ def sense(
     pictures: Iterable[Picture],
     later_s: float = 0.0,
 ) -> Iterator[Sensed]:
-    """Each turn, in order, from the first before take-off on. `later_s` is added to the time at
-    which a live source's pictures were taken.
+    """See each turn again, in order, from the first before take-off on. `later_s` is added to the
+    time at which a live source's pictures were taken.
 
     Raises PictureMissing where a frame was taken whose picture is not there, is another one or
     cannot be read: from then on the pipeline would remember another flight.
@@ -159,7 +158,7 @@ def sense(
 
 
 def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
-    """A recording that cannot be read costs the planner's replay nothing."""
+    """Yield the pictures; one that cannot be read ends the pictures, not the planner's replay."""
     try:
         yield from pictures
     except (InvalidValue, NotFound) as error:
@@ -175,55 +174,10 @@ def _observed(turn: Turn, inputs: FlightInputs) -> Observation | None:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """OpenCV's sums then have one order."""
+    """Keep OpenCV to one thread, so that its sums have one order."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
         yield
     finally:
         cv2.setNumThreads(threads)
-
-
-# --- What the planner would be shown, from a log alone ------------------------------------------
-# The part of the inputs that needs no picture: whether the estimate jumped, how far the heading
-# stepped, and how old the battery's reading is. What a picture showed is as it was in the flight.
-
-
-def shown(turns: Sequence[Turn], flown: Profile, profile: Profile) -> Iterator[Sensed]:
-    """Each turn, in order, from the first before take-off on: `flown` is the profile that it was
-    flown by, `profile` the one whose `safety.jump_*` and `positioning.latency_s` count. With the
-    same one twice the observations are the recorded ones, to the bit."""
-    history = History()
-    later_s = placed_later_s(turns, flown, profile)
-    for turn in turns:
-        history = add_samples(history, list(turn.taken.samples), profile.safety)
-        if turn.t_s != turn.began_s:
-            history = add_late_samples(history, list(turn.taken.late), profile.safety)
-        obs, newest = turn.observation, history.newest
-        if obs is None or newest is None:
-            yield Sensed(turn, turn.poses, None)
-            continue
-        again = replace(
-            obs,
-            telemetry=newest,
-            battery_age_s=battery_age_s(history, turn.t_s),
-            jumped=history.jumped,
-            turned_rad=history.turned_rad,
-        )
-        yield older(Sensed(turn, turn.poses, again), later_s)
-
-
-def placed_later_s(turns: Sequence[Turn], flown: Profile, profile: Profile) -> float:
-    """How much older positions from outside are by the other profile; 0 of a flight by decks."""
-    if not any(turn.outside is not None for turn in turns):
-        return 0.0
-    return profile.positioning.latency_s - flown.positioning.latency_s
-
-
-def older(sensed: Sensed, later_s: float) -> Sensed:
-    """With positions that are so much older."""
-    obs = sensed.observation
-    if obs is None or not later_s:
-        return sensed
-    aged = replace(obs, position_age_s=obs.position_age_s + later_s)
-    return replace(sensed, observation=aged)

@@ -24,7 +24,7 @@ _END_KEYS = (
 
 
 def show_record(flight: FlightAnalysis) -> dict[str, Any]:
-    """All that `show_text` shows, for programs: SI, times from the flight's first turn."""
+    """Return all that `show_text` shows, for programs: SI, times from the flight's first turn."""
     log, end, header = flight.log, flight.summary, flight.log.header
     ended = end.as_record()
     return {
@@ -47,7 +47,7 @@ def show_record(flight: FlightAnalysis) -> dict[str, Any]:
                 "reason": stay.reason,
                 "row": stay.row or None,
             }
-            for stay in flight.stays
+            for stay in flight.log.phases
         ],
         "holds": [
             {
@@ -72,12 +72,13 @@ def show_record(flight: FlightAnalysis) -> dict[str, Any]:
 
 
 def show_text(flight: FlightAnalysis) -> str:
-    """How it ended, its phases, what held it, and what is known of vision, link and battery."""
+    """Return how a flight ended, its figures, its phases, and what held it or took over, as lines
+    for a terminal."""
     log = flight.log
     lines = [*_end_lines(flight), *_named("record", _origin(log)), *_measure_lines(flight)]
-    if flight.stays:
+    if flight.log.phases:
         lines += ["", "  at [s]  for [s]  phase     why"]
-    for stay in flight.stays:
+    for stay in flight.log.phases:
         why = stay.reason + (f" ({stay.row})" if stay.row else "")
         lines += hung(f"{_span(stay.start_s, stay.duration_s)}{plain(stay.phase):<9} ", why)
     lines += _table(
@@ -99,7 +100,7 @@ def show_text(flight: FlightAnalysis) -> str:
 
 
 def _table(head: str, rows: Sequence[tuple[str, str]]) -> Iterator[str]:
-    """The first rows, each with its begin and its text; nothing where there is none."""
+    """Yield a table's first rows, each with its begin and its text; nothing without rows."""
     if not rows:
         return
     yield ""
@@ -115,7 +116,7 @@ def _span(start_s: float, duration_s: float) -> str:
 
 
 def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
-    """The lines that `fly` ends with, but for the phases, which come as a table."""
+    """Yield the lines that `fly` ends with, but for the phases, which come as a table."""
     log = flight.log
     end = replace(flight.summary, phases=(), battery_min_v=None)
     first, *others = summary_text(end).splitlines()
@@ -143,7 +144,7 @@ def _origin(log: FlightLog) -> str:
 
 
 def utc_text(started_utc: Any) -> str:
-    """A header's `started_utc` as people read it."""
+    """Return a header's `started_utc` as people read it."""
     return str(started_utc).replace("T", " ").replace("+00:00", " UTC")
 
 
@@ -179,7 +180,7 @@ def _measure_lines(flight: FlightAnalysis) -> Iterator[str]:
 
 
 def plain(text: str) -> str:
-    """Without what a terminal would obey."""
+    """Return the text without characters that a terminal would obey."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
@@ -192,7 +193,7 @@ def _named(name: str, text: str) -> list[str]:
 
 
 def hung(begin: str, text: str) -> Iterator[str]:
-    """The text behind its begin, its further lines below it."""
+    """Yield the text behind its begin, its further lines below it."""
     room = " " * len(begin)
     lines = wrap(
         plain(text), COLUMNS, initial_indent=begin, subsequent_indent=room, break_on_hyphens=False
@@ -217,7 +218,7 @@ _LISTED = (
 
 
 def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
-    """The folder's flight logs by the time of their last record, the newest first.
+    """Return the folder's flight logs by the time of their last record, the newest first.
 
     What only ends like one is not among them. Errors: NotFound.
     """
@@ -238,13 +239,13 @@ def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
 
 
 def list_logs(folder: Path, most: int | None = None) -> list[dict[str, Any]]:
-    """The newest logs of a folder, each with how it ended, as JSON's own types. Of a file that
-    cannot be read `problem` says why, and the rest is None. Errors: NotFound."""
+    """Return the newest logs of a folder, each with how it ended, as JSON's own types. For a file
+    that cannot be read `problem` says why, and the rest is None. Errors: NotFound."""
     return [list_log(path) for path in newest_logs(folder, most)]
 
 
 def list_log(path: Path) -> dict[str, Any]:
-    """One log of a folder, by its header and end. Never raises for a file that is bad."""
+    """Return one log of a folder, by its header and end. Never raises for a file that is bad."""
     found: dict[str, Any] = dict.fromkeys(_LISTED) | {"log": str(path)}
     try:
         log = read_log(path, ends_suffice=True)
@@ -265,7 +266,7 @@ def list_log(path: Path) -> dict[str, Any]:
 
 
 def list_text(logs: Sequence[Mapping[str, Any]]) -> str:
-    """The records of `list_logs`, a line each, as wide as a terminal of 80 columns."""
+    """Return the records of `list_logs`, a line each, as wide as a terminal of 80 columns."""
     names = [plain(Path(each["log"]).name) for each in logs]
     width = min(44, max([3, *map(len, names)]))
     lines = [f"{'log':<{width}}  {'s':>6}  how it ended"]
@@ -277,7 +278,7 @@ def list_text(logs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _how(listed: Mapping[str, Any]) -> str:
-    """How a flight ended, or why its log cannot be read."""
+    """Return how a flight ended, or why its log cannot be read."""
     if listed["problem"] is not None:
         return str(listed["problem"])
     if listed["outcome"] == "perched":
@@ -287,7 +288,7 @@ def _how(listed: Mapping[str, Any]) -> str:
 
 
 def _is_log(path: Path) -> bool:
-    """By its begin; by its name where that is lost, as a flight that left nothing is one, too."""
+    """True if a file is a flight log, by its begin; where that is lost, by its name."""
     if not path.name.endswith(SUFFIXES) or path.is_dir():
         return False
     if path.name.startswith(_NAME):

@@ -11,47 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.record import FlightLog
+from perchctl.record import FlightLog, PhaseSpan
 
 BLIND_PHASE = "COMPLETE"
 """Against the ceiling no frame is looked at."""
 GAP_PERIODS = 2.5
 """Frames come irregularly: less than that may be a late one."""
-LED_BY_CAMERA = ("SEARCH", "ESTIMATE", "ALIGN", "ASCEND", "PERCH", "RECOVER")
-
-
-@dataclass(frozen=True)
-class Stay:
-    """One stay in a phase; times since the flight's first turn, `end_s` that of the next stay.
-
-    Attributes:
-        reason: why the phase was entered; `row`: the row of the mission's table that led there,
-            `severity` and `simulated` as in the log's event. Empty where the log has none.
-    """
-
-    phase: str
-    start_s: float
-    end_s: float
-    reason: str = ""
-    row: str = ""
-    severity: str = ""
-    simulated: str = ""
-
-    @property
-    def duration_s(self) -> float:
-        return self.end_s - self.start_s
 
 
 def percentile(values: Array, percent: float) -> float:
     """A percentile of the known values; NaN where none is known."""
     known = values[np.isfinite(values)]
     return float(np.percentile(known, percent)) if known.size else math.nan
-
-
-def shows_target(record: Mapping[str, Any]) -> bool:
-    """True if the frame of a tick held the target, as the planner's estimate took it."""
-    found = any(record.get(f"{source}x_m") is not None for source in "jls")
-    return found and record.get("measured") is not False
 
 
 # --- frames -----------------------------------------------------------------------------
@@ -62,38 +33,61 @@ class Frames:
     """The camera frames that the pipeline was given, in order.
 
     Attributes:
-        ticks: (n,) the index of the tick that processed each.
+        ticks: (n,) the index of the tick that processed each frame.
         t_s: (n,) times of exposure since the flight's first turn.
-        seen: (n,) bool, True for those that showed the target.
-        gaps_s: (k, 2) from when to when no frame came that could be used.
+        seen: (n,) bool, True for the frames that showed the target.
+        gaps_s: (k, 2) from when to when no usable frame came.
+        rate_hz: 1 over the median time between two frames; NaN where it is unknown.
+        age_s: median age of a picture when it was used; NaN where it is unknown.
+        misfit_px: median misfit of the corners and the pose; NaN where it is unknown. Four corners
+            alone fit nearly any pose: where both markers were ever seen, only such frames count.
     """
 
     ticks: NDArray[np.int_]
     t_s: Array
     seen: NDArray[np.bool_]
     gaps_s: Array
+    rate_hz: float
+    age_s: float
+    misfit_px: float
 
     @property
     def seen_s(self) -> Array:
+        """Times of the frames that showed the target."""
         return self.t_s[self.seen]
 
     @property
     def unseen_s(self) -> Array:
+        """Times of the frames that did not show the target."""
         return self.t_s[~self.seen]
 
 
 def frames_of(log: FlightLog) -> Frames:
-    """The frames of a flight; the median period decides what is a gap."""
+    """Read the frames of a flight; the median period decides what is a gap."""
     taken = [i for i, record in enumerate(log.records) if record.get("frame_t_s") is not None]
     records = [log.records[i] for i in taken]
     times_s = log.since(np.array([r["frame_t_s"] for r in records], dtype=np.float64))
-    seen = np.array([shows_target(record) for record in records], dtype=bool)
-    gaps_s = np.empty((0, 2))
+    ages_s = np.array([r["t_s"] - r["frame_t_s"] for r in records], dtype=np.float64)
+    age_s, gaps_s = percentile(ages_s, 50), np.empty((0, 2))
     if taken:
         # The flight's end, as old as frames are when they are measured, may end a gap, too.
-        late_s = float(np.median([r["t_s"] - r["frame_t_s"] for r in records]))
-        gaps_s = _gaps(log, np.append(times_s, max(log.end_s - late_s, times_s[-1])))
-    return Frames(np.array(taken, dtype=int), times_s, seen, gaps_s)
+        gaps_s = _gaps(log, np.append(times_s, max(log.end_s - age_s, times_s[-1])))
+    between_s = np.diff(np.sort(times_s))
+    return Frames(
+        ticks=np.array(taken, dtype=int),
+        t_s=times_s,
+        seen=np.array([shows_target(record) for record in records], dtype=bool),
+        gaps_s=gaps_s,
+        rate_hz=1.0 / percentile(between_s[between_s > 0], 50),
+        age_s=age_s,
+        misfit_px=_misfit_px(records),
+    )
+
+
+def shows_target(record: Mapping[str, Any]) -> bool:
+    """True if the frame of a tick held the target, as the planner's estimate took it."""
+    found = any(record.get(f"{source}x_m") is not None for source in "jls")
+    return found and record.get("measured") is not False
 
 
 def _gaps(log: FlightLog, times_s: Array) -> Array:
@@ -102,62 +96,8 @@ def _gaps(log: FlightLog, times_s: Array) -> Array:
     gaps_s = gaps_s[between_s > GAP_PERIODS * np.median(between_s)]
     for span in log.phases:
         if span.phase == BLIND_PHASE:
-            start_s, end_s = log.since(span.start_s), log.since(span.end_s)
-            gaps_s = gaps_s[(gaps_s[:, 1] <= start_s) | (gaps_s[:, 0] >= end_s)]
+            gaps_s = gaps_s[(gaps_s[:, 1] <= span.start_s) | (gaps_s[:, 0] >= span.end_s)]
     return gaps_s
-
-
-@dataclass(frozen=True)
-class Vision:
-    """How well the camera saw during some of the frames; NaN where nothing is known.
-
-    Attributes:
-        phase: whose frames these are, all stays together.
-        frames, with_target: those that the pipeline was given, and those that showed the target.
-        rate_hz: by the median time between two frames.
-        age_s, age_most_s: age of the picture when it was used: median, and 95 of 100 are below.
-        misfit_px: by what the corners miss the pose, median. Four corners alone fit nearly any
-            pose: where both markers were ever seen, only such frames count.
-        strangers: frames whose pose was not taken for the target's.
-    """
-
-    phase: str
-    frames: int
-    with_target: int
-    rate_hz: float
-    age_s: float
-    age_most_s: float
-    misfit_px: float
-    strangers: int
-
-    @property
-    def share(self) -> float:
-        return self.with_target / self.frames if self.frames else math.nan
-
-
-def vision_of(
-    log: FlightLog, frames: Frames, name: str, phases: Sequence[str] | None = None
-) -> Vision:
-    """Of the frames that came in the phases; None is all of the flight."""
-    inside = [
-        k
-        for k, i in enumerate(frames.ticks)
-        if phases is None or log.records[i].get("phase") in phases
-    ]
-    records = [log.records[i] for i in frames.ticks[inside]]
-    ages = np.array([r["t_s"] - r["frame_t_s"] for r in records], dtype=np.float64)
-    between_s = np.diff(np.sort(frames.t_s[inside]))
-    period_s = percentile(between_s[between_s > 0], 50)
-    return Vision(
-        name,
-        len(records),
-        int(np.count_nonzero(frames.seen[inside])),
-        1.0 / period_s,
-        percentile(ages, 50),
-        percentile(ages, 95),
-        _misfit_px(records),
-        sum(bool(r.get("lock_note")) for r in records),
-    )
 
 
 def _misfit_px(records: Sequence[Mapping[str, Any]]) -> float:
@@ -201,8 +141,9 @@ class Loss:
         return self.end_s - self.start_s
 
 
-def losses_of(log: FlightLog, frames: Frames, stays: Sequence[Stay]) -> tuple[Loss, ...]:
-    """All losses in order. A vehicle at the ceiling looks at nothing, and loses nothing."""
+def losses_of(log: FlightLog, frames: Frames) -> tuple[Loss, ...]:
+    """Find all losses in order. A vehicle at the ceiling looks at nothing, and loses nothing."""
+    stays = log.phases
     speed_mps = np.linalg.norm([log.column(f"v{axis}_mps") for axis in "xyz"], axis=0)
     starts_s = [float(t_s) for t_s in frames.seen_s]
     ends_s = [*starts_s[1:], log.end_s]
@@ -225,7 +166,7 @@ def losses_of(log: FlightLog, frames: Frames, stays: Sequence[Stay]) -> tuple[Lo
     return tuple(found)
 
 
-def _end_of_loss(start_s: float, end_s: float, stays: Sequence[Stay]) -> float | None:
+def _end_of_loss(start_s: float, end_s: float, stays: Sequence[PhaseSpan]) -> float | None:
     """When it ended; None where nothing was lost."""
     if end_s - start_s < LEAST_LOSS_S:
         return None
@@ -242,7 +183,7 @@ def _end_of_loss(start_s: float, end_s: float, stays: Sequence[Stay]) -> float |
     return end_s
 
 
-def _phase_at(stays: Sequence[Stay], t_s: float) -> str:
+def _phase_at(stays: Sequence[PhaseSpan], t_s: float) -> str:
     return next((s.phase for s in reversed(stays) if s.start_s <= t_s), "")
 
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.analysis.edges import runs_of
-from perchctl.analysis.flight import FlightAnalysis
-from perchctl.analysis.sight import Loss, Stay
+from perchctl.analysis.flight import FlightAnalysis, runs_of
+from perchctl.analysis.sight import Loss
 from perchctl.analysis.words import count, length
 from perchctl.mission import SEVEN_PHASES, Phase
+from perchctl.record import PhaseSpan
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 HELD_LEAST_S = 0.1
@@ -23,6 +23,7 @@ TOOK_OVER = {
     "rescue": "The rescue took over, after an error",
     "reconnect": "The link was opened once more",
 }
+ENDS = {"PERCHED": "Perched", "LANDED": "Down", "ABORTED": "The flight was broken off"}
 ACTS = {
     "position": "it gave it a place to hold",
     "thrust": "it kept the thrust",
@@ -43,7 +44,7 @@ class Sentence:
 
 
 def story_of(flight: FlightAnalysis) -> tuple[Sentence, ...]:
-    """The whole flight, in order; empty for a log without ticks."""
+    """Tell the whole flight in order; empty for a log without ticks."""
     if not flight.log.records:
         return ()
     told = [
@@ -51,6 +52,7 @@ def story_of(flight: FlightAnalysis) -> tuple[Sentence, ...]:
         *map(_told_loss, flight.losses),
         *_holds(flight),
         *_taken_over(flight),
+        *_unpositioned(flight),
         *_notes(flight),
         *_motors(flight),
         *_end(flight),
@@ -62,8 +64,8 @@ def story_of(flight: FlightAnalysis) -> tuple[Sentence, ...]:
 
 
 def _steps(flight: FlightAnalysis) -> Iterator[Sentence]:
-    for i, stay in enumerate(flight.stays):
-        text = TELLS.get(stay.phase, _plain)(flight, stay)
+    for i, stay in enumerate(flight.log.phases):
+        text = _step_text(flight, stay)
         if stay.simulated:
             text += f" (the simulation: {stay.simulated})"
         if i == 0 and stay.phase == "APPROACH":
@@ -71,7 +73,7 @@ def _steps(flight: FlightAnalysis) -> Iterator[Sentence]:
         yield Sentence(stay.start_s, text, _grade(stay))
 
 
-def _grade(stay: Stay) -> str:
+def _grade(stay: PhaseSpan) -> str:
     if stay.phase in ("PERCHED", "COMPLETE"):
         return "good"
     if stay.phase == "ABORTED" or stay.severity == "stop":
@@ -81,104 +83,65 @@ def _grade(stay: Stay) -> str:
     return "warn" if stay.phase == "LANDING" else "step"
 
 
-def _plain(flight: FlightAnalysis, stay: Stay) -> str:
-    return f"{stay.phase}: {stay.reason}" if stay.reason else stay.phase
+def _step_text(flight: FlightAnalysis, stay: PhaseSpan) -> str:
+    reason, at_s = _upper(stay.reason), stay.start_s
+    match stay.phase:
+        case "APPROACH":
+            return "Took off"
+        case "SEARCH":
+            at = f"at {length(flight.height_m(at_s))}"
+            if stay.row == "approached" or stay.reason == "hovering in the perching area":
+                return f"It hovered {at}, and looked for the target"
+            return f"{reason}: it looked for the target again, {at}"
+        case "ESTIMATE":
+            where = _where(flight, at_s)
+            if stay.row == "recovered" or "again" in stay.reason or "once more" in stay.reason:
+                return f"{reason}:{where}" if where else reason
+            return f"Found the target{where}"
+        case "ALIGN":
+            if stay.severity == "hold" or "cone" in stay.reason:
+                return f"{reason}{_beside(flight, at_s)}: it aligned again"
+            return f"Its pose was steady{_spread(flight, at_s)}: it went under the target"
+        case "ASCEND":
+            return f"Aligned{_beside(flight, at_s)}{_heading_and_time(flight, stay)}: it climbed"
+        case "PERCH":
+            return _perch(flight, stay)
+        case "COMPLETE":
+            thrust = flight.at(at_s, "thrust") / 655.35
+            at = f", at {thrust:.0f} % thrust" if math.isfinite(thrust) else ""
+            return f"{reason}{at}: the thrust was taken away"
+        case "RECOVER":
+            return f"{reason}: {_backed_off(flight, stay)}"
+        case "LANDING":
+            height_m = flight.height_m(at_s)
+            at = f", from {length(height_m)}" if math.isfinite(height_m) else ""
+            return f"{reason}: it landed{at}"
+    begin = ENDS.get(stay.phase, stay.phase)
+    return f"{begin}: {stay.reason}" if stay.reason else begin
 
 
-def _approach(flight: FlightAnalysis, stay: Stay) -> str:
-    return "Took off"
+def _heading_and_time(flight: FlightAnalysis, stay: PhaseSpan) -> str:
+    turned, took_s = flight.at(stay.start_s, "eyaw_rad"), _time_before(flight, stay, "ALIGN")
+    text = f" and {abs(math.degrees(turned)):.1f} deg off" if math.isfinite(turned) else ""
+    return f"{text}, after {took_s:.1f} s" if took_s else text
 
 
-def _search(flight: FlightAnalysis, stay: Stay) -> str:
-    at = f"at {length(flight.height_m(stay.start_s))}"
-    if stay.row == "approached" or stay.reason == "hovering in the perching area":
-        return f"It hovered {at}, and looked for the target"
-    return f"{_upper(stay.reason)}: it looked for the target again, {at}"
-
-
-def _estimate(flight: FlightAnalysis, stay: Stay) -> str:
-    where = _where(flight, stay.start_s)
-    if stay.row == "recovered" or "again" in stay.reason or "once more" in stay.reason:
-        return f"{_upper(stay.reason)}:{where}" if where else _upper(stay.reason)
-    return f"Found the target{where}"
-
-
-def _align(flight: FlightAnalysis, stay: Stay) -> str:
-    if stay.severity == "hold" or "cone" in stay.reason:
-        return f"{_upper(stay.reason)}{_beside(flight, stay.start_s)}: it aligned again"
-    return f"Its pose was steady{_spread(flight, stay.start_s)}: it went under the target"
-
-
-def _ascend(flight: FlightAnalysis, stay: Stay) -> str:
-    took_s = _time_before(flight, stay, "ALIGN")
-    turned = flight.at(stay.start_s, "eyaw_rad")
-    text = f"Aligned{_beside(flight, stay.start_s)}"
-    if math.isfinite(turned):
-        text += f" and {abs(math.degrees(turned)):.1f} deg off"
-    if took_s:
-        text += f", after {took_s:.1f} s"
-    return f"{text}: it climbed"
-
-
-def _perch(flight: FlightAnalysis, stay: Stay) -> str:
+def _perch(flight: FlightAnalysis, stay: PhaseSpan) -> str:
     below_m = flight.at(stay.start_s, "ez_m")
     below = f" {length(below_m)} below the target" if math.isfinite(below_m) else ""
     text = f"Settled at the stand-off{below}{_beside(flight, stay.start_s)}"
     took_s = _time_before(flight, stay, "ASCEND")
-    return f"{text}, after {took_s:.1f} s of ascent: it pressed" if took_s else f"{text}"
+    return f"{text}, after {took_s:.1f} s of ascent: it pressed" if took_s else text
 
 
-def _complete(flight: FlightAnalysis, stay: Stay) -> str:
-    speed = flight.at(stay.start_s, "vz_mps")
-    thrust = flight.at(stay.start_s, "thrust") / 655.35
-    text = _upper(stay.reason)
-    if math.isfinite(thrust) and math.isfinite(speed):
-        text += f", at {thrust:.0f} % thrust"
-    return f"{text}: the thrust was taken away"
-
-
-def _recover(flight: FlightAnalysis, stay: Stay) -> str:
+def _backed_off(flight: FlightAnalysis, stay: PhaseSpan) -> str:
     heights = flight.log.column("z_m")[flight.within(stay.start_s, stay.end_s)]
     heights = heights[np.isfinite(heights)]
     down_m = float(heights[0] - np.min(heights)) if heights.size else 0.0
     attempts = flight.at(stay.start_s, "attempts")
     nth = f" (failed attempt {attempts:.0f})" if attempts >= 1 else ""
     away = f"backed off {length(down_m)}" if down_m >= BACKED_OFF_M else "it stayed where it was"
-    return f"{_upper(stay.reason)}: {away}{nth}"
-
-
-def _landing(flight: FlightAnalysis, stay: Stay) -> str:
-    height_m = flight.height_m(stay.start_s)
-    at = f", from {length(height_m)}" if math.isfinite(height_m) else ""
-    return f"{_upper(stay.reason)}: it landed{at}"
-
-
-def _perched(flight: FlightAnalysis, stay: Stay) -> str:
-    return f"Perched: {stay.reason}"
-
-
-def _landed(flight: FlightAnalysis, stay: Stay) -> str:
-    return f"Down: {stay.reason}"
-
-
-def _aborted(flight: FlightAnalysis, stay: Stay) -> str:
-    return f"The flight was broken off: {stay.reason}"
-
-
-TELLS: dict[str, Callable[[FlightAnalysis, Stay], str]] = {
-    "APPROACH": _approach,
-    "SEARCH": _search,
-    "ESTIMATE": _estimate,
-    "ALIGN": _align,
-    "ASCEND": _ascend,
-    "PERCH": _perch,
-    "COMPLETE": _complete,
-    "RECOVER": _recover,
-    "LANDING": _landing,
-    "PERCHED": _perched,
-    "LANDED": _landed,
-    "ABORTED": _aborted,
-}
+    return f"{away}{nth}"
 
 
 def _battery(flight: FlightAnalysis) -> str:
@@ -207,10 +170,10 @@ def _spread(flight: FlightAnalysis, t_s: float) -> str:
     return f" to {length(sigma_m)}" if math.isfinite(sigma_m) else ""
 
 
-def _time_before(flight: FlightAnalysis, stay: Stay, phase: str) -> float:
-    """How long the phase before lasted, 0 where another one was before."""
-    at = flight.stays.index(stay)
-    before = flight.stays[at - 1] if at else None
+def _time_before(flight: FlightAnalysis, stay: PhaseSpan, phase: str) -> float:
+    """Return how long the phase before lasted, 0 where another one was before."""
+    at = flight.log.phases.index(stay)
+    before = flight.log.phases[at - 1] if at else None
     return before.duration_s if before and before.phase == phase else 0.0
 
 
@@ -235,8 +198,8 @@ def _holds(flight: FlightAnalysis) -> Iterator[Sentence]:
 
 
 def _taken_over(flight: FlightAnalysis) -> Iterator[Sentence]:
-    """What came from elsewhere than the loop. The farewell, to a vehicle that is down, is none of
-    the flight's."""
+    """Tell what was sent in the loop's place. The farewell, to a vehicle that is down, is not part
+    of the flight."""
     for go in flight.takeovers:
         who = TOOK_OVER.get(go.by)
         if who is None:
@@ -250,6 +213,12 @@ def _taken_over(flight: FlightAnalysis) -> Iterator[Sentence]:
         yield Sentence(t_s, text, "warn" if steered else "bad")
 
 
+def _unpositioned(flight: FlightAnalysis) -> Iterator[Sentence]:
+    for start_s, end_s, why in runs_of(flight.log, "pos_note"):
+        text = f"No external position was sent for {end_s - start_s:.1f} s: {why}"
+        yield Sentence(start_s, text, "warn")
+
+
 def _notes(flight: FlightAnalysis) -> Iterator[Sentence]:
     for t_s, note in flight.notes:
         if note:
@@ -257,7 +226,7 @@ def _notes(flight: FlightAnalysis) -> Iterator[Sentence]:
 
 
 def _motors(flight: FlightAnalysis) -> Iterator[Sentence]:
-    """Each kind once: a stop may be repeated, and an emergency cut may come long after it."""
+    """Tell each kind of stop once: it may be repeated, and an emergency cut may come long after."""
     tells = {"stop": "The motors were stopped", "emergency": "The motors were cut and locked"}
     for start_s, _end_s, command in runs_of(flight.log, "cmd"):
         text = tells.pop(command, None)
@@ -266,7 +235,7 @@ def _motors(flight: FlightAnalysis) -> Iterator[Sentence]:
 
 
 def _end(flight: FlightAnalysis) -> Iterator[Sentence]:
-    """Where a log stops without saying how the flight ended."""
+    """Tell what the vehicle needs after the flight, or where a log stops without its end."""
     if flight.log.summary is not None:
         end = flight.summary
         if end.locked:
@@ -277,7 +246,7 @@ def _end(flight: FlightAnalysis) -> Iterator[Sentence]:
         if end.fell:
             yield Sentence(flight.end_s, "The vehicle fell", "bad")
         return
-    phase = flight.stays[-1].phase if flight.stays else "?"
+    phase = flight.log.phases[-1].phase if flight.log.phases else "?"
     text = f"The log ends here, in {phase}"
     height_m = flight.height_m(flight.end_s)
     if phase in FLYING | {"LANDING"} and math.isfinite(height_m):

@@ -29,7 +29,7 @@ from perchctl.record import (
     from_exact,
     json_line,
     make_log_folder,
-    recording_path,
+    path_beside,
     to_exact,
 )
 
@@ -76,7 +76,7 @@ class CampaignResults(Generic[R]):
         if self._file is not None:
             self._file.append(result)
         if self._failed_logs_only and result.log is not None and not result.is_bad:
-            for path in (result.log, recording_path(result.log)):
+            for path in (result.log, path_beside(result.log, ".mcap")):
                 with suppress(OSError):
                     path.unlink(missing_ok=True)
 

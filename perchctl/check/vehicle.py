@@ -96,7 +96,8 @@ GONE_S = 1.0
 def gone(link: ProbeLink) -> str:
     """Return why the vehicle is not there any more, or an empty text.
 
-    Silence counts, too: a radio keeps its link to a vehicle that is off, cflib to one that restarts.
+    Silence counts, too: a radio keeps its link to a vehicle that is off, and cflib keeps it to one
+    that restarts.
     """
     if lost := link.lost():
         return f"the link was lost: {lost}"

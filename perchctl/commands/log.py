@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -31,24 +31,22 @@ from perchctl.commands.command_line import (
     new_app,
 )
 from perchctl.commands.output import print_result, say
-from perchctl.errors import InvalidValue, ReplayDiffers, UsageError
+from perchctl.errors import ReplayDiffers, UsageError
 from perchctl.files import check_output, same_file, write_files
 from perchctl.profile import Profile, changed_profile, load_profile
 from perchctl.record import (
     FlightLog,
-    export_mcap,
     log_table,
     log_values,
     path_beside,
     read_log,
     recorded_pictures,
-    recording_path,
 )
 
 FORMATS = (".png", ".pdf", ".svg")
 FILMS = (".mp4", ".gif")
 DRAWN_IN = "what plots are drawn in"
-EXPORTS = (".csv", ".parquet", ".mcap")
+EXPORTS = (".csv",)
 PAGE_SUFFIXES = (".html", ".htm")
 
 LogArgument = Annotated[
@@ -180,62 +178,31 @@ def compare(
 @command(
     app,
     "perchctl log export",
-    "perchctl log export perchctl-logs/flight.jsonl -o flight.parquet",
-    "perchctl log export -o flight.mcap",
+    "perchctl log export perchctl-logs/flight.jsonl -o flight.csv",
+    "perchctl log export --force --json",
 )
 def export(
     file: LogArgument = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="The file: .csv (for any program), .parquet (for pandas, polars, DuckDB) or "
-            ".mcap (for Foxglove, rosbag2, PlotJuggler). Default: .csv beside the log.",
-        ),
+        typer.Option("--output", "-o", help="The file: .csv. Default: beside the log."),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
-) -> int:
-    """Write a log in a form that other programs open."""
+) -> None:
+    """Write a log as a table that other programs open."""
     path = _log_file(file)
     place = output or path_beside(path, ".csv")
     check_output(place, EXPORTS, force, "what a log is exported to")
-    form = place.suffix.lower().removeprefix(".")
-    done = _write_mcap(path, place, force) if form == "mcap" else _write_table(path, place, form)
-    if as_json:
-        print_result({"log": str(path), "output": str(place), "format": form, **done})
-        return 0
-    counts = [f"{done[key]} {key}" for key in ("rows", "columns", "pictures") if key in done]
-    print(f"export:    {place} ({', '.join(counts)})")
-    if "layout" in done:
-        print(f"layout:    {done['layout']}, for Foxglove")
-    return 0
-
-
-def _write_table(path: Path, place: Path, form: str) -> dict[str, Any]:
     with _opened(path) as log:
         table = log_table(log)
-        if form == "csv":
-            content = table.csv().encode("utf-8", errors="backslashreplace")
-        else:
-            content = table.parquet()
-    write_files({place: content})
-    return {"rows": table.rows, "columns": len(table.columns)}
-
-
-def _write_mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
-    own = recording_path(path)
-    if same_file(place, own):
-        raise InvalidValue(
-            f"{own} is the flight's own recording, with its pictures: open that, or name another "
-            f"file with -o"
-        )
-    with _opened(path) as log:
-        done = export_mcap(log, place, force)
-    for note in done.notes:
-        say(note)
-    return {"layout": str(done.layout), "pictures": done.pictures, "notes": list(done.notes)}
+    write_files({place: table.csv().encode("utf-8", errors="backslashreplace")})
+    rows, columns = len(table.rows), len(table.columns)
+    if as_json:
+        found = {"log": str(path), "output": str(place), "format": "csv"}
+        print_result(found | {"rows": rows, "columns": columns})
+    else:
+        print(f"export:    {place} ({rows} rows, {columns} columns)")
 
 
 @command(
@@ -282,7 +249,7 @@ def replay(
             base = log.flown_profile if profile is None else load_profile(profile)
             wanted = changed_profile(base, settings or ())
         check_readable(log)
-    is_recorded = pictures and recording_path(path).is_file()
+    is_recorded = pictures and path_beside(path, ".mcap").is_file()
     found = replay_flight(log, recorded_pictures(path) if is_recorded else None, wanted)
     if wanted is not None and not found.changed:
         say("nothing was changed: that is what was flown")
@@ -361,7 +328,7 @@ def film(
     path = _log_file(file)
     place = output or path_beside(path, ".mp4")
     check_output(place, FILMS, force, "what films are made in")
-    is_recorded = recording_path(path).is_file()
+    is_recorded = path_beside(path, ".mcap").is_file()
     if not is_recorded:
         say(f"there is no recording beside {path}: the film has no camera picture")
     with _opened(path) as log:

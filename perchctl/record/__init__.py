@@ -1,4 +1,4 @@
-"""The flight log and its recording: written, read, summarised and exported."""
+"""The flight log and its recording: written, read, summarised and made a table."""
 
 import lazy_loader
 

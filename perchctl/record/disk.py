@@ -16,7 +16,7 @@ Job = Callable[[], None]
 
 
 class Stream(Protocol):
-    """What records are written to. All but `tell` may raise OSError."""
+    """What a recording is written to. All methods but `tell` may raise OSError."""
 
     def write(self, data: bytes) -> int: ...
 
@@ -42,12 +42,12 @@ class DiskFile:
 
     @classmethod
     def new(cls, path: Path, sync: bool = True) -> DiskFile:
-        """A new file. Raises OSError, where one is there already, too."""
+        """Create a file. Raises OSError, where one is there already, too."""
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_BINARY", 0)
         return cls(path, os.open(path, flags, 0o644), sync)
 
     def write(self, data: bytes) -> int:
-        """Append the whole record; returns its length."""
+        """Append the whole record; return its length. Raises OSError."""
         done, view = 0, memoryview(data)
         try:
             while done < len(data):
@@ -61,7 +61,7 @@ class DiskFile:
         return done
 
     def tell(self) -> int:
-        """Length of the file."""
+        """Return the length of the file."""
         return self._good_bytes
 
     def flush(self) -> None:
@@ -75,11 +75,11 @@ class DiskFile:
                 raise
 
     def free_bytes(self) -> int:
-        """Left on its disk."""
+        """Return the bytes that are left on its disk."""
         return shutil.disk_usage(self._path).free
 
     def close(self) -> None:
-        """Close the file; twice is once."""
+        """Close the file; a second call does nothing."""
         fd, self._fd = self._fd, -1  # the number may be another file's by the second time
         if fd >= 0:
             os.close(fd)
@@ -91,6 +91,7 @@ class BackgroundWriter:
     What a job raises is dropped: it has to remember itself what failed."""
 
     def __init__(self, most: int, name: str, live: bool) -> None:
+        """Begin with room for `most` jobs; `name` is the thread's."""
         self._most = most
         self._jobs: deque[Job] = deque()
         self._changed = threading.Condition()
@@ -101,7 +102,8 @@ class BackgroundWriter:
             self._thread.start()
 
     def put(self, job: Job, share: float = 1.0) -> bool:
-        """False when that share of the queue is full: the job is not done."""
+        """Hand over a job; False when that share of the queue is full, and the job is not done. A
+        share of infinity is never full."""
         if self._thread is None:
             _do(job)
             return True
@@ -112,24 +114,9 @@ class BackgroundWriter:
             self._changed.notify()
         return True
 
-    def wait(self, job: Job, timeout_s: float) -> bool:
-        """One more, however many there are; True if it was done by then. Later it may be, too."""
-        if self._thread is None:
-            _do(job)
-            return True
-        done = threading.Event()
-
-        def run() -> None:
-            _do(job)
-            done.set()
-
-        with self._changed:
-            self._jobs.append(run)
-            self._changed.notify()
-        return done.wait(timeout_s)
-
     def finish(self, job: Job, timeout_s: float, late: Job) -> int:
-        """One last job; waits for it. How many jobs were not done by then: 0 is all done.
+        """Hand over a last job and wait for it. Return how many jobs were not done by then; 0 is
+        all done.
 
         `late` is done instead of them should the thread ever get on: it frees what they held."""
         if self._thread is None:

@@ -32,7 +32,7 @@ _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 
 def to_exact(value: Any) -> Any:
-    """JSON's own types, from which `from_exact` makes the same value.
+    """Return JSON's own types, from which `from_exact` makes the same value.
 
     Raises TypeError for what has no exact form.
     """
@@ -43,7 +43,7 @@ def to_exact(value: Any) -> Any:
 
 
 def from_exact(kind: type[T], data: Any) -> T:
-    """The value of `kind` that `to_exact` wrote. A field that is missing has its default.
+    """Return the value of `kind` that `to_exact` wrote. A field that is missing has its default.
 
     Raises ValueError, with the way to it, for data that is none.
     """
@@ -131,12 +131,12 @@ def _writer_for(kind: Any) -> _Plan:
 
 
 def _classes_in(hint: Any) -> list[Any]:
-    """The dataclasses that a field may hold."""
+    """Return the dataclasses that a field may hold."""
     return [part for part in _members(hint) if dataclasses.is_dataclass(part)]
 
 
 def _members(hint: Any) -> tuple[Any, ...]:
-    """Of a union, else the one."""
+    """Return the members of a union; of any other type itself."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         return typing.get_args(hint)
     return (hint,)
@@ -275,37 +275,29 @@ DECIMALS = 6
 
 
 def to_plain(value: Any) -> Any:
-    """JSON's own types: numbers rounded to `DECIMALS`, NaN and infinities as None.
+    """Return JSON's own types: numbers rounded to `DECIMALS`, NaN and infinities as None.
 
     Raises TypeError for a value that has no place in a log.
     """
-    if type(value) is float:  # nearly all of a record, and a match is slow
-        return round(value, DECIMALS) + 0.0 if math.isfinite(value) else None
-    match value:
-        case None | bool() | str():
-            return value
-        case Enum():
-            return to_plain(value.value)
-        case float() | np.floating():
-            number = float(value)
-            return round(number, DECIMALS) + 0.0 if math.isfinite(number) else None
-        case np.bool_():
-            return bool(value)
-        case int() | np.integer():
-            return int(value)
-        case np.ndarray():
-            return to_plain(value.tolist())
-        case Mapping():
-            return {str(k): to_plain(v) for k, v in value.items()}
-        case list() | tuple():
-            return [to_plain(v) for v in value]
-        case PurePath():
-            return str(value)
+    if isinstance(value, float):  # nearly all of a record
+        return round(float(value), DECIMALS) + 0.0 if math.isfinite(value) else None
+    if isinstance(value, Enum):
+        return to_plain(value.value)
+    if value is None or isinstance(value, (bool, str, int)):
+        return value
+    if isinstance(value, (np.ndarray, np.generic)):
+        return to_plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(k): to_plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_plain(v) for v in value]
+    if isinstance(value, PurePath):
+        return str(value)
     raise TypeError(f"{type(value).__name__} cannot be written into a flight log")
 
 
 def encode(record: Mapping[str, Any]) -> bytes:
-    """The record as one line, keys in the record's own order, ended by a newline.
+    """Return the record as one line, keys in the record's own order, ended by a newline.
 
     Top-level keys whose value is None are left out.
     """
@@ -313,13 +305,13 @@ def encode(record: Mapping[str, Any]) -> bytes:
 
 
 def json_line(plain: Mapping[str, Any]) -> bytes:
-    """JSON's own types as one line; no number is rounded."""
+    """Return JSON's own types as one line of UTF-8 with its newline; no number is rounded."""
     text = json.dumps(plain, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return text.encode("utf-8", errors="backslashreplace") + b"\n"
 
 
 def decode_line(line: bytes) -> dict[str, Any]:
-    """Inverse of `encode`; ValueError for anything that is not one JSON object."""
+    """Return the record of a line. Raises ValueError for anything that is not one JSON object."""
     try:
         record = json.loads(line.decode("utf-8"), parse_constant=_refuse_constant)
     except RecursionError:

@@ -152,7 +152,7 @@ _KINDS: dict[Kind, tuple[str, ...]] = {
 
 
 def field_kind(key: str) -> Kind:
-    """What a field of `FIELDS` holds; `corners` are eight numbers."""
+    """Return what a field of `FIELDS` holds; `corners` are eight numbers."""
     return next((kind for kind, keys in _KINDS.items() if key in keys), "number")
 
 
@@ -168,7 +168,7 @@ EVENT_FIELDS: dict[str, str] = {
 
 
 def event_record(event: Event) -> dict[str, Any]:
-    """One event as a flat record with the keys of `EVENT_FIELDS`."""
+    """Return an event as a flat record with the keys of `EVENT_FIELDS`."""
     return {
         "t_s": event.t_s,
         "event": event.kind.value,
@@ -185,8 +185,8 @@ def tick_record(
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,
 ) -> dict[str, Any]:
-    """One tick as a flat record with all keys of `FIELDS`, in their order; with the truth of a
-    simulation."""
+    """Return a tick as a flat record with all keys of `FIELDS`, in their order; with the truth of a
+    simulation, where there is one."""
     seen, battery = tick.output or tick.target, tick.state.battery
     values: dict[str, Any] = {
         "t_s": tick.t_s,
@@ -247,17 +247,14 @@ def _xyz(prefix: str, vector: Any, unit: str = "m") -> dict[str, Any]:
 
 
 def _telemetry_values(tel: Telemetry) -> dict[str, Any]:
+    same = (
+        "roll_rad", "pitch_rad", "yaw_rad", "acc_z_g", "thrust", "battery_v", "battery_state",
+        "supervisor",
+    )  # fmt: skip
     return {
         **_xyz("", tel.position_m),
         **_xyz("v", tel.velocity_mps, "mps"),
-        "roll_rad": tel.roll_rad,
-        "pitch_rad": tel.pitch_rad,
-        "yaw_rad": tel.yaw_rad,
-        "acc_z_g": tel.acc_z_g,
-        "thrust": tel.thrust,
-        "battery_v": tel.battery_v,
-        "battery_state": tel.battery_state,
-        "supervisor": tel.supervisor,
+        **{name: getattr(tel, name) for name in same},
         "var_m2": tel.position_variance_m2,
     }
 
@@ -303,7 +300,7 @@ def _target_values(target: TargetEstimate | None) -> dict[str, Any]:
 
 
 def command_values(command: Command) -> Mapping[str, Any]:
-    """``cmd`` and what belongs to it."""
+    """Return the values of a command by the names of a tick's fields: ``cmd`` and its numbers."""
     match command:
         case Idle():
             return {"cmd": "idle"}
@@ -321,5 +318,5 @@ def command_values(command: Command) -> Mapping[str, Any]:
 
 
 def sent_values(sent: SentCommand) -> dict[str, Any]:
-    """What was sent in the loop's place, by the names of a tick's fields, and ``by``."""
+    """Return what was sent in the loop's place by the names of a tick's fields, and ``by``."""
     return {"t_s": sent.t_s, "by": sent.by, **command_values(sent.command)}

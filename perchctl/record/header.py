@@ -50,8 +50,9 @@ def make_header(
     started: datetime | None = None,
     t0_s: float = 0.0,
 ) -> dict[str, Any]:
-    """The first record. Without `started` it depends on nothing but its arguments and the files
-    that the profile names. `t0_s`: the loop's clock when the log began, or at `started`."""
+    """Return a log's first record. Without `started` it depends on nothing but its arguments and
+    the files that the profile names. `t0_s` is the loop's clock when the log began, or at
+    `started`."""
     return {
         "kind": "header",
         "format": FORMAT,
@@ -74,8 +75,8 @@ def make_header(
 
 
 def camera_record(profile: Profile) -> dict[str, Any]:
-    """``camera``, the calibration, and ``mask``, what the gear covers in it; of a file that
-    cannot be read, nothing: that is the flight's to say."""
+    """Return ``camera``, the calibration, and ``mask``, what the gear covers in it. A file that
+    cannot be read is left out: the flight says so."""
     with contextlib.suppress(PerchError):
         camera = profile_camera(profile.camera)
         record = {"camera": to_exact(camera)}
@@ -86,7 +87,7 @@ def camera_record(profile: Profile) -> dict[str, Any]:
 
 
 def computer_record() -> dict[str, Any]:
-    """``computer``: what the last bits of a sum may depend on."""
+    """Return ``computer``: what the last bits of a sum may depend on."""
     return {
         "computer": {
             "system": platform.system(),
@@ -114,9 +115,9 @@ _SIDES = (2, 3, 4, 6, 8, 12)
 
 @cache
 def arithmetic_fingerprint() -> str:
-    """Eight hexadecimal digits. Where they are the same, with the same libraries, single-threaded
-    results are the same to the bit: they stand for the kernels that may be chosen, and for what
-    came of some small calculations."""
+    """Return eight hexadecimal digits. Where they are the same, with the same libraries,
+    single-threaded results are the same to the bit: they stand for the kernels that may be chosen,
+    and for the results of some small calculations."""
     bits = zlib.crc32(repr((_kernels(), cv2.getCPUFeaturesLine())).encode())
     for part in (_of_libm(), *_of_numpy(), *_of_opencv()):
         bits = zlib.crc32(np.ascontiguousarray(part).tobytes(), bits)

@@ -33,7 +33,6 @@ from perchctl.record.fields import (
     sent_values,
 )
 from perchctl.record.header import computer_record
-from perchctl.record.write import path_beside
 from perchctl.vision import CameraModel
 
 Times = TypeVar("Times", float, Array)
@@ -44,18 +43,28 @@ KINDS = ("tick", "turn", "sent", "event", "summary", "recording")
 MOST_LOG_BYTES = 300_000_000
 """Of a log, unpacked: three quarters of an hour of flight at 0.115 MB/s. What a packed file of a
 megabyte unfolds to may otherwise fill the memory."""
+SAME_S = 1e-3
+"""Times that differ by less are those of one tick."""
 _GZIP = b"\x1f\x8b"
 _TAIL_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
 class PhaseSpan:
-    """One stay in a phase; times on the loop's clock."""
+    """One stay in a phase; times since the flight's first turn, `end_s` that of the next stay.
+
+    Attributes:
+        reason: why the phase was entered; `row`: the row of the mission's table that led there,
+            `severity` and `simulated` as in the log's event. Empty where the log has none.
+    """
 
     phase: str
     start_s: float
     end_s: float
     reason: str = ""
+    row: str = ""
+    severity: str = ""
+    simulated: str = ""
 
     @property
     def duration_s(self) -> float:
@@ -96,11 +105,12 @@ class FlightLog:
 
     @property
     def sent_values(self) -> list[dict[str, Any]]:
-        """The same by the names of a tick's fields, and ``by``. Errors: InvalidValue."""
+        """What was sent in the loop's place by the names of a tick's fields, and ``by``. Errors:
+        InvalidValue."""
         return [sent_values(each) for each in self.sent]
 
     def column(self, key: str) -> Array:
-        """A field over the ticks, shape (n,); NaN where it is missing.
+        """Return a field over the ticks, shape (n,); NaN where it is missing.
 
         Raises InvalidValue for a value that is no number.
         """
@@ -111,19 +121,32 @@ class FlightLog:
         return np.array(values, dtype=np.float64)
 
     def texts(self, key: str) -> list[str]:
-        """A field over the ticks as text, empty where it is missing."""
+        """Return a field over the ticks as text, empty where it is missing."""
         return [str(record.get(key) or "") for record in self.records]
 
     @cached_property
     def phases(self) -> tuple[PhaseSpan, ...]:
-        """The phases flown through, in order; each lasts until the next begins."""
+        """The phases in the order in which they were entered, with the rows that led there where
+        the log has its events; also an end that no tick followed."""
         spans: list[PhaseSpan] = []
         for record in self.records:
-            t_s, phase = float(record["t_s"]), str(record.get("phase") or "")
+            t_s, phase = self.since(float(record["t_s"])), str(record.get("phase") or "")
             if spans:
                 spans[-1] = replace(spans[-1], end_s=t_s)
             if not spans or spans[-1].phase != phase:
                 spans.append(PhaseSpan(phase, t_s, t_s, str(record.get("reason") or "")))
+        for event in (e for e in self.events if e.get("event") == "phase"):
+            at_s, phase = self.since(float(event["t_s"])), str(event.get("phase") or "")
+            words = [str(event.get(k) or "") for k in ("reason", "row", "severity", "simulated")]
+            begun = [k for k, span in enumerate(spans) if abs(span.start_s - at_s) < SAME_S]
+            for k in begun:
+                if spans[k].phase == phase and not spans[k].row:
+                    reason = spans[k].reason or words[0]
+                    spans[k] = PhaseSpan(
+                        phase, spans[k].start_s, spans[k].end_s, reason, *words[1:]
+                    )
+            if not begun and spans and at_s > spans[-1].end_s - SAME_S:
+                spans.append(PhaseSpan(phase, at_s, at_s, *words))
         return tuple(spans)
 
     # --- times
@@ -136,7 +159,7 @@ class FlightLog:
         return 0.0 if first is None else float(first["t_s"])
 
     def since(self, t_s: Times) -> Times:
-        """Times on the loop's clock, counted from the first flown turn as all outputs do."""
+        """Count times on the loop's clock from the first flown turn, as all outputs do."""
         return t_s - self.start_s
 
     @property
@@ -152,14 +175,14 @@ class FlightLog:
     # --- the setup that was flown
 
     def setting(self, key: str) -> Any:
-        """The flown profile's value of a dotted key, as JSON has it; None where there is none."""
+        """Return the flown profile's value of a dotted key, as JSON has it; None without one."""
         value = self.header.get("profile")
         for name in key.split("."):
             value = value.get(name) if isinstance(value, Mapping) else None
         return value
 
     def number(self, key: str) -> float | None:
-        """The flown profile's value of a dotted key; None where that is no finite number."""
+        """Return the flown profile's value of a dotted key; None if it is no finite number."""
         value = self.setting(key)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return None
@@ -199,8 +222,8 @@ class FlightLog:
             raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
 
     def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
-        """(height, width), True where the gear covers; None without a mask. Errors:
-        InvalidValue."""
+        """Return the flown mask, (height, width), True where the gear covers; None without one.
+        Errors: InvalidValue."""
         text = self.header.get("mask")
         if text is None:
             return None
@@ -276,7 +299,7 @@ def read_log(path: Path | str, *, ends_suffice: bool = False) -> FlightLog:
 
 
 def _ends_of(path: Path) -> FlightLog | None:
-    """Header and summary alone; None where the file does not end with its summary."""
+    """Read header and summary alone; None where the file does not end with its summary."""
     try:
         with path.open("rb") as stream:
             first = stream.readline()
@@ -294,7 +317,7 @@ def _ends_of(path: Path) -> FlightLog | None:
 
 @contextlib.contextmanager
 def log_values(path: Path) -> Iterator[None]:
-    """Around what works with the values of a log: one that is of no flight raises InvalidValue."""
+    """Raise InvalidValue where the code within meets a value of the log that no flight writes."""
     try:
         yield
     except OSError:
@@ -306,8 +329,8 @@ def log_values(path: Path) -> Iterator[None]:
 
 
 def _lines(path: Path) -> list[bytes]:
-    """Empty for what cannot be a log, as it may be a video of gigabytes. The end of what was
-    packed and cut is lost."""
+    """Read the lines of a file; none of what cannot be a log, as it may be a video of gigabytes.
+    The end of a packed file that was cut is lost."""
     lines: list[bytes] = []
     left = MOST_LOG_BYTES + 1
     try:
@@ -340,8 +363,8 @@ def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
         header = {}
     if header.get("kind") != "header" or header.get("format") != FORMAT:
         raise InvalidValue(
-            f"{path}: line 1: not a flight log of perchctl, or cut off in its header; "
-            f"{_remedy(path)}"
+            f"{path}: line 1: not a flight log of perchctl, or cut off in its header; logs are the "
+            f"{SUFFIX} files in the profile's log.directory"
         )
     version = header.get("version")
     if version not in READABLE_VERSIONS:
@@ -353,14 +376,6 @@ def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
             + (": update perchctl" if newer else "")
         )
     return header
-
-
-def _remedy(path: Path) -> str:
-    """The log that lies beside a plot or a table of it, where there is one."""
-    log = path_beside(path, SUFFIX)
-    if log != path and log.is_file():
-        return f"its flight's log is {log}"
-    return f"logs are the {SUFFIX} files in the profile's log.directory"
 
 
 def _checked(record: dict[str, Any]) -> dict[str, Any]:
@@ -382,7 +397,7 @@ def _without_kind(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def turn_of(record: dict[str, Any]) -> Turn:
-    """The turn of a record, to the same bits. Errors: InvalidValue."""
+    """Return the turn of a record, to the same bits. Errors: InvalidValue."""
     obs, taken = record.get("observation"), record.get("taken")
     if isinstance(obs, dict) and "telemetry" not in obs and isinstance(taken, dict):
         # The newest sample of the turn stands in the line once.
@@ -393,7 +408,7 @@ def turn_of(record: dict[str, Any]) -> Turn:
 
 
 def sent_of(record: Mapping[str, Any]) -> SentCommand:
-    """The command of a record, to the same bits. Errors: InvalidValue."""
+    """Return the command of a record, to the same bits. Errors: InvalidValue."""
     return _exact(
         SentCommand, record, f"the log's record of what was sent at {record.get('t_s', '?')} s"
     )

@@ -45,8 +45,8 @@ class Picture(NamedTuple):
 def recorded_pictures(
     path: Path | str, *, exact: bool = True, numbers: Container[int] | None = None
 ) -> Iterator[Picture]:
-    """The pictures `(number, t_s, image)`, oldest first, of a recording or of the log that it lies
-    beside; of one that was cut off, those that are whole.
+    """Yield the pictures `(number, t_s, image)`, oldest first, of a recording or of the log that it
+    lies beside; of one that was cut off, those that are whole.
 
     Args:
         exact: every picture must be the flight's to the bit.
@@ -72,7 +72,7 @@ def recorded_pictures(
 
 
 def recorded_frames(path: Path) -> Iterator[tuple[dict[str, Any], CompressedImage | None]]:
-    """Each frame of a recording as `frame_record` has it, with its picture where it was kept.
+    """Yield each frame of a recording as `frame_record` has it, with its picture where it was kept.
 
     Errors: NotFound where there is no file, InvalidValue where it is no MCAP file.
     """
@@ -88,7 +88,7 @@ def recorded_frames(path: Path) -> Iterator[tuple[dict[str, Any], CompressedImag
 
 
 def _messages(path: Path, topics: Sequence[str]) -> Iterator[tuple[str, Message]]:
-    """The messages of the topics in the file's order, up to its end or its first torn record."""
+    """Yield the topics' messages in the file's order, up to its end or its first torn record."""
     names: dict[int, str] = {}
     for record in _records(path):
         if isinstance(record, Channel):
@@ -137,7 +137,7 @@ def _records(path: Path) -> Iterator[McapRecord]:
 
 
 def _unfolded(path: Path, chunk: Chunk) -> Chunk:
-    """The chunk without compression. Errors: InvalidValue where it is too large; those of
+    """Return the chunk without compression. Errors: InvalidValue where it is too large; those of
     `_TORN`."""
     if chunk.compression == "lz4":
         unpacker = LZ4FrameDecompressor()

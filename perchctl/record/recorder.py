@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
 from perchctl.profile import Profile
 from perchctl.record.disk import BackgroundWriter, DiskFile, Stream
@@ -34,7 +33,7 @@ GOES_ON = "the flight and its log go on"
 
 @dataclass(eq=False)
 class _Turn:
-    """What one turn of the loop hands over."""
+    """What one turn of the loop hands over to the thread that writes."""
 
     frame: Frame | None = None
     events: list[Mapping[str, Any]] = field(default_factory=list)
@@ -43,14 +42,9 @@ class _Turn:
 
     @property
     def held_bytes(self) -> int:
-        """In memory, while it waits; a frame that repeats holds its picture too."""
+        """Bytes in memory while it waits; a frame that repeats holds its picture too."""
         frame = self.frame
         return 0 if frame is None else frame.image.nbytes + len(frame.encoded or b"")
-
-    @property
-    def picture_bytes(self) -> int:
-        frame = self.frame
-        return 0 if frame is None or frame.repeated else frame.image.nbytes
 
 
 class Recorder:
@@ -64,7 +58,7 @@ class Recorder:
     def __init__(
         self, path: Path, stream: Stream, header: Mapping[str, Any], profile: Profile, live: bool
     ) -> None:
-        """Begins the file. Raises OSError; NotFound and InvalidValue of the calibration."""
+        """Begin the file. Raises OSError; NotFound and InvalidValue for the calibration."""
         self.path = path
         self._most_bytes = profile.log.max_mb * 1_000_000
         self._remarks: deque[str] = deque()
@@ -76,8 +70,8 @@ class Recorder:
         self._handed_bytes = 0
         self._closed = False
         # Of the thread that writes.
-        self._file = RecordingFile(stream, header, profile, profile_camera(profile.camera))
-        self._over = False
+        self._file = RecordingFile(stream, header, profile)
+        self._over = self._full = False
         self._done_bytes = 0
         self._flushed_s: float | None = None
         self._flushed_pictures = 0
@@ -86,7 +80,7 @@ class Recorder:
     def open(
         cls, path: Path, header: Mapping[str, Any], profile: Profile, live: bool = False
     ) -> Recorder:
-        """A new file beside the log. Errors: NotFound, InvalidValue, before the flight."""
+        """Begin a new file beside the log. Errors: NotFound, InvalidValue, before the flight."""
         try:
             stream = DiskFile.new(path, sync=live)
         except OSError as error:
@@ -101,7 +95,7 @@ class Recorder:
             raise
 
     def frame(self, frame: Frame) -> None:
-        """One that the source gave. Never raises."""
+        """Record a frame that the source gave. Never raises."""
         if self._closed:
             return
         self._pictures += not frame.repeated
@@ -110,12 +104,12 @@ class Recorder:
         self._turn.frame = frame
 
     def event(self, record: Mapping[str, Any]) -> None:
-        """An event's record (`perchctl.record.fields.event_record`). Never raises."""
+        """Record an event (`perchctl.record.fields.event_record`). Never raises."""
         if not self._closed:
             self._turn.events.append(record)
 
     def sent(self, values: Mapping[str, Any]) -> None:
-        """What was sent in the loop's place (`perchctl.record.fields.sent_values`). From any
+        """Record what was sent in the loop's place (`perchctl.record.fields.sent_values`), from any
         thread: the loop hangs, perhaps, and its turn is left alone. Never raises."""
         if self._closed or self._over:
             return
@@ -124,21 +118,21 @@ class Recorder:
             self._note_lag("turns are missing in it")
 
     def tick(self, record: Mapping[str, Any]) -> None:
-        """A tick's record (`perchctl.record.fields.tick_record`). Never raises."""
+        """Record a tick (`perchctl.record.fields.tick_record`), which ends a turn. Never raises."""
         if not self._closed:
             self._turn.tick = record
             self._hand_over()
 
     def take_remarks(self) -> list[str]:
-        """What went wrong since the last call, each once a flight."""
+        """Return what went wrong since the last call, a sentence each, each once a flight."""
         new = []
         while self._remarks:
             new.append(self._remarks.popleft())
         return new
 
     def close(self) -> RecordingEnd:
-        """End the file; waits for a disk that hangs, but for `CLOSE_TIMEOUT_S` at most. Never
-        raises; twice is once."""
+        """End the file and return what became of it; a second call only returns that. Waits for a
+        disk that hangs, but for `CLOSE_TIMEOUT_S` at most. Never raises."""
         if not self._closed:
             self._hand_over()
             self._closed = True
@@ -178,14 +172,14 @@ class Recorder:
     def _written(self, turn: _Turn) -> None:
         file = self._file
         if turn.frame is not None:
-            full = file.size_bytes + turn.picture_bytes > self._most_bytes
-            kept = None if full or turn.frame.repeated else encoded(turn.frame)
-            file.frame(frame_record(turn.frame), kept)
-            if full:
+            kept = None if self._full or turn.frame.repeated else encoded(turn.frame)
+            if kept is not None and file.size_bytes + len(kept[0]) > self._most_bytes:
+                self._full, kept = True, None
                 self._remember(
                     f"the recording is full (log.max_mb in the profile, "
                     f"{self._most_bytes / 1e6:g}): it goes on without pictures"
                 )
+            file.frame(frame_record(turn.frame), kept)
         for event in turn.events:
             file.event(event)
         if turn.sent is not None:

@@ -1,11 +1,10 @@
 """A flight's recording as an MCAP file: what is written into it, and how.
 
-Every message is made from the records that the log holds, so that a recording made in flight and
-one made of its log say the same. The messages are Foxglove's protobuf ones, with the definitions of
-Foxglove's own package: a picture stays the bytes that it came as, which the JSON variant of the
-same schemas would make a third longer. What is perchctl's own is JSON. Frames: `world` (of the
-state estimate), `body`, `gear`, `camera` (OpenCV's axes, which are Foxglove's), `target` and
-`setpoint`.
+The messages are made of the log's own records. They are Foxglove's protobuf ones, with the
+definitions of Foxglove's own package: a picture stays the bytes that it came as, which the JSON
+variant of the same schemas would make a third longer. What is perchctl's own is JSON. Frames:
+`world` (of the state estimate), `body`, `gear`, `camera` (OpenCV's axes, which are Foxglove's),
+`target` and `setpoint`.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -43,6 +42,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
 import perchctl
+from perchctl.calibration import profile_camera
 from perchctl.geometry import quaternion_from_rotation, quaternion_from_rpy
 from perchctl.profile import Profile
 from perchctl.record.disk import Stream
@@ -66,6 +66,9 @@ LOOP_TIMES = ("t_s", "frame_t_s")
 PATH_PERIOD_S = 1.0
 """The whole path so far is written so often: who jumps into the middle sees what was flown."""
 PATH_STEP_S = 0.1
+BODY_KEYS = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
+TARGET_KEYS = ("tx_m", "ty_m", "tz_m", "tyaw_rad")
+SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
 
 
 # --- the file -------------------------------------------------------------------------------
@@ -77,80 +80,90 @@ class RecordingFile:
 
     Attributes:
         pictures: how many were written; `newest_s`: the loop's time of what was written last.
+        size_bytes: of all messages so far, before they are compressed.
     """
 
     def __init__(
-        self,
-        stream: Stream,
-        header: Mapping[str, Any],
-        profile: Profile | None,
-        camera: CameraModel | None,
+        self, stream: Stream, header: Mapping[str, Any], profile: Profile | None = None
     ) -> None:
-        """Without a profile or camera it lacks what follows from them."""
-        self.pictures = 0
+        """Begin the file. Without a profile it has neither mounting nor calibration. Raises
+        NotFound and InvalidValue for the profile's calibration."""
+        self.pictures = self.size_bytes = 0
         self.newest_s = 0.0
         self._header = header
-        self._profile = profile
-        self._camera = camera
+        self._mounts = () if profile is None else mounts_of(profile)
+        self._camera = None if profile is None else profile_camera(profile.camera)
         self._epoch: Epoch | None = None
         self._first_s: float | None = None
-        self._space = SpaceMessages(Epoch(0, 0.0))
+        self._target: FrameTransform | None = None  # where it was last
+        self._path = PosesInFrame(frame_id=WORLD)
+        self._path_s = self._point_s = -math.inf
         self._stream = stream
         self._writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)  # type: ignore[arg-type]
         self._channels: dict[str, int] = {}
-        self._pending_bytes = 0
         self._closed = False
         self._writer.start(library=f"perchctl {perchctl.__version__}")
 
-    @property
-    def size_bytes(self) -> int:
-        """On the disk, with what waits for it, as far as it is known."""
-        return self._stream.tell() + self._pending_bytes
-
     def frame(self, about: Mapping[str, Any], picture: tuple[bytes, str] | None) -> None:
-        """A frame as its source gave it (`frame_record`), and its picture with its format
+        """Write a frame as its source gave it (`frame_record`), and its picture with its format
         (`encoded`) where it is to be kept."""
-        ns = self._at(about["t_arrival_s"])
+        ns = self._ns_of(about["t_arrival_s"])
         number = about["number"] & 0xFFFFFFFF
         if picture is not None:
-            taken_ns = self._epoch_at(about["t_s"]).ns(about["t_s"])
             data, form = picture
-            self._add(IMAGE, ns, CompressedImage(timestamp=stamp(taken_ns), frame_id=CAMERA,
-                                                 data=data, format=form), number)  # fmt: skip
+            taken = stamp(self._epoch_at(about["t_s"]).ns(about["t_s"]))
+            image = CompressedImage(timestamp=taken, frame_id=CAMERA, data=data, format=form)
+            self._add(IMAGE, ns, image, number)
             self.pictures += 1
         # With all digits: a replay needs the very times.
         self._add(FRAME, ns, json.dumps(about).encode(), number)
 
     def tick(self, record: Mapping[str, Any]) -> None:
-        """A tick's record (`perchctl.record.fields.FIELDS`)."""
-        ns = self._at(float(record["t_s"]))
+        """Write a tick's record (`perchctl.record.fields.FIELDS`), and what it shows in space.
+
+        What stands still is written with every tick: who jumps into the middle of a flight gets
+        the newest message of each topic, and no older one."""
+        t_s = float(record["t_s"])
+        ns = self._ns_of(t_s)
+        epoch = self._epoch_at(t_s)
         if self._first_s is None:
-            self._first_s = float(record["t_s"])
-        for topic, message in self._space.of(record):
-            self._add(topic, ns, message)
+            self._first_s = t_s
+        body_ns = epoch.ns(t_s - (_number(record, "tel_age_s") or 0.0))
+        body = _transform_to(BODY, body_ns, record, BODY_KEYS)
+        setpoint = _transform_to(SETPOINT, ns, record, SETPOINT_KEYS)
+        self._target = _transform_to(TARGET, ns, record, TARGET_KEYS) or self._target
+        for still in (*self._mounts, self._target):
+            if still is not None:
+                still.timestamp.CopyFrom(stamp(ns))
+        if body is not None:
+            self._add_path(body, t_s, ns)
+        moving = [each for each in (body, self._target, setpoint) if each is not None]
+        self._add(TF, ns, FrameTransforms(transforms=[*self._mounts, *moving]))
+        if record.get("frame_t_s") is not None:
+            exposed_ns = epoch.ns(float(record["frame_t_s"]))
+            self._add(CORNERS, ns, corners_message(exposed_ns, record))
         self._add(TICK, ns, encode(self._since_first(record))[:-1])
 
     def sent(self, values: Mapping[str, Any]) -> None:
-        """What was sent in the loop's place (`perchctl.record.fields.sent_values`)."""
-        ns = self._at(float(values["t_s"]))
+        """Write what was sent in the loop's place (`perchctl.record.fields.sent_values`)."""
+        ns = self._ns_of(float(values["t_s"]))
         self._add(SENT, ns, encode(self._since_first(values))[:-1])
 
     def event(self, record: Mapping[str, Any]) -> None:
-        """An event's record (`perchctl.record.fields.event_record`)."""
-        ns = self._at(float(record["t_s"]))
+        """Write an event's record (`perchctl.record.fields.event_record`)."""
+        ns = self._ns_of(float(record["t_s"]))
         self._add(LOG, ns, log_message(ns, record))
 
     def flush(self) -> None:
-        """What was added so far is on the disk when this returns."""
+        """Bring to the disk what was added so far."""
         self._writer.flush()
-        self._pending_bytes = 0
 
     def free_bytes(self) -> int:
-        """Left on its disk."""
+        """Return the bytes that are left on its disk."""
         return self._stream.free_bytes()
 
     def finish(self) -> None:
-        """End it with its index; nothing can be added any more."""
+        """End the file with its index; nothing can be added any more."""
         self._writer.finish()
         self._stream.flush()
         self._closed = True
@@ -171,9 +184,18 @@ class RecordingFile:
         with suppress(OSError):
             self._stream.close()
 
+    def _add_path(self, body: FrameTransform, t_s: float, ns: int) -> None:
+        if t_s - self._point_s >= PATH_STEP_S:
+            self._point_s = t_s
+            self._path.poses.append(Pose(position=body.translation, orientation=body.rotation))
+        if t_s - self._path_s >= PATH_PERIOD_S:
+            self._path_s = t_s
+            self._path.timestamp.CopyFrom(stamp(ns))
+            self._add(PATH, ns, self._path)
+
     def _since_first(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """With its times as every output counts them, from the first flown turn; before that
-        without them."""
+        """Return the record with its times counted from the first flown turn, as every output
+        does; before that turn without them."""
         first_s = self._first_s
         times = [key for key in LOOP_TIMES if record.get(key) is not None]
         return {
@@ -181,18 +203,16 @@ class RecordingFile:
             **{key: None if first_s is None else record[key] - first_s for key in times},
         }
 
-    def _at(self, t_s: float) -> int:
+    def _ns_of(self, t_s: float) -> int:
         self.newest_s = t_s
         return self._epoch_at(t_s).ns(t_s)
 
     def _epoch_at(self, t_s: float) -> Epoch:
-        """The start's, which is known by the first record at the latest; with it goes what is
-        written once."""
+        """Return the start's epoch, which is known by the first record at the latest; with it goes
+        what is written once."""
         if self._epoch is None:
             self._epoch = epoch = epoch_of(self._header, t_s)
             ns = epoch.ns(epoch.t0_s)
-            mounts = [] if self._profile is None else mounts_of(self._profile)
-            self._space = SpaceMessages(epoch, mounts)
             text = json.dumps(self._header).encode()
             self._writer.add_attachment(ns, ns, HEADER_NAME, "application/json", text)
             if self._camera is not None:
@@ -200,16 +220,13 @@ class RecordingFile:
         return self._epoch
 
     def _add(self, topic: str, ns: int, message: Message | bytes, sequence: int = 0) -> None:
-        """A message of Foxglove's, or the JSON of one of `SCHEMAS`."""
+        """Add a message of Foxglove's, or the JSON of one of `SCHEMAS`."""
         channel = self._channels.get(topic)
         if channel is None:
             channel = self._channels[topic] = self._new_channel(topic, message)
         data = message if isinstance(message, bytes) else message.SerializeToString()
-        before = self._stream.tell()
         self._writer.add_message(channel, ns, data, ns, sequence)
-        self._pending_bytes += len(data)
-        if self._stream.tell() != before:  # a chunk was full
-            self._pending_bytes = 0
+        self.size_bytes += len(data)
 
     def _new_channel(self, topic: str, message: Message | bytes) -> int:
         if isinstance(message, bytes):
@@ -222,7 +239,7 @@ class RecordingFile:
 
 
 def frame_record(frame: Frame) -> dict[str, Any]:
-    """The frame without its picture, but with the checksum by which one is known to be it."""
+    """Return the frame without its picture, but with the checksum that identifies it."""
     return {
         "number": frame.index,
         "t_s": frame.t_s,
@@ -233,7 +250,7 @@ def frame_record(frame: Frame) -> dict[str, Any]:
 
 
 def encoded(frame: Frame) -> tuple[bytes, str]:
-    """The picture's bytes and their format: as they came, or without loss."""
+    """Return the picture's bytes and their format: as they came, or without loss."""
     if frame.encoded is not None:
         return frame.encoded, "jpeg"
     ok, data = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
@@ -256,7 +273,7 @@ _JSON_TYPES: dict[str, dict[str, Any]] = {
 def _schema(
     name: str, title: str, keys: Iterable[str], **own: tuple[str, str]
 ) -> tuple[str, dict[str, Any]]:
-    """Of the log's fields `keys`, and of `own` ones by type and meaning."""
+    """Return a JSON schema of the log's fields `keys`, and of `own` ones by type and meaning."""
     properties = {k: {"type": kind, "description": text} for k, (kind, text) in own.items()}
     properties |= {k: {**_JSON_TYPES[field_kind(k)], "description": FIELDS[k]} for k in keys}
     return name, {"type": "object", "title": title, "properties": properties}
@@ -293,11 +310,13 @@ _OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)
 
 
 def stamp(ns: int) -> Timestamp:
+    """Return nanoseconds since 1970 as protobuf's time stamp."""
     return Timestamp(seconds=ns // NS, nanos=ns % NS)
 
 
 def calibration_message(ns: int, camera: CameraModel) -> CameraCalibration:
-    """With its distortion. One camera needs no rectification: R is 1 and P holds K."""
+    """Return the calibration with its distortion. One camera needs no rectification: R is 1 and P
+    holds K."""
     width, height = camera.size_px
     P = np.hstack([camera.K, np.zeros((3, 1))])
     return CameraCalibration(
@@ -314,7 +333,8 @@ def calibration_message(ns: int, camera: CameraModel) -> CameraCalibration:
 
 
 def log_message(ns: int, record: Mapping[str, Any]) -> Log:
-    """An event's record. What goes on is an info, a landing an error, a stop fatal."""
+    """Return the message of an event's record. What goes on is an info, a landing an error, a stop
+    fatal."""
     level = _LEVELS.get(str(record.get("severity")), Log.INFO)
     what, phase = record.get("event"), record.get("phase")
     text = str(record.get("reason") or "")
@@ -334,8 +354,8 @@ def log_message(ns: int, record: Mapping[str, Any]) -> Log:
 
 
 def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
-    """The markers' outlines in the frame of a tick's record; none of one without the target,
-    so that no old one stays in the picture."""
+    """Return the markers' outlines in the frame of a tick's record; a frame without the target has
+    none, so that no old one stays in the picture."""
     return ImageAnnotations(
         timestamp=stamp(ns),
         points=[
@@ -353,7 +373,7 @@ def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
 
 
 def mounts_of(profile: Profile) -> list[FrameTransform]:
-    """What does not move against the body."""
+    """Return the transforms of what does not move against the body: camera and gear."""
     T_body_cam = profile.camera.mount.T_body_cam
     q = quaternion_from_rotation(T_body_cam[:3, :3])
     gear_m = profile.vehicle.gear_body_m
@@ -363,59 +383,11 @@ def mounts_of(profile: Profile) -> list[FrameTransform]:
     ]
 
 
-class SpaceMessages:
-    """The messages of each tick for the 3-D panel, and the path that grows with them.
-
-    What stands still is written with every tick: who jumps into the middle of a flight gets the
-    newest message of each topic, and no older one.
-    """
-
-    def __init__(self, epoch: Epoch, mounts: Sequence[FrameTransform] = ()) -> None:
-        self._epoch = epoch
-        self._mounts = mounts
-        self._target: FrameTransform | None = None  # where it was last
-        self._path = PosesInFrame(frame_id=WORLD)
-        self._path_s = self._point_s = -math.inf
-
-    def of(self, record: Mapping[str, Any]) -> Iterator[tuple[str, Message]]:
-        """The recording's messages for one tick's record (`perchctl.record.fields.FIELDS`)."""
-        t_s = float(record["t_s"])
-        ns = self._epoch.ns(t_s)
-        sampled_ns = self._epoch.ns(t_s - (_number(record, "tel_age_s") or 0.0))
-        body = _transform_to(BODY, sampled_ns, record, "x_m", "y_m", "z_m", "roll_rad",
-                             "pitch_rad", "yaw_rad")  # fmt: skip
-        target = _transform_to(TARGET, ns, record, "tx_m", "ty_m", "tz_m", "tyaw_rad")
-        setpoint = _transform_to(
-            SETPOINT, ns, record, "cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad"
-        )
-        self._target = target or self._target
-        for still in (*self._mounts, self._target):
-            if still is not None:
-                still.timestamp.CopyFrom(stamp(ns))
-        moving = [each for each in (body, self._target, setpoint) if each is not None]
-        if body is not None:
-            yield from self._path_with(body, t_s, ns)
-        yield TF, FrameTransforms(transforms=[*self._mounts, *moving])
-        if record.get("frame_t_s") is not None:
-            yield CORNERS, corners_message(self._epoch.ns(float(record["frame_t_s"])), record)
-
-    def _path_with(
-        self, body: FrameTransform, t_s: float, ns: int
-    ) -> Iterator[tuple[str, Message]]:
-        if t_s - self._point_s >= PATH_STEP_S:
-            self._point_s = t_s
-            self._path.poses.append(Pose(position=body.translation, orientation=body.rotation))
-        if t_s - self._path_s >= PATH_PERIOD_S:
-            self._path_s = t_s
-            self._path.timestamp.CopyFrom(stamp(ns))
-            yield PATH, self._path
-
-
 def _transform_to(
-    child: str, ns: int, record: Mapping[str, Any], *keys: str
+    child: str, ns: int, record: Mapping[str, Any], keys: Sequence[str]
 ) -> FrameTransform | None:
-    """From the world, by three keys of a position and one of a heading, or three of an attitude;
-    None where one of them is missing."""
+    """Return the transform from the world, by three keys of a position and one of a heading or
+    three of an attitude; None where one of them is missing."""
     values = [_number(record, key) for key in keys]
     if any(value is None for value in values):
         return None
@@ -425,7 +397,8 @@ def _transform_to(
 
 
 def _number(record: Mapping[str, Any], key: str) -> float | None:
-    """None for what is missing or not finite: a view of it would fail."""
+    """Return a number of the record; None for one that is missing or not finite, which no view
+    could show."""
     value = record.get(key)
     return float(value) if value is not None and math.isfinite(value) else None
 
@@ -450,7 +423,7 @@ NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Epoch:
-    """`started_ns` of the wall's clock, since 1970, is `t0_s` of the loop's.
+    """The moment at which the wall's clock has `started_ns`, since 1970, and the loop's `t0_s`.
 
     A flight in lockstep has no wall clock: its recording begins in 1970, at 0.
     """
@@ -459,13 +432,13 @@ class Epoch:
     t0_s: float
 
     def ns(self, t_s: float) -> int:
-        """Nanoseconds since 1970; what was before that is at 0, which MCAP begins at."""
+        """Return nanoseconds since 1970; what was before that is at 0, which MCAP begins at."""
         return max(0, self.started_ns + round((t_s - self.t0_s) * NS))
 
 
 def epoch_of(header: Mapping[str, Any], first_s: float) -> Epoch:
-    """By a log's header; `first_s` is the loop's time of the first record, which counts as the
-    start where the header does not say more."""
+    """Return the epoch by a log's header; `first_s` is the loop's time of the first record, which
+    counts as the start where the header does not say more."""
     t0_s = header.get("t0_s")
     if not isinstance(t0_s, (int, float)) or not math.isfinite(t0_s):
         t0_s = first_s

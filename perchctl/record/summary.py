@@ -36,7 +36,7 @@ class RecordingEnd:
         return f"{told} ({self.problem})" if self.problem else told
 
     def as_record(self) -> dict[str, Any]:
-        """For the log, beside which the recording lies: its name is enough."""
+        """Return the record for the log, beside which the recording lies: its name is enough."""
         return {
             "recording": self.path.name,
             "pictures": self.pictures,
@@ -47,7 +47,7 @@ class RecordingEnd:
 
 @dataclass(frozen=True)
 class FlightSummary:
-    """What is worth saying after one flight.
+    """How one flight ended, and what it found out.
 
     Attributes:
         outcome: ``perched``, ``landed``, ``aborted``, or ``unknown`` for a log
@@ -79,7 +79,7 @@ class FlightSummary:
 
     @classmethod
     def of(cls, log: FlightLog) -> FlightSummary:
-        """From the log's summary record; from its ticks where that is missing."""
+        """Return the summary by the log's record; by its ticks where that is missing."""
         phases = log.phases
         battery_v = log.column("battery_v")
         known_v = battery_v[battery_v >= NO_BATTERY_READING_V]
@@ -109,8 +109,8 @@ class FlightSummary:
         )
 
     def as_record(self) -> dict[str, Any]:
-        """For `FlightLogWriter.close`; the phases are in the ticks already, and what the log
-        lacks is the writer's to say."""
+        """Return the record for `FlightLogWriter.conclude`. The phases are in the ticks already,
+        and the writer adds what the log lacks."""
         return {
             "outcome": self.outcome,
             "cause": self.cause or None,
@@ -145,7 +145,7 @@ def _keys_of(part: Any, keys: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _part_in(end: Mapping[str, Any], kind: Any, keys: Mapping[str, str]) -> Any:
-    """The part of that kind; None where the record does not have it."""
+    """Return the part of that kind; None where the record does not have it."""
     known = {name: end[key] for key, name in keys.items() if end.get(key) is not None}
     if next(iter(keys.values())) not in known:
         return None
@@ -171,17 +171,8 @@ def _last_known(log: FlightLog) -> str:
     return f"the log ends in {phases[-1]}" if phases else "the log holds no flight"
 
 
-def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None) -> str:
-    """A few lines, no colour, no line break at the end."""
-    faults = []
-    if isinstance(flight, FlightLog):
-        if flight.ignored_bytes:
-            faults.append(f"log lost:  its tail, {flight.ignored_bytes} unreadable bytes")
-        flight = FlightSummary.of(flight)
-    if flight.lost_records:
-        faults.insert(0, f"log lost:  {flight.lost_records} records ({flight.log_problem})")
-    elif flight.log_problem is not None:
-        faults.insert(0, f"log lost:  perhaps its last records ({flight.log_problem})")
+def summary_text(flight: FlightSummary, log_path: Path | None = None) -> str:
+    """Return a few lines about a flight, without colour and without a line break at the end."""
     lines = [f"{flight.outcome.upper()}: {flight.reason}".rstrip(": ")]
     if flight.cause and flight.cause != flight.outcome:
         lines[0] += f" [{flight.cause}]"
@@ -205,7 +196,10 @@ def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None
         lines.append(f"vehicle:   {flight.touchdown.text}")
     if flight.fell:
         lines.append("vehicle:   fell")
-    lines += faults
+    if flight.lost_records:
+        lines.append(f"log lost:  {flight.lost_records} records ({flight.log_problem})")
+    elif flight.log_problem is not None:
+        lines.append(f"log lost:  perhaps its last records ({flight.log_problem})")
     if flight.recording is not None:
         lines.append(f"recording: {flight.recording.text}")
     if log_path is not None:
@@ -214,6 +208,6 @@ def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None
 
 
 def phases_text(phases: Sequence[PhaseSpan]) -> str:
-    """``APPROACH 3.1 s > SEARCH 0.4 s > ...``; terminals, which take no time, by name."""
+    """Return ``APPROACH 3.1 s > SEARCH 0.4 s > ...``; ends, which take no time, by name alone."""
     parts = [f"{p.phase} {p.duration_s:.1f} s" if p.duration_s > 0 else p.phase for p in phases]
     return " > ".join(parts)

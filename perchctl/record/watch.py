@@ -44,7 +44,8 @@ class LogWatcher:
 
     @classmethod
     def lockstep(cls, path: Path, profile: Profile, seed: int, record: bool = False) -> LogWatcher:
-        """For a simulated flight: the same seed gives the same bytes. Errors: InvalidValue."""
+        """Open the log of a simulated flight: the same seed gives the same bytes. Errors:
+        InvalidValue."""
         header = make_header(profile, uri="sim://", source="sim:", seed=seed, lockstep=True)
         return cls._opened(path, header, profile, record, live=False)
 
@@ -58,9 +59,7 @@ class LogWatcher:
         seed: int | None = None,
         record: bool = False,
     ) -> LogWatcher:
-        """A new file in `directory`, written behind the flight.
-
-        Errors: InvalidValue."""
+        """Open a new log in `directory`, which a thread of its own writes. Errors: InvalidValue."""
         started, t0_s = datetime.now(UTC), time.monotonic()
         header = make_header(profile, uri=uri, source=source, seed=seed, started=started, t0_s=t0_s)
         path = log_path(directory, profile.name, started)
@@ -84,11 +83,12 @@ class LogWatcher:
             raise
 
     def watched(self, source: FrameSource) -> FrameSource:
-        """The same source; the frames that it gives are recorded, where that is wanted."""
+        """Return the same source; the frames that it gives are recorded, where that is wanted."""
         return source if self._recorder is None else WatchedSource(source, self._recorder.frame)
 
     def remarks(self) -> list[str]:
-        """What is new about the recording and about records without a form, a sentence each."""
+        """Return what is new about the recording and about records that no line could be made of,
+        a sentence each."""
         new = [] if self._recorder is None else self._recorder.take_remarks()
         if self.writer.formless is not None and not self._formless_told:
             self._formless_told = True
@@ -101,10 +101,11 @@ class LogWatcher:
 
     @property
     def begun(self) -> bool:
-        """Whether the flight has: `abandon` leaves no file of one that has not."""
+        """True if the flight has begun; `abandon` leaves no file of one that has not."""
         return self._ticks > 0
 
     def tick(self, tick: Tick) -> None:
+        """Write a tick, with its turn and the simulation's truth. Never raises."""
         self._ticks += 1
         battery_v = tick.telemetry.battery_v
         if battery_v >= NO_BATTERY_READING_V:
@@ -118,11 +119,11 @@ class LogWatcher:
             self._recorder.tick(record)
 
     def turn(self, turn: Turn) -> None:
-        """One without a tick."""
+        """Write a turn that has no tick."""
         self.writer.turn(turn)
 
     def sent(self, sent: SentCommand) -> None:
-        """From any thread: it goes to those that write, and waits for none of them."""
+        """Write what was sent in the loop's place; from any thread, and without waiting."""
         self.writer.sent(sent)
         if self._recorder is not None:
             self._recorder.sent(sent_values(sent))
@@ -135,7 +136,8 @@ class LogWatcher:
     def close(
         self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False
     ) -> FlightSummary | None:
-        """Write the summary and close; without a report (the flight raised) only close.
+        """Write the summary and close; without a report (the flight raised) only close. Return the
+        summary.
 
         The summary comes first: a recording's disk that hangs holds up its own end only."""
         if report is None:
@@ -181,12 +183,11 @@ class LogWatcher:
 
 
 def spans_of(report: FlightReport) -> tuple[PhaseSpan, ...]:
-    """The report's history as stays in phases."""
+    """Return the report's history as stays in phases."""
     starts = report.history
-    if not starts:
-        return ()
-    ends = [event.t_s for event in starts[1:]] + [starts[-1].t_s]
+    times_s = [event.t_s - starts[0].t_s for event in starts]
+    ends_s = [*times_s[1:], *times_s[-1:]]
     return tuple(
-        PhaseSpan(event.phase.value if event.phase else "", event.t_s, end_s, event.reason)
-        for event, end_s in zip(starts, ends, strict=True)
+        PhaseSpan(event.phase.value if event.phase else "", start_s, end_s, event.reason)
+        for event, start_s, end_s in zip(starts, times_s, ends_s, strict=True)
     )

@@ -29,7 +29,7 @@ from perchctl.record.fields import event_record
 
 FSYNC_PERIOD_S = 1.0
 RETRY_PERIOD_S = 1.0
-CLOSE_TIMEOUT_S, RECOVERED_S = 3.0, 0.2
+CLOSE_TIMEOUT_S = 3.0
 BEHIND_S = 30.0
 """Of a flight may wait for the disk; more is dropped."""
 RECORDS_A_TURN = 2
@@ -56,7 +56,7 @@ class FlightLogWriter:
         self.formless: str | None = None
         self._file = file
         self._writer = writer
-        self._closed = self._concluded = self._hung = False
+        self._closed = self._concluded = False
         self._dropped = 0  # by the loop's thread, and by the link's
         self._dropping = threading.Lock()
         # Below: of the thread that writes.
@@ -70,7 +70,7 @@ class FlightLogWriter:
 
     @property
     def lacks(self) -> str | None:
-        """Why the log is not whole, the disk first."""
+        """One sentence why the log is not whole, the disk first; None for a whole one."""
         return self.problem or self.formless
 
     @classmethod
@@ -125,12 +125,11 @@ class FlightLogWriter:
         self._put(partial(encode, {"kind": "event", **event_record(event)}), event.t_s)
 
     def conclude(self, summary: Mapping[str, Any]) -> None:
-        """Append the summary, and bring it to the disk: what is still to be done before `close`
-        may hang. Never raises; waits as `close` does."""
-        if self._closed or self._concluded:
-            return
-        self._concluded = True
-        self._hung = not self._writer.wait(partial(self._summarise, summary), CLOSE_TIMEOUT_S)
+        """Append the summary and bring it to the disk; live, the thread does so while the caller
+        goes on. Nothing but `close` may follow. Never raises."""
+        if not self._closed and not self._concluded:
+            self._concluded = True
+            self._writer.put(partial(self._summarise, summary), math.inf)
 
     def close(
         self,
@@ -138,18 +137,18 @@ class FlightLogWriter:
         recording: Mapping[str, Any] | None = None,
     ) -> None:
         """Append the summary, if there is one, and what became of a recording, and close. Never
-        raises; twice is once.
+        raises; a second call does nothing.
 
-        Waits for a disk that hangs, but for `CLOSE_TIMEOUT_S` at most, and for a moment only
-        where `conclude` did in vain."""
+        Waits for a disk that hangs, but for `CLOSE_TIMEOUT_S` at most."""
         if self._closed:
             return
+        if summary is not None:
+            self.conclude(summary)
         self._closed = True
-        end = partial(self._end, summary, recording)
-        once_more_s = RECOVERED_S if self._hung else CLOSE_TIMEOUT_S
-        left = self._writer.finish(end, once_more_s, self._let_go)
+        end = partial(self._end, recording)
+        left = self._writer.finish(end, CLOSE_TIMEOUT_S, self._release_file)
         if left:
-            self._drop(left)
+            self._drop(left - 1)  # the end itself is no record
             self._remember(NO_ANSWER)
 
     def _summarise(self, summary: Mapping[str, Any]) -> None:
@@ -158,17 +157,13 @@ class FlightLogWriter:
         self._store(partial(encode, {"kind": "summary", **summary, **lost}), None)
         self._sync_to_disk()
 
-    def _end(
-        self, summary: Mapping[str, Any] | None, recording: Mapping[str, Any] | None = None
-    ) -> None:
-        if summary is not None:
-            self._summarise(summary)
+    def _end(self, recording: Mapping[str, Any] | None) -> None:
         if recording is not None:
             self._store(partial(encode, {"kind": "recording", **recording}), None)
         self._sync_to_disk()
-        self._let_go()
+        self._release_file()
 
-    def _let_go(self) -> None:
+    def _release_file(self) -> None:
         with suppress(OSError):
             self._file.close()
 
@@ -203,7 +198,7 @@ class FlightLogWriter:
             self._sync_sometimes(t_s)
 
     def _is_waiting(self, t_s: float | None) -> bool:
-        """After a failure the disk is left alone for a while: a failing one is slow."""
+        """True shortly after a failure: a failing disk is slow, so it is left alone for a while."""
         if t_s is None or self._failed_s is None:
             return False
         return t_s - self._failed_s < RETRY_PERIOD_S
@@ -227,17 +222,18 @@ class FlightLogWriter:
 
 
 def _header_line(header: Mapping[str, Any]) -> bytes:
-    """A replay flies by the profile in it: its numbers are not rounded."""
+    """Return the header as a line; a replay flies by the profile in it, so no number is rounded."""
     return json_line(to_exact({k: v for k, v in header.items() if v is not None}))
 
 
 def sent_line(sent: SentCommand) -> bytes:
-    """What was sent in the loop's place as one line of the log, exact."""
+    """Return what was sent in the loop's place as one line of the log, exact."""
     return json_line({"kind": "sent", **to_exact(sent)})
 
 
 def turn_line(turn: Turn) -> bytes:
-    """A turn as one line of the log, whole and exact: the fields of `perchctl.mission.Turn`."""
+    """Return a turn as one line of the log, whole and exact, by the fields of
+    `perchctl.mission.Turn`."""
     record = {"kind": "turn", **to_exact(turn)}
     obs, samples = turn.observation, turn.taken.late or turn.taken.samples
     if obs is not None and samples and obs.telemetry is samples[-1]:
@@ -260,23 +256,21 @@ _ELSEWHERE = "name another folder with --log-dir, or in the profile (log.directo
 
 
 def path_beside(log: Path | str, suffix: str) -> Path:
-    """The file of a log's name with another ending, such as ``.png``; of a packed log, too."""
+    """Return the path of a log, packed or not, with another ending, such as ``.png``."""
     path = Path(log)
     whole = path.with_suffix("") if path.suffix == PACKED else path
     return whole.with_name(whole.stem + suffix)
 
 
 def log_path(directory: Path, profile_name: str, started: datetime) -> Path:
-    """``flight_<UTC yyyymmdd_hhmmss>_<profile>.jsonl`` in the directory.
-
-    (A flight in lockstep is named ``flight_seed<seed>.jsonl`` by the campaign.)
-    """
+    """Return the path of a flight that starts now: ``flight_<UTC yyyymmdd_hhmmss>_<profile>.jsonl``
+    in the directory. A campaign names its logs ``flight_seed<seed>.jsonl``."""
     safe = re.sub(r"[^A-Za-z0-9._-]+", "-", profile_name).strip("-.") or "profile"
     return directory / f"flight_{started.astimezone(UTC):%Y%m%d_%H%M%S}_{safe[:60]}.jsonl"
 
 
 def make_log_folder(directory: Path) -> None:
-    """Where it is missing. Errors: InvalidValue."""
+    """Make the folder where it is missing. Errors: InvalidValue."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -285,8 +279,9 @@ def make_log_folder(directory: Path) -> None:
 
 
 def new_file(path: Path, none_beside: tuple[str, ...], sync: bool) -> tuple[DiskFile, Path]:
-    """A file that did not exist before, by `path`'s name or the next free one; `none_beside`:
-    suffixes of files of the same name that must not be there, either. Raises OSError."""
+    """Create a file that did not exist before, by `path`'s name or the next free one;
+    `none_beside` are suffixes of files of the same name that must not be there, either. Raises
+    OSError."""
     for number in count(1):
         free = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
         if any(path_beside(free, suffix).exists() for suffix in none_beside):
@@ -304,9 +299,8 @@ def cannot_start(path: Path, error: OSError) -> str:
 
 
 RECORDING_SUFFIX = ".mcap"
-LAYOUT_SUFFIX = ".foxglove.json"
 
 
 def recording_path(path: Path | str) -> Path:
-    """The recording's place, of a log's path or the recording's own."""
+    """Return the recording's path, by the log's or by its own."""
     return path_beside(path, RECORDING_SUFFIX)

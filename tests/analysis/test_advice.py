@@ -87,12 +87,26 @@ def small_print(record: dict[str, Any]) -> None:
         record |= {"sz_m": 0.3, "lz_m": 0.318}
 
 
+def hidden(record: dict[str, Any]) -> None:
+    quiet(record)
+    record |= {"pos_sent": 100, **{f"pos_{a}_m": record[f"{a}_m"] for a in "xyz"}}
+    if 6.0 < record["t_s"] < 7.0:
+        record["pos_note"] = "the body is hidden"
+
+
+def apart(record: dict[str, Any]) -> None:
+    quiet(record)
+    record |= {"pos_sent": 100, **{f"pos_{a}_m": record[f"{a}_m"] + 0.05 for a in "xyz"}}
+
+
 CASES: tuple[tuple[Callable[[dict[str, Any]], None], str, str], ...] = (
     (late, "computer", "1 turn in 100 began 15 ms late or more, of a period of 20 ms"),
     (weak, "battery", "it came down to 3.08 V, and at 3.00 V a flight is ended"),
     (silent, "link", "telemetry was older than 300 ms once, at most 580 ms"),
     (no_picture, "video", "once no picture came for more than 0.3 s, at most 1.0 s"),
     (small_print, "print", "the large marker seems 6 % farther away than the small one"),
+    (hidden, "positioning", "once no position was sent, at most for 1.0 s: the body is hidden"),
+    (apart, "positioning", "the vehicle's estimate was 8.7 cm from the positions from outside"),
     (unseen, "light", "frames did not show the target, though it was overhead"),
 )
 

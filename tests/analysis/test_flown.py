@@ -69,7 +69,7 @@ def test_snow_is_told_with_its_true_times(
     assert flight.story[-1].text.startswith("Perched")
 
 
-def test_a_silent_camera_lands_it_and_the_page_says_why(
+def test_a_silent_camera_lands_it_and_a_killed_flight_has_no_end(
     flights: tuple[Path, dict[str, FaultResult]],
 ) -> None:
     flight = told(flights, "landed")
@@ -78,8 +78,6 @@ def test_a_silent_camera_lands_it_and_the_page_says_why(
     assert any("it landed" in s.text for s in flight.story)
     assert {a.about for a in flight.advice} >= {"video"}
 
-
-def test_a_killed_flight_has_no_end(flights: tuple[Path, dict[str, FaultResult]]) -> None:
     flight = told(flights, "killed")
     assert flight.outcome == "unfinished"
     assert "The log ends here, in ASCEND" in flight.story[-1].text

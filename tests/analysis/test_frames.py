@@ -51,6 +51,15 @@ def test_frames_without_the_target_are_told_apart() -> None:
     frames = frames_of(log)
     assert frames.unseen_s == pytest.approx(np.array([3, 4, 7]) * PERIOD_S - 0.05)
     assert len(frames.seen_s) == 7
+    assert (frames.rate_hz, frames.age_s) == pytest.approx((30.0, 0.05))
+
+
+def test_only_both_markers_together_tell_the_misfit() -> None:
+    """Four corners alone fit nearly any pose."""
+    alone = {"l_rms_px": dict.fromkeys(range(10), 0.1)}
+    assert frames_of(flight(regular(10), **alone)).misfit_px == pytest.approx(0.1)
+    both = {"j_rms_px": {3: 0.4, 5: 0.6, 6: 0.5}}
+    assert frames_of(flight(regular(10), **alone, **both)).misfit_px == pytest.approx(0.5)
 
 
 def test_where_no_frame_is_looked_at_none_is_lost() -> None:

@@ -17,7 +17,7 @@ from perchctl.analysis import (
 )
 from perchctl.analysis.flight import last_ascent
 from perchctl.analysis.show import COLUMNS, list_log
-from perchctl.mission import Event
+from perchctl.mission import Event, EventKind, Phase
 from perchctl.record import FlightLog, read_log
 from tests.helpers import log as synthetic
 from tests.helpers.mission import note
@@ -47,7 +47,7 @@ def test_settled_is_the_last_second_before_the_last_contact() -> None:
         tick(6.0, "PERCH", 9.0),
     ]
     log = log_of(records)
-    contact = last_ascent(FlightAnalysis(log).stays)
+    contact = last_ascent(log.phases)
     assert contact is not None
     assert contact.start_s == 4.0
     found = FlightAnalysis(log).measures
@@ -109,13 +109,18 @@ def test_a_killed_flight_says_what_is_lost(tmp_path: Path) -> None:
     assert "its tail, " in text
 
 
-def test_the_rows_that_were_taken_are_told(tmp_path: Path) -> None:
-    from perchctl.mission import EventKind, Phase
-
-    entered = Event(4.1, EventKind.PHASE, "hovering in the perching area", Phase.SEARCH,
-                    row="approached")  # fmt: skip
-    log = read_log(synthetic.write(tmp_path / "f.jsonl", most=200, events=[entered]))
+def test_the_rows_that_were_taken_and_an_end_without_a_tick_are_told(tmp_path: Path) -> None:
+    events = [
+        Event(
+            4.1, EventKind.PHASE, "hovering in the perching area", Phase.SEARCH, row="approached"
+        ),
+        Event(5.2, EventKind.PHASE, "the operator cut the motors", Phase.ABORTED, row="operator"),
+    ]
+    log = read_log(synthetic.write(tmp_path / "f.jsonl", most=200, events=events))
     assert "hovering in the perching area (approached)" in show_text(FlightAnalysis(log))
+    *_, before, end = log.phases
+    assert (end.phase, end.row, end.duration_s) == ("ABORTED", "operator", 0.0)
+    assert (before.phase, before.end_s) == ("ESTIMATE", log.end_s)
 
 
 # --- a folder of logs ------------------------------------------------------------------

@@ -61,11 +61,6 @@ def told(change: Change = lambda record: None, **more: Any) -> ReportedFlight:
     return ReportedFlight(FlightAnalysis(made(change, **more)))
 
 
-@pytest.fixture(scope="module")
-def perched() -> str:
-    return page_of([told()])
-
-
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the flight's plot, which takes most of a page's time."""
@@ -97,11 +92,6 @@ def assert_closed(html: str) -> Page:
     return page
 
 
-def test_a_page_is_whole_with_its_plot_and_asks_for_nothing(perched: str) -> None:
-    (plot,) = (a for a in assert_closed(perched).loads if a.startswith("data:image/png;base64,"))
-    assert base64.b64decode(plot.partition(",")[2]).startswith(b"\x89PNG")
-
-
 @words_only
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_log_has_its_page(kind: str) -> None:
@@ -109,40 +99,21 @@ def test_every_log_has_its_page(kind: str) -> None:
     assert "What happened" in words
 
 
-@pytest.mark.long
-def test_every_log_has_its_plots() -> None:
-    page = assert_closed(page_of([told(**more) for more in KINDS.values()]))
-    assert page.tags.count("img") == len(KINDS)
-
-
-def test_its_sections_say_what_the_flight_was(perched: str) -> None:
-    words = Page(perched).words
+def test_a_page_is_whole_with_its_plot_and_says_what_the_flight_was() -> None:
+    page = assert_closed(page_of([told()]))
+    (plot,) = (a for a in page.loads if a.startswith("data:image/png;base64,"))
+    assert base64.b64decode(plot.partition(",")[2]).startswith(b"\x89PNG")
+    words = page.words
     for part in (
         "Perched, 3.1 mm off centre",
         "What happened",
         "ASCEND 6.0 s",
         "no recording was made beside this log",
-        "gaps without a picture",
-        "of them with new telemetry",
-        "mAh by the count of the thrust",
-        "each turn began at its time",
+        "settled, heading, RMS",
+        "miss 3.1 mm",
     ):
         assert part in words, part
-    assert "External positions" not in words
-
-
-@words_only
-def test_the_sum_of_the_frames_says_what_it_counts() -> None:
-    """Frames of the other phases are not in it: `log show` counts those, too."""
-
-    def change(record: dict[str, Any]) -> None:
-        if record["phase"] == "APPROACH":
-            record["frame_t_s"] = record["t_s"]
-
-    flight = told(change).flight
-    assert flight.vision_led.phase == "in these phases"
-    assert flight.vision_led.frames == sum(each.frames for each in flight.vision_by_phase)
-    assert flight.vision_led.frames < flight.vision.frames == flight.measures.frames
+    assert "external" not in words
 
 
 def test_a_log_without_a_tick_says_so() -> None:
@@ -181,29 +152,6 @@ def test_what_is_text_stays_text() -> None:
 
 
 @words_only
-def test_no_folder_of_the_computer_is_on_the_page(tmp_path: Path) -> None:
-    from perchctl.analysis import write_report
-
-    log = written(tmp_path / "deep" / "flight.jsonl")
-    write_report([log], tmp_path / "page.html")
-    html = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert str(tmp_path) not in html
-    assert "deep" not in html
-
-
-@words_only
-def test_times_of_turns_are_told() -> None:
-    def change(record: dict[str, Any]) -> None:
-        record["late_s"] = 0.004 if record["t_s"] < 5 else 0.0005
-
-    log = made(change)
-    log.turn_records.extend({"timing": {"pipeline_s": 0.011, "turn_s": 0.012}} for _ in range(50))
-    words = Page(page_of([ReportedFlight(FlightAnalysis(log))])).words
-    assert "late 0.5 ms 4.0 ms 4.0 ms" in words
-    assert "pipeline 11 ms 11 ms 11 ms" in words
-
-
-@words_only
 def test_positions_from_outside_are_told_where_they_were_sent() -> None:
     def change(record: dict[str, Any]) -> None:
         record |= {"pos_sent": 100, "pos_hz": 100.0, "pos_age_s": 0.012}
@@ -212,9 +160,9 @@ def test_positions_from_outside_are_told_where_they_were_sent() -> None:
             record["pos_note"] = "the body is hidden"
 
     words = Page(page_of([told(change)])).words
-    assert "External positions" in words
-    assert "5.2 mm, 95 % below 5.2 mm" in words
-    assert "at 4.9 s for 1.0 s: the body is hidden" in words
+    assert "external positions sent 100" in words
+    assert "off the own estimate, 95 % 5.2 mm" in words
+    assert "4.9 s No external position was sent for 1.0 s: the body is hidden" in words
 
 
 @words_only
@@ -224,7 +172,6 @@ def test_several_flights_have_a_table_that_leads_to_each() -> None:
     assert "3 flights: 1 perched, 1 unfinished, 1 landed" in page.words
     assert {f"#flight-{n}" for n in (1, 2, 3)} <= set(page.loads)
     assert {f"flight-{n}" for n in (1, 2, 3)} <= set(page.ids)
-    assert len(set(page.ids)) == len(page.ids)
 
 
 # --- the command ----------------------------------------------------------------------
@@ -232,30 +179,17 @@ def test_several_flights_have_a_table_that_leads_to_each() -> None:
 
 @words_only
 def test_the_command_writes_beside_the_log_and_replaces_nothing(tmp_path: Path) -> None:
-    log = written(tmp_path / "flight.jsonl")
+    log = written(tmp_path / "deep" / "flight.jsonl")
     said = run("log", "report", str(log))
+    html = log.with_suffix(".html").read_text(encoding="utf-8")
+    assert "deep" not in html  # no folder of the computer is on it
     assert (said.code, said.stdout.strip()) == (0, str(log.with_suffix(".html")))
-    assert "already" in run("log", "report", str(log)).complaint
+    again = run("log", "report", str(log))
+    assert again.code == 30
+    assert "already" in again.complaint
+    assert run("log", "report", str(log), "-o", "page.pdf").code == 30
     other = written(tmp_path / "other.jsonl")
     said = run("log", "report", str(log), str(other), "-o", "both.html", "--json")
     answer = json.loads(said.stdout)
     assert answer["report"] == "both.html"
     assert [flight["outcome"] for flight in answer["flights"]] == ["perched", "perched"]
-
-
-@words_only
-@pytest.mark.parametrize(
-    ("words", "code", "sentence"),
-    [
-        (("nowhere.jsonl",), 20, "does not exist"),
-        (("flight.jsonl", "-o", "flight.jsonl", "--force"), 2, "one of the logs"),
-        (("flight.jsonl", "-o", "page.pdf"), 30, "must end in .html"),
-    ],
-)
-def test_the_command_refuses(
-    tmp_path: Path, words: tuple[str, ...], code: int, sentence: str
-) -> None:
-    written(tmp_path / "flight.jsonl")
-    said = run("log", "report", *words)
-    assert said.code == code
-    assert sentence in said.complaint

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,22 +14,18 @@ from perchctl.analysis import FlightAnalysis, plot_flight
 from perchctl.analysis.plot import title_of
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.record import FlightLog, read_log
-from perchctl.record.write import FlightLogWriter
-from tests.helpers import log as synthetic
-from tests.helpers.disk import full_disk
+from perchctl.record import FlightLog
+from tests.helpers.told import made
 
 pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> FlightLog:
-    path = tmp_path_factory.mktemp("log") / "f.jsonl"
-    writer = FlightLogWriter.open(path, synthetic.header())
-    for record in synthetic.ticks():
-        writer.write(record | {"true_miss_m": 0.004})
-    writer.close(synthetic.SUMMARY)
-    return read_log(writer.path)
+def log() -> FlightLog:
+    def change(record: dict[str, Any]) -> None:
+        record |= {"true_miss_m": 0.004, "battery_rest_v": record["battery_v"] + 0.05}
+
+    return made(change)
 
 
 def picture(log: FlightLog, path: Path) -> Array:
@@ -57,7 +55,7 @@ def test_the_picture_holds_the_flight(plain: Array) -> None:
 def test_raw_points_come_from_the_detections(log: FlightLog, plain: Array, tmp_path: Path) -> None:
     """Without the small marker's poses its colour is left in the legend only."""
     blind = [r | dict.fromkeys(("sx_m", "sy_m", "sz_m", "syaw_rad")) for r in log.records]
-    without = FlightLog(log.path, log.header, blind, log.events, log.summary, False)
+    without = replace(log, records=blind)
     upper = slice(0, int(0.75 * len(plain)))  # below it is a line of that colour
     full = share_of(plain[upper], "#E69F00")
     assert share_of(picture(without, tmp_path / "b.png")[upper], "#E69F00") < full / 5
@@ -70,7 +68,7 @@ def test_the_last_seconds_are_in_millimetres(log: FlightLog, plain: Array, tmp_p
         r | {"ex_m": r["ex_m"] + 0.001} if r["ex_m"] is not None and r["t_s"] > start_s else r
         for r in log.records
     ]
-    other = FlightLog(log.path, log.header, moved, log.events, log.summary, False)
+    other = replace(log, records=moved)
     changed = plain != picture(other, tmp_path / "b.png")
     rows = changed.any(axis=2).sum(axis=1)
     last = int(0.8 * len(rows))
@@ -81,39 +79,30 @@ def test_the_last_seconds_are_in_millimetres(log: FlightLog, plain: Array, tmp_p
 @pytest.mark.parametrize("count", [1, 2, 60])
 def test_a_short_flight_without_a_target(log: FlightLog, count: int, tmp_path: Path) -> None:
     """One tick, no pose, no summary: still a picture, and no warning."""
-    short = FlightLog(log.path, log.header, log.records[:count], [], None, True)
+    short = replace(log, records=log.records[:count], summary=None)
     assert picture(short, tmp_path / "f.png").std() > 1.0
 
 
 def test_many_attempts_and_names_that_matplotlib_would_typeset(tmp_path: Path) -> None:
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
-    for i, record in enumerate(synthetic.ticks()):
-        phase = ("ALIGN", "ASCEND", "PERCH", "RECOVER")[i // 10 % 4]
-        writer.write(record | {"phase": phase, "reason": "50 $ and _more_ {"})
-    writer.close({"outcome": "landed", "reason": "a $ in {a} reason $ with \\frac"})
-    log = read_log(writer.path)
+    def change(record: dict[str, Any]) -> None:
+        phase = ("ALIGN", "ASCEND", "PERCH", "RECOVER")[round(record["t_s"] / 0.2) % 4]
+        record |= {"phase": phase, "reason": "50 $ and _more_ {"}
+
+    log = made(change, {"outcome": "landed", "reason": "a $ in {a} reason $ with \\frac"})
     assert len(log.phases) > 50
     assert picture(log, tmp_path / "f.png").std() > 1.0
 
 
 def test_title(log: FlightLog) -> None:
     assert title_of(FlightAnalysis(log)) == "profile sim, seed 7   |   perched   |   miss 3.1 mm"
-    cut = FlightLog(log.path, {}, log.records, [], None, True)
+    cut = replace(log, header={}, summary=None)
     assert "unknown (the log ends in PERCHED)" in title_of(FlightAnalysis(cut))
 
 
 def test_nothing_to_plot(log: FlightLog, tmp_path: Path) -> None:
-    empty = FlightLog(log.path, log.header, [], [], None, True)
+    empty = replace(log, records=[])
     with pytest.raises(InvalidValue, match="no ticks"):
         plot_flight(empty, tmp_path / "f.png")
     (tmp_path / "no").write_text("in the way")
     with pytest.raises(InvalidValue, match=r"no is a file, not a folder"):
         plot_flight(log, tmp_path / "no" / "folder.png")
-
-
-def test_a_full_disk_leaves_the_old_plot(log: FlightLog, tmp_path: Path) -> None:
-    png = tmp_path / "f.png"
-    png.write_bytes(b"old")
-    with full_disk(room=4_000), pytest.raises(InvalidValue, match="cannot be written"):
-        plot_flight(log, png)
-    assert [p.read_bytes() for p in tmp_path.glob("*.png")] == [b"old"]

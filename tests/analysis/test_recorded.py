@@ -12,7 +12,6 @@ import pytest
 from perchctl.analysis import FlightAnalysis
 from perchctl.analysis.report import decisions_of, reported_flight
 from perchctl.profile import Profile
-from perchctl.record import recorded_pictures
 from perchctl.record.recorder import Recorder
 from perchctl.vision import Frame
 from tests.helpers import log as synthetic
@@ -37,15 +36,6 @@ def log(tmp_path: Path) -> Path:
     end = recorder.close()
     assert (end.pictures, end.problem) == (len(frames), None)
     return path
-
-
-def test_single_pictures_are_given_and_no_others(log: Path) -> None:
-    every = [picture.number for picture in recorded_pictures(log)]
-    wanted = {every[3], every[40]}
-    some = list(recorded_pictures(log, numbers=wanted))
-    assert {picture.number for picture in some} == wanted
-    for picture in some:
-        np.testing.assert_array_equal(picture.image, grey(picture.number))
 
 
 def test_a_report_shows_the_picture_of_each_decision(log: Path) -> None:

@@ -108,6 +108,28 @@ def test_a_link_that_is_lost_on_the_way_is_told() -> None:
     assert rows["decks"].verdict is rows["battery"].verdict is Verdict.SKIPPED
 
 
+@pytest.mark.long
+def test_a_vehicle_that_falls_silent_after_its_rows_is_named() -> None:
+    """The rows before were true when they were asked for; at the end they are not."""
+    with SimProcess.start() as sim:
+        probe = ProbeLink(sim.uri, LinkConfig(connect_timeout_s=30.0), time.monotonic)
+        probe.connect()
+        try:
+            asked = session.VehicleSession(probe, sim.uri, Profile(), None, CheckScope(**QUICK))
+            rows = []
+            for row in asked.answering_rows():
+                rows.append(row)
+                if row.name == vehicle.LIFTED:
+                    sim.silence(60.0)
+                    while probe.lost() is None and probe.age_s() <= vehicle.GONE_S:
+                        wait_for(sim, 0.1)
+        finally:
+            probe.close()
+    assert rows[-1].name == "link"
+    assert rows[-1].verdict is Verdict.FAIL
+    assert "the vehicle is gone" in rows[-1].found
+
+
 def answerer() -> tuple[socket.socket, str]:
     """Something that answers a scan on one of the ports that cflib asks, and its address."""
     answering = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

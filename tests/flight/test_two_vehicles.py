@@ -225,7 +225,7 @@ class Flown:
     def kept_up(self) -> bool:
         """Whether the computer was fast enough; a flight that perched had all it needs."""
         late_s = max(self.log.column("late_s").max(), self.log.column("tel_age_s").max())
-        t_s = self.log.column("t_s")[np.isfinite(self.log.column("frame"))]
+        t_s = self.log.t_s[np.isfinite(self.log.column("frame"))]
         windows = [np.sum((t_s >= s) & (t_s < s + WINDOW_S)) for s in self._looking_s()]
         fewest_hz = min(windows, default=0) / WINDOW_S
         return self.code == 0 or bool(late_s <= LATEST_S and fewest_hz >= FEWEST_HZ)

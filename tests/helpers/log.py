@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
@@ -25,6 +27,7 @@ from perchctl.vehicle import (
     Telemetry,
 )
 from perchctl.vision import Detection, Detections, MarkerPose, PipelineOutput, Stage, TargetEstimate
+from tests.helpers.mission import note
 
 PERIOD_S = 0.02
 PLAN: tuple[tuple[str, float, str], ...] = (
@@ -200,3 +203,20 @@ SUMMARY = {
     "locked": False,
     "fell": False,
 }
+
+
+def small_log(path: Path, ticks: int = 5) -> Path:
+    writer = FlightLogWriter.open(path, header())
+    for i in range(ticks):
+        writer.write({"t_s": 0.02 * i, "phase": "SEARCH", "z_m": 0.1 * i})
+        writer.event(note(0.02 * i, f"event {i}"))
+    writer.close(SUMMARY)
+    assert writer.problem is None
+    return writer.path
+
+
+def run_python(code: str, path: Path) -> subprocess.CompletedProcess[str]:
+    """Run the code in a process of its own, with the path as its argument."""
+    root = Path(__file__).resolve().parents[2]
+    command = [sys.executable, "-c", code, str(path)]
+    return subprocess.run(command, cwd=root, check=False, capture_output=True, text=True)

@@ -13,6 +13,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from perchctl.geometry import Array, make_T, rotation_from_quaternion
 from perchctl.mission import Event, EventKind, Phase
 from perchctl.mission.state import Severity
 from perchctl.profile import Profile
@@ -85,6 +86,16 @@ def messages(path: Path) -> dict[str, list[Any]]:
             decode = factory.decoder_for(channel.message_encoding, schema)
             data = message.data if decode is None else decode(message.data)
             found.setdefault(channel.topic, []).append(data)
+    return found
+
+
+def transforms(message: Any) -> dict[str, Array]:
+    """The transforms of a message of `/tf`, by ``parent child``."""
+    found = {}
+    for each in message.transforms:
+        q, t = each.rotation, each.translation
+        R = rotation_from_quaternion((q.w, q.x, q.y, q.z))
+        found[f"{each.parent_frame_id} {each.child_frame_id}"] = make_T(R, (t.x, t.y, t.z))
     return found
 
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from perchctl.mission import BatteryOutlook, ExternalPositions, Phase, PlannerState
-from perchctl.record import read_log, recording_path, to_plain
+from perchctl.record import path_beside, read_log, to_plain
 from perchctl.record.fields import FIELDS, tick_record
 from perchctl.record.write import FlightLogWriter, log_path
 from perchctl.vehicle import (
@@ -30,8 +30,12 @@ from tests.helpers.mission import held
 STARTED = datetime(2024, 3, 1, 14, 5, 9, tzinfo=UTC)
 
 
-def test_a_flight_comes_back(tmp_path: Path) -> None:
-    writer = FlightLogWriter.open(tmp_path / "new" / "f.jsonl", synthetic.header())
+@pytest.mark.parametrize("live", [False, True])
+def test_a_flight_comes_back(tmp_path: Path, live: bool) -> None:
+    """In lockstep without a thread."""
+    threads = threading.active_count()
+    writer = FlightLogWriter.open(tmp_path / "new" / "f.jsonl", synthetic.header(), live=live)
+    assert threading.active_count() == threads + live
     written = list(synthetic.ticks())
     for record in written:
         writer.write(record)
@@ -51,6 +55,7 @@ def test_a_flight_comes_back(tmp_path: Path) -> None:
     assert log.summary is not None
     assert log.summary["miss_m"] == 0.0031
     assert (log.truncated, log.ignored_bytes) == (False, 0)
+    assert (writer.problem, writer.lost_records) == (None, 0)
     assert [(p.phase, round(p.duration_s, 2)) for p in log.phases] == [
         (phase, duration_s) for phase, duration_s, _ in synthetic.PLAN
     ]
@@ -93,23 +98,6 @@ def test_names_and_no_overwriting(tmp_path: Path) -> None:
     assert read_log(path).header["started_utc"] == "2024-03-01T14:05:09+00:00"
 
 
-def test_commands_and_telemetry_in_a_record() -> None:
-    def of(command: Any) -> dict[str, Any]:
-        state = PlannerState(Phase.PERCH, reason="settled")
-        return tick_record(synthetic.tick(1.0, synthetic.telemetry(0.99, 0.8), command, state))
-
-    assert of(PositionSetpoint(1.0, 2.0, 3.0, 0.5))["cmd_z_m"] == 3.0
-    assert of(RawThrust(60000))["cmd_thrust"] == 60000
-    assert of(Land(-0.05, 2.5))["cmd_duration_s"] == 2.5
-    assert of(Land(-0.05, 2.0))["cmd_z_m"] == -0.05
-    names = [of(c)["cmd"] for c in (Idle(), StopMotors(), EmergencyStop())]
-    assert names == ["idle", "stop", "emergency"]
-    record = of(Idle())
-    assert set(record) == set(FIELDS)
-    assert record["tel_age_s"] == pytest.approx(0.01)
-    assert (record["z_m"], record["ex_m"], record["stage"]) == (0.8, None, None)
-
-
 def test_every_field_is_filled_by_something() -> None:
     """No documented key that nothing writes."""
     pose = synthetic.target(1.0, 1.6)
@@ -120,7 +108,11 @@ def test_every_field_is_filled_by_something() -> None:
     state = PlannerState(Phase.ALIGN, reason="steady", hold="no picture", battery=battery)
     place = ExternalPosition((1.0, 2.0, 0.5), (1.0, 0.0, 0.0, 0.0))
     seen: set[str] = set()
-    for command in (Land(-0.05, 2.0), PositionSetpoint(0.0, 0.0, 1.0, 0.1), RawThrust(1)):
+    for command, name in (
+        (Land(-0.05, 2.0), "land"), (PositionSetpoint(1.0, 2.0, 3.0, 0.5), "position"),
+        (RawThrust(60000), "thrust"), (Idle(), "idle"), (StopMotors(), "stop"),
+        (EmergencyStop(), "emergency"),
+    ):  # fmt: skip
         tick = synthetic.tick(
             1.0,
             synthetic.telemetry(),
@@ -134,10 +126,13 @@ def test_every_field_is_filled_by_something() -> None:
         )
         record = tick_record(tick, (0.0, 0.0, 1.0), 0.01)
         seen |= {key for key, value in record.items() if value is not None}
+        assert record["cmd"] == name
+        height_m = {"land": -0.05, "position": 3.0}.get(name)
+        assert (record["cmd_z_m"], record["z_m"]) == (height_m, 0.0)
+        assert list(record) == list(FIELDS)
     assert set(FIELDS) - seen == {"var_m2"}  # this vehicle does not report it
 
 
 @pytest.mark.parametrize("name", ["x.jsonl", "x.jsonl.gz", "x.mcap"])
-@pytest.mark.parametrize("kind", [str, Path])
-def test_it_is_found_by_the_log_the_packed_log_and_itself(name: str, kind: type) -> None:
-    assert recording_path(kind(Path("logs.d") / name)) == Path("logs.d") / "x.mcap"
+def test_the_recording_is_found_by_the_log_the_packed_log_and_itself(name: str) -> None:
+    assert path_beside(f"logs.d/{name}", ".mcap") == Path("logs.d") / "x.mcap"

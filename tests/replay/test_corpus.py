@@ -36,8 +36,6 @@ def corpus(name: str) -> FlightLog:
 @pytest.mark.parametrize("name", NAMES)
 def test_the_planner_decides_as_it_did(name: str) -> None:
     found = replay(corpus(name))
-    assert found.shown is not None
-    assert found.shown.first is None, f"{difference_text(found.shown.first)}; {ANEW}"
     if found.first is None:
         assert found.ticks > 50
         return

@@ -9,7 +9,6 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.analysis import replay
-from perchctl.analysis.replay_text import pose_changes
 from perchctl.analysis.replayer import Replay
 from perchctl.campaign.flights import fly_seed
 from perchctl.faults import FAULTS
@@ -68,9 +67,6 @@ def test_a_recorded_flight_is_seen_again(tmp_path: Path) -> None:
     nearer = changed_profile(short_profile(), ["vehicle.gear_body_m=[0, 0, 0.031]"])
     found = replay(log, recorded_pictures(path), nearer)
     assert found.changed == ("vehicle.gear_body_m",)
-    joint = next(change for change in pose_changes(found) if change.name == "joint")
-    moved_m = 0.031 - short_profile().vehicle.gear_body_m[2]
-    assert joint.z_m == pytest.approx(abs(moved_m), rel=0.05)
     assert found.first is not None
     assert found.first.field.startswith(("command.", "phase"))
 

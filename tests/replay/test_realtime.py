@@ -59,5 +59,3 @@ def test_a_flight_in_real_time_replays(tmp_path: Path) -> None:
     assert found.ticks > 100
     assert found.seen.frames > 50
     assert all(turn.timing is not None for turn in log.turns if turn.role == "flown")
-    alone = replay(log)  # what the planner was shown, from telemetry and times alone
-    assert alone.same

@@ -111,10 +111,7 @@ def test_a_source_that_ends_does_so_again(tmp_path: Path) -> None:
     log, pictures = flown(tmp_path, Rig(camera=Camera(frames=40)))
     observed = [turn.observation for turn in log.turns if turn.observation is not None]
     assert observed[-1].camera_problem == "the scripted camera has ended"
-    found = seen_again(log, pictures)
-    assert found.seen is not None
-    assert found.seen.first is None, found.seen.first
-    assert found.same
+    assert seen_again(log, pictures).same
 
 
 def test_with_another_latency_the_pictures_are_of_another_time(
@@ -187,10 +184,6 @@ def test_a_recording_that_cannot_be_read_costs_the_planner_nothing(
     assert part.seen is not None
     assert part.seen.frames > 5
     assert part.same
-    other = changed_profile(PROFILE, ["kalman.n_max=3"])
-    what_if = replay(log, damaged([], error), other, Rig().setup)
-    assert what_if.ticks == found.ticks
-    assert any(note.startswith("kalman.n_max: ") for note in what_if.notes)
 
 
 def test_a_missing_picture_ends_it(flight: tuple[FlightLog, list[Picture]]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from importlib.resources import files
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,8 @@ from mcap.reader import make_reader
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import (
-    Array,
     make_T,
     rot_z,
-    rotation_from_quaternion,
     rotation_from_rpy,
 )
 from perchctl.mission import SentCommand
@@ -28,15 +26,18 @@ from perchctl.record.recording_file import SCHEMAS, calibration_message
 from perchctl.vehicle import Land
 from perchctl.vision import CameraModel
 from tests.helpers import recorded
+from tests.helpers.flights import ROOT
 
-STARTED = {"started": None, "t0_s": 1.0}
 FLIGHT = recorded.flown(120)
+
+
+STARTED = datetime(2024, 5, 17, 12, 30, 15, tzinfo=UTC)
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "flight.mcap"
-    recorder = recorded.recorder(path, **STARTED)
+    recorder = recorded.recorder(path, started=STARTED, t0_s=1.0)
     recorded.fly(recorder, FLIGHT)
     recorder.sent(sent_values(SentCommand(FLIGHT.ticks[-1]["t_s"], "watchdog", Land(-0.05, 2.0))))
     end = recorder.close()
@@ -55,16 +56,11 @@ def test_each_picture_is_the_pipeline_s_to_the_bit(recording: Path) -> None:
     for got, frame in zip(found, FLIGHT.frames, strict=True):
         assert got.image.dtype == np.uint8
         np.testing.assert_array_equal(got.image, frame.image)
-
-
-def test_a_jpeg_lies_there_as_it_came(found: dict[str, list[Any]]) -> None:
-    stored = found["/camera/image"]
+    some = recorded_pictures(recording.with_suffix(".jsonl"), numbers={3, 40})
+    assert [picture.number for picture in some] == [3, 40]  # by the log's name, and no others
+    stored = recorded.messages(recording)["/camera/image"]
     assert [image.format for image in stored[:4]] == ["jpeg", "png", "jpeg", "png"]
-    assert stored[0].data == FLIGHT.frames[0].encoded
-
-
-def test_the_logs_own_path_names_it_too(recording: Path) -> None:
-    assert next(recorded_pictures(recording.with_suffix(".jsonl"))).number == 0
+    assert stored[0].data == FLIGHT.frames[0].encoded  # a JPEG lies there as it came
 
 
 def test_a_picture_that_decodes_otherwise_here_is_said(
@@ -117,6 +113,9 @@ def test_readers_find_it_whole_by_its_index_and_foxgloves_own_schemas(
     assert schemas == own | theirs
     assert len(found["/camera/image"]) == len(found["/camera/frame"]) == len(FLIGHT.frames)
     assert len(found["/tick"]) == len(found["/tf"]) == len(FLIGHT.ticks)
+    with recording.open("rb") as stream:
+        (attached,) = make_reader(stream).iter_attachments()
+    assert json.loads(attached.data)["profile"]["name"] == "sim"  # the log's header
 
 
 KINDS: dict[str, tuple[type, ...]] = {
@@ -145,30 +144,9 @@ def test_messages_have_the_wall_s_time(recording: Path, found: dict[str, list[An
     assert json.loads(found["/tick"][0])["t_s"] == 0.0
     with recording.open("rb") as stream:
         times = [m.log_time for _, c, m in make_reader(stream).iter_messages(topics=["/tick"])]
+    begun_ns = round(STARTED.timestamp()) * 10**9
     told = [round((tick["t_s"] - 1.0) * 1e9) for tick in FLIGHT.ticks]
-    assert times == pytest.approx(told, abs=1)
-
-
-def test_the_wall_clock_is_the_headers(tmp_path: Path) -> None:
-    from datetime import UTC, datetime
-
-    started = datetime(2024, 5, 17, 12, 30, 15, tzinfo=UTC)
-    recorder = recorded.recorder(tmp_path / "f.mcap", started=started, t0_s=1.0)
-    recorded.fly(recorder, recorded.flown(2))
-    recorder.close()
-    with (tmp_path / "f.mcap").open("rb") as stream:
-        first = next(make_reader(stream).iter_messages(topics=["/tick"]))[2].log_time
-    assert first == pytest.approx(started.timestamp() * 1e9 + 0.1e9, abs=1000)
-
-
-def _transforms(message: Any) -> dict[str, Array]:
-    """By ``parent child``."""
-    found = {}
-    for each in message.transforms:
-        q, t = each.rotation, each.translation
-        R = rotation_from_quaternion((q.w, q.x, q.y, q.z))
-        found[f"{each.parent_frame_id} {each.child_frame_id}"] = make_T(R, (t.x, t.y, t.z))
-    return found
+    assert [t_ns - begun_ns for t_ns in times] == pytest.approx(told, abs=1)
 
 
 def test_the_transforms_lead_from_the_world_to_camera_gear_and_target(
@@ -177,7 +155,7 @@ def test_the_transforms_lead_from_the_world_to_camera_gear_and_target(
     said = found["/tf"]
     mount = recorded.PROFILE.camera.mount.T_body_cam
     for n in (0, 60, len(FLIGHT.ticks) - 1):
-        tick, T = FLIGHT.ticks[n], _transforms(said[n])
+        tick, T = FLIGHT.ticks[n], recorded.transforms(said[n])
         R = rotation_from_rpy(tick["roll_rad"], tick["pitch_rad"], tick["yaw_rad"])
         T_world_body = make_T(R, (tick["x_m"], tick["y_m"], tick["z_m"]))
         np.testing.assert_allclose(T["world body"], T_world_body, atol=1e-12)
@@ -195,7 +173,8 @@ def test_the_body_is_where_it_was_when_that_was_measured(found: dict[str, list[A
     said = found["/tf"][50].transforms
     (body,) = [each for each in said if each.child_frame_id == "body"]
     told_s = FLIGHT.ticks[50]["t_s"] - FLIGHT.ticks[50]["tel_age_s"] - 1.0
-    assert body.timestamp.seconds + body.timestamp.nanos * 1e-9 == pytest.approx(told_s, abs=1e-8)
+    since_s = body.timestamp.seconds - STARTED.timestamp() + body.timestamp.nanos * 1e-9
+    assert since_s == pytest.approx(told_s, abs=1e-8)
 
 
 def test_a_target_out_of_sight_stays_where_it_was(tmp_path: Path) -> None:
@@ -218,7 +197,7 @@ def test_values_that_are_no_numbers_make_no_transform(tmp_path: Path) -> None:
     recorder.tick({**FLIGHT.ticks[0], "x_m": float("nan"), "cmd_z_m": float("inf")})
     recorder.close()
     found = recorded.messages(tmp_path / "f.mcap")
-    assert set(_transforms(found["/tf"][0])) == {"body camera", "body gear"}
+    assert set(recorded.transforms(found["/tf"][0])) == {"body camera", "body gear"}
 
 
 def test_the_calibration_is_the_flights(found: dict[str, list[Any]]) -> None:
@@ -230,11 +209,8 @@ def test_the_calibration_is_the_flights(found: dict[str, list[Any]]) -> None:
     np.testing.assert_array_equal(np.reshape(said.K, (3, 3)), camera.K)
     np.testing.assert_array_equal(np.reshape(said.R, (3, 3)), np.eye(3))
     np.testing.assert_array_equal(np.reshape(said.P, (3, 4))[:, :3], camera.K)
-
-
-def test_a_fisheye_has_foxgloves_name() -> None:
-    said = calibration_message(0, CameraModel((8, 6), np.eye(3), np.zeros(4), "fisheye"))
-    assert said.distortion_model == "kannala_brandt"
+    fisheye = CameraModel((8, 6), np.eye(3), np.zeros(4), "fisheye")
+    assert calibration_message(0, fisheye).distortion_model == "kannala_brandt"
 
 
 def test_events_are_log_lines_with_their_gravity(found: dict[str, list[Any]]) -> None:
@@ -244,30 +220,21 @@ def test_events_are_log_lines_with_their_gravity(found: dict[str, list[Any]]) ->
     assert (said.name, said.file) == ("perchctl", "searched-out")
 
 
-def test_the_path_grows(found: dict[str, list[Any]]) -> None:
+def test_the_path_grows_and_corners_lie_on_the_picture(found: dict[str, list[Any]]) -> None:
     said = found["/vehicle/path"]
     lengths = [len(message.poses) for message in said]
     assert lengths == sorted(set(lengths))
     assert len(said) == 5  # 4.8 s, each second
     assert said[-1].poses[-1].position.z > said[0].poses[0].position.z
-
-
-def test_corners_lie_on_the_picture(found: dict[str, list[Any]]) -> None:
     said = found["/camera/corners"]
     tick = next(tick for tick in FLIGHT.ticks if tick["large_px"] is not None)
     outline = next(message for message in said if message.points).points[0]
     assert [v for p in outline.points for v in (p.x, p.y)] == tick["large_px"]
 
 
-def test_the_header_goes_along(recording: Path) -> None:
-    with recording.open("rb") as stream:
-        (attached,) = make_reader(stream).iter_attachments()
-    header = json.loads(attached.data)
-    assert header["profile"]["name"] == "sim"
-
-
 def test_the_layout_shows_what_is_there(found: dict[str, list[Any]]) -> None:
-    shown = json.loads(files("perchctl.record").joinpath("foxglove.json").read_bytes())
+    """Of the layout for Foxglove that docs/recording.md names."""
+    shown = json.loads((ROOT / "docs" / "foxglove.json").read_bytes())
     topics = set(found)
     text = json.dumps(shown)
     named = {word for word in text.replace(".", '"').split('"') if word.startswith("/")}

@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from perchctl.calibration import profile_camera
 from perchctl.campaign.flights import fly_seed
 from perchctl.flight import lockstep
-from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rotation_from_quaternion
+from perchctl.geometry import R_MARKER_TARGET, invert_T, make_T
 from perchctl.profile import load_profile
 from perchctl.record import read_log, recorded_pictures
 from perchctl.vision import Frame, project, square_corners
@@ -61,15 +61,6 @@ def test_every_frame_of_a_flight_is_there_to_the_bit(flown: tuple[Path, list[Fra
     assert summary["pictures"] == len(new)
 
 
-def chain(transforms: Any) -> dict[str, Array]:
-    found = {}
-    for each in transforms:
-        q, t = each.rotation, each.translation
-        R = rotation_from_quaternion((q.w, q.x, q.y, q.z))
-        found[each.child_frame_id] = make_T(R, (t.x, t.y, t.z))
-    return found
-
-
 @pytest.mark.long
 def test_the_target_of_the_transforms_lies_on_that_of_the_pictures(
     flown: tuple[Path, list[Frame]],
@@ -85,8 +76,8 @@ def test_the_target_of_the_transforms_lies_on_that_of_the_pictures(
     for record, message in zip(records, said, strict=True):
         if record["large_px"] is None or record["phase"] not in ("ALIGN", "ASCEND"):
             continue
-        T = chain(message.transforms)
-        T_cam_target = invert_T(T["body"] @ T["camera"]) @ T["target"]
+        T = recorded.transforms(message)
+        T_cam_target = invert_T(T["world body"] @ T["body camera"]) @ T["world target"]
         T_cam_marker = T_cam_target @ make_T(R_MARKER_TARGET, (0.0, 0.0, 0.0))
         rvec = np.asarray(cv2.Rodrigues(T_cam_marker[:3, :3])[0], dtype=float).ravel()
         side_m = profile.target.large.side_m
