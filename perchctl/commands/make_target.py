@@ -186,7 +186,7 @@ def sheet(
     epilog=examples(
         "perchctl make-target board charuco:10x7:25mm:18mm:DICT_5X5_100",
         "perchctl make-target board chessboard:9x6:25mm --page letter -o chess.pdf",
-        "perchctl make-target board aprilgrid:6x6:22mm:0.3 -o april.pdf",
+        "perchctl make-target board chessboard:20x14:40mm --page 900x700mm --tile a3",
     ),
 )
 @reporting
@@ -195,8 +195,7 @@ def board(
         str,
         typer.Argument(
             help="charuco:10x7:25mm:18mm:DICT_5X5_100 (squares), chessboard:9x6:25mm (inner "
-            "corners), aprilgrid:6x6:22mm:0.3 (tags, gap as a share of a tag), or Kalibr's .yaml "
-            "of a board."
+            "corners)."
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="PDF to write.")] = Path(

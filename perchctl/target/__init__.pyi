@@ -1,8 +1,5 @@
-from .boards import TAG_BORDER_CELLS as TAG_BORDER_CELLS
-from .boards import TAG_DICTIONARY as TAG_DICTIONARY
 from .boards import Board as Board
 from .boards import parse_board as parse_board
-from .boards import tag_cells as tag_cells
 from .design import make_design as make_design
 from .design import suggest_target as suggest_target
 from .drawing import TargetDrawing as TargetDrawing

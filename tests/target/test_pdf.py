@@ -222,10 +222,7 @@ def test_a_page_too_small_is_refused_with_the_one_that_fits(large: float, page: 
         assert "allowed are a4, letter, a3" in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    "notation",
-    ["charuco:10x7:25mm:18mm:DICT_5X5_100", "chessboard:9x6:25mm", "aprilgrid:7x5:22mm:0.3"],
-)
+@pytest.mark.parametrize("notation", ["charuco:10x7:25mm:18mm:DICT_5X5_100", "chessboard:9x6:25mm"])
 def test_a_printed_board_is_found_and_true_to_size(notation: str) -> None:
     board = parse_board(notation)
     page = board_page(board, parse_page("a4"))
@@ -243,16 +240,6 @@ def board_corners(board: Board, picture: NDArray[np.uint8]) -> NDArray[np.float6
         found, ids, _, _ = cv2.aruco.CharucoDetector(board.cv2_board()).detectBoard(picture)
         order = np.argsort(np.asarray(ids).ravel())
         corners = np.asarray(found, np.float32).reshape(-1, 2)[order]
-    elif board.kind == "aprilgrid":
-        finding = cv2.aruco.DetectorParameters()
-        finding.markerBorderBits = 2
-        tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-        quads, ids, _ = cv2.aruco.ArucoDetector(tags, finding).detectMarkers(picture)
-        assert ids is not None
-        assert sorted(ids.ravel()) == list(range(35))
-        corners = np.zeros((140, 2), np.float32)
-        for tag, quad in zip(ids.ravel(), quads, strict=True):
-            corners[list(board.tag_corners(int(tag)))] = quad.reshape(4, 2)
     else:
         ok, found = cv2.findChessboardCorners(picture, board.corner_count)
         assert ok
