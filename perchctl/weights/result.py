@@ -24,7 +24,6 @@ from perchctl.weights.fit import (
     Errors,
     Evidence,
     Fitted,
-    LmsRun,
     errors_of,
     evidence,
     fit_all,
@@ -45,7 +44,6 @@ class Result:
 
     errors: Errors
     fits: dict[str, Fitted]
-    run: LmsRun
     evidence: Evidence
     other: Evidence | None
     other_name: str
@@ -93,28 +91,24 @@ class Result:
         return notes
 
 
-def fit_weights(
-    paths: Sequence[Path], chosen: str, test: Path | None = None, step: float | None = None
-) -> Result:
-    """Read all data and fit the weights to it by each method.
+def fit_weights(paths: Sequence[Path], chosen: str, test: Path | None = None) -> Result:
+    """Read the data, fit the weights by each method, and judge them by held-out positions.
 
     Args:
         chosen: the method that is offered, one of `FITTED`.
         test: other data to judge the weights by.
-        step: a constant step of LMS, in 1 / mean(d^2); None: it falls.
 
     Errors: NotFound, InvalidValue, UsageError.
     """
     data, tested = read_data(paths, test)
     errors = errors_of(data)
-    fits, run = fit_all(errors, step)
+    fits = fit_all(errors)
     other = None
     if tested is not None:
         other = evidence(errors_of(tested), {name: fit.weights for name, fit in fits.items()})
     return Result(
         errors=errors,
         fits=fits,
-        run=run,
         evidence=evidence(errors, {name: fit.folds for name, fit in fits.items()}),
         other=other,
         other_name="" if test is None else str(test),
@@ -127,7 +121,7 @@ def fit_weights(
 
 
 def _by_axis(values: Iterable[float]) -> dict[str, float | None]:
-    """To six figures, as a person may read them."""
+    """Return the values by axis, to six figures, as a person may read them."""
     return {
         axis: float(f"{value:.6g}") if math.isfinite(value) else None
         for axis, value in zip(AXES, values, strict=True)
@@ -135,7 +129,7 @@ def _by_axis(values: Iterable[float]) -> dict[str, float | None]:
 
 
 def weights_record(result: Result) -> dict[str, Any]:
-    """The one object of `--json`. Lengths in m, angles in rad."""
+    """Return the one object of `--json`. Lengths in m, angles in rad."""
     record: dict[str, Any] = {name: _by_axis(result.fits[name].weights) for name in FITTED}
     record |= {
         "paper": _by_axis(PAPER_WEIGHTS),
@@ -161,8 +155,8 @@ def weights_record(result: Result) -> dict[str, Any]:
 
 
 def _errors_record(found: Evidence) -> dict[str, Any]:
-    """By each way its RMS error (x, y, z, yaw) with the half width of the interval, and the gain
-    over the better single marker with its own."""
+    """Return the RMS error (x, y, z, yaw) of each set of weights with the half width of its
+    interval, and the gain over the better single marker with its own."""
     record = {}
     for name in found.squares:
         (rms, half), (gain, gain_half) = found.rms(name), found.gain(name, found.better_squares)
@@ -195,7 +189,7 @@ _HEADS = ("x [um]", "y [um]", "z [um]", "yaw [mdeg]")
 
 
 def report_text(result: Result) -> str:
-    """Verdict, errors, gains, weights, offsets, positions, notes."""
+    """Return the report: verdict, errors, gains, weights, offsets, positions, notes."""
     errors, label = result.errors, LABELS[result.chosen]
     data = f"{errors.name}: {len(errors)} rows of {len(errors.positions)} positions"
     if errors.single_rows:
@@ -218,8 +212,8 @@ def report_text(result: Result) -> str:
         for name, fit in result.fits.items()
     }
     weights[LABELS["paper"]] = [f"{w:.3f}{'':8}" for w in PAPER_WEIGHTS]
-    away = np.abs(result.run.weights - result.fits["closed_form"].raw).max()
-    title = f"fitted weights; LMS ends {away:.4f} from the closed form, {result.run.passes} passes"
+    away = np.abs(result.fits["lms"].raw - result.fits["closed_form"].raw).max()
+    title = f"fitted weights; LMS ends {away:.4f} from the closed form"
     parts.append(_table(title, AXES, weights))
     offsets = {f"{name} marker": _scaled(*found, "+") for name, found in errors.biases.items()}
     offsets["outliers left out"] = [f"{n}{'':6}" for n in (~errors.use).sum(axis=0)]
@@ -231,7 +225,7 @@ def report_text(result: Result) -> str:
 
 
 def _verdict(result: Result) -> str:
-    """What to fly with, and why, in a line for each axis."""
+    """Return the weights to fly with, and why, in a line for each axis."""
     if not any(result.proven):
         return _wrapped(
             "not recommended: on no axis do these weights beat the better single marker beyond "
@@ -251,8 +245,8 @@ def _verdict(result: Result) -> str:
 
 
 def _positions_text(result: Result) -> str:
-    """The paper's tables I and II in one: a line for each position, with the mean merged pose's
-    error by weights fitted without it."""
+    """Return the paper's tables I and II in one: a line for each position, with the mean merged
+    pose's error by weights fitted without it."""
     a, b = result.errors.position_means
     folds = result.fits[result.chosen].folds
     error = folds * a + (1.0 - folds) * b
@@ -280,7 +274,8 @@ def _table(title: str, heads: Sequence[str], rows: dict[str, list[str]]) -> str:
 
 
 def _scaled(values: Array, halves: Array, sign: str = "") -> list[str]:
-    """``6.5 +-1.2``, in micrometres and thousandths of a degree; large ones in thousands (k)."""
+    """Return cells as ``6.5 +-1.2``, in micrometres and thousandths of a degree; large ones in
+    thousands (k)."""
     cells = []
     for value, half in zip(values * _SCALES, halves * _SCALES, strict=True):
         size = max(abs(value), abs(half))

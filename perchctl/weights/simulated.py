@@ -17,7 +17,7 @@ from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, w
 from perchctl.profile import Profile
 from perchctl.sim import Renderer, Scenario
 from perchctl.vision import CameraModel, Frame, project, rotation_vector, square_corners
-from perchctl.weights.collect import SessionFile, fault_of, read_markers, rows_of
+from perchctl.weights.collect import SessionFile, position_fault, read_markers, session_rows
 
 NOISE_SIGMA, BLUR_PX = 4.0, 1.0
 MARGIN_PX = 4.0
@@ -28,7 +28,8 @@ _STREAM = 611
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """`actual`: the target relative to the gear in the level frame, (4,)."""
+    """A place of the camera, and `actual`, the target relative to the gear in the level frame
+    there, (4,)."""
 
     T_world_cam: Array
     actual: Array
@@ -51,7 +52,7 @@ class SimulatedStand:
         self._corners = square_corners(profile.target.large.side_m)
 
     def fill(self, session: SessionFile, frames: int, advance: Callable[[], None]) -> None:
-        """Complete the session; `advance` is called with each frame. Errors: InvalidValue."""
+        """Complete the session; `advance` is called with each frame. Raises InvalidValue."""
         while len(session.done) < self._positions:
             position = session.next_position
             place, readings = self.place(position), []
@@ -59,17 +60,17 @@ class SimulatedStand:
             for reading in read_markers(shown, self._profile, self._camera):
                 readings.append(reading)
                 advance()
-            fault = fault_of(readings)
+            fault = position_fault(readings)
             if fault is not None:
                 raise InvalidValue(
                     f"position {position} of the simulated experiment cannot be used ({fault}): "
                     f"take another --seed"
                 )
-            session.append(position, rows_of(position, readings, place.actual))
+            session.append(position, session_rows(position, readings, place.actual))
 
     def place(self, position: int) -> Place:
-        """The place of a position, counted from 1: its distance falls into its own share of
-        z3 to z2, so that few positions cover the range. Errors: InvalidValue."""
+        """Return the place of a position, counted from 1. Its distance falls into its own share of
+        z3 to z2, so that few positions cover the range. Raises InvalidValue."""
         merge = self._profile.merge
         rng = np.random.default_rng([self._seed, _STREAM, position])
         share = (position - 1) % self._positions
@@ -88,14 +89,14 @@ class SimulatedStand:
         )
 
     def frames(self, position: int, place: Place, count: int) -> Iterator[Frame]:
-        """The pictures of a place."""
+        """Yield the pictures of a place."""
         for k in range(count):
             index = position * 100_000 + k
             image = self._renderer.render([place.T_world_cam], frame_index=index)
             yield Frame(k, k * FRAME_S, image, k * FRAME_S)
 
     def _at(self, x_m: float, y_m: float, z_m: float, yaw: float) -> Place:
-        """The camera `z_m` under the target and off it by x, y in its own level axes."""
+        """Return the place that is `z_m` under the target and off it by x, y in level axes."""
         T_body_cam = self._profile.camera.mount.T_body_cam
         lens = np.array([x_m, y_m, z_m])  # target relative to the camera, level axes
         gear = np.asarray(self._profile.vehicle.gear_body_m)
