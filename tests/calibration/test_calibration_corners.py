@@ -1,4 +1,4 @@
-"""Corners: their bias, their spread, and what the window takes in."""
+"""Corners: their bias, their spread, what the window takes in, and interlaced pictures."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 
 from perchctl.calibration import BoardView
+from perchctl.calibration.board.capture import sharpness
 from perchctl.calibration.board.detect import find_board, fit_saddles
 from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.target import Board
-from perchctl.vision import project
+from perchctl.vision import is_combed, project
 from tests.helpers.boards import (
     CHARUCO,
     CHESSBOARD,
     BoardRenderer,
     draw_camera,
+    draw_poses,
 )
 
 CAMERA = draw_camera(np.random.default_rng(1), (480, 360))
@@ -112,3 +114,38 @@ def test_a_large_picture_keeps_the_places_of_its_pixels() -> None:
     there = project(CHARUCO.corners_m(), pose[:3], pose[3:], CAMERA)[view.ids]
     expected = (there + 0.5) * 4 - 0.5
     assert np.abs((view.corners_px - expected).mean(axis=0)).max() < 0.1
+
+
+# --- interlaced pictures -------------------------------------------------------------------
+
+FIELDS_S = 0.02
+SPEED = np.array([0.15, 0.15, 0.3, 0.08, 0.08, 0.08])  # rad/s and m/s of a hand, one sigma
+
+
+def test_corners_of_an_interlaced_picture_are_half_way_between_its_fields() -> None:
+    """Or those of the one field that shows the board."""
+    rng = np.random.default_rng(3)
+    renderer = BoardRenderer(CAMERA, CHARUCO)
+    combed = 0
+    for pose in draw_poses(rng, CAMERA, CHARUCO, 8):
+        step = rng.normal(0.0, 1.0, 6) * SPEED * FIELDS_S / 2.0
+        poses = pose - step, pose + step
+        picture, bottom = (renderer.render(each, rng, noise=2.0) for each in poses)
+        picture[1::2] = bottom[1::2]
+        combed += is_combed(picture)
+        view = _view(CHARUCO, picture)
+        there = [project(CHARUCO.corners_m(), p[:3], p[3:], CAMERA)[view.ids] for p in poses]
+        moments = [(there[0] + there[1]) / 2.0, *there]
+        assert min(rms(view.corners_px - moment) for moment in moments) < 0.1
+    assert combed >= 5
+
+
+def test_a_comb_is_no_sharpness() -> None:
+    """Of a video's frames the sharpest are searched: not those that moved most."""
+    rng = np.random.default_rng(8)
+    pose = draw_poses(rng, CAMERA, CHARUCO, 1)[0]
+    still = BoardRenderer(CAMERA, CHARUCO).render(pose, rng, noise=2.0)
+    combed = still.copy()
+    combed[1::2] = np.roll(still, 3, axis=1)[1::2]
+    assert is_combed(combed)
+    assert sharpness(combed) < 1.2 * sharpness(still)

@@ -20,7 +20,6 @@ from perchctl.calibration import (
 from perchctl.calibration.mounting.carry import Carried
 from perchctl.calibration.mounting.motion import missing
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.calibration.mounting.robust import student_factor
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.sim.hand import Hand
@@ -38,11 +37,6 @@ def mounted(held: Hand, R_body_cam: Array) -> Hand:
     T = make_T(R_body_cam, held.T_body_cam[:3, 3])
     scenario = replace(held.scenario, T_body_cam_true=tuple(map(tuple, T.tolist())))
     return replace(held, scenario=scenario)
-
-
-def test_students_factor_is_the_tables() -> None:
-    for freedom, t in ((4, 2.776), (9, 2.262), (14, 2.145), (1000, 1.962)):
-        assert student_factor(freedom) == pytest.approx(t / 1.96, rel=0.01)
 
 
 # --- the carry ---------------------------------------------------------------------------
