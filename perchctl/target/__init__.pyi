@@ -8,7 +8,6 @@ from .drawing import mm_text as mm_text
 from .drawing import parse_length as parse_length
 from .measured import NOTABLE_SCALE_ERROR as NOTABLE_SCALE_ERROR
 from .measured import measured_target as measured_target
-from .page import PAGES_MM as PAGES_MM
 from .print_check import PrintCheck as PrintCheck
 from .print_check import PrintVerdict as PrintVerdict
 from .reading import Optics as Optics
