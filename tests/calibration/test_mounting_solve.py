@@ -18,7 +18,7 @@ from perchctl.calibration import (
     solve_pivot,
 )
 from perchctl.calibration.mounting.carry import Carried
-from perchctl.calibration.mounting.motion import missing
+from perchctl.calibration.mounting.motion import missing_motion
 from perchctl.calibration.mounting.recording import SeenPose
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, make_T, rotation_from_rpy
@@ -163,8 +163,8 @@ def without(recording: MountingRecording, *axes: int) -> MountingRecording:
 @pytest.mark.parametrize(("axis", "name"), [(0, "roll"), (1, "pitch"), (2, "yaw")])
 def test_the_missing_turn_is_named(axis: int, name: str) -> None:
     recording = seen(hand("carry", 3), errors=False)
-    assert missing(recording) == ()
-    lacking = missing(without(recording, axis))
+    assert missing_motion(recording) == ()
+    lacking = missing_motion(without(recording, axis))
     assert [words.split(":")[0] for words in lacking] == [name]
     with pytest.raises(InvalidValue, match=f"the carry lacks motion: {name}"):
         solve_carry(without(recording, axis))
@@ -183,13 +183,13 @@ def slower(recording: MountingRecording, factor: float) -> MountingRecording:
 
 def test_too_short_too_slow_too_few() -> None:
     recording = seen(hand("carry", 3), errors=False)
-    assert any("faster" in w for w in missing(slower(recording, 6.0)))
+    assert any("faster" in w for w in missing_motion(slower(recording, 6.0)))
     short = replace(recording, poses=tuple(p for p in recording.poses if p.t_s < 16.0))
-    assert [w.split(":")[0] for w in missing(short)] == ["longer"]
+    assert [w.split(":")[0] for w in missing_motion(short)] == ["longer"]
     few = replace(recording, poses=recording.poses[::3])
-    assert [w.split(":")[0] for w in missing(few)] == ["more pictures"]
-    assert missing(replace(recording, poses=())) == ("bring the target into view",)
-    assert missing(MountingRecording("carry", (), ())) == ("wait for the vehicle",)
+    assert [w.split(":")[0] for w in missing_motion(few)] == ["more pictures"]
+    assert missing_motion(replace(recording, poses=())) == ("bring the target into view",)
+    assert missing_motion(MountingRecording("carry", (), ())) == ("wait for the vehicle",)
 
 
 def test_a_pivot_that_is_not_tilted_enough() -> None:
@@ -200,7 +200,7 @@ def test_a_pivot_that_is_not_tilted_enough() -> None:
         straight = replace(held, turns=replace(held.turns, amplitude=amplitude))
         if still == (1,):  # heading turns would tilt it the other way, too
             amplitude[2] = 0.0
-        assert any(w.startswith(words) for w in missing(seen(straight)))
+        assert any(w.startswith(words) for w in missing_motion(seen(straight)))
         with pytest.raises(InvalidValue, match=words):
             solve_pivot(seen(straight))
 

@@ -37,8 +37,8 @@ def views_of_images(
     board: Board,
     progress: Progress = lambda done, total: None,
 ) -> tuple[list[BoardView], list[Rejection]]:
-    """Every picture of a folder or glob (or those given): the views, and those without a board or
-    broken.
+    """Search every picture of a folder or glob (or those given); return the views of the board, and
+    the pictures that are broken or show none.
 
     Raises:
         NotFound: no pictures. InvalidValue: unequal sizes.
@@ -82,7 +82,7 @@ def views_of_images(
 def views_of_video(
     path: Path, board: Board, progress: Progress = lambda done, total: None
 ) -> tuple[list[BoardView], list[Rejection]]:
-    """The sharp and different views of a video.
+    """Return the sharp and different views of a video, and why there are none.
 
     Raises NotFound or InvalidValue for a file that is none.
     """
@@ -110,7 +110,7 @@ def views_of_video(
 
 
 def _sharpest(source: VideoSource) -> Iterator[Frame]:
-    """The sharpest frame of each window."""
+    """Yield the sharpest frame of each window."""
     window: list[Frame] = []
     while (frame := source.poll(0.0)) is not None:
         window.append(frame)
@@ -122,8 +122,8 @@ def _sharpest(source: VideoSource) -> Iterator[Frame]:
 
 
 def sharpness(image: Grey) -> float:
-    """Variance of a picture's second derivative; of one field where there are two: the comb of
-    a moving picture is no sharpness."""
+    """Return the variance of a picture's second derivative; of one field where there are two: the
+    comb of a moving picture is no sharpness."""
     if is_combed(image):
         image = field_picture(image, 0)
     step = max(1, image.shape[1] // _SHARPNESS_WIDTH)
@@ -132,7 +132,7 @@ def sharpness(image: Grey) -> float:
 
 
 def _workers() -> int:
-    """Threads: OpenCV and numpy leave the interpreter free while they work."""
+    """Return the number of threads: OpenCV and numpy leave the interpreter free at work."""
     return max(1, min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2))
 
 
@@ -162,7 +162,7 @@ class Signature:
     tilt_y: float
 
     def distance(self, other: Signature) -> float:
-        """How different two views are."""
+        """Return how different two views are; beyond `NEW_BEYOND` one is new."""
         return float(np.abs(self._vector() - other._vector()).sum())
 
     def _vector(self) -> Array:
@@ -170,7 +170,8 @@ class Signature:
 
 
 def signature(view: BoardView, board: Board) -> Signature:
-    """From the homography board -> picture; tilt is the change of scale across the board."""
+    """Return a view's signature, from the homography board -> picture; tilt is the change of scale
+    across the board."""
     w, h = view.size_px
     x, y = (view.corners_px.mean(axis=0) / (w, h)).tolist()
     squares = view.object_m[:, :2] / board.square_m
@@ -190,7 +191,7 @@ def signature(view: BoardView, board: Board) -> Signature:
 
 
 def progress(signatures: Sequence[Signature]) -> dict[str, float]:
-    """How far each of `AXES` is covered, 0..1."""
+    """Return how far each of `AXES` is covered, 0..1."""
     if not signatures:
         return dict.fromkeys(AXES, 0.0)
     shown = np.array([(s.x, s.y, s.size, s.tilt_x, s.tilt_y) for s in signatures])
@@ -200,7 +201,7 @@ def progress(signatures: Sequence[Signature]) -> dict[str, float]:
 
 
 def pick(views: Sequence[BoardView], board: Board) -> list[BoardView]:
-    """The sharp and different ones of a video's views, at most `MOST_VIEWS`, in order.
+    """Return the sharp and different ones of a video's views, at most `MOST_VIEWS`, in order.
 
     The one most unlike those taken is taken next (the sharper the better), until what is
     left repeats them.
@@ -238,8 +239,8 @@ def capture_views(
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
 ) -> list[BoardView]:
-    """Views of a live camera, until all is covered or `stopped`; a picture is taken whenever the
-    view is new, sharp and still. `show` gets each frame's moment.
+    """Take views of a live camera until all is covered or `stopped`, whenever the view is new,
+    sharp and still. `show` gets each frame's moment.
 
     A source that is gone ends the capture with what there is, if that may be enough.
 
@@ -288,7 +289,8 @@ class Capture:
 
 
 def consider(capture: Capture, seen: BoardView | str, board: Board) -> Capture:
-    """The automatic shutter: takes the view when it is new, sharp and still."""
+    """Return the capture after one more picture: the automatic shutter takes a view that is new,
+    sharp and still. `seen` is the board's view, or why there is none."""
     taken, signatures = capture.taken, capture.signatures
     if isinstance(seen, str):
         return Capture(taken, signatures, None, seen)
@@ -306,7 +308,7 @@ def consider(capture: Capture, seen: BoardView | str, board: Board) -> Capture:
 
 
 def _moved_px(before: BoardView | None, now: BoardView) -> float:
-    """The median motion of the corners that both views show."""
+    """Return the median motion in px of the corners that both views show; infinite without any."""
     if before is None:
         return float("inf")
     _, a, b = np.intersect1d(before.ids, now.ids, return_indices=True)
@@ -316,7 +318,7 @@ def _moved_px(before: BoardView | None, now: BoardView) -> float:
 
 
 def hint(signatures: Sequence[Signature]) -> str:
-    """One thing to do, in the picture's directions: towards where the least was shown so far
+    """Return one thing to do, in the picture's directions: towards where the least was shown so far
     of what is covered least."""
     done = progress(signatures)
     least = min(AXES, key=lambda axis: done[axis])
@@ -339,6 +341,7 @@ def hint(signatures: Sequence[Signature]) -> str:
 
 
 def _moment(frame: Frame, seen: BoardView | str, state: Capture) -> Moment:
+    """Return what to show of a frame."""
     outlines: tuple[tuple[str, Array], ...] = ()
     if isinstance(seen, BoardView):
         hull = cv2.convexHull(seen.corners_px.astype(np.float32)).reshape(-1, 2)

@@ -1,5 +1,5 @@
-"""Whether a recording holds enough motion, and which is missing: while recording, and before a
-solve would be in vain."""
+"""The motion that a recording needs, and which of it is missing: named while recording, and before
+a solve would be in vain."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ def check_recording(recording: MountingRecording, part: MountingPart) -> None:
                 f"only {together} of {len(poses)} pictures fall into the time of the "
                 f"telemetry: both must be on one clock; record anew"
             )
-    if lacking := missing(recording):
+    if lacking := missing_motion(recording):
         raise InvalidValue(f"the {part} lacks motion: {'; '.join(lacking)}")
 
 
-def missing(recording: MountingRecording) -> tuple[str, ...]:
-    """Which motion is still lacking, in a few words each; nothing: it is enough."""
+def missing_motion(recording: MountingRecording) -> tuple[str, ...]:
+    """Return which motion is still missing, in a few words each; empty when it is enough."""
     if recording.part == "carry" and len(recording.attitudes) < 2:
         return ("wait for the vehicle",)
     if len(recording.poses) < 2:
@@ -82,7 +82,7 @@ def _lacking_rotation(recording: MountingRecording) -> list[str]:
 
 
 def _seen_rpy_deg(recording: MountingRecording) -> Array:
-    """The vehicle's attitude at each picture (n, 3), latency left out of account; heading
+    """Return the vehicle's attitude at each picture (n, 3), latency left out of account; heading
     unwrapped."""
     attitudes = recording.attitudes
     t_s = np.array([a.t_s for a in attitudes])
@@ -107,7 +107,7 @@ def _lacking_tilt(recording: MountingRecording) -> list[str]:
 
 
 def tilts_rad(poses: tuple[SeenPose, ...]) -> Array:
-    """Of the camera to the target's x and y, (n, 2): its view in the target's axes."""
+    """Return the camera's tilts to the target's x and y, (n, 2)."""
     view = np.array([p.rotation_cam_target[2] for p in poses])
     return np.asarray(np.arctan2(view[:, :2], view[:, 2:]))
 
@@ -122,5 +122,5 @@ def _lacking_length(recording: MountingRecording) -> list[str]:
 
 
 def _extent(values: Array) -> float:
-    """From one side to the other, without the outermost hundredths."""
+    """Return how far values go from one side to the other, without the outermost hundredths."""
     return float(np.ptp(np.percentile(values, (2.0, 98.0)))) if len(values) else 0.0

@@ -50,12 +50,12 @@ class Pivoted:
 
     @property
     def gear_cam_sigma_m(self) -> Array:
-        """Of the tip along the camera's axes, (3,)."""
+        """Sigma of the tip along the camera's axes, (3,) m."""
         return np.sqrt(np.diagonal(self.covariance_m2))
 
 
 def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivoted:
-    """The gear's tip in the camera's frame.
+    """Solve for the gear's tip in the camera's frame.
 
     Args:
         size_sigma: by which share the printed sizes may be off (`target.size_sigma`): all
@@ -86,7 +86,7 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
 
 
 def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
-    """Covariance (n, 3, 3) of what each pose's error does to the tip."""
+    """Return the covariance (n, 3, 3) of what each pose's error does to the tip."""
     way_m = poses.R_cam_target @ point_m
     across = np.cross(np.eye(3), way_m[:, None, :])  # [way]x
     J = np.concatenate([across, -np.broadcast_to(np.eye(3), across.shape)], axis=2)
@@ -94,6 +94,7 @@ def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
 
 
 def _check_known(cov_m2: Array, counted: Array) -> None:
+    """Raises InvalidValue if the tip is not known well enough."""
     left_out = float((counted < COUNTS_LITTLE).mean())
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov_m2)[-1]))
     if left_out > MOST_LEFT_OUT or not sigma_m <= MOST_TIP_SIGMA_M:
@@ -129,5 +130,5 @@ def _check_slip(poses: PoseArrays, design: Array, misfit: Array, inverse: Array)
 
 
 def _size(misfit: Array, inverse: Array) -> float:
-    """Of the misfits on the whole; single wrong ones add little."""
+    """Return the size of all misfits together; single wrong ones add little."""
     return float(np.log1p(squared_distance(misfit, inverse) / 3.0).mean())

@@ -57,9 +57,9 @@ class SeenPose:
 
 @dataclass(frozen=True, eq=False)
 class MountingRecording:
-    """One part. `mirrored_pictures` counts those in which the target was seen mirrored only;
-    `seen_by` says what else the poses rest on (see `perchctl.calibration.mounting.eye`), empty
-    where that is not known."""
+    """The recording of one part. `mirrored_pictures` counts those in which the target was seen
+    mirrored only; `seen_by` says what else the poses rest on (see
+    `perchctl.calibration.mounting.eye`), empty where that is not known."""
 
     part: MountingPart
     attitudes: tuple[AttitudeSample, ...]
@@ -80,8 +80,8 @@ class PoseArrays:
 
 
 def pose_arrays(recording: MountingRecording) -> PoseArrays:
-    """The poses of a recording as arrays."""
-    poses = in_order(recording)
+    """Return the poses of a recording as arrays, by time."""
+    poses = sorted(recording.poses, key=lambda pose: pose.t_s)
     covs = []
     for pose in poses:
         far_m = float(np.linalg.norm(pose.position_cam_target_m))
@@ -93,11 +93,6 @@ def pose_arrays(recording: MountingRecording) -> PoseArrays:
         p_cam_target_m=np.array([p.position_cam_target_m for p in poses]),
         cov=np.array(covs),
     )
-
-
-def in_order(recording: MountingRecording) -> tuple[SeenPose, ...]:
-    """The poses by time."""
-    return tuple(sorted(recording.poses, key=lambda pose: pose.t_s))
 
 
 # --- The file --------------------------------------------------------------------------------
@@ -144,7 +139,7 @@ def _plain(value: Any) -> Any:
 
 
 def read_recordings(path: Path) -> tuple[MountingRecording, ...]:
-    """The parts of a file, in its order.
+    """Return the parts of a file, in its order.
 
     Raises:
         NotFound: no such file.
@@ -183,7 +178,7 @@ def read_recordings(path: Path) -> tuple[MountingRecording, ...]:
 
 
 def _head(record: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a recording beside its samples."""
+    """Return the fields of a recording beside its samples."""
     if record["format"] != _FORMAT or record["part"] not in get_args(MountingPart):
         raise ValueError("the part or its format is unknown")
     return {

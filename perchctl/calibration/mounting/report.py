@@ -39,7 +39,7 @@ class MountingReport:
 
     @property
     def written_latency_s(self) -> float | None:
-        """By the profile; None where each flight is to measure it."""
+        """Latency by the profile; None where each flight is to measure it."""
         latency_s: object = self.profile.camera.latency_s
         return float(latency_s) if isinstance(latency_s, (int, float)) else None
 
@@ -50,8 +50,8 @@ class MountingReport:
         return np.asarray(T[:3, :3].T @ (np.array(self.profile.vehicle.gear_body_m) - T[:3, 3]))
 
     def profile_values(self) -> dict[str, float | tuple[float, ...]]:
-        """What the profile should say, by dotted key: what was measured, but for a latency that
-        each flight is to measure."""
+        """Return the values to write into the profile, by dotted key: what was measured, but for a
+        latency that each flight is to measure."""
         values: dict[str, float | tuple[float, ...]] = {}
         if self.carried is not None:
             values["camera.mount.rpy_deg"] = _rounded(self.carried.rpy_deg, _DEG_DECIMALS)
@@ -63,7 +63,7 @@ class MountingReport:
         return values
 
     def keys_text(self) -> str:
-        """The profile's keys, as they are typed into it."""
+        """Return the profile's keys, as they are typed into it."""
         lines = []
         for key, value in self.profile_values().items():
             numbers = value if isinstance(value, tuple) else (value,)
@@ -72,7 +72,8 @@ class MountingReport:
         return "\n".join(lines)
 
     def record(self) -> dict[str, Any]:
-        """The measured part of the object of `calibrate mount --json`; null is not measured."""
+        """Return the measured part of the object of `calibrate mount --json`; null is not
+        measured."""
         measured: dict[str, Any] = dict.fromkeys(("rpy_deg", "latency_s", "gear_cam_m"))
         sigma = measured.copy()
         if (carried := self.carried) is not None:
@@ -93,7 +94,7 @@ class MountingReport:
         return measured | {"sigma": sigma, "written": written, "profile_values": values}
 
     def lines(self) -> list[str]:
-        """Each number, its 95 % interval, and what the profile says instead."""
+        """Return each number, its 95 % interval, and what the profile says instead."""
         lines = []
         if (carried := self.carried) is not None:
             written = self.profile.camera.mount
@@ -132,7 +133,8 @@ class MountingReport:
 def _value_lines(
     name: str, values: Any, sigmas: Any, decimals: int, unit: str, written: Any, away: str
 ) -> list[str]:
-    """`written` is what the profile says, empty where it has no number."""
+    """Return the two lines of a value; `written` is what the profile says, empty where it has no
+    number."""
     found = " ".join(f"{v:g}" for v in _rounded(values, decimals))
     interval = " ".join(f"{IN_95 * float(sigma):.{decimals}f}" for sigma in sigmas)
     before = " ".join(f"{v:g}" for v in _rounded(written, decimals)) or "measured"
