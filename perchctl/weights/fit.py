@@ -33,8 +33,6 @@ OUTLIER_SIGMAS = 6.0
 """A row does not count on an axis where a marker's error is farther from the median of
 its position than this many robust standard deviations (1.4826 times the median absolute
 deviation): of a million normal errors not one."""
-ODD_POSITION_SIGMAS = 8.0
-"""A position is named when both markers' errors there are this far from the others'."""
 LEAST_ROWS = 8
 """Rows a position, on average, below which nothing is called an outlier."""
 _MAD_TO_SIGMA = 1.4826
@@ -144,23 +142,6 @@ def _inliers(error: Array, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
         spread = np.where(spread > 0.0, spread, away.mean(axis=0))
         use[start:end] = away <= OUTLIER_SIGMAS * spread + 1e-12
     return use
-
-
-def odd_positions(errors: Errors) -> list[tuple[int, str, float]]:
-    """Return the positions whose actual pose seems wrong: number, axis, and how far both markers
-    are off, m or rad."""
-    if len(errors.positions) < 5:
-        return []
-    offsets = errors.position_means
-    away = offsets - np.median(offsets, axis=1, keepdims=True)
-    spread = _MAD_TO_SIGMA * np.median(np.abs(away), axis=1, keepdims=True)
-    floor = np.array([0.002, 0.002, 0.002, np.radians(1.0)])
-    far = np.abs(away) > np.maximum(ODD_POSITION_SIGMAS * spread, floor)
-    odd = far.all(axis=0) & (np.sign(away[0]) == np.sign(away[1]))
-    return [
-        (int(errors.positions[g]), AXES[axis], float(away[:, g, axis].mean()))
-        for g, axis in zip(*np.nonzero(odd), strict=True)
-    ]
 
 
 def t_quantile(freedom: int) -> float:

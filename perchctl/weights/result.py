@@ -27,7 +27,6 @@ from perchctl.weights.fit import (
     errors_of,
     evidence,
     fit_all,
-    odd_positions,
 )
 
 FORMAT = "perchctl-merge-weights"
@@ -52,7 +51,7 @@ class Result:
 
     @property
     def proven(self) -> list[bool]:
-        """Whether the chosen weight beats the better single marker, by axis."""
+        """True where the chosen weight beats the better single marker, by axis."""
         return [bool(p) for p in self.evidence.proven(self.chosen)]
 
     @property
@@ -69,7 +68,7 @@ class Result:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences on clipped weights, odd positions, and too few of them."""
+        """Sentences on clipped weights, and on too few positions."""
         notes = []
         for name, found in self.fits.items():
             outside = [
@@ -79,12 +78,6 @@ class Result:
             ]
             if outside:
                 notes.append(f"{name}: clipped to 0 .. 1: {', '.join(outside)}")
-        for number, axis, off in odd_positions(self.errors):
-            size = f"{np.degrees(off):.1f} deg" if axis == "yaw" else f"{off * 1e3:.1f} mm"
-            notes.append(
-                f"position {number}: both markers are off by {size} in {axis} more than "
-                f"elsewhere; was its actual pose taken down wrongly?"
-            )
         count = len(self.errors.positions)
         if count < 5:
             notes.append(f"{count} positions are few: intervals are wide (10 are usual)")

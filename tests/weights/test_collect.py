@@ -13,9 +13,9 @@ from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, NotFound
 from perchctl.positioning import BodyPose, CaptureFrame
 from perchctl.profile import PositioningConfig, find_calibration, load_profile
-from perchctl.weights import MocapTruth, SessionFile, SimulatedStand
+from perchctl.weights import MocapTruth, SimulatedStand
 from perchctl.weights.collect import ActualPose, motion_fault, position_fault, read_markers
-from perchctl.weights.data import HEADER, NEEDED, read_csv
+from perchctl.weights.data import read_csv
 from tests.helpers.fit_weights import run
 
 
@@ -166,10 +166,3 @@ def test_motion_capture_is_the_profile_s(tmp_path: Path) -> None:
     assert done.exit_code == 2
     assert "by: mocap" in done.stderr
     assert not list(tmp_path.iterdir())
-
-
-def test_a_session_of_another_header_and_the_shipped_header_agree(tmp_path: Path) -> None:
-    file = SessionFile(tmp_path / "new.csv", 10)
-    assert file.path.read_text() == HEADER + "\n"
-    assert HEADER.startswith(",".join(NEEDED))
-    assert file.next_position == 1
