@@ -101,10 +101,10 @@ MOST_NAMES = {
     "positioning": 15,
     "profile": 38,
     "sim": 25,
-    "target": 28,
+    "target": 24,
     "track": 15,
     "vision": 50,
-    "weights": 15,
+    "weights": 9,
 }
 
 

@@ -6,10 +6,10 @@ from .drawing import TargetDrawing as TargetDrawing
 from .drawing import draw_target as draw_target
 from .drawing import mm_text as mm_text
 from .drawing import parse_length as parse_length
-from .measured import NOTABLE_SCALE_ERROR as NOTABLE_SCALE_ERROR
-from .measured import measured_target as measured_target
-from .print_check import PrintCheck as PrintCheck
-from .print_check import PrintVerdict as PrintVerdict
+from .prints import NOTABLE_SCALE_ERROR as NOTABLE_SCALE_ERROR
+from .prints import PrintCheck as PrintCheck
+from .prints import PrintVerdict as PrintVerdict
+from .prints import measured_target as measured_target
 from .reading import Optics as Optics
 from .reading import check_target as check_target
 from .sheets import board_pdf as board_pdf

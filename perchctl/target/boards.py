@@ -26,6 +26,7 @@ from perchctl.profile import MarkerConfig, dictionary_size
 from perchctl.target.drawing import (
     Rectangle,
     marker_cells,
+    measured_scale,
     merged_rectangles,
     mm_text,
     parse_length,
@@ -34,8 +35,6 @@ from perchctl.target.drawing import (
 BoardKind = Literal["chessboard", "charuco"]
 EXAMPLES = "chessboard:9x6:25mm or charuco:10x7:25mm:18mm:DICT_5X5_100"
 MAX_COUNT = 100
-MAX_SCALE_ERROR = 0.1
-"""A print off by more than this was not measured in the unit that was meant."""
 _MEASURED = ":measured="
 
 
@@ -102,19 +101,14 @@ class Board:
 
     def measured(self, width_m: float, height_m: float) -> Board:
         """Return the same board with the black area's measured sides. Raises InvalidValue where
-        they are off by more than `MAX_SCALE_ERROR`."""
-        scale = []
-        for name, meant_m, is_m in zip(
-            ("width", "height"), self.size_m, (width_m, height_m), strict=True
-        ):
-            off = is_m / meant_m - 1.0
-            if abs(off) > MAX_SCALE_ERROR:
-                raise InvalidValue(
-                    f"the board's {name} of {mm_text(is_m)} mm is {100 * off:+.0f} % off the "
-                    f"{mm_text(meant_m)} mm of {self.notation()}: measure its black area, in mm"
-                )
-            scale.append(is_m / meant_m)
-        return replace(self, scale=(scale[0], scale[1]))
+        they cannot be this board's."""
+        across, down = (
+            measured_scale(f"the board's {name}", is_m, meant_m, self.notation())
+            for name, is_m, meant_m in zip(
+                ("width", "height"), (width_m, height_m), self.size_m, strict=True
+            )
+        )
+        return replace(self, scale=(across, down))
 
     def cv2_board(self) -> Any:
         """Return a `cv2.aruco.CharucoBoard` for a detector. Raises ValueError for a chessboard."""

@@ -46,7 +46,7 @@ class Filled:
 
 @dataclass(frozen=True)
 class Line:
-    """`dash` is the length of dashes and gaps; 0 is solid."""
+    """A straight line. `dash` is the length of dashes and gaps; 0 is solid."""
 
     x0: float
     y0: float
@@ -68,14 +68,15 @@ class Circle:
 
 @dataclass(frozen=True)
 class Polygon:
-    """Filled black."""
+    """A polygon, filled black."""
 
     points: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
 class Text:
-    """`y` is the base line, `size` the font's size in mm; `upwards` reads from below."""
+    """A line of text. `y` is the base line, `size` the font's size in mm; `upwards` reads from
+    below."""
 
     x: float
     y: float
@@ -98,7 +99,7 @@ class Page:
 
 
 def parse_page(text: str) -> tuple[float, float]:
-    """``a4``, ``letter``, ``a3`` or ``220x240mm`` as width and height in mm.
+    """Return width and height in mm of ``a4``, ``letter``, ``a3`` or ``220x240mm``.
 
     Raises InvalidValue.
     """
@@ -121,7 +122,7 @@ def parse_page(text: str) -> tuple[float, float]:
 
 
 def page_name(width: float, height: float) -> str:
-    """``A4`` or ``220 x 240 mm``."""
+    """Return a page's name, ``A4`` or ``220 x 240 mm``."""
     for name, size in PAGES_MM.items():
         if size in ((width, height), (height, width)):
             return name.capitalize()
@@ -129,7 +130,7 @@ def page_name(width: float, height: float) -> str:
 
 
 def filled(rectangles: Sequence[Rectangle], x: float, y: float) -> Filled:
-    """Rectangles of a drawing (metres, y up) with its origin at x, y of the page."""
+    """Return rectangles of a drawing (metres, y up) with its origin at x, y of the page."""
     return Filled(
         tuple(
             (
@@ -149,12 +150,12 @@ def _widths() -> dict[str, int]:
 
 
 def text_width(text: str, size: float) -> float:
-    """Width of a line of Helvetica, mm."""
+    """Return the width of a line of Helvetica, mm."""
     return sum(_widths().get(character, 600) for character in text) * size / 1000.0
 
 
 def wrapped(texts: Sequence[str], size: float, width: float) -> list[str]:
-    """Every text in as many lines as `width` mm needs; words are never cut."""
+    """Return every text in as many lines as `width` mm needs; words are never cut."""
     lines: list[str] = []
     for text in texts:
         line = ""

@@ -84,7 +84,7 @@ REFUSALS = [
     (["measured", "--measured-large", "149.6", "-p", "crazyflie"], 2,
      "-p crazyflie -o my_vehicle.yaml"),
     (["measured", "--measured-large", "0.1496", "-p", "m.yaml"], 30,
-     "measure the black square, in mm"),
+     "measure what is black, in mm"),
     (["measured", "--measured-large", "150in", "-p", "m.yaml"], 30, "unit 'in'"),
     (["measured", "--measured-large", "149.6", "-o", "m.pdf"], 2, "a .yaml file"),
 ]  # fmt: skip
