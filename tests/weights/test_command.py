@@ -17,8 +17,7 @@ from perchctl.commands import app
 from perchctl.errors import InvalidValue
 from perchctl.profile import load_profile
 from perchctl.weights.data import NEEDED, read_csv
-from tests.helpers.fit_weights import run
-from tests.helpers.weights_data import BEST, independent, known, write
+from tests.helpers.weights_data import BEST, independent, known, run, write
 
 
 @pytest.fixture

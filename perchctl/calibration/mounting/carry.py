@@ -70,7 +70,6 @@ class Carried:
         latency_s: from exposure to the picture's timestamp; positive is a late picture.
         attitude_bias_rad: of the vehicle's own estimate, (3,) in body axes; only roll and pitch
             are known.
-        counted: how much each pose counted, (n,), 0 to 1.
     """
 
     R_body_cam: Array
@@ -78,7 +77,6 @@ class Carried:
     latency_s: float
     latency_sigma_s: float
     attitude_bias_rad: Array
-    counted: Array
 
     @property
     def rpy_deg(self) -> tuple[float, float, float]:
@@ -109,15 +107,14 @@ def solve_carry(recording: MountingRecording) -> Carried:
     start = first_guess(integrate(imu, np.zeros(3), np.zeros(3)), poses)
     if start is None:
         raise InvalidValue(f"the target was not seen twice within half a second: {AGAIN['carry']}")
-    solved = _solve(imu, poses, *start)
-    _check(solved)
+    state, rows, cov = _solve(imu, poses, *start)
+    _check(state, rows, cov)
     return Carried(
-        R_body_cam=solved.state.R_body_cam,
-        turn_cov_rad2=solved.cov[TURN, TURN],
-        latency_s=solved.state.latency_s,
-        latency_sigma_s=float(np.sqrt(solved.cov[LATENCY, LATENCY])),
-        attitude_bias_rad=solved.state.off_rad,
-        counted=solved.counted,
+        R_body_cam=state.R_body_cam,
+        turn_cov_rad2=cov[TURN, TURN],
+        latency_s=state.latency_s,
+        latency_sigma_s=float(np.sqrt(cov[LATENCY, LATENCY])),
+        attitude_bias_rad=state.off_rad,
     )
 
 
@@ -326,18 +323,12 @@ class _Rows:
     gradient: Array
 
 
-@dataclass(frozen=True, eq=False)
-class _Solved:
-    """The minimum; `cov` (16, 16) of all but the walk, in the order of this module's slices."""
-
-    state: State
-    misfit: Array
-    counted: Array
-    cov: Array
-
-
-def _solve(imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: float) -> _Solved:
-    """Solve from a start within some ten degrees and some hundredths of a second."""
+def _solve(
+    imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: float
+) -> tuple[State, _Rows, Array]:
+    """Solve from a start within some ten degrees and some hundredths of a second. Return the
+    minimum, its rows, and the covariance (16, 16) of all but the walk, in the order of this
+    module's slices."""
     state = _first_state(imu, poses, R_body_cam, latency_s)
     cov_rad2 = poses.cov[:, :3, :3] + np.eye(3) * FLOOR_RAD**2
     factor, jitter_s = 3.0, 0.005
@@ -356,7 +347,7 @@ def _solve(imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: floa
     of_poses, _ = normal_equations(rows.design, rows.misfit, rows.inverse, rows.counted)
     known = rows.information - of_poses
     cov = covariance(rows.design, rows.misfit, rows.inverse, rows.counted, known, KNOTS)
-    return _Solved(state, rows.misfit, np.minimum(rows.counted, 1.0), cov)
+    return state, rows, cov
 
 
 def _first_state(imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: float) -> State:
@@ -455,11 +446,11 @@ def _hats(knots_s: Array, t_s: Array) -> Array:
     return np.stack([np.interp(t_s, knots_s, one) for one in np.eye(len(knots_s))], axis=1)
 
 
-def _check(solved: _Solved) -> None:
+def _check(state: State, rows: _Rows, cov: Array) -> None:
     """Raises InvalidValue unless vehicle and camera agree, and well enough."""
-    used = solved.counted > 0.0
-    size = np.linalg.norm(solved.misfit[used], axis=1)
-    left_out = float((solved.counted[used] < COUNTS_LITTLE).mean())
+    used = rows.counted > 0.0
+    size = np.linalg.norm(rows.misfit[used], axis=1)
+    left_out = float((rows.counted[used] < COUNTS_LITTLE).mean())
     if np.median(size) > MOST_MISFIT_RAD or left_out > MOST_LEFT_OUT:
         raise InvalidValue(
             f"the turns that the vehicle felt and those that the camera saw differ by "
@@ -467,7 +458,7 @@ def _check(solved: _Solved) -> None:
             f"not fit at all): target and camera must not move in the room or on the vehicle; "
             f"then {AGAIN['carry']}"
         )
-    sigma = np.sqrt(np.diagonal(solved.cov))
+    sigma = np.sqrt(np.diagonal(cov))
     turn_deg, latency_s = math.degrees(sigma[TURN].max()), float(sigma[LATENCY])
     if not turn_deg <= MOST_TURN_SIGMA_DEG:
         raise InvalidValue(
@@ -479,8 +470,8 @@ def _check(solved: _Solved) -> None:
             f"the latency is known to {1e3 * latency_s:.0f} ms only (at most "
             f"{1e3 * MOST_LATENCY_SIGMA_S:g} is accepted): turn faster to and fro"
         )
-    if solved.state.latency_s < -2.0 * latency_s:
+    if state.latency_s < -2.0 * latency_s:
         raise InvalidValue(
-            f"the pictures are stamped {-1e3 * solved.state.latency_s:.0f} ms before they can have "
+            f"the pictures are stamped {-1e3 * state.latency_s:.0f} ms before they can have "
             f"been taken: camera and telemetry must be on one clock"
         )

@@ -45,18 +45,16 @@ def normal_equations(
 
 
 def robust_least_squares(
-    design: Array, right: Array, inverse: Array, rounds: int, known: Array | None = None
+    design: Array, right: Array, inverse: Array, rounds: int
 ) -> tuple[Array, Array, Array]:
     """Solve ``design @ x = right`` (n, 3): x (p,), the misfits (n, 3) and how much each counts.
 
     Args:
         inverse: covariances of the right-hand sides, inverted, (n, 3, 3).
-        known: information (p, p) that x is zero.
     """
     counted = np.ones(len(right))
     for _ in range(rounds):
         information, gradient = normal_equations(design, -right, inverse, counted)
-        information = information if known is None else information + known
         found = np.asarray(np.linalg.solve(information, gradient), dtype=np.float64)
         misfit = design @ found - right
         counted = student_weights(squared_distance(misfit, inverse))
