@@ -21,7 +21,7 @@ from perchctl.target.reading import TRIALS, Optics, check_target, smallest_side_
 from perchctl.target.sheets import fits, fitting_page
 from perchctl.target.sight import (
     FieldOfView,
-    Mounted,
+    MountingView,
     gear_from_camera,
     least_side_px,
     mounted_camera,
@@ -72,7 +72,7 @@ class TargetDesign:
     optics: Optics
     ranges: Ranges
     gear_nearest_m: tuple[float | None, float | None]
-    mount: Mounted
+    mount: MountingView
     search_range_m: float | None
     search_height_m: float
     warnings: tuple[str, ...]

@@ -28,7 +28,10 @@ class PlainReader:
     its id (the other ids of a nested dictionary are not searched)."""
 
     def __init__(self, target: TargetConfig) -> None:
-        dictionaries = [_own(target.large), _own(target.small)]
+        dictionaries = [
+            _single_marker_dictionary(target.large),
+            _single_marker_dictionary(target.small),
+        ]
         self._detector: Any = cv2.aruco.ArucoDetector(dictionaries, cv2.aruco.DetectorParameters())
 
     def read(self, image: NDArray[np.uint8]) -> dict[MarkerName, NDArray[np.float32]]:
@@ -42,7 +45,7 @@ class PlainReader:
         }
 
 
-def _own(marker: MarkerConfig) -> Any:
+def _single_marker_dictionary(marker: MarkerConfig) -> Any:
     source = aruco_dictionary(marker.dictionary)
     return cv2.aruco.Dictionary(
         np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1]), source.markerSize, 0
@@ -90,7 +93,7 @@ def smallest_side_px(
 
     @cache
     def rate(i: int) -> float:
-        return _rate(
+        return _found_share(
             drawing, reader, marker, SIDE_RANGE_PX[0] * STEP**i, optics, picture_px, trials
         )
 
@@ -111,7 +114,7 @@ def smallest_side_px(
     return float(SIDE_RANGE_PX[0] * STEP**high)
 
 
-def _rate(
+def _found_share(
     drawing: TargetDrawing,
     reader: PlainReader,
     marker: MarkerName,
@@ -175,7 +178,7 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
                 f"{name} marker: id {marker.id} of {marker.dictionary} looks the same when turned, "
                 f"so that its heading is ambiguous: take another id"
             )
-    if _distance(target.large, target.small) < MIN_DISTANCE:
+    if _pattern_distance(target.large, target.small) < MIN_DISTANCE:
         large, small = target.large, target.small
         raise InvalidValue(
             f"id {large.id} of {large.dictionary} and id {small.id} of {small.dictionary} are "
@@ -238,7 +241,7 @@ def _ids_read(image: NDArray[np.uint8], dictionary: Any) -> set[int]:
     return set() if ids is None else {int(i) for i in np.asarray(ids).ravel()}
 
 
-def _distance(a: MarkerConfig, b: MarkerConfig) -> int:
+def _pattern_distance(a: MarkerConfig, b: MarkerConfig) -> int:
     """Return the fewest cells in which one, in any turn, differs from the other; patterns of
     another size differ in all."""
     first, second = marker_cells(a), marker_cells(b)

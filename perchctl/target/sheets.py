@@ -50,7 +50,7 @@ _ARROW = 10.0
 
 
 @dataclass(frozen=True)
-class Place:
+class SheetLayout:
     """The sheet that is cut out of the page: its side, and the white in it, mm."""
 
     width: float
@@ -96,7 +96,7 @@ def target_pages(
     """Return front and back, with the largest quiet zone, up to one cell, that leaves room for
     rulers and caption. Raises InvalidValue where the page is too small."""
     texts = _caption(target, origin, date)
-    place = _fitted(target, page, texts)
+    place = _layout_on(target, page, texts)
     if place is None:
         raise InvalidValue(
             f"a target of {1e3 * target.large.side_m:g} mm with its white and its rulers does not "
@@ -137,7 +137,9 @@ def board_page(board: Board, page: tuple[float, float]) -> Page:
 
 def fits(target: TargetConfig, page: tuple[float, float]) -> bool:
     """Return true if the page, in mm, holds the target with its white and its rulers."""
-    return _fitted(target, page, _caption(target, "sizes from the command line", None)) is not None
+    return (
+        _layout_on(target, page, _caption(target, "sizes from the command line", None)) is not None
+    )
 
 
 def fitting_page(target: TargetConfig) -> str:
@@ -145,9 +147,9 @@ def fitting_page(target: TargetConfig) -> str:
     return _fitting_page(target, _caption(target, "sizes from the command line", None))
 
 
-def _fitted(
+def _layout_on(
     target: TargetConfig, page: tuple[float, float], texts: tuple[str, ...]
-) -> Place | None:
+) -> SheetLayout | None:
     side, cell = _side_and_cell(target)
     width, height = page
     lines, below = _caption_room(texts, width)
@@ -156,7 +158,7 @@ def _fitted(
     quiet = math.floor(2.0 * min(cell, half - side / 2) + 1e-6) / 2.0
     if quiet < MIN_QUIET_CELLS * cell - 1e-9 or half < _ruler_half(side / 2 + quiet) - 1e-9:
         return None
-    return Place(width, height, side + 2.0 * quiet, quiet, tuple(lines))
+    return SheetLayout(width, height, side + 2.0 * quiet, quiet, tuple(lines))
 
 
 def _side_and_cell(target: TargetConfig) -> tuple[float, float]:
@@ -180,7 +182,7 @@ def _caption_room(texts: tuple[str, ...], width: float) -> tuple[list[str], floa
 
 def _fitting_page(target: TargetConfig, texts: tuple[str, ...]) -> str:
     for name, size in PAGES_MM.items():
-        if _fitted(target, size, texts):
+        if _layout_on(target, size, texts):
             return name
     side, cell = _side_and_cell(target)
     half = _ruler_half(side / 2 + math.ceil(2.0 * MIN_QUIET_CELLS * cell) / 2.0) + UNPRINTABLE
@@ -211,7 +213,7 @@ def _caption(target: TargetConfig, origin: str, date: datetime.date | None) -> t
     )
 
 
-def _front(target: TargetConfig, place: Place) -> Page:
+def _front(target: TargetConfig, place: SheetLayout) -> Page:
     cx, cy, half = place.width / 2, place.height / 2, place.sheet / 2
     items: list[Item] = [filled(draw_target(target).rectangles(), cx, cy)]
     items += _cut_marks(cx, cy, half)
@@ -226,7 +228,7 @@ def _front(target: TargetConfig, place: Place) -> Page:
     return Page(place.width, place.height, tuple(items))
 
 
-def _back(target: TargetConfig, place: Place, magnet_m: float) -> Page:
+def _back(target: TargetConfig, place: SheetLayout, magnet_m: float) -> Page:
     """Return the page as seen from the back, the sheet turned about its upright axis: all of it is
     symmetric."""
     cx, cy, half = place.width / 2, place.height / 2, place.sheet / 2

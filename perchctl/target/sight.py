@@ -253,14 +253,14 @@ def _directions(values: tuple[float, float], least: float, figures: str, unit: s
 
 
 FROM_M = 0.10
-"""The last stretch that is looked at, from gear to target."""
+"""The last stretch that is judged, from gear to target."""
 _STEP_M, _FINE_M = 0.005, 0.0005
 _WORTH_M = 0.002  # less is no reason to turn a camera
 _OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its axes
 
 
 @dataclass(frozen=True)
-class Blind:
+class BlindRange:
     """Ranges from the gear's tip to the target from which on nothing is measured any more, m: by
     whole markers, and by what is left of their drawing. 0: down to contact; None: all of the
     last 10 cm."""
@@ -281,12 +281,12 @@ def _blind_words(nearest_m: float | None) -> str:
 
 
 @dataclass(frozen=True)
-class Mounted:
+class MountingView:
     """A mounting's blind range, and, where the camera should rather be turned by 90 degrees about
     its view, its mounting's `rpy_deg` and blind range then."""
 
-    blind: Blind
-    turned: Blind | None = None
+    blind: BlindRange
+    turned: BlindRange | None = None
     turned_rpy_deg: tuple[float, float, float] | None = None
 
     def lines(self) -> list[str]:
@@ -310,14 +310,14 @@ class Mounted:
         }
 
 
-def mounted_camera(target: TargetConfig, camera: CameraModel, profile: Profile) -> Mounted:
+def mounted_camera(target: TargetConfig, camera: CameraModel, profile: Profile) -> MountingView:
     """Return from where on the profile's `camera.mount` and `vehicle.gear_body_m` see too
     little."""
     T_body_cam = profile.camera.mount.T_body_cam
     gear_m = np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3]
-    here = _blind(target, camera, T_body_cam[:3, :3], gear_m)
+    here = _blind_range(target, camera, T_body_cam[:3, :3], gear_m)
     R_turned = T_body_cam[:3, :3] @ rot_z(math.pi / 2.0)
-    turned = _blind(target, camera, R_turned, gear_m)
+    turned = _blind_range(target, camera, R_turned, gear_m)
     gain_m, whole_gain_m = (
         (FROM_M if old is None else old) - (FROM_M if new is None else new)
         for old, new in ((here.left_m, turned.left_m), (here.whole_m, turned.whole_m))
@@ -325,8 +325,8 @@ def mounted_camera(target: TargetConfig, camera: CameraModel, profile: Profile) 
     # A whole marker is the surer sight.
     if gain_m >= _WORTH_M or (gain_m >= 0.0 and whole_gain_m >= _WORTH_M):
         roll, pitch, yaw = (round(math.degrees(a), 1) + 0.0 for a in rpy_from_rotation(R_turned))
-        return Mounted(here, turned, (roll, pitch, yaw))
-    return Mounted(here)
+        return MountingView(here, turned, (roll, pitch, yaw))
+    return MountingView(here)
 
 
 def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> bool:
@@ -344,7 +344,9 @@ def gear_from_camera(profile: Profile) -> tuple[Array, Array]:
     return R, R @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])
 
 
-def _blind(target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m: Array) -> Blind:
+def _blind_range(
+    target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m: Array
+) -> BlindRange:
     """Return the blind range of a camera turned so; `gear_m` is the gear from it, body axes."""
     R, offset = R_body_cam.T, R_body_cam.T @ gear_m
     view, patterns = FieldOfView(camera), make_aruco_detector(DetectorConfig(), target).patterns
@@ -359,7 +361,7 @@ def _blind(target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m:
         pose = RigidPose(R @ R_MARKER_TARGET @ _OWN_AXES, centre / half_m)
         return whole(range_m) or shows_enough_of_target(pose, patterns, camera)
 
-    return Blind(_lost_at_m(whole), _lost_at_m(left))
+    return BlindRange(_lost_at_m(whole), _lost_at_m(left))
 
 
 def _lost_at_m(seen: Callable[[float], bool]) -> float | None:

@@ -48,7 +48,7 @@ STILL_PX = 1.0
 """The target's picture must not wander farther than this within a position (between its
 thirds), nor shake with a greater standard deviation."""
 FAR_M, FAR_RAD = 0.03, math.radians(10.0)
-"""A typed pose that differs from the camera's by more is asked about."""
+"""A typed pose that differs from the camera's by more must be confirmed."""
 SAMPLES = 30
 """Poses of motion capture whose median is the actual pose; they must come within `WITHIN_S`."""
 WITHIN_S = 5.0

@@ -216,7 +216,7 @@ def _recursion(errors: Errors) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FittedWeights:
     """One method's weights: as fitted, clipped to [0, 1], and the half width of their 95 %
     interval over positions (jackknife), (4,); `folds` without each position in turn, (g, 4)."""
 
@@ -226,7 +226,7 @@ class Fitted:
     folds: Array
 
 
-def fit_all(errors: Errors) -> dict[str, Fitted]:
+def fit_all(errors: Errors) -> dict[str, FittedWeights]:
     """Return the weights of both methods by name. Raises InvalidValue for an axis on which every
     weight fits alike."""
     total = errors.sums.sum(axis=1)
@@ -244,7 +244,7 @@ def fit_all(errors: Errors) -> dict[str, Fitted]:
     spread = np.sqrt((g - 1) / g * ((folds - folds.mean(axis=0)) ** 2).sum(axis=0))
     half = t_quantile(g - 1) * spread
     return {
-        name: Fitted(raw, np.clip(raw, 0.0, 1.0), half, np.clip(left, 0.0, 1.0))
+        name: FittedWeights(raw, np.clip(raw, 0.0, 1.0), half, np.clip(left, 0.0, 1.0))
         for name, (raw, left) in {"lms": lms(errors), "closed_form": (closed, folds)}.items()
     }
 
@@ -268,20 +268,20 @@ class Evidence:
         return np.where(self.better == 0, self.squares["large"], self.squares["small"])
 
     def rms(self, name: str) -> tuple[Array, Array]:
-        """Root mean square error over all positions, (4,), m and rad, and the half width of its
-        95 % interval."""
+        """Return the root mean square error over all positions, (4,), m and rad, and the half width
+        of its 95 % interval."""
         rms, influence = _root(self.squares[name])
         return rms, _half_width(influence)
 
     def gain(self, name: str, other: Array) -> tuple[Array, Array]:
-        """By how much the RMS error is below that of `other` (g, 4), and the half width of the
-        difference's interval, (4,)."""
+        """Return by how much the RMS error is below that of `other` (g, 4), and the half width of
+        the difference's interval, (4,)."""
         there = np.where(np.isnan(other), np.nan, self.squares[name])
         (rms, influence), (reference, of_reference) = _root(there), _root(other)
         return reference - rms, _half_width(of_reference - influence)
 
     def proven(self, name: str) -> NDArray[np.bool_]:
-        """True where the gain over the better single marker is above zero with its whole
+        """Return true where the gain over the better single marker is above zero with its whole
         interval, (4,)."""
         gain, half = self.gain(name, self.better_squares)
         return np.asarray(gain - half > 0.0)

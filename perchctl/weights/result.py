@@ -23,7 +23,7 @@ from perchctl.weights.fit import (
     SINGLE,
     Errors,
     Evidence,
-    Fitted,
+    FittedWeights,
     errors_of,
     evidence,
     fit_all,
@@ -42,7 +42,7 @@ class Result:
     the evidence from other data, named `other_name`."""
 
     errors: Errors
-    fits: dict[str, Fitted]
+    fits: dict[str, FittedWeights]
     evidence: Evidence
     other: Evidence | None
     other_name: str

@@ -27,7 +27,7 @@ _STREAM = 611
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class CameraPlace:
     """A place of the camera, and `actual`, the target relative to the gear in the level frame
     there, (4,)."""
 
@@ -68,7 +68,7 @@ class SimulatedStand:
                 )
             session.append(position, session_rows(position, readings, place.actual))
 
-    def place(self, position: int) -> Place:
+    def place(self, position: int) -> CameraPlace:
         """Return the place of a position, counted from 1. Its distance falls into its own share of
         z3 to z2, so that few positions cover the range. Raises InvalidValue."""
         merge = self._profile.merge
@@ -88,14 +88,14 @@ class SimulatedStand:
             f"large marker to this camera: correct merge.z3_m and z2_m in the profile"
         )
 
-    def frames(self, position: int, place: Place, count: int) -> Iterator[Frame]:
+    def frames(self, position: int, place: CameraPlace, count: int) -> Iterator[Frame]:
         """Yield the pictures of a place."""
         for k in range(count):
             index = position * 100_000 + k
             image = self._renderer.render([place.T_world_cam], frame_index=index)
             yield Frame(k, k * FRAME_S, image, k * FRAME_S)
 
-    def _at(self, x_m: float, y_m: float, z_m: float, yaw: float) -> Place:
+    def _at(self, x_m: float, y_m: float, z_m: float, yaw: float) -> CameraPlace:
         """Return the place that is `z_m` under the target and off it by x, y in level axes."""
         T_body_cam = self._profile.camera.mount.T_body_cam
         lens = np.array([x_m, y_m, z_m])  # target relative to the camera, level axes
@@ -105,9 +105,9 @@ class SimulatedStand:
         T_world_body = make_T(rot_z(yaw), body)
         e_m = lens + T_body_cam[:3, 3] - gear
         heading = wrap_rad(self._scenario.target_yaw_rad - yaw)
-        return Place(T_world_body @ T_body_cam, np.array([*e_m, heading]))
+        return CameraPlace(T_world_body @ T_body_cam, np.array([*e_m, heading]))
 
-    def _in_picture(self, place: Place) -> bool:
+    def _in_picture(self, place: CameraPlace) -> bool:
         T_world_marker = self._renderer.T_world_target @ make_T(R_MARKER_TARGET, (0.0, 0.0, 0.0))
         T_cam_marker = invert_T(place.T_world_cam) @ T_world_marker
         rvec, tvec = rotation_vector(T_cam_marker[:3, :3]), T_cam_marker[:3, 3]

@@ -17,10 +17,10 @@ from perchctl.calibration import Moment, capture_views
 from perchctl.calibration.board.capture import (
     Capture,
     Signature,
-    consider,
-    hint,
-    progress,
+    covered_shares,
+    next_advice,
     signature,
+    update_capture,
 )
 from perchctl.camera import Grey
 from perchctl.commands.calibrate import captured_views
@@ -138,12 +138,12 @@ def test_one_advice_at_a_time_leads_to_the_end() -> None:
             (0.1, 0.1, 0.2, -0.3, -0.3), (0.9, 0.9, 0.9, 0.3, 0.3)
         )
         shown = [Signature(x, y, size, tilt_x, tilt_y)]
-        while (advice := hint(shown)) != "show the board somewhere new":
+        while (advice := next_advice(shown)) != "show the board somewhere new":
             assert advice in FOLLOWED, advice
-            before = min(progress(shown).values())
+            before = min(covered_shares(shown).values())
             shown.append(dataclasses.replace(shown[-1], **FOLLOWED[advice]))
             given.add(advice)
-            assert min(progress(shown).values()) >= before
+            assert min(covered_shares(shown).values()) >= before
             assert len(shown) < 12
     assert given == set(FOLLOWED)
 
@@ -204,15 +204,15 @@ def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> 
     state = Capture()
     for pose in draw_poses(rng, camera, CHARUCO, 40):
         view = corner_view(rng, camera, CHARUCO, pose, 0.05, "v")
-        state = consider(consider(state, view, CHARUCO), view, CHARUCO)
+        state = update_capture(update_capture(state, view, CHARUCO), view, CHARUCO)
         if state.finished:
             break
     assert state.finished
     assert len(state.taken) >= 15
-    assert not consider(state, state.taken[-1], CHARUCO).shot
+    assert not update_capture(state, state.taken[-1], CHARUCO).shot
     blurred = dataclasses.replace(view, blur_px=8.0)
-    before = consider(Capture(), blurred, CHARUCO)
-    assert "blurred" in consider(before, blurred, CHARUCO).advice
+    before = update_capture(Capture(), blurred, CHARUCO)
+    assert "blurred" in update_capture(before, blurred, CHARUCO).advice
 
 
 def test_a_pipe_gets_a_line_whenever_it_changes_and_the_page_its_shares() -> None:

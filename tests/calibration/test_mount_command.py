@@ -20,7 +20,7 @@ from perchctl.calibration import (
     read_recordings,
     write_recordings,
 )
-from perchctl.calibration.mounting.carry import Carried
+from perchctl.calibration.mounting.carry import CarrySolution
 from perchctl.commands import calibrate_mount
 from perchctl.geometry import Array
 from perchctl.profile import Mounting, load_profile
@@ -273,10 +273,10 @@ def test_a_latency_that_flights_measure_stays_so() -> None:
     assert "you wrote measured: each flight measures it" in "\n".join(c.lines())
 
 
-def carried(R: Array) -> Carried:
+def carried(R: Array) -> CarrySolution:
     """A solution with that turn."""
     known = np.eye(3) * np.radians(0.05) ** 2
-    return Carried(R, known, 0.0803, 0.001, np.zeros(3))
+    return CarrySolution(R, known, 0.0803, 0.001, np.zeros(3))
 
 
 def test_the_simulator_tells_the_truth_beside(

@@ -17,9 +17,8 @@ from perchctl.calibration import (
     solve_carry,
     solve_pivot,
 )
-from perchctl.calibration.mounting.carry import Carried
-from perchctl.calibration.mounting.motion import missing_motion
-from perchctl.calibration.mounting.recording import SeenPose
+from perchctl.calibration.mounting.carry import CarrySolution
+from perchctl.calibration.mounting.recording import SeenPose, missing_motion
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.sim.hand import Hand
@@ -28,7 +27,7 @@ from tests.helpers.mounting import hand, seen
 ANGLE = st.floats(-np.pi, np.pi)
 
 
-def turn_error_deg(found: Carried, held: Hand) -> float:
+def turn_error_deg(found: CarrySolution, held: Hand) -> float:
     off = Rotation.from_matrix(found.R_body_cam @ held.T_body_cam[:3, :3].T)
     return float(np.degrees(off.magnitude()))
 

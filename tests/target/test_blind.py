@@ -7,7 +7,7 @@ import pytest
 from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig
 from perchctl.profile.vision import VehicleConfig
 from perchctl.target import mounted_camera
-from perchctl.target.sight import Mounted
+from perchctl.target.sight import MountingView
 from tests.target.rig import camera_of
 
 CAMERA = camera_of()
@@ -15,7 +15,7 @@ SMALL_M = 0.0125  # its half side
 WIDE, HIGH = 317 / 380, 237 / 380  # of the picture, from the axis, less the margin
 
 
-def of(gear_m: tuple[float, float, float], yaw_deg: float = 0.0) -> Mounted:
+def of(gear_m: tuple[float, float, float], yaw_deg: float = 0.0) -> MountingView:
     """With the gear there from the camera, body axes."""
     mount = Mounting(position_m=(0.01, 0.0, 0.005), rpy_deg=(0.0, 0.0, yaw_deg))
     x, y, z = gear_m

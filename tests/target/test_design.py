@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
+import importlib
 import math
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -40,16 +39,12 @@ def profile() -> Profile:
     return load_profile("sim")
 
 
-@pytest.fixture(scope="module")
-def bench() -> ModuleType:
-    path = ROOT / "benchmarks" / "ranges_by_design.py"
-    spec = importlib.util.spec_from_file_location("ranges_by_design", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    vars(module)["START"] = 1.2  # beyond what may be wrong, and quick
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The benchmark of the ranges, from beyond what may be wrong on, and quick."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    module = importlib.import_module("ranges_by_design")
+    monkeypatch.setattr(module, "START", 1.2)
     return module
 
 

@@ -90,7 +90,7 @@ def test_a_constant_offset_is_reported_and_moves_no_weight() -> None:
     assert (np.abs(mean[:3] - [0.004, -0.002, 0.01]) < 2 * half[:3]).all()
 
 
-def judged(errors: fit.Errors) -> tuple[dict[str, fit.Fitted], fit.Evidence]:
+def judged(errors: fit.Errors) -> tuple[dict[str, fit.FittedWeights], fit.Evidence]:
     fits = fit.fit_all(errors)
     return fits, fit.evidence(errors, {name: each.folds for name, each in fits.items()})
 

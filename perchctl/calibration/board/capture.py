@@ -95,7 +95,7 @@ def views_of_video(
     searched = 0
     try:
         with ThreadPoolExecutor(_workers()) as pool:
-            sharpest = _sharpest(source)
+            sharpest = _sharpest_frames(source)
             # A whole video at once would not fit into the memory.
             while batch := [frame for frame, _ in zip(sharpest, range(4 * _workers()))]:  # noqa: B905
                 seen = list(pool.map(search, batch))
@@ -106,10 +106,10 @@ def views_of_video(
         source.close()
     if not found:
         return [], [Rejection(f"{searched} frames", "no board found")]
-    return pick(found, board), []
+    return select_views(found, board), []
 
 
-def _sharpest(source: VideoSource) -> Iterator[Frame]:
+def _sharpest_frames(source: VideoSource) -> Iterator[Frame]:
     """Yield the sharpest frame of each window."""
     window: list[Frame] = []
     while (frame := source.poll(0.0)) is not None:
@@ -190,7 +190,7 @@ def signature(view: BoardView, board: Board) -> Signature:
     return Signature(x, y, size, tilt_x, tilt_y)
 
 
-def progress(signatures: Sequence[Signature]) -> dict[str, float]:
+def covered_shares(signatures: Sequence[Signature]) -> dict[str, float]:
     """Return how far each of `AXES` is covered, 0..1."""
     if not signatures:
         return dict.fromkeys(AXES, 0.0)
@@ -200,7 +200,7 @@ def progress(signatures: Sequence[Signature]) -> dict[str, float]:
     return {axis: float(min(1.0, spread[axis] / GOALS[axis])) for axis in AXES}
 
 
-def pick(views: Sequence[BoardView], board: Board) -> list[BoardView]:
+def select_views(views: Sequence[BoardView], board: Board) -> list[BoardView]:
     """Return the sharp and different ones of a video's views, at most `MOST_VIEWS`, in order.
 
     The one most unlike those taken is taken next (the sharper the better), until what is
@@ -255,7 +255,7 @@ def capture_views(
             if frame is None or frame.repeated:  # a repeated one would look still
                 continue
             seen = find_board(frame.image, board, f"view {len(state.taken) + 1}")
-            state = consider(state, seen, board)
+            state = update_capture(state, seen, board)
             show(_moment(frame, seen, state))
             if state.finished:
                 return list(state.taken)
@@ -284,11 +284,11 @@ class Capture:
     @property
     def finished(self) -> bool:
         """Enough of everything, or so many views that more would not change the solution."""
-        covered = min(progress(self.signatures).values()) >= 1.0
+        covered = min(covered_shares(self.signatures).values()) >= 1.0
         return len(self.signatures) >= (ENOUGH_VIEWS if covered else MOST_VIEWS)
 
 
-def consider(capture: Capture, seen: BoardView | str, board: Board) -> Capture:
+def update_capture(capture: Capture, seen: BoardView | str, board: Board) -> Capture:
     """Return the capture after one more picture: the automatic shutter takes a view that is new,
     sharp and still. `seen` is the board's view, or why there is none."""
     taken, signatures = capture.taken, capture.signatures
@@ -302,7 +302,7 @@ def consider(capture: Capture, seen: BoardView | str, board: Board) -> Capture:
         return Capture(taken, signatures, seen, "too blurred: more light, or hold still")
     here = signature(seen, board)
     if any(here.distance(s) <= NEW_BEYOND for s in signatures):
-        return Capture(taken, signatures, seen, hint(signatures))
+        return Capture(taken, signatures, seen, next_advice(signatures))
     grown = (*signatures, here)
     return Capture((*taken, seen), grown, seen, f"taken, {len(grown)} views", True)
 
@@ -317,10 +317,10 @@ def _moved_px(before: BoardView | None, now: BoardView) -> float:
     return float(np.median(np.linalg.norm(before.corners_px[a] - now.corners_px[b], axis=1)))
 
 
-def hint(signatures: Sequence[Signature]) -> str:
+def next_advice(signatures: Sequence[Signature]) -> str:
     """Return one thing to do, in the picture's directions: towards where the least was shown so far
     of what is covered least."""
-    done = progress(signatures)
+    done = covered_shares(signatures)
     least = min(AXES, key=lambda axis: done[axis])
     if done[least] >= 1.0:
         return "show the board somewhere new"
@@ -346,7 +346,9 @@ def _moment(frame: Frame, seen: BoardView | str, state: Capture) -> Moment:
     if isinstance(seen, BoardView):
         hull = cv2.convexHull(seen.corners_px.astype(np.float32)).reshape(-1, 2)
         outlines = (("small" if state.shot else "large", hull.astype(np.float64)),)
-    covered = {name: (f"{100 * s:.0f} %", s) for name, s in progress(state.signatures).items()}
+    covered = {
+        name: (f"{100 * s:.0f} %", s) for name, s in covered_shares(state.signatures).items()
+    }
     shares = ", ".join(f"{name} {text}" for name, (text, _) in covered.items())
     taken = len(state.taken)
     return Moment(

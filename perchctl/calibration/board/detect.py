@@ -201,7 +201,7 @@ _MIN_WIDTH_PX, _MAX_WIDTH_SHARE = 0.25, 1.2
 
 
 @dataclass(frozen=True, eq=False)
-class Saddles:
+class RefinedCorners:
     """Refined corners: corners_px (n, 2); ok (n,), true where the fit holds; width_px (n,), the
     wider edge's spread."""
 
@@ -216,7 +216,7 @@ def fit_saddles(
     along_px: Array,
     down_px: Array,
     white: float = 1.0,
-) -> Saddles:
+) -> RefinedCorners:
     """Return the corners refined to hundredths of a pixel.
 
     Args:
@@ -292,7 +292,7 @@ def _fit(
     weight: Array,
     size_px: Array,
     reach: Array,
-) -> Saddles:
+) -> RefinedCorners:
     n = len(start)
     span_px = reach * size_px
     # Lines: along u (normal to it: 1) and along v. State: x, y, angle 1, 2, ln w1, ln w2.
@@ -322,7 +322,7 @@ def _fit(
         on = on[~settled]
         if len(on) == 0:
             break
-    return _judged(start, state, linear, cost, J, weight, span_px)
+    return _checked_corners(start, state, linear, cost, J, weight, span_px)
 
 
 def _step(J: Array, residual: Array, damping: Array) -> Array:
@@ -370,7 +370,7 @@ def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Ar
     return linear, residual, J
 
 
-def _judged(
+def _checked_corners(
     start: Array,
     state: Array,
     linear: Array,
@@ -378,7 +378,7 @@ def _judged(
     J: Array,
     weight: Array,
     span_px: Array,
-) -> Saddles:
+) -> RefinedCorners:
     samples = weight.sum(axis=1)
     noise2 = cost / np.maximum(samples - 12.0, 1.0)
     # Samples lie closer than pixels do: neighbours share their noise.
@@ -400,4 +400,4 @@ def _judged(
         & (sigma < 0.5)
     )
     corners = np.where(ok[:, None], start + state[:, :2], start)
-    return Saddles(corners, ok, np.exp(state[:, 4:]).max(axis=1))
+    return RefinedCorners(corners, ok, np.exp(state[:, 4:]).max(axis=1))

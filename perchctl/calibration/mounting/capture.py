@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 from perchctl.calibration.live import Moment, polled
 from perchctl.calibration.mounting.eye import Eye
-from perchctl.calibration.mounting.motion import MIRRORED, missing_motion
 from perchctl.calibration.mounting.recording import (
+    MIRRORED,
     AttitudeSample,
     MountingPart,
     MountingRecording,
     SeenPose,
+    missing_motion,
 )
 from perchctl.camera import FrameSource
 from perchctl.errors import InvalidValue, TimedOut

@@ -19,17 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from perchctl.calibration.mounting.motion import AGAIN, check_recording
 from perchctl.calibration.mounting.recording import (
+    HOW_TO_RECORD,
     AttitudeSample,
     MountingRecording,
     PoseArrays,
+    check_recording,
     pose_arrays,
 )
 from perchctl.calibration.mounting.robust import (
     covariance,
+    estimate_noise,
     inverses,
-    likeliest,
     normal_equations,
     squared_distance,
     student_weights,
@@ -62,7 +63,7 @@ KNOTS = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class CarrySolution:
     """The carry's solution. A sigma is such that the value +- 1.96 sigma is a 95 % interval.
 
     Attributes:
@@ -96,7 +97,7 @@ class Carried:
         return x, y, z
 
 
-def solve_carry(recording: MountingRecording) -> Carried:
+def solve_carry(recording: MountingRecording) -> CarrySolution:
     """Solve for the camera's turn in the body and its latency.
 
     Raises InvalidValue: too little motion, a mirrored picture, or vehicle and camera do not
@@ -106,10 +107,12 @@ def solve_carry(recording: MountingRecording) -> Carried:
     imu, poses = imu_arrays(recording.attitudes), pose_arrays(recording)
     start = first_guess(integrate(imu, np.zeros(3), np.zeros(3)), poses)
     if start is None:
-        raise InvalidValue(f"the target was not seen twice within half a second: {AGAIN['carry']}")
+        raise InvalidValue(
+            f"the target was not seen twice within half a second: {HOW_TO_RECORD['carry']}"
+        )
     state, rows, cov = _solve(imu, poses, *start)
     _check(state, rows, cov)
-    return Carried(
+    return CarrySolution(
         R_body_cam=state.R_body_cam,
         turn_cov_rad2=cov[TURN, TURN],
         latency_s=state.latency_s,
@@ -343,7 +346,9 @@ def _solve(
         rows = _rows(state, imu, poses, cov_rad2, factor, jitter_s)
         within = rows.counted > 0.0
         if k < _ROUNDS - 1:
-            factor, jitter_s = likeliest(rows.misfit[within], cov_rad2[within], rows.along[within])
+            factor, jitter_s = estimate_noise(
+                rows.misfit[within], cov_rad2[within], rows.along[within]
+            )
     of_poses, _ = normal_equations(rows.design, rows.misfit, rows.inverse, rows.counted)
     known = rows.information - of_poses
     cov = covariance(rows.design, rows.misfit, rows.inverse, rows.counted, known, KNOTS)
@@ -456,14 +461,15 @@ def _check(state: State, rows: _Rows, cov: Array) -> None:
             f"the turns that the vehicle felt and those that the camera saw differ by "
             f"{math.degrees(np.median(size)):.1f} deg ({100 * left_out:.0f} % of the pictures do "
             f"not fit at all): target and camera must not move in the room or on the vehicle; "
-            f"then {AGAIN['carry']}"
+            f"then {HOW_TO_RECORD['carry']}"
         )
     sigma = np.sqrt(np.diagonal(cov))
     turn_deg, latency_s = math.degrees(sigma[TURN].max()), float(sigma[LATENCY])
     if not turn_deg <= MOST_TURN_SIGMA_DEG:
         raise InvalidValue(
             f"the camera's turn is known to {turn_deg:.1f} deg only (at most "
-            f"{MOST_TURN_SIGMA_DEG:g} is accepted): {AGAIN['carry']}, and farther to each side"
+            f"{MOST_TURN_SIGMA_DEG:g} is accepted): {HOW_TO_RECORD['carry']}, and farther to each "
+            f"side"
         )
     if not latency_s <= MOST_LATENCY_SIGMA_S:
         raise InvalidValue(

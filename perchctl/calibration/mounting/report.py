@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perchctl.calibration.mounting.carry import Carried
-from perchctl.calibration.mounting.pivot import Pivoted
-from perchctl.calibration.mounting.robust import IN_95
+from perchctl.calibration.mounting.carry import CarrySolution
+from perchctl.calibration.mounting.pivot import PivotSolution
+from perchctl.calibration.mounting.robust import SIGMAS_95
 from perchctl.geometry import Array
 from perchctl.profile import Profile
 
@@ -25,8 +25,8 @@ class MountingReport:
     """What was measured of a profile's vehicle; a part that was not done is None."""
 
     profile: Profile
-    carried: Carried | None
-    pivoted: Pivoted | None
+    carried: CarrySolution | None
+    pivoted: PivotSolution | None
 
     @property
     def gear_body_m(self) -> Array:
@@ -100,7 +100,7 @@ class MountingReport:
             written = self.profile.camera.mount
             turned = Rotation.from_matrix(written.T_body_cam[:3, :3].T @ carried.R_body_cam)
             off_deg = math.degrees(turned.magnitude())
-            most_deg = math.degrees(IN_95 * math.sqrt(float(np.trace(carried.turn_cov_rad2))))
+            most_deg = math.degrees(SIGMAS_95 * math.sqrt(float(np.trace(carried.turn_cov_rad2))))
             away = f"{off_deg:.1f} deg away" if off_deg > most_deg else ""
             angles = (carried.rpy_deg, carried.rpy_sigma_deg)
             lines += _value_lines("turn", *angles, 2, "deg", written.rpy_deg, away)
@@ -111,7 +111,7 @@ class MountingReport:
             else:
                 written_ms = (1e3 * self.written_latency_s,)
                 off_ms = abs(late_ms - written_ms[0])
-                away = f"{off_ms:.1f} ms away" if off_ms > IN_95 * sigma_ms else ""
+                away = f"{off_ms:.1f} ms away" if off_ms > SIGMAS_95 * sigma_ms else ""
             lines += _value_lines("latency", (late_ms,), (sigma_ms,), 1, "ms", written_ms, away)
             if self.pivoted is None and off_deg > NOTABLE_TURN_DEG:
                 lines.append(
@@ -121,7 +121,7 @@ class MountingReport:
             tip_mm, sigma_mm = 1e3 * pivoted.gear_cam_m, 1e3 * pivoted.gear_cam_sigma_m
             written_mm = 1e3 * self.written_gear_cam_m
             apart_mm = tip_mm - written_mm
-            far = (np.abs(apart_mm) > IN_95 * sigma_mm).any()
+            far = (np.abs(apart_mm) > SIGMAS_95 * sigma_mm).any()
             away = f"{np.linalg.norm(apart_mm):.1f} mm away" if far else ""
             tip = ("gear's tip", tip_mm, sigma_mm, 2, "mm in camera axes", written_mm, away)
             lines += _value_lines(*tip)
@@ -136,7 +136,7 @@ def _value_lines(
     """Return the two lines of a value; `written` is what the profile says, empty where it has no
     number."""
     found = " ".join(f"{v:g}" for v in _rounded(values, decimals))
-    interval = " ".join(f"{IN_95 * float(sigma):.{decimals}f}" for sigma in sigmas)
+    interval = " ".join(f"{SIGMAS_95 * float(sigma):.{decimals}f}" for sigma in sigmas)
     before = " ".join(f"{v:g}" for v in _rounded(written, decimals)) or "measured"
     return [
         f"{name:<12}{found} +- {interval} {unit} (95 %)",

@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 
 from perchctl.geometry import Array
 
-IN_95 = 1.96
+SIGMAS_95 = 1.96
 """Standard deviations to each side of a 95 % interval."""
 FREEDOM = 5.0
 BLOCKS = 15
@@ -67,8 +67,8 @@ def inverses(cov: Array, factor: float, along: Array, jitter_s: float) -> Array:
     return np.asarray(np.linalg.inv(factor**2 * cov + late))
 
 
-def likeliest(misfit: Array, cov: Array, along: Array | None = None) -> tuple[float, float]:
-    """Return the likeliest factor and jitter in s of misfits (n, 3) with claimed covariances
+def estimate_noise(misfit: Array, cov: Array, along: Array | None = None) -> tuple[float, float]:
+    """Return the estimate_noise factor and jitter in s of misfits (n, 3) with claimed covariances
     (n, 3, 3); `along` (n, 3) is what a second of delay does to each (None: no jitter)."""
     jitters_s = _JITTERS_S if along is not None else _JITTERS_S[:1]
     along = np.zeros_like(misfit) if along is None else along
@@ -135,4 +135,4 @@ def _robust_shares(distance2: Array) -> tuple[float, float]:
 def student_factor(freedom: int) -> float:
     """Return half the width of a 95 % interval whose spread was estimated from so many values, over
     the normal distribution's; below 3 degrees of freedom that of 3."""
-    return float(stdtrit(max(freedom, 3), 0.975)) / IN_95
+    return float(stdtrit(max(freedom, 3), 0.975)) / SIGMAS_95
