@@ -8,6 +8,7 @@ import re
 
 import cv2
 import numpy as np
+import pypdfium2  # type: ignore[import-untyped]
 import pytest
 from numpy.typing import NDArray
 
@@ -28,13 +29,38 @@ from perchctl.target.page import (
 from perchctl.target.page import text_width as width_of
 from perchctl.target.reading import PlainReader
 from perchctl.target.sheets import board_page, target_pages
-from tests.helpers.raster import PX_PER_MM, black_runs_mm, page_picture
 from tests.target.rig import sized
 
+DPI = 600
+PX_PER_MM = DPI / 25.4
 TARGET = TargetConfig()
 MAGNET_M = 0.05
 TOLERANCE_MM = 0.05
 PAGES = ("a4", "letter", "220x240mm")
+
+
+def page_picture(pdf: bytes, page: int, dpi: int = DPI) -> NDArray[np.uint8]:
+    document = pypdfium2.PdfDocument(pdf)
+    try:
+        bitmap = document[page].render(scale=dpi / 72.0, grayscale=True)
+        return np.array(bitmap.to_numpy(), np.uint8).reshape(bitmap.height, bitmap.width)
+    finally:
+        document.close()
+
+
+def black_runs_mm(line: NDArray[np.uint8]) -> list[tuple[float, float]]:
+    """Start and end of every dark run of a row or column, mm, from the grey at its ends."""
+    dark = line < 128
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], dark, [False]]).astype(int)))
+    ink = 1.0 - line.astype(float) / 255.0
+    runs = []
+    for start, stop in edges.reshape(-1, 2):
+        before = ink[start - 1] if start > 0 else 0.0
+        after = ink[stop] if stop < len(line) else 0.0
+        low = start + (1.0 - ink[start]) - before
+        high = stop - (1.0 - ink[stop - 1]) + after
+        runs.append((low * 25.4 / DPI, high * 25.4 / DPI))
+    return runs
 
 
 def pages_of(target: TargetConfig, page: str) -> tuple[Page, Page]:
@@ -192,6 +218,10 @@ def test_a_page_too_small_is_refused_with_the_one_that_fits(large: float, page: 
     named = re.search(r"--page (\S+) holds it", str(refused.value))
     if named is not None:
         assert pages_of(target, named[1])[0].width > large
+        if sides := re.fullmatch(r"(\d+)x(\d+)mm", named[1]):
+            narrower = f"{int(sides[1]) - 4}x{sides[2]}mm"
+            with pytest.raises(InvalidValue, match="holds it"):
+                pages_of(target, narrower)
     else:
         assert "allowed are a4, letter, a3" in str(refused.value)
 
