@@ -64,7 +64,6 @@ class TargetDesign:
             small marker are whole at any turn, the gear right under the target's centre.
         search_range_m: from the camera to the target at the highest search position, where the
             ceiling's height is known.
-        warnings: a sentence for each gap.
     """
 
     target: TargetConfig
@@ -75,7 +74,52 @@ class TargetDesign:
     mount: MountingView
     search_range_m: float | None
     search_height_m: float
-    warnings: tuple[str, ...]
+    ceiling_m: float | None
+    standoff_m: float
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each gap."""
+        found: list[str] = []
+        ranges, search_m, height_m = self.ranges, self.search_range_m, self.search_height_m
+        if ranges.z1_m is None or ranges.z2_m is None or ranges.z3_m is None:
+            return (
+                "a marker is never read through this blur and noise: a sharper picture is needed",
+            )
+        if search_m is not None and height_m == 0.0:
+            sure_m = ranges.focal_px * self.target.large.side_m / least_side_px(ranges.large_px)
+            if search_m > sure_m:
+                found.append(
+                    f"gap on the ground: under a ceiling of {self.ceiling_m:g} m the target is "
+                    f"{search_m:.2f} m from the camera, and is surely found up to {sure_m:.2f} m"
+                )
+        elif search_m is not None and search_m > ranges.z1_m:
+            found.append(
+                f"gap at the search height: from {height_m:g} m the target under a ceiling of "
+                f"{self.ceiling_m:g} m is {search_m:.2f} m away, and is seen from "
+                f"{ranges.z1_m:.2f} m on"
+            )
+        if search_m is not None and search_m < 0.3 and height_m > 0.0:
+            found.append(
+                f"the ceiling ({self.ceiling_m:g} m) is hardly above the search height "
+                f"({height_m:g} m): lower planner.search.max_height_m"
+            )
+        if ranges.z2_m <= ranges.z3_m:
+            found.append(
+                f"gap between the markers: the small one is read up to {_cm(ranges.z2_m)}, and "
+                f"the large one is whole at any turn only from {_cm(ranges.z3_m)} on"
+            )
+        elif ranges.z2_m < 1.15 * ranges.z3_m:
+            found.append("the overlap is short: less than 15 % of the range")
+        nearest_m = self.gear_nearest_m[1]
+        if nearest_m is None or nearest_m > self.standoff_m:
+            at = "" if nearest_m is None else f" (only from {_cm(nearest_m)} on)"
+            found.append(
+                f"gap before contact: with the gear {_cm(self.standoff_m)} under the target the "
+                f"small marker is not wholly in the picture{at}; mount the camera nearer to the "
+                f"gear"
+            )
+        return tuple(found)
 
     def record(self) -> dict[str, object]:
         """Return ranges, gaps and blind range for machines; metres."""
@@ -179,8 +223,6 @@ def make_design(
     search = None
     if ceiling_m is not None:
         search = ceiling_m - height - profile.camera.mount.position_m[2]
-    standoff = profile.planner.ascend.standoff_m
-    warnings = _warnings(target, ranges, small_m, standoff, height, ceiling_m, search)
     return TargetDesign(
         target=target,
         camera=camera,
@@ -190,53 +232,9 @@ def make_design(
         mount=mounted_camera(target, camera, profile),
         search_range_m=search,
         search_height_m=height,
-        warnings=tuple(warnings),
+        ceiling_m=ceiling_m,
+        standoff_m=profile.planner.ascend.standoff_m,
     )
-
-
-def _warnings(
-    target: TargetConfig,
-    ranges: Ranges,
-    nearest_m: float | None,
-    standoff_m: float,
-    height_m: float,
-    ceiling_m: float | None,
-    search_m: float | None,
-) -> list[str]:
-    found: list[str] = []
-    if ranges.z1_m is None or ranges.z2_m is None or ranges.z3_m is None:
-        return ["a marker is never read through this blur and noise: a sharper picture is needed"]
-    if search_m is not None and height_m == 0.0:
-        sure_m = ranges.focal_px * target.large.side_m / least_side_px(ranges.large_px)
-        if search_m > sure_m:
-            found.append(
-                f"gap on the ground: under a ceiling of {ceiling_m:g} m the target is "
-                f"{search_m:.2f} m from the camera, and is surely found up to {sure_m:.2f} m"
-            )
-    elif search_m is not None and search_m > ranges.z1_m:
-        found.append(
-            f"gap at the search height: from {height_m:g} m the target under a ceiling of "
-            f"{ceiling_m:g} m is {search_m:.2f} m away, and is seen from {ranges.z1_m:.2f} m on"
-        )
-    if search_m is not None and search_m < 0.3 and height_m > 0.0:
-        found.append(
-            f"the ceiling ({ceiling_m:g} m) is hardly above the search height ({height_m:g} m): "
-            f"lower planner.search.max_height_m"
-        )
-    if ranges.z2_m <= ranges.z3_m:
-        found.append(
-            f"gap between the markers: the small one is read up to {_cm(ranges.z2_m)}, and "
-            f"the large one is whole at any turn only from {_cm(ranges.z3_m)} on"
-        )
-    elif ranges.z2_m < 1.15 * ranges.z3_m:
-        found.append("the overlap is short: less than 15 % of the range")
-    if nearest_m is None or nearest_m > standoff_m:
-        at = "" if nearest_m is None else f" (only from {_cm(nearest_m)} on)"
-        found.append(
-            f"gap before contact: with the gear {_cm(standoff_m)} under the target the "
-            f"small marker is not wholly in the picture{at}; mount the camera nearer to the gear"
-        )
-    return found
 
 
 def _cm(length_m: float | None) -> str:
