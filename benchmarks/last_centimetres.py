@@ -24,7 +24,7 @@ from perchctl.geometry import Array, make_T, rot_z, rotation_from_rpy, wrap_rad
 from perchctl.profile import CameraConfig, DetectorConfig, Mounting, Profile
 from perchctl.profile.vision import VehicleConfig
 from perchctl.sim import Renderer
-from perchctl.target.measured import MEASURED_SIGMA
+from perchctl.target.prints import MEASURED_SIGMA
 from perchctl.vision import Attitude, Frame, Pipeline, PipelineState, make_pipeline, step
 
 LAST_M, FROM_M, SPEED_MPS, RATE_HZ = 0.10, 0.16, 0.10, 30.0

@@ -28,7 +28,7 @@ from perchctl.calibration import (
     solve_carry,
     solve_pivot,
 )
-from perchctl.calibration.mounting.robust import IN_95
+from perchctl.calibration.mounting.robust import SIGMAS_95
 from perchctl.errors import InvalidValue
 from perchctl.profile import load_profile
 from perchctl.sim import draw_hand, record_hand
@@ -86,7 +86,7 @@ def main() -> int:
             found[name].append(value)
         line = ", ".join(f"{name} {value:.3f}" for name, value in errors.items())
         print(f"seed {seed:2d}: {line}; farthest {max(off):.1f} sigma", flush=True)
-    covered = float(np.mean(np.array(sigmas) < IN_95)) if sigmas else 0.0
+    covered = float(np.mean(np.array(sigmas) < SIGMAS_95)) if sigmas else 0.0
     met = not refused and COVERED[0] <= covered <= COVERED[1]
     for name, (median, worst) in GOALS.items():
         values = found[name] or [math.inf]

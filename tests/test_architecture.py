@@ -101,9 +101,9 @@ MOST_NAMES = {
     "positioning": 15,
     "profile": 36,
     "sim": 25,
-    "target": 28,
+    "target": 24,
     "vision": 50,
-    "weights": 15,
+    "weights": 9,
 }
 
 

@@ -26,7 +26,7 @@ from perchctl.mission.table import TABLE
 from perchctl.profile import Profile, load_profile
 from perchctl.profile.keys import keys
 from perchctl.record import decode_line
-from tests.helpers.boards import APRILGRID, CHARUCO, render_folder
+from tests.helpers.boards import CHARUCO, render_folder
 from tests.helpers.flights import ROOT, SEED, short_profile
 from tests.helpers.gear import write_turned_about
 from tests.helpers.mounting import hand, seen
@@ -52,7 +52,6 @@ CAMCHAIN = """cam0:
   intrinsics: [400.5, 401.5, 320.25, 240.75]
   resolution: [640, 480]
 """
-APRIL = "{target_type: aprilgrid, tagCols: 6, tagRows: 6, tagSize: 0.022, tagSpacing: 0.3}\n"
 QUICK = """extends: sim
 planner: {perching_time_s: 0.3}
 """
@@ -142,8 +141,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("place")
     make_recording(folder)
     render_folder(folder / "board", load_calibration(folder / "camera.yaml"), CHARUCO, 8, seed=1)
-    render_folder(folder / "april", load_calibration(folder / "camera.yaml"), APRILGRID, 8, seed=2)
-    (folder / "april_6x6.yaml").write_text(APRIL, encoding="utf-8")
     write_turned_about(folder / "turned")
     write_recordings(folder / "hand.jsonl", [seen(hand("pivot"))])
     write_session(known(positions=4, per=20), folder / "session.csv")
@@ -191,7 +188,6 @@ LONG = (
     "perchctl log compare",
     "perchctl log export",
     "perchctl simulate",
-    "perchctl calibrate images:april",
     "perchctl calibrate aideck:",
     "perchctl calibrate images:board --measured",
     "perchctl fit-weights collect",

@@ -28,7 +28,7 @@ class SizeMissing(InvalidValue):
 
 
 def profile_camera(config: CameraConfig) -> CameraModel:
-    """The calibrated camera of a profile. Errors: those of `load_calibration`."""
+    """Return the calibrated camera of a profile. Raises as `load_calibration`."""
     return load_calibration(config.calibration, cam=config.cam)
 
 
@@ -91,7 +91,7 @@ def _check_no_cam(path: Path, cam: str | None) -> None:
 
 
 def _named(path: Path, cameras: list[str], cam: str | None) -> str:
-    """The camera that is meant."""
+    """Return the name of the camera to read."""
     held = ", ".join(cameras)
     if cam is None and len(cameras) > 1:
         raise InvalidValue(
@@ -104,7 +104,7 @@ def _named(path: Path, cameras: list[str], cam: str | None) -> str:
 
 
 def _kalibr_values(path: Path, raw: dict[Any, Any], cam: str) -> dict[str, Any]:
-    """One camera of a camchain; pixel (0, 0) is a pixel's centre there too."""
+    """Return the values of one camera of a camchain; pixel (0, 0) is a pixel's centre there too."""
     camera = raw[cam]
     if not isinstance(camera, dict):
         raise InvalidValue(f"{path}: {cam} must hold keys (intrinsics, resolution, ...)")
@@ -159,7 +159,7 @@ def _opencv_values(path: Path) -> dict[str, Any]:
 
 
 def _size(width: Any, height: Any) -> tuple[int, int] | None:
-    """None where either is missing."""
+    """Return the size, None where either is missing."""
     return None if width is None or height is None else (int(width), int(height))
 
 
@@ -216,7 +216,8 @@ def _checked(
 def camera_text(
     camera: CameraModel, name: str, notes: Mapping[str, str | float | int | Array]
 ) -> str:
-    """The file's text; `notes` are further keys (ROS readers pass over them), arrays (n, m)."""
+    """Return the file's text; `notes` are further keys (ROS readers pass over them), arrays (n,
+    m)."""
     entries: dict[str, str | float | int | Array] = {
         "image_width": camera.size_px[0],
         "image_height": camera.size_px[1],
@@ -241,7 +242,7 @@ def camera_text(
 
 
 def camera_record(camera: CameraModel) -> dict[str, Any]:
-    """The camera model as JSON's own types: lengths in pixels, distances in metres."""
+    """Return the camera model as JSON's own types: lengths in pixels, distances in metres."""
     K = camera.K
     return {
         "fx": float(K[0, 0]),
@@ -255,13 +256,14 @@ def camera_record(camera: CameraModel) -> dict[str, Any]:
 
 
 def _coefficients(camera: CameraModel) -> Array:
-    """The distortion; ROS wants five coefficients of plumb_bob."""
+    """Return the distortion; ROS wants five coefficients of plumb_bob."""
     short = camera.model == "plumb_bob" and camera.dist.size == 4
     return np.append(camera.dist, 0.0) if short else camera.dist
 
 
 def _number(value: float | int) -> str:
-    """Read back to the very same number; with a point, or PyYAML reads a string."""
+    """Return text that reads back to the very same number; with a point, or PyYAML reads a
+    string."""
     if isinstance(value, int):
         return str(value)
     text = repr(float(value))

@@ -1,4 +1,4 @@
-"""What of the picture the vehicle itself covers, learned from pictures that move.
+"""The part of the picture that the vehicle itself covers, learned from pictures that move.
 
 While the vehicle is turned about, everything else in the picture changes. What stays the same, and
 is connected with the picture's edge, as legs and guards are, is the vehicle.
@@ -26,7 +26,7 @@ _CLOSED_PX, _EDGE_PX = 7, 3  # gaps that are gear; blur around it
 
 @dataclass(frozen=True, eq=False)
 class Gear:
-    """covered (h, w), and the number of pictures that it was learned from."""
+    """The vehicle's own gear: `covered` (h, w), and the number of pictures it was learned from."""
 
     covered: NDArray[np.bool_]
     pictures: int
@@ -37,12 +37,12 @@ class Gear:
         return float(self.covered.mean())
 
     def png(self) -> bytes:
-        """The mask as `camera.mask` has it: white is what the vehicle covers."""
+        """Return the mask as `camera.mask` has it: white is what the vehicle covers."""
         return bytes(cv2.imencode(".png", np.where(self.covered, np.uint8(255), np.uint8(0)))[1])
 
 
 def learn_gear(pictures: Iterable[Grey]) -> Gear:
-    """From grey pictures (h, w) of one size, in which everything but the gear moves.
+    """Learn the gear from grey pictures (h, w) of one size, in which everything else moves.
 
     Raises:
         InvalidValue: too few pictures, unequal sizes, too little motion, or nothing found.
@@ -87,7 +87,7 @@ def learn_gear(pictures: Iterable[Grey]) -> Gear:
 
 
 def _connected(still: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The parts that reach the picture's edge, without specks and gaps."""
+    """Return the parts that reach the picture's edge, without specks and gaps."""
     clean = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     gap = np.ones((_CLOSED_PX, _CLOSED_PX), np.uint8)
     clean = cv2.morphologyEx(clean, cv2.MORPH_CLOSE, gap)

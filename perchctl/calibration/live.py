@@ -16,7 +16,7 @@ GONE_AFTER_S = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """What a guided recording shows of a frame.
+    """What a guided recording shows a person with a frame.
 
     Attributes:
         index, image: the frame's number and picture (h, w).
@@ -39,7 +39,7 @@ class Moment:
 def polled(
     source: FrameSource, clock: Callable[[], float], sleep: Callable[[float], None]
 ) -> Iterator[tuple[float, Frame | None]]:
-    """The time and the new frame, or None, at each look at a source, until it has ended.
+    """Yield the time and the new frame, or None, at each poll of a source, until it has ended.
 
     Raises TimedOut: the source reports a problem, and gave no frame for `GONE_AFTER_S`.
     """

@@ -87,8 +87,7 @@ BoardOption = Annotated[
         "--board",
         "-b",
         help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 "
-        "(squares; :legacy behind it for OpenCV's old layout), aprilgrid:6x6:22mm:0.3 (tags, "
-        "gap as a share of a tag), or Kalibr's .yaml of a board.",
+        "(squares; :legacy behind it for OpenCV's old layout).",
     ),
 ]
 MeasuredOption = Annotated[
@@ -229,7 +228,7 @@ def mask(
     app,
     "perchctl calibrate check camera.yaml images:board",
     "perchctl calibrate check camera.yaml camera:0 --view",
-    "perchctl calibrate check camchain.yaml images:april --cam cam0",
+    "perchctl calibrate check camchain.yaml images:board --cam cam0",
 )
 def check(
     calibration: Annotated[Path, typer.Argument(help="The calibration file to judge.")],

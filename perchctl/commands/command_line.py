@@ -141,7 +141,8 @@ class _Commands(TyperGroup):
 
 def _refuse_misspelt(word: str, names: list[str], path: str) -> None:
     """Raises UsageError if a word looks like one of the commands below `path`, misspelt."""
-    if close := difflib.get_close_matches(word, names, 1, _CLOSE):
+    is_word = word.replace("-", "").isalpha()  # a file or a source has more in its name
+    if is_word and (close := difflib.get_close_matches(word, names, 1, _CLOSE)):
         raise UsageError(
             f"{path}{word} is no command; did you mean {path}{close[0]}? ({path}--help lists all)"
         )

@@ -65,10 +65,6 @@ def fit(
         Literal["closed_form", "lms"],
         typer.Option("--method", help="Least squares in closed form, or the paper's LMS."),
     ] = "closed_form",
-    step: Annotated[
-        float | None,
-        typer.Option("--step", help="Constant step of LMS, in 1 / mean(d^2); else it falls."),
-    ] = None,
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Write weights that are not recommended, too.")
     ] = False,
@@ -89,7 +85,7 @@ def fit(
         check_output(output, (".yaml", ".yml"), force)
     # The weights file may not be there yet: this command makes it.
     config = load_profile(profile, with_weights=False)
-    result = fit_weights(files, method, test, step)
+    result = fit_weights(files, method, test)
     if not as_json:
         print(report_text(result), flush=True)
     file: Path | None = None

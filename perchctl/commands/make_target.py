@@ -33,7 +33,6 @@ from perchctl.profile import (
     write_profile_values,
 )
 from perchctl.target import (
-    PAGES_MM,
     Optics,
     board_pdf,
     check_target,
@@ -48,16 +47,10 @@ from perchctl.target import (
 )
 from perchctl.vision import CameraModel
 
-TILE = "a3"
-"""Sheets that are proposed for a page that is larger than the named ones."""
 SIDE_LIMITS_M = (0.004, 2.0)
 ANOTHER = "Another target than the profile's"
 
 PageOption = Annotated[str, typer.Option("--page", help="a4, letter, a3, or 220x240mm.")]
-TileOption = Annotated[
-    str | None,
-    typer.Option("--tile", help="Print it on several sheets of this size, to be glued: a4, a3."),
-]
 MagnetOption = Annotated[
     str, typer.Option("--magnet", help="Diameter of the magnet behind the sheet.")
 ]
@@ -116,7 +109,7 @@ app = new_app(Group)
     app,
     "perchctl make-target -p crazyflie -o target.pdf",
     "perchctl make-target --large 120mm --small 20mm --page letter",
-    "perchctl make-target --large 355mm --small 35mm --page 442x470mm --tile a3",
+    "perchctl make-target --large 355mm --small 35mm --page 442x470mm",
     short_help="Print the target true to size, front and back.",
 )
 def sheet(
@@ -125,7 +118,6 @@ def sheet(
         "target.pdf"
     ),
     page: PageOption = "a4",
-    tile: TileOption = None,
     magnet: MagnetOption = "50mm",
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -145,7 +137,7 @@ def sheet(
     magnet_m = parse_length(magnet, "--magnet")
     check_target(target, magnet_m)
     _check_pdf(output)
-    pdf = target_pdf(target, page, magnet_m, *_origin(config, target), tile)
+    pdf = target_pdf(target, page, magnet_m, *_origin(config, target))
     lines = [
         f"wrote {output}",
         "both markers are read from the drawing",
@@ -160,22 +152,20 @@ def sheet(
     app,
     "perchctl make-target board charuco:10x7:25mm:18mm:DICT_5X5_100",
     "perchctl make-target board chessboard:9x6:25mm --page letter -o chess.pdf",
-    "perchctl make-target board aprilgrid:6x6:22mm:0.3 -o april.pdf",
+    "perchctl make-target board chessboard:13x9:25mm --page a3",
 )
 def board(
     notation: Annotated[
         str,
         typer.Argument(
             help="charuco:10x7:25mm:18mm:DICT_5X5_100 (squares), chessboard:9x6:25mm (inner "
-            "corners), aprilgrid:6x6:22mm:0.3 (tags, gap as a share of a tag), or Kalibr's .yaml "
-            "of a board."
+            "corners)."
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="PDF to write.")] = Path(
         "board.pdf"
     ),
     page: PageOption = "a4",
-    tile: TileOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -189,7 +179,7 @@ def board(
         "print at 100 %, glue it on something flat, and measure both rulers: 100 mm each",
     ]
     record = {"board": printed.notation()}
-    _write({output: board_pdf(printed, page, tile)}, lines, record, force, as_json)
+    _write({output: board_pdf(printed, page)}, lines, record, force, as_json)
 
 
 @command(
@@ -247,7 +237,7 @@ def suggest(
         f"perchctl make-target --large {large.side_m * 1e3:g}mm --large-id {large.id} "
         f"--large-dict {large.dictionary} --small {small.side_m * 1e3:g}mm --small-id {small.id} "
         f"--small-dict {small.dictionary} --page {held_by}"
-    ) + ("" if held_by in PAGES_MM else f" --tile {TILE}")
+    )
     record = {"command": command, "target": found.target.model_dump(mode="json")}
     _write({}, [command, "", found.text(name)], record | found.record(), False, as_json)
 

@@ -1,5 +1,5 @@
-"""What a target will do with a camera: from where to where each marker is seen, and how
-exactly; and sizes that cover the way from the search height to the contact.
+"""What a target will do with a camera: from where to where each marker is seen, and sizes that
+cover the way from the search height to the contact.
 
 z1 and z2 are the farthest ranges of the large and the small marker, z3 the nearest of the
 whole large one (paper, section III-B: 115, 25, 12 cm). They follow from the smallest side
@@ -14,15 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.errors import InvalidValue
-from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig, Profile, TargetConfig
-from perchctl.target.drawing import marker_corners_m, mm_text
+from perchctl.target.drawing import mm_text
 from perchctl.target.page import parse_page
 from perchctl.target.reading import TRIALS, Optics, check_target, smallest_side_px
 from perchctl.target.sheets import fits, fitting_page
 from perchctl.target.sight import (
     FieldOfView,
-    Mounted,
+    MountingView,
     gear_from_camera,
     least_side_px,
     mounted_camera,
@@ -31,10 +30,6 @@ from perchctl.target.sight import (
     turned_outline,
 )
 from perchctl.vision import CameraModel
-
-CORNER_SIGMA_PX = 0.2
-"""Spread of a corner that the error bound is drawn for: a plainly refined one."""
-_TABLE_CM = (3, 5, 7, 10, 15, 20, 25, 30, 50, 75, 100, 150, 200, 300, 500)
 
 
 @dataclass(frozen=True)
@@ -61,66 +56,129 @@ class Ranges:
 
 
 @dataclass(frozen=True)
-class GearRanges:
-    """The same while the gear is right under the target, so that the target lies beside
-    the camera's axis; ranges from the gear's tip to the target, at any turn, m."""
-
-    large_nearest_m: float | None
-    small_nearest_m: float | None
-
-
-@dataclass(frozen=True)
 class TargetDesign:
     """A target, a camera and a profile, and what follows from them.
 
     Attributes:
+        gear_nearest_m: nearest range from the gear's tip to the target at which the large and the
+            small marker are whole at any turn, the gear right under the target's centre.
         search_range_m: from the camera to the target at the highest search position, where the
             ceiling's height is known.
-        warnings: a sentence for each gap.
     """
 
     target: TargetConfig
     camera: CameraModel
     optics: Optics
     ranges: Ranges
-    gear: GearRanges
-    mount: Mounted
-    standoff_m: float
+    gear_nearest_m: tuple[float | None, float | None]
+    mount: MountingView
     search_range_m: float | None
     search_height_m: float
-    warnings: tuple[str, ...]
+    ceiling_m: float | None
+    standoff_m: float
 
     @property
-    def spans_m(self) -> dict[str, tuple[float | None, float | None]]:
-        """The nearest and the farthest range of each marker."""
-        r = self.ranges
-        return {"large": (r.z3_m, r.z1_m), "small": (r.z4_m, r.z2_m)}
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each gap."""
+        found: list[str] = []
+        ranges, search_m, height_m = self.ranges, self.search_range_m, self.search_height_m
+        if ranges.z1_m is None or ranges.z2_m is None or ranges.z3_m is None:
+            return (
+                "a marker is never read through this blur and noise: a sharper picture is needed",
+            )
+        if search_m is not None and height_m == 0.0:
+            sure_m = ranges.focal_px * self.target.large.side_m / least_side_px(ranges.large_px)
+            if search_m > sure_m:
+                found.append(
+                    f"gap on the ground: under a ceiling of {self.ceiling_m:g} m the target is "
+                    f"{search_m:.2f} m from the camera, and is surely found up to {sure_m:.2f} m"
+                )
+        elif search_m is not None and search_m > ranges.z1_m:
+            found.append(
+                f"gap at the search height: from {height_m:g} m the target under a ceiling of "
+                f"{self.ceiling_m:g} m is {search_m:.2f} m away, and is seen from "
+                f"{ranges.z1_m:.2f} m on"
+            )
+        if search_m is not None and search_m < 0.3 and height_m > 0.0:
+            found.append(
+                f"the ceiling ({self.ceiling_m:g} m) is hardly above the search height "
+                f"({height_m:g} m): lower planner.search.max_height_m"
+            )
+        if ranges.z2_m <= ranges.z3_m:
+            found.append(
+                f"gap between the markers: the small one is read up to {_cm(ranges.z2_m)}, and "
+                f"the large one is whole at any turn only from {_cm(ranges.z3_m)} on"
+            )
+        elif ranges.z2_m < 1.15 * ranges.z3_m:
+            found.append("the overlap is short: less than 15 % of the range")
+        nearest_m = self.gear_nearest_m[1]
+        if nearest_m is None or nearest_m > self.standoff_m:
+            at = "" if nearest_m is None else f" (only from {_cm(nearest_m)} on)"
+            found.append(
+                f"gap before contact: with the gear {_cm(self.standoff_m)} under the target the "
+                f"small marker is not wholly in the picture{at}; mount the camera nearer to the "
+                f"gear"
+            )
+        return tuple(found)
 
     def record(self) -> dict[str, object]:
-        """Ranges, gaps and blind range for machines; metres."""
+        """Return ranges, gaps and blind range for machines; metres."""
         return {
             **vars(self.ranges),
-            "gear_large_nearest_m": self.gear.large_nearest_m,
-            "gear_small_nearest_m": self.gear.small_nearest_m,
+            "gear_large_nearest_m": self.gear_nearest_m[0],
+            "gear_small_nearest_m": self.gear_nearest_m[1],
             "blind": self.mount.record(),
             "search_range_m": self.search_range_m,
             "warnings": list(self.warnings),
         }
 
     def text(self, camera_name: str) -> str:
-        """Ranges, overlap, error over the range, warnings; several lines."""
-        return _text(self, camera_name)
+        """Return ranges, overlap, mounting and warnings for people; several lines."""
+        r, optics, target = self.ranges, self.optics, self.target
+        width, height = self.camera.size_px
+        large, small = target.large, target.small
+        both = "none: the two markers are never seen together at every turn"
+        if r.z2_m is not None and r.z3_m is not None and r.z2_m > r.z3_m:
+            both = f"{_cm(r.z3_m)} to {_cm(r.z2_m)}, both markers at any turn"
+        blind, *advice = self.mount.lines()
+        lines = [
+            f"camera    {camera_name}, {width}x{height}, f {r.focal_px:.0f} px",
+            f"optics    blur sigma {optics.blur_px:g} px, noise sigma {optics.noise:g}",
+            f"target    {mm_text(large.side_m)} mm {large.dictionary}/{large.id} around "
+            f"{mm_text(small.side_m)} mm {small.dictionary}/{small.id}",
+            f"z1        {_cm(r.z1_m):<9} large marker from here on inwards "
+            f"(side {_px(r.large_px)})",
+            f"z2        {_cm(r.z2_m):<9} small marker from here on inwards "
+            f"(side {_px(r.small_px)})",
+            f"z3        {_cm(r.z3_m):<9} whole large marker down to here at any turn; "
+            f"{_cm(r.z3_upright_m)} where it is upright",
+            f"z4        {_cm(r.z4_m):<9} whole small marker down to here at any turn",
+            f"overlap   {both}",
+            f"at gear   whole large marker down to {_cm(self.gear_nearest_m[0])}, small down to "
+            f"{_cm(self.gear_nearest_m[1])} between gear and target, the gear under its centre",
+            f"mounting  {blind}",
+            *(f"advice    {text}" for text in advice),
+        ]
+        if self.search_range_m is not None:
+            where = f"at the highest search position ({self.search_height_m:g} m)"
+            if self.search_height_m == 0.0:
+                where = "on the ground, from where it has to be seen"
+            lines.append(f"search    target {_cm(self.search_range_m)} away {where}")
+        lines += ["", *(f"warning: {text}" for text in self.warnings)]
+        if not self.warnings:
+            lines.append("no gap from search to stand-off")
+        return "\n".join(lines)
 
 
 def focal_px(camera: CameraModel) -> float:
-    """The mean focal length."""
+    """Return the mean focal length in px."""
     return math.sqrt(float(camera.K[0, 0] * camera.K[1, 1]))
 
 
 def design_ranges(
     target: TargetConfig, camera: CameraModel, optics: Optics, trials: int = TRIALS
 ) -> Ranges:
-    """By trial through the detector (far) and by geometry (near)."""
+    """Return the ranges: by trial through the detector (far) and by geometry (near)."""
     f, view, ahead = focal_px(camera), FieldOfView(camera), (np.eye(3), np.zeros(3))
     picture_px = max(camera.size_px)
     large_px = smallest_side_px(target, "large", optics, picture_px, trials)
@@ -139,7 +197,8 @@ def design_ranges(
 
 
 def is_seen_from_ground(profile: Profile) -> bool:
-    """It has to be where the target is the positioning system."""
+    """Return true where the target is the positioning system, so that it must be seen from the
+    ground."""
     return profile.positioning.by == "target"
 
 
@@ -152,134 +211,30 @@ def make_design(
     ranges: Ranges | None = None,
     trials: int = TRIALS,
 ) -> TargetDesign:
-    """Ranges and what is wrong with them for a flight by that profile under a ceiling of
-    that height over the floor (None: unknown). `trials` are the pictures of a side, where the
+    """Return the ranges, and what is wrong with them for a flight by that profile under a ceiling
+    of that height over the floor (None: unknown). `trials` are the pictures of a side, where the
     ranges are not given."""
     ranges = ranges or design_ranges(target, camera, optics, trials)
     view, sides = FieldOfView(camera), (target.large.side_m, target.small.side_m)
-    nearest = (view.nearest_m(turned_outline(s), *gear_from_camera(profile)) for s in sides)
+    large_m, small_m = (
+        view.nearest_m(turned_outline(s), *gear_from_camera(profile)) for s in sides
+    )
     height = 0.0 if is_seen_from_ground(profile) else profile.planner.search.max_height_m
     search = None
     if ceiling_m is not None:
         search = ceiling_m - height - profile.camera.mount.position_m[2]
-    gear, standoff = GearRanges(*nearest), profile.planner.ascend.standoff_m
-    warnings = _warnings(target, ranges, gear, standoff, height, ceiling_m, search)
     return TargetDesign(
         target=target,
         camera=camera,
         optics=optics,
         ranges=ranges,
-        gear=gear,
+        gear_nearest_m=(large_m, small_m),
         mount=mounted_camera(target, camera, profile),
-        standoff_m=standoff,
         search_range_m=search,
         search_height_m=height,
-        warnings=tuple(warnings),
+        ceiling_m=ceiling_m,
+        standoff_m=profile.planner.ascend.standoff_m,
     )
-
-
-def _warnings(
-    target: TargetConfig,
-    ranges: Ranges,
-    gear: GearRanges,
-    standoff_m: float,
-    height_m: float,
-    ceiling_m: float | None,
-    search_m: float | None,
-) -> list[str]:
-    found: list[str] = []
-    if ranges.z1_m is None or ranges.z2_m is None or ranges.z3_m is None:
-        return ["a marker is never read through this blur and noise: a sharper picture is needed"]
-    if search_m is not None and height_m == 0.0:
-        sure_m = ranges.focal_px * target.large.side_m / least_side_px(ranges.large_px)
-        if search_m > sure_m:
-            found.append(
-                f"gap on the ground: under a ceiling of {ceiling_m:g} m the target is "
-                f"{search_m:.2f} m from the camera, and is surely found up to {sure_m:.2f} m"
-            )
-    elif search_m is not None and search_m > ranges.z1_m:
-        found.append(
-            f"gap at the search height: from {height_m:g} m the target under a ceiling of "
-            f"{ceiling_m:g} m is {search_m:.2f} m away, and is seen from {ranges.z1_m:.2f} m on"
-        )
-    if search_m is not None and search_m < 0.3 and height_m > 0.0:
-        found.append(
-            f"the ceiling ({ceiling_m:g} m) is hardly above the search height ({height_m:g} m): "
-            f"lower planner.search.max_height_m"
-        )
-    if ranges.z2_m <= ranges.z3_m:
-        found.append(
-            f"gap between the markers: the small one is read up to {_cm(ranges.z2_m)}, and "
-            f"the large one is whole at any turn only from {_cm(ranges.z3_m)} on"
-        )
-    elif ranges.z2_m < 1.15 * ranges.z3_m:
-        found.append("the overlap is short: less than 15 % of the range")
-    nearest_m = gear.small_nearest_m
-    if nearest_m is None or nearest_m > standoff_m:
-        at = "" if nearest_m is None else f" (only from {_cm(nearest_m)} on)"
-        found.append(
-            f"gap before contact: with the gear {_cm(standoff_m)} under the target the "
-            f"small marker is not wholly in the picture{at}; mount the camera nearer to the gear"
-        )
-    return found
-
-
-def _text(design: TargetDesign, camera_name: str) -> str:
-    r, optics, target = design.ranges, design.optics, design.target
-    width, height = design.camera.size_px
-    large, small = target.large, target.small
-    both = "none: the two markers are never seen together at every turn"
-    if r.z2_m is not None and r.z3_m is not None and r.z2_m > r.z3_m:
-        both = f"{_cm(r.z3_m)} to {_cm(r.z2_m)}, both markers at any turn"
-    blind, *advice = design.mount.lines()
-    lines = [
-        f"camera    {camera_name}, {width}x{height}, f {r.focal_px:.0f} px",
-        f"optics    blur sigma {optics.blur_px:g} px, noise sigma {optics.noise:g}",
-        f"target    {mm_text(large.side_m)} mm {large.dictionary}/{large.id} around "
-        f"{mm_text(small.side_m)} mm {small.dictionary}/{small.id}",
-        f"z1        {_cm(r.z1_m):<9} large marker from here on inwards (side {_px(r.large_px)})",
-        f"z2        {_cm(r.z2_m):<9} small marker from here on inwards (side {_px(r.small_px)})",
-        f"z3        {_cm(r.z3_m):<9} whole large marker down to here at any turn; "
-        f"{_cm(r.z3_upright_m)} where it is upright",
-        f"z4        {_cm(r.z4_m):<9} whole small marker down to here at any turn",
-        f"overlap   {both}",
-        f"at gear   whole large marker down to {_cm(design.gear.large_nearest_m)}, small down to "
-        f"{_cm(design.gear.small_nearest_m)} between gear and target, the gear under its centre",
-        f"mounting  {blind}",
-        *(f"advice    {text}" for text in advice),
-    ]
-    if design.search_range_m is not None:
-        where = f"at the highest search position ({design.search_height_m:g} m)"
-        if design.search_height_m == 0.0:
-            where = "on the ground, from where it has to be seen"
-        lines.append(f"search    target {_cm(design.search_range_m)} away {where}")
-    lines += ["", *_error_table(design), ""]
-    lines += [f"warning: {text}" for text in design.warnings] or ["no gap from search to stand-off"]
-    return "\n".join(lines)
-
-
-def _error_table(design: TargetDesign) -> list[str]:
-    """Least possible errors at a few ranges, by the markers that are seen there."""
-    lines = [
-        f"least error that the corners allow (sigma {CORNER_SIGMA_PX:g} px):",
-        "   range cm   x, y mm     z mm   turn deg   seen",
-    ]
-    sides_m = {"large": design.target.large.side_m, "small": design.target.small.side_m}
-    for z_cm in _TABLE_CM:
-        z_m = z_cm / 100.0
-        seen = [
-            name
-            for name, (near, far) in design.spans_m.items()
-            if near is not None and far is not None and near <= z_m <= far
-        ]
-        if seen:
-            sides = [sides_m[name] for name in seen]
-            x, _, z, yaw = pose_bound(sides, z_m, design.ranges.focal_px, CORNER_SIGMA_PX)
-            lines.append(
-                f"   {z_cm:8.1f}  {1e3 * x:8.3f}  {1e3 * z:7.3f}  {math.degrees(yaw):9.3f}   "
-                f"{' and '.join(seen)}"
-            )
-    return lines
 
 
 def _cm(length_m: float | None) -> str:
@@ -288,33 +243,6 @@ def _cm(length_m: float | None) -> str:
 
 def _px(side_px: float | None) -> str:
     return "never" if side_px is None else f"{side_px:.0f} px"
-
-
-# --- The least pose error that corners of a given spread allow (Cramer-Rao bound) --------------
-
-
-def pose_bound(
-    sides_m: list[float], z_m: float, focal_px: float, sigma_px: float
-) -> tuple[float, float, float, float]:
-    """The least standard deviations of x, y, z (m, in the camera frame) and of the turn (rad), for
-    centred, concentric markers of these sides, seen straight on from `z_m`, all corners solved
-    together; every corner has `sigma_px` in x and in y.
-
-    The pose has all six degrees of freedom. Perturbed by a turn w and a shift t, a corner
-    X moves by w x X + t.
-    """
-    X = np.concatenate([marker_corners_m(side) for side in sides_m])
-    X = X * (1.0, -1.0, -1.0)  # facing the camera
-    x, y = X[:, 0], X[:, 1]
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    dx = np.stack([zero, zero, -y, one, zero, zero], axis=1)
-    dy = np.stack([zero, zero, x, zero, one, zero], axis=1)
-    dz = np.stack([y, -x, zero, zero, zero, one], axis=1)
-    du = focal_px * (dx / z_m - x[:, None] * dz / z_m**2)
-    dv = focal_px * (dy / z_m - y[:, None] * dz / z_m**2)
-    J: Array = np.concatenate([du, dv])
-    sigma = sigma_px * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
-    return float(sigma[3]), float(sigma[4]), float(sigma[5]), float(sigma[2])
 
 
 # --- Sizes and ids that cover the way from the search height to the contact ----------------------
@@ -342,9 +270,9 @@ def suggest_target(
     ceiling_m: float | None = None,
     page: str = "a4",
 ) -> tuple[TargetDesign, str]:
-    """The design of the largest markers that the page holds and of which the small one takes over
-    from the large one, as every error falls with the size, and the page: a larger one only where
-    the search needs it. What they do not cover is in the design's warnings.
+    """Return the design of the largest markers that the page holds and of which the small one takes
+    over from the large one, as every error falls with the size; and the page, a larger one only
+    where the search needs it. What they do not cover is in the design's warnings.
 
     Raises InvalidValue where the blur leaves nothing to read, for a ceiling too low, or for a
     magnet that is smaller than what the small marker needs.
@@ -368,13 +296,13 @@ def suggest_target(
     )
 
     def target_of(large_m: float) -> TargetConfig:
-        """With the largest small marker."""
+        """Return the target with the largest small marker."""
         small_m = max(min(SMALL_RANGE[1] * large_m, most_m), SMALL_RANGE[0] * large_m, 0.005)
         small_m = math.floor(small_m / _SMALL_STEP_M + 1e-6) * _SMALL_STEP_M
         return _sized(round(large_m, 4), round(small_m, 4))
 
     def takes_over(target: TargetConfig) -> bool:
-        """Whether the small marker is read before the large one leaves the picture."""
+        """Return true if the small marker is read before the large one leaves the picture."""
         near_m = view.nearest_m(turned_outline(target.large.side_m), np.eye(3), np.zeros(3))
         return near_m is None or f * target.small.side_m >= OVERLAP_MARGIN * near_m * small_px
 
@@ -388,8 +316,8 @@ def suggest_target(
 
 
 def _search_range_m(profile: Profile, ceiling_m: float | None) -> float:
-    """Camera to target at the highest search position, or on the ground where it has to be seen
-    from there."""
+    """Return the metres from camera to target at the highest search position, or on the ground
+    where it has to be seen from there."""
     if is_seen_from_ground(profile):
         return (ceiling_m or DEFAULT_CEILING_M) - profile.camera.mount.position_m[2]
     if ceiling_m is None:
@@ -411,7 +339,7 @@ def _sized(large_m: float, small_m: float) -> TargetConfig:
 
 
 def _largest_at_standoff_m(view: FieldOfView, profile: Profile) -> float:
-    """The largest side whose circle is in the picture with the gear at the stand-off."""
+    """Return the largest side, m, whose circle is in the picture with the gear at the stand-off."""
     R, gear = gear_from_camera(profile)
     low, high = 0.0, 1.0
     while high - low > 1e-4:

@@ -66,31 +66,31 @@ class TargetDrawing:
     ring_m: float
 
     def ink_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-        """Exact share of black in the windows of size_px x size_px pixels around the centre,
-        0..1."""
+        """Return the exact share of black in the windows of size_px x size_px pixels around the
+        centre, 0..1."""
         w = overlap(self.edges_m, px_per_m, size_px, window_px)
         # The grid is symmetric about 0, so the same weights serve rows from the top.
         return np.asarray(w @ self.black.astype(np.float64) @ w.T)
 
     def sheet_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-        """Exact share of the sheet in each pixel's window, 0..1, shape (size_px, size_px)."""
+        """Return the share of the sheet in each pixel's window, 0..1, shape (size_px, size_px)."""
         half = self.sheet_side_m / 2.0
         w = overlap(np.array([-half, half]), px_per_m, size_px, window_px)
         return np.asarray(w @ w.T)
 
     def bitmap(self, px_per_m: float) -> NDArray[np.uint8]:
-        """The whole sheet, black 0 on white 255, (n, n), each pixel the exact mean of its area;
-        row 0 is at the top of the print, the centre in the middle of the picture."""
+        """Return the whole sheet, black 0 on white 255, (n, n), each pixel the exact mean of its
+        area; row 0 is at the top of the print, the centre in the middle of the picture."""
         size = max(1, int(np.ceil(self.sheet_side_m * px_per_m - 1e-9)))
         return np.rint(255.0 * (1.0 - self.ink_coverage(px_per_m, size))).astype(np.uint8)
 
     def rectangles(self) -> list[Rectangle]:
-        """The black area as few, large, non-overlapping rectangles (for a PDF)."""
+        """Return the black area as few, large, non-overlapping rectangles (for a PDF)."""
         return merged_rectangles(self.black, self.edges_m, -self.edges_m)
 
 
 def marker_cells(marker: MarkerConfig) -> NDArray[np.bool_]:
-    """Black cells of a marker with its border, shape (n, n), row 0 at the top."""
+    """Return the black cells of a marker with its border, shape (n, n), row 0 at the top."""
     dictionary = aruco_dictionary(marker.dictionary)
     n = int(dictionary.markerSize) + 2 * BORDER_BITS
     picture = cv2.aruco.generateImageMarker(dictionary, marker.id, n, borderBits=BORDER_BITS)
@@ -98,13 +98,13 @@ def marker_cells(marker: MarkerConfig) -> NDArray[np.bool_]:
 
 
 def marker_corners_m(side_m: float) -> Array:
-    """Corners in OpenCV's marker axes, TL TR BR BL, shape (4, 3)."""
+    """Return the corners in OpenCV's marker axes, TL TR BR BL, shape (4, 3)."""
     h = side_m / 2.0
     return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
 
 
 def draw_target(target: TargetConfig) -> TargetDrawing:
-    """The drawing of both markers; sizes are taken from the configuration.
+    """Return the drawing of both markers; sizes are taken from the configuration.
 
     The white ring is one cell of the small marker wide, or as wide as the large
     marker's black cells under it allow. Where the large marker's own centre is
@@ -129,7 +129,7 @@ def _nested(
     small_side_m: float,
     ring_m: float,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Edges and black squares of the small marker in a white hole of the large one."""
+    """Return the edges and black squares of the small marker in a white hole of the large one."""
     hole = small_side_m / 2.0 + ring_m
     large_edges = np.linspace(-large_side_m / 2, large_side_m / 2, len(large) + 1)
     small_edges = np.linspace(-small_side_m / 2, small_side_m / 2, len(small) + 1)
@@ -145,7 +145,7 @@ def _nested(
 def _white_in_black_cells(
     large: NDArray[np.bool_], large_side_m: float, edges_m: Array, black: NDArray[np.bool_]
 ) -> float:
-    """The largest share of white in what is looked at of a black cell, 0..1."""
+    """Return the largest share of white in the sampled part of a black cell, 0..1."""
     n = len(large)
     w = overlap(edges_m, n / large_side_m, n, 1.0 - 2.0 * SAMPLED_MARGIN)
     ink = w @ black.astype(np.float64) @ w.T
@@ -153,13 +153,14 @@ def _white_in_black_cells(
 
 
 def _merged(edges_m: Array) -> Array:
-    """Sorted edges without the doubles that differ by rounding only."""
+    """Return sorted edges without the doubles that differ by rounding only."""
     edges = np.sort(edges_m)
     keep = np.concatenate([[True], np.diff(edges) > 1e-9])
     return np.asarray(edges[keep])
 
 
 def _lookup(cells: NDArray[np.bool_], side_m: float, xs: Array, ys: Array) -> NDArray[np.bool_]:
+    """Return whether points lie in a black cell of a marker in the centre, shape of xs and ys."""
     n = len(cells)
     col = np.floor((xs / side_m + 0.5) * n).astype(int)
     row = np.floor((0.5 - ys / side_m) * n).astype(int)
@@ -168,7 +169,8 @@ def _lookup(cells: NDArray[np.bool_], side_m: float, xs: Array, ys: Array) -> ND
 
 
 def overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-    """Share of each pixel's window that lies in each interval of `edges_m`, (size_px, n).
+    """Return the share of each pixel's window that lies in each interval of `edges_m`, (size_px,
+    n).
 
     Pixel i is centred at ``(i - (size_px - 1) / 2) / px_per_m``; its window is
     `window_px` wide: 1 is the pixel itself.
@@ -180,7 +182,7 @@ def overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: float = 1.
 
 
 def merged_rectangles(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> list[Rectangle]:
-    """Black cells of a grid as few, large, non-overlapping rectangles.
+    """Return the black cells of a grid as few, large, non-overlapping rectangles.
 
     `xs_m` ascends over the columns' edges, `ys_m` descends over the rows'. Few and
     large, because viewers draw hair lines between rectangles that touch.
@@ -213,12 +215,13 @@ def merged_rectangles(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> lis
 # --- Lengths as people write them: with their unit ---------------------------------------------
 
 
+MAX_SCALE_ERROR = 0.1
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _LENGTH = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*([a-zA-Z]*)\s*")
 
 
 def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float:
-    """``150mm``, ``15cm`` or ``0.15m`` in metres.
+    """Return the metres of ``150mm``, ``15cm`` or ``0.15m``.
 
     `what` names the value in the error; a number without a unit is taken in `bare_unit`,
     and refused where that is None. Raises InvalidValue.
@@ -240,6 +243,21 @@ def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float
     return float(f"{value:.12g}")
 
 
+def measured_scale(what: str, measured_m: float, meant_m: float, source: str) -> float:
+    """Return a print's measured length over the length that it was meant to have by `source`.
+
+    Raises InvalidValue, which begins with `what`, for a scale that no printer makes: the length
+    was not measured in the unit that was meant.
+    """
+    off = measured_m / meant_m - 1.0
+    if abs(off) > MAX_SCALE_ERROR:
+        raise InvalidValue(
+            f"{what}: {mm_text(measured_m)} mm is {100 * off:+.0f} % off the {mm_text(meant_m)} mm "
+            f"of {source}: measure what is black, in mm"
+        )
+    return measured_m / meant_m
+
+
 def mm_text(length_m: float) -> str:
-    """``150`` or ``149.6``: a length in millimetres, without a unit, to 1 um."""
+    """Return ``150`` or ``149.6``: a length in millimetres, without a unit, to 1 um."""
     return f"{round(length_m * 1e3, 3):g}"

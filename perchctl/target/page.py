@@ -1,4 +1,4 @@
-"""A printed page as shapes in millimetres, cut into sheets of paper, and written as a PDF.
+"""A printed page as shapes in millimetres, and its PDF.
 
 Page axes: origin at the top left corner of the paper, x right, y down, mm.
 """
@@ -6,7 +6,6 @@ Page axes: origin at the top left corner of the paper, x right, y down, mm.
 from __future__ import annotations
 
 import datetime
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,9 +30,6 @@ PAGES_MM: dict[str, tuple[float, float]] = {
 MAX_PAGE_MM = 5000.0
 UNPRINTABLE = 5.0
 """mm at the paper's edges that many printers leave white."""
-OVERLAP = 10.0
-"""mm that two neighbouring sheets of one page share: what is cut off, and glued on."""
-_CUT_MARK = 4.0
 _PT_PER_MM = 72.0 / 25.4
 _EPOCH = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
 """The date in the file where the profile names none: never the clock's."""
@@ -50,7 +46,7 @@ class Filled:
 
 @dataclass(frozen=True)
 class Line:
-    """`dash` is the length of dashes and gaps; 0 is solid."""
+    """A straight line. `dash` is the length of dashes and gaps; 0 is solid."""
 
     x0: float
     y0: float
@@ -72,14 +68,15 @@ class Circle:
 
 @dataclass(frozen=True)
 class Polygon:
-    """Filled black."""
+    """A polygon, filled black."""
 
     points: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
 class Text:
-    """`y` is the base line, `size` the font's size in mm; `upwards` reads from below."""
+    """A line of text. `y` is the base line, `size` the font's size in mm; `upwards` reads from
+    below."""
 
     x: float
     y: float
@@ -94,17 +91,15 @@ Item = Filled | Line | Circle | Polygon | Text
 
 @dataclass(frozen=True)
 class Page:
-    """Width and height of the paper, mm, and what is printed on it, with the items' origin at
-    `origin` on the paper."""
+    """Width and height of the paper, mm, and what is printed on it."""
 
     width: float
     height: float
     items: tuple[Item, ...]
-    origin: tuple[float, float] = (0.0, 0.0)
 
 
 def parse_page(text: str) -> tuple[float, float]:
-    """``a4``, ``letter``, ``a3`` or ``220x240mm`` as width and height in mm.
+    """Return width and height in mm of ``a4``, ``letter``, ``a3`` or ``220x240mm``.
 
     Raises InvalidValue.
     """
@@ -127,7 +122,7 @@ def parse_page(text: str) -> tuple[float, float]:
 
 
 def page_name(width: float, height: float) -> str:
-    """``A4`` or ``220 x 240 mm``."""
+    """Return a page's name, ``A4`` or ``220 x 240 mm``."""
     for name, size in PAGES_MM.items():
         if size in ((width, height), (height, width)):
             return name.capitalize()
@@ -135,7 +130,7 @@ def page_name(width: float, height: float) -> str:
 
 
 def filled(rectangles: Sequence[Rectangle], x: float, y: float) -> Filled:
-    """Rectangles of a drawing (metres, y up) with its origin at x, y of the page."""
+    """Return rectangles of a drawing (metres, y up) with its origin at x, y of the page."""
     return Filled(
         tuple(
             (
@@ -155,12 +150,12 @@ def _widths() -> dict[str, int]:
 
 
 def text_width(text: str, size: float) -> float:
-    """Width of a line of Helvetica, mm."""
+    """Return the width of a line of Helvetica, mm."""
     return sum(_widths().get(character, 600) for character in text) * size / 1000.0
 
 
 def wrapped(texts: Sequence[str], size: float, width: float) -> list[str]:
-    """Every text in as many lines as `width` mm needs; words are never cut."""
+    """Return every text in as many lines as `width` mm needs; words are never cut."""
     lines: list[str] = []
     for text in texts:
         line = ""
@@ -175,57 +170,12 @@ def wrapped(texts: Sequence[str], size: float, width: float) -> list[str]:
     return lines
 
 
-# --- A page that is larger than the printer's paper, on sheets that overlap ---------------------
-
-
-def tile_page(page: Page, paper: tuple[float, float]) -> list[Page]:
-    """The page on sheets (width, height, mm), upright or across, whichever are fewer; row by row
-    from the top left one. A page that fits is one sheet of its own size.
-
-    Each sheet shows `OVERLAP` of its neighbour's; lines at the page's edges, in the middle of
-    the overlap, say where to cut.
-    """
-    if any(page.width <= w and page.height <= h for w, h in (paper, paper[::-1])):
-        return [page]
-    width, height = min((paper, paper[::-1]), key=lambda size: math.prod(_counts(page, size)))
-    columns, rows = _counts(page, (width, height))
-    dx, dy = (side - 2.0 * UNPRINTABLE - OVERLAP for side in (width, height))
-    cuts_x = [i * dx + OVERLAP / 2 for i in range(1, columns)]
-    cuts_y = [j * dy + OVERLAP / 2 for j in range(1, rows)]
-    marks = [
-        *(Line(x, a, x, a + _CUT_MARK) for x in cuts_x for a in (0.0, page.height - _CUT_MARK)),
-        *(Line(a, y, a + _CUT_MARK, y) for y in cuts_y for a in (0.0, page.width - _CUT_MARK)),
-    ]
-    return [
-        Page(width, height, (*page.items, *marks), (UNPRINTABLE - i * dx, UNPRINTABLE - j * dy))
-        for j in range(rows)
-        for i in range(columns)
-    ]
-
-
-def _counts(page: Page, paper: tuple[float, float]) -> tuple[int, int]:
-    """Columns and rows of sheets."""
-    columns, rows = (
-        max(1, math.ceil((whole - OVERLAP) / (side - 2.0 * UNPRINTABLE - OVERLAP) - 1e-9))
-        for whole, side in zip((page.width, page.height), paper, strict=True)
-    )
-    return columns, rows
-
-
 # --- The PDF ------------------------------------------------------------------------------------
 
 
-def pdf_bytes(
-    pages: Sequence[Page], title: str, date: datetime.date | None = None, tile: str | None = None
-) -> bytes:
-    """A PDF of all pages, true to size, the same bytes for the same pages; print scaling is
-    switched off in the viewer's preferences. `tile` names the paper that the pages are cut to.
-
-    Raises InvalidValue for a `tile` that is no page.
-    """
-    if tile is not None:
-        paper = parse_page(tile)
-        pages = [sheet for page in pages for sheet in tile_page(page, paper)]
+def pdf_bytes(pages: Sequence[Page], title: str, date: datetime.date | None = None) -> bytes:
+    """Return a PDF of all pages, true to size, the same bytes for the same pages; print scaling is
+    switched off in the viewer's preferences."""
     first = pages[0]
     pdf = FPDF(unit="mm", format=(first.width, first.height))
     pdf.set_auto_page_break(False)
@@ -243,12 +193,11 @@ def pdf_bytes(
     for page in pages:
         pdf.add_page(orientation="portrait", format=(page.width, page.height))
         for item in page.items:
-            _draw(pdf, item, *page.origin)
+            _draw(pdf, item)
     return bytes(pdf.output())
 
 
-def _draw(pdf: FPDF, item: Item, dx: float, dy: float) -> None:
-    """The item, moved by dx and dy."""
+def _draw(pdf: FPDF, item: Item) -> None:
     match item:
         case Filled() | Polygon():
             with pdf.new_path(paint_rule=PathPaintRule.FILL_NONZERO) as path:
@@ -256,26 +205,26 @@ def _draw(pdf: FPDF, item: Item, dx: float, dy: float) -> None:
                 path.style.stroke_color = None
                 if isinstance(item, Filled):
                     for x, y, w, h in item.boxes:
-                        path.rectangle(x + dx, y + dy, w, h)
+                        path.rectangle(x, y, w, h)
                 else:
                     (x, y), *others = item.points
-                    path.move_to(x + dx, y + dy)
+                    path.move_to(x, y)
                     for x, y in others:
-                        path.line_to(x + dx, y + dy)
+                        path.line_to(x, y)
                     path.close()
         case Line(x0, y0, x1, y1, width, dash):
             pdf.set_line_width(width)
             pdf.set_dash_pattern(dash=dash, gap=dash)
-            pdf.line(x0 + dx, y0 + dy, x1 + dx, y1 + dy)
+            pdf.line(x0, y0, x1, y1)
         case Circle(x, y, radius, width):
             pdf.set_line_width(width)
             pdf.set_dash_pattern()
-            pdf.circle(x + dx, y + dy, radius)
+            pdf.circle(x, y, radius)
         case Text(x, y, text, size, anchor, upwards):
             pdf.set_font("helvetica", size=size * _PT_PER_MM)
             back = {"start": 0.0, "middle": 0.5, "end": 1.0}[anchor] * text_width(text, size)
             if upwards:
-                with pdf.rotation(90.0, x + dx, y + dy):
-                    pdf.text(x + dx - back, y + dy, text)
+                with pdf.rotation(90.0, x, y):
+                    pdf.text(x - back, y, text)
             else:
-                pdf.text(x + dx - back, y + dy, text)
+                pdf.text(x - back, y, text)

@@ -1,4 +1,4 @@
-"""What a plain detector reads of a target: of its drawing, before ink is spent, and of small
+"""The reading of a target by a plain detector: of its drawing, before ink is spent, and of small
 pictures through blur and noise.
 
 The smallest side that is read is found by trial: a formula would hold for one id and one
@@ -28,11 +28,14 @@ class PlainReader:
     its id (the other ids of a nested dictionary are not searched)."""
 
     def __init__(self, target: TargetConfig) -> None:
-        dictionaries = [_own(target.large), _own(target.small)]
+        dictionaries = [
+            _single_marker_dictionary(target.large),
+            _single_marker_dictionary(target.small),
+        ]
         self._detector: Any = cv2.aruco.ArucoDetector(dictionaries, cv2.aruco.DetectorParameters())
 
     def read(self, image: NDArray[np.uint8]) -> dict[MarkerName, NDArray[np.float32]]:
-        """Corners (4, 2) px of the markers in a grey picture (TL TR BR BL)."""
+        """Return the corners (4, 2) px of the markers in a grey picture (TL TR BR BL)."""
         corners, ids, _, which = self._detector.detectMarkersMultiDict(image)
         if ids is None or len(corners) == 0:
             return {}
@@ -42,7 +45,7 @@ class PlainReader:
         }
 
 
-def _own(marker: MarkerConfig) -> Any:
+def _single_marker_dictionary(marker: MarkerConfig) -> Any:
     source = aruco_dictionary(marker.dictionary)
     return cv2.aruco.Dictionary(
         np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1]), source.markerSize, 0
@@ -80,7 +83,7 @@ def smallest_side_px(
     picture_px: int,
     trials: int = TRIALS,
 ) -> float | None:
-    """Side in px from which on the marker, seen straight on at any turn, is found in
+    """Return the side in px from which on the marker, seen straight on at any turn, is found in
     `FOUND_RATE` of the pictures; None where even `SIDE_RANGE_PX[1]` is not.
 
     `picture_px` is the larger side of the camera's picture; `trials` are the pictures of a side.
@@ -90,7 +93,7 @@ def smallest_side_px(
 
     @cache
     def rate(i: int) -> float:
-        return _rate(
+        return _found_share(
             drawing, reader, marker, SIDE_RANGE_PX[0] * STEP**i, optics, picture_px, trials
         )
 
@@ -111,7 +114,7 @@ def smallest_side_px(
     return float(SIDE_RANGE_PX[0] * STEP**high)
 
 
-def _rate(
+def _found_share(
     drawing: TargetDrawing,
     reader: PlainReader,
     marker: MarkerName,
@@ -134,7 +137,7 @@ def _rate(
 def sample_pictures(
     drawing: TargetDrawing, px_per_m: float, side_px: float, optics: Optics, count: int
 ) -> list[NDArray[np.uint8]]:
-    """`count` pictures around the target's centre, 3 times `side_px` wide, at any turn and
+    """Return `count` pictures around the target's centre, 3 times `side_px` wide, at any turn and
     any place between the pixels."""
     fine = 2 if optics.blur_px >= 1.0 else 4
     size = max(_MIN_PICTURE_PX, math.ceil(3.0 * side_px))
@@ -175,7 +178,7 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
                 f"{name} marker: id {marker.id} of {marker.dictionary} looks the same when turned, "
                 f"so that its heading is ambiguous: take another id"
             )
-    if _distance(target.large, target.small) < MIN_DISTANCE:
+    if _pattern_distance(target.large, target.small) < MIN_DISTANCE:
         large, small = target.large, target.small
         raise InvalidValue(
             f"id {large.id} of {large.dictionary} and id {small.id} of {small.dictionary} are "
@@ -206,7 +209,7 @@ def _turns_onto_itself(marker: MarkerConfig) -> bool:
 
 
 def _check_reading(target: TargetConfig) -> None:
-    """Reads the drawing: both markers must be found, and each whole dictionary must find
+    """Read the drawing: both markers must be found, and each whole dictionary must find
     nothing else in it."""
     large, small = target.large, target.small
     image = draw_target(target).bitmap(_READ_SIDE_PX / large.side_m)
@@ -238,9 +241,9 @@ def _ids_read(image: NDArray[np.uint8], dictionary: Any) -> set[int]:
     return set() if ids is None else {int(i) for i in np.asarray(ids).ravel()}
 
 
-def _distance(a: MarkerConfig, b: MarkerConfig) -> int:
-    """Fewest cells in which one, in any turn, differs from the other; patterns of another
-    size differ in all."""
+def _pattern_distance(a: MarkerConfig, b: MarkerConfig) -> int:
+    """Return the fewest cells in which one, in any turn, differs from the other; patterns of
+    another size differ in all."""
     first, second = marker_cells(a), marker_cells(b)
     if first.shape != second.shape:
         return first.size

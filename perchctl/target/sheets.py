@@ -50,7 +50,7 @@ _ARROW = 10.0
 
 
 @dataclass(frozen=True)
-class Place:
+class SheetLayout:
     """The sheet that is cut out of the page: its side, and the white in it, mm."""
 
     width: float
@@ -66,26 +66,24 @@ def target_pdf(
     magnet_m: float,
     origin: str = "",
     date: datetime.date | None = None,
-    tile: str | None = None,
 ) -> bytes:
-    """The target's sheet, front and back, as a PDF.
+    """Return the target's sheet, front and back, as a PDF.
 
     Args:
         page: ``a4``, ``letter``, ``a3`` or a size such as ``220x240mm``.
         origin: where the sizes come from, for the caption.
-        tile: the paper that the page is cut to, as `page`.
 
     Raises InvalidValue where the page is too small, with the page that fits.
     """
     pages = target_pages(target, parse_page(page), magnet_m, origin, date)
-    return pdf_bytes(pages, f"perchctl target, {mm_text(target.large.side_m)} mm", date, tile)
+    return pdf_bytes(pages, f"perchctl target, {mm_text(target.large.side_m)} mm", date)
 
 
-def board_pdf(board: Board, page: str, tile: str | None = None) -> bytes:
-    """The board as a PDF; `page` and `tile` as in `target_pdf`. Raises InvalidValue where it does
-    not fit."""
+def board_pdf(board: Board, page: str) -> bytes:
+    """Return the board as a PDF; `page` as in `target_pdf`. Raises InvalidValue where it does not
+    fit."""
     sheet = board_page(board, parse_page(page))
-    return pdf_bytes([sheet], f"perchctl {board.notation()}", tile=tile)
+    return pdf_bytes([sheet], f"perchctl {board.notation()}")
 
 
 def target_pages(
@@ -95,10 +93,10 @@ def target_pages(
     origin: str = "",
     date: datetime.date | None = None,
 ) -> tuple[Page, Page]:
-    """Front and back, with the largest quiet zone, up to one cell, that leaves room for rulers
-    and caption. Raises InvalidValue where the page is too small."""
+    """Return front and back, with the largest quiet zone, up to one cell, that leaves room for
+    rulers and caption. Raises InvalidValue where the page is too small."""
     texts = _caption(target, origin, date)
-    place = _fitted(target, page, texts)
+    place = _layout_on(target, page, texts)
     if place is None:
         raise InvalidValue(
             f"a target of {1e3 * target.large.side_m:g} mm with its white and its rulers does not "
@@ -108,7 +106,7 @@ def target_pages(
 
 
 def board_page(board: Board, page: tuple[float, float]) -> Page:
-    """A board in the middle of the page, upright or across as it fits; the caption above,
+    """Return a board in the middle of the page, upright or across as it fits; the caption above,
     rulers left and below. Raises InvalidValue where it does not fit."""
     width, height = (1e3 * side for side in board.size_m)
     side = UNPRINTABLE + _RULER_DEPTH
@@ -138,18 +136,20 @@ def board_page(board: Board, page: tuple[float, float]) -> Page:
 
 
 def fits(target: TargetConfig, page: tuple[float, float]) -> bool:
-    """Whether the page, in mm, holds the target with its white and its rulers."""
-    return _fitted(target, page, _caption(target, "sizes from the command line", None)) is not None
+    """Return true if the page, in mm, holds the target with its white and its rulers."""
+    return (
+        _layout_on(target, page, _caption(target, "sizes from the command line", None)) is not None
+    )
 
 
 def fitting_page(target: TargetConfig) -> str:
-    """The page, for --page, that holds the target: a named one, or a size."""
+    """Return the page, for --page, that holds the target: a named one, or a size."""
     return _fitting_page(target, _caption(target, "sizes from the command line", None))
 
 
-def _fitted(
+def _layout_on(
     target: TargetConfig, page: tuple[float, float], texts: tuple[str, ...]
-) -> Place | None:
+) -> SheetLayout | None:
     side, cell = _side_and_cell(target)
     width, height = page
     lines, below = _caption_room(texts, width)
@@ -158,7 +158,7 @@ def _fitted(
     quiet = math.floor(2.0 * min(cell, half - side / 2) + 1e-6) / 2.0
     if quiet < MIN_QUIET_CELLS * cell - 1e-9 or half < _ruler_half(side / 2 + quiet) - 1e-9:
         return None
-    return Place(width, height, side + 2.0 * quiet, quiet, tuple(lines))
+    return SheetLayout(width, height, side + 2.0 * quiet, quiet, tuple(lines))
 
 
 def _side_and_cell(target: TargetConfig) -> tuple[float, float]:
@@ -167,7 +167,7 @@ def _side_and_cell(target: TargetConfig) -> tuple[float, float]:
 
 
 def _ruler_half(half: float) -> float:
-    """Distance of the rulers from the centre: at the sheet, or where the sheet is small
+    """Return the distance of the rulers from the centre: at the sheet, or where the sheet is small
     outside of its cut marks and of each other."""
     if half >= _RULER_REACH:
         return half
@@ -175,14 +175,14 @@ def _ruler_half(half: float) -> float:
 
 
 def _caption_room(texts: tuple[str, ...], width: float) -> tuple[list[str], float]:
-    """The caption's lines, and the room for rulers and caption below the sheet, mm."""
+    """Return the caption's lines, and the room for rulers and caption below the sheet, mm."""
     lines = wrapped(texts, _TEXT, width - 2 * (UNPRINTABLE + _RULER_DEPTH))
     return lines, _RULER_DEPTH + 2.0 + _LINE * len(lines)
 
 
 def _fitting_page(target: TargetConfig, texts: tuple[str, ...]) -> str:
     for name, size in PAGES_MM.items():
-        if _fitted(target, size, texts):
+        if _layout_on(target, size, texts):
             return name
     side, cell = _side_and_cell(target)
     half = _ruler_half(side / 2 + math.ceil(2.0 * MIN_QUIET_CELLS * cell) / 2.0) + UNPRINTABLE
@@ -213,7 +213,7 @@ def _caption(target: TargetConfig, origin: str, date: datetime.date | None) -> t
     )
 
 
-def _front(target: TargetConfig, place: Place) -> Page:
+def _front(target: TargetConfig, place: SheetLayout) -> Page:
     cx, cy, half = place.width / 2, place.height / 2, place.sheet / 2
     items: list[Item] = [filled(draw_target(target).rectangles(), cx, cy)]
     items += _cut_marks(cx, cy, half)
@@ -228,8 +228,9 @@ def _front(target: TargetConfig, place: Place) -> Page:
     return Page(place.width, place.height, tuple(items))
 
 
-def _back(target: TargetConfig, place: Place, magnet_m: float) -> Page:
-    """As seen from the back, the sheet turned about its upright axis: all of it is symmetric."""
+def _back(target: TargetConfig, place: SheetLayout, magnet_m: float) -> Page:
+    """Return the page as seen from the back, the sheet turned about its upright axis: all of it is
+    symmetric."""
     cx, cy, half = place.width / 2, place.height / 2, place.sheet / 2
     radius = 500.0 * magnet_m
     items: list[Item] = [*_cut_marks(cx, cy, half), *_up_arrow(cx, cy - half - 2.0)]
@@ -254,7 +255,7 @@ def _back(target: TargetConfig, place: Place, magnet_m: float) -> Page:
 
 
 def _rulers(cx: float, cy: float, half_x: float, half_y: float) -> list[Item]:
-    """100 mm each: below, from left to right, and at the left, from below upwards."""
+    """Return two rulers of 100 mm: below, from left to right, and at the left, upwards."""
     y, x = cy + half_y + _GAP, cx - half_x - _GAP
     start = RULER / 2
     items: list[Item] = [
@@ -287,7 +288,7 @@ def _cut_marks(cx: float, cy: float, half: float) -> list[Item]:
 
 
 def _corner_ticks(cx: float, cy: float, half: float, side_half: float) -> list[Item]:
-    """Short ticks in line with the large marker's sides (and its centre, at the right),
+    """Return short ticks in line with the large marker's sides (and its centre, at the right),
     where no ruler is."""
     near, far = half + _MARK_GAP, half + _MARK_GAP + _CORNER_TICK
     items: list[Item] = [Line(cx + near, cy, cx + far, cy, 0.2)]

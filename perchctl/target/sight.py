@@ -1,4 +1,4 @@
-"""What of the ceiling a camera has in its picture: from the ground, and as the gear comes near.
+"""The part of the ceiling in a camera's picture: from the ground, and as the gear comes near.
 
 The vehicle stands or flies level. Directions are the vehicle's: forward and left.
 """
@@ -44,7 +44,7 @@ class FieldOfView:
         self._angle, self._reach = angle[order], np.hypot(*rays.T)[order]
 
     def holds(self, points_cam_m: Array) -> bool:
-        """Whether all points (n, 3) of the camera frame are in the picture."""
+        """Return true if all points (n, 3) of the camera frame are in the picture."""
         x, y, z = points_cam_m.T
         if (z <= 0.0).any():
             return False
@@ -52,7 +52,7 @@ class FieldOfView:
         return bool((np.hypot(x, y) <= reach * z).all())
 
     def nearest_m(self, outline_m: Array, R: Array, offset_m: Array) -> float | None:
-        """The shortest distance d at which ``R (x, y, d) + offset`` is in the picture for
+        """Return the shortest distance d at which ``R (x, y, d) + offset`` is in the picture for
         all points (x, y) of `outline_m` (n, 2) and from there on; None if for no distance."""
 
         def seen(d: float) -> bool:
@@ -70,20 +70,20 @@ class FieldOfView:
 
 
 def square_outline(side_m: float) -> Array:
-    """Points along an upright square, (n, 2)."""
+    """Return points along an upright square, (n, 2)."""
     s = np.linspace(-0.5, 0.5, 21) * side_m
     h = np.full_like(s, side_m / 2.0)
     return np.concatenate([np.column_stack(pair) for pair in ((s, h), (s, -h), (h, s), (-h, s))])
 
 
 def turned_outline(side_m: float) -> Array:
-    """The circle through the corners: the square at any turn, (n, 2)."""
+    """Return points of the circle through a square's corners: the square at any turn, (n, 2)."""
     a = np.linspace(0.0, 2.0 * math.pi, 180, endpoint=False)
     return np.asarray(side_m / math.sqrt(2.0) * np.column_stack([np.cos(a), np.sin(a)]))
 
 
 def raised(outline_m: Array, height_m: float) -> Array:
-    """The outline's points at that height, (n, 3)."""
+    """Return the outline's points at that height, (n, 3)."""
     return np.column_stack([outline_m, np.full(len(outline_m), height_m)])
 
 
@@ -96,14 +96,14 @@ SURE_PX = 18.0
 BLURRED = 1.15
 """Times the least side that a plain search reads through a measured blur."""
 STRAIGHT_DEG = 2.0
-"""No eye sees such a lean."""
+"""A lean below this is too small to be named."""
 LEAST_UP = 0.2
 """Of the view's upward part: a camera that looks farther aside sees no target over it."""
 
 
 @dataclass(frozen=True)
 class Reach:
-    """What is seen of one height above the camera: the large marker at any turn whose centre is
+    """The area at one height above the camera in which a large marker at any turn is seen: centres
     within `radius_m` of where the camera's axis goes, `axis_xy_m` from the camera."""
 
     height_m: float
@@ -122,7 +122,7 @@ class Overhead:
 
     @property
     def words(self) -> str:
-        """Where the target has to be, for people."""
+        """Where the target has to be, in words."""
         lean = _directions(self.lean_deg, STRAIGHT_DEG, ".0f", "deg")
         axis = f"leans {lean}" if lean else "points straight up"
         if not self.reaches:
@@ -137,15 +137,15 @@ class Overhead:
 
 
 def least_side_px(plain_px: float | None = None) -> float:
-    """The side from which on the ground's search finds the large marker surely. `plain_px`: what a
-    plain one reads through the camera's own blur, where that was measured."""
+    """Return the side in px from which on the ground's search finds the large marker surely.
+    `plain_px`: what a plain one reads through the camera's own blur, where that was measured."""
     return SURE_PX if plain_px is None else max(SURE_PX, BLURRED * plain_px)
 
 
 def overhead_view(
     target: TargetConfig, camera: CameraModel, mount: Mounting, plain_px: float | None = None
 ) -> Overhead:
-    """From where on the ground the large marker is surely found; `plain_px` as in
+    """Return from where on the ground the large marker is surely found; `plain_px` as in
     `least_side_px`."""
     side_m, view = target.large.side_m, mount.T_body_cam[:3, 2]
     highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / least_side_px(plain_px)
@@ -156,8 +156,8 @@ def overhead_view(
 
 
 def reach_at(side_m: float, camera: CameraModel, mount: Mounting, height_m: float) -> Reach | None:
-    """None where not even a marker on the camera's axis is wholly in the picture, or the camera
-    does not look up."""
+    """Return the area in which the camera sees a marker of that side at that height; None where
+    not even one on the camera's axis is wholly in the picture, or the camera does not look up."""
     R = mount.T_body_cam[:3, :3]
     view, field = R[:, 2], FieldOfView(camera)
     if view[2] < LEAST_UP:
@@ -179,7 +179,7 @@ def reach_at(side_m: float, camera: CameraModel, mount: Mounting, height_m: floa
 
 @dataclass(frozen=True)
 class TargetFromBody:
-    """A target as a level body at some place has it.
+    """A target as a level vehicle at some place sees it.
 
     Attributes:
         whole: whether one of its markers is wholly in the picture.
@@ -201,7 +201,8 @@ def sight_from(
     camera: CameraModel,
     mount: Mounting,
 ) -> TargetFromBody:
-    """Positions (3,) and headings in one world, z up; the body level, the target too."""
+    """Return how a level vehicle sees a level target. Positions (3,) and headings are in one world,
+    z up."""
     T, field = mount.T_body_cam, FieldOfView(camera)
     R, camera_m = T[:3, :3], T[:3, 3]
     centre = rot_z(body_yaw_rad).T @ (target_m - body_m) - camera_m
@@ -222,19 +223,20 @@ def sight_from(
 
 
 def edge_margin(points_px: Array, size_px: tuple[int, int]) -> float:
-    """The least way of points (n, 2) px to the picture's edge, a share of its larger side."""
+    """Return the least way of points (n, 2) px to the picture's edge, a share of its larger
+    side."""
     size = np.array(size_px, dtype=np.float64)
     least_px = np.minimum(points_px + 0.5, size - 0.5 - points_px).min()
     return float(least_px) / max(size_px)
 
 
 def offset_text(aside_m: tuple[float, float]) -> str:
-    """``0.31 m forward and 0.12 m to the right``."""
+    """Return an offset in words: ``0.31 m forward and 0.12 m to the right``."""
     return _directions(aside_m, 0.01, ".2f", "m") or "less than 1 cm"
 
 
 def _directions(values: tuple[float, float], least: float, figures: str, unit: str) -> str:
-    """Forward and left in words, without what is less than `least`."""
+    """Return values forward and left in words, without what is less than `least`."""
     names = (("forward", "back"), ("to the left", "to the right"))
     return " and ".join(
         f"{abs(value):{figures}} {unit} {ahead if value > 0.0 else behind}"
@@ -251,14 +253,14 @@ def _directions(values: tuple[float, float], least: float, figures: str, unit: s
 
 
 FROM_M = 0.10
-"""The last stretch that is looked at, from gear to target."""
+"""The last stretch that is judged, from gear to target."""
 _STEP_M, _FINE_M = 0.005, 0.0005
 _WORTH_M = 0.002  # less is no reason to turn a camera
 _OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its axes
 
 
 @dataclass(frozen=True)
-class Blind:
+class BlindRange:
     """Ranges from the gear's tip to the target from which on nothing is measured any more, m: by
     whole markers, and by what is left of their drawing. 0: down to contact; None: all of the
     last 10 cm."""
@@ -267,7 +269,7 @@ class Blind:
     left_m: float | None
 
     def words(self) -> str:
-        """Both ranges, for people."""
+        """Return both ranges in words."""
         left, whole = (_blind_words(range_m) for range_m in (self.left_m, self.whole_m))
         return f"{left} (by whole markers alone: {whole})"
 
@@ -279,16 +281,16 @@ def _blind_words(nearest_m: float | None) -> str:
 
 
 @dataclass(frozen=True)
-class Mounted:
+class MountingView:
     """A mounting's blind range, and, where the camera should rather be turned by 90 degrees about
     its view, its mounting's `rpy_deg` and blind range then."""
 
-    blind: Blind
-    turned: Blind | None = None
+    blind: BlindRange
+    turned: BlindRange | None = None
     turned_rpy_deg: tuple[float, float, float] | None = None
 
     def lines(self) -> list[str]:
-        """For people, a line or two."""
+        """Return the mounting's blind range and the advice in words, a line each."""
         lines = [f"{self.blind.words()}, the gear under the target's centre"]
         if self.turned is not None and self.turned_rpy_deg is not None:
             turn = ", ".join(f"{a:g}" for a in self.turned_rpy_deg)
@@ -299,7 +301,7 @@ class Mounted:
         return lines
 
     def record(self) -> dict[str, object]:
-        """For machines; m."""
+        """Return the same for machines; metres."""
         return {
             "whole_m": self.blind.whole_m,
             "left_m": self.blind.left_m,
@@ -308,13 +310,14 @@ class Mounted:
         }
 
 
-def mounted_camera(target: TargetConfig, camera: CameraModel, profile: Profile) -> Mounted:
-    """From where on the profile's `camera.mount` and `vehicle.gear_body_m` see too little."""
+def mounted_camera(target: TargetConfig, camera: CameraModel, profile: Profile) -> MountingView:
+    """Return from where on the profile's `camera.mount` and `vehicle.gear_body_m` see too
+    little."""
     T_body_cam = profile.camera.mount.T_body_cam
     gear_m = np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3]
-    here = _blind(target, camera, T_body_cam[:3, :3], gear_m)
+    here = _blind_range(target, camera, T_body_cam[:3, :3], gear_m)
     R_turned = T_body_cam[:3, :3] @ rot_z(math.pi / 2.0)
-    turned = _blind(target, camera, R_turned, gear_m)
+    turned = _blind_range(target, camera, R_turned, gear_m)
     gain_m, whole_gain_m = (
         (FROM_M if old is None else old) - (FROM_M if new is None else new)
         for old, new in ((here.left_m, turned.left_m), (here.whole_m, turned.whole_m))
@@ -322,26 +325,29 @@ def mounted_camera(target: TargetConfig, camera: CameraModel, profile: Profile) 
     # A whole marker is the surer sight.
     if gain_m >= _WORTH_M or (gain_m >= 0.0 and whole_gain_m >= _WORTH_M):
         roll, pitch, yaw = (round(math.degrees(a), 1) + 0.0 for a in rpy_from_rotation(R_turned))
-        return Mounted(here, turned, (roll, pitch, yaw))
-    return Mounted(here)
+        return MountingView(here, turned, (roll, pitch, yaw))
+    return MountingView(here)
 
 
 def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> bool:
-    """Whether the whole small marker is in the picture with the gear's tip so far under it."""
+    """Return true if the whole small marker is in the picture with the gear's tip so far under
+    it."""
     R, gear = gear_from_camera(profile)
     outline = raised(square_outline(profile.target.small.side_m), range_m)
     return FieldOfView(camera).holds(outline @ R.T + gear)
 
 
 def gear_from_camera(profile: Profile) -> tuple[Array, Array]:
-    """The rotation from body to camera axes, and the gear's tip in the camera's, m."""
+    """Return the rotation from body to camera axes, and the gear's tip in the camera's, m."""
     T_body_cam = profile.camera.mount.T_body_cam
     R = T_body_cam[:3, :3].T
     return R, R @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])
 
 
-def _blind(target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m: Array) -> Blind:
-    """`gear_m` is the gear from the camera, body axes."""
+def _blind_range(
+    target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m: Array
+) -> BlindRange:
+    """Return the blind range of a camera turned so; `gear_m` is the gear from it, body axes."""
     R, offset = R_body_cam.T, R_body_cam.T @ gear_m
     view, patterns = FieldOfView(camera), make_aruco_detector(DetectorConfig(), target).patterns
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
@@ -355,11 +361,11 @@ def _blind(target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m:
         pose = RigidPose(R @ R_MARKER_TARGET @ _OWN_AXES, centre / half_m)
         return whole(range_m) or shows_enough_of_target(pose, patterns, camera)
 
-    return Blind(_lost_at_m(whole), _lost_at_m(left))
+    return BlindRange(_lost_at_m(whole), _lost_at_m(left))
 
 
 def _lost_at_m(seen: Callable[[float], bool]) -> float | None:
-    """The range down to which the target is seen from `FROM_M` on."""
+    """Return the range down to which the target is seen from `FROM_M` on; None if not there."""
     low = FROM_M
     for step_m in (_STEP_M, _FINE_M):
         for k in range(round(FROM_M / step_m) + 1):

@@ -1,9 +1,9 @@
 from .collect import Experiment as Experiment
+from .collect import MocapTruth as MocapTruth
 from .collect import SessionFile as SessionFile
+from .collect import TypedTruth as TypedTruth
 from .result import fit_weights as fit_weights
 from .result import report_text as report_text
 from .result import weights_record as weights_record
 from .result import write_weights as write_weights
 from .simulated import SimulatedStand as SimulatedStand
-from .truth import MocapTruth as MocapTruth
-from .truth import TypedTruth as TypedTruth

@@ -37,7 +37,7 @@ MOST_APART = np.array([0.3, 0.3, 0.3, np.radians(30.0)])
 
 
 def pose_columns(source: str) -> tuple[str, ...]:
-    """Names of the four columns of a pose."""
+    """Return the names of the four columns of a pose."""
     return tuple(f"{source}_{axis}_{unit}" for axis, unit in zip(AXES, UNITS, strict=True))
 
 
@@ -79,12 +79,12 @@ class Measurements:
 
 
 def wrap(angle_rad: Any) -> Any:
-    """The same angles in (-pi, pi], any shape."""
+    """Return the same angles in (-pi, pi], any shape."""
     return -((-angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def row_text(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
-    """One line of the CSV for large, small, actual and joint, each (4,) or None."""
+    """Return one line of the CSV for large, small, actual and joint, each (4,) or None."""
     cells = [str(position), f"{t_s:.6f}"]
     for pose in poses:
         cells += [""] * 4 if pose is None else [f"{float(value):.8f}" for value in pose]
@@ -94,10 +94,10 @@ def row_text(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
 def read_data(
     paths: Sequence[Path], test: Path | None = None
 ) -> tuple[Measurements, Measurements | None]:
-    """All files as one, and the data of `test` (None without it), all of them checked.
+    """Return all files as one, and the data of `test` (None without it), all of them checked.
 
-    Positions of different files stay different. Errors: NotFound, UsageError; InvalidValue for a
-    file that cannot be fitted, and for a row that is there twice."""
+    Positions of different files stay different. Raises NotFound, UsageError, and InvalidValue for
+    a file that cannot be fitted or a row that is there twice."""
     if not paths:
         raise UsageError("no data: name a CSV file; perchctl fit-weights collect makes one")
     parts = [read_csv(path) for path in paths]
@@ -105,11 +105,12 @@ def read_data(
     whole = [*parts, *([] if tested is None else [tested])]
     for part in whole:
         _check_positions(part)
-    _refuse_repeated(whole, tested)
+    _refuse_repeated(whole)
     return _joined(parts), tested
 
 
 def _joined(parts: list[Measurements]) -> Measurements:
+    """Return the parts as one, with positions of different parts numbered apart."""
     if len(parts) == 1:
         return parts[0]
     offset, positions = 0, []
@@ -131,7 +132,7 @@ def _joined(parts: list[Measurements]) -> Measurements:
 
 
 def read_csv(path: Path) -> Measurements:
-    """Reads a file. Errors: NotFound; InvalidValue, which names file and line."""
+    """Return the rows of a file. Raises NotFound, and InvalidValue that names file and line."""
     try:
         with path.open("rb") as stream:
             sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -154,7 +155,8 @@ def read_csv(path: Path) -> Measurements:
 
 
 def _read_table(path: Path, reader: Any) -> tuple[tuple[str, ...], NDArray[np.int64], Array]:
-    """The columns that count, each row's line (n,), and the numbers, NaN where a cell is empty."""
+    """Return the columns that count, each row's line (n,), and the numbers (n, columns), NaN where
+    a cell is empty."""
     header = [name.strip() for name in next(reader, [])]
     missing = [name for name in NEEDED if header.count(name) != 1]
     if missing:
@@ -243,31 +245,22 @@ def _check_positions(data: Measurements) -> None:
                 )
 
 
-def _refuse_repeated(parts: Sequence[Measurements], test: Measurements | None) -> None:
+def _refuse_repeated(parts: Sequence[Measurements]) -> None:
     """Raises InvalidValue where a row is there twice: it would narrow the intervals and is no more
-    evidence, and one that was fitted to is no test.
+    evidence, and no test of weights that were fitted to it.
 
-    Without times, rows of one position may well be equal: rounded, of a camera at rest.
+    Data without times are not judged: rounded, rows of a camera at rest may well be equal.
     """
-    first: dict[bytes, tuple[Measurements, int]] = {}
+    seen: set[bytes] = set()
     for part in parts:
-        timeless = float(np.ptp(part.t_s)) == 0.0
-        poses = [np.nan_to_num(pose) for pose in (part.large, part.small, part.actual)]
-        values = np.column_stack([part.t_s, *poses]) + 0.0  # no zero with a minus
-        content, size = values.tobytes(), values.itemsize * values.shape[1]
-        for row in range(len(part)):
-            key = content[row * size : (row + 1) * size]
-            before, old_row = first.setdefault(key, (part, row))
-            if before is part and old_row == row:
-                continue
-            if before is part and timeless and part.position[row] == part.position[old_row]:
-                continue
-            why = (
-                "--test judges by other data than was fitted to"
-                if part is test and before is not test
-                else "the same rows twice are no more evidence; take out what is there twice"
-            )
-            raise InvalidValue(
-                f"{part.name}: its row {row + 1} stands in row {old_row + 1} of {before.name} too: "
-                f"{why}"
-            )
+        if float(np.ptp(part.t_s)) == 0.0:
+            continue
+        rows = np.column_stack([part.t_s, part.large, part.small, part.actual])
+        for number, row in enumerate(np.nan_to_num(rows) + 0.0, start=1):  # no zero with a minus
+            key = row.tobytes()
+            if key in seen:
+                raise InvalidValue(
+                    f"{part.name}: its row {number} is there twice, or was in the files before: "
+                    f"the same rows are no more evidence, and no test of what was fitted to them"
+                )
+            seen.add(key)

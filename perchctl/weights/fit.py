@@ -33,8 +33,6 @@ OUTLIER_SIGMAS = 6.0
 """A row does not count on an axis where a marker's error is farther from the median of
 its position than this many robust standard deviations (1.4826 times the median absolute
 deviation): of a million normal errors not one."""
-ODD_POSITION_SIGMAS = 8.0
-"""A position is named when both markers' errors there are this far from the others'."""
 LEAST_ROWS = 8
 """Rows a position, on average, below which nothing is called an outlier."""
 _MAD_TO_SIGMA = 1.4826
@@ -81,7 +79,7 @@ class Errors:
 
     @cached_property
     def sums(self) -> Array:
-        """Of each position the sums of 1, a, b, a^2, b^2 and a b over its rows, (6, g, 4)."""
+        """Sums over the rows of each position: of 1, a, b, a^2, b^2 and a b, (6, g, 4)."""
         use = self.use.astype(np.float64)
         a, b = self.large * use, self.small * use
         parts = np.stack([use, a, b, a * a, b * b, a * b])
@@ -106,7 +104,7 @@ class Errors:
 
 
 def errors_of(data: Measurements) -> Errors:
-    """The errors of the rows with both markers."""
+    """Return the errors of the rows with both markers."""
     rows = np.flatnonzero(data.both)
     rows = rows[np.argsort(data.position[rows], kind="stable")]
     positions, starts = np.unique(data.position[rows], return_index=True)
@@ -131,7 +129,8 @@ def errors_of(data: Measurements) -> Errors:
 
 
 def _inliers(error: Array, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """The robust rule of `OUTLIER_SIGMAS`, for errors (n, 4) of positions at `starts`."""
+    """Return false where the rule of `OUTLIER_SIGMAS` finds an outlier, (n, 4), for errors (n, 4)
+    of positions that begin at the rows `starts`."""
     use = np.ones(error.shape, dtype=bool)
     if len(starts) * LEAST_ROWS > len(error):
         return use  # too few rows a position to estimate what is usual
@@ -145,30 +144,14 @@ def _inliers(error: Array, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
     return use
 
 
-def odd_positions(errors: Errors) -> list[tuple[int, str, float]]:
-    """Positions whose truth seems wrong: number, axis, and how far both markers are off."""
-    if len(errors.positions) < 5:
-        return []
-    offsets = errors.position_means
-    away = offsets - np.median(offsets, axis=1, keepdims=True)
-    spread = _MAD_TO_SIGMA * np.median(np.abs(away), axis=1, keepdims=True)
-    floor = np.array([0.002, 0.002, 0.002, np.radians(1.0)])
-    far = np.abs(away) > np.maximum(ODD_POSITION_SIGMAS * spread, floor)
-    odd = far.all(axis=0) & (np.sign(away[0]) == np.sign(away[1]))
-    return [
-        (int(errors.positions[g]), AXES[axis], float(away[:, g, axis].mean()))
-        for g, axis in zip(*np.nonzero(odd), strict=True)
-    ]
-
-
 def t_quantile(freedom: int) -> float:
-    """The two-sided 95 % quantile of Student's t; inf without a degree of freedom."""
+    """Return the two-sided 95 % quantile of Student's t; inf without a degree of freedom."""
     return float(stdtrit(freedom, 0.975)) if freedom >= 1 else math.inf
 
 
 def closed_form(sums: Array) -> Array:
-    """The weight of least squared merged error about its mean; NaN where any fits. `sums` is
-    (6, ..., 4), as `Errors.sums`."""
+    """Return the weights of least squared merged error about its mean, (..., 4); NaN where any
+    weight fits. `sums` is (6, ..., 4), as `Errors.sums`."""
     a, b, aa, bb, ab = sums[1:] / np.maximum(sums[0], 1.0)
     var_a, var_b, cov = aa - a * a, bb - b * b, ab - a * b
     below = var_a + var_b - 2.0 * cov
@@ -178,10 +161,8 @@ def closed_form(sums: Array) -> Array:
 
 # --- Widrow and Hoff's LMS, the paper's way ------------------------------------------------------
 # ``w <- w + mu e d`` with d = large - small and e = actual - merged is, in the errors a and b,
-# ``w <- w - mu (d^2 w + b d)``. The step mu is given in units of 1 / mean(d^2): below 2 LMS
-# converges in the mean. Without a step of its own it begins at `START_STEP` and falls as 1 / rows,
-# which ends at the least-squares weight instead of wandering about it; a step that is given stays
-# constant, and the answer is the mean over the last pass.
+# ``w <- w - mu (d^2 w + b d)``. The step mu, in units of 1 / mean(d^2), begins at `START_STEP` and
+# falls as 1 / rows, so that LMS ends at the least-squares weight instead of wandering about it.
 
 
 START_STEP = 0.02
@@ -189,28 +170,16 @@ LEAST_RUN_ROWS, LEAST_PASSES = 40_000, 3
 """Rows to run through, in as many passes as that takes, so that few rows suffice."""
 MOST_ROWS, MOST_FOLDS = 100_000, 20
 """Of more rows an even share is run through; of more positions so many groups are held out."""
-BLOCK_ROWS = 64
-ESCAPED = 1e3
-"""No weight that is on its way to [0, 1] gets here."""
 _STREAM = (0, 601)
 
 
-@dataclass(frozen=True, eq=False)
-class LmsRun:
-    """Weights (4,), unclipped; those without each position in turn, `folds` (g, 4); and the
-    number of passes through the data."""
+def lms(errors: Errors, start: float = 0.5) -> tuple[Array, Array]:
+    """Return the weights that LMS ends at, (4,), not clipped, and those that it ends at without
+    each position in turn, (g, 4).
 
-    weights: Array
-    folds: Array
-    passes: int
-
-
-def lms(errors: Errors, step: float | None = None, start: float = 0.5) -> LmsRun:
-    """Run LMS over the rows in a shuffled order, the mean errors taken off, from the weight
-    `start`; a fold's rows do not move its own weights. Raises InvalidValue for a step that is not
-    positive, and where LMS diverges."""
-    if step is not None and not (math.isfinite(step) and step > 0.0):
-        raise InvalidValue(f"--step {step:g} must be a positive number, such as 0.02")
+    It begins at the weight `start` and takes the rows in a shuffled order, the mean errors taken
+    off; the rows of a position do not move the weights that are without it.
+    """
     power, pull = _recursion(errors)
     g = len(errors.positions)
     group = np.arange(g) * min(g, MOST_FOLDS) // g
@@ -218,43 +187,21 @@ def lms(errors: Errors, step: float | None = None, start: float = 0.5) -> LmsRun
     share = slice(None, None, 1 + len(errors) // MOST_ROWS)
     power, pull, fold_of_row = power[share], pull[share], fold_of_row[share]
     n, folds = len(power), int(group[-1]) + 1
-    kept = fold_of_row[:, None] != np.arange(folds + 1)  # the last one keeps all rows
-    passes = max(LEAST_PASSES, math.ceil(LEAST_RUN_ROWS / n))
+    kept = fold_of_row[:, None, None] != np.arange(folds + 1)[:, None]  # the last one keeps all
     rng = np.random.default_rng(_STREAM)
+    passes = max(LEAST_PASSES, math.ceil(LEAST_RUN_ROWS / n))
     order = np.concatenate([rng.permutation(n) for _ in range(passes)])
     first = np.minimum(START_STEP, 0.5 / np.maximum(power.max(axis=0), 1.0))
-    mu = np.full((len(order), 4), step or 0.0)
-    if step is None:
-        mu = first / (1.0 + 0.5 * first * np.arange(len(order))[:, None])
-    w, total = np.full((folds + 1, 4), start), np.zeros((folds + 1, 4))
-    with np.errstate(all="ignore"):
-        for at in range(0, len(order), BLOCK_ROWS):
-            rows = order[at : at + BLOCK_ROWS]
-            moves = mu[at : at + BLOCK_ROWS, None] * kept[rows, :, None]
-            trace = _run(w, moves * power[rows, None], moves * pull[rows, None])
-            w = trace[-1]
-            total += trace[max(len(order) - n - at, 0) :].sum(axis=0)
-    if not (np.abs(w) < ESCAPED).all():
-        # Mean-square stability of one weight: |1 - mu p| below 1 in the mean square.
-        bound = 2.0 / float((power**2).mean(axis=0).max())
-        raise InvalidValue(
-            f"LMS diverges: --step {step:g} is too large for this data's spread (the weights stay "
-            f"bounded below about {bound:.2g}); leave --step out, or take {bound / 10:.2g}"
-        )
-    ends = w if step is None else total / n
-    return LmsRun(ends[-1], ends[:-1][group], passes)
-
-
-def _run(w: Array, p: Array, q: Array) -> Array:
-    """The weights after each row of ``w <- w - (p w + q)``, from `w` (f, 4), with p and q
-    (n, f, 4): the steps are affine in w, and so they compose."""
-    factor = np.cumprod(1.0 - p, axis=0)
-    return np.asarray(factor * (w - np.cumsum(q / factor, axis=0)))
+    w = np.full((folds + 1, 4), start)
+    for taken, row in enumerate(order.tolist()):
+        step = first / (1.0 + 0.5 * first * taken)
+        w -= kept[row] * (step * power[row] * w + step * pull[row])
+    return w[-1], w[:-1][group]
 
 
 def _recursion(errors: Errors) -> tuple[Array, Array]:
-    """p of mean 1 and q of ``w <- w - mu (p w + q)``, (n, 4) each. An outlier's row is zero and
-    moves nothing."""
+    """Return p of mean 1 and q of ``w <- w - mu (p w + q)``, (n, 4) each. An outlier's row is zero
+    and moves nothing."""
     use = errors.use
     n = np.maximum(use.sum(axis=0), 1)
     a, b = np.where(use, errors.large, 0.0), np.where(use, errors.small, 0.0)
@@ -269,7 +216,7 @@ def _recursion(errors: Errors) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FittedWeights:
     """One method's weights: as fitted, clipped to [0, 1], and the half width of their 95 %
     interval over positions (jackknife), (4,); `folds` without each position in turn, (g, 4)."""
 
@@ -279,9 +226,9 @@ class Fitted:
     folds: Array
 
 
-def fit_all(errors: Errors, step: float | None = None) -> tuple[dict[str, Fitted], LmsRun]:
-    """The weights of both methods by name, and the run of LMS. Raises InvalidValue for an axis on
-    which every weight fits alike, and as `lms`."""
+def fit_all(errors: Errors) -> dict[str, FittedWeights]:
+    """Return the weights of both methods by name. Raises InvalidValue for an axis on which every
+    weight fits alike."""
     total = errors.sums.sum(axis=1)
     closed = closed_form(total)
     if np.isnan(closed).any():
@@ -296,17 +243,16 @@ def fit_all(errors: Errors, step: float | None = None) -> tuple[dict[str, Fitted
     # LMS approaches the closed form, and so its weights have the same spread over positions.
     spread = np.sqrt((g - 1) / g * ((folds - folds.mean(axis=0)) ** 2).sum(axis=0))
     half = t_quantile(g - 1) * spread
-    run = lms(errors, step)
     return {
-        name: Fitted(raw, np.clip(raw, 0.0, 1.0), half, np.clip(left, 0.0, 1.0))
-        for name, raw, left in (("lms", run.weights, run.folds), ("closed_form", closed, folds))
-    }, run
+        name: FittedWeights(raw, np.clip(raw, 0.0, 1.0), half, np.clip(left, 0.0, 1.0))
+        for name, (raw, left) in {"lms": lms(errors), "closed_form": (closed, folds)}.items()
+    }
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Mean square errors of each position by each way's name, (g, 4), on positions that it was
-    not fitted to; NaN where a position has no joint pose."""
+    """Mean square errors of each position by the name of each set of weights, (g, 4), on positions
+    that it was not fitted to; NaN where a position has no joint pose."""
 
     squares: dict[str, Array]
 
@@ -322,28 +268,28 @@ class Evidence:
         return np.where(self.better == 0, self.squares["large"], self.squares["small"])
 
     def rms(self, name: str) -> tuple[Array, Array]:
-        """Root mean square error over all positions, (4,), m and rad, and the half width of its
-        95 % interval."""
+        """Return the root mean square error over all positions, (4,), m and rad, and the half width
+        of its 95 % interval."""
         rms, influence = _root(self.squares[name])
         return rms, _half_width(influence)
 
     def gain(self, name: str, other: Array) -> tuple[Array, Array]:
-        """By how much the RMS error is below that of `other` (g, 4), and the half width of the
-        difference's interval, (4,)."""
+        """Return by how much the RMS error is below that of `other` (g, 4), and the half width of
+        the difference's interval, (4,)."""
         there = np.where(np.isnan(other), np.nan, self.squares[name])
         (rms, influence), (reference, of_reference) = _root(there), _root(other)
         return reference - rms, _half_width(of_reference - influence)
 
     def proven(self, name: str) -> NDArray[np.bool_]:
-        """True where the gain over the better single marker is above zero with its whole
+        """Return true where the gain over the better single marker is above zero with its whole
         interval, (4,)."""
         gain, half = self.gain(name, self.better_squares)
         return np.asarray(gain - half > 0.0)
 
 
 def evidence(errors: Errors, weights: Mapping[str, Array]) -> Evidence:
-    """Errors of every way. `weights` by the fitted methods' names: (4,), or with another row
-    for each position, (g, 4)."""
+    """Return the errors of the fitted weights, of the paper's, of each marker alone and of the
+    joint solve. `weights` by the fitted methods' names: (4,), or a row a position, (g, 4)."""
     n, _, _, aa, bb, ab = errors.sums
     known = {"large": np.ones(4), "small": np.zeros(4), "paper": np.array(PAPER_WEIGHTS)}
     squares = {
@@ -359,14 +305,14 @@ def evidence(errors: Errors, weights: Mapping[str, Array]) -> Evidence:
 
 
 def _root(square: Array) -> tuple[Array, Array]:
-    """The root of the mean over positions (4,), and each position's influence on it (g, 4)."""
+    """Return the root of the mean over positions (4,), and each position's influence (g, 4)."""
     mean = np.nanmean(square, axis=0)
     rms = np.sqrt(mean)
     return rms, (square - mean) / (2.0 * np.maximum(rms, 1e-300))
 
 
 def _half_width(influence: Array) -> Array:
-    """Of the 95 % interval, (4,); infinite with a single position."""
+    """Return half the width of the 95 % interval, (4,); infinite with a single position."""
     g = int(np.isfinite(influence[:, 0]).sum())
     if g < 2:
         return np.full(4, np.inf)

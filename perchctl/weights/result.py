@@ -23,12 +23,10 @@ from perchctl.weights.fit import (
     SINGLE,
     Errors,
     Evidence,
-    Fitted,
-    LmsRun,
+    FittedWeights,
     errors_of,
     evidence,
     fit_all,
-    odd_positions,
 )
 
 FORMAT = "perchctl-merge-weights"
@@ -44,8 +42,7 @@ class Result:
     the evidence from other data, named `other_name`."""
 
     errors: Errors
-    fits: dict[str, Fitted]
-    run: LmsRun
+    fits: dict[str, FittedWeights]
     evidence: Evidence
     other: Evidence | None
     other_name: str
@@ -54,7 +51,7 @@ class Result:
 
     @property
     def proven(self) -> list[bool]:
-        """Whether the chosen weight beats the better single marker, by axis."""
+        """True where the chosen weight beats the better single marker, by axis."""
         return [bool(p) for p in self.evidence.proven(self.chosen)]
 
     @property
@@ -71,7 +68,7 @@ class Result:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences on clipped weights, odd positions, and too few of them."""
+        """Sentences on clipped weights, and on too few positions."""
         notes = []
         for name, found in self.fits.items():
             outside = [
@@ -81,40 +78,30 @@ class Result:
             ]
             if outside:
                 notes.append(f"{name}: clipped to 0 .. 1: {', '.join(outside)}")
-        for number, axis, off in odd_positions(self.errors):
-            size = f"{np.degrees(off):.1f} deg" if axis == "yaw" else f"{off * 1e3:.1f} mm"
-            notes.append(
-                f"position {number}: both markers are off by {size} in {axis} more than "
-                f"elsewhere; was its actual pose taken down wrongly?"
-            )
         count = len(self.errors.positions)
         if count < 5:
             notes.append(f"{count} positions are few: intervals are wide (10 are usual)")
         return notes
 
 
-def fit_weights(
-    paths: Sequence[Path], chosen: str, test: Path | None = None, step: float | None = None
-) -> Result:
-    """Read all data and fit the weights to it by each method.
+def fit_weights(paths: Sequence[Path], chosen: str, test: Path | None = None) -> Result:
+    """Read the data, fit the weights by each method, and judge them by held-out positions.
 
     Args:
         chosen: the method that is offered, one of `FITTED`.
         test: other data to judge the weights by.
-        step: a constant step of LMS, in 1 / mean(d^2); None: it falls.
 
     Errors: NotFound, InvalidValue, UsageError.
     """
     data, tested = read_data(paths, test)
     errors = errors_of(data)
-    fits, run = fit_all(errors, step)
+    fits = fit_all(errors)
     other = None
     if tested is not None:
         other = evidence(errors_of(tested), {name: fit.weights for name, fit in fits.items()})
     return Result(
         errors=errors,
         fits=fits,
-        run=run,
         evidence=evidence(errors, {name: fit.folds for name, fit in fits.items()}),
         other=other,
         other_name="" if test is None else str(test),
@@ -127,7 +114,7 @@ def fit_weights(
 
 
 def _by_axis(values: Iterable[float]) -> dict[str, float | None]:
-    """To six figures, as a person may read them."""
+    """Return the values by axis, to six figures, as a person may read them."""
     return {
         axis: float(f"{value:.6g}") if math.isfinite(value) else None
         for axis, value in zip(AXES, values, strict=True)
@@ -135,7 +122,7 @@ def _by_axis(values: Iterable[float]) -> dict[str, float | None]:
 
 
 def weights_record(result: Result) -> dict[str, Any]:
-    """The one object of `--json`. Lengths in m, angles in rad."""
+    """Return the one object of `--json`. Lengths in m, angles in rad."""
     record: dict[str, Any] = {name: _by_axis(result.fits[name].weights) for name in FITTED}
     record |= {
         "paper": _by_axis(PAPER_WEIGHTS),
@@ -161,8 +148,8 @@ def weights_record(result: Result) -> dict[str, Any]:
 
 
 def _errors_record(found: Evidence) -> dict[str, Any]:
-    """By each way its RMS error (x, y, z, yaw) with the half width of the interval, and the gain
-    over the better single marker with its own."""
+    """Return the RMS error (x, y, z, yaw) of each set of weights with the half width of its
+    interval, and the gain over the better single marker with its own."""
     record = {}
     for name in found.squares:
         (rms, half), (gain, gain_half) = found.rms(name), found.gain(name, found.better_squares)
@@ -195,7 +182,7 @@ _HEADS = ("x [um]", "y [um]", "z [um]", "yaw [mdeg]")
 
 
 def report_text(result: Result) -> str:
-    """Verdict, errors, gains, weights, offsets, positions, notes."""
+    """Return the report: verdict, errors, gains, weights, offsets, positions, notes."""
     errors, label = result.errors, LABELS[result.chosen]
     data = f"{errors.name}: {len(errors)} rows of {len(errors.positions)} positions"
     if errors.single_rows:
@@ -218,8 +205,8 @@ def report_text(result: Result) -> str:
         for name, fit in result.fits.items()
     }
     weights[LABELS["paper"]] = [f"{w:.3f}{'':8}" for w in PAPER_WEIGHTS]
-    away = np.abs(result.run.weights - result.fits["closed_form"].raw).max()
-    title = f"fitted weights; LMS ends {away:.4f} from the closed form, {result.run.passes} passes"
+    away = np.abs(result.fits["lms"].raw - result.fits["closed_form"].raw).max()
+    title = f"fitted weights; LMS ends {away:.4f} from the closed form"
     parts.append(_table(title, AXES, weights))
     offsets = {f"{name} marker": _scaled(*found, "+") for name, found in errors.biases.items()}
     offsets["outliers left out"] = [f"{n}{'':6}" for n in (~errors.use).sum(axis=0)]
@@ -231,7 +218,7 @@ def report_text(result: Result) -> str:
 
 
 def _verdict(result: Result) -> str:
-    """What to fly with, and why, in a line for each axis."""
+    """Return the weights to fly with, and why, in a line for each axis."""
     if not any(result.proven):
         return _wrapped(
             "not recommended: on no axis do these weights beat the better single marker beyond "
@@ -251,8 +238,8 @@ def _verdict(result: Result) -> str:
 
 
 def _positions_text(result: Result) -> str:
-    """The paper's tables I and II in one: a line for each position, with the mean merged pose's
-    error by weights fitted without it."""
+    """Return the paper's tables I and II in one: a line for each position, with the mean merged
+    pose's error by weights fitted without it."""
     a, b = result.errors.position_means
     folds = result.fits[result.chosen].folds
     error = folds * a + (1.0 - folds) * b
@@ -280,7 +267,8 @@ def _table(title: str, heads: Sequence[str], rows: dict[str, list[str]]) -> str:
 
 
 def _scaled(values: Array, halves: Array, sign: str = "") -> list[str]:
-    """``6.5 +-1.2``, in micrometres and thousandths of a degree; large ones in thousands (k)."""
+    """Return cells as ``6.5 +-1.2``, in micrometres and thousandths of a degree; large ones in
+    thousands (k)."""
     cells = []
     for value, half in zip(values * _SCALES, halves * _SCALES, strict=True):
         size = max(abs(value), abs(half))

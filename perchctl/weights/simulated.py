@@ -17,7 +17,7 @@ from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, w
 from perchctl.profile import Profile
 from perchctl.sim import Renderer, Scenario
 from perchctl.vision import CameraModel, Frame, project, rotation_vector, square_corners
-from perchctl.weights.collect import SessionFile, fault_of, read_markers, rows_of
+from perchctl.weights.collect import SessionFile, position_fault, read_markers, session_rows
 
 NOISE_SIGMA, BLUR_PX = 4.0, 1.0
 MARGIN_PX = 4.0
@@ -27,8 +27,9 @@ _STREAM = 611
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """`actual`: the target relative to the gear in the level frame, (4,)."""
+class CameraPlace:
+    """A place of the camera, and `actual`, the target relative to the gear in the level frame
+    there, (4,)."""
 
     T_world_cam: Array
     actual: Array
@@ -51,7 +52,7 @@ class SimulatedStand:
         self._corners = square_corners(profile.target.large.side_m)
 
     def fill(self, session: SessionFile, frames: int, advance: Callable[[], None]) -> None:
-        """Complete the session; `advance` is called with each frame. Errors: InvalidValue."""
+        """Complete the session; `advance` is called with each frame. Raises InvalidValue."""
         while len(session.done) < self._positions:
             position = session.next_position
             place, readings = self.place(position), []
@@ -59,17 +60,17 @@ class SimulatedStand:
             for reading in read_markers(shown, self._profile, self._camera):
                 readings.append(reading)
                 advance()
-            fault = fault_of(readings)
+            fault = position_fault(readings)
             if fault is not None:
                 raise InvalidValue(
                     f"position {position} of the simulated experiment cannot be used ({fault}): "
                     f"take another --seed"
                 )
-            session.append(position, rows_of(position, readings, place.actual))
+            session.append(position, session_rows(position, readings, place.actual))
 
-    def place(self, position: int) -> Place:
-        """The place of a position, counted from 1: its distance falls into its own share of
-        z3 to z2, so that few positions cover the range. Errors: InvalidValue."""
+    def place(self, position: int) -> CameraPlace:
+        """Return the place of a position, counted from 1. Its distance falls into its own share of
+        z3 to z2, so that few positions cover the range. Raises InvalidValue."""
         merge = self._profile.merge
         rng = np.random.default_rng([self._seed, _STREAM, position])
         share = (position - 1) % self._positions
@@ -87,15 +88,15 @@ class SimulatedStand:
             f"large marker to this camera: correct merge.z3_m and z2_m in the profile"
         )
 
-    def frames(self, position: int, place: Place, count: int) -> Iterator[Frame]:
-        """The pictures of a place."""
+    def frames(self, position: int, place: CameraPlace, count: int) -> Iterator[Frame]:
+        """Yield the pictures of a place."""
         for k in range(count):
             index = position * 100_000 + k
             image = self._renderer.render([place.T_world_cam], frame_index=index)
             yield Frame(k, k * FRAME_S, image, k * FRAME_S)
 
-    def _at(self, x_m: float, y_m: float, z_m: float, yaw: float) -> Place:
-        """The camera `z_m` under the target and off it by x, y in its own level axes."""
+    def _at(self, x_m: float, y_m: float, z_m: float, yaw: float) -> CameraPlace:
+        """Return the place that is `z_m` under the target and off it by x, y in level axes."""
         T_body_cam = self._profile.camera.mount.T_body_cam
         lens = np.array([x_m, y_m, z_m])  # target relative to the camera, level axes
         gear = np.asarray(self._profile.vehicle.gear_body_m)
@@ -104,9 +105,9 @@ class SimulatedStand:
         T_world_body = make_T(rot_z(yaw), body)
         e_m = lens + T_body_cam[:3, 3] - gear
         heading = wrap_rad(self._scenario.target_yaw_rad - yaw)
-        return Place(T_world_body @ T_body_cam, np.array([*e_m, heading]))
+        return CameraPlace(T_world_body @ T_body_cam, np.array([*e_m, heading]))
 
-    def _in_picture(self, place: Place) -> bool:
+    def _in_picture(self, place: CameraPlace) -> bool:
         T_world_marker = self._renderer.T_world_target @ make_T(R_MARKER_TARGET, (0.0, 0.0, 0.0))
         T_cam_marker = invert_T(place.T_world_cam) @ T_world_marker
         rvec, tvec = rotation_vector(T_cam_marker[:3, :3]), T_cam_marker[:3, 3]

@@ -20,14 +20,6 @@ def chessboard_folder() -> Path:
 
 
 @pytest.fixture(scope="session")
-def scenes_folder() -> Path:
-    folder = DATA / "scenes"
-    if not (folder / "truth.json").is_file():
-        pytest.skip(f"the rendered scenes are absent ({folder})")
-    return folder
-
-
-@pytest.fixture(scope="session")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CameraModel]:
     """A folder of ten pictures of a ChArUco board, and the camera that took them."""
     camera = draw_camera(np.random.default_rng(5), (480, 360))

@@ -102,21 +102,12 @@ def test_the_same_pictures_pass_the_check_and_another_camera_s_fail(
     assert "image size is missing; " in unsized.stderr
 
 
-def test_an_existing_file_needs_force(rendered: Rendered, tmp_path: Path) -> None:
-    output = tmp_path / "camera.yaml"
-    output.write_text("mine")
-    result = calibrate(f"images:{rendered[0]}", "-b", BOARD, "-o", str(output))
-    assert "--force" in refused(result, 30)
-    assert output.read_text() == "mine"
-
-
 def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Path) -> None:
     words = (f"images:{tmp_path}", "-b", BOARD, "-o", str(tmp_path / "o.yaml"))
     whole = (rendered[0] / "board_00.png").read_bytes()
     (tmp_path / "board_99.png").write_bytes(b"no picture")
-    alone = refused(calibrate(*words), 30)
-    assert "none of 1 pictures" in alone
-    assert "board_99.png: cannot be read as a picture" in alone
+    unread = "board_99.png: cannot be read as a picture"
+    refused(calibrate(*words), 30, "none of 1 pictures", unread)
     for path in sorted(rendered[0].iterdir())[:6]:
         (tmp_path / path.name).write_bytes(path.read_bytes())
     (tmp_path / "board_02b.png").write_bytes(whole[: len(whole) // 2])
@@ -129,22 +120,9 @@ def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Pa
     assert named == ["board_02b.png", "board_99.png"]
 
 
-def test_pictures_of_two_sizes(rendered: Rendered, tmp_path: Path) -> None:
-    for i, path in enumerate(sorted(rendered[0].iterdir())[:4]):
-        picture = cv2.imread(str(path))
-        cv2.imwrite(str(tmp_path / path.name), picture[: 300 if i == 2 else 360])
-    sentence = refused(
-        calibrate(f"images:{tmp_path}", "-b", BOARD, "-o", str(tmp_path / "o.yaml")), 30
-    )
-    assert "480x300" in sentence
-    assert "480x360" in sentence
-
-
 def test_a_print_is_measured_along_both_sides(rendered: Rendered, tmp_path: Path) -> None:
     output = tmp_path / "o.yaml"
     words = (f"images:{rendered[0]}", "-b", BOARD, "-o", str(output), "--measured")
-    assert "not WIDTHxHEIGHT in mm" in refused(calibrate(*words, "249.5"), 30)
-    assert "measure its black area, in mm" in refused(calibrate(*words, "24.9x17.4"), 30)
     result = calibrate(*words, "245.8x174.1mm")
     assert result.exit_code == 0, result.output
     assert "width: 245.8 mm, -1.68 % against 250 mm" in result.stderr
@@ -152,13 +130,6 @@ def test_a_print_is_measured_along_both_sides(rendered: Rendered, tmp_path: Path
     assert "height: 174.1 mm, -0.51 % against 175 mm" in result.stderr
     board = yaml.safe_load(output.read_text())["board"]
     assert board == f"{BOARD}:measured=245.8x174.1mm"
-
-
-def test_two_views_only(rendered: Rendered, tmp_path: Path) -> None:
-    pattern = f"{rendered[0]}/board_0[01].png"
-    sentence = refused(calibrate(pattern, "-b", BOARD, "-o", str(tmp_path / "o.yaml")), 30)
-    assert "only 2 pictures" in sentence
-    assert "add 3" in sentence
 
 
 def test_pictures_named_one_by_one_are_the_folder_s(
@@ -174,16 +145,40 @@ def test_pictures_named_one_by_one_are_the_folder_s(
     }
 
 
-def test_many_sources_must_all_be_pictures(rendered: Rendered, tmp_path: Path) -> None:
-    one, two = (f"{rendered[0]}/board_0{k}.png" for k in (0, 1))
-    output = ("-o", f"{tmp_path}/o.yaml")
-    assert "does not exist" in refused(calibrate(one, f"{tmp_path}/no.png", *output), 20)
-    for other in (str(rendered[0]), "camera:0"):
-        said = refused(calibrate(one, two, other, *output), 20 if ":" in other else 2)
-        assert other in said
-    said = refused(calibrate(one, two, "-b", "chessboard:9x6:25mm", *output), 30)
-    assert "none of 2 pictures of" in said
-    assert "and 1 more shows" in said
+@pytest.mark.parametrize(
+    ("words", "code", "expected"),
+    [
+        (["images:{board}", "-o", "mine.yaml"], 30, ["--force"]),
+        (["{board}/board_0[01].png"], 30, ["only 2 pictures", "add 3"]),
+        (["images:sizes"], 30, ["480x300", "480x360"]),
+        (["images:{board}", "--measured", "249.5"], 30, ["WIDTHxHEIGHT in mm"]),
+        (["images:{board}", "--measured", "24.9x17.4"], 30, ["WIDTHxHEIGHT in mm"]),
+        (["{one}", "no.png"], 20, ["no.png does not exist"]),
+        (["{one}", "{one}", "{board}"], 2, ["{board}"]),
+        (["{one}", "{one}", "camera:0"], 20, ["camera:0"]),
+        (["{one}", "{two}", "-b", "chessboard:9x6:25mm"], 30, ["none of 2 pictures", "and 1 more"]),
+    ],
+)
+def test_pictures_that_will_not_do_are_refused(
+    rendered: Rendered,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+    code: int,
+    expected: list[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yaml").write_text("mine")
+    Path("sizes").mkdir()
+    files = sorted(rendered[0].iterdir())
+    for i, path in enumerate(files[:4] if "images:sizes" in words else []):
+        picture = cv2.imread(str(path))
+        cv2.imwrite(f"sizes/{path.name}", picture[: 300 if i == 2 else 360])
+    places = {"board": rendered[0], "one": files[0], "two": files[1]}
+    given = ["-b", BOARD, "-o", "o.yaml", *(word.format(**places) for word in words)]
+    refused(calibrate(*given), code, *(part.format(**places) for part in expected))
+    assert Path("mine.yaml").read_text() == "mine"
+    assert not Path("o.yaml").exists()
 
 
 @pytest.mark.parametrize(
@@ -213,14 +208,6 @@ def test_wrong_usage_writes_nothing(
     assert result.exit_code == code, result.output
     assert not result.stdout
     assert not list(tmp_path.iterdir())
-
-
-def test_the_old_form_s_camera_is_still_the_main_one() -> None:
-    named, plain = calibrate("camera", "--help"), calibrate("--help")
-    assert named.exit_code == plain.exit_code == 0
-    for subcommand in ("camera", "mount", "mask", "check", "convert"):
-        assert f"  {subcommand} " in plain.stdout
-    assert "--model" in named.stdout
 
 
 def test_convert(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Corners: their bias, their spread, and what the window takes in."""
+"""Corners: their bias, their spread, what the window takes in, and interlaced pictures."""
 
 from __future__ import annotations
 
@@ -7,25 +7,21 @@ import numpy as np
 import pytest
 
 from perchctl.calibration import BoardView
+from perchctl.calibration.board.capture import sharpness
 from perchctl.calibration.board.detect import find_board, fit_saddles
 from perchctl.camera import Grey
 from perchctl.geometry import Array
-from perchctl.target import Board, parse_board
-from perchctl.vision import project
+from perchctl.target import Board
+from perchctl.vision import is_combed, project
 from tests.helpers.boards import (
-    APRILGRID,
     CHARUCO,
     CHESSBOARD,
     BoardRenderer,
     draw_camera,
+    draw_poses,
 )
 
 CAMERA = draw_camera(np.random.default_rng(1), (480, 360))
-
-
-@pytest.fixture(scope="module")
-def tag_renderer() -> BoardRenderer:
-    return BoardRenderer(CAMERA, APRILGRID)
 
 
 def crossing(
@@ -120,96 +116,36 @@ def test_a_large_picture_keeps_the_places_of_its_pixels() -> None:
     assert np.abs((view.corners_px - expected).mean(axis=0)).max() < 0.1
 
 
-def _tag_errors(renderer: BoardRenderer, pose: Array, blur_px: float = 0.7) -> Array:
-    """Of the corners found of an aprilgrid, which all know where they belong, (n, 2)."""
-    view = _view(APRILGRID, renderer.render(pose, np.random.default_rng(0), blur_px, noise=2.0))
-    there = project(APRILGRID.corners_m(), pose[:3], pose[3:], CAMERA)
-    return np.asarray(view.corners_px - there[view.ids])
+# --- interlaced pictures -------------------------------------------------------------------
+
+FIELDS_S = 0.02
+SPEED = np.array([0.15, 0.15, 0.3, 0.08, 0.08, 0.08])  # rad/s and m/s of a hand, one sigma
 
 
-def _turned(degrees: float, z_m: float) -> Array:
-    """An aprilgrid in the middle, tilted by 25 deg and turned about the view."""
-    tilt, roll = (np.radians([25.0, 0, 0]), np.radians([0, 0, degrees]))
-    R = cv2.Rodrigues(tilt)[0] @ cv2.Rodrigues(roll)[0]
-    t = np.array([0.0, 0.0, z_m]) - R @ APRILGRID.corners_m().mean(axis=0)
-    return np.concatenate([cv2.Rodrigues(R)[0].ravel(), t])
+def test_corners_of_an_interlaced_picture_are_half_way_between_its_fields() -> None:
+    """Or those of the one field that shows the board."""
+    rng = np.random.default_rng(3)
+    renderer = BoardRenderer(CAMERA, CHARUCO)
+    combed = 0
+    for pose in draw_poses(rng, CAMERA, CHARUCO, 8):
+        step = rng.normal(0.0, 1.0, 6) * SPEED * FIELDS_S / 2.0
+        poses = pose - step, pose + step
+        picture, bottom = (renderer.render(each, rng, noise=2.0) for each in poses)
+        picture[1::2] = bottom[1::2]
+        combed += is_combed(picture)
+        view = _view(CHARUCO, picture)
+        there = [project(CHARUCO.corners_m(), p[:3], p[3:], CAMERA)[view.ids] for p in poses]
+        moments = [(there[0] + there[1]) / 2.0, *there]
+        assert min(rms(view.corners_px - moment) for moment in moments) < 0.1
+    assert combed >= 5
 
 
-@pytest.mark.parametrize("degrees", [0, 45, 100, 180, 270])
-@pytest.mark.parametrize(("z_m", "blur_px"), [(0.3, 0.7), (0.35, 1.1), (0.45, 0.7)])
-def test_an_aprilgrid_s_corners_are_as_exact_as_a_charuco_board_s(
-    tag_renderer: BoardRenderer, degrees: float, z_m: float, blur_px: float
-) -> None:
-    """However it is turned, and where the tags (15 to 25 px) hang together by the squares."""
-    errors = _tag_errors(tag_renderer, _turned(degrees, z_m), blur_px=blur_px)
-    assert len(errors) > 0.7 * 144
-    assert rms(errors) < 0.08
-    assert np.linalg.norm(errors, axis=1).max() < 0.5
-    assert np.abs(errors.mean(axis=0)).max() < 0.02
-
-
-def test_a_wide_gap_s_window_leaves_the_tag_s_cells_out() -> None:
-    """With a gap of 0.6 the window reaches over the tag's border."""
-    board = parse_board("aprilgrid:4x4:22mm:0.6")
-    pose = np.array([0.3, -0.2, 0.4, -0.03, -0.08, 0.35])
-    picture = BoardRenderer(CAMERA, board).render(pose, np.random.default_rng(0), noise=2.0)
-    view = _view(board, picture)
-    assert len(view) == 64
-    errors = view.corners_px - project(board.corners_m(), pose[:3], pose[3:], CAMERA)
-    assert rms(errors) < 0.05
-
-
-def test_a_partly_seen_aprilgrid_is_used(tag_renderer: BoardRenderer) -> None:
-    errors = _tag_errors(tag_renderer, np.array([0.2, 0.3, 0.0, -0.02, -0.03, 0.15]))
-    assert 24 < len(errors) < 120
-    assert rms(errors) < 0.08
-
-
-@pytest.mark.parametrize("degrees", [0, 100])
-def test_small_soft_tags_are_found_by_either_threshold(
-    tag_renderer: BoardRenderer, degrees: float
-) -> None:
-    """Tags of 15 px, each way of which one threshold alone finds no two."""
-    assert len(_tag_errors(tag_renderer, _turned(degrees, 0.45), blur_px=1.1)) > 60
-
-
-def test_a_window_as_wide_as_the_gap_allows_holds_a_steep_board(
-    tag_renderer: BoardRenderer,
-) -> None:
-    R = cv2.Rodrigues(np.radians([60.0, 0, 0]))[0]
-    t = np.array([0, 0, 0.28]) - R @ APRILGRID.corners_m().mean(axis=0)
-    pose = np.concatenate([np.radians([60.0, 0, 0]), t])
-    errors = _tag_errors(tag_renderer, pose, blur_px=1.2)
-    assert len(errors) > 60
-    assert rms(errors) < 0.09
-
-
-def test_a_corner_on_the_picture_s_rim_is_not_measured(tag_renderer: BoardRenderer) -> None:
-    """Its window sees one side only: it would be off by 0.6 px."""
-    pose, off = _turned(20, 0.3), 1.0
-    while abs(off) > 0.01:  # until the leftmost corner is on the left rim
-        off = project(APRILGRID.corners_m(), pose[:3], pose[3:], CAMERA)[:, 0].min()
-        pose[3] -= off * pose[5] / CAMERA.K[0, 0]
-    picture = tag_renderer.render(pose, np.random.default_rng(0), noise=2.0)
-    view = _view(APRILGRID, picture)
-    assert 130 < len(view) < 144
-    there = project(APRILGRID.corners_m(), pose[:3], pose[3:], CAMERA)[view.ids]
-    assert np.linalg.norm(view.corners_px - there, axis=1).max() < 0.3
-
-
-def test_a_tag_of_something_else_is_none_of_the_board_s(tag_renderer: BoardRenderer) -> None:
-    """One that the board has too, and one in the place of whose like a hand lies."""
-    pose = _turned(0, 0.45)
-    picture = tag_renderer.render(pose, np.random.default_rng(0), noise=2.0)
-    there = project(APRILGRID.corners_m(), pose[:3], pose[3:], CAMERA)
-    hand = there[list(APRILGRID.tag_corners(7))].round().astype(np.int32)
-    cv2.fillConvexPoly(picture, hand, 120)
-    stranger = np.full((50, 50), 225, np.uint8)
-    tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    for tag, (x, y) in ((3, (5, 5)), (7, (5, 300))):
-        stranger[5:45, 5:45] = tags.generateImageMarker(tag, 40, borderBits=2)
-        picture[y : y + 50, x : x + 50] = stranger
-    view = _view(APRILGRID, picture)
-    assert len(view) > 100
-    assert np.abs(view.corners_px - there[view.ids]).max() < 0.5
-    assert not set(APRILGRID.tag_corners(7)) & set(view.ids)
+def test_a_comb_is_no_sharpness() -> None:
+    """Of a video's frames the sharpest are searched: not those that moved most."""
+    rng = np.random.default_rng(8)
+    pose = draw_poses(rng, CAMERA, CHARUCO, 1)[0]
+    still = BoardRenderer(CAMERA, CHARUCO).render(pose, rng, noise=2.0)
+    combed = still.copy()
+    combed[1::2] = np.roll(still, 3, axis=1)[1::2]
+    assert is_combed(combed)
+    assert sharpness(combed) < 1.2 * sharpness(still)

@@ -13,15 +13,16 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration import BoardView, Moment, capture_views
+from perchctl.calibration import Moment, capture_views
 from perchctl.calibration.board.capture import (
     Capture,
     Signature,
-    consider,
-    hint,
-    progress,
+    covered_shares,
+    next_advice,
     signature,
+    update_capture,
 )
+from perchctl.camera import Grey
 from perchctl.commands.calibrate import capture_live_views
 from perchctl.commands.guide import guide, page_state
 from perchctl.display import LivePage, Sketch
@@ -64,10 +65,15 @@ def test_a_video_s_sharp_and_different_frames(tmp_path: Path) -> None:
 class _Frames:
     """A live source that shows prepared pictures, one at a time."""
 
-    live, finished, size_px = True, False, (320, 240)
+    live, size_px = True, (320, 240)
 
-    def __init__(self, images: list[np.ndarray]) -> None:  # type: ignore[type-arg]
+    def __init__(self, images: list[Grey], ends: bool = False) -> None:
         self._frames = [Frame(i, float(i), image) for i, image in enumerate(images)]
+        self._ends = ends
+
+    @property
+    def finished(self) -> bool:
+        return self._ends and not self._frames
 
     def poll(self, now_s: float) -> Frame | None:
         return self._frames.pop(0) if self._frames else None
@@ -80,14 +86,6 @@ class _Frames:
 
     def close(self) -> None:
         pass
-
-
-class _Ended(_Frames):
-    """A stream that is over with its last picture."""
-
-    @property
-    def finished(self) -> bool:  # type: ignore[override]
-        return not self._frames
 
 
 def _clock() -> Callable[[], float]:
@@ -110,9 +108,6 @@ def test_guided_capture_takes_still_new_sharp_views_and_ends() -> None:
     shots = [m.index for m in moments if m.taken]
     assert all(i % 3 == 1 for i in shots)  # at once when still, and once each
     assert moments[0].advice == "hold still"
-    name, text, share = moments[-1].rows[0]
-    assert (name, text) == ("x", f"{100 * share:.0f} %")
-    assert 0 < share <= 1
     assert moments[-1].rows[-1] == ("views", str(len(views)), None)
     assert len({m.line for m in moments}) == len(views) + 1  # a pipe gets one line a view
     with pytest.raises(TimedOut, match="only 1 views"):
@@ -143,12 +138,12 @@ def test_one_advice_at_a_time_leads_to_the_end() -> None:
             (0.1, 0.1, 0.2, -0.3, -0.3), (0.9, 0.9, 0.9, 0.3, 0.3)
         )
         shown = [Signature(x, y, size, tilt_x, tilt_y)]
-        while (advice := hint(shown)) != "show the board somewhere new":
+        while (advice := next_advice(shown)) != "show the board somewhere new":
             assert advice in FOLLOWED, advice
-            before = min(progress(shown).values())
+            before = min(covered_shares(shown).values())
             shown.append(dataclasses.replace(shown[-1], **FOLLOWED[advice]))
             given.add(advice)
-            assert min(progress(shown).values()) >= before
+            assert min(covered_shares(shown).values()) >= before
             assert len(shown) < 12
     assert given == set(FOLLOWED)
 
@@ -178,13 +173,13 @@ def test_live_pictures_are_kept_as_they_come_also_of_a_camera_that_goes(
         images += [renderer.render(pose, rng, noise=1.0)] * 2
     folder = tmp_path / "calib" / "pictures"
     with pytest.raises(TimedOut, match="only 2 views"):
-        capture_live_views(_Ended(list(images)), CHESSBOARD, folder, None)
+        capture_live_views(_Frames(images, ends=True), CHESSBOARD, folder, None)
     assert f"kept 2 pictures: images:{folder} takes them again" in capsys.readouterr().err
     for k, name in enumerate(("view_001.png", "view_002.png")):
         assert (cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) == images[2 * k]).all()
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(TimedOut, match="only 2 views"):  # a full disk is no reason to end
-        capture_live_views(_Ended(list(images)), CHESSBOARD, tmp_path / "file" / "p", None)
+        capture_live_views(_Frames(images, True), CHESSBOARD, tmp_path / "file" / "p", None)
     assert capsys.readouterr().err.count("no longer kept") == 1
 
 
@@ -207,37 +202,26 @@ def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> 
     rng = np.random.default_rng(4)
     camera = draw_camera(rng)
     state = Capture()
-    poses = draw_poses(rng, camera, CHARUCO, 60)
-    views = [corner_view(rng, camera, CHARUCO, pose, 0.05, "v") for pose in poses]
-    shown = 0
-    for view in views:
+    for pose in draw_poses(rng, camera, CHARUCO, 40):
+        view = corner_view(rng, camera, CHARUCO, pose, 0.05, "v")
+        state = update_capture(update_capture(state, view, CHARUCO), view, CHARUCO)
         if state.finished:
             break
-        state = consider(consider(state, view, CHARUCO), view, CHARUCO)
-        shown += 1
     assert state.finished
-    assert 15 <= len(state.taken) <= shown <= 40
-    again = consider(state, state.taken[-1], CHARUCO)
-    assert not again.shot
-    blurred = BoardView(*(getattr(views[-1], n) for n in ("name", "size_px", "ids", "object_m")),
-                   views[-1].corners_px, 8.0)  # fmt: skip
-    before = consider(Capture(), blurred, CHARUCO)
-    assert "blurred" in consider(before, blurred, CHARUCO).advice
+    assert len(state.taken) >= 15
+    assert not update_capture(state, state.taken[-1], CHARUCO).shot
+    blurred = dataclasses.replace(view, blur_px=8.0)
+    before = update_capture(Capture(), blurred, CHARUCO)
+    assert "blurred" in update_capture(before, blurred, CHARUCO).advice
 
 
-ROWS = (("x", "50 %", 0.5), ("views", "3", None))
-
-
-def test_the_page_s_bars_are_shares_and_no_characters() -> None:
-    moment = Moment(0, np.zeros((4, 4), np.uint8), (), ROWS, "hold still", "3 views")
-    state = page_state(moment)
-    assert state == {"rows": [["x", "50 %", 0.5], ["views", "3"]], "phase": "hold still"}
-
-
-def test_a_pipe_gets_a_line_whenever_it_changes() -> None:
+def test_a_pipe_gets_a_line_whenever_it_changes_and_the_page_its_shares() -> None:
     out = io.StringIO()
-    moment = Moment(0, np.zeros((4, 4), np.uint8), (), ROWS, "hold still", "")
+    rows = (("x", "50 %", 0.5), ("views", "3", None))
+    moment = Moment(0, np.zeros((4, 4), np.uint8), (), rows, "hold still", "")
     with guide(None, out) as show:
         for line in ("a", "a", "b"):
             show(dataclasses.replace(moment, line=line))
     assert out.getvalue().splitlines() == ["perchctl: a", "perchctl: b"]
+    state = {"rows": [["x", "50 %", 0.5], ["views", "3"]], "phase": "hold still"}
+    assert page_state(moment) == state

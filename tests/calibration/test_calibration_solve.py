@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -19,7 +17,6 @@ from perchctl.calibration.board.adjust import (
     start_fit,
 )
 from perchctl.calibration.board.predict import limit_mm, position_errors_mm, predict_errors
-from perchctl.camera import read_grey
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel
@@ -45,29 +42,8 @@ def moved(view: BoardView, which: Array, by: tuple[float, float]) -> BoardView:
     return dataclasses.replace(view, corners_px=corners)
 
 
-@pytest.fixture(scope="module")
-def plain_corners(chessboard_folder: Path) -> list[BoardView]:
-    """The photographs' views with OpenCV's own corners, as its program for chessboards has them."""
-    views = []
-    for path in sorted(chessboard_folder.glob("*.jpg")):
-        image = read_grey(path)
-        found, corners = cv2.findChessboardCorners(image, (9, 6))
-        assert found
-        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.001)
-        cv2.cornerSubPix(image, corners, (11, 11), (-1, -1), stop)
-        size_px = (image.shape[1], image.shape[0])
-        object_m = CHESSBOARD.corners_m()
-        px = corners.reshape(-1, 2).astype(np.float64)
-        views.append(BoardView(path.name, size_px, np.arange(54), object_m, px))
-    return views
-
-
-def test_photographs_as_opencv_has_them(plain_corners: list[BoardView]) -> None:
-    assert len(plain_corners) == 13
-    assert start_fit(plain_corners, "plumb_bob").rms_px == pytest.approx(0.4087, abs=0.005)
-
-
-def test_photographs_with_the_better_corners(chessboard_folder: Path) -> None:
+def test_photographs(chessboard_folder: Path) -> None:
+    """Of two of them OpenCV's own corners are off by pixels: RMS 0.41 px."""
     views, _ = views_of_images(str(chessboard_folder), CHESSBOARD)
     result = calibrate_camera(views, "")
     assert len(result.views) >= 11
@@ -81,56 +57,14 @@ def test_photographs_with_the_better_corners(chessboard_folder: Path) -> None:
         assert rms.get(faulty, 1.0) < 0.25 or faulty in named
 
 
-def test_opencv_s_faulty_corners_are_rejected_and_named(plain_corners: list[BoardView]) -> None:
-    result = calibrate_camera(plain_corners, "")
-    named = {r.view: r for r in result.rejections}
-    assert {"left02.jpg", "left13.jpg"} <= set(named)
-    assert len(result.views) >= 11
-    assert result.fit.rms_px <= 0.24
-    assert 532 <= result.camera.K[0, 0] <= 537
-
-
-def test_rendered_boards_and_their_truth(scenes_folder: Path) -> None:
-    text = json.loads((scenes_folder / "truth.json").read_text())
-    K, dist = np.array(text["camera_matrix"]), np.array(text["dist_coeffs"])
-    truth = CameraModel(tuple(text["image_size"]), K, dist)
-    views, _ = views_of_images(str(scenes_folder / "calib"), CHARUCO)
-    result = calibrate_camera(views, "")
-    error = result.fit.parameters - parameters_of(truth)
-    assert np.abs(error[:2]).max() < 0.3
-    assert np.abs(error[2:4]).max() < 0.6
-    assert (np.abs(error) < 3 * result.std).all()
-    for e in result.errors:
-        true_mm = position_errors_mm(result.camera, truth, e.z_m, result.covered)
-        assert true_mm.max() < e.mm95
-        assert true_mm[0] < e.axis_mm95
-
-
-RANK = {"stop": 0, "care": 1, "fly": 2}
-
-
-def rank_and_aside(views: Sequence[BoardView]) -> tuple[int, float]:
-    """How good the verdict is (a refusal is the worst), and the error aside, in limits."""
-    try:
-        result = calibrate_camera(views, "")
-    except InvalidValue:
-        return -1, np.inf
-    return RANK[result.level], max(e.mm95 / limit_mm(e.z_m) for e in result.errors)
-
-
-def test_more_photographs_do_not_look_worse(chessboard_folder: Path) -> None:
-    """Beyond the corners the polynomial of all of them is wilder than that of six."""
-    views, _ = views_of_images(str(chessboard_folder), CHESSBOARD)
-    few, many = rank_and_aside(views[:6]), rank_and_aside(views)
-    assert few[0] <= many[0] == RANK["care"]
-    assert few[1] > many[1]
-
-
 def test_more_views_do_not_look_worse() -> None:
+    """A refusal is the worst verdict."""
     views, _ = drawn(5, views=14, noise_px=0.2)
-    ranks = [rank_and_aside(views[:n])[0] for n in (4, 6, 9, 14)]
-    assert ranks == sorted(ranks)
-    assert (ranks[0], ranks[-1]) == (-1, RANK["fly"])
+    levels = [calibrate_camera(views[:n], "").level for n in (6, 9, 14)]
+    assert levels == sorted(levels, key=["stop", "care", "fly"].index)
+    assert levels[-1] == "fly"
+    with pytest.raises(InvalidValue, match="only 4 pictures show the board"):
+        calibrate_camera(views[:4], "")
 
 
 def test_what_boards_did_not_cover_is_not_good_to_fly_with() -> None:
@@ -231,24 +165,26 @@ def test_views_that_fit_no_camera_are_refused() -> None:
         calibrate_camera(views, "", "plumb_bob")
 
 
-def test_too_few_views_say_how_many_to_add() -> None:
-    views, _ = drawn(0)
-    with pytest.raises(InvalidValue, match=r"only 2 pictures show the board.*add 3 or more"):
-        calibrate_camera(views[:2], "")
-
-
-def test_frontal_views_are_refused() -> None:
-    views, _ = drawn(1, max_tilt_deg=4.0)
-    with pytest.raises(InvalidValue, match=r"tilted by more than.*add .* 20 to 45 deg"):
-        calibrate_camera(views, "")
-
-
-def test_boards_in_one_corner_of_the_picture_are_refused() -> None:
-    views, camera = drawn(2)
-    near = np.array(camera.size_px) * (0.5, 0.6)
+def near_a_corner(views: list[BoardView]) -> list[BoardView]:
+    """The views' corners in a third of the picture."""
+    near = np.array(views[0].size_px) * (0.5, 0.6)
     cut = [v.keep((v.corners_px < near).all(axis=1)) for v in views]
-    with pytest.raises(InvalidValue, match=r"cover .* %.*add views with the board at the .*right"):
-        calibrate_camera([v for v in cut if len(v) >= 8], "")
+    return [v for v in cut if len(v) >= 8]
+
+
+@pytest.mark.parametrize(
+    ("views", "advice"),
+    [
+        (drawn(0)[0][:2], r"only 2 pictures.*add 3 or more"),
+        (drawn(1, max_tilt_deg=4.0)[0], r"tilted by more than.*add .* 20 to 45 deg"),
+        (near_a_corner(drawn(2)[0]), r"cover .* %.*add views with the board at the .*right"),
+    ],
+)
+def test_too_little_to_calibrate_from_is_refused_with_what_to_add(
+    views: list[BoardView], advice: str
+) -> None:
+    with pytest.raises(InvalidValue, match=advice):
+        calibrate_camera(views, "")
 
 
 def test_the_simplest_lens_model_that_follows_the_lens_is_taken() -> None:

@@ -10,10 +10,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
@@ -30,16 +28,14 @@ from perchctl.calibration import (
 )
 from perchctl.calibration.mounting.capture import LEAST_S, MOST_S
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.commands import app, calibrate_mount
+from perchctl.commands import calibrate_mount
 from perchctl.errors import InvalidValue, TimedOut
-from perchctl.geometry import R_MARKER_TARGET
 from perchctl.link import MotionLink
-from perchctl.profile import load_profile
 from perchctl.sim import Scenario, SimProcess
 from perchctl.vision import Frame
+from tests.helpers.calibrating import calibrate
 from tests.helpers.mounting import hand, seen
 from tests.helpers.relay import relayed
-from tests.helpers.target_picture import CAMERA, pose_of, render
 
 RPY_RAD = (0.1, 0.2, 0.5)
 STILL = Scenario(ceiling_z_m=1.4)
@@ -81,7 +77,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     Path("mine.yaml").write_text("extends: crazyflie\n", encoding="utf-8")
     with relayed(sim.uri) as relay:
         words = ["-p", "mine.yaml", "-u", relay.uri, "--source", sim.stream_url, "--part", "carry"]
-        said = CliRunner().invoke(app, ["calibrate", "mount", *words])
+        said = calibrate("mount", *words)
         assert relay.up
         assert relay.commands() == []
         assert relay.writes() == []
@@ -98,7 +94,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     ages_s = np.diff([a.t_s for a in recording.attitudes])
     assert np.median(ages_s) == pytest.approx(0.01, abs=1e-4)
     assert abs(recording.poses[-1].t_s - newest.t_s) < 0.5  # one clock
-    again = CliRunner().invoke(app, ["calibrate", "mount", "-p", "mine.yaml", "--from", str(log)])
+    again = calibrate("mount", "-p", "mine.yaml", "--from", log)
     assert again.exit_code == 30
     assert "lacks motion" in again.stderr
 
@@ -115,7 +111,7 @@ def test_a_vehicle_that_does_not_answer(
             "extends: crazyflie\nlink: {connect_timeout_s: 0.5}\n", encoding="utf-8"
         )
         words = ["-p", "mine.yaml", "-u", uri, "--source", sim.stream_url]
-        said = CliRunner().invoke(app, ["calibrate", "mount", *words])
+        said = calibrate("mount", *words)
     assert said.exit_code == 10
     assert f"no Crazyflie at {uri}: no answer" in said.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
@@ -128,7 +124,7 @@ def test_turning_motors_end_it(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(MotionLink, "motors_run", True)
     words = ["-p", "crazyflie", "-u", sim.uri, "--source", sim.stream_url]
-    said = CliRunner().invoke(app, ["calibrate", "mount", *words])
+    said = calibrate("mount", *words)
     assert said.exit_code == 52
     assert "motors" in said.stderr
     assert not list(tmp_path.iterdir())
@@ -261,7 +257,7 @@ def test_a_receivers_repetitions_are_no_pictures_without_the_target() -> None:
     assert len(moments) == len(tape.poses) == pytest.approx(20, abs=2)
     film = _Receiver(stuck_s=1.0)
     recorded(MountingTape("pivot"), film, looks)
-    assert film.now_s == pytest.approx(MOST_S, abs=1.0), "and it ends though none is new"
+    assert film.now_s == pytest.approx(MOST_S, abs=1.0), "nobody records for ever"
 
 
 def test_a_mirrored_picture_ends_it_soon() -> None:
@@ -269,30 +265,6 @@ def test_a_mirrored_picture_ends_it_soon() -> None:
     with pytest.raises(InvalidValue, match=r"mirrored.*camera\.mirrored"):
         recorded(MountingTape("carry"), film, _Looks((), mirrored=True))
     assert film.now_s < 5.0
-
-
-def test_pictures_become_poses_or_are_counted_as_mirrored() -> None:
-    rvec, tvec = pose_of(0.02, -0.01, 0.6, yaw_rad=0.4)
-    picture = render(rvec, tvec, CAMERA)
-    eye = Eye(load_profile("sim"), CAMERA, live=True)
-    (pose,) = eye.look(Frame(0, 1.25, picture, 1.25))
-    assert pose.t_s == 1.25
-    assert pose.position_cam_target_m == pytest.approx(tvec, abs=1e-3)
-    wanted = cv2.Rodrigues(rvec)[0] @ R_MARKER_TARGET
-    assert pose.rotation_cam_target == pytest.approx(wanted, abs=0.02)
-    assert pose.covariance is not None
-    assert [name for name, _ in eye.outlines] == ["large", "small"]
-    assert eye.look(Frame(1, 1.3, picture, 1.3)) == []  # the receiver repeats it
-    assert eye.mirrored == 0
-    flipped = Eye(load_profile("sim"), CAMERA, live=True)
-    assert flipped.look(Frame(0, 1.0, np.ascontiguousarray(picture[:, ::-1]), 1.0)) == []
-    assert flipped.mirrored == 1
-
-
-def test_nobody_records_for_ever() -> None:
-    film = _Film()
-    recorded(MountingTape("pivot"), film, _Looks(()))
-    assert film.now_s == pytest.approx(MOST_S, abs=1.0)
 
 
 def test_a_camera_or_a_vehicle_that_goes_ends_it_and_the_tape_keeps_what_was() -> None:

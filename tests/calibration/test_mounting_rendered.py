@@ -65,3 +65,8 @@ def test_a_picture_is_seen_as_it_is_and_mirrored_as_such(flipped: bool) -> None:
             np.testing.assert_allclose(pose.position_cam_target_m, place_m, atol=4e-3)
             assert pose.covariance is not None
     assert (eye.mirrored, len(poses)) == ((4, 0) if flipped else (0, 4))
+    assert bool(eye.outlines) is not flipped
+    again = Frame(frame.index + 1, frame.t_arrival_s + 0.03, image, frame.t_arrival_s + 0.03)
+    live = Eye(profile(), camera, live=True)
+    assert len(live.look(again)) == len(found)
+    assert live.look(replace(again, index=99)) == [], "a receiver's repetition is no picture"

@@ -16,10 +16,8 @@ from perchctl.vision import CameraModel, project, undistort
 
 CHARUCO = parse_board("charuco:10x7:25mm:18mm:DICT_5X5_100")
 CHESSBOARD = parse_board("chessboard:9x6:25mm")
-APRILGRID = parse_board("aprilgrid:6x6:22mm:0.3")
 _SUPER = 3  # samples across a pixel
 _SQUARE_PX = 50  # of the drawn board; a marker of 18 in 25 mm is 36 px, in the middle
-_TAG_PX = 120  # of a drawn aprilgrid; the gap of 0.3 is 36 px
 
 
 def draw_camera(rng: np.random.Generator, size_px: tuple[int, int] = (640, 480)) -> CameraModel:
@@ -133,7 +131,7 @@ class BoardRenderer:
         b = rays @ H[:, :2].T + H[:, 2]
         xy = b[..., :2] / b[..., 2:]
         first = 1.0 if self.board.kind == "chessboard" else 0.0
-        place = (xy + (first + 1.0) * self.board.square_m) * _px_per_m(self.board) - 0.5
+        place = (xy + (first + 1.0) * self.board.square_m) * _SQUARE_PX / self.board.square_m - 0.5
         place[b[..., 2] <= 0] = -1e6
         drawn = cv2.remap(
             self._texture,
@@ -168,16 +166,8 @@ def render_folder(
     return paths
 
 
-def _px_per_m(board: Board) -> float:
-    if board.kind == "aprilgrid" and board.marker_m:
-        return _TAG_PX / board.marker_m
-    return _SQUARE_PX / board.square_m
-
-
 def _drawn(board: Board) -> Grey:
     """The board with one square of white around it."""
-    if board.kind == "aprilgrid":
-        return _drawn_tags(board)
     black = black_squares(board)
     sheet = np.where(black, 30, 225).astype(np.uint8).repeat(_SQUARE_PX, 0).repeat(_SQUARE_PX, 1)
     if board.marker_m is not None:
@@ -189,23 +179,6 @@ def _drawn(board: Board) -> Grey:
             y, x = row * _SQUARE_PX + margin, column * _SQUARE_PX + margin
             sheet[y : y + side, x : x + side] = np.where(marker > 0, 225, 30)
     return np.asarray(np.pad(sheet, _SQUARE_PX, constant_values=225))
-
-
-def _drawn_tags(board: Board) -> Grey:
-    """From OpenCV's own tags, turned as Kalibr prints them, not from perchctl's drawing."""
-    scale, (width, height) = _px_per_m(board), board.size_m
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    gap, pitch = round(board.square_m * scale), round((board.square_m + board.marker_m) * scale)
-    sheet = np.full((round(height * scale), round(width * scale)), 225, np.uint8)
-    for y in range(board.rows + 1):
-        for x in range(board.columns + 1):
-            sheet[y * pitch :, x * pitch :][:gap, :gap] = 30
-    for tag in range(board.columns * board.rows):
-        column, row = tag % board.columns, board.rows - 1 - tag // board.columns
-        picture = dictionary.generateImageMarker(tag, _TAG_PX, borderBits=2)
-        place = sheet[row * pitch + gap :, column * pitch + gap :][:_TAG_PX, :_TAG_PX]
-        place[:] = np.where(np.rot90(picture, 2) > 0, 225, 30)
-    return np.asarray(np.pad(sheet, gap, constant_values=225))
 
 
 def _moved(drawn: Grey, motion_px: tuple[float, float]) -> Grey:

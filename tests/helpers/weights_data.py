@@ -1,11 +1,13 @@
-"""Synthetic sessions whose best weights are known."""
+"""Synthetic sessions whose best weights are known, and the command that fits them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
+from typer.testing import CliRunner, Result
 
+from perchctl.commands import app
 from perchctl.geometry import Array
 from perchctl.weights.data import NEEDED, Measurements, row_text, wrap
 
@@ -79,3 +81,9 @@ def write(data: Measurements, path: Path) -> Path:
     ]
     path.write_text("\n".join([",".join(NEEDED), *rows, ""]), encoding="utf-8")
     return path
+
+
+def run(*words: object, stdin: str | None = None) -> Result:
+    result = CliRunner().invoke(app, ["fit-weights", *map(str, words)], input=stdin)
+    assert "Traceback" not in result.output
+    return result

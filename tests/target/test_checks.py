@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.errors import InvalidValue, NotFound
-from perchctl.target import Board, check_target, parse_board, parse_length, tag_cells
+from perchctl.errors import InvalidValue
+from perchctl.target import Board, check_target, parse_board, parse_length
 from perchctl.target.boards import black_squares, board_rectangles
 from perchctl.target.page import parse_page
 from tests.target.rig import target_of
@@ -104,15 +101,6 @@ boards = st.one_of(
         st.floats(0.4, 0.94),
         st.booleans(),
     ),
-    st.builds(
-        lambda columns, rows, tag, spacing: parse_board(
-            f"aprilgrid:{columns}x{rows}:{tag / 10}mm:{spacing / 100}"
-        ),
-        st.integers(3, 20),
-        st.integers(3, 20),
-        st.integers(50, 900),
-        st.integers(10, 100),
-    ),
 )
 
 
@@ -143,14 +131,10 @@ def test_a_measured_print_moves_the_corners_along_each_side_for_itself() -> None
         ("chessboard:9:25mm", "not COLUMNSxROWS"),
         ("chessboard:2x6:25mm", "3 to 100"),
         ("circles:9x6:25mm", "kind 'circles'"),
+        ("aprilgrid:6x6:22mm:0.3", "reads its camchain.yaml"),
+        ("april_6x6.yaml", "reads its camchain.yaml"),
         ("chessboard:9x6:25mm:measured=25x17cm", "not WIDTHxHEIGHT in mm"),
         ("chessboard:9x6:25mm:measured=25x17.5mm", "-90 % off the 250 mm"),
-        ("aprilgrid:6x6:22", "no unit"),
-        ("aprilgrid:6x6:22mm:6.6mm", "as a share of the tag's side"),
-        ("aprilgrid:6x6:22mm:1.5", "0.1 to 1"),
-        ("aprilgrid:6x6:22mm:nan", "0.1 to 1"),
-        ("aprilgrid:30x20:22mm", "tag36h11 holds 587"),
-        ("aprilgrid:6x6:22mm:0.3:legacy", "aprilgrid:COLUMNSxROWS:TAG:SPACING"),
         ("charuco:10x7:25mm", "MARKER:DICTIONARY"),
         ("charuco:10x7:25mm:25mm:DICT_5X5_100", "needs white around it"),
         ("charuco:10x7:25mm:18mm:DICT_9X9", "is unknown"),
@@ -194,90 +178,3 @@ def test_a_chessboard_has_one_more_square_than_corners() -> None:
     assert board.corners_m()[0] == pytest.approx([0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="only a charuco board"):
         board.cv2_board()
-
-
-KALIBR = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.088\ntagSpacing: 0.3\n"
-
-
-def test_kalibr_s_own_file_of_a_board_is_read(tmp_path: Path) -> None:
-    file = tmp_path / "april.yaml"
-    file.write_text(KALIBR)
-    assert parse_board(str(file)) == parse_board("aprilgrid:6x5:88mm:0.3")
-    file.write_text(KALIBR.replace("0.088", "0.0879137"))  # as measured with a caliper
-    assert parse_board(str(file)).marker_m == 0.0879137
-    file.write_text(
-        "target_type: checkerboard\ntargetCols: 6\ntargetRows: 7\n"
-        "rowSpacingMeters: 0.06\ncolSpacingMeters: 0.06\n"
-    )
-    assert parse_board(str(file)) == parse_board("chessboard:6x7:60mm")
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("'aprilgrid'", "circlegrid", "must be an aprilgrid"),
-        ("target_type: 'aprilgrid'", "", "target_type is missing"),
-        ("tagSize: 0.088", "", "tagSize is missing"),
-        ("0.088", "big", "convert"),
-        ("0.088", "[1, 2]", "float"),
-        ("'aprilgrid'", "x" * 9999, "must be an aprilgrid"),
-        ("tagCols: 6", "tagCols: 6.5", "not COLUMNSxROWS"),
-        ("tagCols: 6", "tagCols: .inf", "not COLUMNSxROWS"),
-        ("0.088", ".nan", "not a length"),
-        ("0.088", "[", "not YAML"),
-        ("tagCols: 6", "tagCols: 1", "3 to 100"),
-        ("tagSpacing: 0.3", "tagSpacing: 3", "share of the tag"),
-    ],
-)
-def test_a_wrong_file_of_a_board_is_one_sentence(
-    tmp_path: Path, old: str, new: str, said: str
-) -> None:
-    file = tmp_path / "april.yaml"
-    file.write_text(KALIBR.replace(old, new))
-    with pytest.raises(InvalidValue, match=said) as refused:
-        parse_board(str(file))
-    assert "\n" not in str(refused.value)
-    assert len(str(refused.value)) < 400
-    with pytest.raises(NotFound, match="does not exist"):
-        parse_board(str(tmp_path / "none.yaml"))
-
-
-def test_tags_are_those_of_apriltag_upright() -> None:
-    """The first three codes of tag36h11 as AprilTag lists them: row by row from the top left
-    cell, the highest bit first, set where it is white."""
-    for tag, code in enumerate((0xD5D628584, 0xD97F18B49, 0xDD280910E)):
-        cells = tag_cells(tag)
-        assert cells.shape == (10, 10)
-        white = np.argwhere(~cells) - 2
-        assert sum(1 << int(35 - 6 * row - column) for row, column in white) == code
-
-
-def test_an_aprilgrid_lies_as_kalibr_has_it() -> None:
-    """Its numbers run from the bottom left tag to the right and up, its y axis upwards."""
-    board = parse_board("aprilgrid:4x3:20mm:0.25")
-    assert board.size_m == pytest.approx((0.105, 0.080))
-    corners = board.corners_m()
-    bottom_left = corners[2 * 4 * 5]
-    kalibr = (corners - bottom_left) * [1, -1, 1]
-    for tag in range(12):
-        # Kalibr's formula of a tag's bottom left corner, and its other three.
-        at = np.array([tag % 4, tag // 4]) * 0.020 * 1.25
-        bottom_right, own, top_left, top_right = kalibr[list(board.tag_corners(tag)), :2]
-        assert own == pytest.approx(at)
-        assert bottom_right == pytest.approx((at[0] + 0.020, at[1]))
-        assert top_right == pytest.approx(at + 0.020)
-        assert top_left == pytest.approx((at[0], at[1] + 0.020))
-
-
-def test_an_aprilgrid_s_corners_are_where_black_meets_black() -> None:
-    board = parse_board("aprilgrid:4x3:20mm:0.3")
-    width, height = board.size_m
-    boxes = [(r.x0_m, r.y0_m, r.x1_m, r.y1_m) for r in board_rectangles(board)]
-
-    def black(x: float, y: float) -> bool:
-        return any(x0 < x < x1 and y0 < y < y1 for x0, y0, x1, y1 in boxes)
-
-    for x, y, _ in board.corners_m():
-        for dx, dy in itertools.product((-1e-3, 1e-3), repeat=2):
-            diagonal = black(x - width / 2 + 1e-3, height / 2 - y + 1e-3)
-            assert black(x - width / 2 + dx, height / 2 - y + dy) == (diagonal == (dx * dy > 0))

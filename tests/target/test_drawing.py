@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from perchctl.profile import MarkerConfig, TargetConfig
 from perchctl.target import draw_target
-from perchctl.target.drawing import marker_cells
 
 targets = st.builds(
     lambda large_id, small_id, large_m, ratio: TargetConfig(
@@ -95,11 +94,3 @@ def test_any_two_ids_are_both_read_from_the_bitmap(target: TargetConfig) -> None
         _, ids, _ = cv2.aruco.ArucoDetector(own).detectMarkers(image)
         read[marker.dictionary] = ids is not None and len(ids) > 0
     assert all(read.values()), read
-
-
-def test_cells_have_the_black_border() -> None:
-    cells = marker_cells(TargetConfig().large)
-    assert cells.shape == (6, 6)
-    assert cells[0].all()
-    assert cells[:, -1].all()
-    assert not cells[2:4, 2:4].any(), "id 997 is white in the middle"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from perchctl.profile import TargetConfig
 from perchctl.target.drawing import marker_corners_m
-from perchctl.target.print_check import PrintCheck, size_ratio
+from perchctl.target.prints import PrintCheck, size_ratio
 from perchctl.vision import CameraModel
 
 TARGET = TargetConfig()

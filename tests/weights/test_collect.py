@@ -13,11 +13,10 @@ from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, NotFound
 from perchctl.positioning import BodyPose, CaptureFrame
 from perchctl.profile import PositioningConfig, find_calibration, load_profile
-from perchctl.weights import MocapTruth, SessionFile, SimulatedStand
-from perchctl.weights.collect import fault_of, read_markers
-from perchctl.weights.data import HEADER, NEEDED, read_csv
-from perchctl.weights.truth import Actual, moved
-from tests.helpers.fit_weights import run
+from perchctl.weights import MocapTruth, SimulatedStand
+from perchctl.weights.collect import ActualPose, motion_fault, position_fault, read_markers
+from perchctl.weights.data import read_csv
+from tests.helpers.weights_data import run
 
 
 @pytest.fixture(scope="module")
@@ -61,15 +60,15 @@ def test_shaken_and_half_seen_positions_are_refused() -> None:
     stand = SimulatedStand(profile, camera, 2, 0)
     place = stand.place(1)
     good = list(read_markers(stand.frames(1, place, 6), profile, camera))
-    assert fault_of(good) is None
+    assert position_fault(good) is None
     moved = place.T_world_cam.copy()
     moved[0, 3] += 0.002
     other = type(place)(moved, place.actual)
     late = list(read_markers(stand.frames(1, other, 6), profile, camera))
-    assert "shaken" in (fault_of([*good, *late]) or "")
+    assert "shaken" in (position_fault([*good, *late]) or "")
     blind = [type(s)(s.t_s, s.large, None, None, None) for s in good]
-    assert "the small marker was found in 6 of 12" in (fault_of([*good, *blind]) or "")
-    assert "only 2 frames" in (fault_of(good[:2]) or "")
+    assert "the small marker was found in 6 of 12" in (position_fault([*good, *blind]) or "")
+    assert "only 2 frames" in (position_fault(good[:2]) or "")
 
 
 def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:
@@ -147,8 +146,8 @@ def test_motion_capture_gives_the_median_of_the_vehicle_s_axes(body: str, yaw_ra
     assert found.pose == pytest.approx([0.0, 0.05, 0.17, 0.4], abs=2e-4)
     assert found.attitude is not None
     later = truth_of(Recorded(), body, math.degrees(yaw_rad)).actual(lambda question: "")
-    assert moved(found, later) is None
-    assert "moved by" in (moved(found, Actual(later.pose + 0.004)) or "")
+    assert motion_fault(found, later) is None
+    assert "moved by" in (motion_fault(found, ActualPose(later.pose + 0.004)) or "")
 
 
 def test_a_capture_that_does_not_see_the_body_is_named() -> None:
@@ -167,10 +166,3 @@ def test_motion_capture_is_the_profile_s(tmp_path: Path) -> None:
     assert done.exit_code == 2
     assert "by: mocap" in done.stderr
     assert not list(tmp_path.iterdir())
-
-
-def test_a_session_of_another_header_and_the_shipped_header_agree(tmp_path: Path) -> None:
-    file = SessionFile(tmp_path / "new.csv", 10)
-    assert file.path.read_text() == HEADER + "\n"
-    assert HEADER.startswith(",".join(NEEDED))
-    assert file.next_position == 1

@@ -41,12 +41,12 @@ together, to poles beside the picture. They are held at 0 +- 5 as if by one corn
 
 
 def make_camera(model: str, size_px: tuple[int, int], parameters: Array) -> CameraModel:
-    """A camera from fx, fy, cx, cy and the distortion, in the order of `PARAMETERS`."""
+    """Return a camera from fx, fy, cx, cy and the distortion, in the order of `PARAMETERS`."""
     return CameraModel(size_px, _matrix(parameters), np.array(parameters[4:], np.float64), model)
 
 
 def _matrix(parameters: Array) -> Array:
-    """The camera matrix (3, 3)."""
+    """Return the camera matrix (3, 3)."""
     K = np.eye(3)
     K[[0, 1], [0, 1]] = parameters[:2]
     K[:2, 2] = parameters[2:4]
@@ -54,7 +54,8 @@ def _matrix(parameters: Array) -> Array:
 
 
 def parameters_of(camera: CameraModel) -> Array:
-    """Inverse of `make_camera`; four coefficients of plumb_bob get k3 = 0."""
+    """Return the lens parameters of a camera, in the order of `PARAMETERS`; four coefficients of
+    plumb_bob get k3 = 0."""
     K, dist = camera.K, camera.dist
     if camera.model == "plumb_bob" and dist.size == 4:
         dist = np.append(dist, 0.0)
@@ -62,7 +63,7 @@ def parameters_of(camera: CameraModel) -> Array:
 
 
 def prior_of(model: str) -> Array:
-    """What pulls each lens parameter to zero, (p,): information in px^-2 of cost."""
+    """Return how strongly each lens parameter is pulled to zero, (p,), in px^2 of cost."""
     names = PARAMETERS[model]
     held = ("k1", "k2", "k3", "k4", "k5", "k6") if model == "rational_polynomial" else ()
     return np.array([(_PRIOR_PX / _PRIOR_SPREAD) ** 2 * (name in held) for name in names])
@@ -71,8 +72,8 @@ def prior_of(model: str) -> Array:
 def project_with_derivatives(
     model: str, parameters: Array, pose: Array, points_m: Array
 ) -> tuple[Array, Array, Array]:
-    """Pixels (n, 2) of points (n, 3) at a pose (rvec and tvec, (6,)), and their derivatives
-    (2 n, p) by the lens and (2 n, 6) by the pose."""
+    """Return the pixels (n, 2) of points (n, 3) at a pose (rvec and tvec, (6,)), and their
+    derivatives (2 n, p) by the lens and (2 n, 6) by the pose."""
     p = len(parameters)
     K, dist = _matrix(parameters), np.ascontiguousarray(parameters[4:])
     points, rvec, tvec = np.ascontiguousarray(points_m), pose[:3].copy(), pose[3:].copy()
@@ -87,7 +88,7 @@ def project_with_derivatives(
 
 
 def pixel_grid(size_px: tuple[int, int], columns: int = 17, rows: int = 13) -> Array:
-    """Pixels over the whole image with its rims, (columns * rows, 2)."""
+    """Return pixels over the whole image with its rims, (columns * rows, 2)."""
     x, y = np.meshgrid(
         np.linspace(0, size_px[0] - 1, columns), np.linspace(0, size_px[1] - 1, rows)
     )
@@ -105,7 +106,7 @@ _IMPOSSIBLE_PX = 1e4  # residual of a lens for which a board has no pose
 
 
 class NoSolution(ArithmeticError):
-    """No start led to a camera."""
+    """No camera fits the corners, from whichever start."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,11 +148,11 @@ class Fit:
         return float(np.sqrt((np.concatenate(self.residuals) ** 2).sum(axis=1).mean()))
 
     def view_rms_px(self) -> Array:
-        """RMS distance of each view, (v,)."""
+        """Return the RMS distance of each view, (v,) px."""
         return np.array([np.sqrt((r**2).sum(axis=1).mean()) for r in self.residuals])
 
     def reduced_blocks(self) -> list[tuple[Array, Array]]:
-        """What each view tells of the lens once its pose is free: the weighted derivative
+        """Return what each view tells of the lens once its pose is free: the weighted derivative
         (2 n, p) with the pose's part projected out, and the weighted residuals (2 n,)."""
         blocks = []
         for r, (A, B), w in zip(self.residuals, self.jacobians, self.weights, strict=True):
@@ -183,14 +184,6 @@ def start_fit(views: Sequence[BoardView], model: str) -> Fit:
     return refit(views, min(found, key=lambda fit: fit.cost))
 
 
-def fit_from(views: Sequence[BoardView], camera: CameraModel) -> Fit:
-    """Solve all parameters from a camera that is nearly right. Raises NoSolution."""
-    posed = poses_only(views, camera)
-    if posed is None:
-        raise NoSolution("the camera given cannot see the boards where they are")
-    return refit(views, posed)
-
-
 def refit(
     views: Sequence[BoardView],
     near: Fit,
@@ -208,7 +201,7 @@ def refit(
 
 
 def poses_only(views: Sequence[BoardView], camera: CameraModel) -> Fit | None:
-    """Best poses for a camera held fixed; None where a view does not fit it at all."""
+    """Return the best poses for a camera held fixed; None where a view does not fit it at all."""
     poses = [_first_pose(view, camera) for view in views]
     found = [pose for pose in poses if pose is not None]
     if len(found) < len(views):
@@ -217,7 +210,8 @@ def poses_only(views: Sequence[BoardView], camera: CameraModel) -> Fit | None:
 
 
 def _minimum(views: Sequence[BoardView], start: Fit, evaluations: int = 60) -> Fit | None:
-    """The fit to which the lens parameters lead from `start`, with its weights."""
+    """Return the minimum to which the lens parameters lead from `start`, with its weights; None
+    where it is no camera."""
     newest = start
     root_prior = np.sqrt(prior_of(start.model))
 
@@ -258,7 +252,7 @@ def _posed(
     poses: Array,
     weights: Sequence[Array] | None = None,
 ) -> Fit | None:
-    """The fit of a lens with the poses that are best for it, from nearby ones (v, 6)."""
+    """Return the fit of a lens with the poses that are best for it, from nearby ones (v, 6)."""
     if parameters[0] <= 0.0 or parameters[1] <= 0.0:
         return None
     weights = tuple(np.ones(len(v)) for v in views) if weights is None else tuple(weights)
@@ -283,7 +277,8 @@ def _posed(
 def _best_pose(
     view: BoardView, model: str, parameters: Array, pose: Array, weight: Array
 ) -> tuple[Array, Array, Array, Array] | None:
-    """The pose (6,) by Gauss-Newton, its residuals (n, 2) and derivatives; None: not in view."""
+    """Return the pose (6,) by Gauss-Newton, its residuals (n, 2) and derivatives by the lens and
+    the pose; None where the board is not in view."""
     twice = np.repeat(weight, 2)[:, None]
     best: tuple[Array, Array, Array, Array] | None = None
     best_cost, trial = np.inf, pose
@@ -316,7 +311,7 @@ def _best_pose(
 
 
 def _first_pose(view: BoardView, camera: CameraModel) -> Array | None:
-    """The board's rvec and tvec (6,) seen by a known camera, or None."""
+    """Return the board's rvec and tvec (6,) as a known camera sees it, or None."""
     normalised = undistort(view.corners_px, camera)
     good = np.isfinite(normalised).all(axis=1) & (np.abs(normalised) < 50.0).all(axis=1)
     if good.sum() < 4:
@@ -370,7 +365,7 @@ class Robust:
 
 
 def weighted_fit(views: Sequence[BoardView], model: str) -> tuple[Fit, float]:
-    """Step 1: the solution that outliers do not bend, and its median spread s in px."""
+    """Return the solution that outliers do not bend (step 1), and its median spread s in px."""
     fit = start_fit(views, model)
     spread = _spread_px(fit.residuals)
     for _ in range(12):
@@ -384,13 +379,14 @@ def weighted_fit(views: Sequence[BoardView], model: str) -> tuple[Fit, float]:
     return fit, spread
 
 
-def reject(views: Sequence[BoardView], start: Fit) -> Robust:
-    """Steps 2 to 4 from the weighted solution of all views; InvalidValue when too many go."""
+def reject_outliers(views: Sequence[BoardView], start: Fit) -> Robust:
+    """Leave outliers out (steps 2 to 4), from the weighted solution of all views. Raises
+    InvalidValue when too many go."""
     whole = {view.name: view for view in views}
     kept, fit = list(views), start
     out_views: dict[str, str] = {}
     for k in range(_REJECTION_ROUNDS):
-        masks, reasons = _judge(kept, fit, whole)
+        masks, reasons = _find_outliers(kept, fit, whole)
         out_views |= reasons
         if len(out_views) > MAX_VIEWS_OUT * len(views):
             named = ", ".join(list(out_views)[:4]) + (", ..." if len(out_views) > 4 else "")
@@ -417,10 +413,10 @@ def reject(views: Sequence[BoardView], start: Fit) -> Robust:
     return Robust(fit, tuple(kept), tuple(rejections))
 
 
-def _judge(
+def _find_outliers(
     views: Sequence[BoardView], fit: Fit, whole: dict[str, BoardView]
 ) -> tuple[list[NDArray[np.bool_]], dict[str, str]]:
-    """Corners to keep in each view, and views to leave out with the reason."""
+    """Return the corners to keep in each view, and the views to leave out with the reason."""
     overall = _spread_px(fit.residuals)
     masks, rms = [], []
     for r in fit.residuals:
@@ -444,7 +440,7 @@ def _judge(
 
 
 def _spread_px(residuals: Sequence[Array]) -> float:
-    """Spread of one coordinate, from the median distance."""
+    """Return the spread of one coordinate in px, from the median distance."""
     distances = np.linalg.norm(np.concatenate(residuals), axis=1)
     return max(float(np.median(distances)) / _MEDIAN_OF_RAYLEIGH, _MIN_SPREAD_PX)
 
@@ -459,7 +455,8 @@ def _spread_px(residuals: Sequence[Array]) -> float:
 
 
 def lens_covariance(fit: Fit) -> Array:
-    """Covariance of the lens parameters (p, p); infinite where the views leave one free."""
+    """Return the covariance of the lens parameters (p, p), infinite where the views leave one
+    free."""
     blocks = fit.reduced_blocks()
     p = len(fit.parameters)
     information = np.sum([A.T @ A for A, _ in blocks], axis=0) + np.diag(prior_of(fit.model))
@@ -476,7 +473,7 @@ def lens_covariance(fit: Fit) -> Array:
 
 
 def _jackknife(blocks: list[tuple[Array, Array]], scaled: Array, d: Array) -> Array:
-    """Spread of the solutions without one view each, in scaled parameters, (p, p)."""
+    """Return the spread of the solutions without one view each, in scaled parameters, (p, p)."""
     p, v = len(d), len(blocks)
     floor = 1e-3 * np.linalg.eigvalsh(scaled)[0]
     moves = []
@@ -490,7 +487,7 @@ def _jackknife(blocks: list[tuple[Array, Array]], scaled: Array, d: Array) -> Ar
 
 
 def _larger(a: Array, b: Array) -> Array:
-    """The smallest covariance that is nowhere below a, and as large as b along each axis
+    """Return the smallest covariance that is nowhere below a, and as large as b along each axis
     in which b exceeds a (axes of b in units of a)."""
     root = np.linalg.cholesky(a + 1e-15 * np.trace(a) * np.eye(len(a)))
     inverse = np.linalg.inv(root)

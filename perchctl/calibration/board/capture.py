@@ -37,8 +37,8 @@ def views_of_images(
     board: Board,
     progress: Progress = lambda done, total: None,
 ) -> tuple[list[BoardView], list[Rejection]]:
-    """Every picture of a folder or glob (or those given): the views, and those without a board or
-    broken.
+    """Search every picture of a folder or glob (or those given); return the views of the board, and
+    the pictures that are broken or show none.
 
     Raises:
         NotFound: no pictures. InvalidValue: unequal sizes.
@@ -82,7 +82,7 @@ def views_of_images(
 def views_of_video(
     path: Path, board: Board, progress: Progress = lambda done, total: None
 ) -> tuple[list[BoardView], list[Rejection]]:
-    """The sharp and different views of a video.
+    """Return the sharp and different views of a video, and why there are none.
 
     Raises NotFound or InvalidValue for a file that is none.
     """
@@ -95,7 +95,7 @@ def views_of_video(
     searched = 0
     try:
         with ThreadPoolExecutor(_workers()) as pool:
-            sharpest = _sharpest(source)
+            sharpest = _sharpest_frames(source)
             # A whole video at once would not fit into the memory.
             while batch := [frame for frame, _ in zip(sharpest, range(4 * _workers()))]:  # noqa: B905
                 seen = list(pool.map(search, batch))
@@ -106,11 +106,11 @@ def views_of_video(
         source.close()
     if not found:
         return [], [Rejection(f"{searched} frames", "no board found")]
-    return pick(found, board), []
+    return select_views(found, board), []
 
 
-def _sharpest(source: VideoSource) -> Iterator[Frame]:
-    """The sharpest frame of each window."""
+def _sharpest_frames(source: VideoSource) -> Iterator[Frame]:
+    """Yield the sharpest frame of each window."""
     window: list[Frame] = []
     while (frame := source.poll(0.0)) is not None:
         window.append(frame)
@@ -122,8 +122,8 @@ def _sharpest(source: VideoSource) -> Iterator[Frame]:
 
 
 def sharpness(image: Grey) -> float:
-    """Variance of a picture's second derivative; of one field where there are two: the comb of
-    a moving picture is no sharpness."""
+    """Return the variance of a picture's second derivative; of one field where there are two: the
+    comb of a moving picture is no sharpness."""
     if is_combed(image):
         image = field_picture(image, 0)
     step = max(1, image.shape[1] // _SHARPNESS_WIDTH)
@@ -132,7 +132,7 @@ def sharpness(image: Grey) -> float:
 
 
 def _workers() -> int:
-    """Threads: OpenCV and numpy leave the interpreter free while they work."""
+    """Return the number of threads: OpenCV and numpy leave the interpreter free at work."""
     return max(1, min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2))
 
 
@@ -162,7 +162,7 @@ class Signature:
     tilt_y: float
 
     def distance(self, other: Signature) -> float:
-        """How different two views are."""
+        """Return how different two views are; beyond `NEW_BEYOND` one is new."""
         return float(np.abs(self._vector() - other._vector()).sum())
 
     def _vector(self) -> Array:
@@ -170,7 +170,8 @@ class Signature:
 
 
 def signature(view: BoardView, board: Board) -> Signature:
-    """From the homography board -> picture; tilt is the change of scale across the board."""
+    """Return a view's signature, from the homography board -> picture; tilt is the change of scale
+    across the board."""
     w, h = view.size_px
     x, y = (view.corners_px.mean(axis=0) / (w, h)).tolist()
     squares = view.object_m[:, :2] / board.square_m
@@ -189,8 +190,8 @@ def signature(view: BoardView, board: Board) -> Signature:
     return Signature(x, y, size, tilt_x, tilt_y)
 
 
-def progress(signatures: Sequence[Signature]) -> dict[str, float]:
-    """How far each of `AXES` is covered, 0..1."""
+def covered_shares(signatures: Sequence[Signature]) -> dict[str, float]:
+    """Return how far each of `AXES` is covered, 0..1."""
     if not signatures:
         return dict.fromkeys(AXES, 0.0)
     shown = np.array([(s.x, s.y, s.size, s.tilt_x, s.tilt_y) for s in signatures])
@@ -199,8 +200,8 @@ def progress(signatures: Sequence[Signature]) -> dict[str, float]:
     return {axis: float(min(1.0, spread[axis] / GOALS[axis])) for axis in AXES}
 
 
-def pick(views: Sequence[BoardView], board: Board) -> list[BoardView]:
-    """The sharp and different ones of a video's views, at most `MOST_VIEWS`, in order.
+def select_views(views: Sequence[BoardView], board: Board) -> list[BoardView]:
+    """Return the sharp and different ones of a video's views, at most `MOST_VIEWS`, in order.
 
     The one most unlike those taken is taken next (the sharper the better), until what is
     left repeats them.
@@ -238,8 +239,8 @@ def capture_views(
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
 ) -> list[BoardView]:
-    """Views of a live camera, until all is covered or `stopped`; a picture is taken whenever the
-    view is new, sharp and still. `show` gets each frame's moment.
+    """Take views of a live camera until all is covered or `stopped`, whenever the view is new,
+    sharp and still. `show` gets each frame's moment.
 
     A source that is gone ends the capture with what there is, if that may be enough.
 
@@ -254,7 +255,7 @@ def capture_views(
             if frame is None or frame.repeated:  # a repeated one would look still
                 continue
             seen = find_board(frame.image, board, f"view {len(state.taken) + 1}")
-            state = consider(state, seen, board)
+            state = update_capture(state, seen, board)
             show(_moment(frame, seen, state))
             if state.finished:
                 return list(state.taken)
@@ -283,12 +284,13 @@ class Capture:
     @property
     def finished(self) -> bool:
         """Enough of everything, or so many views that more would not change the solution."""
-        covered = min(progress(self.signatures).values()) >= 1.0
+        covered = min(covered_shares(self.signatures).values()) >= 1.0
         return len(self.signatures) >= (ENOUGH_VIEWS if covered else MOST_VIEWS)
 
 
-def consider(capture: Capture, seen: BoardView | str, board: Board) -> Capture:
-    """The automatic shutter: takes the view when it is new, sharp and still."""
+def update_capture(capture: Capture, seen: BoardView | str, board: Board) -> Capture:
+    """Return the capture after one more picture: the automatic shutter takes a view that is new,
+    sharp and still. `seen` is the board's view, or why there is none."""
     taken, signatures = capture.taken, capture.signatures
     if isinstance(seen, str):
         return Capture(taken, signatures, None, seen)
@@ -300,13 +302,13 @@ def consider(capture: Capture, seen: BoardView | str, board: Board) -> Capture:
         return Capture(taken, signatures, seen, "too blurred: more light, or hold still")
     here = signature(seen, board)
     if any(here.distance(s) <= NEW_BEYOND for s in signatures):
-        return Capture(taken, signatures, seen, hint(signatures))
+        return Capture(taken, signatures, seen, next_advice(signatures))
     grown = (*signatures, here)
     return Capture((*taken, seen), grown, seen, f"taken, {len(grown)} views", True)
 
 
 def _moved_px(before: BoardView | None, now: BoardView) -> float:
-    """The median motion of the corners that both views show."""
+    """Return the median motion in px of the corners that both views show; infinite without any."""
     if before is None:
         return float("inf")
     _, a, b = np.intersect1d(before.ids, now.ids, return_indices=True)
@@ -315,10 +317,10 @@ def _moved_px(before: BoardView | None, now: BoardView) -> float:
     return float(np.median(np.linalg.norm(before.corners_px[a] - now.corners_px[b], axis=1)))
 
 
-def hint(signatures: Sequence[Signature]) -> str:
-    """One thing to do, in the picture's directions: towards where the least was shown so far
+def next_advice(signatures: Sequence[Signature]) -> str:
+    """Return one thing to do, in the picture's directions: towards where the least was shown so far
     of what is covered least."""
-    done = progress(signatures)
+    done = covered_shares(signatures)
     least = min(AXES, key=lambda axis: done[axis])
     if done[least] >= 1.0:
         return "show the board somewhere new"
@@ -339,11 +341,14 @@ def hint(signatures: Sequence[Signature]) -> str:
 
 
 def _moment(frame: Frame, seen: BoardView | str, state: Capture) -> Moment:
+    """Return what to show of a frame."""
     outlines: tuple[tuple[str, Array], ...] = ()
     if isinstance(seen, BoardView):
         hull = cv2.convexHull(seen.corners_px.astype(np.float32)).reshape(-1, 2)
         outlines = (("small" if state.shot else "large", hull.astype(np.float64)),)
-    covered = {name: (f"{100 * s:.0f} %", s) for name, s in progress(state.signatures).items()}
+    covered = {
+        name: (f"{100 * s:.0f} %", s) for name, s in covered_shares(state.signatures).items()
+    }
     shares = ", ".join(f"{name} {text}" for name, (text, _) in covered.items())
     taken = len(state.taken)
     return Moment(

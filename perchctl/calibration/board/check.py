@@ -1,4 +1,4 @@
-"""Does an existing calibration fit new pictures?
+"""The check of an existing calibration by new pictures.
 
 The new views give two solutions: the file's camera with only the boards' poses fitted,
 and a camera of the same model fitted to these views alone. The first's reprojection
@@ -24,10 +24,9 @@ import numpy as np
 from perchctl.calibration.board.adjust import (
     Fit,
     NoSolution,
-    fit_from,
     lens_covariance,
     poses_only,
-    reject,
+    reject_outliers,
     weighted_fit,
 )
 from perchctl.calibration.board.detect import BoardView, Rejection
@@ -45,8 +44,8 @@ UNSURE_FACTOR = 2.0
 
 @dataclass(frozen=True)
 class Deviation:
-    """mm: between the target's places by the two cameras, straight ahead; mm95: how well
-    the new pictures fix it."""
+    """The distance between the target's places by the two cameras, straight ahead, in mm; `mm95`
+    is how well the new pictures fix that."""
 
     z_m: float
     mm: float
@@ -54,7 +53,7 @@ class Deviation:
 
     @property
     def share(self) -> float:
-        """Of the limit; zero where the pictures themselves do not fix it so well."""
+        """Share of the limit; zero where the pictures themselves do not fix it so well."""
         return self.mm / limit_mm(self.z_m) if self.mm > self.mm95 else 0.0
 
 
@@ -75,7 +74,7 @@ class CheckResult:
     deviations: tuple[Deviation, ...]
 
     def record(self, file: Path) -> dict[str, Any]:
-        """The object of `calibrate check --json`."""
+        """Return the object of `calibrate check --json`."""
         return {
             "pass": self.passed,
             "reason": self.reason,
@@ -99,12 +98,12 @@ def check_calibration(camera: CameraModel, views: Sequence[BoardView]) -> CheckR
             f"some with the board tilted by 20 to 45 deg and near the picture's rims"
         )
     try:
-        robust = reject(views, weighted_fit(views, camera.model)[0])
+        robust = reject_outliers(views, weighted_fit(views, camera.model)[0])
     except NoSolution:
         raise InvalidValue(
             "no camera fits these pictures: is --board the true layout of the board?"
         ) from None
-    free = _nearer(robust.views, robust.fit, camera)
+    free = robust.fit
     fixed = poses_only(robust.views, camera)
     if fixed is None:
         reason = "the calibration cannot see the boards where they are: it is another camera's"
@@ -115,7 +114,7 @@ def check_calibration(camera: CameraModel, views: Sequence[BoardView]) -> CheckR
         Deviation(e.z_m, float(position_errors_mm(camera, free.camera, e.z_m)[0]), e.axis_mm95)
         for e in known
     )
-    passed, reason = _judged(fixed, free, deviations)
+    passed, reason = _verdict(fixed, free, deviations)
     if passed:
         _check_evidence(free, deviations)
     names = [view.name for view in robust.views]
@@ -125,15 +124,8 @@ def check_calibration(camera: CameraModel, views: Sequence[BoardView]) -> CheckR
     )
 
 
-def _nearer(views: Sequence[BoardView], fit: Fit, camera: CameraModel) -> Fit:
-    """The better of the free solutions from nothing and from the file's camera."""
-    try:
-        return min(fit, fit_from(views, camera), key=lambda end: end.cost)
-    except NoSolution:
-        return fit
-
-
-def _judged(fixed: Fit, free: Fit, deviations: Sequence[Deviation]) -> tuple[bool, str]:
+def _verdict(fixed: Fit, free: Fit, deviations: Sequence[Deviation]) -> tuple[bool, str]:
+    """Return whether the fixed camera passes, and why."""
     if fixed.rms_px > max(RMS_FACTOR * free.rms_px, RMS_FLOOR_PX):
         return False, (
             f"reprojection RMS {fixed.rms_px:.2f} px, where these pictures allow "

@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.calibration.board.tags import find_tags
 from perchctl.camera import Grey
 from perchctl.geometry import Array
-from perchctl.target import TAG_BORDER_CELLS, Board, tag_cells
+from perchctl.target import Board
 from perchctl.vision import field_picture, is_combed
 
 MIN_CORNERS = 6
@@ -21,10 +20,6 @@ SEARCH_PX = 1600
 """Larger pictures are scaled down to it for the search; corners are fitted at full size."""
 _MOST_MOTION_PX = 12.0
 """Between two fields, for which the mean of both is a picture of the board too."""
-TAG_REACH = 0.6
-"""Of the small squares of an aprilgrid; they are a third as large as a chessboard's."""
-_RIM_PX = 2.0
-"""A tag's corner nearer to the picture's rim is not seen from all sides."""
 _CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE  # exhaustive would take a second where there is none
 
@@ -53,7 +48,7 @@ class BoardView:
         return len(self.ids)
 
     def keep(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> BoardView:
-        """The same view with some of its corners."""
+        """Return the same view with some of its corners."""
         return replace(
             self,
             ids=self.ids[which],
@@ -72,30 +67,31 @@ class Rejection:
 
 
 def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
-    """The view of a board in a grey picture (h, w), or why there is none.
+    """Return the view of a board in a grey picture (h, w), or why there is none.
 
     Of an interlaced picture, whose fields show a moving board in two places, the view is the
     mean of both fields' corners: where the board was half way between them.
     """
     if is_combed(image):
-        return _half_way(*(_whole(field_picture(image, row), board, name) for row in (0, 1)))
-    return _whole(image, board, name)
+        fields = (_find_in_field(field_picture(image, row), board, name) for row in (0, 1))
+        return _mean_of_fields(*fields)
+    return _find_in_field(image, board, name)
 
 
-def _half_way(a: BoardView | str, b: BoardView | str) -> BoardView | str:
-    """The mean of the corners that both fields show; without a second field, the one."""
+def _mean_of_fields(a: BoardView | str, b: BoardView | str) -> BoardView | str:
+    """Return the mean of the corners that both fields show, or the better field alone."""
     if isinstance(a, str) or isinstance(b, str):
         return b if isinstance(a, str) else a
-    if np.linalg.norm(a.corners_px.mean(axis=0) - b.corners_px.mean(axis=0)) > _MOST_MOTION_PX:
-        return a if len(a.ids) >= len(b.ids) else b
+    motion_px = np.linalg.norm(a.corners_px.mean(axis=0) - b.corners_px.mean(axis=0))
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
-    if len(in_a) < MIN_CORNERS:
-        return a if len(a.ids) >= len(b.ids) else b
+    if motion_px > _MOST_MOTION_PX or len(in_a) < MIN_CORNERS:
+        return a if len(a) >= len(b) else b
     middle = (a.corners_px[in_a] + b.corners_px[in_b]) / 2.0
     return replace(a.keep(in_a), corners_px=middle)
 
 
-def _whole(image: Grey, board: Board, name: str) -> BoardView | str:
+def _find_in_field(image: Grey, board: Board, name: str) -> BoardView | str:
+    """Return the board's view in a picture of one moment, or why there is none."""
     h, w = image.shape
     scale = min(1.0, SEARCH_PX / max(h, w))
     small = image
@@ -110,37 +106,14 @@ def _whole(image: Grey, board: Board, name: str) -> BoardView | str:
     # cv2.resize keeps the outer rims of the outer pixels, half a pixel before (0, 0).
     corners = (corners + 0.5) / scale - 0.5
     along, down = _local_axes(_cells(board, ids), corners)
-    fit = fit_saddles(image, corners, along, down, _room(board))
+    # A ChArUco board's markers begin so far inside of its white squares.
+    white = 1.0 if board.marker_m is None else 0.5 * (1.0 - board.marker_m / board.square_m)
+    fit = fit_saddles(image, corners, along, down, white)
     if fit.ok.sum() < MIN_CORNERS:
         return f"only {int(fit.ok.sum())} corners are sharp enough to be measured"
     blur_px = float(np.median(fit.width_px[fit.ok]))
     object_m = board.corners_m()[ids]
     return BoardView(name, (w, h), ids, object_m, fit.corners_px, blur_px).keep(fit.ok)
-
-
-def _room(board: Board) -> Room:
-    """How far from a corner nothing but its own four squares is printed."""
-    if board.kind == "aprilgrid" and board.marker_m:
-        # The squares are small; a tag's cells begin behind its border.
-        border = TAG_BORDER_CELLS / len(tag_cells(0)) * board.marker_m / board.square_m
-        return Room(reach=TAG_REACH, black=border)
-    if board.kind == "charuco" and board.marker_m:
-        return Room(white=0.5 * (1.0 - board.marker_m / board.square_m))
-    return Room()
-
-
-def _aprilgrid(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
-    tags = find_tags(image, board)
-    if isinstance(tags, str):
-        return tags
-    ids = np.array([corner for tag in tags for corner in board.tag_corners(tag)], dtype=np.intp)
-    corners = np.concatenate(list(tags.values()))
-    h, w = image.shape
-    inside = ((corners > _RIM_PX) & (corners < (w - 1 - _RIM_PX, h - 1 - _RIM_PX))).all(axis=1)
-    order = np.flatnonzero(inside)[np.argsort(ids[inside])]
-    if len(order) < MIN_CORNERS:
-        return f"only {len(order)} corners of the board found"
-    return ids[order], corners[order]
 
 
 def _charuco(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
@@ -180,18 +153,17 @@ def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | s
 _FINDERS: dict[str, Callable[[Grey, Board], tuple[NDArray[np.intp], Array] | str]] = {
     "chessboard": _chessboard,
     "charuco": _charuco,
-    "aprilgrid": _aprilgrid,
 }
 
 
 def _cells(board: Board, ids: NDArray[np.intp]) -> Array:
-    """Places of inner corners in squares, (n, 2)."""
+    """Return the places of inner corners in squares, (n, 2)."""
     return np.asarray(board.corners_m()[ids, :2] / board.square_m)
 
 
 def _local_axes(cells: Array, corners: Array) -> tuple[Array, Array]:
-    """A square's two sides at each corner, as seen: the derivative of the homography from
-    board to picture, which smooths over single bad corners; (n, 2) each."""
+    """Return a square's two sides at each corner as the picture shows them, (n, 2) px each: the
+    derivative of the homography from board to picture, which smooths over single bad corners."""
     H, _ = cv2.findHomography(cells, corners, cv2.RANSAC, 5.0)
     if H is None:
         H, _ = cv2.findHomography(cells, corners)
@@ -217,6 +189,8 @@ def _local_axes(cells: Array, corners: Array) -> tuple[Array, Array]:
 # All corners of a picture run through the same arrays (Levenberg-Marquardt).
 
 
+REACH = 0.42
+"""Half of the window, in squares; the next corner's edges begin at 1."""
 MIN_REACH_PX, MAX_REACH_PX = 2.0, 14.0
 GRID = 21  # samples across the largest window
 _ITERATIONS = 25
@@ -227,27 +201,13 @@ _MIN_WIDTH_PX, _MAX_WIDTH_SHARE = 0.25, 1.2
 
 
 @dataclass(frozen=True, eq=False)
-class Saddles:
-    """corners_px (n, 2); ok (n,): the fit holds; width_px (n,): the wider edge's spread."""
+class RefinedCorners:
+    """Refined corners: corners_px (n, 2); ok (n,), true where the fit holds; width_px (n,), the
+    wider edge's spread."""
 
     corners_px: Array
     ok: NDArray[np.bool_]
     width_px: Array
-
-
-@dataclass(frozen=True)
-class Room:
-    """What is around a corner, in squares.
-
-    Attributes:
-        reach: half of the window; the next corner's edges begin at 1.
-        white, black: how far the white and the black squares are of one grey at their rims (a
-            ChArUco board's markers begin in its white squares, a tag's cells in the black).
-    """
-
-    reach: float = 0.42
-    white: float = 1.0
-    black: float = 1.0
 
 
 def fit_saddles(
@@ -255,42 +215,40 @@ def fit_saddles(
     corners_px: Array,
     along_px: Array,
     down_px: Array,
-    room: Room = Room(),
-) -> Saddles:
-    """Refine corners.
+    white: float = 1.0,
+) -> RefinedCorners:
+    """Return the corners refined to hundredths of a pixel.
 
     Args:
         image: grey picture (h, w).
         corners_px: first guess, good to a fifth of a square, (n, 2).
         along_px, down_px: the vectors from a corner to its neighbours on the board, as
             the picture shows them, (n, 2) each.
-        room: how far the picture is of use around a corner.
+        white: how far the white squares are empty at their rims, in squares.
     """
     start = np.asarray(corners_px, dtype=np.float64)
     axes = np.stack([along_px, down_px], axis=2)  # (n, 2, 2): board units -> px
     size_px = _thickness_px(axes)
     reach = np.clip(
-        room.reach,
+        REACH,
         MIN_REACH_PX / np.maximum(size_px, 1e-6),
         MAX_REACH_PX / np.maximum(size_px, 1e-6),
     )
     uv, offsets = _window(axes, reach)
     grey, inside = _sample(image, start, offsets)
-    positive = _white_quadrants(grey, uv)
-    weight = inside * _unprinted(uv, positive, room.white, room.reach, size_px)
-    weight *= _unprinted(uv, ~positive, room.black, room.reach, size_px)
+    weight = inside * _unprinted(uv, _white_quadrants(grey, uv), white, size_px)
     return _fit(start, axes, offsets, grey, weight, size_px, reach)
 
 
 def _thickness_px(axes: Array) -> Array:
-    """The narrower height of the parallelogram that a square makes, (n,)."""
+    """Return the narrower height of the parallelogram that a square makes, (n,)."""
     area = np.abs(axes[:, 0, 0] * axes[:, 1, 1] - axes[:, 0, 1] * axes[:, 1, 0])
     longer = np.linalg.norm(axes, axis=1).max(axis=1)
     return np.asarray(area / np.maximum(longer, 1e-9))
 
 
 def _window(axes: Array, reach: Array) -> tuple[Array, Array]:
-    """Sample places in board units (n, m, 2) and in px from the corner (n, m, 2)."""
+    """Return the sample places in board units (n, m, 2) and in px from the corner (n, m, 2)."""
     t = np.linspace(-1.0, 1.0, GRID)
     u, v = np.meshgrid(t, t)
     uv = np.stack([u.ravel(), v.ravel()], axis=1)[None] * reach[:, None, None]
@@ -309,22 +267,20 @@ def _sample(
 
 
 def _white_quadrants(grey: Array, uv: Array) -> NDArray[np.bool_]:
-    """Where u v > 0 is white, (n,)."""
+    """Return true for corners at which u v > 0 is white, (n,)."""
     product = np.sign(uv[..., 0] * uv[..., 1])
     # Near the corner only: there even a ChArUco board's white is empty.
     near = np.abs(uv).max(axis=2) < 0.5 * np.abs(uv).max(axis=(1, 2))[:, None]
     return np.asarray((grey * product * near).sum(axis=1) > 0)
 
 
-def _unprinted(
-    uv: Array, positive: NDArray[np.bool_], margin: float, reach: float, size_px: Array
-) -> Array:
-    """0 inside of what is printed in the squares of one colour (those with u v > 0 where
+def _unprinted(uv: Array, positive: NDArray[np.bool_], white: float, size_px: Array) -> Array:
+    """Return 0 inside of what is printed in the white squares (those with u v > 0 where
     `positive`), and within its blur, else 1, (n, m)."""
-    if margin >= reach:
+    if white >= REACH:
         return np.ones(uv.shape[:2])
     those = (uv[..., 0] * uv[..., 1] > 0) == positive[:, None]
-    clear = np.maximum(margin - 1.0 / np.maximum(size_px, 1e-6), 0.5 * margin)
+    clear = np.maximum(white - 1.0 / np.maximum(size_px, 1e-6), 0.5 * white)
     return np.asarray(~(those & (np.abs(uv).min(axis=2) > clear[:, None])), dtype=np.float64)
 
 
@@ -336,7 +292,7 @@ def _fit(
     weight: Array,
     size_px: Array,
     reach: Array,
-) -> Saddles:
+) -> RefinedCorners:
     n = len(start)
     span_px = reach * size_px
     # Lines: along u (normal to it: 1) and along v. State: x, y, angle 1, 2, ln w1, ln w2.
@@ -366,11 +322,11 @@ def _fit(
         on = on[~settled]
         if len(on) == 0:
             break
-    return _judged(start, state, linear, cost, J, weight, span_px)
+    return _checked_corners(start, state, linear, cost, J, weight, span_px)
 
 
 def _step(J: Array, residual: Array, damping: Array) -> Array:
-    """The damped step of each corner, of bounded length, (n, 6)."""
+    """Return the damped step of each corner, of bounded length, (n, 6)."""
     A = J.transpose(0, 2, 1) @ J
     b = (J.transpose(0, 2, 1) @ residual[..., None])[..., 0]
     scale = np.einsum("nii->ni", A)
@@ -380,8 +336,8 @@ def _step(J: Array, residual: Array, damping: Array) -> Array:
 
 
 def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, Array]:
-    """Best a, gx, gy, c, hx, hy for the state (n, 6); weighted residuals (n, m); the derivative of
-    the modelled grey (n, m, 6), freed of what those can take up."""
+    """Return the best a, gx, gy, c, hx, hy for the state (n, 6), the weighted residuals (n, m),
+    and the derivative of the modelled grey (n, m, 6), freed of what those can take up."""
     x = offsets[..., 0] - state[:, 0, None]
     y = offsets[..., 1] - state[:, 1, None]
     parts = []
@@ -414,7 +370,7 @@ def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Ar
     return linear, residual, J
 
 
-def _judged(
+def _checked_corners(
     start: Array,
     state: Array,
     linear: Array,
@@ -422,7 +378,7 @@ def _judged(
     J: Array,
     weight: Array,
     span_px: Array,
-) -> Saddles:
+) -> RefinedCorners:
     samples = weight.sum(axis=1)
     noise2 = cost / np.maximum(samples - 12.0, 1.0)
     # Samples lie closer than pixels do: neighbours share their noise.
@@ -444,4 +400,4 @@ def _judged(
         & (sigma < 0.5)
     )
     corners = np.where(ok[:, None], start + state[:, :2], start)
-    return Saddles(corners, ok, np.exp(state[:, 4:]).max(axis=1))
+    return RefinedCorners(corners, ok, np.exp(state[:, 4:]).max(axis=1))

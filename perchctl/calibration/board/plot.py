@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from perchctl.calibration.board.adjust import PARAMETERS
 from perchctl.calibration.board.predict import limit_mm
 from perchctl.calibration.board.result import Calibration, Level
 from perchctl.plot import BLACK, BLUE, GREEN, GREY, GRID, VERMILLION, new_figure, save_png
@@ -17,24 +16,23 @@ from perchctl.plot import BLACK, BLUE, GREEN, GREY, GRID, VERMILLION, new_figure
 BANNER: dict[Level, str] = {"fly": GREEN, "care": "#B36B00", "stop": "#B00020"}
 WIDTH_IN, PANELS_IN, LINE_IN = 13.0, 8.6, 0.26
 DPI = 100
-_LINE_CHARS, _TEXT_CHARS = 104, 76
-"""As many fit into the banner's width, and into a panel's."""
+_LINE_CHARS = 104
+"""As many fit into the banner's width."""
 _ARROW_SHARE = 0.06  # of the width: the largest residual's arrow
-_MOST_LINES = 12  # of what was left out
 LIMIT_LOW = 0.5  # mm: the axis reaches down to it
 
 
 def draw_calibration(calibration: Calibration) -> bytes:
-    """The report as a PNG."""
+    """Return the report as a PNG."""
     content = io.BytesIO()
     save_png(report_figure(calibration), content)
     return content.getvalue()
 
 
 def report_figure(calibration: Calibration) -> Figure:
-    """The verdict in a banner, coverage, residuals, the error at the target, and the numbers."""
-    said = [calibration.sentence, *map(str, calibration.lacks)]
-    lines = [line for sentence in said for line in wrap(sentence, _LINE_CHARS)]
+    """Return the verdict in a banner, coverage, residuals, and the error at the target."""
+    sentences = [calibration.sentence, *map(str, calibration.lacks)]
+    lines = [line for sentence in sentences for line in wrap(sentence, _LINE_CHARS)]
     banner_in = LINE_IN * (len(lines) + 1)
     figure = new_figure(WIDTH_IN, banner_in + PANELS_IN, dpi=DPI)
     halves = figure.add_gridspec(2, 1, height_ratios=(banner_in, PANELS_IN))
@@ -44,19 +42,14 @@ def report_figure(calibration: Calibration) -> Figure:
         0.012, 0.5, _plain("\n".join(lines)), fontsize=13, color="white", weight="bold",
         va="center", linespacing=1.3,
     )  # fmt: skip
-    axes = panels.subplots(2, 2)
-    _coverage(axes[0, 0], calibration)
-    _residuals(axes[0, 1], calibration)
-    _target(axes[1, 0], calibration)
-    axes[1, 1].set_axis_off()
-    axes[1, 1].text(
-        0.0, 1.0, _plain("\n".join(_number_lines(calibration))), family="monospace", fontsize=7.8,
-        linespacing=1.15, va="top", transform=axes[1, 1].transAxes, in_layout=False,
-    )  # fmt: skip
+    axes = panels.subplot_mosaic("ab;cc")
+    _draw_coverage(axes["a"], calibration)
+    _draw_residuals(axes["b"], calibration)
+    _draw_target_error(axes["c"], calibration)
     return figure
 
 
-def _coverage(ax: Axes, calibration: Calibration) -> None:
+def _draw_coverage(ax: Axes, calibration: Calibration) -> None:
     w, h = calibration.camera.size_px
     shade = np.zeros((*calibration.covered.shape, 4))
     shade[~calibration.covered] = (0.84, 0.37, 0.0, 0.28)
@@ -68,7 +61,7 @@ def _coverage(ax: Axes, calibration: Calibration) -> None:
     _frame(ax, w, h)
 
 
-def _residuals(ax: Axes, calibration: Calibration) -> None:
+def _draw_residuals(ax: Axes, calibration: Calibration) -> None:
     w, h = calibration.camera.size_px
     points = np.concatenate([v.corners_px for v in calibration.views])
     residuals = np.concatenate(calibration.fit.residuals)
@@ -86,7 +79,7 @@ def _residuals(ax: Axes, calibration: Calibration) -> None:
     _frame(ax, w, h)
 
 
-def _target(ax: Axes, calibration: Calibration) -> None:
+def _draw_target_error(ax: Axes, calibration: Calibration) -> None:
     z_cm = 100 * np.array([e.z_m for e in calibration.errors])
     axis = np.array([e.axis_mm95 for e in calibration.errors])
     worst = np.array([e.mm95 for e in calibration.errors])
@@ -113,24 +106,6 @@ def _target(ax: Axes, calibration: Calibration) -> None:
     ax.legend(fontsize=8, loc="upper left")
 
 
-def _number_lines(calibration: Calibration) -> list[str]:
-    """Views, lens parameters, models, and what was left out."""
-    fit = calibration.fit
-    lines = [f"{len(calibration.views)} views, RMS {fit.rms_px:.3f} px", ""]
-    lines.append(f"{fit.model:14}{'value':>12}{'+- 1 sigma':>12}")
-    for name, value, std in zip(
-        PARAMETERS[fit.model], fit.parameters, calibration.std, strict=True
-    ):
-        digits = 2 if name[0] in "fc" else 5
-        lines.append(f"{name:14}{value:12.{digits}f}{std:12.{digits}f}")
-    lines.append("")
-    lines += [f"spread with {name}: {s:.4f} px" for name, s in calibration.tried.items()]
-    out = [f"{r.view}: {r.reason}" for r in (*calibration.rejections, *calibration.missing)]
-    if out:
-        lines += ["", f"left out: {len(out)} (--json names all)"]
-    return lines + [text[:_TEXT_CHARS] for text in out[:_MOST_LINES]]
-
-
 def _frame(ax: Axes, w: int, h: int) -> None:
     ax.set_xlim(-0.5, w - 0.5)
     ax.set_ylim(h - 0.5, -0.5)
@@ -139,5 +114,5 @@ def _frame(ax: Axes, w: int, h: int) -> None:
 
 
 def _plain(text: str) -> str:
-    """No mathematics in file names."""
+    """Return the text with its dollars escaped: no mathematics."""
     return text.replace("$", r"\$")

@@ -53,13 +53,14 @@ class RangeError:
 
 
 def limit_mm(z_m: float) -> float:
-    """1 mm, or 1 % of the distance where that is more: the gear settles within 4 mm a hand's
-    breadth under the target, and an approach from 1.5 m tolerates centimetres."""
+    """Return the error that perching allows: 1 mm, or 1 % of the distance where that is more. The
+    gear settles within 4 mm a hand's breadth under the target, and an approach from 1.5 m
+    tolerates centimetres."""
     return max(_LIMIT_FLOOR_MM, 1e3 * _LIMIT_SHARE * z_m)
 
 
 def coverage(views: Sequence[BoardView]) -> NDArray[np.bool_]:
-    """Cells of the picture (rows, columns) that lie inside of some board's corners."""
+    """Return the cells of the picture (rows, columns) that lie inside of some board's corners."""
     rows, columns = CELLS
     cells_seen = np.zeros(CELLS, dtype=np.uint8)
     for view in views:
@@ -74,8 +75,8 @@ def predict_errors(
     ranges_m: Sequence[float] = RANGES_M,
     covered: NDArray[np.bool_] | None = None,
 ) -> tuple[RangeError, ...]:
-    """95 % lines of the target's position error at each distance, where all of the target
-    lies in `covered` cells of the picture (None: anywhere), and straight ahead."""
+    """Return the 95 % lines of the target's position error at each distance, where all of the
+    target lies in `covered` cells of the picture (None: anywhere), and straight ahead."""
     errors = _draws(covariance)
     result = []
     for z_m in ranges_m:
@@ -92,7 +93,7 @@ def position_errors_mm(
     z_m: float,
     covered: NDArray[np.bool_] | None = None,
 ) -> Array:
-    """How far a target seen by `truth` is from where `camera` puts it, at each of the
+    """Return how far a target seen by `truth` is from where `camera` puts it, at each of the
     places of `truth`; the first is on the axis, (n,) mm."""
     errors = []
     for place in _places(truth, z_m, covered):
@@ -107,7 +108,7 @@ def position_errors_mm(
 
 
 def _draws(covariance: Array, seed: int = 0) -> Array:
-    """Lens errors as the covariance has them, (DRAWS, p); the same for the same seed."""
+    """Return lens errors drawn from the covariance, (DRAWS, p); the same for the same seed."""
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     normal = np.random.default_rng(seed).standard_normal((DRAWS, len(covariance)))
@@ -115,7 +116,7 @@ def _draws(covariance: Array, seed: int = 0) -> Array:
 
 
 def _places(camera: CameraModel, z_m: float, covered: NDArray[np.bool_] | None = None) -> Array:
-    """Target centres at that depth, (n, 3): straight ahead, then over the whole picture
+    """Return target centres at that depth, (n, 3): straight ahead, then over the whole picture
     wherever all corners of a marker are in view; with `covered`, in covered cells."""
     middles = undistort(pixel_grid(camera.size_px, 9, 7), camera)
     there = np.column_stack([middles, np.ones(len(middles))]) * z_m
@@ -129,12 +130,13 @@ def _places(camera: CameraModel, z_m: float, covered: NDArray[np.bool_] | None =
 
 
 def _target_m(camera: CameraModel, place: Array) -> Array:
-    """The corners in the target's own axes that are in view there, (4 or 8, 3)."""
+    """Return the corners in the target's own axes that are in view there, (4 or 8, 3)."""
     sides = [side_m for side_m in (LARGE_M, SMALL_M) if _in_view(camera, place, side_m)]
     return np.concatenate([_SQUARE * side_m for side_m in sides or [SMALL_M]])
 
 
 def _in_view(camera: CameraModel, place: Array, side_m: float) -> bool:
+    """Return true if a marker of that side is wholly in the picture there."""
     pixels = project(_SQUARE * side_m, _FACING, place, camera)
     w, h = camera.size_px
     if not ((pixels >= 0).all() and (pixels <= (w - 1, h - 1)).all()):
@@ -146,7 +148,7 @@ def _in_view(camera: CameraModel, place: Array, side_m: float) -> bool:
 
 
 def _is_covered(camera: CameraModel, place: Array, covered: NDArray[np.bool_]) -> bool:
-    """True if all of the target's corners lie in covered cells."""
+    """Return true if all of the target's corners lie in covered cells."""
     seen = project(_target_m(camera, place), _FACING, place, camera)
     rows, columns = covered.shape
     cells = np.floor((seen + 0.5) / camera.size_px * (columns, rows)).astype(np.intp)
@@ -155,7 +157,7 @@ def _is_covered(camera: CameraModel, place: Array, covered: NDArray[np.bool_]) -
 
 
 def _absorbed(camera: CameraModel, place: Array) -> Array:
-    """The solved translation's change by a change of the lens parameters, (3, p)."""
+    """Return the change of the solved translation by a change of the lens parameters, (3, p)."""
     pose = np.concatenate([_FACING, place])
     corners_m = _target_m(camera, place)
     _, L, J = project_with_derivatives(camera.model, parameters_of(camera), pose, corners_m)

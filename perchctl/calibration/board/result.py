@@ -77,9 +77,9 @@ class Calibration:
 
     @property
     def level(self) -> Level:
-        """By the predicted error straight ahead of the camera, where perching happens; aside,
-        where the search may see the target first, twice the limit will do. Of what the boards did
-        not cover nothing is known, so that a calibration that lacks coverage is no good one."""
+        """Verdict by the predicted error straight ahead of the camera, where perching happens;
+        aside, where the search may see the target first, twice the limit will do. Of what the
+        boards did not cover nothing is known: a calibration that lacks coverage is no good one."""
         ahead = max(e.axis_mm95 / limit_mm(e.z_m) for e in self.errors)
         aside = max(e.mm95 / limit_mm(e.z_m) for e in self.errors)
         if ahead <= 1.0 and aside <= ASIDE_FACTOR and not self.lacks:
@@ -103,7 +103,7 @@ class Calibration:
         return text
 
     def lines(self) -> list[str]:
-        """What was left out, the lens, the models, what it lacks, and the verdict at the end."""
+        """Return what was left out, lens, models, what it lacks, and the verdict at the end."""
         lines = [f"left out {r.view}: {r.reason}" for r in self.missing[:_MOST_MISSING]]
         if len(self.missing) > _MOST_MISSING:
             left = len(self.missing) - _MOST_MISSING
@@ -123,7 +123,7 @@ class Calibration:
         return [*lines, *map(str, self.lacks), self.sentence]
 
     def record(self, file: Path, report: Path | None) -> dict[str, Any]:
-        """The object of `calibrate --json`, with the places of the file and its picture."""
+        """Return the object of `calibrate --json`, with the places of the file and its picture."""
         names = PARAMETERS[self.fit.model]
         return camera_record(self.camera) | {
             "board": self.board,
@@ -151,7 +151,7 @@ class Calibration:
         }
 
     def text(self, name: str, date: str) -> str:
-        """The calibration file, with its quality and the parameters' covariance."""
+        """Return the calibration file, with its quality and the parameters' covariance."""
         return camera_text(
             self.camera,
             name,
@@ -172,5 +172,5 @@ class Calibration:
 
 
 def rejected_views(rejections: Iterable[Rejection]) -> list[dict[str, str]]:
-    """Whole views that were left out, as a record has them."""
+    """Return the whole views that were left out, as a record has them."""
     return [{"name": r.view, "reason": r.reason} for r in rejections if not r.corners]

@@ -15,7 +15,7 @@ from perchctl.calibration.board.adjust import (
     Robust,
     lens_covariance,
     pixel_grid,
-    reject,
+    reject_outliers,
     weighted_fit,
 )
 from perchctl.calibration.board.capture import MIN_VIEWS
@@ -36,7 +36,7 @@ def calibrate_camera(
     model: str = "auto",
     missing: Sequence[Rejection] = (),
 ) -> Calibration:
-    """Solve, leave outliers out, predict the error at the target.
+    """Solve for the camera, leave outliers out, and predict the error at the target.
 
     Args:
         model: ``plumb_bob``, ``rational_polynomial`` or ``fisheye``; ``auto`` for the simplest one
@@ -73,9 +73,9 @@ def calibrate_camera(
 def _robust_fit(
     views: Sequence[BoardView], models: Sequence[str]
 ) -> tuple[Robust, dict[str, float]]:
-    """The views without outliers and their fit, by the simplest of `models` that follows the lens:
-    one that cannot would call the views at the picture's rim outliers. And the spread of the
-    residuals that each model leaves, in px.
+    """Return the views without outliers and their fit, by the simplest of `models` that follows the
+    lens (one that cannot would call the views at the picture's rim outliers); and the spread of
+    the residuals that each model leaves, in px.
 
     Raises InvalidValue: the views fit no camera.
     """
@@ -91,11 +91,11 @@ def _robust_fit(
     for fit, spread in fits.values():
         if spread < _EASIER * best_spread and _is_usable(fit):
             best, best_spread = fit, spread
-    return reject(views, best), {name: spread for name, (_, spread) in fits.items()}
+    return reject_outliers(views, best), {name: spread for name, (_, spread) in fits.items()}
 
 
 def _is_usable(fit: Fit) -> bool:
-    """True if the lens is one-to-one over the image and its centre lies inside."""
+    """Return true if the lens is one-to-one over the image and its centre lies inside."""
     camera = fit.camera
     w, h = camera.size_px
     grid = pixel_grid(camera.size_px)
@@ -163,8 +163,8 @@ def _check_focal(parameters: Array, std: Array) -> None:
 
 
 def _lacks(fit: Fit, views: int, covered: NDArray[np.bool_]) -> list[Lack]:
-    """What keeps it from being a good calibration, whatever its error, and goes
-    with more pictures."""
+    """Return what keeps it from being a good calibration, whatever its error, and goes with more
+    pictures."""
     lacks = []
     if not _is_usable(fit):
         advice = "no corners were seen there, add views at its rims"
@@ -178,13 +178,13 @@ def _lacks(fit: Fit, views: int, covered: NDArray[np.bool_]) -> list[Lack]:
 
 
 def tilts_deg(poses: Array) -> Array:
-    """How far each board (its pose (6,)) is turned out of the image plane, (v,)."""
+    """Return how far each board (poses (v, 6)) is turned out of the image plane, (v,) deg."""
     normals = np.array([cv2.Rodrigues(pose[:3])[0][2, 2] for pose in poses])
     return np.asarray(np.degrees(np.arccos(np.minimum(np.abs(normals), 1.0))), dtype=np.float64)
 
 
 def _uncovered_text(covered: NDArray[np.bool_]) -> str:
-    """The emptier ninths of the picture, the emptiest first: 'at the top left and right'."""
+    """Return the emptier ninths of the picture, the emptiest first: 'at the top left and right'."""
     thirds = [
         (float(cell.mean()), name)
         for row, names in zip(np.array_split(covered, 3), _NAMES, strict=True)

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 from perchctl.calibration.live import Moment, polled
 from perchctl.calibration.mounting.eye import Eye
-from perchctl.calibration.mounting.motion import MIRRORED, missing
 from perchctl.calibration.mounting.recording import (
+    MIRRORED,
     AttitudeSample,
     MountingPart,
     MountingRecording,
     SeenPose,
+    missing_motion,
 )
 from perchctl.camera import FrameSource
 from perchctl.errors import InvalidValue, TimedOut
@@ -28,14 +29,14 @@ JUDGED_EVERY_S = 0.5
 BEFORE_S = 1.5
 """Attitudes older than this when a part begins belong to no picture of it."""
 MIRRORED_PICTURES = 60
-"""So many without one that is not mirrored, and nobody need go on."""
+"""After so many mirrored pictures, and no other, the recording ends."""
 SHARE_OVER = 60
-"""Pictures over which the share with a target is taken."""
+"""Number of the newest pictures whose share with a target is shown."""
 LEAST_SHARE = 0.3
 
 
 class MountingTape:
-    """What one part has recorded so far."""
+    """The samples that one part has recorded so far."""
 
     def __init__(self, part: MountingPart, seen_by: str = "") -> None:
         self.part: MountingPart = part
@@ -45,6 +46,7 @@ class MountingTape:
         self.mirrored = 0
 
     def recording(self) -> MountingRecording:
+        """Return what is recorded, by now, as a value."""
         attitudes, poses = tuple(self.attitudes), tuple(self.poses)
         return MountingRecording(self.part, attitudes, poses, self.mirrored, self.seen_by)
 
@@ -54,7 +56,8 @@ class MountingTape:
 
 @dataclass(frozen=True)
 class VehicleSensors:
-    """The vehicle's side: new attitudes, oldest first, and what is wrong, if anything is."""
+    """How a recording reads the vehicle: `attitudes` returns those that are new, oldest first, and
+    `problem` what is wrong by then, None if nothing is."""
 
     attitudes: Callable[[], list[AttitudeSample]] = list
     problem: Callable[[float], str | None] = lambda now_s: None
@@ -87,7 +90,7 @@ def capture(
         if frame is None:
             continue
         poses = eye.look(frame)
-        progress.go_on(frame.t_s if not source.live else now_s)
+        progress.advance_time(frame.t_s if not source.live else now_s)
         if frame.repeated and not eye.trouble:  # no picture without a target: no picture
             continue
         tape.poses += poses
@@ -99,7 +102,7 @@ def capture(
 
 
 class _Progress:
-    """How far a part is."""
+    """How far the recording of a part is."""
 
     def __init__(self, part: MountingPart) -> None:
         self._least_s = LEAST_S[part]
@@ -111,24 +114,25 @@ class _Progress:
 
     @property
     def over(self) -> bool:
-        """No motion is missing, or too much time has gone."""
+        """True when no motion is missing, or too much time has gone."""
         enough = not self._missing and self._seconds >= self._least_s
         return enough or self._seconds >= MOST_S
 
-    def go_on(self, now_s: float) -> None:
-        """Time goes on from the first frame."""
+    def advance_time(self, now_s: float) -> None:
+        """Count the seconds from the first frame on."""
         self._start_s = now_s if self._start_s is None else self._start_s
         self._seconds = now_s - self._start_s
 
     def judge(self, tape: MountingTape, seen: bool) -> None:
-        """Which motion is missing, now and then; `seen`: the newest picture shows the target."""
+        """Judge now and then which motion is missing; `seen` is true if the newest picture shows
+        the target."""
         self._with_target.append(seen)
         if self._seconds - self._judged_s >= JUDGED_EVERY_S:
             self._judged_s = self._seconds
-            self._missing = missing(tape.recording())
+            self._missing = missing_motion(tape.recording())
 
     def moment(self, frame: Frame, tape: MountingTape, eye: Eye) -> Moment:
-        """What to show of the newest frame."""
+        """Return what to show of the newest frame."""
         share = sum(self._with_target) / max(len(self._with_target), 1)
         if eye.trouble:
             advice = eye.trouble

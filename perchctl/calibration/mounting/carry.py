@@ -19,17 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from perchctl.calibration.mounting.motion import AGAIN, check_recording
 from perchctl.calibration.mounting.recording import (
+    HOW_TO_RECORD,
     AttitudeSample,
     MountingRecording,
     PoseArrays,
+    check_recording,
     pose_arrays,
 )
 from perchctl.calibration.mounting.robust import (
     covariance,
+    estimate_noise,
     inverses,
-    likeliest,
     normal_equations,
     squared_distance,
     student_weights,
@@ -62,7 +63,7 @@ KNOTS = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class CarrySolution:
     """The carry's solution. A sigma is such that the value +- 1.96 sigma is a 95 % interval.
 
     Attributes:
@@ -70,7 +71,6 @@ class Carried:
         latency_s: from exposure to the picture's timestamp; positive is a late picture.
         attitude_bias_rad: of the vehicle's own estimate, (3,) in body axes; only roll and pitch
             are known.
-        counted: how much each pose counted, (n,), 0 to 1.
     """
 
     R_body_cam: Array
@@ -78,17 +78,16 @@ class Carried:
     latency_s: float
     latency_sigma_s: float
     attitude_bias_rad: Array
-    counted: Array
 
     @property
     def rpy_deg(self) -> tuple[float, float, float]:
-        """The camera's turn as `camera.mount.rpy_deg` has it."""
+        """The camera's turn in degrees, as `camera.mount.rpy_deg` has it."""
         x, y, z = np.degrees(rpy_from_rotation(self.R_body_cam)).tolist()
         return x, y, z
 
     @property
     def rpy_sigma_deg(self) -> tuple[float, float, float]:
-        """Of the angles, from the covariance of a small turn on the left of R_body_cam."""
+        """Sigma of the three angles, from the covariance of a small turn left of R_body_cam."""
         step = 1e-6
         small = Rotation.from_rotvec(step * np.eye(3)).as_matrix()
         here = np.array(rpy_from_rotation(self.R_body_cam))
@@ -98,8 +97,8 @@ class Carried:
         return x, y, z
 
 
-def solve_carry(recording: MountingRecording) -> Carried:
-    """The camera's turn in the body and its latency.
+def solve_carry(recording: MountingRecording) -> CarrySolution:
+    """Solve for the camera's turn in the body and its latency.
 
     Raises InvalidValue: too little motion, a mirrored picture, or vehicle and camera do not
     agree; with what to do.
@@ -108,16 +107,17 @@ def solve_carry(recording: MountingRecording) -> Carried:
     imu, poses = imu_arrays(recording.attitudes), pose_arrays(recording)
     start = first_guess(integrate(imu, np.zeros(3), np.zeros(3)), poses)
     if start is None:
-        raise InvalidValue(f"the target was not seen twice within half a second: {AGAIN['carry']}")
-    solved = _solve(imu, poses, *start)
-    _check(solved)
-    return Carried(
-        R_body_cam=solved.state.R_body_cam,
-        turn_cov_rad2=solved.cov[TURN, TURN],
-        latency_s=solved.state.latency_s,
-        latency_sigma_s=float(np.sqrt(solved.cov[LATENCY, LATENCY])),
-        attitude_bias_rad=solved.state.off_rad,
-        counted=solved.counted,
+        raise InvalidValue(
+            f"the target was not seen twice within half a second: {HOW_TO_RECORD['carry']}"
+        )
+    state, rows, cov = _solve(imu, poses, *start)
+    _check(state, rows, cov)
+    return CarrySolution(
+        R_body_cam=state.R_body_cam,
+        turn_cov_rad2=cov[TURN, TURN],
+        latency_s=state.latency_s,
+        latency_sigma_s=float(np.sqrt(cov[LATENCY, LATENCY])),
+        attitude_bias_rad=state.off_rad,
     )
 
 
@@ -139,7 +139,7 @@ class ImuArrays:
 
 
 def imu_arrays(samples: Sequence[AttitudeSample]) -> ImuArrays:
-    """The samples as arrays."""
+    """Return the samples as arrays, by time."""
     _, kept = np.unique([a.t_s for a in samples], return_index=True)
     ordered = [samples[k] for k in kept.tolist()]
     rpy = np.array([(a.roll_rad, a.pitch_rad, a.yaw_rad) for a in ordered])
@@ -166,7 +166,7 @@ class Integrated:
 
 
 def integrate(imu: ImuArrays, bias_radps: Array, scale: Array) -> Integrated:
-    """With the gyroscope's errors taken off: rate = (gyro - bias) (1 + scale).
+    """Integrate the gyroscope, its errors taken off: rate = (gyro - bias) (1 + scale).
 
     Between two samples the rate goes straight from one to the other, to fourth order (Magnus).
     Where it begins in the world is chosen to agree with the estimate on the whole.
@@ -188,13 +188,13 @@ def integrate(imu: ImuArrays, bias_radps: Array, scale: Array) -> Integrated:
 
 
 def _integral(values: Array, dt: Array) -> Array:
-    """Integral (n, 3, 3) from the first on, by trapezia."""
+    """Return the integral (n, 3, 3) from the first sample on, by trapezia."""
     steps = 0.5 * dt[:, :, None] * (values[1:] + values[:-1])
     return np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
 
 
 def interpolate(whole: Integrated, t_s: Array) -> Integrated:
-    """At other times (m,), which are held within the recording's."""
+    """Return the rotation at other times (m,), which are clipped to the recording's."""
     grid = whole.t_s
     t_s = np.clip(t_s, grid[0], grid[-1])
     k = np.clip(np.searchsorted(grid, t_s, side="right") - 1, 0, len(grid) - 2)
@@ -216,12 +216,12 @@ def interpolate(whole: Integrated, t_s: Array) -> Integrated:
 
 
 def _turns(vectors: Array) -> Array:
-    """Rotation matrices (n, 3, 3) of rotation vectors (n, 3)."""
+    """Return rotation matrices (n, 3, 3) of rotation vectors (n, 3)."""
     return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
 
 
 def _vectors(R: Array) -> Array:
-    """Rotation vectors (n, 3) of rotation matrices (n, 3, 3)."""
+    """Return rotation vectors (n, 3) of rotation matrices (n, 3, 3)."""
     return np.asarray(Rotation.from_matrix(R).as_rotvec())
 
 
@@ -241,7 +241,8 @@ _HALF_COUNTED_RAD = 0.02
 
 
 def first_guess(whole: Integrated, poses: PoseArrays) -> tuple[Array, float] | None:
-    """R_body_cam and the latency; None without pairs of pictures some tenths apart."""
+    """Return a guess of R_body_cam and the latency; None without pairs of pictures some tenths of
+    a second apart."""
     first, second = _pairs(poses.t_s)
     if len(first) < 3:
         return None
@@ -258,7 +259,7 @@ def first_guess(whole: Integrated, poses: PoseArrays) -> tuple[Array, float] | N
 
 
 def _pairs(t_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Each picture and the first one that is `_SPAN_S` later."""
+    """Return the indices of pictures, and of the first one that is `_SPAN_S` later."""
     second = np.searchsorted(t_s, t_s + _SPAN_S[0])
     first = np.flatnonzero(second < len(t_s))
     second = second[first]
@@ -268,7 +269,8 @@ def _pairs(t_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _fit_turn(body: Array, seen: Array) -> tuple[Array, float]:
-    """R with body = R seen, by least squares in which what fits badly counts less; the misfit."""
+    """Return R with body = R seen, by least squares in which what fits badly counts less, and the
+    misfit."""
     weight = np.ones(len(body))
     R = np.eye(3)
     for _ in range(_FIT_ROUNDS):
@@ -295,7 +297,7 @@ class State:
     walk: Array
 
     def moved(self, step: Array) -> State:
-        """The state after a step, small turns on the left of the rotations."""
+        """Return the state after a step, small turns on the left of the rotations."""
         turn, target = _turns(np.stack([step[TURN], step[TARGET]]))
         return replace(
             self,
@@ -324,19 +326,13 @@ class _Rows:
     gradient: Array
 
 
-@dataclass(frozen=True, eq=False)
-class _Solved:
-    """The minimum; `cov` (16, 16) of all but the walk, in the order of this module's slices."""
-
-    state: State
-    misfit: Array
-    counted: Array
-    cov: Array
-
-
-def _solve(imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: float) -> _Solved:
-    """From a start within some ten degrees and some hundredths of a second."""
-    state = _begin(imu, poses, R_body_cam, latency_s)
+def _solve(
+    imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: float
+) -> tuple[State, _Rows, Array]:
+    """Solve from a start within some ten degrees and some hundredths of a second. Return the
+    minimum, its rows, and the covariance (16, 16) of all but the walk, in the order of this
+    module's slices."""
+    state = _first_state(imu, poses, R_body_cam, latency_s)
     cov_rad2 = poses.cov[:, :3, :3] + np.eye(3) * FLOOR_RAD**2
     factor, jitter_s = 3.0, 0.005
     for k in range(_ROUNDS):
@@ -350,18 +346,20 @@ def _solve(imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: floa
         rows = _rows(state, imu, poses, cov_rad2, factor, jitter_s)
         within = rows.counted > 0.0
         if k < _ROUNDS - 1:
-            factor, jitter_s = likeliest(rows.misfit[within], cov_rad2[within], rows.along[within])
+            factor, jitter_s = estimate_noise(
+                rows.misfit[within], cov_rad2[within], rows.along[within]
+            )
     of_poses, _ = normal_equations(rows.design, rows.misfit, rows.inverse, rows.counted)
     known = rows.information - of_poses
     cov = covariance(rows.design, rows.misfit, rows.inverse, rows.counted, known, KNOTS)
-    return _Solved(state, rows.misfit, np.minimum(rows.counted, 1.0), cov)
+    return state, rows, cov
 
 
-def _begin(imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: float) -> State:
+def _first_state(imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: float) -> State:
+    """Return the state to start from, its target's turn the middle one of all pictures'."""
     seconds = imu.t_s[-1] - imu.t_s[0]
     knots_s = np.linspace(imu.t_s[0], imu.t_s[-1], 1 + max(1, round(seconds / KNOT_S)))
     body = interpolate(integrate(imu, np.zeros(3), np.zeros(3)), poses.t_s - latency_s)
-    # Of many targets in the world that with the least distance to all.
     each = body.R_world_body @ R_body_cam @ poses.R_cam_target
     distance = np.abs(each[:, None] - each[None, :: 1 + len(each) // 60]).sum(axis=(2, 3))
     middle = int(np.argmin(np.median(distance, axis=1)))
@@ -378,7 +376,7 @@ def _rows(
     factor: float,
     jitter_s: float,
 ) -> _Rows:
-    """The normal equations; a Gauss-Newton step is information^-1 gradient."""
+    """Return all rows at a state; a Gauss-Newton step is information^-1 gradient."""
     whole = integrate(imu, state.bias_radps, state.scale)
     exposed_s = poses.t_s - state.latency_s
     within = (exposed_s >= imu.t_s[0]) & (exposed_s <= imu.t_s[-1])
@@ -406,7 +404,8 @@ def _rows(
 
 
 def _known(state: State) -> tuple[Array, Array]:
-    """What is known before: how large the sensor's errors may be, and how the walk goes."""
+    """Return the normal equations of what is known before: how large the sensor's errors may be,
+    and how far the walk goes."""
     p = KNOTS + state.walk.size
     information, gradient = np.zeros((p, p)), np.zeros(p)
     for where, value, sigma in (
@@ -426,7 +425,8 @@ def _known(state: State) -> tuple[Array, Array]:
 
 
 def _estimated(state: State, imu: ImuArrays, whole: Integrated) -> tuple[Array, Array]:
-    """The vehicle's own attitude, by its mean over each second; it errs slowly."""
+    """Return the normal equations of the vehicle's own attitude, by its mean over each second; it
+    errs slowly."""
     some = slice(None, None, _ESTIMATES_APART)
     hats = _hats(state.knots_s, imu.t_s[some])
     R_world_body = _turns(hats @ state.walk) @ whole.R_world_body[some]
@@ -447,36 +447,37 @@ def _estimated(state: State, imu: ImuArrays, whole: Integrated) -> tuple[Array, 
 
 
 def _hats(knots_s: Array, t_s: Array) -> Array:
-    """Weights (n, j) of the knots in linear interpolation."""
+    """Return the weights (n, j) of the knots in linear interpolation."""
     return np.stack([np.interp(t_s, knots_s, one) for one in np.eye(len(knots_s))], axis=1)
 
 
-def _check(solved: _Solved) -> None:
+def _check(state: State, rows: _Rows, cov: Array) -> None:
     """Raises InvalidValue unless vehicle and camera agree, and well enough."""
-    used = solved.counted > 0.0
-    size = np.linalg.norm(solved.misfit[used], axis=1)
-    left_out = float((solved.counted[used] < COUNTS_LITTLE).mean())
+    used = rows.counted > 0.0
+    size = np.linalg.norm(rows.misfit[used], axis=1)
+    left_out = float((rows.counted[used] < COUNTS_LITTLE).mean())
     if np.median(size) > MOST_MISFIT_RAD or left_out > MOST_LEFT_OUT:
         raise InvalidValue(
             f"the turns that the vehicle felt and those that the camera saw differ by "
             f"{math.degrees(np.median(size)):.1f} deg ({100 * left_out:.0f} % of the pictures do "
             f"not fit at all): target and camera must not move in the room or on the vehicle; "
-            f"then {AGAIN['carry']}"
+            f"then {HOW_TO_RECORD['carry']}"
         )
-    sigma = np.sqrt(np.diagonal(solved.cov))
+    sigma = np.sqrt(np.diagonal(cov))
     turn_deg, latency_s = math.degrees(sigma[TURN].max()), float(sigma[LATENCY])
     if not turn_deg <= MOST_TURN_SIGMA_DEG:
         raise InvalidValue(
             f"the camera's turn is known to {turn_deg:.1f} deg only (at most "
-            f"{MOST_TURN_SIGMA_DEG:g} is accepted): {AGAIN['carry']}, and farther to each side"
+            f"{MOST_TURN_SIGMA_DEG:g} is accepted): {HOW_TO_RECORD['carry']}, and farther to each "
+            f"side"
         )
     if not latency_s <= MOST_LATENCY_SIGMA_S:
         raise InvalidValue(
             f"the latency is known to {1e3 * latency_s:.0f} ms only (at most "
             f"{1e3 * MOST_LATENCY_SIGMA_S:g} is accepted): turn faster to and fro"
         )
-    if solved.state.latency_s < -2.0 * latency_s:
+    if state.latency_s < -2.0 * latency_s:
         raise InvalidValue(
-            f"the pictures are stamped {-1e3 * solved.state.latency_s:.0f} ms before they can have "
+            f"the pictures are stamped {-1e3 * state.latency_s:.0f} ms before they can have "
             f"been taken: camera and telemetry must be on one clock"
         )

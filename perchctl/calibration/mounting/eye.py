@@ -27,7 +27,7 @@ from perchctl.vision import (
 
 
 class Eye:
-    """Frame in, poses out; remembers what the pipeline must.
+    """Reads the target's pose from each frame, and remembers what the pipeline must.
 
     `mirrored` counts the pictures in which a target was seen mirrored only. `outlines` are
     those of the newest picture, a marker's name and corners (4, 2) px; `trouble` is what keeps
@@ -47,7 +47,7 @@ class Eye:
         self.trouble = ""
 
     def look(self, frame: Frame) -> list[SeenPose]:
-        """The target's pose in a frame, in each of its two fields where it has such."""
+        """Return the target's poses in a frame: one, or one in each of its two fields."""
         self._health, judged = assess_frame(self._health, frame, self._live)
         if judged.kind == "repeated":
             return []
@@ -70,7 +70,7 @@ class Eye:
 
 
 def pose_basis(profile: Profile, camera: CameraModel) -> str:
-    """What poses rest on beside the pictures, in words: the printed sizes and the lens."""
+    """Return what poses rest on beside the pictures, in words: the printed sizes and the lens."""
     sides_mm = [f"{1e3 * m.side_m:g}" for m in (profile.target.large, profile.target.small)]
     K = camera.K
     lens = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(camera.dist)]
@@ -79,7 +79,7 @@ def pose_basis(profile: Profile, camera: CameraModel) -> str:
 
 
 def _best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
-    """The surest of a picture's poses, None without one.
+    """Return the surest of a picture's poses, None without one.
 
     Args:
         t_s: the camera's own timestamp of the picture.
@@ -107,7 +107,8 @@ def _uncertainty(pose: MarkerPose) -> float:
 
 
 def _left_jacobian(v: Array) -> Array:
-    """Change (3, 3) of a small rotation on the left of the one with the vector v (3,)."""
+    """Return the change (3, 3) of a small rotation on the left of the one with the vector v
+    (3,)."""
     angle = float(np.linalg.norm(v))
     K = np.cross(np.eye(3), v)
     if angle < 1e-6:

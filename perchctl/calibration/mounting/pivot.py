@@ -12,15 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.calibration.mounting.carry import COUNTS_LITTLE, MOST_LEFT_OUT
-from perchctl.calibration.mounting.motion import AGAIN, check_recording
 from perchctl.calibration.mounting.recording import (
+    HOW_TO_RECORD,
     MountingRecording,
     PoseArrays,
+    check_recording,
     pose_arrays,
 )
 from perchctl.calibration.mounting.robust import (
     covariance,
-    likeliest,
+    estimate_noise,
     robust_least_squares,
     squared_distance,
 )
@@ -36,7 +37,7 @@ _ROUNDS, _SPLITS, _SLIP_ROUNDS = 4, 19, 4
 
 
 @dataclass(frozen=True, eq=False)
-class Pivoted:
+class PivotSolution:
     """The pivot's solution. A sigma is such that the value +- 1.96 sigma is a 95 % interval.
 
     Attributes:
@@ -50,12 +51,12 @@ class Pivoted:
 
     @property
     def gear_cam_sigma_m(self) -> Array:
-        """Of the tip along the camera's axes, (3,)."""
+        """Sigma of the tip along the camera's axes, (3,) m."""
         return np.sqrt(np.diagonal(self.covariance_m2))
 
 
-def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivoted:
-    """The gear's tip in the camera's frame.
+def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> PivotSolution:
+    """Solve for the gear's tip in the camera's frame.
 
     Args:
         size_sigma: by which share the printed sizes may be off (`target.size_sigma`): all
@@ -72,13 +73,13 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
         found, misfit, counted = robust_least_squares(design, p_m, inverse, 3)
         if k < _ROUNDS:
             cov = _misfit_covariance(poses, found[3:])
-            factor, _ = likeliest(misfit, cov)
+            factor, _ = estimate_noise(misfit, cov)
             inverse = np.asarray(np.linalg.inv(cov)) / factor**2
     tip_m = found[:3]
     cov_m2 = covariance(design, misfit, inverse, counted, np.zeros((6, 6)), 3)
     _check_slip(poses, design, misfit, inverse)
     _check_known(cov_m2, counted)
-    return Pivoted(
+    return PivotSolution(
         gear_cam_m=tip_m,
         covariance_m2=cov_m2 + size_sigma**2 * np.outer(tip_m, tip_m),
         point_target_m=found[3:],
@@ -86,7 +87,7 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
 
 
 def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
-    """Covariance (n, 3, 3) of what each pose's error does to the tip."""
+    """Return the covariance (n, 3, 3) of what each pose's error does to the tip."""
     way_m = poses.R_cam_target @ point_m
     across = np.cross(np.eye(3), way_m[:, None, :])  # [way]x
     J = np.concatenate([across, -np.broadcast_to(np.eye(3), across.shape)], axis=2)
@@ -94,13 +95,14 @@ def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
 
 
 def _check_known(cov_m2: Array, counted: Array) -> None:
+    """Raises InvalidValue if the tip is not known well enough."""
     left_out = float((counted < COUNTS_LITTLE).mean())
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov_m2)[-1]))
     if left_out > MOST_LEFT_OUT or not sigma_m <= MOST_TIP_SIGMA_M:
         raise InvalidValue(
             f"the tip is known to {1e3 * sigma_m:.1f} mm only, at most "
             f"{1e3 * MOST_TIP_SIGMA_M:g} is accepted, and {100 * left_out:.0f} % of the pictures "
-            f"do not fit: {AGAIN['pivot']}"
+            f"do not fit: {HOW_TO_RECORD['pivot']}"
         )
 
 
@@ -124,10 +126,10 @@ def _check_slip(poses: PoseArrays, design: Array, misfit: Array, inverse: Array)
     if moved_m > SLIPPED_M and explains > SLIP_EXPLAINS:
         raise InvalidValue(
             f"the tip slipped by {1e3 * moved_m:.1f} mm {at_s:.0f} s after "
-            f"the beginning: {AGAIN['pivot']}; a dent or a ring of tape holds it"
+            f"the beginning: {HOW_TO_RECORD['pivot']}; a dent or a ring of tape holds it"
         )
 
 
 def _size(misfit: Array, inverse: Array) -> float:
-    """Of the misfits on the whole; single wrong ones add little."""
+    """Return the size of all misfits together; single wrong ones add little."""
     return float(np.log1p(squared_distance(misfit, inverse) / 3.0).mean())

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perchctl.calibration.mounting.carry import Carried
-from perchctl.calibration.mounting.pivot import Pivoted
-from perchctl.calibration.mounting.robust import IN_95
+from perchctl.calibration.mounting.carry import CarrySolution
+from perchctl.calibration.mounting.pivot import PivotSolution
+from perchctl.calibration.mounting.robust import SIGMAS_95
 from perchctl.geometry import Array
 from perchctl.profile import Profile
 
@@ -25,8 +25,8 @@ class MountingReport:
     """What was measured of a profile's vehicle; a part that was not done is None."""
 
     profile: Profile
-    carried: Carried | None
-    pivoted: Pivoted | None
+    carried: CarrySolution | None
+    pivoted: PivotSolution | None
 
     @property
     def gear_body_m(self) -> Array:
@@ -39,7 +39,7 @@ class MountingReport:
 
     @property
     def written_latency_s(self) -> float | None:
-        """By the profile; None where each flight is to measure it."""
+        """Latency by the profile; None where each flight is to measure it."""
         latency_s: object = self.profile.camera.latency_s
         return float(latency_s) if isinstance(latency_s, (int, float)) else None
 
@@ -50,8 +50,8 @@ class MountingReport:
         return np.asarray(T[:3, :3].T @ (np.array(self.profile.vehicle.gear_body_m) - T[:3, 3]))
 
     def profile_values(self) -> dict[str, float | tuple[float, ...]]:
-        """What the profile should say, by dotted key: what was measured, but for a latency that
-        each flight is to measure."""
+        """Return the values to write into the profile, by dotted key: what was measured, but for a
+        latency that each flight is to measure."""
         values: dict[str, float | tuple[float, ...]] = {}
         if self.carried is not None:
             values["camera.mount.rpy_deg"] = _rounded(self.carried.rpy_deg, _DEG_DECIMALS)
@@ -63,7 +63,7 @@ class MountingReport:
         return values
 
     def keys_text(self) -> str:
-        """The profile's keys, as they are typed into it."""
+        """Return the profile's keys, as they are typed into it."""
         lines = []
         for key, value in self.profile_values().items():
             numbers = value if isinstance(value, tuple) else (value,)
@@ -72,7 +72,8 @@ class MountingReport:
         return "\n".join(lines)
 
     def record(self) -> dict[str, Any]:
-        """The measured part of the object of `calibrate mount --json`; null is not measured."""
+        """Return the measured part of the object of `calibrate mount --json`; null is not
+        measured."""
         measured: dict[str, Any] = dict.fromkeys(("rpy_deg", "latency_s", "gear_cam_m"))
         sigma = measured.copy()
         if (carried := self.carried) is not None:
@@ -93,13 +94,13 @@ class MountingReport:
         return measured | {"sigma": sigma, "written": written, "profile_values": values}
 
     def lines(self) -> list[str]:
-        """Each number, its 95 % interval, and what the profile says instead."""
+        """Return each number, its 95 % interval, and what the profile says instead."""
         lines = []
         if (carried := self.carried) is not None:
             written = self.profile.camera.mount
             turned = Rotation.from_matrix(written.T_body_cam[:3, :3].T @ carried.R_body_cam)
             off_deg = math.degrees(turned.magnitude())
-            most_deg = math.degrees(IN_95 * math.sqrt(float(np.trace(carried.turn_cov_rad2))))
+            most_deg = math.degrees(SIGMAS_95 * math.sqrt(float(np.trace(carried.turn_cov_rad2))))
             away = f"{off_deg:.1f} deg away" if off_deg > most_deg else ""
             angles = (carried.rpy_deg, carried.rpy_sigma_deg)
             lines += _value_lines("turn", *angles, 2, "deg", written.rpy_deg, away)
@@ -110,7 +111,7 @@ class MountingReport:
             else:
                 written_ms = (1e3 * self.written_latency_s,)
                 off_ms = abs(late_ms - written_ms[0])
-                away = f"{off_ms:.1f} ms away" if off_ms > IN_95 * sigma_ms else ""
+                away = f"{off_ms:.1f} ms away" if off_ms > SIGMAS_95 * sigma_ms else ""
             lines += _value_lines("latency", (late_ms,), (sigma_ms,), 1, "ms", written_ms, away)
             if self.pivoted is None and off_deg > NOTABLE_TURN_DEG:
                 lines.append(
@@ -120,7 +121,7 @@ class MountingReport:
             tip_mm, sigma_mm = 1e3 * pivoted.gear_cam_m, 1e3 * pivoted.gear_cam_sigma_m
             written_mm = 1e3 * self.written_gear_cam_m
             apart_mm = tip_mm - written_mm
-            far = (np.abs(apart_mm) > IN_95 * sigma_mm).any()
+            far = (np.abs(apart_mm) > SIGMAS_95 * sigma_mm).any()
             away = f"{np.linalg.norm(apart_mm):.1f} mm away" if far else ""
             tip = ("gear's tip", tip_mm, sigma_mm, 2, "mm in camera axes", written_mm, away)
             lines += _value_lines(*tip)
@@ -132,9 +133,10 @@ class MountingReport:
 def _value_lines(
     name: str, values: Any, sigmas: Any, decimals: int, unit: str, written: Any, away: str
 ) -> list[str]:
-    """`written` is what the profile says, empty where it has no number."""
+    """Return the two lines of a value; `written` is what the profile says, empty where it has no
+    number."""
     found = " ".join(f"{v:g}" for v in _rounded(values, decimals))
-    interval = " ".join(f"{IN_95 * float(sigma):.{decimals}f}" for sigma in sigmas)
+    interval = " ".join(f"{SIGMAS_95 * float(sigma):.{decimals}f}" for sigma in sigmas)
     before = " ".join(f"{v:g}" for v in _rounded(written, decimals)) or "measured"
     return [
         f"{name:<12}{found} +- {interval} {unit} (95 %)",

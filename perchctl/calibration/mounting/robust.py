@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 
 from perchctl.geometry import Array
 
-IN_95 = 1.96
+SIGMAS_95 = 1.96
 """Standard deviations to each side of a 95 % interval."""
 FREEDOM = 5.0
 BLOCKS = 15
@@ -23,20 +23,21 @@ _JITTERS_S = 1e-3 * np.concatenate([np.arange(0.0, 12.0), np.geomspace(13.0, 30.
 
 
 def squared_distance(misfit: Array, inverse: Array) -> Array:
-    """In standard deviations, (n,), of misfits (n, 3) by inverse covariances (n, 3, 3)."""
+    """Return the squared size, in standard deviations, (n,), of misfits (n, 3) by their inverse
+    covariances (n, 3, 3)."""
     return np.asarray(np.einsum("ni,nij,nj->n", misfit, inverse, misfit))
 
 
 def student_weights(distance2: Array) -> Array:
-    """How much each misfit counts, (n,), by its squared distance: 1 where nothing is off."""
+    """Return how much each misfit counts, (n,), by its squared distance: most where it is 0."""
     return np.asarray((FREEDOM + 3) / (FREEDOM + distance2))
 
 
 def normal_equations(
     design: Array, misfit: Array, inverse: Array, counted: Array
 ) -> tuple[Array, Array]:
-    """Information (p, p) and gradient (p,) by a design (n, 3, p): the step to the least misfit is
-    information^-1 gradient."""
+    """Return information (p, p) and gradient (p,) by a design (n, 3, p): the step to the least
+    misfit is information^-1 gradient."""
     weighted = (inverse * counted[:, None, None]) @ design
     p = design.shape[2]
     flat = weighted.reshape(-1, p)
@@ -44,18 +45,16 @@ def normal_equations(
 
 
 def robust_least_squares(
-    design: Array, right: Array, inverse: Array, rounds: int, known: Array | None = None
+    design: Array, right: Array, inverse: Array, rounds: int
 ) -> tuple[Array, Array, Array]:
     """Solve ``design @ x = right`` (n, 3): x (p,), the misfits (n, 3) and how much each counts.
 
     Args:
         inverse: covariances of the right-hand sides, inverted, (n, 3, 3).
-        known: information (p, p) that x is zero.
     """
     counted = np.ones(len(right))
     for _ in range(rounds):
         information, gradient = normal_equations(design, -right, inverse, counted)
-        information = information if known is None else information + known
         found = np.asarray(np.linalg.solve(information, gradient), dtype=np.float64)
         misfit = design @ found - right
         counted = student_weights(squared_distance(misfit, inverse))
@@ -63,14 +62,14 @@ def robust_least_squares(
 
 
 def inverses(cov: Array, factor: float, along: Array, jitter_s: float) -> Array:
-    """Inverses (n, 3, 3) of ``factor^2 cov + jitter^2 along along^T``."""
+    """Return the inverses (n, 3, 3) of ``factor^2 cov + jitter^2 along along^T``."""
     late = jitter_s**2 * along[:, :, None] * along[:, None, :]
     return np.asarray(np.linalg.inv(factor**2 * cov + late))
 
 
-def likeliest(misfit: Array, cov: Array, along: Array | None = None) -> tuple[float, float]:
-    """Factor and jitter of misfits (n, 3) with claimed covariances (n, 3, 3); `along` (n, 3) is
-    what a second of delay does to each (None: no jitter)."""
+def estimate_noise(misfit: Array, cov: Array, along: Array | None = None) -> tuple[float, float]:
+    """Return the estimate_noise factor and jitter in s of misfits (n, 3) with claimed covariances
+    (n, 3, 3); `along` (n, 3) is what a second of delay does to each (None: no jitter)."""
     jitters_s = _JITTERS_S if along is not None else _JITTERS_S[:1]
     along = np.zeros_like(misfit) if along is None else along
     inverse = np.asarray(np.linalg.inv(cov))
@@ -93,7 +92,7 @@ def likeliest(misfit: Array, cov: Array, along: Array | None = None) -> tuple[fl
 def covariance(
     design: Array, misfit: Array, inverse: Array, counted: Array, known: Array, first: int
 ) -> Array:
-    """Covariance of the first parameters at a minimum, as the lens's: the inverse information, or
+    """Return the covariance of the first parameters at a minimum: the inverse information, or
     what leaving out each block of pictures in turn (the jackknife) shows where that is more, since
     the errors of neighbouring pictures go together.
 
@@ -124,9 +123,9 @@ def covariance(
 
 
 def _robust_shares(distance2: Array) -> tuple[float, float]:
-    """What the weights make of the normal equations: by which factor the cost is truly curved, as
-    a weight sinks with the distance, and by which the information is then less or more than the
-    inverse of the estimate's spread (an M-estimator's sandwich)."""
+    """Return what the weights make of the normal equations: by which factor the cost is truly
+    curved, as a weight sinks with the distance, and by which the information is then less or more
+    than the inverse of the estimate's spread (an M-estimator's sandwich)."""
     w = student_weights(distance2)
     curved = float((w * (1.0 - 2.0 * distance2 / (3 * (FREEDOM + distance2)))).mean())
     pushed = float((w**2 * distance2).mean()) / 3
@@ -134,6 +133,6 @@ def _robust_shares(distance2: Array) -> tuple[float, float]:
 
 
 def student_factor(freedom: int) -> float:
-    """Half the width of a 95 % interval whose spread was estimated from so many values, over the
-    normal distribution's; below 3 degrees of freedom that of 3."""
-    return float(stdtrit(max(freedom, 3), 0.975)) / IN_95
+    """Return half the width of a 95 % interval whose spread was estimated from so many values, over
+    the normal distribution's; below 3 degrees of freedom that of 3."""
+    return float(stdtrit(max(freedom, 3), 0.975)) / SIGMAS_95

@@ -1,4 +1,4 @@
-"""Whether the small marker was printed in the right proportion to the large one.
+"""The print: its sizes as measured on paper, and the small marker's proportion to the large one.
 
 Seen together, both markers lie in one plane at one distance: the ratio of their apparent
 sizes is the ratio of their prints, whatever the distance and the focal length.
@@ -7,15 +7,67 @@ sizes is the ratio of their prints, whatever the distance and the focal length.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
+from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.profile import TargetConfig
-from perchctl.target.drawing import marker_corners_m
+from perchctl.profile import MarkerConfig, TargetConfig
+from perchctl.target.drawing import marker_corners_m, measured_scale, mm_text
 from perchctl.vision import CameraModel, PipelineOutput, undistort_px
+
+MEASURED_SIGMA = 0.001
+"""What measured sizes may be off by, relative: 0.15 mm of a large marker."""
+NOTABLE_SCALE_ERROR = 0.01
+"""Printers err by some 0.3 %; from here on a viewer has scaled the page."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The target with its measured sizes, and what follows for the print."""
+
+    target: TargetConfig
+    notes: tuple[str, ...]
+
+
+def measured_target(nominal: TargetConfig, sides_m: Mapping[str, float]) -> Measured:
+    """Return the target with the sides of ``large`` and ``small``, as far as they were measured.
+    Both together make its sizes count as measured.
+
+    Raises InvalidValue for a size that cannot be this marker's.
+    """
+    notes, scales = [], {}
+    target = nominal
+    for name, side_m in sides_m.items():
+        marker: MarkerConfig = getattr(nominal, name)
+        scale = measured_scale(f"--measured-{name}", side_m, marker.side_m, "the profile")
+        off = scales[name] = scale - 1.0
+        notes.append(
+            f"{name}: {mm_text(side_m)} mm, {100 * off:+.2f} % against {mm_text(marker.side_m)} mm"
+        )
+        if abs(off) > NOTABLE_SCALE_ERROR:
+            notes.append(f"{name}: more than 1 % off: was the page scaled when it was printed?")
+        target = target.model_copy(update={name: marker.model_copy(update={"side_m": side_m})})
+    if len(scales) == 2:
+        between = scales["small"] - scales["large"]
+        notes.append(f"small against large: {100 * between:+.2f} %")
+        sigma = min(nominal.size_sigma, MEASURED_SIGMA)
+        target = target.model_copy(update={"size_sigma": sigma})
+    if target.small.side_m >= target.large.side_m / 2:
+        raise InvalidValue(
+            f"the small marker ({mm_text(target.small.side_m)} mm) must be less than half of the "
+            f"large one ({mm_text(target.large.side_m)} mm): measure both black squares"
+        )
+    if target.size_sigma > MEASURED_SIGMA:
+        notes.append("measure both markers: distances claim less until both sizes are known")
+    return Measured(target, tuple(notes))
+
+
+# --- The proportion of the two prints, as a camera sees it ---------------------------------------
+
 
 CORNER_BIAS_PX = 0.02
 """What a refined corner errs inwards or outwards in all frames alike; no number of frames
@@ -40,9 +92,9 @@ class PrintVerdict:
 def size_ratio(
     large_px: Array, small_px: Array, camera: CameraModel, target: TargetConfig
 ) -> tuple[float, float] | None:
-    """The small marker's size relative to the large one's, over the ratio in the profile (1.01
-    is printed 1 % too large), from one frame's corners, (4, 2) px each; and the share by which
-    corners may err systematically. None where the corners span no plane."""
+    """Return the small marker's size relative to the large one's, over the ratio in the profile
+    (1.01 is printed 1 % too large), from one frame's corners, (4, 2) px each; and the share by
+    which corners may err systematically. None where the corners span no plane."""
     seen = undistort_px(np.concatenate([large_px, small_px]), camera).astype(np.float32)
     sides = [
         float(np.linalg.norm(q - np.roll(q, 1, axis=0), axis=1).mean()) for q in np.split(seen, 2)
@@ -66,7 +118,7 @@ class PrintCheck:
     _ratios: list[tuple[float, float]] = field(default_factory=list)
 
     def add(self, output: PipelineOutput | None) -> None:
-        """One more picture; it counts if both markers are in it, and refined."""
+        """Count one more picture if both markers are in it, and refined."""
         if output is None:
             return
         large, small = output.detections.large, output.detections.small
@@ -74,18 +126,18 @@ class PrintCheck:
             self.add_corners(large.corners_px, small.corners_px)
 
     def add_corners(self, large_px: Array, small_px: Array) -> None:
-        """One more picture by its corners, (4, 2) px each."""
+        """Count one more picture by its corners, (4, 2) px each."""
         ratio = size_ratio(large_px, small_px, self.camera, self.target)
         if ratio is not None:
             self._ratios.append(ratio)
 
     @property
     def judged(self) -> bool:
-        """Whether enough frames showed both markers."""
+        """True when enough frames showed both markers."""
         return len(self._ratios) >= MIN_FRAMES
 
     def verdict(self) -> PrintVerdict:
-        """Names a print error only where the median frame's is beyond noise and bias."""
+        """Return the verdict: an error only where the median frame's is beyond noise and bias."""
         if not self.judged:
             return PrintVerdict(
                 False,
