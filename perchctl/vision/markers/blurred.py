@@ -176,7 +176,7 @@ _MIN_SIGMA_PX = 0.015
 _BLUR_SIGMA = 0.012  # of the blur: no picture is its drawing with an even blur
 _MIN_PATTERN, _MIN_LIKENESS = 0.9, 0.9
 _MIN_STRENGTH, _MAX_STRENGTH = 0.6, 1.6
-_MAX_WORST_CELL = 0.3
+_MAX_CELL_DEPARTURE = 0.3
 _MAX_FLIP, _MAX_FLIP_SIGMA = 0.4, 0.35
 _MAX_SIGMA = 0.06  # of the side
 _MIN_REACH_PX = 3.0
@@ -233,7 +233,7 @@ def verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
         found.pattern > _MIN_PATTERN
         and found.likeness > _MIN_LIKENESS
         and _MIN_STRENGTH < found.strength < _MAX_STRENGTH
-        and found.worst_cell < _MAX_WORST_CELL
+        and found.cell_departure < _MAX_CELL_DEPARTURE
         and found.sigma_px < max_sigma * mean_side_px(found.corners_px)
     )
 

@@ -28,16 +28,16 @@ from perchctl.vision.lens import distort, undistort
 from perchctl.vision.markers.corners import (
     BEFORE,
     NEXT,
+    OUT,
     RAW_SIGMA_PX,
     UNIT,
-    Border,
     RefinedCorners,
     doubled_area,
-    edge_shift,
     from_unit,
     mapped,
     refine_each,
     side_lengths_px,
+    to_unit,
 )
 from perchctl.vision.markers.pattern import Rim
 from perchctl.vision.types import CameraModel, EdgeShift
@@ -139,6 +139,10 @@ _NEAR_END_PX = 4.0  # of 7: an edge 6 px off, cut off there, was seen up to 0.3 
 _LEAST_ROWS = 2.0  # times the other sides' variance shows that rows shake
 _LEAST_ASPECT = 0.05  # variance of the sides' slants (0 to 1), to tell them apart
 _MIN_CONTRAST = 6.0  # grey levels between the flanks
+_SHIFT_FLOOR_PX = 0.01
+_MAX_SHIFT_PX = 1.0
+_MAX_BLUR_CELLS = 0.45  # beyond it the two edges of a border are one
+_MIN_PROFILES = 3.0  # in total weight, of a side that counts
 _SHIFT_PRIOR_PX = 0.15  # what glare and gamma do to edges
 _CLIPPED_PRIOR_PX = 0.4  # what clipping does
 CLIPPED_GREY = 248.0
@@ -147,15 +151,6 @@ _ONES32: Floats = np.ones(PROFILES, dtype=np.float32)
 _QUARTERS: Array = np.full(4, 0.25)
 _PARABOLA: Array = ALONG**2 - (ALONG**2).mean()
 _BOWED = 3.0  # standard deviations
-
-
-@dataclass(frozen=True, eq=False)
-class _Lines:
-    """Lines (4m, 3) as (nx, ny, c) with n.x = c and |n| = 1, normalised, and the weighted
-    RMS distance of their points, px (4m,)."""
-
-    lines: Array
-    residual_px: Array
 
 
 def refine(
@@ -217,32 +212,33 @@ def _refined_once(
     camera: CameraModel,
     known: EdgeShift | None,
 ) -> list[RefinedCorners | None]:
-    nothing: list[RefinedCorners | None] = [None] * len(raw_px)
+    found: list[RefinedCorners | None] = [None] * len(raw_px)
     markers = markers_of(raw_px, rims, camera)
     if markers is None:
-        return nothing
-    measured = measure(image, markers, camera, with_inner=known is None)
-    sides = measured.sides
+        return found
+    sides, inner = measure(image, markers, camera, with_inner=known is None)
     clipped = _clipped(sides) > CLIPPED_SHARE
     if known is not None and clipped.any():
         # How far clipping moves edges changes with the light.
         return _refined_once(image, raw_px, rims, camera, None)
-    fit = _fit_lines(markers, sides)
+    lines, residual_px = _fit_lines(markers, sides)
     shift = known
     if shift is None:
-        corners = _intersect(fit.lines)
+        corners = _intersect(lines)
         if not finite(corners):
-            return nothing
-        shift = _measured_shift(markers, measured, fit, corners)
+            return found
+        shift = _measured_shift(markers, sides, inner, lines, residual_px, corners)
     applied = shift if shift is not None else EdgeShift(0.0, _shift_prior_px(sides))
-    corners = _intersect(_moved_outwards(markers, fit, applied.shift_px))
+    if applied.shift_px != 0.0:
+        lines = lines.copy()
+        lines[:, 2] += _outwards(markers, lines) * (applied.shift_px / markers.px_per_unit)
+    corners = _intersect(lines)
     if not finite(corners):
-        return nothing
+        return found
     corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
-    accepted = _accepted(markers, sides, fit, corners_px)
-    ends_px2 = _ends_px2(markers, sides, fit).tolist()
-    blurs_px, normals_x = sides.blur_px.tolist(), fit.lines[:, 0].tolist()
-    found = nothing
+    accepted = _accepted(markers, sides, residual_px, corners_px)
+    ends_px2 = _ends_px2(markers, sides, residual_px).tolist()
+    blurs_px, normals_x = sides.blur_px.tolist(), lines[:, 0].tolist()
     for i, rim in enumerate(rims):
         if not accepted[i]:
             continue
@@ -262,8 +258,9 @@ def _refined_once(
     return found
 
 
-def _fit_lines(markers: Markers, sides: Samples) -> _Lines:
-    """Total least squares on the points of each side."""
+def _fit_lines(markers: Markers, sides: Samples) -> tuple[Array, Array]:
+    """Lines (4m, 3) as (nx, ny, c) with n.x = c and |n| = 1, normalised, by total least squares
+    on the points of each side; and the weighted RMS distance of these, px (4m,)."""
     w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
     x, y = sides.points[..., 0], sides.points[..., 1]
     cx, cy = (w * x).dot(_ONES), (w * y).dot(_ONES)
@@ -275,7 +272,7 @@ def _fit_lines(markers: Markers, sides: Samples) -> _Lines:
     residual2 = nx * nx * sxx + 2.0 * nx * ny * sxy + ny * ny * syy
     lines = np.empty((len(w), 3))
     lines[:, 0], lines[:, 1], lines[:, 2] = nx, ny, nx * cx + ny * cy
-    return _Lines(lines, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_unit)
+    return lines, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_unit
 
 
 def _intersect(lines: Array) -> Array:
@@ -300,58 +297,80 @@ def _shift_prior_px(sides: Samples) -> float:
 
 
 def _measured_shift(
-    markers: Markers, measured: Measured, fit: _Lines, corners: Array
+    markers: Markers,
+    sides: Samples,
+    inner: Samples | None,
+    lines: Array,
+    residual_px: Array,
+    corners: Array,
 ) -> EdgeShift | None:
-    """None where no inner edge was sampled."""
-    inner, k = measured.inner, measured.inner_of
+    """How far white has grown over black, by the width of a border, of which `corners` (m, 4, 2)
+    are the outer edge's; None where no inner edge was sampled.
+
+    Outer edges that moved in by d shrink the marker's own scale; the inner edges, at
+    the part r of it, moved out by d: they appear d (1 + r) too far out.
+    """
     if inner is None:
         return None
-    border = Border(
-        corners=corners[k],
-        points=inner.points,
-        weight=inner.weight,
-        blur_px=inner.blur_px,
-        depth_px=markers.depth_px[k],
-        cells=markers.rims[k].cells,
-        cell_px=float(markers.cell_px[k]),
-        tolerance=markers.rims[k].tolerance,
-        bow_px=_bow_px(markers, measured.sides, fit, k),
+    k, prior_px = markers.widest, _shift_prior_px(sides)
+    rim, depth_px, cell_px = markers.rims[k], markers.depth_px[k], float(markers.cell_px[k])
+    r = 1.0 - 2.0 / rim.cells
+    own = mapped(to_unit(corners[k]), inner.points)
+    far = np.matmul(own, OUT[:, :, None])[..., 0] - r
+    far_px = far * (depth_px / (1.0 - r * r))[:, None]
+    w = inner.weight * (inner.blur_px < _MAX_BLUR_CELLS * depth_px)[:, None]
+    w *= np.abs(far_px) < _MAX_SHIFT_PX
+    mass = w.sum(axis=1)
+    some = mass > _MIN_PROFILES
+    if not some.any():
+        return EdgeShift(0.0, prior_px)
+    # A sheet that curls, or a lens that is known badly, moves places by the square of their way
+    # from the centre: outer edges farther than inner ones, and their ends farther than middles.
+    bent_px = 8.0 * r / (3.0 * rim.cells) * _bow_px(markers, sides, lines, residual_px)
+    far_px = far_px + bent_px
+    share = w / np.maximum(mass, 1e-9)[:, None]
+    mean = (share * far_px).sum(axis=1)
+    scatter = (share * (far_px - mean[:, None]) ** 2).sum(axis=1)
+    least = _SHIFT_FLOOR_PX**2 + bent_px**2
+    information = some / (2.0 * scatter / np.maximum(mass, 1.0) + least)
+    total = float(information.sum())
+    shift = float(information @ mean) / total
+    # Sides that disagree are worth less.
+    chi2 = float(information @ (mean - shift) ** 2) / max(int(np.count_nonzero(some)) - 1, 1)
+    variance = max(chi2, 1.0) / total
+    # What no averaging takes away: the neighbours' blur and the print.
+    variance += (2.0 * math.exp(-cell_px / 2.2)) ** 2 + (rim.tolerance * cell_px) ** 2
+    prior = prior_px**2
+    return EdgeShift(
+        shift_px=shift * prior / (prior + variance),
+        sigma_px=(1.0 / variance + 1.0 / prior) ** -0.5,
     )
-    return edge_shift(border, _shift_prior_px(measured.sides))
 
 
-def _bow_px(markers: Markers, sides: Samples, fit: _Lines, k: int) -> float:
-    """How far the ends of marker k's sides lie further out than their middles, the mean of
-    its sides, as far as noise does not explain it."""
-    of_k = slice(4 * k, 4 * k + 4)
-    lines, points = fit.lines[of_k], sides.points[of_k]
-    away = np.matmul(points, lines[:, :2, None])[..., 0] - lines[:, 2:]
-    scale = _outwards(markers, fit)[of_k] * markers.px_per_unit[of_k]
-    mass = np.maximum(sides.weight[of_k] @ (_PARABOLA * _PARABOLA), 1e-9)
-    bow_px = scale * ((sides.weight[of_k] * away) @ _PARABOLA) / mass
+def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) -> float:
+    """How far the ends of the widest marker's sides lie further out than their middles, the
+    mean of its sides, as far as noise does not explain it."""
+    four = slice(4 * markers.widest, 4 * markers.widest + 4)
+    away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
+    scale = _outwards(markers, lines)[four] * markers.px_per_unit[four]
+    mass = np.maximum(sides.weight[four] @ (_PARABOLA * _PARABOLA), 1e-9)
+    bow_px = scale * ((sides.weight[four] * away) @ _PARABOLA) / mass
     mean_px = float(bow_px @ _QUARTERS)
-    noise_px = 0.25 * math.sqrt(float((fit.residual_px[of_k] ** 2 / mass).sum()))
+    noise_px = 0.25 * math.sqrt(float((residual_px[four] ** 2 / mass).sum()))
     return mean_px if abs(mean_px) > _BOWED * noise_px else 0.0
 
 
-def _moved_outwards(markers: Markers, fit: _Lines, shift_px: float) -> Array:
-    """The lines (4m, 3) moved out of their markers."""
-    if shift_px == 0.0:
-        return fit.lines
-    lines = fit.lines.copy()
-    lines[:, 2] += _outwards(markers, fit) * (shift_px / markers.px_per_unit)
-    return lines
-
-
-def _outwards(markers: Markers, fit: _Lines) -> Array:
+def _outwards(markers: Markers, lines: Array) -> Array:
     """+1 where a line's normal, which may point either way, points out of its marker, else
     -1, (4m,)."""
     corners = markers.corners
     out = (corners - (_QUARTERS @ corners)[:, None]).reshape(-1, 2)
-    return np.asarray(np.sign(fit.lines[:, 0] * out[:, 0] + fit.lines[:, 1] * out[:, 1]))
+    return np.asarray(np.sign(lines[:, 0] * out[:, 0] + lines[:, 1] * out[:, 1]))
 
 
-def _accepted(markers: Markers, sides: Samples, fit: _Lines, corners_px: Array) -> list[bool]:
+def _accepted(
+    markers: Markers, sides: Samples, residual_px: Array, corners_px: Array
+) -> list[bool]:
     """Which of the m markers have lines for sides, near to where they were expected."""
     inliers = (sides.weight > 0.0).dot(_ONES32)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
@@ -363,7 +382,7 @@ def _accepted(markers: Markers, sides: Samples, fit: _Lines, corners_px: Array) 
         and grey > _MIN_CONTRAST * PROFILES
         and is_sharp
         for residual, count, grey, is_sharp in zip(
-            fit.residual_px.tolist(), inliers.tolist(), contrast.tolist(), sharp.tolist(),
+            residual_px.tolist(), inliers.tolist(), contrast.tolist(), sharp.tolist(),
             strict=True,
         )
     ]  # fmt: skip
@@ -387,11 +406,10 @@ def _clipped(sides: Samples) -> Array:
     return np.asarray(glaring.reshape(-1, 4) @ _QUARTERS)
 
 
-def _ends_px2(markers: Markers, sides: Samples, fit: _Lines) -> Array:
+def _ends_px2(markers: Markers, sides: Samples, residual_px: Array) -> Array:
     """Variance of the ends of the sides, (4m,): a line fitted to n samples spreads twice as far
     there as in its middle."""
     independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
-    residual_px = fit.residual_px
     return np.asarray(4.0 * _TAILS * residual_px * residual_px / independent)
 
 
@@ -438,35 +456,19 @@ _SIDES = np.arange(4)[:, None]
 @dataclass(frozen=True, eq=False)
 class Markers:
     """What is to be measured: raw_px (m, 4, 2), the same normalised, the lengths of their
-    sides and the width of the cells behind each of them (m, 4), the number and mean width
-    of a marker's cells (m,), +1 or -1 as its corners run (m,), and pixels for a unit of
-    normalised coordinates along each side (4m,)."""
+    sides and the width of the cells behind each of them (m, 4), the mean width of a marker's
+    cells (m,), the number of the marker with the widest, +1 or -1 as its corners run (m,), and
+    pixels for a unit of normalised coordinates along each side (4m,)."""
 
     raw_px: Array
     rims: Sequence[Rim]
     corners: Array
     sides_px: Array
     depth_px: Array
-    cells: Array
     cell_px: Array
+    widest: int
     turn: Array
     px_per_unit: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """The sides across which profiles are sampled: every marker's, and after them perhaps
-    the inner edges of the border of marker number `best`. starts, ends (rows, 2)
-    normalised; lengths_px, depth_px (rows,); of: the marker of each; sign: +1 where white
-    is to the left of the way from start to end."""
-
-    starts: Array
-    ends: Array
-    lengths_px: Array
-    depth_px: Array
-    of: NDArray[np.intp]
-    sign: Array
-    best: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -481,15 +483,6 @@ class Samples:
     blur_px: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """All markers' sides, and the inner edges of the border of marker number `inner_of`."""
-
-    sides: Samples
-    inner: Samples | None
-    inner_of: int
-
-
 def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Markers | None:
     """None where one of the markers is no square at all."""
     sides_px = side_lengths_px(raw_px)
@@ -501,6 +494,7 @@ def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Marke
         return None
     along = corners.take(NEXT, axis=1) - corners
     across_px = sides_px.take(BEFORE, axis=1) + sides_px.take(NEXT, axis=1)
+    cell_px = sides_px @ _QUARTERS / cells
     return Markers(
         raw_px=raw_px,
         rims=rims,
@@ -508,56 +502,42 @@ def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Marke
         sides_px=sides_px,
         # The inner row lies one cell further in, along the neighbouring sides.
         depth_px=0.5 * across_px / cells[:, None],
-        cells=cells,
-        cell_px=sides_px @ _QUARTERS / cells,
+        cell_px=cell_px,
+        widest=int(cell_px.argmax()),
         turn=turn,
         px_per_unit=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
     )
 
 
-def _rows(markers: Markers, with_inner: bool) -> _Rows:
-    """Every marker's sides; then the inner edge of the border with the largest cells,
-    which shows best by how much all edges are shifted."""
+def measure(
+    image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
+) -> tuple[Samples, Samples | None]:
+    """The edges' places on profiles across all sides; and, on request, across the inner edges of
+    the border with the widest cells, which shows best by how much all edges are shifted. None
+    where these cells are too small."""
     starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
     of = np.arange(len(starts)).repeat(4)
-    best = int(markers.cell_px.argmax())
-    with_inner = with_inner and float(markers.cell_px[best]) > _MIN_SHIFT_CELL_PX
+    widest = markers.widest
+    rim = markers.rims[widest]
+    with_inner = with_inner and float(markers.cell_px[widest]) > _MIN_SHIFT_CELL_PX
     if with_inner:
-        r = 1.0 - 2.0 / float(markers.cells[best])
-        inner = mapped(from_unit(markers.corners[best]), r * UNIT)[None]
+        r = 1.0 - 2.0 / rim.cells
+        inner = mapped(from_unit(markers.corners[widest]), r * UNIT)[None]
         starts = np.concatenate([starts, inner])
-        lengths_px = np.concatenate([lengths_px, r * lengths_px[best : best + 1]])
-        depth_px = np.concatenate([depth_px, depth_px[best : best + 1]])
-        of = np.append(of, (best, best, best, best))
+        lengths_px = np.concatenate([lengths_px, r * lengths_px[widest : widest + 1]])
+        depth_px = np.concatenate([depth_px, depth_px[widest : widest + 1]])
+        of = np.append(of, (widest, widest, widest, widest))
     # Normals point out of a marker whose corners run clockwise; dark must come first.
     sign = markers.turn[of]
     if with_inner:
         sign[-4:] *= -1.0
-    return _Rows(
-        starts=starts.reshape(-1, 2),
-        ends=starts.take(NEXT, axis=1).reshape(-1, 2),
-        lengths_px=lengths_px.ravel(),
-        depth_px=depth_px.ravel(),
-        of=of,
-        sign=sign,
-        best=best,
-    )
-
-
-def measure(
-    image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
-) -> Measured:
-    """The edges' places on profiles across all sides, and across the inner edges of the
-    border with the largest cells, on request and if these are large enough."""
-    rows = _rows(markers, with_inner)
-    s = places(rows.lengths_px)
-    origin, normal = side_profiles(rows.starts, rows.ends, s, camera)
-    normal *= rows.sign[:, None, None]
-    cell_px = markers.cell_px
-    near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)[rows.of]
-    half_px = np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)[rows.of]
+    s = places(lengths_px.ravel())
+    ends = starts.take(NEXT, axis=1).reshape(-1, 2)
+    origin, normal = side_profiles(starts.reshape(-1, 2), ends, s, camera)
+    normal *= sign[:, None, None]
+    near_px, half_px = (each[of] for each in reaches_px(markers.cell_px))
     grey = sample(image, origin, normal, half_px)
-    edges = locate(grey, half_px, near_px, _surroundings(s, markers.rims, rows))
+    edges = locate(grey, half_px, near_px, surroundings(s, markers.rims, rim, depth_px.ravel()))
     points = undistort((origin + edges.offset_px[..., None] * normal).reshape(-1, 2), camera)
     points = points.reshape(-1, PROFILES, 2)
     if not finite(points):
@@ -573,26 +553,33 @@ def measure(
         )
 
     n = 4 * len(markers.raw_px)
-    inner = part(slice(n, None)) if len(rows.of) > n else None
-    return Measured(part(slice(0, n)), inner, rows.best)
+    return part(slice(0, n)), part(slice(n, None)) if with_inner else None
 
 
-def _surroundings(s: Array, rims: Sequence[Rim], rows: _Rows) -> Surroundings:
-    """Which profiles at places `s` have a neighbouring edge, and which have an edge."""
+def reaches_px(cell_px: Array) -> tuple[Array, Array]:
+    """How far from an edge the window around it and the profile across it reach, by the width
+    of the cells beside it."""
+    near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
+    return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
+
+
+def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> Surroundings:
+    """Which profiles at places `s` (rows, n) have a neighbouring edge, `depth_px` (rows,) away,
+    and which have an edge: four rows a rim, and then perhaps the border's inner edges of
+    one."""
     inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
     possible = np.ones(s.shape, np.bool_)
     for i, rim in enumerate(rims):
         four = slice(4 * i, 4 * i + 4)
         inside[four] = rim.white[_SIDES, (s[four] * rim.cells).astype(np.intp)]
     if len(s) > 4 * len(rims):
-        rim = rims[rows.best]
-        at = 1.0 + s[-4:] * (rim.cells - 2)  # in cells from the border's corner
+        at = 1.0 + s[-4:] * (inner.cells - 2)  # in cells from the border's corner
         # Near a black cell of the rim, or with one behind, blur bends the edge.
-        free = rim.open[_SIDES, (at - 0.3).astype(np.intp)]
-        free = free * rim.open[_SIDES, (at + 0.3).astype(np.intp)]
+        free = inner.open[_SIDES, (at - 0.3).astype(np.intp)]
+        free = free * inner.open[_SIDES, (at + 0.3).astype(np.intp)]
         possible[-4:] = free > 0.0
         outside[-4:] = 1.0
-    return Surroundings(rows.depth_px, inside, outside, possible)
+    return Surroundings(depth_px, inside, outside, possible)
 
 
 # --- Edges between black and white to a hundredth of a pixel, on grey profiles across them -----

@@ -34,7 +34,7 @@ from perchctl.vision.markers.cut import (
     outline_of,
 )
 from perchctl.vision.markers.detect import between, detect_markers, with_ghosts
-from perchctl.vision.markers.partial import look as look_for_edges
+from perchctl.vision.markers.partial import seen_edges
 from perchctl.vision.markers.search import Found, search
 from tests.helpers.markers import SETUP, both, corners, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -346,6 +346,4 @@ def test_a_stream_without_double_edges_is_looked_at_in_every_fourth_picture() ->
 def test_a_square_beyond_all_lenses_shows_no_edges(side_px: float) -> None:
     """Where a lens model throws a near target's far corners overflows a picture's coordinates."""
     square_px = np.array([[side_px, 0.0, 320.0], [0.0, side_px, 240.0], [0.0, 0.0, 1.0]])
-    assert (
-        look_for_edges(picture("height"), square_px, SETUP.patterns["large"], CAMERA, None) is None
-    )
+    assert seen_edges(picture("height"), square_px, SETUP.patterns["large"], CAMERA, None) is None
