@@ -103,7 +103,7 @@ MOST_NAMES = {
     "sim": 25,
     "target": 28,
     "track": 15,
-    "vision": 50,
+    "vision": 44,
     "weights": 15,
 }
 

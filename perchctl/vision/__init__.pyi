@@ -1,10 +1,3 @@
-from .consistency import ATTITUDE_STEP_S as ATTITUDE_STEP_S
-from .consistency import LEAST_CONSISTENCY_RANGE_M as LEAST_CONSISTENCY_RANGE_M
-from .consistency import Consistency as Consistency
-from .consistency import ConsistencySums as ConsistencySums
-from .consistency import add_moment as add_moment
-from .consistency import consistency_moment as consistency_moment
-from .consistency import solve_consistency as solve_consistency
 from .fields import BLENDED as BLENDED
 from .fields import INTERLACED as INTERLACED
 from .fields import FieldState as FieldState
@@ -37,6 +30,7 @@ from .tracks import surest_pose as surest_pose
 from .types import MARKERS as MARKERS
 from .types import Attitude as Attitude
 from .types import CameraModel as CameraModel
+from .types import Consistency as Consistency
 from .types import Detection as Detection
 from .types import Detections as Detections
 from .types import Frame as Frame

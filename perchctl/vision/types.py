@@ -341,3 +341,18 @@ class PipelineOutput:
     fields: PictureKind = "whole"  # what the picture was
     lock_note: str = ""  # why this frame's pose was not taken, or taken at another place
     refused: bool = False  # this frame showed another vehicle's target, by its place
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """What a flight shows of the camera beyond the profile, each with one standard deviation.
+
+    `delay_s`: by how much the pictures are later. `turn_rad`: the camera's turn about body x, y
+    and z. The attitude's constant error, which moves the target just as a mounting's roll and
+    pitch do, is in their `turn_sigma_rad`.
+    """
+
+    delay_s: float
+    delay_sigma_s: float
+    turn_rad: tuple[float, float, float]
+    turn_sigma_rad: tuple[float, float, float]

@@ -11,7 +11,7 @@ import pytest
 from perchctl.mission import Phase
 from perchctl.mission.context import Context
 from perchctl.perception import History
-from perchctl.perception.perception import (
+from perchctl.perception.online_calibration import (
     SLEW,
     USED_SIGMA_S,
     OnlineCalibration,

@@ -9,21 +9,24 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import Array, rotation_from_rpy
+from perchctl.perception.online_calibration import (
+    ATTITUDE_STEP_S,
+    STAMPS_S,
+    ConsistencySums,
+    Moment,
+    add_moment,
+    consistency_moment,
+    solve_consistency,
+)
 from perchctl.profile import Profile
 from perchctl.vision import (
-    ATTITUDE_STEP_S,
     Attitude,
     CameraModel,
     Consistency,
-    ConsistencySums,
     MarkerPose,
     PoseSetup,
-    add_moment,
-    consistency_moment,
     rotation_vector,
-    solve_consistency,
 )
-from perchctl.vision.consistency import STAMPS_S, Moment
 from perchctl.vision.pose import make_pose_setup
 
 PROFILE = Profile()
