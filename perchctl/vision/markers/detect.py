@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -90,26 +91,77 @@ def detect_markers(
     is looked at, and the result is the mean: where the markers were at the frame's own time.
     """
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
+    both = completed(expected, setup.ratio, camera)
     look = _look(empty_frames, bool(expected), setup)
-    turn = (
-        (empty_frames + 2) // 4 if empty_frames is not None and look in ("near", "fits") else None
-    )
+    turn = None
+    if empty_frames is not None and look in ("near", "fits"):
+        turn = (empty_frames + 2) // 4
     lately = measured_lately(previous, frame.t_s)
     was_cut = setup.cut and cut_lately(previous, frame.t_s, frame.image.shape)
     shift = known_from(None if previous is None else previous.edge_shift)
 
-    def looked(picture: Frame) -> Detections:
-        hidden = hidden_in(picture, setup.mask)
-        if hidden is not None:
-            picture = replace(picture, image=filled(picture.image, hidden), encoded=None)
-        return _looked(
-            picture, hidden, expected, setup, camera, shift, look, lately, was_cut, turn, own
+    def detected(frame: Frame) -> Detections:
+        """What is in a frame of one moment."""
+        hidden = hidden_in(frame, setup.mask)
+        image = frame.image if hidden is None else filled(frame.image, hidden)
+        picture, found = Picture(image, hidden, setup, camera), Found()
+        seen: _Seen = {}
+        if look != "fits" and setup.window and both and setup.by_lines:
+            seen, found = _followed(picture, both, shift)
+        if not seen and lately and setup.cut and is_cut(both, image.shape, hidden):
+            seen = cut_markers(image, expected, setup.patterns, camera, hidden)
+        findable = not was_cut or may_be_whole(both, image.shape)
+        if look not in ("blurred", "fits") and (
+            (not seen and findable) or _missing(picture, seen, expected)
+        ):
+            found = search(image, expected, setup, look, own)
+            if len(found.corners_px) >= len(seen):
+                seen = _refined(picture, found)
+        if not seen and look not in ("sharp", "window") and setup.blurred and setup.by_lines:
+            seen = _in_blur(picture, expected, turn)
+        shifts = (r.edge_shift for r in seen.values())
+        return Detections(
+            frame_index=frame.index,
+            t_s=frame.t_s,
+            large=_detection("large", seen, frame.fields),
+            small=_detection("small", seen, frame.fields),
+            full_frame=found.full_frame,
+            mirrored=found.mirrored and not seen,
+            targets=found.targets,
+            edge_shift=next((each for each in shifts if each is not None), None),
         )
 
     if frame.fields == "woven":
-        return with_motion(between(*(looked(field) for field in halves(frame))), previous)
-    result = with_motion(looked(frame), previous)
+        return with_motion(between(*map(detected, halves(frame))), previous)
+    result = with_motion(detected(frame), previous)
     return with_ghosts(result, previous, frame.image) if frame.fields == "whole" else result
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture of one moment, and what is needed to measure markers in it. `hidden` (h, w) is
+    where something else is before the target; None: nowhere."""
+
+    image: NDArray[np.uint8]
+    hidden: Covered | None
+    setup: DetectorSetup
+    camera: CameraModel
+
+    def seen_partly(
+        self,
+        name: MarkerName,
+        start_px: Array,
+        known_by: KnownBy,
+        shift: EdgeShift | None = None,
+    ) -> RefinedCorners | None:
+        """The marker near to `start_px` (4, 2) by what is seen of it (`partial.seen_partly`)."""
+        pattern = self.setup.patterns[name]
+        return seen_partly(self.image, start_px, pattern, self.camera, known_by, self.hidden, shift)
+
+    def nested(self, corners_px: Array, name: MarkerName) -> Array:
+        """Where the other marker's corners (4, 2) put those of this one."""
+        ratio = self.setup.ratio if name == "small" else 1.0 / self.setup.ratio
+        return nested(corners_px, ratio, self.camera)
 
 
 def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Look:
@@ -133,151 +185,75 @@ def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Loo
     return "blurred" if empty_frames and empty_frames % setup.blurred_every == 0 else "sharp"
 
 
-def _looked(
-    frame: Frame,
-    hidden: Covered | None,
-    expected: Mapping[MarkerName, Array],
-    setup: DetectorSetup,
-    camera: CameraModel,
-    shift: EdgeShift | None,
-    look: Look,
-    lately: bool,
-    was_cut: bool,
-    turn: int | None,
-    own: TargetSelector | None,
-) -> Detections:
-    """What is in a picture of one moment; `hidden` (h, w) is where that is not seen, `lately`
-    whether the target was measured a moment ago, `was_cut` no marker of it being whole, `turn` of
-    the fits to a blurred one."""
-    image = frame.image
-    found = Found({}, mirrored=False, full_frame=False)
-    both = completed(expected, setup.ratio, camera)
-    seen: _Seen = {}
-    if look != "fits" and setup.window and both and setup.by_lines:
-        seen, found = _followed(image, hidden, both, setup, camera, shift)
-    if not seen and lately and setup.cut and is_cut(both, image.shape, hidden):
-        seen = cut_markers(image, expected, setup.patterns, camera, hidden)
-    findable = not was_cut or may_be_whole(both, image.shape)
-    if look not in ("blurred", "fits") and (
-        (not seen and findable) or _missing(seen, expected, image.shape, hidden)
-    ):
-        found = search(image, expected, setup, look, own)
-        if len(found.corners_px) >= len(seen):
-            seen = _refined(image, hidden, found, setup, camera)
-    if not seen and look not in ("sharp", "window") and setup.blurred and setup.by_lines:
-        seen = _in_blur(image, expected, setup, camera, turn)
-    return Detections(
-        frame_index=frame.index,
-        t_s=frame.t_s,
-        large=_detection("large", seen, frame.fields),
-        small=_detection("small", seen, frame.fields),
-        full_frame=found.full_frame,
-        mirrored=found.mirrored and not seen,
-        targets=found.targets,
-        edge_shift=next((r.edge_shift for r in seen.values() if r.edge_shift is not None), None),
-    )
-
-
 def _followed(
-    image: NDArray[np.uint8],
-    hidden: Covered | None,
-    expected: Mapping[MarkerName, Array],
-    setup: DetectorSetup,
-    camera: CameraModel,
-    shift: EdgeShift | None,
+    picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None
 ) -> tuple[_Seen, Found]:
     """What is where both are expected, or nearby: where no side was met, a near target has most
     often moved on further than a side is looked for, and a look around costs less than to fit
     what may be seen of it in the old place."""
-    patterns, nothing = setup.patterns, Found({}, mirrored=False, full_frame=False)
-    seen = follow(image, expected, patterns, camera, shift, hidden)
+    seen = follow(picture, expected, shift)
     if not seen:
-        found = search_halved(image, expected, setup)
-        again = {} if found is None else _refined(image, hidden, found, setup, camera)
+        found = search_halved(picture.image, expected, picture.setup)
+        again = {} if found is None else _refined(picture, found)
         if found is not None and again:
             return again, found
-    seen = follow_partly(image, expected, seen, patterns, camera, shift, hidden)
-    if any(lines_suffice(r, patterns[name]) for name, r in seen.items()):
-        return seen, nothing
-    return improved(image, seen, patterns, camera, hidden=hidden), nothing
+    seen = follow_partly(picture, expected, seen, shift)
+    if any(lines_suffice(r, picture.setup.patterns[name]) for name, r in seen.items()):
+        return seen, Found()
+    return improved(picture, seen), Found()
 
 
-def _missing(
-    seen: _Seen,
-    expected: Mapping[MarkerName, Array],
-    shape: tuple[int, ...],
-    hidden: Covered | None,
-) -> bool:
+def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]) -> bool:
     """Whether a marker that should be in the picture, and not hidden, was not verified, other
     than one too far away to be found by a search."""
     return any(
         name not in seen
-        and within(corners, shape)
+        and within(corners, picture.image.shape)
         and side_lengths_px(corners).min() > _SEARCHED_SIDE_PX
-        and not hides(hidden, corners)
+        and not hides(picture.hidden, corners)
         for name, corners in expected.items()
     )
 
 
-def _refined(
-    image: NDArray[np.uint8],
-    hidden: Covered | None,
-    found: Found,
-    setup: DetectorSetup,
-    camera: CameraModel,
-) -> _Seen:
-    """What the search found, by the profile's refinement."""
+def _refined(picture: Picture, found: Found) -> _Seen:
+    """What the search found, by the profile's refinement. Those without four lines for sides are
+    measured by what of these is seen: a search takes the picture's edge for the side of a marker
+    that is cut off there."""
+    image, setup = picture.image, picture.setup
     names = [name for name in MARKERS if name in found.corners_px]
     raw = np.array([found.corners_px[name] for name in names]).reshape(-1, 4, 2)
     rims = [setup.patterns[name].rim for name in names]
-    refined = refine(image, raw, rims, camera, setup.refinement)
+    refined = refine(image, raw, rims, picture.camera, setup.refinement)
     seen = dict(zip(names, refined, strict=True))
     if not setup.by_lines:
         return seen
-    seen = _whole_or_partly(image, hidden, seen, setup, camera)
-    return improved(image, seen, setup.patterns, camera, searched=True, hidden=hidden)
-
-
-def _whole_or_partly(
-    image: NDArray[np.uint8],
-    hidden: Covered | None,
-    seen: _Seen,
-    setup: DetectorSetup,
-    camera: CameraModel,
-) -> _Seen:
-    """What the search found, those without four lines for sides by what of these is seen. A
-    search takes the picture's edge for the side of a marker that is cut off there."""
-    fitted = dict(seen)
+    fitted, small = dict(seen), seen.get("small")
     for name, r in seen.items():
-        if r.refined and wholly_seen(r, image.shape, hidden):
+        if r.refined and wholly_seen(r, image.shape, picture.hidden):
             continue
-        pattern, small = setup.patterns[name], seen.get("small")
         starts = [r.corners_px]
         if name == "large" and not r.refined and small is not None and small.refined:
-            starts.insert(0, nested(small.corners_px, 1.0 / setup.ratio, camera))
+            starts.insert(0, picture.nested(small.corners_px, "large"))
         known_by: KnownBy = "other" if len(seen) == 2 else "bits"
-        tried = (seen_partly(image, s, pattern, camera, known_by, hidden) for s in starts)
+        tried = (picture.seen_partly(name, start, known_by) for start in starts)
         partly = next((found for found in tried if found is not None), None)
         if partly is not None:
             fitted[name] = partly
-        elif not within(r.corners_px, image.shape, ROOM_PX) or hides(hidden, r.corners_px, 1.0):
+        elif not within(r.corners_px, image.shape, ROOM_PX) or hides(
+            picture.hidden, r.corners_px, 1.0
+        ):
             del fitted[name]
-    return fitted
+    return improved(picture, fitted, searched=True)
 
 
-def _in_blur(
-    image: NDArray[np.uint8],
-    expected: Mapping[MarkerName, Array],
-    setup: DetectorSetup,
-    camera: CameraModel,
-    turn: int | None,
-) -> _Seen:
+def _in_blur(picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None) -> _Seen:
     """What only the drawing shows: near to where it is expected, or anywhere."""
+    image, setup, camera = picture.image, picture.setup, picture.camera
     if expected:
         seen = expected_in_blur(image, expected, setup.patterns, camera, turn)
     else:
         seen = hidden_in_blur(image, setup, camera)
-    return improved(image, seen, setup.patterns, camera)
+    return improved(replace(picture, hidden=None), seen)
 
 
 def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Detection | None:
@@ -355,32 +331,25 @@ def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
     return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * seen.blur_px)
 
 
-def improved(
-    image: NDArray[np.uint8],
-    seen: Mapping[MarkerName, RefinedCorners],
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
-    searched: bool = False,
-    hidden: NDArray[np.bool_] | None = None,
-) -> dict[MarkerName, RefinedCorners]:
+def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
     """The markers that were seen, with better corners and with the other marker if it shows.
 
-    `hidden` (h, w) is where there is something else: a drawing is not laid over that. What a
-    search found, its bits read one by one, stays only where lines suffice, the drawing
-    confirms it, or the other marker was seen with it."""
-    better = dict(seen)
+    A drawing is not laid over what is hidden. What a search found, its bits read one by one,
+    stays only where lines suffice, the drawing confirms it, or the other marker was seen with
+    it."""
+    image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
-        large = around(image, better["small"], patterns, camera, hidden)
+        large = around(picture, better["small"])
         if large is not None:
             better["large"] = large
     for name in MARKERS:
-        start = _start(name, better, patterns, camera)
-        if start is None or not within(start, image.shape) or hides(hidden, start):
+        start = _start(picture, name, better)
+        if start is None or not within(start, image.shape) or hides(picture.hidden, start):
             continue
         alone = _OTHER[name] not in better
         max_sigma = _MAX_SIGMA_ALONE if alone else _MAX_SIGMA
         exact = aligned(
-            image, start, patterns[name], camera, _REACH, _blur_px(better.get(name)),
+            image, start, patterns[name], picture.camera, _REACH, _blur_px(better.get(name)),
             max_sigma=max_sigma, alone=alone,
         )  # fmt: skip
         if exact is not None:
@@ -399,12 +368,7 @@ def _blur_px(seen: RefinedCorners | None) -> float:
     return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _BLUR_PX)
 
 
-def _start(
-    name: MarkerName,
-    seen: Mapping[MarkerName, RefinedCorners],
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
-) -> Array | None:
+def _start(picture: Picture, name: MarkerName, seen: _Seen) -> Array | None:
     """Corners (4, 2) px from which the drawing should be aligned, None where that is of no
     use."""
     this, other = seen.get(name), seen.get(_OTHER[name])
@@ -412,10 +376,11 @@ def _start(
         if this.cov_px2 is not None:
             return None  # what hides a part of it would spoil the drawing, too
         # Small cells matter only where no larger ones were measured.
-        enough = lines_suffice(this, patterns[name]) or (name == "small" and other is not None)
+        enough = lines_suffice(this, picture.setup.patterns[name])
+        enough = enough or (name == "small" and other is not None)
         return None if this.refined and enough else this.corners_px
     if name == "small" and other is not None and other.refined:
-        return nested(other.corners_px, patterns["large"].drawing.ratio, camera)
+        return picture.nested(other.corners_px, "small")
     return None
 
 
@@ -430,16 +395,11 @@ _ANCHOR = 0.12  # of the small marker's side
 
 
 def follow(
-    image: NDArray[np.uint8],
-    expected: Mapping[MarkerName, Array],
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
-    shift: EdgeShift | None = None,
-    hidden: NDArray[np.bool_] | None = None,
-) -> dict[MarkerName, RefinedCorners]:
+    picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
+) -> _Seen:
     """The expected markers (corners (4, 2) px) that are verified by all sides and cells; `shift`
-    is what was measured of the edges in an earlier picture, `hidden` (h, w) where there is
-    something else."""
+    is what was measured of the edges in an earlier picture."""
+    image, patterns = picture.image, picture.setup.patterns
     names = [
         name
         for name in MARKERS
@@ -450,88 +410,74 @@ def follow(
     if not names:
         return {}
     raw = np.array([expected[name] for name in names])
-    fitted = refine_lines(image, raw, [patterns[name].rim for name in names], camera, shift)
+    rims = [patterns[name].rim for name in names]
+    fitted = refine_lines(image, raw, rims, picture.camera, shift)
     return {
         name: result
         for name, result in zip(names, fitted, strict=True)
         if result is not None
-        and wholly_seen(result, image.shape, hidden)
+        and wholly_seen(result, image.shape, picture.hidden)
         and cells_agree(image, result.corners_px, patterns[name])
     }
 
 
 def follow_partly(
-    image: NDArray[np.uint8],
+    picture: Picture,
     expected: Mapping[MarkerName, Array],
-    seen: Mapping[MarkerName, RefinedCorners],
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
+    seen: _Seen,
     shift: EdgeShift | None = None,
-    hidden: NDArray[np.bool_] | None = None,
-) -> dict[MarkerName, RefinedCorners]:
+) -> _Seen:
     """With those that `follow` did not verify, by what is seen of them. Where the small marker
     was met, the large one is looked for around it instead of where it was expected."""
     places, seen = dict(expected), dict(seen)
     if "small" in seen and "large" not in seen:
-        places["large"] = nested(
-            seen["small"].corners_px, 1.0 / patterns["large"].drawing.ratio, camera
-        )
+        places["large"] = picture.nested(seen["small"].corners_px, "large")
     for name in MARKERS:
         if name in places and name not in seen:
-            partly = seen_partly(
-                image, places[name], patterns[name], camera, "track", hidden, shift
-            )
+            partly = picture.seen_partly(name, places[name], "track", shift)
             if partly is not None:
                 seen[name] = partly
-    large = seen.get("large")
-    if large is not None and "small" not in seen:
+    if "large" in seen and "small" not in seen:
         # Too small for lines, but where it must be: enough to know that it is there.
-        small_px = nested(large.corners_px, patterns["large"].drawing.ratio, camera)
-        if mean_side_px(small_px) > LEAST_SIDE_PX and resembles(image, small_px, patterns["small"]):
+        small_px = picture.nested(seen["large"].corners_px, "small")
+        if mean_side_px(small_px) > LEAST_SIDE_PX and resembles(
+            picture.image, small_px, picture.setup.patterns["small"]
+        ):
             seen["small"] = RefinedCorners(small_px, NESTED_SIGMA_PX, False)
     return seen
 
 
-def around(
-    image: NDArray[np.uint8],
-    small: RefinedCorners,
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
-    hidden: NDArray[np.bool_] | None = None,
-) -> RefinedCorners | None:
+def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
     """The large marker around a small one that was found: something may cover a part of
     it, and it may be cut off by the picture's edge, so long as its sides are lines where they
     are seen and most cells show."""
-    pattern = patterns["large"]
-    start = nested(small.corners_px, 1.0 / pattern.drawing.ratio, camera)
+    image, pattern = picture.image, picture.setup.patterns["large"]
+    start = picture.nested(small.corners_px, "large")
     if not np.isfinite(start).all():
         return None
-    found: RefinedCorners | None = None
+
+    def is_centred(large: RefinedCorners) -> bool:
+        """Whether the small marker is where the large one has it."""
+        centre = picture.nested(large.corners_px, "small")
+        off_px = float(np.abs(centre - small.corners_px).max())
+        return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
+
     if within(start, image.shape, ROOM_PX):
         # A small marker gives a rough place; the first fit is where to look closely.
-        found = refine_lines(image, start[None], [pattern.rim], camera)[0]
+        found = refine_lines(image, start[None], [pattern.rim], picture.camera)[0]
         if found is not None:
-            found = refine_lines(image, found.corners_px[None], [pattern.rim], camera)[0]
+            found = refine_lines(image, found.corners_px[None], [pattern.rim], picture.camera)[0]
+        if found is not None:
+            start = found.corners_px
         if (
             found is not None
-            and wholly_seen(found, image.shape, hidden)
-            and _centred(found, small, pattern, camera)
+            and wholly_seen(found, image.shape, picture.hidden)
+            and is_centred(found)
             and cells_mostly_agree(image, found.corners_px, pattern)
         ):
             return found
-    if found is not None:
-        start = found.corners_px
-    partly = seen_partly(image, start, pattern, camera, "other", hidden)
-    return partly if partly and _centred(partly, small, pattern, camera) else None
-
-
-def _centred(
-    large: RefinedCorners, small: RefinedCorners, pattern: Pattern, camera: CameraModel
-) -> bool:
-    """Whether the small marker is where the large one has it."""
-    centre = nested(large.corners_px, pattern.drawing.ratio, camera)
-    off_px = float(np.abs(centre - small.corners_px).max())
-    return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
+    partly = picture.seen_partly("large", start, "other")
+    return partly if partly and is_centred(partly) else None
 
 
 # --- The markers of two fields, at the moment half way between them ----------------------------

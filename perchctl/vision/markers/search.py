@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import cv2
@@ -39,22 +39,8 @@ _HALVED_SIDE_PX = 60.0
 _CENTRE_TOLERANCE = 0.35  # of the small marker's side
 
 
-@dataclass(frozen=True)
-class Box:
-    """A part of the picture, px, right and bottom excluded."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-    @property
-    def width(self) -> int:
-        return self.right - self.left
-
-    @property
-    def height(self) -> int:
-        return self.bottom - self.top
+Window = tuple[slice, slice]
+"""Rows and columns of a part of the picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +49,9 @@ class Found:
     mirror image is there, whether it was looked for in the whole picture, and how many whole
     targets, both markers, there were to choose from."""
 
-    corners_px: dict[MarkerName, Array]
-    mirrored: bool
-    full_frame: bool
+    corners_px: dict[MarkerName, Array] = field(default_factory=dict)
+    mirrored: bool = False
+    full_frame: bool = False
     targets: int = 0
 
 
@@ -85,14 +71,14 @@ def search(
         quickly = search_halved(image, expected, setup, own)
         if quickly is not None:
             return quickly
-        box = search_window(expected, setup.ratio, image.shape) or whole
-        found = Found({}, mirrored=False, full_frame=False)
+        window = search_window(expected, setup.ratio, image.shape) or whole
+        found = Found()
         if len(expected) == 2:
-            found = _pass(image, box, expected, setup, QUICK_THRESHOLDS, own)
-        if len(found.corners_px) < 2 and box != whole:
-            found = _pass(image, box, expected, setup, OPENCV_THRESHOLDS, own)
-        if len(found.corners_px) >= (2 if box == whole else 1) or (
-            look in ("near", "window") and box != whole
+            found = _pass(image, window, expected, setup, QUICK_THRESHOLDS, own)
+        if len(found.corners_px) < 2 and window != whole:
+            found = _pass(image, window, expected, setup, OPENCV_THRESHOLDS, own)
+        if len(found.corners_px) >= (2 if window == whole else 1) or (
+            look in ("near", "window") and window != whole
         ):
             return found
     return _pass(image, whole, expected, setup, OPENCV_THRESHOLDS, own)
@@ -109,18 +95,18 @@ def search_halved(
     in_view = [quad for quad in expected.values() if within(quad, image.shape)]
     if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _HALVED_SIDE_PX:
         return None
-    box = search_window(expected, setup.ratio, image.shape) or _whole(image)
-    found = _pass(image, box, expected, setup, QUICK_THRESHOLDS, own, halved=True)
+    window = search_window(expected, setup.ratio, image.shape) or _whole(image)
+    found = _pass(image, window, expected, setup, QUICK_THRESHOLDS, own, halved=True)
     return found if len(found.corners_px) >= len(in_view) else None
 
 
-def _whole(image: NDArray[np.uint8]) -> Box:
-    return Box(0, 0, image.shape[1], image.shape[0])
+def _whole(image: NDArray[np.uint8]) -> Window:
+    return slice(0, image.shape[0]), slice(0, image.shape[1])
 
 
 def search_window(
     expected: Mapping[MarkerName, Array], ratio: float, shape: tuple[int, ...]
-) -> Box | None:
+) -> Window | None:
     """Where to look, None where a window would not pay.
 
     It holds the whole large marker as long as that can be in the picture, so that
@@ -139,30 +125,32 @@ def search_window(
     margin = np.maximum(_WINDOW_MARGIN * (high - low).max(), _WINDOW_MARGIN_PX)
     left, top = np.clip(np.floor(low - margin), 0, (w, h)).astype(int)
     right, bottom = np.clip(np.ceil(high + margin), 0, (w, h)).astype(int)
-    box = Box(int(left), int(top), int(right), int(bottom))
-    large_enough = min(box.width, box.height) >= _MIN_WINDOW_PX
-    return box if large_enough and box.width * box.height <= _MAX_WINDOW * w * h else None
+    width, height = int(right - left), int(bottom - top)
+    if min(width, height) < _MIN_WINDOW_PX or width * height > _MAX_WINDOW * w * h:
+        return None
+    return slice(int(top), int(bottom)), slice(int(left), int(right))
 
 
 def _pass(
     image: NDArray[np.uint8],
-    box: Box,
+    window: Window,
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
     thresholds: Thresholds,
     own: TargetSelector | None,
     halved: bool = False,
 ) -> Found:
-    """What one pass of OpenCV's detector over the box gives, or over that at half its size."""
-    part = image[box.top : box.bottom, box.left : box.right]
+    """What one pass of OpenCV's detector over the window gives, or over that at half its size."""
+    part = image[window]
     full_frame = part.shape == image.shape
     if halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     detector = strict_detector(setup, (part.shape[1], part.shape[0]), thresholds)
     corners, ids, _, which = detector.detectMarkersMultiDict(part)
     if ids is None or len(corners) == 0:
-        return Found({}, False, full_frame)
-    first = np.array([box.left, box.top], dtype=np.float64)
+        return Found(full_frame=full_frame)
+    rows, columns = window
+    first = np.array([columns.start, rows.start], dtype=np.float64)
     candidates: dict[MarkerName, list[Array]] = {"large": [], "small": []}
     mirrored = False
     for quad, index, dictionary in zip(corners, ids.ravel(), which.ravel(), strict=True):

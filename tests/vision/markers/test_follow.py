@@ -12,7 +12,7 @@ import pytest
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
 from perchctl.vision import make_aruco_detector
 from perchctl.vision.markers.corners import RefinedCorners
-from perchctl.vision.markers.detect import around, detect_markers, follow
+from perchctl.vision.markers.detect import Picture, around, detect_markers, follow
 from perchctl.vision.markers.partial import KnownBy, seen_partly
 from tests.helpers.markers import POSE, SETUP, both, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -82,8 +82,8 @@ def test_around_a_lone_small_marker_there_is_no_large_one() -> None:
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.small is not None
     assert found.large is None
-    seen = follow(image, {"small": corners("small", pose)}, SETUP.patterns, CAMERA)
-    assert around(image, seen["small"], SETUP.patterns, CAMERA) is None
+    seen = follow(Picture(image, None, SETUP, CAMERA), {"small": corners("small", pose)})
+    assert around(Picture(image, None, SETUP, CAMERA), seen["small"]) is None
 
 
 @pytest.mark.parametrize("seed", range(4))

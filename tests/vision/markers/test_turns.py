@@ -58,11 +58,11 @@ def stream(build: object, monkeypatch: pytest.MonkeyPatch) -> Stream:
         detect_room.hidden_in_blur,
     )
 
-    def passed(image, box, *rest):  # type: ignore[no-untyped-def]
-        whole = (box.height, box.width) == image.shape
+    def passed(image, window, *rest):  # type: ignore[no-untyped-def]
+        whole = image[window].shape == image.shape
         made.done[-1].whole += whole
         made.done[-1].window += not whole
-        return one_pass(image, box, *rest)
+        return one_pass(image, window, *rest)
 
     def near_in_blur(*rest):  # type: ignore[no-untyped-def]
         made.done[-1].near_in_blur += 1
