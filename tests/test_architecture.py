@@ -103,7 +103,7 @@ MOST_NAMES = {
     "sim": 25,
     "target": 28,
     "track": 15,
-    "vision": 44,
+    "vision": 38,
     "weights": 15,
 }
 

@@ -55,8 +55,8 @@ def update_calibration(
     camera: CameraConfig,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
-    """The estimate with one more picture of the target. `t_s`: its arrival less the profile's
-    latency."""
+    """Return the estimate with one more picture of the target. `t_s` is its arrival less the
+    profile's latency."""
     new = _learned(old, t_s, pose, history, setup, attitude_sigma_rad)
     if camera.latency_s != "measured":
         return new
@@ -71,8 +71,9 @@ def _learned(
     setup: PoseSetup,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
-    """The sums with the picture's target, and once a second their solution; unchanged by a pose
-    that is no number or too near, or where the attitude of its time is not known."""
+    """Return the estimate with the picture's target in its sums, and once a second with their
+    solution; unchanged by a pose that is no number or too near, or where the attitude of its time
+    is not known."""
     if pose.cov is None or not finite(pose.cov) or float(pose.tvec_m[2]) < LEAST_RANGE_M:
         return old
     likely = old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
@@ -92,8 +93,8 @@ def _learned(
 
 
 def _slewed(new: OnlineCalibration, camera: CameraConfig, dt_s: float) -> float:
-    """What is used, one picture on: towards what is measured, or as it was where that is
-    unsure."""
+    """Return the latency in use, one picture on: closer to what is measured, or as it was where
+    that is unsure."""
     if new.newest is None or not new.newest.delay_sigma_s <= USED_SIGMA_S:
         return new.used_s
     (least_s, most_s), start_s = USED_LATENCY_S, camera.start_latency_s
@@ -182,9 +183,9 @@ def consistency_moment(
     delay_s: float,
     setup: PoseSetup,
 ) -> Moment:
-    """The frame's target for the vehicle's attitude `ATTITUDE_STEP_S` before and after the frame's
-    time less `delay_s`, and its velocity then. `delay_s` is the delay that is thought likely: about
-    it, the factors are those of small changes."""
+    """Return the frame's target, for the vehicle's attitude `ATTITUDE_STEP_S` before and after the
+    frame's time less `delay_s`, and its velocity then. `delay_s` is the delay that is thought
+    likely: about it, the factors are those of small changes."""
     assert pose.cov is not None
     T_body_cam = setup.T_body_cam
     R_body_cam = T_body_cam[:3, :3]
@@ -217,12 +218,14 @@ def consistency_moment(
 
 
 def _above(size: float, noise: float) -> float:
-    """The part of a motion that counts: none of what noise can be, all of what is far above."""
+    """Return the part of a motion that counts: none of what noise can be, all of what is far
+    above."""
     return max(0.0, 1.0 - (2.0 * noise / max(size, 1e-9)) ** 2)
 
 
 def _upper_rows(attitude: Attitude) -> tuple[tuple[float, float, float], ...]:
-    """The first two of ``R_world_body``: without arrays, as this is done for every picture."""
+    """Return the first two rows of ``R_world_body``: without arrays, as this is done for every
+    picture."""
     cr, sr = math.cos(attitude.roll_rad), math.sin(attitude.roll_rad)
     cp, sp = math.cos(attitude.pitch_rad), math.sin(attitude.pitch_rad)
     cy, sy = math.cos(attitude.yaw_rad), math.sin(attitude.yaw_rad)
@@ -233,12 +236,13 @@ def _upper_rows(attitude: Attitude) -> tuple[tuple[float, float, float], ...]:
 
 
 def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    """Return the dot product of two short sequences, without arrays."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def add_moment(old: ConsistencySums, new: Moment) -> ConsistencySums:
-    """The sums with one more frame. After a gap, or where the target or the estimate's world has
-    jumped, the level begins anew, and what was learned is kept."""
+    """Return the sums with one more frame. After a gap, or where the target or the estimate's world
+    has jumped, the level begins anew, and what was learned is kept."""
     if old.level is None:
         first = new.rows, new.variance
         return replace(old, t_s=new.t_s, began_s=new.t_s, level=first[0], variance=first[1])
@@ -268,9 +272,9 @@ def add_moment(old: ConsistencySums, new: Moment) -> ConsistencySums:
 
 
 def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> Consistency | None:
-    """What the flight shows so far; None after less than a second of frames.
+    """Return what the flight shows so far; None after less than a second of frames.
 
-    `attitude_sigma_rad`: constant error of the estimate's roll and pitch.
+    `attitude_sigma_rad` is the constant error of the estimate's roll and pitch.
     """
     if sums.rows < 3 * LEAST_FRAMES:
         return None

@@ -25,9 +25,6 @@ from perchctl.perception.visual_inertial import (
 )
 from perchctl.profile import Profile
 from perchctl.vision import (
-    BLENDED,
-    INTERLACED,
-    OTHER_TARGET_TEXT,
     Consistency,
     Detections,
     FieldState,
@@ -39,9 +36,17 @@ from perchctl.vision import (
     estimate,
     pictures,
     step,
-    surest_pose,
 )
 
+INTERLACED = "interlaced: the two fields of a frame are measured each for itself"
+BLENDED = (
+    "blended: moving edges are double, as if the camera's fields had been averaged: switch that "
+    "off in the receiver or converter"
+)
+_OTHER_TARGET = (
+    "a target is in view that is too far from target.expected_xy_m to be the own one: it is not "
+    "followed"
+)
 MIRRORED_FRAMES = 5
 REMARK_PICTURES = 3
 
@@ -123,7 +128,7 @@ class Perception:
 
     def _calibrate(self, output: PipelineOutput, later_s: float) -> None:
         """Latency and mounting, from a picture whose pose was taken for the target's."""
-        pose = surest_pose(self.state.measured)
+        pose = self.state.measured.surest
         if pose is not None and pose.t_s == output.detections.t_s:
             T_body_cam, history = self.pipeline.pose.T_body_cam, self.history
             x_m, y_m, z_m = (T_body_cam[:3, :3] @ pose.tvec_m + T_body_cam[:3, 3]).tolist()
@@ -148,7 +153,7 @@ class Perception:
         for text, shown in (
             (INTERLACED, output.fields != "whole"),
             (BLENDED, output.detections.ghost_px > 0.0),
-            (OTHER_TARGET_TEXT, output.refused),
+            (_OTHER_TARGET, output.refused),
         ):
             before = self._shown.get(text, 0)
             if before < REMARK_PICTURES:

@@ -9,12 +9,10 @@ from dataclasses import dataclass, field
 
 from perchctl.camera import mirrored_note
 from perchctl.display import PageState, Sketch
-from perchctl.perception import Perception
+from perchctl.perception import BLENDED, INTERLACED, Perception
 from perchctl.profile import Profile
 from perchctl.track.result import CameraPose, Tracked, text_rows, track_record, tracked_of
 from perchctl.vision import (
-    BLENDED,
-    INTERLACED,
     MARKERS,
     CameraModel,
     Frame,

@@ -1,5 +1,3 @@
-from .fields import BLENDED as BLENDED
-from .fields import INTERLACED as INTERLACED
 from .fields import FieldState as FieldState
 from .fields import field_picture as field_picture
 from .fields import is_combed as is_combed
@@ -20,13 +18,9 @@ from .pipeline import pictures as pictures
 from .pipeline import step as step
 from .pose import PoseSetup as PoseSetup
 from .pose import estimate_pose as estimate_pose
-from .pose import level_rotation as level_rotation
-from .pose import rotation_vector as rotation_vector
 from .pose import square_corners as square_corners
-from .target_selection import OTHER_TARGET_TEXT as OTHER_TARGET_TEXT
 from .target_selection import to_level as to_level
 from .target_selection import to_world as to_world
-from .tracks import surest_pose as surest_pose
 from .types import MARKERS as MARKERS
 from .types import Attitude as Attitude
 from .types import CameraModel as CameraModel

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -25,7 +26,6 @@ from perchctl.vision import (
     Consistency,
     MarkerPose,
     PoseSetup,
-    rotation_vector,
 )
 from perchctl.vision.pose import make_pose_setup
 
@@ -113,9 +113,10 @@ def _fly(
         spoilt = rotation_from_rpy(0.0, 0.0, rng.normal(0.0, POSE_RAD)) @ R_cam_marker
         way = way + rng.normal(0.0, POSE_M, 3)
         cov = np.diag([POSE_M**2] * 3 + [POSE_RAD**2])
+        rvec = cv2.Rodrigues(spoilt)[0].ravel()
         pose = MarkerPose(
-            "joint", exposed_s, rotation_vector(spoilt), way, np.zeros(3), 0.0, np.full(3, POSE_M),
-            POSE_RAD, 0.1, cov=cov,
+            "joint", exposed_s, rvec, way, np.zeros(3), 0.0, np.full(3, POSE_M), POSE_RAD, 0.1,
+            cov=cov,
         )  # fmt: skip
         t_s = exposed_s + late_s
         before, after = (

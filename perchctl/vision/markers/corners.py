@@ -32,26 +32,26 @@ _INCREMENTS: Array = np.array(
 
 
 def from_unit(corners: Array) -> Array:
-    """Homography (3, 3) of the unit square to corners (4, 2)."""
+    """Return the homography (3, 3) of the unit square to corners (4, 2)."""
     H = cv2.getPerspectiveTransform(_UNIT32, corners.astype(np.float32))
     return np.asarray(H, dtype=np.float64)
 
 
 def to_unit(corners: Array) -> Array:
-    """Homography (3, 3) of corners (4, 2) to the unit square."""
+    """Return the homography (3, 3) of corners (4, 2) to the unit square."""
     H = cv2.getPerspectiveTransform(corners.astype(np.float32), _UNIT32)
     return np.asarray(H, dtype=np.float64)
 
 
 def mapped(H: Array, points: Array) -> Array:
-    """Points (..., 2) through a homography."""
+    """Return the points (..., 2) through a homography."""
     images = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H)
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
 
 def corner_jacobian(H: Array) -> Array:
-    """Change (8, 8) of the four corners that H (3, 3) makes of the unit square with the terms of
-    an increment P, H (1 + P): its rows one after the other, without the last term."""
+    """Return the change (8, 8) of the four corners that H (3, 3) makes of the unit square with the
+    terms of an increment P, H (1 + P): its rows one after the other, without the last term."""
     q = _UNIT1.dot(H.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (H[:2, :2] - x[:, :, None] * H[2, :2]) / d
@@ -59,38 +59,39 @@ def corner_jacobian(H: Array) -> Array:
 
 
 def incremented(H: Array, p: Array) -> Array:
-    """H (1 + P), scaled to 1 in its last term: P has the terms p (8,) of an increment in the
+    """Return H (1 + P), scaled to 1 in its last term: P has the terms p (8,) of an increment in the
     order of its rows, and a last one of 0."""
     H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
     return np.asarray(H / H[2, 2])
 
 
 def side_lengths_px(corners_px: Array) -> Array:
-    """Lengths of the four sides, (..., 4)."""
+    """Return the lengths of the four sides, (..., 4)."""
     d = corners_px.take(NEXT, axis=-2) - corners_px
     return np.asarray(np.hypot(d[..., 0], d[..., 1]), dtype=np.float64)
 
 
 def mean_side_px(corners_px: Array) -> float:
-    """Mean length of the sides of one square (4, 2)."""
+    """Return the mean length of the sides of one square (4, 2)."""
     a, b, c, d = corners_px.tolist()
     return (math.dist(a, b) + math.dist(b, c) + math.dist(c, d) + math.dist(d, a)) / 4.0
 
 
 def shortest_side_px(corners_px: Array) -> float:
-    """Of the sides of one square (4, 2); NaN where a corner is."""
+    """Return the shortest side of one square (4, 2); NaN where a corner is."""
     a, b, c, d = corners_px.tolist()
     return min(math.dist(a, b), math.dist(b, c), math.dist(c, d), math.dist(d, a))
 
 
 def doubled_area(corners: Array) -> Array:
-    """Positive for corners (m, 4, 2) that run clockwise as the picture is seen, (m,)."""
+    """Return twice the area, positive for corners (m, 4, 2) that run clockwise as the picture is
+    seen, (m,)."""
     a, b = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> bool:
-    """Whether all corners (4, 2) are finite and inside a picture of that shape, at least
+    """Return True if all corners (4, 2) are finite and inside a picture of that shape, at least
     `room_px` from its edge."""
     h, w = shape[:2]
     right, low = w - 1 - room_px, h - 1 - room_px
@@ -99,7 +100,7 @@ def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> b
 
 
 def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:
-    """Corners (4, 2) of a square `ratio` times as large with the same centre and plane;
+    """Return the corners (4, 2) of a square `ratio` times as large with the same centre and plane;
     without a camera, as if the lens did not bend the square's sides."""
     straight = corners_px if camera is None else undistort(corners_px, camera)
     found = mapped(from_unit(straight), (_UNIT32 * ratio).astype(np.float64))
@@ -109,7 +110,7 @@ def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -
 def completed(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
-    """With the other marker where the one that is expected puts it; `ratio` is the small
+    """Return both markers, the other where the one that is expected puts it; `ratio` is the small
     marker's side over the large one's."""
     both = dict(expected)
     if "small" not in both and "large" in both:
@@ -150,8 +151,8 @@ class RefinedCorners:
 
 
 def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
-    """Corners (4, 2) of a marker `cells` wide by `cv2.cornerSubPix`; the raw ones where it
-    leads away."""
+    """Return the corners (4, 2) of a marker `cells` wide by `cv2.cornerSubPix`; the raw ones where
+    it leads away."""
     side_px = float(side_lengths_px(raw_px).min())
     half = int(np.clip(round(0.5 * side_px / cells), 1, 5))
     points = np.ascontiguousarray(raw_px, dtype=np.float32).reshape(-1, 1, 2)
@@ -165,7 +166,7 @@ def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedC
 
 
 def known_from(earlier: EdgeShift | None) -> EdgeShift | None:
-    """What an earlier picture's shift still gives a picture later, None once it is too old:
+    """Return what an earlier picture's shift still gives a picture later; None once it is too old:
     light, lens and ink change slowly."""
     if earlier is None or earlier.age + 1 >= _PICTURES:
         return None

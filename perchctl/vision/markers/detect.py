@@ -13,7 +13,7 @@ frame, and only where the one before saw too little.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -38,7 +38,6 @@ from perchctl.vision.markers.corners import (
     within,
 )
 from perchctl.vision.markers.cut import (
-    cut_lately,
     cut_markers,
     is_cut,
     may_be_whole,
@@ -97,16 +96,19 @@ def detect_markers(
     if empty_frames is not None and look in ("near", "fits"):
         turn = (empty_frames + 2) // 4
     lately = measured_lately(previous, frame.t_s)
-    was_cut = setup.cut and cut_lately(previous, frame.t_s, frame.image.shape)
+    was_cut = False
+    if previous is not None and lately and setup.cut:
+        last = {each.marker: each.corners_px for each in previous.markers}
+        was_cut = not may_be_whole(last, frame.image.shape)
     shift = known_from(None if previous is None else previous.edge_shift)
 
     def detected(frame: Frame) -> Detections:
-        """What is in a frame of one moment."""
+        """Return what is in a frame of one moment."""
         hidden = hidden_in(frame, setup.mask)
         image = frame.image if hidden is None else filled(frame.image, hidden)
         picture, found = Picture(image, hidden, setup, camera), Found()
         seen: _Seen = {}
-        if look != "fits" and setup.window and both and setup.by_lines:
+        if look != "fits" and setup.config.window and both and setup.by_lines:
             seen, found = _followed(picture, both, shift)
         if not seen and lately and setup.cut and is_cut(both, image.shape, hidden):
             seen = cut_markers(image, expected, setup.patterns, camera, hidden)
@@ -117,7 +119,7 @@ def detect_markers(
             found = search(image, expected, setup, look, own)
             if len(found.corners_px) >= len(seen):
                 seen = _refined(picture, found)
-        if not seen and look not in ("sharp", "window") and setup.blurred and setup.by_lines:
+        if not seen and look not in ("sharp", "window") and setup.blurred:
             seen = _in_blur(picture, expected, turn)
         shifts = (r.edge_shift for r in seen.values())
         return Detections(
@@ -154,24 +156,26 @@ class Picture:
         known_by: KnownBy,
         shift: EdgeShift | None = None,
     ) -> RefinedCorners | None:
-        """The marker near to `start_px` (4, 2) by what is seen of it (`partial.seen_partly`)."""
+        """Return the marker near to `start_px` (4, 2) by what is seen of it
+        (`partial.seen_partly`)."""
         pattern = self.setup.patterns[name]
         return seen_partly(self.image, start_px, pattern, self.camera, known_by, self.hidden, shift)
 
     def nested(self, corners_px: Array, name: MarkerName) -> Array:
-        """Where the other marker's corners (4, 2) put those of this one."""
+        """Return where the other marker's corners (4, 2) put those of this one."""
         ratio = self.setup.ratio if name == "small" else 1.0 / self.setup.ratio
         return nested(corners_px, ratio, self.camera)
 
 
 def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Look:
-    """After a loss the place where the target should be and the whole picture take turns, and
-    there the search and the fits of a blurred target do; later a sharp target and, in every Nth
-    frame, a blurred one. The first frame without it may only be blurred: that has both."""
+    """Return how to search this frame. After a loss the place where the target should be and the
+    whole picture take turns, and there the search and the fits of a blurred target do; later a
+    sharp target and, in every Nth frame, a blurred one. The first frame without it may only be
+    blurred: that has both."""
     if empty_frames is None:
         return "all"
-    fits = setup.blurred and setup.by_lines
-    if expected and setup.window:
+    fits = setup.blurred
+    if expected and setup.config.window:
         if empty_frames % 2:
             return "sharp"
         if empty_frames == 0 or not fits:
@@ -179,17 +183,17 @@ def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Loo
         return "fits" if empty_frames % 4 else "window"
     if not fits:
         return "sharp"
-    if setup.blurred_every == 1:
+    if setup.config.blurred_every == 1:
         return "all"
     # At 0 something was seen, though not where the target should be.
-    return "blurred" if empty_frames and empty_frames % setup.blurred_every == 0 else "sharp"
+    return "blurred" if empty_frames and empty_frames % setup.config.blurred_every == 0 else "sharp"
 
 
 def _followed(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None
 ) -> tuple[_Seen, Found]:
-    """What is where both are expected, or nearby: where no side was met, a near target has most
-    often moved on further than a side is looked for, and a look around costs less than to fit
+    """Return what is where both are expected, or nearby: where no side was met, a near target has
+    most often moved on further than a side is looked for, and a look around costs less than to fit
     what may be seen of it in the old place."""
     seen = follow(picture, expected, shift)
     if not seen:
@@ -204,8 +208,8 @@ def _followed(
 
 
 def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]) -> bool:
-    """Whether a marker that should be in the picture, and not hidden, was not verified, other
-    than one too far away to be found by a search."""
+    """Return True if a marker that should be in the picture, and not hidden, was not verified,
+    other than one too far away to be found by a search."""
     return any(
         name not in seen
         and within(corners, picture.image.shape)
@@ -216,14 +220,14 @@ def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]
 
 
 def _refined(picture: Picture, found: Found) -> _Seen:
-    """What the search found, by the profile's refinement. Those without four lines for sides are
-    measured by what of these is seen: a search takes the picture's edge for the side of a marker
-    that is cut off there."""
+    """Return what the search found, by the profile's refinement. Those without four lines for sides
+    are measured by what of these is seen: a search takes the picture's edge for the side of a
+    marker that is cut off there."""
     image, setup = picture.image, picture.setup
     names = [name for name in MARKERS if name in found.corners_px]
     raw = np.array([found.corners_px[name] for name in names]).reshape(-1, 4, 2)
     rims = [setup.patterns[name].rim for name in names]
-    refined = refine(image, raw, rims, picture.camera, setup.refinement)
+    refined = refine(image, raw, rims, picture.camera, setup.config.refinement)
     seen = dict(zip(names, refined, strict=True))
     if not setup.by_lines:
         return seen
@@ -247,7 +251,7 @@ def _refined(picture: Picture, found: Found) -> _Seen:
 
 
 def _in_blur(picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None) -> _Seen:
-    """What only the drawing shows: near to where it is expected, or anywhere."""
+    """Return what only the drawing shows: near to where it is expected, or anywhere."""
     image, setup, camera = picture.image, picture.setup, picture.camera
     if expected:
         seen = expected_in_blur(image, expected, setup.patterns, camera, turn)
@@ -257,6 +261,7 @@ def _in_blur(picture: Picture, expected: Mapping[MarkerName, Array], turn: int |
 
 
 def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Detection | None:
+    """Return the marker's detection in a picture of that kind, None where it was not seen."""
     r = seen.get(name)
     if r is None:
         return None
@@ -276,23 +281,21 @@ _MAX_GAP_S = 0.25  # older motion is no evidence of where to look
 
 
 def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
-    """The last corners (4, 2) px, moved on as they moved before; empty if there are none."""
+    """Return the last corners (4, 2) px, moved on as they moved before; empty if there are none."""
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
     moves = 0.0 < gap_s <= _MAX_GAP_S
     corners: dict[MarkerName, Array] = {}
-    for name in MARKERS:
-        detection = previous.get(name)
-        if detection is None:
-            continue
-        flow = previous.flow_px_s.get(name, previous.velocity_px_s)
-        corners[name] = detection.corners_px + (flow * gap_s if moves and flow is not None else 0)
+    for d in previous.markers:
+        flow = previous.flow_px_s.get(d.marker, previous.velocity_px_s)
+        corners[d.marker] = d.corners_px + (flow * gap_s if moves and flow is not None else 0)
     return corners
 
 
 def with_motion(now: Detections, previous: Detections | None) -> Detections:
-    """`now` with velocity_px_s and flow_px_s, where markers were seen a short time before."""
+    """Return `now` with velocity_px_s and flow_px_s, where markers were seen a short time
+    before."""
     if previous is None:
         return now
     gap_s = now.t_s - previous.t_s
@@ -326,13 +329,13 @@ _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
 def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
-    """Whether no drawing could give better corners."""
+    """Return True if no drawing could give better corners."""
     cell_px = mean_side_px(seen.corners_px) / pattern.rim.cells
     return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * seen.blur_px)
 
 
 def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
-    """The markers that were seen, with better corners and with the other marker if it shows.
+    """Return the markers that were seen, with better corners and with the other marker if it shows.
 
     A drawing is not laid over what is hidden. What a search found, its bits read one by one,
     stays only where lines suffice, the drawing confirms it, or the other marker was seen with
@@ -362,15 +365,16 @@ def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
 
 
 def _blur_px(seen: RefinedCorners | None) -> float:
-    """That of the sides, where lines were fitted: the fit of the drawing gets there sooner."""
+    """Return the blur of the sides, where lines were fitted: the fit of the drawing gets there
+    sooner."""
     if seen is None or not seen.refined or seen.blur_px <= 0.0:
         return _BLUR_PX
     return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _BLUR_PX)
 
 
 def _start(picture: Picture, name: MarkerName, seen: _Seen) -> Array | None:
-    """Corners (4, 2) px from which the drawing should be aligned, None where that is of no
-    use."""
+    """Return the corners (4, 2) px from which the drawing should be aligned, None where that is of
+    no use."""
     this, other = seen.get(name), seen.get(_OTHER[name])
     if this is not None:
         if this.cov_px2 is not None:
@@ -397,8 +401,8 @@ _ANCHOR = 0.12  # of the small marker's side
 def follow(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Seen:
-    """The expected markers (corners (4, 2) px) that are verified by all sides and cells; `shift`
-    is what was measured of the edges in an earlier picture."""
+    """Return the expected markers (corners (4, 2) px) that are verified by all sides and cells;
+    `shift` is what was measured of the edges in an earlier picture."""
     image, patterns = picture.image, picture.setup.patterns
     names = [
         name
@@ -427,8 +431,9 @@ def follow_partly(
     seen: _Seen,
     shift: EdgeShift | None = None,
 ) -> _Seen:
-    """With those that `follow` did not verify, by what is seen of them. Where the small marker
-    was met, the large one is looked for around it instead of where it was expected."""
+    """Return the markers of `follow` with those that it did not verify, by what is seen of them.
+    Where the small marker was met, the large one is looked for around it instead of where it was
+    expected."""
     places, seen = dict(expected), dict(seen)
     if "small" in seen and "large" not in seen:
         places["large"] = picture.nested(seen["small"].corners_px, "large")
@@ -448,16 +453,16 @@ def follow_partly(
 
 
 def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
-    """The large marker around a small one that was found: something may cover a part of
-    it, and it may be cut off by the picture's edge, so long as its sides are lines where they
-    are seen and most cells show."""
+    """Return the large marker around a small one that was found: something may cover a part of it,
+    and it may be cut off by the picture's edge, so long as its sides are lines where they are seen
+    and most cells show."""
     image, pattern = picture.image, picture.setup.patterns["large"]
     start = picture.nested(small.corners_px, "large")
     if not np.isfinite(start).all():
         return None
 
     def is_centred(large: RefinedCorners) -> bool:
-        """Whether the small marker is where the large one has it."""
+        """Return True if the small marker is where the large one has it."""
         centre = picture.nested(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
         return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
@@ -487,50 +492,46 @@ _MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 
 
 def between(a: Detections, b: Detections) -> Detections:
-    """The mean of both fields' corners, which is right for either order of the fields.
+    """Return the mean of both fields' corners, which is right for either order of the fields.
 
     A marker that only one field shows is left out where the other marker is in both: the
     two would belong to different moments. Nothing lies between two different targets.
     """
-    both = {
-        name: _middle(one, other)
-        for name in MARKERS
-        if (one := a.get(name)) is not None
-        and (other := b.get(name)) is not None
-        and _is_one(one.corners_px, other.corners_px)
-    }
+    both: dict[MarkerName, Detection] = {}
+    for name in MARKERS:
+        one, other = a.get(name), b.get(name)
+        if one is None or other is None:
+            continue
+        way_px = one.corners_px.mean(axis=0) - other.corners_px.mean(axis=0)
+        if float(np.linalg.norm(way_px)) < _MOST_SIDES * mean_side_px(one.corners_px):
+            both[name] = _middle(one, other)
     if not both:
-        alone = a if a.large is not None or a.small is not None else b
+        alone = a if a.markers else b
         return replace(alone, mirrored=alone.mirrored or b.mirrored)
     return replace(a, large=both.get("large"), small=both.get("small"), mirrored=False)
 
 
-def _is_one(a_px: Array, b_px: Array) -> bool:
-    """Whether a marker can have moved from one place to the other between the fields."""
-    moved_px = float(np.linalg.norm(a_px.mean(axis=0) - b_px.mean(axis=0)))
-    return moved_px < _MOST_SIDES * mean_side_px(a_px)
-
-
 def _middle(a: Detection, b: Detection) -> Detection:
-    """Each field has its own noise, so the mean is surer than either."""
+    """Return the mean of two fields' detections. Each field has its own noise, so the mean is
+    surer than either."""
+
+    def half(one: float, other: float) -> float:
+        return float(((one**2 + other**2) / 4.0) ** 0.5)
+
+    cov_px2 = None
+    if a.cov_px2 is not None or b.cov_px2 is not None:
+        one, other = (d.sigma_px**2 * np.eye(8) if d.cov_px2 is None else d.cov_px2 for d in (a, b))
+        cov_px2 = (one + other) / 4.0
     return Detection(
         a.marker,
         (a.corners_px + b.corners_px) / 2.0,
-        ((a.sigma_px**2 + b.sigma_px**2) / 4.0) ** 0.5,
+        half(a.sigma_px, b.sigma_px),
         a.refined and b.refined,
         max(a.shift_sigma_px, b.shift_sigma_px),
-        cov_px2=_mean_cov_px2(a, b),
-        row_sigma_px=((a.row_sigma_px**2 + b.row_sigma_px**2) / 4.0) ** 0.5,
-        lying_sigma_px=((a.lying_sigma_px**2 + b.lying_sigma_px**2) / 4.0) ** 0.5,
+        cov_px2=cov_px2,
+        row_sigma_px=half(a.row_sigma_px, b.row_sigma_px),
+        lying_sigma_px=half(a.lying_sigma_px, b.lying_sigma_px),
     )
-
-
-def _mean_cov_px2(a: Detection, b: Detection) -> Array | None:
-    """None where in both the corners spread alike."""
-    if a.cov_px2 is None and b.cov_px2 is None:
-        return None
-    one, other = (d.sigma_px**2 * np.eye(8) if d.cov_px2 is None else d.cov_px2 for d in (a, b))
-    return np.asarray((one + other) / 4.0)
 
 
 # --- Double edges: what a converter leaves that averages the two fields of a moving picture ----
@@ -556,8 +557,8 @@ _CELLS = {"large": 6.0, "small": 7.0}  # of a side; with a little less all goes 
 def with_ghosts(
     now: Detections, previous: Detections | None, image: NDArray[np.uint8]
 ) -> Detections:
-    """`now` with `ghost_px`, and the corners' spread widened by it, where a marker that moves,
-    or of which that is not known, has double edges. Where the picture before had none, as in
+    """Return `now` with `ghost_px`, and the corners' spread widened by it, where a marker that
+    moves, or of which that is not known, has double edges. Where the picture before had none, as in
     most streams, it is looked for in every fourth."""
     velocity = now.velocity_px_s
     if velocity is not None and float(np.hypot(*velocity)) < SLOW_PX_S:
@@ -566,38 +567,31 @@ def with_ghosts(
         age = previous.ghost_age + 1
         if age < _EVERY:
             return replace(now, ghost_age=age)
-    seen = [d for name in MARKERS if (d := now.get(name)) is not None]
-    shows = _shows_best(seen)
-    ghost_px = 0.0 if shows is None else double_edge_px(image, shows)
+    # The smallest marker with room enough beside its sides: larger ones bend more, and may be
+    # outside of the picture, where sides show nothing.
+    whole = [d for d in now.markers if d.cov_px2 is None]
+    roomy = whole[-1:] if whole and _reach_px(whole[-1]) >= _ROOM_PX else whole[:1]
+    ghost_px = double_edge_px(image, roomy[0]) if roomy else 0.0
     if ghost_px == 0.0:
         return now
-    wider = {d.marker: _wider(d, ghost_px / 4.0) for d in seen}
+    # The middle of both steps is where the edge was at the middle moment, but an edge fit may
+    # hold to one of them.
+    sigma_px, wider = ghost_px / 4.0, {}
+    for d in now.markers:
+        cov_px2 = None if d.cov_px2 is None else d.cov_px2 + sigma_px**2 * np.eye(8)
+        wide_px = float(np.hypot(d.sigma_px, sigma_px))
+        wider[d.marker] = replace(d, sigma_px=wide_px, cov_px2=cov_px2)
     return replace(now, large=wider.get("large"), small=wider.get("small"), ghost_px=ghost_px)
 
 
-def _shows_best(seen: Sequence[Detection]) -> Detection | None:
-    """The smallest marker with room enough beside its sides: larger ones bend more, and may
-    be outside of the picture, where sides show nothing."""
-    whole = [d for d in seen if d.cov_px2 is None]
-    small = whole[-1:] if whole and _reach_px(whole[-1]) >= _ROOM_PX else whole[:1]
-    return small[0] if small else None
-
-
 def _reach_px(marker: Detection) -> float:
-    """How far from the sides the next edges are not yet seen."""
+    """Return how far from the sides the next edges are not yet seen."""
     cell_px = float(side_lengths_px(marker.corners_px).min()) / _CELLS[marker.marker]
     return min(_REACH_CELLS * cell_px, _MOST_REACH_PX)
 
 
-def _wider(d: Detection, sigma_px: float) -> Detection:
-    """The middle of both steps is where the edge was at the middle moment, but an edge fit may
-    hold to one of them."""
-    cov_px2 = None if d.cov_px2 is None else d.cov_px2 + sigma_px**2 * np.eye(8)
-    return replace(d, sigma_px=float(np.hypot(d.sigma_px, sigma_px)), cov_px2=cov_px2)
-
-
 def double_edge_px(image: NDArray[np.uint8], marker: Detection) -> float:
-    """How far the two steps of a marker's sides are apart, the mean over opposite sides and
+    """Return how far the two steps of a marker's sides are apart, the mean over opposite sides and
     the greater of the two directions; 0 where the sides are single."""
     profiles = _profiles(image, marker)
     if profiles is None:
@@ -609,8 +603,8 @@ def double_edge_px(image: NDArray[np.uint8], marker: Detection) -> float:
 
 
 def _profiles(image: NDArray[np.uint8], marker: Detection) -> Array | None:
-    """Mean grey across each side from the inside outwards, `_STEP_PX` apart, (4, n); None of a
-    marker that is too small."""
+    """Return the mean grey across each side from the inside outwards, `_STEP_PX` apart, (4, n);
+    None of a marker that is too small."""
     reach_px = _reach_px(marker)
     if reach_px < _LEAST_REACH_PX:
         return None
@@ -631,21 +625,21 @@ def _profiles(image: NDArray[np.uint8], marker: Detection) -> Array | None:
 
 
 def _apart_px(profiles: Array) -> list[float]:
-    """The distance of two equal steps in each of the profiles (m, n), 0 where there is one."""
+    """Return the distance of the two highest steps in each of the profiles (m, n), if they are
+    about equal, with a valley between; else 0."""
     rise = np.diff(profiles, axis=1) / _STEP_PX
-    slope = 0.25 * rise[:, :-2] + 0.5 * rise[:, 1:-1] + 0.25 * rise[:, 2:]
-    middle = slope[:, 1:-1]
-    peak = (middle > slope[:, :-2]) & (middle >= slope[:, 2:]) & (middle >= _LEAST_SLOPE)
-    return [_between_px(s, np.flatnonzero(p) + 1) for s, p in zip(slope, peak, strict=True)]
-
-
-def _between_px(slope: Array, peaks: NDArray[np.intp]) -> float:
-    """The distance of the two highest peaks, if they are about equal, with a valley between."""
-    if len(peaks) < 2:
-        return 0.0
-    low, high = np.sort(slope[peaks])[-2:]
-    if low < _ALIKE * high:
-        return 0.0
-    a, b = np.sort(peaks[np.argsort(slope[peaks])[-2:]])
-    apart_px = float(b - a) * _STEP_PX
-    return apart_px if apart_px >= _LEAST_PX and slope[a:b].min() < _VALLEY * low else 0.0
+    slopes = 0.25 * rise[:, :-2] + 0.5 * rise[:, 1:-1] + 0.25 * rise[:, 2:]
+    middle = slopes[:, 1:-1]
+    is_peak = (middle > slopes[:, :-2]) & (middle >= slopes[:, 2:]) & (middle >= _LEAST_SLOPE)
+    found = []
+    for slope, peaks in zip(slopes, map(np.flatnonzero, is_peak), strict=True):
+        highest = (peaks + 1)[np.argsort(slope[peaks + 1])[-2:]]
+        apart_px = 0.0
+        if len(highest) == 2:
+            low, high = slope[highest]
+            a, b = np.sort(highest)
+            wide_px = float(b - a) * _STEP_PX
+            if low >= _ALIKE * high and wide_px >= _LEAST_PX and slope[a:b].min() < _VALLEY * low:
+                apart_px = wide_px
+        found.append(apart_px)
+    return found

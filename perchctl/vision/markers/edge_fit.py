@@ -67,16 +67,16 @@ _TO_THE_LEFT = np.array(-1j)
 
 
 def places(lengths_px: Array) -> Array:
-    """How far along its side (rows,) of that length each profile is: (rows, n) in 0..1;
-    the ends keep clear of the neighbouring sides' blur."""
+    """Return how far along its side (rows,) of that length each profile is: (rows, n) in 0..1; the
+    ends keep clear of the neighbouring sides' blur."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
 
 def side_profiles(starts: Array, ends: Array, s: Array, camera: CameraModel) -> tuple[Array, Array]:
-    """Where the profiles cross the sides, in the picture, and the unit normals there,
-    to the left of the way from start to end as the picture is seen (outwards for a
-    marker whose corners run clockwise): each (rows, n, 2).
+    """Return where the profiles cross the sides, in the picture, and the unit normals there, to the
+    left of the way from start to end as the picture is seen (outwards for a marker whose corners
+    run clockwise): each (rows, n, 2).
 
     A side's image through the lens is smooth: a few nodes define all of it.
 
@@ -96,7 +96,7 @@ def side_profiles(starts: Array, ends: Array, s: Array, camera: CameraModel) -> 
 
 
 def sample(image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Array) -> Floats:
-    """Grey values along the profiles, (rows, n, steps + 1): bilinear, the picture's rim
+    """Return the grey values along the profiles, (rows, n, steps + 1): bilinear, the picture's rim
     repeated outside.
 
     On float pictures OpenCV 5 interpolates at the exact position; on bytes, other
@@ -187,10 +187,10 @@ def refine_lines(
     camera: CameraModel,
     known: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
-    """The line fit alone, for m markers (m, 4, 2); None where its residual, inliers,
-    contrast, blur or movement show that these are not a marker's sides. The shift of all
-    edges is measured unless it is known. Wide edges, and those near to the profiles' ends, are
-    looked at twice, the second time with the profiles centred on them."""
+    """Fit lines to the sides of m markers (m, 4, 2); None where residual, inliers, contrast, blur
+    or movement show that these are not a marker's sides. The shift of all edges is measured unless
+    it is known. Wide edges, and those near to the profiles' ends, are looked at twice, the second
+    time with the profiles centred on them."""
     found = _refined_once(image, raw_px, rims, camera, known)
     centred = raw_px.copy()
     for i, each in enumerate(found):
@@ -212,6 +212,7 @@ def _refined_once(
     camera: CameraModel,
     known: EdgeShift | None,
 ) -> list[RefinedCorners | None]:
+    """Fit lines to the sides near to the raw corners, as `refine_lines` does, once."""
     found: list[RefinedCorners | None] = [None] * len(raw_px)
     markers = markers_of(raw_px, rims, camera)
     if markers is None:
@@ -259,8 +260,8 @@ def _refined_once(
 
 
 def _fit_lines(markers: Markers, sides: Samples) -> tuple[Array, Array]:
-    """Lines (4m, 3) as (nx, ny, c) with n.x = c and |n| = 1, normalised, by total least squares
-    on the points of each side; and the weighted RMS distance of these, px (4m,)."""
+    """Return the lines (4m, 3) as (nx, ny, c) with n.x = c and |n| = 1, normalised, by total least
+    squares on the points of each side; and the weighted RMS distance of these, px (4m,)."""
     w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
     x, y = sides.points[..., 0], sides.points[..., 1]
     cx, cy = (w * x).dot(_ONES), (w * y).dot(_ONES)
@@ -276,7 +277,7 @@ def _fit_lines(markers: Markers, sides: Samples) -> tuple[Array, Array]:
 
 
 def _intersect(lines: Array) -> Array:
-    """Corner i of each marker, where side i - 1 meets side i: (m, 4, 2)."""
+    """Return the corner i of each marker, where side i - 1 meets side i: (m, 4, 2)."""
     sides = lines.reshape(-1, 4, 3)
     before = sides.take(BEFORE, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
@@ -290,7 +291,7 @@ def _intersect(lines: Array) -> Array:
 
 
 def _shift_prior_px(sides: Samples) -> float:
-    """How far edges are shifted before that is measured: by white as the camera sees it
+    """Return how far edges are shifted before that is measured: by white as the camera sees it
     beyond the sides."""
     clipped = float(sides.grey[:, :, -1].mean()) > CLIPPED_GREY
     return _CLIPPED_PRIOR_PX if clipped else _SHIFT_PRIOR_PX
@@ -304,8 +305,8 @@ def _measured_shift(
     residual_px: Array,
     corners: Array,
 ) -> EdgeShift | None:
-    """How far white has grown over black, by the width of a border, of which `corners` (m, 4, 2)
-    are the outer edge's; None where no inner edge was sampled.
+    """Return how far white has grown over black, by the width of a border, of which `corners` (m,
+    4, 2) are the outer edge's; None where no inner edge was sampled.
 
     Outer edges that moved in by d shrink the marker's own scale; the inner edges, at
     the part r of it, moved out by d: they appear d (1 + r) too far out.
@@ -348,7 +349,7 @@ def _measured_shift(
 
 
 def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) -> float:
-    """How far the ends of the widest marker's sides lie further out than their middles, the
+    """Return how far the ends of the widest marker's sides lie further out than their middles, the
     mean of its sides, as far as noise does not explain it."""
     four = slice(4 * markers.widest, 4 * markers.widest + 4)
     away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
@@ -361,7 +362,7 @@ def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) 
 
 
 def _outwards(markers: Markers, lines: Array) -> Array:
-    """+1 where a line's normal, which may point either way, points out of its marker, else
+    """Return +1 where a line's normal, which may point either way, points out of its marker, else
     -1, (4m,)."""
     corners = markers.corners
     out = (corners - (_QUARTERS @ corners)[:, None]).reshape(-1, 2)
@@ -371,7 +372,7 @@ def _outwards(markers: Markers, lines: Array) -> Array:
 def _accepted(
     markers: Markers, sides: Samples, residual_px: Array, corners_px: Array
 ) -> list[bool]:
-    """Which of the m markers have lines for sides, near to where they were expected."""
+    """Return which of the m markers have lines for sides, near to where they were expected."""
     inliers = (sides.weight > 0.0).dot(_ONES32)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
     contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).dot(_ONES32)
@@ -398,7 +399,7 @@ def _accepted(
 
 
 def _clipped(sides: Samples) -> Array:
-    """Share of the profiles of the m markers that end in clipped white, (m,)."""
+    """Return the share of the profiles of the m markers that end in clipped white, (m,)."""
     ends = sides.grey[:, :, -1]
     if ends.max() <= CLIPPED_GREY:
         return np.zeros(len(ends) // 4)
@@ -407,8 +408,8 @@ def _clipped(sides: Samples) -> Array:
 
 
 def _ends_px2(markers: Markers, sides: Samples, residual_px: Array) -> Array:
-    """Variance of the ends of the sides, (4m,): a line fitted to n samples spreads twice as far
-    there as in its middle."""
+    """Return the variance of the ends of the sides, (4m,): a line fitted to n samples spreads twice
+    as far there as in its middle."""
     independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
     return np.asarray(4.0 * _TAILS * residual_px * residual_px / independent)
 
@@ -416,7 +417,7 @@ def _ends_px2(markers: Markers, sides: Samples, residual_px: Array) -> Array:
 def _sigma_px(
     cell_px: float, blur_px: float, noise_px2: float, clipped: bool, tolerance: float
 ) -> float:
-    """Spread of a marker's corners; `noise_px2` is the variance of its sides' ends, and
+    """Return the spread of a marker's corners; `noise_px2` is the variance of its sides' ends, and
     `tolerance` that of the print, in cells."""
     blur_px = max(blur_px, 1e-3)
     # Cells of few pixels let the inner pattern's blur reach the border's edge.
@@ -430,9 +431,9 @@ def _sigma_px(
 
 
 def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
-    """Spread of a marker's corners by what shakes a picture's rows, each along itself: it moves
-    upright sides, both of a marker's alike, and lying ones not. As the residuals of its four
-    sides show it; 0 where the marker stands on a corner and nothing shows."""
+    """Return the spread of a marker's corners by what shakes a picture's rows, each along itself,
+    as the residuals of its four sides show it: it moves upright sides, both of a marker's alike,
+    and lying ones not. 0 where the marker stands on a corner and nothing shows."""
     upright = [x * x for x in normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
@@ -484,7 +485,8 @@ class Samples:
 
 
 def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Markers | None:
-    """None where one of the markers is no square at all."""
+    """Return what is to be measured of markers with these raw corners; None where one of them is no
+    square at all."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
@@ -512,9 +514,9 @@ def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Marke
 def measure(
     image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
 ) -> tuple[Samples, Samples | None]:
-    """The edges' places on profiles across all sides; and, on request, across the inner edges of
-    the border with the widest cells, which shows best by how much all edges are shifted. None
-    where these cells are too small."""
+    """Return the edges' places on profiles across all sides; and, on request, across the inner
+    edges of the border with the widest cells, which shows best by how much all edges are shifted.
+    None where these cells are too small."""
     starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
     of = np.arange(len(starts)).repeat(4)
     widest = markers.widest
@@ -557,16 +559,16 @@ def measure(
 
 
 def reaches_px(cell_px: Array) -> tuple[Array, Array]:
-    """How far from an edge the window around it and the profile across it reach, by the width
-    of the cells beside it."""
+    """Return how far from an edge the window around it and the profile across it reach, by the
+    width of the cells beside it."""
     near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
     return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
 
 def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> Surroundings:
-    """Which profiles at places `s` (rows, n) have a neighbouring edge, `depth_px` (rows,) away,
-    and which have an edge: four rows a rim, and then perhaps the border's inner edges of
-    one."""
+    """Return which profiles at places `s` (rows, n) have a neighbouring edge, `depth_px` (rows,)
+    away, and which have an edge: four rows a rim, and then perhaps the border's inner edges of one.
+    """
     inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
     possible = np.ones(s.shape, np.bool_)
     for i, rim in enumerate(rims):
@@ -592,7 +594,8 @@ def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> 
 
 
 def _single(value: float) -> Floats:
-    """A number as arrays meet it soonest: beside one of numpy's scalars they take twice as long."""
+    """Return a number as arrays meet it soonest: beside one of numpy's scalars they take twice as
+    long."""
     return np.array(value, dtype=np.float32)
 
 
@@ -635,7 +638,7 @@ class Surroundings:
     possible: NDArray[np.bool_]
 
     def only(self, kept: NDArray[np.intp]) -> Surroundings:
-        """Of some of the rows."""
+        """Return the surroundings of some of the rows."""
         return Surroundings(
             self.depth_px[kept], self.inside[kept], self.outside[kept], self.possible[kept]
         )
@@ -652,128 +655,97 @@ class Edges:
     blur_px: Array
 
 
-@dataclass(frozen=True, eq=False)
-class _Gradients:
-    """The profiles' gradients at places `u` (rows, steps) and what every window over them
-    needs: its reach `near`, the cells' width, the square of its largest sigma, the
-    flanks with a neighbouring edge (`both`, `side`: outside less inside), the
-    profiles that `can` show an edge, and `part`, which makes of a row's sum the least
-    value that counts."""
-
-    gradient: Floats
-    u: Floats
-    near: Floats
-    depth: Floats
-    most2: Floats
-    both: Floats
-    side: Floats
-    can: Floats
-    part: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class _Centroids:
-    """Where the window saw the edges, px, which of them count, and the blur's square."""
-
-    edge: Floats
-    usable: NDArray[np.bool_]
-    blur2: Floats
-
-
 def locate(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> Edges:
-    """The place of an edge that rises along the profile.
+    """Return the place of an edge that rises along the profile.
 
     Args:
         grey: (rows, n, steps + 1), the profile from -half_px to +half_px.
         half_px, near_px: reach of the profiles and of the windows, (rows,).
     """
-    gradients = _gradients(grey, half_px, near_px, around)
-    seen = _wide(gradients)
-    line = weight = _halves_line(seen.edge, seen.usable)
+    profiles = _Profiles(grey, half_px, near_px, around)
+    edge, usable = profiles.wide()
+    blur2 = np.ones(len(near_px), dtype=np.float32)
+    line = weight = _halves_line(edge, usable)
     moved_px = np.inf
     for k in range(_ROUNDS):
         if k == 1 and moved_px < _ONE_ROUND_PX:
             continue
-        seen = _narrow(gradients, line, seen.blur2)
+        edge, usable, blur2 = profiles.narrow(line, blur2)
         rounds = 2 if k == _ROUNDS - 1 else 1
-        centre, weight = _robust_line(seen.edge, seen.usable, rounds)
+        centre, weight = _robust_line(edge, usable, rounds)
         moved_px, line = float(np.abs(centre - line).max()), centre
         if moved_px < _SETTLED_PX:
             break
     return Edges(
-        offset_px=seen.edge.astype(np.float64),
+        offset_px=edge.astype(np.float64),
         weight=weight.astype(np.float64),
-        blur_px=np.sqrt(seen.blur2).astype(np.float64),
+        blur_px=np.sqrt(blur2).astype(np.float64),
     )
 
 
-def _gradients(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> _Gradients:
-    inside, outside, can = around.inside, around.outside, around.possible.astype(np.float32)
-    near, depth = near_px.astype(np.float32), around.depth_px.astype(np.float32)
-    return _Gradients(
-        gradient=grey[:, :, 1:] - grey[:, :, :-1],
-        u=half_px.astype(np.float32)[:, None] * MIDDLES,
-        near=near,
-        depth=depth,
-        most2=_QUARTER_OF * near * near,
-        both=inside + outside,
-        side=outside - inside,
-        can=can,
+class _Profiles:
+    """The gradients along all profiles, and what every window over them needs."""
+
+    def __init__(self, grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> None:
+        self.gradient = grey[:, :, 1:] - grey[:, :, :-1]
+        self.u = half_px.astype(np.float32)[:, None] * MIDDLES  # where, (rows, steps)
+        self.near, self.depth = near_px.astype(np.float32), around.depth_px.astype(np.float32)
+        self.most2 = _QUARTER_OF * self.near * self.near  # square of a window's largest sigma
+        # The flanks with a neighbouring edge: both, and outside less inside.
+        self.both, self.side = around.inside + around.outside, around.outside - around.inside
+        self.can = around.possible.astype(np.float32)
         # Multiplies a sum over a row's profiles: a part of the mean over those possible.
-        part=_LEAST_SHARE / np.maximum(can.dot(_ONES32), _ONE),
-    )
+        self.part = _LEAST_SHARE / np.maximum(self.can.dot(_ONES32), _ONE)
 
+    def wide(self) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the edges by one window around the middle of all profiles, and which count."""
+        spread = self.u * (_PER_NEAR / self.near)[:, None]
+        spread *= spread
+        window = np.empty((*self.u.shape, 2), dtype=np.float32)
+        np.exp(_MINUS_HALF * spread, out=window[..., 0])
+        np.multiply(window[..., 0], self.u, out=window[..., 1])
+        moments: Floats = np.maximum(self.gradient, _ZERO) @ window
+        total = moments[..., 0] * self.can
+        usable = total > (total.dot(_ONES32) * self.part)[:, None]
+        return np.divide(moments[..., 1], np.where(usable, total, _ONE)), usable
 
-def _wide(g: _Gradients) -> _Centroids:
-    """By one window around the middle of all profiles; the blur is not measured yet."""
-    spread = g.u * (_PER_NEAR / g.near)[:, None]
-    spread *= spread
-    window = np.empty((*g.u.shape, 2), dtype=np.float32)
-    np.exp(_MINUS_HALF * spread, out=window[..., 0])
-    np.multiply(window[..., 0], g.u, out=window[..., 1])
-    moments: Floats = np.maximum(g.gradient, _ZERO) @ window
-    total = moments[..., 0] * g.can
-    usable = total > (total.dot(_ONES32) * g.part)[:, None]
-    edge = np.divide(moments[..., 1], np.where(usable, total, _ONE))
-    return _Centroids(edge, usable, np.ones(len(g.near), dtype=np.float32))
-
-
-def _narrow(g: _Gradients, line: Floats, blur2: Floats) -> _Centroids:
-    """By a window around the row's line (rows, n), as wide as its blur so far demands."""
-    relative = g.u[:, None, :] - line[:, :, None]
-    # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
-    w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), g.most2)
-    squared = relative * relative
-    mass = squared * (_MINUS_HALF / w2)[:, None, None]
-    np.exp(mass, out=mass)
-    mass *= g.gradient
-    total = (mass @ _STEP_ONES) * g.can
-    usable = total > np.maximum(total.dot(_ONES32) * g.part, _TINY)[:, None]
-    # A neighbour seen through the window has this share, at this place, with this
-    # spread; the one outside lies at the same distance on the other flank.
-    wide2 = w2 + blur2
-    place = g.depth * w2 / wide2
-    lost = np.exp(_MINUS_HALF * g.depth * g.depth / wide2)
-    share = np.minimum(g.both * lost[:, None], _MOST_SHARE)
-    total = np.where(usable, total / (_ONE - share), _ONE)
-    relative *= mass
-    first = relative @ _STEP_ONES + total * g.side * (lost * place)[:, None]
-    mass *= squared
-    second = mass @ _STEP_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
-    moment = (second * usable).dot(_ONES32)
-    moment /= np.maximum((total * usable).dot(_ONES32), _TINY)
-    moment = np.minimum(np.maximum(moment, _LEAST_MOMENT2), _MOST_MOMENT * w2)
-    found2 = moment * w2 / (w2 - moment)
-    # The window pulls the centroid towards its own middle: undo that.
-    centroid = first / total * (_ONE + found2 / w2)[:, None]
-    limit = g.near[:, None]
-    return _Centroids(line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2)
+    def narrow(self, line: Floats, blur2: Floats) -> tuple[Floats, NDArray[np.bool_], Floats]:
+        """Return the edges by a window around the row's line (rows, n), as wide as its blur so
+        far demands, which of them count, and the blur's square."""
+        relative = self.u[:, None, :] - line[:, :, None]
+        # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
+        w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), self.most2)
+        squared = relative * relative
+        mass = squared * (_MINUS_HALF / w2)[:, None, None]
+        np.exp(mass, out=mass)
+        mass *= self.gradient
+        total = (mass @ _STEP_ONES) * self.can
+        usable = total > np.maximum(total.dot(_ONES32) * self.part, _TINY)[:, None]
+        # A neighbour seen through the window has this share, at this place, with this
+        # spread; the one outside lies at the same distance on the other flank.
+        wide2 = w2 + blur2
+        place = self.depth * w2 / wide2
+        lost = np.exp(_MINUS_HALF * self.depth * self.depth / wide2)
+        share = np.minimum(self.both * lost[:, None], _MOST_SHARE)
+        total = np.where(usable, total / (_ONE - share), _ONE)
+        relative *= mass
+        first = relative @ _STEP_ONES + total * self.side * (lost * place)[:, None]
+        mass *= squared
+        second = mass @ _STEP_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
+        moment = (second * usable).dot(_ONES32)
+        moment /= np.maximum((total * usable).dot(_ONES32), _TINY)
+        moment = np.minimum(np.maximum(moment, _LEAST_MOMENT2), _MOST_MOMENT * w2)
+        found2 = moment * w2 / (w2 - moment)
+        # The window pulls the centroid towards its own middle: undo that.
+        centroid = first / total * (_ONE + found2 / w2)[:, None]
+        limit = self.near[:, None]
+        return line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2
 
 
 def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Straight lines (rows, n) through the middles of the two halves of each row: where a
-    window is put, whatever a quarter of either half shows. A half that shows nothing is
-    taken to lie where the other does."""
+    """Return straight lines (rows, n) through the middles of the two halves of each row: where a
+    window is put, whatever a quarter of either half shows. A half that shows nothing is taken to
+    lie where the other does."""
     halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
     halves.sort(axis=2)
     first = _QUARTER // 2
@@ -786,7 +758,7 @@ def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
 
 
 def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:
-    """Straight lines edge(s) a row with Tukey's weights; returns (line, weight)."""
+    """Return straight lines edge(s) a row with Tukey's weights, and these weights."""
     line = median(edge, usable)[:, None]
     for _ in range(rounds):
         size = np.abs(edge - line)
@@ -806,7 +778,7 @@ def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[
 
 
 def median(values: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Each row's median over its usable values, to a rank, (rows,); 0 without any.
+    """Return each row's median over its usable values, to a rank, (rows,); 0 without any.
 
     The others are set high and low by turns, which keeps the middle where it is.
     """

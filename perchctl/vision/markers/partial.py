@@ -68,10 +68,10 @@ def fit_partly(
     hidden: NDArray[np.bool_] | None = None,
     known: EdgeShift | None = None,
 ) -> RefinedCorners | None:
-    """The marker near to corners `start_px` (4, 2), which may be outside of the picture.
+    """Fit the whole marker near to corners `start_px` (4, 2), which may be outside of the picture.
 
-    `hidden` (h, w) is where pixels show something else. None where what is seen does not
-    determine the corners. Nothing is said about the marker's cells.
+    `hidden` (h, w) is where pixels show something else. None where what is seen does not determine
+    the corners. The marker's cells are not looked at.
     """
     if not _large_enough(start_px, pattern):
         return None
@@ -92,7 +92,7 @@ def fit_partly(
         if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_STEP):
             return None
         H = incremented(H, p)
-        if k > 0 and float(np.abs(p[:6]).max() * seen.scale_px.mean()) < _STILL_PX:
+        if k > 0 and float(np.abs(p[:6]).max() * seen.rows.scale_px.mean()) < _STILL_PX:
             break
     assert seen is not None
     left_px = seen.far_px - (step @ A).reshape(seen.far_px.shape)
@@ -108,7 +108,7 @@ def seen_partly(
     hidden: NDArray[np.bool_] | None = None,
     known: EdgeShift | None = None,
 ) -> RefinedCorners | None:
-    """`fit_partly`, if the cells that are seen are the marker's."""
+    """Return the result of `fit_partly`, if the cells that are seen are the marker's."""
     if not _large_enough(start_px, pattern):
         return None
     if not may_show_enough(start_px, image.shape, pattern, camera, known_by, _MOST_OFF_PX):
@@ -121,13 +121,14 @@ def seen_partly(
 
 
 def _large_enough(start_px: Array, pattern: Pattern) -> bool:
+    """Return True if a part of a side may show anything."""
     return mean_side_px(start_px) / pattern.rim.cells >= LEAST_CELL_PX
 
 
 def wholly_seen(
     found: RefinedCorners, shape: tuple[int, ...], hidden: NDArray[np.bool_] | None
 ) -> bool:
-    """Whether nothing of the marker is hidden, and the picture's edge too far away to take
+    """Return True if nothing of the marker is hidden, and the picture's edge too far away to take
     anything from the sides' blur."""
     return within(found.corners_px, shape, ROOM_PX + found.blur_px) and not hides(
         hidden, found.corners_px
@@ -135,25 +136,26 @@ def wholly_seen(
 
 
 def _prior_px(seen: SeenEdges) -> float:
+    """Return how far edges are shifted before that is measured."""
     return _CLIPPED_PRIOR_PX if seen.white > _CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 
 def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
-    """Changes (9, rows * n) of the edges with the square's increment, in the terms of
-    `corner_jacobian`, and with the shift of all edges, px; and their normal equations (9, 9),
-    (9,), per px^2 of an edge's spread."""
-    u, v = seen.own[..., 0], seen.own[..., 1]
-    nx, ny = OUT[seen.side].T[..., None] * seen.scale_px[:, None]
+    """Return the changes (9, rows * n) of the edges with the square's increment, in the terms of
+    `corner_jacobian`, and with the shift of all edges, px; and their normal equations (9, 9), (9,),
+    per px^2 of an edge's spread."""
+    u, v, rows = seen.own[..., 0], seen.own[..., 1], seen.rows
+    nx, ny = OUT[rows.side].T[..., None] * rows.scale_px[:, None]
     A = np.empty((9, *u.shape))
     A[0], A[1], A[2] = nx * u, nx * v, nx
     A[3], A[4], A[5] = ny * u, ny * v, ny
     across = A[0] + A[4]
     A[6], A[7] = -u * across, -v * across
     # The model's edge moves with the square, the seen one by the shift.
-    A[8] = -seen.inwards[:, None]
+    A[8] = np.where(rows.at < 1.0, 1.0, -1.0)[:, None]
     A = A.reshape(9, -1)
     # Profiles nearer to each other than a pixel measure the same.
-    worth = np.minimum(1.0, 2.0 * seen.scale_px * seen.at / PROFILES)
+    worth = np.minimum(1.0, 2.0 * rows.scale_px * rows.at / PROFILES)
     weighted = A * (seen.weight * worth[:, None]).ravel()
     N, g = weighted.dot(A.T), weighted.dot(seen.far_px.ravel())
     # An edge's spread is about a tenth of a pixel while it is not known.
@@ -167,9 +169,9 @@ def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
 def _corners(
     H: Array, seen: SeenEdges, left_px: Array, N: Array, pattern: Pattern, camera: CameraModel
 ) -> RefinedCorners | None:
-    """Corners and covariance of the square H (3, 3), unit to pinhole px, after the last round,
-    by what that leaves over of its edges, px (rows, n), and by its normal matrix (9, 9); None
-    where they are not determined."""
+    """Return the corners and covariance of the square H (3, 3), unit to pinhole px, after the last
+    round, by what that leaves over of its edges, px (rows, n), and by its normal matrix (9, 9);
+    None where they are not determined."""
     spread = _spread(seen, left_px)
     if spread is None:
         return None
@@ -198,8 +200,8 @@ def _corners(
 
 
 def _spread(seen: SeenEdges, left: Array) -> tuple[float, float] | None:
-    """Mean square of what the fit leaves over within rows, px^2, and by how much rows contradict
-    each other beyond it; None where these are no edges of a square."""
+    """Return the mean square of what the fit leaves over within rows, px^2, and by how much rows
+    contradict each other beyond it; None where these are no edges of a square."""
     w = seen.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
@@ -234,8 +236,8 @@ def visible_cells_agree(
     hidden: NDArray[np.bool_] | None,
     known_by: KnownBy,
 ) -> bool:
-    """Whether the cells that are seen have their colour: not those beyond the picture's edge,
-    behind what is `hidden` (h, w), or in light that glares. How many that must be depends on
+    """Return True if the cells that are seen have their colour: not those beyond the picture's
+    edge, behind what is `hidden` (h, w), or in light that glares. How many that must be depends on
     what else says which marker it is."""
     h, w = image.shape
     at = _spots_px(corners_px, pattern, camera)
@@ -274,17 +276,17 @@ def may_show_enough(
     known_by: KnownBy,
     off_px: float,
 ) -> bool:
-    """Whether so many cells may be in the picture as `visible_cells_agree` asks for, of a marker
-    that is within `off_px` of corners (4, 2)."""
+    """Return True if so many cells may be in the picture as `visible_cells_agree` asks for, of a
+    marker that is within `off_px` of corners (4, 2)."""
     seen = _within(_spots_px(start_px, pattern, camera), shape, off_px)
     count = np.bincount(pattern.owner, weights=seen)
     return _enough(count >= 0.5 * pattern.spots_per_cell, pattern, known_by)
 
 
 def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
-    """The spots of a marker at corners (4, 2) as the lens shows them, (n, 2); NaN where it does
-    not reach. A marker that fills the picture is no square in it: its middle is a third of a cell
-    from where its corners alone put it."""
+    """Return the spots of a marker at corners (4, 2) as the lens shows them, (n, 2); NaN where it
+    does not reach. A marker that fills the picture is no square in it: its middle is a third of a
+    cell from where its corners alone put it."""
     rays = undistort(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.spots), 2), np.nan)
@@ -295,14 +297,14 @@ def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array
 
 
 def _within(at_px: Array, shape: tuple[int, ...], room_px: float) -> NDArray[np.bool_]:
-    """Which points (n, 2) are in the picture, or no farther outside."""
+    """Return which points (n, 2) are in the picture, or no farther outside."""
     h, w = shape[:2]
     inside = (at_px >= -room_px) & (at_px <= (w - 1 + room_px, h - 1 + room_px))
     return np.asarray(inside.all(axis=1))
 
 
 def _enough(known: NDArray[np.bool_], pattern: Pattern, known_by: KnownBy) -> bool:
-    """Whether the known cells (cells,) tell which marker it is."""
+    """Return True if the known cells (cells,) tell which marker it is."""
     most_unknown = len(known) if known_by == "other" else _UNKNOWN_BITS[known_by]
     return bool(
         np.count_nonzero(pattern.inner & ~known) <= most_unknown
@@ -342,33 +344,21 @@ class _Rows:
     sign: Array
 
     def only(self, kept: NDArray[np.intp]) -> _Rows:
-        """Some of them."""
-        return _Rows(
-            starts=self.starts[kept],
-            ends=self.ends[kept],
-            side=self.side[kept],
-            at=self.at[kept],
-            lengths_px=self.lengths_px[kept],
-            scale_px=self.scale_px[kept],
-            cell_px=self.cell_px,
-            sign=self.sign[kept],
-        )
+        """Return some of the rows."""
+        of_each = ("starts", "ends", "side", "at", "lengths_px", "scale_px", "sign")
+        return replace(self, **{name: getattr(self, name)[kept] for name in of_each})
 
 
 @dataclass(frozen=True, eq=False)
 class SeenEdges:
     """Edges of one round: of each profile (rows, n) its place in the marker's own coordinates
-    (rows, n, 2), how far outwards it is from where the square has it, and its weight; of
-    each row (rows,) what `_Rows` has of it, +1 where white grown over black moves it in, and
-    its blur in terms of the window; and how white the paper is."""
+    (rows, n, 2), how far outwards it is from where the square has it, and its weight; the rows,
+    and the blur of each in terms of the window (rows,); and how white the paper is."""
 
     own: Array
     far_px: Array
     weight: Array
-    side: NDArray[np.intp]
-    at: Array
-    scale_px: Array
-    inwards: Array
+    rows: _Rows
     blur: Array
     white: float
 
@@ -380,7 +370,7 @@ def seen_edges(
     camera: CameraModel,
     hidden: NDArray[np.bool_] | None,
 ) -> SeenEdges | None:
-    """The edges near to where the square H has them; None where too few are seen. Sides of
+    """Return the edges near to where the square H has them; None where too few are seen. Sides of
     which nothing is seen are left out."""
     rows = _rows(H, pattern, camera)
     if rows is None:
@@ -417,17 +407,14 @@ def seen_edges(
         own=own,
         far_px=far * rows.scale_px[:, None],
         weight=weight,
-        side=rows.side,
-        at=rows.at,
-        scale_px=rows.scale_px,
-        inwards=np.where(rows.at < 1.0, -1.0, 1.0),
+        rows=rows,
         blur=edges.blur_px / near_px,
         white=white,
     )
 
 
 def _rows(H: Array, pattern: Pattern, camera: CameraModel) -> _Rows | None:
-    """Of the square H, unit to pinhole px; None where that is none."""
+    """Return the rows of the square H, unit to pinhole px; None where that is none."""
     corners, cells = mapped(H, UNIT), pattern.rim.cells
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
@@ -459,7 +446,7 @@ def _in_view(
     normal: Array,
     near_px: Array,
 ) -> NDArray[np.bool_]:
-    """Which profiles (rows, n) are in the picture, and not hidden, as far as they count."""
+    """Return which profiles (rows, n) are in the picture, and not hidden, as far as they count."""
     h, w = shape[:2]
     # A profile is as far in the picture as both its ends are.
     reach, last = near_px[:, None, None] * np.abs(normal), (w - 1 - ROOM_PX, h - 1 - ROOM_PX)
@@ -475,9 +462,9 @@ def _in_view(
 def _unspoilt(
     grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array
 ) -> tuple[NDArray[np.bool_], float] | None:
-    """Which of the free profiles (rows, n) begin black and end white, as most do, and how white
-    the paper is; None without contrast. Light that glares makes black bright; what lies on the
-    paper makes white dark."""
+    """Return which of the free profiles (rows, n) begin black and end white, as most do, and how
+    white the paper is; None without contrast. Light that glares makes black bright; what lies on
+    the paper makes white dark."""
     # At half the window from the edge, blur has ended and no neighbour begins.
     off = max(1, round(0.5 * STEPS * float((0.6 * near_px / half_px)[0])))
     dark, bright = grey[:, :, STEPS // 2 - off], grey[:, :, STEPS // 2 + off]

@@ -192,8 +192,8 @@ def align(
 
 
 def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
-    """None without contrast. 16 or 17 unknowns: shape, blur and light; `total` (8,) is the sum
-    of the increments so far."""
+    """Return the normal equations of the next increment; None without contrast. There are 16 or 17
+    unknowns: shape, blur and light; `total` (8,) is the sum of the increments so far."""
     light = fit_light(seen, grey)
     gain = light.gain
     if gain < _MIN_GAIN:
@@ -217,7 +217,7 @@ def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
 
 
 def likeness(grey: Array, error: Array) -> float:
-    """Correlation of the picture with the fit that leaves `error` over."""
+    """Return the correlation of the picture with the fit that leaves `error` over."""
     spread = grey - grey.mean()
     explained = 1.0 - float((error**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
@@ -226,13 +226,13 @@ def likeness(grey: Array, error: Array) -> float:
 def _cells_seen(
     seen: Rendered, equations: _Equations, inverse: Array, many: float
 ) -> tuple[float, float]:
-    """`flip` and `flip_sigma` of an `Alignment`; `inverse` is that of N, and so `many` nodes
+    """Return `flip` and `flip_sigma` of an `Alignment`; `inverse` is that of N, and so `many` nodes
     measure the same.
 
-    The mean over a cell shows a wrong bit as long as blur is smaller than the cell. Beyond that
-    a wrong bit is spread over its neighbours, and shape, blur and light of the fit take a part
-    of what it leaves over. So each cell is looked for as it would look: blurred, and without
-    what the fit's unknowns explain (a matched filter).
+    The mean over a cell shows a wrong bit as long as blur is smaller than the cell. Beyond that a
+    wrong bit is spread over its neighbours, and shape, blur and light of the fit take a part of
+    what it leaves over. So each cell is looked for as it would look: blurred, and without what the
+    fit's unknowns explain (a matched filter).
     """
     soft, noise, gain = seen.soft_cells, equations.noise, equations.light.gain
     n, m = soft.shape
@@ -247,7 +247,7 @@ def _cells_seen(
 
 
 def _pattern_seen(drawing: Rendered, grey: Array, light: Light) -> tuple[float, float]:
-    """Correlation and height of the inner pattern in the picture's grey values (n * n,):
+    """Return the correlation and height of the inner pattern in the picture's grey values (n * n,):
     what no plain square explains of them."""
     plain = drawing.plain
     A = plain.products + 1e-9 * np.eye(len(plain.products))
@@ -263,7 +263,7 @@ def _pattern_seen(drawing: Rendered, grey: Array, light: Light) -> tuple[float, 
 
 
 def _repeated(error: Array) -> float:
-    """How many neighbouring nodes measure the same: from the correlation along rows and
+    """Return how many neighbouring nodes measure the same: from the correlation along rows and
     columns (n, n) of what is left (nodes closer than a pixel; blur that is not round)."""
     energy = max(float((error * error).mean()), 1e-9)
     factor = 1.0
@@ -274,7 +274,7 @@ def _repeated(error: Array) -> float:
 
 
 def _cell_departure(error: Array, grid: Grid, n_cells: int) -> float:
-    """Largest mean departure over a cell."""
+    """Return the largest mean departure over a cell."""
     index, count = _cells_of(grid, n_cells)
     total = np.bincount(index, weights=error, minlength=n_cells**2 + 1)[:-1]
     return float(np.abs(total / count).max())
@@ -282,7 +282,7 @@ def _cell_departure(error: Array, grid: Grid, n_cells: int) -> float:
 
 @lru_cache(maxsize=32)
 def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
-    """Of each node the cell's number, behind the last one's around the marker, and how many
+    """Return each node's number of its cell, behind the last one's around the marker, and how many
     nodes each cell has."""
     x, y = ((g + 1.0) * 0.5 * n_cells for g in (grid.u, grid.v))
     inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
@@ -317,7 +317,7 @@ class Light:
 
 
 def fit_light(drawing: Rendered, grey: Array) -> Light:
-    """The light that explains grey values (n * n,) best."""
+    """Return the light that explains grey values (n * n,) best."""
     light = drawing.light
     A = light.products + 1e-6 * np.eye(len(light.products))
     A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
@@ -326,8 +326,8 @@ def fit_light(drawing: Rendered, grey: Array) -> Light:
 
 
 def _lit_jacobian(drawing: Rendered, light: Light) -> Array:
-    """Changes (9, n * n) of the grey values with the homography's increment and the blur's
-    square, in this light."""
+    """Return the changes (9, n * n) of the grey values with the homography's increment and the
+    blur's square, in this light."""
     c, gain, grid = light.coefficients, light.gain, drawing.grid
     (white, changes), *others = drawing.sheets
     bend = min(max(float(c[BEND]) / gain, -0.9), 0.9)
@@ -376,24 +376,25 @@ class _Patch:
 
 @lru_cache(maxsize=64)
 def make_grid(n: int, reach: float) -> Grid:
-    """Nodes in the middle of n by n equal parts of the square from -reach to reach."""
+    """Return the nodes in the middle of n by n equal parts of the square from -reach to reach."""
     axis = reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
     return Grid(n, axis, _crossings(axis))
 
 
 def _crossings(axis: Array) -> Array:
+    """Return u, v and 1 where the lines of a grid cross, (3, n * n)."""
     u, v = np.meshgrid(axis, axis)
     return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
 
 
 def projected(H: Array, uv1: Array) -> Array:
-    """Own coordinates (3, n) through a homography to pinhole pixels, x and y (2, n)."""
+    """Map own coordinates (3, n) through a homography to pinhole pixels, x and y (2, n)."""
     q = H.dot(uv1)
     return np.asarray(q[:2] / q[2])
 
 
 def through_lens(pin_px: Array, camera: CameraModel) -> Array:
-    """Pinhole pixels (2, n) to pixels of the real lens."""
+    """Convert pinhole pixels (2, n) to pixels of the real lens."""
     K = camera.K
     rays = np.empty((pin_px.shape[1], 2))
     rays[:, 1] = (pin_px[1] - K[1, 2]) / K[1, 1]
@@ -402,9 +403,9 @@ def through_lens(pin_px: Array, camera: CameraModel) -> Array:
 
 
 def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
-    """How far the lens moves each node that is seen through H, (2, n * n). A lens moves
-    neighbours alike: it is computed for a few nodes, and the rest by the polynomial through
-    these."""
+    """Return how far the lens moves each node that is seen through H, (2, n * n). A lens moves
+    neighbours alike: it is computed for a few nodes, and the rest by the polynomial through these.
+    """
     uv1, between = _few(grid)
     pin = projected(H, uv1)
     shift = (through_lens(pin, camera) - pin).reshape(2, _FEW, _FEW)
@@ -413,8 +414,8 @@ def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
 
 @lru_cache(maxsize=64)
 def _few(grid: Grid) -> tuple[Array, Array]:
-    """Chebyshev's nodes over the grid (3, _FEW^2), and the weights (n, _FEW) that a row's nodes
-    give to its values there."""
+    """Return Chebyshev's nodes over the grid (3, _FEW^2), and the weights (n, _FEW) that a row's
+    nodes give to its values there."""
     reach = float(grid.axis[-1])
     x = chebyshev.chebpts2(_FEW)
     degree = _FEW - 1
@@ -423,7 +424,7 @@ def _few(grid: Grid) -> tuple[Array, Array]:
 
 
 def _patch_around(image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array) -> _Patch | None:
-    """The part of the picture that the nodes may reach, None where they leave it."""
+    """Return the part of the picture that the nodes may reach, None where they leave it."""
     h, w = image.shape
     x, y = projected(H, grid.uv1) + lens_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -436,8 +437,8 @@ def _patch_around(image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array
 
 
 def _read(patch: _Patch, grid: Grid, H: Array, offset_px: Array) -> Array:
-    """Grey values at the nodes, (n * n,); `offset_px` (2, n * n) is the lens's shift less the
-    patch's first pixel."""
+    """Return the grey values at the nodes, (n * n,); `offset_px` (2, n * n) is the lens's shift
+    less the patch's first pixel."""
     at = (projected(H, grid.uv1) + offset_px).astype(np.float32)
     x, y = at.reshape(2, grid.n, grid.n)
     grey = cv2.remap(patch.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -461,7 +462,7 @@ class Basis:
 
 
 def gram(rows: Array) -> Array:
-    """Products (k, k) of rows (k, n) with each other."""
+    """Return the products (k, k) of rows (k, n) with each other."""
     k, n = rows.shape
     whole = n - n % _BLOCK
     blocks = rows[:, :whole].reshape(k, -1, _BLOCK).transpose(1, 0, 2)
@@ -471,12 +472,12 @@ def gram(rows: Array) -> Array:
 
 
 def _onto(rows: Array, values: Array) -> Array:
-    """Products (k,) of the rows (k, n) with values (n,)."""
+    """Return the products (k,) of the rows (k, n) with values (n,)."""
     return np.asarray(np.einsum("kn,n->k", rows, values))
 
 
 def _mixed(rows: Array, coefficients: Array) -> Array:
-    """The rows (k, n) times coefficients (k,)."""
+    """Return the sum of the rows (k, n), each times its coefficient, (n,)."""
     return np.asarray(np.einsum("kn,k->n", rows, coefficients))
 
 
@@ -531,11 +532,12 @@ class Rendered:
 
 
 def _basis(rows: Array) -> Basis:
+    """Return the basis of these rows."""
     return Basis(rows, gram(rows))
 
 
 def rendered(drawing: Drawing, n: int, sigma: float) -> Rendered:
-    """The drawing at n by n nodes over its reach, blurred by about `sigma` nodes."""
+    """Return the drawing at n by n nodes over its reach, blurred by about `sigma` nodes."""
     return _rendered_at_step(drawing, n, round(math.log(sigma) / _STEP))
 
 
@@ -545,7 +547,7 @@ def _rendered_at_step(drawing: Drawing, n: int, step: int) -> Rendered:
 
 
 def _blurred(sharp: NDArray[np.float32], sigma: float, axis: Array) -> tuple[Array, Array]:
-    """A sheet blurred by sigma nodes, and its changes, per unit of the drawing."""
+    """Return a sheet blurred by sigma nodes, and its changes, per unit of the drawing."""
     soft = softened(sharp, sigma)
     step = float(axis[1] - axis[0])
     e, n = EDGE, len(axis)

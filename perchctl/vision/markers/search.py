@@ -21,7 +21,7 @@ from perchctl.vision.markers.detector import (
     QUICK_THRESHOLDS,
     DetectorSetup,
     Thresholds,
-    strict_detector,
+    make_marker_decoder,
 )
 from perchctl.vision.target_selection import TargetSelector
 from perchctl.vision.types import MARKERS, MarkerName
@@ -62,12 +62,12 @@ def search(
     look: Look = "all",
     own: TargetSelector | None = None,
 ) -> Found:
-    """By the window, if there is one, and by the whole picture where that gave too little; only
+    """Search the window, if there is one, and the whole picture where that gave too little; only
     one of them with a `look` that is "near", "window" or "sharp". Large markers are looked for at
-    half the size first: all that may be whole in the picture is enough. `own` chooses among
-    several where none is expected."""
+    half the size first: all that may be whole in the picture is enough. `own` chooses among several
+    where none is expected."""
     whole = _whole(image)
-    if setup.window and expected and look != "sharp":
+    if setup.config.window and expected and look != "sharp":
         quickly = search_halved(image, expected, setup, own)
         if quickly is not None:
             return quickly
@@ -90,8 +90,8 @@ def search_halved(
     setup: DetectorSetup,
     own: TargetSelector | None = None,
 ) -> Found | None:
-    """By the window, at half the size: a millisecond. None where that did not show all that should
-    be whole in the picture, or where that is too small for it."""
+    """Search the window at half the size: a millisecond. None where that did not show all that
+    should be whole in the picture, or where that is too small for it."""
     in_view = [quad for quad in expected.values() if within(quad, image.shape)]
     if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _HALVED_SIDE_PX:
         return None
@@ -101,13 +101,14 @@ def search_halved(
 
 
 def _whole(image: NDArray[np.uint8]) -> Window:
+    """Return the whole picture as a window."""
     return slice(0, image.shape[0]), slice(0, image.shape[1])
 
 
 def search_window(
     expected: Mapping[MarkerName, Array], ratio: float, shape: tuple[int, ...]
 ) -> Window | None:
-    """Where to look, None where a window would not pay.
+    """Return where to look, None where a window would not pay.
 
     It holds the whole large marker as long as that can be in the picture, so that
     the stage can change from one frame to the next.
@@ -140,12 +141,13 @@ def _pass(
     own: TargetSelector | None,
     halved: bool = False,
 ) -> Found:
-    """What one pass of OpenCV's detector over the window gives, or over that at half its size."""
+    """Return what one pass of OpenCV's detector over the window gives, or over that at half its
+    size."""
     part = image[window]
     full_frame = part.shape == image.shape
     if halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-    detector = strict_detector(setup, (part.shape[1], part.shape[0]), thresholds)
+    detector = make_marker_decoder(setup, (part.shape[1], part.shape[0]), thresholds)
     corners, ids, _, which = detector.detectMarkersMultiDict(part)
     if ids is None or len(corners) == 0:
         return Found(full_frame=full_frame)
@@ -172,7 +174,7 @@ def choose(
     ratio: float,
     own: TargetSelector | None = None,
 ) -> dict[MarkerName, Array]:
-    """At most one of each marker: look-alikes and what does not fit together are dropped.
+    """Return at most one of each marker: look-alikes and what does not fit together are dropped.
 
     A small marker in the centre of a large one, of the right size and turn, verifies
     both; of several such pairs the one counts that is nearest to the last detections, and what
@@ -211,7 +213,7 @@ def _chosen(
     expected: Mapping[MarkerName, Array],
     own: TargetSelector | None,
 ) -> tuple[float, int, int]:
-    """Of several whole targets."""
+    """Return the one that counts of several whole targets."""
     if len(wholes) == 1 or not (expected or own):
         return wholes[0]
     if expected:
@@ -226,8 +228,8 @@ def _chosen(
 def _possible(
     candidates: Mapping[MarkerName, list[Array]], own: TargetSelector
 ) -> Mapping[MarkerName, list[Array]]:
-    """Without the markers that are too far aside. A lone one is left to the pipeline, which says
-    why it is not taken."""
+    """Return the candidates without the markers that are too far aside. A lone one is left to the
+    pipeline, which says why it is not taken."""
     if not own.refuses or sum(map(len, candidates.values())) < 2:
         return candidates
     kept: dict[MarkerName, list[Array]] = {
@@ -238,6 +240,7 @@ def _possible(
 
 
 def _least_aside(name: MarkerName, quads: list[Array], own: TargetSelector) -> list[Array]:
+    """Return the quadrilateral that `own` has nearest, of several."""
     if len(quads) < 2:
         return quads
     away = [own.aside_m(name, quad) for quad in quads]
@@ -247,8 +250,8 @@ def _least_aside(name: MarkerName, quads: list[Array], own: TargetSelector) -> l
 def _wholes(
     candidates: Mapping[MarkerName, list[Array]], ratio: float
 ) -> list[tuple[float, int, int]]:
-    """Pairs that belong together, each large marker in one: misfit and both indices, the best
-    first."""
+    """Return the pairs that belong together, each large marker in one: misfit and both indices, the
+    best first."""
     large, small = candidates["large"], candidates["small"]
     pairs = [(misfit(a, b, ratio), i, j) for i, a in enumerate(large) for j, b in enumerate(small)]
     best: dict[int, tuple[float, int, int]] = {}
@@ -259,8 +262,8 @@ def _wholes(
 
 
 def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
-    """How far the small marker's corners are from where the large one puts them, in
-    units of what is allowed (1 or less: they belong together)."""
+    """Return how far the small marker's corners are from where the large one puts them, in units of
+    what is allowed (1 or less: they belong together)."""
     mapped = nested(large_px, ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE * side_px, 2.5)
@@ -270,7 +273,8 @@ def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
 def _nearest(
     name: MarkerName, quads: list[Array], expected: Mapping[MarkerName, Array], ratio: float
 ) -> Array | None:
-    """The candidate that continues the last detections, in place and in size, if any does."""
+    """Return the candidate that continues the last detections, in place and in size, if any
+    does."""
     if not expected or not quads:
         return None
     if name in expected:
