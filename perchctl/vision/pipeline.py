@@ -24,7 +24,7 @@ from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, GearMask, make_aruco_detector, make_mask
 from perchctl.vision.merge import Merged, MergePrior, MergeStrategy, make_strategy, stage_of
-from perchctl.vision.pose import PoseCandidate, PoseSetup, make_pose_setup, normal_cam
+from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPlace,
     TargetSelector,
@@ -73,11 +73,14 @@ def make_pipeline(
     """Return the profile's pipeline for a calibrated camera. It is never changed: several streams
     may share one, each with a `PipelineState` of its own. `covered` is what `camera.mask` holds,
     which else is read. Errors: NotFound, InvalidValue (`camera.mask`)."""
-    mount, gear_body_m = profile.camera.mount, profile.vehicle.gear_body_m
-    pose = make_pose_setup(
-        profile.pose, profile.target, mount.T_body_cam, gear_body_m, camera,
-        profile.camera.readout_s,
-    )  # fmt: skip
+    pose = PoseSetup(
+        config=profile.pose,
+        target=profile.target,
+        T_body_cam=profile.camera.mount.T_body_cam,
+        gear_body_m=np.asarray(profile.vehicle.gear_body_m, dtype=np.float64),
+        camera=camera,
+        readout_s=profile.camera.readout_s,
+    )
     strategy = make_strategy(profile.merge, pose)
     detector = make_aruco_detector(
         profile.detector, profile.target, _mask(profile, camera, covered)

@@ -34,17 +34,22 @@ _Source = Literal["large", "small", "joint"]
 
 @dataclass(frozen=True, eq=False)
 class PoseSetup:
-    """The constants of pose estimation. `object_points` (4, 3) m are in marker axes, in the order
-    of the corners."""
+    """The constants of pose estimation. `T_body_cam` (4, 4) is the camera's mounting, `gear_body_m`
+    (3,) the gear's tip, and `readout_s` the time from a picture's first row to its last; None: not
+    known."""
 
     config: PoseConfig
-    object_points: dict[MarkerName, Array]
+    target: TargetConfig
     T_body_cam: Array
     gear_body_m: Array
     camera: CameraModel
-    readout_s: float | None = 0.0  # of the camera's shutter; None: not known
-    size_sigma: float = 0.0  # of the printed sizes, a share of them
-    curl_per_m: float = 0.0  # of the sheet: lift over the square of the way from its centre
+    readout_s: float | None = 0.0
+
+    @cached_property
+    def object_points(self) -> dict[MarkerName, Array]:
+        """Each marker's corners in its own axes, (4, 3) m, in the order of a detection's."""
+        large, small = self.target.large.side_m, self.target.small.side_m
+        return {"large": square_corners(large), "small": square_corners(small)}
 
     @cached_property
     def all_points(self) -> Array:
@@ -54,36 +59,13 @@ class PoseSetup:
     @cached_property
     def lift(self) -> dict[MarkerName, Array]:
         """How far each marker's corners are out of the plane of a sheet that curls (`lift_of`)."""
-        return {n: lift_of(points, self.curl_per_m) for n, points in self.object_points.items()}
+        curl = self.target.curl_per_m
+        return {n: lift_of(points, curl) for n, points in self.object_points.items()}
 
     @cached_property
     def all_lift(self) -> Array:
         """The same for both markers' corners, the large one's first."""
-        return lift_of(self.all_points, self.curl_per_m)
-
-
-def make_pose_setup(
-    config: PoseConfig,
-    target: TargetConfig,
-    T_body_cam: Array,
-    gear_body_m: Sequence[float] | Array,
-    camera: CameraModel,
-    readout_s: float | None = 0.0,
-) -> PoseSetup:
-    """Return the constants of pose estimation, from the profile and the calibrated camera."""
-    return PoseSetup(
-        config=config,
-        object_points={
-            "large": square_corners(target.large.side_m),
-            "small": square_corners(target.small.side_m),
-        },
-        T_body_cam=np.asarray(T_body_cam, dtype=np.float64),
-        gear_body_m=np.asarray(gear_body_m, dtype=np.float64),
-        camera=camera,
-        readout_s=readout_s,
-        size_sigma=target.size_sigma,
-        curl_per_m=target.curl_per_m,
-    )
+        return lift_of(self.all_points, self.target.curl_per_m)
 
 
 def square_corners(side_m: float) -> Array:
@@ -128,7 +110,7 @@ def estimate_pose(
         return None
     source = "joint" if len(detections) > 1 else detections[0].marker
     pose = _level_pose(source, t_s, solution, points, R_level_body, setup)
-    if source != "joint" or pose.chi2 < _CURLED_CHI2 or setup.curl_per_m == 0.0:
+    if source != "joint" or pose.chi2 < _CURLED_CHI2 or setup.target.curl_per_m == 0.0:
         return pose
     if any(d.lying_sigma_px > 0.0 for d in detections):
         return pose  # sides between interpolated rows look curled
@@ -201,7 +183,7 @@ def _level_pose(
     G[3, :3] = _yaw_gradient(R_level_cam, heading, dR)
     cov_e = G.dot(cov).dot(G.T)
     # A target that is larger by a share is farther away by that share of the way to it.
-    print_cam = np.array([setup.size_sigma * solution.tvec, curl[3:]])
+    print_cam = np.array([setup.target.size_sigma * solution.tvec, curl[3:]])
     print_m = R_level_cam.dot(print_cam.T)
     cov_e[:3, :3] += print_m.dot(print_m.T)
     sigma = np.sqrt(np.maximum(cov_e.diagonal(), 0.0))
@@ -248,8 +230,6 @@ def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
 # --- Rotation and translation from corners: closed forms, then least squares in which each -----
 # corner counts as it was measured.
 
-
-Solver = Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"]
 
 _FLAGS = {
     "sqpnp": cv2.SOLVEPNP_SQPNP,
@@ -307,7 +287,7 @@ class TiltPrior:
         )
 
 
-def solve(points: Points, solver: Solver, refine: bool, prior: TiltPrior) -> Scored | None:
+def solve(points: Points, solver: str, refine: bool, prior: TiltPrior) -> Scored | None:
     """Return the better of both tilts; None without a finite one in front of the camera, or where a
     solver other than ``sqpnp`` gives a start from which nothing settles."""
     candidates = _closed_form(points, solver)
@@ -438,7 +418,7 @@ def tilt_rad(rvec: Array, expected_cam: Array) -> float:
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
 
 
-def _closed_form(points: Points, solver: Solver) -> list[PoseCandidate]:
+def _closed_form(points: Points, solver: str) -> list[PoseCandidate]:
     """Return the candidates of OpenCV's solver; none of corners all on one line or point."""
     if solver == "ippe_square" and len(points.object_m) != 4:
         solver = "ippe"

@@ -8,10 +8,9 @@ from perchctl.calibration import profile_camera
 from perchctl.geometry import Array, Place, rot_z, wrap_rad
 from perchctl.profile import Profile, load_profile
 from perchctl.vision import Attitude, MarkerPose, PoseSetup
-from perchctl.vision.pose import make_pose_setup
 
 TARGET_ONLY: Profile = load_profile("target_only")
-SETUP: PoseSetup = make_pose_setup(
+SETUP: PoseSetup = PoseSetup(
     TARGET_ONLY.pose, TARGET_ONLY.target, TARGET_ONLY.camera.mount.T_body_cam, (0.01, -0.02, 0.03),
     profile_camera(TARGET_ONLY.camera),
 )  # fmt: skip

@@ -27,7 +27,6 @@ from perchctl.vision import (
     MarkerPose,
     PoseSetup,
 )
-from perchctl.vision.pose import make_pose_setup
 
 PROFILE = Profile()
 CAMERA = CameraModel((640, 480), np.diag([380.0, 380.0, 1.0]), np.zeros(5))
@@ -55,7 +54,7 @@ class Truth:
 @pytest.fixture(scope="module")
 def setup() -> PoseSetup:
     mount, gear_m = PROFILE.camera.mount, PROFILE.vehicle.gear_body_m
-    return make_pose_setup(PROFILE.pose, PROFILE.target, mount.T_body_cam, gear_m, CAMERA)
+    return PoseSetup(PROFILE.pose, PROFILE.target, mount.T_body_cam, gear_m, CAMERA)
 
 
 def _flown(t_s: float, truth: Truth, phase: Array) -> tuple[Array, Array]:

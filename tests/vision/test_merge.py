@@ -18,6 +18,7 @@ from perchctl.vision import (
     FieldState,
     MarkerPose,
     PipelineState,
+    PoseSetup,
     Stage,
     better_conditioned,
     make_pipeline,
@@ -34,7 +35,6 @@ from perchctl.vision.merge import (
     stage_of,
     weight_matrix,
 )
-from perchctl.vision.pose import PoseSetup, make_pose_setup
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 
@@ -148,7 +148,7 @@ CORNERS = np.array([[100.0, 50.0], [200.0, 50.0], [200.0, 400.0], [100.0, 400.0]
 def shutter(readout_s: float | None) -> PoseSetup:
     values = Profile()
     mount, gear_m = values.camera.mount, values.vehicle.gear_body_m
-    return make_pose_setup(values.pose, values.target, mount.T_body_cam, gear_m, CAMERA, readout_s)
+    return PoseSetup(values.pose, values.target, mount.T_body_cam, gear_m, CAMERA, readout_s)
 
 
 def moving(corners: Array, velocity_px_s: tuple[float, float]) -> Detections:

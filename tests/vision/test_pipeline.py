@@ -37,11 +37,11 @@ from perchctl.vision import (
     Pipeline,
     PipelineOutput,
     PipelineState,
+    PoseSetup,
     Stage,
     estimate,
     step,
 )
-from perchctl.vision.pose import make_pose_setup
 from perchctl.vision.tracks import expected_corners, update_sight
 from perchctl.vision.types import Sighting
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -327,7 +327,7 @@ def test_the_vehicles_motion_predicts_the_corners(build: Build) -> None:
 # --- Which of the vehicle's two accounts of its way tells where the target goes is learned -----
 
 
-SETUP = make_pose_setup(
+SETUP = PoseSetup(
     PoseConfig(), TargetConfig(), CameraConfig().mount.T_body_cam, (0.0, 0.0, 0.03), CAMERA
 )
 TARGET_M = np.array([0.0, 0.0, 2.0])

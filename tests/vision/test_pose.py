@@ -38,7 +38,7 @@ from perchctl.vision import (
 )
 from perchctl.vision.filter import PRINT, make_filter
 from perchctl.vision.merge import disagree
-from perchctl.vision.pose import PoseCandidate, make_pose_setup, mirror_solution, normal_cam
+from perchctl.vision.pose import PoseCandidate, mirror_solution, normal_cam
 from perchctl.vision.target_selection import measurement
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -49,7 +49,7 @@ GEAR = np.array([0.004, -0.003, 0.03])
 
 
 def setup_with(mount: Array | None = None, gear: Array | None = None, **config) -> PoseSetup:
-    return make_pose_setup(
+    return PoseSetup(
         PoseConfig(**config),
         TargetConfig(size_sigma=0.0, curl_per_m=0.0),
         np.eye(4) if mount is None else mount,
@@ -343,7 +343,7 @@ SEEN = [["large"], ["small"], ["large", "small"]]
 
 
 def setup_of(**target: float) -> PoseSetup:
-    return make_pose_setup(PoseConfig(), TargetConfig(**target), MOUNT, (0.01, 0.0, 0.03), CAMERA)
+    return PoseSetup(PoseConfig(), TargetConfig(**target), MOUNT, (0.01, 0.0, 0.03), CAMERA)
 
 
 def solved(

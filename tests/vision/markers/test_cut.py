@@ -21,6 +21,7 @@ from perchctl.vision import (
     MarkerName,
     PipelineOutput,
     PipelineState,
+    PoseSetup,
     RigidPose,
     distort,
     estimate_pose,
@@ -41,7 +42,6 @@ from perchctl.vision.markers.cut import (
 )
 from perchctl.vision.markers.detect import between, detect_markers, with_ghosts
 from perchctl.vision.markers.partial import seen_edges
-from perchctl.vision.pose import make_pose_setup
 from tests.helpers.markers import SETUP, both, corners, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -353,7 +353,7 @@ def test_without_it_the_last_centimetres_are_blind(build: Any) -> None:
 def test_a_pose_heeds_the_covariance_of_its_corners() -> None:
     """What is off in the direction in which the corners are vague moves the pose little, and
     the pose claims as much as they do."""
-    setup = make_pose_setup(Profile().pose, Profile().target, np.eye(4), (0.0, 0.0, 0.0), CAMERA)
+    setup = PoseSetup(Profile().pose, Profile().target, np.eye(4), (0.0, 0.0, 0.0), CAMERA)
     true = pose_of(0.0, -0.01, 0.05, 0.1)
     at = project(square_corners(0.025), *true, CAMERA)
     vague = np.tile([0.0, 1.0], 4)  # all of them together, along the picture's height
