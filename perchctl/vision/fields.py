@@ -175,9 +175,9 @@ def separate_fields(
     if frame.fields == "whole":
         new = FieldState(kind, skipped, state.votes, state.top_first, periods_s, frame.t_s)
         return new, (frame,)
-    state = replace(state, kind=kind, skipped=skipped)
+    state = replace(state, kind=kind, skipped=skipped, periods_s=periods_s)
     if mode in ("top", "bottom"):
-        state = replace(_timed(state, frame), top_first=mode == "top")
+        state = replace(state, last_s=frame.t_s, top_first=mode == "top")
     else:
         state = _voted(state, frame)
     if frame.fields != "woven" or state.top_first is None:
@@ -200,11 +200,6 @@ def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
     return state.periods_s
 
 
-def _timed(state: FieldState, frame: Frame) -> FieldState:
-    """Return the state at the frame's time."""
-    return replace(state, periods_s=_periods_s(state, frame), last_s=frame.t_s)
-
-
 def _voted(state: FieldState, frame: Frame) -> FieldState:
     """Return the state with the evidence of this frame and the one before about the order."""
     before, votes, top_first = state.previous, state.votes, state.top_first
@@ -215,8 +210,7 @@ def _voted(state: FieldState, frame: Frame) -> FieldState:
         top_first = votes > 0.0
     elif top_first is not None and (votes if not top_first else -votes) > _TURNED_EVIDENCE:
         top_first = not top_first
-    state = replace(_timed(state, frame), votes=votes, top_first=top_first)
-    return replace(state, previous=frame.image)
+    return replace(state, last_s=frame.t_s, votes=votes, top_first=top_first, previous=frame.image)
 
 
 def _vote(before: Grey, now: Grey) -> float:

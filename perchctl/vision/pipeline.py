@@ -19,7 +19,7 @@ from perchctl.geometry import Array
 from perchctl.profile import KalmanConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
 from perchctl.vision.fields import FieldsMode, FieldState, classify_fields, separate_fields
-from perchctl.vision.filter import MAX_TRACK_GAP_S, FilterSetup, make_filter, predict_track
+from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, GearMask, make_aruco_detector, make_mask
@@ -263,10 +263,7 @@ def estimate(
     tracks = {n: predict_track(t, t_s, world, spread) for n, t in state.tracks.items()}
     merged = pipeline.strategy.merge(tracks, state.measured.fed)
     assert merged is not None
-    now = replace(target, t_s=t_s, **estimate_in_world(merged, attitude, pipeline.pose))
-    if not spread:
-        return now
-    return replace(now, **spread_in_world(merged, attitude, world, pipeline.pose))
+    return replace(target, t_s=t_s, **_seen_in_world(merged, attitude, pipeline, spread))
 
 
 # --- from the tracks to the target -------------------------------------------------
@@ -290,10 +287,9 @@ def _at_frame(
     small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
     never = -np.inf
     if attitude is not None and in_world:
-        place = estimate_in_world(merged, attitude, pipeline.pose)
-        place |= spread_in_world(merged, attitude, pipeline.tracks.world, pipeline.pose)
+        place = _seen_in_world(merged, attitude, pipeline)
     else:
-        place = estimate_in_level(merged, attitude, pipeline.pose)
+        place = _seen_in_level(merged, attitude, pipeline)
     return TargetEstimate(
         t_s=t_s,
         measured_s=t_s if measured else never if before is None else before.measured_s,
@@ -319,57 +315,48 @@ def _carried(
 # --- What merged tracks say of the target, as a `TargetEstimate` has it ------------------------
 
 
-def estimate_in_level(
-    merged: Merged, attitude: Attitude | None, setup: PoseSetup
-) -> dict[str, Any]:
-    """Return place and motion of tracks in the level frame, as a `TargetEstimate` has them."""
+def _seen_in_level(merged: Merged, attitude: Attitude | None, pipeline: Pipeline) -> dict[str, Any]:
+    """Return place, motion and spread of tracks in the level frame."""
     e_m, e_yaw_rad = merged.vector[:3], float(merged.vector[3])
     world_m, world_yaw_rad = None, None
     if attitude is not None:
-        world_m, world_yaw_rad = to_world(e_m, e_yaw_rad, attitude, setup)
+        world_m, world_yaw_rad = to_world(e_m, e_yaw_rad, attitude, pipeline.pose)
     return {
         "e_m": e_m,
         "e_yaw_rad": e_yaw_rad,
         "velocity_mps": merged.velocity_mps,
-        "sigma_m": _sigma(merged.cov_m2, merged.bias_m),
-        "sigma_yaw_rad": _sigma_yaw(merged),
         "world_m": world_m,
         "world_yaw_rad": world_yaw_rad,
+        **_spread(merged, merged.cov_m2, merged.bias_m),
     }
 
 
-def estimate_in_world(merged: Merged, attitude: Attitude, setup: PoseSetup) -> dict[str, Any]:
-    """Return place and motion, without the spread, of tracks in the world, as a `TargetEstimate` of
-    a vehicle at `attitude` has them."""
+def _seen_in_world(
+    merged: Merged, attitude: Attitude, pipeline: Pipeline, spread: bool = True
+) -> dict[str, Any]:
+    """Return place, motion and, on request, spread of tracks in the world, as seen from the
+    vehicle at `attitude`."""
     world_m, world_yaw_rad = merged.vector[:3], float(merged.vector[3])
-    e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, setup)
-    return {
+    e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, pipeline.pose)
+    turn = attitude.R_world_level.T
+    seen = {
         "e_m": e_m,
         "e_yaw_rad": e_yaw_rad,
-        "velocity_mps": attitude.R_world_level.T.dot(merged.velocity_mps),
+        "velocity_mps": turn.dot(merged.velocity_mps),
         "world_m": world_m,
         "world_yaw_rad": world_yaw_rad,
         "world_velocity_mps": merged.velocity_mps,
     }
+    if not spread:
+        return seen
+    bias_m = seen_from(merged.bias_m, attitude, pipeline.tracks.world, pipeline.pose)
+    return seen | _spread(merged, turn.dot(merged.cov_m2).dot(turn.T), bias_m)
 
 
-def spread_in_world(
-    merged: Merged, attitude: Attitude, constants: FilterSetup, setup: PoseSetup
-) -> dict[str, Any]:
-    """Return the spread of tracks in the world, as a `TargetEstimate` of a vehicle at `attitude`
-    has it."""
-    turn = attitude.R_world_level.T
-    bias_m = seen_from(merged.bias_m, attitude, constants, setup)
-    return {
-        "sigma_m": _sigma(turn.dot(merged.cov_m2).dot(turn.T), bias_m),
-        "sigma_yaw_rad": _sigma_yaw(merged),
-    }
-
-
-def _sigma_yaw(merged: Merged) -> float:
-    return math.sqrt(max(merged.var_yaw_rad2, 0.0))
-
-
-def _sigma(cov_m2: Array, bias_m: Array) -> Array:
+def _spread(merged: Merged, cov_m2: Array, bias_m: Array) -> dict[str, Any]:
+    """Return the standard deviations of a place with that covariance and constant errors."""
     variance = cov_m2.diagonal() + (bias_m * bias_m).sum(axis=1)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+    return {
+        "sigma_m": np.asarray(np.sqrt(np.maximum(variance, 0.0))),
+        "sigma_yaw_rad": math.sqrt(max(merged.var_yaw_rad2, 0.0)),
+    }

@@ -309,11 +309,12 @@ def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) ->
     start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
     G = np.array([[1.0 / step, 0.0, -start[0] / step], [0.0, 1.0 / step, -start[1] / step],
                   [0.0, 0.0, 1.0]])  # fmt: skip
-    M = G @ H @ np.linalg.inv(texture.T)
+    white, T = texture
+    M = G @ H @ np.linalg.inv(T)
     rows, columns = lattice.inside.shape
     size = (_FINE * (columns + 2 * margin), _FINE * (rows + 2 * margin))
     fine = cv2.warpPerspective(
-        texture.white,
+        white,
         M,
         size,
         flags=cv2.INTER_LINEAR,
@@ -381,13 +382,9 @@ class Outline:
     small: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class Texture:
-    """How white the paper is, float32 (m, m), 0 to 1, and T (3, 3), which maps own coordinates
-    to its pixels."""
-
-    white: NDArray[np.float32]
-    T: Array
+Texture = tuple[NDArray[np.float32], Array]
+"""How white the paper is, float32 (m, m), 0 to 1, and T (3, 3), which maps own coordinates to its
+pixels."""
 
 
 @lru_cache(maxsize=8)
@@ -423,7 +420,7 @@ def texture_of(drawing: Drawing) -> Texture:
     scale = _TEXELS / (2.0 * PAPER)
     first = PAPER * scale - 0.5 + more
     T = np.array([[scale, 0.0, first], [0.0, scale, first], [0.0, 0.0, 1.0]])
-    return Texture(np.clip(wide, 0.0, 1.0), T)
+    return np.clip(wide, 0.0, 1.0), T
 
 
 def _edges(

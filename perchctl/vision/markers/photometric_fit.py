@@ -90,11 +90,11 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """The light in which a drawing looks most like the picture's grey values, what it leaves
-    over, the changes J with the unknowns, and the normal equations N x = g of the next
-    increment, per unit of noise."""
+    """What a picture's grey values leave over of a drawing in its best light, with a gain of grey
+    levels from black to white; the changes J with the unknowns; and the normal equations N x = g
+    of the next increment, per unit of noise."""
 
-    light: Light
+    gain: float
     error: Array
     J: Array
     noise: float
@@ -128,6 +128,7 @@ def align(
     patch = _patch_around(image, grid, H, lens_px)
     if patch is None:
         return None
+    around, first = patch
 
     def drawn(blur_px: float) -> Rendered:
         return rendered(drawing, n, blur_px / node_px)
@@ -136,12 +137,11 @@ def align(
         return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_px)
 
     seen = drawn(possible_px(blur_px))
-    first = patch.first[:, None]
     offset_px, since_lens_px, total = lens_px - first, 0.0, np.zeros(8)
     for k in range(_ROUNDS):
         if since_lens_px > _LENS_PX:
             offset_px, since_lens_px = lens_shift_px(grid, H, camera) - first, 0.0
-        grey = _read(patch, grid, H, offset_px)
+        grey = _read(around, grid, H, offset_px)
         equations = _equations(grey, seen, total)
         if equations is None:
             return None
@@ -168,9 +168,9 @@ def align(
             break
     assert equations is not None
     # What the last round left over, its step being next to nothing.
-    light, error = equations.light, equations.error
+    gain, error = equations.gain, equations.error
     corners_px = through_lens(mapped(H, UNIT).T, camera).T
-    pattern, strength = _pattern_seen(seen, grey, light)
+    pattern, strength = _pattern_seen(seen, grey, gain)
     many = _repeated(error.reshape(n, n))
     inverse = np.asarray(np.linalg.inv(equations.N))
     flip, flip_sigma = _cells_seen(seen, equations, inverse, many)
@@ -182,11 +182,11 @@ def align(
         likeness=likeness(grey, error),
         pattern=pattern,
         strength=strength,
-        cell_departure=_cell_departure(error / light.gain, grid, len(drawing.cells)),
+        cell_departure=_cell_departure(error / gain, grid, len(drawing.cells)),
         flip=flip,
         flip_sigma=flip_sigma,
         blur_px=seen.sigma * node_px,
-        gain=light.gain,
+        gain=gain,
         moved_px=float(np.abs(corners_px - start_px).max()),
     )
 
@@ -194,23 +194,26 @@ def align(
 def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
     """Return the normal equations of the next increment; None without contrast. There are 16 or 17
     unknowns: shape, blur and light; `total` (8,) is the sum of the increments so far."""
-    light = fit_light(seen, grey)
-    gain = light.gain
+    rows, products = seen.light
+    A = products + 1e-6 * np.eye(len(products))
+    A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
+    light = np.asarray(np.linalg.solve(A, _onto(rows, grey)), np.float64)
+    gain = float(light[GAIN])
     if gain < _MIN_GAIN:
         return None
-    error = grey - light.grey
-    J = np.concatenate([_lit_jacobian(seen, light), light.rows, error[None]])
+    error = grey - _mixed(rows, light)
+    J = np.concatenate([_lit_jacobian(seen, light), rows, error[None]])
     noise = max(float((error**2).mean()), 1.0)
     products = gram(J) / noise
     J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
     bend = _LIGHT + BEND
     N[_BLUR, _BLUR] += 1.0  # about a node's width a round
     N[bend, bend] += (_BEND_SIGMA * gain) ** -2.0
-    g[bend] -= light.coefficients[BEND] * (_BEND_SIGMA * gain) ** -2.0
+    g[bend] -= light[BEND] * (_BEND_SIGMA * gain) ** -2.0
     N[range(_LIGHT, len(g)), range(_LIGHT, len(g))] += 1e-6
     N[range(8), range(8)] += _PRIOR
     g[_SHAPE] -= _PRIOR * total
-    return _Equations(light, error, J, noise, N, g)
+    return _Equations(gain, error, J, noise, N, g)
 
 
 # --- How much the picture looks like a drawing that was fitted to it ---------------------------
@@ -234,7 +237,7 @@ def _cells_seen(
     what it leaves over. So each cell is looked for as it would look: blurred, and without what the
     fit's unknowns explain (a matched filter).
     """
-    soft, noise, gain = seen.soft_cells, equations.noise, equations.light.gain
+    soft, noise, gain = seen.soft_cells, equations.noise, equations.gain
     n, m = soft.shape
     found = gain * (soft.T @ equations.error.reshape(n, n) @ soft).ravel()
     shared = gain * (soft.T @ equations.J.reshape(-1, n, n) @ soft).reshape(-1, m * m)
@@ -246,20 +249,20 @@ def _cells_seen(
     return float(flips.max()), math.sqrt(many * noise / float(own.min()))
 
 
-def _pattern_seen(drawing: Rendered, grey: Array, light: Light) -> tuple[float, float]:
-    """Return the correlation and height of the inner pattern in the picture's grey values (n * n,):
-    what no plain square explains of them."""
-    plain = drawing.plain
-    A = plain.products + 1e-9 * np.eye(len(plain.products))
-    both = light.rows[GAIN], grey
-    b = np.stack([_onto(plain.rows, each) for each in both], axis=1)
+def _pattern_seen(drawing: Rendered, grey: Array, gain: float) -> tuple[float, float]:
+    """Return the correlation and height of the inner pattern in the picture's grey values
+    (n * n,): what no plain square explains of them."""
+    rows, products = drawing.plain
+    A = products + 1e-9 * np.eye(len(products))
+    both = drawing.light[0][GAIN], grey
+    b = np.stack([_onto(rows, each) for each in both], axis=1)
     shares = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
-    bits, seen = (each - _mixed(plain.rows, shares[:, k]) for k, each in enumerate(both))
+    bits, seen = (each - _mixed(rows, shares[:, k]) for k, each in enumerate(both))
     energy, product = float((bits * bits).sum()), float((bits * seen).sum())
     scale = math.sqrt(energy * float((seen * seen).sum()))
     if scale < 1e-9:
         return 0.0, 0.0
-    return product / scale, product / max(energy, 1e-9) / light.gain
+    return product / scale, product / max(energy, 1e-9) / gain
 
 
 def _repeated(error: Array) -> float:
@@ -297,44 +300,16 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
 # gamma) and the grey beyond the sheet. All of them shift edges if left out.
 
 
-@dataclass(frozen=True, eq=False)
-class Light:
-    """rows (7 or 8, n * n), without a sheet's end the last one is absent, and their
-    coefficients, in grey levels."""
-
-    rows: Array
-    coefficients: Array
-
-    @property
-    def gain(self) -> float:
-        """Grey levels from black to white."""
-        return float(self.coefficients[GAIN])
-
-    @property
-    def grey(self) -> Array:
-        """What the drawing looks like in this light, (n * n,)."""
-        return _mixed(self.rows, self.coefficients)
-
-
-def fit_light(drawing: Rendered, grey: Array) -> Light:
-    """Return the light that explains grey values (n * n,) best."""
-    light = drawing.light
-    A = light.products + 1e-6 * np.eye(len(light.products))
-    A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
-    coefficients = np.linalg.solve(A, _onto(light.rows, grey))
-    return Light(light.rows, np.asarray(coefficients, np.float64))
-
-
-def _lit_jacobian(drawing: Rendered, light: Light) -> Array:
+def _lit_jacobian(drawing: Rendered, light: Array) -> Array:
     """Return the changes (9, n * n) of the grey values with the homography's increment and the
-    blur's square, in this light."""
-    c, gain, grid = light.coefficients, light.gain, drawing.grid
+    blur's square, in this light (7 or 8,)."""
+    gain, grid = float(light[GAIN]), drawing.grid
     (white, changes), *others = drawing.sheets
-    bend = min(max(float(c[BEND]) / gain, -0.9), 0.9)
-    slope = gain + c[GAIN_U] * grid.u + c[GAIN_V] * grid.v
+    bend = min(max(float(light[BEND]) / gain, -0.9), 0.9)
+    slope = gain + light[GAIN_U] * grid.u + light[GAIN_V] * grid.v
     slope = slope * (1.0 + bend * (1.0 - 2.0 * white))
     change: Array = changes * slope
-    for (_, more), height in zip(others, c[BEYOND:], strict=True):
+    for (_, more), height in zip(others, light[BEYOND:], strict=True):
         change += more * height
     return change
 
@@ -364,14 +339,6 @@ class Grid:
         """Down, (n * n,)."""
         v: Array = self.uv1[1]
         return v
-
-
-@dataclass(frozen=True, eq=False)
-class _Patch:
-    """A part of the picture: its grey values and its first pixel (x, y)."""
-
-    grey: NDArray[np.float32]
-    first: NDArray[np.intp]
 
 
 @lru_cache(maxsize=64)
@@ -423,8 +390,11 @@ def _few(grid: Grid) -> tuple[Array, Array]:
     return _crossings(reach * x), chebyshev.chebvander(grid.axis / reach, degree) @ through
 
 
-def _patch_around(image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array) -> _Patch | None:
-    """Return the part of the picture that the nodes may reach, None where they leave it."""
+def _patch_around(
+    image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array
+) -> tuple[NDArray[np.float32], Array] | None:
+    """Return the part of the picture that the nodes may reach, and its first pixel x and y (2, 1);
+    None where they leave the picture."""
     h, w = image.shape
     x, y = projected(H, grid.uv1) + lens_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -433,15 +403,16 @@ def _patch_around(image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array
     room = 0.15 * float((most - least).max()) + 3.0
     low = np.clip(least - room, 0, (w - 2, h - 2)).astype(np.intp)
     high = np.clip(most + room + 1.0, low + 2, (w, h)).astype(np.intp)
-    return _Patch(image[low[1] : high[1], low[0] : high[0]].astype(np.float32), low)
+    part = image[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    return part, low[:, None].astype(np.float64)
 
 
-def _read(patch: _Patch, grid: Grid, H: Array, offset_px: Array) -> Array:
+def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) -> Array:
     """Return the grey values at the nodes, (n * n,); `offset_px` (2, n * n) is the lens's shift
     less the patch's first pixel."""
     at = (projected(H, grid.uv1) + offset_px).astype(np.float32)
     x, y = at.reshape(2, grid.n, grid.n)
-    grey = cv2.remap(patch.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(grey, dtype=np.float64).ravel()
 
 
@@ -451,14 +422,6 @@ def _read(patch: _Patch, grid: Grid, H: Array, offset_px: Array) -> Array:
 
 
 _BLOCK = 256  # values of a row
-
-
-@dataclass(frozen=True, eq=False)
-class Basis:
-    """Rows (k, n) by which pictures are explained, and their products (k, k)."""
-
-    rows: Array
-    products: Array
 
 
 def gram(rows: Array) -> Array:
@@ -507,33 +470,30 @@ class Rendered:
         return tuple(_blurred(each, self.sigma, self.grid.axis) for each in sharp)
 
     @cached_property
-    def light(self) -> Basis:
+    def light(self) -> tuple[Array, Array]:
         """What light makes of the drawing: rows (7 or 8, n * n), the last one only with a
-        sheet's end."""
+        sheet's end, and their products."""
         u, v = self.grid.u, self.grid.v
         (white, _), *others = self.sheets
         rows = [np.ones_like(u), u, v, white, white * u, white * v, white * (1.0 - white)]
-        return _basis(np.stack(rows + [beyond for beyond, _ in others]))
+        stacked = np.stack(rows + [beyond for beyond, _ in others])
+        return stacked, gram(stacked)
 
     @cached_property
-    def plain(self) -> Basis:
+    def plain(self) -> tuple[Array, Array]:
         """What light makes of a black square of the drawing's size, without its slopes and
-        bend: rows (4 or 5, n * n)."""
+        bend: rows (4 or 5, n * n), and their products."""
         soft = softened(square(len(self.drawing.cells), self.grid.n), self.sigma)
         black = soft[EDGE:-EDGE, EDGE:-EDGE].reshape(1, -1)
-        rows = self.light.rows
-        return _basis(np.concatenate([rows[:GAIN], black, rows[BEYOND:]]))
+        lit, _ = self.light
+        rows = np.concatenate([lit[:GAIN], black, lit[BEYOND:]])
+        return rows, gram(rows)
 
     @cached_property
     def soft_cells(self) -> Array:
         """Share of each row (or column) of cells in each node, (n, cells)."""
         half_node = self.drawing.reach / self.grid.n
         return soft_cells(self.drawing, self.grid.axis, half_node, self.sigma)
-
-
-def _basis(rows: Array) -> Basis:
-    """Return the basis of these rows."""
-    return Basis(rows, gram(rows))
 
 
 def rendered(drawing: Drawing, n: int, sigma: float) -> Rendered:
