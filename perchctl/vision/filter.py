@@ -218,7 +218,11 @@ def step_track(
     if dt_s <= 0.0:
         return track
     if measured is None:
-        return _coast(track, dt_s, t_s, setup)
+        if track.unseen >= setup.n_max:
+            return None
+        x = track.x.copy()
+        x[RATES] *= setup.alpha  # equation 3
+        return _moved(track, x, dt_s, t_s, track.unseen + 1, setup)
     F, Q = transition(dt_s), process_noise(dt_s, track.x[POSITION], setup)
     x, P = predict(track.x, track.P, F=F, Q=Q)
     x, P, gain = _updated(x, P, measured.z, setup.R if measured.R is None else measured.R)
@@ -300,15 +304,6 @@ def _drifting(x: Array, setup: FilterSetup) -> Array:
     x = x.copy()
     x[VELOCITY] *= setup.drift_mps / speed_mps
     return x
-
-
-def _coast(track: MarkerTrack, dt_s: float, t_s: float, setup: FilterSetup) -> MarkerTrack | None:
-    """Return the track after a frame without a measurement; None beyond `n_max` of these."""
-    if track.unseen >= setup.n_max:
-        return None
-    x = track.x.copy()
-    x[RATES] *= setup.alpha  # equation 3
-    return _moved(track, x, dt_s, t_s, track.unseen + 1, setup)
 
 
 def _moved(

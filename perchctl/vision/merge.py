@@ -158,11 +158,6 @@ MergeStrategy = Weights | Joint
 """How poses of both markers become one."""
 
 
-def make_strategy(config: MergeConfig, pose: PoseSetup) -> MergeStrategy:
-    """Return the strategy that the profile's `merge.method` names."""
-    return Joint(config, pose) if config.method == "joint" else Weights(config, pose)
-
-
 def _singles(
     seen: list[Detection],
     t_s: float,

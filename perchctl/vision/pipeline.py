@@ -23,7 +23,7 @@ from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, GearMask, make_aruco_detector, make_mask
-from perchctl.vision.merge import Merged, MergePrior, MergeStrategy, make_strategy, stage_of
+from perchctl.vision.merge import Joint, Merged, MergePrior, MergeStrategy, Weights, stage_of
 from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPlace,
@@ -81,7 +81,8 @@ def make_pipeline(
         camera=camera,
         readout_s=profile.camera.readout_s,
     )
-    strategy = make_strategy(profile.merge, pose)
+    way = Joint if profile.merge.method == "joint" else Weights
+    strategy = way(profile.merge, pose)
     detector = make_aruco_detector(
         profile.detector, profile.target, _mask(profile, camera, covered)
     )

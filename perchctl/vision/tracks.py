@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,8 +81,11 @@ def update_tracks(
     }
     old = state.tracks if state.in_world == in_world else {}
     sight, verdict = None, Verdict(taken=True, stranger=state.stranger)
-    if fed:
-        sight = _sight(measured, fed, t_s, in_world)
+    pose = measured.surest
+    if fed and pose is not None:
+        name = next(n for n, each in measured.fed.items() if each is pose)
+        whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
+        sight = Sight(t_s, pose, fed[name], in_world, whole)
         if state.stranger is not None and state.lock is not None and attitude is not None:
             place_m = state.lock.track.x[POSITION]
             looks = not in_world or is_in_view(place_m, attitude, setup.pose)
@@ -119,17 +121,6 @@ def _verdict(
     if another is not None and verdict.taken and not goes_on:
         return Verdict(taken=False, stranger=state.stranger, text=another, refused=True)
     return verdict
-
-
-def _sight(
-    measured: MeasuredMarkers, fed: Mapping[str, Measurement], t_s: float, in_world: bool
-) -> Sight:
-    """Return what the gate has to judge: the surest pose of those that would be fed."""
-    pose = measured.surest
-    assert pose is not None
-    name = next(n for n, each in measured.fed.items() if each is pose)
-    whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
-    return Sight(t_s, pose, fed[name], in_world, whole)
 
 
 # --- Whether a pose is the target's that was locked on -----------------------------------------

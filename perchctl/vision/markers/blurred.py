@@ -198,16 +198,12 @@ def aligned(
     ):
         return None
     sigma_px = math.hypot(max(found.sigma_px, _MIN_SIGMA_PX), _BLUR_SIGMA * found.blur_px)
-    if _is_clipped(image, found.corners_px):
+    (left, top), (right, bottom) = found.corners_px.min(axis=0), found.corners_px.max(axis=0)
+    part = image[max(int(top), 0) : int(bottom) + 1, max(int(left), 0) : int(right) + 1]
+    if int(np.count_nonzero(part > CLIPPED_GREY)) > CLIPPED_SHARE * part.size:
+        # No light makes a drawing whose white is clipped.
         sigma_px = math.hypot(sigma_px, CLIPPED_SIGMA_PX)
     return RefinedCorners(found.corners_px, sigma_px, True)
-
-
-def _is_clipped(image: NDArray[np.uint8], corners_px: Array) -> bool:
-    """Return True if the marker's white is clipped: no light makes its drawing then."""
-    (left, top), (right, bottom) = corners_px.min(axis=0), corners_px.max(axis=0)
-    part = image[max(int(top), 0) : int(bottom) + 1, max(int(left), 0) : int(right) + 1]
-    return int(np.count_nonzero(part > CLIPPED_GREY)) > CLIPPED_SHARE * part.size
 
 
 def verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:

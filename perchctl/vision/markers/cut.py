@@ -544,7 +544,8 @@ def fitted(
         found = _solved(places, offset_px, shows, total)
         if found is None:
             return None
-        pose, total = _moved(pose, found.step[:6]), total + found.step[:6]
+        turn = np.asarray(cv2.Rodrigues(found.step[:3])[0], dtype=np.float64)
+        pose, total = RigidPose(turn @ pose.R, pose.t + found.step[3:6]), total + found.step[:6]
         moved_px = float(np.abs(places.J @ found.step[:6]).max())
         if moved_px < _STILL_PX:
             break
@@ -666,12 +667,6 @@ def _solved(
         if not np.isfinite(step).all():
             return None
     return _Round(step, inverse, weight, J, variance)
-
-
-def _moved(pose: RigidPose, step: Array) -> RigidPose:
-    """Return the pose after a step of turn and move."""
-    turn = np.asarray(cv2.Rodrigues(step[:3])[0], dtype=np.float64)
-    return RigidPose(turn @ pose.R, pose.t + step[3:])
 
 
 def _visible(

@@ -238,7 +238,10 @@ def _refined_once(
         return found
     corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
     accepted = _accepted(markers, sides, residual_px, corners_px)
-    ends_px2 = _ends_px2(markers, sides, residual_px).tolist()
+    # Variance of the ends of the sides: a line fitted to n samples spreads twice as far there as
+    # in its middle.
+    independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
+    ends_px2 = (4.0 * _TAILS * residual_px * residual_px / independent).tolist()
     blurs_px, normals_x = sides.blur_px.tolist(), lines[:, 0].tolist()
     for i, rim in enumerate(rims):
         if not accepted[i]:
@@ -405,13 +408,6 @@ def _clipped(sides: Samples) -> Array:
         return np.zeros(len(ends) // 4)
     glaring = np.count_nonzero(ends > CLIPPED_GREY, axis=1) / PROFILES
     return np.asarray(glaring.reshape(-1, 4) @ _QUARTERS)
-
-
-def _ends_px2(markers: Markers, sides: Samples, residual_px: Array) -> Array:
-    """Return the variance of the ends of the sides, (4m,): a line fitted to n samples spreads twice
-    as far there as in its middle."""
-    independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
-    return np.asarray(4.0 * _TAILS * residual_px * residual_px / independent)
 
 
 def _sigma_px(
