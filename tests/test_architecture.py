@@ -102,7 +102,7 @@ MOST_NAMES = {
     "profile": 36,
     "sim": 25,
     "target": 24,
-    "vision": 50,
+    "vision": 38,
     "weights": 9,
 }
 

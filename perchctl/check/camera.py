@@ -32,14 +32,14 @@ from perchctl.flight import (
     target_from,
     too_near_problem,
 )
-from perchctl.perception import MIRRORED_FRAMES
+from perchctl.perception import BLENDED, MIRRORED_FRAMES
 from perchctl.profile import Profile
 from perchctl.target import (
     edge_margin,
     offset_text,
     overhead_view,
 )
-from perchctl.vision import BLENDED, CameraModel
+from perchctl.vision import CameraModel
 
 RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 7.0
 """An AI-deck's program as it comes gives 8, and a simulated one perches with 7."""

@@ -56,12 +56,10 @@ from perchctl.commands.track_output import (
 from perchctl.display import AXES_OF_SIDE, live_page
 from perchctl.errors import Interrupted, NotFound, UsageError
 from perchctl.files import check_output, same_file
-from perchctl.perception import Perception
+from perchctl.perception import BLENDED, INTERLACED, Perception
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.target import PrintCheck
 from perchctl.vision import (
-    BLENDED,
-    INTERLACED,
     CameraModel,
     Frame,
     PipelineOutput,

@@ -28,7 +28,6 @@ from perchctl.vision import (
     Pipeline,
     PipelineOutput,
     TargetEstimate,
-    surest_pose,
 )
 
 HEARD_S = 0.15  # a sight carried on by an older estimate swings the vehicle
@@ -245,7 +244,7 @@ class TargetPositioning:
 
     def see(self, measured: MeasuredMarkers, history: History, now_s: float) -> None:
         """Sends the position by a picture, unless the vehicle is pressed or hangs."""
-        pose = surest_pose(measured)
+        pose = measured.surest
         if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_S:
             return
         then, now = attitude_at(history, pose.t_s), attitude_at(history, now_s)

@@ -12,41 +12,41 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from perchctl.camera import HealthState, HealthVerdict, assess_frame
-from perchctl.geometry import finite
-from perchctl.perception.history import History, attitude_at, attitude_of, velocity_at
+from perchctl.perception.history import History, attitude_at, attitude_of
+from perchctl.perception.online_calibration import (
+    OnlineCalibration,
+    solve_consistency,
+    update_calibration,
+)
 from perchctl.perception.visual_inertial import (
     VisualInertialWindow,
     drop_sights,
     estimate_motion,
 )
-from perchctl.profile import USED_LATENCY_S, CameraConfig, Profile
-from perchctl.values import replace
+from perchctl.profile import Profile
 from perchctl.vision import (
-    ATTITUDE_STEP_S,
-    BLENDED,
-    INTERLACED,
-    LEAST_CONSISTENCY_RANGE_M,
-    OTHER_TARGET_TEXT,
     Consistency,
-    ConsistencySums,
     Detections,
     FieldState,
     Frame,
-    MarkerPose,
     Pipeline,
     PipelineOutput,
     PipelineState,
-    PoseSetup,
     TargetEstimate,
-    add_moment,
-    consistency_moment,
     estimate,
     pictures,
-    solve_consistency,
     step,
-    surest_pose,
 )
 
+INTERLACED = "interlaced: the two fields of a frame are measured each for itself"
+BLENDED = (
+    "blended: moving edges are double, as if the camera's fields had been averaged: switch that "
+    "off in the receiver or converter"
+)
+_OTHER_TARGET = (
+    "a target is in view that is too far from target.expected_xy_m to be the own one: it is not "
+    "followed"
+)
 MIRRORED_FRAMES = 5
 REMARK_PICTURES = 3
 
@@ -69,7 +69,7 @@ class Perception:
     stills: bool = False
     history: History = field(default_factory=History)
     state: PipelineState = field(default_factory=PipelineState)
-    calibration: OnlineCalibration = field(default_factory=lambda: OnlineCalibration())
+    calibration: OnlineCalibration = field(default_factory=OnlineCalibration)
     motion: VisualInertialWindow = field(default_factory=VisualInertialWindow)
     refused: str | None = None
     _health: HealthState = field(default_factory=HealthState)
@@ -128,7 +128,7 @@ class Perception:
 
     def _calibrate(self, output: PipelineOutput, later_s: float) -> None:
         """Latency and mounting, from a picture whose pose was taken for the target's."""
-        pose = surest_pose(self.state.measured)
+        pose = self.state.measured.surest
         if pose is not None and pose.t_s == output.detections.t_s:
             T_body_cam, history = self.pipeline.pose.T_body_cam, self.history
             x_m, y_m, z_m = (T_body_cam[:3, :3] @ pose.tvec_m + T_body_cam[:3, 3]).tolist()
@@ -153,7 +153,7 @@ class Perception:
         for text, shown in (
             (INTERLACED, output.fields != "whole"),
             (BLENDED, output.detections.ghost_px > 0.0),
-            (OTHER_TARGET_TEXT, output.refused),
+            (_OTHER_TARGET, output.refused),
         ):
             before = self._shown.get(text, 0)
             if before < REMARK_PICTURES:
@@ -167,93 +167,3 @@ def _mirrored_frames(before: int, found: Detections) -> int:
     if found.mirrored:
         return before + 1
     return 0 if found.large is not None or found.small is not None else before
-
-
-# --- Latency and mounting, estimated picture by picture ----------------------------------------
-# With `camera.latency_s: measured` the latency is used, too: taken off the pictures' times, once
-# it is sure, slowly, and within bounds. What is estimated rests on the pictures' times before
-# that, so that its use does not feed back.
-
-
-SOLVE_EVERY_S = 1.0
-LIKELY_S = 0.02
-"""A delay whose sigma is smaller is where the next pictures' factors are taken."""
-USED_SIGMA_S = 0.008
-"""A delay that is less sure is not used: of its 95 % interval, half is 16 ms, and 30 ms make an
-alignment swing."""
-SLEW = 0.02
-"""Seconds a second: at 0.4 m/s the target's place moves by 8 mm/s, as a drift does."""
-LONGEST_STEP_S = 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class OnlineCalibration:
-    """Estimate of the camera's latency and mounting from pictures and telemetry.
-
-    `newest` is the solution of `sums` at `solved_s`; `used_s` is subtracted from the pictures'
-    times beyond the profile's latency, since the picture of `seen_s`.
-    """
-
-    sums: ConsistencySums = field(default_factory=ConsistencySums)
-    newest: Consistency | None = None
-    solved_s: float = -math.inf
-    used_s: float = 0.0
-    seen_s: float = -math.inf
-
-
-def update_calibration(
-    old: OnlineCalibration,
-    t_s: float,
-    pose: MarkerPose,
-    history: History,
-    setup: PoseSetup,
-    camera: CameraConfig,
-    attitude_sigma_rad: float,
-) -> OnlineCalibration:
-    """The estimate with one more picture of the target. `t_s`: its arrival less the profile's
-    latency."""
-    new = _learned(old, t_s, pose, history, setup, attitude_sigma_rad)
-    if camera.latency_s != "measured":
-        return new
-    return replace(new, seen_s=t_s, used_s=_slewed(new, camera, t_s - old.seen_s))
-
-
-def _learned(
-    old: OnlineCalibration,
-    t_s: float,
-    pose: MarkerPose,
-    history: History,
-    setup: PoseSetup,
-    attitude_sigma_rad: float,
-) -> OnlineCalibration:
-    if (
-        pose.cov is None
-        or not finite(pose.cov)
-        or float(pose.tvec_m[2]) < LEAST_CONSISTENCY_RANGE_M
-    ):
-        return old
-    likely = old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
-    delay_s = old.newest.delay_s if old.newest is not None and likely else 0.0
-    delay_s = max(-USED_LATENCY_S[1], min(USED_LATENCY_S[1], delay_s))
-    before = attitude_at(history, t_s - delay_s - ATTITUDE_STEP_S)
-    after = attitude_at(history, t_s - delay_s + ATTITUDE_STEP_S)
-    if before is None or after is None:
-        return old
-    velocity_mps = velocity_at(history, t_s - delay_s)
-    moment = consistency_moment(t_s, pose, before, after, velocity_mps, delay_s, setup)
-    new = replace(old, sums=add_moment(old.sums, moment))
-    if t_s - old.solved_s >= SOLVE_EVERY_S:
-        newest = solve_consistency(new.sums, attitude_sigma_rad)
-        new = replace(new, newest=newest, solved_s=t_s)
-    return new
-
-
-def _slewed(new: OnlineCalibration, camera: CameraConfig, dt_s: float) -> float:
-    """What is used, one picture on: towards what is measured, or as it was where that is
-    unsure."""
-    if new.newest is None or not new.newest.delay_sigma_s <= USED_SIGMA_S:
-        return new.used_s
-    (least_s, most_s), start_s = USED_LATENCY_S, camera.start_latency_s
-    goal_s = max(least_s, min(most_s, start_s + new.newest.delay_s)) - start_s
-    step_s = SLEW * max(0.0, min(dt_s, LONGEST_STEP_S))
-    return new.used_s + max(-step_s, min(step_s, goal_s - new.used_s))

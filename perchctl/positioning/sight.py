@@ -28,7 +28,6 @@ from perchctl.vision import (
     MarkerPose,
     PoseSetup,
     TargetEstimate,
-    level_rotation,
     to_level,
     to_world,
 )
@@ -56,7 +55,7 @@ def body_place(pose: MarkerPose, attitude: Attitude, target: Place, setup: PoseS
     """Return the body's place under a target that stands still. Of `attitude` roll and pitch count
     alone."""
     yaw_rad = wrap_rad(target.yaw_rad - pose.e_yaw_rad)
-    way_m = pose.e_m + level_rotation(attitude).dot(setup.gear_body_m)
+    way_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
     return Place(target.position_m - rot_z(yaw_rad).dot(way_m), yaw_rad)
 
 

@@ -33,12 +33,6 @@ from perchctl.vision.types import Frame, PictureKind
 FieldsMode = Literal["auto", "top", "bottom", "progressive"]
 Grey = NDArray[np.uint8]
 
-INTERLACED = "interlaced: the two fields of a frame are measured each for itself"
-BLENDED = (
-    "blended: moving edges are double, as if the camera's fields had been averaged: switch that "
-    "off in the receiver or converter"
-)
-
 _COMBED = 1.4
 # Of so many rows in a group all but the outer four are compared with their neighbours, in
 # one go. Odd and even rows must both be: a single lost line of an analogue picture then counts
@@ -79,7 +73,7 @@ class FieldState:
 
     @property
     def period_s(self) -> float:
-        """Of the frames: television's where it is near to that."""
+        """The frames' period, which is television's where it is near to that."""
         if not self.periods_s:
             return _PERIODS_S[1]
         middle_s = median(self.periods_s)
@@ -92,8 +86,8 @@ class FieldState:
 
 
 def combing(image: Grey) -> float:
-    """How much more the rows differ from the other field's than from their own field's;
-    from 1.4 on the picture counts as combed: fields a pixel apart. Grey, (h, w)."""
+    """Return how much more the rows of a picture, (h, w) grey, differ from the other field's rows
+    than from their own field's. From 1.4 on the picture counts as combed: fields a pixel apart."""
     groups, width = len(image) // _GROUP, image.shape[1]
     if groups == 0:
         return 0.0
@@ -122,9 +116,9 @@ def is_combed(image: Grey) -> bool:
 
 
 def field_picture(image: Grey, first_row: int) -> Grey:
-    """One field at full height: its own rows (`first_row`, and every second after it) stay
-    where they are, those between are interpolated. What is at row y in the frame is there
-    in this picture."""
+    """Return one field at full height: its own rows (`first_row`, and every second after it) stay
+    where they are, those between are interpolated. What is at row y in the frame is there in this
+    picture."""
     own = image[first_row::2]
     # Row k of the result lies between rows k and k + 1 of the field.
     between = cv2.filter2D(own, -1, _TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)
@@ -138,13 +132,13 @@ def field_picture(image: Grey, first_row: int) -> Grey:
 
 
 def interpolated_sigma_px(blur_px: float) -> float:
-    """Spread of an edge along the rows of a field, by its blur in the whole picture: between
-    rows that are 2 px apart, a sharp edge is where it happens to be taken for."""
+    """Return the spread of an edge along the rows of a field, by its blur in the whole picture:
+    between rows that are 2 px apart, a sharp edge is where it happens to be taken for."""
     return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
 
 
 def classify_fields(frame: Frame, mode: FieldsMode) -> Frame:
-    """The frame, with `fields` saying what it is."""
+    """Return the frame with `fields` set to what it is."""
     if frame.fields is not None:
         return frame
     if mode == "progressive":
@@ -154,7 +148,7 @@ def classify_fields(frame: Frame, mode: FieldsMode) -> Frame:
 
 
 def halves(frame: Frame) -> tuple[Frame, Frame]:
-    """The top and the bottom field of a woven frame, both at the frame's time."""
+    """Return the top and the bottom field of a woven frame, both at the frame's time."""
     return (
         replace(frame, image=field_picture(frame.image, 0), fields="top", encoded=None),
         replace(frame, image=field_picture(frame.image, 1), fields="bottom", encoded=None),
@@ -164,7 +158,7 @@ def halves(frame: Frame) -> tuple[Frame, Frame]:
 def separate_fields(
     state: FieldState, frame: Frame, mode: FieldsMode
 ) -> tuple[FieldState, tuple[Frame, ...]]:
-    """The pictures of a stream's frame, in their order of time: one, or two fields.
+    """Return the pictures of a stream's frame, in their order of time: one, or two fields.
 
     The frame's time is the middle between its fields. `mode`: ``auto`` finds all by measure,
     ``top`` and ``bottom`` say that every frame is woven and which field is earlier,
@@ -181,9 +175,9 @@ def separate_fields(
     if frame.fields == "whole":
         new = FieldState(kind, skipped, state.votes, state.top_first, periods_s, frame.t_s)
         return new, (frame,)
-    state = replace(state, kind=kind, skipped=skipped)
+    state = replace(state, kind=kind, skipped=skipped, periods_s=periods_s)
     if mode in ("top", "bottom"):
-        state = replace(_timed(state, frame), top_first=mode == "top")
+        state = replace(state, last_s=frame.t_s, top_first=mode == "top")
     else:
         state = _voted(state, frame)
     if frame.fields != "woven" or state.top_first is None:
@@ -198,7 +192,7 @@ def separate_fields(
 
 
 def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
-    """With the time since the last frame."""
+    """Return the frames' periods, with the time since the last frame."""
     if state.last_s is not None:
         gap_s = frame.t_s - state.last_s
         if _ANY_PERIOD_S[0] < gap_s < _ANY_PERIOD_S[1]:
@@ -206,12 +200,8 @@ def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
     return state.periods_s
 
 
-def _timed(state: FieldState, frame: Frame) -> FieldState:
-    return replace(state, periods_s=_periods_s(state, frame), last_s=frame.t_s)
-
-
 def _voted(state: FieldState, frame: Frame) -> FieldState:
-    """With the evidence of this frame and the one before about the order."""
+    """Return the state with the evidence of this frame and the one before about the order."""
     before, votes, top_first = state.previous, state.votes, state.top_first
     near = state.last_s is not None and 0.0 < frame.t_s - state.last_s < _MAX_GAP_S
     if near and before is not None and before.shape == frame.image.shape:
@@ -220,15 +210,14 @@ def _voted(state: FieldState, frame: Frame) -> FieldState:
         top_first = votes > 0.0
     elif top_first is not None and (votes if not top_first else -votes) > _TURNED_EVIDENCE:
         top_first = not top_first
-    state = replace(_timed(state, frame), votes=votes, top_first=top_first)
-    return replace(state, previous=frame.image)
+    return replace(state, last_s=frame.t_s, votes=votes, top_first=top_first, previous=frame.image)
 
 
 def _vote(before: Grey, now: Grey) -> float:
-    """-1 (the bottom field is earlier) .. 1 (the top field is).
+    """Return -1 (the bottom field is earlier) to 1 (the top field is).
 
-    Rows are compared with the mean of their two neighbours of the other field, or motion
-    along the columns would count for one of the two orders.
+    Rows are compared with the mean of their two neighbours of the other field, or motion along the
+    columns would count for one of the two orders.
     """
     rows = (min(len(before), len(now)) - 2) // 2 * 2
     tops = [image[0:rows:2] for image in (before, now)]

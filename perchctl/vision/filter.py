@@ -101,9 +101,9 @@ class Measurement:
 
 
 def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
-    """The filter's constants. At first sight, a target in the world stands nearly still
-    (5 cm/s of drift); one in the level frame moves as the vehicle does (30 cm/s), or, where
-    the camera may be in a hand, faster."""
+    """Return the filter's constants. At first sight, a target in the world stands nearly still (5
+    cm/s of drift); one in the level frame moves as the vehicle does (30 cm/s), or, where the camera
+    may be in a hand, faster."""
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
@@ -129,7 +129,7 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
 
 
 def pose_noise(cov: Array) -> Array | None:
-    """R (4, 4) of a measured (yaw, x, y, z) from a pose's covariance of (x, y, z, yaw), None
+    """Return R (4, 4) of a measured (yaw, x, y, z) from a pose's covariance of (x, y, z, yaw); None
     where that is not finite."""
     if not finite(cov):
         return None
@@ -137,18 +137,18 @@ def pose_noise(cov: Array) -> Array | None:
 
 
 def tilted(way_m: Array) -> Array:
-    """Change of a way (3,) with a turn about the level x and y axes, m/rad, (3, 2)."""
+    """Return the change of a way (3,) with a turn about the level x and y axes, m/rad, (3, 2)."""
     x, y, z = way_m
     return np.array([[0.0, z], [-z, 0.0], [y, -x]])
 
 
 def transition(dt_s: float) -> Array:
-    """F of equation 1, (8, 8)."""
+    """Return F of equation 1, (8, 8)."""
     return _STILL + dt_s * _MOVES
 
 
 def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
-    """Q (8, 8) of a step, for a target at `position_m` (3,) in the tracks' frame."""
+    """Return Q (8, 8) of a step, for a target at `position_m` (3,) in the tracks' frame."""
     noise = setup.process
     if noise is None:
         return setup.Q
@@ -162,7 +162,7 @@ def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
 
 
 def _pushed(noise: ProcessNoise, position_m: Array) -> Array:
-    """What a second adds to the rates of yaw, x, y and z, (4, 4)."""
+    """Return what a second adds to the rates of yaw, x, y and z, (4, 4)."""
     if noise.turn_radps2 == 0.0:
         return noise.unturned
     turned2 = noise.turn_radps2**2 * _PUSH_S
@@ -175,7 +175,7 @@ def _pushed(noise: ProcessNoise, position_m: Array) -> Array:
 
 
 def start_track(measured: Measurement, t_s: float, setup: FilterSetup) -> MarkerTrack:
-    """A track at its first measurement."""
+    """Return a track at its first measurement."""
     x = np.zeros(8)
     x[MEASURED] = measured.z
     x[YAW] = wrap_rad(float(measured.z[0]))
@@ -194,7 +194,7 @@ def step_track(
     t_s: float,
     setup: FilterSetup,
 ) -> MarkerTrack | None:
-    """One frame's predict and, where the marker was seen, update.
+    """Return the track after one frame's prediction and, where the marker was seen, its update.
 
     Args:
         track: the track so far, None before the first sight.
@@ -218,7 +218,11 @@ def step_track(
     if dt_s <= 0.0:
         return track
     if measured is None:
-        return _coast(track, dt_s, t_s, setup)
+        if track.unseen >= setup.n_max:
+            return None
+        x = track.x.copy()
+        x[RATES] *= setup.alpha  # equation 3
+        return _moved(track, x, dt_s, t_s, track.unseen + 1, setup)
     F, Q = transition(dt_s), process_noise(dt_s, track.x[POSITION], setup)
     x, P = predict(track.x, track.P, F=F, Q=Q)
     x, P, gain = _updated(x, P, measured.z, setup.R if measured.R is None else measured.R)
@@ -229,7 +233,7 @@ def step_track(
 
 
 def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Array]:
-    """State and covariance after a measurement, in Joseph's form, and the gain (8, 4).
+    """Return the state and covariance after a measurement, in Joseph's form, and the gain (8, 4).
 
     filterpy's `update` does the same and takes four times as long: equation 2's H only picks rows.
     """
@@ -249,8 +253,8 @@ def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Arra
 def predict_track(
     track: MarkerTrack, t_s: float, setup: FilterSetup, spread: bool = True
 ) -> MarkerTrack:
-    """The track at a time after its frame, with no measurement in between. Without `spread` its
-    covariance stays that of the frame."""
+    """Return the track at a time after its frame, with no measurement in between. Without `spread`
+    its covariance stays that of the frame."""
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
     if dt_s <= 0.0:
         return track
@@ -262,8 +266,8 @@ def predict_track(
 
 
 def foreseen(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Measurement:
-    """What a measurement at a later time should be, its R being what the track leaves open:
-    of `predict_track` the part that is measured."""
+    """Return the measurement that the track predicts for a later time, with what it leaves open for
+    its R: the part of `predict_track` that is measured."""
     dt_s, x = _ahead(track, t_s, setup)
     P, noise = track.P, setup.process
     R = P[MEASURED, MEASURED] + dt_s * (P[MEASURED, RATES] + P[RATES, MEASURED])
@@ -279,7 +283,7 @@ def foreseen(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Measurement:
 
 
 def foreseen_z(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Array:
-    """The z (4,) of `foreseen` alone."""
+    """Return the z (4,) of `foreseen` alone."""
     dt_s, x = _ahead(track, t_s, setup)
     z = x[MEASURED] + dt_s * x[RATES]
     z[0] = wrap_rad(float(z[0]))
@@ -287,13 +291,13 @@ def foreseen_z(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Array:
 
 
 def _ahead(track: MarkerTrack, t_s: float, setup: FilterSetup) -> tuple[float, Array]:
-    """How long to predict, and from which state."""
+    """Return for how long to predict, and from which state."""
     dt_s = max(min(t_s - track.t_s, MAX_PREDICTION_S), 0.0)
     return dt_s, _drifting(track.x, setup) if dt_s > 0.0 else track.x
 
 
 def _drifting(x: Array, setup: FilterSetup) -> Array:
-    """The state, its speed being at most what the frame's drift is."""
+    """Return the state with its speed limited to the frame's drift."""
     speed_mps = math.hypot(*x[VELOCITY].tolist())
     if speed_mps <= setup.drift_mps:
         return x
@@ -302,18 +306,10 @@ def _drifting(x: Array, setup: FilterSetup) -> Array:
     return x
 
 
-def _coast(track: MarkerTrack, dt_s: float, t_s: float, setup: FilterSetup) -> MarkerTrack | None:
-    if track.unseen >= setup.n_max:
-        return None
-    x = track.x.copy()
-    x[RATES] *= setup.alpha  # equation 3
-    return _moved(track, x, dt_s, t_s, track.unseen + 1, setup)
-
-
 def _moved(
     track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen: int, setup: FilterSetup
 ) -> MarkerTrack:
-    """The track, its state being x, after `dt_s` without a measurement: at `t_s`."""
+    """Return the track at `t_s`, its state being x, after `dt_s` without a measurement."""
     x = _drifting(x, setup)
     F = transition(dt_s)
     x, P = predict(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))

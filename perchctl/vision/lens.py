@@ -18,10 +18,10 @@ _ZERO = np.zeros(3)
 
 
 def undistort(points_px: Array, camera: CameraModel) -> Array:
-    """Pixels (n, 2) to normalised coordinates (n, 2): x/z and y/z in the camera frame.
+    """Convert pixels (n, 2) to normalised coordinates (n, 2): x/z and y/z in the camera frame.
 
-    A point that the lens model cannot have imaged comes back as NaN or far out,
-    never as an exception.
+    A point that the lens model cannot have imaged comes back as NaN or far out, never as an
+    exception.
     """
     points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 1, 2)
     if len(points) == 0:
@@ -33,12 +33,12 @@ def undistort(points_px: Array, camera: CameraModel) -> Array:
 
 
 def undistort_px(points_px: Array, camera: CameraModel) -> Array:
-    """Pixels (n, 2) of the real lens to pixels (n, 2) of a pinhole with the same `K`."""
+    """Convert pixels (n, 2) of the real lens to pixels (n, 2) of a pinhole with the same `K`."""
     return pinhole_px(undistort(points_px, camera), camera)
 
 
 def pinhole_px(normalised: Array, camera: CameraModel) -> Array:
-    """Normalised coordinates (n, 2) to pixels (n, 2) of the pinhole `K`."""
+    """Convert normalised coordinates (n, 2) to pixels (n, 2) of the pinhole `K`."""
     K = camera.K
     result = np.empty_like(normalised)
     result[:, 0] = K[0, 0] * normalised[:, 0] + K[0, 1] * normalised[:, 1] + K[0, 2]
@@ -47,21 +47,21 @@ def pinhole_px(normalised: Array, camera: CameraModel) -> Array:
 
 
 def distort(normalised: Array, camera: CameraModel) -> Array:
-    """Normalised coordinates (n, 2) to pixels (n, 2); inverse of `undistort`."""
+    """Convert normalised coordinates (n, 2) to pixels (n, 2); the inverse of `undistort`."""
     rays = np.ones((len(normalised), 1, 3))
     rays[:, 0, :2] = normalised
     return _projected(rays, _ZERO, _ZERO, camera)
 
 
 def project(points_m: Array, rvec_rad: Array, tvec_m: Array, camera: CameraModel) -> Array:
-    """Points (n, 3) of a frame with pose rvec, tvec in the camera to pixels (n, 2)."""
+    """Project points (n, 3) of a frame with pose rvec, tvec in the camera to pixels (n, 2)."""
     points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 1, 3)
     rvec, tvec = np.asarray(rvec_rad, float).ravel(), np.asarray(tvec_m, float).ravel()
     return _projected(points, rvec, tvec, camera)
 
 
 def _projected(points: Array, rvec: Array, tvec: Array, camera: CameraModel) -> Array:
-    """`project` of points (n, 1, 3)."""
+    """Project points (n, 1, 3), as `project` does."""
     if len(points) == 0:
         return np.empty((0, 2))
     call = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints

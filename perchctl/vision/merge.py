@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -62,34 +61,19 @@ class MergePrior:
     normal_cam: Array | None
 
 
-class MergeStrategy(Protocol):
-    """How poses of both markers become one: the paper's weights, or one joint solution."""
-
-    @property
-    def tracks(self) -> tuple[str, ...]:
-        """Names of its filters."""
-
-    def measure(self, detections: Detections, prior: MergePrior) -> MeasuredMarkers:
-        """Solve what this frame needs, once, and choose the track that each pose feeds."""
-
-    def merge(
-        self, tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose]
-    ) -> Merged | None:
-        """The target from the tracks; `fed` is what the newest frame fed them with."""
-
-
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """The paper's: each marker its pose and its filter, merged by W (equations 5, 8, 12)."""
+    """The paper's: each marker its pose and its filter, merged by W (equations 5, 8, 12).
+    `tracks` are the names of its filters."""
 
     config: MergeConfig
     pose: PoseSetup
     tracks: tuple[str, ...] = MARKERS
 
     def measure(self, detections: Detections, prior: MergePrior) -> MeasuredMarkers:
-        singles = _singles(
-            _seen(detections, self.pose), detections.t_s, prior, self.pose, prior.near
-        )
+        """Solve each marker's pose, and choose the tracks that they feed."""
+        seen = seen_at_once(detections, self.pose)
+        singles = _singles(seen, detections.t_s, prior, self.pose, prior.near)
         contradicting = _contradict(singles, self.config)
         fed = _usable(singles, contradicting, prior, self.config, self.pose)
         return MeasuredMarkers(singles, fed, contradicting)
@@ -97,7 +81,8 @@ class Weights:
     def merge(
         self, tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose]
     ) -> Merged | None:
-        """The tracks that this frame fed, or else those unseen for the shortest time."""
+        """Return the target by the tracks that this frame `fed`, or else by those unseen for the
+        shortest time; None without a track."""
         if not tracks:
             return None
         least = min(track.unseen for track in tracks.values())
@@ -131,7 +116,8 @@ class Joint:
     tracks: tuple[str, ...] = ("joint",)
 
     def measure(self, detections: Detections, prior: MergePrior) -> MeasuredMarkers:
-        seen, t_s = _seen(detections, self.pose), detections.t_s
+        """Solve both markers at once, and single ones where the frame needs them."""
+        seen, t_s = seen_at_once(detections, self.pose), detections.t_s
         joint = None
         if len(seen) == 2:
             joint = estimate_pose(
@@ -164,16 +150,12 @@ class Joint:
     def merge(
         self, tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose]
     ) -> Merged | None:
+        """Return the target by the one track; None without it."""
         return _alone(tracks["joint"], fed.get("joint")) if tracks else None
 
 
-def make_strategy(config: MergeConfig, pose: PoseSetup) -> MergeStrategy:
-    """The profile's `merge.method`."""
-    return Joint(config, pose) if config.method == "joint" else Weights(config, pose)
-
-
-def _seen(detections: Detections, setup: PoseSetup) -> list[Detection]:
-    return seen_at_once(detections, setup.readout_s, setup.camera.size_px[1])
+MergeStrategy = Weights | Joint
+"""How poses of both markers become one."""
 
 
 def _singles(
@@ -183,11 +165,13 @@ def _singles(
     setup: PoseSetup,
     start: PoseCandidate | None,
 ) -> dict[str, MarkerPose]:
+    """Solve the pose of each marker that was seen, by its name."""
     found = (estimate_pose([d], t_s, prior.attitude, setup, prior.normal_cam, start) for d in seen)
     return {pose.source: pose for pose in found if pose is not None}
 
 
 def _contradict(singles: Mapping[str, MarkerPose], config: MergeConfig) -> bool:
+    """Return True if there are both markers' poses and they exclude each other."""
     if len(singles) < 2:
         return False
     return disagree(singles["large"], singles["small"], config.disagreement_m)
@@ -200,8 +184,8 @@ def _usable(
     config: MergeConfig,
     setup: PoseSetup,
 ) -> dict[str, MarkerPose]:
-    """The single markers' poses that count: of two that contradict the better, else what
-    the stage asks for."""
+    """Return the single markers' poses that count: of two that contradict the better, else what the
+    stage asks for."""
     if len(singles) < 2:
         return dict(singles)
     use = better_conditioned(singles["large"], singles["small"])
@@ -214,11 +198,13 @@ def _usable(
 
 
 def _as_joint(fed: Mapping[str, MarkerPose]) -> dict[str, MarkerPose]:
+    """Return the one pose that counts as what feeds the joint track."""
     pose = next(iter(fed.values()), None)
     return {} if pose is None else {"joint": pose}
 
 
 def _alone(track: MarkerTrack, pose: MarkerPose | None) -> Merged:
+    """Return the target by one track, and the pose that has fed it in this frame."""
     return Merged(
         vector=track.x[_PLACE_YAW],
         velocity_mps=track.x[VELOCITY],
@@ -244,28 +230,29 @@ FLOW_SIGMA, TURN_SIGMA = 0.05, 0.015
 one, and changes."""
 
 
-def seen_at_once(
-    detections: Detections, readout_s: float | None, height_px: int
-) -> list[Detection]:
-    """The markers with their corners at the frame's own time, as far as their motion is known.
+def seen_at_once(detections: Detections, setup: PoseSetup) -> list[Detection]:
+    """Return the markers with their corners at the frame's own time, as far as their motion is
+    known.
 
-    `readout_s` is from a picture's first row to its last; where it is None the corners stay
+    `setup.readout_s` is from a picture's first row to its last; where it is None the corners stay
     where they are, with what a likely read-out would do to them for an error (`common_px`);
     else with what the motion's own error does.
     """
-    seen = [d for name in MARKERS if (d := detections.get(name)) is not None]
+    readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
-        return seen
+        return detections.markers
     late = UNKNOWN_READOUT_S if readout_s is None else readout_s
     out = []
-    for d in seen:
+    for d in detections.markers:
         flow = detections.flow_px_s.get(d.marker, detections.velocity_px_s)
         if flow is None:
             out.append(d)
             continue
         # From frame to frame a corner that moves down is also seen later.
         flow = flow / (1.0 + flow[..., 1:] * late / (height_px - 1.0))
-        moved_px = flow * _late_s(d.corners_px, late, height_px)
+        # How much later than the middle row each corner's row is exposed.
+        late_s = (d.corners_px[:, 1:] / (height_px - 1.0) - 0.5) * late
+        moved_px = flow * late_s
         if readout_s is None:
             out.append(replace(d, common_px=moved_px))
         else:
@@ -283,40 +270,30 @@ def seen_at_once(
     return out
 
 
-def _late_s(corners_px: Array, readout_s: float, height_px: int) -> Array:
-    """How much later than the middle row each corner's row is exposed, (4, 1)."""
-    return np.asarray((corners_px[:, 1:] / (height_px - 1.0) - 0.5) * readout_s)
-
-
 # --- Merging the two markers into the one pose of the target (paper, section II-A.2) -----------
 
 
 def stage_of(large: bool, small: bool) -> Stage:
-    """The stage by what is there."""
+    """Return the stage by the markers that are there."""
     if large:
         return Stage.BOTH if small else Stage.LARGE
     return Stage.SMALL if small else Stage.NONE
 
 
-def stage_by_range(z_m: float, config: MergeConfig) -> Stage:
-    """Equations 4, 6 and 11, with the distance from the camera to the target's plane;
-    beyond z1 the large marker is all that could be seen."""
+def choose_stage(large: bool, small: bool, z_m: float | None, config: MergeConfig) -> Stage:
+    """Return what to merge: all that is there, or (`merge.stages: range`) what the distance from
+    the camera to the target's plane asks for (equations 4, 6 and 11), as far as it is there. Beyond
+    z1 the large marker is all that could be seen."""
+    there = stage_of(large, small)
+    if config.stages == "seen" or there is not Stage.BOTH or z_m is None:
+        return there
     if z_m > config.z2_m:
         return Stage.LARGE
     return Stage.BOTH if z_m > config.z3_m else Stage.SMALL
 
 
-def choose_stage(large: bool, small: bool, z_m: float | None, config: MergeConfig) -> Stage:
-    """What to merge: all that is there, or (`merge.stages: range`) what the distance
-    asks for, as far as it is there."""
-    there = stage_of(large, small)
-    if config.stages == "seen" or there is not Stage.BOTH or z_m is None:
-        return there
-    return stage_by_range(z_m, config)
-
-
 def weight_matrix(weights: WeightsConfig) -> Array:
-    """W of equation 9, (4, 8), for the vector of equation 7."""
+    """Return W of equation 9, (4, 8), for the vector of equation 7."""
     W = np.zeros((4, 8))
     for row, w in enumerate((weights.x, weights.y, weights.z, weights.yaw)):
         W[row, 2 * row : 2 * row + 2] = w, 1.0 - w
@@ -324,7 +301,7 @@ def weight_matrix(weights: WeightsConfig) -> Array:
 
 
 def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
-    """Equation 8 for (x, y, z, yaw) of both markers, each (4,); yaw on the circle."""
+    """Merge (x, y, z, yaw) of both markers, each (4,), by equation 8; the yaw on the circle."""
     W = weight_matrix(weights)
     merged = W @ np.stack([large, small], axis=1).ravel()
     merged[3] = circular_mean(W[3, 6:8], np.array([large[3], small[3]]))
@@ -332,15 +309,15 @@ def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
 
 
 def merge_variance(large: Array, small: Array, weights: WeightsConfig) -> Array:
-    """Variances (4,) of `merge_pair` for markers with independent errors."""
+    """Return the variances (4,) of `merge_pair` for markers with independent errors."""
     W = weight_matrix(weights)
     return np.asarray(W**2 @ np.stack([large, small], axis=1).ravel())
 
 
 def disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
-    """Whether the markers contradict: farther apart than the limit and than four
-    standard deviations, in any axis (a far small marker is merely vague). What is
-    wrong with the print moves both alike, and excuses no gap."""
+    """Return True if the markers contradict: farther apart than the limit and than four standard
+    deviations, in any axis (a far small marker is merely vague). What is wrong with the print moves
+    both alike, and excuses no gap."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [np.maximum(p.sigma_m**2 - (p.print_m**2).sum(axis=1), 0.0) for p in (large, small)]
     vague = 4.0 * np.sqrt(variance[0] + variance[1])
@@ -348,6 +325,6 @@ def disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
 
 
 def better_conditioned(large: MarkerPose, small: MarkerPose) -> MarkerPose:
-    """The better-conditioned of the two, by the spread of its position."""
+    """Return the better-conditioned of the two poses, by the spread of its position."""
     spread_large, spread_small = (float(np.linalg.norm(p.sigma_m)) for p in (large, small))
     return small if spread_small < spread_large else large

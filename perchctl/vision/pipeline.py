@@ -19,12 +19,12 @@ from perchctl.geometry import Array
 from perchctl.profile import KalmanConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
 from perchctl.vision.fields import FieldsMode, FieldState, classify_fields, separate_fields
-from perchctl.vision.filter import MAX_TRACK_GAP_S, FilterSetup, predict_track
+from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, GearMask, make_aruco_detector, make_mask
-from perchctl.vision.merge import Merged, MergePrior, MergeStrategy, make_strategy, stage_of
-from perchctl.vision.pose import PoseCandidate, PoseSetup, make_pose_setup, normal_cam
+from perchctl.vision.merge import Joint, Merged, MergePrior, MergeStrategy, Weights, stage_of
+from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPlace,
     TargetSelector,
@@ -36,8 +36,6 @@ from perchctl.vision.tracks import (
     TrackedFrame,
     TrackSetup,
     expected_corners,
-    make_track_setup,
-    surest_pose,
     update_sight,
     update_tracks,
 )
@@ -72,25 +70,40 @@ class Pipeline:
 def make_pipeline(
     profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None = None
 ) -> Pipeline:
-    """The profile's pipeline for a calibrated camera. It is never changed: several streams may
-    share one, each with a `PipelineState` of its own. `covered` is what `camera.mask` holds,
+    """Return the profile's pipeline for a calibrated camera. It is never changed: several streams
+    may share one, each with a `PipelineState` of its own. `covered` is what `camera.mask` holds,
     which else is read. Errors: NotFound, InvalidValue (`camera.mask`)."""
-    mount, gear_body_m = profile.camera.mount, profile.vehicle.gear_body_m
-    pose = make_pose_setup(
-        profile.pose, profile.target, mount.T_body_cam, gear_body_m, camera,
-        profile.camera.readout_s,
-    )  # fmt: skip
-    strategy = make_strategy(profile.merge, pose)
+    pose = PoseSetup(
+        config=profile.pose,
+        target=profile.target,
+        T_body_cam=profile.camera.mount.T_body_cam,
+        gear_body_m=np.asarray(profile.vehicle.gear_body_m, dtype=np.float64),
+        camera=camera,
+        readout_s=profile.camera.readout_s,
+    )
+    way = Joint if profile.merge.method == "joint" else Weights
+    strategy = way(profile.merge, pose)
     detector = make_aruco_detector(
         profile.detector, profile.target, _mask(profile, camera, covered)
     )
     if detector.cut:
         prepare_cut_markers(detector.patterns, camera)
+    target = profile.target
+    own = OwnTargetPlace(profile.planner.approach_xy_m)  # where the vehicle is sent to look for it
+    if target.expected_xy_m is not None:
+        own = OwnTargetPlace(target.expected_xy_m, target.expected_within_m)
     return Pipeline(
         detector=detector,
         pose=pose,
         strategy=strategy,
-        tracks=make_track_setup(profile.kalman, strategy.tracks, pose, _own_place(profile)),
+        tracks=TrackSetup(
+            level=make_filter(profile.kalman, in_world=False),
+            world=make_filter(profile.kalman, in_world=True),
+            names=strategy.tracks,
+            pose=pose,
+            gate=profile.kalman.gate,
+            own=own,
+        ),
         kalman=profile.kalman,
         camera=camera,
         fields=profile.camera.fields,
@@ -100,8 +113,8 @@ def make_pipeline(
 def _mask(
     profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None
 ) -> GearMask | None:
-    """What the vehicle's own gear covers. The file is of the camera's own pictures, which
-    `camera.mirrored` has turned over since."""
+    """Return what the vehicle's own gear covers; None without `camera.mask`. The file is of the
+    camera's own pictures, which `camera.mirrored` has turned over since."""
     if profile.camera.mask is None:
         return None
     if covered is None:
@@ -109,17 +122,9 @@ def _mask(
     return make_mask(covered[:, ::-1] if profile.camera.mirrored else covered)
 
 
-def _own_place(profile: Profile) -> OwnTargetPlace:
-    """The target's, or else where the vehicle is sent to look for it."""
-    target = profile.target
-    if target.expected_xy_m is not None:
-        return OwnTargetPlace(target.expected_xy_m, target.expected_within_m)
-    return OwnTargetPlace(profile.planner.approach_xy_m)
-
-
 def camera_profile(profile: Profile) -> Profile:
-    """The profile with the camera in the place of vehicle and gear, for the target's pose in
-    the camera frame, without a vehicle; each marker's pose is wanted then, too."""
+    """Return the profile with the camera in the place of vehicle and gear, and with each marker's
+    pose: for the target's pose in the camera frame, without a vehicle."""
     bare = Mounting(position_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
     return profile.model_copy(
         update={
@@ -133,7 +138,7 @@ def camera_profile(profile: Profile) -> Profile:
 def pictures(
     state: FieldState, frame: Frame, pipeline: Pipeline
 ) -> tuple[FieldState, tuple[Frame, ...]]:
-    """What a stream's frame holds, each for a `step` of its own: one picture, or the two
+    """Return what a stream's frame holds, each for a `step` of its own: one picture, or the two
     fields of an interlaced camera in their order of time, each with its own time."""
     return separate_fields(state, frame, pipeline.fields)
 
@@ -141,7 +146,8 @@ def pictures(
 def step(
     state: PipelineState, frame: Frame, attitude: Attitude | None, pipeline: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
-    """One frame. `attitude` is the vehicle's at the frame's time, None without one.
+    """Run one frame, and return the new memory and what it gave. `attitude` is the vehicle's at the
+    frame's time, None without one.
 
     Without an attitude the vehicle counts as level and at rest: the filter then works
     in the level frame, whatever `kalman.frame` says. The frame is one picture of what
@@ -165,7 +171,7 @@ def step(
 def follow(
     state: PipelineState, detections: Detections, attitude: Attitude | None, pipeline: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
-    """`step` from the corners on: what a picture gave, at its time."""
+    """Do what `step` does from the corners on: from what a picture gave, at its time."""
     _, near = expected_corners(state.sighting, detections.t_s, attitude, pipeline.pose)
     return _followed(state, detections, near, attitude, pipeline)
 
@@ -178,32 +184,37 @@ def _followed(
     pipeline: Pipeline,
     fields: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
-    """`near` is the pose that is expected."""
+    """Measure, track and estimate what the detections show; `near` is the pose that is expected."""
     sighting, t_s = state.sighting, detections.t_s
     normal = normal_cam(sighting.pose) if sighting is not None and attitude is None else None
     measured = pipeline.strategy.measure(detections, MergePrior(attitude, near, normal))
 
     in_world = pipeline.kalman.frame == "world" and attitude is not None
     followed = update_tracks(state, measured, t_s, attitude, in_world, pipeline.tracks)
-    measured, taken = followed.measured, followed.taken
+    measured, verdict = followed.measured, followed.verdict
 
-    both = detections.large is not None and detections.small is not None
-    anything = detections.large is not None or detections.small is not None
+    stage = stage_of(detections.large is not None, detections.small is not None)
+    anything = stage is not Stage.NONE
     disagreeing = state.disagreeing_frames
-    if both and taken:
+    if stage is Stage.BOTH and verdict.taken:
         disagreeing = disagreeing + 1 if measured.contradicting else 0
-    surest = surest_pose(measured)
-    sees = surest is not None and taken
+    surest = measured.surest
+    sees = surest is not None and verdict.taken
     if surest is not None and sees:
         sighting = update_sight(sighting, surest, attitude, pipeline.pose)
     target = _at_frame(followed, state.target, t_s, attitude, in_world, pipeline)
+    last = state.last
+    if anything and verdict.taken:
+        last = detections
+    elif last is not None and not 0.0 <= t_s - last.t_s <= MAX_TRACK_GAP_S:
+        last = None
     new = PipelineState(
         tracks=followed.tracks,
         in_world=in_world,
         measured=measured,
         attitude=attitude,
         target=target or state.target,
-        last=detections if anything and taken else _still_useful(state.last, t_s),
+        last=last,
         sighting=sighting if sees or followed.tracks else None,
         disagreeing_frames=disagreeing,
         empty_frames=0 if anything else state.empty_frames + 1,
@@ -214,11 +225,11 @@ def _followed(
         detections=detections,
         poses=measured.poses,
         target=target,
-        stage=stage_of(detections.large is not None, detections.small is not None),
+        stage=stage,
         disagreeing_frames=disagreeing,
-        lock_note=followed.note or (SEVERAL if detections.targets > 1 else ""),
+        lock_note=verdict.text or (SEVERAL if detections.targets > 1 else ""),
         fields=fields,
-        refused=followed.refused,
+        refused=verdict.refused,
     )
     return new, output
 
@@ -230,7 +241,7 @@ def estimate(
     pipeline: Pipeline,
     spread: bool = True,
 ) -> TargetEstimate | None:
-    """The target at a moment after the newest frame, for the vehicle's attitude of then.
+    """Return the target at a moment after the newest frame, for the vehicle's attitude of then.
 
     A tracked target is predicted by its filter, and carried to where the vehicle is now by
     the vehicle's own motion since the frame. One that is no longer tracked stays in the
@@ -253,14 +264,7 @@ def estimate(
     tracks = {n: predict_track(t, t_s, world, spread) for n, t in state.tracks.items()}
     merged = pipeline.strategy.merge(tracks, state.measured.fed)
     assert merged is not None
-    now = replace(target, t_s=t_s, **estimate_in_world(merged, attitude, pipeline.pose))
-    if not spread:
-        return now
-    return replace(now, **spread_in_world(merged, attitude, world, pipeline.pose))
-
-
-def _still_useful(last: Detections | None, t_s: float) -> Detections | None:
-    return last if last is not None and 0.0 <= t_s - last.t_s <= MAX_TRACK_GAP_S else None
+    return replace(target, t_s=t_s, **_seen_in_world(merged, attitude, pipeline, spread))
 
 
 # --- from the tracks to the target -------------------------------------------------
@@ -274,7 +278,8 @@ def _at_frame(
     in_world: bool,
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
-    """The target at the newest frame's time; None without a track. `before`: the last one."""
+    """Return the target at the newest frame's time; None without a track. `before` is the last
+    one."""
     fed, tracks = followed.measured.fed, followed.tracks
     merged = pipeline.strategy.merge(tracks, fed)
     if merged is None:
@@ -283,10 +288,9 @@ def _at_frame(
     small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
     never = -np.inf
     if attitude is not None and in_world:
-        place = estimate_in_world(merged, attitude, pipeline.pose)
-        place |= spread_in_world(merged, attitude, pipeline.tracks.world, pipeline.pose)
+        place = _seen_in_world(merged, attitude, pipeline)
     else:
-        place = estimate_in_level(merged, attitude, pipeline.pose)
+        place = _seen_in_level(merged, attitude, pipeline)
     return TargetEstimate(
         t_s=t_s,
         measured_s=t_s if measured else never if before is None else before.measured_s,
@@ -302,7 +306,7 @@ def _at_frame(
 def _carried(
     target: TargetEstimate, t_s: float, attitude: Attitude, pipeline: Pipeline
 ) -> TargetEstimate:
-    """The same place in the world, seen from the vehicle at `attitude`."""
+    """Return the same place in the world, seen from the vehicle at `attitude`."""
     assert target.world_m is not None
     assert target.world_yaw_rad is not None
     e_m, e_yaw_rad = to_level(target.world_m, target.world_yaw_rad, attitude, pipeline.pose)
@@ -312,55 +316,48 @@ def _carried(
 # --- What merged tracks say of the target, as a `TargetEstimate` has it ------------------------
 
 
-def estimate_in_level(
-    merged: Merged, attitude: Attitude | None, setup: PoseSetup
-) -> dict[str, Any]:
-    """Place and motion of tracks in the level frame, as a `TargetEstimate` has them."""
+def _seen_in_level(merged: Merged, attitude: Attitude | None, pipeline: Pipeline) -> dict[str, Any]:
+    """Return place, motion and spread of tracks in the level frame."""
     e_m, e_yaw_rad = merged.vector[:3], float(merged.vector[3])
     world_m, world_yaw_rad = None, None
     if attitude is not None:
-        world_m, world_yaw_rad = to_world(e_m, e_yaw_rad, attitude, setup)
+        world_m, world_yaw_rad = to_world(e_m, e_yaw_rad, attitude, pipeline.pose)
     return {
         "e_m": e_m,
         "e_yaw_rad": e_yaw_rad,
         "velocity_mps": merged.velocity_mps,
-        "sigma_m": _sigma(merged.cov_m2, merged.bias_m),
-        "sigma_yaw_rad": _sigma_yaw(merged),
         "world_m": world_m,
         "world_yaw_rad": world_yaw_rad,
+        **_spread(merged, merged.cov_m2, merged.bias_m),
     }
 
 
-def estimate_in_world(merged: Merged, attitude: Attitude, setup: PoseSetup) -> dict[str, Any]:
-    """The same of tracks in the world, as seen from the vehicle at `attitude`, but the spread."""
+def _seen_in_world(
+    merged: Merged, attitude: Attitude, pipeline: Pipeline, spread: bool = True
+) -> dict[str, Any]:
+    """Return place, motion and, on request, spread of tracks in the world, as seen from the
+    vehicle at `attitude`."""
     world_m, world_yaw_rad = merged.vector[:3], float(merged.vector[3])
-    e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, setup)
-    return {
+    e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, pipeline.pose)
+    turn = attitude.R_world_level.T
+    seen = {
         "e_m": e_m,
         "e_yaw_rad": e_yaw_rad,
-        "velocity_mps": attitude.R_world_level.T.dot(merged.velocity_mps),
+        "velocity_mps": turn.dot(merged.velocity_mps),
         "world_m": world_m,
         "world_yaw_rad": world_yaw_rad,
         "world_velocity_mps": merged.velocity_mps,
     }
+    if not spread:
+        return seen
+    bias_m = seen_from(merged.bias_m, attitude, pipeline.tracks.world, pipeline.pose)
+    return seen | _spread(merged, turn.dot(merged.cov_m2).dot(turn.T), bias_m)
 
 
-def spread_in_world(
-    merged: Merged, attitude: Attitude, constants: FilterSetup, setup: PoseSetup
-) -> dict[str, Any]:
-    """The spread of tracks in the world, as seen from the vehicle at `attitude`."""
-    turn = attitude.R_world_level.T
-    bias_m = seen_from(merged.bias_m, attitude, constants, setup)
-    return {
-        "sigma_m": _sigma(turn.dot(merged.cov_m2).dot(turn.T), bias_m),
-        "sigma_yaw_rad": _sigma_yaw(merged),
-    }
-
-
-def _sigma_yaw(merged: Merged) -> float:
-    return math.sqrt(max(merged.var_yaw_rad2, 0.0))
-
-
-def _sigma(cov_m2: Array, bias_m: Array) -> Array:
+def _spread(merged: Merged, cov_m2: Array, bias_m: Array) -> dict[str, Any]:
+    """Return the standard deviations of a place with that covariance and constant errors."""
     variance = cov_m2.diagonal() + (bias_m * bias_m).sum(axis=1)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+    return {
+        "sigma_m": np.asarray(np.sqrt(np.maximum(variance, 0.0))),
+        "sigma_yaw_rad": math.sqrt(max(merged.var_yaw_rad2, 0.0)),
+    }

@@ -31,80 +31,51 @@ _CURLED_CHI2 = 3.0  # of both markers' corners on a flat sheet, a degree of free
 _EXPLAINED = 0.5  # of that is left where the sheet's curl is what it comes from
 _Source = Literal["large", "small", "joint"]
 
-__all__ = [
-    "PoseSetup",
-    "estimate_pose",
-    "level_rotation",
-    "make_pose_setup",
-    "mirror_solution",
-    "normal_cam",
-    "rotation_matrix",
-    "rotation_vector",
-    "square_corners",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class PoseSetup:
-    """`object_points` (4, 3) m in marker axes, in the order of the corners."""
+    """The constants of pose estimation. `T_body_cam` (4, 4) is the camera's mounting, `gear_body_m`
+    (3,) the gear's tip, and `readout_s` the time from a picture's first row to its last; None: not
+    known."""
 
     config: PoseConfig
-    object_points: dict[MarkerName, Array]
+    target: TargetConfig
     T_body_cam: Array
     gear_body_m: Array
     camera: CameraModel
-    readout_s: float | None = 0.0  # of the camera's shutter; None: not known
-    size_sigma: float = 0.0  # of the printed sizes, a share of them
-    curl_per_m: float = 0.0  # of the sheet: lift over the square of the way from its centre
+    readout_s: float | None = 0.0
+
+    @cached_property
+    def object_points(self) -> dict[MarkerName, Array]:
+        """Each marker's corners in its own axes, (4, 3) m, in the order of a detection's."""
+        large, small = self.target.large.side_m, self.target.small.side_m
+        return {"large": square_corners(large), "small": square_corners(small)}
 
     @cached_property
     def all_points(self) -> Array:
-        """Of both markers, the large one's first, (8, 3)."""
+        """Both markers' points, the large one's first, (8, 3)."""
         return np.concatenate([self.object_points[name] for name in MARKERS])
 
     @cached_property
     def lift(self) -> dict[MarkerName, Array]:
-        """Of each marker's corners, on a sheet that curls."""
-        return {n: lift_of(points, self.curl_per_m) for n, points in self.object_points.items()}
+        """How far each marker's corners are out of the plane of a sheet that curls (`lift_of`)."""
+        curl = self.target.curl_per_m
+        return {n: lift_of(points, curl) for n, points in self.object_points.items()}
 
     @cached_property
     def all_lift(self) -> Array:
-        """Of both."""
-        return lift_of(self.all_points, self.curl_per_m)
-
-
-def make_pose_setup(
-    config: PoseConfig,
-    target: TargetConfig,
-    T_body_cam: Array,
-    gear_body_m: Sequence[float] | Array,
-    camera: CameraModel,
-    readout_s: float | None = 0.0,
-) -> PoseSetup:
-    """The constants of pose estimation, from the profile and the calibrated camera."""
-    return PoseSetup(
-        config=config,
-        object_points={
-            "large": square_corners(target.large.side_m),
-            "small": square_corners(target.small.side_m),
-        },
-        T_body_cam=np.asarray(T_body_cam, dtype=np.float64),
-        gear_body_m=np.asarray(gear_body_m, dtype=np.float64),
-        camera=camera,
-        readout_s=readout_s,
-        size_sigma=target.size_sigma,
-        curl_per_m=target.curl_per_m,
-    )
+        """The same for both markers' corners, the large one's first."""
+        return lift_of(self.all_points, self.target.curl_per_m)
 
 
 def square_corners(side_m: float) -> Array:
-    """Corners TL TR BR BL of a marker in its own axes, (4, 3)."""
+    """Return the corners TL TR BR BL of a marker in its own axes, (4, 3)."""
     h = side_m / 2.0
     return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
 
 
 def level_rotation(attitude: Attitude | None) -> Array:
-    """``R_level_body`` (3, 3); without an attitude the vehicle counts as level."""
+    """Return ``R_level_body`` (3, 3); without an attitude the vehicle counts as level."""
     return np.eye(3) if attitude is None else attitude.R_level_body
 
 
@@ -116,7 +87,7 @@ def estimate_pose(
     previous_normal_cam: Array | None = None,
     start: PoseCandidate | None = None,
 ) -> MarkerPose | None:
-    """The pose from one marker's corners, or from both markers' corners at once.
+    """Return the pose from one marker's corners, or from both markers' corners at once.
 
     `start` is a pose of the same frame whose tilt is already decided (the joint one):
     it is refined on these corners instead of solving anew.
@@ -139,7 +110,7 @@ def estimate_pose(
         return None
     source = "joint" if len(detections) > 1 else detections[0].marker
     pose = _level_pose(source, t_s, solution, points, R_level_body, setup)
-    if source != "joint" or pose.chi2 < _CURLED_CHI2 or setup.curl_per_m == 0.0:
+    if source != "joint" or pose.chi2 < _CURLED_CHI2 or setup.target.curl_per_m == 0.0:
         return pose
     if any(d.lying_sigma_px > 0.0 for d in detections):
         return pose  # sides between interpolated rows look curled
@@ -153,7 +124,7 @@ def estimate_pose(
 
 
 def _points(detections: Sequence[Detection], setup: PoseSetup) -> Points | None:
-    """The corners through a pinhole, None where the lens cannot have imaged them."""
+    """Return the corners through a pinhole; None where the lens cannot have imaged them."""
     if len(detections) > 1:
         object_m, lift = setup.all_points, setup.all_lift
         raw_px = np.concatenate([d.corners_px for d in detections])
@@ -169,7 +140,7 @@ def _points(detections: Sequence[Detection], setup: PoseSetup) -> Points | None:
 def _continued(
     points: Points, start: PoseCandidate | None, prior: TiltPrior, config: PoseConfig
 ) -> Scored | None:
-    """The solution next to a start, None where there is none that fits."""
+    """Return the solution next to a start; None where there is none that fits."""
     if start is None or not config.refine:
         return None
     solution = gauss_newton(points, start)
@@ -179,7 +150,7 @@ def _continued(
 
 
 def _solved(points: Points, prior: TiltPrior, config: PoseConfig) -> Scored | None:
-    """The solution without a start, None where none fits."""
+    """Return the solution without a start; None where none fits."""
     solution = solve(points, config.solver, config.refine, prior)
     if not _fits(solution, config) and config.solver != "sqpnp":
         # EPnP and IPPE fail on exactly frontal views, which is where hovering happens.
@@ -188,6 +159,7 @@ def _solved(points: Points, prior: TiltPrior, config: PoseConfig) -> Scored | No
 
 
 def _fits(solution: Scored | None, config: PoseConfig) -> bool:
+    """Return True if there is a solution that leaves no more than the profile allows."""
     return solution is not None and solution.rms_px <= config.max_reprojection_px
 
 
@@ -199,7 +171,7 @@ def _level_pose(
     R_level_body: Array,
     setup: PoseSetup,
 ) -> MarkerPose:
-    """The solution, relative to the gear in the level frame, with its covariance there."""
+    """Return the solution relative to the gear in the level frame, with its covariance there."""
     R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
     R_level_cam = R_level_body.dot(R_body_cam)
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
@@ -211,7 +183,7 @@ def _level_pose(
     G[3, :3] = _yaw_gradient(R_level_cam, heading, dR)
     cov_e = G.dot(cov).dot(G.T)
     # A target that is larger by a share is farther away by that share of the way to it.
-    print_cam = np.array([setup.size_sigma * solution.tvec, curl[3:]])
+    print_cam = np.array([setup.target.size_sigma * solution.tvec, curl[3:]])
     print_m = R_level_cam.dot(print_cam.T)
     cov_e[:3, :3] += print_m.dot(print_m.T)
     sigma = np.sqrt(np.maximum(cov_e.diagonal(), 0.0))
@@ -233,22 +205,23 @@ def _level_pose(
 
 
 def rotation_matrix(rvec: Array) -> Array:
+    """Return the rotation matrix (3, 3) of a rotation vector (3,) rad."""
     return np.asarray(cv2.Rodrigues(rvec)[0], dtype=np.float64)
 
 
 def rotation_vector(R: Array) -> Array:
-    """The rotation vector (3,) rad of a rotation matrix (3, 3)."""
+    """Return the rotation vector (3,) rad of a rotation matrix (3, 3)."""
     return flat(cv2.Rodrigues(R)[0])
 
 
 def normal_cam(pose: MarkerPose) -> Array:
-    """The marker's z axis (out of the paper) in camera axes, (3,)."""
+    """Return the marker's z axis (out of the paper) in camera axes, (3,)."""
     return np.asarray(cv2.Rodrigues(pose.rvec_rad)[0][:, 2])
 
 
 def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
-    """Change of atan2(h[1, 0], h[0, 0]) with rvec through ``dR/drvec`` (3, 9); the
-    target's x axis is the marker's. (3,)"""
+    """Return the change (3,) of atan2(h[1, 0], h[0, 0]) with rvec through ``dR/drvec`` (3, 9); the
+    target's x axis is the marker's."""
     dx = dR.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)  # (rvec component, level axis)
     hx, hy = float(heading[0, 0]), float(heading[1, 0])
     return np.asarray((hx * dx[:, 1] - hy * dx[:, 0]) / max(hx * hx + hy * hy, 1e-12))
@@ -257,8 +230,6 @@ def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
 # --- Rotation and translation from corners: closed forms, then least squares in which each -----
 # corner counts as it was measured.
 
-
-Solver = Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"]
 
 _FLAGS = {
     "sqpnp": cv2.SOLVEPNP_SQPNP,
@@ -295,7 +266,7 @@ class Scored(PoseCandidate):
 
     @property
     def rms_px(self) -> float:
-        """Over the corners."""
+        """The root of the mean square of the corners' errors."""
         flat = self.error_px.ravel()
         return math.sqrt(float(flat.dot(flat)) / len(self.error_px))
 
@@ -308,17 +279,17 @@ class TiltPrior:
     spread_rad: float
 
     def contradicts(self, candidate: PoseCandidate) -> bool:
-        """Whether it is known and further away than its spread."""
+        """Return True if the normal is known and the candidate's is further away than the
+        spread."""
         return (
             self.normal_cam is not None
             and tilt_rad(candidate.rvec, self.normal_cam) > self.spread_rad
         )
 
 
-def solve(points: Points, solver: Solver, refine: bool, prior: TiltPrior) -> Scored | None:
-    """The better of both tilts, None without a finite one in front of the camera, or where
-    a solver other than ``sqpnp`` gives a start from which nothing settles.
-    """
+def solve(points: Points, solver: str, refine: bool, prior: TiltPrior) -> Scored | None:
+    """Return the better of both tilts; None without a finite one in front of the camera, or where a
+    solver other than ``sqpnp`` gives a start from which nothing settles."""
     candidates = _closed_form(points, solver)
     if refine:
         candidates = [_refined(points, c) for c in candidates]
@@ -337,8 +308,8 @@ def solve(points: Points, solver: Solver, refine: bool, prior: TiltPrior) -> Sco
 
 
 def gauss_newton(points: Points, start: PoseCandidate) -> Scored | None:
-    """Gauss-Newton with each corner's own spread, from a start that is near (the frame
-    before); None where it does not settle within some steps."""
+    """Refine a pose by Gauss-Newton with each corner's own spread, from a start that is near (the
+    frame before); None where it does not settle within some steps."""
     candidate: PoseCandidate = start
     before = math.inf
     W = points.whitening
@@ -378,8 +349,8 @@ def gauss_newton(points: Points, start: PoseCandidate) -> Scored | None:
 
 
 def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
-    """Of (rvec, tvec), (6, 6), the squared error per degree of freedom, and by how much one
-    standard deviation of the sheet's curl moves them, (6,).
+    """Return the covariance (6, 6) of (rvec, tvec), the squared error per degree of freedom, and by
+    how much one standard deviation of the sheet's curl moves them, (6,).
 
     The covariance is that of the corners' noise, grown as far as the residuals show that they
     spread more than they claim, and what common shifts do to the pose, and a twist; not the curl.
@@ -406,13 +377,18 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
 
 
 def _curl(points: Points, scored: Scored) -> Array:
-    lift = np.zeros((len(points.whitening), 2)) if points.lift is None else points.lift
-    curl: Array = points.whitening.dot(moved_by(lift, scored.rvec, scored.jacobian))
-    return curl
+    """Return what one standard deviation of each kind of curl does to the whitened errors."""
+    if points.lift is None:
+        return np.zeros((len(points.whitening), 2))
+    normal_cam = cv2.Rodrigues(scored.rvec)[0][:, 2]
+    # A corner out of the sheet's plane is where a target moved along its normal would have it.
+    moved = scored.jacobian[:, 3:].dot(normal_cam)[:, None] * points.lift
+    return np.asarray(points.whitening.dot(moved))
 
 
 def mirror_solution(rvec: Array, tvec: Array) -> Array | None:
-    """The other tilt: the normal mirrored at the line of sight; None where both agree."""
+    """Return the rotation vector of the other tilt, whose normal is mirrored at the line of sight;
+    None where both agree."""
     R = cv2.Rodrigues(rvec)[0]
     normal, sight = R[:, 2], tvec / np.linalg.norm(tvec)
     other = 2.0 * float(normal @ sight) * sight - normal
@@ -432,16 +408,18 @@ def mirror_solution(rvec: Array, tvec: Array) -> Array | None:
 
 
 def flat(values: Any) -> Array:
+    """Return the values as a flat array of doubles."""
     return np.asarray(values, dtype=np.float64).ravel()
 
 
 def tilt_rad(rvec: Array, expected_cam: Array) -> float:
-    """Angle between the marker's normal and the expected one."""
+    """Return the angle between the marker's normal and the expected one."""
     normal = cv2.Rodrigues(rvec)[0][:, 2]
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
 
 
-def _closed_form(points: Points, solver: Solver) -> list[PoseCandidate]:
+def _closed_form(points: Points, solver: str) -> list[PoseCandidate]:
+    """Return the candidates of OpenCV's solver; none of corners all on one line or point."""
     if solver == "ippe_square" and len(points.object_m) != 4:
         solver = "ippe"
     try:
@@ -455,11 +433,13 @@ def _closed_form(points: Points, solver: Solver) -> list[PoseCandidate]:
 
 
 def _usable(candidate: PoseCandidate) -> bool:
+    """Return True if the candidate is finite and in front of the camera."""
     rvec, tvec = candidate.rvec, candidate.tvec
     return bool(finite(rvec) and finite(tvec) and tvec[2] > 0.0)
 
 
 def _refined(points: Points, start: PoseCandidate) -> PoseCandidate:
+    """Return the candidate refined by OpenCV's Levenberg-Marquardt, or as it was."""
     first = start.rvec.reshape(3, 1).copy(), start.tvec.reshape(3, 1).copy()
     try:
         rvec, tvec = cv2.solvePnPRefineLM(points.object_m, points.image_px, points.K, None, *first)
@@ -469,6 +449,7 @@ def _refined(points: Points, start: PoseCandidate) -> PoseCandidate:
 
 
 def _scored(candidate: PoseCandidate, points: Points) -> Scored:
+    """Return the candidate with what it leaves over of the corners."""
     rvec, tvec = candidate.rvec, candidate.tvec
     projected, jacobian = cv2.projectPoints(points.object_m, rvec, tvec, points.K, None)
     error: Array = projected.reshape(-1, 2) - points.image_px
@@ -476,7 +457,7 @@ def _scored(candidate: PoseCandidate, points: Points) -> Scored:
 
 
 def _other_tilt(scored: Scored, points: Points) -> list[Scored]:
-    """The best candidate near the mirror solution, if there is one."""
+    """Return the best candidate near the mirror solution, if there is one."""
     rvec = mirror_solution(scored.rvec, scored.tvec)
     if rvec is None:
         return []
@@ -485,7 +466,8 @@ def _other_tilt(scored: Scored, points: Points) -> list[Scored]:
 
 
 def _likeliest(scored: list[Scored], points: Points, prior: TiltPrior) -> Scored:
-    """By the squared errors of corners and tilt, in units of their spread."""
+    """Return the best candidate by the squared errors of corners and tilt, in units of their
+    spread."""
     if len(scored) == 1:
         return scored[0]
     sigma = np.maximum(points.sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
@@ -505,25 +487,16 @@ def _likeliest(scored: list[Scored], points: Points, prior: TiltPrior) -> Scored
 
 
 def lift_of(object_m: Array, curl_per_m: float) -> Array:
-    """How far corners (n, 3) are out of the sheet's plane at one standard deviation of each kind
-    of curl, (2n, 2) m, for x and y of each: the whole rim to one side, or two corners of it to
+    """Return how far corners (n, 3) are out of the sheet's plane at one standard deviation of each
+    kind of curl, (2n, 2) m, for x and y of each: the whole rim to one side, or two corners of it to
     one and two to the other. A sheet rolled about any axis is as much of one as of the other."""
     x, y = object_m[:, 0], object_m[:, 1]
     lift: Array = curl_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
 
 
-def moved_by(lift: Array, rvec: Array, jacobian: Array) -> Array:
-    """By how much `lift` moves the corners in the picture, (2n, 2), where a change of (rvec,
-    tvec) moves them by `jacobian` (2n, 6)."""
-    normal_cam = cv2.Rodrigues(rvec)[0][:, 2]
-    # A corner out of the sheet's plane is where a target moved along its normal would have it.
-    moved: Array = jacobian[:, 3:].dot(normal_cam)[:, None] * lift
-    return moved
-
-
 def weight_with(curl: Array) -> Array:
-    """The inverse covariance (2n, 2n) of errors of unit spread that have `curl` (2n, k), one
+    """Return the inverse covariance (2n, 2n) of errors of unit spread that have `curl` (2n, k), one
     standard deviation each, among them."""
     inner = np.linalg.inv(np.eye(curl.shape[1]) + curl.T @ curl)
     weight: Array = np.eye(len(curl)) - curl @ inner @ curl.T
@@ -575,6 +548,8 @@ def make_points(
     K: Array,
     lift: Array | None = None,
 ) -> Points:
+    """Return the corners of one or both detections with what each is worth; `lift` as of
+    `PoseSetup`."""
     n, m = len(image_px), len(detections)
     W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_px.reshape(m, 4, 2)
@@ -607,7 +582,8 @@ def make_points(
 
 
 def _outward_normals(corners: Array) -> Array:
-    """Unit normals (m, 4, 2) of the sides of m squares, whichever way round these are."""
+    """Return the unit normals (m, 4, 2) of the sides of m squares, whichever way round these
+    are."""
     side = corners.take(_END, axis=1) - corners
     x, y = side[..., 0], side[..., 1]
     length = np.maximum(np.hypot(x, y), 1e-9)
@@ -619,7 +595,8 @@ def _outward_normals(corners: Array) -> Array:
 
 
 def _whitened(cov_px2: Array) -> Array:
-    """(8, 8): what makes errors of that covariance independent and of unit spread."""
+    """Return the matrix (8, 8) that makes errors of that covariance independent and of unit
+    spread."""
     try:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(cov_px2)), dtype=np.float64)
     except np.linalg.LinAlgError:
@@ -627,7 +604,7 @@ def _whitened(cov_px2: Array) -> Array:
 
 
 def _lying_px(d: Detection, corners: Array) -> Array:
-    """Spread of the sides, (4,): the more of a side lies along the rows, the worse. Over
+    """Return the spread of the sides, (4,): the more of a side lies along the rows, the worse. Over
     several rows errors of interpolation cancel out."""
     way = corners.take(_END, axis=0) - corners
     lying = np.abs(way[:, 0]) / np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
@@ -636,8 +613,8 @@ def _lying_px(d: Detection, corners: Array) -> Array:
 
 
 def _of_lines(normals: Array, sigma_px: float | Array) -> Array:
-    """Whitening of the corners of four fitted lines with normals (4, 2), by the offset and the
-    tilt of each, at `_SIDES`; `sigma_px` of all or of each, (4,)."""
+    """Return the whitening of the corners of four fitted lines with normals (4, 2), by the offset
+    and the tilt of each, at `_SIDES`; `sigma_px` is of all or of each, (4,)."""
     across = (normals.T / sigma_px).ravel()
     tilt = across * _TILT
     return np.concatenate([across, across, -tilt, tilt])

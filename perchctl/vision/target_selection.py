@@ -15,13 +15,9 @@ import numpy as np
 
 from perchctl.geometry import Array, wrap_rad
 from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, pose_noise, tilted
-from perchctl.vision.pose import PoseSetup, estimate_pose, level_rotation
+from perchctl.vision.pose import PoseSetup, estimate_pose
 from perchctl.vision.types import Attitude, Detection, MarkerName, MarkerPose
 
-OTHER_TARGET_TEXT = (
-    "a target is in view that is too far from target.expected_xy_m to be the own one: it is not "
-    "followed"
-)
 _SIGMA_PX = 1.0  # of corners as a search finds them
 
 
@@ -49,11 +45,12 @@ class TargetSelector:
 
     @property
     def refuses(self) -> bool:
-        """Whether some markers are too far aside."""
+        """True if some markers are too far aside to be the own target's."""
         return self.attitude is not None and math.isfinite(self.place.within_m)
 
     def aside_m(self, marker: MarkerName, corners_px: Array) -> float:
-        """From where the own target is; inf for one that cannot be it. Corners (4, 2) px."""
+        """Return how far a marker with corners (4, 2) px is from where the own target is; inf for
+        one that cannot be it."""
         seen = Detection(marker, corners_px, _SIGMA_PX, refined=False)
         pose = estimate_pose([seen], self.t_s, self.attitude, self.pose)
         if pose is None:
@@ -65,8 +62,8 @@ class TargetSelector:
 def aside_m(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> float:
-    """How far a target is from the own one's place; without that, or without an attitude, from
-    the upward axis through the gear."""
+    """Return how far a target is from the own one's place; without that, or without an attitude,
+    from the upward axis through the gear."""
     if place.xy_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
     seen_m, _ = to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
@@ -76,8 +73,8 @@ def aside_m(
 def refusal(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> str | None:
-    """One sentence where the target is another vehicle's. Nothing is refused without an attitude:
-    where the vehicle is, is not known then."""
+    """Return one sentence where the target is another vehicle's, else None. Nothing is refused
+    without an attitude: where the vehicle is, is not known then."""
     if attitude is None or place.xy_m is None:
         return None
     away_m = aside_m(pose, attitude, place, setup)
@@ -99,9 +96,9 @@ _STILL = np.eye(4)
 def to_world(
     e_m: Array, e_yaw_rad: float, attitude: Attitude, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Place (3,) and heading in the world of the state estimate, from those relative to the
+    """Return place (3,) and heading in the world of the state estimate, from those relative to the
     gear in the level frame."""
-    way_m = e_m + level_rotation(attitude).dot(setup.gear_body_m)
+    way_m = e_m + attitude.R_level_body.dot(setup.gear_body_m)
     position_m = np.asarray(attitude.position_m) + attitude.R_world_level.dot(way_m)
     return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
 
@@ -109,8 +106,9 @@ def to_world(
 def to_level(
     position_m: Array, yaw_rad: float, attitude: Attitude, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Inverse of `to_world`."""
-    gear_level = level_rotation(attitude).dot(setup.gear_body_m)
+    """Return place (3,) and heading relative to the gear in the level frame; the inverse of
+    `to_world`."""
+    gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     way = (position_m - np.asarray(attitude.position_m)).dot(attitude.R_world_level)
     return way - gear_level, wrap_rad(yaw_rad - attitude.yaw_rad)
 
@@ -122,7 +120,8 @@ def measurement(
     constants: FilterSetup,
     setup: PoseSetup,
 ) -> Measurement:
-    """What a pose tells a track in the world (with an attitude), or in the level frame."""
+    """Return what a pose measures of a track in the world (with an attitude), or in the level
+    frame."""
     z, way_m = np.empty(4), pose.e_m
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if in_world:
@@ -147,10 +146,10 @@ def measurement(
 
 
 def seen_from(bias_m: Array, attitude: Attitude, constants: FilterSetup, setup: PoseSetup) -> Array:
-    """What constant errors make of the way from the gear to a target in the world, level axes
-    (3, 4): of `bias_m` (3, 4), by which they have moved the target, less what roll and pitch
+    """Return what constant errors make of the way from the gear to a target in the world, level
+    axes (3, 4): of `bias_m` (3, 4), by which they have moved the target, less what roll and pitch
     make of the gear's place."""
-    gear_level = level_rotation(attitude).dot(setup.gear_body_m)
+    gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(bias_m)
     moved[:, TILTS] -= tilted(gear_level) * constants.tilt_sigma_rad
     return np.asarray(moved)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from perchctl.geometry import Array, finite, wrap_rad
-from perchctl.profile import KalmanConfig
 from perchctl.values import replace
 from perchctl.vision.filter import (
     MAX_TRACK_GAP_S,
@@ -18,7 +16,6 @@ from perchctl.vision.filter import (
     Measurement,
     foreseen,
     foreseen_z,
-    make_filter,
     start_track,
     step_track,
 )
@@ -52,36 +49,20 @@ class TrackSetup:
     own: OwnTargetPlace = NOWHERE
 
     def constants(self, in_world: bool) -> FilterSetup:
+        """Return the filters' constants in the tracks' frame."""
         return self.world if in_world else self.level
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """The tracks one frame on. `measured` feeds nothing where its pose was not `taken`; `note`
-    is a sentence for people on a pose that was not, or that begins the tracks anew; `refused`, it
-    was another vehicle's target."""
+    """The tracks one frame on; `measured` feeds nothing where the verdict has not taken its
+    pose."""
 
     measured: MeasuredMarkers
     tracks: dict[str, MarkerTrack]
+    verdict: Verdict
     lock: Lock | None = None
     stranger: Stranger | None = None
-    taken: bool = True
-    note: str = ""
-    refused: bool = False
-
-
-def make_track_setup(
-    config: KalmanConfig, names: tuple[str, ...], pose: PoseSetup, own: OwnTargetPlace = NOWHERE
-) -> TrackSetup:
-    """The constants of the Kalman filters of these tracks, from the profile."""
-    return TrackSetup(
-        level=make_filter(config, in_world=False),
-        world=make_filter(config, in_world=True),
-        names=names,
-        pose=pose,
-        gate=config.gate,
-        own=own,
-    )
 
 
 def update_tracks(
@@ -92,7 +73,7 @@ def update_tracks(
     in_world: bool,
     setup: TrackSetup,
 ) -> TrackedFrame:
-    """What the gate lets through goes into the tracks."""
+    """Return the tracks one frame on, fed with what the gate lets through."""
     constants = setup.constants(in_world)
     fed = {
         name: measurement(pose, attitude, in_world, constants, setup.pose)
@@ -100,40 +81,38 @@ def update_tracks(
     }
     old = state.tracks if state.in_world == in_world else {}
     sight, verdict = None, Verdict(taken=True, stranger=state.stranger)
-    if fed:
-        sight = _sight(measured, fed, t_s, in_world)
+    pose = measured.surest
+    if fed and pose is not None:
+        name = next(n for n, each in measured.fed.items() if each is pose)
+        whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
+        sight = Sight(t_s, pose, fed[name], in_world, whole)
         if state.stranger is not None and state.lock is not None and attitude is not None:
             place_m = state.lock.track.x[POSITION]
             looks = not in_world or is_in_view(place_m, attitude, setup.pose)
             sight = replace(sight, looks_there=looks)
         another = refusal(sight.pose, attitude, setup.own, setup.pose)
         verdict = _verdict(state, sight, another, constants, setup.gate)
-    if not setup.gate:
-        fed = fed if verdict.taken else {}
-        measured = measured if verdict.taken else replace(measured, fed={})
-        tracks = _stepped(old, fed, t_s, setup.names, constants)
-        return TrackedFrame(
-            measured, tracks, taken=verdict.taken, note=verdict.text, refused=verdict.refused
-        )
     if not verdict.taken:
         measured, fed = replace(measured, fed={}), {}
-    tracks = _stepped({} if verdict.afresh else old, fed, t_s, setup.names, constants)
+    begun = {} if verdict.afresh else old
+    stepped = {n: step_track(begun.get(n), fed.get(n), t_s, constants) for n in setup.names}
+    tracks = {n: track for n, track in stepped.items() if track is not None}
+    if not setup.gate:
+        return TrackedFrame(measured, tracks, verdict)
     lock, stranger = remembered(state.lock, verdict.stranger, t_s)
     if sight is not None and verdict.taken and tracks:
         surest = next(iter(tracks.values()))
         if len(tracks) > 1:
             surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
         lock = locked(lock, surest, sight, verdict)
-    return TrackedFrame(
-        measured, tracks, lock, stranger, verdict.taken, verdict.text, verdict.refused
-    )
+    return TrackedFrame(measured, tracks, verdict, lock, stranger)
 
 
 def _verdict(
     state: PipelineState, sight: Sight, another: str | None, constants: FilterSetup, gate: bool
 ) -> Verdict:
-    """The gate's; and a target that is `another` vehicle's is never locked on. One that was
-    locked on goes on, however far the estimate's world has drifted meanwhile."""
+    """Return the gate's verdict. A target that is `another` vehicle's is never locked on; one that
+    was locked on goes on, however far the estimate's world has drifted meanwhile."""
     verdict = Verdict(taken=True, stranger=state.stranger)
     if gate:
         verdict = judged(state.lock, state.stranger, sight, constants)
@@ -142,35 +121,6 @@ def _verdict(
     if another is not None and verdict.taken and not goes_on:
         return Verdict(taken=False, stranger=state.stranger, text=another, refused=True)
     return verdict
-
-
-def _sight(
-    measured: MeasuredMarkers, fed: Mapping[str, Measurement], t_s: float, in_world: bool
-) -> Sight:
-    """What the gate has to judge: the surest pose of those that would be fed."""
-    pose = surest_pose(measured)
-    assert pose is not None
-    name = next(n for n, each in measured.fed.items() if each is pose)
-    whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
-    return Sight(t_s, pose, fed[name], in_world, whole)
-
-
-def surest_pose(measured: MeasuredMarkers) -> MarkerPose | None:
-    """Of the poses that are fed, or else of all."""
-    poses = measured.fed or measured.poses
-    return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
-
-
-def _stepped(
-    old: Mapping[str, MarkerTrack],
-    fed: Mapping[str, Measurement],
-    t_s: float,
-    names: tuple[str, ...],
-    constants: FilterSetup,
-) -> dict[str, MarkerTrack]:
-    """All tracks one frame on."""
-    tracks = {n: step_track(old.get(n), fed.get(n), t_s, constants) for n in names}
-    return {n: track for n, track in tracks.items() if track is not None}
 
 
 # --- Whether a pose is the target's that was locked on -----------------------------------------
@@ -243,7 +193,7 @@ class Verdict:
 def judged(
     lock: Lock | None, stranger: Stranger | None, sight: Sight, constants: FilterSetup
 ) -> Verdict:
-    """The verdict on a frame's pose."""
+    """Return the verdict on a frame's pose."""
     lock, stranger = remembered(lock, stranger, sight.t_s)
     if stranger is not None and stranger.in_world != sight.in_world:
         stranger = None
@@ -273,7 +223,7 @@ def judged(
 def remembered(
     lock: Lock | None, stranger: Stranger | None, t_s: float
 ) -> tuple[Lock | None, Stranger | None]:
-    """What of both still counts."""
+    """Return what of a lock and a stranger still counts at `t_s`."""
     if stranger is not None and not 0.0 <= t_s - stranger.track.t_s <= MAX_TRACK_GAP_S:
         stranger = None
     if lock is None:
@@ -288,7 +238,7 @@ def remembered(
 
 
 def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, verdict: Verdict) -> Lock:
-    """The lock after a pose that was taken; `track` is what it fed."""
+    """Return the lock after a pose that was taken; `track` is what it fed."""
     anew = verdict.afresh and not verdict.same
     before = None if lock is None or anew or lock.in_world != sight.in_world else lock
     return Lock(
@@ -318,12 +268,12 @@ class _Fit:
 
     @property
     def cost(self) -> float:
-        """The squared distance with what a vaguer claim costs."""
+        """The squared distance, with what a vaguer claim costs."""
         return self.squared + float(np.linalg.slogdet(self.S)[1])
 
 
 def _expected(track: MarkerTrack, t_s: float, constants: FilterSetup) -> Measurement:
-    """What a measurement at a later time should be, however late: what is not measured
+    """Return the measurement that is expected at a later time, however late: what is not measured
     drifts."""
     ahead = foreseen(track, t_s, constants)
     # The most that it drifts counts as three standard deviations.
@@ -333,6 +283,7 @@ def _expected(track: MarkerTrack, t_s: float, constants: FilterSetup) -> Measure
 
 
 def _misfit(wanted: Measurement, sight: Sight, constants: FilterSetup) -> _Fit:
+    """Return by how much the pose is off from the one that is `wanted`."""
     measured = sight.measured
     assert wanted.R is not None
     assert wanted.bias is not None
@@ -354,8 +305,8 @@ def _misfit(wanted: Measurement, sight: Sight, constants: FilterSetup) -> _Fit:
 
 
 def _clearly(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> bool:
-    """Whether what no pose claims explains it all, as in most frames: no other spread can
-    make that too little."""
+    """Return True if what no pose claims explains all that the pose is off, as in most frames: no
+    other spread can make that too little."""
     off = sight.measured.z - foreseen_z(track, sight.t_s, constants)
     off[0] = wrap_rad(float(off[0]))
     off /= _unclaimed(_range_m(sight))
@@ -363,17 +314,18 @@ def _clearly(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> bool:
 
 
 def _range_m(sight: Sight) -> float:
+    """Return the target's distance from the camera."""
     return math.hypot(*sight.pose.tvec_m.tolist())
 
 
 def _unclaimed(range_m: float) -> Array:
-    """Spread of (yaw, x, y, z) that no pose claims."""
+    """Return the spread of (yaw, x, y, z) that no pose claims."""
     sideways_m, along_m = _LEAST_M + _SIDEWAYS * range_m, _LEAST_M + _ALONG * range_m
     return np.array([_LEAST_YAW_RAD, sideways_m, sideways_m, along_m])
 
 
 def _goes_on(lock: Lock, sight: Sight, fit: _Fit) -> bool:
-    """Whether the pose goes on from the last one as seen from the vehicle, much better than
+    """Return True if the pose goes on from the last one as seen from the vehicle, much better than
     in the world (`fit`): what is off in both did not come about by the estimate."""
     dt_s = sight.t_s - lock.track.t_s
     if not sight.in_world or dt_s > _CALM_S:
@@ -393,6 +345,7 @@ def _goes_on(lock: Lock, sight: Sight, fit: _Fit) -> bool:
 
 
 def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: FilterSetup) -> Stranger:
+    """Return the stranger with one more pose, or a new one where there was none before."""
     if before is not None:
         track = step_track(before.track, sight.measured, sight.t_s, constants)
         assert track is not None
@@ -416,7 +369,7 @@ def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: Filter
 
 
 def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
-    """Whether the target is there now, and not where the lock has it."""
+    """Return True if the target is where the stranger is now, and not where the lock has it."""
     if lock.frames < ESTABLISHED_FRAMES and stranger.frames > lock.frames:
         return True
     if stranger.whole < ESTABLISHED_FRAMES or not sight.whole:
@@ -447,11 +400,11 @@ _FORGOTTEN = 0.1  # of what was learned, with each picture
 def expected_corners(
     sight: Sighting | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
-    """Where both markers' corners should be, (4, 2) px each: the last sighting of the target,
-    moved by the vehicle's own motion since; and that pose.
+    """Return where both markers' corners should be, (4, 2) px each, and the pose that they follow
+    from: the last sighting of the target, moved by the vehicle's own motion since.
 
-    Without an attitude at both times there are no corners and the pose is unmoved. Both
-    are None where the sighting is too old or the target has gone behind the camera.
+    Without an attitude at both times there are no corners and the pose is unmoved. Both are None
+    where the sighting is too old or the target has gone behind the camera.
     """
     if sight is None or not 0.0 < t_s - sight.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
@@ -478,7 +431,7 @@ def expected_corners(
 def update_sight(
     before: Sighting | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
 ) -> Sighting:
-    """The target seen once more; with what that says of the vehicle's own account of its way."""
+    """Return the new sighting, with what it shows of the vehicle's own account of its way."""
     if before is None:
         return Sighting(pose, attitude)
     then, passed_s = before.attitude, pose.t_s - before.pose.t_s
@@ -496,7 +449,7 @@ def update_sight(
 
 
 def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
-    """Whether a place (3,) in the world of the state estimate lies in the picture."""
+    """Return True if a place (3,) in the world of the state estimate lies in the picture."""
     R = _R_world_cam(attitude, setup)
     way_m = R.T @ (place_m - attitude.position_m - _ahead_m(attitude, setup))
     # Farther off the axis a lens model may fold back into the picture.
@@ -507,7 +460,8 @@ def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
 
 
 def _moves(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
-    """The camera's way in the world (3,) m, by the state estimate's places and by its speeds."""
+    """Return the camera's way in the world (3,) m, by the state estimate's places and by its
+    speeds."""
     turned_m = _ahead_m(now, setup) - _ahead_m(then, setup)
     stepped_m = turned_m + np.subtract(now.position_m, then.position_m)
     if now.velocity_mps is None or then.velocity_mps is None:
@@ -517,11 +471,12 @@ def _moves(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Arra
 
 
 def _R_world_cam(attitude: Attitude, setup: PoseSetup) -> Array:
+    """Return the camera's rotation in the world of the state estimate, (3, 3)."""
     R_world_cam: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, :3])
     return R_world_cam
 
 
 def _ahead_m(attitude: Attitude, setup: PoseSetup) -> Array:
-    """From the vehicle's place to the camera, in the world (3,)."""
+    """Return the way from the vehicle's place to the camera, in the world (3,)."""
     ahead_m: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, 3])
     return ahead_m

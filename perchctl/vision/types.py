@@ -44,7 +44,7 @@ class CameraModel:
 
     @property
     def contents(self) -> tuple[tuple[int, int], str, bytes, bytes]:
-        """The same for two cameras whose numbers are the same."""
+        """A value that is the same for two cameras whose numbers are the same."""
         K, dist = (np.asarray(each, np.float64).tobytes() for each in (self.K, self.dist))
         return self.size_px, self.model, K, dist
 
@@ -105,6 +105,8 @@ class EdgeShift:
 
 @dataclass(frozen=True, eq=False)
 class Detections:
+    """What was found of the target in one frame."""
+
     frame_index: int
     t_s: float
     large: Detection | None = None
@@ -119,7 +121,13 @@ class Detections:
     ghost_age: int = 0  # pictures since these were looked for
 
     def get(self, marker: MarkerName) -> Detection | None:
+        """Return that marker's detection, None without one."""
         return self.large if marker == "large" else self.small
+
+    @property
+    def markers(self) -> list[Detection]:
+        """The markers that were detected, the large one first."""
+        return [each for each in (self.large, self.small) if each is not None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,16 +147,17 @@ class Attitude:
 
     @cached_property
     def R_level_body(self) -> Array:
-        """Roll and pitch, (3, 3)."""
+        """The rotation by roll and pitch, (3, 3)."""
         return rotation_from_rpy(self.roll_rad, self.pitch_rad, 0.0)
 
     @cached_property
     def R_world_level(self) -> Array:
-        """The heading, (3, 3)."""
+        """The rotation by the heading, (3, 3)."""
         return rot_z(self.yaw_rad)
 
     @cached_property
     def R_world_body(self) -> Array:
+        """The whole rotation, (3, 3)."""
         return self.R_world_level @ self.R_level_body
 
 
@@ -204,7 +213,7 @@ class MarkerTrack:
 
     @property
     def cov(self) -> Array:
-        """Of the state, with both, (8, 8)."""
+        """Covariance of the state with the constant errors, (8, 8)."""
         return self.P + self.bias @ self.bias.T
 
 
@@ -311,6 +320,12 @@ class MeasuredMarkers:
     fed: dict[str, MarkerPose] = field(default_factory=dict)
     contradicting: bool = False
 
+    @property
+    def surest(self) -> MarkerPose | None:
+        """The surest of the poses that are fed, or else of all; None without any."""
+        poses = self.fed or self.poses
+        return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
+
 
 @dataclass(frozen=True, eq=False)
 class PipelineState:
@@ -341,3 +356,18 @@ class PipelineOutput:
     fields: PictureKind = "whole"  # what the picture was
     lock_note: str = ""  # why this frame's pose was not taken, or taken at another place
     refused: bool = False  # this frame showed another vehicle's target, by its place
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """What a flight shows of the camera beyond the profile, each with one standard deviation.
+
+    `delay_s`: by how much the pictures are later. `turn_rad`: the camera's turn about body x, y
+    and z. The attitude's constant error, which moves the target just as a mounting's roll and
+    pitch do, is in their `turn_sigma_rad`.
+    """
+
+    delay_s: float
+    delay_sigma_s: float
+    turn_rad: tuple[float, float, float]
+    turn_sigma_rad: tuple[float, float, float]

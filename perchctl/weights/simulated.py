@@ -10,13 +10,14 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, wrap_rad
 from perchctl.profile import Profile
 from perchctl.sim import Renderer, Scenario
-from perchctl.vision import CameraModel, Frame, project, rotation_vector, square_corners
+from perchctl.vision import CameraModel, Frame, project, square_corners
 from perchctl.weights.collect import SessionFile, position_fault, read_markers, session_rows
 
 NOISE_SIGMA, BLUR_PX = 4.0, 1.0
@@ -110,7 +111,7 @@ class SimulatedStand:
     def _in_picture(self, place: CameraPlace) -> bool:
         T_world_marker = self._renderer.T_world_target @ make_T(R_MARKER_TARGET, (0.0, 0.0, 0.0))
         T_cam_marker = invert_T(place.T_world_cam) @ T_world_marker
-        rvec, tvec = rotation_vector(T_cam_marker[:3, :3]), T_cam_marker[:3, 3]
+        rvec, tvec = np.asarray(cv2.Rodrigues(T_cam_marker[:3, :3])[0], float), T_cam_marker[:3, 3]
         corners = project(self._corners, rvec, tvec, self._camera)
         highest = np.array(self._camera.size_px) - 1 - MARGIN_PX
         return bool((corners > MARGIN_PX).all() and (corners < highest).all())

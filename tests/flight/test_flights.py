@@ -23,7 +23,7 @@ from perchctl.flight.lockstep import LockstepFlight
 from perchctl.geometry import rot_z
 from perchctl.mission import Event, EventKeeper, EventKind, Operator, Outcome, Phase, Tick
 from perchctl.mission.state import SEVEN_PHASES
-from perchctl.perception.perception import SLEW
+from perchctl.perception.online_calibration import SLEW
 from perchctl.profile import load_profile
 from perchctl.record import FlightLog, read_log
 from perchctl.sim import draw_scenario

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig, aruco_dictionary
 from perchctl.vision import MARKERS, Frame, MarkerName, make_aruco_detector, project, square_corners
 from perchctl.vision.markers.corners import RefinedCorners
-from perchctl.vision.markers.detect import follow, follow_partly
+from perchctl.vision.markers.detect import Picture, follow, follow_partly
 from perchctl.vision.markers.pattern import Pattern
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -38,12 +39,12 @@ def frame(image: NDArray[np.uint8], index: int = 0) -> Frame:
 def followed(
     image: NDArray[np.uint8],
     expected: Mapping[MarkerName, Array],
-    patterns: Mapping[MarkerName, Pattern] = SETUP.patterns,
+    patterns: dict[MarkerName, Pattern] = SETUP.patterns,
     hidden: NDArray[np.bool_] | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
     """What is where it is expected, wholly or partly."""
-    seen = follow(image, expected, patterns, CAMERA, hidden=hidden)
-    return follow_partly(image, expected, seen, patterns, CAMERA, hidden=hidden)
+    picture = Picture(image, hidden, replace(SETUP, patterns=patterns), CAMERA)
+    return follow_partly(picture, expected, follow(picture, expected))
 
 
 def box(cx: float, cy: float, side: float) -> Array:

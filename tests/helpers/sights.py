@@ -7,11 +7,10 @@ import numpy as np
 from perchctl.calibration import profile_camera
 from perchctl.geometry import Array, Place, rot_z, wrap_rad
 from perchctl.profile import Profile, load_profile
-from perchctl.vision import Attitude, MarkerPose, PoseSetup, level_rotation
-from perchctl.vision.pose import make_pose_setup
+from perchctl.vision import Attitude, MarkerPose, PoseSetup
 
 TARGET_ONLY: Profile = load_profile("target_only")
-SETUP: PoseSetup = make_pose_setup(
+SETUP: PoseSetup = PoseSetup(
     TARGET_ONLY.pose, TARGET_ONLY.target, TARGET_ONLY.camera.mount.T_body_cam, (0.01, -0.02, 0.03),
     profile_camera(TARGET_ONLY.camera),
 )  # fmt: skip
@@ -27,7 +26,7 @@ def attitude(
 def seen(target: Place, at: Attitude, sigma_m: float = 0.002) -> MarkerPose:
     """The target from a vehicle that is truly at `at`."""
     way_m: Array = rot_z(at.yaw_rad).T @ (target.position_m - np.array(at.position_m))
-    e_m = way_m - level_rotation(at) @ SETUP.gear_body_m
+    e_m = way_m - at.R_level_body @ SETUP.gear_body_m
     return MarkerPose(
         source="joint", t_s=at.t_s, rvec_rad=np.zeros(3), tvec_m=e_m, e_m=e_m,
         e_yaw_rad=wrap_rad(target.yaw_rad - at.yaw_rad), sigma_m=np.full(3, sigma_m),

@@ -11,20 +11,19 @@ import pytest
 from perchctl.mission import Phase
 from perchctl.mission.context import Context
 from perchctl.perception import History
-from perchctl.perception.perception import (
+from perchctl.perception.online_calibration import (
     SLEW,
     USED_SIGMA_S,
     OnlineCalibration,
     update_calibration,
 )
 from perchctl.profile import USED_LATENCY_S, CameraConfig
-from perchctl.vision import CameraModel, Consistency, MarkerPose
-from perchctl.vision.pose import make_pose_setup
+from perchctl.vision import CameraModel, Consistency, MarkerPose, PoseSetup
 from tests.helpers.mission import PROFILE, observation, state_in, telemetry
 
 FRAME_S = 1 / 30
 CAMERA = CameraModel((640, 480), np.diag([380.0, 380.0, 1.0]), np.zeros(5))
-SETUP = make_pose_setup(
+SETUP = PoseSetup(
     PROFILE.pose, PROFILE.target, PROFILE.camera.mount.T_body_cam,
     PROFILE.vehicle.gear_body_m, CAMERA,
 )  # fmt: skip

@@ -10,13 +10,8 @@ import pytest
 
 from perchctl.profile import (
     CameraConfig,
-    DetectorConfig,
-    KalmanConfig,
-    MergeConfig,
     Mounting,
-    PoseConfig,
     Profile,
-    TargetConfig,
 )
 from perchctl.profile.vision import VehicleConfig
 from perchctl.vision import CameraModel, Pipeline, make_pipeline
@@ -30,30 +25,18 @@ BARE = Mounting(position_m=(0.0, 0.0, 0.0))
 
 @pytest.fixture(scope="session")
 def build() -> Callable[..., Pipeline]:
-    """`make_pipeline` with defaults: camera = body = gear, unless told otherwise."""
+    """`make_pipeline` of a profile with these sections; camera = body = gear where nothing else is
+    said."""
 
     def make(
-        detector: DetectorConfig | None = None,
-        pose: PoseConfig | None = None,
-        kalman: KalmanConfig | None = None,
-        merge: MergeConfig | None = None,
-        mount: Mounting | None = None,
-        target: TargetConfig | None = None,
+        mount: Mounting = BARE,
         gear_body_m: Any = (0.0, 0.0, 0.0),
         camera: CameraModel = CAMERA,
+        **sections: Any,
     ) -> Pipeline:
-        return make_pipeline(
-            Profile(
-                camera=CameraConfig(mount=mount or BARE),
-                vehicle=VehicleConfig(gear_body_m=gear_body_m),
-                target=target or TargetConfig(),
-                detector=detector or DetectorConfig(),
-                pose=pose or PoseConfig(),
-                kalman=kalman or KalmanConfig(),
-                merge=merge or MergeConfig(),
-            ),
-            camera,
-        )
+        vehicle = VehicleConfig(gear_body_m=gear_body_m)
+        profile = Profile(camera=CameraConfig(mount=mount), vehicle=vehicle, **sections)
+        return make_pipeline(profile, camera)
 
     return make
 

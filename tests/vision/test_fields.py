@@ -26,7 +26,7 @@ from perchctl.vision import (
     pictures,
     step,
 )
-from perchctl.vision.fields import FieldsMode, classify_fields, combing, halves, separate_fields
+from perchctl.vision.fields import FieldsMode, combing, separate_fields
 from perchctl.vision.markers.detect import detect_markers, with_ghosts
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -42,7 +42,7 @@ def woven_frames(count: int, first: str = "top", **scenario: Any) -> tuple[Pass,
     return scene, list(scene.frames(count))
 
 
-# --- Fields ------------------------------------------------------------------------------
+# --- Fields ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("first_row", [0, 1])
@@ -56,15 +56,7 @@ def test_a_field_at_full_height_keeps_everything_in_its_place(first_row: int) ->
     assert np.abs(picture[[0, -1]] - truth[[0, -1]]).max() <= 20.0  # one row on, at the rims
 
 
-def test_only_the_rows_of_a_field_are_in_its_picture() -> None:
-    image = np.random.default_rng(1).integers(0, 256, (40, 30)).astype(np.uint8)
-    other = image.copy()
-    other[1::2] = 255 - other[1::2]
-    assert np.array_equal(field_picture(image, 0), field_picture(other, 0))
-    assert not np.array_equal(field_picture(image, 1), field_picture(other, 1))
-
-
-# --- Combed or not -----------------------------------------------------------------------
+# --- Combed or not -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("first", ["top", "bottom"])
@@ -101,7 +93,7 @@ def test_no_shared_whole_picture_is_taken_for_two(folder: str) -> None:
     assert max(measured.values()) < 1.0  # 1.4 would be combed
 
 
-# --- Order and time ------------------------------------------------------------------------
+# --- Order and time ----------------------------------------------------------------------------
 
 
 def kinds(state: FieldState, frames: list[Frame], mode: FieldsMode = "auto") -> list[Any]:
@@ -187,17 +179,7 @@ def test_the_profile_may_know_better() -> None:
     assert kinds(FieldState(), still, "top") == [("top", "bottom")] * 2
 
 
-def test_what_was_looked_at_is_not_looked_at_again() -> None:
-    _, (frame,) = woven_frames(1)
-    whole = replace(frame, fields="whole")
-    assert classify_fields(whole, "auto") is whole
-    assert classify_fields(frame, "auto").fields == "woven"
-    top, bottom = halves(frame)
-    assert (top.fields, bottom.fields) == ("top", "bottom")
-    assert (top.index, top.t_s, top.t_arrival_s) == (frame.index, frame.t_s, frame.t_arrival_s)
-
-
-# --- The target ----------------------------------------------------------------------------
+# --- The target --------------------------------------------------------------------------------
 
 
 def measured(scene: Pass, frames: list[Frame], setup: Pipeline) -> tuple[list[Array], int]:
@@ -227,16 +209,6 @@ def test_each_field_is_measured_at_its_own_time(build: Build, first: str) -> Non
     assert np.sqrt(np.mean(np.square(errors[6:]), axis=0)).max() < 0.1
 
 
-def test_as_whole_pictures_they_would_be_lost(build: Build) -> None:
-    """What the separation is for."""
-    scene, frames = woven_frames(8, below_m=0.12, velocity_mps=(0.3, 0.1, 0.05))
-    setup = build()
-    apart, count = measured(scene, frames, setup)
-    together, _ = measured(scene, frames, replace(setup, fields="progressive"))
-    assert len(apart) == count
-    assert len(together) < 0.5 * len(frames)
-
-
 def test_a_single_woven_picture_gives_the_middle_moment(build: Build) -> None:
     """In either order, of which one picture knows nothing."""
     for first in ("top", "bottom"):
@@ -245,22 +217,6 @@ def test_a_single_woven_picture_gives_the_middle_moment(build: Build) -> None:
         assert output.fields == "woven"
         pose = output.poses["joint"]
         assert np.abs(pose.tvec_m - scene.target_m(frame.t_s)).max() < 1e-4
-
-
-def test_whole_pictures_go_on_as_ever(build: Build) -> None:
-    scene = Pass()
-    setup = build()
-    state = plain = PipelineState()
-    fields = FieldState()
-    for frame in scene.frames(4):
-        fields, (part,) = pictures(fields, frame, setup)
-        assert part.image is frame.image
-        assert part.t_s == frame.t_s
-        state, one = step(state, part, None, setup)
-        plain, other = step(plain, replace(frame, fields="whole"), None, setup)
-        assert one.target is not None
-        assert other.target is not None
-        assert np.array_equal(one.target.e_m, other.target.e_m)
 
 
 @pytest.mark.parametrize("kind", ["top", "bottom"])
@@ -276,19 +232,16 @@ def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
         image = render(*T, noise=2.0, seed=k)
         field = Frame(0, 0.0, field_picture(image, first_row), fields=kind)
         seen = detect_markers(field, None, setup.detector, CAMERA).large
-        assert seen is not None
         assert seen.lying_sigma_px > 0.0
         for name, d in (("claimed", seen), ("as elsewhere", replace(seen, lying_sigma_px=0.0))):
             pose = estimate_pose([d], 0.0, None, setup.pose)
-            assert pose is not None
-            assert pose.cov is not None
             e = pose.tvec_m - T[1]
             squares[name].append(float(e @ np.linalg.solve(pose.cov[:3, :3], e)) / 3.0)
     assert 0.2 < np.mean(squares["claimed"]) < 2.0
     assert np.mean(squares["as elsewhere"]) > 3.0
 
 
-# --- Blended -----------------------------------------------------------------------------
+# --- Blended -----------------------------------------------------------------------------------
 
 
 def ghosts(setup: Pipeline, scene: Pass) -> list[tuple[float, float]]:
@@ -347,7 +300,6 @@ def shared_errors(folder: str, build: Build) -> Array:
             continue
         image = np.asarray(cv2.imread(str(hard / folder / name), cv2.IMREAD_GRAYSCALE), np.uint8)
         _, output = step(PipelineState(), Frame(0, 0.0, image), None, setup)
-        assert output.target is not None, name
         errors.append((output.target.e_m - np.array(truth["t"])) * 1000.0)
     assert len(errors) == 16
     return np.sqrt(np.mean(np.square(errors), axis=0))

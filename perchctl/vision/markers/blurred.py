@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -25,7 +24,7 @@ from perchctl.vision.markers.corners import (
     to_unit,
     within,
 )
-from perchctl.vision.markers.detector import DetectorSetup, loose_detector
+from perchctl.vision.markers.detector import DetectorSetup, make_quadrilateral_finder
 from perchctl.vision.markers.edge_fit import CLIPPED_GREY, CLIPPED_SHARE, CLIPPED_SIGMA_PX
 from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, resemblance, resemblances
 from perchctl.vision.markers.photometric_fit import Alignment, align
@@ -42,15 +41,6 @@ _SAME = 0.15  # of a side
 _SHEET = 1.3  # half sides of a marker that are surely paper
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    """A quadrilateral (4, 2) px in the turn in which it resembles a marker most."""
-
-    name: MarkerName
-    corners_px: Array
-    resemblance: float
-
-
 def expected_in_blur(
     image: NDArray[np.uint8],
     expected: Mapping[MarkerName, Array],
@@ -58,8 +48,8 @@ def expected_in_blur(
     camera: CameraModel,
     turn: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """The first of the markers that is near to where it is expected (4, 2) px. Fits that begin
-    with little and with much blur take turns; without a `turn`, both are tried."""
+    """Return the first of the markers that is near to where it is expected (4, 2) px. Fits that
+    begin with little and with much blur take turns; without a `turn`, both are tried."""
     blurs_px = _BLURS_PX if turn is None else (_BLURS_PX[turn % len(_BLURS_PX)],)
     for name in MARKERS:
         corners = expected.get(name)
@@ -80,53 +70,48 @@ def expected_in_blur(
 def hidden_in_blur(
     image: NDArray[np.uint8], setup: DetectorSetup, camera: CameraModel
 ) -> dict[MarkerName, RefinedCorners]:
-    """A marker anywhere in the picture: of all its quadrilaterals, those whose grey values
-    go best with a marker's cells are verified."""
-    corners, _, others, _ = loose_detector(setup).detectMarkersMultiDict(image)
+    """Find a marker anywhere in the picture: of all its quadrilaterals, those whose grey values go
+    best with a marker's cells are verified."""
+    corners, _, others, _ = make_quadrilateral_finder(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
-    for candidate in _best(_candidates(image, quads, setup.patterns)):
-        pattern = setup.patterns[candidate.name]
-        seen = aligned(image, candidate.corners_px, pattern, camera, blur_px=_BLUR_PX)
+    for name, corners_px in _best(image, quads, setup.patterns):
+        seen = aligned(image, corners_px, setup.patterns[name], camera, blur_px=_BLUR_PX)
         if seen is not None:
-            return {candidate.name: seen}
+            return {name: seen}
     return {}
 
 
-def _candidates(
+def _best(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, Pattern]
-) -> list[_Candidate]:
-    """Those of the quadrilaterals (m, 4, 2) that resemble one of the markers."""
+) -> list[tuple[MarkerName, Array]]:
+    """Return those of the quadrilaterals (m, 4, 2) that resemble one of the markers, in the turn in
+    which they do; the most alike first, and each place once: several thresholds find the same
+    quadrilateral."""
     quads = quads[side_lengths_px(quads).min(axis=1) >= LEAST_SIDE_PX]
     if len(quads) == 0:
         return []
-    found = []
+    found: list[tuple[float, MarkerName, Array]] = []
     squares = np.array([from_unit(quad) for quad in quads])
     for name in MARKERS:
         like = resemblances(image, squares, patterns[name])
         for i in np.flatnonzero(like.max(axis=1) > _MIN_RESEMBLANCE):
             turn = int(like[i].argmax())
-            found.append(_Candidate(name, np.roll(quads[i], turn, axis=0), float(like[i, turn])))
-    return found
-
-
-def _best(candidates: list[_Candidate]) -> list[_Candidate]:
-    """The most alike, each place once: several thresholds find the same quadrilateral."""
-    chosen: list[_Candidate] = []
-    for candidate in sorted(candidates, key=lambda c: -c.resemblance):
+            found.append((float(like[i, turn]), name, np.roll(quads[i], turn, axis=0)))
+    chosen: list[tuple[MarkerName, Array]] = []
+    for _, name, corners_px in sorted(found, key=lambda each: -each[0]):
         if len(chosen) == _MAX_CANDIDATES:
             break
-        if not any(_same_place(candidate, other) for other in chosen):
-            chosen.append(candidate)
+        middle, room_px = corners_px.mean(axis=0), _SAME * mean_side_px(corners_px)
+        if not any(
+            name == other and float(np.abs(there.mean(axis=0) - middle).max()) < room_px
+            for other, there in chosen
+        ):
+            chosen.append((name, corners_px))
     return chosen
 
 
-def _same_place(one: _Candidate, other: _Candidate) -> bool:
-    off_px = np.abs(other.corners_px.mean(axis=0) - one.corners_px.mean(axis=0)).max()
-    return one.name == other.name and float(off_px) < _SAME * mean_side_px(one.corners_px)
-
-
 def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
-    """The expected corners moved to where the marker's drawing, as it would look there,
+    """Return the expected corners moved to where the marker's drawing, as it would look there,
     correlates best with the picture."""
     side_px = mean_side_px(corners_px)
     # Large markers are found on a picture reduced to what the search needs.
@@ -155,8 +140,8 @@ def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> A
 
 
 def _template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np.float32]:
-    """The drawing at points (n, n, 2) of the marker's own coordinates, softened; grey
-    where there may be anything."""
+    """Return the drawing at points (n, n, 2) of the marker's own coordinates, softened; grey where
+    there may be anything."""
     n = len(pattern.drawing.cells)
     cell = np.floor((own + 1.0) * 0.5 * n).astype(np.intp)
     inside = ((cell >= 0) & (cell < n)).all(axis=2)
@@ -176,7 +161,7 @@ _MIN_SIGMA_PX = 0.015
 _BLUR_SIGMA = 0.012  # of the blur: no picture is its drawing with an even blur
 _MIN_PATTERN, _MIN_LIKENESS = 0.9, 0.9
 _MIN_STRENGTH, _MAX_STRENGTH = 0.6, 1.6
-_MAX_WORST_CELL = 0.3
+_MAX_CELL_DEPARTURE = 0.3
 _MAX_FLIP, _MAX_FLIP_SIGMA = 0.4, 0.35
 _MAX_SIGMA = 0.06  # of the side
 _MIN_REACH_PX = 3.0
@@ -194,7 +179,7 @@ def aligned(
     max_sigma: float = _MAX_SIGMA,
     alone: bool = True,
 ) -> RefinedCorners | None:
-    """The marker by its drawing, None unless the picture looks like it.
+    """Return the marker by its drawing, None unless the picture looks like it.
 
     `reach` is how far the corners may be from `start_px`, and `max_sigma` how vague they
     may stay, in sides. Where the other marker shows which one it must be (not `alone`), its
@@ -213,39 +198,35 @@ def aligned(
     ):
         return None
     sigma_px = math.hypot(max(found.sigma_px, _MIN_SIGMA_PX), _BLUR_SIGMA * found.blur_px)
-    if _is_clipped(image, found.corners_px):
+    (left, top), (right, bottom) = found.corners_px.min(axis=0), found.corners_px.max(axis=0)
+    part = image[max(int(top), 0) : int(bottom) + 1, max(int(left), 0) : int(right) + 1]
+    if int(np.count_nonzero(part > CLIPPED_GREY)) > CLIPPED_SHARE * part.size:
+        # No light makes a drawing whose white is clipped.
         sigma_px = math.hypot(sigma_px, CLIPPED_SIGMA_PX)
     return RefinedCorners(found.corners_px, sigma_px, True)
 
 
-def _is_clipped(image: NDArray[np.uint8], corners_px: Array) -> bool:
-    """Whether the marker's white is: no light makes its drawing then."""
-    (left, top), (right, bottom) = corners_px.min(axis=0), corners_px.max(axis=0)
-    part = image[max(int(top), 0) : int(bottom) + 1, max(int(left), 0) : int(right) + 1]
-    return int(np.count_nonzero(part > CLIPPED_GREY)) > CLIPPED_SHARE * part.size
-
-
 def verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
-    """The gate. On pictures without the marker the pattern's correlation stays below
-    0.72 where its strength is as it should be; on the marker, unless noise drowns it, it
-    is above 0.95."""
+    """Return True if the picture looks like the drawing: the gate. On pictures without the marker
+    the pattern's correlation stays below 0.72 where its strength is as it should be; on the marker,
+    unless noise drowns it, it is above 0.95."""
     return (
         found.pattern > _MIN_PATTERN
         and found.likeness > _MIN_LIKENESS
         and _MIN_STRENGTH < found.strength < _MAX_STRENGTH
-        and found.worst_cell < _MAX_WORST_CELL
+        and found.cell_departure < _MAX_CELL_DEPARTURE
         and found.sigma_px < max_sigma * mean_side_px(found.corners_px)
     )
 
 
 def told_apart(found: Alignment) -> bool:
-    """Whether another codeword would look different, and this one is seen. Of 36 others that
+    """Return True if another codeword would look different, and this one is seen. Of 36 others that
     the gate before this one took for the marker, all had a flip above 0.5."""
     return found.flip < _MAX_FLIP and found.flip_sigma < _MAX_FLIP_SIGMA
 
 
 def _same_square(start_px: Array, corners_px: Array) -> bool:
-    """Whether a square is still one, of about the same size, and the same way round."""
+    """Return True if a square is still one, of about the same size, and the same way round."""
     sides_px = side_lengths_px(corners_px)
     growth = float(sides_px.mean()) / mean_side_px(start_px)
     turn = float(doubled_area(corners_px[None])[0]) * float(doubled_area(start_px[None])[0])

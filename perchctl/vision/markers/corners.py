@@ -1,5 +1,5 @@
 """A marker's square in the picture: its sides, its area, and the squares that share its centre;
-its corners as they were refined; and by how much white has grown over black.
+and its corners as they were refined.
 
 The unit square is a marker in its own coordinates: corners at (-1, -1), (1, -1), (1, 1),
 (-1, 1) in the order of `Detection.corners_px`.
@@ -21,6 +21,8 @@ from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 UNIT: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 NEXT, BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])  # corner i's neighbours
+OUT: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+"""Of each side, in the marker's own coordinates."""
 _UNIT32 = UNIT.astype(np.float32)
 _UNIT1: Array = np.column_stack([UNIT, np.ones(4)])
 _INCREMENTS: Array = np.array(
@@ -30,58 +32,66 @@ _INCREMENTS: Array = np.array(
 
 
 def from_unit(corners: Array) -> Array:
-    """Homography (3, 3) of the unit square to corners (4, 2)."""
+    """Return the homography (3, 3) of the unit square to corners (4, 2)."""
     H = cv2.getPerspectiveTransform(_UNIT32, corners.astype(np.float32))
     return np.asarray(H, dtype=np.float64)
 
 
 def to_unit(corners: Array) -> Array:
-    """Homography (3, 3) of corners (4, 2) to the unit square."""
+    """Return the homography (3, 3) of corners (4, 2) to the unit square."""
     H = cv2.getPerspectiveTransform(corners.astype(np.float32), _UNIT32)
     return np.asarray(H, dtype=np.float64)
 
 
 def mapped(H: Array, points: Array) -> Array:
-    """Points (..., 2) through a homography."""
+    """Return the points (..., 2) through a homography."""
     images = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H)
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
 
 def corner_jacobian(H: Array) -> Array:
-    """Change (8, 8) of the four corners that H (3, 3) makes of the unit square with the terms of
-    an increment P, H (1 + P): its rows one after the other, without the last term."""
+    """Return the change (8, 8) of the four corners that H (3, 3) makes of the unit square with the
+    terms of an increment P, H (1 + P): its rows one after the other, without the last term."""
     q = _UNIT1.dot(H.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (H[:2, :2] - x[:, :, None] * H[2, :2]) / d
     return np.asarray((A @ _INCREMENTS).reshape(8, 8))
 
 
+def incremented(H: Array, p: Array) -> Array:
+    """Return H (1 + P), scaled to 1 in its last term: P has the terms p (8,) of an increment in the
+    order of its rows, and a last one of 0."""
+    H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
+    return np.asarray(H / H[2, 2])
+
+
 def side_lengths_px(corners_px: Array) -> Array:
-    """Lengths of the four sides, (..., 4)."""
+    """Return the lengths of the four sides, (..., 4)."""
     d = corners_px.take(NEXT, axis=-2) - corners_px
     return np.asarray(np.hypot(d[..., 0], d[..., 1]), dtype=np.float64)
 
 
 def mean_side_px(corners_px: Array) -> float:
-    """Mean length of the sides of one square (4, 2)."""
+    """Return the mean length of the sides of one square (4, 2)."""
     a, b, c, d = corners_px.tolist()
     return (math.dist(a, b) + math.dist(b, c) + math.dist(c, d) + math.dist(d, a)) / 4.0
 
 
 def shortest_side_px(corners_px: Array) -> float:
-    """Of the sides of one square (4, 2); NaN where a corner is."""
+    """Return the shortest side of one square (4, 2); NaN where a corner is."""
     a, b, c, d = corners_px.tolist()
     return min(math.dist(a, b), math.dist(b, c), math.dist(c, d), math.dist(d, a))
 
 
 def doubled_area(corners: Array) -> Array:
-    """Positive for corners (m, 4, 2) that run clockwise as the picture is seen, (m,)."""
+    """Return twice the area, positive for corners (m, 4, 2) that run clockwise as the picture is
+    seen, (m,)."""
     a, b = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> bool:
-    """Whether all corners (4, 2) are finite and inside a picture of that shape, at least
+    """Return True if all corners (4, 2) are finite and inside a picture of that shape, at least
     `room_px` from its edge."""
     h, w = shape[:2]
     right, low = w - 1 - room_px, h - 1 - room_px
@@ -90,7 +100,7 @@ def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> b
 
 
 def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:
-    """Corners (4, 2) of a square `ratio` times as large with the same centre and plane;
+    """Return the corners (4, 2) of a square `ratio` times as large with the same centre and plane;
     without a camera, as if the lens did not bend the square's sides."""
     straight = corners_px if camera is None else undistort(corners_px, camera)
     found = mapped(from_unit(straight), (_UNIT32 * ratio).astype(np.float64))
@@ -100,7 +110,7 @@ def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -
 def completed(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
-    """With the other marker where the one that is expected puts it; `ratio` is the small
+    """Return both markers, the other where the one that is expected puts it; `ratio` is the small
     marker's side over the large one's."""
     both = dict(expected)
     if "small" not in both and "large" in both:
@@ -118,6 +128,7 @@ def completed(
 RAW_SIGMA_PX = 0.6
 SUBPIX_SIGMA_PX = 0.25
 NESTED_SIGMA_PX = 0.6  # a place taken over from the other marker measures nothing
+_PICTURES = 5  # for which a measured shift of all edges holds
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,8 +151,8 @@ class RefinedCorners:
 
 
 def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
-    """Corners (4, 2) of a marker `cells` wide by `cv2.cornerSubPix`; the raw ones where it
-    leads away."""
+    """Return the corners (4, 2) of a marker `cells` wide by `cv2.cornerSubPix`; the raw ones where
+    it leads away."""
     side_px = float(side_lengths_px(raw_px).min())
     half = int(np.clip(round(0.5 * side_px / cells), 1, 5))
     points = np.ascontiguousarray(raw_px, dtype=np.float32).reshape(-1, 1, 2)
@@ -154,90 +165,9 @@ def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedC
     return RefinedCorners(moved, SUBPIX_SIGMA_PX, False)
 
 
-# --- By how much white has grown over black in a picture: from the width of a border -----------
-
-
-_SHIFT_FLOOR_PX = 0.01
-_MAX_SHIFT_PX = 1.0
-_MAX_BLUR_CELLS = 0.45  # beyond it the two edges of a border are one
-_MIN_PROFILES = 3.0  # in total weight, of a side that counts
-_PICTURES = 5  # for which a measured shift holds
-_OUT: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])  # of each side
-
-
-@dataclass(frozen=True, eq=False)
-class Border:
-    """A marker's border as it was measured, one cell wide.
-
-    corners (4, 2): of its outer edge as fitted, normalised. points (4, n, 2) and weight
-    (4, n): of its inner edge. blur_px, depth_px (4,): of the inner edge, and the border's
-    width. cells: along a side; cell_px: their mean width. tolerance: of a printed edge's
-    place, in cells. bow_px: how far the outer edge's ends lie further out than its middle.
-    """
-
-    corners: Array
-    points: Array
-    weight: Array
-    blur_px: Array
-    depth_px: Array
-    cells: int
-    cell_px: float
-    tolerance: float
-    bow_px: float = 0.0
-
-
-def edge_shift(border: Border, prior_px: float) -> EdgeShift:
-    """How far white has grown over black; `prior_px` is how far edges are shifted before
-    anything is measured.
-
-    Outer edges that moved in by d shrink the marker's own scale; the inner edges, at
-    the part r of it, moved out by d: they appear d (1 + r) too far out.
-    """
-    r = 1.0 - 2.0 / border.cells
-    own = mapped(to_unit(border.corners), border.points)
-    far = np.matmul(own, _OUT[:, :, None])[..., 0] - r
-    far_px = far * (border.depth_px / (1.0 - r * r))[:, None]
-    w = border.weight * (border.blur_px < _MAX_BLUR_CELLS * border.depth_px)[:, None]
-    w *= np.abs(far_px) < _MAX_SHIFT_PX
-    mass = w.sum(axis=1)
-    some = mass > _MIN_PROFILES
-    if not some.any():
-        return EdgeShift(0.0, prior_px)
-    # A sheet that curls, or a lens that is known badly, moves places by the square of their way
-    # from the centre: outer edges farther than inner ones, and their ends farther than middles.
-    bent_px = 8.0 * r / (3.0 * border.cells) * border.bow_px
-    shift, variance = _mean_of_sides(far_px + bent_px, w, mass, some, bent_px)
-    # What no averaging takes away: the neighbours' blur and the print.
-    variance += (2.0 * math.exp(-border.cell_px / 2.2)) ** 2 + (
-        border.tolerance * border.cell_px
-    ) ** 2
-    prior = prior_px**2
-    return EdgeShift(
-        shift_px=shift * prior / (prior + variance),
-        sigma_px=(1.0 / variance + 1.0 / prior) ** -0.5,
-    )
-
-
 def known_from(earlier: EdgeShift | None) -> EdgeShift | None:
-    """What an earlier picture's shift still gives a picture later, None once it is too old:
+    """Return what an earlier picture's shift still gives a picture later; None once it is too old:
     light, lens and ink change slowly."""
     if earlier is None or earlier.age + 1 >= _PICTURES:
         return None
     return EdgeShift(earlier.shift_px, earlier.sigma_px, earlier.age + 1)
-
-
-def _mean_of_sides(
-    far_px: Array, w: Array, mass: Array, some: NDArray[np.bool_], each_px: float
-) -> tuple[float, float]:
-    """Mean over the sides that count and its variance, px and px^2; `each_px` is by how much
-    one may be off beside its noise."""
-    share = w / np.maximum(mass, 1e-9)[:, None]
-    mean = (share * far_px).sum(axis=1)
-    scatter = (share * (far_px - mean[:, None]) ** 2).sum(axis=1)
-    least = _SHIFT_FLOOR_PX**2 + each_px**2
-    information = some / (2.0 * scatter / np.maximum(mass, 1.0) + least)
-    total = float(information.sum())
-    shift = float(information @ mean) / total
-    # Sides that disagree are worth less.
-    chi2 = float(information @ (mean - shift) ** 2) / max(int(np.count_nonzero(some)) - 1, 1)
-    return shift, max(chi2, 1.0) / total

@@ -44,7 +44,7 @@ _INVERTED = 1e-3  # normalised; the lens model holds where its inverse is one
 
 
 def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
-    """Makes what `cut_markers` keeps of a target and a camera before it is in a hurry."""
+    """Make what `cut_markers` keeps of a target and a camera, before it is in a hurry."""
     drawing = patterns["large"].drawing
     outline_of(drawing), texture_of(drawing), lattice_of(camera)
 
@@ -52,7 +52,7 @@ def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraMo
 def is_cut(
     expected: Mapping[MarkerName, Array], shape: tuple[int, ...], hidden: Covered | None = None
 ) -> bool:
-    """Whether none of the markers expected at corners (4, 2) px is wholly in the picture and
+    """Return True if none of the markers expected at corners (4, 2) px is wholly in the picture and
     free of the vehicle's gear, or may not be if the prediction is a little off."""
     h, w = shape[:2]
     inner = (h - 2 * _EDGE_PX, w - 2 * _EDGE_PX)
@@ -61,26 +61,19 @@ def is_cut(
 
 
 def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -> bool:
-    """Whether one of the markers expected at corners (4, 2) px is wholly in the picture, or may
-    be if the prediction is a little off: a search finds no others."""
+    """Return True if one of the markers expected at corners (4, 2) px is wholly in the picture, or
+    may be if the prediction is a little off: a search finds no others."""
     h, w = shape[:2]
     outer = (h + 2 * _EDGE_PX, w + 2 * _EDGE_PX)
     return any(within(corners + _EDGE_PX, outer) for corners in expected.values())
 
 
 def measured_lately(previous: Detections | None, t_s: float) -> bool:
-    """Whether the target was measured so short a time ago that a part of it is known again."""
-    if previous is None or (previous.large is None and previous.small is None):
+    """Return True if the target was measured so short a time ago that a part of it is known
+    again."""
+    if previous is None or not previous.markers:
         return False
     return 0.0 < t_s - previous.t_s <= MOST_AGE_S
-
-
-def cut_lately(previous: Detections | None, t_s: float, shape: tuple[int, ...]) -> bool:
-    """Whether the target was measured lately, and no marker can have been wholly in the picture."""
-    if previous is None or not measured_lately(previous, t_s):
-        return False
-    seen = {d.marker: d.corners_px for d in (previous.large, previous.small) if d is not None}
-    return not may_be_whole(seen, shape)
 
 
 def cut_markers(
@@ -90,10 +83,10 @@ def cut_markers(
     camera: CameraModel,
     hidden: Covered | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """The marker that what is in view of the target stands for, or none.
+    """Return the marker that what is in view of the target stands for, or none.
 
-    `expected` are corners (4, 2) px, of one marker at least; `hidden` (h, w) is where the
-    vehicle's own gear covers the picture.
+    `expected` are corners (4, 2) px, of one marker at least; `hidden` (h, w) is where the vehicle's
+    own gear covers the picture.
     """
     drawing = patterns["large"].drawing
     ratio, centre = drawing.ratio, drawing.centre
@@ -122,7 +115,8 @@ def cut_markers(
 def shows_enough_of_target(
     pose: RigidPose, patterns: Mapping[MarkerName, Pattern], camera: CameraModel
 ) -> bool:
-    """Whether what a picture taken in that pose shows of the target is enough to measure it."""
+    """Return True if what a picture taken in that pose shows of the target is enough to measure
+    it."""
     drawing = patterns["large"].drawing
     found = foreseen(pose, outline_of(drawing), _print_sigma(patterns), camera)
     if found is None or not _trusted(found):
@@ -132,21 +126,22 @@ def shows_enough_of_target(
 
 
 def _print_sigma(patterns: Mapping[MarkerName, Pattern]) -> Array:
-    """By how much the line at each place of the outline may be printed off its place (n,)."""
+    """Return how far the line at each place of the outline may be printed off its place, (n,)."""
     outline = outline_of(patterns["large"].drawing)
     small, large = (patterns[name].rim.tolerance for name in ("small", "large"))
     return np.where(outline.small, small, large) * outline.cell
 
 
 def _stands_for(found: Visible) -> MarkerName:
+    """Return the marker that was seen: the small one, if enough of it was."""
     return "small" if found.small >= _SMALL_PLACES else "large"
 
 
 def _start(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> RigidPose | None:
-    """The pose that goes with expected corners. The small marker's are nearer to the picture,
-    where the lens is known; its own are preferred."""
+    """Return the pose that goes with expected corners. The small marker's are nearer to the
+    picture, where the lens is known; its own are preferred."""
     name: MarkerName = "small" if "small" in expected else "large"
     rays = undistort(expected[name], camera)
     if not np.isfinite(rays).all():
@@ -167,7 +162,7 @@ def _start(
 
 
 def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose | None:
-    """The prediction moved to where the picture goes best with the drawing, None if it does
+    """Return the prediction moved to where the picture goes best with the drawing, None if it does
     nowhere near."""
     best, pose = _MIN_GLANCE, None
     for growth in _GROWTHS:
@@ -181,7 +176,7 @@ def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose
 
 
 def _trusted(found: Visible) -> bool:
-    """Whether nearly all edges in view are there, and tell enough of where the target is."""
+    """Return True if nearly all edges in view are there, and tell enough of where the target is."""
     spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
     return (
         found.shown >= _MIN_SHOWN * found.in_view
@@ -191,7 +186,8 @@ def _trusted(found: Visible) -> bool:
 
 
 def _corners(found: Visible, half: float, camera: CameraModel) -> RefinedCorners | None:
-    """Of the marker of that half side; None where the lens model does not reach as far."""
+    """Return the corners of the marker of that half side; None where the lens model does not reach
+    as far."""
     found_at = corners_of(found.pose, half, camera)
     if found_at is None:
         return None
@@ -248,6 +244,7 @@ class Overview:
 
 @lru_cache(maxsize=8)
 def lattice_of(camera: CameraModel) -> Lattice:
+    """Return the lattice over a camera's picture."""
     w, h = camera.size_px
     s = np.linspace(0.0, 1.0, _RIM_POINTS)
     low, high = np.zeros_like(s), np.ones_like(s)
@@ -283,7 +280,7 @@ def lattice_of(camera: CameraModel) -> Lattice:
 def overview_of(
     image: NDArray[np.uint8], camera: CameraModel, mask: NDArray[np.uint8] | None = None
 ) -> Overview:
-    """Of a picture; what `mask` (its shape, 0: free) covers is not seen."""
+    """Return a picture at a glance; what `mask` (its shape, 0: free) covers is not seen."""
     lattice = lattice_of(camera)
     seen = lattice.inside
     if mask is not None:
@@ -293,28 +290,31 @@ def overview_of(
 
 
 def _looked_up(picture: NDArray[np.uint8] | Grey, lattice: Lattice) -> Grey:
+    """Return the picture's values at the lattice's nodes."""
     small = cv2.resize(picture, lattice.size, interpolation=cv2.INTER_AREA).astype(np.float32)
     fine = cv2.remap(small, lattice.x, lattice.y, cv2.INTER_LINEAR)
     return _coarse(np.asarray(fine, np.float32))
 
 
 def _coarse(fine: Grey) -> Grey:
+    """Return the mean of the samples of each node."""
     rows, columns = (n // _FINE for n in fine.shape)
     return np.asarray(cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
-    """Whiteness of the drawing at the lattice's nodes and `margin` more all around; H (3, 3)
-    maps own coordinates to normalised ones."""
+    """Return the whiteness of the drawing at the lattice's nodes and `margin` more all around; H
+    (3, 3) maps own coordinates to normalised ones."""
     step = lattice.step / _FINE
     start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
     G = np.array([[1.0 / step, 0.0, -start[0] / step], [0.0, 1.0 / step, -start[1] / step],
                   [0.0, 0.0, 1.0]])  # fmt: skip
-    M = G @ H @ np.linalg.inv(texture.T)
+    white, T = texture
+    M = G @ H @ np.linalg.inv(T)
     rows, columns = lattice.inside.shape
     size = (_FINE * (columns + 2 * margin), _FINE * (rows + 2 * margin))
     fine = cv2.warpPerspective(
-        texture.white,
+        white,
         M,
         size,
         flags=cv2.INTER_LINEAR,
@@ -325,7 +325,7 @@ def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) ->
 
 
 def drift_of(H: Array, texture: Texture, view: Overview) -> tuple[Array, float]:
-    """How far the picture is from the drawing through H, (2,) normalised, to a node; and the
+    """Return how far the picture is from the drawing through H, (2,) normalised, to a node; and the
     correlation there."""
     lattice = view.lattice
     wide = drawn_over(H, texture, lattice, _SEARCHED)
@@ -338,8 +338,8 @@ def drift_of(H: Array, texture: Texture, view: Overview) -> tuple[Array, float]:
 
 
 def looks_like(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
-    """Likeness of the picture with the drawing through H in its best light, where there is
-    paper; and that light's gain, grey levels from black to white."""
+    """Return the likeness of the picture with the drawing through H in its best light, where there
+    is paper; and that light's gain, grey levels from black to white."""
     lattice = view.lattice
     rows, columns = np.nonzero(view.seen)
     at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
@@ -382,62 +382,52 @@ class Outline:
     small: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class Texture:
-    """How white the paper is, float32 (m, m), 0 to 1, and T (3, 3), which maps own coordinates
-    to its pixels."""
-
-    white: NDArray[np.float32]
-    T: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Edge:
-    """One cell's side, as of an `Outline`; `line` is a name."""
-
-    at: Array
-    normal: tuple[float, float]
-    line: tuple[float, int, int]
-    cell: float
+Texture = tuple[NDArray[np.float32], Array]
+"""How white the paper is, float32 (m, m), 0 to 1, and T (3, 3), which maps own coordinates to its
+pixels."""
 
 
 @lru_cache(maxsize=8)
 def outline_of(drawing: Drawing) -> Outline:
-    """Of a large marker with the small one in its centre."""
+    """Return the outline of a large marker with the small one in its centre."""
     hidden = _HIDDEN * drawing.ratio
     edges = [
         edge
         for edge in _edges(drawing.cells, 1.0, _LARGE_PLACES)
-        if np.abs(edge.at).max(axis=1).min() > hidden
+        if np.abs(edge[0]).max(axis=1).min() > hidden
     ]
     large = len(edges)
     if drawing.centre is not None:
         edges += _edges(drawing.centre, drawing.ratio, _SMALL_CELL_PLACES)
-    names = {edge.line: k for k, edge in enumerate(edges)}
-    places = np.array([len(edge.at) for edge in edges])
+    at, normals, names, cells = zip(*edges, strict=True)
+    numbers = {name: k for k, name in enumerate(names)}
+    places = np.array([len(each) for each in at])
     return Outline(
-        at=np.concatenate([edge.at for edge in edges]),
-        normal=np.repeat([edge.normal for edge in edges], places, axis=0),
-        line=np.repeat([names[edge.line] for edge in edges], places),
-        cell=np.repeat([edge.cell for edge in edges], places),
+        at=np.concatenate(at),
+        normal=np.repeat(normals, places, axis=0),
+        line=np.repeat([numbers[name] for name in names], places),
+        cell=np.repeat(cells, places),
         small=np.repeat(np.arange(len(edges)) >= large, places),
     )
 
 
 @lru_cache(maxsize=8)
 def texture_of(drawing: Drawing) -> Texture:
-    """A picture of the drawing up to `PAPER`, beyond which it is white."""
+    """Return a picture of the drawing up to `PAPER`, beyond which it is white."""
     axis = make_grid(_TEXELS, PAPER).axis
     wide = drawn(drawing, axis, PAPER / _TEXELS)
     more = (len(wide) - _TEXELS) // 2
     scale = _TEXELS / (2.0 * PAPER)
     first = PAPER * scale - 0.5 + more
     T = np.array([[scale, 0.0, first], [0.0, scale, first], [0.0, 0.0, 1.0]])
-    return Texture(np.clip(wide, 0.0, 1.0), T)
+    return np.clip(wide, 0.0, 1.0), T
 
 
-def _edges(cells: Array, half: float, places: int) -> Iterator[_Edge]:
-    """The sides at which a marker's cells (or the paper around it) differ."""
+def _edges(
+    cells: Array, half: float, places: int
+) -> Iterator[tuple[Array, tuple[float, float], tuple[float, int, int], float]]:
+    """Return the sides at which a marker's cells (or the paper around it) differ: places along it
+    and its normal, as an `Outline` has them, a name for its line, and the cell's width."""
     width = 2.0 * half / len(cells)
     s = _FROM_END + (1.0 - 2.0 * _FROM_END) * (np.arange(places) + 0.5) / places
     for across in (0, 1):
@@ -450,7 +440,7 @@ def _edges(cells: Array, half: float, places: int) -> Iterator[_Edge]:
             at[:, 1 - across] = width * (i + s) - half
             towards = float(np.sign(step[i, j]))
             normal = (towards, 0.0) if across == 0 else (0.0, towards)
-            yield _Edge(at, normal, (half, across, j), width)
+            yield at, normal, (half, across, j), width
 
 
 # --- The target's pose from the edges that are in view, where its markers are cut by the picture
@@ -537,10 +527,10 @@ def fitted(
     camera: CameraModel,
     mask: NDArray[np.uint8] | None = None,
 ) -> Visible | None:
-    """The pose in which the outline's edges are the picture's, from one a few pixels off.
+    """Fit the pose in which the outline's edges are the picture's, from one a few pixels off.
 
-    `print_sigma` (n,) is by how much each place's line may be printed off its place. None
-    where too few edges are in view, or the fit breaks down.
+    `print_sigma` (n,) is how far each place's line may be printed off its place. None where too few
+    edges are in view, or the fit breaks down.
     """
     pose, total, found, moved_px = start, np.zeros(6), None, math.inf
     for reach_px in _REACH_PX:
@@ -554,7 +544,8 @@ def fitted(
         found = _solved(places, offset_px, shows, total)
         if found is None:
             return None
-        pose, total = _moved(pose, found.step[:6]), total + found.step[:6]
+        turn = np.asarray(cv2.Rodrigues(found.step[:3])[0], dtype=np.float64)
+        pose, total = RigidPose(turn @ pose.R, pose.t + found.step[3:6]), total + found.step[:6]
         moved_px = float(np.abs(places.J @ found.step[:6]).max())
         if moved_px < _STILL_PX:
             break
@@ -566,7 +557,7 @@ def fitted(
 def foreseen(
     pose: RigidPose, outline: Outline, print_sigma: Array, camera: CameraModel
 ) -> Visible | None:
-    """What `fitted` would make of a picture without a flaw, taken in that pose."""
+    """Return what `fitted` would make of a picture without a flaw, taken in that pose."""
     places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
     n = len(places.index)
     if n < _LEAST_PLACES:
@@ -583,7 +574,7 @@ def _in_view(
     camera: CameraModel,
     mask: NDArray[np.uint8] | None,
 ) -> _Places:
-    """The places at which a whole profile is in the picture, and not covered."""
+    """Return the places at which a whole profile is in the picture, and not covered."""
     h, w = shape[:2]
     X = np.column_stack([outline.at, np.zeros(len(outline.at))]) @ pose.R.T + pose.t
     ahead = X[:, 2] > 0.05
@@ -633,8 +624,8 @@ def _in_view(
 def _offsets(
     image: NDArray[np.uint8], places: _Places, half_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """How far along its normal each place's edge is in the picture, (n,) px, and whether there
-    is one from dark to bright."""
+    """Return how far along its normal each place's edge is in the picture, (n,) px, and whether
+    there is one from dark to bright."""
     half_px = np.maximum(half_px, _LEAST_REACH_PX)
     grey = sample(image, places.at[:, None], places.normal[:, None], half_px)[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
@@ -651,7 +642,7 @@ def _offsets(
 def _solved(
     places: _Places, offset_px: Array, shows: NDArray[np.bool_], total: Array
 ) -> _Round | None:
-    """A robust step of turn, move and the common shift of edges (white over black)."""
+    """Return a robust step of turn, move and the common shift of edges (white over black)."""
     J = np.concatenate([places.J, -np.ones((len(offset_px), 1))], axis=1)
     prior = np.append(_PRIOR, _SHIFT_PX**-2.0)
     pull = np.append(-_PRIOR * total, 0.0)
@@ -678,14 +669,11 @@ def _solved(
     return _Round(step, inverse, weight, J, variance)
 
 
-def _moved(pose: RigidPose, step: Array) -> RigidPose:
-    turn = np.asarray(cv2.Rodrigues(step[:3])[0], dtype=np.float64)
-    return RigidPose(turn @ pose.R, pose.t + step[3:])
-
-
-def _covariance(found: _Round, places: _Places, outline: Outline, print_sigma: Array) -> Array:
-    """Of turn and move (6, 6): of each place's own noise, of what moves a line as a whole, and
-    of the prediction."""
+def _visible(
+    pose: RigidPose, found: _Round, places: _Places, outline: Outline, print_sigma: Array
+) -> Visible:
+    """Return the pose with its covariance: of each place's own noise, of what moves a line as a
+    whole, and of the prediction."""
     J, w, variance = found.J, found.weight, found.variance
     line = outline.line[places.index]
     common_px = np.hypot(print_sigma[places.index] * places.px, _LENS_PX)
@@ -694,26 +682,20 @@ def _covariance(found: _Round, places: _Places, outline: Outline, print_sigma: A
     middle = variance * (J * (w**2)[:, None]).T @ J + by_line.T @ by_line
     prior = np.diag(np.append(_PRIOR, _SHIFT_PX**-2.0))
     cov = found.inverse @ (middle / variance**2 + prior) @ found.inverse
-    return np.asarray(cov[:6, :6])
-
-
-def _visible(
-    pose: RigidPose, found: _Round, places: _Places, outline: Outline, print_sigma: Array
-) -> Visible:
-    shown = found.weight > 0.0
+    shown = w > 0.0
     return Visible(
         pose=pose,
-        cov=_covariance(found, places, outline, print_sigma),
+        cov=cov[:6, :6],
         in_view=len(shown),
         shown=int(np.count_nonzero(shown)),
         small=int(np.count_nonzero(shown & outline.small[places.index])),
-        residual_px=math.sqrt(found.variance),
+        residual_px=math.sqrt(variance),
     )
 
 
 def corners_of(pose: RigidPose, half: float, camera: CameraModel) -> tuple[Array, Array] | None:
-    """Corners (4, 2) of the square of that half side, normalised, and their changes (8, 6) with
-    turn and move, pixels of a pinhole; None where one is beside or behind the camera."""
+    """Return the corners (4, 2) of the square of that half side, normalised, and their changes (8,
+    6) with turn and move, pixels of a pinhole; None where one is beside or behind the camera."""
     r = np.column_stack([half * UNIT, np.zeros(4)]) @ pose.R.T
     X = r + pose.t
     if X[:, 2].min() <= 0.0:

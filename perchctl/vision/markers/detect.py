@@ -13,7 +13,8 @@ frame, and only where the one before saw too little.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -37,7 +38,6 @@ from perchctl.vision.markers.corners import (
     within,
 )
 from perchctl.vision.markers.cut import (
-    cut_lately,
     cut_markers,
     is_cut,
     may_be_whole,
@@ -90,36 +90,92 @@ def detect_markers(
     is looked at, and the result is the mean: where the markers were at the frame's own time.
     """
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
+    both = completed(expected, setup.ratio, camera)
     look = _look(empty_frames, bool(expected), setup)
-    turn = (
-        (empty_frames + 2) // 4 if empty_frames is not None and look in ("near", "fits") else None
-    )
+    turn = None
+    if empty_frames is not None and look in ("near", "fits"):
+        turn = (empty_frames + 2) // 4
     lately = measured_lately(previous, frame.t_s)
-    was_cut = setup.cut and cut_lately(previous, frame.t_s, frame.image.shape)
+    was_cut = False
+    if previous is not None and lately and setup.cut:
+        last = {each.marker: each.corners_px for each in previous.markers}
+        was_cut = not may_be_whole(last, frame.image.shape)
     shift = known_from(None if previous is None else previous.edge_shift)
 
-    def looked(picture: Frame) -> Detections:
-        hidden = hidden_in(picture, setup.mask)
-        if hidden is not None:
-            picture = replace(picture, image=filled(picture.image, hidden), encoded=None)
-        return _looked(
-            picture, hidden, expected, setup, camera, shift, look, lately, was_cut, turn, own
+    def detected(frame: Frame) -> Detections:
+        """Return what is in a frame of one moment."""
+        hidden = hidden_in(frame, setup.mask)
+        image = frame.image if hidden is None else filled(frame.image, hidden)
+        picture, found = Picture(image, hidden, setup, camera), Found()
+        seen: _Seen = {}
+        if look != "fits" and setup.config.window and both and setup.by_lines:
+            seen, found = _followed(picture, both, shift)
+        if not seen and lately and setup.cut and is_cut(both, image.shape, hidden):
+            seen = cut_markers(image, expected, setup.patterns, camera, hidden)
+        findable = not was_cut or may_be_whole(both, image.shape)
+        if look not in ("blurred", "fits") and (
+            (not seen and findable) or _missing(picture, seen, expected)
+        ):
+            found = search(image, expected, setup, look, own)
+            if len(found.corners_px) >= len(seen):
+                seen = _refined(picture, found)
+        if not seen and look not in ("sharp", "window") and setup.blurred:
+            seen = _in_blur(picture, expected, turn)
+        shifts = (r.edge_shift for r in seen.values())
+        return Detections(
+            frame_index=frame.index,
+            t_s=frame.t_s,
+            large=_detection("large", seen, frame.fields),
+            small=_detection("small", seen, frame.fields),
+            full_frame=found.full_frame,
+            mirrored=found.mirrored and not seen,
+            targets=found.targets,
+            edge_shift=next((each for each in shifts if each is not None), None),
         )
 
     if frame.fields == "woven":
-        return with_motion(between(*(looked(field) for field in halves(frame))), previous)
-    result = with_motion(looked(frame), previous)
+        return with_motion(between(*map(detected, halves(frame))), previous)
+    result = with_motion(detected(frame), previous)
     return with_ghosts(result, previous, frame.image) if frame.fields == "whole" else result
 
 
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture of one moment, and what is needed to measure markers in it. `hidden` (h, w) is
+    where something else is before the target; None: nowhere."""
+
+    image: NDArray[np.uint8]
+    hidden: Covered | None
+    setup: DetectorSetup
+    camera: CameraModel
+
+    def seen_partly(
+        self,
+        name: MarkerName,
+        start_px: Array,
+        known_by: KnownBy,
+        shift: EdgeShift | None = None,
+    ) -> RefinedCorners | None:
+        """Return the marker near to `start_px` (4, 2) by what is seen of it
+        (`partial.seen_partly`)."""
+        pattern = self.setup.patterns[name]
+        return seen_partly(self.image, start_px, pattern, self.camera, known_by, self.hidden, shift)
+
+    def nested(self, corners_px: Array, name: MarkerName) -> Array:
+        """Return where the other marker's corners (4, 2) put those of this one."""
+        ratio = self.setup.ratio if name == "small" else 1.0 / self.setup.ratio
+        return nested(corners_px, ratio, self.camera)
+
+
 def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Look:
-    """After a loss the place where the target should be and the whole picture take turns, and
-    there the search and the fits of a blurred target do; later a sharp target and, in every Nth
-    frame, a blurred one. The first frame without it may only be blurred: that has both."""
+    """Return how to search this frame. After a loss the place where the target should be and the
+    whole picture take turns, and there the search and the fits of a blurred target do; later a
+    sharp target and, in every Nth frame, a blurred one. The first frame without it may only be
+    blurred: that has both."""
     if empty_frames is None:
         return "all"
-    fits = setup.blurred and setup.by_lines
-    if expected and setup.window:
+    fits = setup.blurred
+    if expected and setup.config.window:
         if empty_frames % 2:
             return "sharp"
         if empty_frames == 0 or not fits:
@@ -127,160 +183,85 @@ def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Loo
         return "fits" if empty_frames % 4 else "window"
     if not fits:
         return "sharp"
-    if setup.blurred_every == 1:
+    if setup.config.blurred_every == 1:
         return "all"
     # At 0 something was seen, though not where the target should be.
-    return "blurred" if empty_frames and empty_frames % setup.blurred_every == 0 else "sharp"
-
-
-def _looked(
-    frame: Frame,
-    hidden: Covered | None,
-    expected: Mapping[MarkerName, Array],
-    setup: DetectorSetup,
-    camera: CameraModel,
-    shift: EdgeShift | None,
-    look: Look,
-    lately: bool,
-    was_cut: bool,
-    turn: int | None,
-    own: TargetSelector | None,
-) -> Detections:
-    """What is in a picture of one moment; `hidden` (h, w) is where that is not seen, `lately`
-    whether the target was measured a moment ago, `was_cut` no marker of it being whole, `turn` of
-    the fits to a blurred one."""
-    image = frame.image
-    found = Found({}, mirrored=False, full_frame=False)
-    both = completed(expected, setup.ratio, camera)
-    seen: _Seen = {}
-    if look != "fits" and setup.window and both and setup.by_lines:
-        seen, found = _followed(image, hidden, both, setup, camera, shift)
-    if not seen and lately and setup.cut and is_cut(both, image.shape, hidden):
-        seen = cut_markers(image, expected, setup.patterns, camera, hidden)
-    findable = not was_cut or may_be_whole(both, image.shape)
-    if look not in ("blurred", "fits") and (
-        (not seen and findable) or _missing(seen, expected, image.shape, hidden)
-    ):
-        found = search(image, expected, setup, look, own)
-        if len(found.corners_px) >= len(seen):
-            seen = _refined(image, hidden, found, setup, camera)
-    if not seen and look not in ("sharp", "window") and setup.blurred and setup.by_lines:
-        seen = _in_blur(image, expected, setup, camera, turn)
-    return Detections(
-        frame_index=frame.index,
-        t_s=frame.t_s,
-        large=_detection("large", seen, frame.fields),
-        small=_detection("small", seen, frame.fields),
-        full_frame=found.full_frame,
-        mirrored=found.mirrored and not seen,
-        targets=found.targets,
-        edge_shift=next((r.edge_shift for r in seen.values() if r.edge_shift is not None), None),
-    )
+    return "blurred" if empty_frames and empty_frames % setup.config.blurred_every == 0 else "sharp"
 
 
 def _followed(
-    image: NDArray[np.uint8],
-    hidden: Covered | None,
-    expected: Mapping[MarkerName, Array],
-    setup: DetectorSetup,
-    camera: CameraModel,
-    shift: EdgeShift | None,
+    picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None
 ) -> tuple[_Seen, Found]:
-    """What is where both are expected, or nearby: where no side was met, a near target has most
-    often moved on further than a side is looked for, and a look around costs less than to fit
+    """Return what is where both are expected, or nearby: where no side was met, a near target has
+    most often moved on further than a side is looked for, and a look around costs less than to fit
     what may be seen of it in the old place."""
-    patterns, nothing = setup.patterns, Found({}, mirrored=False, full_frame=False)
-    seen = follow(image, expected, patterns, camera, shift, hidden)
+    seen = follow(picture, expected, shift)
     if not seen:
-        found = search_halved(image, expected, setup)
-        again = {} if found is None else _refined(image, hidden, found, setup, camera)
+        found = search_halved(picture.image, expected, picture.setup)
+        again = {} if found is None else _refined(picture, found)
         if found is not None and again:
             return again, found
-    seen = follow_partly(image, expected, seen, patterns, camera, shift, hidden)
-    if any(lines_suffice(r, patterns[name]) for name, r in seen.items()):
-        return seen, nothing
-    return improved(image, seen, patterns, camera, hidden=hidden), nothing
+    seen = follow_partly(picture, expected, seen, shift)
+    if any(lines_suffice(r, picture.setup.patterns[name]) for name, r in seen.items()):
+        return seen, Found()
+    return improved(picture, seen), Found()
 
 
-def _missing(
-    seen: _Seen,
-    expected: Mapping[MarkerName, Array],
-    shape: tuple[int, ...],
-    hidden: Covered | None,
-) -> bool:
-    """Whether a marker that should be in the picture, and not hidden, was not verified, other
-    than one too far away to be found by a search."""
+def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]) -> bool:
+    """Return True if a marker that should be in the picture, and not hidden, was not verified,
+    other than one too far away to be found by a search."""
     return any(
         name not in seen
-        and within(corners, shape)
+        and within(corners, picture.image.shape)
         and side_lengths_px(corners).min() > _SEARCHED_SIDE_PX
-        and not hides(hidden, corners)
+        and not hides(picture.hidden, corners)
         for name, corners in expected.items()
     )
 
 
-def _refined(
-    image: NDArray[np.uint8],
-    hidden: Covered | None,
-    found: Found,
-    setup: DetectorSetup,
-    camera: CameraModel,
-) -> _Seen:
-    """What the search found, by the profile's refinement."""
+def _refined(picture: Picture, found: Found) -> _Seen:
+    """Return what the search found, by the profile's refinement. Those without four lines for sides
+    are measured by what of these is seen: a search takes the picture's edge for the side of a
+    marker that is cut off there."""
+    image, setup = picture.image, picture.setup
     names = [name for name in MARKERS if name in found.corners_px]
     raw = np.array([found.corners_px[name] for name in names]).reshape(-1, 4, 2)
     rims = [setup.patterns[name].rim for name in names]
-    refined = refine(image, raw, rims, camera, setup.refinement)
+    refined = refine(image, raw, rims, picture.camera, setup.config.refinement)
     seen = dict(zip(names, refined, strict=True))
     if not setup.by_lines:
         return seen
-    seen = _whole_or_partly(image, hidden, seen, setup, camera)
-    return improved(image, seen, setup.patterns, camera, searched=True, hidden=hidden)
-
-
-def _whole_or_partly(
-    image: NDArray[np.uint8],
-    hidden: Covered | None,
-    seen: _Seen,
-    setup: DetectorSetup,
-    camera: CameraModel,
-) -> _Seen:
-    """What the search found, those without four lines for sides by what of these is seen. A
-    search takes the picture's edge for the side of a marker that is cut off there."""
-    fitted = dict(seen)
+    fitted, small = dict(seen), seen.get("small")
     for name, r in seen.items():
-        if r.refined and wholly_seen(r, image.shape, hidden):
+        if r.refined and wholly_seen(r, image.shape, picture.hidden):
             continue
-        pattern, small = setup.patterns[name], seen.get("small")
         starts = [r.corners_px]
         if name == "large" and not r.refined and small is not None and small.refined:
-            starts.insert(0, nested(small.corners_px, 1.0 / setup.ratio, camera))
+            starts.insert(0, picture.nested(small.corners_px, "large"))
         known_by: KnownBy = "other" if len(seen) == 2 else "bits"
-        tried = (seen_partly(image, s, pattern, camera, known_by, hidden) for s in starts)
+        tried = (picture.seen_partly(name, start, known_by) for start in starts)
         partly = next((found for found in tried if found is not None), None)
         if partly is not None:
             fitted[name] = partly
-        elif not within(r.corners_px, image.shape, ROOM_PX) or hides(hidden, r.corners_px, 1.0):
+        elif not within(r.corners_px, image.shape, ROOM_PX) or hides(
+            picture.hidden, r.corners_px, 1.0
+        ):
             del fitted[name]
-    return fitted
+    return improved(picture, fitted, searched=True)
 
 
-def _in_blur(
-    image: NDArray[np.uint8],
-    expected: Mapping[MarkerName, Array],
-    setup: DetectorSetup,
-    camera: CameraModel,
-    turn: int | None,
-) -> _Seen:
-    """What only the drawing shows: near to where it is expected, or anywhere."""
+def _in_blur(picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None) -> _Seen:
+    """Return what only the drawing shows: near to where it is expected, or anywhere."""
+    image, setup, camera = picture.image, picture.setup, picture.camera
     if expected:
         seen = expected_in_blur(image, expected, setup.patterns, camera, turn)
     else:
         seen = hidden_in_blur(image, setup, camera)
-    return improved(image, seen, setup.patterns, camera)
+    return improved(replace(picture, hidden=None), seen)
 
 
 def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Detection | None:
+    """Return the marker's detection in a picture of that kind, None where it was not seen."""
     r = seen.get(name)
     if r is None:
         return None
@@ -300,23 +281,21 @@ _MAX_GAP_S = 0.25  # older motion is no evidence of where to look
 
 
 def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
-    """The last corners (4, 2) px, moved on as they moved before; empty if there are none."""
+    """Return the last corners (4, 2) px, moved on as they moved before; empty if there are none."""
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
     moves = 0.0 < gap_s <= _MAX_GAP_S
     corners: dict[MarkerName, Array] = {}
-    for name in MARKERS:
-        detection = previous.get(name)
-        if detection is None:
-            continue
-        flow = previous.flow_px_s.get(name, previous.velocity_px_s)
-        corners[name] = detection.corners_px + (flow * gap_s if moves and flow is not None else 0)
+    for d in previous.markers:
+        flow = previous.flow_px_s.get(d.marker, previous.velocity_px_s)
+        corners[d.marker] = d.corners_px + (flow * gap_s if moves and flow is not None else 0)
     return corners
 
 
 def with_motion(now: Detections, previous: Detections | None) -> Detections:
-    """`now` with velocity_px_s and flow_px_s, where markers were seen a short time before."""
+    """Return `now` with velocity_px_s and flow_px_s, where markers were seen a short time
+    before."""
     if previous is None:
         return now
     gap_s = now.t_s - previous.t_s
@@ -350,37 +329,30 @@ _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
 def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
-    """Whether no drawing could give better corners."""
+    """Return True if no drawing could give better corners."""
     cell_px = mean_side_px(seen.corners_px) / pattern.rim.cells
     return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * seen.blur_px)
 
 
-def improved(
-    image: NDArray[np.uint8],
-    seen: Mapping[MarkerName, RefinedCorners],
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
-    searched: bool = False,
-    hidden: NDArray[np.bool_] | None = None,
-) -> dict[MarkerName, RefinedCorners]:
-    """The markers that were seen, with better corners and with the other marker if it shows.
+def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
+    """Return the markers that were seen, with better corners and with the other marker if it shows.
 
-    `hidden` (h, w) is where there is something else: a drawing is not laid over that. What a
-    search found, its bits read one by one, stays only where lines suffice, the drawing
-    confirms it, or the other marker was seen with it."""
-    better = dict(seen)
+    A drawing is not laid over what is hidden. What a search found, its bits read one by one,
+    stays only where lines suffice, the drawing confirms it, or the other marker was seen with
+    it."""
+    image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
-        large = around(image, better["small"], patterns, camera, hidden)
+        large = around(picture, better["small"])
         if large is not None:
             better["large"] = large
     for name in MARKERS:
-        start = _start(name, better, patterns, camera)
-        if start is None or not within(start, image.shape) or hides(hidden, start):
+        start = _start(picture, name, better)
+        if start is None or not within(start, image.shape) or hides(picture.hidden, start):
             continue
         alone = _OTHER[name] not in better
         max_sigma = _MAX_SIGMA_ALONE if alone else _MAX_SIGMA
         exact = aligned(
-            image, start, patterns[name], camera, _REACH, _blur_px(better.get(name)),
+            image, start, patterns[name], picture.camera, _REACH, _blur_px(better.get(name)),
             max_sigma=max_sigma, alone=alone,
         )  # fmt: skip
         if exact is not None:
@@ -393,29 +365,26 @@ def improved(
 
 
 def _blur_px(seen: RefinedCorners | None) -> float:
-    """That of the sides, where lines were fitted: the fit of the drawing gets there sooner."""
+    """Return the blur of the sides, where lines were fitted: the fit of the drawing gets there
+    sooner."""
     if seen is None or not seen.refined or seen.blur_px <= 0.0:
         return _BLUR_PX
     return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _BLUR_PX)
 
 
-def _start(
-    name: MarkerName,
-    seen: Mapping[MarkerName, RefinedCorners],
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
-) -> Array | None:
-    """Corners (4, 2) px from which the drawing should be aligned, None where that is of no
-    use."""
+def _start(picture: Picture, name: MarkerName, seen: _Seen) -> Array | None:
+    """Return the corners (4, 2) px from which the drawing should be aligned, None where that is of
+    no use."""
     this, other = seen.get(name), seen.get(_OTHER[name])
     if this is not None:
         if this.cov_px2 is not None:
             return None  # what hides a part of it would spoil the drawing, too
         # Small cells matter only where no larger ones were measured.
-        enough = lines_suffice(this, patterns[name]) or (name == "small" and other is not None)
+        enough = lines_suffice(this, picture.setup.patterns[name])
+        enough = enough or (name == "small" and other is not None)
         return None if this.refined and enough else this.corners_px
     if name == "small" and other is not None and other.refined:
-        return nested(other.corners_px, patterns["large"].drawing.ratio, camera)
+        return picture.nested(other.corners_px, "small")
     return None
 
 
@@ -430,16 +399,11 @@ _ANCHOR = 0.12  # of the small marker's side
 
 
 def follow(
-    image: NDArray[np.uint8],
-    expected: Mapping[MarkerName, Array],
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
-    shift: EdgeShift | None = None,
-    hidden: NDArray[np.bool_] | None = None,
-) -> dict[MarkerName, RefinedCorners]:
-    """The expected markers (corners (4, 2) px) that are verified by all sides and cells; `shift`
-    is what was measured of the edges in an earlier picture, `hidden` (h, w) where there is
-    something else."""
+    picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
+) -> _Seen:
+    """Return the expected markers (corners (4, 2) px) that are verified by all sides and cells;
+    `shift` is what was measured of the edges in an earlier picture."""
+    image, patterns = picture.image, picture.setup.patterns
     names = [
         name
         for name in MARKERS
@@ -450,88 +414,75 @@ def follow(
     if not names:
         return {}
     raw = np.array([expected[name] for name in names])
-    fitted = refine_lines(image, raw, [patterns[name].rim for name in names], camera, shift)
+    rims = [patterns[name].rim for name in names]
+    fitted = refine_lines(image, raw, rims, picture.camera, shift)
     return {
         name: result
         for name, result in zip(names, fitted, strict=True)
         if result is not None
-        and wholly_seen(result, image.shape, hidden)
+        and wholly_seen(result, image.shape, picture.hidden)
         and cells_agree(image, result.corners_px, patterns[name])
     }
 
 
 def follow_partly(
-    image: NDArray[np.uint8],
+    picture: Picture,
     expected: Mapping[MarkerName, Array],
-    seen: Mapping[MarkerName, RefinedCorners],
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
+    seen: _Seen,
     shift: EdgeShift | None = None,
-    hidden: NDArray[np.bool_] | None = None,
-) -> dict[MarkerName, RefinedCorners]:
-    """With those that `follow` did not verify, by what is seen of them. Where the small marker
-    was met, the large one is looked for around it instead of where it was expected."""
+) -> _Seen:
+    """Return the markers of `follow` with those that it did not verify, by what is seen of them.
+    Where the small marker was met, the large one is looked for around it instead of where it was
+    expected."""
     places, seen = dict(expected), dict(seen)
     if "small" in seen and "large" not in seen:
-        places["large"] = nested(
-            seen["small"].corners_px, 1.0 / patterns["large"].drawing.ratio, camera
-        )
+        places["large"] = picture.nested(seen["small"].corners_px, "large")
     for name in MARKERS:
         if name in places and name not in seen:
-            partly = seen_partly(
-                image, places[name], patterns[name], camera, "track", hidden, shift
-            )
+            partly = picture.seen_partly(name, places[name], "track", shift)
             if partly is not None:
                 seen[name] = partly
-    large = seen.get("large")
-    if large is not None and "small" not in seen:
+    if "large" in seen and "small" not in seen:
         # Too small for lines, but where it must be: enough to know that it is there.
-        small_px = nested(large.corners_px, patterns["large"].drawing.ratio, camera)
-        if mean_side_px(small_px) > LEAST_SIDE_PX and resembles(image, small_px, patterns["small"]):
+        small_px = picture.nested(seen["large"].corners_px, "small")
+        if mean_side_px(small_px) > LEAST_SIDE_PX and resembles(
+            picture.image, small_px, picture.setup.patterns["small"]
+        ):
             seen["small"] = RefinedCorners(small_px, NESTED_SIGMA_PX, False)
     return seen
 
 
-def around(
-    image: NDArray[np.uint8],
-    small: RefinedCorners,
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
-    hidden: NDArray[np.bool_] | None = None,
-) -> RefinedCorners | None:
-    """The large marker around a small one that was found: something may cover a part of
-    it, and it may be cut off by the picture's edge, so long as its sides are lines where they
-    are seen and most cells show."""
-    pattern = patterns["large"]
-    start = nested(small.corners_px, 1.0 / pattern.drawing.ratio, camera)
+def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
+    """Return the large marker around a small one that was found: something may cover a part of it,
+    and it may be cut off by the picture's edge, so long as its sides are lines where they are seen
+    and most cells show."""
+    image, pattern = picture.image, picture.setup.patterns["large"]
+    start = picture.nested(small.corners_px, "large")
     if not np.isfinite(start).all():
         return None
-    found: RefinedCorners | None = None
+
+    def is_centred(large: RefinedCorners) -> bool:
+        """Return True if the small marker is where the large one has it."""
+        centre = picture.nested(large.corners_px, "small")
+        off_px = float(np.abs(centre - small.corners_px).max())
+        return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
+
     if within(start, image.shape, ROOM_PX):
         # A small marker gives a rough place; the first fit is where to look closely.
-        found = refine_lines(image, start[None], [pattern.rim], camera)[0]
+        found = refine_lines(image, start[None], [pattern.rim], picture.camera)[0]
         if found is not None:
-            found = refine_lines(image, found.corners_px[None], [pattern.rim], camera)[0]
+            found = refine_lines(image, found.corners_px[None], [pattern.rim], picture.camera)[0]
+        if found is not None:
+            start = found.corners_px
         if (
             found is not None
-            and wholly_seen(found, image.shape, hidden)
-            and _centred(found, small, pattern, camera)
+            and wholly_seen(found, image.shape, picture.hidden)
+            and is_centred(found)
             and cells_mostly_agree(image, found.corners_px, pattern)
         ):
             return found
-    if found is not None:
-        start = found.corners_px
-    partly = seen_partly(image, start, pattern, camera, "other", hidden)
-    return partly if partly and _centred(partly, small, pattern, camera) else None
-
-
-def _centred(
-    large: RefinedCorners, small: RefinedCorners, pattern: Pattern, camera: CameraModel
-) -> bool:
-    """Whether the small marker is where the large one has it."""
-    centre = nested(large.corners_px, pattern.drawing.ratio, camera)
-    off_px = float(np.abs(centre - small.corners_px).max())
-    return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
+    partly = picture.seen_partly("large", start, "other")
+    return partly if partly and is_centred(partly) else None
 
 
 # --- The markers of two fields, at the moment half way between them ----------------------------
@@ -541,50 +492,46 @@ _MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 
 
 def between(a: Detections, b: Detections) -> Detections:
-    """The mean of both fields' corners, which is right for either order of the fields.
+    """Return the mean of both fields' corners, which is right for either order of the fields.
 
     A marker that only one field shows is left out where the other marker is in both: the
     two would belong to different moments. Nothing lies between two different targets.
     """
-    both = {
-        name: _middle(one, other)
-        for name in MARKERS
-        if (one := a.get(name)) is not None
-        and (other := b.get(name)) is not None
-        and _is_one(one.corners_px, other.corners_px)
-    }
+    both: dict[MarkerName, Detection] = {}
+    for name in MARKERS:
+        one, other = a.get(name), b.get(name)
+        if one is None or other is None:
+            continue
+        way_px = one.corners_px.mean(axis=0) - other.corners_px.mean(axis=0)
+        if float(np.linalg.norm(way_px)) < _MOST_SIDES * mean_side_px(one.corners_px):
+            both[name] = _middle(one, other)
     if not both:
-        alone = a if a.large is not None or a.small is not None else b
+        alone = a if a.markers else b
         return replace(alone, mirrored=alone.mirrored or b.mirrored)
     return replace(a, large=both.get("large"), small=both.get("small"), mirrored=False)
 
 
-def _is_one(a_px: Array, b_px: Array) -> bool:
-    """Whether a marker can have moved from one place to the other between the fields."""
-    moved_px = float(np.linalg.norm(a_px.mean(axis=0) - b_px.mean(axis=0)))
-    return moved_px < _MOST_SIDES * mean_side_px(a_px)
-
-
 def _middle(a: Detection, b: Detection) -> Detection:
-    """Each field has its own noise, so the mean is surer than either."""
+    """Return the mean of two fields' detections. Each field has its own noise, so the mean is
+    surer than either."""
+
+    def half(one: float, other: float) -> float:
+        return float(((one**2 + other**2) / 4.0) ** 0.5)
+
+    cov_px2 = None
+    if a.cov_px2 is not None or b.cov_px2 is not None:
+        one, other = (d.sigma_px**2 * np.eye(8) if d.cov_px2 is None else d.cov_px2 for d in (a, b))
+        cov_px2 = (one + other) / 4.0
     return Detection(
         a.marker,
         (a.corners_px + b.corners_px) / 2.0,
-        ((a.sigma_px**2 + b.sigma_px**2) / 4.0) ** 0.5,
+        half(a.sigma_px, b.sigma_px),
         a.refined and b.refined,
         max(a.shift_sigma_px, b.shift_sigma_px),
-        cov_px2=_mean_cov_px2(a, b),
-        row_sigma_px=((a.row_sigma_px**2 + b.row_sigma_px**2) / 4.0) ** 0.5,
-        lying_sigma_px=((a.lying_sigma_px**2 + b.lying_sigma_px**2) / 4.0) ** 0.5,
+        cov_px2=cov_px2,
+        row_sigma_px=half(a.row_sigma_px, b.row_sigma_px),
+        lying_sigma_px=half(a.lying_sigma_px, b.lying_sigma_px),
     )
-
-
-def _mean_cov_px2(a: Detection, b: Detection) -> Array | None:
-    """None where in both the corners spread alike."""
-    if a.cov_px2 is None and b.cov_px2 is None:
-        return None
-    one, other = (d.sigma_px**2 * np.eye(8) if d.cov_px2 is None else d.cov_px2 for d in (a, b))
-    return np.asarray((one + other) / 4.0)
 
 
 # --- Double edges: what a converter leaves that averages the two fields of a moving picture ----
@@ -610,8 +557,8 @@ _CELLS = {"large": 6.0, "small": 7.0}  # of a side; with a little less all goes 
 def with_ghosts(
     now: Detections, previous: Detections | None, image: NDArray[np.uint8]
 ) -> Detections:
-    """`now` with `ghost_px`, and the corners' spread widened by it, where a marker that moves,
-    or of which that is not known, has double edges. Where the picture before had none, as in
+    """Return `now` with `ghost_px`, and the corners' spread widened by it, where a marker that
+    moves, or of which that is not known, has double edges. Where the picture before had none, as in
     most streams, it is looked for in every fourth."""
     velocity = now.velocity_px_s
     if velocity is not None and float(np.hypot(*velocity)) < SLOW_PX_S:
@@ -620,38 +567,31 @@ def with_ghosts(
         age = previous.ghost_age + 1
         if age < _EVERY:
             return replace(now, ghost_age=age)
-    seen = [d for name in MARKERS if (d := now.get(name)) is not None]
-    shows = _shows_best(seen)
-    ghost_px = 0.0 if shows is None else double_edge_px(image, shows)
+    # The smallest marker with room enough beside its sides: larger ones bend more, and may be
+    # outside of the picture, where sides show nothing.
+    whole = [d for d in now.markers if d.cov_px2 is None]
+    roomy = whole[-1:] if whole and _reach_px(whole[-1]) >= _ROOM_PX else whole[:1]
+    ghost_px = double_edge_px(image, roomy[0]) if roomy else 0.0
     if ghost_px == 0.0:
         return now
-    wider = {d.marker: _wider(d, ghost_px / 4.0) for d in seen}
+    # The middle of both steps is where the edge was at the middle moment, but an edge fit may
+    # hold to one of them.
+    sigma_px, wider = ghost_px / 4.0, {}
+    for d in now.markers:
+        cov_px2 = None if d.cov_px2 is None else d.cov_px2 + sigma_px**2 * np.eye(8)
+        wide_px = float(np.hypot(d.sigma_px, sigma_px))
+        wider[d.marker] = replace(d, sigma_px=wide_px, cov_px2=cov_px2)
     return replace(now, large=wider.get("large"), small=wider.get("small"), ghost_px=ghost_px)
 
 
-def _shows_best(seen: Sequence[Detection]) -> Detection | None:
-    """The smallest marker with room enough beside its sides: larger ones bend more, and may
-    be outside of the picture, where sides show nothing."""
-    whole = [d for d in seen if d.cov_px2 is None]
-    small = whole[-1:] if whole and _reach_px(whole[-1]) >= _ROOM_PX else whole[:1]
-    return small[0] if small else None
-
-
 def _reach_px(marker: Detection) -> float:
-    """How far from the sides the next edges are not yet seen."""
+    """Return how far from the sides the next edges are not yet seen."""
     cell_px = float(side_lengths_px(marker.corners_px).min()) / _CELLS[marker.marker]
     return min(_REACH_CELLS * cell_px, _MOST_REACH_PX)
 
 
-def _wider(d: Detection, sigma_px: float) -> Detection:
-    """The middle of both steps is where the edge was at the middle moment, but an edge fit may
-    hold to one of them."""
-    cov_px2 = None if d.cov_px2 is None else d.cov_px2 + sigma_px**2 * np.eye(8)
-    return replace(d, sigma_px=float(np.hypot(d.sigma_px, sigma_px)), cov_px2=cov_px2)
-
-
 def double_edge_px(image: NDArray[np.uint8], marker: Detection) -> float:
-    """How far the two steps of a marker's sides are apart, the mean over opposite sides and
+    """Return how far the two steps of a marker's sides are apart, the mean over opposite sides and
     the greater of the two directions; 0 where the sides are single."""
     profiles = _profiles(image, marker)
     if profiles is None:
@@ -663,8 +603,8 @@ def double_edge_px(image: NDArray[np.uint8], marker: Detection) -> float:
 
 
 def _profiles(image: NDArray[np.uint8], marker: Detection) -> Array | None:
-    """Mean grey across each side from the inside outwards, `_STEP_PX` apart, (4, n); None of a
-    marker that is too small."""
+    """Return the mean grey across each side from the inside outwards, `_STEP_PX` apart, (4, n);
+    None of a marker that is too small."""
     reach_px = _reach_px(marker)
     if reach_px < _LEAST_REACH_PX:
         return None
@@ -685,21 +625,21 @@ def _profiles(image: NDArray[np.uint8], marker: Detection) -> Array | None:
 
 
 def _apart_px(profiles: Array) -> list[float]:
-    """The distance of two equal steps in each of the profiles (m, n), 0 where there is one."""
+    """Return the distance of the two highest steps in each of the profiles (m, n), if they are
+    about equal, with a valley between; else 0."""
     rise = np.diff(profiles, axis=1) / _STEP_PX
-    slope = 0.25 * rise[:, :-2] + 0.5 * rise[:, 1:-1] + 0.25 * rise[:, 2:]
-    middle = slope[:, 1:-1]
-    peak = (middle > slope[:, :-2]) & (middle >= slope[:, 2:]) & (middle >= _LEAST_SLOPE)
-    return [_between_px(s, np.flatnonzero(p) + 1) for s, p in zip(slope, peak, strict=True)]
-
-
-def _between_px(slope: Array, peaks: NDArray[np.intp]) -> float:
-    """The distance of the two highest peaks, if they are about equal, with a valley between."""
-    if len(peaks) < 2:
-        return 0.0
-    low, high = np.sort(slope[peaks])[-2:]
-    if low < _ALIKE * high:
-        return 0.0
-    a, b = np.sort(peaks[np.argsort(slope[peaks])[-2:]])
-    apart_px = float(b - a) * _STEP_PX
-    return apart_px if apart_px >= _LEAST_PX and slope[a:b].min() < _VALLEY * low else 0.0
+    slopes = 0.25 * rise[:, :-2] + 0.5 * rise[:, 1:-1] + 0.25 * rise[:, 2:]
+    middle = slopes[:, 1:-1]
+    is_peak = (middle > slopes[:, :-2]) & (middle >= slopes[:, 2:]) & (middle >= _LEAST_SLOPE)
+    found = []
+    for slope, peaks in zip(slopes, map(np.flatnonzero, is_peak), strict=True):
+        highest = (peaks + 1)[np.argsort(slope[peaks + 1])[-2:]]
+        apart_px = 0.0
+        if len(highest) == 2:
+            low, high = slope[highest]
+            a, b = np.sort(highest)
+            wide_px = float(b - a) * _STEP_PX
+            if low >= _ALIKE * high and wide_px >= _LEAST_PX and slope[a:b].min() < _VALLEY * low:
+                apart_px = wide_px
+        found.append(apart_px)
+    return found

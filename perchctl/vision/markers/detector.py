@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
-from perchctl.vision.markers.pattern import Pattern, Rim, drawing_of, pattern_of, rim_of_bits
+from perchctl.vision.markers.pattern import Pattern, drawing_of, pattern_of, rim_of_bits
 from perchctl.vision.types import Frame, MarkerName
 
 MIRROR_INDEX = 1
@@ -26,18 +26,11 @@ _LOOSE_PERIMETER_RATE = 0.05
 _LOOSE_ACCURACY_RATE = 0.1
 
 
-@dataclass(frozen=True)
-class Thresholds:
-    """Windows of the adaptive threshold, px: OpenCV tries them from the least to the most
-    in steps of 10."""
-
-    least_px: int
-    most_px: int
-
-
-OPENCV_THRESHOLDS = Thresholds(3, 23)
-QUICK_THRESHOLDS = Thresholds(13, 13)  # enough where both markers were seen a frame ago
-_LOOSE_THRESHOLDS = Thresholds(15, 35)
+Thresholds = tuple[int, int]
+"""Least and greatest window of the adaptive threshold, px; OpenCV tries them in steps of 10."""
+OPENCV_THRESHOLDS: Thresholds = (3, 23)
+QUICK_THRESHOLDS: Thresholds = (13, 13)  # enough where both markers were seen a frame ago
+_LOOSE_THRESHOLDS: Thresholds = (15, 35)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,28 +40,35 @@ class DetectorSetup:
     `dictionaries` are the large and the small marker's, each with the marker and, behind it
     (`MIRROR_INDEX`), its mirror image where that cannot be confused with the marker
     itself; `patterns` is how each marker looks, `ratio` the small marker's side over the
-    large one's, `mask` what the vehicle covers; the rest is the profile's.
+    large one's, `mask` what the vehicle covers; `config` is the profile's.
     """
 
     dictionaries: tuple[Any, Any]
     patterns: dict[MarkerName, Pattern]
     ratio: float
-    refinement: str
-    window: bool
-    blurred: bool
-    blurred_every: int
-    cut: bool
+    config: DetectorConfig
     mask: GearMask | None = None
 
     @property
     def by_lines(self) -> bool:
-        return self.refinement == "line"
+        """True if lines are fitted to the sides; else there are no other fits either."""
+        return self.config.refinement == "line"
+
+    @property
+    def cut(self) -> bool:
+        """True if a target is measured of which the picture cuts both markers."""
+        return self.config.cut and self.by_lines
+
+    @property
+    def blurred(self) -> bool:
+        """True if drawings are laid over pictures that show no edges."""
+        return self.config.blurred and self.by_lines
 
 
 def make_aruco_detector(
     config: DetectorConfig, target: TargetConfig, mask: GearMask | None = None
 ) -> DetectorSetup:
-    """Dictionaries of just the target's ids, and how its markers look."""
+    """Return dictionaries of just the target's ids, and how its markers look."""
     large_bits, small_bits = _bits(target.large), _bits(target.small)
     ratio = target.small.side_m / target.large.side_m
     return DetectorSetup(
@@ -78,57 +78,56 @@ def make_aruco_detector(
         ),
         patterns={
             "large": pattern_of(
-                _rim(large_bits, target.large.side_m), drawing_of(large_bits, small_bits, ratio)
+                rim_of_bits(large_bits, _PRINT_M * (len(large_bits) + 2) / target.large.side_m),
+                drawing_of(large_bits, small_bits, ratio),
             ),
-            "small": pattern_of(_rim(small_bits, target.small.side_m), drawing_of(small_bits)),
+            "small": pattern_of(
+                rim_of_bits(small_bits, _PRINT_M * (len(small_bits) + 2) / target.small.side_m),
+                drawing_of(small_bits),
+            ),
         },
         ratio=ratio,
-        refinement=config.refinement,
-        window=config.window,
-        blurred=config.blurred,
-        blurred_every=config.blurred_every,
-        cut=config.cut and config.refinement == "line",
+        config=config,
         mask=mask,
     )
 
 
-def strict_detector(setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds) -> Any:
-    """OpenCV's detector for one pass over a picture of that size. Making one takes about a
-    microsecond, a pass a thousand times as long."""
+def make_marker_decoder(
+    setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds
+) -> Any:
+    """Return OpenCV's detector of markers that it can decode, for one pass over a picture of that
+    size. Making one takes about a microsecond, a pass a thousand times as long."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.errorCorrectionRate = 1.0  # so that maxCorrectionBits is the limit itself
     parameters.minDistanceToBorder = 0
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-    parameters.adaptiveThreshWinSizeMin = thresholds.least_px
-    parameters.adaptiveThreshWinSizeMax = thresholds.most_px
+    parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = thresholds
     parameters.minMarkerPerimeterRate = min(1.0, _MIN_PERIMETER_PX / max(size_px))
     return cv2.aruco.ArucoDetector(list(setup.dictionaries), parameters)
 
 
-def loose_detector(setup: DetectorSetup) -> Any:
-    """One that takes nearly any quadrilateral for a candidate, for blurred pictures: round
-    corners, wide dark borders, small sides."""
+def make_quadrilateral_finder(setup: DetectorSetup) -> Any:
+    """Return OpenCV's detector, set so that it takes nearly any quadrilateral for a candidate, for
+    blurred pictures: round corners, wide dark borders, small sides."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
     parameters.polygonalApproxAccuracyRate = _LOOSE_ACCURACY_RATE
-    parameters.adaptiveThreshWinSizeMin = _LOOSE_THRESHOLDS.least_px
-    parameters.adaptiveThreshWinSizeMax = _LOOSE_THRESHOLDS.most_px
-    parameters.adaptiveThreshWinSizeStep = _LOOSE_THRESHOLDS.most_px - _LOOSE_THRESHOLDS.least_px
+    least_px, most_px = _LOOSE_THRESHOLDS
+    parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = least_px, most_px
+    parameters.adaptiveThreshWinSizeStep = most_px - least_px
     parameters.minMarkerPerimeterRate = _LOOSE_PERIMETER_RATE
     return cv2.aruco.ArucoDetector(list(setup.dictionaries), parameters)
 
 
-def _rim(bits: NDArray[np.uint8], side_m: float) -> Rim:
-    return rim_of_bits(bits, _PRINT_M * (len(bits) + 2) / side_m)
-
-
 def _bits(marker: MarkerConfig) -> NDArray[np.uint8]:
+    """Return the inner bits (n, n) of the profile's marker, 1 = white."""
     source = aruco_dictionary(marker.dictionary)
     rows = np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1])
     return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize))
 
 
 def _dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
+    """Return a dictionary of the marker and, where these cannot be confused, its mirror image."""
     patterns, mirror = [bits], np.ascontiguousarray(bits[:, ::-1])
     if _distance(mirror, bits) > 2 * correction_bits + 1:
         patterns.append(mirror)
@@ -139,7 +138,7 @@ def _dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
 
 
 def _distance(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> int:
-    """Fewest bits in which a, in any turn, differs from b."""
+    """Return the fewest bits in which a, in any turn, differs from b."""
     return min(int((np.rot90(a, turn) != b).sum()) for turn in range(4))
 
 
@@ -167,20 +166,20 @@ class GearMask:
 
 
 def make_mask(covered: Covered) -> GearMask:
-    """From where the gear is in the picture (h, w)."""
+    """Return the mask, from where the gear is in the picture (h, w)."""
     rows = np.ones((_FIELD_ROWS, 1), np.uint8)
     return GearMask(covered, cv2.dilate(covered.astype(np.uint8), rows) > 0)
 
 
 def hidden_in(frame: Frame, mask: GearMask | None) -> Covered | None:
-    """Where a frame of one moment shows the vehicle."""
+    """Return where a frame of one moment shows the vehicle."""
     if mask is None:
         return None
     return mask.field if frame.fields in ("top", "bottom") else mask.whole
 
 
 def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
-    """The picture with what is hidden replaced by the mean of what is around it."""
+    """Return the picture with what is hidden replaced by the mean of what is around it."""
     h, w = image.shape
     free = (~hidden).astype(np.float32)
     size = (max(w // _REDUCED, 1), max(h // _REDUCED, 1))
@@ -196,8 +195,8 @@ def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
 
 
 def hides(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) -> bool:
-    """Whether a part of the marker with these corners (4, 2) is hidden, as far as `reach` half
-    sides from its centre."""
+    """Return True if a part of the marker with these corners (4, 2) is hidden, as far as `reach`
+    half sides from its centre."""
     if hidden is None:
         return False
     h, w = hidden.shape

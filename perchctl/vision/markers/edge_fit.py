@@ -28,16 +28,16 @@ from perchctl.vision.lens import distort, undistort
 from perchctl.vision.markers.corners import (
     BEFORE,
     NEXT,
+    OUT,
     RAW_SIGMA_PX,
     UNIT,
-    Border,
     RefinedCorners,
     doubled_area,
-    edge_shift,
     from_unit,
     mapped,
     refine_each,
     side_lengths_px,
+    to_unit,
 )
 from perchctl.vision.markers.pattern import Rim
 from perchctl.vision.types import CameraModel, EdgeShift
@@ -67,16 +67,16 @@ _TO_THE_LEFT = np.array(-1j)
 
 
 def places(lengths_px: Array) -> Array:
-    """How far along its side (rows,) of that length each profile is: (rows, n) in 0..1;
-    the ends keep clear of the neighbouring sides' blur."""
+    """Return how far along its side (rows,) of that length each profile is: (rows, n) in 0..1; the
+    ends keep clear of the neighbouring sides' blur."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
 
 def side_profiles(starts: Array, ends: Array, s: Array, camera: CameraModel) -> tuple[Array, Array]:
-    """Where the profiles cross the sides, in the picture, and the unit normals there,
-    to the left of the way from start to end as the picture is seen (outwards for a
-    marker whose corners run clockwise): each (rows, n, 2).
+    """Return where the profiles cross the sides, in the picture, and the unit normals there, to the
+    left of the way from start to end as the picture is seen (outwards for a marker whose corners
+    run clockwise): each (rows, n, 2).
 
     A side's image through the lens is smooth: a few nodes define all of it.
 
@@ -96,7 +96,7 @@ def side_profiles(starts: Array, ends: Array, s: Array, camera: CameraModel) -> 
 
 
 def sample(image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Array) -> Floats:
-    """Grey values along the profiles, (rows, n, steps + 1): bilinear, the picture's rim
+    """Return the grey values along the profiles, (rows, n, steps + 1): bilinear, the picture's rim
     repeated outside.
 
     On float pictures OpenCV 5 interpolates at the exact position; on bytes, other
@@ -139,6 +139,10 @@ _NEAR_END_PX = 4.0  # of 7: an edge 6 px off, cut off there, was seen up to 0.3 
 _LEAST_ROWS = 2.0  # times the other sides' variance shows that rows shake
 _LEAST_ASPECT = 0.05  # variance of the sides' slants (0 to 1), to tell them apart
 _MIN_CONTRAST = 6.0  # grey levels between the flanks
+_SHIFT_FLOOR_PX = 0.01
+_MAX_SHIFT_PX = 1.0
+_MAX_BLUR_CELLS = 0.45  # beyond it the two edges of a border are one
+_MIN_PROFILES = 3.0  # in total weight, of a side that counts
 _SHIFT_PRIOR_PX = 0.15  # what glare and gamma do to edges
 _CLIPPED_PRIOR_PX = 0.4  # what clipping does
 CLIPPED_GREY = 248.0
@@ -147,15 +151,6 @@ _ONES32: Floats = np.ones(PROFILES, dtype=np.float32)
 _QUARTERS: Array = np.full(4, 0.25)
 _PARABOLA: Array = ALONG**2 - (ALONG**2).mean()
 _BOWED = 3.0  # standard deviations
-
-
-@dataclass(frozen=True, eq=False)
-class _Lines:
-    """Lines (4m, 3) as (nx, ny, c) with n.x = c and |n| = 1, normalised, and the weighted
-    RMS distance of their points, px (4m,)."""
-
-    lines: Array
-    residual_px: Array
 
 
 def refine(
@@ -192,10 +187,10 @@ def refine_lines(
     camera: CameraModel,
     known: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
-    """The line fit alone, for m markers (m, 4, 2); None where its residual, inliers,
-    contrast, blur or movement show that these are not a marker's sides. The shift of all
-    edges is measured unless it is known. Wide edges, and those near to the profiles' ends, are
-    looked at twice, the second time with the profiles centred on them."""
+    """Fit lines to the sides of m markers (m, 4, 2); None where residual, inliers, contrast, blur
+    or movement show that these are not a marker's sides. The shift of all edges is measured unless
+    it is known. Wide edges, and those near to the profiles' ends, are looked at twice, the second
+    time with the profiles centred on them."""
     found = _refined_once(image, raw_px, rims, camera, known)
     centred = raw_px.copy()
     for i, each in enumerate(found):
@@ -217,32 +212,37 @@ def _refined_once(
     camera: CameraModel,
     known: EdgeShift | None,
 ) -> list[RefinedCorners | None]:
-    nothing: list[RefinedCorners | None] = [None] * len(raw_px)
+    """Fit lines to the sides near to the raw corners, as `refine_lines` does, once."""
+    found: list[RefinedCorners | None] = [None] * len(raw_px)
     markers = markers_of(raw_px, rims, camera)
     if markers is None:
-        return nothing
-    measured = measure(image, markers, camera, with_inner=known is None)
-    sides = measured.sides
+        return found
+    sides, inner = measure(image, markers, camera, with_inner=known is None)
     clipped = _clipped(sides) > CLIPPED_SHARE
     if known is not None and clipped.any():
         # How far clipping moves edges changes with the light.
         return _refined_once(image, raw_px, rims, camera, None)
-    fit = _fit_lines(markers, sides)
+    lines, residual_px = _fit_lines(markers, sides)
     shift = known
     if shift is None:
-        corners = _intersect(fit.lines)
+        corners = _intersect(lines)
         if not finite(corners):
-            return nothing
-        shift = _measured_shift(markers, measured, fit, corners)
+            return found
+        shift = _measured_shift(markers, sides, inner, lines, residual_px, corners)
     applied = shift if shift is not None else EdgeShift(0.0, _shift_prior_px(sides))
-    corners = _intersect(_moved_outwards(markers, fit, applied.shift_px))
+    if applied.shift_px != 0.0:
+        lines = lines.copy()
+        lines[:, 2] += _outwards(markers, lines) * (applied.shift_px / markers.px_per_unit)
+    corners = _intersect(lines)
     if not finite(corners):
-        return nothing
+        return found
     corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
-    accepted = _accepted(markers, sides, fit, corners_px)
-    ends_px2 = _ends_px2(markers, sides, fit).tolist()
-    blurs_px, normals_x = sides.blur_px.tolist(), fit.lines[:, 0].tolist()
-    found = nothing
+    accepted = _accepted(markers, sides, residual_px, corners_px)
+    # Variance of the ends of the sides: a line fitted to n samples spreads twice as far there as
+    # in its middle.
+    independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
+    ends_px2 = (4.0 * _TAILS * residual_px * residual_px / independent).tolist()
+    blurs_px, normals_x = sides.blur_px.tolist(), lines[:, 0].tolist()
     for i, rim in enumerate(rims):
         if not accepted[i]:
             continue
@@ -262,8 +262,9 @@ def _refined_once(
     return found
 
 
-def _fit_lines(markers: Markers, sides: Samples) -> _Lines:
-    """Total least squares on the points of each side."""
+def _fit_lines(markers: Markers, sides: Samples) -> tuple[Array, Array]:
+    """Return the lines (4m, 3) as (nx, ny, c) with n.x = c and |n| = 1, normalised, by total least
+    squares on the points of each side; and the weighted RMS distance of these, px (4m,)."""
     w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
     x, y = sides.points[..., 0], sides.points[..., 1]
     cx, cy = (w * x).dot(_ONES), (w * y).dot(_ONES)
@@ -275,11 +276,11 @@ def _fit_lines(markers: Markers, sides: Samples) -> _Lines:
     residual2 = nx * nx * sxx + 2.0 * nx * ny * sxy + ny * ny * syy
     lines = np.empty((len(w), 3))
     lines[:, 0], lines[:, 1], lines[:, 2] = nx, ny, nx * cx + ny * cy
-    return _Lines(lines, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_unit)
+    return lines, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_unit
 
 
 def _intersect(lines: Array) -> Array:
-    """Corner i of each marker, where side i - 1 meets side i: (m, 4, 2)."""
+    """Return the corner i of each marker, where side i - 1 meets side i: (m, 4, 2)."""
     sides = lines.reshape(-1, 4, 3)
     before = sides.take(BEFORE, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
@@ -293,66 +294,88 @@ def _intersect(lines: Array) -> Array:
 
 
 def _shift_prior_px(sides: Samples) -> float:
-    """How far edges are shifted before that is measured: by white as the camera sees it
+    """Return how far edges are shifted before that is measured: by white as the camera sees it
     beyond the sides."""
     clipped = float(sides.grey[:, :, -1].mean()) > CLIPPED_GREY
     return _CLIPPED_PRIOR_PX if clipped else _SHIFT_PRIOR_PX
 
 
 def _measured_shift(
-    markers: Markers, measured: Measured, fit: _Lines, corners: Array
+    markers: Markers,
+    sides: Samples,
+    inner: Samples | None,
+    lines: Array,
+    residual_px: Array,
+    corners: Array,
 ) -> EdgeShift | None:
-    """None where no inner edge was sampled."""
-    inner, k = measured.inner, measured.inner_of
+    """Return how far white has grown over black, by the width of a border, of which `corners` (m,
+    4, 2) are the outer edge's; None where no inner edge was sampled.
+
+    Outer edges that moved in by d shrink the marker's own scale; the inner edges, at
+    the part r of it, moved out by d: they appear d (1 + r) too far out.
+    """
     if inner is None:
         return None
-    border = Border(
-        corners=corners[k],
-        points=inner.points,
-        weight=inner.weight,
-        blur_px=inner.blur_px,
-        depth_px=markers.depth_px[k],
-        cells=markers.rims[k].cells,
-        cell_px=float(markers.cell_px[k]),
-        tolerance=markers.rims[k].tolerance,
-        bow_px=_bow_px(markers, measured.sides, fit, k),
+    k, prior_px = markers.widest, _shift_prior_px(sides)
+    rim, depth_px, cell_px = markers.rims[k], markers.depth_px[k], float(markers.cell_px[k])
+    r = 1.0 - 2.0 / rim.cells
+    own = mapped(to_unit(corners[k]), inner.points)
+    far = np.matmul(own, OUT[:, :, None])[..., 0] - r
+    far_px = far * (depth_px / (1.0 - r * r))[:, None]
+    w = inner.weight * (inner.blur_px < _MAX_BLUR_CELLS * depth_px)[:, None]
+    w *= np.abs(far_px) < _MAX_SHIFT_PX
+    mass = w.sum(axis=1)
+    some = mass > _MIN_PROFILES
+    if not some.any():
+        return EdgeShift(0.0, prior_px)
+    # A sheet that curls, or a lens that is known badly, moves places by the square of their way
+    # from the centre: outer edges farther than inner ones, and their ends farther than middles.
+    bent_px = 8.0 * r / (3.0 * rim.cells) * _bow_px(markers, sides, lines, residual_px)
+    far_px = far_px + bent_px
+    share = w / np.maximum(mass, 1e-9)[:, None]
+    mean = (share * far_px).sum(axis=1)
+    scatter = (share * (far_px - mean[:, None]) ** 2).sum(axis=1)
+    least = _SHIFT_FLOOR_PX**2 + bent_px**2
+    information = some / (2.0 * scatter / np.maximum(mass, 1.0) + least)
+    total = float(information.sum())
+    shift = float(information @ mean) / total
+    # Sides that disagree are worth less.
+    chi2 = float(information @ (mean - shift) ** 2) / max(int(np.count_nonzero(some)) - 1, 1)
+    variance = max(chi2, 1.0) / total
+    # What no averaging takes away: the neighbours' blur and the print.
+    variance += (2.0 * math.exp(-cell_px / 2.2)) ** 2 + (rim.tolerance * cell_px) ** 2
+    prior = prior_px**2
+    return EdgeShift(
+        shift_px=shift * prior / (prior + variance),
+        sigma_px=(1.0 / variance + 1.0 / prior) ** -0.5,
     )
-    return edge_shift(border, _shift_prior_px(measured.sides))
 
 
-def _bow_px(markers: Markers, sides: Samples, fit: _Lines, k: int) -> float:
-    """How far the ends of marker k's sides lie further out than their middles, the mean of
-    its sides, as far as noise does not explain it."""
-    of_k = slice(4 * k, 4 * k + 4)
-    lines, points = fit.lines[of_k], sides.points[of_k]
-    away = np.matmul(points, lines[:, :2, None])[..., 0] - lines[:, 2:]
-    scale = _outwards(markers, fit)[of_k] * markers.px_per_unit[of_k]
-    mass = np.maximum(sides.weight[of_k] @ (_PARABOLA * _PARABOLA), 1e-9)
-    bow_px = scale * ((sides.weight[of_k] * away) @ _PARABOLA) / mass
+def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) -> float:
+    """Return how far the ends of the widest marker's sides lie further out than their middles, the
+    mean of its sides, as far as noise does not explain it."""
+    four = slice(4 * markers.widest, 4 * markers.widest + 4)
+    away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
+    scale = _outwards(markers, lines)[four] * markers.px_per_unit[four]
+    mass = np.maximum(sides.weight[four] @ (_PARABOLA * _PARABOLA), 1e-9)
+    bow_px = scale * ((sides.weight[four] * away) @ _PARABOLA) / mass
     mean_px = float(bow_px @ _QUARTERS)
-    noise_px = 0.25 * math.sqrt(float((fit.residual_px[of_k] ** 2 / mass).sum()))
+    noise_px = 0.25 * math.sqrt(float((residual_px[four] ** 2 / mass).sum()))
     return mean_px if abs(mean_px) > _BOWED * noise_px else 0.0
 
 
-def _moved_outwards(markers: Markers, fit: _Lines, shift_px: float) -> Array:
-    """The lines (4m, 3) moved out of their markers."""
-    if shift_px == 0.0:
-        return fit.lines
-    lines = fit.lines.copy()
-    lines[:, 2] += _outwards(markers, fit) * (shift_px / markers.px_per_unit)
-    return lines
-
-
-def _outwards(markers: Markers, fit: _Lines) -> Array:
-    """+1 where a line's normal, which may point either way, points out of its marker, else
+def _outwards(markers: Markers, lines: Array) -> Array:
+    """Return +1 where a line's normal, which may point either way, points out of its marker, else
     -1, (4m,)."""
     corners = markers.corners
     out = (corners - (_QUARTERS @ corners)[:, None]).reshape(-1, 2)
-    return np.asarray(np.sign(fit.lines[:, 0] * out[:, 0] + fit.lines[:, 1] * out[:, 1]))
+    return np.asarray(np.sign(lines[:, 0] * out[:, 0] + lines[:, 1] * out[:, 1]))
 
 
-def _accepted(markers: Markers, sides: Samples, fit: _Lines, corners_px: Array) -> list[bool]:
-    """Which of the m markers have lines for sides, near to where they were expected."""
+def _accepted(
+    markers: Markers, sides: Samples, residual_px: Array, corners_px: Array
+) -> list[bool]:
+    """Return which of the m markers have lines for sides, near to where they were expected."""
     inliers = (sides.weight > 0.0).dot(_ONES32)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
     contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).dot(_ONES32)
@@ -363,7 +386,7 @@ def _accepted(markers: Markers, sides: Samples, fit: _Lines, corners_px: Array) 
         and grey > _MIN_CONTRAST * PROFILES
         and is_sharp
         for residual, count, grey, is_sharp in zip(
-            fit.residual_px.tolist(), inliers.tolist(), contrast.tolist(), sharp.tolist(),
+            residual_px.tolist(), inliers.tolist(), contrast.tolist(), sharp.tolist(),
             strict=True,
         )
     ]  # fmt: skip
@@ -379,7 +402,7 @@ def _accepted(markers: Markers, sides: Samples, fit: _Lines, corners_px: Array) 
 
 
 def _clipped(sides: Samples) -> Array:
-    """Share of the profiles of the m markers that end in clipped white, (m,)."""
+    """Return the share of the profiles of the m markers that end in clipped white, (m,)."""
     ends = sides.grey[:, :, -1]
     if ends.max() <= CLIPPED_GREY:
         return np.zeros(len(ends) // 4)
@@ -387,18 +410,10 @@ def _clipped(sides: Samples) -> Array:
     return np.asarray(glaring.reshape(-1, 4) @ _QUARTERS)
 
 
-def _ends_px2(markers: Markers, sides: Samples, fit: _Lines) -> Array:
-    """Variance of the ends of the sides, (4m,): a line fitted to n samples spreads twice as far
-    there as in its middle."""
-    independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
-    residual_px = fit.residual_px
-    return np.asarray(4.0 * _TAILS * residual_px * residual_px / independent)
-
-
 def _sigma_px(
     cell_px: float, blur_px: float, noise_px2: float, clipped: bool, tolerance: float
 ) -> float:
-    """Spread of a marker's corners; `noise_px2` is the variance of its sides' ends, and
+    """Return the spread of a marker's corners; `noise_px2` is the variance of its sides' ends, and
     `tolerance` that of the print, in cells."""
     blur_px = max(blur_px, 1e-3)
     # Cells of few pixels let the inner pattern's blur reach the border's edge.
@@ -412,9 +427,9 @@ def _sigma_px(
 
 
 def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
-    """Spread of a marker's corners by what shakes a picture's rows, each along itself: it moves
-    upright sides, both of a marker's alike, and lying ones not. As the residuals of its four
-    sides show it; 0 where the marker stands on a corner and nothing shows."""
+    """Return the spread of a marker's corners by what shakes a picture's rows, each along itself,
+    as the residuals of its four sides show it: it moves upright sides, both of a marker's alike,
+    and lying ones not. 0 where the marker stands on a corner and nothing shows."""
     upright = [x * x for x in normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
@@ -438,35 +453,19 @@ _SIDES = np.arange(4)[:, None]
 @dataclass(frozen=True, eq=False)
 class Markers:
     """What is to be measured: raw_px (m, 4, 2), the same normalised, the lengths of their
-    sides and the width of the cells behind each of them (m, 4), the number and mean width
-    of a marker's cells (m,), +1 or -1 as its corners run (m,), and pixels for a unit of
-    normalised coordinates along each side (4m,)."""
+    sides and the width of the cells behind each of them (m, 4), the mean width of a marker's
+    cells (m,), the number of the marker with the widest, +1 or -1 as its corners run (m,), and
+    pixels for a unit of normalised coordinates along each side (4m,)."""
 
     raw_px: Array
     rims: Sequence[Rim]
     corners: Array
     sides_px: Array
     depth_px: Array
-    cells: Array
     cell_px: Array
+    widest: int
     turn: Array
     px_per_unit: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """The sides across which profiles are sampled: every marker's, and after them perhaps
-    the inner edges of the border of marker number `best`. starts, ends (rows, 2)
-    normalised; lengths_px, depth_px (rows,); of: the marker of each; sign: +1 where white
-    is to the left of the way from start to end."""
-
-    starts: Array
-    ends: Array
-    lengths_px: Array
-    depth_px: Array
-    of: NDArray[np.intp]
-    sign: Array
-    best: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -481,17 +480,9 @@ class Samples:
     blur_px: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """All markers' sides, and the inner edges of the border of marker number `inner_of`."""
-
-    sides: Samples
-    inner: Samples | None
-    inner_of: int
-
-
 def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Markers | None:
-    """None where one of the markers is no square at all."""
+    """Return what is to be measured of markers with these raw corners; None where one of them is no
+    square at all."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
@@ -501,6 +492,7 @@ def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Marke
         return None
     along = corners.take(NEXT, axis=1) - corners
     across_px = sides_px.take(BEFORE, axis=1) + sides_px.take(NEXT, axis=1)
+    cell_px = sides_px @ _QUARTERS / cells
     return Markers(
         raw_px=raw_px,
         rims=rims,
@@ -508,56 +500,42 @@ def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Marke
         sides_px=sides_px,
         # The inner row lies one cell further in, along the neighbouring sides.
         depth_px=0.5 * across_px / cells[:, None],
-        cells=cells,
-        cell_px=sides_px @ _QUARTERS / cells,
+        cell_px=cell_px,
+        widest=int(cell_px.argmax()),
         turn=turn,
         px_per_unit=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
     )
 
 
-def _rows(markers: Markers, with_inner: bool) -> _Rows:
-    """Every marker's sides; then the inner edge of the border with the largest cells,
-    which shows best by how much all edges are shifted."""
+def measure(
+    image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
+) -> tuple[Samples, Samples | None]:
+    """Return the edges' places on profiles across all sides; and, on request, across the inner
+    edges of the border with the widest cells, which shows best by how much all edges are shifted.
+    None where these cells are too small."""
     starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
     of = np.arange(len(starts)).repeat(4)
-    best = int(markers.cell_px.argmax())
-    with_inner = with_inner and float(markers.cell_px[best]) > _MIN_SHIFT_CELL_PX
+    widest = markers.widest
+    rim = markers.rims[widest]
+    with_inner = with_inner and float(markers.cell_px[widest]) > _MIN_SHIFT_CELL_PX
     if with_inner:
-        r = 1.0 - 2.0 / float(markers.cells[best])
-        inner = mapped(from_unit(markers.corners[best]), r * UNIT)[None]
+        r = 1.0 - 2.0 / rim.cells
+        inner = mapped(from_unit(markers.corners[widest]), r * UNIT)[None]
         starts = np.concatenate([starts, inner])
-        lengths_px = np.concatenate([lengths_px, r * lengths_px[best : best + 1]])
-        depth_px = np.concatenate([depth_px, depth_px[best : best + 1]])
-        of = np.append(of, (best, best, best, best))
+        lengths_px = np.concatenate([lengths_px, r * lengths_px[widest : widest + 1]])
+        depth_px = np.concatenate([depth_px, depth_px[widest : widest + 1]])
+        of = np.append(of, (widest, widest, widest, widest))
     # Normals point out of a marker whose corners run clockwise; dark must come first.
     sign = markers.turn[of]
     if with_inner:
         sign[-4:] *= -1.0
-    return _Rows(
-        starts=starts.reshape(-1, 2),
-        ends=starts.take(NEXT, axis=1).reshape(-1, 2),
-        lengths_px=lengths_px.ravel(),
-        depth_px=depth_px.ravel(),
-        of=of,
-        sign=sign,
-        best=best,
-    )
-
-
-def measure(
-    image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
-) -> Measured:
-    """The edges' places on profiles across all sides, and across the inner edges of the
-    border with the largest cells, on request and if these are large enough."""
-    rows = _rows(markers, with_inner)
-    s = places(rows.lengths_px)
-    origin, normal = side_profiles(rows.starts, rows.ends, s, camera)
-    normal *= rows.sign[:, None, None]
-    cell_px = markers.cell_px
-    near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)[rows.of]
-    half_px = np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)[rows.of]
+    s = places(lengths_px.ravel())
+    ends = starts.take(NEXT, axis=1).reshape(-1, 2)
+    origin, normal = side_profiles(starts.reshape(-1, 2), ends, s, camera)
+    normal *= sign[:, None, None]
+    near_px, half_px = (each[of] for each in reaches_px(markers.cell_px))
     grey = sample(image, origin, normal, half_px)
-    edges = locate(grey, half_px, near_px, _surroundings(s, markers.rims, rows))
+    edges = locate(grey, half_px, near_px, surroundings(s, markers.rims, rim, depth_px.ravel()))
     points = undistort((origin + edges.offset_px[..., None] * normal).reshape(-1, 2), camera)
     points = points.reshape(-1, PROFILES, 2)
     if not finite(points):
@@ -573,26 +551,33 @@ def measure(
         )
 
     n = 4 * len(markers.raw_px)
-    inner = part(slice(n, None)) if len(rows.of) > n else None
-    return Measured(part(slice(0, n)), inner, rows.best)
+    return part(slice(0, n)), part(slice(n, None)) if with_inner else None
 
 
-def _surroundings(s: Array, rims: Sequence[Rim], rows: _Rows) -> Surroundings:
-    """Which profiles at places `s` have a neighbouring edge, and which have an edge."""
+def reaches_px(cell_px: Array) -> tuple[Array, Array]:
+    """Return how far from an edge the window around it and the profile across it reach, by the
+    width of the cells beside it."""
+    near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
+    return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
+
+
+def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> Surroundings:
+    """Return which profiles at places `s` (rows, n) have a neighbouring edge, `depth_px` (rows,)
+    away, and which have an edge: four rows a rim, and then perhaps the border's inner edges of one.
+    """
     inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
     possible = np.ones(s.shape, np.bool_)
     for i, rim in enumerate(rims):
         four = slice(4 * i, 4 * i + 4)
         inside[four] = rim.white[_SIDES, (s[four] * rim.cells).astype(np.intp)]
     if len(s) > 4 * len(rims):
-        rim = rims[rows.best]
-        at = 1.0 + s[-4:] * (rim.cells - 2)  # in cells from the border's corner
+        at = 1.0 + s[-4:] * (inner.cells - 2)  # in cells from the border's corner
         # Near a black cell of the rim, or with one behind, blur bends the edge.
-        free = rim.open[_SIDES, (at - 0.3).astype(np.intp)]
-        free = free * rim.open[_SIDES, (at + 0.3).astype(np.intp)]
+        free = inner.open[_SIDES, (at - 0.3).astype(np.intp)]
+        free = free * inner.open[_SIDES, (at + 0.3).astype(np.intp)]
         possible[-4:] = free > 0.0
         outside[-4:] = 1.0
-    return Surroundings(rows.depth_px, inside, outside, possible)
+    return Surroundings(depth_px, inside, outside, possible)
 
 
 # --- Edges between black and white to a hundredth of a pixel, on grey profiles across them -----
@@ -605,7 +590,8 @@ def _surroundings(s: Array, rims: Sequence[Rim], rows: _Rows) -> Surroundings:
 
 
 def _single(value: float) -> Floats:
-    """A number as arrays meet it soonest: beside one of numpy's scalars they take twice as long."""
+    """Return a number as arrays meet it soonest: beside one of numpy's scalars they take twice as
+    long."""
     return np.array(value, dtype=np.float32)
 
 
@@ -648,7 +634,7 @@ class Surroundings:
     possible: NDArray[np.bool_]
 
     def only(self, kept: NDArray[np.intp]) -> Surroundings:
-        """Of some of the rows."""
+        """Return the surroundings of some of the rows."""
         return Surroundings(
             self.depth_px[kept], self.inside[kept], self.outside[kept], self.possible[kept]
         )
@@ -665,128 +651,97 @@ class Edges:
     blur_px: Array
 
 
-@dataclass(frozen=True, eq=False)
-class _Gradients:
-    """The profiles' gradients at places `u` (rows, steps) and what every window over them
-    needs: its reach `near`, the cells' width, the square of its largest sigma, the
-    flanks with a neighbouring edge (`both`, `side`: outside less inside), the
-    profiles that `can` show an edge, and `part`, which makes of a row's sum the least
-    value that counts."""
-
-    gradient: Floats
-    u: Floats
-    near: Floats
-    depth: Floats
-    most2: Floats
-    both: Floats
-    side: Floats
-    can: Floats
-    part: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class _Centroids:
-    """Where the window saw the edges, px, which of them count, and the blur's square."""
-
-    edge: Floats
-    usable: NDArray[np.bool_]
-    blur2: Floats
-
-
 def locate(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> Edges:
-    """The place of an edge that rises along the profile.
+    """Return the place of an edge that rises along the profile.
 
     Args:
         grey: (rows, n, steps + 1), the profile from -half_px to +half_px.
         half_px, near_px: reach of the profiles and of the windows, (rows,).
     """
-    gradients = _gradients(grey, half_px, near_px, around)
-    seen = _wide(gradients)
-    line = weight = _halves_line(seen.edge, seen.usable)
+    profiles = _Profiles(grey, half_px, near_px, around)
+    edge, usable = profiles.wide()
+    blur2 = np.ones(len(near_px), dtype=np.float32)
+    line = weight = _halves_line(edge, usable)
     moved_px = np.inf
     for k in range(_ROUNDS):
         if k == 1 and moved_px < _ONE_ROUND_PX:
             continue
-        seen = _narrow(gradients, line, seen.blur2)
+        edge, usable, blur2 = profiles.narrow(line, blur2)
         rounds = 2 if k == _ROUNDS - 1 else 1
-        centre, weight = _robust_line(seen.edge, seen.usable, rounds)
+        centre, weight = _robust_line(edge, usable, rounds)
         moved_px, line = float(np.abs(centre - line).max()), centre
         if moved_px < _SETTLED_PX:
             break
     return Edges(
-        offset_px=seen.edge.astype(np.float64),
+        offset_px=edge.astype(np.float64),
         weight=weight.astype(np.float64),
-        blur_px=np.sqrt(seen.blur2).astype(np.float64),
+        blur_px=np.sqrt(blur2).astype(np.float64),
     )
 
 
-def _gradients(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> _Gradients:
-    inside, outside, can = around.inside, around.outside, around.possible.astype(np.float32)
-    near, depth = near_px.astype(np.float32), around.depth_px.astype(np.float32)
-    return _Gradients(
-        gradient=grey[:, :, 1:] - grey[:, :, :-1],
-        u=half_px.astype(np.float32)[:, None] * MIDDLES,
-        near=near,
-        depth=depth,
-        most2=_QUARTER_OF * near * near,
-        both=inside + outside,
-        side=outside - inside,
-        can=can,
+class _Profiles:
+    """The gradients along all profiles, and what every window over them needs."""
+
+    def __init__(self, grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> None:
+        self.gradient = grey[:, :, 1:] - grey[:, :, :-1]
+        self.u = half_px.astype(np.float32)[:, None] * MIDDLES  # where, (rows, steps)
+        self.near, self.depth = near_px.astype(np.float32), around.depth_px.astype(np.float32)
+        self.most2 = _QUARTER_OF * self.near * self.near  # square of a window's largest sigma
+        # The flanks with a neighbouring edge: both, and outside less inside.
+        self.both, self.side = around.inside + around.outside, around.outside - around.inside
+        self.can = around.possible.astype(np.float32)
         # Multiplies a sum over a row's profiles: a part of the mean over those possible.
-        part=_LEAST_SHARE / np.maximum(can.dot(_ONES32), _ONE),
-    )
+        self.part = _LEAST_SHARE / np.maximum(self.can.dot(_ONES32), _ONE)
 
+    def wide(self) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the edges by one window around the middle of all profiles, and which count."""
+        spread = self.u * (_PER_NEAR / self.near)[:, None]
+        spread *= spread
+        window = np.empty((*self.u.shape, 2), dtype=np.float32)
+        np.exp(_MINUS_HALF * spread, out=window[..., 0])
+        np.multiply(window[..., 0], self.u, out=window[..., 1])
+        moments: Floats = np.maximum(self.gradient, _ZERO) @ window
+        total = moments[..., 0] * self.can
+        usable = total > (total.dot(_ONES32) * self.part)[:, None]
+        return np.divide(moments[..., 1], np.where(usable, total, _ONE)), usable
 
-def _wide(g: _Gradients) -> _Centroids:
-    """By one window around the middle of all profiles; the blur is not measured yet."""
-    spread = g.u * (_PER_NEAR / g.near)[:, None]
-    spread *= spread
-    window = np.empty((*g.u.shape, 2), dtype=np.float32)
-    np.exp(_MINUS_HALF * spread, out=window[..., 0])
-    np.multiply(window[..., 0], g.u, out=window[..., 1])
-    moments: Floats = np.maximum(g.gradient, _ZERO) @ window
-    total = moments[..., 0] * g.can
-    usable = total > (total.dot(_ONES32) * g.part)[:, None]
-    edge = np.divide(moments[..., 1], np.where(usable, total, _ONE))
-    return _Centroids(edge, usable, np.ones(len(g.near), dtype=np.float32))
-
-
-def _narrow(g: _Gradients, line: Floats, blur2: Floats) -> _Centroids:
-    """By a window around the row's line (rows, n), as wide as its blur so far demands."""
-    relative = g.u[:, None, :] - line[:, :, None]
-    # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
-    w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), g.most2)
-    squared = relative * relative
-    mass = squared * (_MINUS_HALF / w2)[:, None, None]
-    np.exp(mass, out=mass)
-    mass *= g.gradient
-    total = (mass @ _STEP_ONES) * g.can
-    usable = total > np.maximum(total.dot(_ONES32) * g.part, _TINY)[:, None]
-    # A neighbour seen through the window has this share, at this place, with this
-    # spread; the one outside lies at the same distance on the other flank.
-    wide2 = w2 + blur2
-    place = g.depth * w2 / wide2
-    lost = np.exp(_MINUS_HALF * g.depth * g.depth / wide2)
-    share = np.minimum(g.both * lost[:, None], _MOST_SHARE)
-    total = np.where(usable, total / (_ONE - share), _ONE)
-    relative *= mass
-    first = relative @ _STEP_ONES + total * g.side * (lost * place)[:, None]
-    mass *= squared
-    second = mass @ _STEP_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
-    moment = (second * usable).dot(_ONES32)
-    moment /= np.maximum((total * usable).dot(_ONES32), _TINY)
-    moment = np.minimum(np.maximum(moment, _LEAST_MOMENT2), _MOST_MOMENT * w2)
-    found2 = moment * w2 / (w2 - moment)
-    # The window pulls the centroid towards its own middle: undo that.
-    centroid = first / total * (_ONE + found2 / w2)[:, None]
-    limit = g.near[:, None]
-    return _Centroids(line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2)
+    def narrow(self, line: Floats, blur2: Floats) -> tuple[Floats, NDArray[np.bool_], Floats]:
+        """Return the edges by a window around the row's line (rows, n), as wide as its blur so
+        far demands, which of them count, and the blur's square."""
+        relative = self.u[:, None, :] - line[:, :, None]
+        # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
+        w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), self.most2)
+        squared = relative * relative
+        mass = squared * (_MINUS_HALF / w2)[:, None, None]
+        np.exp(mass, out=mass)
+        mass *= self.gradient
+        total = (mass @ _STEP_ONES) * self.can
+        usable = total > np.maximum(total.dot(_ONES32) * self.part, _TINY)[:, None]
+        # A neighbour seen through the window has this share, at this place, with this
+        # spread; the one outside lies at the same distance on the other flank.
+        wide2 = w2 + blur2
+        place = self.depth * w2 / wide2
+        lost = np.exp(_MINUS_HALF * self.depth * self.depth / wide2)
+        share = np.minimum(self.both * lost[:, None], _MOST_SHARE)
+        total = np.where(usable, total / (_ONE - share), _ONE)
+        relative *= mass
+        first = relative @ _STEP_ONES + total * self.side * (lost * place)[:, None]
+        mass *= squared
+        second = mass @ _STEP_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
+        moment = (second * usable).dot(_ONES32)
+        moment /= np.maximum((total * usable).dot(_ONES32), _TINY)
+        moment = np.minimum(np.maximum(moment, _LEAST_MOMENT2), _MOST_MOMENT * w2)
+        found2 = moment * w2 / (w2 - moment)
+        # The window pulls the centroid towards its own middle: undo that.
+        centroid = first / total * (_ONE + found2 / w2)[:, None]
+        limit = self.near[:, None]
+        return line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2
 
 
 def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Straight lines (rows, n) through the middles of the two halves of each row: where a
-    window is put, whatever a quarter of either half shows. A half that shows nothing is
-    taken to lie where the other does."""
+    """Return straight lines (rows, n) through the middles of the two halves of each row: where a
+    window is put, whatever a quarter of either half shows. A half that shows nothing is taken to
+    lie where the other does."""
     halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
     halves.sort(axis=2)
     first = _QUARTER // 2
@@ -799,7 +754,7 @@ def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
 
 
 def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:
-    """Straight lines edge(s) a row with Tukey's weights; returns (line, weight)."""
+    """Return straight lines edge(s) a row with Tukey's weights, and these weights."""
     line = median(edge, usable)[:, None]
     for _ in range(rounds):
         size = np.abs(edge - line)
@@ -819,7 +774,7 @@ def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[
 
 
 def median(values: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Each row's median over its usable values, to a rank, (rows,); 0 without any.
+    """Return each row's median over its usable values, to a rank, (rows,); 0 without any.
 
     The others are set high and low by turns, which keeps the middle where it is.
     """

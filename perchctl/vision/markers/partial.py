@@ -21,11 +21,13 @@ from perchctl.vision.lens import distort, pinhole_px, undistort, undistort_px
 from perchctl.vision.markers.corners import (
     BEFORE,
     NEXT,
+    OUT,
     UNIT,
     RefinedCorners,
     corner_jacobian,
     doubled_area,
     from_unit,
+    incremented,
     mapped,
     mean_side_px,
     side_lengths_px,
@@ -36,11 +38,12 @@ from perchctl.vision.markers.edge_fit import (
     PROFILES,
     STEPS,
     Floats,
-    Surroundings,
     locate,
     places,
+    reaches_px,
     sample,
     side_profiles,
+    surroundings,
 )
 from perchctl.vision.markers.pattern import CELL_MARGIN, MIN_CONTRAST, MOST_CELLS, Pattern
 from perchctl.vision.types import CameraModel, EdgeShift
@@ -57,18 +60,6 @@ _MAX_STEP = 0.5
 _MOST_OFF_PX = 20.0  # from its start, three windows on: no edges lead a fit farther
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """A round's square H (3, 3), unit to pinhole px, how far it moved, the edges that it rests
-    on, by how much they are off then, px (rows, n), and the normal matrix (9, 9)."""
-
-    H: Array
-    moved_px: float
-    seen: SeenEdges
-    left_px: Array
-    N: Array
-
-
 def fit_partly(
     image: NDArray[np.uint8],
     start_px: Array,
@@ -77,10 +68,10 @@ def fit_partly(
     hidden: NDArray[np.bool_] | None = None,
     known: EdgeShift | None = None,
 ) -> RefinedCorners | None:
-    """The marker near to corners `start_px` (4, 2), which may be outside of the picture.
+    """Fit the whole marker near to corners `start_px` (4, 2), which may be outside of the picture.
 
-    `hidden` (h, w) is where pixels show something else. None where what is seen does not
-    determine the corners. Nothing is said about the marker's cells.
+    `hidden` (h, w) is where pixels show something else. None where what is seen does not determine
+    the corners. The marker's cells are not looked at.
     """
     if not _large_enough(start_px, pattern):
         return None
@@ -88,16 +79,24 @@ def fit_partly(
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
         return None
     H = from_unit(start)
-    fit: _Fit | None = None
     for k in range(_ROUNDS):
-        seen = look(image, H, pattern, camera, hidden)
-        fit = None if seen is None else _stepped(H, seen, known)
-        if fit is None:
+        seen = seen_edges(image, H, pattern, camera, hidden)
+        if seen is None:
             return None
-        H = fit.H
-        if k > 0 and fit.moved_px < _STILL_PX:
+        A, N, g = _equations(seen, known or EdgeShift(0.0, _prior_px(seen)))
+        try:
+            step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            return None
+        p = step[:8]
+        if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_STEP):
+            return None
+        H = incremented(H, p)
+        if k > 0 and float(np.abs(p[:6]).max() * seen.rows.scale_px.mean()) < _STILL_PX:
             break
-    return None if fit is None else _corners(fit, pattern, camera)
+    assert seen is not None
+    left_px = seen.far_px - (step @ A).reshape(seen.far_px.shape)
+    return _corners(H, seen, left_px, N, pattern, camera)
 
 
 def seen_partly(
@@ -109,7 +108,7 @@ def seen_partly(
     hidden: NDArray[np.bool_] | None = None,
     known: EdgeShift | None = None,
 ) -> RefinedCorners | None:
-    """`fit_partly`, if the cells that are seen are the marker's."""
+    """Return the result of `fit_partly`, if the cells that are seen are the marker's."""
     if not _large_enough(start_px, pattern):
         return None
     if not may_show_enough(start_px, image.shape, pattern, camera, known_by, _MOST_OFF_PX):
@@ -122,13 +121,14 @@ def seen_partly(
 
 
 def _large_enough(start_px: Array, pattern: Pattern) -> bool:
+    """Return True if a part of a side may show anything."""
     return mean_side_px(start_px) / pattern.rim.cells >= LEAST_CELL_PX
 
 
 def wholly_seen(
     found: RefinedCorners, shape: tuple[int, ...], hidden: NDArray[np.bool_] | None
 ) -> bool:
-    """Whether nothing of the marker is hidden, and the picture's edge too far away to take
+    """Return True if nothing of the marker is hidden, and the picture's edge too far away to take
     anything from the sides' blur."""
     return within(found.corners_px, shape, ROOM_PX + found.blur_px) and not hides(
         hidden, found.corners_px
@@ -136,39 +136,27 @@ def wholly_seen(
 
 
 def _prior_px(seen: SeenEdges) -> float:
+    """Return how far edges are shifted before that is measured."""
     return _CLIPPED_PRIOR_PX if seen.white > _CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 
-def _stepped(H: Array, seen: SeenEdges, known: EdgeShift | None) -> _Fit | None:
-    """The square H one round on; None where the fit breaks down."""
-    A, N, g = _equations(seen, known or EdgeShift(0.0, _prior_px(seen)))
-    try:
-        step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return None
-    p = step[:8]
-    if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_STEP):
-        return None
-    H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
-    moved_px = float(np.abs(p[:6]).max() * seen.scale_px.mean())
-    return _Fit(H / H[2, 2], moved_px, seen, seen.far_px - (step @ A).reshape(seen.far_px.shape), N)
-
-
 def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
-    """Changes (9, rows * n) of the edges with the square's increment, in the terms of
-    `corner_jacobian`, and with the shift of all edges, px; and their normal equations (9, 9),
-    (9,), per px^2 of an edge's spread."""
-    u, v = seen.own[..., 0], seen.own[..., 1]
-    nx, ny = OUT[seen.side].T[..., None] * seen.scale_px[:, None]
+    """Return the changes (9, rows * n) of the edges with the square's increment, in the terms of
+    `corner_jacobian`, and with the shift of all edges, px; and their normal equations (9, 9), (9,),
+    per px^2 of an edge's spread."""
+    u, v, rows = seen.own[..., 0], seen.own[..., 1], seen.rows
+    nx, ny = OUT[rows.side].T[..., None] * rows.scale_px[:, None]
     A = np.empty((9, *u.shape))
     A[0], A[1], A[2] = nx * u, nx * v, nx
     A[3], A[4], A[5] = ny * u, ny * v, ny
     across = A[0] + A[4]
     A[6], A[7] = -u * across, -v * across
     # The model's edge moves with the square, the seen one by the shift.
-    A[8] = -seen.inwards[:, None]
+    A[8] = np.where(rows.at < 1.0, 1.0, -1.0)[:, None]
     A = A.reshape(9, -1)
-    weighted = A * (seen.weight * _worth(seen)[:, None]).ravel()
+    # Profiles nearer to each other than a pixel measure the same.
+    worth = np.minimum(1.0, 2.0 * rows.scale_px * rows.at / PROFILES)
+    weighted = A * (seen.weight * worth[:, None]).ravel()
     N, g = weighted.dot(A.T), weighted.dot(seen.far_px.ravel())
     # An edge's spread is about a tenth of a pixel while it is not known.
     certain = (0.1 / prior.sigma_px) ** 2
@@ -178,26 +166,23 @@ def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
     return A, N, g
 
 
-def _worth(seen: SeenEdges) -> Array:
-    """Profiles nearer to each other than a pixel measure the same, (rows,)."""
-    length_px = 2.0 * seen.scale_px * seen.at
-    return np.minimum(1.0, length_px / PROFILES)
-
-
-def _corners(fit: _Fit, pattern: Pattern, camera: CameraModel) -> RefinedCorners | None:
-    """Corners and covariance after the last round; None where they are not determined."""
-    seen, N = fit.seen, fit.N
-    spread = _spread(seen, fit.left_px)
+def _corners(
+    H: Array, seen: SeenEdges, left_px: Array, N: Array, pattern: Pattern, camera: CameraModel
+) -> RefinedCorners | None:
+    """Return the corners and covariance of the square H (3, 3), unit to pinhole px, after the last
+    round, by what that leaves over of its edges, px (rows, n), and by its normal matrix (9, 9);
+    None where they are not determined."""
+    spread = _spread(seen, left_px)
     if spread is None:
         return None
     residual2, growth = spread
-    pinhole = mapped(fit.H, UNIT)
+    pinhole = mapped(H, UNIT)
     corners_px = distort(mapped(np.asarray(np.linalg.inv(camera.K)), pinhole), camera)
     side_px = mean_side_px(pinhole)
     cell_px = side_px / pattern.rim.cells
     noise2 = max(_TAILS * residual2 * growth, _MIN_SIGMA_PX**2)
     # Of the square alone; what the shift of all edges leaves open is `shift_sigma_px`.
-    J = corner_jacobian(fit.H)
+    J = corner_jacobian(H)
     cov_px2: Array = J @ np.linalg.inv(N[:8, :8]) @ J.T * noise2
     floor2 = _MIN_SIGMA_PX**2 + (pattern.rim.tolerance * cell_px) ** 2
     cov_px2 = cov_px2 + np.eye(8) * (floor2 + 0.25 * np.exp(cell_px * (-2.0 / 1.8)))
@@ -215,8 +200,8 @@ def _corners(fit: _Fit, pattern: Pattern, camera: CameraModel) -> RefinedCorners
 
 
 def _spread(seen: SeenEdges, left: Array) -> tuple[float, float] | None:
-    """Mean square of what the fit leaves over within rows, px^2, and by how much rows contradict
-    each other beyond it; None where these are no edges of a square."""
+    """Return the mean square of what the fit leaves over within rows, px^2, and by how much rows
+    contradict each other beyond it; None where these are no edges of a square."""
     w = seen.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
@@ -251,8 +236,8 @@ def visible_cells_agree(
     hidden: NDArray[np.bool_] | None,
     known_by: KnownBy,
 ) -> bool:
-    """Whether the cells that are seen have their colour: not those beyond the picture's edge,
-    behind what is `hidden` (h, w), or in light that glares. How many that must be depends on
+    """Return True if the cells that are seen have their colour: not those beyond the picture's
+    edge, behind what is `hidden` (h, w), or in light that glares. How many that must be depends on
     what else says which marker it is."""
     h, w = image.shape
     at = _spots_px(corners_px, pattern, camera)
@@ -291,17 +276,17 @@ def may_show_enough(
     known_by: KnownBy,
     off_px: float,
 ) -> bool:
-    """Whether so many cells may be in the picture as `visible_cells_agree` asks for, of a marker
-    that is within `off_px` of corners (4, 2)."""
+    """Return True if so many cells may be in the picture as `visible_cells_agree` asks for, of a
+    marker that is within `off_px` of corners (4, 2)."""
     seen = _within(_spots_px(start_px, pattern, camera), shape, off_px)
     count = np.bincount(pattern.owner, weights=seen)
     return _enough(count >= 0.5 * pattern.spots_per_cell, pattern, known_by)
 
 
 def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
-    """The spots of a marker at corners (4, 2) as the lens shows them, (n, 2); NaN where it does
-    not reach. A marker that fills the picture is no square in it: its middle is a third of a cell
-    from where its corners alone put it."""
+    """Return the spots of a marker at corners (4, 2) as the lens shows them, (n, 2); NaN where it
+    does not reach. A marker that fills the picture is no square in it: its middle is a third of a
+    cell from where its corners alone put it."""
     rays = undistort(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.spots), 2), np.nan)
@@ -312,14 +297,14 @@ def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array
 
 
 def _within(at_px: Array, shape: tuple[int, ...], room_px: float) -> NDArray[np.bool_]:
-    """Which points (n, 2) are in the picture, or no farther outside."""
+    """Return which points (n, 2) are in the picture, or no farther outside."""
     h, w = shape[:2]
     inside = (at_px >= -room_px) & (at_px <= (w - 1 + room_px, h - 1 + room_px))
     return np.asarray(inside.all(axis=1))
 
 
 def _enough(known: NDArray[np.bool_], pattern: Pattern, known_by: KnownBy) -> bool:
-    """Whether the known cells (cells,) tell which marker it is."""
+    """Return True if the known cells (cells,) tell which marker it is."""
     most_unknown = len(known) if known_by == "other" else _UNKNOWN_BITS[known_by]
     return bool(
         np.count_nonzero(pattern.inner & ~known) <= most_unknown
@@ -333,8 +318,6 @@ def _enough(known: NDArray[np.bool_], pattern: Pattern, known_by: KnownBy) -> bo
 
 ROOM_PX = 2.0
 """To the picture's edge, where blur would need what is beyond it."""
-OUT: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
-"""Of each side, in the marker's own coordinates."""
 _INNER_CELL_PX = 6.0  # of a border whose inner edge is seen apart from the outer one
 _TOO_BRIGHT, _TOO_DARK = 0.2, 0.5  # of the contrast: of black inside, of white outside
 _LEAST_CONTRAST = 10.0
@@ -361,53 +344,33 @@ class _Rows:
     sign: Array
 
     def only(self, kept: NDArray[np.intp]) -> _Rows:
-        """Some of them."""
-        return _Rows(
-            starts=self.starts[kept],
-            ends=self.ends[kept],
-            side=self.side[kept],
-            at=self.at[kept],
-            lengths_px=self.lengths_px[kept],
-            scale_px=self.scale_px[kept],
-            cell_px=self.cell_px,
-            sign=self.sign[kept],
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Lit:
-    """Which profiles (rows, n) show an edge as it should be, and how white the paper is."""
-
-    good: NDArray[np.bool_]
-    white: float
+        """Return some of the rows."""
+        of_each = ("starts", "ends", "side", "at", "lengths_px", "scale_px", "sign")
+        return replace(self, **{name: getattr(self, name)[kept] for name in of_each})
 
 
 @dataclass(frozen=True, eq=False)
 class SeenEdges:
     """Edges of one round: of each profile (rows, n) its place in the marker's own coordinates
-    (rows, n, 2), how far outwards it is from where the square has it, and its weight; of
-    each row (rows,) what `_Rows` has of it, +1 where white grown over black moves it in, and
-    its blur in terms of the window; and how white the paper is."""
+    (rows, n, 2), how far outwards it is from where the square has it, and its weight; the rows,
+    and the blur of each in terms of the window (rows,); and how white the paper is."""
 
     own: Array
     far_px: Array
     weight: Array
-    side: NDArray[np.intp]
-    at: Array
-    scale_px: Array
-    inwards: Array
+    rows: _Rows
     blur: Array
     white: float
 
 
-def look(
+def seen_edges(
     image: NDArray[np.uint8],
     H: Array,
     pattern: Pattern,
     camera: CameraModel,
     hidden: NDArray[np.bool_] | None,
 ) -> SeenEdges | None:
-    """The edges near to where the square H has them; None where too few are seen. Sides of
+    """Return the edges near to where the square H has them; None where too few are seen. Sides of
     which nothing is seen are left out."""
     rows = _rows(H, pattern, camera)
     if rows is None:
@@ -417,9 +380,9 @@ def look(
     if not (np.abs(origin) < _FAR_PX).all():
         return None  # a lens model throws what is far outside anywhere, to no number too
     normal *= rows.sign[:, None, None]
-    near_px = np.full(len(rows.at), min(max(0.85 * rows.cell_px, 1.5), 7.0))
-    half_px = np.full(len(rows.at), min(max(1.5 * rows.cell_px, 1.75), 7.0))
-    around = _surroundings(s, pattern, 2.0 * rows.scale_px / pattern.rim.cells)
+    near_px, half_px = reaches_px(np.full(len(rows.at), rows.cell_px))
+    depth_px = 2.0 * rows.scale_px / pattern.rim.cells
+    around = surroundings(s, [pattern.rim], pattern.rim, depth_px)
     free = around.possible & _in_view(image.shape, hidden, origin, normal, near_px)
     kept = np.flatnonzero(np.count_nonzero(free, axis=1) >= _MIN_WEIGHT)
     if len(kept) < _LEAST_EDGES:
@@ -431,8 +394,9 @@ def look(
     lit = _unspoilt(grey, free, near_px, half_px)
     if lit is None:
         return None
-    edges = locate(grey, half_px, near_px, replace(around, possible=lit.good))
-    weight = np.where(lit.good, edges.weight, 0.0)
+    good, white = lit
+    edges = locate(grey, half_px, near_px, replace(around, possible=good))
+    weight = np.where(good, edges.weight, 0.0)
     weight[weight.sum(axis=1) < _MIN_WEIGHT] = 0.0
     found = undistort((origin + edges.offset_px[..., None] * normal).reshape(-1, 2), camera)
     own = mapped(np.asarray(np.linalg.inv(H)), pinhole_px(found, camera)).reshape(origin.shape)
@@ -443,17 +407,14 @@ def look(
         own=own,
         far_px=far * rows.scale_px[:, None],
         weight=weight,
-        side=rows.side,
-        at=rows.at,
-        scale_px=rows.scale_px,
-        inwards=np.where(rows.at < 1.0, -1.0, 1.0),
+        rows=rows,
         blur=edges.blur_px / near_px,
-        white=lit.white,
+        white=white,
     )
 
 
 def _rows(H: Array, pattern: Pattern, camera: CameraModel) -> _Rows | None:
-    """Of the square H, unit to pinhole px; None where that is none."""
+    """Return the rows of the square H, unit to pinhole px; None where that is none."""
     corners, cells = mapped(H, UNIT), pattern.rim.cells
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
@@ -478,20 +439,6 @@ def _rows(H: Array, pattern: Pattern, camera: CameraModel) -> _Rows | None:
     )
 
 
-def _surroundings(s: Array, pattern: Pattern, depth_px: Array) -> Surroundings:
-    """Which profiles at places `s` (rows, n) have a neighbouring edge, and which have one."""
-    rim, four = pattern.rim, np.arange(4)[:, None]
-    inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
-    possible = np.ones(s.shape, np.bool_)
-    inside[:4] = rim.white[four, (s[:4] * rim.cells).astype(np.intp)]
-    if len(s) > 4:
-        along = 1.0 + s[4:] * (rim.cells - 2)  # in cells from the border's corner
-        free = rim.open[four, (along - 0.3).astype(np.intp)]
-        possible[4:] = free * rim.open[four, (along + 0.3).astype(np.intp)] > 0.0
-        outside[4:] = 1.0
-    return Surroundings(depth_px, inside, outside, possible)
-
-
 def _in_view(
     shape: tuple[int, ...],
     hidden: NDArray[np.bool_] | None,
@@ -499,7 +446,7 @@ def _in_view(
     normal: Array,
     near_px: Array,
 ) -> NDArray[np.bool_]:
-    """Which profiles (rows, n) are in the picture, and not hidden, as far as they count."""
+    """Return which profiles (rows, n) are in the picture, and not hidden, as far as they count."""
     h, w = shape[:2]
     # A profile is as far in the picture as both its ends are.
     reach, last = near_px[:, None, None] * np.abs(normal), (w - 1 - ROOM_PX, h - 1 - ROOM_PX)
@@ -512,9 +459,12 @@ def _in_view(
     return np.asarray(seen)
 
 
-def _unspoilt(grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array) -> _Lit | None:
-    """Which of the free profiles (rows, n) begin black and end white, as most do; None without
-    contrast. Light that glares makes black bright; what lies on the paper makes white dark."""
+def _unspoilt(
+    grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array
+) -> tuple[NDArray[np.bool_], float] | None:
+    """Return which of the free profiles (rows, n) begin black and end white, as most do, and how
+    white the paper is; None without contrast. Light that glares makes black bright; what lies on
+    the paper makes white dark."""
     # At half the window from the edge, blur has ended and no neighbour begins.
     off = max(1, round(0.5 * STEPS * float((0.6 * near_px / half_px)[0])))
     dark, bright = grey[:, :, STEPS // 2 - off], grey[:, :, STEPS // 2 + off]
@@ -523,4 +473,4 @@ def _unspoilt(grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Ar
     if contrast < _LEAST_CONTRAST:
         return None
     good = (dark < black + _TOO_BRIGHT * contrast) & (bright > white - _TOO_DARK * contrast)
-    return _Lit(free & good, white)
+    return free & good, white

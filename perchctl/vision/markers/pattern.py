@@ -65,7 +65,7 @@ class Pattern:
 
 
 def rim_of_bits(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
-    """The rim of a marker with the inner bits (n, n), 1 = white.
+    """Return the rim of a marker with the inner bits (n, n), 1 = white.
 
     At small sizes the rim's blur reaches the border's outer edge and would push it out.
     """
@@ -85,7 +85,8 @@ def rim_of_bits(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
 
 
 def pattern_of(rim: Rim, drawing: Drawing) -> Pattern:
-    """Spots in every cell, but for those that another marker in the centre covers."""
+    """Return how a marker looks, with spots in every cell but those that another marker in the
+    centre covers."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
@@ -114,7 +115,7 @@ def pattern_of(rim: Rim, drawing: Drawing) -> Pattern:
 
 
 def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Whether every cell of the marker at these corners has its colour, clearly."""
+    """Return True if every cell of the marker at these corners has its colour, clearly."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -130,7 +131,7 @@ def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Whether nearly all cells have their colour, the others being covered."""
+    """Return True if nearly all cells have their colour, the others being covered."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -140,19 +141,20 @@ def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pat
 
 
 def resembles(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Whether the grey values in the cells go with the pattern, blurred as they may be."""
+    """Return True if the grey values in the cells go with the pattern, blurred as they may be."""
     return float(resemblance(image, corners_px, pattern)[0]) > _MIN_RESEMBLANCE
 
 
 def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
-    """Correlation of the cells' grey values with the pattern for corners (4, 2) rolled on
-    by 0 to 3, as `np.roll` does; (4,), 0 without contrast."""
+    """Return the correlation of the cells' grey values with the pattern for corners (4, 2) rolled
+    on by 0 to 3, as `np.roll` does; (4,), 0 without contrast."""
     grey = _read(image, corners_px, pattern)
     return np.zeros(4) if grey is None else _likeness(grey[None], pattern)[0]
 
 
 def resemblances(image: NDArray[np.uint8], squares: Array, pattern: Pattern) -> Array:
-    """`resemblance` of many at a time: homographies (m, 3, 3) of the unit square to (m, 4)."""
+    """Return the `resemblance` of many at a time: homographies (m, 3, 3) of the unit square to (m,
+    4)."""
     like = np.zeros((len(squares), 4))
     inside, grey = _read_many(image, squares, pattern)
     like[inside] = _likeness(grey, pattern)
@@ -160,7 +162,7 @@ def resemblances(image: NDArray[np.uint8], squares: Array, pattern: Pattern) -> 
 
 
 def _likeness(grey: Array, pattern: Pattern) -> Array:
-    """Correlation (m, 4) of grey values (m, k) at the spots, 0 without contrast."""
+    """Return the correlation (m, 4) of grey values (m, k) at the spots, 0 without contrast."""
     grey = grey - grey.sum(axis=1, keepdims=True) / grey.shape[1]
     spread = np.sqrt((grey * grey).sum(axis=1))[:, None]
     like = grey @ pattern.soft.T / np.maximum(spread, 1e-9)
@@ -170,7 +172,8 @@ def _likeness(grey: Array, pattern: Pattern) -> Array:
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Mean grey value of each cell that is read, None where one is outside of the picture."""
+    """Return the mean grey value of each cell that is read, None where one is outside of the
+    picture."""
     grey = _read(image, corners_px, pattern)
     if grey is None:
         return None
@@ -178,7 +181,8 @@ def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Grey values (k,) at the pattern's k spots, None where one is outside of the picture."""
+    """Return the grey values (k,) at the pattern's k spots, None where one is outside of the
+    picture."""
     at = mapped(from_unit(corners_px), pattern.spots)
     # Spots are inside of the corners.
     if not (within(corners_px, image.shape) or within(at, image.shape)):
@@ -190,8 +194,8 @@ def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Arra
 def _read_many(
     image: NDArray[np.uint8], H: Array, pattern: Pattern
 ) -> tuple[NDArray[np.bool_], Array]:
-    """Which of m squares (m, 3, 3) have all spots in the picture, and the grey values
-    (n, k) at the k spots of those."""
+    """Return which of m squares (m, 3, 3) have all spots in the picture, and the grey values (n, k)
+    at the k spots of those."""
     h, w = image.shape
     at = pattern.spots @ H[:, :2, :2].transpose(0, 2, 1) + H[:, None, :2, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -203,7 +207,7 @@ def _read_many(
 
 
 def _softened(drawing: Drawing, spots: Array) -> Array:
-    """Whiteness at the spots with a blur of half a cell."""
+    """Return the whiteness at the spots with a blur of half a cell."""
     n, fine = len(drawing.cells), 8
     sharp = np.kron(np.pad(drawing.cells, 2, constant_values=1.0), np.ones((fine, fine)))
     white = np.asarray(cv2.GaussianBlur(sharp, (0, 0), 0.5 * fine), dtype=np.float64)
@@ -238,8 +242,8 @@ class Drawing:
 
 def drawing_of(bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None,
                ratio: float = 0.0) -> Drawing:  # fmt: skip
-    """From inner bits, 1 = white; with a centre, the target's large marker: its sheet has
-    a cell of white around it."""
+    """Return the drawing of inner bits, 1 = white; with a centre, that of the target's large
+    marker: its sheet has a cell of white around it."""
     cells = np.pad(bits.astype(np.float64), 1)
     if centre is None:
         return Drawing(cells)
@@ -247,7 +251,7 @@ def drawing_of(bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None,
 
 
 def _coverage(axis: Array, half_node: float, n_cells: int, size: float) -> Array:
-    """Share of each cell in each node, (nodes, cells)."""
+    """Return the share of each cell in each node, (nodes, cells)."""
     edges = size * np.linspace(-1.0, 1.0, n_cells + 1)
     low, high = axis[:, None] - half_node, axis[:, None] + half_node
     overlap = np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1])
@@ -255,13 +259,14 @@ def _coverage(axis: Array, half_node: float, n_cells: int, size: float) -> Array
 
 
 def _wide(axis: Array, half_node: float) -> Array:
+    """Return the axis with `EDGE` nodes more at either end."""
     more = 2.0 * half_node * np.arange(1, EDGE + 1)
     return np.concatenate([axis[0] - more[::-1], axis, axis[-1] + more])
 
 
 @lru_cache(maxsize=64)
 def sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
-    """The drawing at n by n nodes over its reach, and perhaps what is beyond its sheet."""
+    """Return the drawing at n by n nodes over its reach, and perhaps what is beyond its sheet."""
     half_node = drawing.reach / n
     axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
     paper = drawn(drawing, axis, half_node)
@@ -271,13 +276,13 @@ def sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
 
 @lru_cache(maxsize=64)
 def square(cells: int, n: int) -> NDArray[np.float32]:
-    """A black square of so many cells at n by n nodes over their reach."""
+    """Return a black square of so many cells at n by n nodes over their reach."""
     return sheets(Drawing(np.zeros((cells, cells))), n)[0]
 
 
 def drawn(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
-    """Whiteness of each node and of `EDGE` nodes more all around, exact in area, as if the
-    paper had no end."""
+    """Return the whiteness of each node and of `EDGE` nodes more all around, exact in area, as if
+    the paper had no end."""
     wide = _wide(axis, half_node)
     C = _coverage(wide, half_node, len(drawing.cells), 1.0)
     black = C @ (1.0 - drawing.cells) @ C.T
@@ -288,8 +293,8 @@ def drawn(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32
 
 
 def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) -> Array:
-    """Share of each row (or column) of cells in each node (n, cells), blurred by sigma nodes:
-    a cell's share in the drawing is the product of its row's and its column's."""
+    """Return the share of each row (or column) of cells in each node (n, cells), blurred by sigma
+    nodes: a cell's share in the drawing is the product of its row's and its column's."""
     wide = _coverage(_wide(axis, half_node), half_node, len(drawing.cells), 1.0)
     soft = cv2.GaussianBlur(
         wide.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=sigma, borderType=cv2.BORDER_REPLICATE
@@ -298,7 +303,7 @@ def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) ->
 
 
 def beyond_sheet(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32] | None:
-    """Share of each node that is not on the paper, likewise; None without an end."""
+    """Return the share of each node that is not on the paper, likewise; None without an end."""
     if drawing.sheet is None:
         return None
     on = _coverage(_wide(axis, half_node), half_node, 1, drawing.sheet)
@@ -306,6 +311,6 @@ def beyond_sheet(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.
 
 
 def softened(sharp: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """Nodes, those all around among them, blurred by so many."""
+    """Return the nodes, those all around among them, blurred by so many."""
     soft = cv2.GaussianBlur(sharp, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(soft, np.float32)

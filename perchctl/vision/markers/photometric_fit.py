@@ -3,10 +3,7 @@
 Where blur has run the cells together, or cells are a few pixels wide, the picture of
 the whole marker still is its drawing, blurred and lit. Gauss-Newton finds the
 homography together with the light and the blur. What does not look like the drawing then, cell
-by cell, is not the marker.
-
-The increment p of the homography H in a round is H (1 + P), with P's terms in the order
-of its rows and its last one 0. Coordinates are the marker's own, see
+by cell, is not the marker. Coordinates are the marker's own, see
 `perchctl.vision.markers.corners`.
 """
 
@@ -22,9 +19,8 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.values import replace
 from perchctl.vision.lens import distort, undistort_px
-from perchctl.vision.markers.corners import UNIT, corner_jacobian, from_unit, mapped
+from perchctl.vision.markers.corners import UNIT, corner_jacobian, from_unit, incremented, mapped
 from perchctl.vision.markers.pattern import (
     EDGE,
     Drawing,
@@ -65,17 +61,26 @@ _PRIOR: Array = (
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """corners_px (4, 2) and their spread; `likeness` is the correlation with the
-    drawing, `pattern` that of what a black square of the same size would leave over,
-    `strength` the height of the pattern's bits over the border's, `worst_cell` the
-    largest mean departure of a cell, in units of the gain."""
+    """A drawing that was laid over the picture, and how well it fits.
+
+    Attributes:
+        corners_px, sigma_px: the marker's corners (4, 2) and their spread.
+        likeness: correlation of the picture with the drawing.
+        pattern, strength: correlation and height of the inner bits, beyond what a black square
+            of the same size explains; the height in units of the border's.
+        cell_departure: largest mean departure of a cell, in units of the gain.
+        flip, flip_sigma: by how much the cell that is most against it has the other colour, 0
+            (drawn as it is seen) to 1 (the bit is wrong), and the least certain cell's spread.
+        blur_px, gain: the blur's sigma, and grey levels from black to white.
+        moved_px: how far the corner that moved most is from its start.
+    """
 
     corners_px: Array
     sigma_px: float
     likeness: float
     pattern: float
     strength: float
-    worst_cell: float
+    cell_departure: float
     flip: float
     flip_sigma: float
     blur_px: float
@@ -84,45 +89,12 @@ class Alignment:
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
-    """What stays the same through all rounds: the picture, the nodes at which it is read,
-    the homography to start with and the lens's shift of the nodes through it, and the
-    drawing."""
-
-    patch: Patch
-    grid: Grid
-    camera: CameraModel
-    H: Array
-    lens_px: Array
-    drawing: Drawing
-    side_px: float
-    node_px: float
-    cell_px: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """The state of the fit: homography to pinhole pixels, the sum of its increments (8,),
-    the offset that the lens makes of it at the nodes and the way since that was computed,
-    the drawing with its blur, and whether it stands still after so many rounds."""
-
-    H: Array
-    total: Array
-    offset_px: Array
-    since_lens_px: float
-    rendered: Rendered
-    rounds: int = 0
-    still: bool = False
-
-
-@dataclass(frozen=True, eq=False)
 class _Equations:
-    """The light in which a fit looks most like the picture's grey values, what it leaves
-    over, the changes J with the unknowns, and the normal equations N x = g of the next
-    increment, per unit of noise."""
+    """What a picture's grey values leave over of a drawing in its best light, with a gain of grey
+    levels from black to white; the changes J with the unknowns; and the normal equations N x = g
+    of the next increment, per unit of noise."""
 
-    grey: Array
-    light: Light
+    gain: float
     error: Array
     J: Array
     noise: float
@@ -143,30 +115,6 @@ def align(
     breaks down.
     """
     start = undistort_px(start_px, camera)
-    scene = _scene(image, start, drawing, camera)
-    if scene is None:
-        return None
-    fit = _first_fit(blur_px, scene)
-    while True:
-        fit = _seen_through_lens(fit, scene)
-        equations = _equations(fit, scene)
-        if equations is None:
-            return None
-        if fit.rounds == _HOPE_ROUNDS and likeness(equations.grey, equations.error) < _LEAST_HOPE:
-            return None
-        step = _solved(equations)
-        if step is None:
-            return None
-        fit = _stepped(fit, step, scene)
-        if fit.still or fit.rounds == _ROUNDS:
-            # What the last round left over, its step being next to nothing.
-            return _alignment(fit, equations, scene, start_px)
-
-
-def _scene(
-    image: NDArray[np.uint8], start: Array, drawing: Drawing, camera: CameraModel
-) -> _Scene | None:
-    """None where corners `start` (4, 2), pinhole px, are no marker inside the picture."""
     if not np.isfinite(start).all():
         return None
     sides = np.hypot(*(start - np.roll(start, 1, axis=0)).T)
@@ -174,217 +122,151 @@ def _scene(
     if float(sides.min()) < _MIN_SIDE_PX or side_px > _MAX_SIDE_PX:
         return None
     n = int(np.clip(math.ceil(reach * side_px / _GRID_PX), _MIN_GRID, _MAX_GRID))
+    node_px, cell_px = reach * side_px / n, side_px / len(drawing.cells)
     grid, H = make_grid(n, reach), from_unit(start)
     lens_px = lens_shift_px(grid, H, camera)
-    patch = patch_around(image, grid, H, lens_px)
+    patch = _patch_around(image, grid, H, lens_px)
     if patch is None:
         return None
-    return _Scene(
-        patch=patch,
-        grid=grid,
-        camera=camera,
-        H=H,
-        lens_px=lens_px,
-        drawing=drawing,
-        side_px=side_px,
-        node_px=reach * side_px / n,
-        cell_px=side_px / len(drawing.cells),
+    around, first = patch
+
+    def drawn(blur_px: float) -> Rendered:
+        return rendered(drawing, n, blur_px / node_px)
+
+    def possible_px(blur_px: float) -> float:
+        return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_px)
+
+    seen = drawn(possible_px(blur_px))
+    offset_px, since_lens_px, total = lens_px - first, 0.0, np.zeros(8)
+    for k in range(_ROUNDS):
+        if since_lens_px > _LENS_PX:
+            offset_px, since_lens_px = lens_shift_px(grid, H, camera) - first, 0.0
+        grey = _read(around, grid, H, offset_px)
+        equations = _equations(grey, seen, total)
+        if equations is None:
+            return None
+        if k == _HOPE_ROUNDS and likeness(grey, equations.error) < _LEAST_HOPE:
+            return None
+        try:
+            step = np.asarray(np.linalg.solve(equations.N, equations.g), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            return None
+        p = step[_SHAPE]
+        if not (np.isfinite(p).all() and np.abs(p).max() <= _MAX_INCREMENT):
+            return None
+        H, total = incremented(H, p), total + p
+        moved_px = 0.5 * side_px * float(np.abs(p[:6]).max())
+        since_lens_px += moved_px
+        sigma2 = seen.sigma**2
+        most = max(1.0, _MOST_BLUR_STEP * sigma2)
+        squared = sigma2 + float(np.clip(step[_BLUR], -most, most))
+        wanted_px = possible_px(math.sqrt(max(squared, 1e-3)) * node_px)
+        drawn_px = seen.sigma * node_px
+        if abs(wanted_px - drawn_px) > min(_BLUR_STEP * drawn_px, _BLUR_STEP_CELLS * cell_px):
+            seen = drawn(wanted_px)
+        elif moved_px < _STILL_PX and since_lens_px <= _LENS_PX:
+            break
+    assert equations is not None
+    # What the last round left over, its step being next to nothing.
+    gain, error = equations.gain, equations.error
+    corners_px = through_lens(mapped(H, UNIT).T, camera).T
+    pattern, strength = _pattern_seen(seen, grey, gain)
+    many = _repeated(error.reshape(n, n))
+    inverse = np.asarray(np.linalg.inv(equations.N))
+    flip, flip_sigma = _cells_seen(seen, equations, inverse, many)
+    J = corner_jacobian(H)
+    variance = float(np.trace(J @ (inverse[_SHAPE, _SHAPE] * many) @ J.T)) / 8.0
+    return Alignment(
+        corners_px=corners_px,
+        sigma_px=math.sqrt(max(variance, 0.0)),
+        likeness=likeness(grey, error),
+        pattern=pattern,
+        strength=strength,
+        cell_departure=_cell_departure(error / gain, grid, len(drawing.cells)),
+        flip=flip,
+        flip_sigma=flip_sigma,
+        blur_px=seen.sigma * node_px,
+        gain=gain,
+        moved_px=float(np.abs(corners_px - start_px).max()),
     )
 
 
-def _possible_blur_px(blur_px: float, scene: _Scene) -> float:
-    return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * scene.cell_px)
-
-
-def _first_fit(blur_px: float, scene: _Scene) -> _Fit:
-    blur_px = _possible_blur_px(blur_px, scene)
-    return _Fit(
-        H=scene.H,
-        total=np.zeros(8),
-        offset_px=scene.lens_px - scene.patch.first[:, None],
-        since_lens_px=0.0,
-        rendered=_rendered(blur_px, scene),
-    )
-
-
-def _rendered(blur_px: float, scene: _Scene) -> Rendered:
-    return rendered(scene.drawing, scene.grid.n, blur_px / scene.node_px)
-
-
-def _seen_through_lens(fit: _Fit, scene: _Scene) -> _Fit:
-    """With the lens computed anew if the fit has moved away from where it was."""
-    if fit.since_lens_px <= _LENS_PX:
-        return fit
-    offset_px = lens_shift_px(scene.grid, fit.H, scene.camera) - scene.patch.first[:, None]
-    return replace(fit, offset_px=offset_px, since_lens_px=0.0)
-
-
-def _equations(fit: _Fit, scene: _Scene) -> _Equations | None:
-    """None without contrast. 16 or 17 unknowns: shape, blur and light."""
-    grey = read(scene.patch, scene.grid, fit.H, fit.offset_px)
-    light = fit_light(fit.rendered, grey)
-    gain = light.gain
+def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
+    """Return the normal equations of the next increment; None without contrast. There are 16 or 17
+    unknowns: shape, blur and light; `total` (8,) is the sum of the increments so far."""
+    rows, products = seen.light
+    A = products + 1e-6 * np.eye(len(products))
+    A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
+    light = np.asarray(np.linalg.solve(A, _onto(rows, grey)), np.float64)
+    gain = float(light[GAIN])
     if gain < _MIN_GAIN:
         return None
-    error = grey - light.grey
-    changes = lit_jacobian(fit.rendered, light)
-    J = np.concatenate([changes, light.rows, error[None]])
+    error = grey - _mixed(rows, light)
+    J = np.concatenate([_lit_jacobian(seen, light), rows, error[None]])
     noise = max(float((error**2).mean()), 1.0)
     products = gram(J) / noise
     J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
     bend = _LIGHT + BEND
     N[_BLUR, _BLUR] += 1.0  # about a node's width a round
     N[bend, bend] += (_BEND_SIGMA * gain) ** -2.0
-    g[bend] -= light.coefficients[BEND] * (_BEND_SIGMA * gain) ** -2.0
+    g[bend] -= light[BEND] * (_BEND_SIGMA * gain) ** -2.0
     N[range(_LIGHT, len(g)), range(_LIGHT, len(g))] += 1e-6
     N[range(8), range(8)] += _PRIOR
-    g[_SHAPE] -= _PRIOR * fit.total
-    return _Equations(grey, light, error, J, noise, N, g)
-
-
-def _solved(equations: _Equations) -> Array | None:
-    """The step of all unknowns, None where it is not one that can be trusted."""
-    try:
-        step = np.asarray(np.linalg.solve(equations.N, equations.g), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return None
-    p = step[_SHAPE]
-    return step if np.isfinite(p).all() and np.abs(p).max() <= _MAX_INCREMENT else None
-
-
-def _stepped(fit: _Fit, step: Array, scene: _Scene) -> _Fit:
-    """The fit one step on."""
-    p = step[_SHAPE]
-    H = fit.H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
-    H /= H[2, 2]
-    moved_px = 0.5 * scene.side_px * float(np.abs(p[:6]).max())
-    since_lens_px = fit.since_lens_px + moved_px
-    sigma2 = fit.rendered.sigma**2
-    most = max(1.0, _MOST_BLUR_STEP * sigma2)
-    squared = sigma2 + float(np.clip(step[_BLUR], -most, most))
-    wanted_px = _possible_blur_px(math.sqrt(max(squared, 1e-3)) * scene.node_px, scene)
-    blur_px = fit.rendered.sigma * scene.node_px
-    least_px = min(_BLUR_STEP * blur_px, _BLUR_STEP_CELLS * scene.cell_px)
-    redraw = abs(wanted_px - blur_px) > least_px
-    return replace(
-        fit,
-        H=H,
-        total=fit.total + p,
-        since_lens_px=since_lens_px,
-        rendered=_rendered(wanted_px, scene) if redraw else fit.rendered,
-        rounds=fit.rounds + 1,
-        still=not redraw and moved_px < _STILL_PX and since_lens_px <= _LENS_PX,
-    )
-
-
-def _alignment(fit: _Fit, equations: _Equations, scene: _Scene, start_px: Array) -> Alignment:
-    drawing, grid, light, error = scene.drawing, scene.grid, equations.light, equations.error
-    corners_px = through_lens(mapped(fit.H, UNIT).T, scene.camera).T
-    pattern = pattern_seen(fit.rendered, equations.grey, light)
-    many = repeated(error.reshape(grid.n, grid.n))
-    inverse = np.asarray(np.linalg.inv(equations.N))
-    covariance = inverse[_SHAPE, _SHAPE] * many
-    cells = cells_seen(
-        drawing.cells,
-        fit.rendered.soft_cells,
-        error,
-        equations.J,
-        inverse / equations.noise,
-        many * equations.noise,
-        light.gain,
-    )
-    J = corner_jacobian(fit.H)
-    return Alignment(
-        corners_px=corners_px,
-        sigma_px=math.sqrt(max(float(np.trace(J @ covariance @ J.T)) / 8.0, 0.0)),
-        likeness=likeness(equations.grey, error),
-        pattern=pattern.correlation,
-        strength=pattern.strength,
-        worst_cell=worst_cell(error / light.gain, grid, len(drawing.cells)),
-        flip=cells.flip,
-        flip_sigma=cells.sigma,
-        blur_px=fit.rendered.sigma * scene.node_px,
-        gain=light.gain,
-        moved_px=float(np.abs(corners_px - start_px).max()),
-    )
-
-
-# --- Which of a drawing's cells the picture contradicts ----------------------------------------
-# The mean over a cell shows a wrong bit as long as blur is smaller than the cell. Beyond that a
-# wrong bit is spread over its neighbours, and shape, blur and light of the fit take a part of
-# what it leaves over. So each cell is looked for as it would look: blurred, and without what the
-# fit's unknowns explain (a matched filter).
-
-
-@dataclass(frozen=True)
-class CellsSeen:
-    """flip: by how much the cell that is most against it has the other colour, 0 (drawn
-    as it is seen) to 1 (the bit is wrong); sigma: the least certain cell's spread."""
-
-    flip: float
-    sigma: float
-
-
-def cells_seen(
-    cells: Array, soft: Array, error: Array, J: Array, inverse: Array, noise: float, gain: float
-) -> CellsSeen:
-    """What a fit leaves over, cell by cell.
-
-    Args:
-        cells: the drawing's, (m, m), 1 = white.
-        soft: share of each row (and column) of cells in each node, blurred, (n, m).
-        error: grey values minus the fit, (n * n,).
-        J: changes of the grey values with the fit's unknowns, (k, n * n).
-        inverse: of the fit's normal matrix with its priors, (k, k), per unit of noise.
-        noise: variance of a node's grey value, of nodes that measure on their own.
-        gain: grey levels from black to white.
-    """
-    n, m = soft.shape
-    seen = gain * (soft.T @ error.reshape(n, n) @ soft).ravel()
-    shared = gain * (soft.T @ J.reshape(-1, n, n) @ soft).reshape(-1, m * m)
-    squared = (soft**2).sum(axis=0)
-    energy = gain**2 * np.outer(squared, squared).ravel()
-    taken = np.einsum("ij,ij->j", shared, inverse.dot(shared))
-    own = np.maximum(energy - taken, 1e-9 * energy + 1e-12)
-    flips = np.where(cells.ravel() > 0.5, -1.0, 1.0) * seen / own
-    return CellsSeen(float(flips.max()), math.sqrt(noise / float(own.min())))
+    g[_SHAPE] -= _PRIOR * total
+    return _Equations(gain, error, J, noise, N, g)
 
 
 # --- How much the picture looks like a drawing that was fitted to it ---------------------------
 
 
-@dataclass(frozen=True)
-class PatternSeen:
-    """Correlation and height of the inner pattern, beyond what a plain square explains."""
-
-    correlation: float
-    strength: float
-
-
-def pattern_seen(drawing: Rendered, grey: Array, light: Light) -> PatternSeen:
-    """In the picture's grey values (n * n,): what no plain square explains of them."""
-    plain = drawing.plain
-    A = plain.products + 1e-9 * np.eye(len(plain.products))
-    both = light.rows[GAIN], grey
-    b = np.stack([onto(plain.rows, each) for each in both], axis=1)
-    shares = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
-    bits, seen = (each - mixed(plain.rows, shares[:, k]) for k, each in enumerate(both))
-    energy, product = float((bits * bits).sum()), float((bits * seen).sum())
-    scale = math.sqrt(energy * float((seen * seen).sum()))
-    if scale < 1e-9:
-        return PatternSeen(0.0, 0.0)
-    return PatternSeen(product / scale, product / max(energy, 1e-9) / light.gain)
-
-
 def likeness(grey: Array, error: Array) -> float:
-    """Correlation of the picture with the fit that leaves `error` over."""
+    """Return the correlation of the picture with the fit that leaves `error` over."""
     spread = grey - grey.mean()
     explained = 1.0 - float((error**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
 
 
-def repeated(error: Array) -> float:
-    """How many neighbouring nodes measure the same: from the correlation along rows and
+def _cells_seen(
+    seen: Rendered, equations: _Equations, inverse: Array, many: float
+) -> tuple[float, float]:
+    """Return `flip` and `flip_sigma` of an `Alignment`; `inverse` is that of N, and so `many` nodes
+    measure the same.
+
+    The mean over a cell shows a wrong bit as long as blur is smaller than the cell. Beyond that a
+    wrong bit is spread over its neighbours, and shape, blur and light of the fit take a part of
+    what it leaves over. So each cell is looked for as it would look: blurred, and without what the
+    fit's unknowns explain (a matched filter).
+    """
+    soft, noise, gain = seen.soft_cells, equations.noise, equations.gain
+    n, m = soft.shape
+    found = gain * (soft.T @ equations.error.reshape(n, n) @ soft).ravel()
+    shared = gain * (soft.T @ equations.J.reshape(-1, n, n) @ soft).reshape(-1, m * m)
+    squared = (soft**2).sum(axis=0)
+    energy = gain**2 * np.outer(squared, squared).ravel()
+    taken = np.einsum("ij,ij->j", shared, (inverse / noise).dot(shared))
+    own = np.maximum(energy - taken, 1e-9 * energy + 1e-12)
+    flips = np.where(seen.drawing.cells.ravel() > 0.5, -1.0, 1.0) * found / own
+    return float(flips.max()), math.sqrt(many * noise / float(own.min()))
+
+
+def _pattern_seen(drawing: Rendered, grey: Array, gain: float) -> tuple[float, float]:
+    """Return the correlation and height of the inner pattern in the picture's grey values
+    (n * n,): what no plain square explains of them."""
+    rows, products = drawing.plain
+    A = products + 1e-9 * np.eye(len(products))
+    both = drawing.light[0][GAIN], grey
+    b = np.stack([_onto(rows, each) for each in both], axis=1)
+    shares = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
+    bits, seen = (each - _mixed(rows, shares[:, k]) for k, each in enumerate(both))
+    energy, product = float((bits * bits).sum()), float((bits * seen).sum())
+    scale = math.sqrt(energy * float((seen * seen).sum()))
+    if scale < 1e-9:
+        return 0.0, 0.0
+    return product / scale, product / max(energy, 1e-9) / gain
+
+
+def _repeated(error: Array) -> float:
+    """Return how many neighbouring nodes measure the same: from the correlation along rows and
     columns (n, n) of what is left (nodes closer than a pixel; blur that is not round)."""
     energy = max(float((error * error).mean()), 1e-9)
     factor = 1.0
@@ -394,8 +276,8 @@ def repeated(error: Array) -> float:
     return factor
 
 
-def worst_cell(error: Array, grid: Grid, n_cells: int) -> float:
-    """Largest mean departure over a cell."""
+def _cell_departure(error: Array, grid: Grid, n_cells: int) -> float:
+    """Return the largest mean departure over a cell."""
     index, count = _cells_of(grid, n_cells)
     total = np.bincount(index, weights=error, minlength=n_cells**2 + 1)[:-1]
     return float(np.abs(total / count).max())
@@ -403,7 +285,7 @@ def worst_cell(error: Array, grid: Grid, n_cells: int) -> float:
 
 @lru_cache(maxsize=32)
 def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
-    """Of each node the cell's number, behind the last one's around the marker, and how many
+    """Return each node's number of its cell, behind the last one's around the marker, and how many
     nodes each cell has."""
     x, y = ((g + 1.0) * 0.5 * n_cells for g in (grid.u, grid.v))
     inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
@@ -418,44 +300,17 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
 # gamma) and the grey beyond the sheet. All of them shift edges if left out.
 
 
-@dataclass(frozen=True, eq=False)
-class Light:
-    """rows (7 or 8, n * n), without a sheet's end the last one is absent, and their
-    coefficients, in grey levels."""
-
-    rows: Array
-    coefficients: Array
-
-    @property
-    def gain(self) -> float:
-        """Grey levels from black to white."""
-        return float(self.coefficients[GAIN])
-
-    @property
-    def grey(self) -> Array:
-        """What the drawing looks like in this light, (n * n,)."""
-        return mixed(self.rows, self.coefficients)
-
-
-def fit_light(drawing: Rendered, grey: Array) -> Light:
-    """The light that explains grey values (n * n,) best."""
-    light = drawing.light
-    A = light.products + 1e-6 * np.eye(len(light.products))
-    A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
-    coefficients = np.linalg.solve(A, onto(light.rows, grey))
-    return Light(light.rows, np.asarray(coefficients, np.float64))
-
-
-def lit_jacobian(drawing: Rendered, light: Light) -> Array:
-    """Changes (9, n * n) of the grey values with the homography's increment and the blur's
-    square, in this light."""
-    c, gain, grid = light.coefficients, light.gain, drawing.grid
-    bend = min(max(float(c[BEND]) / gain, -0.9), 0.9)
-    slope = gain + c[GAIN_U] * grid.u + c[GAIN_V] * grid.v
-    slope = slope * (1.0 + bend * (1.0 - 2.0 * drawing.sheets[0].value))
-    change: Array = drawing.sheets[0].jacobian * slope
-    for sheet, height in zip(drawing.sheets[1:], c[BEYOND:], strict=True):
-        change += sheet.jacobian * height
+def _lit_jacobian(drawing: Rendered, light: Array) -> Array:
+    """Return the changes (9, n * n) of the grey values with the homography's increment and the
+    blur's square, in this light (7 or 8,)."""
+    gain, grid = float(light[GAIN]), drawing.grid
+    (white, changes), *others = drawing.sheets
+    bend = min(max(float(light[BEND]) / gain, -0.9), 0.9)
+    slope = gain + light[GAIN_U] * grid.u + light[GAIN_V] * grid.v
+    slope = slope * (1.0 + bend * (1.0 - 2.0 * white))
+    change: Array = changes * slope
+    for (_, more), height in zip(others, light[BEYOND:], strict=True):
+        change += more * height
     return change
 
 
@@ -475,43 +330,38 @@ class Grid:
 
     @property
     def u(self) -> Array:
+        """Across, (n * n,)."""
         u: Array = self.uv1[0]
         return u
 
     @property
     def v(self) -> Array:
+        """Down, (n * n,)."""
         v: Array = self.uv1[1]
         return v
 
 
-@dataclass(frozen=True, eq=False)
-class Patch:
-    """A part of the picture: its grey values and its first pixel (x, y)."""
-
-    grey: NDArray[np.float32]
-    first: NDArray[np.intp]
-
-
 @lru_cache(maxsize=64)
 def make_grid(n: int, reach: float) -> Grid:
-    """Nodes in the middle of n by n equal parts of the square from -reach to reach."""
+    """Return the nodes in the middle of n by n equal parts of the square from -reach to reach."""
     axis = reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
     return Grid(n, axis, _crossings(axis))
 
 
 def _crossings(axis: Array) -> Array:
+    """Return u, v and 1 where the lines of a grid cross, (3, n * n)."""
     u, v = np.meshgrid(axis, axis)
     return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
 
 
 def projected(H: Array, uv1: Array) -> Array:
-    """Own coordinates (3, n) through a homography to pinhole pixels, x and y (2, n)."""
+    """Map own coordinates (3, n) through a homography to pinhole pixels, x and y (2, n)."""
     q = H.dot(uv1)
     return np.asarray(q[:2] / q[2])
 
 
 def through_lens(pin_px: Array, camera: CameraModel) -> Array:
-    """Pinhole pixels (2, n) to pixels of the real lens."""
+    """Convert pinhole pixels (2, n) to pixels of the real lens."""
     K = camera.K
     rays = np.empty((pin_px.shape[1], 2))
     rays[:, 1] = (pin_px[1] - K[1, 2]) / K[1, 1]
@@ -520,9 +370,9 @@ def through_lens(pin_px: Array, camera: CameraModel) -> Array:
 
 
 def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
-    """How far the lens moves each node that is seen through H, (2, n * n). A lens moves
-    neighbours alike: it is computed for a few nodes, and the rest by the polynomial through
-    these."""
+    """Return how far the lens moves each node that is seen through H, (2, n * n). A lens moves
+    neighbours alike: it is computed for a few nodes, and the rest by the polynomial through these.
+    """
     uv1, between = _few(grid)
     pin = projected(H, uv1)
     shift = (through_lens(pin, camera) - pin).reshape(2, _FEW, _FEW)
@@ -531,8 +381,8 @@ def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
 
 @lru_cache(maxsize=64)
 def _few(grid: Grid) -> tuple[Array, Array]:
-    """Chebyshev's nodes over the grid (3, _FEW^2), and the weights (n, _FEW) that a row's nodes
-    give to its values there."""
+    """Return Chebyshev's nodes over the grid (3, _FEW^2), and the weights (n, _FEW) that a row's
+    nodes give to its values there."""
     reach = float(grid.axis[-1])
     x = chebyshev.chebpts2(_FEW)
     degree = _FEW - 1
@@ -540,8 +390,11 @@ def _few(grid: Grid) -> tuple[Array, Array]:
     return _crossings(reach * x), chebyshev.chebvander(grid.axis / reach, degree) @ through
 
 
-def patch_around(image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array) -> Patch | None:
-    """The part of the picture that the nodes may reach, None where they leave it."""
+def _patch_around(
+    image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array
+) -> tuple[NDArray[np.float32], Array] | None:
+    """Return the part of the picture that the nodes may reach, and its first pixel x and y (2, 1);
+    None where they leave the picture."""
     h, w = image.shape
     x, y = projected(H, grid.uv1) + lens_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -550,15 +403,16 @@ def patch_around(image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array)
     room = 0.15 * float((most - least).max()) + 3.0
     low = np.clip(least - room, 0, (w - 2, h - 2)).astype(np.intp)
     high = np.clip(most + room + 1.0, low + 2, (w, h)).astype(np.intp)
-    return Patch(image[low[1] : high[1], low[0] : high[0]].astype(np.float32), low)
+    part = image[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    return part, low[:, None].astype(np.float64)
 
 
-def read(patch: Patch, grid: Grid, H: Array, offset_px: Array) -> Array:
-    """Grey values at the nodes, (n * n,); `offset_px` (2, n * n) is the lens's shift less the
-    patch's first pixel."""
+def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) -> Array:
+    """Return the grey values at the nodes, (n * n,); `offset_px` (2, n * n) is the lens's shift
+    less the patch's first pixel."""
     at = (projected(H, grid.uv1) + offset_px).astype(np.float32)
     x, y = at.reshape(2, grid.n, grid.n)
-    grey = cv2.remap(patch.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(grey, dtype=np.float64).ravel()
 
 
@@ -570,20 +424,8 @@ def read(patch: Patch, grid: Grid, H: Array, offset_px: Array) -> Array:
 _BLOCK = 256  # values of a row
 
 
-@dataclass(frozen=True, eq=False)
-class Basis:
-    """Rows (k, n) by which pictures are explained, and their products (k, k)."""
-
-    rows: Array
-    products: Array
-
-
-def make_basis(rows: Array) -> Basis:
-    return Basis(rows, gram(rows))
-
-
 def gram(rows: Array) -> Array:
-    """Products (k, k) of rows (k, n) with each other."""
+    """Return the products (k, k) of rows (k, n) with each other."""
     k, n = rows.shape
     whole = n - n % _BLOCK
     blocks = rows[:, :whole].reshape(k, -1, _BLOCK).transpose(1, 0, 2)
@@ -592,13 +434,13 @@ def gram(rows: Array) -> Array:
     return np.asarray(total + rest.dot(rest.T))
 
 
-def onto(rows: Array, values: Array) -> Array:
-    """Products (k,) of the rows (k, n) with values (n,)."""
+def _onto(rows: Array, values: Array) -> Array:
+    """Return the products (k,) of the rows (k, n) with values (n,)."""
     return np.asarray(np.einsum("kn,n->k", rows, values))
 
 
-def mixed(rows: Array, coefficients: Array) -> Array:
-    """The rows (k, n) times coefficients (k,)."""
+def _mixed(rows: Array, coefficients: Array) -> Array:
+    """Return the sum of the rows (k, n), each times its coefficient, (n,)."""
     return np.asarray(np.einsum("kn,k->n", rows, coefficients))
 
 
@@ -613,15 +455,6 @@ OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
 
 
 @dataclass(frozen=True, eq=False)
-class Rendering:
-    """A sheet at the nodes (n * n,) with its changes (9, n * n) with the eight terms of
-    a homography's increment and with the blur's square."""
-
-    value: Array
-    jacobian: Array
-
-
-@dataclass(frozen=True, eq=False)
 class Rendered:
     """The drawing's sheets, blurred by `sigma` nodes: the paper, and perhaps what is beyond it."""
 
@@ -630,26 +463,31 @@ class Rendered:
     sigma: float
 
     @cached_property
-    def sheets(self) -> tuple[Rendering, ...]:
+    def sheets(self) -> tuple[tuple[Array, Array], ...]:
+        """Each sheet at the nodes (n * n,), and its changes (9, n * n) with the eight terms of a
+        homography's increment and with the blur's square."""
         sharp = sheets(self.drawing, self.grid.n)
         return tuple(_blurred(each, self.sigma, self.grid.axis) for each in sharp)
 
     @cached_property
-    def light(self) -> Basis:
+    def light(self) -> tuple[Array, Array]:
         """What light makes of the drawing: rows (7 or 8, n * n), the last one only with a
-        sheet's end."""
-        u, v, white = self.grid.u, self.grid.v, self.sheets[0].value
+        sheet's end, and their products."""
+        u, v = self.grid.u, self.grid.v
+        (white, _), *others = self.sheets
         rows = [np.ones_like(u), u, v, white, white * u, white * v, white * (1.0 - white)]
-        return make_basis(np.stack(rows + [sheet.value for sheet in self.sheets[1:]]))
+        stacked = np.stack(rows + [beyond for beyond, _ in others])
+        return stacked, gram(stacked)
 
     @cached_property
-    def plain(self) -> Basis:
+    def plain(self) -> tuple[Array, Array]:
         """What light makes of a black square of the drawing's size, without its slopes and
-        bend: rows (4 or 5, n * n)."""
+        bend: rows (4 or 5, n * n), and their products."""
         soft = softened(square(len(self.drawing.cells), self.grid.n), self.sigma)
         black = soft[EDGE:-EDGE, EDGE:-EDGE].reshape(1, -1)
-        rows = self.light.rows
-        return make_basis(np.concatenate([rows[:GAIN], black, rows[BEYOND:]]))
+        lit, _ = self.light
+        rows = np.concatenate([lit[:GAIN], black, lit[BEYOND:]])
+        return rows, gram(rows)
 
     @cached_property
     def soft_cells(self) -> Array:
@@ -659,7 +497,7 @@ class Rendered:
 
 
 def rendered(drawing: Drawing, n: int, sigma: float) -> Rendered:
-    """At n by n nodes over the drawing's reach, blurred by about `sigma` nodes."""
+    """Return the drawing at n by n nodes over its reach, blurred by about `sigma` nodes."""
     return _rendered_at_step(drawing, n, round(math.log(sigma) / _STEP))
 
 
@@ -668,8 +506,8 @@ def _rendered_at_step(drawing: Drawing, n: int, step: int) -> Rendered:
     return Rendered(drawing, make_grid(n, drawing.reach), math.exp(_STEP * step))
 
 
-def _blurred(sharp: NDArray[np.float32], sigma: float, axis: Array) -> Rendering:
-    """A sheet blurred by sigma nodes, and its changes, per unit of the drawing."""
+def _blurred(sharp: NDArray[np.float32], sigma: float, axis: Array) -> tuple[Array, Array]:
+    """Return a sheet blurred by sigma nodes, and its changes, per unit of the drawing."""
     soft = softened(sharp, sigma)
     step = float(axis[1] - axis[0])
     e, n = EDGE, len(axis)
@@ -687,4 +525,4 @@ def _blurred(sharp: NDArray[np.float32], sigma: float, axis: Array) -> Rendering
     ):  # fmt: skip
         np.multiply(-one, other, out=changes[part])
     changes[2], changes[5], changes[8] = -du, -dv, 0.5 * laplace
-    return Rendering(value.ravel().astype(np.float64), changes.reshape(9, n * n))
+    return value.ravel().astype(np.float64), changes.reshape(9, n * n)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import cv2
@@ -21,7 +21,7 @@ from perchctl.vision.markers.detector import (
     QUICK_THRESHOLDS,
     DetectorSetup,
     Thresholds,
-    strict_detector,
+    make_marker_decoder,
 )
 from perchctl.vision.target_selection import TargetSelector
 from perchctl.vision.types import MARKERS, MarkerName
@@ -39,22 +39,8 @@ _HALVED_SIDE_PX = 60.0
 _CENTRE_TOLERANCE = 0.35  # of the small marker's side
 
 
-@dataclass(frozen=True)
-class Box:
-    """A part of the picture, px, right and bottom excluded."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-    @property
-    def width(self) -> int:
-        return self.right - self.left
-
-    @property
-    def height(self) -> int:
-        return self.bottom - self.top
+Window = tuple[slice, slice]
+"""Rows and columns of a part of the picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +49,9 @@ class Found:
     mirror image is there, whether it was looked for in the whole picture, and how many whole
     targets, both markers, there were to choose from."""
 
-    corners_px: dict[MarkerName, Array]
-    mirrored: bool
-    full_frame: bool
+    corners_px: dict[MarkerName, Array] = field(default_factory=dict)
+    mirrored: bool = False
+    full_frame: bool = False
     targets: int = 0
 
 
@@ -76,23 +62,23 @@ def search(
     look: Look = "all",
     own: TargetSelector | None = None,
 ) -> Found:
-    """By the window, if there is one, and by the whole picture where that gave too little; only
+    """Search the window, if there is one, and the whole picture where that gave too little; only
     one of them with a `look` that is "near", "window" or "sharp". Large markers are looked for at
-    half the size first: all that may be whole in the picture is enough. `own` chooses among
-    several where none is expected."""
+    half the size first: all that may be whole in the picture is enough. `own` chooses among several
+    where none is expected."""
     whole = _whole(image)
-    if setup.window and expected and look != "sharp":
+    if setup.config.window and expected and look != "sharp":
         quickly = search_halved(image, expected, setup, own)
         if quickly is not None:
             return quickly
-        box = search_window(expected, setup.ratio, image.shape) or whole
-        found = Found({}, mirrored=False, full_frame=False)
+        window = search_window(expected, setup.ratio, image.shape) or whole
+        found = Found()
         if len(expected) == 2:
-            found = _pass(image, box, expected, setup, QUICK_THRESHOLDS, own)
-        if len(found.corners_px) < 2 and box != whole:
-            found = _pass(image, box, expected, setup, OPENCV_THRESHOLDS, own)
-        if len(found.corners_px) >= (2 if box == whole else 1) or (
-            look in ("near", "window") and box != whole
+            found = _pass(image, window, expected, setup, QUICK_THRESHOLDS, own)
+        if len(found.corners_px) < 2 and window != whole:
+            found = _pass(image, window, expected, setup, OPENCV_THRESHOLDS, own)
+        if len(found.corners_px) >= (2 if window == whole else 1) or (
+            look in ("near", "window") and window != whole
         ):
             return found
     return _pass(image, whole, expected, setup, OPENCV_THRESHOLDS, own)
@@ -104,24 +90,25 @@ def search_halved(
     setup: DetectorSetup,
     own: TargetSelector | None = None,
 ) -> Found | None:
-    """By the window, at half the size: a millisecond. None where that did not show all that should
-    be whole in the picture, or where that is too small for it."""
+    """Search the window at half the size: a millisecond. None where that did not show all that
+    should be whole in the picture, or where that is too small for it."""
     in_view = [quad for quad in expected.values() if within(quad, image.shape)]
     if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _HALVED_SIDE_PX:
         return None
-    box = search_window(expected, setup.ratio, image.shape) or _whole(image)
-    found = _pass(image, box, expected, setup, QUICK_THRESHOLDS, own, halved=True)
+    window = search_window(expected, setup.ratio, image.shape) or _whole(image)
+    found = _pass(image, window, expected, setup, QUICK_THRESHOLDS, own, halved=True)
     return found if len(found.corners_px) >= len(in_view) else None
 
 
-def _whole(image: NDArray[np.uint8]) -> Box:
-    return Box(0, 0, image.shape[1], image.shape[0])
+def _whole(image: NDArray[np.uint8]) -> Window:
+    """Return the whole picture as a window."""
+    return slice(0, image.shape[0]), slice(0, image.shape[1])
 
 
 def search_window(
     expected: Mapping[MarkerName, Array], ratio: float, shape: tuple[int, ...]
-) -> Box | None:
-    """Where to look, None where a window would not pay.
+) -> Window | None:
+    """Return where to look, None where a window would not pay.
 
     It holds the whole large marker as long as that can be in the picture, so that
     the stage can change from one frame to the next.
@@ -139,30 +126,33 @@ def search_window(
     margin = np.maximum(_WINDOW_MARGIN * (high - low).max(), _WINDOW_MARGIN_PX)
     left, top = np.clip(np.floor(low - margin), 0, (w, h)).astype(int)
     right, bottom = np.clip(np.ceil(high + margin), 0, (w, h)).astype(int)
-    box = Box(int(left), int(top), int(right), int(bottom))
-    large_enough = min(box.width, box.height) >= _MIN_WINDOW_PX
-    return box if large_enough and box.width * box.height <= _MAX_WINDOW * w * h else None
+    width, height = int(right - left), int(bottom - top)
+    if min(width, height) < _MIN_WINDOW_PX or width * height > _MAX_WINDOW * w * h:
+        return None
+    return slice(int(top), int(bottom)), slice(int(left), int(right))
 
 
 def _pass(
     image: NDArray[np.uint8],
-    box: Box,
+    window: Window,
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
     thresholds: Thresholds,
     own: TargetSelector | None,
     halved: bool = False,
 ) -> Found:
-    """What one pass of OpenCV's detector over the box gives, or over that at half its size."""
-    part = image[box.top : box.bottom, box.left : box.right]
+    """Return what one pass of OpenCV's detector over the window gives, or over that at half its
+    size."""
+    part = image[window]
     full_frame = part.shape == image.shape
     if halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-    detector = strict_detector(setup, (part.shape[1], part.shape[0]), thresholds)
+    detector = make_marker_decoder(setup, (part.shape[1], part.shape[0]), thresholds)
     corners, ids, _, which = detector.detectMarkersMultiDict(part)
     if ids is None or len(corners) == 0:
-        return Found({}, False, full_frame)
-    first = np.array([box.left, box.top], dtype=np.float64)
+        return Found(full_frame=full_frame)
+    rows, columns = window
+    first = np.array([columns.start, rows.start], dtype=np.float64)
     candidates: dict[MarkerName, list[Array]] = {"large": [], "small": []}
     mirrored = False
     for quad, index, dictionary in zip(corners, ids.ravel(), which.ravel(), strict=True):
@@ -184,7 +174,7 @@ def choose(
     ratio: float,
     own: TargetSelector | None = None,
 ) -> dict[MarkerName, Array]:
-    """At most one of each marker: look-alikes and what does not fit together are dropped.
+    """Return at most one of each marker: look-alikes and what does not fit together are dropped.
 
     A small marker in the centre of a large one, of the right size and turn, verifies
     both; of several such pairs the one counts that is nearest to the last detections, and what
@@ -223,7 +213,7 @@ def _chosen(
     expected: Mapping[MarkerName, Array],
     own: TargetSelector | None,
 ) -> tuple[float, int, int]:
-    """Of several whole targets."""
+    """Return the one that counts of several whole targets."""
     if len(wholes) == 1 or not (expected or own):
         return wholes[0]
     if expected:
@@ -238,8 +228,8 @@ def _chosen(
 def _possible(
     candidates: Mapping[MarkerName, list[Array]], own: TargetSelector
 ) -> Mapping[MarkerName, list[Array]]:
-    """Without the markers that are too far aside. A lone one is left to the pipeline, which says
-    why it is not taken."""
+    """Return the candidates without the markers that are too far aside. A lone one is left to the
+    pipeline, which says why it is not taken."""
     if not own.refuses or sum(map(len, candidates.values())) < 2:
         return candidates
     kept: dict[MarkerName, list[Array]] = {
@@ -250,6 +240,7 @@ def _possible(
 
 
 def _least_aside(name: MarkerName, quads: list[Array], own: TargetSelector) -> list[Array]:
+    """Return the quadrilateral that `own` has nearest, of several."""
     if len(quads) < 2:
         return quads
     away = [own.aside_m(name, quad) for quad in quads]
@@ -259,8 +250,8 @@ def _least_aside(name: MarkerName, quads: list[Array], own: TargetSelector) -> l
 def _wholes(
     candidates: Mapping[MarkerName, list[Array]], ratio: float
 ) -> list[tuple[float, int, int]]:
-    """Pairs that belong together, each large marker in one: misfit and both indices, the best
-    first."""
+    """Return the pairs that belong together, each large marker in one: misfit and both indices, the
+    best first."""
     large, small = candidates["large"], candidates["small"]
     pairs = [(misfit(a, b, ratio), i, j) for i, a in enumerate(large) for j, b in enumerate(small)]
     best: dict[int, tuple[float, int, int]] = {}
@@ -271,8 +262,8 @@ def _wholes(
 
 
 def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
-    """How far the small marker's corners are from where the large one puts them, in
-    units of what is allowed (1 or less: they belong together)."""
+    """Return how far the small marker's corners are from where the large one puts them, in units of
+    what is allowed (1 or less: they belong together)."""
     mapped = nested(large_px, ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE * side_px, 2.5)
@@ -282,7 +273,8 @@ def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
 def _nearest(
     name: MarkerName, quads: list[Array], expected: Mapping[MarkerName, Array], ratio: float
 ) -> Array | None:
-    """The candidate that continues the last detections, in place and in size, if any does."""
+    """Return the candidate that continues the last detections, in place and in size, if any
+    does."""
     if not expected or not quads:
         return None
     if name in expected:

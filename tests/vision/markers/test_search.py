@@ -1,13 +1,20 @@
+"""The search, its choice among candidates, and its turns after a loss."""
+
 from __future__ import annotations
 
 import math
-from typing import Any
+from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from perchctl.vision.markers.detector import DetectorSetup, Thresholds, strict_detector
-from perchctl.vision.markers.search import choose, search, search_window
+from perchctl.profile import DetectorConfig
+from perchctl.vision import Frame, PipelineState, step
+from perchctl.vision.markers import detect as detect_room
+from perchctl.vision.markers import search as search_room
+from perchctl.vision.markers.search import choose, search_halved, search_window
 from tests.helpers.markers import SETUP, both, box
 from tests.helpers.markers import corners as corners_of
 from tests.helpers.target_picture import pose_of, render
@@ -18,13 +25,12 @@ RATIO = SETUP.ratio
 def test_the_window_leaves_room_for_the_large_marker_around_the_small_one() -> None:
     window = search_window({"small": box(300, 240, 20)}, RATIO, (480, 640))
     assert window is not None
-    assert window.left <= 240
-    assert window.right >= 360
-    assert window.top <= 180
-    assert window.bottom >= 300
+    rows, columns = window
+    assert columns.start <= 240 < 360 <= columns.stop
+    assert rows.start <= 180 < 300 <= rows.stop
     close = search_window({"small": box(300, 240, 90)}, RATIO, (480, 640))
     assert close is not None
-    assert close.width * close.height < 0.4 * 640 * 480
+    assert np.empty((480, 640))[close].size < 0.4 * 640 * 480
     assert search_window({"large": box(320, 240, 430)}, RATIO, (480, 640)) is None
 
 
@@ -66,35 +72,180 @@ def test_the_window_leaves_room_for_the_large_marker_around_the_small_one() -> N
         ([], [box(400, 200, 10)], {"large": box(405, 200, 60)}, {"small": 0}),
     ],
 )
-def test_choice_among_candidates(large, small, expected, result) -> None:  # type: ignore[no-untyped-def]
+def test_choice_among_candidates(large, small, expected, result) -> None:
     chosen = choose({"large": large, "small": small}, expected, RATIO)
     pools = {"large": large, "small": small}
     assert set(chosen) == set(result)
     for name, index in result.items():
-        assert chosen[name] is pools[name][index]  # type: ignore[index]
+        assert chosen[name] is pools[name][index]
 
 
 @pytest.mark.parametrize(("z_m", "found"), [(0.1, {"small"}), (0.16, {"large", "small"})])
 def test_large_markers_are_found_at_half_the_size_at_their_place(
-    z_m: float, found: set[str], monkeypatch: pytest.MonkeyPatch
+    z_m: float, found: set[str]
 ) -> None:
-    """In the last centimetres the prediction may be off by more than lines are looked for. A search
-    of the whole picture takes eight times as long."""
-    widths: list[int] = []
-
-    def noting(setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds) -> Any:
-        widths.append(size_px[0])
-        return strict_detector(setup, size_px, thresholds)
-
-    monkeypatch.setattr("perchctl.vision.markers.search.strict_detector", noting)
+    """In the last centimetres the prediction may be off by more than lines are looked for."""
     for seed in range(8):
         rng = np.random.default_rng(seed)
         x_m, y_m = rng.uniform(-0.02, 0.02, 2) * z_m
         pose = pose_of(x_m, y_m, z_m, 0.5 * math.pi * seed + rng.uniform(-0.1, 0.1))
         off = {name: corners + rng.uniform(-25.0, 25.0, 2) for name, corners in both(pose).items()}
-        seen = search(render(*pose, noise=4.0, seed=seed), off, SETUP, "near").corners_px
+        seen = search_halved(render(*pose, noise=4.0, seed=seed), off, SETUP).corners_px
         assert seen.keys() == found
         for name, quad in seen.items():  # lines are looked for within 7 px
             assert np.abs(quad - corners_of(name, pose)).max() < 4.0
-    assert len(widths) == 8
-    assert max(widths) <= 320
+
+
+def test_a_whole_target_elsewhere_does_not_stand_in_for_the_own_one() -> None:
+    """Of which the search sees one marker only: large of one, and small of the other, never."""
+    large, small = [box(100, 100, 60), box(400, 200, 60)], [box(400, 200, 10)]
+    near = choose({"large": large, "small": small}, {"large": box(104, 98, 60)}, RATIO)
+    assert list(near) == ["large"]
+    assert near["large"] is large[0]
+    small = [box(100, 100, 10), box(400, 200, 10)]
+    near = choose({"large": large[1:], "small": small}, {"small": box(104, 98, 10)}, RATIO)
+    assert list(near) == ["small"]
+    assert near["small"] is small[0]
+
+
+def test_a_lone_look_alike_goes_before_a_whole_target_until_it_is_out_of_sight() -> None:
+    """As the gate says of it: with the whole picture searched both are seen, and one is told."""
+    whole = {"large": [box(400, 200, 60)], "small": [box(400, 200, 10)]}
+    lone = {"large": box(104, 98, 60)}
+    both = {"large": [box(100, 100, 60), *whole["large"]], "small": whole["small"]}
+    assert list(choose(both, lone, RATIO)) == ["large"]
+    assert choose(both, lone, RATIO)["large"] is both["large"][0]
+    assert choose(whole, lone, RATIO) == {"large": whole["large"][0], "small": whole["small"][0]}
+    # Not a look-alike of another size: that goes on from nothing.
+    other = {"large": [box(100, 100, 20), *whole["large"]], "small": whole["small"]}
+    assert choose(other, lone, RATIO)["large"] is whole["large"][0]
+
+
+# --- After a loss the searches take turns: none is left out, and no frame has two dear ones ----
+
+
+RATE_HZ = 30.0
+EMPTY: NDArray[np.uint8] = np.full((480, 640), 120, np.uint8)
+NEAR, ASIDE = pose_of(0.05, -0.05, 1.2, 0.4), pose_of(-0.45, 0.3, 1.2, 0.4)
+
+
+@dataclass
+class Done:
+    """What one frame was searched by."""
+
+    window: int = 0
+    whole: int = 0
+    near_in_blur: int = 0
+    all_in_blur: int = 0
+
+    @property
+    def dear(self) -> int:
+        return self.whole + self.near_in_blur + self.all_in_blur
+
+
+@dataclass
+class Stream:
+    """Frames through the pipeline, and what each was searched by."""
+
+    setup: object
+    state: PipelineState = field(default_factory=PipelineState)
+    done: list[Done] = field(default_factory=list)
+
+    def see(self, picture: NDArray[np.uint8]) -> bool:
+        self.done.append(Done())
+        k = len(self.done)
+        self.state, output = step(self.state, Frame(k, k / RATE_HZ, picture), None, self.setup)
+        return output.detections.large is not None
+
+
+@pytest.fixture
+def stream(build: object, monkeypatch: pytest.MonkeyPatch) -> Stream:
+    made = Stream(build())
+    one_pass, near, anywhere = (
+        search_room._pass,
+        detect_room.expected_in_blur,
+        detect_room.hidden_in_blur,
+    )
+
+    def passed(image, window, *rest):
+        whole = image[window].shape == image.shape
+        made.done[-1].whole += whole
+        made.done[-1].window += not whole
+        return one_pass(image, window, *rest)
+
+    def near_in_blur(*rest):
+        made.done[-1].near_in_blur += 1
+        return near(*rest)
+
+    def all_in_blur(*rest):
+        made.done[-1].all_in_blur += 1
+        return anywhere(*rest)
+
+    monkeypatch.setattr(search_room, "_pass", passed)
+    monkeypatch.setattr(detect_room, "expected_in_blur", near_in_blur)
+    monkeypatch.setattr(detect_room, "hidden_in_blur", all_in_blur)
+    return made
+
+
+def test_no_frame_of_a_stream_has_two_dear_searches(stream: Stream) -> None:
+    for k in range(60):
+        stream.see(render(*NEAR) if k < 3 else EMPTY)
+    lost = stream.done[3:]
+    assert max(done.dear for done in lost) == 1
+    # ... and each of them has its turn.
+    assert sum(done.near_in_blur for done in lost) > 1
+    assert sum(done.all_in_blur for done in lost) > 5
+    assert sum(done.whole for done in lost) > 20
+    assert lost[0].window > 0
+
+
+def test_a_first_picture_is_searched_by_all(stream: Stream) -> None:
+    stream.see(EMPTY)
+    assert stream.done[0].whole == 1
+    assert stream.done[0].all_in_blur == 1
+
+
+@pytest.mark.parametrize("lost", [0, 1, 2, 3, 7, 40])
+@pytest.mark.parametrize("place", [NEAR, ASIDE])
+def test_what_comes_back_is_found_by_the_second_frame(
+    stream: Stream, lost: int, place: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """Wherever it is by then, sharp as it is; a jump out of the window costs one frame at most."""
+    for _ in range(3):
+        assert stream.see(render(*NEAR))
+    for _ in range(lost):
+        assert not stream.see(EMPTY)
+    back = render(*place)
+    assert any(stream.see(back) for _ in range(2))
+
+
+@pytest.mark.parametrize("lost", [2, 6])
+def test_without_fits_to_blurred_targets_no_frame_is_left_unsearched(
+    build: object, lost: int
+) -> None:
+    stream = Stream(build(detector=DetectorConfig(blurred=False)))
+    for k in range(3 + lost):
+        assert stream.see(render(*NEAR) if k < 3 else EMPTY) == (k < 3)
+    assert stream.see(render(*NEAR))
+
+
+def test_blur_after_a_loss_is_seen_through_near_the_old_place(stream: Stream) -> None:
+    for _ in range(3):
+        assert stream.see(render(*NEAR))
+    soft = cv2.GaussianBlur(render(*pose_of(0.1, -0.03, 1.2, 0.4)).astype(np.float32), (0, 0), 5.0)
+    picture = np.clip(np.rint(soft), 0, 255).astype(np.uint8)
+    for _ in range(2):
+        stream.see(EMPTY)
+    assert any(stream.see(picture) for _ in range(2))
+    assert stream.done[-1].near_in_blur == 1
+
+
+def test_what_is_seen_and_not_the_target_does_not_end_the_sharp_search(stream: Stream) -> None:
+    """A stranger in every frame: once nothing is expected any more, all is searched."""
+    for _ in range(8):
+        assert stream.see(render(*NEAR))
+    farther = render(*pose_of(-0.3, 0.2, 2.2, 0.4))
+    for _ in range(45):
+        stream.see(farther)
+    assert stream.state.lock.pose.tvec_m[2] < 1.3
+    assert [(done.whole, done.all_in_blur) for done in stream.done[-10:]] == [(1, 0)] * 10

@@ -18,8 +18,6 @@ from perchctl.sim import Neighbour, Renderer, Scenario
 from perchctl.vision import (
     Attitude,
     CameraModel,
-    Detection,
-    Detections,
     Frame,
     Pipeline,
     PipelineOutput,
@@ -27,8 +25,6 @@ from perchctl.vision import (
     make_pipeline,
     step,
 )
-from perchctl.vision.markers.detect import between
-from perchctl.vision.markers.search import choose
 
 K = np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = CameraModel((640, 480), K, np.zeros(5))
@@ -105,7 +101,6 @@ def place(output: Output) -> tuple[float, float] | None:
     target = output.target
     if target is None or not target.measured:
         return None
-    assert target.world_m is not None
     return float(target.world_m[0]), float(target.world_m[1])
 
 
@@ -195,44 +190,3 @@ def test_a_target_with_other_ids_is_none() -> None:
         output = flown.at(OTHER_M, BOTH_READ_M)
         assert place(output) == pytest.approx(OWN_M, abs=0.02)
         assert output.detections.targets <= 1
-
-
-def box(x: float, y: float, side: float) -> np.ndarray:
-    h = side / 2.0
-    return np.array([[x - h, y - h], [x + h, y - h], [x + h, y + h], [x - h, y + h]])
-
-
-def test_a_whole_target_elsewhere_does_not_stand_in_for_the_own_one() -> None:
-    """Of which the search sees one marker only: large of one, and small of the other, never."""
-    large, small = [box(100, 100, 60), box(400, 200, 60)], [box(400, 200, 10)]
-    near = choose({"large": large, "small": small}, {"large": box(104, 98, 60)}, 1 / 6)
-    assert list(near) == ["large"]
-    assert near["large"] is large[0]
-    small = [box(100, 100, 10), box(400, 200, 10)]
-    near = choose({"large": large[1:], "small": small}, {"small": box(104, 98, 10)}, 1 / 6)
-    assert list(near) == ["small"]
-    assert near["small"] is small[0]
-
-
-def test_a_lone_look_alike_goes_before_a_whole_target_until_it_is_out_of_sight() -> None:
-    """As the gate says of it: with the whole picture searched both are seen, and one is told."""
-    whole = {"large": [box(400, 200, 60)], "small": [box(400, 200, 10)]}
-    lone = {"large": box(104, 98, 60)}
-    both = {"large": [box(100, 100, 60), *whole["large"]], "small": whole["small"]}
-    assert list(choose(both, lone, 1 / 6)) == ["large"]
-    assert choose(both, lone, 1 / 6)["large"] is both["large"][0]
-    assert choose(whole, lone, 1 / 6) == {"large": whole["large"][0], "small": whole["small"][0]}
-    # Not a look-alike of another size: that goes on from nothing.
-    other = {"large": [box(100, 100, 20), *whole["large"]], "small": whole["small"]}
-    assert choose(other, lone, 1 / 6)["large"] is whole["large"][0]
-
-
-def test_nothing_is_between_two_targets() -> None:
-    """A frame's two fields, of which each shows another one."""
-    fields = [
-        Detections(0, 0.0, large=Detection("large", box(x, 100, 60), 0.1, refined=True))
-        for x in (100.0, 400.0)
-    ]
-    mean = between(*fields)
-    assert mean.large is not None
-    assert mean.large.corners_px[:, 0].mean() == pytest.approx(100.0)

@@ -5,26 +5,28 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 
 from perchctl.geometry import Array, rotation_from_rpy
+from perchctl.perception.online_calibration import (
+    ATTITUDE_STEP_S,
+    STAMPS_S,
+    ConsistencySums,
+    Moment,
+    add_moment,
+    consistency_moment,
+    solve_consistency,
+)
 from perchctl.profile import Profile
 from perchctl.vision import (
-    ATTITUDE_STEP_S,
     Attitude,
     CameraModel,
     Consistency,
-    ConsistencySums,
     MarkerPose,
     PoseSetup,
-    add_moment,
-    consistency_moment,
-    rotation_vector,
-    solve_consistency,
 )
-from perchctl.vision.consistency import STAMPS_S, Moment
-from perchctl.vision.pose import make_pose_setup
 
 PROFILE = Profile()
 CAMERA = CameraModel((640, 480), np.diag([380.0, 380.0, 1.0]), np.zeros(5))
@@ -52,7 +54,7 @@ class Truth:
 @pytest.fixture(scope="module")
 def setup() -> PoseSetup:
     mount, gear_m = PROFILE.camera.mount, PROFILE.vehicle.gear_body_m
-    return make_pose_setup(PROFILE.pose, PROFILE.target, mount.T_body_cam, gear_m, CAMERA)
+    return PoseSetup(PROFILE.pose, PROFILE.target, mount.T_body_cam, gear_m, CAMERA)
 
 
 def _flown(t_s: float, truth: Truth, phase: Array) -> tuple[Array, Array]:
@@ -110,9 +112,10 @@ def _fly(
         spoilt = rotation_from_rpy(0.0, 0.0, rng.normal(0.0, POSE_RAD)) @ R_cam_marker
         way = way + rng.normal(0.0, POSE_M, 3)
         cov = np.diag([POSE_M**2] * 3 + [POSE_RAD**2])
+        rvec = cv2.Rodrigues(spoilt)[0].ravel()
         pose = MarkerPose(
-            "joint", exposed_s, rotation_vector(spoilt), way, np.zeros(3), 0.0, np.full(3, POSE_M),
-            POSE_RAD, 0.1, cov=cov,
+            "joint", exposed_s, rvec, way, np.zeros(3), 0.0, np.full(3, POSE_M), POSE_RAD, 0.1,
+            cov=cov,
         )  # fmt: skip
         t_s = exposed_s + late_s
         before, after = (

@@ -1,27 +1,37 @@
-"""Markers of which a part cannot be seen: what is measured of them, and what is claimed."""
+"""Markers of which a part cannot be seen: beyond the picture, in glaring light, behind the gear."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.geometry import Array
-from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
-from perchctl.vision import Detections, Frame, MarkerName, PipelineState, make_aruco_detector, step
+from perchctl.profile import DetectorConfig, MarkerConfig, Profile, TargetConfig, load_profile
+from perchctl.vision import (
+    Detections,
+    Frame,
+    MarkerName,
+    PipelineState,
+    field_picture,
+    make_aruco_detector,
+    make_pipeline,
+    step,
+)
 from perchctl.vision.markers.corners import from_unit, mapped
 from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.markers.detector import filled, hidden_in, hides, make_mask
 from perchctl.vision.markers.partial import (
     KnownBy,
     fit_partly,
-    may_show_enough,
     seen_partly,
-    visible_cells_agree,
 )
 from perchctl.vision.markers.search import search
 from tests.helpers.markers import POSE, SETUP, corners, followed, frame
@@ -64,8 +74,6 @@ def glaring(image: Grey, centre: Array, radius_px: float, light_grey: float = 80
 def sigmas(found: Detections, pose: tuple[Array, Array]) -> Array:
     """The corners' errors of the large marker in units of what is claimed, in its own axes."""
     large = found.large
-    assert large is not None
-    assert large.cov_px2 is not None
     error = (large.corners_px - corners("large", pose)).ravel()
     values, axes = np.linalg.eigh(large.cov_px2)
     return np.asarray(axes.T @ error / np.sqrt(values))
@@ -78,7 +86,6 @@ def test_a_marker_that_the_picture_cuts_is_measured_by_what_is_left_of_it(share:
         pose = cut(share, seed)
         found = detect_markers(frame(render(*pose, noise=2.0, seed=seed)), None, SETUP, CAMERA)
         squares.append(sigmas(found, pose))
-        assert found.large is not None
         # A pixel of a corner beyond the picture may be a millimetre of the target.
         assert np.abs(found.large.corners_px - corners("large", pose)).max() < 0.3
     assert np.abs(squares).max() < 4.0
@@ -88,7 +95,6 @@ def test_a_marker_that_the_picture_cuts_is_measured_by_what_is_left_of_it(share:
 def test_corners_out_of_sight_are_claimed_to_be_known_less() -> None:
     pose = cut(0.1, 1)
     found = detect_markers(frame(render(*pose, noise=2.0)), None, SETUP, CAMERA).large
-    assert found is not None
     assert found.cov_px2 is not None
     spread = np.sqrt(np.diagonal(found.cov_px2).reshape(4, 2).sum(axis=1))
     gone = int(corners("large", pose)[:, 0].argmin())
@@ -116,10 +122,8 @@ def test_a_side_along_the_edge_of_the_picture_is_not_drawn_inwards(share: float)
     true, image = corners("large", pose), render(*pose, blur_px=2.0)
     first = detect_markers(frame(image), None, SETUP, CAMERA)
     for found in (first, detect_markers(frame(image, 1), first, SETUP, CAMERA)):
-        assert found.large is not None
         assert np.abs(found.large.corners_px - true).max() < 0.03
     seen = seen_partly(image, true + 1.0, LARGE, CAMERA, "bits")
-    assert seen is not None
     assert np.abs(seen.corners_px - true).max() < 0.03
 
 
@@ -141,9 +145,8 @@ def test_a_pose_from_a_cut_marker_is_as_good_as_it_claims(build: Callable[..., o
     for seed in range(4):
         pose = cut(0.04, seed)
         image = render(*pose, noise=2.0, seed=seed)
-        output = step(PipelineState(), Frame(0, 0.0, image), None, setup)[1]  # type: ignore[arg-type]
+        output = step(PipelineState(), Frame(0, 0.0, image), None, setup)[1]
         joint = output.poses["joint"]
-        assert joint.cov is not None
         error = joint.e_m - pose[1]
         assert np.abs(error).max() < 6e-4
         assert error @ np.linalg.solve(joint.cov[:3, :3], error) < 16.0
@@ -166,7 +169,6 @@ def test_a_marker_that_leaves_the_picture_is_followed_out_of_it() -> None:
     before: Detections | None = None
     for k, pose in enumerate(poses):
         before = detect_markers(frame(render(*pose, noise=2.0), k), before, SETUP, CAMERA)
-        assert before.large is not None
         assert np.abs(before.large.corners_px - corners("large", pose)).max() < 0.3
 
 
@@ -179,12 +181,10 @@ def test_a_highlight_on_a_corner_leaves_three_sides(radius: float, corner: int) 
     centre = true[corner] + 0.1 * (true.mean(axis=0) - true[corner])
     image = glaring(render(*pose, noise=2.0), centre, radius * side)
     found = detect_markers(frame(image), None, SETUP, CAMERA)
-    assert found.large is not None
     assert np.abs(found.large.corners_px - true).max() < 0.3
     if found.large.cov_px2 is not None:
         assert np.abs(sigmas(found, pose)).max() < 4.0
     again = detect_markers(frame(image, 1), found, SETUP, CAMERA)
-    assert again.large is not None
     assert np.abs(again.large.corners_px - true).max() < 0.3
 
 
@@ -194,7 +194,6 @@ def test_the_way_of_the_last_round_is_not_taken_for_spread() -> None:
     spreads = []
     for off_px in (0.0, 0.5, 1.5, 3.0):
         found = fit_partly(image, true + off_px, LARGE, CAMERA)
-        assert found is not None
         spreads.append(found.sigma_px)
     assert max(spreads) < 1.03 * min(spreads)
 
@@ -208,7 +207,6 @@ def test_what_is_hidden_is_no_edge() -> None:
     cv2.line(covered, ends[0], ends[1], 1, 13)
     for off_px in (0.0, 3.0):
         found = seen_partly(image, true + off_px, LARGE, CAMERA, "bits", covered > 0)
-        assert found is not None
         assert np.abs(found.corners_px - true).max() < 0.2
 
 
@@ -218,7 +216,6 @@ def test_light_over_most_of_two_sides_moves_no_corner(light_grey: float) -> None
     side = float(np.linalg.norm(true[0] - true[1]))
     bright = glaring(image, true[2] + 0.05 * (true[0] - true[2]), 0.55 * side, light_grey)
     found = fit_partly(bright, true + 1.0, LARGE, CAMERA)
-    assert found is not None
     assert np.abs(found.corners_px - true).max() < 0.3
 
 
@@ -229,7 +226,6 @@ def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     side = float(np.linalg.norm(true[0] - true[1]))
     bright = glaring(image, spots.mean(axis=0), side / 9.0)
     found = seen_partly(bright, true, LARGE, CAMERA, "track")
-    assert found is not None
     assert np.abs(found.corners_px - true).max() < 0.1
     grey = np.where(bright > image + 20, 200, image).astype(np.uint8)  # white paper instead
     assert seen_partly(grey, true, LARGE, CAMERA, "track") is None
@@ -277,23 +273,170 @@ def test_a_marker_that_fills_the_picture_is_known_by_its_cells_as_the_lens_bends
         pose = pose_of(x_m, y_m, z_m, 0.05)
         true = corners("large", pose)
         found = seen_partly(render(*pose, noise=2.0), true + 3.0, LARGE, CAMERA, "track")
-        assert found is not None
         assert np.abs(found.corners_px - true).max() < 0.5
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("known_by", ["track", "bits", "other"])
-def test_where_cells_cannot_be_enough_no_fit_is_tried(known_by: KnownBy) -> None:
-    # Of what a fit from 10 px beside would have taken, nothing is turned down beforehand.
-    tried = []
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        pose = pose_of(*rng.uniform(-0.12, 0.12, 2), rng.uniform(0.1, 0.3), rng.uniform(-3, 3))
-        start = corners("large", pose) + rng.uniform(-10.0, 10.0, 2)
-        agree = visible_cells_agree(
-            render(*pose), corners("large", pose), LARGE, CAMERA, None, known_by
-        )
-        may = may_show_enough(start, (H, W), LARGE, CAMERA, known_by, 20.0)
-        assert may or not agree
-        tried.append(may)
-    assert 0 < sum(tried) < len(tried)
+# --- The vehicle's own gear in the picture: `camera.mask`, from the file to the corners --------
+
+
+TRUE = corners("large")
+
+
+def over(*ends: tuple[float, float], width: int = 22) -> NDArray[np.bool_]:
+    """A leg between two points."""
+    drawn = np.zeros((H, W), np.uint8)
+    a, b = (tuple(round(v) for v in end) for end in ends)
+    cv2.line(drawn, a, b, 1, width)
+    return drawn > 0
+
+
+def behind(image: NDArray[np.uint8], covered: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The picture with the leg before it, dark, and a little smaller than its mask."""
+    inner = cv2.erode(covered.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    return np.where(inner, 25, image).astype(np.uint8)
+
+
+def middle(a: int, b: int) -> tuple[float, float]:
+    x, y = 0.5 * (TRUE[a] + TRUE[b])
+    return float(x), float(y)
+
+
+LEGS = {
+    "corner": over((float(TRUE[1][0]) + 20, float(TRUE[1][1]) + 5), (W, H / 2)),
+    "across a corner": over(middle(0, 1), middle(1, 2)),
+    "side": over(tuple(TRUE[2]), tuple(TRUE[3])),
+}
+
+
+@pytest.mark.parametrize("name", sorted(LEGS))
+def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
+    covered = LEGS[name]
+    assert hides(covered, TRUE)
+    setup = replace(SETUP, mask=make_mask(covered))
+    image = behind(render(*POSE, noise=2.0), covered)
+    before: Detections | None = None
+    for k in range(2):
+        before = detect_markers(frame(image, k), before, setup, CAMERA)
+        assert before.large.cov_px2 is not None
+        assert np.abs(before.large.corners_px - TRUE).max() < 0.2
+
+
+def test_where_it_is_expected_a_hidden_cell_is_unknown_and_not_wrong() -> None:
+    pattern = SETUP.patterns["large"]
+    black = np.flatnonzero(pattern.inner & ~pattern.white)[0]
+    spots = mapped(from_unit(TRUE), pattern.spots[pattern.owner == black])
+    x, y = spots.mean(axis=0)
+    covered = over((x, y), (x, y), width=40)
+    image = filled(behind(render(*POSE, noise=2.0), covered), covered)
+    expected: dict[MarkerName, Array] = {"large": TRUE + 1.0}
+    seen = followed(image, expected, hidden=covered)
+    assert np.abs(seen["large"].corners_px - TRUE).max() < 0.2
+    assert "large" not in followed(image, expected)
+
+
+@pytest.mark.parametrize("name", sorted(LEGS))
+def test_what_a_leg_covers_counts_for_nothing(name: str) -> None:
+    """Whatever grey the gear has, the same is found."""
+    covered = LEGS[name]
+    setup = replace(SETUP, mask=make_mask(covered))
+    found = []
+    for grey in (0, 120, 255):
+        image = np.where(covered, grey, render(*POSE, noise=2.0)).astype(np.uint8)
+        large = detect_markers(frame(image), None, setup, CAMERA).large
+        found.append(large.corners_px)
+    assert np.array_equal(found[0], found[1])
+    assert np.array_equal(found[0], found[2])
+
+
+def test_a_field_shows_the_gear_in_the_rows_beside_it_too() -> None:
+    covered = LEGS["corner"]
+    mask = make_mask(covered)
+    image = np.where(covered, 0, 200).astype(np.uint8)
+    for first_row, name in ((0, "top"), (1, "bottom")):
+        field = field_picture(image, first_row)
+        hidden = hidden_in(Frame(0, 0.0, field, fields=name), mask)
+        assert hidden is not None
+        assert (field[~hidden] == 200).all()
+    whole = hidden_in(Frame(0, 0.0, image, fields="whole"), mask)
+    assert whole is not None
+    assert np.array_equal(whole, covered)
+
+
+def test_the_fields_of_a_woven_frame_are_measured_behind_a_leg() -> None:
+    covered = LEGS["across a corner"]
+    top, bottom = (render(*pose_of(0.03 + x, -0.02, 0.35, 0.7, 0.05, -0.08)) for x in (-2e-3, 2e-3))
+    woven = top.copy()
+    woven[1::2] = bottom[1::2]
+    setup = replace(SETUP, mask=make_mask(covered))
+    seen = Frame(0, 0.0, behind(woven, covered), fields="woven")
+    found = detect_markers(seen, None, setup, CAMERA)
+    assert np.abs(found.large.corners_px - TRUE).max() < 0.2
+
+
+def test_what_is_filled_in_makes_no_edge() -> None:
+    image = np.full((H, W), 180, np.uint8)
+    covered = LEGS["corner"]
+    assert np.abs(filled(behind(image, covered), covered).astype(int) - 180).max() <= 1
+    everything = np.ones((H, W), np.bool_)
+    everything[:, :4] = False
+    assert np.abs(filled(image, everything).astype(int) - 180).max() <= 1
+
+
+def test_hides_is_about_the_marker_and_the_white_around_it() -> None:
+    assert not hides(None, TRUE)
+    assert not hides(over((0, 0), (60, 10)), TRUE)
+    assert not hides(LEGS["corner"], TRUE + 5000.0)
+    assert not hides(LEGS["corner"], np.full((4, 2), np.nan))
+    # Beside the marker, within its bounding box.
+    turned = corners("large", pose_of(0.0, 0.0, 0.5, np.pi / 4))
+    corner = tuple(turned.min(axis=0) + 4.0)
+    assert not hides(over(corner, corner, width=5), turned)
+
+
+# --- the file ----------------------------------------------------------------------------------
+
+
+def profile_with(folder: Path, image: NDArray[np.uint8] | None, **camera: object) -> Profile:
+    """A profile in a folder, with the mask beside it."""
+    if image is not None:
+        cv2.imwrite(str(folder / "gear.png"), image)
+    keys = "".join(f", {key}: {value}" for key, value in camera.items())
+    (folder / "mine.yaml").write_text(f"extends: sim\ncamera: {{mask: gear.png{keys}}}\n")
+    return load_profile(str(folder / "mine.yaml"))
+
+
+def test_a_mask_stands_beside_its_profile(tmp_path: Path) -> None:
+    drawn = np.zeros((H, W), np.uint8)
+    drawn[:40, :70] = 255
+    mask = make_pipeline(profile_with(tmp_path, drawn), CAMERA).detector.mask
+    assert np.array_equal(mask.whole, drawn > 0)
+    turned = make_pipeline(profile_with(tmp_path, drawn, mirrored="true"), CAMERA).detector.mask
+    assert np.array_equal(turned.whole, drawn[:, ::-1] > 0)
+    assert make_pipeline(Profile(), CAMERA).detector.mask is None
+
+
+WHITE, BLACK = np.full((H, W), 255, np.uint8), np.zeros((H, W), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("image", "error", "told"),
+    [
+        (None, NotFound, "does not exist"),
+        (WHITE[:240, :320], InvalidValue, "320x240 px, but the calibration was made at 640x480"),
+        (WHITE, InvalidValue, "covers 100 % of the picture, at most 75 %"),
+        (BLACK, InvalidValue, "covers nothing"),
+    ],
+)
+def test_a_mask_that_cannot_be_is_one_sentence(
+    image: NDArray[np.uint8] | None, error: type[PerchError], told: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=told) as caught:
+        make_pipeline(profile_with(tmp_path, image), CAMERA)
+    assert "gear.png" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_mask_that_is_no_picture_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "gear.png").write_text("legs")
+    with pytest.raises(InvalidValue, match="cannot be read as a picture"):
+        make_pipeline(profile_with(tmp_path, None), CAMERA)

@@ -1,17 +1,8 @@
-"""What a flight tells about the camera's latency and mounting, while it flies.
+"""The camera's latency and mounting, estimated picture by picture while the vehicle flies.
 
-The target stands still in the world. Where the pictures are later than the profile says by d,
-it is placed as the vehicle was d earlier: beside its place by d times the speed at which the
-vehicle's motion and turning sweep the line of sight. Where the camera is turned from what the
-profile says, it is placed beside by the turn times the way to it. So the place of the target in
-the estimate's world, frame by frame, is linear in the delay and the turn, with what the vehicle
-did as known factors, and one least squares over a flight gives both.
-
-The rest of the place's wandering is no white noise: the vehicle's estimate walks and drifts. So
-each row (`X`, `Y`, `HEADING`) goes through the Kalman filter of a level that walks, the factors
-through the same one as the target's place, and what is summed are the innovations: that is
-the generalized least squares of the whole flight with a few numbers of memory (de Jong 1991, "The
-diffuse Kalman filter"). Nothing is solved until somebody asks (`solve_consistency`).
+With `camera.latency_s: measured` the latency is used, too: taken off the pictures' times, once
+it is sure, slowly, and within bounds. What is estimated rests on the pictures' times before
+that, so that its use does not feed back.
 """
 
 from __future__ import annotations
@@ -20,12 +11,112 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 
-from perchctl.geometry import Array, wrap_rad
+from perchctl.geometry import Array, finite, wrap_rad
+from perchctl.perception.history import History, attitude_at, velocity_at
+from perchctl.profile import USED_LATENCY_S, CameraConfig
 from perchctl.values import replace
-from perchctl.vision.pose import PoseSetup, rotation_matrix
-from perchctl.vision.types import Attitude, MarkerPose
+from perchctl.vision import Attitude, Consistency, MarkerPose, PoseSetup
+
+SOLVE_EVERY_S = 1.0
+LIKELY_S = 0.02
+"""A delay whose sigma is smaller is where the next pictures' factors are taken."""
+USED_SIGMA_S = 0.008
+"""A delay that is less sure is not used: of its 95 % interval, half is 16 ms, and 30 ms make an
+alignment swing."""
+SLEW = 0.02
+"""Seconds a second: at 0.4 m/s the target's place moves by 8 mm/s, as a drift does."""
+LONGEST_STEP_S = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class OnlineCalibration:
+    """Estimate of the camera's latency and mounting from pictures and telemetry.
+
+    `newest` is the solution of `sums` at `solved_s`; `used_s` is subtracted from the pictures'
+    times beyond the profile's latency, since the picture of `seen_s`.
+    """
+
+    sums: ConsistencySums = field(default_factory=lambda: ConsistencySums())
+    newest: Consistency | None = None
+    solved_s: float = -math.inf
+    used_s: float = 0.0
+    seen_s: float = -math.inf
+
+
+def update_calibration(
+    old: OnlineCalibration,
+    t_s: float,
+    pose: MarkerPose,
+    history: History,
+    setup: PoseSetup,
+    camera: CameraConfig,
+    attitude_sigma_rad: float,
+) -> OnlineCalibration:
+    """Return the estimate with one more picture of the target. `t_s` is its arrival less the
+    profile's latency."""
+    new = _learned(old, t_s, pose, history, setup, attitude_sigma_rad)
+    if camera.latency_s != "measured":
+        return new
+    return replace(new, seen_s=t_s, used_s=_slewed(new, camera, t_s - old.seen_s))
+
+
+def _learned(
+    old: OnlineCalibration,
+    t_s: float,
+    pose: MarkerPose,
+    history: History,
+    setup: PoseSetup,
+    attitude_sigma_rad: float,
+) -> OnlineCalibration:
+    """Return the estimate with the picture's target in its sums, and once a second with their
+    solution; unchanged by a pose that is no number or too near, or where the attitude of its time
+    is not known."""
+    if pose.cov is None or not finite(pose.cov) or float(pose.tvec_m[2]) < LEAST_RANGE_M:
+        return old
+    likely = old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
+    delay_s = old.newest.delay_s if old.newest is not None and likely else 0.0
+    delay_s = max(-USED_LATENCY_S[1], min(USED_LATENCY_S[1], delay_s))
+    before = attitude_at(history, t_s - delay_s - ATTITUDE_STEP_S)
+    after = attitude_at(history, t_s - delay_s + ATTITUDE_STEP_S)
+    if before is None or after is None:
+        return old
+    velocity_mps = velocity_at(history, t_s - delay_s)
+    moment = consistency_moment(t_s, pose, before, after, velocity_mps, delay_s, setup)
+    new = replace(old, sums=add_moment(old.sums, moment))
+    if t_s - old.solved_s >= SOLVE_EVERY_S:
+        newest = solve_consistency(new.sums, attitude_sigma_rad)
+        new = replace(new, newest=newest, solved_s=t_s)
+    return new
+
+
+def _slewed(new: OnlineCalibration, camera: CameraConfig, dt_s: float) -> float:
+    """Return the latency in use, one picture on: closer to what is measured, or as it was where
+    that is unsure."""
+    if new.newest is None or not new.newest.delay_sigma_s <= USED_SIGMA_S:
+        return new.used_s
+    (least_s, most_s), start_s = USED_LATENCY_S, camera.start_latency_s
+    goal_s = max(least_s, min(most_s, start_s + new.newest.delay_s)) - start_s
+    step_s = SLEW * max(0.0, min(dt_s, LONGEST_STEP_S))
+    return new.used_s + max(-step_s, min(step_s, goal_s - new.used_s))
+
+
+# --- What a flight tells about the latency and the mounting --------------------------------------
+# The target stands still in the world. Where the pictures are later than the profile says by d,
+# it is placed as the vehicle was d earlier: beside its place by d times the speed at which the
+# vehicle's motion and turning sweep the line of sight. Where the camera is turned from what the
+# profile says, it is placed beside by the turn times the way to it. So the place of the target in
+# the estimate's world, frame by frame, is linear in the delay and the turn, with what the vehicle
+# did as known factors, and one least squares over a flight gives both.
+#
+# The rest of the place's wandering is no white noise: the vehicle's estimate walks and drifts. So
+# each row (`X`, `Y`, `HEADING`) goes through the Kalman filter of a level that walks, the factors
+# through the same one as the target's place, and what is summed are the innovations: that is
+# the generalized least squares of the whole flight with a few numbers of memory (de Jong 1991, "The
+# diffuse Kalman filter"). Nothing is solved until somebody asks (`solve_consistency`).
+
 
 X, Y, HEADING = range(3)
 PLACE, DELAY, TILT_X, TILT_Y, TURN, SCALE, DRIFT_X, DRIFT_Y = range(8)
@@ -49,7 +140,7 @@ MOST_GAP_S = 0.5
 GATE_SIGMAS = 5.0
 _POSSIBLE = np.array([0.0, 0.2, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0])
 """What the gate takes for possible beyond the noise: 200 ms, and 0.4 rad about each axis."""
-LEAST_CONSISTENCY_RANGE_M = 0.15
+LEAST_RANGE_M = 0.15
 """Nearer, nothing is swept: it is pressed soon, and its estimate may run away."""
 STAMPS_S = 0.003
 """What an average does not take away: of the stamps of telemetry and exposure, and of the
@@ -72,21 +163,6 @@ class ConsistencySums:
     rows: int = 0
 
 
-@dataclass(frozen=True)
-class Consistency:
-    """What the flight shows beyond the profile, each with one standard deviation.
-
-    `delay_s`: by how much the pictures are later. `turn_rad`: the camera's turn about body x, y
-    and z. The attitude's constant error, which moves the target just as a mounting's roll and
-    pitch do, is in their `turn_sigma_rad`.
-    """
-
-    delay_s: float
-    delay_sigma_s: float
-    turn_rad: tuple[float, float, float]
-    turn_sigma_rad: tuple[float, float, float]
-
-
 @dataclass(frozen=True, eq=False)
 class Moment:
     """One frame's target. `rows` (3, 8) as the columns have them, `variance` (3,) of the place,
@@ -107,15 +183,15 @@ def consistency_moment(
     delay_s: float,
     setup: PoseSetup,
 ) -> Moment:
-    """The frame's target for the vehicle's attitude `ATTITUDE_STEP_S` before and after the frame's
-    time less `delay_s`, and its velocity then. `delay_s` is the delay that is thought likely: about
-    it, the factors are those of small changes."""
+    """Return the frame's target, for the vehicle's attitude `ATTITUDE_STEP_S` before and after the
+    frame's time less `delay_s`, and its velocity then. `delay_s` is the delay that is thought
+    likely: about it, the factors are those of small changes."""
     assert pose.cov is not None
     T_body_cam = setup.T_body_cam
     R_body_cam = T_body_cam[:3, :3]
     x, y, z = (R_body_cam @ pose.tvec_m).tolist()  # from the camera, body axes
     place = (R_body_cam @ pose.tvec_m + T_body_cam[:3, 3]).tolist()
-    axis = (R_body_cam @ rotation_matrix(pose.rvec_rad)[:, 0]).tolist()
+    axis = (R_body_cam @ np.asarray(cv2.Rodrigues(pose.rvec_rad)[0])[:, 0]).tolist()
     R0, R1 = _upper_rows(before), _upper_rows(after)
     heading0, heading1 = (math.atan2(_dot(R[1], axis), _dot(R[0], axis)) for R in (R0, R1))
     turned = wrap_rad(heading1 - heading0)
@@ -142,12 +218,14 @@ def consistency_moment(
 
 
 def _above(size: float, noise: float) -> float:
-    """The part of a motion that counts: none of what noise can be, all of what is far above."""
+    """Return the part of a motion that counts: none of what noise can be, all of what is far
+    above."""
     return max(0.0, 1.0 - (2.0 * noise / max(size, 1e-9)) ** 2)
 
 
 def _upper_rows(attitude: Attitude) -> tuple[tuple[float, float, float], ...]:
-    """The first two of ``R_world_body``: without arrays, as this is done for every picture."""
+    """Return the first two rows of ``R_world_body``: without arrays, as this is done for every
+    picture."""
     cr, sr = math.cos(attitude.roll_rad), math.sin(attitude.roll_rad)
     cp, sp = math.cos(attitude.pitch_rad), math.sin(attitude.pitch_rad)
     cy, sy = math.cos(attitude.yaw_rad), math.sin(attitude.yaw_rad)
@@ -158,12 +236,13 @@ def _upper_rows(attitude: Attitude) -> tuple[tuple[float, float, float], ...]:
 
 
 def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    """Return the dot product of two short sequences, without arrays."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def add_moment(old: ConsistencySums, new: Moment) -> ConsistencySums:
-    """The sums with one more frame. After a gap, or where the target or the estimate's world has
-    jumped, the level begins anew, and what was learned is kept."""
+    """Return the sums with one more frame. After a gap, or where the target or the estimate's world
+    has jumped, the level begins anew, and what was learned is kept."""
     if old.level is None:
         first = new.rows, new.variance
         return replace(old, t_s=new.t_s, began_s=new.t_s, level=first[0], variance=first[1])
@@ -193,9 +272,9 @@ def add_moment(old: ConsistencySums, new: Moment) -> ConsistencySums:
 
 
 def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> Consistency | None:
-    """What the flight shows so far; None after less than a second of frames.
+    """Return what the flight shows so far; None after less than a second of frames.
 
-    `attitude_sigma_rad`: constant error of the estimate's roll and pitch.
+    `attitude_sigma_rad` is the constant error of the estimate's roll and pitch.
     """
     if sums.rows < 3 * LEAST_FRAMES:
         return None

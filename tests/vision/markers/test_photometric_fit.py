@@ -1,0 +1,365 @@
+"""A marker's drawing laid over the picture: corners, refusals, and what blur hides."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from perchctl.geometry import Array
+from perchctl.profile import DetectorConfig, TargetConfig
+from perchctl.vision import (
+    CameraModel,
+    Detection,
+    Detections,
+    make_aruco_detector,
+    project,
+    square_corners,
+    undistort_px,
+)
+from perchctl.vision.markers.blurred import (
+    aligned,
+    expected_in_blur,
+    hidden_in_blur,
+    told_apart,
+    verified,
+)
+from perchctl.vision.markers.corners import UNIT, corner_jacobian, from_unit, mapped
+from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.markers.pattern import Drawing, drawing_of
+from perchctl.vision.markers.photometric_fit import (
+    Alignment,
+    align,
+    lens_shift_px,
+    make_grid,
+    projected,
+    through_lens,
+)
+from tests.helpers.markers import SETUP, blurry, box, corners, frame
+from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
+
+LARGE_BITS, SMALL_BITS = bits_of("DICT_4X4_1000", 997), bits_of("DICT_ARUCO_ORIGINAL", 5)
+DRAWINGS: dict[str, Drawing] = {
+    "large": drawing_of(LARGE_BITS, SMALL_BITS, 1.0 / 6.0),
+    "small": drawing_of(SMALL_BITS),
+}
+SIDES = {"large": 0.150, "small": 0.025}
+
+
+def view(name: str, side_px: float, seed: int, **looks: float) -> tuple[NDArray[np.uint8], Array]:
+    """A picture and the marker's true corners."""
+    rng = np.random.default_rng(seed)
+    z = 401.0 * SIDES[name] / side_px
+    x, y, yaw, roll, pitch = rng.uniform(-1, 1, 5) * (0.3 * z, 0.25 * z, math.pi, 0.12, 0.12)
+    rvec, tvec = pose_of(x, y, z, yaw, roll, pitch)
+    return render(rvec, tvec, seed=seed, **looks), project(
+        square_corners(SIDES[name]), rvec, tvec, CAMERA
+    )
+
+
+def off(corners: Array, seed: int) -> Array:
+    """Corners as a poor prediction has them: moved, turned, of another size."""
+    rng = np.random.default_rng(100 + seed)
+    centre, side = corners.mean(axis=0), np.linalg.norm(corners[1] - corners[0])
+    angle, size = rng.normal(0.0, 0.03), rng.uniform(0.95, 1.05)
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    return np.asarray(centre + size * (corners - centre) @ turn.T + rng.normal(0, 0.05 * side, 2))
+
+
+@pytest.mark.parametrize(
+    ("name", "side_px", "blur_px", "allowed_px"),
+    [
+        ("large", 12.0, 1.0, 0.08),
+        ("large", 30.0, 1.0, 0.03),
+        ("large", 40.0, 4.0, 0.15),
+        ("small", 14.0, 1.0, 0.08),
+        ("small", 30.0, 1.0, 0.03),
+        ("small", 34.0, 4.0, 0.15),
+    ],
+)
+def test_corners_of_small_and_blurred_markers(
+    name: str, side_px: float, blur_px: float, allowed_px: float
+) -> None:
+    squares = []
+    for seed in range(6):
+        image, true = view(name, side_px, seed, blur_px=blur_px, noise=3.0)
+        found = align(image, off(true, seed), DRAWINGS[name], CAMERA, 1.5)
+        assert verified(found)
+        error = found.corners_px - true
+        squares.append((error**2).mean())
+        assert np.abs(error).max() < 6.0 * found.sigma_px + 0.02
+        assert found.gain == pytest.approx(175.0, rel=0.2)
+    assert math.sqrt(np.mean(squares)) < allowed_px
+
+
+@pytest.mark.parametrize(
+    ("name", "side_px", "blur_px"),
+    [("large", 24.0, 4.0), ("large", 24.0, 5.0), ("small", 26.0, 4.0), ("small", 32.0, 5.0)],
+)
+def test_a_blur_that_nobody_expected_is_found_well_enough_to_tell_codewords_apart(
+    name: str, side_px: float, blur_px: float
+) -> None:
+    """Of half a cell; a fit that ends while the blur still grows leaves more than they differ."""
+    for seed in range(6):
+        image, true = view(name, side_px, seed, blur_px=blur_px, noise=1.0)
+        found = align(image, off(true, seed), DRAWINGS[name], CAMERA, 1.5)
+        assert found is not None
+        assert verified(found)
+        assert told_apart(found)
+
+
+@pytest.mark.parametrize("tone", ["gamma", "clipped", "slope"])
+def test_no_light_moves_the_corners(tone: str) -> None:
+    for seed in range(4):
+        image, true = view("small", 26.0, seed, blur_px=1.0)
+        if tone == "gamma":
+            image = np.rint(255.0 * (image / 255.0) ** 0.55).astype(np.uint8)
+        elif tone == "clipped":
+            image = np.clip(image * 1.6, 0, 255).astype(np.uint8)
+        else:
+            image = (image * np.linspace(0.45, 1.0, image.shape[1])).astype(np.uint8)
+        found = align(image, off(true, seed), DRAWINGS["small"], CAMERA, 1.0)
+        out = true - true.mean(axis=0)
+        out /= np.linalg.norm(out, axis=1, keepdims=True)
+        assert abs(((found.corners_px - true) * out).sum(axis=1).mean()) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "dictionary", "index"),
+    [
+        ("large", "DICT_4X4_1000", 16),
+        ("large", "DICT_4X4_1000", 45),
+        ("large", "DICT_4X4_1000", 314),
+        ("small", "DICT_ARUCO_ORIGINAL", 320),  # its mirror image
+        ("small", "DICT_ARUCO_ORIGINAL", 1),
+        ("small", "DICT_ARUCO_ORIGINAL", 21),
+    ],
+)
+@pytest.mark.parametrize(("side_px", "blur_px"), [(16.0, 1.0), (24.0, 3.0), (40.0, 4.0)])
+def test_other_markers_are_not_verified(
+    name: str, dictionary: str, index: int, side_px: float, blur_px: float
+) -> None:
+    """A picture of another marker, aligned as well as it goes in all four turns."""
+    pose = pose_of(0.0, 0.0, 401.0 * SIDES[name] / side_px)
+    other = (dictionary, index, SIDES[name])
+    image = render(*pose, markers=(other,), sheet_m=0.6, blur_px=blur_px, noise=2.0)
+    true = project(square_corners(SIDES[name]), *pose, CAMERA)
+    for k in range(4):
+        found = align(image, np.roll(true, k, axis=0), DRAWINGS[name], CAMERA, 1.0)
+        assert found is None or not verified(found)
+
+
+def test_nothing_is_verified_where_there_is_no_marker() -> None:
+    rng = np.random.default_rng(7)
+    smooth = np.zeros((480, 640))
+    for step in (6, 12, 30):  # a texture of all sizes
+        coarse = rng.uniform(-60, 60, (480 // step + 2, 640 // step + 2))
+        smooth += np.kron(coarse, np.ones((step, step)))[:480, :640]
+    image = np.clip(120 + smooth, 0, 255).astype(np.uint8)
+    for _ in range(60):
+        side = float(np.exp(rng.uniform(math.log(10), math.log(90))))
+        angle, centre = rng.uniform(0, math.tau), rng.uniform((100, 100), (540, 380))
+        turns = angle + np.arange(4) * math.pi / 2
+        corners = centre + side / math.sqrt(2) * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        for drawing in DRAWINGS.values():
+            found = align(image, corners, drawing, CAMERA, 1.5)
+            assert found is None or not verified(found)
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        np.full((4, 2), np.nan),
+        np.full((4, 2), 100.0),
+        np.array([[-200.0, 0.0], [-160.0, 0.0], [-160.0, 40.0], [-200.0, 40.0]]),
+        np.array([[630.0, 0.0], [670.0, 0.0], [670.0, 40.0], [630.0, 40.0]]),
+    ],
+)
+def test_impossible_starts_and_flat_pictures_give_nothing(corners: Array) -> None:
+    flat = np.full((480, 640), 130, np.uint8)
+    assert align(flat, corners, DRAWINGS["large"], CAMERA) is None
+    middle = np.array([[300.0, 200.0], [340.0, 200.0], [340.0, 240.0], [300.0, 240.0]])
+    assert align(flat, middle, DRAWINGS["large"], CAMERA) is None
+
+
+def test_a_drawing_whose_white_is_clipped_is_measured_less_surely() -> None:
+    """No light makes it then: its corners were off by three times what was claimed of them."""
+    rvec, tvec = pose_of(0.02, -0.01, 0.6, 0.4, 0.0, 0.0)
+    image = render(rvec, tvec, blur_px=0.8)
+    start = corners("small", (rvec, tvec))
+    bright = np.clip(image * (1.45 * 255.0 / float(image.max())), 0, 255).astype(np.uint8)
+    dim = np.clip(image * (200.0 / float(image.max())), 0, 255).astype(np.uint8)
+    true, clipped = (
+        aligned(seen, start, SETUP.patterns["small"], CAMERA, alone=False) for seen in (dim, bright)
+    )
+    assert true.sigma_px < 0.05
+    assert clipped.sigma_px > 0.1
+
+
+# --- Which codeword it is ----------------------------------------------------------------------
+
+
+PINHOLE = CameraModel(
+    (160, 120), np.array([[200.0, 0, 80], [0, 200.0, 60], [0, 0, 1]]), np.zeros(5)
+)
+CELLS: Array = SETUP.patterns["small"].drawing.cells
+INNER = [(row, column) for row in range(1, 6) for column in range(1, 6)]
+DOTS = 12
+
+
+def seen(cells: Array, cell_px: float, blur_px: float, noise: float, seed: int) -> Alignment:
+    """The small marker's drawing laid over a picture of these cells."""
+    image, corners = picture(cells, cell_px, blur_px, noise, seed)
+    found = align(image, corners, SETUP.patterns["small"].drawing, PINHOLE, blur_px)
+    assert found is not None
+    return found
+
+
+def picture(
+    cells: Array, cell_px: float, blur_px: float, noise: float, seed: int
+) -> tuple[Array, Array]:
+    fine = np.kron(np.pad(cells, 2, constant_values=1.0), np.ones((DOTS, DOTS)))
+    scale, shift = cell_px / DOTS, 42.3
+    M = np.array([[scale, 0.0, shift], [0.0, scale, shift - 20.0]])
+    soft = cv2.GaussianBlur(fine.astype(np.float32), (0, 0), blur_px / scale)
+    grey = cv2.warpAffine(soft, M, (160, 120), borderMode=cv2.BORDER_REPLICATE)
+    rng = np.random.default_rng(seed)
+    noisy = 40.0 + 160.0 * grey + rng.normal(0.0, noise, grey.shape)
+    first, size = 2.0 * cell_px, len(cells) * cell_px
+    unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    # A dot's middle is half a dot from its edge.
+    corners = unit * size + first + (shift, shift - 20.0) - 0.5 * scale
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8), corners
+
+
+@given(
+    cell_px=st.floats(2.5, 6.0),
+    blurs=st.floats(0.3, 0.9),
+    noise=st.floats(0.5, 4.0),
+    seed=st.integers(0, 99),
+)
+def test_the_marker_itself_is_told_apart(
+    cell_px: float, blurs: float, noise: float, seed: int
+) -> None:
+    assert told_apart(seen(CELLS, cell_px, blurs * cell_px, noise, seed))
+
+
+@given(
+    wrong=st.lists(st.sampled_from(INNER), min_size=1, max_size=3, unique=True),
+    cell_px=st.floats(2.5, 6.0),
+    blurs=st.floats(0.3, 0.9),
+    noise=st.floats(0.5, 4.0),
+    seed=st.integers(0, 99),
+)
+def test_wrong_bits_show_where_blur_hides_them(
+    wrong: list[tuple[int, int]], cell_px: float, blurs: float, noise: float, seed: int
+) -> None:
+    cells = CELLS.copy()
+    for row, column in wrong:
+        cells[row, column] = 1.0 - cells[row, column]
+    assert not told_apart(seen(cells, cell_px, blurs * cell_px, noise, seed))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        [(1, 1), (1, 2)],
+        [(1, 1), (4, 1)],
+        [(1, 1), (2, 4)],
+        [(1, 5), (3, 4), (4, 4)],
+        [(1, 2), (1, 4), (3, 2)],
+    ],
+)
+def test_a_blurred_marker_of_another_codeword_is_not_taken(wrong: list[tuple[int, int]]) -> None:
+    cells = CELLS.copy()
+    for row, column in wrong:
+        cells[row, column] = 1.0 - cells[row, column]
+    image, _ = picture(cells, 4.0, 2.0, 2.0, seed=1)
+    assert detect_markers(frame(image), None, SETUP, PINHOLE).small is None
+    own, _ = picture(CELLS, 4.0, 2.0, 2.0, seed=1)
+    assert detect_markers(frame(own), None, SETUP, PINHOLE).small is not None
+
+
+# --- What the lens does to a marker's nodes, from a few of them --------------------------------
+
+
+@given(st.floats(20.0, 620.0), st.floats(20.0, 460.0), st.floats(8.0, 60.0))
+def test_a_small_marker_anywhere(cx: float, cy: float, side_px: float) -> None:
+    grid, H = make_grid(30, 1.2), from_unit(undistort_px(box(cx, cy, side_px), CAMERA))
+    assert np.abs(_exact(grid.uv1, H) - lens_shift_px(grid, H, CAMERA)).max() < 1e-4
+
+
+@pytest.mark.parametrize("z_m", [0.14, 0.2, 0.5])
+def test_a_large_marker_aslant(z_m: float) -> None:
+    quad = corners("large", pose_of(0.02, -0.01, z_m, 0.6, 0.15, -0.2))
+    grid, H = make_grid(44, 1.2), from_unit(undistort_px(quad, CAMERA))
+    assert np.abs(_exact(grid.uv1, H) - lens_shift_px(grid, H, CAMERA)).max() < 0.01
+
+
+def _exact(uv1: Array, H: Array) -> Array:
+    pin = projected(H, uv1)
+    return np.asarray(through_lens(pin, CAMERA) - pin)
+
+
+@given(st.floats(20.0, 620.0), st.floats(20.0, 460.0), st.floats(8.0, 200.0), st.floats(-0.2, 0.2))
+def test_the_corners_move_as_their_jacobian_says(
+    cx: float, cy: float, side_px: float, slant: float
+) -> None:
+    H = from_unit(box(cx, cy, side_px)) @ np.array([[1, 0, 0], [0.1, 1, 0], [slant, -slant, 1.0]])
+    step = 1e-6 * np.eye(8)
+    moved = [(_moved(H, p) - _moved(H, -p)).ravel() / 2e-6 for p in step]
+    assert np.allclose(corner_jacobian(H), np.array(moved).T, rtol=1e-5, atol=1e-4)
+
+
+def _moved(H: Array, p: Array) -> Array:
+    return mapped(H @ (np.eye(3) + np.append(p, 0.0).reshape(3, 3)), UNIT)
+
+
+# --- Blur that hides the target ----------------------------------------------------------------
+
+
+ARUCO = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_blur_that_hides_the_target_from_the_plain_detector(seed: int) -> None:
+    image, true = blurry(26.0, 3.0, seed)
+    ids = ARUCO.detectMarkers(image)[1]
+    assert ids is None or 997 not in ids
+    still = hidden_in_blur(image, SETUP, CAMERA)
+    assert np.abs(still["large"].corners_px - true).max() < 0.5
+    found = detect_markers(frame(image), None, SETUP, CAMERA)
+    assert found.large is not None
+    blind = make_aruco_detector(DetectorConfig(blurred=False), TargetConfig())
+    assert detect_markers(frame(image), None, blind, CAMERA).large is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_in_blur_the_target_is_found_beside_where_it_is_expected(seed: int) -> None:
+    image, true = blurry(24.0, 3.0, seed)
+    way = np.random.default_rng(seed).uniform(-8.0, 8.0, 2)
+    seen = expected_in_blur(image, {"large": true + way}, SETUP.patterns, CAMERA)
+    assert np.abs(seen["large"].corners_px - true).max() < 0.5
+    before = Detections(0, 0.0, Detection("large", true + way, 0.1, True))
+    found = detect_markers(frame(image, 1), before, SETUP, CAMERA)
+    assert np.abs(found.large.corners_px - true).max() < 0.5
+
+
+def test_in_blur_nothing_is_taken_for_the_target() -> None:
+    rng = np.random.default_rng(2)
+    expected = {"large": np.array([[300.0, 200.0], [330.0, 200.0], [330.0, 230.0], [300.0, 230.0]])}
+    for sigma in (1.0, 2.0, 4.0):
+        noise = rng.normal(0.0, 200.0 * sigma, (480, 640)).astype(np.float32)
+        image = np.clip(130 + cv2.GaussianBlur(noise, (0, 0), sigma), 0, 255).astype(np.uint8)
+        for _ in range(3):  # dark squares with a light inside, of no marker
+            x, y, side = rng.integers(60, 400), rng.integers(60, 380), int(rng.integers(14, 60))
+            image[y : y + side, x : x + side] = 30
+            image[y + side // 5 : y + 4 * side // 5, x + side // 5 : x + 4 * side // 5] = 210
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.uint8)
+        assert hidden_in_blur(image, SETUP, CAMERA) == {}
+        assert expected_in_blur(image, expected, SETUP.patterns, CAMERA) == {}
