@@ -142,7 +142,7 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
 
 
 def sinking(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The held setpoint, a tick later. Without a sight of the target it sinks: the camera's cone
+    """The held setpoint one tick later. Without a sight of the target it sinks: the camera's cone
     opens upwards, so the target is soonest seen again from lower down."""
     if not (c.by_sight and c.position_is_stale) or c.state.ground_m is None:
         return setpoint
@@ -210,7 +210,7 @@ def unpressed(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
 
 
 def lower(c: Context) -> Acted:
-    """Stage one: the setpoint goes down in steps, or the raw thrust where it pressed."""
+    """The release's first stage: the setpoint goes down in steps, or the raw thrust of a press."""
     complete, perch, state = c.profile.planner.complete, c.profile.planner.perch, c.state
     step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
     part = step / complete.steps
@@ -232,9 +232,9 @@ def lower(c: Context) -> Acted:
 
 
 def let_go(c: Context) -> Acted:
-    """Stage two: raw thrust down to still motors, and the stop when the whole weight has hung long
-    enough. Without fresh telemetry it begins anew; in a landing late telemetry is enough, or what
-    hangs would end by its own landing."""
+    """The release's second stage: raw thrust down to still motors, and the stop when the whole
+    weight has hung long enough. Without fresh telemetry it begins anew; in a landing late telemetry
+    is enough, or what hangs would end by its own landing."""
     late_s = c.profile.safety.telemetry_hold_s if c.state.phase is Phase.LANDING else 0.0
     if not c.imu_proves and c.attitude_age_s > late_s:
         return ready(c)

@@ -190,7 +190,7 @@ def step_landing(
 
 
 def begun(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """The state with its way down begun, unless that has."""
+    """The state with its way down begun; the same state if it had begun before."""
     if state.phase is Phase.LANDING:
         return state
     c = Context(state, obs, profile)
@@ -239,11 +239,12 @@ def started(
 def evidence_of(c: Context) -> Evidence:
     """The best that is fresh in this tick."""
     heard = c.attitude_age_s <= c.profile.safety.telemetry_hold_s
-    if c.by_sight or c.state.astray or c.state.blind_s is not None:
-        if not heard:
-            return Evidence.NOTHING
-        if c.state.blind_s is not None or c.state.astray or not _is_sighted(c):
-            return Evidence.IMU
+    unplaced = c.state.astray or c.state.blind_s is not None
+    if not heard and (c.by_sight or unplaced):
+        return Evidence.NOTHING
+    if unplaced or (c.by_sight and not _is_sighted(c)):
+        return Evidence.IMU
+    if c.by_sight:
         return Evidence.HEIGHT if c.state.heading_lost else Evidence.SIGHT
     if heard and c.state.heading_lost:
         fresh = c.telemetry_age_s <= c.profile.safety.telemetry_hold_s
@@ -269,17 +270,17 @@ def _is_sighted(c: Context) -> bool:
 
 def _has_lost_its_position(c: Context) -> bool:
     """True if only accelerometer and attitude are left."""
-    if c.by_sight:
-        return not _is_sighted(c)
-    return not (c.located or c.state.astray)
+    return not (_is_sighted(c) if c.by_sight else c.located or c.state.astray)
 
 
 def reach_of(c: Context) -> Reach:
+    """Whether the magnet may hold the vehicle: since a contact, or since it was reckoned near."""
     within = c.state.contact_z_m is not None or c.state.reach_s is not None
     return Reach.MAGNET if within else Reach.FREE
 
 
 def stage_of(c: Context) -> Stage:
+    """How far the way down has come, by the orders that were given."""
     if c.state.stopped_s is not None:
         return Stage.STOPPED
     if c.state.released_s is not None:
@@ -300,8 +301,7 @@ def rest_finding(c: Context) -> Finding:
         if c.tracked and c.far_below_target:
             return Finding.STANDS
         return _by_fall(c, state.reach_s)
-    ground_m = state.ground_m[2] if state.ground_m else 0.0
-    high = state.entry_m[2] - ground_m > HIGH_M
+    high = state.entry_m[2] - state.ground_z_m > HIGH_M
     stayed = high and not c.far_below_target and state.entry_m[2] - tel.position_m[2] < STAYED_M
     if stayed or (c.height_m > LOW_M and not c.far_below_target and state.contact_z_m is not None):
         return Finding.HANGS
@@ -324,7 +324,8 @@ def _is_held_elsewhere(c: Context) -> bool:
 
 
 def _by_fall(c: Context, since_s: float | None) -> Finding:
-    """By falls and silences, of a vehicle that is within the magnet's reach since `since_s`."""
+    """Where a vehicle is that came within the magnet's reach at `since_s`, if ever: by the falls
+    that the accelerometer felt since, and the silences that could hide one."""
     imu, reckoning = c.obs.imu, c.state.reckoning
     down_s = max(imu.fell_s, -math.inf if c.state.touch_s is None else c.state.touch_s)
     unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sight ends the doubt
@@ -337,8 +338,12 @@ def _by_fall(c: Context, since_s: float | None) -> Finding:
 def hangs_where_it_did(c: Context) -> bool:
     """True if it is at its contact by a position, or has hung all the time by the accelerometer.
     A silence as long as a fall leaves it unknown."""
-    if not c.by_sight and c.placed and _is_at_contact(c):
-        return True
+    contact_z_m, tel = c.state.contact_z_m, c.obs.telemetry
+    if not c.by_sight and c.placed and contact_z_m is not None:
+        # A slip ends the contact at once, and the estimate of what hangs drifts less.
+        falls = tel.velocity_mps[2] < -c.profile.planner.complete.slip_mps
+        if not falls and contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M:
+            return True
     return _by_fall(c, c.state.reach_s) is Finding.HANGS
 
 
@@ -348,35 +353,6 @@ def hangs_stopped(c: Context) -> bool:
     if stopped_s is None or (landing and stopped_s >= c.state.entered_s and c.state.orders == 0):
         return False
     return hangs_where_it_did(c)
-
-
-def _is_at_contact(c: Context) -> bool:
-    """True if it is where the magnet has it: a slip ends the contact at once, and the estimate of
-    a hanging vehicle drifts less."""
-    contact_z_m, tel = c.state.contact_z_m, c.obs.telemetry
-    if contact_z_m is None:
-        return False
-    falls = tel.velocity_mps[2] < -c.profile.planner.complete.slip_mps
-    return not falls and contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M
-
-
-def why_landed(c: Context) -> str:
-    if c.state.blind_s is not None:
-        return "motors off; it was felt to come down to the floor"
-    return "motors off"
-
-
-def why_unknown(c: Context) -> str:
-    return (
-        "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
-        "whether it hangs or stands: look before you touch it"
-    )
-
-
-def why_fell_unseen(c: Context) -> str:
-    if c.placed or c.state.reach_s is None or c.obs.imu.fell_s > c.state.reach_s:
-        return "it is not where it hung before"
-    return "the telemetry was silent: whether it still hangs is not known"
 
 
 # --- What is remembered -------------------------------------------------------------------------
@@ -412,7 +388,7 @@ def observed(state: PlannerState, obs: Observation, profile: Profile) -> Planner
 
 
 def ordered(state: PlannerState, command: Command) -> PlannerState:
-    """The state with what was commanded: the thrust that is read has to follow it."""
+    """The state with the commanded raw thrust, which the telemetry's thrust has to follow."""
     match command:
         case RawThrust(thrust):
             return replace(state, raw_order=thrust)
@@ -423,7 +399,8 @@ def ordered(state: PlannerState, command: Command) -> PlannerState:
 
 
 def _answered(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """A reading that stands still under a changed order leaves the thrust unknown."""
+    """The state with the time since which the thrust that is read differs from the order: a reading
+    that stands still under a changed order leaves the thrust unknown."""
     if state.raw_order is None:
         return state
     wanted = 0.0 if state.raw_order < STILL_THRUST else min(MOST_RAW, state.raw_order)
@@ -438,11 +415,12 @@ def blinded(state: PlannerState, obs: Observation) -> PlannerState:
     """The state once accelerometer and attitude are all that is left, for good: each change of the
     mode costs height, so no sight is believed again on this way down."""
     hover = _hover_thrust(state, obs)
-    height_m = obs.telemetry.position_m[2] - (state.ground_m[2] if state.ground_m else 0.0)
+    height_m = obs.telemetry.position_m[2] - state.ground_z_m
     return replace(state, blind_s=obs.t_s, blind_height_m=height_m, hover_thrust=hover)
 
 
 def _reckon(c: Context) -> PlannerState:
+    """The state with its dead reckoning one tick later, and whether the magnet is within reach."""
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
     # By the target no sight is sent on the way down: the estimate's change is its own.
@@ -553,8 +531,9 @@ def _moved(place: Vector, by_m: Vector) -> Vector:
 
 
 def _hover_thrust(state: PlannerState, obs: Observation) -> float:
-    """As learned; else the thrust for each g that is measured, now: in a climb, or sinking, it is
-    beside the weight. Nothing hovers on the least of position mode."""
+    """The hover thrust as learned; else the present thrust for each g that is measured, since in a
+    climb, or sinking, the thrust differs from the weight. Nothing hovers on the least of position
+    mode."""
     tel = obs.telemetry
     measured = max(THRUST_MIN, tel.thrust / min(1.5, max(0.75, tel.acc_z_g)))
     return state.hover_thrust or obs.imu.hover_thrust or measured
@@ -577,6 +556,11 @@ def act(c: Context) -> Acted:
     if c.held(Condition.HANGING) >= HANGING_S and stage_of(c) is Stage.DOWN:
         return let_go(c)
     manoeuvre = MANOEUVRES[evidence_of(c), reach_of(c), stage_of(c)]
+    if manoeuvre in BY_SETPOINTS and (c.by_sight or manoeuvre is not Manoeuvre.PEEL):
+        state, away = unpressed(c)
+        if away is not None:
+            return state, away
+        c = c.with_state(state)
     return ACTIONS[manoeuvre](c)
 
 
@@ -622,10 +606,6 @@ def _catch(c: Context) -> Acted | None:
 
 def _setpoints(c: Context) -> Acted:
     """Down by setpoints to the hand-over, the rest by the vehicle's own landing."""
-    state, away = unpressed(c)
-    if away is not None:
-        return state, away
-    c = c.with_state(state)
     # When the landing's time is over nothing is sent: by then it must be landing by itself.
     overdue = c.in_phase_s > c.profile.planner.landing.overdue_s
     if overdue or c.height_m <= c.profile.planner.landing.handover_m:
@@ -636,10 +616,6 @@ def _setpoints(c: Context) -> Acted:
 def _setpoints_level(c: Context) -> Acted:
     """Down by setpoints to the hand-over, the rest level: the vehicle's own landing would follow an
     estimate that rests on pictures, to an unmeasured floor."""
-    state, away = unpressed(c)
-    if away is not None:
-        return state, away
-    c = c.with_state(state)
     if c.state.level_thrust or c.height_m <= c.profile.planner.landing.handover_m:
         return _level(c)
     return _by_setpoints(c)
@@ -648,11 +624,6 @@ def _setpoints_level(c: Context) -> Acted:
 def _peel(c: Context) -> Acted:
     """A setpoint below takes the thrust to its least. What that does not move is given to the
     magnet; without fresh telemetry the setpoint goes on down to the floor."""
-    if c.by_sight:
-        state, away = unpressed(c)
-        if away is not None:
-            return state, away
-        c = c.with_state(state)
     watched = evidence_of(c) is not Evidence.ONBOARD or c.imu_proves
     if c.in_phase_s > PEEL_S and watched:
         return let_go(c)
@@ -667,8 +638,7 @@ def _by_setpoints(c: Context) -> Acted:
     # A setpoint far above (the press, a search step) is not walked down slowly.
     start = replace(start, z_m=min(start.z_m, here.z_m))
     x, y, _ = state.entry_m
-    ground_z = state.ground_m[2] if state.ground_m else 0.0
-    goal = replace(start, x_m=x, y_m=y, z_m=ground_z + 0.5 * landing.handover_m)
+    goal = replace(start, x_m=x, y_m=y, z_m=state.ground_z_m + 0.5 * landing.handover_m)
     setpoint = walk(
         start,
         goal,
@@ -713,12 +683,11 @@ def _own_landing(c: Context) -> Acted:
     carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
     if c.imu_proves and tel.thrust < 1 and carried and (state.orders or not tel.has(FLYING)):
         return state, Idle()  # on the floor: another order would spin the motors up again
-    ground_z = state.ground_m[2] if state.ground_m else 0.0
     waited = math.inf if state.ordered_s is None else c.obs.t_s - state.ordered_s
     seen = state.orders >= LEAST_ORDERS and c.imu_proves and tel.has(HL_ACTIVE)
     if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
         flown_s = c.obs.t_s - state.started_s
-        order = own_landing(landing, ground_z, flown_s, tel.position_m[2])
+        order = own_landing(landing, state.ground_z_m, flown_s, tel.position_m[2])
         return replace(state, ordered_s=c.obs.t_s, orders=state.orders + 1, setpoint=None), order
     return state, Idle()
 
@@ -825,8 +794,7 @@ def _is_overdue(c: Context) -> bool:
     drifted away."""
     if c.state.blind_s is None and not c.state.astray:
         return False
-    ground_m = c.state.ground_m[2] if c.state.ground_m else 0.0
-    way_m = max(0.0, c.state.entry_m[2] - ground_m)
+    way_m = max(0.0, c.state.entry_m[2] - c.state.ground_z_m)
     # After a slip off the magnet the time begins anew.
     began_s = max(c.state.blind_s or 0.0, c.state.entered_s)
     heard = c.attitude_age_s <= LATEST_S
@@ -859,6 +827,7 @@ def _braking(c: Context) -> tuple[float, float]:
 
 
 def _against(mps: float) -> float:
+    """The limited tilt, in rad, that brakes a sideways speed."""
     return max(-MOST_BRAKE_RAD, min(MOST_BRAKE_RAD, -BRAKE_RAD_PER_MPS * mps))
 
 
@@ -880,3 +849,4 @@ ACTIONS = {
     Manoeuvre.WEIGHT_ON_MAGNET: _weight_on_magnet,
     Manoeuvre.STOP: stop_motors,
 }
+BY_SETPOINTS = (Manoeuvre.SETPOINTS, Manoeuvre.SETPOINTS_LEVEL, Manoeuvre.PEEL)

@@ -21,7 +21,7 @@ from perchctl.vision import Consistency, PictureKind, PipelineOutput, TargetEsti
 SentBy = Literal["watchdog", "rescue", "reconnect", "farewell"]
 TurnRole = Literal["waiting", "redone", "flown", "failed"]
 RESCUE = " in flight: "
-"""In the note of what a rescue did after an error, behind the error's name."""
+"""The words between the error's name and what was done, in the note of a rescue in flight."""
 
 
 class EventKind(Enum):

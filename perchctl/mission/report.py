@@ -134,7 +134,7 @@ def touchdown_of(c: Context) -> Touchdown | None:
 
 
 def _contact_error(state: PlannerState) -> ContactError | None:
-    """Of what hangs, where the contact was ever placed."""
+    """The contact error of a vehicle that hangs; None if its contact was never placed."""
     aside_m, sigma_m = state.contact_aside_m, state.contact_sigma_m
     if state.phase is not Phase.PERCHED or aside_m is None or not math.isfinite(sigma_m):
         return None
@@ -142,7 +142,7 @@ def _contact_error(state: PlannerState) -> ContactError | None:
 
 
 def _reason(state: PlannerState, obs: Observation, history: tuple[Event, ...]) -> str:
-    """Why it ended so, after what led to the landing where there was one."""
+    """Why the flight ended so, behind what led to the landing where there was one."""
     why = next((e.reason for e in reversed(history) if e.phase is Phase.LANDING), "")
     if state.phase in (Phase.LANDED, Phase.PERCHED):
         return f"{why}; {state.reason}" if why else state.reason

@@ -30,9 +30,6 @@ from perchctl.mission.lander import (
     hangs_stopped,
     hangs_where_it_did,
     rest_finding,
-    why_fell_unseen,
-    why_landed,
-    why_unknown,
 )
 from perchctl.mission.mounting import explained
 from perchctl.mission.state import (
@@ -382,6 +379,17 @@ def release_monitored(c: Context) -> bool:
     return monitored and c.held(C.DOWN) >= 0.1
 
 
+def why_fell_unseen(c: Context) -> str:
+    if c.placed or c.state.reach_s is None or c.obs.imu.fell_s > c.state.reach_s:
+        return "it is not where it hung before"
+    return "the telemetry was silent: whether it still hangs is not known"
+
+
+def is_off_as(finding: Finding) -> Predicate:
+    """The predicate that the motors are off, and that the vehicle is found to hang or stand so."""
+    return lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is finding
+
+
 # --- Why the vehicle is held in place ------------------------------------------------------------
 
 
@@ -695,23 +703,23 @@ TABLE: tuple[Transition, ...] = (
     ),
     # --- landing ---------------------------------------------------------------
     Transition(
-        "hung", only(P.LANDING),
-        lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is Finding.HANGS, P.PERCHED,
+        "hung", only(P.LANDING), is_off_as(Finding.HANGS), P.PERCHED,
         "hanging with the motors off",
     ),
     Transition(
-        "landed", only(P.LANDING),
-        lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is Finding.STANDS, P.LANDED, why_landed,
+        "landed", only(P.LANDING), is_off_as(Finding.STANDS), P.LANDED,
+        lambda c: "motors off"
+        + ("" if c.state.blind_s is None else "; it was felt to come down to the floor"),
     ),
     Transition(
-        "held-elsewhere", only(P.LANDING),
-        lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is Finding.HELD, P.ABORTED,
+        "held-elsewhere", only(P.LANDING), is_off_as(Finding.HELD), P.ABORTED,
         "motors off; something holds it where its estimate has no target: look before you touch it",
         S.LAND, O.SAFETY,
     ),
     Transition(
         "hangs-or-stands", only(P.LANDING), lambda c: c.held(C.DOWN) >= LOOKED_S, P.ABORTED,
-        why_unknown, S.LAND, O.SAFETY,
+        "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
+        "whether it hangs or stands: look before you touch it", S.LAND, O.SAFETY,
     ),
     Transition(
         "landing-timeout", only(P.LANDING),

@@ -93,7 +93,7 @@ def _alike(a: Mismatch, b: Mismatch) -> bool:
 
 
 def _nearest(mismatch: Mismatch) -> int:
-    """Its index among those that are tried."""
+    """The index of a mismatch among those that are tried."""
     later_s, turn_rad = mismatch.later_s, mismatch.turn_rad
     return int(np.argmin(np.abs(LATER_S - later_s) + np.abs(TURNS_RAD - turn_rad)))
 
@@ -107,7 +107,7 @@ def _best_about(mismatch: Mismatch, wanders_m: Array) -> int:
 
 
 def _found(wanders_m: Array) -> Mismatch | None:
-    """What explains the pictures if the profile does not."""
+    """The mismatch that explains the pictures; None if the profile does."""
     best = int(np.argmin(wanders_m))
     as_it_is = float(wanders_m[_nearest(Mismatch())])
     if as_it_is < max(WANDERS_M, WANDERS_MORE * float(wanders_m[best])):
