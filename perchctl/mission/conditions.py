@@ -339,9 +339,7 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.OTHERWISE: _moves_otherwise,
 }
 C = Condition
-KEPT_OVER_A_CHANGE = frozenset(
-    {C.BATTERY_LOW, C.TILTED, C.UNSURE, C.SATURATED, C.CARRIED, C.OTHERWISE}
-)
+LASTING = frozenset({C.BATTERY_LOW, C.TILTED, C.UNSURE, C.SATURATED, C.CARRIED, C.OTHERWISE})
 """The vehicle's own, whatever the phase, and however it is held."""
 PROOFS = frozenset(
     {
@@ -364,9 +362,9 @@ def conditions_since(c: Context) -> dict[Condition, float]:
     }
 
 
-def kept_over_a_change(since: dict[Condition, float]) -> dict[Condition, float]:
+def lasting_conditions(since: dict[Condition, float]) -> dict[Condition, float]:
     """The entries of `PlannerState.since` that last when the phase changes, or while held."""
-    return {name: s for name, s in since.items() if name in KEPT_OVER_A_CHANGE}
+    return {name: s for name, s in since.items() if name in LASTING}
 
 
 def _void(c: Context) -> frozenset[Condition]:

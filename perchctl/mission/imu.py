@@ -84,7 +84,7 @@ class Corrections:
         certain = self.changed_s - self.none_since_s >= UNCORRECTED_S
         return now_s - self.none_since_s if certain else 0.0
 
-    def watched(self, sample: Telemetry) -> Corrections:
+    def updated(self, sample: Telemetry) -> Corrections:
         """The corrections with one more sample. An unchanged variance means that no packet came."""
         variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
         if variance is None or variance == before:
@@ -164,7 +164,7 @@ def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> 
         frozen_s=_frozen_s(motion.frozen_s, last, new, _ACCELERATION),
         attitude_frozen_s=_frozen_s(motion.attitude_frozen_s, last, new, _ATTITUDE),
         place_frozen_s=_frozen_s(motion.place_frozen_s, last, new, _PLACE),
-        corrections=motion.corrections.watched(new),
+        corrections=motion.corrections.updated(new),
         off_s=min(motion.off_s, new.t_s) if new.thrust < 1 else math.inf,
     )
     if last is None or not 0.0 < dt_s <= GAP_S or motion.frozen_s > FROZEN_S:
@@ -367,7 +367,7 @@ class Reckoning:
     struck_mps: float = 0.0  # vertical speed just before `ImuMotion.blow`
 
 
-def reckoned(
+def advance_reckoning(
     old: Reckoning, imu: ImuMotion, sample: Telemetry, *, believed: bool, astray: bool = False
 ) -> Reckoning:
     """The reckoning one tick later. `believed`: the sample's estimated velocity is true; `astray`:
@@ -445,7 +445,7 @@ def reckoned(
     )
 
 
-def led_astray(old: Reckoning) -> Reckoning:
+def discount_wrong_positions(old: Reckoning) -> Reckoning:
     """The reckoning once the positions are found to be wrong: they have turned the attitude, too,
     of which hardly any was learned in so short a time."""
     (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.beside_mps
@@ -466,7 +466,7 @@ def _most_climb_m(old: Reckoning, now_s: float, *, flew: bool) -> float:
     return climb_mps**2 / (2.0 * GRAVITY_MPS2)
 
 
-def stepped(old: Reckoning, last: Telemetry, sample: Telemetry) -> Reckoning:
+def add_step(old: Reckoning, last: Telemetry, sample: Telemetry) -> Reckoning:
     """The reckoning with the step of the estimate's position between two samples, which its speed
     does not explain. Steps smeared over some samples add up, a step aside and back cancels; where
     samples are missing none is seen."""
@@ -490,7 +490,7 @@ def _position_s(sample: Telemetry) -> float:
     return sample.t_s - max(0.0, sample.behind_s - CARRIED_S)
 
 
-def sighted(
+def add_sight(
     old: Reckoning, t_s: float, aside_m: tuple[float, float], below_m: float, sigma_m: float
 ) -> Reckoning:
     """The reckoning with a sight: `aside_m` from the gear to the target's axis, world axes,

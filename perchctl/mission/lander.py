@@ -29,7 +29,7 @@ from perchctl.mission.conditions import (
     conditions_since,
     contact_within_m,
     has_slipped,
-    kept_over_a_change,
+    lasting_conditions,
     latency_changed,
 )
 from perchctl.mission.context import FAR_BELOW_M, HANGING_S, PUT_RIGHT_S, Context
@@ -41,15 +41,15 @@ from perchctl.mission.guidance import (
     catch,
     catch_above_m,
     hold_here,
+    leave_press,
     left_contact,
-    let_go,
     limited,
     presses,
+    release_by_thrust,
     stop_motors,
-    unpressed,
     walk,
 )
-from perchctl.mission.imu import REACH_M, UNSEEN_S, Vector, reckoned, sighted, stepped
+from perchctl.mission.imu import REACH_M, UNSEEN_S, Vector, add_sight, add_step, advance_reckoning
 from perchctl.mission.state import Condition, Observation, Phase, PlannerState, Severity
 from perchctl.profile import LandingConfig, Profile
 from perchctl.values import replace
@@ -107,17 +107,10 @@ class Manoeuvre(Enum):
 _E, _R, _S, _M = Evidence, Reach, Stage, Manoeuvre
 MANOEUVRES: dict[tuple[Evidence, Reach, Stage], Manoeuvre] = {
     (_E.POSITION, _R.FREE, _S.DOWN): _M.SETPOINTS,
-    (_E.POSITION, _R.MAGNET, _S.DOWN): _M.PEEL,
     (_E.SIGHT, _R.FREE, _S.DOWN): _M.SETPOINTS_LEVEL,
-    (_E.SIGHT, _R.MAGNET, _S.DOWN): _M.PEEL,
-    (_E.HEIGHT, _R.FREE, _S.DOWN): _M.LEVEL,
-    (_E.HEIGHT, _R.MAGNET, _S.DOWN): _M.LEVEL,
-    (_E.IMU, _R.FREE, _S.DOWN): _M.LEVEL,
-    (_E.IMU, _R.MAGNET, _S.DOWN): _M.LEVEL,
     (_E.ONBOARD, _R.FREE, _S.DOWN): _M.OWN_LANDING,
-    (_E.ONBOARD, _R.MAGNET, _S.DOWN): _M.PEEL,
-    (_E.NOTHING, _R.FREE, _S.DOWN): _M.LEVEL,
-    (_E.NOTHING, _R.MAGNET, _S.DOWN): _M.LEVEL,
+    **{(e, _R.MAGNET, _S.DOWN): _M.PEEL for e in (_E.POSITION, _E.SIGHT, _E.ONBOARD)},
+    **{(e, r, _S.DOWN): _M.LEVEL for e in (_E.HEIGHT, _E.IMU, _E.NOTHING) for r in _R},
     # A landing of its own goes on, whatever is known: to change it costs height.
     **{(e, r, _S.ORDERED): _M.OWN_LANDING for e in _E for r in _R},
     **{(e, r, _S.RELEASED): _M.WEIGHT_ON_MAGNET for e in _E for r in _R},
@@ -183,27 +176,27 @@ def step_landing(
     state: PlannerState, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
     """One tick of the way down without the mission's table, for watchdog and rescue."""
-    state = observed(begun(state, obs, profile), obs, profile)
+    state = observe(begin_landing(state, obs, profile), obs, profile)
     state = replace(state, since=conditions_since(Context(state, obs, profile)))
     state, command = act(Context(state, obs, profile))
-    return replace(ordered(state, command), t_s=obs.t_s, last=obs.telemetry), command
+    return replace(note_order(state, command), t_s=obs.t_s, last=obs.telemetry), command
 
 
-def begun(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
+def begin_landing(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
     """The state with its way down begun; the same state if it had begun before."""
     if state.phase is Phase.LANDING:
         return state
     c = Context(state, obs, profile)
     new = replace(
         state, phase=Phase.LANDING, entered_s=obs.t_s, severity=max(state.severity, Severity.LAND),
-        since=kept_over_a_change(state.since),
+        since=lasting_conditions(state.since),
         entry_m=obs.telemetry.position_m, entry_yaw_rad=obs.telemetry.yaw_rad,
         pressed=state.caught and presses(c), ordered_s=None, orders=0,
     )  # fmt: skip
-    return started(new, state, obs, profile)
+    return enter_landing(new, state, obs, profile)
 
 
-def started(
+def enter_landing(
     new: PlannerState, old: PlannerState, obs: Observation, profile: Profile
 ) -> PlannerState:
     """The state that a way down from `old` starts with; `new` has its entry already."""
@@ -230,7 +223,7 @@ def started(
         contact_z_m=contact_z_m, level_hover=hover, hover_thrust=hover,
         level_within=HOVER_WITHIN if old.hover_thrust else UNLEARNED_WITHIN,
     )  # fmt: skip
-    return blinded(new, obs) if _has_lost_its_position(c) else new
+    return lose_position(new, obs) if _has_lost_its_position(c) else new
 
 
 # --- What is known ------------------------------------------------------------------------------
@@ -358,12 +351,12 @@ def hangs_stopped(c: Context) -> bool:
 # --- What is remembered -------------------------------------------------------------------------
 
 
-def observed(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
+def observe(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
     """The state with one more observation. Hangs of the loop, jumps of the estimate and lost
     positions are noticed here, for all who fly a way down."""
     if state.last is not None and obs.t_s - state.t_s > profile.positioning.hold_s:
         # After a hang of the loop everything from before is stale; dwell times begin anew.
-        kept = kept_over_a_change(state.since)
+        kept = lasting_conditions(state.since)
         off_s = max(obs.imu.off_s, obs.imu.silent_s)
         if Condition.DOWN in state.since and math.isfinite(off_s):
             # All samples of the hang have come, and in none do the motors turn: else a loop that
@@ -383,11 +376,11 @@ def observed(state: PlannerState, obs: Observation, profile: Profile) -> Planner
     c = Context(state, obs, profile)
     comes_down = state.phase is Phase.LANDING and stage_of(c) in (Stage.DOWN, Stage.ORDERED)
     if comes_down and state.blind_s is None and _has_lost_its_position(c):
-        return blinded(state, obs)
+        return lose_position(state, obs)
     return state
 
 
-def ordered(state: PlannerState, command: Command) -> PlannerState:
+def note_order(state: PlannerState, command: Command) -> PlannerState:
     """The state with the commanded raw thrust, which the telemetry's thrust has to follow."""
     match command:
         case RawThrust(thrust):
@@ -411,7 +404,7 @@ def _answered(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     return new if known else replace(new, unread_s=obs.t_s)
 
 
-def blinded(state: PlannerState, obs: Observation) -> PlannerState:
+def lose_position(state: PlannerState, obs: Observation) -> PlannerState:
     """The state once accelerometer and attitude are all that is left, for good: each change of the
     mode costs height, so no sight is believed again on this way down."""
     hover = _hover_thrust(state, obs)
@@ -425,9 +418,11 @@ def _reckon(c: Context) -> PlannerState:
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
     # By the target no sight is sent on the way down: the estimate's change is its own.
     astray = state.astray and not c.by_sight
-    new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray)
+    new = advance_reckoning(
+        state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray
+    )
     if c.located and not c.by_sight and state.last is not None:
-        new = stepped(new, state.last, obs.telemetry)
+        new = add_step(new, state.last, obs.telemetry)
     rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
     if state.contact_z_m is not None and new.below_m < REACH_M and rests:
         # Pressed or hanging it stands still, whatever speed the impact left to the estimate. On
@@ -456,7 +451,7 @@ def _reckon(c: Context) -> PlannerState:
             # An estimate without a position since then was moved when that came back.
             if not seen and state.stale_s is not None and state.stale_s >= target.measured_s:
                 aside_m, sigma_m = new.aside_m, new.aside_sigma_m
-            new = sighted(new, target.measured_s, aside_m, float(ez), sigma_m)
+            new = add_sight(new, target.measured_s, aside_m, float(ez), sigma_m)
             if seen and target.measured_s > new.stepped_s:
                 new = replace(new, stepped_m=(0.0, 0.0))
     held_s = c.held(Condition.CARRIED)
@@ -554,10 +549,10 @@ def act(c: Context) -> Acted:
     if c.state.stopped_s is None and _stands(c):
         return stop_motors(c)
     if c.held(Condition.HANGING) >= HANGING_S and stage_of(c) is Stage.DOWN:
-        return let_go(c)
+        return release_by_thrust(c)
     manoeuvre = MANOEUVRES[evidence_of(c), reach_of(c), stage_of(c)]
     if manoeuvre in BY_SETPOINTS and (c.by_sight or manoeuvre is not Manoeuvre.PEEL):
-        state, away = unpressed(c)
+        state, away = leave_press(c)
         if away is not None:
             return state, away
         c = c.with_state(state)
@@ -626,7 +621,7 @@ def _peel(c: Context) -> Acted:
     magnet; without fresh telemetry the setpoint goes on down to the floor."""
     watched = evidence_of(c) is not Evidence.ONBOARD or c.imu_proves
     if c.in_phase_s > PEEL_S and watched:
-        return let_go(c)
+        return release_by_thrust(c)
     return _by_setpoints(c)
 
 
@@ -675,7 +670,7 @@ def own_landing(landing: LandingConfig, ground_z_m: float, flown_s: float, z_m: 
 def _own_landing(c: Context) -> Acted:
     """The vehicle's own landing, ordered again while it shows no effect."""
     landing, state, tel = c.profile.planner.landing, c.state, c.obs.telemetry
-    state, away = unpressed(c)
+    state, away = leave_press(c)
     if away is not None and not _is_doubtful(c) and not state.orders:
         return state, away
     # Ordered often enough, a short fall near the floor, or at an unknown height, is its end.
@@ -835,7 +830,7 @@ def _weight_on_magnet(c: Context) -> Acted:
     """Put the whole weight on whatever carries it, and monitor that; without telemetry order what
     carries most of it: what hangs stays, what has fallen does not rise."""
     if c.attitude_age_s <= c.profile.safety.telemetry_hold_s:
-        return let_go(c)
+        return release_by_thrust(c)
     thrust = int(max(STILL_THRUST, min(THRUST_MIN, LEAST_PART * c.state.hover_thrust)))
     return replace(c.state, released_s=c.obs.t_s), RawThrust(thrust)
 

@@ -192,16 +192,14 @@ def _about_latency(found: Findings, camera: CameraConfig) -> list[str]:
     off_s = found.latency_s - used_s
     if not _is_worth_saying(off_s, LATENCY_GATE_S, found.latency_sigma_s):
         return []
+    found_text = f"latency {latency_text(found)}"
     if measured:
         return [
-            f"latency {latency_text(found)}, and {least_s * 1e3:.0f} to {most_s * 1e3:.0f} are "
-            f"used with camera.latency_s: measured: find what delays the pictures"
+            f"{found_text}, and {least_s * 1e3:.0f} to {most_s * 1e3:.0f} are used with "
+            f"camera.latency_s: measured: find what delays the pictures"
         ]
-    to_set = f"{max(0.0, found.latency_s):.3f}"
-    return [
-        f"latency {latency_text(found)}, profile says {used_s * 1e3:.0f}: set "
-        f"camera.latency_s to {to_set}"
-    ]
+    to_set = f"set camera.latency_s to {max(0.0, found.latency_s):.3f}"
+    return [f"{found_text}, profile says {used_s * 1e3:.0f}: {to_set}"]
 
 
 def _about_turn(found: Findings) -> list[str]:

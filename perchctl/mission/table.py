@@ -31,7 +31,7 @@ from perchctl.mission.lander import (
     hangs_where_it_did,
     rest_finding,
 )
-from perchctl.mission.mounting import explained
+from perchctl.mission.mounting import describe_turn
 from perchctl.mission.state import (
     BEFORE_CONTACT,
     FLYING_PHASES,
@@ -70,7 +70,7 @@ class Transition:
         return self.reason if isinstance(self.reason, str) else self.reason(c)
 
 
-def risen(before: Severity, row: Severity) -> Severity:
+def raise_severity(before: Severity, row: Severity) -> Severity:
     """The flight's severity after a transition: from `LAND` on it only rises."""
     return max(before, row) if before >= Severity.LAND else row
 
@@ -231,9 +231,9 @@ def _measured_turn_rad(c: Context) -> float:
 
 def why_mounted_wrong(c: Context) -> str:
     if turn_rad := _measured_turn_rad(c):
-        return explained(turn_rad)
+        return describe_turn(turn_rad)
     if c.state.mount.wrong:
-        text = explained(c.state.mount.turn_rad)
+        text = describe_turn(c.state.mount.turn_rad)
         by_capture = c.profile.positioning.by == "mocap"
         return f"{text}; or swapped axes in the motion capture" if by_capture else text
     return (

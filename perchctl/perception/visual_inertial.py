@@ -72,7 +72,7 @@ def estimate_motion(
     short = t_s - new.sights[0][0] < LEAST_S or len(new.sights) < LEAST_SIGHTS
     if short or len(samples) < LEAST_SIGHTS or t_s - old.judged_s < EVERY_S:
         return new
-    wanders_m, velocity_mps, bias_mps2 = explained(new.sights, samples, offset_g)
+    wanders_m, velocity_mps, bias_mps2 = motion_by_hypothesis(new.sights, samples, offset_g)
     if old.mismatch is None:  # else it stays
         found = _found(wanders_m)
         agrees = found is not None and old.found is not None and _alike(found, old.found)
@@ -116,7 +116,7 @@ def _found(wanders_m: Array) -> Mismatch | None:
     return found if found.turn_rad or abs(found.later_s) >= LEAST_LATER_S else None
 
 
-def explained(
+def motion_by_hypothesis(
     sights: tuple[tuple[float, Vector], ...], samples: tuple[Telemetry, ...], offset_g: Vector
 ) -> tuple[Array, Array, Array]:
     """For each pair of `LATER_S` and `TURNS_RAD`: the target's sideways motion, rms in m, (n,); and

@@ -206,7 +206,7 @@ def judged(profile: Profile, state: dict[str, Any], **observed: Any) -> Evidence
     began = replace(state_in(Phase.LANDING, NOW_S - 1.0, HIGH_M), t_s=NOW_S - TICK_S, **state)
     age_s, behind_s = observed.pop("age_s", 0.01), observed.pop("behind_s", 0.0)
     obs = at(HIGH_M, age_s=age_s, obs=observed, behind_s=behind_s)(NOW_S)
-    return evidence_of(Context(lander.observed(began, obs, profile), obs, profile))
+    return evidence_of(Context(lander.observe(began, obs, profile), obs, profile))
 
 
 @pytest.mark.parametrize(
@@ -293,7 +293,7 @@ def test_what_presses_by_the_target_may_be_in_the_magnet_s_reach(
 ) -> None:
     """Under a sheet that hangs above a ceiling which the camera does not see."""
     obs = at(1.2, thrust=65535.0)(NOW_S)
-    state = lander.begun(state_in(Phase.ASCEND), obs, PROFILES[positioning])
+    state = lander.begin_landing(state_in(Phase.ASCEND), obs, PROFILES[positioning])
     assert state.pressed
     assert (state.contact_z_m == 1.2) is within
 
@@ -378,11 +378,11 @@ def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
     c = context(down(Evidence.IMU), reckoning=Reckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
     motion = VisualInertialMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0), 0.0)
     obs = replace(c.obs, felt=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
-    state = lander.observed(c.state, obs, c.profile)
+    state = lander.observe(c.state, obs, c.profile)
     assert state.reckoning.velocity_mps[:2] == (0.3, 0.0)
     later = replace(obs, imu=replace(obs.imu, t_s=NOW_S + 0.01))  # the same motion again
     moved = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.1, 0.0, 0.0)))
-    assert lander.observed(moved, later, c.profile).reckoning.velocity_mps[0] < 0.2
+    assert lander.observe(moved, later, c.profile).reckoning.velocity_mps[0] < 0.2
 
 
 @pytest.mark.parametrize("starts", [0, 1])
@@ -394,7 +394,7 @@ def test_a_silence_on_the_way_down_has_the_height_that_the_estimate_felt(starts:
     c = context(down(Evidence.IMU), 0.5, last=last, reckoning=reckoning)
     tel = telemetry(NOW_S, 0.2, start=starts)
     imu = ImuMotion(t_s=NOW_S, silent_s=NOW_S)
-    state = lander.observed(c.state, replace(c.obs, telemetry=tel, imu=imu), c.profile)
+    state = lander.observe(c.state, replace(c.obs, telemetry=tel, imu=imu), c.profile)
     assert state.blind_height_m == pytest.approx(0.5 if starts else 0.2)
 
 
@@ -405,7 +405,7 @@ def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     c = context(down(Evidence.IMU), blind_height_m=2.0, reckoning=reckoning)
     motion = VisualInertialMotion(NOW_S - 0.01, (0.0, 0.0), (0.0, 0.0), -0.4)
     obs = replace(c.obs, felt=motion, mismatch=Mismatch(later_s) if later_s else None)
-    state = lander.observed(c.state, replace(obs, imu=replace(obs.imu, t_s=NOW_S)), c.profile)
+    state = lander.observe(c.state, replace(obs, imu=replace(obs.imu, t_s=NOW_S)), c.profile)
     assert state.reckoning.velocity_mps[2] == pytest.approx(-0.4 if later_s else -0.7, abs=0.05)
     state = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.0, 0.0, -0.4)))
     _, command = lander.act(Context(state, obs, c.profile))
@@ -420,7 +420,7 @@ def test_a_hover_thrust_that_was_not_learned_is_felt() -> None:
         acc_z_g = 1.0 if i == 59 else 1.07
         obs = felt(at(thrust=1.07 * HOVER_THRUST, acc_z_g=acc_z_g)(NOW_S + 0.01 * i))
     unlearned = replace(state_in(Phase.APPROACH), hover_thrust=0.0)
-    state = lander.begun(unlearned, obs, BY_TARGET)
+    state = lander.begin_landing(unlearned, obs, BY_TARGET)
     assert state.level_hover == pytest.approx(HOVER_THRUST, rel=0.01)
     hovering = replace(unlearned, phase=Phase.ALIGN, t_s=obs.t_s - TICK_S, last=None)
     state, _ = planner.step_mission(hovering, obs, DECKS)
@@ -438,14 +438,14 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
         since={planner.Condition.DOWN: 0.0, planner.Condition.BATTERY_LOW: 1.0},
     )  # fmt: skip
     obs = observation(NOW_S + hung * profile.positioning.hold_s, HIGH_M)
-    after = lander.observed(state, obs, profile)
+    after = lander.observe(state, obs, profile)
     assert (planner.Condition.DOWN in after.since) is not stale
     assert planner.Condition.BATTERY_LOW in after.since
     assert after.caught is stale
     # The setpoint of a catch is far above, and would press; any other is held.
     assert (after.setpoint is None) is stale
     held = replace(state, caught=True)
-    assert lander.observed(held, obs, profile).setpoint == held.setpoint
+    assert lander.observe(held, obs, profile).setpoint == held.setpoint
     if positioning == "target":
         assert (after.blind_s is not None) is stale
 
@@ -518,7 +518,7 @@ def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
     before = state_in(phase, NOW_S - 11.0, HANG_Z_M)
     before = replace(before, reckoning=Reckoning(UNMOVED, below_m=below_m))
     entered = replace(before, phase=Phase.LANDING, entered_s=NOW_S, t_s=NOW_S)
-    new = lander.started(entered, before, obs, BY_TARGET)
+    new = lander.enter_landing(entered, before, obs, BY_TARGET)
     assert new.stopped_s == NOW_S
     assert lander.rest_finding(Context(new, obs, BY_TARGET)) is Finding.HANGS
 
@@ -577,7 +577,7 @@ def began(phase: Phase, remembered: dict[str, Any], profile: Profile) -> Planner
     flies = state_in(Phase.ALIGN if phase is Phase.LANDING else phase, z_m=1.0)
     state = replace(flies, hover_thrust=remembered.get("hover_thrust", HOVER_THRUST))
     if phase is Phase.LANDING:
-        state = lander.begun(state, observation(NOW_S, 1.0), profile)
+        state = lander.begin_landing(state, observation(NOW_S, 1.0), profile)
     return replace(state, **{k: v for k, v in remembered.items() if k != "hover_thrust"})
 
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
-from perchctl.mission.mounting import MountWatch, Sight, explained, sight_of, watched
+from perchctl.mission.mounting import MountWatch, Sight, describe_turn, sight_of, update_watch
 from perchctl.vehicle import Command, PositionSetpoint
 from tests.helpers.mission import CEILING_M, state_in, target_at, telemetry
 from tests.mission.rig import BEGIN_S, Motors, at, fly
@@ -41,7 +41,7 @@ def flown(seen: Seen, way_m: float = 0.5, noise_m: float = 0.003) -> tuple[Mount
         moved_m = max(0.0, t_s - 0.5) * SPEED_MPS
         p = moved_m * cmath.exp(0.7j)
         spoiled = seen(t_s, p) + complex(*rng.normal(0.0, noise_m, 2))
-        watch = watched(watch, Sight(t_s, p, spoiled))
+        watch = update_watch(watch, Sight(t_s, p, spoiled))
     return watch, moved_m
 
 
@@ -62,7 +62,7 @@ HEIGHT_M = 1.5
 
 
 def _tilting(deg: float, late_s: float = 0.0) -> MountWatch:
-    """A vehicle on its place that leans by 5 deg to all sides, watched for four seconds; its
+    """A vehicle on its place that leans by 5 deg to all sides, update_watch for four seconds; its
     pictures are so much later than the profile says."""
     watch, M = MountWatch(), cmath.exp(-1j * math.radians(deg))
 
@@ -73,7 +73,7 @@ def _tilting(deg: float, late_s: float = 0.0) -> MountWatch:
     for i in range(120):
         t_s = i * FRAME_S
         seen = lean(t_s) + M * (TARGET - lean(t_s - late_s))
-        watch = watched(watch, Sight(t_s, 0j, seen, lean(t_s)))
+        watch = update_watch(watch, Sight(t_s, 0j, seen, lean(t_s)))
     return watch
 
 
@@ -115,7 +115,7 @@ def test_a_landing_for_the_mounting_stops_at_once() -> None:
 def test_a_target_that_stands_still_ends_the_watch() -> None:
     watch, _ = flown(turned(0.0))
     assert watch.fits
-    assert watched(watch, Sight(9.0, 0j, 5.0 + 0j)) is watch
+    assert update_watch(watch, Sight(9.0, 0j, 5.0 + 0j)) is watch
 
 
 @given(st.floats(0.3, 2.0), st.floats(0.0, 2 * math.pi), st.sampled_from([0, 2, 5]))
@@ -144,7 +144,7 @@ def test_a_world_that_moves_under_both_is_no_turned_mounting(
     watch = MountWatch()
     for i in range(900):
         shift = shift_m(i)
-        watch = watched(watch, Sight(i * FRAME_S, complex(shift), TARGET + shift))
+        watch = update_watch(watch, Sight(i * FRAME_S, complex(shift), TARGET + shift))
         assert not watch.wrong
 
 
@@ -154,7 +154,7 @@ def test_a_world_that_moves_under_both_is_no_turned_mounting(
      (132.0, "about 130 deg")],
 )  # fmt: skip
 def test_the_turn_is_named(deg: float, words: str) -> None:
-    text = explained(math.radians(deg))
+    text = describe_turn(math.radians(deg))
     assert words in text
     assert "camera.mount" in text
     assert "`perchctl calibrate mount`" in text

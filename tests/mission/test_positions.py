@@ -12,7 +12,7 @@ import pytest
 from perchctl.mission import ImuMotion, Observation, Outcome, Phase, PlannerState
 from perchctl.mission.conditions import OTHERWISE_MPS, contact_aside_m
 from perchctl.mission.context import Context
-from perchctl.mission.imu import Reckoning, stepped
+from perchctl.mission.imu import Reckoning, add_step
 from perchctl.mission.lander import LEAST_ORDERS
 from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile
@@ -441,7 +441,7 @@ def test_a_position_that_moves_as_fast_as_it_says_is_no_step() -> None:
         tel = telemetry(
             t_s, position_m=(at_m, 0.0, 1.0), velocity_mps=(0.6, 0.0, 0.0), behind_s=behind_s
         )
-        old = stepped(old, last, tel) if k else old
+        old = add_step(old, last, tel) if k else old
         last = tel
     assert old.stepped_m == (0.0, 0.0)
 

@@ -21,7 +21,7 @@ from perchctl.mission import (
 )
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
 from perchctl.mission.state import FLYING_PHASES, Severity
-from perchctl.mission.table import TABLE, Transition, first_match, risen
+from perchctl.mission.table import TABLE, Transition, first_match, raise_severity
 from perchctl.vehicle import (
     CRASHED,
     LOCKED,
@@ -351,7 +351,7 @@ def test_no_row_undoes_a_landing() -> None:
 def test_from_landing_on_the_severity_only_rises(rows: list[Severity]) -> None:
     severity, grave = Severity.CONTINUE, False
     for row in rows:
-        before, severity = severity, risen(severity, row)
+        before, severity = severity, raise_severity(severity, row)
         assert not grave or severity >= before
         grave = grave or severity >= Severity.LAND
         assert grave == (severity >= Severity.LAND)

@@ -540,7 +540,7 @@ def test_what_is_felt_to_be_held_is_within_reach_whatever_late_pictures_say(
     flight = fly(state_in(phase, z_m=z_m), look, 0.9, PROFILE, feels=True)
     assert (flight.state.reach_s is not None) is within
     if within:
-        landing = lander.begun(flight.state, flight.obs, PROFILE)
+        landing = lander.begin_landing(flight.state, flight.obs, PROFILE)
         reach = lander.reach_of(Context(landing, flight.obs, PROFILE))
         assert reach is lander.Reach.MAGNET
 
