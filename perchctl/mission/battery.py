@@ -194,7 +194,7 @@ class Needs:
 
 
 def outlook(c: Context) -> BatteryOutlook:
-    """What is left, and for how many attempts that is enough.
+    """The outlook of the battery: what it has left, and for how many attempts that is enough.
 
     An unknown charge counts as what the last reading left, less what was used since, and at most
     as the grace of a vehicle without a reading (fault 7)."""

@@ -19,7 +19,7 @@ HANGING_S = 1.0  # a thrust below the weight must be enough for so long to prove
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What the table's predicates and the phases' actions are given."""
+    """The argument of the table's predicates and the phases' actions: one tick, whole."""
 
     state: PlannerState
     obs: Observation
@@ -43,6 +43,7 @@ class Context:
 
     @cached_property
     def speed_mps(self) -> float:
+        """Length of the estimated velocity."""
         return math.sqrt(sum(v * v for v in self.obs.telemetry.velocity_mps))
 
     @property
@@ -156,6 +157,7 @@ class Context:
 
     @property
     def tilt_rad(self) -> float:
+        """Angle between the vehicle's upward axis and the vertical."""
         tel = self.obs.telemetry
         return math.acos(max(-1.0, min(1.0, math.cos(tel.roll_rad) * math.cos(tel.pitch_rad))))
 
@@ -168,20 +170,24 @@ class Context:
 
     @property
     def target_yaw_rad(self) -> float | None:
+        """The target's heading in the world of the state estimate; None while none was seen."""
         return None if self.obs.target is None else self.obs.target.world_yaw_rad
 
     @property
     def error_xy_m(self) -> float:
+        """Horizontal distance of the gear from the target's axis; infinite without a target."""
         target = self.obs.target
         return math.inf if target is None else math.hypot(target.e_m[0], target.e_m[1])
 
     @property
     def error_z_m(self) -> float:
+        """Height of the target above the gear; infinite without a target."""
         target = self.obs.target
         return math.inf if target is None else float(target.e_m[2])
 
     @property
     def error_yaw_rad(self) -> float:
+        """Heading of the target relative to the vehicle's; infinite without a target."""
         target = self.obs.target
         return math.inf if target is None else target.e_yaw_rad
 

@@ -73,7 +73,7 @@ UNCORRECTED_M2PS2_PER_S, UNCORRECTED_S = 5e-4, 0.45
 
 @dataclass(frozen=True)
 class Corrections:
-    """Shows by the variance of the vertical speed if anything still corrects the estimate."""
+    """The variance of the vertical speed, which shows if anything still corrects the estimate."""
 
     variance_m2ps2: float | None = None  # the newest
     changed_s: float = -math.inf  # when that came
@@ -97,7 +97,7 @@ class Corrections:
 
 @dataclass(frozen=True)
 class Blow:
-    """A blow from below: as from the floor."""
+    """A blow from below, as the floor gives one."""
 
     t_s: float = -math.inf  # -inf: there was none
     estimated_mps: float = 0.0  # vertical speed just before it, by the state estimate
@@ -285,7 +285,8 @@ def _struck(motion: ImuMotion, new: Telemetry, last_moment: tuple[Blow, ...], mp
 def _misled(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """By how much corrections have turned roll and pitch, and the rates that are no correction."""
+    """The angles by which corrections have turned roll and pitch, in rad, and the rates of the
+    vehicle's own rotation, in rad/s."""
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
     kept = 1.0 - dt_s / CORRECTED_MEMORY_S
@@ -349,7 +350,7 @@ def acceleration_mps2(
 
 @dataclass(frozen=True)
 class Reckoning:
-    """Speed, and place under the target, carried on by the accelerometer. World axes."""
+    """Speed and place under the target in world axes, carried on by the accelerometer."""
 
     imu: ImuMotion | None = None  # the motion up to which it is reckoned
     velocity_mps: Vector = ZERO

@@ -93,7 +93,7 @@ class Stage(Enum):
 
 
 class Manoeuvre(Enum):
-    """What is commanded."""
+    """What the lander commands."""
 
     SETPOINTS = "position setpoints, then its own landing"
     SETPOINTS_LEVEL = "position setpoints, then level"
@@ -175,7 +175,8 @@ AT_REST_S = 0.3
 def step_landing(
     state: PlannerState, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
-    """One tick of the way down without the mission's table, for watchdog and rescue."""
+    """Fly one tick of the way down without the mission's table, for watchdog and rescue; the way
+    down begins with the first. Returns the new state, and the command to send."""
     state = observe(begin_landing(state, obs, profile), obs, profile)
     state = replace(state, since=conditions_since(Context(state, obs, profile)))
     state, command = act(Context(state, obs, profile))
@@ -600,7 +601,7 @@ def _catch(c: Context) -> Acted | None:
 
 
 def _setpoints(c: Context) -> Acted:
-    """Down by setpoints to the hand-over, the rest by the vehicle's own landing."""
+    """Sink by setpoints to the hand-over, and by the vehicle's own landing from there."""
     # When the landing's time is over nothing is sent: by then it must be landing by itself.
     overdue = c.in_phase_s > c.profile.planner.landing.overdue_s
     if overdue or c.height_m <= c.profile.planner.landing.handover_m:
@@ -609,16 +610,16 @@ def _setpoints(c: Context) -> Acted:
 
 
 def _setpoints_level(c: Context) -> Acted:
-    """Down by setpoints to the hand-over, the rest level: the vehicle's own landing would follow an
-    estimate that rests on pictures, to an unmeasured floor."""
+    """Sink by setpoints to the hand-over, and level from there: the vehicle's own landing would
+    follow an estimate that rests on pictures, to an unmeasured floor."""
     if c.state.level_thrust or c.height_m <= c.profile.planner.landing.handover_m:
         return _level(c)
     return _by_setpoints(c)
 
 
 def _peel(c: Context) -> Acted:
-    """A setpoint below takes the thrust to its least. What that does not move is given to the
-    magnet; without fresh telemetry the setpoint goes on down to the floor."""
+    """Send a setpoint below, which takes the thrust to its least. What that does not move is given
+    to the magnet; without fresh telemetry the setpoint goes on down to the floor."""
     watched = evidence_of(c) is not Evidence.ONBOARD or c.imu_proves
     if c.in_phase_s > PEEL_S and watched:
         return release_by_thrust(c)
@@ -626,7 +627,7 @@ def _peel(c: Context) -> Acted:
 
 
 def _by_setpoints(c: Context) -> Acted:
-    """Straight down at the landing's speed, from where the landing began."""
+    """Sink straight down at the landing's speed, from where the landing began."""
     landing, state = c.profile.planner.landing, c.state
     here = hold_here(c)
     start = state.setpoint if state.caught and state.setpoint is not None else here
@@ -688,9 +689,10 @@ def _own_landing(c: Context) -> Acted:
 
 
 def _level(c: Context) -> Acted:
-    """Level by raw thrust, on the vertical speed of the accelerometer and, where it is believed,
-    the estimate; tilted against the sideways speed. What does not sink gets less and less thrust:
-    it begins to sink, the ceiling lets go or proves that it holds, and the floor proves itself."""
+    """Sink level by raw thrust, on the vertical speed of the accelerometer and, where it is
+    believed, the estimate; tilted against the sideways speed. What does not sink gets less and less
+    thrust: it begins to sink, the ceiling lets go or proves that it holds, and the floor proves
+    itself."""
     state, tel = c.state, c.obs.telemetry
     dt_s = max(0.0, min(0.1, c.obs.t_s - state.t_s))
     age_s = max(1e-3, dt_s, c.attitude_age_s)

@@ -49,6 +49,7 @@ class Sight:
 
     @property
     def aim(self) -> complex:
+        """Where the vehicle's upward axis meets the target's plane."""
         return self.vehicle + self.lean
 
 
@@ -74,6 +75,7 @@ class MountWatch:
 
     @property
     def wrong(self) -> bool:
+        """True once enough sights in a row speak against the mounting."""
         return self.against >= SIGHTS_IN_A_ROW
 
     @property

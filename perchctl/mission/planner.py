@@ -93,7 +93,7 @@ def start_mission(obs: Observation) -> PlannerState:
 def step_mission(
     state: PlannerState, obs: Observation, profile: Profile, table: tuple[Transition, ...] = TABLE
 ) -> tuple[PlannerState, Command]:
-    """One tick of the mission: the new state, and the command to send."""
+    """Fly one tick of the mission; returns the new state, and the command to send."""
     state = _remember(state, obs, profile)
     row = first_match(Context(state, obs, profile), table)
     if row is not None:
@@ -286,7 +286,8 @@ def _fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Ac
 def _walk_to(
     c: Context, goal: PositionSetpoint, *, up_mps: float = 0.0, down_mps: float = 0.4
 ) -> Acted:
-    """Only SEARCH and ASCEND pass an `up_mps`; APPROACH, the press and a catch climb too."""
+    """Walk the setpoint towards the goal. Only SEARCH and ASCEND pass an `up_mps`; APPROACH, the
+    press and a catch climb in other ways."""
     return _fly_to(c, _walked(c, goal, up_mps, down_mps))
 
 

@@ -35,7 +35,7 @@ class ContactError:
 
     @property
     def text(self) -> str:
-        """``1.8 +- 0.6 mm off centre``."""
+        """The error in words, as in ``1.8 +- 0.6 mm off centre``."""
         return f"{1e3 * self.aside_m:.1f} +- {1e3 * self.sigma_m:.1f} mm off centre"
 
 
@@ -54,7 +54,7 @@ class Touchdown:
 
     @property
     def text(self) -> str:
-        """One sentence without its end."""
+        """The touchdown as a sentence without its end."""
         how = "touched down hard" if self.is_hard else "touched down"
         return f"{how}: {self.speed_mps:.1f} m/s, {self.peak_g:.1f} g"
 
@@ -68,7 +68,7 @@ class Rest(NamedTuple):
 
 @dataclass(frozen=True)
 class FlightReport:
-    """How the flight ended."""
+    """How a flight ended, and what it showed."""
 
     phase: Phase
     outcome: Outcome
@@ -222,11 +222,12 @@ def _is_worth_saying(off: float, gate: float, sigma: float) -> bool:
 
 
 def latency_text(found: Findings) -> str:
-    """``92 +- 6 ms``, the 95 % interval."""
+    """The latency with its 95 % interval, as in ``92 +- 6 ms``."""
     return f"{found.latency_s * 1e3:.0f} +- {SURE * found.latency_sigma_s * 1e3:.0f} ms"
 
 
 def turn_text(found: Findings) -> str:
-    """``0.2 +- 0.6, -0.1 +- 0.6, 0.4 +- 1.8 deg``, about x, y and z."""
+    """The turn about x, y and z with 95 % intervals, as in
+    ``0.2 +- 0.6, -0.1 +- 0.6, 0.4 +- 1.8 deg``."""
     each = zip(found.turn_deg, found.turn_sigma_deg, strict=True)
     return ", ".join(f"{turn:.1f} +- {SURE * sigma:.1f}" for turn, sigma in each) + " deg"

@@ -183,8 +183,8 @@ def _is_placed(s: Telemetry) -> bool:
 
 
 def _carried_on(last: Telemetry, new: Telemetry) -> Telemetry:
-    """A sample without a position, with that of the last one: attitude, acceleration and thrust are
-    fresh all the same, and by them the vehicle comes down."""
+    """The sample with position and velocity of the last one: its attitude, acceleration and thrust
+    are fresh all the same, and by them the vehicle comes down."""
     behind_s = last.behind_s + max(0.0, new.t_s - last.t_s)
     return replace(
         new, position_m=last.position_m, velocity_mps=last.velocity_mps, behind_s=behind_s

@@ -53,7 +53,7 @@ REMARK_PICTURES = 3
 
 @dataclass(eq=False)
 class Perception:
-    """One stream's frames in, the target out.
+    """The session that turns one stream's frames into the target's place.
 
     Attributes:
         stills: each frame is searched for itself, thoroughly, and nothing is remembered.
@@ -118,7 +118,8 @@ class Perception:
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
 
     def drop_sights(self) -> None:
-        """Judge the vehicle's motion anew: wrong positions have turned its attitude."""
+        """Forget the sights by which the vehicle's motion is judged, since wrong positions have
+        turned its attitude."""
         self.motion = drop_sights(self.motion)
 
     def take_remarks(self) -> list[str]:

@@ -49,6 +49,7 @@ class VisualInertialWindow:
 
     @property
     def mismatch(self) -> Mismatch | None:
+        """The newest judgement, once enough in a row agree; None before that."""
         return self.found if self.agreed >= AGREED else None
 
 
@@ -119,8 +120,8 @@ def _found(wanders_m: Array) -> Mismatch | None:
 def motion_by_hypothesis(
     sights: tuple[tuple[float, Vector], ...], samples: tuple[Telemetry, ...], offset_g: Vector
 ) -> tuple[Array, Array, Array]:
-    """For each pair of `LATER_S` and `TURNS_RAD`: the target's sideways motion, rms in m, (n,); and
-    with it the vehicle's speed at the newest sample and the offset, (3, n)."""
+    """The motion under each hypothesis, a pair of `LATER_S` and `TURNS_RAD`: the target's sideways
+    motion, rms in m, (n,); the vehicle's speed at the newest sample and the offset, (3, n)."""
     stamps_s = np.array([s.t_s for s in samples])
     attitudes = np.array([(s.roll_rad, s.pitch_rad, s.yaw_rad) for s in samples])
     attitudes[:, 2] = np.unwrap(attitudes[:, 2])

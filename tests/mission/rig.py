@@ -32,7 +32,7 @@ def at(
 
 @dataclass(frozen=True)
 class Tick:
-    """One tick of a flight: its time, and what came of it."""
+    """One tick of a flight: what was observed, and what the planner decided."""
 
     t_s: float
     obs: Observation
@@ -68,12 +68,12 @@ class Flight:
 
     @property
     def stops_s(self) -> list[float]:
-        """When the motors were told to stop."""
+        """The times at which the motors were ordered to stop."""
         return [tick.t_s for tick in self.ticks if isinstance(tick.command, StopMotors)]
 
     @property
     def still_s(self) -> list[float]:
-        """When a raw thrust was sent on which the motors stand still."""
+        """The times at which a raw thrust was sent on which the motors stand still."""
         return [
             tick.t_s
             for tick in self.ticks
@@ -124,7 +124,7 @@ class Motors:
         self.thrust = thrust
 
     def look(self, t_s: float, state: PlannerState) -> Observation:
-        """What is observed of it."""
+        """The observation of the vehicle at a time, flown by a planner in that state."""
         raise NotImplementedError
 
     def obey(self, state: PlannerState, command: Command) -> None:
