@@ -73,6 +73,9 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         _obs(position_age_s=0.8, position_problem="occluded"), 0.1,
         CAMERA_PHASES | {Phase.APPROACH, Phase.PERCH}, LAND, Outcome.SAFETY,
     ),
+    "heading-lost": (
+        _obs(jumped=True, turned_rad=1.5), 0.1, BEFORE_CONTACT, LAND, Outcome.SAFETY,
+    ),
     "estimator-jump": (_obs(jumped=True), 0.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
     "estimate-unsure": (
         _tel(position_variance_m2=0.08), 1.2, CAMERA_PHASES | {Phase.APPROACH}, LAND,
@@ -101,8 +104,9 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
 
 BY_ITSELF = ("link-lost", "telemetry-stale", "estimator-jump", "loop-late")
 """Where height, link or loop are doubtful the vehicle lands by its own; else by setpoints."""
-LEVEL = "position-lost"
-"""Where nothing measures the position it comes down level, by thrust."""
+LEVEL = ("position-lost", "heading-lost")
+"""Where nothing measures the position, or a heading that is far off would lead position setpoints
+away from their place, it comes down level, by thrust."""
 
 
 def down(command: object, z_m: float, *, by_itself: bool = False, level: bool = False) -> None:
@@ -152,7 +156,7 @@ def test_every_phase_meets_every_abort(phase: Phase, name: str) -> None:
         assert state.phase is Phase.LANDING
         at_ceiling = phase in (Phase.PERCH, Phase.COMPLETE)  # peeled off first, also blindly
         by_itself = name in BY_ITSELF and not at_ceiling
-        down(commands[-1], state.entry_m[2], by_itself=by_itself, level=name == LEVEL)
+        down(commands[-1], state.entry_m[2], by_itself=by_itself, level=name in LEVEL)
     assert state.reason
 
 
@@ -166,7 +170,7 @@ def test_a_landing_is_never_undone(name: str) -> None:
         obs = observation(20.0 + 0.02 * i, 0.8)
         state, command = planner.step_mission(state, obs, PROFILE)
         assert state.phase is Phase.LANDING
-        assert isinstance(command, RawThrust if name == LEVEL else Land | Idle | PositionSetpoint)
+        assert isinstance(command, RawThrust if name in LEVEL else Land | Idle | PositionSetpoint)
         if isinstance(command, PositionSetpoint):
             assert command.z_m < 0.8
         orders += isinstance(command, Land)

@@ -11,18 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.mission import (
-    EnergyState,
-    Outcome,
-    Phase,
-    PlannerState,
-    charge_at,
-    fit_battery,
-    update_energy,
-)
+from perchctl.mission import Outcome, Phase, PlannerState
 from perchctl.mission.battery import (
     CURVE,
     Floor,
+    charge_at,
+    fit_battery,
     floor_of,
     left_s,
     loaded_v,
@@ -30,8 +24,10 @@ from perchctl.mission.battery import (
     outlook,
     read_battery,
     resting_v,
+    update_energy,
 )
 from perchctl.mission.context import Context
+from perchctl.mission.state import EnergyState
 from perchctl.profile import Profile, load_profile
 from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.powertrain import Cell, CellKind

@@ -222,6 +222,10 @@ def judged(profile: Profile, state: dict[str, Any], **observed: Any) -> Evidence
         ({"age_s": 0.6}, Evidence.ONBOARD, Evidence.NOTHING),
         ({"jumped": True, "turned_rad": 1.5}, Evidence.HEIGHT, Evidence.IMU),
         ({"jumped": True, "turned_rad": 1.5, "behind_s": 0.5}, Evidence.IMU, Evidence.IMU),
+        # A level descent does not change its mode for a moment; without a vertical speed raw thrust
+        # would be blind, and the vehicle's own landing is left.
+        ({"jumped": True, "turned_rad": 1.5, "age_s": 0.2}, Evidence.IMU, Evidence.IMU),
+        ({"jumped": True, "turned_rad": 1.5, "age_s": 0.6}, Evidence.ONBOARD, Evidence.NOTHING),
     ],
 )
 def test_each_part_of_what_is_known_has_its_own_age(

@@ -774,13 +774,6 @@ def test_a_height_that_has_frozen_far_below_the_target_is_no_hanging() -> None:
     assert state.phase is Phase.LANDED
 
 
-@pytest.mark.parametrize(("age_s", "level"), [(0.02, True), (0.2, True), (0.5, False)])
-def test_a_level_descent_does_not_change_its_mode_for_a_moment(age_s: float, level: bool) -> None:
-    look = at(1.5, age_s=age_s)
-    _, command = step_mission(landing(1.5, heading_lost=True), look(10.5), PROFILE)
-    assert isinstance(command, RawThrust) is level
-
-
 @pytest.mark.parametrize(
     "frozen",
     [{"roll_rad": 0.1}, {"position_m": (0.0, 0.0, 1.01), "velocity_mps": (0.0, 0.0, 0.01)}],
