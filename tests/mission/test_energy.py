@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from perchctl.mission import Outcome, Phase, PlannerState
 from perchctl.mission.battery import (
-    CURVE,
     Floor,
     charge_at,
     fit_battery,
@@ -183,11 +182,6 @@ def test_readings_that_begin_under_load_are_taken_as_usual_ones() -> None:
 @given(st.floats(3.0, 4.2))
 def test_charge_and_voltage_are_each_other_s(volts: float) -> None:
     assert resting_v(charge_at(volts)) == pytest.approx(volts, abs=1e-6)
-
-
-def test_the_curve_rises() -> None:
-    assert list(CURVE) == sorted(CURVE)
-    assert [v for _, v in CURVE] == sorted(v for _, v in CURVE)
 
 
 @settings(max_examples=60)
