@@ -29,7 +29,7 @@ MOST_LINES = {
     "link": 2700,
     "record": 3400,
     "mission": 4900,
-    "perception": 650,
+    "perception": 880,
     "positioning": 1250,
     "profile": 2150,
     "sim": 7100,

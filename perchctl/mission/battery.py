@@ -53,7 +53,8 @@ _SHARES, _VOLTS = zip(*CURVE, strict=True)
 
 @dataclass(frozen=True)
 class BatteryFit:
-    """`sag_v` under full thrust; `hunger`: how much faster it empties than assumed."""
+    """The battery as fitted: its `sag_v` under full thrust, and its `hunger`, by how much faster it
+    empties than assumed."""
 
     sag_v: float
     hunger: float
@@ -131,7 +132,7 @@ def _along(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> float:
 
 
 def _counted(state: EnergyState, dt_s: float, battery_mah: float) -> EnergyState:
-    """Without a reading: the last estimate, less what the thrust takes."""
+    """The state after a time without a reading: the last estimate, less what the thrust takes."""
     state = replace(state, unknown_s=state.unknown_s + dt_s)
     if state.rest_v is None:
         return state
@@ -175,8 +176,8 @@ def _towards(value: float, goal: float, part: float) -> float:
 
 @dataclass(frozen=True)
 class Floor:
-    """Where the battery ends a flight: the voltage under a long load, and under that of a press,
-    which takes `press_load` of the full thrust."""
+    """The voltages that end a flight: under a long load, and under that of a press, which takes
+    `press_load` of the full thrust."""
 
     hover_v: float
     press_v: float
@@ -185,7 +186,7 @@ class Floor:
 
 @dataclass(frozen=True)
 class Needs:
-    """Seconds of flight for the attempt at hand, for each further one, and for the landing."""
+    """The seconds of flight that the attempt at hand, each further one and the landing take."""
 
     attempt_s: float
     again_s: float
@@ -193,7 +194,7 @@ class Needs:
 
 
 def outlook(c: Context) -> BatteryOutlook:
-    """What is left, and for how many attempts that is enough.
+    """The outlook of the battery: what it has left, and for how many attempts that is enough.
 
     An unknown charge counts as what the last reading left, less what was used since, and at most
     as the grace of a vehicle without a reading (fault 7)."""
@@ -219,9 +220,9 @@ def outlook(c: Context) -> BatteryOutlook:
 def left_s(
     state: EnergyState, floor: Floor, battery_mah: float, hover_load: float | None = None
 ) -> float | None:
-    """For how long hovering keeps the voltage above the floor; None if that is unknown.
+    """Seconds for which hovering keeps the voltage above the floor; None if that is unknown.
 
-    `hover_load`: of the full thrust; by default that of the last seconds."""
+    `hover_load` is a share of the full thrust, by default that of the last seconds."""
     load = hover_load or state.mean_load
     if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
         return None
@@ -233,8 +234,8 @@ def left_s(
 
 
 def floor_of(profile: Profile) -> Floor:
-    """Where `battery-low` fires: by the firmware's limit under a long load, by the profile's under
-    one that outlasts `safety.battery_debounce_s`, which a press seldom does."""
+    """The voltages at which `battery-low` fires: by the firmware's limit under a long load, by the
+    profile's under one that outlasts `safety.battery_debounce_s`, which a press seldom does."""
     safety = profile.safety
     low_v = float(profile.link.parameters.get("pm.lowVoltage", LOW_POWER_V))
     press_s = TOUCHING_S + profile.planner.perch.contact_dwell_s
@@ -244,7 +245,7 @@ def floor_of(profile: Profile) -> Floor:
 
 
 def needs_of(c: Context) -> Needs:
-    """By the height of the target, which must have been seen."""
+    """The seconds that attempts and landing take, by the height of a target that was seen."""
     planner = c.profile.planner
     up_m = max(0.0, c.contact_goal_z_m - c.obs.telemetry.position_m[2])
     touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
@@ -285,7 +286,7 @@ def why_short(c: Context) -> str:
 
 
 def _grace_s(c: Context) -> float:
-    """What `battery-unknown` leaves of its time to a vehicle whose reading is unknown."""
+    """Seconds that `battery-unknown` leaves to a vehicle whose reading is unknown."""
     return c.profile.safety.battery_stale_s - max(c.state.energy.unknown_s, c.obs.battery_age_s)
 
 

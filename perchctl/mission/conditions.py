@@ -42,7 +42,7 @@ def _aligned(c: Context) -> bool:
 
 
 def _settled(c: Context) -> bool:
-    """Under the target at the stand-off, slow, and seen by the small marker (fault 33)."""
+    """True if it is slow under the target at the stand-off, by the small marker (fault 33)."""
     ascend = c.profile.planner.ascend
     return (
         c.fresh
@@ -60,14 +60,14 @@ def _near_standoff(c: Context) -> bool:
 
 
 def _moves_otherwise(c: Context) -> bool:
-    """The estimate follows a motion capture whose axes are mirrored, turned or swapped, against
-    the accelerometer. A vehicle at rest cannot show it."""
+    """True if the estimate follows a motion capture against the accelerometer, since the capture's
+    axes are mirrored, turned or swapped. A vehicle at rest cannot show it."""
     by_capture = c.profile.positioning.by == "mocap"
     return by_capture and math.hypot(*c.state.reckoning.beside_mps) > OTHERWISE_MPS
 
 
 def _contact(c: Context) -> bool:
-    """Position, acceleration and thrust together (fault 40).
+    """True if position, acceleration and thrust together show a contact (fault 40).
 
     The gear has stopped at the target's height, the accelerometer reads one g, and the thrust is
     above what hovering takes: the ceiling must carry the difference. By the target alone, the
@@ -80,7 +80,7 @@ def _contact(c: Context) -> bool:
     return (
         abs(c.error_z_m) <= perch.contact_z_m + (CARRIED_ON_MPS * unseen_s(c) if c.by_sight else 0)
         and (steady or felt_s >= perch.contact_dwell_s)
-        and abs(tel.acc_z_g - 1.0) <= perch.contact_acc_g
+        and c.reads_one_g
         and c.state.hover_thrust > 0
         and c.thrust_is_known
         and tel.thrust >= contact_thrust(c)
@@ -106,9 +106,9 @@ def contact_aside_m(c: Context) -> tuple[float, float]:
 
 
 def touched_aside_m(c: Context) -> tuple[float, float] | None:
-    """`contact_aside_m` as it was when the gear touched something at the target's height and
-    backed off; what has not left since is still there. None after it left, and where a sight of
-    now or a motion capture gives the place."""
+    """The `contact_aside_m` of the moment in which the gear touched something at the target's
+    height: what has not left since is still there. None after it left, and where a sight of now or
+    a motion capture gives the place."""
     state = c.state
     if state.phase is not Phase.RECOVER or state.contact_aside_m is None or c.fresh:
         return None
@@ -166,7 +166,7 @@ def hovers(c: Context) -> bool:
 
 
 def _magnet_holds(c: Context) -> bool:
-    """The vehicle stays up on a thrust that could not carry it."""
+    """True if the vehicle stays up on a thrust that could not carry it."""
     return _is_carried(c) and not _slipping(c) and (c.placed or _still(c))
 
 
@@ -177,7 +177,7 @@ def _is_carried(c: Context) -> bool:
 
 
 def _slipping(c: Context) -> bool:
-    """Falling away from the proven contact, by position or by acceleration."""
+    """True if it falls away from the proven contact, by position or by acceleration."""
     complete, tel = c.profile.planner.complete, c.obs.telemetry
     if c.state.contact_z_m is None or not c.sinks(complete.slip_mps):
         return False
@@ -186,15 +186,13 @@ def _slipping(c: Context) -> bool:
 
 
 def _still(c: Context) -> bool:
-    """Not moving, and carried by something: the accelerometer reads one g. While no position
-    corrects the speed, it alone counts."""
-    tel = c.obs.telemetry
-    at_rest = abs(tel.acc_z_g - 1.0) <= c.profile.planner.perch.contact_acc_g
-    return at_rest and (abs(tel.velocity_mps[2]) < 0.05 or not c.placed)
+    """True if it does not move, and something carries it: the accelerometer reads one g. While no
+    position corrects the speed, the accelerometer alone counts."""
+    return c.reads_one_g and (abs(c.obs.telemetry.velocity_mps[2]) < 0.05 or not c.placed)
 
 
 def _weight_hangs(c: Context) -> bool:
-    """The motors stand still, and the vehicle hangs where it made contact."""
+    """True if the motors stand still, and the vehicle hangs where it made contact."""
     return (
         c.state.released_s is not None
         and (c.obs.telemetry.thrust <= STILL_MOTORS_THRUST or not c.thrust_is_known)
@@ -204,8 +202,8 @@ def _weight_hangs(c: Context) -> bool:
 
 
 def _hanging(c: Context) -> bool:
-    """Held up by something: still, off the floor, on a thrust that could not carry the vehicle.
-    `is_at_target` tells if that is the target's magnet.
+    """True if something holds it up: it is still, off the floor, on a thrust that could not carry
+    it. `is_at_target` tells if that is the target's magnet.
 
     Without a position a magnet looks like the floor; the slow release that follows suits both."""
     tel, complete = c.obs.telemetry, c.profile.planner.complete
@@ -241,21 +239,21 @@ def _estimated(c: Context) -> bool:
 
 
 def _tilted(c: Context) -> bool:
-    """By a fresh attitude, however old the position is."""
+    """True if a fresh attitude is beyond the tilt limit, however old the position is."""
     return c.imu_proves and c.tilt_rad > math.radians(c.profile.safety.max_tilt_deg)
 
 
 def _down(c: Context) -> bool:
-    """Motors off by the telemetry, and the supervisor agrees that nothing flies, or has not
-    changed its word for long."""
+    """True if the motors are off by the telemetry, and the supervisor agrees that nothing flies, or
+    has not changed its word for long."""
     stopped_s = c.state.stopped_s
     long_off = stopped_s is not None and c.obs.t_s - stopped_s > SUPERVISOR_S
     return c.obs.telemetry.thrust < 1 and (not c.obs.telemetry.has(FLYING) or long_off)
 
 
 def _on_floor(c: Context) -> bool:
-    """Low, or come down from where the landing began (a drifting estimate may place the floor
-    anywhere); not moving, on a thrust that could not carry the vehicle."""
+    """True if it does not move on a thrust that could not carry it, low or below where the landing
+    began: a drifting estimate may place the floor anywhere."""
     near_target = c.obs.target is not None and abs(c.error_z_m) <= 0.3
     came_down_m = c.state.entry_m[2] - c.obs.telemetry.position_m[2]
     came_down = c.state.phase is Phase.LANDING and came_down_m > DESCENDED_M
@@ -266,8 +264,9 @@ def _on_floor(c: Context) -> bool:
 
 
 def _blocked(c: Context) -> bool:
-    """Pressed against something: the setpoint is above, the thrust at its limit or above what
-    hovering takes, and nothing moves. If hovering takes nearly all thrust, that is no proof."""
+    """True if it is pressed against something: the setpoint is above, the thrust at its limit or
+    above what hovering takes, and nothing moves. If hovering takes nearly all thrust, that is no
+    proof."""
     setpoint, tel, safety = c.state.setpoint, c.obs.telemetry, c.profile.safety
     if setpoint is None or setpoint.z_m - tel.position_m[2] < PRESSED_M:
         return False
@@ -280,8 +279,9 @@ def _blocked(c: Context) -> bool:
 
 
 def _carried(c: Context) -> bool:
-    """By accelerometer and thrust alone: much more or much less than hovering takes, at one g and
-    a steady speed. In the air the vehicle would rise or sink."""
+    """True if accelerometer and thrust alone show that something carries or presses it: much more
+    or much less thrust than hovering takes, at one g and a steady speed, by which it would rise or
+    sink in the air."""
     tel, perch, hover = c.obs.telemetry, c.profile.planner.perch, c.state.hover_thrust
     apart = (c.profile.safety.blocked_thrust_ratio - 1.0) * hover
     pressed = tel.thrust >= min(hover + apart, SATURATED * FULL_THRUST)
@@ -289,7 +289,7 @@ def _carried(c: Context) -> bool:
         0 < hover < LITTLE_LEFT * FULL_THRUST
         and c.thrust_is_known
         and (pressed or tel.thrust <= hover - apart)
-        and abs(tel.acc_z_g - 1.0) <= perch.contact_acc_g
+        and c.reads_one_g
         and c.obs.t_s - c.obs.imu.steady_s >= perch.contact_dwell_s
     )
 
@@ -300,13 +300,13 @@ def _knocked(c: Context) -> bool:
 
 
 def _saturated(c: Context) -> bool:
-    """Full thrust, and the vehicle does not rise (nor is it just being caught)."""
+    """True at full thrust on which the vehicle does not rise (nor is it just being caught)."""
     full = c.obs.telemetry.thrust >= SATURATED * FULL_THRUST
     return full and -0.15 < c.climb_mps < 0.05
 
 
 def _battery_is_low(c: Context) -> bool:
-    """By the firmware's word, or by a voltage that was measured at all."""
+    """True if the firmware reports low power, or the voltage is low and was measured at all."""
     tel = c.obs.telemetry
     known = tel.battery_v >= NO_BATTERY_READING_V
     low = known and tel.battery_v < c.profile.safety.min_load_v
@@ -339,9 +339,7 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.OTHERWISE: _moves_otherwise,
 }
 C = Condition
-KEPT_OVER_A_CHANGE = frozenset(
-    {C.BATTERY_LOW, C.TILTED, C.UNSURE, C.SATURATED, C.CARRIED, C.OTHERWISE}
-)
+LASTING = frozenset({C.BATTERY_LOW, C.TILTED, C.UNSURE, C.SATURATED, C.CARRIED, C.OTHERWISE})
 """The vehicle's own, whatever the phase, and however it is held."""
 PROOFS = frozenset(
     {
@@ -364,13 +362,13 @@ def conditions_since(c: Context) -> dict[Condition, float]:
     }
 
 
-def kept_over_a_change(since: dict[Condition, float]) -> dict[Condition, float]:
-    """Those of `PlannerState.since` that go on when the phase changes, or the vehicle is held."""
-    return {name: s for name, s in since.items() if name in KEPT_OVER_A_CHANGE}
+def lasting_conditions(since: dict[Condition, float]) -> dict[Condition, float]:
+    """The entries of `PlannerState.since` that last when the phase changes, or while held."""
+    return {name: s for name, s in since.items() if name in LASTING}
 
 
 def _void(c: Context) -> frozenset[Condition]:
-    """Those that do not count in this tick, since what they rest on is not fresh."""
+    """The conditions that do not count in this tick, since what they rest on is not fresh."""
     void: frozenset[Condition] = frozenset()
     if not c.imu_proves:
         void = PROOFS
@@ -390,8 +388,8 @@ def _void(c: Context) -> frozenset[Condition]:
 
 
 def has_slipped(c: Context) -> bool:
-    """Debounced; in free fall at once: each 10 ms costs what full thrust takes 80 ms to give
-    back."""
+    """True if it has slipped off its contact: debounced, but in free fall at once, since each 10 ms
+    costs what full thrust takes 80 ms to give back."""
     tel, complete = c.obs.telemetry, c.profile.planner.complete
     falls = c.state.released_s is not None and tel.acc_z_g < complete.slip_acc_g
     if falls and c.imu_proves and c.climb_mps < FALLING_MPS:

@@ -19,7 +19,7 @@ HANGING_S = 1.0  # a thrust below the weight must be enough for so long to prove
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What the table's predicates and the phases' actions are given."""
+    """The argument of the table's predicates and the phases' actions: one tick, whole."""
 
     state: PlannerState
     obs: Observation
@@ -31,6 +31,7 @@ class Context:
 
     @property
     def in_phase_s(self) -> float:
+        """Seconds since the phase was entered."""
         return self.obs.t_s - self.state.entered_s
 
     def held(self, condition: Condition) -> float:
@@ -42,30 +43,30 @@ class Context:
 
     @cached_property
     def speed_mps(self) -> float:
+        """Length of the estimated velocity."""
         return math.sqrt(sum(v * v for v in self.obs.telemetry.velocity_mps))
 
     @property
     def height_m(self) -> float:
-        """Above the ground that the flight started from, in the estimate's world."""
-        ground = self.state.ground_m
-        return self.obs.telemetry.position_m[2] - (ground[2] if ground else 0.0)
+        """Height above the ground that the flight started from, in the estimate's world."""
+        return self.obs.telemetry.position_m[2] - self.state.ground_z_m
 
     @property
     def telemetry_age_s(self) -> float:
-        """Age of its oldest part: position and velocity come in a packet of their own, and a
-        frozen reading is as old as its first one."""
+        """Age of the telemetry's oldest part: position and velocity come in a packet of their own,
+        and a frozen reading is as old as its first one."""
         tel, imu = self.obs.telemetry, self.obs.imu
         return self.obs.t_s - tel.t_s + max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
 
     @property
     def attitude_age_s(self) -> float:
-        """Of attitude, acceleration, thrust and supervisor bits, which come together."""
+        """Age of attitude, acceleration, thrust and supervisor bits, which come together."""
         return self.obs.t_s - self.obs.telemetry.t_s
 
     @property
     def position_age_s(self) -> float:
-        """Of the newest external position that was sent to the vehicle; with decks, of the newest
-        correction of its estimate."""
+        """Age of the newest external position that was sent to the vehicle; with decks, of the
+        newest correction of its estimate."""
         age_s = self.obs.position_age_s
         if self.profile.positioning.by == "deck":
             age_s = max(age_s, self.obs.imu.corrections.age_s(self.obs.t_s))
@@ -83,7 +84,8 @@ class Context:
 
     @property
     def imu_proves(self) -> bool:
-        """`proves` for attitude, acceleration, thrust and supervisor bits alone."""
+        """True if attitude, acceleration, thrust and supervisor bits are new enough to prove
+        anything, whatever the age of the position."""
         return self.attitude_age_s <= self.profile.safety.proof_age_s
 
     @property
@@ -134,8 +136,8 @@ class Context:
         return self.profile.positioning.by == "target"
 
     def sinks(self, mps: float) -> bool:
-        """True if it sinks faster than that. A speed that no position corrects counts only while
-        the accelerometer reads less than the weight, too."""
+        """True if the vehicle sinks faster than `mps`. A speed that no position corrects counts
+        only while the accelerometer reads less than the weight, too."""
         tel = self.obs.telemetry
         if self.climb_mps >= -mps:
             return False
@@ -143,12 +145,19 @@ class Context:
 
     @property
     def variance_m2(self) -> float:
-        """Of the position; 0 if the firmware reports none, infinite if it is no number."""
+        """Variance of the position; 0 if the firmware reports none, infinite if it is no number."""
         variance = self.obs.telemetry.position_variance_m2 or 0.0
         return math.inf if math.isnan(variance) else variance
 
     @property
+    def reads_one_g(self) -> bool:
+        """True if the accelerometer reads one g, as of what something carries."""
+        acc_g = self.profile.planner.perch.contact_acc_g
+        return abs(self.obs.telemetry.acc_z_g - 1.0) <= acc_g
+
+    @property
     def tilt_rad(self) -> float:
+        """Angle between the vehicle's upward axis and the vertical."""
         tel = self.obs.telemetry
         return math.acos(max(-1.0, min(1.0, math.cos(tel.roll_rad) * math.cos(tel.pitch_rad))))
 
@@ -161,26 +170,30 @@ class Context:
 
     @property
     def target_yaw_rad(self) -> float | None:
+        """The target's heading in the world of the state estimate; None while none was seen."""
         return None if self.obs.target is None else self.obs.target.world_yaw_rad
 
     @property
     def error_xy_m(self) -> float:
+        """Horizontal distance of the gear from the target's axis; infinite without a target."""
         target = self.obs.target
         return math.inf if target is None else math.hypot(target.e_m[0], target.e_m[1])
 
     @property
     def error_z_m(self) -> float:
+        """Height of the target above the gear; infinite without a target."""
         target = self.obs.target
         return math.inf if target is None else float(target.e_m[2])
 
     @property
     def error_yaw_rad(self) -> float:
+        """Heading of the target relative to the vehicle's; infinite without a target."""
         target = self.obs.target
         return math.inf if target is None else target.e_yaw_rad
 
     @property
     def target_age_s(self) -> float:
-        """Since the exposure of the last frame in which the target was measured."""
+        """Seconds since the exposure of the last frame in which the target was measured."""
         target = self.obs.target
         return math.inf if target is None else self.obs.t_s - target.measured_s
 
@@ -191,10 +204,12 @@ class Context:
 
     @property
     def fresh(self) -> bool:
+        """True if the target is tracked, and was measured as lately as the latency allows."""
         return self.tracked and self.target_age_s <= self._fresh_limit_s
 
     @property
     def small_is_fresh(self) -> bool:
+        """True if the small marker was measured as lately as the latency allows."""
         target = self.obs.target
         if target is None:
             return False
@@ -221,5 +236,6 @@ class Context:
 
     @property
     def cone_m(self) -> float:
+        """How far aside of the target an ascent may be at the present height."""
         ascend = self.profile.planner.ascend
         return ascend.cone_base_m + ascend.cone_slope * max(0.0, self.error_z_m)

@@ -142,7 +142,7 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
 
 
 def sinking(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The held setpoint, a tick later. Without a sight of the target it sinks: the camera's cone
+    """The held setpoint one tick later. Without a sight of the target it sinks: the camera's cone
     opens upwards, so the target is soonest seen again from lower down."""
     if not (c.by_sight and c.position_is_stale) or c.state.ground_m is None:
         return setpoint
@@ -187,7 +187,7 @@ def _is_strong(c: Context) -> bool:
     return thrust >= PRESSING_PART * FULL_THRUST or (hover > 0 and thrust >= PRESSING_RATIO * hover)
 
 
-def unpressed(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
+def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     """A setpoint below the vehicle until it is away from what it pressed against and the onboard
     integrators have come down; None once they have, or if nothing was pressed.
 
@@ -209,14 +209,14 @@ def unpressed(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     return state, limited(c, setpoint)
 
 
-def lower(c: Context) -> Acted:
-    """Stage one: the setpoint goes down in steps, or the raw thrust where it pressed."""
+def lower_thrust(c: Context) -> Acted:
+    """The release's first stage: the setpoint goes down in steps, or the raw thrust of a press."""
     complete, perch, state = c.profile.planner.complete, c.profile.planner.perch, c.state
     step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
     part = step / complete.steps
     if perch.mode == "raw":
         if not c.imu_proves:
-            return ready(c)
+            return hold_by_position(c)
         # The lowest step stays below what could carry the vehicle, above the idle cut.
         lowest = 0.9 * complete.hold_ratio * state.hover_thrust
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
@@ -231,13 +231,13 @@ def lower(c: Context) -> Acted:
     return replace(state, setpoint=setpoint), sent
 
 
-def let_go(c: Context) -> Acted:
-    """Stage two: raw thrust down to still motors, and the stop when the whole weight has hung long
-    enough. Without fresh telemetry it begins anew; in a landing late telemetry is enough, or what
-    hangs would end by its own landing."""
+def release_by_thrust(c: Context) -> Acted:
+    """The release's second stage: raw thrust down to still motors, and the stop when the whole
+    weight has hung long enough. Without fresh telemetry it begins anew; in a landing late telemetry
+    is enough, or what hangs would end by its own landing."""
     late_s = c.profile.safety.telemetry_hold_s if c.state.phase is Phase.LANDING else 0.0
     if not c.imu_proves and c.attitude_age_s > late_s:
-        return ready(c)
+        return hold_by_position(c)
     complete, state = c.profile.planner.complete, c.state
     if state.released_s is None:
         z_m = c.obs.telemetry.position_m[2]
@@ -253,7 +253,7 @@ def let_go(c: Context) -> Acted:
     return state, RawThrust(int(start + part * (STILL_THRUST - start)))
 
 
-def ready(c: Context) -> Acted:
+def hold_by_position(c: Context) -> Acted:
     """Hold by position while telemetry is old: what hangs stays, what falls unseen is caught.
     Still motors would be a stop without a proof."""
     state, tel = c.state, c.obs.telemetry

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.values import replace
@@ -72,7 +73,7 @@ UNCORRECTED_M2PS2_PER_S, UNCORRECTED_S = 5e-4, 0.45
 
 @dataclass(frozen=True)
 class Corrections:
-    """Shows by the variance of the vertical speed if anything still corrects the estimate."""
+    """The variance of the vertical speed, which shows if anything still corrects the estimate."""
 
     variance_m2ps2: float | None = None  # the newest
     changed_s: float = -math.inf  # when that came
@@ -83,8 +84,8 @@ class Corrections:
         certain = self.changed_s - self.none_since_s >= UNCORRECTED_S
         return now_s - self.none_since_s if certain else 0.0
 
-    def watched(self, sample: Telemetry) -> Corrections:
-        """With one more sample. An unchanged variance means that no packet came."""
+    def updated(self, sample: Telemetry) -> Corrections:
+        """The corrections with one more sample. An unchanged variance means that no packet came."""
         variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
         if variance is None or variance == before:
             return self
@@ -96,7 +97,7 @@ class Corrections:
 
 @dataclass(frozen=True)
 class Blow:
-    """A blow from below: as from the floor."""
+    """A blow from below, as the floor gives one."""
 
     t_s: float = -math.inf  # -inf: there was none
     estimated_mps: float = 0.0  # vertical speed just before it, by the state estimate
@@ -142,12 +143,13 @@ class ImuMotion:
 
     @property
     def attitude_age_s(self) -> float:
-        """For how long the attitude has read the same while the accelerometer changed."""
+        """Seconds for which the attitude has read the same while the accelerometer changed."""
         return max(0.0, self.attitude_frozen_s - self.frozen_s)
 
     @property
     def place_age_s(self) -> float:
-        """`attitude_age_s` of position and velocity."""
+        """Seconds for which position and velocity have read the same while the accelerometer
+        changed."""
         return max(0.0, self.place_frozen_s - self.frozen_s)
 
 
@@ -159,10 +161,10 @@ def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> 
         motion,
         t_s=new.t_s,
         started_s=new.t_s if started_anew else motion.started_s,
-        frozen_s=_still_s(motion.frozen_s, last, new, _acceleration),
-        attitude_frozen_s=_still_s(motion.attitude_frozen_s, last, new, _attitude),
-        place_frozen_s=_still_s(motion.place_frozen_s, last, new, _place),
-        corrections=motion.corrections.watched(new),
+        frozen_s=_frozen_s(motion.frozen_s, last, new, _ACCELERATION),
+        attitude_frozen_s=_frozen_s(motion.attitude_frozen_s, last, new, _ATTITUDE),
+        place_frozen_s=_frozen_s(motion.place_frozen_s, last, new, _PLACE),
+        corrections=motion.corrections.updated(new),
         off_s=min(motion.off_s, new.t_s) if new.thrust < 1 else math.inf,
     )
     if last is None or not 0.0 < dt_s <= GAP_S or motion.frozen_s > FROZEN_S:
@@ -171,8 +173,8 @@ def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> 
     if new.thrust < 1 and not new.has(FLYING):
         offset_g = _offset_at_rest(offset_g, new, min(1.0, dt_s / REST_MEMORY_S))
     misled_rad, turning_radps = _misled(motion, last, new, dt_s)
-    before = acceleration_mps2(_led_right(last, motion.misled_rad), offset_g)
-    after = acceleration_mps2(_led_right(new, misled_rad), offset_g)
+    before = acceleration_mps2(last, offset_g, motion.misled_rad)
+    after = acceleration_mps2(new, offset_g, misled_rad)
     dv = tuple(0.5 * (a + b) * dt_s for a, b in zip(before, after, strict=True))
     x, y, z = (v + d for v, d in zip(motion.velocity_mps, dv, strict=True))
     up_mps2 = dv[2] / dt_s
@@ -194,7 +196,14 @@ def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> 
     if math.dist((x, y), steady_aside_mps) > STEADY_ASIDE_MPS:
         steady_aside_s = new.t_s
     now = Blow(new.t_s, new.velocity_mps[2], z, new.acc_z_g)
-    aside_g = _aside_g(motion.aside_g, new, offset_g, dt_s)
+    # The mean sideways force with one more sample.
+    keeps = math.exp(-dt_s / PUSH_MEMORY_S)
+    x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
+    mean_x_g, mean_y_g = motion.aside_g
+    aside_g = (
+        x_g + keeps * (mean_x_g - new.acc_x_g + offset_g[0]),
+        y_g + keeps * (mean_y_g - new.acc_y_g + offset_g[1]),
+    )
     last_moment = (*(m for m in motion.last_moment if new.t_s - m.t_s <= BEFORE_BLOW_S), now)
     return replace(
         motion,
@@ -273,21 +282,11 @@ def _struck(motion: ImuMotion, new: Telemetry, last_moment: tuple[Blow, ...], mp
     return replace(old, peak_g=max(old.peak_g, new.acc_z_g)) if follows else old
 
 
-def _aside_g(
-    old_g: tuple[float, float], new: Telemetry, offset_g: Vector, dt_s: float
-) -> tuple[float, float]:
-    """The mean sideways force with one more sample."""
-    keeps, (x_g, y_g) = math.exp(-dt_s / PUSH_MEMORY_S), old_g
-    return (
-        new.acc_x_g - offset_g[0] + keeps * (x_g - new.acc_x_g + offset_g[0]),
-        new.acc_y_g - offset_g[1] + keeps * (y_g - new.acc_y_g + offset_g[1]),
-    )
-
-
 def _misled(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """By how much corrections have turned roll and pitch, and the rates that are no correction."""
+    """The angles by which corrections have turned roll and pitch, in rad, and the rates of the
+    vehicle's own rotation, in rad/s."""
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
     kept = 1.0 - dt_s / CORRECTED_MEMORY_S
@@ -300,30 +299,13 @@ def _misled(
     ), rates
 
 
-def _led_right(sample: Telemetry, misled_rad: tuple[float, float]) -> Telemetry:
-    if misled_rad == (0.0, 0.0):
-        return sample
-    roll, pitch = misled_rad
-    return replace(sample, roll_rad=sample.roll_rad - roll, pitch_rad=sample.pitch_rad - pitch)
+_ACCELERATION = attrgetter("acc_x_g", "acc_y_g", "acc_z_g")
+_ATTITUDE = attrgetter("roll_rad", "pitch_rad", "yaw_rad")
+_PLACE = attrgetter("position_m", "velocity_mps")
 
 
-def _acceleration(sample: Telemetry) -> Vector:
-    return sample.acc_x_g, sample.acc_y_g, sample.acc_z_g
-
-
-def _attitude(sample: Telemetry) -> Vector:
-    return sample.roll_rad, sample.pitch_rad, sample.yaw_rad
-
-
-def _place(sample: Telemetry) -> tuple[float, ...]:
-    return *sample.position_m, *sample.velocity_mps
-
-
-def _still_s(
-    before_s: float,
-    last: Telemetry | None,
-    new: Telemetry,
-    reading: Callable[[Telemetry], tuple[float, ...]],
+def _frozen_s(
+    before_s: float, last: Telemetry | None, new: Telemetry, reading: Callable[[Telemetry], object]
 ) -> float:
     """Seconds for which a reading has been the very same."""
     if last is None:
@@ -332,7 +314,7 @@ def _still_s(
 
 
 def _hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
-    """The hover thrust with one sample of free flight: neither at rest nor pressed."""
+    """The hover thrust with one more sample, which counts if it neither rests nor presses."""
     flies = sample.has(FLYING) and sample.thrust < SATURATED * FULL_THRUST
     if not flies or sample.thrust < LEAST_FLYING * FULL_THRUST or not 0.8 <= sample.acc_z_g <= 1.2:
         return old
@@ -348,10 +330,14 @@ def _offset_at_rest(old: Vector, sample: Telemetry, share: float) -> Vector:
     return (ox + share * (x - ox), oy + share * (y - oy), oz + share * (z - oz))
 
 
-def acceleration_mps2(sample: Telemetry, offset_g: Vector = ZERO) -> Vector:
-    """Acceleration in world axes by the specific force and the attitude of one sample."""
-    cr, sr = math.cos(sample.roll_rad), math.sin(sample.roll_rad)
-    cp, sp = math.cos(sample.pitch_rad), math.sin(sample.pitch_rad)
+def acceleration_mps2(
+    sample: Telemetry, offset_g: Vector, misled_rad: tuple[float, float] = (0.0, 0.0)
+) -> Vector:
+    """Acceleration in world axes by the specific force and the attitude of one sample, without the
+    accelerometer's offset and the part of roll and pitch that corrections have turned wrongly."""
+    roll_rad, pitch_rad = sample.roll_rad - misled_rad[0], sample.pitch_rad - misled_rad[1]
+    cr, sr = math.cos(roll_rad), math.sin(roll_rad)
+    cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
     cy, sy = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
     fx, fy = sample.acc_x_g - offset_g[0], sample.acc_y_g - offset_g[1]
     fz = sample.acc_z_g - offset_g[2]
@@ -364,7 +350,7 @@ def acceleration_mps2(sample: Telemetry, offset_g: Vector = ZERO) -> Vector:
 
 @dataclass(frozen=True)
 class Reckoning:
-    """Speed, and place under the target, carried on by the accelerometer. World axes."""
+    """Speed and place under the target in world axes, carried on by the accelerometer."""
 
     imu: ImuMotion | None = None  # the motion up to which it is reckoned
     velocity_mps: Vector = ZERO
@@ -382,7 +368,7 @@ class Reckoning:
     struck_mps: float = 0.0  # vertical speed just before `ImuMotion.blow`
 
 
-def reckoned(
+def advance_reckoning(
     old: Reckoning, imu: ImuMotion, sample: Telemetry, *, believed: bool, astray: bool = False
 ) -> Reckoning:
     """The reckoning one tick later. `believed`: the sample's estimated velocity is true; `astray`:
@@ -460,7 +446,7 @@ def reckoned(
     )
 
 
-def led_astray(old: Reckoning) -> Reckoning:
+def discount_wrong_positions(old: Reckoning) -> Reckoning:
     """The reckoning once the positions are found to be wrong: they have turned the attitude, too,
     of which hardly any was learned in so short a time."""
     (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.beside_mps
@@ -481,7 +467,7 @@ def _most_climb_m(old: Reckoning, now_s: float, *, flew: bool) -> float:
     return climb_mps**2 / (2.0 * GRAVITY_MPS2)
 
 
-def stepped(old: Reckoning, last: Telemetry, sample: Telemetry) -> Reckoning:
+def add_step(old: Reckoning, last: Telemetry, sample: Telemetry) -> Reckoning:
     """The reckoning with the step of the estimate's position between two samples, which its speed
     does not explain. Steps smeared over some samples add up, a step aside and back cancels; where
     samples are missing none is seen."""
@@ -505,7 +491,7 @@ def _position_s(sample: Telemetry) -> float:
     return sample.t_s - max(0.0, sample.behind_s - CARRIED_S)
 
 
-def sighted(
+def add_sight(
     old: Reckoning, t_s: float, aside_m: tuple[float, float], below_m: float, sigma_m: float
 ) -> Reckoning:
     """The reckoning with a sight: `aside_m` from the gear to the target's axis, world axes,

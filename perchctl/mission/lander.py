@@ -29,7 +29,7 @@ from perchctl.mission.conditions import (
     conditions_since,
     contact_within_m,
     has_slipped,
-    kept_over_a_change,
+    lasting_conditions,
     latency_changed,
 )
 from perchctl.mission.context import FAR_BELOW_M, HANGING_S, PUT_RIGHT_S, Context
@@ -41,15 +41,15 @@ from perchctl.mission.guidance import (
     catch,
     catch_above_m,
     hold_here,
+    leave_press,
     left_contact,
-    let_go,
     limited,
     presses,
+    release_by_thrust,
     stop_motors,
-    unpressed,
     walk,
 )
-from perchctl.mission.imu import REACH_M, UNSEEN_S, Vector, reckoned, sighted, stepped
+from perchctl.mission.imu import REACH_M, UNSEEN_S, Vector, add_sight, add_step, advance_reckoning
 from perchctl.mission.state import Condition, Observation, Phase, PlannerState, Severity
 from perchctl.profile import LandingConfig, Profile
 from perchctl.values import replace
@@ -93,7 +93,7 @@ class Stage(Enum):
 
 
 class Manoeuvre(Enum):
-    """What is commanded."""
+    """What the lander commands."""
 
     SETPOINTS = "position setpoints, then its own landing"
     SETPOINTS_LEVEL = "position setpoints, then level"
@@ -107,17 +107,10 @@ class Manoeuvre(Enum):
 _E, _R, _S, _M = Evidence, Reach, Stage, Manoeuvre
 MANOEUVRES: dict[tuple[Evidence, Reach, Stage], Manoeuvre] = {
     (_E.POSITION, _R.FREE, _S.DOWN): _M.SETPOINTS,
-    (_E.POSITION, _R.MAGNET, _S.DOWN): _M.PEEL,
     (_E.SIGHT, _R.FREE, _S.DOWN): _M.SETPOINTS_LEVEL,
-    (_E.SIGHT, _R.MAGNET, _S.DOWN): _M.PEEL,
-    (_E.HEIGHT, _R.FREE, _S.DOWN): _M.LEVEL,
-    (_E.HEIGHT, _R.MAGNET, _S.DOWN): _M.LEVEL,
-    (_E.IMU, _R.FREE, _S.DOWN): _M.LEVEL,
-    (_E.IMU, _R.MAGNET, _S.DOWN): _M.LEVEL,
     (_E.ONBOARD, _R.FREE, _S.DOWN): _M.OWN_LANDING,
-    (_E.ONBOARD, _R.MAGNET, _S.DOWN): _M.PEEL,
-    (_E.NOTHING, _R.FREE, _S.DOWN): _M.LEVEL,
-    (_E.NOTHING, _R.MAGNET, _S.DOWN): _M.LEVEL,
+    **{(e, _R.MAGNET, _S.DOWN): _M.PEEL for e in (_E.POSITION, _E.SIGHT, _E.ONBOARD)},
+    **{(e, r, _S.DOWN): _M.LEVEL for e in (_E.HEIGHT, _E.IMU, _E.NOTHING) for r in _R},
     # A landing of its own goes on, whatever is known: to change it costs height.
     **{(e, r, _S.ORDERED): _M.OWN_LANDING for e in _E for r in _R},
     **{(e, r, _S.RELEASED): _M.WEIGHT_ON_MAGNET for e in _E for r in _R},
@@ -182,28 +175,29 @@ AT_REST_S = 0.3
 def step_landing(
     state: PlannerState, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
-    """One tick of the way down without the mission's table, for watchdog and rescue."""
-    state = observed(begun(state, obs, profile), obs, profile)
+    """Fly one tick of the way down without the mission's table, for watchdog and rescue; the way
+    down begins with the first. Returns the new state, and the command to send."""
+    state = observe(begin_landing(state, obs, profile), obs, profile)
     state = replace(state, since=conditions_since(Context(state, obs, profile)))
     state, command = act(Context(state, obs, profile))
-    return replace(ordered(state, command), t_s=obs.t_s, last=obs.telemetry), command
+    return replace(note_order(state, command), t_s=obs.t_s, last=obs.telemetry), command
 
 
-def begun(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """The state with its way down begun, unless that has."""
+def begin_landing(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
+    """The state with its way down begun; the same state if it had begun before."""
     if state.phase is Phase.LANDING:
         return state
     c = Context(state, obs, profile)
     new = replace(
         state, phase=Phase.LANDING, entered_s=obs.t_s, severity=max(state.severity, Severity.LAND),
-        since=kept_over_a_change(state.since),
+        since=lasting_conditions(state.since),
         entry_m=obs.telemetry.position_m, entry_yaw_rad=obs.telemetry.yaw_rad,
         pressed=state.caught and presses(c), ordered_s=None, orders=0,
     )  # fmt: skip
-    return started(new, state, obs, profile)
+    return enter_landing(new, state, obs, profile)
 
 
-def started(
+def enter_landing(
     new: PlannerState, old: PlannerState, obs: Observation, profile: Profile
 ) -> PlannerState:
     """The state that a way down from `old` starts with; `new` has its entry already."""
@@ -230,7 +224,7 @@ def started(
         contact_z_m=contact_z_m, level_hover=hover, hover_thrust=hover,
         level_within=HOVER_WITHIN if old.hover_thrust else UNLEARNED_WITHIN,
     )  # fmt: skip
-    return blinded(new, obs) if _has_lost_its_position(c) else new
+    return lose_position(new, obs) if _has_lost_its_position(c) else new
 
 
 # --- What is known ------------------------------------------------------------------------------
@@ -239,11 +233,12 @@ def started(
 def evidence_of(c: Context) -> Evidence:
     """The best that is fresh in this tick."""
     heard = c.attitude_age_s <= c.profile.safety.telemetry_hold_s
-    if c.by_sight or c.state.astray or c.state.blind_s is not None:
-        if not heard:
-            return Evidence.NOTHING
-        if c.state.blind_s is not None or c.state.astray or not _is_sighted(c):
-            return Evidence.IMU
+    unplaced = c.state.astray or c.state.blind_s is not None
+    if not heard and (c.by_sight or unplaced):
+        return Evidence.NOTHING
+    if unplaced or (c.by_sight and not _is_sighted(c)):
+        return Evidence.IMU
+    if c.by_sight:
         return Evidence.HEIGHT if c.state.heading_lost else Evidence.SIGHT
     if heard and c.state.heading_lost:
         fresh = c.telemetry_age_s <= c.profile.safety.telemetry_hold_s
@@ -269,17 +264,17 @@ def _is_sighted(c: Context) -> bool:
 
 def _has_lost_its_position(c: Context) -> bool:
     """True if only accelerometer and attitude are left."""
-    if c.by_sight:
-        return not _is_sighted(c)
-    return not (c.located or c.state.astray)
+    return not (_is_sighted(c) if c.by_sight else c.located or c.state.astray)
 
 
 def reach_of(c: Context) -> Reach:
+    """Whether the magnet may hold the vehicle: since a contact, or since it was reckoned near."""
     within = c.state.contact_z_m is not None or c.state.reach_s is not None
     return Reach.MAGNET if within else Reach.FREE
 
 
 def stage_of(c: Context) -> Stage:
+    """How far the way down has come, by the orders that were given."""
     if c.state.stopped_s is not None:
         return Stage.STOPPED
     if c.state.released_s is not None:
@@ -300,8 +295,7 @@ def rest_finding(c: Context) -> Finding:
         if c.tracked and c.far_below_target:
             return Finding.STANDS
         return _by_fall(c, state.reach_s)
-    ground_m = state.ground_m[2] if state.ground_m else 0.0
-    high = state.entry_m[2] - ground_m > HIGH_M
+    high = state.entry_m[2] - state.ground_z_m > HIGH_M
     stayed = high and not c.far_below_target and state.entry_m[2] - tel.position_m[2] < STAYED_M
     if stayed or (c.height_m > LOW_M and not c.far_below_target and state.contact_z_m is not None):
         return Finding.HANGS
@@ -324,7 +318,8 @@ def _is_held_elsewhere(c: Context) -> bool:
 
 
 def _by_fall(c: Context, since_s: float | None) -> Finding:
-    """By falls and silences, of a vehicle that is within the magnet's reach since `since_s`."""
+    """Where a vehicle is that came within the magnet's reach at `since_s`, if ever: by the falls
+    that the accelerometer felt since, and the silences that could hide one."""
     imu, reckoning = c.obs.imu, c.state.reckoning
     down_s = max(imu.fell_s, -math.inf if c.state.touch_s is None else c.state.touch_s)
     unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sight ends the doubt
@@ -337,8 +332,12 @@ def _by_fall(c: Context, since_s: float | None) -> Finding:
 def hangs_where_it_did(c: Context) -> bool:
     """True if it is at its contact by a position, or has hung all the time by the accelerometer.
     A silence as long as a fall leaves it unknown."""
-    if not c.by_sight and c.placed and _is_at_contact(c):
-        return True
+    contact_z_m, tel = c.state.contact_z_m, c.obs.telemetry
+    if not c.by_sight and c.placed and contact_z_m is not None:
+        # A slip ends the contact at once, and the estimate of what hangs drifts less.
+        falls = tel.velocity_mps[2] < -c.profile.planner.complete.slip_mps
+        if not falls and contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M:
+            return True
     return _by_fall(c, c.state.reach_s) is Finding.HANGS
 
 
@@ -350,44 +349,15 @@ def hangs_stopped(c: Context) -> bool:
     return hangs_where_it_did(c)
 
 
-def _is_at_contact(c: Context) -> bool:
-    """True if it is where the magnet has it: a slip ends the contact at once, and the estimate of
-    a hanging vehicle drifts less."""
-    contact_z_m, tel = c.state.contact_z_m, c.obs.telemetry
-    if contact_z_m is None:
-        return False
-    falls = tel.velocity_mps[2] < -c.profile.planner.complete.slip_mps
-    return not falls and contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M
-
-
-def why_landed(c: Context) -> str:
-    if c.state.blind_s is not None:
-        return "motors off; it was felt to come down to the floor"
-    return "motors off"
-
-
-def why_unknown(c: Context) -> str:
-    return (
-        "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
-        "whether it hangs or stands: look before you touch it"
-    )
-
-
-def why_fell_unseen(c: Context) -> str:
-    if c.placed or c.state.reach_s is None or c.obs.imu.fell_s > c.state.reach_s:
-        return "it is not where it hung before"
-    return "the telemetry was silent: whether it still hangs is not known"
-
-
 # --- What is remembered -------------------------------------------------------------------------
 
 
-def observed(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
+def observe(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
     """The state with one more observation. Hangs of the loop, jumps of the estimate and lost
     positions are noticed here, for all who fly a way down."""
     if state.last is not None and obs.t_s - state.t_s > profile.positioning.hold_s:
         # After a hang of the loop everything from before is stale; dwell times begin anew.
-        kept = kept_over_a_change(state.since)
+        kept = lasting_conditions(state.since)
         off_s = max(obs.imu.off_s, obs.imu.silent_s)
         if Condition.DOWN in state.since and math.isfinite(off_s):
             # All samples of the hang have come, and in none do the motors turn: else a loop that
@@ -407,12 +377,12 @@ def observed(state: PlannerState, obs: Observation, profile: Profile) -> Planner
     c = Context(state, obs, profile)
     comes_down = state.phase is Phase.LANDING and stage_of(c) in (Stage.DOWN, Stage.ORDERED)
     if comes_down and state.blind_s is None and _has_lost_its_position(c):
-        return blinded(state, obs)
+        return lose_position(state, obs)
     return state
 
 
-def ordered(state: PlannerState, command: Command) -> PlannerState:
-    """The state with what was commanded: the thrust that is read has to follow it."""
+def note_order(state: PlannerState, command: Command) -> PlannerState:
+    """The state with the commanded raw thrust, which the telemetry's thrust has to follow."""
     match command:
         case RawThrust(thrust):
             return replace(state, raw_order=thrust)
@@ -423,7 +393,8 @@ def ordered(state: PlannerState, command: Command) -> PlannerState:
 
 
 def _answered(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """A reading that stands still under a changed order leaves the thrust unknown."""
+    """The state with the time since which the thrust that is read differs from the order: a reading
+    that stands still under a changed order leaves the thrust unknown."""
     if state.raw_order is None:
         return state
     wanted = 0.0 if state.raw_order < STILL_THRUST else min(MOST_RAW, state.raw_order)
@@ -434,22 +405,25 @@ def _answered(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     return new if known else replace(new, unread_s=obs.t_s)
 
 
-def blinded(state: PlannerState, obs: Observation) -> PlannerState:
+def lose_position(state: PlannerState, obs: Observation) -> PlannerState:
     """The state once accelerometer and attitude are all that is left, for good: each change of the
     mode costs height, so no sight is believed again on this way down."""
     hover = _hover_thrust(state, obs)
-    height_m = obs.telemetry.position_m[2] - (state.ground_m[2] if state.ground_m else 0.0)
+    height_m = obs.telemetry.position_m[2] - state.ground_z_m
     return replace(state, blind_s=obs.t_s, blind_height_m=height_m, hover_thrust=hover)
 
 
 def _reckon(c: Context) -> PlannerState:
+    """The state with its dead reckoning one tick later, and whether the magnet is within reach."""
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
     # By the target no sight is sent on the way down: the estimate's change is its own.
     astray = state.astray and not c.by_sight
-    new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray)
+    new = advance_reckoning(
+        state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray
+    )
     if c.located and not c.by_sight and state.last is not None:
-        new = stepped(new, state.last, obs.telemetry)
+        new = add_step(new, state.last, obs.telemetry)
     rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
     if state.contact_z_m is not None and new.below_m < REACH_M and rests:
         # Pressed or hanging it stands still, whatever speed the impact left to the estimate. On
@@ -478,7 +452,7 @@ def _reckon(c: Context) -> PlannerState:
             # An estimate without a position since then was moved when that came back.
             if not seen and state.stale_s is not None and state.stale_s >= target.measured_s:
                 aside_m, sigma_m = new.aside_m, new.aside_sigma_m
-            new = sighted(new, target.measured_s, aside_m, float(ez), sigma_m)
+            new = add_sight(new, target.measured_s, aside_m, float(ez), sigma_m)
             if seen and target.measured_s > new.stepped_s:
                 new = replace(new, stepped_m=(0.0, 0.0))
     held_s = c.held(Condition.CARRIED)
@@ -553,8 +527,9 @@ def _moved(place: Vector, by_m: Vector) -> Vector:
 
 
 def _hover_thrust(state: PlannerState, obs: Observation) -> float:
-    """As learned; else the thrust for each g that is measured, now: in a climb, or sinking, it is
-    beside the weight. Nothing hovers on the least of position mode."""
+    """The hover thrust as learned; else the present thrust for each g that is measured, since in a
+    climb, or sinking, the thrust differs from the weight. Nothing hovers on the least of position
+    mode."""
     tel = obs.telemetry
     measured = max(THRUST_MIN, tel.thrust / min(1.5, max(0.75, tel.acc_z_g)))
     return state.hover_thrust or obs.imu.hover_thrust or measured
@@ -575,8 +550,13 @@ def act(c: Context) -> Acted:
     if c.state.stopped_s is None and _stands(c):
         return stop_motors(c)
     if c.held(Condition.HANGING) >= HANGING_S and stage_of(c) is Stage.DOWN:
-        return let_go(c)
+        return release_by_thrust(c)
     manoeuvre = MANOEUVRES[evidence_of(c), reach_of(c), stage_of(c)]
+    if manoeuvre in BY_SETPOINTS and (c.by_sight or manoeuvre is not Manoeuvre.PEEL):
+        state, away = leave_press(c)
+        if away is not None:
+            return state, away
+        c = c.with_state(state)
     return ACTIONS[manoeuvre](c)
 
 
@@ -621,11 +601,7 @@ def _catch(c: Context) -> Acted | None:
 
 
 def _setpoints(c: Context) -> Acted:
-    """Down by setpoints to the hand-over, the rest by the vehicle's own landing."""
-    state, away = unpressed(c)
-    if away is not None:
-        return state, away
-    c = c.with_state(state)
+    """Sink by setpoints to the hand-over, and by the vehicle's own landing from there."""
     # When the landing's time is over nothing is sent: by then it must be landing by itself.
     overdue = c.in_phase_s > c.profile.planner.landing.overdue_s
     if overdue or c.height_m <= c.profile.planner.landing.handover_m:
@@ -634,41 +610,31 @@ def _setpoints(c: Context) -> Acted:
 
 
 def _setpoints_level(c: Context) -> Acted:
-    """Down by setpoints to the hand-over, the rest level: the vehicle's own landing would follow an
-    estimate that rests on pictures, to an unmeasured floor."""
-    state, away = unpressed(c)
-    if away is not None:
-        return state, away
-    c = c.with_state(state)
+    """Sink by setpoints to the hand-over, and level from there: the vehicle's own landing would
+    follow an estimate that rests on pictures, to an unmeasured floor."""
     if c.state.level_thrust or c.height_m <= c.profile.planner.landing.handover_m:
         return _level(c)
     return _by_setpoints(c)
 
 
 def _peel(c: Context) -> Acted:
-    """A setpoint below takes the thrust to its least. What that does not move is given to the
-    magnet; without fresh telemetry the setpoint goes on down to the floor."""
-    if c.by_sight:
-        state, away = unpressed(c)
-        if away is not None:
-            return state, away
-        c = c.with_state(state)
+    """Send a setpoint below, which takes the thrust to its least. What that does not move is given
+    to the magnet; without fresh telemetry the setpoint goes on down to the floor."""
     watched = evidence_of(c) is not Evidence.ONBOARD or c.imu_proves
     if c.in_phase_s > PEEL_S and watched:
-        return let_go(c)
+        return release_by_thrust(c)
     return _by_setpoints(c)
 
 
 def _by_setpoints(c: Context) -> Acted:
-    """Straight down at the landing's speed, from where the landing began."""
+    """Sink straight down at the landing's speed, from where the landing began."""
     landing, state = c.profile.planner.landing, c.state
     here = hold_here(c)
     start = state.setpoint if state.caught and state.setpoint is not None else here
     # A setpoint far above (the press, a search step) is not walked down slowly.
     start = replace(start, z_m=min(start.z_m, here.z_m))
     x, y, _ = state.entry_m
-    ground_z = state.ground_m[2] if state.ground_m else 0.0
-    goal = replace(start, x_m=x, y_m=y, z_m=ground_z + 0.5 * landing.handover_m)
+    goal = replace(start, x_m=x, y_m=y, z_m=state.ground_z_m + 0.5 * landing.handover_m)
     setpoint = walk(
         start,
         goal,
@@ -705,7 +671,7 @@ def own_landing(landing: LandingConfig, ground_z_m: float, flown_s: float, z_m: 
 def _own_landing(c: Context) -> Acted:
     """The vehicle's own landing, ordered again while it shows no effect."""
     landing, state, tel = c.profile.planner.landing, c.state, c.obs.telemetry
-    state, away = unpressed(c)
+    state, away = leave_press(c)
     if away is not None and not _is_doubtful(c) and not state.orders:
         return state, away
     # Ordered often enough, a short fall near the floor, or at an unknown height, is its end.
@@ -713,20 +679,20 @@ def _own_landing(c: Context) -> Acted:
     carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
     if c.imu_proves and tel.thrust < 1 and carried and (state.orders or not tel.has(FLYING)):
         return state, Idle()  # on the floor: another order would spin the motors up again
-    ground_z = state.ground_m[2] if state.ground_m else 0.0
     waited = math.inf if state.ordered_s is None else c.obs.t_s - state.ordered_s
     seen = state.orders >= LEAST_ORDERS and c.imu_proves and tel.has(HL_ACTIVE)
     if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
         flown_s = c.obs.t_s - state.started_s
-        order = own_landing(landing, ground_z, flown_s, tel.position_m[2])
+        order = own_landing(landing, state.ground_z_m, flown_s, tel.position_m[2])
         return replace(state, ordered_s=c.obs.t_s, orders=state.orders + 1, setpoint=None), order
     return state, Idle()
 
 
 def _level(c: Context) -> Acted:
-    """Level by raw thrust, on the vertical speed of the accelerometer and, where it is believed,
-    the estimate; tilted against the sideways speed. What does not sink gets less and less thrust:
-    it begins to sink, the ceiling lets go or proves that it holds, and the floor proves itself."""
+    """Sink level by raw thrust, on the vertical speed of the accelerometer and, where it is
+    believed, the estimate; tilted against the sideways speed. What does not sink gets less and less
+    thrust: it begins to sink, the ceiling lets go or proves that it holds, and the floor proves
+    itself."""
     state, tel = c.state, c.obs.telemetry
     dt_s = max(0.0, min(0.1, c.obs.t_s - state.t_s))
     age_s = max(1e-3, dt_s, c.attitude_age_s)
@@ -825,8 +791,7 @@ def _is_overdue(c: Context) -> bool:
     drifted away."""
     if c.state.blind_s is None and not c.state.astray:
         return False
-    ground_m = c.state.ground_m[2] if c.state.ground_m else 0.0
-    way_m = max(0.0, c.state.entry_m[2] - ground_m)
+    way_m = max(0.0, c.state.entry_m[2] - c.state.ground_z_m)
     # After a slip off the magnet the time begins anew.
     began_s = max(c.state.blind_s or 0.0, c.state.entered_s)
     heard = c.attitude_age_s <= LATEST_S
@@ -859,6 +824,7 @@ def _braking(c: Context) -> tuple[float, float]:
 
 
 def _against(mps: float) -> float:
+    """The limited tilt, in rad, that brakes a sideways speed."""
     return max(-MOST_BRAKE_RAD, min(MOST_BRAKE_RAD, -BRAKE_RAD_PER_MPS * mps))
 
 
@@ -866,7 +832,7 @@ def _weight_on_magnet(c: Context) -> Acted:
     """Put the whole weight on whatever carries it, and monitor that; without telemetry order what
     carries most of it: what hangs stays, what has fallen does not rise."""
     if c.attitude_age_s <= c.profile.safety.telemetry_hold_s:
-        return let_go(c)
+        return release_by_thrust(c)
     thrust = int(max(STILL_THRUST, min(THRUST_MIN, LEAST_PART * c.state.hover_thrust)))
     return replace(c.state, released_s=c.obs.t_s), RawThrust(thrust)
 
@@ -880,3 +846,4 @@ ACTIONS = {
     Manoeuvre.WEIGHT_ON_MAGNET: _weight_on_magnet,
     Manoeuvre.STOP: stop_motors,
 }
+BY_SETPOINTS = (Manoeuvre.SETPOINTS, Manoeuvre.SETPOINTS_LEVEL, Manoeuvre.PEEL)

@@ -49,6 +49,7 @@ class Sight:
 
     @property
     def aim(self) -> complex:
+        """Where the vehicle's upward axis meets the target's plane."""
         return self.vehicle + self.lean
 
 
@@ -74,6 +75,7 @@ class MountWatch:
 
     @property
     def wrong(self) -> bool:
+        """True once enough sights in a row speak against the mounting."""
         return self.against >= SIGHTS_IN_A_ROW
 
     @property
@@ -88,7 +90,7 @@ class MountWatch:
         return not (self.fits or self.still)
 
 
-def watched(old: MountWatch, sight: Sight) -> MountWatch:
+def update_watch(old: MountWatch, sight: Sight) -> MountWatch:
     """The watch with one more sight of a measured target."""
     if old.fits or old.wrong:
         return old
@@ -142,7 +144,7 @@ def _judged(watch: MountWatch, against: int) -> MountWatch:
     return watch
 
 
-def explained(turn_rad: float) -> str:
+def describe_turn(turn_rad: float) -> str:
     """A sentence on the turn, to the nearest quarter if it is about one, else to 10 degrees."""
     turn_deg = math.degrees(turn_rad)
     quarter = 90.0 * round(turn_deg / 90.0)

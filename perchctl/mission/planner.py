@@ -21,7 +21,7 @@ from perchctl.mission.conditions import (
     contact_aside_m,
     contact_within_m,
     hovers,
-    kept_over_a_change,
+    lasting_conditions,
     touched_aside_m,
 )
 from perchctl.mission.context import Context
@@ -36,19 +36,19 @@ from perchctl.mission.guidance import (
     integrated,
     is_carried,
     is_still,
+    leave_press,
     left_contact,
-    let_go,
     limited,
-    lower,
+    lower_thrust,
     presses,
+    release_by_thrust,
     sinking,
     stop_motors,
     under_target_xy,
-    unpressed,
     walk,
 )
-from perchctl.mission.imu import led_astray
-from perchctl.mission.mounting import MountWatch, sight_of, watched
+from perchctl.mission.imu import discount_wrong_positions
+from perchctl.mission.mounting import MountWatch, sight_of, update_watch
 from perchctl.mission.state import (
     Condition,
     MotorStop,
@@ -57,7 +57,14 @@ from perchctl.mission.state import (
     Phase,
     PlannerState,
 )
-from perchctl.mission.table import IN_THE_OPEN, TABLE, Transition, first_match, hold_reason, risen
+from perchctl.mission.table import (
+    IN_THE_OPEN,
+    TABLE,
+    Transition,
+    first_match,
+    hold_reason,
+    raise_severity,
+)
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import Command, EmergencyStop, Idle, PositionSetpoint, RawThrust, StopMotors
@@ -86,24 +93,24 @@ def start_mission(obs: Observation) -> PlannerState:
 def step_mission(
     state: PlannerState, obs: Observation, profile: Profile, table: tuple[Transition, ...] = TABLE
 ) -> tuple[PlannerState, Command]:
-    """One tick of the mission: the new state, and the command to send."""
+    """Fly one tick of the mission; returns the new state, and the command to send."""
     state = _remember(state, obs, profile)
     row = first_match(Context(state, obs, profile), table)
     if row is not None:
         state = _enter(state, row, Context(state, obs, profile))
         state = replace(state, hold=hold_reason(Context(state, obs, profile)))
     new, command = act(Context(state, obs, profile))
-    return replace(lander.ordered(new, command), t_s=obs.t_s), command
+    return replace(lander.note_order(new, command), t_s=obs.t_s), command
 
 
 def _remember(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    state = lander.observed(_with_target(state, obs), obs, profile)
+    state = lander.observe(_with_target(state, obs), obs, profile)
     context = Context(state, obs, profile)
     state = replace(state, hold=hold_reason(context))
     since = conditions_since(context)
     if state.hold:
-        since = kept_over_a_change(since)  # a held vehicle proves nothing: dwell times begin anew
-    # Near the target an ascent may press against a ceiling that is lower than thought.
+        since = lasting_conditions(since)  # a held vehicle proves nothing: dwell times begin anew
+    # Near the target an ascent may press against a ceiling that is lower_thrust than thought.
     away = state.phase is not Phase.ASCEND or context.error_z_m > profile.planner.ascend.near_m
     if away and state.phase in _LEARNING and hovers(context):
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
@@ -139,7 +146,7 @@ def _mount_watched(c: Context) -> MountWatch:
         return mount
     if target is None or not target.measured or target.world_m is None:
         return mount
-    return watched(mount, sight_of(c.obs.t_s, c.obs.telemetry, target.world_m))
+    return update_watch(mount, sight_of(c.obs.t_s, c.obs.telemetry, target.world_m))
 
 
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
@@ -161,10 +168,10 @@ def _enter(state: PlannerState, row: Transition, context: Context) -> PlannerSta
         entered_s=obs.t_s,
         reason=row.explain(context),
         row=row.name,
-        severity=risen(state.severity, row.severity),
+        severity=raise_severity(state.severity, row.severity),
         motor_stop=row.motor_stop,
         outcome=_outcome(state, row),
-        since=kept_over_a_change(state.since),
+        since=lasting_conditions(state.since),
         attempts=state.attempts + int(row.counts_attempt),
         entry_m=obs.telemetry.position_m,
         entry_yaw_rad=obs.telemetry.yaw_rad,
@@ -226,14 +233,14 @@ def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerS
             # would speed up until it tilts over.
             capture = c.profile.positioning.by == "mocap" and old.mount.wrong
             if new.row == "position-astray" or (new.row == "mounting" and capture):
-                reckoning = old.reckoning if old.astray else led_astray(old.reckoning)
+                reckoning = old.reckoning if old.astray else discount_wrong_positions(old.reckoning)
                 new = replace(new, astray=True, reckoning=reckoning)
             if new.row == "mounting":
                 # The setpoint is ahead, in a wrong direction.
                 new = replace(new, setpoint=None)
             if old.phase is Phase.RECOVER and new.row != "hangs-at-contact":
                 new = replace(new, contact_aside_m=None)  # nothing was felt to hold it there
-            return lander.started(new, old, obs, c.profile)
+            return lander.enter_landing(new, old, obs, c.profile)
         case Phase.ASCEND:
             return replace(new, searches=0)
         case Phase.SEARCH if old.setpoint is not None:
@@ -279,7 +286,8 @@ def _fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Ac
 def _walk_to(
     c: Context, goal: PositionSetpoint, *, up_mps: float = 0.0, down_mps: float = 0.4
 ) -> Acted:
-    """Only SEARCH and ASCEND pass an `up_mps`; APPROACH, the press and a catch climb too."""
+    """Walk the setpoint towards the goal. Only SEARCH and ASCEND pass an `up_mps`; APPROACH, the
+    press and a catch climb in other ways."""
     return _fly_to(c, _walked(c, goal, up_mps, down_mps))
 
 
@@ -398,7 +406,7 @@ def _complete(c: Context) -> Acted:
     if c.state.stopped_s is not None:
         return stop_motors(c)
     holds = c.held(Condition.MAGNET_HOLDS) >= c.profile.planner.complete.hold_dwell_s
-    return let_go(c) if holds or c.state.released_s is not None else lower(c)
+    return release_by_thrust(c) if holds or c.state.released_s is not None else lower_thrust(c)
 
 
 def _recover(c: Context) -> Acted:
@@ -408,7 +416,7 @@ def _recover(c: Context) -> Acted:
         return caught
     recover = c.profile.planner.recover
     c = left_contact(c, min(AWAY_M, 0.5 * recover.descend_m))
-    state, away = unpressed(c)
+    state, away = leave_press(c)
     if away is not None:
         return state, away
     if not state.caught:

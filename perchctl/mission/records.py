@@ -21,7 +21,7 @@ from perchctl.vision import Consistency, PictureKind, PipelineOutput, TargetEsti
 SentBy = Literal["watchdog", "rescue", "reconnect", "farewell"]
 TurnRole = Literal["waiting", "redone", "flown", "failed"]
 RESCUE = " in flight: "
-"""In the note of what a rescue did after an error, behind the error's name."""
+"""The words between the error's name and what was done, in the note of a rescue in flight."""
 
 
 class EventKind(Enum):
@@ -110,7 +110,7 @@ class FrameSeen:
 
 @dataclass(frozen=True)
 class TurnInputs:
-    """What link and camera gave in one turn."""
+    """The samples and the frame that link and camera gave in one turn."""
 
     samples: tuple[Telemetry, ...] = ()  # in the order in which they came
     late: tuple[Telemetry, ...] = ()  # those that came while camera or vision hung
@@ -170,7 +170,7 @@ class Turn:
 
 @dataclass(frozen=True, eq=False)
 class Tick:
-    """All that one flown turn knew and did, for the log and the display."""
+    """What one flown turn knew and did, for the log and the display."""
 
     t_s: float
     telemetry: Telemetry
@@ -188,14 +188,17 @@ class Tick:
 
 
 class Watcher(Protocol):
-    """Looks on at a flight: flight log, panel, live page. Must not raise."""
+    """What looks on at a flight: flight log, panel, live page. Its methods must not raise."""
 
-    def tick(self, tick: Tick) -> None: ...
+    def tick(self, tick: Tick) -> None:
+        """Take a flown turn."""
 
-    def event(self, event: Event) -> None: ...
+    def event(self, event: Event) -> None:
+        """Take something that happened."""
 
     @property
-    def problem(self) -> str | None: ...
+    def problem(self) -> str | None:
+        """Why the watcher lost something; None while it lost nothing."""
 
 
 class EventKeeper:

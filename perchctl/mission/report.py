@@ -35,7 +35,7 @@ class ContactError:
 
     @property
     def text(self) -> str:
-        """``1.8 +- 0.6 mm off centre``."""
+        """The error in words, as in ``1.8 +- 0.6 mm off centre``."""
         return f"{1e3 * self.aside_m:.1f} +- {1e3 * self.sigma_m:.1f} mm off centre"
 
 
@@ -54,7 +54,7 @@ class Touchdown:
 
     @property
     def text(self) -> str:
-        """One sentence without its end."""
+        """The touchdown as a sentence without its end."""
         how = "touched down hard" if self.is_hard else "touched down"
         return f"{how}: {self.speed_mps:.1f} m/s, {self.peak_g:.1f} g"
 
@@ -68,7 +68,7 @@ class Rest(NamedTuple):
 
 @dataclass(frozen=True)
 class FlightReport:
-    """How the flight ended."""
+    """How a flight ended, and what it showed."""
 
     phase: Phase
     outcome: Outcome
@@ -134,7 +134,7 @@ def touchdown_of(c: Context) -> Touchdown | None:
 
 
 def _contact_error(state: PlannerState) -> ContactError | None:
-    """Of what hangs, where the contact was ever placed."""
+    """The contact error of a vehicle that hangs; None if its contact was never placed."""
     aside_m, sigma_m = state.contact_aside_m, state.contact_sigma_m
     if state.phase is not Phase.PERCHED or aside_m is None or not math.isfinite(sigma_m):
         return None
@@ -142,7 +142,7 @@ def _contact_error(state: PlannerState) -> ContactError | None:
 
 
 def _reason(state: PlannerState, obs: Observation, history: tuple[Event, ...]) -> str:
-    """Why it ended so, after what led to the landing where there was one."""
+    """Why the flight ended so, behind what led to the landing where there was one."""
     why = next((e.reason for e in reversed(history) if e.phase is Phase.LANDING), "")
     if state.phase in (Phase.LANDED, Phase.PERCHED):
         return f"{why}; {state.reason}" if why else state.reason
@@ -192,16 +192,14 @@ def _about_latency(found: Findings, camera: CameraConfig) -> list[str]:
     off_s = found.latency_s - used_s
     if not _is_worth_saying(off_s, LATENCY_GATE_S, found.latency_sigma_s):
         return []
+    found_text = f"latency {latency_text(found)}"
     if measured:
         return [
-            f"latency {latency_text(found)}, and {least_s * 1e3:.0f} to {most_s * 1e3:.0f} are "
-            f"used with camera.latency_s: measured: find what delays the pictures"
+            f"{found_text}, and {least_s * 1e3:.0f} to {most_s * 1e3:.0f} are used with "
+            f"camera.latency_s: measured: find what delays the pictures"
         ]
-    to_set = f"{max(0.0, found.latency_s):.3f}"
-    return [
-        f"latency {latency_text(found)}, profile says {used_s * 1e3:.0f}: set "
-        f"camera.latency_s to {to_set}"
-    ]
+    to_set = f"set camera.latency_s to {max(0.0, found.latency_s):.3f}"
+    return [f"{found_text}, profile says {used_s * 1e3:.0f}: {to_set}"]
 
 
 def _about_turn(found: Findings) -> list[str]:
@@ -224,11 +222,12 @@ def _is_worth_saying(off: float, gate: float, sigma: float) -> bool:
 
 
 def latency_text(found: Findings) -> str:
-    """``92 +- 6 ms``, the 95 % interval."""
+    """The latency with its 95 % interval, as in ``92 +- 6 ms``."""
     return f"{found.latency_s * 1e3:.0f} +- {SURE * found.latency_sigma_s * 1e3:.0f} ms"
 
 
 def turn_text(found: Findings) -> str:
-    """``0.2 +- 0.6, -0.1 +- 0.6, 0.4 +- 1.8 deg``, about x, y and z."""
+    """The turn about x, y and z with 95 % intervals, as in
+    ``0.2 +- 0.6, -0.1 +- 0.6, 0.4 +- 1.8 deg``."""
     each = zip(found.turn_deg, found.turn_sigma_deg, strict=True)
     return ", ".join(f"{turn:.1f} +- {SURE * sigma:.1f}" for turn, sigma in each) + " deg"

@@ -259,3 +259,8 @@ class PlannerState:
     unanswered_s: float | None = None  # the thrust that is read is not what is ordered, since
     unread_s: float = -math.inf  # when that last had lasted too long
     hold: str = ""  # why the vehicle is held in place, empty when it is not
+
+    @property
+    def ground_z_m(self) -> float:
+        """Height of the ground that the flight started from; 0 if it is unknown."""
+        return self.ground_m[2] if self.ground_m else 0.0

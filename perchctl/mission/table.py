@@ -30,11 +30,8 @@ from perchctl.mission.lander import (
     hangs_stopped,
     hangs_where_it_did,
     rest_finding,
-    why_fell_unseen,
-    why_landed,
-    why_unknown,
 )
-from perchctl.mission.mounting import explained
+from perchctl.mission.mounting import describe_turn
 from perchctl.mission.state import (
     BEFORE_CONTACT,
     FLYING_PHASES,
@@ -52,7 +49,7 @@ Predicate = Callable[[Context], bool]
 
 @dataclass(frozen=True, eq=False)
 class Transition:
-    """From any of `phases`, when `when` holds, to `to`.
+    """A row of the table: from any of `phases`, when `when` holds, to the phase `to`.
 
     `reason` is shown to the user; `motor_stop` is what a transition into ABORTED does to the
     motors.
@@ -73,7 +70,7 @@ class Transition:
         return self.reason if isinstance(self.reason, str) else self.reason(c)
 
 
-def risen(before: Severity, row: Severity) -> Severity:
+def raise_severity(before: Severity, row: Severity) -> Severity:
     """The flight's severity after a transition: from `LAND` on it only rises."""
     return max(before, row) if before >= Severity.LAND else row
 
@@ -105,6 +102,7 @@ UNCORRECTED = "the estimate's variance only grows; is the positioning system gon
 
 
 def only(*phases: Phase) -> frozenset[Phase]:
+    """The phases as a set."""
     return frozenset(phases)
 
 
@@ -112,11 +110,12 @@ def only(*phases: Phase) -> frozenset[Phase]:
 
 
 def is_astray(c: Context) -> bool:
-    """Position control leads away from its setpoint: by external positions in other axes than the
-    vehicle's, which a vehicle at rest does not show (fault 11).
+    """True if position control leads away from its setpoint, by external positions in other axes
+    than the vehicle's, which a vehicle at rest does not show (fault 11).
 
-    At take-off sideways, where only a climb was ordered; later farther than any draught carries it;
-    in a landing that began for another reason, too, which would speed up until it tilts over."""
+    That is a step sideways at take-off, where only a climb was ordered; later a way farther than
+    any draught carries it; in a landing that began for another reason, too, which would speed up
+    until it tilts over."""
     setpoint = c.state.setpoint
     if c.profile.positioning.by == "deck" or not c.placed:
         return False
@@ -144,7 +143,7 @@ def _swings(c: Context) -> bool:
 
 
 def _only_climbs(c: Context) -> bool:
-    """Its setpoint is still above the place of its take-off."""
+    """True if its setpoint is still above the place of its take-off."""
     setpoint, ground = c.state.setpoint, c.state.ground_m
     if setpoint is None or ground is None or c.state.phase not in ONLY_UP:
         return False
@@ -177,15 +176,15 @@ def why_astray(c: Context) -> str:
 
 
 def is_lost(c: Context) -> bool:
-    """No position has come for so long that none is waited for any more; by the target alone, by
-    the estimate's own variance, too."""
+    """True if no position has come for so long that none is waited for any more; by the target
+    alone, by the estimate's own variance, too."""
     if c.position_age_s > c.profile.positioning.land_s or c.is_blown:
         return True
     return c.by_sight and c.position_is_stale and c.variance_m2 > BLIND_VARIANCE_M2
 
 
 def unplaced_text(c: Context) -> str:
-    """For how long no external position was sent, and why."""
+    """The words for how long no external position was sent, and why."""
     if c.is_blown:
         return "pushed aside while the target was not seen"
     age_s, why = c.position_age_s, c.obs.position_problem
@@ -196,11 +195,13 @@ def unplaced_text(c: Context) -> str:
 
 
 def left_jump_hold(c: Context) -> bool:
+    """True if the vehicle was held long enough since its estimate jumped."""
     jump = c.state.jump_s
     return jump is not None and c.obs.t_s - jump >= c.profile.safety.jump_hold_s
 
 
 def fence_broken(c: Context) -> bool:
+    """True if the vehicle is farther from its take-off than the fence allows."""
     if c.state.ground_m is None:
         return False
     x, y, _ = c.obs.telemetry.position_m
@@ -223,7 +224,7 @@ def why_latency(c: Context) -> str:
 
 
 def mounted_wrong(c: Context) -> bool:
-    """The target moves with the vehicle, or seems to lie below it."""
+    """True if the target moves with the vehicle, or seems to lie below it."""
     below = c.held(C.TARGET_BELOW) >= BELOW_S
     return c.state.mount.wrong or _measured_turn_rad(c) != 0.0 or below
 
@@ -234,9 +235,9 @@ def _measured_turn_rad(c: Context) -> float:
 
 def why_mounted_wrong(c: Context) -> str:
     if turn_rad := _measured_turn_rad(c):
-        return explained(turn_rad)
+        return describe_turn(turn_rad)
     if c.state.mount.wrong:
-        text = explained(c.state.mount.turn_rad)
+        text = describe_turn(c.state.mount.turn_rad)
         by_capture = c.profile.positioning.by == "mocap"
         return f"{text}; or swapped axes in the motion capture" if by_capture else text
     return (
@@ -260,8 +261,8 @@ def why_not_found(c: Context) -> str:
 
 
 def is_caught(c: Context) -> bool:
-    """The target's magnet holds it already: it hangs at the target, or where it met the target's
-    height, within the magnet's radius as far as its place there was known."""
+    """True if the target's magnet holds it already: it hangs at the target, or where it met the
+    target's height, within the magnet's radius as far as its place there was known."""
     if c.held(C.HANGING) < HANGING_S:
         return False
     touched = touched_aside_m(c)
@@ -270,13 +271,13 @@ def is_caught(c: Context) -> bool:
 
 
 def is_held(c: Context) -> bool:
-    """Something holds it: the magnet, a hand, a net, another ceiling."""
+    """True if something holds it: the magnet, a hand, a net, another ceiling."""
     return c.held(C.HANGING) >= HELD_S
 
 
 def is_held_elsewhere(c: Context) -> bool:
-    """Something else than the target's magnet holds it: at another height than the target's, or
-    surely beside the magnet (two standard deviations)."""
+    """True if something else than the target's magnet holds it: at another height than the
+    target's, or surely beside the magnet (two standard deviations)."""
     touched = touched_aside_m(c)
     aside_m, sigma_m = touched or contact_aside_m(c)
     at_its_height = touched is not None or abs(c.error_z_m) <= contact_within_m(c)
@@ -303,18 +304,20 @@ def why_hangs_at_contact(c: Context) -> str:
 
 
 def is_blocked(c: Context) -> bool:
+    """True if it has been pressed against something for long enough."""
     return c.held(C.BLOCKED) >= c.profile.safety.blocked_s
 
 
 def is_blocked_off_target(c: Context) -> bool:
-    """Pressed, and in the press so far from the target's height that no contact can be proven."""
+    """True if it is blocked, and in the press so far from the target's height that no contact can
+    be proven."""
     pressing = c.state.phase is P.PERCH
     return is_blocked(c) and not (pressing and abs(c.error_z_m) <= contact_within_m(c))
 
 
 def too_weak(c: Context) -> bool:
-    """No thrust is left to press with: seen at full thrust, or known before the press. A press
-    that it backs off from explains full thrust."""
+    """True if no thrust is left to press with: seen at full thrust, or known before the press. A
+    press that it backs off from explains full thrust."""
     if c.state.pressed:
         return False
     if c.held(C.SATURATED) >= WEAK_S:
@@ -335,19 +338,20 @@ def is_aligned(c: Context) -> bool:
 
 
 def has_recovered(c: Context) -> bool:
+    """True if it has been steady for long enough, away from what it touched."""
     dwell_s = c.profile.planner.recover.dwell_s
     steady = c.held(C.STEADY) >= dwell_s and c.in_phase_s >= dwell_s
     return steady and c.state.contact_z_m is None
 
 
 def too_little_left(c: Context) -> bool:
-    """An attempt would begin, or begin anew, and the battery has not enough for it."""
+    """True if an attempt would begin, or begin anew, and the battery has not enough for it."""
     begins = is_aligned(c) if c.state.phase is P.ALIGN else has_recovered(c)
     return begins and not attempts_used(c) and is_short_of_charge(c)
 
 
 def is_beside_magnet(c: Context) -> bool:
-    """Contact, but farther aside than the magnet reaches, or at an unknown place."""
+    """True of a contact farther aside than the magnet reaches, or at an unknown place."""
     if c.held(C.CONTACT) < c.profile.planner.perch.contact_dwell_s:
         return False
     aside_m, sigma_m = contact_aside_m(c)
@@ -373,13 +377,25 @@ def why_contact(c: Context) -> str:
 
 
 def stopped_for_s(c: Context) -> float:
+    """Seconds since the first order to stop the motors; -1 before one."""
     return -1.0 if c.state.stopped_s is None else c.obs.t_s - c.state.stopped_s
 
 
 def release_monitored(c: Context) -> bool:
-    """The motors have been off for as long as a perched vehicle is monitored."""
+    """True if the motors have been off for as long as a perched vehicle is monitored."""
     monitored = stopped_for_s(c) >= c.profile.planner.complete.watch_s
     return monitored and c.held(C.DOWN) >= 0.1
+
+
+def why_fell_unseen(c: Context) -> str:
+    if c.placed or c.state.reach_s is None or c.obs.imu.fell_s > c.state.reach_s:
+        return "it is not where it hung before"
+    return "the telemetry was silent: whether it still hangs is not known"
+
+
+def is_off_as(finding: Finding) -> Predicate:
+    """The predicate that the motors are off, and that the vehicle is found to hang or stand so."""
+    return lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is finding
 
 
 # --- Why the vehicle is held in place ------------------------------------------------------------
@@ -695,23 +711,23 @@ TABLE: tuple[Transition, ...] = (
     ),
     # --- landing ---------------------------------------------------------------
     Transition(
-        "hung", only(P.LANDING),
-        lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is Finding.HANGS, P.PERCHED,
+        "hung", only(P.LANDING), is_off_as(Finding.HANGS), P.PERCHED,
         "hanging with the motors off",
     ),
     Transition(
-        "landed", only(P.LANDING),
-        lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is Finding.STANDS, P.LANDED, why_landed,
+        "landed", only(P.LANDING), is_off_as(Finding.STANDS), P.LANDED,
+        lambda c: "motors off"
+        + ("" if c.state.blind_s is None else "; it was felt to come down to the floor"),
     ),
     Transition(
-        "held-elsewhere", only(P.LANDING),
-        lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is Finding.HELD, P.ABORTED,
+        "held-elsewhere", only(P.LANDING), is_off_as(Finding.HELD), P.ABORTED,
         "motors off; something holds it where its estimate has no target: look before you touch it",
         S.LAND, O.SAFETY,
     ),
     Transition(
         "hangs-or-stands", only(P.LANDING), lambda c: c.held(C.DOWN) >= LOOKED_S, P.ABORTED,
-        why_unknown, S.LAND, O.SAFETY,
+        "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
+        "whether it hangs or stands: look before you touch it", S.LAND, O.SAFETY,
     ),
     Transition(
         "landing-timeout", only(P.LANDING),

@@ -13,6 +13,8 @@ from perchctl.values import replace
 from perchctl.vehicle import Telemetry, is_battery_reading
 from perchctl.vision import Attitude
 
+Vector = tuple[float, float, float]
+
 KEEP_S = 2.0
 SMEARED_S = 0.15
 FASTEST_TURN_RADPS, FASTEST_MPS2 = 7.0, 20.0
@@ -25,7 +27,7 @@ class History:
 
     `battery_changed_s`: when the last reading differed from the one before, `battery_v`; without
     any reading, when the first sample came: an absent one ages like one that stands still.
-    `imu`: the motion that all samples of the flight tell.
+    `imu`: the motion by the accelerometer over all samples of the flight.
     """
 
     samples: tuple[Telemetry, ...] = ()
@@ -74,14 +76,15 @@ def add_samples(history: History, new: list[Telemetry], safety: SafetyConfig) ->
 
 
 def add_late_samples(history: History, late: list[Telemetry], safety: SafetyConfig) -> History:
-    """With what has come since in the same turn: what `history` says of its own samples stays."""
+    """The history with samples that came later in the same turn; `jumped` and `turned_rad` go on to
+    count the earlier ones, too."""
     after = add_samples(history, late, safety)
     turned_rad = max(history.turned_rad, after.turned_rad)
     return replace(after, jumped=history.jumped or after.jumped, turned_rad=turned_rad)
 
 
 def battery_age_s(history: History, now_s: float) -> float:
-    """Since the last new reading; 0 before there is telemetry."""
+    """Seconds since the battery's last new reading; 0 before there is telemetry."""
     changed_s = history.battery_changed_s
     return 0.0 if changed_s is None else now_s - changed_s
 
@@ -107,21 +110,19 @@ def attitude_at(history: History, t_s: float) -> Attitude | None:
         a.roll_rad + part * wrap_rad(b.roll_rad - a.roll_rad),
         a.pitch_rad + part * wrap_rad(b.pitch_rad - a.pitch_rad),
         wrap_rad(a.yaw_rad + part * wrap_rad(b.yaw_rad - a.yaw_rad)),
-        (
-            a.position_m[0] + part * (b.position_m[0] - a.position_m[0]),
-            a.position_m[1] + part * (b.position_m[1] - a.position_m[1]),
-            a.position_m[2] + part * (b.position_m[2] - a.position_m[2]),
-        ),
-        (
-            a.velocity_mps[0] + part * (b.velocity_mps[0] - a.velocity_mps[0]),
-            a.velocity_mps[1] + part * (b.velocity_mps[1] - a.velocity_mps[1]),
-            a.velocity_mps[2] + part * (b.velocity_mps[2] - a.velocity_mps[2]),
-        ),
+        _between(a.position_m, b.position_m, part),
+        _between(a.velocity_mps, b.velocity_mps, part),
     )
 
 
+def _between(a: Vector, b: Vector, part: float) -> Vector:
+    x, y, z = (old + part * (new - old) for old, new in zip(a, b, strict=True))
+    return x, y, z
+
+
 def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
-    """World axes, of the first sample from `t_s` on, or of the newest; at rest without one."""
+    """The velocity in world axes by the first sample from `t_s` on, or by the newest; zero without
+    a sample."""
     samples = history.samples
     if not samples:
         return 0.0, 0.0, 0.0
@@ -144,7 +145,7 @@ def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
 
 
 def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> bool:
-    """Whether the estimate stepped farther than any flight leads: at once, or smeared over a
+    """True if the estimate stepped farther than any flight leads: at once, or smeared over a
     few samples by the vehicle's own filter."""
     last = before[-1]
     first = before[bisect.bisect_left(before, last.t_s - SMEARED_S, key=_time_s)]
@@ -158,12 +159,13 @@ def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> b
 
 
 def _turned_rad(a: Telemetry, b: Telemetry) -> float:
-    """The heading's step beyond what the vehicle can turn in between."""
+    """The heading's step beyond what the vehicle can turn between two samples."""
     return abs(wrap_rad(b.yaw_rad - a.yaw_rad)) - FASTEST_TURN_RADPS * (b.t_s - a.t_s)
 
 
 def _is_moved(a: Telemetry, b: Telemetry, safety: SafetyConfig) -> bool:
-    """Floor and ceiling are near: a step in height counts sooner."""
+    """True if the position moved farther than its speed explains. Floor and ceiling are near: a
+    step in height counts sooner."""
     moved_m = math.dist(a.position_m, b.position_m)
     rise_m = abs(b.position_m[2] - a.position_m[2])
     fastest = max(math.hypot(*a.velocity_mps), math.hypot(*b.velocity_mps))
@@ -172,7 +174,7 @@ def _is_moved(a: Telemetry, b: Telemetry, safety: SafetyConfig) -> bool:
 
 
 def _between_s(a: Telemetry, b: Telemetry) -> float:
-    """Between the two positions, which are as old as their own packets."""
+    """Seconds between two positions, which are as old as their own packets."""
     return max(b.t_s - a.t_s, b.t_s - b.behind_s - (a.t_s - a.behind_s))
 
 
@@ -181,7 +183,8 @@ def _is_placed(s: Telemetry) -> bool:
 
 
 def _carried_on(last: Telemetry, new: Telemetry) -> Telemetry:
-    """Attitude, acceleration and thrust are fresh all the same: by them it comes down."""
+    """The sample with position and velocity of the last one: its attitude, acceleration and thrust
+    are fresh all the same, and by them the vehicle comes down."""
     behind_s = last.behind_s + max(0.0, new.t_s - last.t_s)
     return replace(
         new, position_m=last.position_m, velocity_mps=last.velocity_mps, behind_s=behind_s
@@ -189,16 +192,7 @@ def _carried_on(last: Telemetry, new: Telemetry) -> Telemetry:
 
 
 def is_finite(s: Telemetry) -> bool:
-    """Whether all that a flight is steered by is a number."""
-    values = (
-        *s.position_m,
-        *s.velocity_mps,
-        s.roll_rad,
-        s.pitch_rad,
-        s.yaw_rad,
-        s.acc_x_g,
-        s.acc_y_g,
-        s.acc_z_g,
-        s.thrust,
-    )
-    return all(map(math.isfinite, values))
+    """True if all that a flight is steered by is a number."""
+    attitude = s.roll_rad, s.pitch_rad, s.yaw_rad
+    forces = s.acc_x_g, s.acc_y_g, s.acc_z_g, s.thrust
+    return _is_placed(s) and all(map(math.isfinite, (*attitude, *forces)))

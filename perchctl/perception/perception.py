@@ -53,7 +53,7 @@ REMARK_PICTURES = 3
 
 @dataclass(eq=False)
 class Perception:
-    """One stream's frames in, the target out.
+    """The session that turns one stream's frames into the target's place.
 
     Attributes:
         stills: each frame is searched for itself, thoroughly, and nothing is remembered.
@@ -79,15 +79,15 @@ class Perception:
     _remarks: list[str] = field(default_factory=list)
 
     def assess(self, frame: Frame, live: bool) -> HealthVerdict:
-        """Whether a frame can be a measurement at all; to be asked once of each frame, in order.
-        Where it is `live`, one that repeats the frame before is an old one."""
+        """Judge whether a frame can be a measurement at all; called once for each frame, in order.
+        Of a `live` source, a frame that repeats the one before is an old one."""
         self._health, verdict = assess_frame(self._health, frame, live)
         return verdict
 
     def look(self, frame: Frame, later_s: float = 0.0) -> Iterator[tuple[Frame, PipelineOutput]]:
-        """What the frame shows: one picture, or the two fields of an interlaced one, in their
-        order of time. `later_s`: by so much the frame's time was set back for the latency that
-        `calibration` measured."""
+        """Yield each picture of the frame with what the pipeline finds in it: one picture, or the
+        two fields of an interlaced one, in their order of time. `later_s` is the latency, measured
+        by `calibration`, by which the frame's time was set back."""
         if self.stills:
             found: tuple[Frame, ...] = (frame,)
             self.state = PipelineState()
@@ -103,7 +103,7 @@ class Perception:
 
     @property
     def is_mirrored(self) -> bool:
-        """Whether the newest frames have shown only the target's mirror image."""
+        """True if the newest frames have shown only the target's mirror image."""
         return self._mirrored >= MIRRORED_FRAMES
 
     def target(self, t_s: float, spread: bool = True) -> TargetEstimate | None:
@@ -114,20 +114,21 @@ class Perception:
         return estimate(self.state, t_s, attitude, self.pipeline, spread=spread)
 
     def consistency(self) -> Consistency | None:
-        """Latency and mounting by all pictures so far; None of too few."""
+        """Latency and mounting by all pictures so far; None if there were too few."""
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
 
     def drop_sights(self) -> None:
-        """Judge the vehicle's motion anew: wrong positions have turned its attitude."""
+        """Forget the sights by which the vehicle's motion is judged, since wrong positions have
+        turned its attitude."""
         self.motion = drop_sights(self.motion)
 
     def take_remarks(self) -> list[str]:
-        """What is new about the pictures since the last call."""
+        """Return the remarks about the pictures that are new since the last call."""
         new, self._remarks = self._remarks, []
         return new
 
     def _calibrate(self, output: PipelineOutput, later_s: float) -> None:
-        """Latency and mounting, from a picture whose pose was taken for the target's."""
+        """Update the estimates of motion, latency and mounting with a picture of the target."""
         pose = self.state.measured.surest
         if pose is not None and pose.t_s == output.detections.t_s:
             T_body_cam, history = self.pipeline.pose.T_body_cam, self.history
@@ -147,7 +148,7 @@ class Perception:
         return math.radians(self.profile.kalman.attitude_sigma_deg)
 
     def _remark(self, output: PipelineOutput) -> None:
-        """Each is made once a stream, when three pictures in a row have shown it."""
+        """Make each remark once a stream, when three pictures in a row have shown its reason."""
         if output.refused:
             self.refused = output.lock_note
         for text, shown in (
@@ -163,7 +164,7 @@ class Perception:
 
 
 def _mirrored_frames(before: int, found: Detections) -> int:
-    """How many frames have shown the target's mirror image, since one showed the target."""
+    """Count the frames that have shown the target's mirror image since one showed the target."""
     if found.mirrored:
         return before + 1
     return 0 if found.large is not None or found.small is not None else before

@@ -49,6 +49,7 @@ class VisualInertialWindow:
 
     @property
     def mismatch(self) -> Mismatch | None:
+        """The newest judgement, once enough in a row agree; None before that."""
         return self.found if self.agreed >= AGREED else None
 
 
@@ -72,7 +73,7 @@ def estimate_motion(
     short = t_s - new.sights[0][0] < LEAST_S or len(new.sights) < LEAST_SIGHTS
     if short or len(samples) < LEAST_SIGHTS or t_s - old.judged_s < EVERY_S:
         return new
-    wanders_m, velocity_mps, bias_mps2 = explained(new.sights, samples, offset_g)
+    wanders_m, velocity_mps, bias_mps2 = motion_by_hypothesis(new.sights, samples, offset_g)
     if old.mismatch is None:  # else it stays
         found = _found(wanders_m)
         agrees = found is not None and old.found is not None and _alike(found, old.found)
@@ -93,7 +94,7 @@ def _alike(a: Mismatch, b: Mismatch) -> bool:
 
 
 def _nearest(mismatch: Mismatch) -> int:
-    """Its index among those that are tried."""
+    """The index of a mismatch among those that are tried."""
     later_s, turn_rad = mismatch.later_s, mismatch.turn_rad
     return int(np.argmin(np.abs(LATER_S - later_s) + np.abs(TURNS_RAD - turn_rad)))
 
@@ -107,7 +108,7 @@ def _best_about(mismatch: Mismatch, wanders_m: Array) -> int:
 
 
 def _found(wanders_m: Array) -> Mismatch | None:
-    """What explains the pictures if the profile does not."""
+    """The mismatch that explains the pictures; None if the profile does."""
     best = int(np.argmin(wanders_m))
     as_it_is = float(wanders_m[_nearest(Mismatch())])
     if as_it_is < max(WANDERS_M, WANDERS_MORE * float(wanders_m[best])):
@@ -116,11 +117,11 @@ def _found(wanders_m: Array) -> Mismatch | None:
     return found if found.turn_rad or abs(found.later_s) >= LEAST_LATER_S else None
 
 
-def explained(
+def motion_by_hypothesis(
     sights: tuple[tuple[float, Vector], ...], samples: tuple[Telemetry, ...], offset_g: Vector
 ) -> tuple[Array, Array, Array]:
-    """For each pair of `LATER_S` and `TURNS_RAD`: the target's sideways motion, rms in m, (n,); and
-    with it the vehicle's speed at the newest sample and the offset, (3, n)."""
+    """The motion under each hypothesis, a pair of `LATER_S` and `TURNS_RAD`: the target's sideways
+    motion, rms in m, (n,); the vehicle's speed at the newest sample and the offset, (3, n)."""
     stamps_s = np.array([s.t_s for s in samples])
     attitudes = np.array([(s.roll_rad, s.pitch_rad, s.yaw_rad) for s in samples])
     attitudes[:, 2] = np.unwrap(attitudes[:, 2])

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from perchctl.mission import (
-    EnergyState,
     Event,
     EventKind,
     ImuMotion,
@@ -19,7 +18,7 @@ from perchctl.mission import (
     integrate_imu,
     planner,
 )
-from perchctl.mission.state import Severity
+from perchctl.mission.state import EnergyState, Severity
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     ARMED,

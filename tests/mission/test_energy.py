@@ -5,24 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.mission import (
-    EnergyState,
-    Outcome,
-    Phase,
-    PlannerState,
+from perchctl.mission import Outcome, Phase, PlannerState
+from perchctl.mission.battery import (
+    Floor,
     charge_at,
     fit_battery,
-    planner,
-    update_energy,
-)
-from perchctl.mission.battery import (
-    CURVE,
-    Floor,
     floor_of,
     left_s,
     loaded_v,
@@ -30,8 +23,10 @@ from perchctl.mission.battery import (
     outlook,
     read_battery,
     resting_v,
+    update_energy,
 )
 from perchctl.mission.context import Context
+from perchctl.mission.state import EnergyState
 from perchctl.profile import Profile, load_profile
 from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.powertrain import Cell, CellKind
@@ -43,8 +38,8 @@ from tests.helpers.mission import (
     changed,
     observation,
     state_in,
-    telemetry,
 )
+from tests.mission.rig import at, fly
 
 PERIOD_S, MAH = 0.02, 250.0
 FLOOR = floor_of(PROFILE)
@@ -138,63 +133,55 @@ def test_a_light_vehicle_s_battery_is_not_asked_for_a_long_press() -> None:
 
 @pytest.mark.parametrize("ohm", [0.12, 0.143, 0.2])
 def test_the_sag_is_found_within_seconds(ohm: float) -> None:
-    last = list(hovering(4.1, CellKind(resistance_ohm=ohm), 5.0))[-1]
+    *_, last = hovering(4.1, CellKind(resistance_ohm=ohm), 5.0)
     assert fit_battery(last.energy).sag_v == pytest.approx(4.4 * ohm, rel=0.05)
     assert loaded_v(last.energy, HOVER) == pytest.approx(last.under_load_v, abs=0.02)
 
 
-def test_a_hungry_battery_is_found_out_while_it_flies() -> None:
-    tame, hungry = (
-        fit_battery(list(hovering(4.1, CellKind(charge=charge), 30.0))[-1].energy).hunger
-        for charge in (1.0, 0.5)
-    )
-    assert 1.0 <= tame < 1.15
-    assert 1.3 < hungry < 2.3
+@pytest.mark.parametrize(("charge", "least", "most"), [(1.0, 1.0, 1.15), (0.5, 1.3, 2.3)])
+def test_a_hungry_battery_is_found_out_while_it_flies(
+    charge: float, least: float, most: float
+) -> None:
+    *_, last = hovering(4.1, CellKind(charge=charge), 30.0)
+    assert least <= fit_battery(last.energy).hunger < most
+
+
+def used_up(energy: EnergyState, volts: float, thrust: float, lasts_s: float) -> EnergyState:
+    """The state after a time under the same reading and thrust."""
+    for _ in range(round(lasts_s / PERIOD_S)):
+        energy = update_energy(energy, PERIOD_S, volts, thrust, MAH)
+    return energy
 
 
 def test_the_count_of_the_thrust() -> None:
-    energy = EnergyState()
-    for _ in range(500):
-        energy = update_energy(energy, PERIOD_S, 3.7, FULL_THRUST, MAH)
+    energy = used_up(EnergyState(), 3.7, FULL_THRUST, 10.0)
     assert energy.used * MAH == pytest.approx(4.4 / 3.6 * 10.0)
 
 
 @pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan])
 def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
-    energy = EnergyState()
-    for i in range(500):
-        energy = update_energy(energy, PERIOD_S, reading_v, HOVER_THRUST * (i > 50), MAH)
+    energy = used_up(used_up(EnergyState(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
     assert left_s(energy, FLOOR, MAH) is None
     assert energy.unknown_s == pytest.approx(10.0)
 
 
 def test_a_moment_without_readings_is_counted_on() -> None:
-    moments = list(hovering(4.0, CellKind(), 12.0))
-    before = moments[-1].energy
-    blind = before
-    for _ in range(200):
-        blind = update_energy(blind, PERIOD_S, math.nan, HOVER_THRUST, MAH)
-    known_s, counted_s = (left_s(each, FLOOR, MAH, HOVER) for each in (before, blind))
+    *_, last = hovering(4.0, CellKind(), 12.0)
+    blind = used_up(last.energy, math.nan, HOVER_THRUST, 4.0)
+    known_s, counted_s = (left_s(each, FLOOR, MAH, HOVER) for each in (last.energy, blind))
     assert known_s is not None
     assert counted_s == pytest.approx(known_s - 4.0, abs=0.5)
 
 
 def test_readings_that_begin_under_load_are_taken_as_usual_ones() -> None:
     """As after a reading that came late: the sag is not known, and what is usual counts."""
-    energy = EnergyState()
-    for _ in range(200):
-        energy = update_energy(energy, PERIOD_S, 3.5, HOVER_THRUST, MAH)
+    energy = used_up(EnergyState(), 3.5, HOVER_THRUST, 4.0)
     assert energy.rest_v == pytest.approx(3.5 + 0.63 * HOVER, abs=0.05)
 
 
 @given(st.floats(3.0, 4.2))
 def test_charge_and_voltage_are_each_other_s(volts: float) -> None:
     assert resting_v(charge_at(volts)) == pytest.approx(volts, abs=1e-6)
-
-
-def test_the_curve_rises() -> None:
-    assert list(CURVE) == sorted(CURVE)
-    assert [v for _, v in CURVE] == sorted(v for _, v in CURVE)
 
 
 @settings(max_examples=60)
@@ -260,16 +247,10 @@ def test_figures_that_are_no_numbers_end_no_flight(reserve_s: float, share: int)
 
 
 def flown(
-    phase: Phase, energy: EnergyState, seconds: float, profile: Profile = PROFILE, **tel: object
+    phase: Phase, energy: EnergyState, seconds: float, profile: Profile = PROFILE, **tel: Any
 ) -> PlannerState:
-    state = replace(state_in(phase), energy=energy)
-    for i in range(1, round(seconds / PERIOD_S)):
-        t_s = 10.0 + PERIOD_S * i
-        sample = telemetry(t_s, **tel)  # type: ignore[arg-type]
-        state, _ = planner.step_mission(state, observation(t_s, telemetry=sample), profile)
-        if state.phase is not phase:
-            break
-    return state
+    begin = replace(state_in(phase), energy=energy)
+    return fly(begin, at(**tel), seconds, profile, one_phase=True).state
 
 
 NEAR_ITS_END = replace(FINE_BATTERY, ground_v=3.79, rest_v=3.77)
@@ -285,31 +266,39 @@ def test_no_attempt_begins_on_a_battery_near_its_end(phase: Phase) -> None:
     assert flown(phase, FINE_BATTERY, 2.0).phase in (Phase.ASCEND, Phase.ESTIMATE)
 
 
-@pytest.mark.parametrize("phase", [Phase.ASCEND, Phase.PERCH])
-def test_what_was_begun_is_flown(phase: Phase) -> None:
-    assert flown(phase, NEAR_ITS_END, 1.0, battery_v=3.24).row != "too-little-left"
+OPEN = changed({"safety.energy_gate": False})
+GRACE_S = PROFILE.safety.battery_stale_s
 
 
-def test_the_gate_can_be_taken_away() -> None:
-    open_ = changed({"safety.energy_gate": False})
-    assert flown(Phase.ALIGN, NEAR_ITS_END, 2.0, open_, battery_v=3.24).row == "aligned"
+@pytest.mark.parametrize(
+    ("phase", "energy", "battery_v", "profile", "gated"),
+    [
+        (Phase.ASCEND, NEAR_ITS_END, 3.24, PROFILE, False),  # what was begun is flown
+        (Phase.PERCH, NEAR_ITS_END, 3.24, PROFILE, False),
+        (Phase.ALIGN, NEAR_ITS_END, 3.24, OPEN, False),
+        # Fault 7: a vehicle that tells nothing of its battery is landed after
+        # `safety.battery_stale_s`, and not in the middle of an ascent.
+        (Phase.ALIGN, EnergyState(unknown_s=8.0), 0.0, PROFILE, False),
+        (Phase.ALIGN, EnergyState(unknown_s=GRACE_S - 10.0), 0.0, PROFILE, True),
+        # What was little is no more without a reading.
+        (Phase.ALIGN, replace(NEAR_ITS_END, unknown_s=8.0), 0.0, PROFILE, True),
+    ],
+    ids=["ascends", "presses", "open", "grace", "grace is over", "little before"],
+)
+def test_the_gate_holds_back_only_what_has_too_little_and_has_not_begun(
+    phase: Phase, energy: EnergyState, battery_v: float, profile: Profile, gated: bool
+) -> None:
+    lasts_s = 2.0 if phase is Phase.ALIGN else 1.0
+    state = flown(phase, energy, lasts_s, profile, battery_v=battery_v)
+    assert (state.row == "too-little-left") is gated
+    assert gated or phase is not Phase.ALIGN or state.row == "aligned"
+    if gated and energy.rest_v is None:
+        assert "not known" in state.reason
+        assert state.battery.left_s is None
+
+
+def test_the_paper_s_profile_has_no_gate() -> None:
     assert not load_profile("paper").safety.energy_gate
-
-
-def test_without_a_reading_attempts_end_within_the_grace() -> None:
-    """Fault 7: a vehicle that tells nothing of its battery is landed after
-    `safety.battery_stale_s`, and not in the middle of an ascent."""
-    grace_s = PROFILE.safety.battery_stale_s
-    assert flown(Phase.ALIGN, EnergyState(unknown_s=8.0), 2.0, battery_v=0.0).row == "aligned"
-    state = flown(Phase.ALIGN, EnergyState(unknown_s=grace_s - 10.0), 2.0, battery_v=0.0)
-    assert state.row == "too-little-left"
-    assert "not known" in state.reason
-    assert state.battery.left_s is None
-
-
-def test_what_was_little_is_no_more_without_a_reading() -> None:
-    lost = replace(NEAR_ITS_END, unknown_s=8.0)
-    assert flown(Phase.ALIGN, lost, 2.0, battery_v=0.0).row == "too-little-left"
 
 
 def test_a_reading_that_stands_still_is_none() -> None:
@@ -321,24 +310,23 @@ def test_a_reading_that_stands_still_is_none() -> None:
         assert (outlook(c).left_s is not None) is known
 
 
-def test_the_firmware_s_word_is_heard() -> None:
-    """It reports low power below `pm.lowVoltage`, and the vehicle is landed for it."""
-    assert floor_of(PROFILE) == Floor(3.2, 2.7)
-    assert floor_of(changed({"link.parameters": {"pm.lowVoltage": 3.4}})) == Floor(3.4, 2.7)
-
-
-def test_a_press_counts_by_what_it_takes_and_how_long_it_lasts() -> None:
-    assert floor_of(changed({"planner.perch.contact_dwell_s": 1.0})) == Floor(3.2, 3.0)
-    raw = changed({"planner.perch.mode": "raw", "planner.perch.thrust": 52428})
-    assert floor_of(raw) == Floor(3.2, 2.7, 0.8)
+@pytest.mark.parametrize(
+    ("changes", "floor"),
+    [
+        ({}, Floor(3.2, 2.7)),
+        # The firmware reports low power below `pm.lowVoltage`, and the vehicle is landed for it.
+        ({"link.parameters": {"pm.lowVoltage": 3.4}}, Floor(3.4, 2.7)),
+        # A press counts by what it takes and how long it lasts.
+        ({"planner.perch.contact_dwell_s": 1.0}, Floor(3.2, 3.0)),
+        ({"planner.perch.mode": "raw", "planner.perch.thrust": 52428}, Floor(3.2, 2.7, 0.8)),
+    ],
+)
+def test_a_flight_ends_where_battery_low_fires(changes: dict[str, Any], floor: Floor) -> None:
+    assert floor_of(changed(changes)) == floor
 
 
 def test_who_has_no_target_goes_on_searching() -> None:
     """Pressed against a lamp in its search, say: no attempt is at hand that could be refused."""
-    state = replace(state_in(Phase.RECOVER), energy=FINE_BATTERY, target_m=None)
-    for i in range(1, 100):
-        t_s = 10.0 + PERIOD_S * i
-        state, _ = planner.step_mission(state, observation(t_s, target=None), PROFILE)
-        if state.phase is not Phase.RECOVER:
-            break
-    assert state.row == "recovered"
+    begin = replace(state_in(Phase.RECOVER), energy=FINE_BATTERY, target_m=None)
+    flight = fly(begin, at(obs={"target": None}), 2.0, one_phase=True)
+    assert flight.state.row == "recovered"

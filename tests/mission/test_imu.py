@@ -19,8 +19,8 @@ from perchctl.mission.imu import (
     REACH_M,
     UNCORRECTED_S,
     Reckoning,
-    reckoned,
-    sighted,
+    add_sight,
+    advance_reckoning,
 )
 from perchctl.vehicle import Telemetry
 from tests.helpers.mission import HOVER_THRUST, telemetry
@@ -100,7 +100,7 @@ def test_with_an_attitude_that_stands_still_the_estimate_s_change_counts() -> No
     assert motion.gap_s < 0.0
     before = Reckoning(flown(samples[:99]), (0.1, 0.2, 0.3), estimated_mps=(0.0, 0.0, 0.0))
     after = replace(samples[-1], velocity_mps=(0.0, 0.1, 0.0))
-    assert reckoned(before, motion, after, believed=False).velocity_mps == (
+    assert advance_reckoning(before, motion, after, believed=False).velocity_mps == (
         pytest.approx((0.1, 0.3, 0.3))
     )
 
@@ -113,7 +113,7 @@ def test_astray_with_an_attitude_that_stands_still_it_still_feels_a_fall() -> No
     ]
     before, motion = flown(samples[:50]), flown(samples)
     old = Reckoning(before, (0.1, 0.2, -0.3))
-    new = reckoned(old, motion, samples[-1], believed=False, astray=True)
+    new = advance_reckoning(old, motion, samples[-1], believed=False, astray=True)
     fell_mps = -0.2 * 9.81 * 0.5
     assert new.velocity_mps == pytest.approx((0.1, 0.2, -0.3 + fell_mps), abs=0.01)
 
@@ -157,10 +157,10 @@ def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     imu = flown([before])
     old = Reckoning(imu, velocity_mps=(0.0, 0.0, 0.05), estimated_mps=before.velocity_mps)
     heard = integrate_imu(imu, before, after)
-    new = reckoned(old, heard, after, believed=False)
+    new = advance_reckoning(old, heard, after, believed=False)
     assert new.velocity_mps == pytest.approx((0.0, 0.2, -0.6))
-    assert reckoned(old, heard, after, believed=True).velocity_mps == after.velocity_mps
-    assert reckoned(old, heard, after, believed=False, astray=True).velocity_mps == (
+    assert advance_reckoning(old, heard, after, believed=True).velocity_mps == after.velocity_mps
+    assert advance_reckoning(old, heard, after, believed=False, astray=True).velocity_mps == (
         old.velocity_mps
     )
 
@@ -171,11 +171,11 @@ def test_in_a_silence_it_may_climb_into_the_magnet_s_reach(below_m: float, silen
     before = telemetry(1.0, velocity_mps=(0.0, 0.0, -0.3))
     after = telemetry(1.0 + silent_s, velocity_mps=(0.0, 0.0, -0.3))
     imu = flown([before])
-    old = sighted(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
-    new = reckoned(old, integrate_imu(imu, before, after), after, believed=False)
+    old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
+    new = advance_reckoning(old, integrate_imu(imu, before, after), after, believed=False)
     assert (new.unsure_s == after.t_s) == (below_m - MOST_CLIMB_MPS * silent_s < REACH_M)
     assert new.below_m == below_m
-    seen = sighted(new, after.t_s + 0.1, (0.0, 0.0), below_m, 0.001)
+    seen = add_sight(new, after.t_s + 0.1, (0.0, 0.0), below_m, 0.001)
     assert seen.nearest_m == below_m
 
 
@@ -186,27 +186,29 @@ def test_what_had_no_thrust_in_a_silence_did_not_climb(below_m: float, silent_s:
         before = telemetry(1.0, thrust=thrust)
         after = telemetry(1.0 + silent_s, thrust=0.0, start=start)
         imu = flown([before])
-        old = sighted(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
-        new = reckoned(old, integrate_imu(imu, before, after), after, believed=False)
+        old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
+        new = advance_reckoning(old, integrate_imu(imu, before, after), after, believed=False)
         assert new.unsure_s == -math.inf
         assert new.below_m == math.inf
         near = replace(old, below_m=0.02, nearest_m=0.02)
-        new = reckoned(near, integrate_imu(imu, before, after), after, believed=False)
+        new = advance_reckoning(near, integrate_imu(imu, before, after), after, believed=False)
         assert (new.unsure_s, new.below_m) == (after.t_s, 0.02)
 
 
 def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring() -> None:
     """It fell by 5 cm, and the setpoint that catches it is a metre above."""
     falls = [telemetry(1.0 + 0.01 * i, acc_z_g=0.3) for i in range(13)]
-    reckoning = sighted(Reckoning(flown(falls[:1])), 0.9, (0.0, 0.0), 0.0, 0.001)
+    reckoning = add_sight(Reckoning(flown(falls[:1])), 0.9, (0.0, 0.0), 0.0, 0.001)
     motion = flown(falls[:1])
     for last, new in pairwise(falls):
         motion = integrate_imu(motion, last, new)
-        reckoning = reckoned(reckoning, motion, new, believed=False)
+        reckoning = advance_reckoning(reckoning, motion, new, believed=False)
     assert motion.fell_s > 1.0
     assert 0.02 < reckoning.nearest_m < 0.1
     late = telemetry(falls[-1].t_s + 1.5)
-    reckoning = reckoned(reckoning, integrate_imu(motion, falls[-1], late), late, believed=False)
+    reckoning = advance_reckoning(
+        reckoning, integrate_imu(motion, falls[-1], late), late, believed=False
+    )
     assert reckoning.unsure_s == late.t_s
 
 
@@ -223,7 +225,7 @@ def beside_mps(turn: int, pushed_g: float = 0.0, samples: int = 4, offset_g: flo
             acc_x_g=offset_g + (pushed_g if 3 <= i < 3 + samples else 1e-6 * (i % 7)),
         )  # fmt: skip
         motion = integrate_imu(motion, last, new)
-        reckoning = reckoned(reckoning, motion, new, believed=True)
+        reckoning = advance_reckoning(reckoning, motion, new, believed=True)
         last = new
     return abs(reckoning.beside_mps[0])
 
@@ -294,5 +296,5 @@ def test_an_offset_that_turning_motors_make_is_learned_while_the_estimate_is_bel
     for i in range(1500):
         new = telemetry(0.01 * i, acc_z_g=1.0 + too_much_g + 1e-6 * (i % 7))
         motion = integrate_imu(motion, last, new)
-        reckoning, last = reckoned(reckoning, motion, new, believed=i < 1000), new
+        reckoning, last = advance_reckoning(reckoning, motion, new, believed=i < 1000), new
     assert abs(reckoning.velocity_mps[2]) < 0.1

@@ -12,10 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import Outcome, Phase, planner
-from perchctl.mission.mounting import MountWatch, Sight, explained, sight_of, watched
-from perchctl.vehicle import PositionSetpoint
-from tests.helpers.mission import CEILING_M, PROFILE, observation, state_in, target_at, telemetry
+from perchctl.mission import Observation, Outcome, Phase, PlannerState
+from perchctl.mission.mounting import MountWatch, Sight, describe_turn, sight_of, update_watch
+from perchctl.vehicle import Command, PositionSetpoint
+from tests.helpers.mission import CEILING_M, state_in, target_at, telemetry
+from tests.mission.rig import BEGIN_S, Motors, at, fly
 
 FRAME_S = 1.0 / 30.0
 TARGET = 0.4 + 0.2j
@@ -40,7 +41,7 @@ def flown(seen: Seen, way_m: float = 0.5, noise_m: float = 0.003) -> tuple[Mount
         moved_m = max(0.0, t_s - 0.5) * SPEED_MPS
         p = moved_m * cmath.exp(0.7j)
         spoiled = seen(t_s, p) + complex(*rng.normal(0.0, noise_m, 2))
-        watch = watched(watch, Sight(t_s, p, spoiled))
+        watch = update_watch(watch, Sight(t_s, p, spoiled))
     return watch, moved_m
 
 
@@ -61,7 +62,7 @@ HEIGHT_M = 1.5
 
 
 def _tilting(deg: float, late_s: float = 0.0) -> MountWatch:
-    """A vehicle on its place that leans by 5 deg to all sides, watched for four seconds; its
+    """A vehicle on its place that leans by 5 deg to all sides, update_watch for four seconds; its
     pictures are so much later than the profile says."""
     watch, M = MountWatch(), cmath.exp(-1j * math.radians(deg))
 
@@ -72,7 +73,7 @@ def _tilting(deg: float, late_s: float = 0.0) -> MountWatch:
     for i in range(120):
         t_s = i * FRAME_S
         seen = lean(t_s) + M * (TARGET - lean(t_s - late_s))
-        watch = watched(watch, Sight(t_s, 0j, seen, lean(t_s)))
+        watch = update_watch(watch, Sight(t_s, 0j, seen, lean(t_s)))
     return watch
 
 
@@ -103,21 +104,18 @@ def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
 
 def test_a_landing_for_the_mounting_stops_at_once() -> None:
     """Not where the setpoint had run to: it lies in the wrong direction."""
-    state = replace(
-        state_in(Phase.ALIGN),
-        mount=MountWatch(against=9, turn_rad=math.pi / 2),
-        setpoint=PositionSetpoint(0.3, 0.0, 1.0, 0.0),
-    )
-    state, command = planner.step_mission(state, observation(10.02), PROFILE)
-    assert state.row == "mounting"
-    assert isinstance(command, PositionSetpoint)
-    assert math.hypot(command.x_m, command.y_m) < 0.02
+    ahead = PositionSetpoint(0.3, 0.0, 1.0, 0.0)
+    watch = MountWatch(against=9, turn_rad=math.pi / 2)
+    flight = fly(replace(state_in(Phase.ALIGN), mount=watch, setpoint=ahead), at())
+    assert flight.state.row == "mounting"
+    assert isinstance(flight.command, PositionSetpoint)
+    assert math.hypot(flight.command.x_m, flight.command.y_m) < 0.02
 
 
 def test_a_target_that_stands_still_ends_the_watch() -> None:
     watch, _ = flown(turned(0.0))
     assert watch.fits
-    assert watched(watch, Sight(9.0, 0j, 5.0 + 0j)) is watch
+    assert update_watch(watch, Sight(9.0, 0j, 5.0 + 0j)) is watch
 
 
 @given(st.floats(0.3, 2.0), st.floats(0.0, 2 * math.pi), st.sampled_from([0, 2, 5]))
@@ -134,22 +132,19 @@ def test_a_target_that_is_moved_is_no_turned_mounting(
     assert not flown(moved)[0].wrong
 
 
-def test_a_world_that_jumps_under_both_is_no_turned_mounting() -> None:
-    def flight(watch: MountWatch) -> MountWatch:
-        for i in range(60):
-            shift = 0.2 if i > 30 else 0.0
-            watch = watched(watch, Sight(i * FRAME_S, shift + 0j, TARGET + shift))
-        return watch
-
-    assert not flight(MountWatch()).wrong
-
-
-def test_a_drifting_world_is_no_turned_mounting() -> None:
-    """The estimate drifts by 2 cm/s: target and vehicle, which follows it, move alike."""
+@pytest.mark.parametrize(
+    "shift_m",
+    [lambda i: 0.2 if i > 30 else 0.0, lambda i: 0.02 * i * FRAME_S],
+    ids=["jumps", "drifts by 2 cm/s"],
+)
+def test_a_world_that_moves_under_both_is_no_turned_mounting(
+    shift_m: Callable[[int], float],
+) -> None:
+    """The estimate moves: target and vehicle, which follows it, move alike."""
     watch = MountWatch()
     for i in range(900):
-        drift = 0.02 * i * FRAME_S
-        watch = watched(watch, Sight(i * FRAME_S, complex(drift), TARGET + drift))
+        shift = shift_m(i)
+        watch = update_watch(watch, Sight(i * FRAME_S, complex(shift), TARGET + shift))
         assert not watch.wrong
 
 
@@ -159,68 +154,56 @@ def test_a_drifting_world_is_no_turned_mounting() -> None:
      (132.0, "about 130 deg")],
 )  # fmt: skip
 def test_the_turn_is_named(deg: float, words: str) -> None:
-    watch = MountWatch(against=9, turn_rad=math.radians(deg))
-    assert words in explained(watch.turn_rad)
-    assert "camera.mount" in explained(watch.turn_rad)
-    assert "`perchctl calibrate mount`" in explained(watch.turn_rad)
+    text = describe_turn(math.radians(deg))
+    assert words in text
+    assert "camera.mount" in text
+    assert "`perchctl calibrate mount`" in text
 
 
-def _mission(deg: float, hold: bool = False) -> tuple[planner.PlannerState, float]:
-    """The planner in ALIGN, its vehicle wherever the setpoint is, its target as it is seen."""
-    state, seen, place = state_in(Phase.ALIGN), turned(deg), 0j
-    far_m = 0.0
-    for i in range(1, 200):
-        t_s = 10.0 + 0.02 * i
-        at = seen(t_s, place)
-        tel = telemetry(t_s, position_m=(place.real, place.imag, 1.0))
-        target = target_at(t_s, (at.real, at.imag, CEILING_M), tel.position_m)
-        late_s = 0.5 if hold else 0.0
-        obs = observation(t_s, telemetry=tel, target=target, loop_late_s=late_s)
-        state, command = planner.step_mission(state, obs, PROFILE)
-        if state.phase is Phase.LANDING:
-            break
-        assert isinstance(command, PositionSetpoint)
-        assert state.setpoint is not None
-        place = complex(state.setpoint.x_m, state.setpoint.y_m)
-        far_m = max(far_m, abs(place))
-    return state, far_m
+class Follows(Motors):
+    """A vehicle wherever its setpoint is, with a target as a turned camera places it."""
+
+    def __init__(self, deg: float) -> None:
+        super().__init__()
+        self.seen, self.place, self.far_m = turned(deg), 0j, [0.0]
+
+    def look(self, t_s: float, state: PlannerState) -> Observation:
+        placed, body_m = self.seen(t_s, self.place), (self.place.real, self.place.imag, 1.0)
+        target = target_at(t_s, (placed.real, placed.imag, CEILING_M), body_m)
+        return at(obs={"target": target}, position_m=body_m)(t_s)
+
+    def obey(self, state: PlannerState, command: Command) -> None:
+        if state.setpoint is not None:
+            self.place = complex(state.setpoint.x_m, state.setpoint.y_m)
+        self.far_m.append(abs(self.place))
 
 
 @pytest.mark.parametrize("deg", [90, 180, -90])
 def test_a_turned_mounting_lands_and_says_so(deg: int) -> None:
-    state, far_m = _mission(deg)
-    assert state.phase is Phase.LANDING
-    assert state.row == "mounting"
-    assert state.outcome is Outcome.SAFETY
+    it = Follows(deg)
+    state = fly(state_in(Phase.ALIGN), it, 4.0, one_phase=True).state
+    assert (state.phase, state.row, state.outcome) == (Phase.LANDING, "mounting", Outcome.SAFETY)
     assert f"turned by about {deg} deg" in state.reason
-    assert far_m < 0.17
+    assert it.far_m[-2] < 0.17
 
 
 def test_a_right_mounting_flies_on() -> None:
-    state, far_m = _mission(0)
+    """Slowly at first: until the mounting shows, a wrong one must not have flown far."""
+    it = Follows(0.0)
+    state = fly(state_in(Phase.ALIGN), it, 3.98).state
     assert state.phase is not Phase.LANDING
     assert state.mount.fits
-    assert far_m > 0.3
-
-
-def test_the_first_decimetres_are_flown_slowly() -> None:
-    """Until the mounting shows, a wrong one must not have flown far."""
-    state, seen = state_in(Phase.ALIGN), turned(0.0)
-    for i in range(1, 16):
-        t_s = 10.0 + 0.02 * i
-        at = seen(t_s, 0j)
-        target = target_at(t_s, (at.real, at.imag, CEILING_M))
-        state, _ = planner.step_mission(state, observation(t_s, target=target), PROFILE)
-    assert state.setpoint is not None
-    assert math.hypot(state.setpoint.x_m, state.setpoint.y_m) <= 0.25 * 0.3 + 1e-9
+    assert max(it.far_m) > 0.3
+    assert it.far_m[15] <= 0.25 * 0.3 + 1e-9
 
 
 def test_a_target_below_the_vehicle_is_not_believed() -> None:
     """A mounting that is upside down in the profile: nothing is on the ceiling below."""
-    state = state_in(Phase.ALIGN)
-    for i in range(1, 30):
-        t_s = 10.0 + 0.02 * i
-        target = target_at(t_s, (0.0, 0.0, -0.2))
-        state, _ = planner.step_mission(state, observation(t_s, target=target), PROFILE)
+    below = target_at(BEGIN_S, (0.0, 0.0, -0.2))
+
+    def look(t_s: float) -> Observation:
+        return at(obs={"target": replace(below, measured_s=t_s, small_measured_s=t_s)})(t_s)
+
+    state = fly(state_in(Phase.ALIGN), look, 0.58).state
     assert state.row == "mounting"
     assert "camera.mount does not look up" in state.reason

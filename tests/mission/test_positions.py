@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from perchctl.mission import ImuMotion, Observation, Outcome, Phase, PlannerState, planner
+from perchctl.mission import ImuMotion, Observation, Outcome, Phase, PlannerState
 from perchctl.mission.conditions import OTHERWISE_MPS, contact_aside_m
 from perchctl.mission.context import Context
-from perchctl.mission.imu import Reckoning, stepped
+from perchctl.mission.imu import Reckoning, add_step
 from perchctl.mission.lander import LEAST_ORDERS
+from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     HL_ACTIVE,
@@ -27,10 +27,12 @@ from perchctl.vehicle import (
 )
 from tests.helpers.mission import (
     AIRBORNE,
+    BY_TARGET,
     HANG_Z_M,
     HOVER_THRUST,
     MOCAP,
     PROFILE,
+    PROFILES,
     READY,
     Felt,
     observation,
@@ -38,34 +40,17 @@ from tests.helpers.mission import (
     target_at,
     telemetry,
 )
+from tests.mission.rig import BEGIN_S, TICK_S, Flight, Motors, at, fly, is_setpoint, times
 
 HOLD_S, LAND_S = MOCAP.positioning.hold_s, MOCAP.positioning.land_s
 HIDDEN = "motion capture at vicon:lab does not see the rigid body 'cf2'"
-TURN_S, BEGIN_S = 0.02, 10.0
 PRESSED = HOVER_THRUST * 1.12
 HELD_PHASES = (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
-
-
-def times(lasts_s: float) -> Iterator[float]:
-    for i in range(1, round(lasts_s / TURN_S) + 1):
-        yield BEGIN_S + TURN_S * i
+LOST = (Phase.LANDING, "position-lost", Outcome.SAFETY)
 
 
 def hidden(age_s: float) -> dict[str, Any]:
     return {"position_age_s": age_s, "position_problem": HIDDEN}
-
-
-def flown(
-    state: PlannerState, look: Callable[[float], Observation], lasts_s: float
-) -> tuple[PlannerState, list[Command]]:
-    """Until the time is over, or the phase is another."""
-    phase, sent = state.phase, []
-    for t_s in times(lasts_s):
-        state, command = planner.step_mission(state, look(t_s), MOCAP)
-        sent.append(command)
-        if state.phase is not phase:
-            break
-    return state, sent
 
 
 # --- In the air --------------------------------------------------------------------------
@@ -74,47 +59,38 @@ def flown(
 @pytest.mark.parametrize("phase", HELD_PHASES)
 def test_a_short_occlusion_is_held_and_the_flight_goes_on(phase: Phase) -> None:
     """0.3 s: the setpoint stands, then moves on, and nothing is landed for it."""
-    begin = state = state_in(phase, z_m=0.3 if phase is Phase.APPROACH else 1.0)
-    held = []
-    for t_s in times(0.5):
-        hidden_s = t_s - BEGIN_S if t_s - BEGIN_S <= 0.3 else 0.0
-        obs = observation(t_s, begin.entry_m[2], **hidden(hidden_s))
-        state, command = planner.step_mission(state, obs, MOCAP)
-        if hidden_s > HOLD_S:
-            held.append((state.hold, state.setpoint, command))
-    assert state.phase in (*HELD_PHASES, Phase.PERCH)
-    assert not state.hold
+    z_m = 0.3 if phase is Phase.APPROACH else 1.0
+
+    def look(t_s: float) -> Observation:
+        return observation(t_s, z_m, **hidden(t_s - BEGIN_S if t_s - BEGIN_S <= 0.3 else 0.0))
+
+    flight = fly(state_in(phase, z_m=z_m), look, 0.5, MOCAP)
+    assert flight.state.phase in (*HELD_PHASES, Phase.PERCH)
+    assert not flight.state.hold
+    held = [tick for tick in flight.ticks if tick.obs.position_age_s > HOLD_S]
     assert len(held) >= 7
-    for why, setpoint, command in held:
-        assert HIDDEN in why
-        assert setpoint == held[0][1]
-        assert isinstance(command, PositionSetpoint)
+    for tick in held:
+        assert HIDDEN in tick.state.hold
+        assert tick.state.setpoint == held[0].state.setpoint
+        assert isinstance(tick.command, PositionSetpoint)
 
 
 @pytest.mark.parametrize("phase", [*HELD_PHASES, Phase.RECOVER, Phase.PERCH])
 def test_a_lasting_occlusion_lands_and_says_why(phase: Phase) -> None:
-    begin = state_in(phase)
-    state, sent = begin, []
-    for t_s in times(2.0):
-        obs = observation(t_s, begin.entry_m[2], new_frame=False, **hidden(t_s - BEGIN_S))
-        state, command = planner.step_mission(state, obs, MOCAP)
-        sent.append(command)
-        if state.phase is not phase:
-            break
-    assert (state.phase, state.row, state.outcome) == (
-        Phase.LANDING, "position-lost", Outcome.SAFETY,
-    )  # fmt: skip
-    assert HIDDEN in state.reason
-    assert len(sent) * TURN_S == pytest.approx(LAND_S, abs=0.03)
+    def look(t_s: float) -> Observation:
+        return observation(t_s, new_frame=False, **hidden(t_s - BEGIN_S))
+
+    flight = fly(state_in(phase), look, 2.0, MOCAP, one_phase=True)
+    assert (flight.state.phase, flight.state.row, flight.state.outcome) == LOST
+    assert HIDDEN in flight.state.reason
+    assert flight.ticks[-1].t_s - BEGIN_S == pytest.approx(LAND_S, abs=0.03)
 
 
 @pytest.mark.parametrize("lost_s", [0.0, 0.06])
 @pytest.mark.parametrize("phase", [*HELD_PHASES, Phase.RECOVER, Phase.PERCH])
 def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, lost_s: float) -> None:
-    """Level, by thrust alone, within a second: long before the estimate itself doubts. Until
-    then the setpoint is nowhere above the one that was flown."""
-    see, state, sent = Felt(), state_in(phase), []
-    state = replace(state, entered_s=BEGIN_S, attempts=1)
+    """Level, by thrust alone, within a second: long before the estimate itself doubts."""
+    felt, state, sent = Felt(), replace(state_in(phase), attempts=1), []
     for i in range(125):
         t_s = BEGIN_S + 0.01 * (i - 24)
         variance = 2e-4 + 1e-4 * max(0, math.ceil(10 * (t_s - BEGIN_S - lost_s) - 1e-6))
@@ -122,24 +98,20 @@ def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, los
             t_s, 1.0, climb_variance_m2ps2=variance, position_variance_m2=variance,
             acc_x_g=1e-4 * (i % 2),
         )  # fmt: skip
-        obs = see(observation(t_s, telemetry=tel, new_frame=False))
+        obs = felt(observation(t_s, telemetry=tel, new_frame=False))
         if i % 2 == 0 and t_s > BEGIN_S:
-            state, command = planner.step_mission(state, obs, PROFILE)
+            state, command = step_mission(state, obs, PROFILE)
             sent.append(command)
         if state.phase is Phase.LANDING:
             break
-    assert (state.phase, state.row, state.outcome) == (
-        Phase.LANDING, "position-lost", Outcome.SAFETY,
-    )  # fmt: skip
+    assert (state.phase, state.row, state.outcome) == LOST
     assert "variance only grows" in state.reason
-    assert LAND_S <= len(sent) * TURN_S <= 1.0
+    assert LAND_S <= len(sent) * TICK_S <= 1.0
     assert isinstance(sent[-1], RawThrust)
 
 
 def test_what_was_never_measured_lands_at_once() -> None:
-    state, _ = planner.step_mission(
-        state_in(Phase.ALIGN), observation(10.02, **hidden(math.inf)), MOCAP
-    )
+    state = fly(state_in(Phase.ALIGN), at(obs=hidden(math.inf)), profile=MOCAP).state
     assert state.phase is Phase.LANDING
     assert "no position has come" in state.reason
 
@@ -151,73 +123,63 @@ def test_no_dwell_time_counts_without_a_position(phase: Phase, to: Phase) -> Non
     """Hidden again and again for 0.3 s, never long enough to be landed for."""
     z_m = 0.5 if phase is Phase.APPROACH else 1.0
 
-    def seen(t_s: float) -> Observation:
-        return observation(t_s, z_m)
-
     def flickers(t_s: float) -> Observation:
         since_s = (t_s - BEGIN_S) % 0.35
         return observation(t_s, z_m, **hidden(since_s if since_s < 0.3 else 0.0))
 
-    assert flown(state_in(phase, z_m=z_m), seen, 1.2)[0].phase is to
-    assert flown(state_in(phase, z_m=z_m), flickers, 1.2)[0].phase is phase
+    begin = state_in(phase, z_m=z_m)
+    assert fly(begin, at(z_m), 1.2, MOCAP, one_phase=True).state.phase is to
+    assert fly(begin, flickers, 1.2, MOCAP).state.phase is phase
 
 
 # --- At the ceiling ----------------------------------------------------------------------
 
 
-def pressed(t_s: float, **changes: Any) -> Observation:
-    return observation(t_s, telemetry=telemetry(t_s, HANG_Z_M, thrust=PRESSED), **changes)
+def presses(hidden_until_s: float, lasts_s: float) -> Flight:
+    def look(t_s: float) -> Observation:
+        obs = hidden(0.3) if t_s < BEGIN_S + hidden_until_s else {}
+        return at(HANG_Z_M, obs=obs, thrust=PRESSED)(t_s)
+
+    return fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, lasts_s, MOCAP, one_phase=True)
 
 
-def test_no_contact_is_proven_without_a_position() -> None:
-    assert flown(state_in(Phase.PERCH, z_m=HANG_Z_M), pressed, 0.6)[0].phase is Phase.COMPLETE
-    state, _ = flown(
-        state_in(Phase.PERCH, z_m=HANG_Z_M), lambda t_s: pressed(t_s, **hidden(0.3)), 0.6
-    )
-    assert state.phase is Phase.PERCH
-
-
-def test_a_position_that_comes_again_proves_nothing_yet() -> None:
+def test_no_contact_is_proven_without_a_position_nor_by_one_that_has_just_come_again() -> None:
     """The estimate is drawn back to it, and its speed is not the vehicle's."""
+    assert presses(0.0, 0.6).state.phase is Phase.COMPLETE
+    assert presses(math.inf, 0.6).state.phase is Phase.PERCH
+    back = presses(0.1, 2.0)
+    assert back.state.phase is Phase.COMPLETE
+    dwell_s = PROFILE.planner.perch.contact_dwell_s
+    assert back.ticks[-1].t_s - BEGIN_S > 0.1 + 0.5 + dwell_s - 0.05
 
-    def back(t_s: float) -> Observation:
-        return pressed(t_s, **(hidden(0.3) if t_s < BEGIN_S + 0.1 else {}))
 
-    state, sent = flown(state_in(Phase.PERCH, z_m=HANG_Z_M), back, 2.0)
-    assert state.phase is Phase.COMPLETE
-    assert len(sent) * TURN_S > 0.1 + 0.5 + PROFILE.planner.perch.contact_dwell_s - 0.05
-
-
-class Hangs:
+class Hangs(Motors):
     """A vehicle with its gear at the magnet, its body hidden, and an estimate that slides: down
     by `drift_mps`, as one that is pressed and blind does (docs/firmware.md). `carries`: as long
     as its thrust is above this part of the weight, the magnet holds."""
 
-    def __init__(self, drift_mps: float, carries: float = 0.0, hover: float = HOVER_THRUST):
-        self.thrust, self.drift_mps = hover, drift_mps
-        self.carries, self.hover = carries, hover
+    def __init__(self, drift_mps: float, carries: float = 0.0, thrust: float = HOVER_THRUST):
+        super().__init__(thrust)
+        self.drift_mps, self.carries = drift_mps, carries
         self.fell_s: float | None = None
         self.estimated_m = HANG_Z_M
-        self.felt = Felt()
 
-    def look(self, t_s: float) -> Observation:
-        lifted = self.thrust / self.hover
+    def look(self, t_s: float, state: PlannerState) -> Observation:
+        lifted = self.thrust / HOVER_THRUST
         if self.fell_s is None and lifted < self.carries:
-            self.fell_s = t_s - TURN_S
+            self.fell_s = t_s - TICK_S
         acc_g, sinks_mps = 1.0, 0.0
         if self.fell_s is not None:
             acc_g, sinks_mps = lifted, 9.81 * (1.0 - lifted) * (t_s - self.fell_s)
         self.estimated_m = HANG_Z_M - self.drift_mps * (t_s - BEGIN_S)
-        off = self.thrust == 0.0
         tel = telemetry(
             t_s, self.estimated_m, acc_z_g=acc_g, thrust=self.thrust,
             velocity_mps=(0.0, 0.0, -self.drift_mps - sinks_mps),
-            supervisor=READY if off else AIRBORNE,
+            supervisor=READY if self.thrust == 0.0 else AIRBORNE,
         )  # fmt: skip
-        obs = observation(t_s, telemetry=tel, target=None, **hidden(t_s - BEGIN_S + 1.0))
-        return self.felt(obs)
+        return observation(t_s, telemetry=tel, target=None, **hidden(t_s - BEGIN_S + 1.0))
 
-    def obeys(self, command: Command) -> None:
+    def obey(self, state: PlannerState, command: Command) -> None:
         match command:
             case RawThrust(thrust):
                 self.thrust = float(thrust)
@@ -227,20 +189,9 @@ class Hangs:
                 self.thrust = 20000.0 if z_m < self.estimated_m else 65535.0
 
 
-def released(it: Hangs, state: PlannerState, lasts_s: float = 12.0) -> tuple[PlannerState, list]:
-    sent = []
-    for t_s in times(lasts_s):
-        state, command = planner.step_mission(state, it.look(t_s), MOCAP)
-        it.obeys(command)
-        sent.append((t_s, command))
-        if state.phase.is_over:
-            break
-    return state, sent
-
-
-def at_the_magnet(phase: Phase = Phase.COMPLETE) -> PlannerState:
-    state = state_in(phase, z_m=HANG_Z_M)
-    return replace(state, contact_z_m=HANG_Z_M, reach_s=BEGIN_S - 5.0)
+def at_the_magnet(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
+    held = {"contact_z_m": HANG_Z_M, "reach_s": BEGIN_S - 5.0}
+    return replace(state_in(phase, z_m=HANG_Z_M), **{**held, **changes})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("drift_mps", [0.0, 0.2, -0.2])
@@ -248,22 +199,21 @@ def test_a_release_goes_on_by_the_accelerometer_when_the_body_is_hidden_for_good
     drift_mps: float,
 ) -> None:
     """To thrust again for a slide of the estimate would take a vehicle off its magnet."""
-    it = Hangs(drift_mps)
-    state, sent = released(it, replace(at_the_magnet(), released_s=BEGIN_S))
-    assert state.phase is Phase.PERCHED
-    stops = [t_s for t_s, command in sent if isinstance(command, StopMotors)]
-    still = next(t_s for t_s, c in sent if isinstance(c, RawThrust) and c.thrust <= 5000)
-    assert stops[0] - still >= PROFILE.planner.complete.hang_s - 0.05
+    begin = at_the_magnet(released_s=BEGIN_S)
+    flight = fly(begin, Hangs(drift_mps), 12.0, MOCAP, feels=True)
+    assert flight.state.phase is Phase.PERCHED
+    assert flight.stops_s[0] - flight.still_s[0] >= PROFILE.planner.complete.hang_s - 0.05
 
 
 def test_the_same_slide_with_decks_is_a_slip() -> None:
     """Their position is measured all the time: what sinks by it falls."""
-    it = Hangs(0.2)
-    state = replace(at_the_magnet(), released_s=BEGIN_S)
-    for t_s in times(0.3):
-        obs = replace(it.look(t_s), position_age_s=0.0)
-        state, _ = planner.step_mission(state, obs, PROFILE)
-    assert state.row == "slipped"
+
+    class Measured(Hangs):
+        def look(self, t_s: float, state: PlannerState) -> Observation:
+            return replace(super().look(t_s, state), position_age_s=0.0)
+
+    flight = fly(at_the_magnet(released_s=BEGIN_S), Measured(0.2), 0.3, feels=True)
+    assert flight.state.row == "slipped"
 
 
 @pytest.mark.parametrize("carries", [0.05, 0.3])
@@ -271,18 +221,12 @@ def test_the_same_slide_with_decks_is_a_slip() -> None:
 def test_a_magnet_that_gives_way_is_noticed_without_a_position(
     carries: float, drift_mps: float
 ) -> None:
-    it = Hangs(drift_mps, carries)
-    state = replace(at_the_magnet(), released_s=BEGIN_S)
-    for t_s in times(4.0):
-        state, command = planner.step_mission(state, it.look(t_s), MOCAP)
-        if state.phase is not Phase.COMPLETE:
-            break
-        assert not isinstance(command, StopMotors)
-        it.obeys(command)
+    it, begin = Hangs(drift_mps, carries), at_the_magnet(released_s=BEGIN_S)
+    flight = fly(begin, it, 4.0, MOCAP, feels=True, one_phase=True)
+    assert not flight.stops_s
     assert it.fell_s is not None
-    assert t_s - it.fell_s < 0.15
-    assert isinstance(command, PositionSetpoint)
-    assert command.z_m > it.look(t_s).telemetry.position_m[2] + 0.15  # caught
+    assert flight.ticks[-1].t_s - it.fell_s < 0.15
+    assert is_setpoint(flight.command, above_m=it.estimated_m + 0.15)  # caught
 
 
 STOPPED: dict[str, Any] = {"stopped_s": BEGIN_S - 1.0, "released_s": BEGIN_S - 3.0, "orders": 5}
@@ -305,103 +249,87 @@ def test_what_nobody_saw_hang_has_not_perched(
 ) -> None:
     """Motors off, no position, and a gap in the telemetry: it may lie on the floor, unless what
     was felt on board meanwhile is no fall."""
-    state, felt = replace(at_the_magnet(), **STOPPED), Felt()
+    felt = Felt()
     felt(off(BEGIN_S))
-    reasons = []
-    for t_s in times(4.0):
+
+    def look(t_s: float) -> Observation:
         heard = t_s > BEGIN_S + silence_s
-        obs = felt(off(t_s, gained_mps=gained_mps) if heard else off(BEGIN_S))
-        state, command = planner.step_mission(state, replace(obs, t_s=t_s), MOCAP)
-        assert not isinstance(command, Land | PositionSetpoint)
-        reasons.append(state.reason)
-        if state.phase.is_over:
-            break
-    assert state.phase is ends
+        return replace(off(t_s, gained_mps=gained_mps) if heard else off(BEGIN_S), t_s=t_s)
+
+    flight = fly(at_the_magnet(**STOPPED), look, 4.0, MOCAP, feels=felt)
+    assert not any(isinstance(command, Land | PositionSetpoint) for command in flight.commands)
+    assert flight.state.phase is ends
     if ends is Phase.ABORTED:
-        assert any("still hangs is not known" in reason for reason in reasons)
-        assert "not known" in state.reason
+        assert any("still hangs is not known" in tick.state.reason for tick in flight.ticks)
+        assert "not known" in flight.state.reason
 
 
 @pytest.mark.parametrize(("silence_s", "gained_mps"), [(0.02, 0.0), (0.5, 0.0), (0.5, -2.5)])
 def test_a_locked_vehicle_hangs_where_it_has_not_fallen_from(
     silence_s: float, gained_mps: float
 ) -> None:
-    state, felt = replace(at_the_magnet(), **STOPPED), Felt()
+    felt = Felt()
     felt(off(BEGIN_S - 0.02))
     locked = felt(off(BEGIN_S + silence_s, READY | LOCKED, gained_mps))
-    state, _ = planner.step_mission(state, locked, MOCAP)
+    state, _ = step_mission(at_the_magnet(**STOPPED), locked, MOCAP)
     assert state.phase is (Phase.ABORTED if gained_mps else Phase.PERCHED)
-
-
-# --- On the way down ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("contact", [True, False])
-def test_what_something_carries_is_put_down_gently_whatever_that_is(contact: bool) -> None:
-    """Magnet or floor. A stop at half of the weight would drop it from a weak magnet; a slow
-    release under watch suits both. What had touched the magnet and has not fallen hangs."""
-    it = Hangs(-0.1)
-    it.thrust = 20000.0
-    state = at_the_magnet(Phase.LANDING)
-    if not contact:
-        state = replace(state, contact_z_m=None, reach_s=None)
-    state, sent = released(it, state)
-    first = next(i for i, (_, command) in enumerate(sent) if isinstance(command, StopMotors))
-    still = [c for _, c in sent[:first] if isinstance(c, RawThrust) and c.thrust <= 5000]
-    assert len(still) * TURN_S >= PROFILE.planner.complete.hang_s - 0.05
-    assert state.phase is (Phase.PERCHED if contact else Phase.LANDED)
-
-
-def test_a_drifting_descent_is_no_floor() -> None:
-    """It seems to have come down by half a metre, and is held by the magnet."""
-    state = replace(state_in(Phase.LANDING, z_m=1.5))
-    for t_s in times(0.9):
-        tel = telemetry(t_s, 0.9, thrust=20000.0)
-        obs = observation(t_s, telemetry=tel, target=None, **hidden(1.0))
-        state, command = planner.step_mission(state, obs, MOCAP)
-        assert not isinstance(command, StopMotors)
-
-
-def test_the_ground_stays_where_it_was_when_the_drift_ends() -> None:
-    """The estimate steps back to the truth: what was remembered before the drift is true."""
-    begin = replace(state_in(Phase.ALIGN), ground_m=(0.0, 0.0, 0.0))
-    state, _ = planner.step_mission(begin, observation(10.02, 1.3, **hidden(0.5)), MOCAP)
-    back, _ = planner.step_mission(state, observation(10.04, 1.0, jumped=True), MOCAP)
-    assert back.ground_m == (0.0, 0.0, 0.0)
-    without, _ = planner.step_mission(
-        replace(state, stale_s=None), observation(10.04, jumped=True), MOCAP
-    )
-    assert without.ground_m != (0.0, 0.0, 0.0)
-
-
-# --- Another world -----------------------------------------------------------------------
 
 
 def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> None:
     """On the floor a magnet's hold and the ground's look alike; a lock makes no perch of it."""
-    state = state_in(Phase.LANDING, z_m=1.0)
     state = replace(
-        state, entered_s=8.0, contact_z_m=0.6, released_s=9.0, stopped_s=9.9, stale_s=BEGIN_S,
-        reach_s=8.0,
+        state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, contact_z_m=0.6, released_s=9.0,
+        stopped_s=9.9, stale_s=BEGIN_S, reach_s=8.0,
     )  # fmt: skip
     felt = Felt()
-    felt(off(BEGIN_S - TURN_S))
+    felt(off(BEGIN_S - TICK_S))
     locked = felt(off(BEGIN_S, READY | LOCKED))
-    assert planner.step_mission(state, locked, MOCAP)[0].phase is Phase.ABORTED
+    assert step_mission(state, locked, MOCAP)[0].phase is Phase.ABORTED
     hung = replace(state, phase=Phase.COMPLETE)
-    assert planner.step_mission(hung, locked, MOCAP)[0].phase is Phase.PERCHED
+    assert step_mission(hung, locked, MOCAP)[0].phase is Phase.PERCHED
 
 
 def test_a_release_that_is_held_goes_by_where_the_estimate_is_now() -> None:
     """It has slid 0.4 m up from the contact: a setpoint at the contact would take the thrust
     away."""
-    state = replace(state_in(Phase.COMPLETE, z_m=HANG_Z_M), contact_z_m=HANG_Z_M, released_s=9.0)
-    late = telemetry(BEGIN_S - 0.2, HANG_Z_M + 0.4, thrust=1000.0)
-    _, command = planner.step_mission(
-        state, observation(BEGIN_S, telemetry=late, **hidden(4.0)), MOCAP
-    )
-    assert isinstance(command, PositionSetpoint)
-    assert command.z_m > late.position_m[2]
+    late = at(HANG_Z_M + 0.4, age_s=0.22, obs=hidden(4.0), thrust=1000.0)
+    flight = fly(at_the_magnet(released_s=9.0, reach_s=None), late, profile=MOCAP)
+    assert is_setpoint(flight.command, above_m=HANG_Z_M + 0.4)
+
+
+# --- On the way down ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("contact", "ends"),
+    [({}, Phase.PERCHED), ({"contact_z_m": None, "reach_s": None}, Phase.LANDED)],
+    ids=["contact", "none"],
+)
+def test_what_something_carries_is_put_down_gently_whatever_that_is(
+    contact: dict[str, Any], ends: Phase
+) -> None:
+    """Magnet or floor. A stop at half of the weight would drop it from a weak magnet; a slow
+    release under watch suits both. What had touched the magnet and has not fallen hangs."""
+    begin = at_the_magnet(Phase.LANDING, **contact)
+    flight = fly(begin, Hangs(-0.1, thrust=20000.0), 12.0, MOCAP, feels=True)
+    still = [t_s for t_s in flight.still_s if t_s < flight.stops_s[0]]
+    assert len(still) * TICK_S >= PROFILE.planner.complete.hang_s - 0.05
+    assert flight.state.phase is ends
+
+
+def test_a_drifting_descent_is_no_floor() -> None:
+    """It seems to have come down by half a metre, and is held by the magnet."""
+    look = at(0.9, obs={"target": None, **hidden(1.0)}, thrust=20000.0)
+    assert not fly(state_in(Phase.LANDING, z_m=1.5), look, 0.9, MOCAP).stops_s
+
+
+def test_the_ground_stays_where_it_was_when_the_drift_ends() -> None:
+    """The estimate steps back to the truth: what was remembered before the drift is true."""
+    state = fly(state_in(Phase.ALIGN), at(1.3, obs=hidden(0.5)), profile=MOCAP).state
+    for stale_s, stays in ((state.stale_s, True), (None, False)):
+        jumps = at(obs={"jumped": True})(10.04)
+        after, _ = step_mission(replace(state, stale_s=stale_s), jumps, MOCAP)
+        assert (after.ground_m == state.ground_m) is stays
 
 
 # --- Where it touched ----------------------------------------------------------------------
@@ -415,16 +343,16 @@ def test_the_spread_of_a_contact_grows_with_what_the_estimate_may_slide(
     by: str, unseen_s: float, least_m: float, most_m: float
 ) -> None:
     """A target that is only remembered keeps the spread of its last sight."""
-    profile = Profile.model_validate({"positioning": by})
-    state = state_in(Phase.PERCH, z_m=HANG_Z_M)
-    for t_s in times(0.1):
+
+    def look(t_s: float) -> Observation:
         remembered = target_at(
             t_s, body_m=(0.0, 0.0, HANG_Z_M), measured_s=t_s - unseen_s, measured=False,
             tracked=False, sigma_m=np.full(3, 1e-4),
         )  # fmt: skip
-        obs = observation(t_s, HANG_Z_M, target=remembered)
-        state, _ = planner.step_mission(state, obs, profile)
-    _, sigma_m = contact_aside_m(Context(state, obs, profile))
+        return observation(t_s, HANG_Z_M, target=remembered)
+
+    flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 0.1, PROFILES[by])
+    _, sigma_m = contact_aside_m(Context(flight.state, flight.obs, PROFILES[by]))
     assert least_m <= sigma_m <= most_m
 
 
@@ -434,16 +362,16 @@ def test_positions_that_come_back_do_not_move_a_gear_that_has_not_moved(
 ) -> None:
     """Felt to stand still at the target, out of sight: 6 cm, by which the estimate is set right
     after half a second without a position, were its own."""
-    felt, state = Felt(), state_in(Phase.PERCH, z_m=HANG_Z_M)
-    for t_s in times(1.5):
-        since_s = t_s - 10.0
-        tel = telemetry(t_s, position_m=(0.06 if since_s > 0.9 else 0.0, 0.0, HANG_Z_M))
-        target = target_at(
-            t_s, body_m=tel.position_m, measured=since_s < 0.2, measured_s=min(t_s, 10.2)
-        )
+
+    def look(t_s: float) -> Observation:
+        since_s = t_s - BEGIN_S
+        body_m = (0.06 if since_s > 0.9 else 0.0, 0.0, HANG_Z_M)
+        target = target_at(t_s, body_m=body_m, measured=since_s < 0.2, measured_s=min(t_s, 10.2))
         gone_s = since_s - 0.3 if silent and since_s < 0.9 else 0.0
-        obs = observation(t_s, telemetry=tel, target=target, position_age_s=max(0.0, gone_s))
-        state, _ = planner.step_mission(state, felt(obs), MOCAP)
+        gone = {"target": target, "position_age_s": max(0.0, gone_s)}
+        return at(obs=gone, position_m=body_m)(t_s)
+
+    state = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.5, MOCAP, feels=True).state
     assert math.hypot(*state.reckoning.aside_m) == pytest.approx(aside_m, abs=0.01)
     assert math.hypot(*state.reckoning.stepped_m) == pytest.approx(aside_m, abs=0.01)
 
@@ -451,18 +379,18 @@ def test_positions_that_come_back_do_not_move_a_gear_that_has_not_moved(
 def test_a_gap_in_the_positions_brings_nothing_nearer_to_the_magnet() -> None:
     """Hovering below a target that is out of sight since: how far below it is, the position tells
     as soon as it is back."""
-    felt, state = Felt(), state_in(Phase.ALIGN, z_m=HANG_Z_M - 0.35)
-    for t_s in times(8.0):
-        since_s = t_s - 10.0
+    z_m = HANG_Z_M - 0.35
+
+    def look(t_s: float) -> Observation:
+        since_s = t_s - BEGIN_S
         target = target_at(
-            t_s, body_m=(0.0, 0.0, HANG_Z_M - 0.35), measured=since_s < 0.2,
-            measured_s=min(t_s, 10.2), tracked=since_s < 0.7,
+            t_s, body_m=(0.0, 0.0, z_m), measured=since_s < 0.2, measured_s=min(t_s, 10.2),
+            tracked=since_s < 0.7,
         )  # fmt: skip
         gone_s = since_s - 0.2 if 0.2 < since_s < 0.5 else 0.0
-        obs = observation(
-            t_s, telemetry=telemetry(t_s, HANG_Z_M - 0.35), target=target, position_age_s=gone_s
-        )
-        state, _ = planner.step_mission(state, felt(obs), MOCAP)
+        return observation(t_s, z_m, target=target, position_age_s=gone_s)
+
+    state = fly(state_in(Phase.ALIGN, z_m=z_m), look, 8.0, MOCAP, feels=True).state
     assert state.reckoning.below_m == pytest.approx(0.35, abs=0.01)
     assert state.reach_s is None
 
@@ -474,13 +402,13 @@ SMEARED_M = (0.0196, 0.0158, 0.0123, 0.0098)
     ("steps_m", "seen_s", "profile", "sigma_m"),
     [
         ((0.06,), 0.5, MOCAP, 0.06),
-        ((0.06,), 0.5, Profile(), 0.06),
+        ((0.06,), 0.5, PROFILE, 0.06),
         (SMEARED_M, 0.5, MOCAP, sum(SMEARED_M)),
         ((0.05, 0.0, -0.05), 0.5, MOCAP, 0.0),
         ((0.06,), 0.97, MOCAP, 0.06),  # by pictures of before it that arrive after it
         ((0.06,), 1.1, MOCAP, 0.0),  # by one that is exposed after it
         ((0.006,), 0.5, MOCAP, 0.0),  # the noise of an estimate
-        ((0.06,), 0.5, Profile.model_validate({"positioning": "target"}), 0.0),
+        ((0.06,), 0.5, BY_TARGET, 0.0),
     ],
 )
 def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
@@ -488,18 +416,20 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
 ) -> None:
     """By as much as it steps beyond its speed, tick by tick from 0.98 s on: it was wrong before, or
     it is now. A picture arrives 0.06 s after its exposure."""
-    felt, state, x_m = Felt(), state_in(Phase.PERCH, z_m=HANG_Z_M), 0.0
-    for i, t_s in enumerate(times(1.3)):
-        x_m += steps_m[i - 48] if 48 <= i < 48 + len(steps_m) else 0.0
-        tel = telemetry(t_s, position_m=(x_m, 0.0, HANG_Z_M))
+
+    def look(t_s: float) -> Observation:
+        done = max(0, round((t_s - BEGIN_S) / TICK_S) - 48)
+        body_m = (sum(steps_m[:done]), 0.0, HANG_Z_M)
         exposed_s = min(t_s - 10.06, seen_s)
         target = target_at(
-            t_s, body_m=tel.position_m, measured=exposed_s < seen_s, measured_s=10.0 + exposed_s
+            t_s, body_m=body_m, measured=exposed_s < seen_s, measured_s=10.0 + exposed_s
         )
-        obs = observation(t_s, telemetry=tel, target=target, new_frame=target.measured)
-        state, _ = planner.step_mission(state, felt(obs), profile)
-    assert math.hypot(*state.reckoning.stepped_m) == pytest.approx(sigma_m, abs=1e-3)
-    assert contact_aside_m(Context(state, obs, profile))[1] >= sigma_m - 1e-3
+        obs = {"target": target, "new_frame": target.measured}
+        return at(obs=obs, position_m=body_m)(t_s)
+
+    flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.3, profile, feels=True)
+    assert math.hypot(*flight.state.reckoning.stepped_m) == pytest.approx(sigma_m, abs=1e-3)
+    assert contact_aside_m(Context(flight.state, flight.obs, profile))[1] >= sigma_m - 1e-3
 
 
 def test_a_position_that_moves_as_fast_as_it_says_is_no_step() -> None:
@@ -508,40 +438,68 @@ def test_a_position_that_moves_as_fast_as_it_says_is_no_step() -> None:
     for k in range(40):
         t_s, behind_s = 10.0 + 0.02 * k, 0.08 if k % 3 else 0.0
         at_m = 0.6 * (t_s - max(0.0, behind_s - 0.05))
-        tel = replace(
-            telemetry(t_s, position_m=(at_m, 0.0, 1.0), velocity_mps=(0.6, 0.0, 0.0)),
-            behind_s=behind_s,
+        tel = telemetry(
+            t_s, position_m=(at_m, 0.0, 1.0), velocity_mps=(0.6, 0.0, 0.0), behind_s=behind_s
         )
-        if k:
-            old = stepped(old, last, tel)
+        old = add_step(old, last, tel) if k else old
         last = tel
     assert old.stepped_m == (0.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("x_m", "row"), [(0.0, "hangs-at-contact"), (0.2, "held")]
-)  # fmt: skip
+@pytest.mark.parametrize(("x_m", "row"), [(0.0, "hangs-at-contact"), (0.2, "held")])
 def test_what_hangs_where_the_place_is_unsure_is_not_said_to_be_held_elsewhere(
     x_m: float, row: str
 ) -> None:
     """On the magnet while the estimate steps by 6 cm, out of sight of the target; or 20 cm aside,
     which no such step explains."""
-    felt, state = Felt(), state_in(Phase.PERCH, z_m=HANG_Z_M)
-    for t_s in times(2.9):
-        x = x_m + (0.06 if t_s > 10.48 else 0.0)
-        tel = telemetry(t_s, position_m=(x, 0.0, HANG_Z_M), thrust=0.34 * HOVER_THRUST)
+
+    def look(t_s: float) -> Observation:
+        body_m = (x_m + (0.06 if t_s > 10.48 else 0.0), 0.0, HANG_Z_M)
         target = target_at(
-            t_s, body_m=tel.position_m, measured=t_s < 10.3, measured_s=min(t_s, 10.3),
-            tracked=t_s < 10.4,
-        )  # fmt: skip
-        obs = observation(t_s, telemetry=tel, target=target, new_frame=target.measured)
-        state, _ = planner.step_mission(state, felt(obs), MOCAP)
-        if state.phase is Phase.LANDING:
-            break
-    assert state.row == row
+            t_s, body_m=body_m, measured=t_s < 10.3, measured_s=min(t_s, 10.3), tracked=t_s < 10.4
+        )
+        obs = {"target": target, "new_frame": target.measured}
+        return at(obs=obs, position_m=body_m, thrust=0.34 * HOVER_THRUST)(t_s)
+
+    flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 2.9, MOCAP, feels=True)
+    landed = [tick.state.row for tick in flight.ticks if tick.state.phase is Phase.LANDING]
+    assert landed[0] == row
 
 
 # --- Another world: what goes astray by it comes down level, by thrust alone ---------------------
+
+
+class Falls(Motors):
+    """A vehicle that flies by its thrust alone from a height on, or from the ground; seen by an
+    accelerometer that reads too much, and by a position in another world."""
+
+    def __init__(
+        self, z_m: float, thrust: float, hover: float = HOVER_THRUST, too_much_g: float = 0.0,
+        y_up: bool = False,
+    ) -> None:  # fmt: skip
+        super().__init__(thrust)
+        self.z_m, self.up_mps, self.hover, self.too_much_g = z_m, 0.0, hover, too_much_g
+        self.y_up, self.highest_m, self.met_mps = y_up, z_m, 0.0
+
+    def look(self, t_s: float, state: PlannerState) -> Observation:
+        acc_g = self.thrust / self.hover
+        if self.met_mps == 0.0:
+            self.up_mps += 9.81 * (acc_g - 1.0) * TICK_S
+            self.z_m += self.up_mps * TICK_S
+            self.highest_m = max(self.highest_m, self.z_m)
+            self.met_mps = self.up_mps if self.z_m <= 0.0 else 0.0
+        body_m = (0.0, self.z_m, 0.0) if self.y_up else (2.0 * (t_s - BEGIN_S), 0.0, self.z_m)
+        velocity_mps = (0.0, self.up_mps, 0.0) if self.y_up else (2.0, 0.0, self.up_mps)
+        tel = telemetry(
+            t_s, position_m=body_m, velocity_mps=velocity_mps, thrust=self.thrust,
+            acc_z_g=acc_g + self.too_much_g,
+        )  # fmt: skip
+        target = target_at(t_s, body_m=body_m) if self.y_up else None
+        return observation(t_s, telemetry=tel, target=target)
+
+    def obey(self, state: PlannerState, command: Command) -> None:
+        if isinstance(command, RawThrust):
+            self.thrust = float(command.thrust)
 
 
 @pytest.mark.parametrize("felt_too_much_g", [0.0, 0.015, -0.015])
@@ -551,89 +509,91 @@ def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
 ) -> None:
     """A world with its y up: the vehicle rises, its position slides, its height and its vertical
     speed stand. It is let down by what its accelerometer feels, one with an offset too."""
-    state = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0, last=None)
-    z_m, up_mps, thrust, highest_m, felt = 0.0, 0.0, 1.15 * hover, 0.0, Felt()
-    for t_s in times(5.0):
-        acc_g = thrust / hover
-        up_mps += 9.81 * (acc_g - 1.0) * TURN_S
-        z_m += up_mps * TURN_S
-        highest_m = max(highest_m, z_m)
-        tel = telemetry(
-            t_s, position_m=(0.0, z_m, 0.0), velocity_mps=(0.0, up_mps, 0.0), thrust=thrust,
-            acc_z_g=acc_g + felt_too_much_g,
-        )  # fmt: skip
-        obs = observation(t_s, telemetry=tel, target=target_at(t_s, body_m=tel.position_m))
-        state, command = planner.step_mission(state, felt(obs), MOCAP)
-        if isinstance(command, RawThrust):
-            thrust = float(command.thrust)
-        if z_m <= 0.0:
-            break
+    begin = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0, last=None)
+    it = Falls(0.0, 1.15 * hover, hover, felt_too_much_g, y_up=True)
+    state = fly(begin, it, 5.0, MOCAP, feels=True).state
     assert (state.phase, state.row) == (Phase.LANDING, "position-astray")
     assert "perchctl check --lift" in state.reason
-    assert z_m <= 0.0
-    assert -0.9 < up_mps < 0.0
-    assert highest_m < 0.3
+    assert -0.9 < it.met_mps < 0.0
+    assert it.highest_m < 0.3
+
+
+@pytest.mark.parametrize("felt_too_much_g", [0.0, 0.02, -0.02])
+@pytest.mark.parametrize("height_m", [0.5, 1.0, 2.0])
+def test_from_high_up_it_comes_down_as_softly(height_m: float, felt_too_much_g: float) -> None:
+    """The axes are swapped in the plane alone. The accelerometer's offset, which would sum up on
+    the longer way, was learned at rest."""
+    felt = Felt().at_rest(BEGIN_S, 1.0 + felt_too_much_g)
+    it = Falls(height_m, HOVER_THRUST, too_much_g=felt_too_much_g)
+    flight = fly(state_in(Phase.ALIGN, z_m=height_m), it, 12.0, MOCAP, feels=felt)
+    assert flight.state.row == "position-astray"
+    assert -0.9 < it.met_mps < 0.0
+
+
+def test_a_felt_speed_that_has_drifted_keeps_nothing_up() -> None:
+    """By an accelerometer whose offset nobody knows it seems to sink faster and faster, and is
+    braked more and more: for so long as the way takes, and no longer."""
+    it = Falls(1.0, HOVER_THRUST, too_much_g=-0.02)
+    fly(state_in(Phase.ALIGN, z_m=1.0), it, 12.0, MOCAP, feels=True)
+    assert it.met_mps < 0.0
 
 
 def test_what_is_astray_and_unfelt_for_a_moment_keeps_the_speed_that_it_had() -> None:
     """A gap in telemetry tells nothing: neither that it stands still nor the estimate's speed."""
     felt = Felt()
-    began = felt(observation(10.0, telemetry=telemetry(10.0)))
+    began = felt(at()(10.0))
     state = replace(
         state_in(Phase.LANDING), astray=True, row="position-astray", last=began.telemetry,
         reckoning=Reckoning(imu=began.imu, velocity_mps=(0.0, 0.0, -0.4)),
     )  # fmt: skip
-    tel = telemetry(10.3, velocity_mps=(0.0, 0.0, 0.8))
-    after, _ = planner.step_mission(state, felt(observation(10.3, telemetry=tel)), MOCAP)
+    wrong = (0.0, 0.0, 0.8)
+    after, _ = step_mission(state, felt(at(velocity_mps=wrong)(10.3)), MOCAP)
     assert after.reckoning.velocity_mps[2] == pytest.approx(-0.4)
-    tel = telemetry(10.32, velocity_mps=(0.0, 0.0, 0.8), acc_z_g=1.1)
-    again, _ = planner.step_mission(after, felt(observation(10.32, telemetry=tel)), MOCAP)
+    again, _ = step_mission(after, felt(at(velocity_mps=wrong, acc_z_g=1.1)(10.32)), MOCAP)
     assert -0.4 < again.reckoning.velocity_mps[2] < -0.38
 
 
 def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:
     """On the floor, by a height that says 0.6 m: the motors are stopped all the same, in time."""
-    state, felt = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0), Felt()
-    thrust = 60000.0
-    for t_s in times(14.0):
-        down = t_s > BEGIN_S + 2.0
-        body_m = (0.0, 0.2, 0.6 if down else 0.0)
-        tel = telemetry(
-            t_s, position_m=body_m, thrust=thrust, supervisor=READY if thrust == 0 else AIRBORNE
-        )
-        obs = felt(observation(t_s, telemetry=tel, target=None))
-        state, command = planner.step_mission(state, obs, MOCAP)
-        if isinstance(command, RawThrust):
-            thrust = float(command.thrust)
-        elif isinstance(command, StopMotors):
-            thrust = 0.0
-        if state.phase.is_over:
-            break
-    assert state.phase is Phase.LANDED
+
+    class OnTheFloor(Motors):
+        def look(self, t_s: float, state: PlannerState) -> Observation:
+            body_m = (0.0, 0.2, 0.6 if t_s > BEGIN_S + 2.0 else 0.0)
+            supervisor = READY if self.thrust == 0 else AIRBORNE
+            return at(
+                obs={"target": None}, position_m=body_m, thrust=self.thrust, supervisor=supervisor
+            )(t_s)
+
+    begin = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0)
+    flight = fly(begin, OnTheFloor(60000.0), 14.0, MOCAP, feels=True)
+    assert flight.state.phase is Phase.LANDED
 
 
-@pytest.mark.parametrize("profile", [PROFILE, MOCAP])
-def test_only_positions_from_outside_go_astray(profile: Any) -> None:
-    tel = telemetry(10.02, position_m=(0.2, 0.0, 0.02))
-    state, _ = planner.step_mission(
-        state_in(Phase.APPROACH, z_m=0.2), observation(10.02, telemetry=tel), profile
-    )
-    assert (state.phase is Phase.LANDING) is (profile is MOCAP)
-
-
-@pytest.mark.parametrize(("phase", "z_m", "aside_m", "lands"), [
-    (Phase.APPROACH, 0.02, 0.08, False), (Phase.APPROACH, 0.2, 0.2, False),
-    (Phase.APPROACH, 0.2, 0.3, True), (Phase.ALIGN, 1.0, 0.6, False), (Phase.ALIGN, 1.0, 0.9, True),
-    (Phase.SEARCH, 0.5, 0.15, False), (Phase.SEARCH, 0.5, 0.3, True),
-    (Phase.ESTIMATE, 0.5, 0.3, True),
-    (Phase.LANDING, 1.0, 0.3, False), (Phase.LANDING, 1.0, 0.5, True),
+@pytest.mark.parametrize(("phase", "body_m", "changes", "profile", "lands"), [
+    (Phase.APPROACH, (0.2, 0.0, 0.02), {}, MOCAP, True),
+    (Phase.APPROACH, (0.2, 0.0, 0.02), {}, PROFILE, False),  # only positions from outside do
+    (Phase.APPROACH, (0.08, 0.0, 0.02), {}, MOCAP, False),  # a draught is not another world
+    (Phase.APPROACH, (0.2, 0.0, 0.2), {}, MOCAP, False),
+    (Phase.APPROACH, (0.3, 0.0, 0.2), {}, MOCAP, True),
+    (Phase.ALIGN, (0.6, 0.0, 1.0), {}, MOCAP, False),
+    (Phase.ALIGN, (0.9, 0.0, 1.0), {}, MOCAP, True),
+    (Phase.SEARCH, (0.15, 0.0, 0.5), {}, MOCAP, False),
+    (Phase.SEARCH, (0.3, 0.0, 0.5), {}, MOCAP, True),
+    (Phase.ESTIMATE, (0.3, 0.0, 0.5), {}, MOCAP, True),
+    (Phase.LANDING, (0.3, 0.0, 1.0), {}, MOCAP, False),
+    (Phase.LANDING, (0.5, 0.0, 1.0), {}, MOCAP, True),
+    # The magnet may hold what has touched the ceiling aside of its setpoint.
+    (Phase.LANDING, (0.5, 0.0, 1.0), {"contact_z_m": 1.0}, MOCAP, False),
 ])  # fmt: skip
-def test_a_draught_is_not_another_world(
-    phase: Phase, z_m: float, aside_m: float, lands: bool
+def test_what_is_carried_off_farther_than_a_draught_leads_is_in_another_world(
+    phase: Phase,
+    body_m: tuple[float, float, float],
+    changes: dict[str, Any],
+    profile: Profile,
+    lands: bool,
 ) -> None:
-    tel = telemetry(10.02, position_m=(aside_m, 0.0, z_m))
-    obs = observation(10.02, telemetry=tel)
-    state, _ = planner.step_mission(state_in(phase, z_m=z_m), obs, MOCAP)
+    begin = replace(state_in(phase, z_m=body_m[2]), **changes)
+    state = fly(begin, at(position_m=body_m), profile=profile).state
     assert (state.row == "position-astray") is lands
 
 
@@ -644,12 +604,13 @@ def test_what_a_gust_carries_off_is_not_in_another_world(
     z_m: float, pushed_s: float, lands: bool
 ) -> None:
     """Moving air is felt as a force from the side. Near the floor nothing asks for it."""
-    tel = telemetry(10.02, position_m=(0.3, 0.0, z_m))
-    obs = observation(10.02, telemetry=tel, imu=ImuMotion(t_s=10.02, pushed_s=pushed_s))
-    state, _ = planner.step_mission(state_in(Phase.ESTIMATE, z_m=0.5), obs, MOCAP)
+    gust = {"imu": ImuMotion(t_s=10.02, pushed_s=pushed_s)}
+    look = at(obs=gust, position_m=(0.3, 0.0, z_m))
+    state = fly(state_in(Phase.ESTIMATE, z_m=0.5), look, profile=MOCAP).state
     assert (state.row == "position-astray") is lands
 
 
+@pytest.mark.parametrize("profile", [MOCAP, PROFILE])
 @pytest.mark.parametrize(
     ("phase", "climb_mps", "lands"),
     [
@@ -658,33 +619,37 @@ def test_what_a_gust_carries_off_is_not_in_another_world(
     ],
 )  # fmt: skip
 def test_positions_that_are_late_swing_it_up_and_down(
-    phase: Phase, climb_mps: float, lands: bool
+    phase: Phase, climb_mps: float, lands: bool, profile: Profile
 ) -> None:
     """A catch falls as fast, and a take-off may be set down by hand."""
-    tel = telemetry(10.02, 1.0, velocity_mps=(0.0, 0.0, climb_mps))
-    for profile in (MOCAP, PROFILE):
-        begin = state_in(phase, z_m=1.0)
-        state, _ = planner.step_mission(begin, observation(10.02, telemetry=tel), profile)
-        assert (state.row == "position-astray") is (lands and profile is MOCAP)
-        if state.row == "position-astray":
-            assert "late" in state.reason
-
-
-def test_what_has_touched_the_ceiling_is_left_to_its_landing() -> None:
-    """The magnet may hold it aside of its setpoint: that is no other world."""
-    begin = replace(state_in(Phase.LANDING, z_m=1.0), contact_z_m=1.0)
-    obs = observation(10.02, telemetry=telemetry(10.02, position_m=(0.5, 0.0, 1.0)))
-    state, _ = planner.step_mission(begin, obs, MOCAP)
-    assert state.row != "position-astray"
+    state = fly(state_in(phase), at(velocity_mps=(0.0, 0.0, climb_mps)), profile=profile).state
+    assert (state.row == "position-astray") is (lands and profile is MOCAP)
+    assert state.row != "position-astray" or "late" in state.reason
 
 
 def test_a_landing_that_goes_astray_is_named_anew_and_flown_level() -> None:
     begin = replace(state_in(Phase.LANDING, z_m=0.5), reason="camera.mount", row="mounting")
-    obs = observation(10.02, telemetry=telemetry(10.02, position_m=(0.5, 0.0, 0.5)))
-    state, command = planner.step_mission(begin, obs, MOCAP)
-    assert isinstance(command, RawThrust)
-    assert state.astray
-    assert "swapped axes" in state.reason
+    flight = fly(begin, at(position_m=(0.5, 0.0, 0.5)), profile=MOCAP)
+    assert isinstance(flight.command, RawThrust)
+    assert flight.state.astray
+    assert "swapped axes" in flight.state.reason
+
+
+def gains_beside(
+    state: PlannerState, beside_mps: float, lasts_s: float, **tel: Any
+) -> tuple[PlannerState, Command]:
+    """Flown by positions that gain so much speed aside which the accelerometer does not feel."""
+    felt = Felt()
+    begun = felt(at()(BEGIN_S))
+    state = replace(state, last=begun.telemetry, reckoning=Reckoning(imu=begun.imu))
+    for t_s in times(lasts_s):
+        if not state.astray:
+            beside = replace(state.reckoning, beside_mps=(0.0, beside_mps))
+            state = replace(state, reckoning=beside)
+        alive = {name: value + 1e-6 * (round(100 * t_s) % 7) for name, value in tel.items()}
+        obs = at(supervisor=AIRBORNE | HL_ACTIVE, **alive)(t_s)
+        state, command = step_mission(state, felt(obs), MOCAP)
+    return state, command
 
 
 @pytest.mark.parametrize("beside_mps", [0.9 * OTHERWISE_MPS, 1.1 * OTHERWISE_MPS])
@@ -692,16 +657,8 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     beside_mps: float,
 ) -> None:
     """It would follow them to its end: 15 m aside within six seconds, where they are mirrored."""
-    felt = Felt()
-    begun = felt(observation(BEGIN_S, telemetry=telemetry(BEGIN_S)))
-    state = replace(
-        state_in(Phase.LANDING), orders=LEAST_ORDERS, ordered_s=BEGIN_S, last=begun.telemetry,
-        reckoning=Reckoning(imu=begun.imu),
-    )  # fmt: skip
-    for t_s in times(0.2):
-        state = replace(state, reckoning=replace(state.reckoning, beside_mps=(0.0, -beside_mps)))
-        tel = telemetry(t_s, supervisor=AIRBORNE | HL_ACTIVE)
-        state, command = planner.step_mission(state, felt(observation(t_s, telemetry=tel)), MOCAP)
+    begin = replace(state_in(Phase.LANDING), orders=LEAST_ORDERS, ordered_s=BEGIN_S)
+    state, command = gains_beside(begin, -beside_mps, 0.2)
     assert state.astray is (beside_mps > OTHERWISE_MPS)
     assert isinstance(command, RawThrust) is state.astray
 
@@ -709,53 +666,6 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
 def test_a_tilt_that_wrong_positions_have_turned_is_taken_off_the_reckoned_motion() -> None:
     """They have added 0.3 m/s to the left: so the attitude leans by 0.05 rad that the vehicle does
     not, and what is reckoned by it would brake a speed that is none."""
-    felt = Felt()
-    begun = felt(observation(BEGIN_S, telemetry=telemetry(BEGIN_S)))
-    state = replace(state_in(Phase.ALIGN), last=begun.telemetry, reckoning=Reckoning(begun.imu))
-    for t_s in times(1.5):
-        if not state.astray:
-            beside = replace(state.reckoning, beside_mps=(0.0, 0.3))
-            state = replace(state, reckoning=beside)
-        tel = telemetry(t_s, roll_rad=-0.05 + 1e-6 * (round(100 * t_s) % 7))  # alive
-        state, _ = planner.step_mission(state, felt(observation(t_s, telemetry=tel)), MOCAP)
+    state, _ = gains_beside(state_in(Phase.ALIGN), 0.3, 1.5, roll_rad=-0.05)
     assert state.row == "position-astray"
     assert abs(state.reckoning.velocity_mps[1]) < 0.15
-
-
-def come_down(height_m: float, felt: Felt, felt_too_much_g: float) -> tuple[PlannerState, float]:
-    """A vehicle in a world whose axes are swapped in the plane alone, until it meets the floor:
-    with what speed, 0 if it does not."""
-    state = state_in(Phase.ALIGN, z_m=height_m)
-    z_m, up_mps, thrust = height_m, 0.0, state.hover_thrust
-    for t_s in times(12.0):
-        acc_g = thrust / HOVER_THRUST
-        up_mps += 9.81 * (acc_g - 1.0) * TURN_S
-        z_m += up_mps * TURN_S
-        aside_m = 2.0 * (t_s - BEGIN_S)
-        tel = telemetry(
-            t_s, position_m=(aside_m, 0.0, z_m), velocity_mps=(2.0, 0.0, up_mps), thrust=thrust,
-            acc_z_g=acc_g + felt_too_much_g,
-        )  # fmt: skip
-        obs = felt(observation(t_s, telemetry=tel, target=None))
-        state, command = planner.step_mission(state, obs, MOCAP)
-        if isinstance(command, RawThrust):
-            thrust = float(command.thrust)
-        if z_m <= 0.0:
-            return state, up_mps
-    return state, 0.0
-
-
-@pytest.mark.parametrize("felt_too_much_g", [0.0, 0.02, -0.02])
-@pytest.mark.parametrize("height_m", [0.5, 1.0, 2.0])
-def test_from_high_up_it_comes_down_as_softly(height_m: float, felt_too_much_g: float) -> None:
-    """The accelerometer's offset, which would sum up on the longer way, was learned at rest."""
-    felt = Felt().at_rest(BEGIN_S, 1.0 + felt_too_much_g)
-    state, up_mps = come_down(height_m, felt, felt_too_much_g)
-    assert state.row == "position-astray"
-    assert -0.9 < up_mps < 0.0
-
-
-def test_a_felt_speed_that_has_drifted_keeps_nothing_up() -> None:
-    """By an accelerometer whose offset nobody knows it seems to sink faster and faster, and is
-    braked more and more: for so long as the way takes, and no longer."""
-    assert come_down(1.0, Felt(), -0.02)[1] < 0.0

@@ -24,7 +24,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.guidance import FLOOR_M, limited
 from perchctl.mission.state import FLYING_PHASES
 from perchctl.profile import Profile
-from perchctl.vehicle import FULL_THRUST, PositionSetpoint
+from perchctl.vehicle import FULL_THRUST, Command, PositionSetpoint
 from tests.helpers.mission import (
     CEILING_M,
     PROFILE,
@@ -33,8 +33,8 @@ from tests.helpers.mission import (
     observation,
     state_in,
     target_at,
-    telemetry,
 )
+from tests.mission.rig import BEGIN_S, Motors, at, fly, is_setpoint, times
 
 CONTACT_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
 
@@ -49,57 +49,46 @@ def flown(
     **tel: Any,
 ) -> PlannerState:
     """For so long in that state of flight, or until the phase changes."""
-    for i in range(1, round(for_s / 0.02) + 1):
-        t_s = 10.0 + 0.02 * i
+    for t_s in times(for_s):
         if setpoint_z_m is not None:
             state = replace(state, setpoint=PositionSetpoint(0.0, 0.0, setpoint_z_m, 0.0))
-        sample = telemetry(t_s, z_m, **tel)
-        target = target_at(t_s, (aside_m, 0.0, CEILING_M), sample.position_m)
-        obs = observation(t_s, telemetry=sample, target=target)
-        new, _ = planner.step_mission(state, obs, profile)
+        target = target_at(t_s, (aside_m, 0.0, CEILING_M), (0.0, 0.0, z_m))
+        new, _ = planner.step_mission(state, at(z_m, obs={"target": target}, **tel)(t_s), profile)
         if new.phase is not state.phase:
             return new
         state = new
     return state
 
 
-def learned(**how: Any) -> float:
-    """The hover thrust after a second in ESTIMATE."""
+@pytest.mark.parametrize(
+    ("how", "learns"),
+    [
+        ({}, True),
+        ({"velocity_mps": (0.0, 0.0, 0.25)}, True),  # a steady climb takes no more
+        ({"setpoint_z_m": 1.3}, False),
+        ({"acc_z_g": 1.2}, False),
+        ({"acc_z_g": 0.8}, False),
+        ({"velocity_mps": (0.0, 0.0, 0.29)}, False),
+        ({"velocity_mps": (0.4, 0.0, 0.0)}, False),
+        ({"behind_s": 0.2}, False),
+    ],
+    ids=["quiet", "climbs", "pressed", "speeds up", "brakes", "climbs hard", "journey", "stale"],
+)
+def test_only_quiet_flight_teaches_the_hover_thrust(how: dict[str, Any], learns: bool) -> None:
     start = replace(state_in(Phase.ESTIMATE), hover_thrust=0.0, target_spread_m=1.0)
-    return flown(start, 0.3, thrust=50000.0, **how).hover_thrust
-
-
-def test_quiet_flight_teaches_the_hover_thrust() -> None:
-    assert learned() == 50000.0
-    assert learned(velocity_mps=(0.0, 0.0, 0.25)) == 50000.0  # a steady climb takes no more
+    assert flown(start, 0.3, thrust=50000.0, **how).hover_thrust == (50000.0 if learns else 0.0)
 
 
 @pytest.mark.parametrize(
-    "how",
-    [
-        {"setpoint_z_m": 1.3},
-        {"acc_z_g": 1.2},
-        {"acc_z_g": 0.8},
-        {"velocity_mps": (0.0, 0.0, 0.29)},
-        {"velocity_mps": (0.4, 0.0, 0.0)},
-        {"behind_s": 0.2},
-    ],
-    ids=["pressed", "speeding up", "braking", "climbing hard", "journey", "stale"],
+    ("hover", "thrust"),
+    [(60000.0, 65535.0), (40000.0, 22000.0), (40000.0, 30000.0), (40000.0, 50000.0)],
 )
-def test_what_is_no_hover_teaches_nothing(how: dict[str, Any]) -> None:
-    assert learned(**how) == 0.0
-
-
-def test_saturated_thrust_teaches_nothing() -> None:
-    start = replace(state_in(Phase.ALIGN), hover_thrust=60000.0)
-    assert flown(start, 0.3, thrust=float(FULL_THRUST)).hover_thrust == 60000.0
-
-
-@pytest.mark.parametrize("ratio", [0.55, 0.75, 1.25])
-def test_nothing_hovers_on_much_less_or_more_than_before(ratio: float) -> None:
+def test_saturated_nothing_is_learned_nor_much_less_or_more_than_before(
+    hover: float, thrust: float
+) -> None:
     """It is held by the ceiling or by a hand; learned, it would hide that."""
-    start = replace(state_in(Phase.ALIGN), hover_thrust=40000.0, target_spread_m=1.0)
-    assert flown(start, 0.3, thrust=ratio * 40000.0).hover_thrust == 40000.0
+    start = replace(state_in(Phase.ALIGN), hover_thrust=hover, target_spread_m=1.0)
+    assert flown(start, 0.3, thrust=thrust).hover_thrust == hover
 
 
 @pytest.mark.parametrize(("z_m", "learns"), [(1.0, True), (CONTACT_Z_M - 0.05, False)])
@@ -141,32 +130,30 @@ def test_a_press_that_could_not_press_is_not_begun(hover: float, presses: bool) 
         assert "too heavy" in state.reason
 
 
-def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed() -> None:
-    """It hovers below its setpoint on all the thrust there is, as it did before on nearly all."""
-    start = replace(state_in(Phase.ALIGN), hover_thrust=62500.0)
-    state = flown(start, 1.9, thrust=float(FULL_THRUST), setpoint_z_m=1.2, aside_m=0.2)
-    assert state.phase is Phase.ALIGN
-    state = flown(start, 2.5, thrust=float(FULL_THRUST), setpoint_z_m=1.2, aside_m=0.2)
-    assert state.row == "too-weak"
-    assert "battery too low" in state.reason
-
-
-def test_a_strong_vehicle_at_full_thrust_is_pressed() -> None:
-    state = flown(
-        state_in(Phase.ALIGN), 1.0, thrust=float(FULL_THRUST), setpoint_z_m=1.2, aside_m=0.2
-    )
-    assert state.row == "blocked"
+@pytest.mark.parametrize(
+    ("hover", "lasts_s", "row"),
+    [
+        # It hovers below its setpoint on all the thrust there is, as before on nearly all.
+        (62500.0, 1.9, ""),
+        (62500.0, 2.5, "too-weak"),
+        (56000.0, 1.0, "blocked"),
+    ],
+)
+def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
+    hover: float, lasts_s: float, row: str
+) -> None:
+    start = replace(state_in(Phase.ALIGN), hover_thrust=hover)
+    full = {"thrust": float(FULL_THRUST), "setpoint_z_m": 1.2, "aside_m": 0.2}
+    state = flown(start, lasts_s, **full)
+    assert state.row == row
+    assert row != "too-weak" or "battery too low" in state.reason
 
 
 def test_a_change_of_phase_does_not_hide_a_weak_vehicle() -> None:
-    state, rows = replace(state_in(Phase.ALIGN), hover_thrust=62500.0), []
-    for i in range(1, 115):
-        t_s = 10.0 + 0.02 * i
-        sample = telemetry(t_s, thrust=float(FULL_THRUST))
-        state, _ = planner.step_mission(state, observation(t_s, telemetry=sample), PROFILE)
-        rows.append(state.row)
-    assert "aligned" in rows
-    assert rows[-1] == "too-weak"
+    start = replace(state_in(Phase.ALIGN), hover_thrust=62500.0)
+    flight = fly(start, at(thrust=float(FULL_THRUST)), 2.28)
+    assert "aligned" in flight.rows
+    assert flight.state.row == "too-weak"
 
 
 @pytest.mark.parametrize(
@@ -186,20 +173,17 @@ def test_a_reading_that_stands_still_under_a_changed_order_is_stale(
         state_in(Phase.COMPLETE, z_m=CONTACT_Z_M), raw_order=raw_order, released_s=9.5,
         setpoint=None if raw_order else PositionSetpoint(0.0, 0.0, CONTACT_Z_M, 0.0),
     )  # fmt: skip
-    for i in range(1, 20):
-        t_s = 10.0 + 0.02 * i
-        obs = observation(t_s, telemetry=telemetry(t_s, CONTACT_Z_M, thrust=reads))
-        state = replace(lander.observed(state, obs, PROFILE), t_s=t_s, last=obs.telemetry)
+    for t_s in times(0.38):
+        obs = at(CONTACT_Z_M, thrust=reads)(t_s)
+        state = replace(lander.observe(state, obs, PROFILE), t_s=t_s, last=obs.telemetry)
     c = Context(state, obs, PROFILE)
-    assert c.thrust_is_known is known
-    held = CONDITIONS[Condition.MAGNET_HOLDS](c)
-    assert held is known
+    assert c.thrust_is_known is CONDITIONS[Condition.MAGNET_HOLDS](c) is known
 
 
 def pressed_late(t_s: float, late_s: float) -> Observation:
     """A vehicle that touches something with all its thrust, seen by a late turn."""
-    sample = telemetry(t_s, CONTACT_Z_M, thrust=float(FULL_THRUST))
-    return observation(t_s, telemetry=sample, target=None, new_frame=False, loop_late_s=late_s)
+    late = {"target": None, "new_frame": False, "loop_late_s": late_s}
+    return at(CONTACT_Z_M, obs=late, thrust=float(FULL_THRUST))(t_s)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.3])
@@ -242,42 +226,43 @@ def test_no_setpoint_lies_in_the_ground(z_m: float, phase: Phase) -> None:
     assert sent == z_m or z_m < lowest or z_m > GROUND_Z_M + PROFILE.safety.max_height_m
 
 
-def test_a_target_that_seems_to_lie_below_is_not_dived_to() -> None:
+class Follows(Motors):
+    """Where its setpoint is; its target is placed below, or as it is."""
+
+    def __init__(self, follows: float, **obs: Any) -> None:
+        super().__init__()
+        self.z_m, self.obs, self.follows, self.sent_m = 1.0, obs, follows, [1.0]
+
+    def look(self, t_s: float, state: PlannerState) -> Observation:
+        return at(self.z_m, obs=self.obs)(t_s)
+
+    def obey(self, state: PlannerState, command: Command) -> None:
+        if isinstance(command, PositionSetpoint):
+            self.sent_m.append(command.z_m)
+            self.z_m += self.follows * (command.z_m - self.z_m)
+
+
+@pytest.mark.parametrize("phase", [Phase.SEARCH, Phase.ASCEND, Phase.PERCH])
+def test_a_target_that_seems_to_lie_below_is_not_dived_to(phase: Phase) -> None:
     """SEARCH looks for a target that it knows from below it."""
-    for phase in (Phase.SEARCH, Phase.ASCEND, Phase.PERCH):
-        state, z_m = state_in(phase), 1.0
-        for i in range(1, 400):
-            t_s = 10.0 + 0.02 * i
-            body_m = (0.0, 0.0, z_m)
-            target = target_at(t_s, (0.0, 0.0, -1.0), body_m, tracked=False, measured=False)
-            tel = telemetry(t_s, position_m=body_m)
-            obs = observation(t_s, telemetry=tel, target=target)
-            state, command = planner.step_mission(state, obs, PROFILE)
-            if isinstance(command, PositionSetpoint):
-                assert command.z_m >= FLOOR_M
-                z_m = command.z_m
+    below = target_at(BEGIN_S, (0.0, 0.0, -1.0), tracked=False, measured=False)
+    it = Follows(1.0, target=below)
+    fly(state_in(phase), it, 8.0)
+    assert min(it.sent_m) >= FLOOR_M
 
 
 def test_a_take_off_begins_on_the_ground() -> None:
-    state = planner.start_mission(observation(0.0, 0.0))
-    tel = telemetry(0.02, 0.0, thrust=0.0, supervisor=READY)
-    _, command = planner.step_mission(state, observation(0.02, telemetry=tel), PROFILE)
-    assert isinstance(command, PositionSetpoint)
-    assert command.z_m < FLOOR_M
+    begin = planner.start_mission(observation(BEGIN_S, 0.0))
+    flight = fly(begin, at(0.0, thrust=0.0, supervisor=READY))
+    assert is_setpoint(flight.command, below_m=FLOOR_M)
 
 
 @pytest.mark.parametrize("handover_m", [0.1, 0.3])
 def test_a_landing_is_handed_over_above_the_floor(handover_m: float) -> None:
     """The lowest setpoint of a landing still leads below where it is handed over."""
     profile = changed({"planner.landing.handover_m": handover_m})
-    state, z_m, lowest_m = state_in(Phase.ALIGN), 1.0, 1.0
-    for i in range(1, 1000):
-        t_s = 10.0 + 0.02 * i
-        obs = observation(t_s, z_m, operator=Operator.LAND)
-        state, command = planner.step_mission(state, obs, profile)
-        if not isinstance(command, PositionSetpoint):
-            break
-        lowest_m = command.z_m
-        z_m += 0.1 * (command.z_m - z_m)
-    assert state.orders == 1
-    assert FLOOR_M <= lowest_m < handover_m
+    it = Follows(0.1, operator=Operator.LAND)
+    flight = fly(state_in(Phase.ALIGN), it, 20.0, profile)
+    ordered = next(i for i, c in enumerate(flight.commands) if not isinstance(c, PositionSetpoint))
+    assert flight.ticks[ordered].state.orders == 1
+    assert FLOOR_M <= it.sent_m[ordered] < handover_m
