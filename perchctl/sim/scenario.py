@@ -58,7 +58,6 @@ class Scenario:
         no_target: the ceiling is bare.
         camera_freeze_at_s, camera_gone_at_s: faults; None means never.
         motor_strength: what is left of each motor's thrust, M1..M4.
-        propeller_shake_g: what each propeller at full shakes the accelerometer by, rms.
         cell_resistance_ohm: of the battery; None means a good one.
         cell_slow_ohm: more of it, that an old or cold cell shows within seconds.
         cell_charge: what an old cell still holds, as a share of a new one's.
@@ -118,7 +117,6 @@ class Scenario:
     magnet_force_n: float = 1.2
     first_contact_force_n: float | None = None
     motor_strength: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
-    propeller_shake_g: tuple[float, float, float, float] = (0.05, 0.05, 0.05, 0.05)
     cell_resistance_ohm: float | None = None
     cell_slow_ohm: float = 0.0
     cell_charge: float = 1.0

@@ -11,14 +11,7 @@ from perchctl.sim.firmware.controller import MODE_RAW, Controller, Setpoint
 from perchctl.sim.firmware.estimator import Estimator
 from perchctl.sim.firmware.outside import SETTINGS
 from perchctl.sim.firmware.planner import HighLevelCommand, Planner
-from perchctl.sim.firmware.power import (
-    BATTERY,
-    MOTORS_OFF,
-    PROPELLERS,
-    Health,
-    MotorDriver,
-    PowerMonitor,
-)
+from perchctl.sim.firmware.power import MOTORS_OFF, MotorDriver, PowerMonitor
 from perchctl.sim.firmware.supervisor import EVERY as SUPERVISOR_EVERY
 from perchctl.sim.firmware.supervisor import State, Supervisor
 from perchctl.sim.firmware.variables import (
@@ -74,7 +67,6 @@ class Firmware:
         self.controller = Controller()
         self.driver = MotorDriver()
         self.power = PowerMonitor(self.world.battery_v)
-        self.health = Health(self.scenario)
         self._pressed = False
         if self.scenario.extra.get("external_position"):
             self._parameters["deck.bcFlow2"] = 0.0  # outside positions instead of a deck
@@ -92,9 +84,6 @@ class Firmware:
         step = self._steps
         t_s = step * CONTROL_PERIOD_S
         supervisor = self.supervisor
-        if self.health.testing:
-            self._test(t_s)
-            return
         self.estimator.update(
             self.world,
             t_s,
@@ -135,18 +124,6 @@ class Firmware:
         self.motors = motors
         self._steps = step + 1
         self.world.step(motors)
-
-    def _test(self, t_s: float) -> None:
-        """A control period of a health test, in which nothing else is heard (source)."""
-        for name in (PROPELLERS, BATTERY):
-            self._parameters[f"health.{name}"] = 0.0
-        self.motors = self.health.pwm(
-            self.world.powertrain.forces_n, self.world.battery_v, self._parameters
-        )
-        if self._steps % SUPERVISOR_EVERY == 0:
-            self.power.update(t_s, self.world.battery_v, self._parameters)
-        self._steps += 1
-        self.world.step(self.motors)
 
     # Commands -----------------------------------------------------------------------
 
@@ -258,9 +235,6 @@ class Firmware:
             self.estimator.hears_outside = value == ESTIMATOR_KALMAN
         elif name in SETTINGS:
             self.estimator.set_outside(name, value)
-        elif name in (f"health.{PROPELLERS}", f"health.{BATTERY}"):
-            if value:
-                self.health.start(name.removeprefix("health."))
         elif name == "stabilizer.stop":
             self.supervisor.emergency = self.supervisor.emergency or value != 0.0
         else:
