@@ -17,7 +17,7 @@ from perchctl.sim.capture import CaptureFault, CaptureSettings
 from perchctl.sim.scenario import Neighbour, Scenario
 
 _STREAM, _GROUPS_STREAM, _IMU_STREAM = 1, 21, 22  # the scenario's own random streams
-_AIR, _CELL, _TILT, _FLOW, _RADIO, _CAPTURE = 0, 1, 2, 4, 6, 7
+_AIR, _CELL, _TILT, _RADIO, _CAPTURE = 0, 1, 2, 6, 7
 _LONGEST_S = 240.0
 """No simulated flight lasts longer."""
 _LEAST_GAP_S = 1.0
@@ -168,8 +168,8 @@ def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
 
 def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
     """Fields of the scenario. Where the ranges are those of `sim`, its defaults."""
-    air, cell, tilt, flow, radio, capture = (
-        _Draws(seed, group) for group in (_AIR, _CELL, _TILT, _FLOW, _RADIO, _CAPTURE)
+    air, cell, tilt, radio, capture = (
+        _Draws(seed, group) for group in (_AIR, _CELL, _TILT, _RADIO, _CAPTURE)
     )
     ohm = sim.cell_resistance_ohm
     return {
@@ -179,7 +179,6 @@ def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
         "cell_charge": cell.between(sim.cell_charge),
         "cell_knee": cell.between(sim.cell_knee),
         "target_tilt_rad": _tilt(sim, tilt),
-        **_flow(sim, flow),
         "radio_loss": radio.between(sim.radio_loss),
         "radio_burst_s": radio.between(sim.radio_burst_s),
         "capture_holes_s": _capture_holes(sim, capture),
@@ -207,15 +206,6 @@ def _tilt(sim: SimulationConfig, draws: _Draws) -> tuple[float, float]:
         return (0.0, 0.0)
     # Lifted on the side of +x is a turn about -y, on that of +y one about x.
     return (tilt_rad * math.sin(towards_rad), -tilt_rad * math.cos(towards_rad))
-
-
-def _flow(sim: SimulationConfig, draws: _Draws) -> dict[str, Any]:
-    noise, bias = draws.between(sim.flow_noise_radps), draws.angle_rad(sim.flow_bias_dps)
-    fields: dict[str, Any] = {"flow_noise_radps": noise, "flow_reach_m": sim.flow_reach_m}
-    angle = draws.angle_rad()
-    if bias:
-        fields["flow_bias_radps"] = (bias * math.cos(angle), bias * math.sin(angle))
-    return fields
 
 
 def _capture_holes(sim: SimulationConfig, draws: _Draws) -> tuple[tuple[float, float], ...]:

@@ -45,9 +45,6 @@ class EventExplainer:
             return self._silence(t_s)
         if event.row in UNSEEN and (hidden := self._hidden(t_s)):
             return hidden
-        reach_m = scenario.flow_reach_m
-        if event.row in UNSURE and reach_m is not None and scenario.ceiling_z_m > reach_m:
-            return f"the flow deck is blind above {reach_m:g} m"
         return ""
 
     def _lost_frames(self, t_s: float) -> str:

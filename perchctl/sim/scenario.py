@@ -69,8 +69,6 @@ class Scenario:
             too much; body axes, of a vehicle without a deck (`perchctl.sim.firmware.outside`).
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
         target_tilt_rad: the target's turns about the world's x and y, after its heading.
-        flow_noise_radps, flow_bias_radps: of the flow deck's readings, the latter in x and y.
-        flow_reach_m: above this it sees no flow; None: it always does.
         radio_loss, radio_burst_s: share of the time in which no packet passes, and how long
             such a time lasts on average (`perchctl.sim.bursts`).
         capture_holes_s: begin and length of the times in which a motion capture does not see
@@ -130,9 +128,6 @@ class Scenario:
     neighbours: tuple[Neighbour, ...] = ()
     ceiling_suction: float = 0.10
     target_tilt_rad: tuple[float, float] = (0.0, 0.0)
-    flow_noise_radps: float = 0.0
-    flow_bias_radps: tuple[float, float] = (0.0, 0.0)
-    flow_reach_m: float | None = None
     radio_loss: float = 0.0
     radio_burst_s: float = 0.1
     capture_holes_s: tuple[tuple[float, float], ...] = ()

@@ -48,12 +48,10 @@ def test_a_log_of_an_earlier_version_is_read() -> None:
 @pytest.mark.parametrize(
     "keys",
     [
-        {"flow_noise_radps": (-0.1, 0.2)},
         {"radio_loss": (0.0, 0.9)},
         {"radio_burst_s": (0.0, 0.1)},
         {"target_tilt_deg": (3.0, 1.0)},
         {"cell_charge": (0.0, 1.0)},
-        {"flow_reach_m": 0.0},
     ],
 )
 def test_what_cannot_be_is_refused(keys: dict[str, Any]) -> None:

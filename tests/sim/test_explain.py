@@ -31,7 +31,6 @@ def hold(reason: str) -> Event:
     return Event(0.0, EventKind.HOLD, reason, Phase.ASCEND, severity=Severity.HOLD)
 
 
-BLIND = Scenario(ceiling_z_m=2.8, flow_reach_m=2.5)
 HIDDEN = Scenario(capture_holes_s=((8.0, 1.0),))
 NO_PICTURE = hold("no picture for 0.5 s")
 
@@ -43,7 +42,6 @@ NO_PICTURE = hold("no picture for 0.5 s")
         (BURST, NO_PICTURE, 10.6, "15 frames lost"),
         (WEAK, phase("slipped"), 5.0, "the first contact holds 20 % of the weight"),
         (Scenario(no_target=True), phase("searched-out"), 9.0, "there is no target"),
-        (BLIND, phase("estimate-unsure"), 9.0, "the flow deck is blind above 2.5 m"),
         (HIDDEN, phase("position-lost"), 9.5, "the motion capture did not see it for 1.0 s"),
     ],
 )
@@ -61,7 +59,6 @@ def test_a_condition_is_told_with_what_it_led_to(
         (BURST, phase("ascend-lost"), 12.0),
         (BURST, hold("telemetry is 0.5 s old"), 10.6),
         (BURST, phase("slipped"), 10.6),
-        (Scenario(flow_reach_m=2.5), phase("estimate-unsure"), 9.0),
         (HIDDEN, phase("position-lost"), 11.0),
     ],
 )
