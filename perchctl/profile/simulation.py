@@ -20,7 +20,7 @@ Bursts = Ordered[Annotated[float, Field(ge=0.01, le=10)]]
 
 
 class SimulationConfig(Section):
-    """Ranges from which a seed draws one flight's conditions (`perchctl.sim.draw`)."""
+    """Ranges from which a seed draws one flight's conditions (`perchctl.sim.scenario`)."""
 
     start_offset_m: float = key(
         0.5, "start under the target, at most so far aside in x and in y", ge=0, le=5

@@ -25,6 +25,8 @@ from perchctl.geometry import (
     rotation_from_rpy,
 )
 from perchctl.positioning import BodyPose, CaptureFrame
+from perchctl.profile import Profile
+from perchctl.sim.scenario import draw_scenario
 
 if TYPE_CHECKING:
     from perchctl.sim.world import World
@@ -119,6 +121,25 @@ class CaptureSettings:
     def names(self) -> tuple[str, ...]:
         """The names of all rigid bodies, the vehicle's first."""
         return (self.body, *(other.name for other in self.others))
+
+
+def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
+    """The motion capture of that seed's flight; None where the vehicle's decks do it."""
+    config, sim = profile.positioning, profile.simulation
+    if config.by != "mocap":
+        return None
+    roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
+    holes = draw_scenario(profile, seed).capture_holes_s
+    hidden = CaptureFault(occluded=True)
+    return CaptureSettings(
+        body=config.body,
+        body_rpy_rad=(roll, pitch, yaw),
+        body_position_m=config.body_position_m,
+        delay_s=sim.capture_delay_s,
+        position_noise_m=sim.capture_noise_m,
+        faults=tuple((begin_s, begin_s + length_s, hidden) for begin_s, length_s in holes),
+        seed=seed,
+    )
 
 
 def axes_matrix(axes: str) -> Array:

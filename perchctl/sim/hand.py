@@ -25,9 +25,8 @@ from perchctl.camera import unmirror_frame
 from perchctl.geometry import Array, invert_T, make_T, rotation_from_rpy, rpy_from_rotation
 from perchctl.profile import Profile
 from perchctl.sim.camera import DeliveredFrame, SimCamera
-from perchctl.sim.draw import draw_scenario
 from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import Scenario
+from perchctl.sim.scenario import Scenario, draw_scenario
 from perchctl.vision import CameraModel, Frame
 
 HAND_STREAM = 430

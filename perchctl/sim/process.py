@@ -34,7 +34,7 @@ from perchctl.children import (
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
 from perchctl.profile import TargetConfig
 from perchctl.sim.capture import CaptureSettings
-from perchctl.sim.crtp.server import LinkOptions
+from perchctl.sim.crtp import LinkOptions
 from perchctl.sim.scenario import Scenario
 from perchctl.vision import CameraModel
 

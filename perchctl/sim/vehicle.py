@@ -10,7 +10,7 @@ from perchctl.link import Packet
 from perchctl.profile import TargetConfig
 from perchctl.sim.camera import SimCamera
 from perchctl.sim.capture import CaptureSettings, SimCapture
-from perchctl.sim.crtp.server import CommandService
+from perchctl.sim.crtp import CommandService
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario

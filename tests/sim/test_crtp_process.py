@@ -23,8 +23,7 @@ from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.link import Packet, Port
 from perchctl.places import data_file
 from perchctl.sim import CONTROL_PERIOD_S, Scenario, SimProcess
-from perchctl.sim.endpoint import MjpegServer
-from perchctl.sim.host import MAX_LAG_S, Runner
+from perchctl.sim.host import MAX_LAG_S, MjpegServer, Runner
 from tests.helpers.crtp_rig import ROOT, WAIT_S, Client, pictures_of, wired
 
 

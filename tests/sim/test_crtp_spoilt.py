@@ -12,7 +12,7 @@ from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 from cflib.utils.power_switch import PowerSwitch
 
 from perchctl.sim import Scenario, SimProcess
-from perchctl.sim.crtp.server import LinkOptions
+from perchctl.sim.crtp import LinkOptions
 from perchctl.sim.host import VehicleHost
 from perchctl.sim.process import HostSetup
 from tests.helpers.crtp_rig import LOCKED_BIT, READY, Client, Pilot, log_block, wired

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
-from perchctl.sim.firmware.controller import MODE_RAW, Controller, Setpoint
+from perchctl.sim.firmware.controller import (
+    MODE_RAW,
+    MOTORS_OFF,
+    Controller,
+    MotorDriver,
+    Setpoint,
+)  # fmt: skip
 from perchctl.sim.firmware.estimator import Estimator
 from perchctl.sim.firmware.outside import SETTINGS
 from perchctl.sim.firmware.planner import HighLevelCommand, Planner
-from perchctl.sim.firmware.power import MOTORS_OFF, MotorDriver, PowerMonitor
 from perchctl.sim.firmware.supervisor import EVERY as SUPERVISOR_EVERY
 from perchctl.sim.firmware.supervisor import State, Supervisor
 from perchctl.sim.firmware.variables import (
@@ -269,3 +274,32 @@ class Firmware:
             (now.vx_mps, now.vy_mps, now.vz_mps),
             math.radians(now.yaw_deg),
         )
+
+
+# --- The battery as the power management reports it: voltage, level, low-power state -----------
+
+
+ON_BATTERY, LOW_POWER = 0, 3
+LOW_DELAY_S = 5.0
+_BATTERY_FILTER = 0.2  # at 25 Hz
+# Voltages at which the level leaves 0, 10, ... 90 per cent.
+_LEVELS_V = (3.00, 3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10)
+
+
+class PowerMonitor:
+    """`update` at 25 Hz. Low below `pm.lowVoltage` for 5 s (docs/firmware.md, "Link")."""
+
+    def __init__(self, battery_v: float) -> None:
+        self.battery_v = battery_v
+        self.state = ON_BATTERY
+        self._fine_s = 0.0
+
+    @property
+    def level_percent(self) -> int:
+        return 10 * max(0, sum(self.battery_v >= v for v in _LEVELS_V) - 1)
+
+    def update(self, t_s: float, battery_v: float, parameters: Mapping[str, float]) -> None:
+        self.battery_v += _BATTERY_FILTER * (battery_v - self.battery_v)
+        if self.battery_v >= parameters["pm.lowVoltage"]:
+            self._fine_s = t_s
+        self.state = LOW_POWER if t_s - self._fine_s > LOW_DELAY_S else ON_BATTERY
