@@ -118,6 +118,7 @@ GONE = frozenset(
     for key in (
         "bare_floor_aside_m",
         "bare_floor_m",
+        "camera_receiver_noise",
         "draught_towards_deg",
         "drift_xyz_mps",
         "estimate_tilt_bias_xy_deg",

@@ -62,7 +62,6 @@ class SimulationConfig(Section):
         gt=0,
         le=200,
     )
-    camera_receiver_noise: ClassVar[float] = 0.0  # that the receiver adds; of 255, one sigma
     camera_blank_rate: float = key(
         0.0, "share of pictures in whose place the screen is blue", ge=0, lt=1
     )

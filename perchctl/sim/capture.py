@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import re
 import socket
 import struct
 import threading
@@ -33,12 +32,7 @@ if TYPE_CHECKING:
 
 _STREAM = 13
 _JITTER_LIMIT_SIGMAS = 3.0
-_AXES = re.compile(r"([+-])([xyz])([+-])([xyz])([+-])([xyz])")
-TRUE_AXES = "+x+y+z"
-Y_UP = "+x+z-y"
-"""The capture's second axis is up, as some systems have it out of the box."""
-SWAPPED_XY = "+y-x+z"
-"""The capture's axes lie a quarter turn from those along which its bodies were defined."""
+TRUE_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 MILLIMETRES_PER_M = 1000.0
 
 
@@ -61,9 +55,8 @@ class CaptureFault:
         swapped: the vehicle's body and the first other one have changed names.
         scale: of all positions; 1000 is millimetres.
         mirrored: positions with y's sign turned, as a left-handed program sends them.
-        axes: the capture's axes in the world's, such as `+x+z-y`; None: as in the settings.
+        axes: rows (3, 3) of the turn from the world's axes to the capture's.
         late_s: more than the settings' delay.
-        rate_hz: at most so many frames a second.
     """
 
     occluded: bool = False
@@ -72,13 +65,8 @@ class CaptureFault:
     swapped: bool = False
     scale: float = 1.0
     mirrored: bool = False
-    axes: str | None = None
+    axes: tuple[tuple[float, ...], ...] = TRUE_AXES
     late_s: float = 0.0
-    rate_hz: float = math.inf
-
-    def __post_init__(self) -> None:
-        if self.axes is not None:
-            axes_matrix(self.axes)
 
 
 @dataclass(frozen=True)
@@ -90,7 +78,6 @@ class CaptureSettings:
         rate_hz: of its cameras.
         delay_s, jitter_s: from an exposure to the frame's arrival; one sigma of it.
         position_noise_m, attitude_noise_rad: one sigma, each axis.
-        axes: the capture's axes in the world's.
         heading_rad, origin_m: of the simulator's world in the capture's.
         faults: (from s, to s, what), on the simulation's clock.
     """
@@ -104,14 +91,12 @@ class CaptureSettings:
     jitter_s: float = 0.0005
     position_noise_m: float = 0.001
     attitude_noise_rad: float = 0.005
-    axes: str = TRUE_AXES
     heading_rad: float = 0.0
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     faults: tuple[tuple[float, float, CaptureFault], ...] = ()
     seed: int = 0
 
     def __post_init__(self) -> None:
-        axes_matrix(self.axes)
         if not self.rate_hz > 0.0:
             raise InvalidValue(f"a motion capture at {self.rate_hz:g} Hz sees nothing")
         if len(set(self.names)) < len(self.names):
@@ -142,20 +127,6 @@ def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
     )
 
 
-def axes_matrix(axes: str) -> Array:
-    """(3, 3): world vector to the capture's. Errors: InvalidValue for what is no right-handed
-    set of axes."""
-    parts = _AXES.fullmatch(axes)
-    matrix = np.zeros((3, 3))
-    if parts is not None:
-        for row in range(3):
-            sign, axis = parts.group(2 * row + 1), parts.group(2 * row + 2)
-            matrix[row, "xyz".index(axis)] = 1.0 if sign == "+" else -1.0
-    if round(float(np.linalg.det(matrix))) != 1:
-        raise InvalidValue(f"axes {axes!r} are none; right-handed ones are such as {Y_UP!r}")
-    return matrix
-
-
 class SimCapture:
     """Exposes at `rate_hz`; same settings and flight, same frames.
 
@@ -177,7 +148,6 @@ class SimCapture:
         self._due_s = float(self._rng.random()) / settings.rate_hz
         self._t_s = 0.0
         self._arrival_s = -math.inf
-        self._delivered_s = -math.inf
         self._before: dict[str, BodyPose] = {}
         self._under_way: deque[CaptureFrame] = deque()
 
@@ -199,10 +169,8 @@ class SimCapture:
         jitter = float(np.clip(self._rng.normal(), -_JITTER_LIMIT_SIGMAS, _JITTER_LIMIT_SIGMAS))
         faults = [fault for since_s, to_s, fault in self._faults if since_s <= t_s < to_s]
         bodies = self._bodies(world, noise, faults)
-        least_s = 1.0 / min([math.inf, *(fault.rate_hz for fault in faults)])
-        if any(fault.gone for fault in faults) or t_s - self._delivered_s < least_s - 1e-9:
+        if any(fault.gone for fault in faults):
             return
-        self._delivered_s = t_s
         delay_s = self.settings.delay_s + jitter * self.settings.jitter_s
         arrival_s = t_s + max(0.0, delay_s) + sum(fault.late_s for fault in faults)
         self._arrival_s = max(arrival_s, self._arrival_s)
@@ -256,10 +224,9 @@ class SimCapture:
         place = place + settings.position_noise_m * noise[:3]
         a, b, c = (float(v) for v in settings.attitude_noise_rad * noise[3:])
         R = self._R_capture_world @ R @ rotation_from_rpy(a, b, c)
-        axes, scale = settings.axes, 1.0
+        turn, scale = np.eye(3), 1.0
         for fault in faults:
-            axes, scale = fault.axes or axes, scale * fault.scale
-        turn = axes_matrix(axes)
+            turn, scale = np.array(fault.axes) @ turn, scale * fault.scale
         # A system defines a body's axes along its own: a level body's attitude is none at all.
         x, y, z = (scale * float(v) for v in turn @ place)
         if any(fault.mirrored for fault in faults):

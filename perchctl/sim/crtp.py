@@ -32,7 +32,7 @@ _ECHO, _SOURCE, _SINK, _NULL = 0, 1, 2, 3
 _BOOTLOADER = 0xFE
 _SYSTEM_ON, _RESET = 0x03, 0xF0
 _COMMAND, _VERSION = 0, 1
-_CONTINUOUS_WAVE, _ARM, _RECOVER, _NOTIFICATION = 0, 1, 2, 3
+_ARM, _RECOVER = 1, 2
 _GET_PROTOCOL, _GET_FIRMWARE, _GET_DEVICE = 0, 1, 2
 _LINK_SOURCE = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")
 _BOOT_TEXT = (
@@ -55,13 +55,10 @@ class LinkOptions:
     Attributes:
         protocol_version: below 12 the supervisor port is missing (an old firmware).
         missing_log_variables: left out of the log table.
-        loss_rate: share of packets lost, each way; drawn by `loss_seed`.
     """
 
     protocol_version: int = PROTOCOL_VERSION
     missing_log_variables: tuple[str, ...] = ()
-    loss_rate: float = 0.0
-    loss_seed: int = 0
 
 
 class CrtpServer:
@@ -162,8 +159,6 @@ class CrtpServer:
                 answer = self._commands.arm(bool(packet.data[1]))
             elif command == _RECOVER:
                 answer = self._commands.recover()
-            elif command in (_CONTINUOUS_WAVE, _NOTIFICATION):
-                answer = packet.data[1:]
         if answer is None:
             return []
         return [Packet(Port.PLATFORM, packet.channel, bytes((command,)) + answer)]
@@ -195,7 +190,7 @@ def _memories(packet: Packet) -> list[Packet]:
 
 
 # Port 8.
-HL_SET_GROUP, HL_STOP, HL_TAKEOFF_2, HL_LAND_2, HL_GO_TO_2 = 0, 3, 7, 8, 12
+HL_STOP, HL_TAKEOFF_2, HL_LAND_2, HL_GO_TO_2 = 3, 7, 8, 12
 # Port 9.
 GET_STATE, ARM, RECOVER, EMERGENCY_STOP, WATCHDOG = 0x0C, 0x01, 0x02, 0x03, 0x04
 REPLY = 0x80
@@ -222,12 +217,11 @@ _GENERIC: dict[int, Callable[[bytes], Setpoint]] = {
 
 
 class CommandService:
-    """Serves the ports that command; holds the group mask."""
+    """Serve the ports that command."""
 
     def __init__(self, firmware: Firmware, protocol_version: int = PROTOCOL_VERSION) -> None:
         self.firmware = firmware
         self._has_supervisor_port = protocol_version >= 12
-        self._groups = 0
         self._handlers: dict[int, Callable[[Packet], list[Packet]]] = {
             Port.COMMANDER: self._commander,
             Port.COMMANDER_GENERIC: self._generic,
@@ -265,8 +259,7 @@ class CommandService:
         if packet.channel == 0 and data[0] in _GENERIC:
             self._low_level(_GENERIC[data[0]](data[1:]))
         elif packet.channel == 1 and data[0] == _NOTIFY_STOP:
-            (remain_ms,) = struct.unpack_from("<I", data, 1)
-            self.firmware.notify_setpoint_stop(remain_ms / 1000.0)
+            self.firmware.notify_setpoint_stop()
         return []
 
     def _low_level(self, setpoint: Setpoint) -> None:
@@ -276,11 +269,10 @@ class CommandService:
 
     def _high_level(self, packet: Packet) -> list[Packet]:
         data, status = packet.data, Status.OK
-        if data[0] == HL_SET_GROUP:
-            self._groups = data[1]
-        elif (command := _high_level(data)) is None:
+        command = _high_level(data)
+        if command is None:
             status = Status.ENOEXEC
-        elif data[1] == 0 or data[1] & self._groups:
+        elif data[1] == 0:  # for all groups; this vehicle is in none
             values = vars(command).values()
             if _all_finite(value for value in values if value is not None):
                 self.firmware.high_level(command)

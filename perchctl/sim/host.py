@@ -18,14 +18,13 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, TextIO
 
 import cv2
-import numpy as np
 
 from perchctl.children import Channel, connect_back
 from perchctl.errors import PerchError
 from perchctl.geometry import rpy_from_rotation
 from perchctl.link import Packet
 from perchctl.sim.capture import CaptureFault, CaptureServer, SimCapture
-from perchctl.sim.crtp import CrtpServer, LinkOptions
+from perchctl.sim.crtp import CrtpServer
 from perchctl.sim.optics import Picture
 from perchctl.sim.process import (
     CLOCK_MARGIN_S,
@@ -52,7 +51,7 @@ class VehicleHost:
         with contextlib.ExitStack() as opened:
             use = opened.enter_context
             bursts = radio_bursts(setup.scenario)
-            self.endpoint = use(contextlib.closing(UdpEndpoint(setup.link, bursts)))
+            self.endpoint = use(contextlib.closing(UdpEndpoint(bursts)))
             self.stream: MjpegServer | None = None
             if setup.camera is not None:
                 self.stream = use(contextlib.closing(MjpegServer()))
@@ -331,7 +330,6 @@ class Runner:
 # --- The link's carrier: one CRTP packet a UDP datagram, as cflib's `udp://` driver sends them ---
 
 
-_STREAM = 90  # this part's own stream of the seed
 _RECEIVE_BYTES = 1 << 20
 _NULL_HEADER = 0xFF
 _EPS_S = 1e-9
@@ -345,11 +343,9 @@ class UdpEndpoint:
     datagram that is a packet, before anything is made of it: time, sender, bytes.
     """
 
-    def __init__(self, options: LinkOptions, bursts: Bursts | None = None) -> None:
-        """`bursts`: in which nothing passes."""
-        self._options = options
+    def __init__(self, bursts: Bursts | None = None) -> None:
+        """Open the socket; nothing passes in `bursts`."""
         self._bursts = bursts
-        self._random = np.random.default_rng([options.loss_seed, _STREAM])
         self._peer: Address | None = None
         self.heard: Callable[[float, Address, bytes], None] | None = None
         self._silent = (math.inf, math.inf)
@@ -373,9 +369,7 @@ class UdpEndpoint:
                 datagram, address = self.socket.recvfrom(64)
             except (BlockingIOError, InterruptedError):
                 return
-            except ConnectionError:  # a former peer's port is closed (Windows)
-                continue
-            if self._is_silent(t_s) or self._is_lost(t_s):
+            if not self._passes(t_s):
                 continue
             packet = Packet.decode(datagram)
             if packet is None:
@@ -393,21 +387,18 @@ class UdpEndpoint:
 
     def _send(self, packets: Iterable[Packet], address: Address, t_s: float) -> None:
         for packet in packets:
-            if self._is_silent(t_s) or self._is_lost(t_s):
+            if not self._passes(t_s):
                 continue
             try:
                 self.socket.sendto(packet.encode(), address)
             except OSError:  # full buffer or a peer that is gone: lost like over the air
                 continue
 
-    def _is_silent(self, t_s: float) -> bool:
-        return self._silent[0] - _EPS_S <= t_s < self._silent[1] - _EPS_S
-
-    def _is_lost(self, t_s: float) -> bool:
-        if self._bursts is not None and self._bursts.lost(t_s):
-            return True
-        rate = self._options.loss_rate
-        return rate > 0.0 and float(self._random.random()) < rate
+    def _passes(self, t_s: float) -> bool:
+        """Return whether the link carries a packet at that time."""
+        if self._silent[0] - _EPS_S <= t_s < self._silent[1] - _EPS_S:
+            return False
+        return self._bursts is None or not self._bursts.lost(t_s)
 
 
 # --- The simulated camera's picture over HTTP, as a network camera would send it ---------------

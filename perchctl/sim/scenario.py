@@ -56,7 +56,7 @@ class Scenario:
         camera_flicker, camera_pumping: share by which lamps (100 Hz) and an exposure control
             that hunts change the brightness.
         camera_receiver_hz: of the receiver's output, where it gives out its newest picture
-            again and again, with `camera_receiver_noise` on it each time; None: it does not.
+            again and again; None: it does not.
         camera_blank_rate: share of pictures that are a blue screen.
         camera_mirrored: it gives its pictures flipped left to right.
         drift_mps: drift of the state estimate, world axes.
@@ -114,7 +114,6 @@ class Scenario:
     camera_flicker: float = 0.0
     camera_pumping: float = 0.0
     camera_receiver_hz: float | None = None
-    camera_receiver_noise: float = 0.0
     camera_blank_rate: float = 0.0
     camera_mirrored: bool = False
     estimate_noise_m: float = 0.002
@@ -217,7 +216,6 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         camera_flicker=sim.camera_flicker,
         camera_pumping=sim.camera_pumping,
         camera_receiver_hz=sim.camera_receiver_hz,
-        camera_receiver_noise=sim.camera_receiver_noise,
         camera_blank_rate=sim.camera_blank_rate,
         estimate_tilt_bias_rad=(bias_x, bias_y),
         drift_mps=(drift_x, drift_y, drift_z),

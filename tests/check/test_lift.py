@@ -23,8 +23,8 @@ from perchctl.errors import SafetyAbort
 from perchctl.flight import require_comparison
 from perchctl.profile import Profile
 from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, CaptureSettings, SimProcess, draw_scenario
-from perchctl.sim.capture import SWAPPED_XY, Y_UP
 from perchctl.sim.world import Stop
+from tests.helpers.capture import SWAPPED_XY, Y_UP
 from tests.helpers.carried import lifted_and_turned
 from tests.helpers.checks import QUICK, options, wait_for
 from tests.helpers.flights import short_profile

@@ -66,6 +66,9 @@ class Client:
 
     def connect(self, wait_s: float = CONNECTED_S) -> bool:
         self.cf.open_link(self.uri)
+        return self.connected(wait_s)
+
+    def connected(self, wait_s: float) -> bool:
         return self._connected.wait(wait_s) and self._complete.wait(wait_s)
 
     def close(self) -> None:

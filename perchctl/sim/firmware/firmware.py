@@ -138,11 +138,8 @@ class Firmware:
         self._low_level = True
         self.planner.stop()
 
-    def notify_setpoint_stop(self, remain_valid_s: float = 0.0) -> None:
-        """Low-level setpoints end: the high-level commander may fly again.
-
-        The firmware reads past `remain_valid_s`; so does this.
-        """
+    def notify_setpoint_stop(self) -> None:
+        """End the low-level setpoints, so that the high-level commander may fly again."""
         self._inform_planner()
         self._low_level = False
 
