@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -19,7 +18,6 @@ from typing import TYPE_CHECKING
 from perchctl.link import Packet, Port
 from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.planner import HighLevelCommand, HlGoTo, HlLand, HlStop, HlTakeoff
-from perchctl.vehicle import CAN_FLY, CRASHED, LOCKED
 
 if TYPE_CHECKING:
     from perchctl.sim.firmware import Firmware
@@ -35,17 +33,6 @@ _COMMAND, _VERSION = 0, 1
 _ARM, _RECOVER = 1, 2
 _GET_PROTOCOL, _GET_FIRMWARE, _GET_DEVICE = 0, 1, 2
 _LINK_SOURCE = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")
-_BOOT_TEXT = (
-    "SYS: ----------------------------\n"
-    "SYS: Crazyflie 2.1 is up and running!\n"
-    f"SYS: Build {FIRMWARE_VERSION} (simulated)\n"
-    "SYS: Free heap: 16920 bytes\n"
-)
-_MESSAGES = (
-    (LOCKED, "SUPERVISOR: Locked, reboot required\n"),
-    (CRASHED, "SUPERVISOR: Crashed, recover required\n"),
-    (CAN_FLY, "SUPERVISOR: Ready to fly\n"),
-)
 
 
 @dataclass(frozen=True)
@@ -72,9 +59,6 @@ class CrtpServer:
         self._log = LogService(firmware, options.missing_log_variables)
         self._param = ParamService(firmware)
         self._commands = CommandService(firmware, version)
-        self._console: deque[Packet] = deque(maxlen=64)
-        self._info = 0
-        self._print(_BOOT_TEXT)
 
     def handle(self, packet: Packet) -> list[Packet]:
         """The answers to one packet, in order."""
@@ -93,16 +77,8 @@ class CrtpServer:
                 return self._commands.handle(packet)
 
     def due(self) -> list[Packet]:
-        """What the vehicle sends by itself by now: console text and log data."""
-        info = self._firmware.supervisor_info
-        if info != self._info:
-            for bit, text in _MESSAGES:
-                if info & bit and not self._info & bit:
-                    self._print(text)
-            self._info = info
-        packets = list(self._console)
-        self._console.clear()
-        return packets + self._log.due()
+        """Return the log data that the vehicle sends by itself by now."""
+        return self._log.due()
 
     def reboot(self) -> None:
         """Start the firmware again; log blocks are lost."""
@@ -118,13 +94,6 @@ class CrtpServer:
         self._log.rebooted(self._firmware, keep_blocks=keep_blocks)
         self._param.firmware = self._firmware
         self._commands.firmware = self._firmware
-        self._info = 0
-        self._print(_BOOT_TEXT)
-
-    def _print(self, text: str) -> None:
-        raw = text.encode("ascii")
-        for at in range(0, len(raw), MAX_DATA):
-            self._console.append(Packet(Port.CONSOLE, 0, raw[at : at + MAX_DATA]))
 
     def _link(self, packet: Packet) -> list[Packet]:
         if packet.channel == _ECHO:

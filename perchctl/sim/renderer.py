@@ -103,8 +103,8 @@ class Renderer:
             small=target.small.model_copy(update={"side_m": scenario.small_side_m}),
         )
         own = () if scenario.no_target else (Placed(printed_sheet(printed.model_dump_json())),)
+        self._still: tuple[tuple[bytes, float], Picture] | None = None
         self._sheets = (*own, *(beside(n, printed) for n in scenario.neighbours))
-        self._still: tuple[bytes, float, Picture] | None = None
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
         lens = lens_of(camera)
@@ -115,7 +115,7 @@ class Renderer:
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
-        """The target's centre is there from now on."""
+        """Put the target's centre there from now on."""
         self._still = None
         scenario = self.scenario
         z_m = scenario.ceiling_z_m + scenario.target_above_ceiling_m
@@ -162,10 +162,10 @@ class Renderer:
         if self._analogue > 0.0:
             rng = np.random.default_rng([self.seed, FRAME_STREAM, frame_index])
             picture = spoil(picture, self._analogue, rng)
-        return np.array(picture, np.uint8, copy=True if self._noise is None else None)
+        return picture.copy()
 
     def _exposed(self, shot: Shot, defocus_px: float | None) -> Picture:
-        """What falls onto the sensor in one shot, before noise. Not to be written into."""
+        """Return what falls onto the sensor in one shot, before noise. Not to be written into."""
         rows = [self._T_target_world @ np.array(poses) for poses in shot.rows]
         motion_px = self._motion_px(rows[len(rows) // 2])
         length_px = path_length_px(motion_px)
@@ -177,12 +177,13 @@ class Renderer:
         return picture if shot.light is None else lit(picture, shot.light)
 
     def _at_rest(self, pose: Array, sigma_px: float) -> Picture:
-        """The picture of a camera that does not move; the last one is kept."""
-        key, last = pose.tobytes(), self._still
-        if last is None or last[:2] != (key, sigma_px):
+        """Return the picture of a camera that does not move. The last one is kept: under the magnet
+        it would cost 4 ms each time."""
+        key = (pose.tobytes(), sigma_px)
+        if self._still is None or self._still[0] != key:
             picture = self._projected([pose[None]], np.zeros((5, 1, 2)), 0.0, sigma_px)
-            last = self._still = (key, sigma_px, picture)
-        return last[2]
+            self._still = key, picture
+        return self._still[1]
 
     # -- through the lens ---------------------------------------------------
 
@@ -213,12 +214,7 @@ class Renderer:
             middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
         nodes, misses = trace(self._coarse, middle)
         views = [view for s in self._sheets if (view := s.view(nodes, length_px)) is not None]
-        if any(view.covers for view in views):
-            views = [view for view in views if view.covers]
-            rows, cols = (COARSE_PX * (n - 2) for n in nodes.shape[:2])
-            picture = np.empty((rows, cols), np.uint8)
-        else:
-            picture = self._background(nodes, misses, motion_px, length_px)
+        picture = self._background(nodes, misses, motion_px, length_px)
         for view in views:
             self._add_sheet(picture, view, maps)
         return picture, box_around([view.box for view in views])
@@ -257,11 +253,9 @@ class Renderer:
         rays = self._pixels.window(rows, cols)
         texels = [trace(rays, view.to_texels @ each)[0] for each in maps]
         seen = mean_of([sample(view.texture.value, each) for each in texels])
-        if not view.covers:
-            alpha = mean_of([sample(view.texture.alpha, each) for each in texels])
-            rest: Any = cv2.multiply(picture[rows, cols], ~alpha, scale=1.0 / 255.0)
-            seen = np.asarray(cv2.add(rest, seen), np.uint8)
-        picture[rows, cols] = seen
+        alpha = mean_of([sample(view.texture.alpha, each) for each in texels])
+        rest: Any = cv2.multiply(picture[rows, cols], ~alpha, scale=1.0 / 255.0)
+        picture[rows, cols] = cv2.add(rest, seen)
 
     # -- motion -------------------------------------------------------------
 
@@ -347,11 +341,10 @@ def blended(frame: Picture) -> Picture:
     return np.asarray((rows[:-2] + 2 * rows[1:-1] + rows[2:] + 2) // 4, np.uint8)
 
 
-# --- A camera that does not move: its picture before noise is made once ------------------------
+# --- A camera that does not move ----------------------------------------------------------------
 # On the floor and under the magnet the vehicle stirs by less than any picture shows. Where the
-# picture moves by less than `STILL_PX` within the exposure, its pose is rounded; the same rounded
-# pose has the same picture. That is so whichever of the others are looked at, as their bytes must
-# not hang on it.
+# picture moves by less than `STILL_PX` within the exposure, its pose is rounded, so that a vehicle
+# at rest sees the same picture again and again but for the noise.
 
 
 STILL_PX = 0.005

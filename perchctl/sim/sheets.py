@@ -152,8 +152,6 @@ def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
 
 Box = tuple[slice, slice]
 """Rows and columns of blocks of `COARSE_PX` pixels."""
-_ROOM_TEXELS = 1.5
-"""For the neighbours that a bilinear look-up reads, and a centre's rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,19 +178,17 @@ class Placed:
         to_texels = np.array([[scale, 0.0, centre], [0.0, scale, centre], [0.0, 0.0, 1.0]])
         if self.plane is not None:
             to_texels = to_texels @ self.plane
-        room_m = _ROOM_TEXELS / scale
-        return View(texture, box, to_texels, bool((off_m + reach_m < half_m - room_m).all()))
+        return View(texture, box, to_texels)
 
 
 @dataclass(frozen=True, eq=False)
 class View:
     """A sheet in one exposure: in the picture's `box`; `to_texels` (3, 3) maps the own target's
-    plane to the texture's columns and rows; `covers`: nothing else is in the picture."""
+    plane to the texture's columns and rows."""
 
     texture: SheetTexture
     box: Box
     to_texels: Array
-    covers: bool
 
 
 def _off_and_reach(
