@@ -77,7 +77,7 @@ class SimCamera:
             self._index += 1
 
     def take(self) -> list[DeliveredFrame]:
-        """The frames that arrived by the time of the last `advance`, oldest first, once."""
+        """Return the frames that arrived by the time of the last `advance`, oldest first, once."""
         out = []
         while self._under_way and self._under_way[0].t_arrival_s <= self._t_s:
             out.append(self._under_way.popleft())
@@ -152,7 +152,7 @@ class Shutter:
     def shots(
         self, middle_s: float, T_world_cam_at: Callable[[float], Array], height: int
     ) -> list[Shot]:
-        """The frame's pictures in their order of time: two fields, or one."""
+        """Return the frame's pictures in their order of time: two fields, or one."""
         if not self._apart_s:
             return [self._shot(middle_s, T_world_cam_at, height)]
         half_s = self._apart_s / 2.0
@@ -229,7 +229,7 @@ class Receiver:
 
 
 def blanked(scenario: Scenario, index: int, picture: Picture) -> Picture:
-    """The picture, or the blue screen in its place."""
+    """Return the picture, or the blue screen in its place."""
     if not scenario.camera_blank_rate:
         return picture
     rng = np.random.default_rng([scenario.seed, STREAM, _BLANKS, index])

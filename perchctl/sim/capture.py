@@ -109,7 +109,7 @@ class CaptureSettings:
 
 
 def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
-    """The motion capture of that seed's flight; None where the vehicle's decks do it."""
+    """Return the motion capture of that seed's flight; None where the vehicle's decks do it."""
     config, sim = profile.positioning, profile.simulation
     if config.by != "mocap":
         return None
@@ -156,11 +156,11 @@ class SimCapture:
         self._faults.append((self._t_s, self._t_s + for_s, fault))
 
     def heal(self) -> None:
-        """Nothing is wrong any more."""
+        """End all faults."""
         self._faults.clear()
 
     def advance(self, world: World) -> None:
-        """Called each control period: exposes if it is time to."""
+        """Expose if it is time to. Called each control period."""
         self._t_s = t_s = world.t_s
         if t_s < self._due_s - 1e-9:
             return
@@ -179,20 +179,20 @@ class SimCapture:
         self._under_way.append(CaptureFrame(self._arrival_s, bodies))
 
     def take(self) -> list[CaptureFrame]:
-        """The frames that arrived by the time of the last `advance`, oldest first, once."""
+        """Return the frames that arrived by the time of the last `advance`, oldest first, once."""
         arrived = []
         while self._under_way and self._under_way[0].t_s <= self._t_s + 1e-9:
             arrived.append(self._under_way.popleft())
         return arrived
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """The newest frame that has arrived since the last call: a flight in lockstep has this
-        capture as its `CaptureSource`."""
+        """Return the newest frame that has arrived since the last call: a flight in lockstep has
+        this capture as its `CaptureSource`."""
         arrived = self.take()
         return arrived[-1] if arrived else None
 
     def problem(self, now_s: float) -> str | None:
-        """None: nothing is ever wrong with the connection."""
+        """Return None, since nothing is ever wrong with this connection."""
         return None
 
     def close(self) -> None:
@@ -255,19 +255,19 @@ def message(kind: int, body: bytes) -> bytes:
 
 
 def kind_of(request: bytes) -> int | None:
-    """The kind of a message; None for what is too short to be one."""
+    """Return the kind of a message; None for what is too short to be one."""
     return int.from_bytes(request[:2], "little") if len(request) >= 4 else None
 
 
 def server_info(data_port: int) -> bytes:
-    """The answer to `CONNECT`: frames will come to that port of the client's, by unicast."""
+    """Return the answer to `CONNECT`: frames will come to that port of the client's, by unicast."""
     name = b"perchctl".ljust(_NAME_BYTES, b"\0")
     where = struct.pack("<QH?4B", _TICKS_HZ, data_port, False, 0, 0, 0, 0)
     return message(SERVER_INFO, name + _VERSION + _VERSION + where)
 
 
 def models(names: Sequence[str]) -> bytes:
-    """The answer to `ASK_MODELS`: rigid bodies, numbered from 1, their origins unmoved."""
+    """Return the answer to `ASK_MODELS`: rigid bodies, numbered from 1, their origins unmoved."""
     body = struct.pack("<i", len(names))
     for number, name in enumerate(names, 1):
         body += struct.pack("<i", _RIGID_BODY) + name.encode() + b"\0"
@@ -320,8 +320,8 @@ class CaptureServer:
         self._thread.start()
 
     def publish(self, seen: CaptureFrame) -> None:
-        """Costs next to nothing while nobody is connected. A client that has gone, and a full
-        buffer, lose a frame, as on any network."""
+        """Send a frame to each client; nothing is sent while nobody is connected. A client that has
+        gone, and a full buffer, lose a frame, as on any network."""
         self._count += 1
         with self._lock:
             if not self._clients:
@@ -356,7 +356,7 @@ class CaptureServer:
                     self._socket.sendto(models(self._names), address)
 
     def _admit(self, host: str) -> int:
-        """A port of the client's own: several on one computer could not share one."""
+        """Return a port of the client's own: several on one computer could not share one."""
         with self._lock:
             taken = {client.getpeername()[1] for client in self._clients}
             while (port := _free_port()) in taken:

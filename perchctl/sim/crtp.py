@@ -61,7 +61,7 @@ class CrtpServer:
         self._commands = CommandService(firmware, version)
 
     def handle(self, packet: Packet) -> list[Packet]:
-        """The answers to one packet, in order."""
+        """Return the answers to one packet, in order."""
         match packet.port:
             case Port.LINK:
                 return self._link(packet)
@@ -169,7 +169,8 @@ _NOTIFY_STOP = 0
 
 
 def _raw(data: bytes) -> Setpoint:
-    """Port 3: ``<fffH``; cflib negates the pitch on its way out."""
+    """Return the setpoint of a packet on port 3 (``<fffH``); cflib negates the pitch on its way
+    out."""
     roll, pitch, yaw_rate, thrust = struct.unpack_from("<fffH", data)
     return Setpoint.raw(roll, -pitch, yaw_rate, thrust)
 
@@ -200,8 +201,8 @@ class CommandService:
         }
 
     def handle(self, packet: Packet) -> list[Packet]:
-        """The answers to one packet. What is too short for its command is passed over, as the
-        firmware does."""
+        """Return the answers to one packet. What is too short for its command is passed over, as
+        the firmware does."""
         handler = self._handlers.get(packet.port)
         if handler is None or not packet.data:
             return []
@@ -211,11 +212,11 @@ class CommandService:
             return []
 
     def arm(self, do_arm: bool) -> bytes:
-        """(success, armed) as bytes; shared with the platform port."""
+        """Return (success, armed) as bytes, shared with the platform port."""
         return bytes(self.firmware.arm(do_arm))
 
     def recover(self) -> bytes:
-        """(success, recovered) as bytes; shared with the platform port."""
+        """Return (success, recovered) as bytes, shared with the platform port."""
         return bytes(self.firmware.recover_from_crash())
 
     def _commander(self, packet: Packet) -> list[Packet]:
@@ -282,7 +283,7 @@ class CommandService:
 
 
 def _high_level(data: bytes) -> HighLevelCommand | None:
-    """The command of a packet on port 8; None for one that this vehicle does not have
+    """Return the command of a packet on port 8; None for one that this vehicle does not have
     (trajectories, spirals)."""
     command = data[0]
     if command == HL_STOP:
@@ -298,7 +299,7 @@ def _high_level(data: bytes) -> HighLevelCommand | None:
 
 
 def _all_finite(values: Iterable[float]) -> bool:
-    """Numbers that are none would poison the controller for good: such packets are dropped."""
+    """Return whether all values are finite. Others would poison the controller for good."""
     return all(map(math.isfinite, values))
 
 
@@ -330,7 +331,8 @@ class Number:
         return struct.calcsize("<" + self.letter)
 
     def pack(self, value: float) -> bytes:
-        """The bytes as C stores the value: integers truncated and wrapped, floats rounded."""
+        """Return the bytes as C stores the value: integers truncated and wrapped, floats
+        rounded."""
         if self.letter in "efd":
             return _pack_float(self.letter, value)
         bits = 8 * self.size
@@ -383,12 +385,12 @@ class Toc:
         self._info = struct.pack("<BHI", _INFO, len(codes), crc) + info_tail
 
     def name(self, ident: bytes) -> str | None:
-        """The name that has this number, two bytes; None where no name has it."""
+        """Return the name that has this number, two bytes; None where no name has it."""
         number = int.from_bytes(ident, "little")
         return self._names[number] if len(ident) == 2 and number < len(self._names) else None
 
     def handle(self, packet: Packet) -> list[Packet]:
-        """The reply to a request on channel 0."""
+        """Return the reply to a request on channel 0."""
         data = packet.data
         if data[:1] == bytes((_INFO,)):
             return [Packet(self._port, 0, self._info)]
@@ -447,7 +449,7 @@ class LogService:
         self._blocks: dict[int, _Block] = {}
 
     def rebooted(self, firmware: Firmware, *, keep_blocks: bool = False) -> None:
-        """Time starts again; the blocks are lost unless kept (a test's short cut)."""
+        """Begin at time 0 again. The blocks are lost unless kept (a test's short cut)."""
         self._firmware = firmware
         if not keep_blocks:
             self._blocks.clear()
@@ -456,7 +458,7 @@ class LogService:
                 block.due_s = firmware.t_s + block.period_s
 
     def handle(self, packet: Packet) -> list[Packet]:
-        """The answers to one packet."""
+        """Return the answers to one packet."""
         if packet.channel == _TOC:
             return self.toc.handle(packet)
         if packet.channel != _SETTINGS or not packet.data:
@@ -466,7 +468,7 @@ class LogService:
         return [Packet(Port.LOG, _SETTINGS, bytes((command, ident, status))), *extra]
 
     def due(self) -> list[Packet]:
-        """Data packets whose time has come."""
+        """Return the data packets whose time has come."""
         now_s = self._firmware.t_s
         packets = []
         for ident, block in self._blocks.items():
@@ -501,7 +503,7 @@ class LogService:
         return Status.OK, []
 
     def _append(self, block: _Block, rest: bytes) -> Status:
-        """Adds variables until one does not fit; an incomplete last entry is ignored.
+        """Add variables until one does not fit; an incomplete last entry is ignored.
 
         cflib leaves one stray byte at the end of a full packet.
         """
@@ -556,7 +558,7 @@ class ParamService:
         self.toc = Toc(Port.PARAM, codes)
 
     def handle(self, packet: Packet) -> list[Packet]:
-        """The answers to one packet; a command that is not simulated has none."""
+        """Return the answers to one packet; a command that is not simulated has none."""
         if packet.channel == _TOC:
             return self.toc.handle(packet)
         if not packet.data:

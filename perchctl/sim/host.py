@@ -86,7 +86,7 @@ class VehicleHost:
         self.endpoint.serve(self.server, self.elapsed_s)
 
     def step(self) -> None:
-        """Packets that have arrived, one control period, then what is due to be sent."""
+        """Serve what has arrived, advance by one control period, and send what is due."""
         self.endpoint.serve(self.server, self.elapsed_s)
         vehicle = self.vehicle
         vehicle.step()
@@ -109,8 +109,8 @@ class VehicleHost:
         return self.elapsed_s
 
     def answer(self, name: str, *arguments: Any, **named: Any) -> Any:
-        """What the method gives: of this host, or `set_pose`, `carry` and `let_go` of its
-        world."""
+        """Return what a method gives: of this host, or `set_pose`, `move_by_hand` and `let_go` of
+        its world."""
         of: Any = self.vehicle.world if hasattr(self.vehicle.world, name) else self
         return getattr(of, name)(*arguments, **named)
 
@@ -118,16 +118,12 @@ class VehicleHost:
         """Change the battery's resting voltage."""
         self.vehicle.world.battery_rest_v = rest_v
 
-    def push(self, force_n: tuple[float, float, float]) -> None:
-        """A constant outside force, world axes, until changed."""
-        self.vehicle.world.external_force_n = force_n
-
     def silence(self, duration_s: float) -> None:
-        """The link receives and sends nothing for `duration_s` of simulated time."""
+        """Let the link receive and send nothing for `duration_s` of simulated time."""
         self.endpoint.silence(self.elapsed_s, duration_s)
 
     def capture_fault(self, fault: CaptureFault | None, for_s: float = math.inf) -> None:
-        """Something goes wrong in the motion capture for so long; None ends all that does."""
+        """Begin a fault of the motion capture for so long; None ends all faults."""
         capture = self.vehicle.capture
         if capture is None:
             raise RuntimeError("it was started without a motion capture")
@@ -141,7 +137,8 @@ class VehicleHost:
         self.server.reboot()
 
     def truth(self) -> dict[str, Any]:
-        """The true state, SI and radians, and the firmware's outputs: no Crazyflie reports it."""
+        """Return the true state, SI and radians, and the firmware's outputs: no Crazyflie reports
+        it."""
         world, firmware = self.vehicle.world, self.vehicle.firmware
         state = world.state()
         return {
@@ -160,7 +157,7 @@ class VehicleHost:
         }
 
     def replace_vehicle(self, scenario: Scenario) -> None:
-        """A new vehicle under the same link: connection and log blocks stay."""
+        """Put a new vehicle under the same link: connection and log blocks stay."""
         self.vehicle = self._new_vehicle(scenario)
         self.server.replace_firmware(self.vehicle.firmware, keep_blocks=True)
 
@@ -290,7 +287,7 @@ class Runner:
             self._answer(self._channel)
 
     def _answer(self, channel: Channel) -> None:
-        """One request of the parent: (name, arguments, named ones) -> (True, result) or
+        """Answer one request of the parent, (name, arguments, named ones), by (True, result) or
         (False, text)."""
         try:
             name, arguments, named = channel.receive()
@@ -428,15 +425,15 @@ class MjpegServer:
         self._thread.start()
 
     def publish(self, image: Picture) -> None:
-        """Grey uint8 (h, w). Costs nothing while nobody watches."""
+        """Publish a picture, grey uint8 (h, w). It costs nothing while nobody watches."""
         with self._changed:
             self._image = image
             self._number += 1
             self._changed.notify_all()
 
     def after(self, number: int) -> tuple[int, Picture] | None:
-        """The newest picture and its number if that is above `number`; None when none came for a
-        while."""
+        """Return the newest picture and its number if that is above `number`; None when none came
+        for a while."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._number > number, _WAIT_S)
             if self._image is None or self._number <= number:
@@ -463,7 +460,7 @@ class _HttpServer(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that goes away is no error."""
+        """Report all errors but a client that goes away."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
 
@@ -495,4 +492,4 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(head.encode() + jpeg + b"\r\n")
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Requests are not worth a line on the terminal."""
+        """Print nothing: requests are not worth a line on the terminal."""

@@ -157,7 +157,7 @@ _LEAST_GAP_S = 1.0
 
 
 def draw_scenario(profile: Profile, seed: int) -> Scenario:
-    """The scenario of that seed. Every value is drawn in a fixed order, so adding a
+    """Return the scenario of that seed. Every value is drawn in a fixed order, so adding a
     range at the end leaves the earlier ones of a seed as they were; the groups of harder
     worlds come from other streams."""
     sim = profile.simulation
@@ -248,8 +248,8 @@ def _neighbours(sim: SimulationConfig) -> tuple[Neighbour, ...]:
 
 
 def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
-    """Biases of gyroscope and accelerometer; the latter has none along z, where the firmware's
-    scale would take it out."""
+    """Return the biases of gyroscope and accelerometer; the latter has none along z, where the
+    firmware's scale would take it out."""
     rng = np.random.default_rng([seed, _IMU_STREAM])
     p, q, r = (math.radians(sim.gyro_bias_dps) * rng.uniform(-1.0, 1.0, size=3)).tolist()
     x, y = (GRAVITY_MPS2 * sim.acc_bias_g * rng.uniform(-1.0, 1.0, size=2)).tolist()
@@ -266,7 +266,8 @@ def _extra(profile: Profile) -> dict[str, float]:
 
 
 def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
-    """A turn and a shift that the profile lacks: up to `mount_error_deg` and `mount_error_m`."""
+    """Return a turn and a shift that the profile lacks: up to `mount_error_deg` and
+    `mount_error_m`."""
     sim = profile.simulation
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
@@ -280,7 +281,7 @@ def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
 
 
 def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
-    """Fields of the scenario. Where the ranges are those of `sim`, its defaults."""
+    """Return the fields of the scenario; where the ranges are those of `sim`, its defaults."""
     air, cell, tilt, radio, capture = (
         _Draws(seed, group) for group in (_AIR, _CELL, _TILT, _RADIO, _CAPTURE)
     )
@@ -312,7 +313,7 @@ class _Draws:
 
 
 def _tilt(sim: SimulationConfig, draws: _Draws) -> tuple[float, float]:
-    """The target's turns about the world's x and y."""
+    """Return the target's turns about the world's x and y."""
     tilt_rad = draws.angle_rad(sim.target_tilt_deg)
     towards_rad = draws.angle_rad()
     if not tilt_rad:
@@ -381,7 +382,7 @@ class Bursts:
 
 
 def radio_bursts(scenario: Scenario) -> Bursts | None:
-    """The bursts of a flight; None where its radio loses nothing."""
+    """Return the bursts of a flight; None where its radio loses nothing."""
     if not scenario.radio_loss:
         return None
     return Bursts(scenario.seed, scenario.radio_loss, scenario.radio_burst_s)
@@ -410,8 +411,8 @@ class EventExplainer:
         self._bursts = Bursts(scenario.seed, scenario.radio_loss, scenario.radio_burst_s)
 
     def __call__(self, event: Event, t_s: float) -> str:
-        """What the scenario did, in a few words, or the empty string. `t_s` is the event's time in
-        the simulation."""
+        """Return what the scenario did, in a few words, or the empty string. `t_s` is the event's
+        time in the simulation."""
         scenario = self._scenario
         held = event.reason if event.kind is EventKind.HOLD else ""
         if event.row in LOSSES or held.startswith(NO_PICTURE_TEXT):

@@ -75,7 +75,7 @@ class Lab:
 
         def tell(text: str) -> None:
             if HOW_TO_TURN in text:
-                self.sim.carry(lifted_and_turned(HOME))
+                self.sim.move_by_hand(lifted_and_turned(HOME))
 
         self._put_down()
         quick = CheckScope(**QUICK)
@@ -85,7 +85,7 @@ class Lab:
 
     def _put_down(self) -> None:
         """By a hand, too: what is put somewhere else no gyroscope follows."""
-        self.sim.carry([Stop(0.5, HOME)])
+        self.sim.move_by_hand([Stop(0.5, HOME)])
         end_s = time.monotonic() + 20.0
         while math.dist(self.sim.truth()["position_m"], HOME) > 1e-3:
             assert time.monotonic() < end_s

@@ -58,7 +58,7 @@ class Setpoint:
 
     @classmethod
     def raw(cls, roll_deg: float, pitch_deg: float, yaw_rate_dps: float, thrust: float) -> Setpoint:
-        """`commander.send_setpoint`: +10 of pitch is nose down, the yaw rate clockwise positive."""
+        """Return that of `commander.send_setpoint`: pitch +10 is nose down, yaw rate clockwise."""
         return cls(
             MODE_RAW,
             roll_deg=roll_deg,
@@ -69,19 +69,20 @@ class Setpoint:
 
     @classmethod
     def position(cls, x_m: float, y_m: float, z_m: float, yaw_deg: float) -> Setpoint:
-        """`send_position_setpoint`: m and degrees, counter-clockwise positive."""
+        """Return that of `send_position_setpoint`: m and degrees, counter-clockwise positive."""
         return cls(MODE_POSITION, x_m, y_m, z_m, yaw_deg=yaw_deg)
 
     @classmethod
     def velocity(cls, vx_mps: float, vy_mps: float, vz_mps: float, yaw_rate_dps: float) -> Setpoint:
-        """`send_velocity_world_setpoint`: yaw rate counter-clockwise positive."""
+        """Return that of `send_velocity_world_setpoint`: yaw rate counter-clockwise positive."""
         return cls(
             MODE_VELOCITY, vx_mps=vx_mps, vy_mps=vy_mps, vz_mps=vz_mps, yaw_rate_dps=yaw_rate_dps
         )
 
     @classmethod
     def hover(cls, vx_mps: float, vy_mps: float, yaw_rate_dps: float, z_m: float) -> Setpoint:
-        """`send_hover_setpoint`: velocity in body axes, yaw rate, absolute height."""
+        """Return that of `send_hover_setpoint`: velocity in body axes, yaw rate, absolute
+        height."""
         return cls(
             MODE_HOVER,
             z_m=z_m,
@@ -95,7 +96,7 @@ class Setpoint:
     def z_distance(
         cls, roll_deg: float, pitch_deg: float, yaw_rate_dps: float, z_m: float
     ) -> Setpoint:
-        """`send_zdistance_setpoint`: attitude, yaw rate, absolute height."""
+        """Return that of `send_zdistance_setpoint`: attitude, yaw rate, absolute height."""
         return cls(
             MODE_Z_DISTANCE,
             z_m=z_m,
@@ -105,7 +106,7 @@ class Setpoint:
         )
 
     def levelled(self) -> Setpoint:
-        """What the supervisor flies while setpoints are missing: level, no turn, z as it is."""
+        """Return what the supervisor flies while setpoints are missing: level, no turn, same z."""
         mode = (DISABLED, DISABLED, self.mode[2], ABSOLUTE, ABSOLUTE, VELOCITY)
         return replace(self, mode=mode, roll_deg=0.0, pitch_deg=0.0, yaw_rate_dps=0.0)
 
@@ -144,7 +145,7 @@ class Pid:
         self._limit = limit
 
     def update(self, desired: float, measured: float, turning: bool = False) -> float:
-        """`turning`: on the circle of 360 degrees."""
+        """Return the output after one period; `turning`: on the circle of 360 degrees."""
         error, change = desired - measured, measured - self._measured
         if turning:
             error, change = cap_deg(error), cap_deg(change)
@@ -169,7 +170,7 @@ class Pid:
 
 
 def cap_deg(angle: float) -> float:
-    """The same angle within +-180 degrees."""
+    """Return the same angle within +-180 degrees."""
     while angle > 180.0:
         angle -= 360.0
     while angle < -180.0:
@@ -320,7 +321,7 @@ class Controller:
 
 
 def _distribute(thrust: float, r: float, p: float, y: float) -> Motors:
-    """Thrust requests of M1..M4; neither bounded above nor below (see `MotorDriver`)."""
+    """Return thrust requests of M1..M4; neither bounded above nor below (see `MotorDriver`)."""
     return (thrust - r + p + y, thrust - r - p - y, thrust + r - p + y, thrust + r + p - y)
 
 
@@ -350,7 +351,7 @@ class MotorDriver:
         self._supply_v = SUPPLY_AT_BOOT_V
 
     def pwm(self, requests: Motors, battery_v: float) -> Motors:
-        """Duty cycles 0..65535 for thrust requests; `MOTORS_OFF` itself when all are 0."""
+        """Return duty cycles 0..65535 for thrust requests; `MOTORS_OFF` itself when all are 0."""
         self._supply_v = supply_v = battery_v + _KEEP * (self._supply_v - battery_v)
         if requests is MOTORS_OFF or supply_v < SUPPLY_LEAST_V:
             self.requested = MOTORS_OFF

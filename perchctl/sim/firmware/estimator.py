@@ -85,31 +85,31 @@ class Estimator:
         self.spoil: Callable[[Estimate], None] | None = None  # a fault's, upon each estimate
 
     def reset(self, t_s: float) -> None:
-        """`kalman.resetEstimation`: drift and outside corrections are forgotten."""
+        """Forget drift and outside corrections, as `kalman.resetEstimation` does."""
         self._reset_s = t_s
         self._drift_s = 0.0
         self._reset_due = True
 
     def external_position(self, position_m: Vector) -> None:
-        """One measurement from outside; only a vehicle without a deck uses it."""
+        """Take one measurement from outside; only a vehicle without a deck uses it."""
         if self.outside is not None and self.hears_outside:
             self._reset_if_due(self.outside)
             self.outside.position(position_m)
 
     def external_pose(self, position_m: Vector, quaternion: Quaternion) -> None:
-        """A measurement with an attitude: w, x, y, z, body to world."""
+        """Take a measurement with an attitude: w, x, y, z, body to world."""
         if self.outside is not None and self.hears_outside:
             self._reset_if_due(self.outside)
             self.outside.pose(position_m, quaternion)
 
     def set_outside(self, name: str, value: float) -> None:
-        """A parameter of `SETTINGS`."""
+        """Set a parameter of `SETTINGS`."""
         if self.outside is not None:
             setattr(self.outside, SETTINGS[name], value)
 
     def shift_accelerometer(self, z_mps2: float) -> None:
-        """The accelerometer reads so much more along z from now on; only without a deck, which is
-        simulated by its errors."""
+        """Let the accelerometer read so much more along z from now on. A deck, which is simulated
+        by its errors, has none."""
         if self._imu is not None:
             x, y, z = self._imu.acc_bias_mps2
             self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
@@ -132,7 +132,8 @@ class Estimator:
         flying: bool = False,
         pressed: bool = False,
     ) -> None:
-        """`spinning`: the motors shake the accelerometer; `flying`: the supervisor says so."""
+        """Estimate one control period later. Motors that are `spinning` shake the accelerometer;
+        `flying` is what the supervisor says."""
         if self._steps % _NOISE_EVERY == 0:
             self._walk()
         self._steps += 1
@@ -173,7 +174,7 @@ class Estimator:
         )
 
     def _integrate(self, world: World) -> tuple[float, float, float, float]:
-        """The attitude after one more control period of turning."""
+        """Return the attitude after one more control period of turning."""
         truth = world.quaternion
         if self.gyro is None:
             return truth

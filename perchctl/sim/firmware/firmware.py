@@ -85,7 +85,7 @@ class Firmware:
         return self._steps * CONTROL_PERIOD_S
 
     def step(self) -> None:
-        """One control period."""
+        """Advance by one control period."""
         step = self._steps
         t_s = step * CONTROL_PERIOD_S
         supervisor = self.supervisor
@@ -133,7 +133,7 @@ class Firmware:
     # Commands -----------------------------------------------------------------------
 
     def low_level(self, setpoint: Setpoint) -> None:
-        """A setpoint packet; takes over from the high-level commander."""
+        """Fly this setpoint; it takes over from the high-level commander."""
         self._accept(self._limited(setpoint) if setpoint.mode == MODE_RAW else setpoint)
         self._low_level = True
         self.planner.stop()
@@ -144,29 +144,29 @@ class Firmware:
         self._low_level = False
 
     def high_level(self, command: HighLevelCommand) -> None:
-        """A high-level command; flown only when no low-level stream has priority."""
+        """Plan a command; it is flown only when no low-level stream has priority."""
         self.planner.command(command, self.t_s)
 
     def emergency_stop(self) -> None:
-        """Motors off and locked, within one supervisor update."""
+        """Stop the motors and lock, within one supervisor update."""
         self.supervisor.emergency = True
 
     def emergency_stop_watchdog(self) -> None:
-        """The first call starts the watchdog; a gap over 1 s then cuts and locks."""
+        """Start the watchdog, or feed it: a gap over 1 s then cuts the motors and locks."""
         self.supervisor.notify_watchdog(self.t_s)
 
     def arm(self, do_arm: bool) -> tuple[bool, bool]:
-        """(success, armed)."""
+        """Arm or disarm; return (success, armed)."""
         success = self.supervisor.request_arming(do_arm)
         return success, self.supervisor.armed
 
     def recover_from_crash(self) -> tuple[bool, bool]:
-        """(success, recovered); refused while still tumbled."""
+        """Recover; return (success, recovered). It is refused while still tumbled."""
         success = self.supervisor.request_recovery()
         return success, not self.supervisor.crashed
 
     def external_position(self, position_m: tuple[float, float, float]) -> None:
-        """A position from outside, m; see `Estimator`."""
+        """Take a position from outside, m; see `Estimator`."""
         self.external_tick_ms = int(1e3 * self.t_s) % 65536
         self.estimator.external_position(position_m)
 
@@ -175,13 +175,13 @@ class Firmware:
         position_m: tuple[float, float, float],
         quaternion_xyzw: tuple[float, float, float, float],
     ) -> None:
-        """A pose from outside: m, and body to world."""
+        """Take a pose from outside: m, and body to world."""
         self.external_tick_ms = int(1e3 * self.t_s) % 65536
         x, y, z, w = quaternion_xyzw
         self.estimator.external_pose(position_m, (w, x, y, z))
 
     def reboot(self) -> None:
-        """Everything but the world, the battery and persistent parameters starts again."""
+        """Restart everything but the world, the battery and persistent parameters."""
         for name, parameter in PARAMETERS.items():
             if not parameter.persistent:
                 self._parameters[name] = parameter.default
@@ -197,7 +197,7 @@ class Firmware:
         )
 
     def log_value(self, name: str) -> float:
-        """A log variable in its own units (degrees, g, pitch nose up).
+        """Return a log variable in its own units (degrees, g, pitch nose up).
 
         Raises KeyError for an unknown name.
         """
@@ -210,7 +210,7 @@ class Firmware:
         return 0.0
 
     def log_values(self, names: Iterable[str]) -> dict[str, float]:
-        """The values of a whole block, by name. Errors as for one."""
+        """Return the values of a whole block, by name. Errors as for one."""
         if self.log_overrides:
             return {name: self.log_value(name) for name in names}
         return {name: LIVE[name](self) if name in LIVE else self.log_value(name) for name in names}
@@ -246,8 +246,8 @@ class Firmware:
         self._setpoint, self._setpoint_s = setpoint, self.t_s
 
     def _limited(self, setpoint: Setpoint) -> Setpoint:
-        """Raw thrust within its limits; it is forced to 0 until one packet with thrust 0 has come
-        since boot (docs/firmware.md, "Raw thrust")."""
+        """Return raw thrust within its limits; it is forced to 0 until one packet with thrust 0 has
+        come since boot (docs/firmware.md, "Raw thrust")."""
         thrust = min(setpoint.thrust, RAW_THRUST_MAX)
         if thrust == 0.0:
             self._thrust_locked = False

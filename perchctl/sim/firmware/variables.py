@@ -136,7 +136,7 @@ def _variance(state: int) -> Getter:
 
 
 def _range_mm(firmware: Any) -> float:
-    """What a deck measures of the height."""
+    """Return what a deck measures of the height."""
     return 1000.0 * max(0.0, firmware.world.z_m) if firmware.estimator.outside is None else 0.0
 
 
