@@ -151,6 +151,13 @@ class Scenario:
 
 _STREAM, _GROUPS_STREAM, _IMU_STREAM = 1, 21, 22  # the scenario's own random streams
 _AIR, _CELL, _TILT, _RADIO, _CAPTURE = 0, 1, 2, 6, 7
+_AS_GIVEN = (
+    "camera_rate_hz", "camera_jitter_s", "camera_drop_rate", "camera_exposure_s",
+    "camera_defocus_px", "camera_fields", "camera_blended", "camera_readout_s", "camera_flicker",
+    "camera_pumping", "camera_receiver_hz", "camera_blank_rate", "estimate_noise_m",
+    "magnet_force_n", "no_target",
+)  # fmt: skip
+"""Keys of the profile that are the same for every seed."""
 _LONGEST_S = 240.0
 """No simulated flight lasts longer."""
 _LEAST_GAP_S = 1.0
@@ -202,26 +209,12 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         camera_burst=burst,
         camera_noise_sigma=noise_sigma,
         camera_mirrored=profile.camera.mirrored,
-        estimate_noise_m=sim.estimate_noise_m,
-        magnet_force_n=sim.magnet_force_n,
-        no_target=sim.no_target,
-        camera_rate_hz=sim.camera_rate_hz,
-        camera_jitter_s=sim.camera_jitter_s,
-        camera_drop_rate=sim.camera_drop_rate,
-        camera_exposure_s=sim.camera_exposure_s,
-        camera_defocus_px=sim.camera_defocus_px,
-        camera_fields=sim.camera_fields,
-        camera_blended=sim.camera_blended,
-        camera_readout_s=sim.camera_readout_s,
-        camera_flicker=sim.camera_flicker,
-        camera_pumping=sim.camera_pumping,
-        camera_receiver_hz=sim.camera_receiver_hz,
-        camera_blank_rate=sim.camera_blank_rate,
         estimate_tilt_bias_rad=(bias_x, bias_y),
         drift_mps=(drift_x, drift_y, drift_z),
         draught_mps=(wind_mps * math.cos(wind_angle), wind_mps * math.sin(wind_angle), 0.0),
         first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
         **_imu_errors(sim, seed),
+        **{name: getattr(sim, name) for name in _AS_GIVEN},
         extra=_extra(profile),
         neighbours=_neighbours(sim),
         **_groups(sim, seed),
