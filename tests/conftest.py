@@ -46,9 +46,7 @@ SLOW_FIRST = (
     "calibration/test_calibration_live.py",
     "faults/test_flights.py",
     "sim/test_crtp_process.py",
-    "sim/test_crtp_spoilt.py",
     "sim/test_crtp_link.py",
-    "sim/test_crtp_logs.py",
     "weights/test_command_sessions.py",
     "weights/test_command.py",
 )

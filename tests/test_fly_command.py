@@ -26,7 +26,7 @@ from perchctl.link.connection import open_connection, plain_cause
 from perchctl.mission import FlightReport, Outcome, Phase
 from perchctl.record import LogWatcher
 from perchctl.sim import SimProcess
-from perchctl.sim.crtp.server import LinkOptions
+from perchctl.sim.crtp import LinkOptions
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT, SHORT
 

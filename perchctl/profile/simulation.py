@@ -20,7 +20,7 @@ Bursts = Ordered[Annotated[float, Field(ge=0.01, le=10)]]
 
 
 class SimulationConfig(Section):
-    """Ranges from which a seed draws one flight's conditions (`perchctl.sim.draw`)."""
+    """Ranges from which a seed draws one flight's conditions (`perchctl.sim.scenario`)."""
 
     start_offset_m: float = key(
         0.5, "start under the target, at most so far aside in x and in y", ge=0, le=5
@@ -62,7 +62,6 @@ class SimulationConfig(Section):
         gt=0,
         le=200,
     )
-    camera_receiver_noise: ClassVar[float] = 0.0  # that the receiver adds; of 255, one sigma
     camera_blank_rate: float = key(
         0.0, "share of pictures in whose place the screen is blue", ge=0, lt=1
     )
@@ -105,15 +104,6 @@ class SimulationConfig(Section):
     cell_charge: Charges = key((1.0, 1.0), "share of a new one's that it holds")
     cell_knee: Knees = key((0.1, 0.1), "share of its charge where the steep end begins")
     target_tilt_deg: Tilts = key((0.0, 0.0), "of the target out of the horizontal")
-    flow_noise_radps: Amounts = key(
-        (0.0, 0.0), "of each reading of the flow sensor; times the height it is a speed"
-    )
-    flow_bias_dps: Amounts = key(
-        (0.0, 0.0), "of the gyroscope, that is taken for flow: drift grows with height"
-    )
-    flow_reach_m: float | None = key(
-        None, "above this the flow sensor sees nothing; none: it always does", gt=0, le=20
-    )
     radio_loss: Losses = key((0.0, 0.0), "share of the time in which no packet passes")
     radio_burst_s: Bursts = key((0.1, 0.1), "mean length of such a time")
     capture_hole_s: Amounts = key(

@@ -1,13 +1,10 @@
-from .bursts import radio_bursts as radio_bursts
 from .camera import DeliveredFrame as DeliveredFrame
 from .camera import SimCamera as SimCamera
 from .capture import MILLIMETRES_PER_M as MILLIMETRES_PER_M
 from .capture import CaptureFault as CaptureFault
 from .capture import CaptureSettings as CaptureSettings
-from .crtp.server import CommandService as CommandService
-from .draw import draw_capture as draw_capture
-from .draw import draw_scenario as draw_scenario
-from .explain import EventExplainer as EventExplainer
+from .capture import draw_capture as draw_capture
+from .crtp import CommandService as CommandService
 from .firmware import Firmware as Firmware
 from .firmware.controller import Estimate as Estimate
 from .hand import draw_hand as draw_hand
@@ -19,7 +16,10 @@ from .process import SharedTime as SharedTime
 from .process import SimProcess as SimProcess
 from .renderer import Renderer as Renderer
 from .scenario import CONTROL_PERIOD_S as CONTROL_PERIOD_S
+from .scenario import EventExplainer as EventExplainer
 from .scenario import Neighbour as Neighbour
 from .scenario import Scenario as Scenario
+from .scenario import draw_scenario as draw_scenario
+from .scenario import radio_bursts as radio_bursts
 from .vehicle import SimulatedVehicle as SimulatedVehicle
 from .world import REST_HEIGHT_M as REST_HEIGHT_M

@@ -77,11 +77,11 @@ class SimCamera:
             self._index += 1
 
     def take(self) -> list[DeliveredFrame]:
-        """The frames that arrived by the time of the last `advance`, oldest first, once."""
+        """Return the frames that arrived by the time of the last `advance`, oldest first, once."""
         out = []
         while self._under_way and self._under_way[0].t_arrival_s <= self._t_s:
             out.append(self._under_way.popleft())
-        return self._receiver.given_out(out, self._t_s)
+        return list(self._receiver.deliver(out, self._t_s))
 
     def _expose(self, middle_s: float, pose_at: PoseAt) -> None:
         s = self.scenario
@@ -152,7 +152,7 @@ class Shutter:
     def shots(
         self, middle_s: float, T_world_cam_at: Callable[[float], Array], height: int
     ) -> list[Shot]:
-        """The frame's pictures in their order of time: two fields, or one."""
+        """Return the frame's pictures in their order of time: two fields, or one."""
         if not self._apart_s:
             return [self._shot(middle_s, T_world_cam_at, height)]
         half_s = self._apart_s / 2.0
@@ -183,7 +183,7 @@ class Shutter:
 STREAM = 412
 BLUE_GREY, BLUE_NOISE = 41.0, 0.6
 """A blue screen, in grey, as it comes out of a converter."""
-_BLANKS, _TICKS = 1, 2  # streams of random numbers
+_BLANKS = 1  # the stream of random numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,26 +198,23 @@ class DeliveredFrame:
 
 
 class Receiver:
-    """Gives out its newest picture at `camera_receiver_hz`, each time with its own noise; one
-    that has no rate of its own hands on what comes."""
+    """Delivers its newest picture at `camera_receiver_hz`, again and again; without a rate of its
+    own it delivers each picture once, as it comes."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
+        self._rate_hz = scenario.camera_receiver_hz
         self._newest: DeliveredFrame | None = None
         rng = np.random.default_rng([scenario.seed, STREAM])
         self._first_s = float(rng.random()) / (scenario.camera_receiver_hz or 1.0)
         self._given = 0
 
-    def given_out(self, arrived: list[DeliveredFrame], t_s: float) -> list[DeliveredFrame]:
-        """Until `t_s`, of what has arrived since the last call, oldest first."""
-        rate_hz = self._scenario.camera_receiver_hz
+    def deliver(self, arrived: list[DeliveredFrame], t_s: float) -> Iterator[DeliveredFrame]:
+        """Yield the frames delivered until `t_s`, oldest first, given those that have arrived since
+        the last call."""
+        rate_hz = self._rate_hz
         if rate_hz is None:
-            return arrived
-        return list(self._ticks(arrived, t_s, rate_hz))
-
-    def _ticks(
-        self, arrived: list[DeliveredFrame], t_s: float, rate_hz: float
-    ) -> Iterator[DeliveredFrame]:
+            yield from arrived
+            return
         waiting = list(arrived)
         last = math.floor((t_s - self._first_s) * rate_hz)
         while self._given <= last:
@@ -225,29 +222,18 @@ class Receiver:
             while waiting and waiting[0].t_arrival_s <= at_s:
                 self._newest = waiting.pop(0)
             if self._newest is not None:
-                yield replace(self._newest, t_arrival_s=at_s, image=self._noisy(self._newest.image))
+                yield replace(self._newest, t_arrival_s=at_s)
             self._given += 1
         if waiting:
             self._newest = waiting[-1]
 
-    def _noisy(self, image: Picture) -> Picture:
-        sigma = self._scenario.camera_receiver_noise
-        if not sigma:
-            return image
-        rng = np.random.default_rng([self._scenario.seed, STREAM, _TICKS, self._given])
-        return _noisy(image, sigma, rng)
-
 
 def blanked(scenario: Scenario, index: int, picture: Picture) -> Picture:
-    """The picture, or the blue screen in its place."""
+    """Return the picture, or the blue screen in its place."""
     if not scenario.camera_blank_rate:
         return picture
     rng = np.random.default_rng([scenario.seed, STREAM, _BLANKS, index])
     if float(rng.random()) >= scenario.camera_blank_rate:
         return picture
-    return _noisy(np.full_like(picture, BLUE_GREY), BLUE_NOISE, rng)
-
-
-def _noisy(image: Picture, sigma: float, rng: np.random.Generator) -> Picture:
-    noise = rng.standard_normal(image.shape, dtype=np.float32)
-    return np.clip(np.rint(image + sigma * noise), 0, 255).astype(np.uint8)
+    noise = rng.standard_normal(picture.shape, dtype=np.float32)
+    return np.asarray(np.rint(BLUE_GREY + BLUE_NOISE * noise), np.uint8)

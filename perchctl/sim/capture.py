@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import re
 import socket
 import struct
 import threading
@@ -25,18 +24,15 @@ from perchctl.geometry import (
     rotation_from_rpy,
 )
 from perchctl.positioning import BodyPose, CaptureFrame
+from perchctl.profile import Profile
+from perchctl.sim.scenario import draw_scenario
 
 if TYPE_CHECKING:
     from perchctl.sim.world import World
 
 _STREAM = 13
 _JITTER_LIMIT_SIGMAS = 3.0
-_AXES = re.compile(r"([+-])([xyz])([+-])([xyz])([+-])([xyz])")
-TRUE_AXES = "+x+y+z"
-Y_UP = "+x+z-y"
-"""The capture's second axis is up, as some systems have it out of the box."""
-SWAPPED_XY = "+y-x+z"
-"""The capture's axes lie a quarter turn from those along which its bodies were defined."""
+TRUE_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 MILLIMETRES_PER_M = 1000.0
 
 
@@ -59,9 +55,8 @@ class CaptureFault:
         swapped: the vehicle's body and the first other one have changed names.
         scale: of all positions; 1000 is millimetres.
         mirrored: positions with y's sign turned, as a left-handed program sends them.
-        axes: the capture's axes in the world's, such as `+x+z-y`; None: as in the settings.
+        axes: rows (3, 3) of the turn from the world's axes to the capture's.
         late_s: more than the settings' delay.
-        rate_hz: at most so many frames a second.
     """
 
     occluded: bool = False
@@ -70,13 +65,8 @@ class CaptureFault:
     swapped: bool = False
     scale: float = 1.0
     mirrored: bool = False
-    axes: str | None = None
+    axes: tuple[tuple[float, ...], ...] = TRUE_AXES
     late_s: float = 0.0
-    rate_hz: float = math.inf
-
-    def __post_init__(self) -> None:
-        if self.axes is not None:
-            axes_matrix(self.axes)
 
 
 @dataclass(frozen=True)
@@ -88,7 +78,6 @@ class CaptureSettings:
         rate_hz: of its cameras.
         delay_s, jitter_s: from an exposure to the frame's arrival; one sigma of it.
         position_noise_m, attitude_noise_rad: one sigma, each axis.
-        axes: the capture's axes in the world's.
         heading_rad, origin_m: of the simulator's world in the capture's.
         faults: (from s, to s, what), on the simulation's clock.
     """
@@ -102,14 +91,12 @@ class CaptureSettings:
     jitter_s: float = 0.0005
     position_noise_m: float = 0.001
     attitude_noise_rad: float = 0.005
-    axes: str = TRUE_AXES
     heading_rad: float = 0.0
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     faults: tuple[tuple[float, float, CaptureFault], ...] = ()
     seed: int = 0
 
     def __post_init__(self) -> None:
-        axes_matrix(self.axes)
         if not self.rate_hz > 0.0:
             raise InvalidValue(f"a motion capture at {self.rate_hz:g} Hz sees nothing")
         if len(set(self.names)) < len(self.names):
@@ -121,18 +108,23 @@ class CaptureSettings:
         return (self.body, *(other.name for other in self.others))
 
 
-def axes_matrix(axes: str) -> Array:
-    """(3, 3): world vector to the capture's. Errors: InvalidValue for what is no right-handed
-    set of axes."""
-    parts = _AXES.fullmatch(axes)
-    matrix = np.zeros((3, 3))
-    if parts is not None:
-        for row in range(3):
-            sign, axis = parts.group(2 * row + 1), parts.group(2 * row + 2)
-            matrix[row, "xyz".index(axis)] = 1.0 if sign == "+" else -1.0
-    if round(float(np.linalg.det(matrix))) != 1:
-        raise InvalidValue(f"axes {axes!r} are none; right-handed ones are such as {Y_UP!r}")
-    return matrix
+def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
+    """Return the motion capture of that seed's flight; None where the vehicle's decks do it."""
+    config, sim = profile.positioning, profile.simulation
+    if config.by != "mocap":
+        return None
+    roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
+    holes = draw_scenario(profile, seed).capture_holes_s
+    hidden = CaptureFault(occluded=True)
+    return CaptureSettings(
+        body=config.body,
+        body_rpy_rad=(roll, pitch, yaw),
+        body_position_m=config.body_position_m,
+        delay_s=sim.capture_delay_s,
+        position_noise_m=sim.capture_noise_m,
+        faults=tuple((begin_s, begin_s + length_s, hidden) for begin_s, length_s in holes),
+        seed=seed,
+    )
 
 
 class SimCapture:
@@ -156,7 +148,6 @@ class SimCapture:
         self._due_s = float(self._rng.random()) / settings.rate_hz
         self._t_s = 0.0
         self._arrival_s = -math.inf
-        self._delivered_s = -math.inf
         self._before: dict[str, BodyPose] = {}
         self._under_way: deque[CaptureFrame] = deque()
 
@@ -165,11 +156,11 @@ class SimCapture:
         self._faults.append((self._t_s, self._t_s + for_s, fault))
 
     def heal(self) -> None:
-        """Nothing is wrong any more."""
+        """End all faults."""
         self._faults.clear()
 
     def advance(self, world: World) -> None:
-        """Called each control period: exposes if it is time to."""
+        """Expose if it is time to. Called each control period."""
         self._t_s = t_s = world.t_s
         if t_s < self._due_s - 1e-9:
             return
@@ -178,10 +169,8 @@ class SimCapture:
         jitter = float(np.clip(self._rng.normal(), -_JITTER_LIMIT_SIGMAS, _JITTER_LIMIT_SIGMAS))
         faults = [fault for since_s, to_s, fault in self._faults if since_s <= t_s < to_s]
         bodies = self._bodies(world, noise, faults)
-        least_s = 1.0 / min([math.inf, *(fault.rate_hz for fault in faults)])
-        if any(fault.gone for fault in faults) or t_s - self._delivered_s < least_s - 1e-9:
+        if any(fault.gone for fault in faults):
             return
-        self._delivered_s = t_s
         delay_s = self.settings.delay_s + jitter * self.settings.jitter_s
         arrival_s = t_s + max(0.0, delay_s) + sum(fault.late_s for fault in faults)
         self._arrival_s = max(arrival_s, self._arrival_s)
@@ -190,20 +179,20 @@ class SimCapture:
         self._under_way.append(CaptureFrame(self._arrival_s, bodies))
 
     def take(self) -> list[CaptureFrame]:
-        """The frames that arrived by the time of the last `advance`, oldest first, once."""
+        """Return the frames that arrived by the time of the last `advance`, oldest first, once."""
         arrived = []
         while self._under_way and self._under_way[0].t_s <= self._t_s + 1e-9:
             arrived.append(self._under_way.popleft())
         return arrived
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """The newest frame that has arrived since the last call: a flight in lockstep has this
-        capture as its `CaptureSource`."""
+        """Return the newest frame that has arrived since the last call: a flight in lockstep has
+        this capture as its `CaptureSource`."""
         arrived = self.take()
         return arrived[-1] if arrived else None
 
     def problem(self, now_s: float) -> str | None:
-        """None: nothing is ever wrong with the connection."""
+        """Return None, since nothing is ever wrong with this connection."""
         return None
 
     def close(self) -> None:
@@ -235,10 +224,9 @@ class SimCapture:
         place = place + settings.position_noise_m * noise[:3]
         a, b, c = (float(v) for v in settings.attitude_noise_rad * noise[3:])
         R = self._R_capture_world @ R @ rotation_from_rpy(a, b, c)
-        axes, scale = settings.axes, 1.0
+        turn, scale = np.eye(3), 1.0
         for fault in faults:
-            axes, scale = fault.axes or axes, scale * fault.scale
-        turn = axes_matrix(axes)
+            turn, scale = np.array(fault.axes) @ turn, scale * fault.scale
         # A system defines a body's axes along its own: a level body's attitude is none at all.
         x, y, z = (scale * float(v) for v in turn @ place)
         if any(fault.mirrored for fault in faults):
@@ -267,19 +255,19 @@ def message(kind: int, body: bytes) -> bytes:
 
 
 def kind_of(request: bytes) -> int | None:
-    """The kind of a message; None for what is too short to be one."""
+    """Return the kind of a message; None for what is too short to be one."""
     return int.from_bytes(request[:2], "little") if len(request) >= 4 else None
 
 
 def server_info(data_port: int) -> bytes:
-    """The answer to `CONNECT`: frames will come to that port of the client's, by unicast."""
+    """Return the answer to `CONNECT`: frames will come to that port of the client's, by unicast."""
     name = b"perchctl".ljust(_NAME_BYTES, b"\0")
     where = struct.pack("<QH?4B", _TICKS_HZ, data_port, False, 0, 0, 0, 0)
     return message(SERVER_INFO, name + _VERSION + _VERSION + where)
 
 
 def models(names: Sequence[str]) -> bytes:
-    """The answer to `ASK_MODELS`: rigid bodies, numbered from 1, their origins unmoved."""
+    """Return the answer to `ASK_MODELS`: rigid bodies, numbered from 1, their origins unmoved."""
     body = struct.pack("<i", len(names))
     for number, name in enumerate(names, 1):
         body += struct.pack("<i", _RIGID_BODY) + name.encode() + b"\0"
@@ -332,8 +320,8 @@ class CaptureServer:
         self._thread.start()
 
     def publish(self, seen: CaptureFrame) -> None:
-        """Costs next to nothing while nobody is connected. A client that has gone, and a full
-        buffer, lose a frame, as on any network."""
+        """Send a frame to each client; nothing is sent while nobody is connected. A client that has
+        gone, and a full buffer, lose a frame, as on any network."""
         self._count += 1
         with self._lock:
             if not self._clients:
@@ -368,7 +356,7 @@ class CaptureServer:
                     self._socket.sendto(models(self._names), address)
 
     def _admit(self, host: str) -> int:
-        """A port of the client's own: several on one computer could not share one."""
+        """Return a port of the client's own: several on one computer could not share one."""
         with self._lock:
             taken = {client.getpeername()[1] for client in self._clients}
             while (port := _free_port()) in taken:

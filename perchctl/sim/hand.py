@@ -25,9 +25,8 @@ from perchctl.camera import unmirror_frame
 from perchctl.geometry import Array, invert_T, make_T, rotation_from_rpy, rpy_from_rotation
 from perchctl.profile import Profile
 from perchctl.sim.camera import DeliveredFrame, SimCamera
-from perchctl.sim.draw import draw_scenario
 from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import Scenario
+from perchctl.sim.scenario import Scenario, draw_scenario
 from perchctl.vision import CameraModel, Frame
 
 HAND_STREAM = 430
@@ -57,7 +56,7 @@ class Waves:
     phase: Array
 
     def __call__(self, t_s: Array) -> Array:
-        """(m,) to (m, k)."""
+        """Return the motion (m, k) at times (m,)."""
         angle = 2.0 * math.pi * self.rate_hz * np.asarray(t_s)[:, None, None] + self.phase
         return np.asarray((self.amplitude * np.sin(angle)).sum(axis=2))
 
@@ -117,7 +116,7 @@ class Hand:
 def draw_hand(
     profile: Profile, part: MountingPart, seed: int, seconds: float | None = None
 ) -> Hand:
-    """The hand of that seed; both parts of one seed have the same vehicle."""
+    """Return the hand of that seed; both parts of one seed have the same vehicle."""
     rng = np.random.default_rng([seed, HAND_STREAM])
     yaw, *tilt = np.radians(rng.uniform(-1.0, 1.0, 3) * (180.0, MOUNT_TILT_DEG, MOUNT_TILT_DEG))
     way, far = rng.uniform(-math.pi, math.pi), MOVED_M * math.sqrt(rng.uniform())
@@ -165,7 +164,7 @@ def draw_hand(
 
 
 def _turns(rng: np.random.Generator, part: MountingPart) -> Waves:
-    """Tilts about the camera's x and y, and its heading, in rad."""
+    """Return tilts about the camera's x and y, and its heading, in rad."""
     slow_deg, round_deg, quick_deg = (27.0, 200.0, 6.0) if part == "carry" else (25.0, 40.0, 2.0)
     slow = _waves(rng, np.radians([slow_deg, slow_deg, 0.0]), (0.12, 0.3))
     # One of the two sines goes round, so that it is tilted to all sides.
@@ -183,8 +182,8 @@ def _turns(rng: np.random.Generator, part: MountingPart) -> Waves:
 def _waves(
     rng: np.random.Generator, amplitude: Sequence[float] | Array, rate_hz: tuple[float, float]
 ) -> Waves:
-    """Two sines a channel, which together reach its amplitude, at rates so different that
-    they do not cancel for long."""
+    """Return two sines a channel, which together reach its amplitude, at rates so different
+    that they do not cancel for long."""
     size = np.array(amplitude)[:, None]
     share = rng.uniform(0.4, 0.6, (len(size), 1))
     low, high = rate_hz
@@ -214,7 +213,7 @@ def _rot_z(angles: Array) -> Array:
 
 
 def R_target_cam(hand: Hand, t_s: Array) -> Array:
-    """The camera's turn at times (n,), (n, 3, 3)."""
+    """Return the camera's turn at times (n,), (n, 3, 3)."""
     turns = hand.turns(t_s)
     return np.asarray(
         _rot_z(hand.heading_rad + turns[:, 2])
@@ -223,7 +222,7 @@ def R_target_cam(hand: Hand, t_s: Array) -> Array:
 
 
 def cam_target_m(hand: Hand, t_s: Array) -> Array:
-    """The camera's place in the target's frame at times (n,), (n, 3)."""
+    """Return the camera's place in the target's frame at times (n,), (n, 3)."""
     R = R_target_cam(hand, t_s)
     if hand.part == "pivot":
         slipped = (np.asarray(t_s) >= hand.slips_at_s)[:, None] * hand.slips_m
@@ -245,7 +244,8 @@ def T_target_cam_at(hand: Hand, t_s: float) -> Array:
 
 
 def attitudes(hand: Hand, errors: bool = True) -> tuple[AttitudeSample, ...]:
-    """The vehicle's samples, those that the radio loses left out; without `errors` the truth."""
+    """Return the vehicle's samples without those that the radio loses; or, without `errors`, the
+    truth."""
     rng = np.random.default_rng([hand.seed, HAND_STREAM, 2, ("carry", "pivot").index(hand.part)])
     t_s = np.arange(0.0, hand.seconds + 0.3, TELEMETRY_S)
     R_cam_body = hand.T_body_cam[:3, :3].T
@@ -281,7 +281,7 @@ def attitudes(hand: Hand, errors: bool = True) -> tuple[AttitudeSample, ...]:
 
 
 def _slow_noise(rng: np.random.Generator, n: int, memory_s: float) -> Array:
-    """Noise (n, 3) of unit spread that forgets itself in `memory_s`."""
+    """Return noise (n, 3) of unit spread that forgets itself in `memory_s`."""
     keep = math.exp(-TELEMETRY_S / memory_s)
     kicks = rng.normal(size=(n, 3)) * math.sqrt(1.0 - keep * keep)
     out = np.empty((n, 3))
@@ -292,7 +292,7 @@ def _slow_noise(rng: np.random.Generator, n: int, memory_s: float) -> Array:
 
 
 def pictures(hand: Hand, profile: Profile, camera: CameraModel) -> Iterator[DeliveredFrame]:
-    """The camera's frames in the order of their arrival, rendered as they are asked for."""
+    """Return the camera's frames in the order of their arrival, rendered as they are asked for."""
     renderer = Renderer(hand.scenario, camera, profile.target, hand.seed)
     source = SimCamera(hand.scenario, renderer)
     T_room_target = renderer.T_world_target

@@ -9,8 +9,12 @@ import math
 import os
 import select
 import signal
+import socket
+import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, TextIO
 
 import cv2
@@ -18,10 +22,10 @@ import cv2
 from perchctl.children import Channel, connect_back
 from perchctl.errors import PerchError
 from perchctl.geometry import rpy_from_rotation
-from perchctl.sim.bursts import radio_bursts
+from perchctl.link import Packet
 from perchctl.sim.capture import CaptureFault, CaptureServer, SimCapture
-from perchctl.sim.crtp.server import CrtpServer
-from perchctl.sim.endpoint import Address, MjpegServer, UdpEndpoint
+from perchctl.sim.crtp import CrtpServer
+from perchctl.sim.optics import Picture
 from perchctl.sim.process import (
     CLOCK_MARGIN_S,
     LOOP_PATIENCE_S,
@@ -29,9 +33,10 @@ from perchctl.sim.process import (
     HostSetup,
     SharedTime,
 )
-from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Bursts, Scenario, radio_bursts
 from perchctl.sim.vehicle import SimulatedVehicle
 
+Address = tuple[str, int]
 TRUTH_EVERY = 10  # control periods between two lines of the truth file
 
 
@@ -46,7 +51,7 @@ class VehicleHost:
         with contextlib.ExitStack() as opened:
             use = opened.enter_context
             bursts = radio_bursts(setup.scenario)
-            self.endpoint = use(contextlib.closing(UdpEndpoint(setup.link, bursts)))
+            self.endpoint = use(contextlib.closing(UdpEndpoint(bursts)))
             self.stream: MjpegServer | None = None
             if setup.camera is not None:
                 self.stream = use(contextlib.closing(MjpegServer()))
@@ -81,7 +86,7 @@ class VehicleHost:
         self.endpoint.serve(self.server, self.elapsed_s)
 
     def step(self) -> None:
-        """Packets that have arrived, one control period, then what is due to be sent."""
+        """Serve what has arrived, advance by one control period, and send what is due."""
         self.endpoint.serve(self.server, self.elapsed_s)
         vehicle = self.vehicle
         vehicle.step()
@@ -104,8 +109,8 @@ class VehicleHost:
         return self.elapsed_s
 
     def answer(self, name: str, *arguments: Any, **named: Any) -> Any:
-        """What the method gives: of this host, or `set_pose`, `carry` and `let_go` of its
-        world."""
+        """Return what a method gives: of this host, or `set_pose`, `move_by_hand` and `let_go` of
+        its world."""
         of: Any = self.vehicle.world if hasattr(self.vehicle.world, name) else self
         return getattr(of, name)(*arguments, **named)
 
@@ -113,16 +118,12 @@ class VehicleHost:
         """Change the battery's resting voltage."""
         self.vehicle.world.battery_rest_v = rest_v
 
-    def push(self, force_n: tuple[float, float, float]) -> None:
-        """A constant outside force, world axes, until changed."""
-        self.vehicle.world.external_force_n = force_n
-
     def silence(self, duration_s: float) -> None:
-        """The link receives and sends nothing for `duration_s` of simulated time."""
+        """Let the link receive and send nothing for `duration_s` of simulated time."""
         self.endpoint.silence(self.elapsed_s, duration_s)
 
     def capture_fault(self, fault: CaptureFault | None, for_s: float = math.inf) -> None:
-        """Something goes wrong in the motion capture for so long; None ends all that does."""
+        """Begin a fault of the motion capture for so long; None ends all faults."""
         capture = self.vehicle.capture
         if capture is None:
             raise RuntimeError("it was started without a motion capture")
@@ -136,7 +137,8 @@ class VehicleHost:
         self.server.reboot()
 
     def truth(self) -> dict[str, Any]:
-        """The true state, SI and radians, and the firmware's outputs: no Crazyflie reports it."""
+        """Return the true state, SI and radians, and the firmware's outputs: no Crazyflie reports
+        it."""
         world, firmware = self.vehicle.world, self.vehicle.firmware
         state = world.state()
         return {
@@ -155,7 +157,7 @@ class VehicleHost:
         }
 
     def replace_vehicle(self, scenario: Scenario) -> None:
-        """A new vehicle under the same link: connection and log blocks stay."""
+        """Put a new vehicle under the same link: connection and log blocks stay."""
         self.vehicle = self._new_vehicle(scenario)
         self.server.replace_firmware(self.vehicle.firmware, keep_blocks=True)
 
@@ -285,7 +287,7 @@ class Runner:
             self._answer(self._channel)
 
     def _answer(self, channel: Channel) -> None:
-        """One request of the parent: (name, arguments, named ones) -> (True, result) or
+        """Answer one request of the parent, (name, arguments, named ones), by (True, result) or
         (False, text)."""
         try:
             name, arguments, named = channel.receive()
@@ -320,3 +322,174 @@ class Runner:
         self._realtime = True
         self._shared = SharedTime()
         self._restart_clock()
+
+
+# --- The link's carrier: one CRTP packet a UDP datagram, as cflib's `udp://` driver sends them ---
+
+
+_RECEIVE_BYTES = 1 << 20
+_NULL_HEADER = 0xFF
+_EPS_S = 1e-9
+
+
+class UdpEndpoint:
+    """The socket of a simulated vehicle, bound to loopback.
+
+    Answers go to the requesting address. What the vehicle sends by itself goes to the
+    peer: the last address that sent anything but a scan's probe. `heard` is called with each
+    datagram that is a packet, before anything is made of it: time, sender, bytes.
+    """
+
+    def __init__(self, bursts: Bursts | None = None) -> None:
+        """Open the socket; nothing passes in `bursts`."""
+        self._bursts = bursts
+        self._peer: Address | None = None
+        self.heard: Callable[[float, Address, bytes], None] | None = None
+        self._silent = (math.inf, math.inf)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
+        self.socket.bind(("127.0.0.1", 0))
+        self.port = int(self.socket.getsockname()[1])
+
+    def close(self) -> None:
+        self.socket.close()
+
+    def silence(self, from_s: float, duration_s: float) -> None:
+        """Receive and send nothing for a while of simulated time."""
+        self._silent = (from_s, from_s + duration_s)
+
+    def serve(self, server: CrtpServer, t_s: float) -> None:
+        """Handle every datagram that has arrived. `t_s`: simulated time, for the silence."""
+        while True:
+            try:
+                datagram, address = self.socket.recvfrom(64)
+            except (BlockingIOError, InterruptedError):
+                return
+            if not self._passes(t_s):
+                continue
+            packet = Packet.decode(datagram)
+            if packet is None:
+                continue
+            if self.heard is not None:
+                self.heard(t_s, address, datagram)
+            if datagram[0] != _NULL_HEADER:
+                self._peer = address
+            self._send(server.handle(packet), address, t_s)
+
+    def send_due(self, server: CrtpServer, t_s: float) -> None:
+        """Send what the vehicle sends by itself; nothing is kept for a missing peer."""
+        if self._peer is not None:
+            self._send(server.due(), self._peer, t_s)
+
+    def _send(self, packets: Iterable[Packet], address: Address, t_s: float) -> None:
+        for packet in packets:
+            if not self._passes(t_s):
+                continue
+            try:
+                self.socket.sendto(packet.encode(), address)
+            except OSError:  # full buffer or a peer that is gone: lost like over the air
+                continue
+
+    def _passes(self, t_s: float) -> bool:
+        """Return whether the link carries a packet at that time."""
+        if self._silent[0] - _EPS_S <= t_s < self._silent[1] - _EPS_S:
+            return False
+        return self._bursts is None or not self._bursts.lost(t_s)
+
+
+# --- The simulated camera's picture over HTTP, as a network camera would send it ---------------
+# One part of a multipart answer is one JPEG; a slow client skips frames, the newest wins.
+
+
+PATH = "/stream.mjpg"
+JPEG_QUALITY = 92
+_BOUNDARY = "perchctlframe"
+_WAIT_S = 0.5
+_CLIENT_TIMEOUT_S = 5.0
+
+
+class MjpegServer:
+    """Serves the newest of the published pictures on loopback."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._image: Picture | None = None
+        self._number = 0
+        self.closed = False
+        self._server = _HttpServer(self)
+        self.url = f"http://127.0.0.1:{self._server.server_address[1]}{PATH}"
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True
+        )
+        self._thread.start()
+
+    def publish(self, image: Picture) -> None:
+        """Publish a picture, grey uint8 (h, w). It costs nothing while nobody watches."""
+        with self._changed:
+            self._image = image
+            self._number += 1
+            self._changed.notify_all()
+
+    def after(self, number: int) -> tuple[int, Picture] | None:
+        """Return the newest picture and its number if that is above `number`; None when none came
+        for a while."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.closed or self._number > number, _WAIT_S)
+            if self._image is None or self._number <= number:
+                return None
+            return self._number, self._image
+
+    def close(self) -> None:
+        """End all streams and free the port."""
+        with self._changed:
+            self.closed = True
+            self._changed.notify_all()
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+class _HttpServer(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+    allow_reuse_address = True
+
+    def __init__(self, pictures: MjpegServer) -> None:
+        self.pictures = pictures
+        super().__init__(("127.0.0.1", 0), _Handler)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Report all errors but a client that goes away."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    timeout = _CLIENT_TIMEOUT_S
+    server: _HttpServer
+
+    def do_GET(self) -> None:
+        if self.path.split("?", 1)[0] != PATH:
+            self.send_error(404, f"the stream is at {PATH}")
+            return
+        self.send_response(200)
+        self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.flush()
+        pictures, number = self.server.pictures, 0
+        while not pictures.closed:
+            newer = pictures.after(number)
+            if newer is None:
+                continue
+            number, image = newer
+            _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+            jpeg = encoded.tobytes()
+            head = (
+                f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+            )
+            self.wfile.write(head.encode() + jpeg + b"\r\n")
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Print nothing: requests are not worth a line on the terminal."""

@@ -50,13 +50,13 @@ class RayGrid:
         return np.stack([x, y, np.ones_like(x)])
 
     def window(self, rows: slice, cols: slice) -> RayGrid:
-        """A part of it, whose outline stays that of the whole."""
+        """Return a part of the grid, whose outline stays that of the whole."""
         xy = np.ascontiguousarray(self.xy[rows, cols])
         return RayGrid(self.stride, xy, self.down[rows], self.outline)
 
 
 def undistorted_rays(camera: CameraModel, pixels: Array) -> Array:
-    """View rays (x, y) at depth one of pixels (n, 2), shape (n, 2)."""
+    """Return view rays (x, y) at depth one of pixels (n, 2), shape (n, 2)."""
     points = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
     criteria = (3, 100, 1e-12)  # by default OpenCV stops early, 0.12 px off in the corners
     if camera.model == "fisheye":
@@ -67,7 +67,7 @@ def undistorted_rays(camera: CameraModel, pixels: Array) -> Array:
 
 
 def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
-    """Rays over the image, its size rounded up to whole coarse blocks."""
+    """Return rays over the image, its size rounded up to whole coarse blocks."""
     cols, rows = (-(-side // COARSE_PX) * (COARSE_PX // stride) + 2 for side in camera.size_px)
     u = stride * (np.arange(cols) - 1) + (stride - 1) / 2.0
     v = stride * (np.arange(rows) - 1) + (stride - 1) / 2.0
@@ -80,8 +80,8 @@ def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
 
 
 def plane_map(T_target_cam: Array) -> Array:
-    """Maps a ray (x, y, 1) to (X w, Y w, w), where it meets the target's plane, (..., 3, 3) of
-    poses (..., 4, 4).
+    """Return what maps a ray (x, y, 1) to (X w, Y w, w), where it meets the target's plane, (...,
+    3, 3) of poses (..., 4, 4).
 
     From X = t + s R r with X_z = 0. A camera above the plane sees nothing of it
     (w is made negative).
@@ -95,7 +95,7 @@ def plane_map(T_target_cam: Array) -> Array:
 
 
 def trace(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Where the grid's rays meet the plane, (rows, cols, 2) m, and which do not.
+    """Return where the grid's rays meet the plane, (rows, cols, 2) m, and which do not.
 
     `to_plane` is the map (3, 3), or with a rolling shutter those of rows at equal distances
     from the picture's first to its last, (n, 3, 3).
@@ -120,7 +120,7 @@ def _trace_by_row(grid: RayGrid, maps: Array) -> tuple[NDArray[np.float32], NDAr
 
 
 def _met(q: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Points of (X w, Y w, w), shape (3, rows, cols)."""
+    """Return points of (X w, Y w, w), shape (3, rows, cols)."""
     misses = q[2] < LEAST_RISE
     q[2, misses] = 1.0
     points = np.stack([q[0] / q[2], q[1] / q[2]], axis=-1)
@@ -136,7 +136,7 @@ def _all_rise(grid: RayGrid, to_plane: Array) -> bool:
 
 
 def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) -> float:
-    """Local scale of the picture around a node (geometric mean of both directions)."""
+    """Return the local scale of the picture around a node (geometric mean of both directions)."""
     row, col = min(max(row, 1), len(nodes) - 2), min(max(col, 1), nodes.shape[1] - 2)
     a = (nodes[row, col + 1] - nodes[row, col - 1]).astype(np.float64)
     b = (nodes[row + 1, col] - nodes[row - 1, col]).astype(np.float64)
@@ -153,7 +153,7 @@ bare lens, real ones correct most of it."""
 
 
 def pixel_rays(fine: RayGrid) -> RayGrid:
-    """The rays of all pixels; between the nodes they are interpolated (1e-4 px)."""
+    """Return the rays of all pixels; between the nodes they are interpolated (1e-4 px)."""
     xy = cv2.resize(fine.xy, None, fx=FINE_PX, fy=FINE_PX)[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX]
     down = np.arange(len(xy)) * ((fine.down[2] - fine.down[1]) / FINE_PX)
     return RayGrid(1, np.asarray(xy, np.float32), np.asarray(down, np.float32), fine.outline)
@@ -173,7 +173,7 @@ class Lens:
 
 
 def lens_of(camera: CameraModel) -> Lens:
-    """The camera's; flights share it, since its rays take longer than 20 pictures."""
+    """Return the camera's lens. Flights share it, since its rays take longer than 20 pictures."""
     return _lens(*camera.contents)
 
 
@@ -195,7 +195,7 @@ def _five_places(coarse: RayGrid) -> Array:
 
 
 def vignetting(fine: RayGrid, size_px: tuple[int, int]) -> Picture:
-    """The lens's relative light, 255 for all of it; (height, width)."""
+    """Return the lens's relative light, 255 for all of it; (height, width)."""
     r2 = (fine.rays[:2] ** 2).sum(axis=0)
     light = (255.0 * (1.0 + r2) ** -VIGNETTING_EXPONENT).astype(np.float32)
     full = cv2.resize(light, None, fx=FINE_PX, fy=FINE_PX)[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX]

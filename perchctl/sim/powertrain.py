@@ -59,7 +59,7 @@ _D = (C1 / (3.0 * C3) - _P * _P) ** 3
 
 
 def motor_v(thrust_n: float) -> float:
-    """The motor voltage at which one motor gives `thrust_n`."""
+    """Return the motor voltage at which one motor gives `thrust_n`."""
     q = _Q + _Q_PER_N * thrust_n
     s = sqrt(q * q + _D)
     return cbrt(q + s) + cbrt(q - s) + _P
@@ -70,7 +70,7 @@ STANDSTILL_V = motor_v(0.0)
 
 
 def thrust_n(volts: float) -> float:
-    """The steady thrust of one motor at a motor voltage."""
+    """Return the steady thrust of one motor at a motor voltage."""
     if volts <= STANDSTILL_V:
         return 0.0
     return C0 + volts * (C1 + volts * (C2 + volts * C3))
@@ -78,7 +78,7 @@ def thrust_n(volts: float) -> float:
 
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age -------------------
 # - Resting voltage by charge: the levels in tenths by which the firmware tells a battery's
-#   state (`perchctl.sim.firmware.power`) are a discharge curve of the Crazyflie's own cell.
+#   state (`perchctl.sim.firmware.firmware`) are a discharge curve of the Crazyflie's own cell.
 #   It is flat in the middle and falls ever faster below a tenth, where 24 s of hovering take
 #   0.7 V; what lies between 0 and 10 per cent is shaped as lithium polymer cells fall off.
 # - The voltage falls under load by the cell's resistance at once, and in an old or cold cell
@@ -113,7 +113,7 @@ class CellKind:
 
     @classmethod
     def of(cls, scenario: Scenario) -> CellKind:
-        """The cell of the scenario's vehicle."""
+        """Return the cell of the scenario's vehicle."""
         ohm = scenario.cell_resistance_ohm
         return cls(
             RESISTANCE_OHM if ohm is None else ohm,
@@ -146,7 +146,7 @@ class Cell:
         self._rest_v = rest_v
 
     def step(self, current_a: float) -> float:
-        """The voltage under load after one control period of a current."""
+        """Return the voltage under load after one control period of a current."""
         kind = self._kind
         self._left -= current_a * self._per_step
         self._slow_v += self._slowly * (kind.slow_ohm * current_a - self._slow_v)
@@ -165,7 +165,8 @@ def _resting_v(left: float, knee: float) -> float:
 
 
 def _charge_at(rest_v: float, knee: float) -> float:
-    """The charge that belongs to a resting voltage; at the curve's ends where it is beyond."""
+    """Return the charge that belongs to a resting voltage; at the curve's ends where it is
+    beyond."""
     low, high = 0.0, 1.05
     for _ in range(40):
         middle = 0.5 * (low + high)
@@ -201,7 +202,7 @@ class Powertrain:
         self._down = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_COAST_S)
 
     def step(self, pwm: Forces) -> Forces:
-        """The forces after one control period under four duty cycles 0..65535."""
+        """Return the forces after one control period under four duty cycles 0..65535."""
         scale = self.battery_v / FULL_COMMAND
         for motor, duty in enumerate(pwm):
             speed_v = self._speeds_v[motor]
@@ -216,7 +217,8 @@ class Powertrain:
 
 
 def most_thrust_n(rest_v: float) -> float:
-    """Four motors' steady thrust at the full duty cycle, from a cell of that resting voltage."""
+    """Return four motors' steady thrust at the full duty cycle, from a cell of that resting
+    voltage."""
     battery_v = rest_v
     for _ in range(30):
         forces_n = 4.0 * thrust_n(battery_v)

@@ -34,7 +34,7 @@ from perchctl.children import (
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
 from perchctl.profile import TargetConfig
 from perchctl.sim.capture import CaptureSettings
-from perchctl.sim.crtp.server import LinkOptions
+from perchctl.sim.crtp import LinkOptions
 from perchctl.sim.scenario import Scenario
 from perchctl.vision import CameraModel
 
@@ -120,7 +120,7 @@ SLOWEST_PACE = 20.0
 _STOP_TIMEOUT_S = 5.0
 _CHILD = "from perchctl.sim.host import serve_parent; serve_parent()"
 REQUESTS = (
-    "truth", "set_pose", "carry", "let_go", "set_battery", "push", "silence", "capture_fault",
+    "truth", "set_pose", "move_by_hand", "let_go", "set_battery", "silence", "capture_fault",
     "reboot", "replace_vehicle",
 )  # fmt: skip
 """Methods of the child's `VehicleHost` and its `World` that a `SimProcess` has, too."""

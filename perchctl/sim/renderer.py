@@ -103,8 +103,8 @@ class Renderer:
             small=target.small.model_copy(update={"side_m": scenario.small_side_m}),
         )
         own = () if scenario.no_target else (Placed(printed_sheet(printed.model_dump_json())),)
+        self._still: tuple[tuple[bytes, float], Picture] | None = None
         self._sheets = (*own, *(beside(n, printed) for n in scenario.neighbours))
-        self._still: tuple[bytes, float, Picture] | None = None
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
         lens = lens_of(camera)
@@ -115,7 +115,7 @@ class Renderer:
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
-        """The target's centre is there from now on."""
+        """Put the target's centre there from now on."""
         self._still = None
         scenario = self.scenario
         z_m = scenario.ceiling_z_m + scenario.target_above_ceiling_m
@@ -129,7 +129,7 @@ class Renderer:
         defocus_px: float | None = None,
         frame_index: int = 0,
     ) -> Picture:
-        """One exposure.
+        """Return the picture of one exposure.
 
         Args:
             T_world_cam_samples: poses (4, 4) at equal steps over the exposure,
@@ -145,7 +145,7 @@ class Renderer:
     def expose(
         self, shots: Sequence[Shot], frame_index: int = 0, defocus_px: float | None = None
     ) -> Picture:
-        """The frame of one shot, or of two fields in their order of time; which rows are
+        """Return the frame of one shot, or of two fields in their order of time; which rows are
         the first one's, and whether they are blended, is the scenario's. Otherwise as
         `render`."""
         scene = self.scenario
@@ -162,10 +162,10 @@ class Renderer:
         if self._analogue > 0.0:
             rng = np.random.default_rng([self.seed, FRAME_STREAM, frame_index])
             picture = spoil(picture, self._analogue, rng)
-        return np.array(picture, np.uint8, copy=True if self._noise is None else None)
+        return picture.copy()
 
     def _exposed(self, shot: Shot, defocus_px: float | None) -> Picture:
-        """What falls onto the sensor in one shot, before noise. Not to be written into."""
+        """Return what falls onto the sensor in one shot, before noise. Not to be written into."""
         rows = [self._T_target_world @ np.array(poses) for poses in shot.rows]
         motion_px = self._motion_px(rows[len(rows) // 2])
         length_px = path_length_px(motion_px)
@@ -177,19 +177,20 @@ class Renderer:
         return picture if shot.light is None else lit(picture, shot.light)
 
     def _at_rest(self, pose: Array, sigma_px: float) -> Picture:
-        """The picture of a camera that does not move; the last one is kept."""
-        key, last = pose.tobytes(), self._still
-        if last is None or last[:2] != (key, sigma_px):
+        """Return the picture of a camera that does not move. The last one is kept: under the magnet
+        it would cost 4 ms each time."""
+        key = (pose.tobytes(), sigma_px)
+        if self._still is None or self._still[0] != key:
             picture = self._projected([pose[None]], np.zeros((5, 1, 2)), 0.0, sigma_px)
-            last = self._still = (key, sigma_px, picture)
-        return last[2]
+            self._still = key, picture
+        return self._still[1]
 
     # -- through the lens ---------------------------------------------------
 
     def _projected(
         self, rows: list[Array], motion_px: Array, length_px: float, sigma_px: float
     ) -> Picture:
-        """The picture at poses T_target_cam, of each row (n, 4, 4)."""
+        """Return the picture at poses T_target_cam, of each row (n, 4, 4)."""
         count = sample_count(length_px)
         by_row = [plane_map(spread(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
@@ -206,19 +207,14 @@ class Renderer:
     def _optical(
         self, maps: Array, motion_px: Array, length_px: float
     ) -> tuple[Picture, Box | None]:
-        """The picture before defocus, at the ray grids' padded size, and the blocks among which
-        there is a sheet, None without one."""
+        """Return the picture before defocus, at the ray grids' padded size, and the blocks among
+        which there is a sheet, None without one."""
         middle = maps[len(maps) // 2]
         if len(maps) % 2 == 0:
             middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
         nodes, misses = trace(self._coarse, middle)
         views = [view for s in self._sheets if (view := s.view(nodes, length_px)) is not None]
-        if any(view.covers for view in views):
-            views = [view for view in views if view.covers]
-            rows, cols = (COARSE_PX * (n - 2) for n in nodes.shape[:2])
-            picture = np.empty((rows, cols), np.uint8)
-        else:
-            picture = self._background(nodes, misses, motion_px, length_px)
+        picture = self._background(nodes, misses, motion_px, length_px)
         for view in views:
             self._add_sheet(picture, view, maps)
         return picture, box_around([view.box for view in views])
@@ -230,7 +226,7 @@ class Renderer:
         motion_px: Array,
         length_px: float,
     ) -> Picture:
-        """The bare ceiling, several pixels drawn as one: its texture carries no measurement."""
+        """Return the bare ceiling, several pixels drawn as one: it carries no measurement."""
         rows, cols = nodes.shape[:2]
         mid = nodes[rows // 2, cols // 2]
         px_per_m = local_px_per_m(nodes, rows // 2, cols // 2, COARSE_PX)
@@ -257,17 +253,15 @@ class Renderer:
         rays = self._pixels.window(rows, cols)
         texels = [trace(rays, view.to_texels @ each)[0] for each in maps]
         seen = mean_of([sample(view.texture.value, each) for each in texels])
-        if not view.covers:
-            alpha = mean_of([sample(view.texture.alpha, each) for each in texels])
-            rest: Any = cv2.multiply(picture[rows, cols], ~alpha, scale=1.0 / 255.0)
-            seen = np.asarray(cv2.add(rest, seen), np.uint8)
-        picture[rows, cols] = seen
+        alpha = mean_of([sample(view.texture.alpha, each) for each in texels])
+        rest: Any = cv2.multiply(picture[rows, cols], ~alpha, scale=1.0 / 255.0)
+        picture[rows, cols] = cv2.add(rest, seen)
 
     # -- motion -------------------------------------------------------------
 
     def _motion_px(self, poses: Array) -> Array:
-        """Path of the ceiling's image during the exposure at five places, (5, n, 2) px, from
-        poses (n, 4, 4)."""
+        """Return the ceiling's path in the image during the exposure at five places, (5, n, 2) px,
+        of poses (n, 4, 4)."""
         if len(poses) == 1:
             return np.zeros((5, 1, 2))
         points = plane_map(poses[len(poses) // 2]).dot(self._places)
@@ -279,9 +273,9 @@ class Renderer:
         return np.asarray(path.transpose(2, 0, 1))
 
     def _noise_bank(self) -> tuple[tuple[Picture, Picture] | None, list[tuple[int, int]]]:
-        """What is added to a picture, and what is taken off, one of them being 0 at each place:
-        such sums of bytes cost a third of one with signed numbers. And from which row and column
-        on for each frame."""
+        """Return what is added to a picture, and what is taken off, one of them being 0 at each
+        place: such sums of bytes cost a third of one with signed numbers. And from which row and
+        column on for each frame."""
         sigma = self.scenario.camera_noise_sigma
         if sigma <= 0.0:
             return None, []
@@ -299,7 +293,7 @@ class Renderer:
 
 
 def mean_of(pictures: Sequence[Picture]) -> Picture:
-    """Their mean, rounded once."""
+    """Return the mean of the pictures, rounded once."""
     if len(pictures) == 1:
         return pictures[0]
     total: Any = pictures[0].astype(np.uint16)
@@ -309,13 +303,13 @@ def mean_of(pictures: Sequence[Picture]) -> Picture:
 
 
 def sample(texture: Picture, texels: Any, border: int = cv2.BORDER_CONSTANT) -> Picture:
-    """Bilinear look-up at `texels` (h, w, 2) float32; 0 outside, or repeating."""
+    """Return a bilinear look-up at `texels` (h, w, 2) float32; 0 outside, or repeating."""
     remap: Any = cv2.remap  # its stub denies that the second map may be None
     return np.asarray(remap(texture, texels, None, cv2.INTER_LINEAR, borderMode=border), np.uint8)
 
 
 def defocused(picture: Picture, sigma_px: float, box: Box) -> None:
-    """Blurs the blocks of `box`, and what is so near to them that it shows a part of their blur."""
+    """Blur the blocks of `box`, and what is so near to them that it shows a part of their blur."""
     reach = math.ceil(3.0 * sigma_px) + 1
     near, far = pixels_of(box, reach), pixels_of(box, 2 * reach)
     blurred = cv2.GaussianBlur(picture[far], (0, 0), sigma_px)
@@ -325,13 +319,13 @@ def defocused(picture: Picture, sigma_px: float, box: Box) -> None:
 
 
 def lit(picture: Picture, light: NDArray[np.float64]) -> Picture:
-    """The picture with each row's brightness multiplied by `light` (height,)."""
+    """Return the picture with each row's brightness multiplied by `light` (height,)."""
     factor = np.broadcast_to(light.astype(np.float32)[:, None], picture.shape)
     return np.asarray(cv2.multiply(picture, np.ascontiguousarray(factor), dtype=cv2.CV_8U))
 
 
 def woven(pictures: Sequence[Picture], top_first: bool) -> Picture:
-    """The frame of two fields in their order of time; a single picture is the frame."""
+    """Return the frame of two fields in their order of time; a single picture is the frame."""
     if len(pictures) == 1:
         return pictures[0]
     top, bottom = pictures if top_first else (pictures[1], pictures[0])
@@ -341,17 +335,16 @@ def woven(pictures: Sequence[Picture], top_first: bool) -> Picture:
 
 
 def blended(frame: Picture) -> Picture:
-    """What a converter makes of a woven frame that averages its fields: each row with the
+    """Return what a converter makes of a woven frame that averages its fields: each row with the
     mean of its neighbours, which are of the other field."""
     rows = np.pad(frame, ((1, 1), (0, 0)), mode="edge").astype(np.uint16)
     return np.asarray((rows[:-2] + 2 * rows[1:-1] + rows[2:] + 2) // 4, np.uint8)
 
 
-# --- A camera that does not move: its picture before noise is made once ------------------------
+# --- A camera that does not move ----------------------------------------------------------------
 # On the floor and under the magnet the vehicle stirs by less than any picture shows. Where the
-# picture moves by less than `STILL_PX` within the exposure, its pose is rounded; the same rounded
-# pose has the same picture. That is so whichever of the others are looked at, as their bytes must
-# not hang on it.
+# picture moves by less than `STILL_PX` within the exposure, its pose is rounded, so that a vehicle
+# at rest sees the same picture again and again but for the noise.
 
 
 STILL_PX = 0.005
@@ -361,7 +354,7 @@ half a step moves no place of a picture of 400 px focal length by 0.01 px, most 
 
 
 def rounded(T_target_cam: Array) -> Array:
-    """The pose (4, 4) of a still camera."""
+    """Return the pose (4, 4) of a still camera."""
     steps = np.full((3, 4), STEP)
     steps[:, 3] *= 2.0 ** np.floor(np.log2(max(abs(float(T_target_cam[2, 3])), 1e-3)))
     T = np.eye(4)
@@ -382,20 +375,20 @@ MAX_KERNEL_REACH_PX = 12
 
 
 def path_length_px(motion_px: Array) -> float:
-    """Longest path of any of the places, `motion_px` (places, times, 2)."""
+    """Return the longest path of any of the places, `motion_px` (places, times, 2)."""
     steps = motion_px[:, 1:] - motion_px[:, :-1]
     return float(np.sqrt((steps * steps).sum(axis=2)).sum(axis=1).max())
 
 
 def sample_count(length_px: float) -> int:
-    """How many poses the blur of a path of that length needs; 1 for a sharp frame."""
+    """Return how many poses the blur of a path of that length needs; 1 for a sharp frame."""
     if length_px < SHARP_MOTION_PX:
         return 1
     return min(max(math.ceil(length_px / SAMPLE_SPACING_PX), 2), MAX_SAMPLES)
 
 
 def spread(poses: Array, count: int) -> Array:
-    """`count` poses (count, 4, 4) at the middles of equal parts of the exposure.
+    """Return `count` poses (count, 4, 4) at the middles of equal parts of the exposure.
 
     Linear in the matrices of `poses` (n, 4, 4): within an exposure the turn is so small
     (< 0.05 rad) that the loss of orthogonality is below 1e-3 of a pixel.
@@ -410,7 +403,7 @@ def spread(poses: Array, count: int) -> Array:
 
 
 def line_kernel(motion_px: Array) -> NDArray[np.float32] | None:
-    """Blur kernel of the path at the image's middle, or None if it is too short to see."""
+    """Return the blur kernel of the path at the image's middle; None if it is too short to see."""
     path = motion_px[0] - motion_px[0].mean(axis=0)
     reach = float(np.abs(path).max())
     if reach < SHARP_MOTION_PX / 2.0:
@@ -443,7 +436,7 @@ SNOW_LINES_PER_FRAME = 12.0
 
 
 def spoil(image: NDArray[np.uint8], strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The picture as a receiver shows it; `strength` 0 (clean) .. 1 (about to be lost)."""
+    """Return the picture as a receiver shows it; `strength` 0 (clean) .. 1 (about to be lost)."""
     height, width = image.shape
     shift = np.asarray(rng.standard_normal(height) * LINE_JITTER_PX * strength)
     for _ in range(rng.poisson(TEARS_PER_FRAME * strength)):

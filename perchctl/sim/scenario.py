@@ -1,8 +1,17 @@
-"""One simulated flight's conditions, drawn from ranges by a seed."""
+"""One simulated flight's conditions: what they are, how a profile's ranges and a seed give them,
+when the radio is silent, and how they explain an event of the flight."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from perchctl.geometry import GRAVITY_MPS2, Array, make_T, rotation_from_rpy
+from perchctl.mission import NO_PICTURE_TEXT, Event, EventKind
+from perchctl.profile import Profile, SimulationConfig
 
 CONTROL_PERIOD_S = 0.002
 """Step of the physics and of the firmware model (500 Hz)."""
@@ -47,7 +56,7 @@ class Scenario:
         camera_flicker, camera_pumping: share by which lamps (100 Hz) and an exposure control
             that hunts change the brightness.
         camera_receiver_hz: of the receiver's output, where it gives out its newest picture
-            again and again, with `camera_receiver_noise` on it each time; None: it does not.
+            again and again; None: it does not.
         camera_blank_rate: share of pictures that are a blue screen.
         camera_mirrored: it gives its pictures flipped left to right.
         drift_mps: drift of the state estimate, world axes.
@@ -58,7 +67,6 @@ class Scenario:
         no_target: the ceiling is bare.
         camera_freeze_at_s, camera_gone_at_s: faults; None means never.
         motor_strength: what is left of each motor's thrust, M1..M4.
-        propeller_shake_g: what each propeller at full shakes the accelerometer by, rms.
         cell_resistance_ohm: of the battery; None means a good one.
         cell_slow_ohm: more of it, that an old or cold cell shows within seconds.
         cell_charge: what an old cell still holds, as a share of a new one's.
@@ -70,10 +78,8 @@ class Scenario:
             too much; body axes, of a vehicle without a deck (`perchctl.sim.firmware.outside`).
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
         target_tilt_rad: the target's turns about the world's x and y, after its heading.
-        flow_noise_radps, flow_bias_radps: of the flow deck's readings, the latter in x and y.
-        flow_reach_m: above this it sees no flow; None: it always does.
         radio_loss, radio_burst_s: share of the time in which no packet passes, and how long
-            such a time lasts on average (`perchctl.sim.bursts`).
+            such a time lasts on average (`perchctl.sim.scenario`).
         capture_holes_s: begin and length of the times in which a motion capture does not see
             the vehicle.
         neighbours: other vehicles' targets. What these vehicles do to the air is in the draught.
@@ -108,7 +114,6 @@ class Scenario:
     camera_flicker: float = 0.0
     camera_pumping: float = 0.0
     camera_receiver_hz: float | None = None
-    camera_receiver_noise: float = 0.0
     camera_blank_rate: float = 0.0
     camera_mirrored: bool = False
     estimate_noise_m: float = 0.002
@@ -118,7 +123,6 @@ class Scenario:
     magnet_force_n: float = 1.2
     first_contact_force_n: float | None = None
     motor_strength: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
-    propeller_shake_g: tuple[float, float, float, float] = (0.05, 0.05, 0.05, 0.05)
     cell_resistance_ohm: float | None = None
     cell_slow_ohm: float = 0.0
     cell_charge: float = 1.0
@@ -132,12 +136,309 @@ class Scenario:
     neighbours: tuple[Neighbour, ...] = ()
     ceiling_suction: float = 0.10
     target_tilt_rad: tuple[float, float] = (0.0, 0.0)
-    flow_noise_radps: float = 0.0
-    flow_bias_radps: tuple[float, float] = (0.0, 0.0)
-    flow_reach_m: float | None = None
     radio_loss: float = 0.0
     radio_burst_s: float = 0.1
     capture_holes_s: tuple[tuple[float, float], ...] = ()
     gyro_bias_radps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     acc_bias_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     extra: dict[str, float] = field(default_factory=dict)
+
+
+# --- From a profile's ranges and a seed to a scenario --------------------------------------------
+# What harder worlds draw beyond that of `sim` comes in groups, each from a random stream of its
+# own, so that no other value of a seed moves.
+
+
+_STREAM, _GROUPS_STREAM, _IMU_STREAM = 1, 21, 22  # the scenario's own random streams
+_AIR, _CELL, _TILT, _RADIO, _CAPTURE = 0, 1, 2, 6, 7
+_AS_GIVEN = (
+    "camera_rate_hz", "camera_jitter_s", "camera_drop_rate", "camera_exposure_s",
+    "camera_defocus_px", "camera_fields", "camera_blended", "camera_readout_s", "camera_flicker",
+    "camera_pumping", "camera_receiver_hz", "camera_blank_rate", "estimate_noise_m",
+    "magnet_force_n", "no_target",
+)  # fmt: skip
+"""Keys of the profile that are the same for every seed."""
+_LONGEST_S = 240.0
+"""No simulated flight lasts longer."""
+_LEAST_GAP_S = 1.0
+
+
+def draw_scenario(profile: Profile, seed: int) -> Scenario:
+    """Return the scenario of that seed. Every value is drawn in a fixed order, so adding a
+    range at the end leaves the earlier ones of a seed as they were; the groups of harder
+    worlds come from other streams."""
+    sim = profile.simulation
+    rng = np.random.default_rng([seed, _STREAM])
+
+    def between(key: str) -> float:
+        return float(rng.uniform(*getattr(sim, key)))
+
+    def direction() -> Array:
+        vector = rng.normal(size=3)
+        return np.asarray(vector / np.linalg.norm(vector))
+
+    offset = rng.uniform(-sim.start_offset_m, sim.start_offset_m, size=2)
+    target_xy_m = (float(offset[0]), float(offset[1]))
+    yaw_rad = math.radians(between("target_yaw_deg"))
+    ceiling_z_m = between("ceiling_z_m")
+    mass_kg = between("mass_kg")
+    battery_v = between("battery_rest_v")
+    latency_s = between("camera_latency_s")
+    noise_sigma = between("camera_noise_sigma")
+    burst = _burst(sim, rng, between("camera_burst_start_s"))
+    T_body_cam = profile.camera.mount.T_body_cam @ _mounting_error(profile, rng)
+    drift_x, drift_y, drift_z = (direction() * sim.drift_mps).tolist()
+    wind_angle = float(rng.uniform(-math.pi, math.pi))
+    wind_mps = between("draught_mps")
+    tilt_bias_rad = math.radians(sim.estimate_tilt_bias_deg)
+    bias_x, bias_y = (rng.uniform(-1, 1, size=2) * tilt_bias_rad).tolist()
+    fails = rng.uniform() < sim.first_contact_fails
+    weak_part = between("first_contact_share")
+    return Scenario(
+        seed=seed,
+        mass_kg=mass_kg,
+        battery_rest_v=battery_v,
+        ceiling_z_m=ceiling_z_m,
+        target_xy_m=target_xy_m,
+        target_yaw_rad=yaw_rad,
+        large_side_m=profile.target.large.side_m,
+        small_side_m=profile.target.small.side_m,
+        gear_body_m=profile.vehicle.gear_body_m,
+        T_body_cam_true=tuple(tuple(float(v) for v in row) for row in T_body_cam),
+        camera_latency_s=latency_s,
+        camera_burst=burst,
+        camera_noise_sigma=noise_sigma,
+        camera_mirrored=profile.camera.mirrored,
+        estimate_tilt_bias_rad=(bias_x, bias_y),
+        drift_mps=(drift_x, drift_y, drift_z),
+        draught_mps=(wind_mps * math.cos(wind_angle), wind_mps * math.sin(wind_angle), 0.0),
+        first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
+        **_imu_errors(sim, seed),
+        **{name: getattr(sim, name) for name in _AS_GIVEN},
+        extra=_extra(profile),
+        neighbours=_neighbours(sim),
+        **_groups(sim, seed),
+    )
+
+
+def _burst(
+    sim: SimulationConfig, rng: np.random.Generator, start_s: float
+) -> tuple[float, int] | None:
+    """Start and number of the frames that are lost in one go."""
+    low, high = sim.camera_burst_frames or (0, 0)
+    if low == high:
+        rng.integers(2)  # numpy draws none of one number, and what comes later must stay
+    frames = int(rng.integers(low, high + 1))
+    return None if sim.camera_burst_frames is None else (start_s, frames)
+
+
+def _neighbours(sim: SimulationConfig) -> tuple[Neighbour, ...]:
+    large_id, small_id = sim.neighbour_ids or (None, None)
+    return tuple(
+        Neighbour((x_m, y_m), math.radians(yaw_deg), large_id, small_id)
+        for x_m, y_m, yaw_deg in sim.neighbours
+    )
+
+
+def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
+    """Return the biases of gyroscope and accelerometer; the latter has none along z, where the
+    firmware's scale would take it out."""
+    rng = np.random.default_rng([seed, _IMU_STREAM])
+    p, q, r = (math.radians(sim.gyro_bias_dps) * rng.uniform(-1.0, 1.0, size=3)).tolist()
+    x, y = (GRAVITY_MPS2 * sim.acc_bias_g * rng.uniform(-1.0, 1.0, size=2)).tolist()
+    return {"gyro_bias_radps": (p, q, r), "acc_bias_mps2": (x, y, 0.0)}
+
+
+def _extra(profile: Profile) -> dict[str, float]:
+    extra = {}
+    if profile.simulation.camera_analogue:
+        extra["analogue"] = profile.simulation.camera_analogue
+    if profile.positioning.by != "deck":
+        extra["external_position"] = 1.0  # and no deck
+    return extra
+
+
+def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
+    """Return a turn and a shift that the profile lacks: up to `mount_error_deg` and
+    `mount_error_m`."""
+    sim = profile.simulation
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    turn = axis * math.radians(rng.uniform(0, sim.mount_error_deg))
+    way = rng.normal(size=3)
+    way *= rng.uniform(0, sim.mount_error_m) / np.linalg.norm(way)
+    return make_T(rotation_from_rpy(*(float(a) for a in turn)), way)
+
+
+# --- What harder worlds draw beyond that ---------------------------------------------------------
+
+
+def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
+    """Return the fields of the scenario; where the ranges are those of `sim`, its defaults."""
+    air, cell, tilt, radio, capture = (
+        _Draws(seed, group) for group in (_AIR, _CELL, _TILT, _RADIO, _CAPTURE)
+    )
+    ohm = sim.cell_resistance_ohm
+    return {
+        "ceiling_suction": air.between(sim.ceiling_suction),
+        "cell_resistance_ohm": None if ohm is None else cell.between(ohm),
+        "cell_slow_ohm": cell.between(sim.cell_slow_ohm),
+        "cell_charge": cell.between(sim.cell_charge),
+        "cell_knee": cell.between(sim.cell_knee),
+        "target_tilt_rad": _tilt(sim, tilt),
+        "radio_loss": radio.between(sim.radio_loss),
+        "radio_burst_s": radio.between(sim.radio_burst_s),
+        "capture_holes_s": _capture_holes(sim, capture),
+    }
+
+
+class _Draws:
+    """One group's random numbers."""
+
+    def __init__(self, seed: int, group: int) -> None:
+        self.rng = np.random.default_rng([seed, _GROUPS_STREAM, group])
+
+    def between(self, bounds: tuple[float, float]) -> float:
+        return float(self.rng.uniform(*bounds))
+
+    def angle_rad(self, bounds_deg: tuple[float, float] = (-180.0, 180.0)) -> float:
+        return math.radians(self.between(bounds_deg))
+
+
+def _tilt(sim: SimulationConfig, draws: _Draws) -> tuple[float, float]:
+    """Return the target's turns about the world's x and y."""
+    tilt_rad = draws.angle_rad(sim.target_tilt_deg)
+    towards_rad = draws.angle_rad()
+    if not tilt_rad:
+        return (0.0, 0.0)
+    # Lifted on the side of +x is a turn about -y, on that of +y one about x.
+    return (tilt_rad * math.sin(towards_rad), -tilt_rad * math.cos(towards_rad))
+
+
+def _capture_holes(sim: SimulationConfig, draws: _Draws) -> tuple[tuple[float, float], ...]:
+    """Begin and length of each."""
+    if not sim.capture_hole_s[1]:
+        return ()
+    holes, t_s = [], 0.0
+    while (t_s := t_s + float(draws.rng.exponential(sim.capture_hole_every_s))) < _LONGEST_S:
+        length_s = draws.between(sim.capture_hole_s)
+        holes.append((t_s, length_s))
+        t_s += length_s + _LEAST_GAP_S
+    return tuple(holes)
+
+
+# --- A radio that loses packets by bursts --------------------------------------------------------
+# A radio that loses packets by bursts: nothing passes for a while, then everything does.
+#
+# Gilbert's model of a channel with two states, in continuous time: both last as long as an
+# exponential distribution says. So a share of the time is lost, in pieces of a given mean length,
+# whatever the packets' rate; both directions suffer together, as from a Wi-Fi nearby or a body in
+# the way.
+
+
+_BURSTS_STREAM = 14
+CONNECTED_S = 4.0
+"""Before that nothing is lost: what is sent until the take-off is repeated until it is answered."""
+
+
+class Bursts:
+    """`lost` is asked with times that never go back; same seed, same bursts.
+
+    Args:
+        share: of the time that is lost, 0 to below 1.
+        mean_s: a burst's mean length.
+        from_s: before that nothing is lost.
+
+    `newest`: begin and end of the last burst that has begun; None before the first.
+    """
+
+    def __init__(self, seed: int, share: float, mean_s: float, from_s: float = CONNECTED_S) -> None:
+        self._rng = np.random.default_rng([seed, _BURSTS_STREAM])
+        self._bad_s = mean_s
+        self._good_s = mean_s * (1.0 - share) / share if share > 0.0 else math.inf
+        self._bad = False
+        self.newest: tuple[float, float] | None = None
+        self._until_s = math.inf
+        if share > 0.0:
+            self._until_s = from_s + float(self._rng.exponential(self._good_s))
+
+    def lost(self, t_s: float) -> bool:
+        """True if a packet sent at that time is lost."""
+        while t_s >= self._until_s:
+            self._bad = not self._bad
+            began_s = self._until_s
+            mean_s = self._bad_s if self._bad else self._good_s
+            self._until_s += float(self._rng.exponential(mean_s))
+            if self._bad:
+                self.newest = (began_s, self._until_s)
+        return self._bad
+
+
+def radio_bursts(scenario: Scenario) -> Bursts | None:
+    """Return the bursts of a flight; None where its radio loses nothing."""
+    if not scenario.radio_loss:
+        return None
+    return Bursts(scenario.seed, scenario.radio_loss, scenario.radio_burst_s)
+
+
+# --- What the scenario did, said with the event that it led to -----------------------------------
+# A newcomer who sees the target lost should not look for the fault in the program.
+
+
+LOSSES = ("estimate-lost", "align-lost", "ascend-lost", "camera-gone")
+"""Rows of the mission's table that lost pictures lead to."""
+UNHEARD = ("link-lost", "telemetry-stale")
+UNSURE = ("estimate-unsure", "position-astray", "estimator-jump", "fence")
+UNSEEN = (*UNSURE, "position-lost", "heading-lost")
+"""Rows that a motion capture leads to which sees nothing."""
+FELT_FOR_S = 1.2
+"""After the last lost frame: a second of no track, and the latency of the next picture."""
+
+
+class EventExplainer:
+    """Explains the events of one flight; call it with each of them, in order."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._slips = 0
+        self._bursts = Bursts(scenario.seed, scenario.radio_loss, scenario.radio_burst_s)
+
+    def __call__(self, event: Event, t_s: float) -> str:
+        """Return what the scenario did, in a few words, or the empty string. `t_s` is the event's
+        time in the simulation."""
+        scenario = self._scenario
+        held = event.reason if event.kind is EventKind.HOLD else ""
+        if event.row in LOSSES or held.startswith(NO_PICTURE_TEXT):
+            return self._lost_frames(t_s)
+        if event.row == "slipped":
+            self._slips += 1
+            force_n = scenario.first_contact_force_n
+            if force_n is not None and self._slips == 1:
+                part = force_n / (scenario.mass_kg * GRAVITY_MPS2)
+                return f"the first contact holds {100 * part:.0f} % of the weight"
+        if event.row == "searched-out" and scenario.no_target:
+            return "there is no target"
+        if event.row in UNHEARD or event.reason.startswith("telemetry is"):
+            return self._silence(t_s)
+        if event.row in UNSEEN and (hidden := self._hidden(t_s)):
+            return hidden
+        return ""
+
+    def _lost_frames(self, t_s: float) -> str:
+        burst, rate_hz = self._scenario.camera_burst, self._scenario.camera_rate_hz
+        if burst is None or not 0.0 <= t_s - burst[0] <= burst[1] / rate_hz + FELT_FOR_S:
+            return ""
+        return f"{burst[1]} frames lost"
+
+    def _silence(self, t_s: float) -> str:
+        self._bursts.lost(t_s)
+        newest = self._bursts.newest
+        if newest is None or t_s > newest[1] + FELT_FOR_S:
+            return ""
+        return f"the radio passed nothing for {newest[1] - newest[0]:.1f} s"
+
+    def _hidden(self, t_s: float) -> str:
+        for begin_s, length_s in self._scenario.capture_holes_s:
+            if 0.0 <= t_s - begin_s <= length_s + FELT_FOR_S:
+                return f"the motion capture did not see it for {length_s:.1f} s"
+        return ""

@@ -75,7 +75,7 @@ class Sheet:
         self._levels: dict[int, SheetTexture] = {}
 
     def texture(self, image_px_per_m: float) -> SheetTexture:
-        """The level that suits an image in which one metre spans that many pixels."""
+        """Return the level that suits an image in which one metre spans that many pixels."""
         ratio = SHEET_FINEST_PX_PER_M / (TEXELS_PER_PIXEL * max(image_px_per_m, 1.0))
         # Level -1 is the finest resolution with single texels, for views nearer than it suits.
         level = min(max(math.floor(4.0 * math.log2(ratio)), -1), SHEET_LEVELS - 1)
@@ -126,7 +126,7 @@ class Ceiling:
         self._levels: dict[int, CeilingTexture] = {}
 
     def texture(self, image_px_per_m: float) -> CeilingTexture:
-        """The level with 1 to 2 texels a pixel, or the nearest there is."""
+        """Return the level with 1 to 2 texels a pixel, or the nearest there is."""
         finest = TILE_FINEST_PX / TILE_M
         level = math.floor(math.log2(finest / max(image_px_per_m, 1.0)))
         level = min(max(level, 0), len(self._tiles) - 1)
@@ -138,7 +138,8 @@ class Ceiling:
 
 
 def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
-    """The same smooth surface with more cells; left and right, top and bottom fit together."""
+    """Return the same smooth surface with more cells; left and right, top and bottom fit
+    together."""
     padded = np.pad(tile, 2, mode="wrap")
     # One axis after the other, without what lies around the tile: at the coarsest a third.
     wide = cv2.resize(padded, None, fx=zoom, fy=1, interpolation=cv2.INTER_CUBIC)
@@ -152,8 +153,6 @@ def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
 
 Box = tuple[slice, slice]
 """Rows and columns of blocks of `COARSE_PX` pixels."""
-_ROOM_TEXELS = 1.5
-"""For the neighbours that a bilinear look-up reads, and a centre's rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +163,9 @@ class Placed:
     plane: Array | None = None
 
     def view(self, nodes: NDArray[np.float32], length_px: float) -> View | None:
-        """At the coarse nodes (rows, columns, 2), in the own target's axes; `length_px` is the
-        longest way of the picture within the exposure. None where the sheet is out of view."""
+        """Return where the sheet is seen at the coarse nodes (rows, columns, 2), in the own
+        target's axes; None where it is out of view. `length_px` is the longest way of the picture
+        within the exposure."""
         if self.plane is not None:
             turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
             nodes = nodes @ turn.astype(np.float32) + shift.astype(np.float32)
@@ -180,27 +180,25 @@ class Placed:
         to_texels = np.array([[scale, 0.0, centre], [0.0, scale, centre], [0.0, 0.0, 1.0]])
         if self.plane is not None:
             to_texels = to_texels @ self.plane
-        room_m = _ROOM_TEXELS / scale
-        return View(texture, box, to_texels, bool((off_m + reach_m < half_m - room_m).all()))
+        return View(texture, box, to_texels)
 
 
 @dataclass(frozen=True, eq=False)
 class View:
     """A sheet in one exposure: in the picture's `box`; `to_texels` (3, 3) maps the own target's
-    plane to the texture's columns and rows; `covers`: nothing else is in the picture."""
+    plane to the texture's columns and rows."""
 
     texture: SheetTexture
     box: Box
     to_texels: Array
-    covers: bool
 
 
 def _off_and_reach(
     nodes: NDArray[np.float32], length_px: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """How far each block's centre is from the sheet's, along the axis along which it is farther,
-    and how far from there its pixels look at most, both (rows, columns) in m. `nodes` are the
-    coarse ones in the sheet's axes."""
+    """Return how far each block's centre is from the sheet's, along the axis along which it is
+    farther, and how far from there its pixels look at most, both (rows, columns) in m. `nodes` are
+    the coarse ones in the sheet's axes."""
     x, y = np.ascontiguousarray(nodes.transpose(2, 0, 1), np.float32)
     # Half a block to each side, by the distance of the nodes at both sides; the outermost pixels'
     # centres lie an eighth less far out.
@@ -210,7 +208,7 @@ def _off_and_reach(
 
 
 def _box_of(near: NDArray[np.bool_]) -> Box | None:
-    """What holds all blocks that are `near`; None where there are none."""
+    """Return the box of all blocks that are `near`; None where there are none."""
     rows, cols = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
     if not len(rows):
         return None
@@ -218,13 +216,13 @@ def _box_of(near: NDArray[np.bool_]) -> Box | None:
 
 
 def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Between the nodes to the left and right, and above and below, in sum."""
+    """Return the distances between the nodes left and right, and above and below, in sum."""
     level = cv2.absdiff(x[1:-1, 2:], x[1:-1, :-2])
     return np.asarray(cv2.add(level, cv2.absdiff(x[2:, 1:-1], x[:-2, 1:-1])), np.float32)
 
 
 def box_around(boxes: Sequence[Box]) -> Box | None:
-    """What holds all of them; None where there are none."""
+    """Return the box that holds all of them; None where there are none."""
     if not boxes:
         return None
     rows, cols = (
@@ -235,7 +233,7 @@ def box_around(boxes: Sequence[Box]) -> Box | None:
 
 
 def pixels_of(box: Box, margin_px: int = 0) -> tuple[slice, slice]:
-    """The rows and columns of pixels in a box, and so many around it."""
+    """Return the rows and columns of pixels in a box, and so many around it."""
     rows, cols = (
         slice(max(COARSE_PX * each.start - margin_px, 0), COARSE_PX * each.stop + margin_px)
         for each in box
@@ -244,7 +242,7 @@ def pixels_of(box: Box, margin_px: int = 0) -> tuple[slice, slice]:
 
 
 def beside(neighbour: Neighbour, own: TargetConfig) -> Placed:
-    """Another vehicle's target; what the neighbour leaves open is as on the own."""
+    """Return another vehicle's target; what the neighbour leaves open is as on the own."""
     large = {} if neighbour.large_id is None else {"id": neighbour.large_id}
     small = {} if neighbour.small_id is None else {"id": neighbour.small_id}
     target = TargetConfig(
@@ -257,5 +255,6 @@ def beside(neighbour: Neighbour, own: TargetConfig) -> Placed:
 
 @lru_cache(maxsize=4)
 def printed_sheet(target_json: str) -> Sheet:
-    """The sheet of a target; its textures cost more than a second, and flights share them."""
+    """Return the sheet of a target; its textures cost more than a second, and flights share
+    them."""
     return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))

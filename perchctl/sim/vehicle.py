@@ -10,7 +10,7 @@ from perchctl.link import Packet
 from perchctl.profile import TargetConfig
 from perchctl.sim.camera import SimCamera
 from perchctl.sim.capture import CaptureSettings, SimCapture
-from perchctl.sim.crtp.server import CommandService
+from perchctl.sim.crtp import CommandService
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
@@ -31,7 +31,7 @@ class PastPoses:
         )
 
     def add(self, world: World) -> None:
-        """The pose of now."""
+        """Add the pose of now."""
         self._poses.append((world.t_s, (world.x_m, world.y_m, world.z_m), world.quaternion))
 
     @property
@@ -84,7 +84,7 @@ class SimulatedVehicle:
         self._commands.handle(packet)
 
     def step(self) -> None:
-        """One control period, and the exposures that fall into it."""
+        """Advance by one control period, with the exposures that fall into it."""
         self.firmware.step()
         if self.capture is not None:
             self.capture.advance(self.world)
@@ -93,7 +93,7 @@ class SimulatedVehicle:
             self.camera.advance(self.world.t_s, self._past)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
-        """The target and its magnet hang there from now on."""
+        """Move the target and its magnet."""
         self.world.magnet.target_xy_m = xy_m
         if self.camera is not None:
             self.camera.renderer.move_target(xy_m)

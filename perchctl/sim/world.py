@@ -114,7 +114,7 @@ class World:
 
     @property
     def magnet_engaged(self) -> bool:
-        """The gear's tip hangs on the magnet."""
+        """True if the gear's tip hangs on the magnet."""
         return self.magnet.engaged
 
     @property
@@ -176,7 +176,7 @@ class World:
         )
 
     def state(self) -> TrueState:
-        """The true state as arrays."""
+        """Return the true state as arrays."""
         ceiling_n, floor = self.contacts()
         return TrueState(
             self.t_s,
@@ -191,7 +191,7 @@ class World:
         )
 
     def gear_tip_m(self) -> tuple[float, float, float]:
-        """The gear's tip in world axes."""
+        """Return the gear's tip in world axes."""
         w, x, y, z = self.quaternion
         gx, gy, gz = self._scenario.gear_body_m
         r02, r12, r22 = self._up
@@ -203,7 +203,7 @@ class World:
         )
 
     def gear_miss_m(self) -> float:
-        """Horizontal distance of the gear's tip from the target's centre."""
+        """Return the horizontal distance of the gear's tip from the target's centre."""
         tip = self.gear_tip_m()
         target = self.magnet.target_xy_m
         return math.hypot(tip[0] - target[0], tip[1] - target[1])
@@ -218,21 +218,21 @@ class World:
     ) -> None:
         """Put the vehicle somewhere, not turning; `hold` pins it there until `let_go`.
 
-        No gyroscope measures it (see `perchctl.sim.firmware.estimator`); it does what `carry` does.
+        No gyroscope measures it (see `perchctl.sim.firmware.estimator`), unlike `move_by_hand`.
         """
         self._held, self._carried = hold, None
         self._place(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
 
-    def carry(self, stops: Sequence[Stop]) -> None:
-        """A hand takes it from where it is through all stops, and holds it at the last until
-        `let_go`. Its sensors feel all of it. Errors: InvalidValue."""
+    def move_by_hand(self, stops: Sequence[Stop]) -> None:
+        """Let a hand take the vehicle from where it is through all stops, and hold it at the last
+        until `let_go`. Its sensors feel all of it. Errors: InvalidValue."""
         roll, pitch, yaw = rpy_from_rotation(rotation_from_quaternion(self.quaternion))
         start = Stop(0.0, (self.x_m, self.y_m, self.z_m), (roll, pitch, yaw))
         self._carried = (self.t_s, Way(start, stops))
         self._held = True
 
     def let_go(self) -> None:
-        """End what `set_pose(..., hold=True)` or `carry` began."""
+        """End what `set_pose(..., hold=True)` or `move_by_hand` began."""
         self._held, self._carried = False, None
 
     def _follow_hand(self) -> None:
@@ -286,7 +286,7 @@ class World:
         return any(self._floor in pair for pair in self._data.contact.geom.tolist())
 
     def contacts(self) -> tuple[float, bool]:
-        """The push between vehicle and ceiling, N, and whether the floor is touched."""
+        """Return the push between vehicle and ceiling, N, and whether the floor is touched."""
         ceiling_n, floor = 0.0, False
         if not self._data.ncon:
             return ceiling_n, floor
@@ -374,7 +374,7 @@ class Magnet:
         self.let_go = False  # for good: it pulls no more
 
     def pull_n(self, tip_m: tuple[float, float, float], *, upright: bool) -> float:
-        """The pull on the gear's tip at `tip_m`, world axes."""
+        """Return the pull on the gear's tip at `tip_m`, world axes."""
         scenario = self._scenario
         gap_m = max(0.0, scenario.ceiling_z_m - tip_m[2])
         target_x, target_y = self.target_xy_m
@@ -393,7 +393,7 @@ class Magnet:
         return scenario.magnet_force_n
 
     def out_of_reach(self) -> float:
-        """No pull, and none held."""
+        """Note that the tip is out of reach; return no pull."""
         self._note(MAGNET_RANGE_M)
         return 0.0
 
@@ -430,7 +430,7 @@ class Wind:
         self._gusts = tuple(_draw_sines(rng, share * speed_mps) for share in _SHARES)
 
     def at(self, t_s: float) -> tuple[float, float, float]:
-        """The wind at t, m/s, world axes; exactly zero in still air."""
+        """Return the wind at t, m/s, world axes; exactly zero in still air."""
         if self._still:
             return (0.0, 0.0, 0.0)
         x, y, z = self._mean
@@ -439,7 +439,7 @@ class Wind:
 
 
 def _draw_sines(rng: np.random.Generator, sigma_mps: float) -> _Terms:
-    """(amplitude m/s, pulsation rad/s, phase) of each sine."""
+    """Return (amplitude m/s, pulsation rad/s, phase) of each sine."""
     amplitude = sigma_mps * math.sqrt(2.0 / _TERMS)
     hz = np.exp(rng.uniform(math.log(_SLOWEST_HZ), math.log(_FASTEST_HZ), _TERMS))
     phases = rng.uniform(0.0, 2.0 * math.pi, _TERMS)
@@ -493,7 +493,7 @@ class Way:
         self._ends_s = (0.0, *itertools.accumulate(stop.after_s for stop in stops))
 
     def at(self, t_s: float) -> Motion:
-        """`t_s`: since it was taken in the hand."""
+        """Return the motion, `t_s` after the vehicle was taken in the hand."""
         before, here, after = (self._pose(t_s + k * _HAND_STEP_S) for k in (-1, 0, 1))
         turn = before[1].T @ after[1]  # so small a turn is its own vector
         rates = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / (2.0 * _HAND_STEP_S)
@@ -506,7 +506,7 @@ class Way:
         )
 
     def _pose(self, t_s: float) -> tuple[Array, Array]:
-        """Place (3,) and turn (3, 3)."""
+        """Return place (3,) and turn (3, 3)."""
         t_s = min(max(t_s, 0.0), self._ends_s[-1])
         leg = next(n for n, end_s in enumerate(self._ends_s) if t_s <= end_s)
         if leg == 0:

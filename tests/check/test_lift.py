@@ -23,8 +23,8 @@ from perchctl.errors import SafetyAbort
 from perchctl.flight import require_comparison
 from perchctl.profile import Profile
 from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, CaptureSettings, SimProcess, draw_scenario
-from perchctl.sim.capture import SWAPPED_XY, Y_UP
 from perchctl.sim.world import Stop
+from tests.helpers.capture import SWAPPED_XY, Y_UP
 from tests.helpers.carried import lifted_and_turned
 from tests.helpers.checks import QUICK, options, wait_for
 from tests.helpers.flights import short_profile
@@ -75,7 +75,7 @@ class Lab:
 
         def tell(text: str) -> None:
             if HOW_TO_TURN in text:
-                self.sim.carry(lifted_and_turned(HOME))
+                self.sim.move_by_hand(lifted_and_turned(HOME))
 
         self._put_down()
         quick = CheckScope(**QUICK)
@@ -85,7 +85,7 @@ class Lab:
 
     def _put_down(self) -> None:
         """By a hand, too: what is put somewhere else no gyroscope follows."""
-        self.sim.carry([Stop(0.5, HOME)])
+        self.sim.move_by_hand([Stop(0.5, HOME)])
         end_s = time.monotonic() + 20.0
         while math.dist(self.sim.truth()["position_m"], HOME) > 1e-3:
             assert time.monotonic() < end_s

@@ -19,7 +19,7 @@ from perchctl.check.vehicle import VEHICLE, Vehicle, look, moved_m
 from perchctl.link import Echoes, ProbeLink
 from perchctl.profile import LinkConfig, Profile
 from perchctl.sim import Scenario, SimProcess
-from perchctl.sim.crtp.server import LinkOptions
+from perchctl.sim.crtp import LinkOptions
 from perchctl.vehicle import (
     CAN_FLY,
     CRASHED,

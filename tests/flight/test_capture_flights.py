@@ -19,7 +19,8 @@ from perchctl.flight import fly_lockstep
 from perchctl.mission import Event, Outcome, Phase, Tick
 from perchctl.profile.positioning import MOST_LATENCY_S
 from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, draw_scenario
-from perchctl.sim.capture import SWAPPED_XY, Y_UP, OtherBody
+from perchctl.sim.capture import OtherBody
+from tests.helpers.capture import SWAPPED_XY, Y_UP, Rows
 from tests.helpers.flights import Flown, fly_short
 from tests.helpers.mission import changed
 from tests.helpers.sights import TARGET_ONLY
@@ -108,7 +109,7 @@ def test_a_capture_that_is_50_ms_late_is_flown_by() -> None:
 @pytest.mark.parametrize(
     ("capture", "words"),
     [
-        ({"axes": Y_UP}, "swapped axes"),
+        (wrong(0.0, axes=Y_UP), "swapped axes"),
         (wrong(0.0, scale=MILLIMETRES_PER_M), "millimetres"),
     ],
 )
@@ -132,9 +133,9 @@ def test_another_vehicle_s_body_from_the_start_is_named_where_it_stands_out_of_r
         )
 
 
-def at_the_origin(axes: str, seed: int) -> None:
+def at_the_origin(axes: Rows, seed: int) -> None:
     """What no vehicle that stands there can know: its positions go another way as it moves."""
-    it = fly_short(MOCAP, base="sim", seed=seed, capture={"axes": axes})
+    it = fly_short(MOCAP, base="sim", seed=seed, capture=wrong(0.0, axes=axes))
     assert it.report.phase is Phase.LANDED, it.report.reason
     assert it.report.outcome is Outcome.SAFETY
     assert "swapped axes in the motion capture" in it.report.reason
@@ -145,7 +146,7 @@ def at_the_origin(axes: str, seed: int) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("axes", "seed"), [(Y_UP, 1), (SWAPPED_XY, 7), (SWAPPED_XY, 16)])
-def test_other_axes_are_named_in_the_first_rise_and_end_softly(axes: str, seed: int) -> None:
+def test_other_axes_are_named_in_the_first_rise_and_end_softly(axes: Rows, seed: int) -> None:
     """Seed 7 sees the target early, 16 is landed for its mounting first where it may be."""
     at_the_origin(axes, seed)
 
@@ -153,7 +154,7 @@ def test_other_axes_are_named_in_the_first_rise_and_end_softly(axes: str, seed: 
 @pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("axes", [Y_UP, SWAPPED_XY])
-def test_other_axes_end_softly_whatever_the_seed(axes: str, seed: int) -> None:
+def test_other_axes_end_softly_whatever_the_seed(axes: Rows, seed: int) -> None:
     at_the_origin(axes, seed)
 
 

@@ -48,3 +48,10 @@ def compared(
     """As if `perchctl check --lift` had found that, so long ago."""
     at = datetime.now(UTC) - timedelta(seconds=ago_s)
     assert save_comparison(config, vehicle_uri(uri), Comparison(at, passed, found)) is None
+
+
+Rows = tuple[tuple[float, ...], ...]
+Y_UP: Rows = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+"""The capture's second axis is up, as some systems have it out of the box."""
+SWAPPED_XY: Rows = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+"""The capture's axes lie a quarter turn from those along which its bodies were defined."""

@@ -53,7 +53,6 @@ class Client:
             cflib.crtp.init_drivers()
         self.uri = uri
         self.cf = Crazyflie(rw_cache=cache)
-        self.console = ""
         self.sent: list[tuple[int, int, bytes]] = []
         self._connected = threading.Event()
         self._complete = threading.Event()
@@ -62,10 +61,12 @@ class Client:
         self.cf.packet_sent.add_callback(
             lambda pk: self.sent.append((pk.port, pk.channel, bytes(pk.data)))
         )
-        self.cf.console.receivedChar.add_callback(self._take_text)
 
     def connect(self, wait_s: float = CONNECTED_S) -> bool:
         self.cf.open_link(self.uri)
+        return self.connected(wait_s)
+
+    def connected(self, wait_s: float) -> bool:
         return self._connected.wait(wait_s) and self._complete.wait(wait_s)
 
     def close(self) -> None:
@@ -96,6 +97,18 @@ class Client:
         packet.data = data
         self.cf.send_packet(packet)
 
+    def start_block(
+        self, block: LogConfig, take: Callable[[int, dict[str, float]], None]
+    ) -> LogConfig:
+        """The block, started; `take` is called with each stamp in ms and its data."""
+        self.cf.log.add_config(block)
+        started = threading.Event()
+        block.started_cb.add_callback(lambda _block, on: on and started.set())
+        block.data_received_cb.add_callback(lambda stamp, data, _block: take(stamp, data))
+        block.start()
+        assert started.wait(WAIT_S)
+        return block
+
     def echo(self, number: int, wait_s: float = WAIT_S) -> bool:
         """Whether the vehicle answers; by then it has served all that was sent before.
 
@@ -110,9 +123,6 @@ class Client:
         assert answer is not None
         assert answer[0] == 0x8C
         return int.from_bytes(answer[1:3], "little")
-
-    def _take_text(self, text: str) -> None:
-        self.console += text
 
 
 class Pilot(Client):
@@ -147,16 +157,10 @@ class Pilot(Client):
         index = len(self._stamps)
         self._stamps.append(-1.0)
         self._periods_s.append(period_ms / 1000.0)
-        block = log_block(f"rig{index}", variables, period_ms)
-        self.cf.log.add_config(block)
-        started = threading.Event()
-        block.started_cb.add_callback(lambda _block, _on: started.set())
-        block.data_received_cb.add_callback(
-            lambda stamp, data, _block: self._take(index, stamp, data)
+        return self.start_block(
+            log_block(f"rig{index}", variables, period_ms),
+            lambda stamp, data: self._take(index, stamp, data),
         )
-        block.start()
-        assert started.wait(WAIT_S)
-        return block
 
     def fresh(self, *, settle_s: float = 0.6, **scenario: Any) -> Pilot:
         """A new vehicle on the floor, its raw thrust unlocked as the facts advise."""
@@ -287,8 +291,8 @@ def notify(pilot: Pilot) -> None:
     pilot.cf.commander.send_notify_setpoint_stop()
 
 
-def read(pilot: Pilot, name: str) -> float:
-    """From the vehicle, not from cflib's memory of it."""
+def parameter_update(client: Client, name: str, act: Callable[[], Any]) -> float:
+    """The value that the vehicle announces for a parameter after `act`."""
     group, _, short = name.partition(".")
     arrived = threading.Event()
     values: list[str] = []
@@ -297,13 +301,18 @@ def read(pilot: Pilot, name: str) -> float:
         values.append(value)
         arrived.set()
 
-    pilot.cf.param.add_update_callback(group, short, take)
+    client.cf.param.add_update_callback(group, short, take)
     try:
-        pilot.cf.param.request_param_update(name)
+        act()
         assert arrived.wait(WAIT_S)
     finally:
-        pilot.cf.param.remove_update_callback(group, short, take)
+        client.cf.param.remove_update_callback(group, short, take)
     return float(values[-1])
+
+
+def read(pilot: Pilot, name: str) -> float:
+    """From the vehicle, not from cflib's memory of it."""
+    return parameter_update(pilot, name, lambda: pilot.cf.param.request_param_update(name))
 
 
 def kept(pilot: Pilot, name: str, value: float) -> None:

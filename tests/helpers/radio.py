@@ -24,7 +24,7 @@ from cflib.drivers.crazyradio import Crazyradio, _radio_ack
 
 from perchctl.link import Packet, Port
 from perchctl.sim import Scenario, SimulatedVehicle
-from perchctl.sim.crtp.server import CrtpServer
+from perchctl.sim.crtp import CrtpServer
 
 URI = "radio://0/80/2M/E7E7E7E7E7"
 FORGETS_LOGS_S = 1.0

@@ -1,22 +1,28 @@
-"""The simulated motion capture: what its cameras see, when it arrives, and what can go wrong."""
+"""The simulated motion capture: what its cameras see, when it arrives, what can go wrong, and its
+server, read by the library that reads a lab's."""
 
 from __future__ import annotations
 
 import itertools
 import math
 import statistics
+import struct
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
-from perchctl.positioning import CaptureFrame, Placed
+from perchctl.positioning import BodyPose, CaptureFrame, Placed
 from perchctl.profile import PositioningConfig
-from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, CaptureSettings
-from perchctl.sim.capture import SWAPPED_XY, TRUE_AXES, Y_UP, SimCapture
+from perchctl.sim import CaptureFault, CaptureSettings, Scenario, SimProcess
+from perchctl.sim import capture as natnet
+from perchctl.sim.capture import SimCapture
+from tests.helpers.capture import Y_UP
 
 STEP_S = 0.002
 EXACT = CaptureSettings(position_noise_m=0.0, attitude_noise_rad=0.0, jitter_s=0.0)
@@ -46,26 +52,23 @@ def watched(
     return frames
 
 
-def last(
-    settings: CaptureSettings, *faults: CaptureFault, room: Room | None = None
-) -> CaptureFrame:
-    settings = replace(settings, faults=tuple((0.0, 9.0, fault) for fault in faults))
-    return watched(SimCapture(settings), 0.5, room or Room())[-1]
+def wrong(since_s: float, to_s: float, **fault: Any) -> list[CaptureFrame]:
+    """The frames of 1.5 s in which something is wrong for a time."""
+    faults = ((since_s, to_s, CaptureFault(**fault)),)
+    return watched(SimCapture(replace(EXACT, faults=faults)), 1.5, Room())
 
 
 def test_frames_come_at_the_cameras_rate_and_late() -> None:
-    room, at = Room(), []
-    frames = watched(SimCapture(EXACT), 2.0, room, lambda: at.append(room.t_s))
+    room = Room()
+
+    def climb() -> None:
+        room.z_m = room.t_s  # so that a frame says when it was exposed
+
+    frames = watched(SimCapture(EXACT), 2.0, room, climb)
     assert len(frames) == pytest.approx(240, abs=3)
     gaps = [b.t_s - a.t_s for a, b in itertools.pairwise(frames)]
     assert statistics.fmean(gaps) == pytest.approx(1 / 120, rel=1e-3)
-    moving = Room()
-    capture = SimCapture(EXACT)
-
-    def climb() -> None:
-        moving.z_m = moving.t_s  # so that a frame says when it was exposed
-
-    for frame in watched(capture, 1.0, moving, climb):
+    for frame in frames:
         assert frame.t_s - frame.bodies["crazyflie"].position_m[2] == pytest.approx(0.01, abs=1e-9)
 
 
@@ -75,9 +78,8 @@ def test_noise_is_what_the_settings_say_and_the_seed_s() -> None:
     x = [frame.bodies["crazyflie"].position_m[0] for frame in frames]
     assert statistics.fmean(x) == pytest.approx(AT[0], abs=2e-4)
     assert statistics.stdev(x) == pytest.approx(0.001, rel=0.15)
-    assert watched(SimCapture(settings), 1.0, Room()) == [
-        frame for frame in frames if frame.t_s <= 1.0
-    ]
+    again = watched(SimCapture(settings), 1.0, Room())
+    assert again == [frame for frame in frames if frame.t_s <= 1.0]
     other = watched(SimCapture(replace(settings, seed=5)), 1.0, Room())
     assert other[0].bodies != frames[0].bodies
 
@@ -88,45 +90,52 @@ def test_a_body_s_own_axes_are_undone_by_the_profile_s() -> None:
     roll, pitch, yaw = (math.radians(angle) for angle in rpy_deg)
     settings = replace(EXACT, body_rpy_rad=(roll, pitch, yaw), body_position_m=offset_m)
     R = rotation_from_rpy(0.1, -0.2, 1.3)
-    seen = last(settings, room=Room(quaternion=quaternion_from_rotation(R)))
+    seen = watched(SimCapture(settings), 0.5, Room(quaternion=quaternion_from_rotation(R)))[-1]
     config = PositioningConfig(by="mocap", body_rpy_deg=rpy_deg, body_position_m=offset_m)
     placed = Placed.of(seen.bodies["crazyflie"], config)
     assert placed.position_m == pytest.approx(AT)
     assert np.allclose(placed.R, R, atol=1e-6)
 
 
-def test_axes_scale_and_world() -> None:
-    def seen(*faults: CaptureFault, settings: CaptureSettings = EXACT) -> tuple[float, ...]:
-        return last(settings, *faults).bodies["crazyflie"].position_m
-
-    x, y, z = AT
-    assert seen() == pytest.approx(AT)
-    assert seen(CaptureFault(axes=Y_UP)) == pytest.approx((x, z, -y))
-    assert seen(settings=replace(EXACT, axes=SWAPPED_XY)) == pytest.approx((y, -x, z))
-    assert seen(CaptureFault(scale=MILLIMETRES_PER_M)) == pytest.approx((300.0, -200.0, 500.0))
-    turned = replace(EXACT, heading_rad=math.pi / 2, origin_m=(1.0, 0.0, 0.0))
-    assert seen(settings=turned) == pytest.approx((1.0 - y, x, z))
-    level = last(EXACT, CaptureFault(axes=Y_UP)).bodies["crazyflie"]
+@pytest.mark.parametrize(
+    ("fault", "at_m"),
+    [
+        ({}, AT),
+        ({"axes": Y_UP}, (0.3, 0.5, 0.2)),
+        ({"scale": 1000.0}, (300.0, -200.0, 500.0)),
+        ({"mirrored": True}, (0.3, 0.2, 0.5)),
+        ({"swapped": True}, (1.2, -0.9, 0.05)),
+    ],
+)
+def test_a_level_body_is_where_the_fault_puts_it(
+    fault: dict[str, Any], at_m: tuple[float, ...]
+) -> None:
+    level = wrong(0.0, 9.0, **fault)[-1].bodies["crazyflie"]
+    assert level.position_m == pytest.approx(at_m)
     assert level.quaternion == pytest.approx((1.0, 0.0, 0.0, 0.0))
 
 
+def test_the_capture_s_world_is_turned_and_shifted() -> None:
+    turned = replace(EXACT, heading_rad=math.pi / 2, origin_m=(1.0, 0.0, 0.0))
+    seen = watched(SimCapture(turned), 0.5, Room())[-1].bodies["crazyflie"]
+    assert seen.position_m == pytest.approx((1.2, 0.3, 0.5))
+
+
 def test_an_occluded_body_is_missing_for_its_time_only() -> None:
-    capture = SimCapture(CaptureSettings())
-    free = SimCapture(CaptureSettings())
-    room, other_room = Room(), Room()
-    before = watched(capture, 0.5, room)
+    """All other frames are as without the fault."""
+    capture, free = (SimCapture(CaptureSettings()) for _ in range(2))
+    room = Room()
+    frames = watched(capture, 0.5, room)
     capture.lay(CaptureFault(occluded=True), 0.3)
-    during = watched(capture, 0.5, room)
-    hidden = [frame for frame in during if "crazyflie" not in frame.bodies]
+    frames += watched(capture, 0.5, room)
+    hidden = [frame for frame in frames if "crazyflie" not in frame.bodies]
     assert len(hidden) == pytest.approx(36, abs=1)
     assert all("wand" in frame.bodies for frame in hidden)
-    undisturbed = watched(free, 1.0, other_room)
-    assert (before + during)[-10:] == undisturbed[-10:]  # the others are as they were
+    assert frames[-10:] == watched(free, 1.0, Room())[-10:]
 
 
-def test_frozen_to_the_last_digit_swapped_gone_late_and_slow() -> None:
-    room = Room()
-    capture = SimCapture(replace(EXACT, position_noise_m=0.001))
+def test_frozen_bodies_stay_to_the_last_digit_until_they_are_healed() -> None:
+    room, capture = Room(), SimCapture(replace(EXACT, position_noise_m=0.001))
     watched(capture, 0.3, room)
     capture.lay(CaptureFault(frozen=True))
     room.x_m = 1.0
@@ -135,21 +144,13 @@ def test_frozen_to_the_last_digit_swapped_gone_late_and_slow() -> None:
     capture.heal()
     assert watched(capture, 0.3, room)[-1].bodies["crazyflie"].position_m[0] > 0.9
 
-    swapped = last(EXACT, CaptureFault(swapped=True)).bodies
-    assert swapped["wand"].position_m == pytest.approx(AT)
-    assert swapped["crazyflie"].position_m == pytest.approx((1.2, -0.9, 0.05))
 
-    capture = SimCapture(replace(EXACT, faults=((0.5, 1.0, CaptureFault(gone=True)),)))
-    arrivals = [frame.t_s for frame in watched(capture, 1.5, Room())]
-    assert not [t_s for t_s in arrivals if 0.515 < t_s < 1.0]
-    capture = SimCapture(replace(EXACT, faults=((0.5, 1.0, CaptureFault(late_s=0.1)),)))
-    arrivals = [frame.t_s for frame in watched(capture, 1.5, Room())]
-    assert arrivals == sorted(arrivals)
-    assert not [t_s for t_s in arrivals if 0.52 < t_s < 0.6]
-    slow = watched(
-        SimCapture(replace(EXACT, faults=((0.0, 9.0, CaptureFault(rate_hz=10)),))), 2.0, Room()
-    )
-    assert len(slow) == pytest.approx(20, abs=2)
+def test_frames_that_are_gone_or_late_leave_a_gap_and_never_overtake() -> None:
+    gone = [frame.t_s for frame in wrong(0.5, 1.0, gone=True)]
+    assert not [t_s for t_s in gone if 0.515 < t_s < 1.0]
+    late = [frame.t_s for frame in wrong(0.5, 1.0, late_s=0.1)]
+    assert late == sorted(late)
+    assert not [t_s for t_s in late if 0.52 < t_s < 0.6]
 
 
 def test_lockstep_hands_on_the_newest_once() -> None:
@@ -165,17 +166,97 @@ def test_lockstep_hands_on_the_newest_once() -> None:
     capture.close()
 
 
-@pytest.mark.parametrize("axes", ["xyz", "+x+y-z", "+x+x+y", "+x+y", ""])
-def test_axes_that_are_none_are_refused(axes: str) -> None:
-    with pytest.raises(InvalidValue, match="axes"):
-        CaptureSettings(axes=axes)
-    with pytest.raises(InvalidValue, match="axes"):
-        CaptureFault(axes=axes)
-
-
 def test_settings_that_cannot_be_are_refused() -> None:
-    assert CaptureSettings().axes == TRUE_AXES
     with pytest.raises(InvalidValue, match="Hz"):
         CaptureSettings(rate_hz=0.0)
     with pytest.raises(InvalidValue, match="one name"):
         CaptureSettings(body="wand")
+
+
+# --- The server -----------------------------------------------------------------------------------
+
+
+WAIT_S = 10.0
+
+
+class Reader:
+    """The library's client, read in a thread, since it waits without a bound. Its connecting
+    lets no other thread run: what answers has to be another process."""
+
+    def __init__(self, host: str) -> None:
+        library = pytest.importorskip("motioncapture", reason="needs the extra [mocap]")
+        name, port = host.split(":")
+        self._client = library.connect(SimCapture.SYSTEM, {"hostname": name, "port_command": port})
+        self._news = threading.Condition()
+        self._bodies: dict[str, Any] = {}
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def until(self, seen: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """Name -> (position, quaternion) of the first frame that is as wanted."""
+        with self._news:
+            assert self._news.wait_for(lambda: seen(self._bodies), WAIT_S), self._bodies
+            return self._bodies
+
+    def until_at(
+        self, name: str, position_m: tuple[float, float, float], within_m: float
+    ) -> dict[str, Any]:
+        return self.until(lambda b: name in b and math.dist(b[name][0], position_m) < within_m)
+
+    def _run(self) -> None:
+        while True:
+            self._client.waitForNextFrame()
+            bodies = {
+                name: (
+                    tuple(float(v) for v in body.position),
+                    (body.rotation.w, body.rotation.x, body.rotation.y, body.rotation.z),
+                )
+                for name, body in self._client.rigidBodies.items()
+            }
+            with self._news:
+                self._bodies = bodies
+                self._news.notify_all()
+
+
+def test_a_hidden_body_is_marked_as_such_and_not_at_the_origin() -> None:
+    target = BodyPose((0.0, 0.0, 2.2), (1.0, 0.0, 0.0, 0.0))
+    seen = CaptureFrame(1.3, {"target": target})
+    frame = natnet.frame_message(7, ("crazyflie", "target"), seen)
+    kind, length = struct.unpack_from("<HH", frame)
+    assert (kind, length) == (natnet.FRAME, len(frame) - 4)
+    bodies = [struct.unpack_from("<i3f4ffh", frame, 4 + 16 + 38 * i) for i in range(2)]
+    assert [body[-1] for body in bodies] == [0, 1]
+    assert bodies[1][1:8] == pytest.approx((0.0, 0.0, 2.2, 0.0, 0.0, 0.0, 1.0))
+
+
+def test_the_library_reads_the_room_of_the_vehicle_s_process() -> None:
+    scenario, here_m = Scenario(extra={"external_position": 1.0}), (0.2, 0.1, 0.6)
+    with SimProcess.start(scenario, "stepped", capture=CaptureSettings()) as sim:
+        assert sim.capture is not None
+        assert sim.capture[0] == SimCapture.SYSTEM
+        first, second = Reader(sim.capture[1]), Reader(sim.capture[1])
+        sim.set_pose(here_m, (0.0, 0.0, 1.0), hold=True)
+        sim.advance(0.1)
+        for reader in (first, second):  # at the same time, on one computer
+            reader.until_at("crazyflie", here_m, 0.006)
+            seen = reader.until_at("wand", (1.2, -0.9, 0.05), 0.006)
+            assert seen["crazyflie"][1] == pytest.approx(
+                (math.cos(0.5), 0.0, 0.0, math.sin(0.5)), abs=0.02
+            )
+        sim.capture_fault(CaptureFault(scale=1000.0), 0.05)
+        sim.advance(0.05)
+        first.until_at("crazyflie", (200.0, 100.0, 600.0), 6.0)
+        sim.advance(0.1)
+        first.until_at("crazyflie", here_m, 0.006)
+        sim.capture_fault(CaptureFault(occluded=True))
+        sim.advance(0.1)
+        first.until(lambda bodies: set(bodies) == {"wand"})
+        sim.capture_fault(None)
+        sim.advance(0.1)
+        first.until(lambda bodies: set(bodies) == {"crazyflie", "wand"})
+
+
+def test_without_a_capture_there_is_none_to_spoil() -> None:
+    with SimProcess.start(pace="stepped") as sim:
+        assert sim.capture is None
+        with pytest.raises(InvalidValue, match="without a motion capture"):
+            sim.capture_fault(CaptureFault(gone=True))

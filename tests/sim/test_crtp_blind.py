@@ -156,35 +156,6 @@ def test_after_a_reset_the_first_position_is_believed(bare: Pilot) -> None:
 # What is sent is believed -------------------------------------------------------------
 
 
-def send_truth(pilot: Pilot) -> None:
-    x, y, z = pilot.sim.truth()["position_m"]
-    pilot.cf.extpos.send_extpos(x, y, z)
-
-
-def test_it_takes_off_by_positions_and_falls_for_false_ones(bare: Pilot) -> None:
-    bare.stream(0.5, lambda: send_truth(bare))
-    bare.unlock()
-
-    def hold() -> None:
-        send_truth(bare)
-        bare.hold(0.5)
-
-    bare.stream(3.0, hold)
-    x, y, z = bare.sim.truth()["position_m"]
-    assert z == pytest.approx(0.5, abs=0.15)
-    assert math.hypot(x, y) < 0.05
-    for axis, value in zip("xyz", (x, y, z), strict=True):
-        assert bare.now(f"stateEstimate.{axis}") == pytest.approx(value, abs=0.02)
-
-    def lie() -> None:
-        x, y, z = bare.sim.truth()["position_m"]
-        bare.cf.extpos.send_extpos(x + 0.5, y, z)
-        bare.hold(0.5)
-
-    bare.stream(3.0, lie)
-    assert bare.sim.truth()["position_m"][0] == pytest.approx(-0.5, abs=0.1)
-
-
 def test_a_pose_turns_the_heading(bare: Pilot) -> None:
     half = math.radians(20.0)
 

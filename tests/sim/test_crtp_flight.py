@@ -29,13 +29,6 @@ def test_first_raw_burst_in_flight_is_a_cut(pilot: Pilot) -> None:
     assert pilot.motors_off()
 
 
-def test_a_zero_packet_in_flight_is_a_cut(pilot: Pilot) -> None:
-    """Row "A zero packet in flight is itself a cut"."""
-    pilot.fly_to(0.6, 0.5)
-    raw(pilot, 0)
-    assert pilot.until(off, 0.1) <= 0.007
-
-
 def test_unlock_without_notify_blocks_the_take_off(pilot: Pilot) -> None:
     """Row "without the notify, an HL take-off shows HL active but the motors stay at 0"."""
     raw(pilot, 0)
@@ -96,25 +89,23 @@ def test_position_controller_pushes_harder_than_raw(pilot: Pilot) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mass_kg", "lowest_m", "within_m"), [(0.042, 0.47, 0.025), (0.030, 0.74, 0.01)]
+    ("mass_kg", "mode", "lowest_m", "within_m"),
+    [
+        (0.042, "hover", 0.47, 0.025),
+        (0.030, "hover", 0.74, 0.01),
+        (0.042, "zdistance", 0.45, 0.045),
+    ],
 )
-def test_position_to_hover_dips(
-    pilot: Pilot, mass_kg: float, lowest_m: float, within_m: float
+def test_position_to_another_mode_dips(
+    pilot: Pilot, mass_kg: float, mode: str, lowest_m: float, within_m: float
 ) -> None:
-    """Row "position -> hover dips to 0.47 m" at 42 g, 0.74 m at 30 g, from 0.8 m."""
+    """Rows "position -> hover dips to 0.47 m" at 42 g, 0.74 m at 30 g; "-> zdistance 0.45 m"."""
     pilot.fresh(mass_kg=mass_kg)
     pilot.fly_to(0.8, 4.0)
-    dip_m = lowest_after(pilot, 3.0, lambda: pilot.cf.commander.send_hover_setpoint(0, 0, 0, 0.8))
-    assert dip_m == pytest.approx(lowest_m, abs=within_m)
-
-
-def test_position_to_zdistance_dips(pilot: Pilot) -> None:
-    """Row "position -> zdistance 0.45 m"."""
-    pilot.fly_to(0.8, 4.0)
-    dip_m = lowest_after(
-        pilot, 3.0, lambda: pilot.cf.commander.send_zdistance_setpoint(0, 0, 0, 0.8)
+    send = getattr(pilot.cf.commander, f"send_{mode}_setpoint")
+    assert lowest_after(pilot, 3.0, lambda: send(0, 0, 0, 0.8)) == pytest.approx(
+        lowest_m, abs=within_m
     )
-    assert dip_m == pytest.approx(0.45, abs=0.045)
 
 
 def test_hover_to_velocity_falls_to_the_floor(pilot: Pilot) -> None:
@@ -188,26 +179,30 @@ def test_raw_yaw_rate_is_clockwise(pilot: Pilot) -> None:
     assert pilot.now("stateEstimate.yaw") == pytest.approx(-48, abs=2)
 
 
-def test_raw_pitch_and_the_estimates_sign(pilot: Pilot) -> None:
-    """Row "send_setpoint pitch +10: estimated pitch -9.6 (nose down), moves +x"."""
+@pytest.mark.parametrize(
+    ("angle", "roll_pitch", "estimated_deg", "axis", "sign"),
+    [("pitch", (0, 10), -9.6, 0, 1), ("roll", (10, 0), 9.6, 1, -1)],
+)
+def test_raw_attitude_and_the_estimates_sign(
+    pilot: Pilot,
+    angle: str,
+    roll_pitch: tuple[int, int],
+    estimated_deg: float,
+    axis: int,
+    sign: int,
+) -> None:
+    """Rows "pitch +10: estimated pitch -9.6 (nose down), moves +x"; "roll +10 moves -y"."""
     pilot.fly_to(1.0)
-    x0, y0, _ = pilot.sim.truth()["position_m"]
+    before = pilot.sim.truth()["position_m"]
     # The attitude loop's integral overshoots by half a degree later on.
-    pilot.stream(0.36, lambda: pilot.cf.commander.send_setpoint(0, 10, 0, 58000))
+    pilot.stream(0.36, lambda: pilot.cf.commander.send_setpoint(*roll_pitch, 0, 58000))
     truth = pilot.sim.truth()
-    assert pilot.now("stateEstimate.pitch") == pytest.approx(-9.6, abs=0.5)
-    assert math.degrees(truth["rpy_rad"][1]) == pytest.approx(9.6, abs=0.5)  # nose down, inside
-    assert truth["position_m"][0] - x0 > 0.03
-    assert abs(truth["position_m"][1] - y0) < 0.03
-
-
-def test_raw_roll_moves_right(pilot: Pilot) -> None:
-    """Row "roll +10 moves -y"."""
-    pilot.fly_to(1.0)
-    y0 = pilot.sim.truth()["position_m"][1]
-    pilot.stream(0.36, lambda: pilot.cf.commander.send_setpoint(10, 0, 0, 58000))
-    assert pilot.now("stateEstimate.roll") == pytest.approx(9.6, abs=0.5)
-    assert pilot.sim.truth()["position_m"][1] - y0 < -0.03
+    moved = [sign * (b - a) for a, b in zip(before, truth["position_m"], strict=True)]
+    assert pilot.now(f"stateEstimate.{angle}") == pytest.approx(estimated_deg, abs=0.5)
+    # Nose down is positive inside, as is a roll to the right.
+    assert math.degrees(truth["rpy_rad"][1 - axis]) == pytest.approx(9.6, abs=0.5)
+    assert moved[axis] > 0.03
+    assert abs(moved[1 - axis]) < 0.03
 
 
 def test_go_to_yaw_in_radians_and_relative_in_world_axes(pilot: Pilot) -> None:

@@ -23,8 +23,7 @@ from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.link import Packet, Port
 from perchctl.places import data_file
 from perchctl.sim import CONTROL_PERIOD_S, Scenario, SimProcess
-from perchctl.sim.endpoint import MjpegServer
-from perchctl.sim.host import MAX_LAG_S, Runner
+from perchctl.sim.host import MAX_LAG_S, MjpegServer, Runner
 from tests.helpers.crtp_rig import ROOT, WAIT_S, Client, pictures_of, wired
 
 
@@ -118,7 +117,6 @@ def test_hooks_change_the_vehicle(stepped: SimProcess) -> None:
     sim.replace_vehicle(Scenario(mass_kg=0.03))
     assert sim.truth()["position_m"][2] < 0.05
     sim.set_battery(3.5)
-    sim.push((0.1, 0.0, 0.0))
     sim.advance(0.5)
     assert sim.truth()["battery_v"] == pytest.approx(3.5, abs=0.01)
     before_s = sim.truth()["t_s"]

@@ -188,7 +188,8 @@ def test_stop_and_notify_is_ready_again(pilot: Pilot) -> None:
 
 
 def test_the_farewell_packet_drops_a_flying_vehicle(pilot: Pilot) -> None:
-    """Row "close_link() sends send_setpoint(0,0,0,0)": falls at once and locks."""
+    """Rows "close_link() sends send_setpoint(0,0,0,0)": falls at once and locks; "a zero packet in
+    flight is itself a cut"."""
     pilot.fly_to(0.8, 0.5, AIRBORNE_S)
     raw(pilot, 0)
     assert pilot.until(off, 0.1) <= 0.007

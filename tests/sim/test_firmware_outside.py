@@ -114,21 +114,6 @@ def test_noise_is_filtered_and_the_parameter_says_how_much(in_the_air: Rig) -> N
     assert spread[0.1] < 0.6 * spread[0.01]
 
 
-def test_a_late_position_is_a_lag() -> None:
-    rig = outside_rig()
-    path: list[Place] = []
-
-    def late(rig: Rig) -> None:
-        path.append(place(rig))
-        rig.firmware.external_position(path[max(0, len(path) - 11)])
-
-    rig.world.set_pose((0.0, 0.0, 0.5), hold=True)
-    for step in range(200):  # carried at 0.5 m/s
-        rig.world.set_pose((0.005 * step, 0.0, 0.5), velocity_mps=(0.5, 0.0, 0.0), hold=True)
-        fed(rig, PERIOD_S, late)
-    assert errors(rig)[0] == pytest.approx(-0.05, abs=0.01)
-
-
 def test_a_wrong_initial_heading_cannot_be_flown() -> None:
     """In the firmware's axes the position is then off in the wrong direction."""
     rig = outside_rig()

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.sim import CONTROL_PERIOD_S, MOTOR_FORCE_N
-from perchctl.sim.firmware.power import _LEVELS_V, MOTORS_OFF, THRUST_MIN, MotorDriver
+from perchctl.sim.firmware.controller import MOTORS_OFF, THRUST_MIN, MotorDriver
+from perchctl.sim.firmware.firmware import _LEVELS_V
 from perchctl.sim.powertrain import (
     FULL_COMMAND,
     STANDSTILL_V,

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from perchctl.geometry import (
@@ -23,8 +21,7 @@ from perchctl.geometry import (
 )
 from perchctl.profile import TargetConfig
 from perchctl.sim import Neighbour, Renderer, Scenario
-from perchctl.sim.renderer import defocused, rounded
-from perchctl.sim.sheets import pixels_of
+from perchctl.sim.renderer import rounded
 from perchctl.target.drawing import marker_corners_m
 from perchctl.vision import CameraModel
 
@@ -130,6 +127,18 @@ POSES = {
 }
 
 
+def plain(size: tuple[int, int]) -> CameraModel:
+    width, height = size
+    f = 0.6 * width
+    return CameraModel(
+        size, np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]]), np.zeros(5)
+    )
+
+
+ASIDE = POSES["far, aside, turned"]
+NEAR = (camera_pose(0.35, 0.02, 0.01, (0.03, -0.02, 0.2)), 0.150, 4.0)
+
+
 @pytest.fixture(scope="module")
 def renderer() -> Renderer:
     return Renderer(scenario(), PLUMB_BOB, TARGET)
@@ -139,23 +148,34 @@ def evenly_lit(image: NDArray[np.uint8], renderer: Renderer) -> NDArray[np.uint8
     return np.clip(image * (255.0 / renderer.shade), 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("name", list(POSES))
-def test_corners_lie_where_opencv_projects_them(renderer: Renderer, name: str) -> None:
-    pose, side_m, reach_px = POSES[name]
-    image = evenly_lit(renderer.render([pose]), renderer)
-    errors = corner_errors_px(image, PLUMB_BOB, scenario(), pose, side_m, reach_px)
+@pytest.mark.parametrize(
+    ("camera", "view", "changes"),
+    [
+        *((PLUMB_BOB, view, {}) for view in POSES.values()),
+        *((camera, view, {}) for camera in (RATIONAL, FISHEYE)
+          for view in (ASIDE, POSES["middle, tilted"])),
+        *((plain(size), (camera_pose(0.5), 0.150, 2.5), {})
+          for size in ((320, 240), (1280, 720), (333, 251))),
+        (PLUMB_BOB, NEAR, {"target_tilt_rad": (math.radians(3.0), 0.0)}),
+        (PLUMB_BOB, NEAR, {"target_tilt_rad": (math.radians(-2.0), math.radians(2.0))}),
+        (PLUMB_BOB, NEAR, {"large_side_m": 0.1485}),
+    ],
+)  # fmt: skip
+def test_corners_lie_where_opencv_projects_them(
+    camera: CameraModel, view: tuple[Array, float, float], changes: dict[str, Any]
+) -> None:
+    """For each lens, size of picture and pose, and for a target that is tilted or printed small."""
+    pose, side_m, reach_px = view
+    scene = scenario(**changes)
+    renderer = Renderer(scene, camera, TARGET)
+    image = renderer.render([pose])
+    assert image.shape == camera.size_px[::-1]
+    side_m = changes.get("large_side_m", side_m)
+    errors = corner_errors_px(evenly_lit(image, renderer), camera, scene, pose, side_m, reach_px)
     assert np.abs(errors).max() < 0.025
-    assert np.abs(errors.mean(axis=0)).max() < 0.01
-
-
-@pytest.mark.parametrize("camera", [RATIONAL, FISHEYE], ids=lambda c: c.model)
-@pytest.mark.parametrize("name", ["far, aside, turned", "middle, tilted"])
-def test_other_lens_models(camera: CameraModel, name: str) -> None:
-    pose, side_m, reach_px = POSES[name]
-    renderer = Renderer(scenario(), camera, TARGET)
-    image = evenly_lit(renderer.render([pose]), renderer)
-    errors = corner_errors_px(image, camera, scenario(), pose, side_m, reach_px)
-    assert np.abs(errors).max() < 0.025
+    assert np.abs(errors.mean(axis=0)).max() < (
+        0.01 if camera is PLUMB_BOB and not changes else 0.025
+    )
 
 
 def test_nothing_shifts_the_corners_together(renderer: Renderer) -> None:
@@ -200,49 +220,9 @@ def test_both_markers_read_unmirrored_with_their_corners_in_order(renderer: Rend
     assert abs(corners[0, 1] - corners[1, 1]) < 2.0
 
 
-@pytest.mark.parametrize("marker_id", [0, 23])
-def test_ids_with_a_black_centre_get_a_white_ring_and_are_found(marker_id: int) -> None:
-    large = TARGET.large.model_copy(update={"id": marker_id})
-    renderer = Renderer(scenario(), PLUMB_BOB, TARGET.model_copy(update={"large": large}))
-    image = renderer.render([camera_pose(0.25)])
-    assert marker_id in detect(image, "DICT_4X4_1000")
-    assert 5 in detect(image, "DICT_ARUCO_ORIGINAL")
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"target_tilt_rad": (math.radians(3.0), 0.0)},
-        {"target_tilt_rad": (math.radians(-2.0), math.radians(2.0))},
-        {"large_side_m": 0.1485},
-    ],
-)
-def test_a_target_that_is_tilted_or_printed_small_is_so_in_the_picture(
-    changes: dict[str, object],
-) -> None:
-    scene = scenario(**changes)
-    pose = camera_pose(0.35, 0.02, 0.01, (0.03, -0.02, 0.2))
-    renderer = Renderer(scene, PLUMB_BOB, TARGET)
-    image = evenly_lit(renderer.render([pose]), renderer)
-    errors = corner_errors_px(image, PLUMB_BOB, scene, pose, scene.large_side_m, 4.0)
-    assert np.abs(errors).max() < 0.025
-
-
 def moving(speed_mps: float, below_m: float = 0.6) -> list[Array]:
     reach = speed_mps * 0.008 / 2.0
     return [camera_pose(below_m, x) for x in (-reach, 0.0, reach)]
-
-
-def test_blur_grows_with_speed_and_keeps_the_place(renderer: Renderer) -> None:
-    sharpness = []
-    for speed in (0.0, 0.5, 1.0, 2.0, 4.0):
-        image = renderer.render(moving(speed))
-        sharpness.append(float(cv2.Laplacian(image, cv2.CV_64F).var()))
-        errors = corner_errors_px(
-            evenly_lit(image, renderer), PLUMB_BOB, scenario(), camera_pose(0.6), 0.150, 6.0
-        )
-        assert np.abs(errors.mean(axis=0)).max() < 0.03
-    assert all(a > 1.02 * b for a, b in pairwise(sharpness))
 
 
 def test_motion_blur_is_the_mean_of_the_views_on_the_way(renderer: Renderer) -> None:
@@ -312,20 +292,6 @@ def test_on_its_side_the_camera_sees_ceiling_and_floor(renderer: Renderer) -> No
     assert image[:200, 320].mean() < 80 < image[280:, 320].mean()
 
 
-@pytest.mark.parametrize("size", [(320, 240), (1280, 720), (333, 251)])
-def test_any_image_size(size: tuple[int, int]) -> None:
-    width, height = size
-    f = 0.6 * width
-    camera_matrix = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
-    camera = CameraModel(size, camera_matrix, np.zeros(5))
-    renderer = Renderer(scenario(), camera, TARGET)
-    pose = camera_pose(0.5)
-    image = evenly_lit(renderer.render([pose]), renderer)
-    assert image.shape == (height, width)
-    errors = corner_errors_px(image, camera, scenario(), pose, 0.150, 2.5)
-    assert np.abs(errors).max() < 0.025
-
-
 def test_a_neighbour_s_target_hangs_where_it_is_said(renderer: Renderer) -> None:
     """In the own target's axes, with its own heading and ids; here beside a bare place, too."""
     beside = Neighbour((0.4, -0.1), 0.9, large_id=145, small_id=254)
@@ -371,27 +337,6 @@ def test_noise_has_its_spread_and_no_memory() -> None:
     assert abs((one * other).mean()) < 0.01 * 36.0
 
 
-SPAN = st.tuples(st.integers(0, 9), st.integers(1, 6))
-"""First block, and how many."""
-
-
-@settings(max_examples=40, deadline=None, derandomize=True)
-@given(st.integers(0, 2**31), st.floats(0.1, 1.5), SPAN, SPAN)
-def test_a_blur_of_some_tiles_is_that_of_the_whole_picture_there(
-    seed: int, sigma_px: float, rows: tuple[int, int], cols: tuple[int, int]
-) -> None:
-    """And as far around as they spread; what is farther off stays as it was."""
-    sharp = np.random.default_rng(seed).integers(0, 256, (128, 128)).astype(np.uint8)
-    box = (slice(rows[0], rows[0] + rows[1]), slice(cols[0], cols[0] + cols[1]))
-    picture = sharp.copy()
-    defocused(picture, sigma_px, box)
-    near = pixels_of(box, math.ceil(3.0 * sigma_px))
-    assert np.array_equal(picture[near], cv2.GaussianBlur(sharp, (0, 0), sigma_px)[near])
-    far = np.ones(sharp.shape, np.bool_)
-    far[pixels_of(box, 8)] = False
-    assert np.array_equal(picture[far], sharp[far])
-
-
 # --- A camera at rest, whose picture is kept ---------------------------------------------------
 
 
@@ -420,14 +365,15 @@ def test_no_picture_hangs_on_those_before() -> None:
 @pytest.mark.parametrize("below_m", [0.02, 0.3, 2.0])
 def test_a_rounded_pose_shows_each_place_where_it_is(below_m: float) -> None:
     rng = np.random.default_rng(5)
-    for _ in range(200):
+    K = np.diag([400.0, 400.0, 1.0])
+    for _ in range(100):
         T = make_T(
             rotation_from_rpy(*rng.uniform(-0.3, 0.3, 3)),
             (*rng.uniform(-0.5, 0.5, 2) * below_m, -below_m),
         )
-        points = np.array([[*rng.uniform(-0.5, 0.5, 2) * below_m, 0.0] for _ in range(9)])
-        seen = [(points - t[:3, 3]) @ t[:3, :3] for t in (T, rounded(T))]
-        one, other = (400.0 * cam[:, :2] / cam[:, 2:] for cam in seen)
+        points = np.hstack([rng.uniform(-0.5, 0.5, (9, 2)) * below_m, np.zeros((9, 1))])
+        cams = [(points - t[:3, 3]) @ t[:3, :3] @ K for t in (T, rounded(T))]
+        one, other = (cam[:, :2] / cam[:, 2:] for cam in cams)
         within = (np.abs(one) < (400.0, 300.0)).all(axis=1)
         assert np.abs(one - other)[within].max(initial=0.0) < 0.01
 

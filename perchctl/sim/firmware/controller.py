@@ -3,8 +3,8 @@
 Gains and limits are the firmware's defaults for the Crazyflie 2.x; they can be changed
 through the parameters of the same names. Angles in degrees, pitch nose up, as inside
 the firmware. Every change of setpoint mode resets all integrators (docs/firmware.md,
-"Setpoint modes"), so the thrust starts again from `thrustBase`. What comes out are thrust
-requests; `perchctl.sim.firmware.power` turns them into duty cycles.
+"Setpoint modes"), so the thrust starts again from `thrustBase`. The loops request
+thrust; `MotorDriver` turns these requests into duty cycles.
 """
 
 from __future__ import annotations
@@ -12,7 +12,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from perchctl.sim.firmware.power import MOTORS_OFF, Motors
+from perchctl.sim.powertrain import FULL_COMMAND, MOTOR_FORCE_N, THRUST_MIN_N, motor_v
+from perchctl.sim.scenario import CONTROL_PERIOD_S
+
+Motors = tuple[float, float, float, float]
+MOTORS_OFF: Motors = (0.0, 0.0, 0.0, 0.0)
 
 # --- Setpoints: which axes are controlled how --------------------------------------------------
 
@@ -54,7 +58,7 @@ class Setpoint:
 
     @classmethod
     def raw(cls, roll_deg: float, pitch_deg: float, yaw_rate_dps: float, thrust: float) -> Setpoint:
-        """`commander.send_setpoint`: +10 of pitch is nose down, the yaw rate clockwise positive."""
+        """Return that of `commander.send_setpoint`: pitch +10 is nose down, yaw rate clockwise."""
         return cls(
             MODE_RAW,
             roll_deg=roll_deg,
@@ -65,19 +69,20 @@ class Setpoint:
 
     @classmethod
     def position(cls, x_m: float, y_m: float, z_m: float, yaw_deg: float) -> Setpoint:
-        """`send_position_setpoint`: m and degrees, counter-clockwise positive."""
+        """Return that of `send_position_setpoint`: m and degrees, counter-clockwise positive."""
         return cls(MODE_POSITION, x_m, y_m, z_m, yaw_deg=yaw_deg)
 
     @classmethod
     def velocity(cls, vx_mps: float, vy_mps: float, vz_mps: float, yaw_rate_dps: float) -> Setpoint:
-        """`send_velocity_world_setpoint`: yaw rate counter-clockwise positive."""
+        """Return that of `send_velocity_world_setpoint`: yaw rate counter-clockwise positive."""
         return cls(
             MODE_VELOCITY, vx_mps=vx_mps, vy_mps=vy_mps, vz_mps=vz_mps, yaw_rate_dps=yaw_rate_dps
         )
 
     @classmethod
     def hover(cls, vx_mps: float, vy_mps: float, yaw_rate_dps: float, z_m: float) -> Setpoint:
-        """`send_hover_setpoint`: velocity in body axes, yaw rate, absolute height."""
+        """Return that of `send_hover_setpoint`: velocity in body axes, yaw rate, absolute
+        height."""
         return cls(
             MODE_HOVER,
             z_m=z_m,
@@ -91,7 +96,7 @@ class Setpoint:
     def z_distance(
         cls, roll_deg: float, pitch_deg: float, yaw_rate_dps: float, z_m: float
     ) -> Setpoint:
-        """`send_zdistance_setpoint`: attitude, yaw rate, absolute height."""
+        """Return that of `send_zdistance_setpoint`: attitude, yaw rate, absolute height."""
         return cls(
             MODE_Z_DISTANCE,
             z_m=z_m,
@@ -101,7 +106,7 @@ class Setpoint:
         )
 
     def levelled(self) -> Setpoint:
-        """What the supervisor flies while setpoints are missing: level, no turn, z as it is."""
+        """Return what the supervisor flies while setpoints are missing: level, no turn, same z."""
         mode = (DISABLED, DISABLED, self.mode[2], ABSOLUTE, ABSOLUTE, VELOCITY)
         return replace(self, mode=mode, roll_deg=0.0, pitch_deg=0.0, yaw_rate_dps=0.0)
 
@@ -140,7 +145,7 @@ class Pid:
         self._limit = limit
 
     def update(self, desired: float, measured: float, turning: bool = False) -> float:
-        """`turning`: on the circle of 360 degrees."""
+        """Return the output after one period; `turning`: on the circle of 360 degrees."""
         error, change = desired - measured, measured - self._measured
         if turning:
             error, change = cap_deg(error), cap_deg(change)
@@ -165,7 +170,7 @@ class Pid:
 
 
 def cap_deg(angle: float) -> float:
-    """The same angle within +-180 degrees."""
+    """Return the same angle within +-180 degrees."""
     while angle > 180.0:
         angle -= 360.0
     while angle < -180.0:
@@ -316,5 +321,51 @@ class Controller:
 
 
 def _distribute(thrust: float, r: float, p: float, y: float) -> Motors:
-    """Thrust requests of M1..M4; neither bounded above nor below (see `MotorDriver`)."""
+    """Return thrust requests of M1..M4; neither bounded above nor below (see `MotorDriver`)."""
     return (thrust - r + p + y, thrust - r - p - y, thrust + r - p + y, thrust + r + p - y)
+
+
+# --- Power distribution: four thrust requests in, four duty cycles (PWM) out -------------------
+# In the firmware's order (source: power distribution, motor driver and stabiliser of release
+# 2026.08): the battery's voltage is compensated by the inverted thrust curve first, then what
+# exceeds the full duty cycle is taken off all four. More than 0.12 N may so be requested of one
+# motor, and is given while the battery suffices: a yaw step at hover costs no height
+# (docs/firmware.md, "Yaw step").
+
+SUPPLY_AT_BOOT_V = 4.2
+SUPPLY_FILTER = 0.01  # of each sample, at `SUPPLY_RATE_HZ`
+SUPPLY_RATE_HZ = 1000.0
+SUPPLY_LEAST_V = 2.0  # below this the reading is taken for broken: no thrust
+THRUST_MIN = FULL_COMMAND * THRUST_MIN_N / MOTOR_FORCE_N
+
+_KEEP = (1.0 - SUPPLY_FILTER) ** (SUPPLY_RATE_HZ * CONTROL_PERIOD_S)
+_N_PER_COMMAND = MOTOR_FORCE_N / FULL_COMMAND
+
+
+class MotorDriver:
+    """`requested`: the duty cycles before the cap (`motor.m1req`)."""
+
+    def __init__(self) -> None:
+        self.requested: Motors = MOTORS_OFF
+        # Low-passed with 0.1 s: the compensation meets a sagging battery late.
+        self._supply_v = SUPPLY_AT_BOOT_V
+
+    def pwm(self, requests: Motors, battery_v: float) -> Motors:
+        """Return duty cycles 0..65535 for thrust requests; `MOTORS_OFF` itself when all are 0."""
+        self._supply_v = supply_v = battery_v + _KEEP * (self._supply_v - battery_v)
+        if requests is MOTORS_OFF or supply_v < SUPPLY_LEAST_V:
+            self.requested = MOTORS_OFF
+            return MOTORS_OFF
+        scale = FULL_COMMAND / supply_v
+        p1, p2, p3, p4 = (
+            scale * motor_v(_N_PER_COMMAND * request) if request >= THRUST_MIN else 0.0
+            for request in requests
+        )
+        self.requested = pwm = (p1, p2, p3, p4)
+        if max(pwm) == 0.0:
+            return MOTORS_OFF
+        excess = max(pwm) - FULL_COMMAND
+        if excess > 0.0:
+            # Attitude comes before thrust: all four give way together.
+            p1, p2, p3, p4 = (max(0.0, duty - excess) for duty in pwm)
+        return (p1, p2, p3, p4)

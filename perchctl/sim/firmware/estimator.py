@@ -1,7 +1,6 @@
 """The state estimate: the truth with the errors of a flow deck or of motion capture.
 
-Drift runs from the moment the motors first turn; what a flow deck adds high above the floor is
-`FlowDeck`. A vehicle without a deck (scenario
+Drift runs from the moment the motors first turn. A vehicle without a deck (scenario
 `extra["external_position"]`) has what it is sent from outside instead, which counts with
 parameter `stabilizer.estimator` = 2: `perchctl.sim.firmware.outside`.
 
@@ -79,9 +78,6 @@ class Estimator:
         self._imu: Imu | None = None
         if scenario.extra.get("external_position"):
             self.outside, self._imu = OutsideFilter(), Imu(scenario)
-        self._flow: FlowDeck | None = None
-        if self.outside is None and has_flow_errors(scenario):
-            self._flow = FlowDeck(scenario)
         self._reset_due = True
         self._reset_s = 0.0
         self._rng.uniform()  # keeps the flights of all seeds as they were
@@ -89,48 +85,42 @@ class Estimator:
         self.spoil: Callable[[Estimate], None] | None = None  # a fault's, upon each estimate
 
     def reset(self, t_s: float) -> None:
-        """`kalman.resetEstimation`: drift and outside corrections are forgotten."""
+        """Forget drift and outside corrections, as `kalman.resetEstimation` does."""
         self._reset_s = t_s
         self._drift_s = 0.0
         self._reset_due = True
-        if self._flow is not None:
-            self._flow.reset()
 
     def external_position(self, position_m: Vector) -> None:
-        """One measurement from outside; only a vehicle without a deck uses it."""
+        """Take one measurement from outside; only a vehicle without a deck uses it."""
         if self.outside is not None and self.hears_outside:
             self._reset_if_due(self.outside)
             self.outside.position(position_m)
 
     def external_pose(self, position_m: Vector, quaternion: Quaternion) -> None:
-        """A measurement with an attitude: w, x, y, z, body to world."""
+        """Take a measurement with an attitude: w, x, y, z, body to world."""
         if self.outside is not None and self.hears_outside:
             self._reset_if_due(self.outside)
             self.outside.pose(position_m, quaternion)
 
     def set_outside(self, name: str, value: float) -> None:
-        """A parameter of `SETTINGS`."""
+        """Set a parameter of `SETTINGS`."""
         if self.outside is not None:
             setattr(self.outside, SETTINGS[name], value)
 
     def shift_accelerometer(self, z_mps2: float) -> None:
-        """The accelerometer reads so much more along z from now on; only without a deck, which is
-        simulated by its errors."""
+        """Let the accelerometer read so much more along z from now on. A deck, which is simulated
+        by its errors, has none."""
         if self._imu is not None:
             x, y, z = self._imu.acc_bias_mps2
             self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
 
     def variance(self, t_s: float, state: int = POSITION) -> float:
-        """The variance of a state as `Covariance` counts them. A deck's is the position's
-        for all of them: it falls after a reset. Flow says nothing of the height, which a laser
-        measures."""
+        """Return the variance of a state, in the order of `Covariance`. All states of a deck's
+        estimate have the same one, which falls after a reset."""
         if self.outside is not None:
             return self.outside.variance(state)
-        deck_m2 = _VARIANCE_FLOOR + _VARIANCE_START * math.exp(
-            -(t_s - self._reset_s) / _VARIANCE_FALL_S
-        )
-        is_height = state % 3 == 2
-        return deck_m2 if self._flow is None or is_height else deck_m2 + self._flow.variance
+        age_s = t_s - self._reset_s
+        return _VARIANCE_FLOOR + _VARIANCE_START * math.exp(-age_s / _VARIANCE_FALL_S)
 
     def update(
         self,
@@ -142,7 +132,8 @@ class Estimator:
         flying: bool = False,
         pressed: bool = False,
     ) -> None:
-        """`spinning`: the motors shake the accelerometer; `flying`: the supervisor says so."""
+        """Estimate one control period later. Motors that are `spinning` shake the accelerometer;
+        `flying` is what the supervisor says."""
         if self._steps % _NOISE_EVERY == 0:
             self._walk()
         self._steps += 1
@@ -183,7 +174,7 @@ class Estimator:
         )
 
     def _integrate(self, world: World) -> tuple[float, float, float, float]:
-        """The attitude after one more control period of turning."""
+        """Return the attitude after one more control period of turning."""
         truth = world.quaternion
         if self.gyro is None:
             return truth
@@ -232,11 +223,6 @@ class Estimator:
         nx, ny, nz = self._velocity_noise
         vx, vy, vz = self._velocity_mps
         now.vx_mps, now.vy_mps, now.vz_mps = vx + dx + nx, vy + dy + ny, vz + dz + nz
-        if self._flow is not None and flown:
-            self._flow.step(world)
-            (px, py, pz), (ex, ey) = self._flow.position_error_m, self._flow.velocity_error_mps
-            now.x_m, now.y_m, now.z_m = now.x_m + px, now.y_m + py, now.z_m + pz
-            now.vx_mps, now.vy_mps = now.vx_mps + ex, now.vy_mps + ey
 
     def _move_outside(
         self, outside: OutsideFilter, imu: Imu, world: World, *, flying: bool, pressed: bool
@@ -255,139 +241,3 @@ class Estimator:
         if self._reset_due:
             self._reset_due = False
             outside.reset()
-
-
-# --- The flow deck ---------------------------------------------------------------------------
-# What a flow deck's estimate is off by, as an estimate minus the truth.
-#
-# A Kalman filter of position, velocity and the acceleration that an attitude which is off by a
-# little would feign, the same for x and y, in the form of its error. Its gains are those of the
-# firmware's own numbers (`stdDev` of a flow reading, `procNoiseAcc_xy`, `measNoiseGyro`; source),
-# so it averages flow as long as a real one does: for a second or two. What leads it astray:
-#
-# - The sensor counts motion in tenths of a pixel of 0.717 / 35 rad, each 10 ms (source): rounding
-#   alone is 0.06 rad/s, of which a part is made up for by the next count. The firmware takes two
-#   counts, 0.41 rad/s, for what a reading is off by. An angular speed is made a speed by the
-#   height, so the position walks the more the higher it is.
-# - The vehicle's own turning is taken out by the gyroscope: what that is off by is taken for flow.
-#   Times the height it is a drift.
-# - Above `Scenario.flow_reach_m` it sees nothing. Then the attitude's error alone is summed up,
-#   twice, as in docs/firmware.md, "The target as the only positioning system".
-# - The height is measured by a laser. Its error is that which the firmware counts on: 2.5 mm, and
-#   from 2.5 m on more by a factor of 80 within 1.5 m (source).
-#
-# A flow sensor measures speeds only: when it sees again, the speed is right within seconds, and
-# the position comes back no farther than the filter can tell from that.
-
-
-_FLOW_STREAM = 15
-_EVERY = 5  # control periods between two readings: 100 Hz
-_DT_S = _EVERY * CONTROL_PERIOD_S
-_FLOW_BATCH = 1024
-_LEAST_HEIGHT_M = 0.1
-"""The firmware takes no height for less (source)."""
-_BIAS_MPS2 = 0.0125
-"""What an attitude that is a little off feigns. Level accelerations are not looked at in flight:
-vibration is nothing to the speed in x and y (source)."""
-_SIGMA_RADPS = 2 * 0.1 * (0.71674 / 35) / _DT_S
-_SPEED_DENSITY = 0.5**2 * 1e-3
-_TURN_DENSITY = (GRAVITY_MPS2 * 0.1) ** 2 * 1e-3
-"""What the filter counts on: of a reading of flow; of `procNoiseAcc_xy` and
-`measNoiseGyro_rollpitch` at 1 kHz, the variance's growth in a second."""
-_RANGE_SIGMA_M, _RANGE_FROM_M, _RANGE_RATE_PER_M = 0.0025, 2.5, math.log(80.0) / 1.5
-_RANGE_MEMORY_S = 0.1
-_START_VV, _START_AA = 1e-4, (GRAVITY_MPS2 * 0.01) ** 2
-
-
-def has_flow_errors(scenario: Scenario) -> bool:
-    """True if the scenario's deck is any worse than the plain noise and drift."""
-    return bool(
-        scenario.flow_noise_radps
-        or any(scenario.flow_bias_radps)
-        or scenario.flow_reach_m is not None
-    )
-
-
-class FlowDeck:
-    """`position_error_m` (3) and `velocity_error_mps` (2), world axes."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
-        self._rng = np.random.default_rng([scenario.seed, _FLOW_STREAM])
-        angle = float(self._rng.uniform(-math.pi, math.pi))
-        self._bias_mps2 = (_BIAS_MPS2 * math.cos(angle), _BIAS_MPS2 * math.sin(angle))
-        self._white: list[float] = []
-        self._range_keep = math.exp(-_DT_S / _RANGE_MEMORY_S)
-        self.reset()
-
-    def reset(self) -> None:
-        """The estimate is the truth again, but for the attitude."""
-        self.position_error_m = (0.0, 0.0, 0.0)
-        self.velocity_error_mps = (0.0, 0.0)
-        self._tilt_mps2 = self._bias_mps2
-        self._pv = self._pa = self._va = 0.0
-        self._vv, self._aa = _START_VV, _START_AA
-        self._range_noise = 0.0
-        self._steps = 0
-
-    @property
-    def variance(self) -> float:
-        """Variance of the speed in x or y, (m/s)^2: that is what `kalman.varPX` holds (source)."""
-        return self._vv
-
-    def sees(self, world: World) -> bool:
-        """True if there is anything in view whose motion can be measured."""
-        reach_m = self._scenario.flow_reach_m
-        return reach_m is None or world.z_m <= reach_m
-
-    def step(self, world: World) -> None:
-        """One control period of flight."""
-        self._steps += 1
-        if self._steps % _EVERY:
-            return
-        if len(self._white) < 3:
-            self._white = self._rng.standard_normal(_FLOW_BATCH).tolist()
-        take = self._white.pop
-        self._predict()
-        if self.sees(world):
-            self._measure(world.z_m, take(), take())
-        self._range(world.z_m, take())
-
-    def _predict(self) -> None:
-        (px, py, pz), (ex, ey) = self.position_error_m, self.velocity_error_mps
-        ax, ay = self._tilt_mps2
-        ex, ey = ex + ax * _DT_S, ey + ay * _DT_S
-        self.position_error_m = (px + ex * _DT_S, py + ey * _DT_S, pz)
-        self.velocity_error_mps = (ex, ey)
-        self._pv += _DT_S * (self._vv + self._pa)
-        self._pa += _DT_S * self._va
-        self._vv += _DT_S * (2.0 * self._va + _DT_S * self._aa + _SPEED_DENSITY)
-        self._va += _DT_S * self._aa
-        self._aa += _DT_S * _TURN_DENSITY
-
-    def _measure(self, z_m: float, white_x: float, white_y: float) -> None:
-        height_m, sigma = max(z_m, _LEAST_HEIGHT_M), self._scenario.flow_noise_radps
-        spread = self._vv + (height_m * _SIGMA_RADPS) ** 2
-        kp, kv, ka = self._pv / spread, self._vv / spread, self._va / spread
-        (px, py, pz), (ex, ey), (ax, ay) = (
-            self.position_error_m, self.velocity_error_mps, self._tilt_mps2,
-        )  # fmt: skip
-        bx, by = self._scenario.flow_bias_radps
-        ix = height_m * (bx + sigma * white_x) - ex
-        iy = height_m * (by + sigma * white_y) - ey
-        self.position_error_m = (px + kp * ix, py + kp * iy, pz)
-        self.velocity_error_mps = (ex + kv * ix, ey + kv * iy)
-        self._tilt_mps2 = (ax + ka * ix, ay + ka * iy)
-        self._aa -= ka * self._va
-        self._pa -= ka * self._pv
-        self._pv -= kv * self._pv
-        self._va -= kv * self._va
-        self._vv -= kv * self._vv
-
-    def _range(self, z_m: float, white: float) -> None:
-        """More than the plain noise has: the part that grows with the distance."""
-        sigma_m = _RANGE_SIGMA_M * math.exp(_RANGE_RATE_PER_M * (min(z_m, 5.0) - _RANGE_FROM_M))
-        keep = self._range_keep
-        self._range_noise = keep * self._range_noise + math.sqrt(1.0 - keep * keep) * white
-        x_m, y_m, _ = self.position_error_m
-        self.position_error_m = (x_m, y_m, sigma_m * self._range_noise)

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
-from perchctl.sim.firmware.controller import MODE_RAW, Controller, Setpoint
+from perchctl.sim.firmware.controller import (
+    MODE_RAW,
+    MOTORS_OFF,
+    Controller,
+    MotorDriver,
+    Setpoint,
+)  # fmt: skip
 from perchctl.sim.firmware.estimator import Estimator
 from perchctl.sim.firmware.outside import SETTINGS
 from perchctl.sim.firmware.planner import HighLevelCommand, Planner
-from perchctl.sim.firmware.power import (
-    BATTERY,
-    MOTORS_OFF,
-    PROPELLERS,
-    Health,
-    MotorDriver,
-    PowerMonitor,
-)
 from perchctl.sim.firmware.supervisor import EVERY as SUPERVISOR_EVERY
 from perchctl.sim.firmware.supervisor import State, Supervisor
 from perchctl.sim.firmware.variables import (
@@ -74,7 +72,6 @@ class Firmware:
         self.controller = Controller()
         self.driver = MotorDriver()
         self.power = PowerMonitor(self.world.battery_v)
-        self.health = Health(self.scenario)
         self._pressed = False
         if self.scenario.extra.get("external_position"):
             self._parameters["deck.bcFlow2"] = 0.0  # outside positions instead of a deck
@@ -88,13 +85,10 @@ class Firmware:
         return self._steps * CONTROL_PERIOD_S
 
     def step(self) -> None:
-        """One control period."""
+        """Advance by one control period."""
         step = self._steps
         t_s = step * CONTROL_PERIOD_S
         supervisor = self.supervisor
-        if self.health.testing:
-            self._test(t_s)
-            return
         self.estimator.update(
             self.world,
             t_s,
@@ -136,58 +130,43 @@ class Firmware:
         self._steps = step + 1
         self.world.step(motors)
 
-    def _test(self, t_s: float) -> None:
-        """A control period of a health test, in which nothing else is heard (source)."""
-        for name in (PROPELLERS, BATTERY):
-            self._parameters[f"health.{name}"] = 0.0
-        self.motors = self.health.pwm(
-            self.world.powertrain.forces_n, self.world.battery_v, self._parameters
-        )
-        if self._steps % SUPERVISOR_EVERY == 0:
-            self.power.update(t_s, self.world.battery_v, self._parameters)
-        self._steps += 1
-        self.world.step(self.motors)
-
     # Commands -----------------------------------------------------------------------
 
     def low_level(self, setpoint: Setpoint) -> None:
-        """A setpoint packet; takes over from the high-level commander."""
+        """Fly this setpoint; it takes over from the high-level commander."""
         self._accept(self._limited(setpoint) if setpoint.mode == MODE_RAW else setpoint)
         self._low_level = True
         self.planner.stop()
 
-    def notify_setpoint_stop(self, remain_valid_s: float = 0.0) -> None:
-        """Low-level setpoints end: the high-level commander may fly again.
-
-        The firmware reads past `remain_valid_s`; so does this.
-        """
+    def notify_setpoint_stop(self) -> None:
+        """End the low-level setpoints, so that the high-level commander may fly again."""
         self._inform_planner()
         self._low_level = False
 
     def high_level(self, command: HighLevelCommand) -> None:
-        """A high-level command; flown only when no low-level stream has priority."""
+        """Plan a command; it is flown only when no low-level stream has priority."""
         self.planner.command(command, self.t_s)
 
     def emergency_stop(self) -> None:
-        """Motors off and locked, within one supervisor update."""
+        """Stop the motors and lock, within one supervisor update."""
         self.supervisor.emergency = True
 
     def emergency_stop_watchdog(self) -> None:
-        """The first call starts the watchdog; a gap over 1 s then cuts and locks."""
+        """Start the watchdog, or feed it: a gap over 1 s then cuts the motors and locks."""
         self.supervisor.notify_watchdog(self.t_s)
 
     def arm(self, do_arm: bool) -> tuple[bool, bool]:
-        """(success, armed)."""
+        """Arm or disarm; return (success, armed)."""
         success = self.supervisor.request_arming(do_arm)
         return success, self.supervisor.armed
 
     def recover_from_crash(self) -> tuple[bool, bool]:
-        """(success, recovered); refused while still tumbled."""
+        """Recover; return (success, recovered). It is refused while still tumbled."""
         success = self.supervisor.request_recovery()
         return success, not self.supervisor.crashed
 
     def external_position(self, position_m: tuple[float, float, float]) -> None:
-        """A position from outside, m; see `Estimator`."""
+        """Take a position from outside, m; see `Estimator`."""
         self.external_tick_ms = int(1e3 * self.t_s) % 65536
         self.estimator.external_position(position_m)
 
@@ -196,13 +175,13 @@ class Firmware:
         position_m: tuple[float, float, float],
         quaternion_xyzw: tuple[float, float, float, float],
     ) -> None:
-        """A pose from outside: m, and body to world."""
+        """Take a pose from outside: m, and body to world."""
         self.external_tick_ms = int(1e3 * self.t_s) % 65536
         x, y, z, w = quaternion_xyzw
         self.estimator.external_pose(position_m, (w, x, y, z))
 
     def reboot(self) -> None:
-        """Everything but the world, the battery and persistent parameters starts again."""
+        """Restart everything but the world, the battery and persistent parameters."""
         for name, parameter in PARAMETERS.items():
             if not parameter.persistent:
                 self._parameters[name] = parameter.default
@@ -218,7 +197,7 @@ class Firmware:
         )
 
     def log_value(self, name: str) -> float:
-        """A log variable in its own units (degrees, g, pitch nose up).
+        """Return a log variable in its own units (degrees, g, pitch nose up).
 
         Raises KeyError for an unknown name.
         """
@@ -231,7 +210,7 @@ class Firmware:
         return 0.0
 
     def log_values(self, names: Iterable[str]) -> dict[str, float]:
-        """The values of a whole block, by name. Errors as for one."""
+        """Return the values of a whole block, by name. Errors as for one."""
         if self.log_overrides:
             return {name: self.log_value(name) for name in names}
         return {name: LIVE[name](self) if name in LIVE else self.log_value(name) for name in names}
@@ -258,9 +237,6 @@ class Firmware:
             self.estimator.hears_outside = value == ESTIMATOR_KALMAN
         elif name in SETTINGS:
             self.estimator.set_outside(name, value)
-        elif name in (f"health.{PROPELLERS}", f"health.{BATTERY}"):
-            if value:
-                self.health.start(name.removeprefix("health."))
         elif name == "stabilizer.stop":
             self.supervisor.emergency = self.supervisor.emergency or value != 0.0
         else:
@@ -270,8 +246,8 @@ class Firmware:
         self._setpoint, self._setpoint_s = setpoint, self.t_s
 
     def _limited(self, setpoint: Setpoint) -> Setpoint:
-        """Raw thrust within its limits; it is forced to 0 until one packet with thrust 0 has come
-        since boot (docs/firmware.md, "Raw thrust")."""
+        """Return raw thrust within its limits; it is forced to 0 until one packet with thrust 0 has
+        come since boot (docs/firmware.md, "Raw thrust")."""
         thrust = min(setpoint.thrust, RAW_THRUST_MAX)
         if thrust == 0.0:
             self._thrust_locked = False
@@ -295,3 +271,32 @@ class Firmware:
             (now.vx_mps, now.vy_mps, now.vz_mps),
             math.radians(now.yaw_deg),
         )
+
+
+# --- The battery as the power management reports it: voltage, level, low-power state -----------
+
+
+ON_BATTERY, LOW_POWER = 0, 3
+LOW_DELAY_S = 5.0
+_BATTERY_FILTER = 0.2  # at 25 Hz
+# Voltages at which the level leaves 0, 10, ... 90 per cent.
+_LEVELS_V = (3.00, 3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10)
+
+
+class PowerMonitor:
+    """`update` at 25 Hz. Low below `pm.lowVoltage` for 5 s (docs/firmware.md, "Link")."""
+
+    def __init__(self, battery_v: float) -> None:
+        self.battery_v = battery_v
+        self.state = ON_BATTERY
+        self._fine_s = 0.0
+
+    @property
+    def level_percent(self) -> int:
+        return 10 * max(0, sum(self.battery_v >= v for v in _LEVELS_V) - 1)
+
+    def update(self, t_s: float, battery_v: float, parameters: Mapping[str, float]) -> None:
+        self.battery_v += _BATTERY_FILTER * (battery_v - self.battery_v)
+        if self.battery_v >= parameters["pm.lowVoltage"]:
+            self._fine_s = t_s
+        self.state = LOW_POWER if t_s - self._fine_s > LOW_DELAY_S else ON_BATTERY

@@ -95,7 +95,7 @@ class Imu:
         return self._count == IMU_EVERY
 
     def read(self, *, pressed: bool) -> Reading:
-        """The mean of what was added since the last reading, with the errors."""
+        """Return the mean of what was added since the last reading, with the errors."""
         white = self._white
         if len(white) < 6:
             white = self._white = self._rng.standard_normal(_IMU_BATCH).tolist()
@@ -152,8 +152,8 @@ class Covariance:
         self.rows = np.diag([m2, m2, height_m2] + [_FIRST_MPS**2] * 3 + [_FIRST_RAD**2] * 3)
 
     def grow(self, period_s: float, force_mps2: tuple[float, float, float]) -> None:
-        """After a prediction. `force_mps2`: specific force in world axes; an attitude that is wrong
-        sends it elsewhere."""
+        """Grow after a prediction. `force_mps2` is the specific force in world axes, which an
+        attitude that is wrong sends elsewhere."""
         sx, sy, sz = (period_s * part for part in force_mps2)
         for rows in (self.rows, self.rows.T):
             rows[POSITION:VELOCITY] += period_s * rows[VELOCITY:ATTITUDE]
@@ -164,8 +164,8 @@ class Covariance:
         self._bound()
 
     def measure(self, state: int, variance: float) -> list[float]:
-        """One state was measured with this variance: what to add to each of the nine for every
-        unit that the measurement is more than the estimate."""
+        """Take a measurement of one state with this variance. Return what to add to each of the
+        nine for every unit that the measurement is more than the estimate."""
         gains = self.rows[state] / (self.rows[state, state] + variance)
         self.rows -= np.outer(gains, self.rows[state])
         self._bound()
@@ -207,11 +207,11 @@ class OutsideFilter:
         self.reset()
 
     def variance(self, state: int) -> float:
-        """The variance of a state; `Covariance` says which it is, and its units."""
+        """Return the variance of a state; `Covariance` says which it is, and its units."""
         return float(self._covariance.rows[state, state])
 
     def reset(self) -> None:
-        """At the place and heading of `kalman.initial*`, level and at rest, whatever is true."""
+        """Begin again at the place and heading of `kalman.initial*`, level and at rest."""
         self._covariance.forget()
         self.position_m: Vector = (self.initial_x_m, self.initial_y_m, self.initial_z_m)
         self.velocity_mps: Vector = (0.0, 0.0, 0.0)
@@ -220,7 +220,7 @@ class OutsideFilter:
         self.quaternion = self._initial
 
     def predict(self, reading: Reading, *, flying: bool) -> None:
-        """`IMU_PERIOD_S` later. An estimate out of its bounds is reset."""
+        """Advance by `IMU_PERIOD_S`. An estimate out of its bounds is reset."""
         t, half_s2 = IMU_PERIOD_S, 0.5 * IMU_PERIOD_S * IMU_PERIOD_S
         force = fx, fy, fz = self._force(reading, flying=flying)
         fz -= GRAVITY_MPS2
@@ -250,7 +250,7 @@ class OutsideFilter:
             self._correct(POSITION, self._innovation(measured_m), self.position_sigma_m)
 
     def pose(self, measured_m: Vector, measured: Quaternion) -> None:
-        """A pose from outside: a position and an attitude, body to world."""
+        """Take a pose from outside: a position and an attitude, body to world."""
         self.position(measured_m)
         norm = math.sqrt(sum(v * v for v in measured))
         if not math.isfinite(norm) or norm < 0.5:
@@ -268,7 +268,7 @@ class OutsideFilter:
         return mx - x, my - y, mz - z
 
     def _correct(self, first: int, wrong: Vector, sigma: float) -> None:
-        """Three states from `first` on are so far off, one after the other."""
+        """Correct three states from `first` on, which are so far off, one after the other."""
         variance = max(sigma, _LEAST_SIGMA) ** 2
         sums = [0.0] * 9
         for axis in range(3):
@@ -285,7 +285,7 @@ class OutsideFilter:
         self.quaternion = normalized(multiplied(turn, self.quaternion))
 
     def _force(self, reading: Reading, *, flying: bool) -> Vector:
-        """What is believed of the specific force, in world axes."""
+        """Return what is believed of the specific force, in world axes."""
         w, x, y, z = self.quaternion
         az = reading.az_mps2
         ux, uy, uz = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
@@ -306,7 +306,7 @@ def normalized(quaternion: Quaternion) -> Quaternion:
 
 
 def multiplied(first: Quaternion, second: Quaternion) -> Quaternion:
-    """The turn by `second` and then by `first`."""
+    """Return the turn by `second` and then by `first`."""
     w, x, y, z = first
     a, b, c, d = second
     return (

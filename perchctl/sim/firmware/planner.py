@@ -118,7 +118,7 @@ class Planner:
         self.state = IDLE
 
     def block(self, blocked: bool) -> None:
-        """The supervisor forbids motors: plans end and new ones are refused."""
+        """Forbid or allow motors. While forbidden, plans end and new ones are refused."""
         if blocked and not self.blocked:
             self.stop()
         self.blocked = blocked
@@ -129,11 +129,11 @@ class Planner:
         velocity_mps: tuple[float, float, float],
         yaw_rad: float,
     ) -> None:
-        """New plans begin here."""
+        """Let new plans begin here."""
         self._start = (position_m, velocity_mps, yaw_rad)
 
     def _begin(self) -> list[AxisState]:
-        """Where a new plan begins: the last setpoint, or the estimate while idle."""
+        """Return where a new plan begins: the last setpoint, or the estimate while idle."""
         if self._start is not None:
             position_m, velocity_mps, yaw_rad = self._start
             axes = zip(position_m, velocity_mps, strict=True)
@@ -159,7 +159,7 @@ class Planner:
         return True
 
     def setpoint(self, t_s: float) -> Setpoint:
-        """The setpoint at t; a null one (motors off) while idle."""
+        """Return the setpoint at t; a null one (motors off) while idle."""
         if self.state == LANDING and self.finished(t_s):
             self.state = IDLE
         if self.state == IDLE:

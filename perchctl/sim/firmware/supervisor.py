@@ -112,7 +112,7 @@ class Supervisor:
         return before in _IN_FLIGHT and self.state in (State.CRASHED, State.RESET)
 
     def info(self, *, hl_active: bool, hl_finished: bool) -> int:
-        """The `supervisor.info` bit field."""
+        """Return the `supervisor.info` bit field."""
         state = self.state
         return (
             (CAN_ARM if state is State.CHECKS_PASSED else 0)

@@ -32,9 +32,6 @@ _LOG_GROUPS: dict[str, str] = {
     "stateEstimateZ": "int16_t: x y z vx vy vz",
     "range": "uint16_t: zrange",
     "locSrvZ": "uint16_t: tick",
-    "health": "float: motorVarXM1 motorVarYM1 motorVarXM2 motorVarYM2 motorVarXM3 motorVarYM3"
-    " motorVarXM4 motorVarYM4; uint8_t: motorPass batteryPass; float: batterySag;"
-    " uint16_t: motorTestCount",
 }
 
 # group -> "ctype: name=default ..."; "*" persistent, "!" read-only.
@@ -62,8 +59,6 @@ _PARAMETER_GROUPS: dict[str, str] = {
     "pm": "float: lowVoltage=3.2* criticalLowVoltage=3.0*",
     "system": "uint8_t: selftestPassed=1!",
     "deck": "uint8_t: bcFlow2=1! bcFlow=0! bcLighthouse4=0! bcLoco=0! bcDWM1000=0! bcAI=0!",
-    "health": "uint8_t: startPropTest=0 startBatTest=0; float: propTestThreshold=0*;"
-    " uint16_t: propTestPWMRatio=0* batTestPWMRatio=0*",
     "locSrv": "uint8_t: enRangeStreamFP32=0 enLhAngleStream=0; float: extPosStdDev=0.01"
     " extQuatStdDev=0.0045",
     "ctrlMel": "float: mass=0.029",
@@ -125,17 +120,10 @@ def _field(path: str, scale: float = 1.0) -> Getter:
     return lambda firmware: scale * float(read(firmware))
 
 
-def _item(path: str, *places: int) -> Getter:
-    """An element of a sequence, or of one within it."""
+def _item(path: str, place: int) -> Getter:
+    """Return a getter of one element of a sequence."""
     read = attrgetter(path)
-
-    def get(firmware: Any) -> float:
-        value = read(firmware)
-        for place in places:
-            value = value[place]
-        return float(value)
-
-    return get
+    return lambda firmware: float(read(firmware)[place])
 
 
 def _duty_cycle(path: str, motor: int) -> Getter:
@@ -148,7 +136,7 @@ def _variance(state: int) -> Getter:
 
 
 def _range_mm(firmware: Any) -> float:
-    """What a deck measures of the height."""
+    """Return what a deck measures of the height."""
     return 1000.0 * max(0.0, firmware.world.z_m) if firmware.estimator.outside is None else 0.0
 
 
@@ -164,10 +152,6 @@ def _live() -> dict[str, Getter]:
         "radio.isConnected": lambda firmware: 1.0,
         "range.zrange": _range_mm,
         "locSrvZ.tick": _field("external_tick_ms"),
-        "health.motorPass": _field("health.motor_pass"),
-        "health.motorTestCount": _field("health.motor_tests"),
-        "health.batteryPass": _field("health.battery_pass"),
-        "health.batterySag": _field("health.sag_v"),
     }
     for i, axis in enumerate(_AXES):
         place, speed = f"estimator.now.{axis}_m", f"estimator.now.v{axis}_mps"
@@ -191,8 +175,6 @@ def _live() -> dict[str, Getter]:
     for i in range(4):
         getters[f"motor.m{i + 1}"] = _duty_cycle("motors", i)
         getters[f"motor.m{i + 1}req"] = _duty_cycle("driver.requested", i)
-        getters[f"health.motorVarXM{i + 1}"] = _item("health.variance", i, 0)
-        getters[f"health.motorVarYM{i + 1}"] = _item("health.variance", i, 1)
     return getters
 
 

@@ -1,1 +1,0 @@
-"""The Crazyflie's side of CRTP: its tables and its server."""
