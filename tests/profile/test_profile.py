@@ -260,9 +260,9 @@ def test_a_harder_world_is_sim_in_all_else(name: str) -> None:
 
 
 @pytest.mark.parametrize("values", [
-    {"neighbour_ids": [1000, 5]}, {"neighbour_ids": [997, -1]}, {"flow_noise_radps": (-0.1, 0.2)},
+    {"neighbour_ids": [1000, 5]}, {"neighbour_ids": [997, -1]},
     {"radio_loss": (0.0, 0.9)}, {"radio_burst_s": (0.0, 0.1)}, {"target_tilt_deg": (3.0, 1.0)},
-    {"cell_charge": (0.0, 1.0)}, {"flow_reach_m": 0.0},
+    {"cell_charge": (0.0, 1.0)},
 ], ids=str)  # fmt: skip
 def test_a_world_that_cannot_be_is_refused(values: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=next(iter(values))):
