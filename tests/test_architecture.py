@@ -94,7 +94,7 @@ MOST_NAMES = {
     "display": 15,
     "faults": 15,
     "flight": 41,
-    "link": 21,
+    "link": 15,
     "record": 19,
     "mission": 48,
     "perception": 15,

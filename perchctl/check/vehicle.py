@@ -33,13 +33,7 @@ from perchctl.flight import (
     unmeasured_problem,
     unsettled_problem,
 )
-from perchctl.link import (
-    NEEDED_PROTOCOL,
-    UDEV_HELP,
-    Echoes,
-    ProbeLink,
-    ScanResult,
-)
+from perchctl.link import UDEV_HELP, Echoes, ProbeLink, ScanResult
 from perchctl.profile import Profile
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, MeasuredBy, Telemetry
 
@@ -65,7 +59,7 @@ class Vehicle:
     """
 
     uri: str
-    protocol: int = NEEDED_PROTOCOL
+    protocol: int = ProbeLink.NEEDED_PROTOCOL
     missing: tuple[str, ...] = ()
     lacking: tuple[str, ...] = ()
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -191,9 +185,10 @@ def _signal(vehicle: Vehicle, profile: Profile) -> Finding:
 
 def _firmware(vehicle: Vehicle, profile: Profile) -> Finding:
     found = f"protocol {vehicle.protocol}"
-    if vehicle.protocol >= NEEDED_PROTOCOL:
+    if vehicle.protocol >= ProbeLink.NEEDED_PROTOCOL:
         return passed(found)
-    advice = f"update it: protocol {NEEDED_PROTOCOL} or later is needed (release 2026.08)"
+    needed = ProbeLink.NEEDED_PROTOCOL
+    advice = f"update it: protocol {needed} or later is needed (release 2026.08)"
     return failed(found, advice)
 
 
