@@ -93,7 +93,7 @@ MOST_NAMES = {
     "commands": 15,
     "display": 15,
     "faults": 15,
-    "flight": 41,
+    "flight": 22,
     "link": 15,
     "record": 19,
     "mission": 48,

@@ -49,7 +49,7 @@ from perchctl.display.panel import (  # noqa: E402
     panel,
     status_rows,
 )
-from perchctl.flight import PLAIN_SEED  # noqa: E402
+from perchctl.flight import FlyOptions  # noqa: E402
 from perchctl.geometry import Array, make_T, rotation_from_rpy  # noqa: E402
 from perchctl.mission import BatteryOutlook  # noqa: E402
 from perchctl.plot import (  # noqa: E402
@@ -539,7 +539,7 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--into", type=Path, default=Path(__file__).parent, help="folder")
     parser.add_argument("--only", nargs="+", choices=sorted(PICTURES), default=list(PICTURES))
     parser.add_argument("--profile", default="sim")
-    parser.add_argument("--seed", type=int, default=PLAIN_SEED)
+    parser.add_argument("--seed", type=int, default=FlyOptions.seed)
     parser.add_argument("--log", type=Path, help="a lockstep flight's log, instead of flying")
     given = parser.parse_args(words)
     with tempfile.TemporaryDirectory() as folder:

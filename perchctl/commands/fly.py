@@ -8,6 +8,7 @@ import sys
 import textwrap
 import time
 from dataclasses import replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -54,16 +55,13 @@ from perchctl.errors import (
     UsageError,
 )
 from perchctl.flight import (
-    PLAIN_SEED,
     FlyOptions,
     OperatorSwitch,
-    SessionResult,
     check_options,
     fly_session,
     require_comparison,
-    wall_date,
 )
-from perchctl.mission import Event, EventKind, Outcome, Phase, Watcher
+from perchctl.mission import Event, EventKind, FlightReport, Outcome, Phase, Watcher
 from perchctl.profile import (
     Profile,
     find_calibration,
@@ -167,7 +165,7 @@ def resolve(
         # An empty URI or source is an unset shell variable: not the profile's, but an error.
         uri=profile.link.uri if uri is None else uri,
         source=profile.camera.source if source is None else source,
-        seed=PLAIN_SEED if seed is None else seed,
+        seed=FlyOptions.seed if seed is None else seed,
         log_dir=log_dir or Path(profile.log.directory),
     )
     options = replace(options, record=not options.simulated if record is None else record)
@@ -202,7 +200,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
     with unheeded(), contextlib.ExitStack() as stack:
         try:
             page = stack.enter_context(live_page(options, port, switch))
-            result = _session(options, log, panel, switch, page, asks)
+            report, miss_m = _session(options, log, panel, switch, page, asks)
         except BaseException as error:
             # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
             if page is not None:
@@ -211,13 +209,12 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
             raise
         finally:
             panel.close()
-        perched = result.report.phase is Phase.PERCHED
-        summary = log.close(result.report, result.miss_m if perched else None)
+        summary = log.close(report, miss_m if report.phase is Phase.PERCHED else None)
         assert summary is not None
         tell(summary_text(summary, log.path), stdout=not as_json)
         if page is not None:
             page.end(summary_card(summary, log.path))
-    code = exit_code(result.report.outcome, summary)
+    code = exit_code(report.outcome, summary)
     plot = drawn(lambda: plot_of(log.path, options.profile))
     if plot is not None:
         tell(f"plot:      {plot}", stdout=not as_json)
@@ -253,7 +250,7 @@ def _session(
     switch: OperatorSwitch,
     page: FlightPage | None,
     asks: bool,
-) -> SessionResult:
+) -> tuple[FlightReport, float | None]:
     """The session with the signals on its switch, and with the live page where there is one."""
     watchers: tuple[Watcher, ...] = (log, display)
     watched = log.watched
@@ -315,7 +312,10 @@ def plan(options: FlyOptions) -> dict[str, Any]:
 
 def _compared(options: FlyOptions) -> list[Row]:
     return comparison_rows(
-        options.profile.positioning, options.uri, wall_date(), simulated=options.simulated
+        options.profile.positioning,
+        options.uri,
+        datetime.now().astimezone(),
+        simulated=options.simulated,
     )
 
 
