@@ -82,7 +82,9 @@ def test_nothing_begins_before_both_blocks_came_and_each_is_missed_by_itself(
     link.hear(other)
     with pytest.raises(TimedOut, match=f"does not send {OF_BLOCK[silent]}$"):
         link._prepare(SimpleNamespace(cf=cf))  # type: ignore[arg-type]
+    assert not link._heard_both.is_set()  # so it is waited for
     link.hear(silent)
+    assert link._heard_both.is_set()
     link._prepare(SimpleNamespace(cf=cf))  # type: ignore[arg-type]
     end_s = link.now_s + SILENCE_S
     while link.now_s < end_s:
