@@ -128,6 +128,14 @@ def quaternion_from_rpy(
     )
 
 
+def nearest_axis(direction: Array) -> str | None:
+    """Return the axis within 30 deg of a unit vector (3,), such as ``-y``; None for none."""
+    i = int(np.argmax(np.abs(direction)))
+    if abs(float(direction[i])) < math.cos(math.radians(30.0)):
+        return None
+    return f"{'-' if direction[i] < 0 else ''}{'xyz'[i]}"
+
+
 def make_T(R: Array, t_m: Array | tuple[float, float, float]) -> Array:
     """Return the homogeneous matrix of a rotation (3, 3) and a translation (3,)."""
     T = np.eye(4)

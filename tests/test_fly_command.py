@@ -21,7 +21,7 @@ from perchctl.calibration import load_calibration
 from perchctl.commands import app
 from perchctl.commands.fly import fly_and_report, resolve
 from perchctl.errors import EXIT_CODES, ConnectionFailed, Interrupted
-from perchctl.flight import PLAIN_SEED, SessionResult
+from perchctl.flight import FlyOptions
 from perchctl.link.connection import open_connection, plain_cause
 from perchctl.mission import FlightReport, Outcome, Phase
 from perchctl.record import LogWatcher
@@ -61,7 +61,7 @@ def test_dry_run_tells_the_plan_and_connects_nothing(tmp_path: Path) -> None:
 def test_dry_run_as_json_holds_the_whole_profile() -> None:
     plan = json.loads(run("fly", "-p", SHORT, "--dry-run", "--json").stdout)
     assert plan["uri"] == "sim://"
-    assert plan["seed"] == PLAIN_SEED
+    assert plan["seed"] == FlyOptions.seed
     assert plan["profile"]["simulation"]["camera_rate_hz"] == 20
     assert plan["profile"]["kalman"]["n_max"] == 8
     assert Path(plan["calibration_file"]).is_file()
@@ -261,7 +261,7 @@ def test_a_calibration_of_another_size(tmp_path: Path) -> None:
 def flown(monkeypatch: pytest.MonkeyPatch) -> None:
     """A flight that has ended, as `fly` gets it, and a plot that is drawn in no time."""
     landed = FlightReport(Phase.LANDED, Outcome.OPERATOR, "Ctrl-C", 0, 3.0, False)
-    monkeypatch.setattr("perchctl.commands.fly.fly_session", lambda *_: SessionResult(landed))
+    monkeypatch.setattr("perchctl.commands.fly.fly_session", lambda *_: (landed, None))
     monkeypatch.setattr("perchctl.analysis.plot_flight", lambda *_: None)
 
 

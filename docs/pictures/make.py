@@ -45,7 +45,7 @@ from perchctl.display import (  # noqa: E402
 )
 from perchctl.display.page import flight_state  # noqa: E402
 from perchctl.display.panel import panel  # noqa: E402
-from perchctl.flight import PLAIN_SEED  # noqa: E402
+from perchctl.flight import FlyOptions  # noqa: E402
 from perchctl.geometry import make_T, rotation_from_rpy  # noqa: E402
 from perchctl.mission import BatteryOutlook, Phase, PlannerState, Tick  # noqa: E402
 from perchctl.plot import (  # noqa: E402
@@ -458,7 +458,7 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--into", type=Path, default=Path(__file__).parent, help="folder")
     parser.add_argument("--only", nargs="+", choices=sorted(PICTURES), default=list(PICTURES))
     parser.add_argument("--profile", default="sim")
-    parser.add_argument("--seed", type=int, default=PLAIN_SEED)
+    parser.add_argument("--seed", type=int, default=FlyOptions.seed)
     parser.add_argument("--log", type=Path, help="a lockstep flight's log, instead of flying")
     given = parser.parse_args(words)
     with tempfile.TemporaryDirectory() as folder:

@@ -25,7 +25,7 @@ from perchctl.analysis.sense import (
 )
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
-from perchctl.flight import SENSED
+from perchctl.flight import FlightInputs
 from perchctl.mission import Observation, Turn
 from perchctl.profile import Profile
 from perchctl.record import FlightLog
@@ -237,7 +237,8 @@ def _unlike(sensed: Sensed) -> tuple[str, object, object] | None:
     was, seen = sensed.turn.observation, sensed.observation
     found = first_differing("poses", sensed.turn.poses, sensed.poses)
     if found is None and was is not None and seen is not None:
-        each = (first_differing(n, getattr(was, n), getattr(seen, n)) for n in SENSED)
+        names = FlightInputs.SENSED
+        each = (first_differing(n, getattr(was, n), getattr(seen, n)) for n in names)
         found = next((difference for difference in each if difference is not None), None)
     return found
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.flight import ENDED_TEXT, SENSED, FlightInputs
+from perchctl.flight import FlightInputs
 from perchctl.mission import FrameSeen, Observation, PoseSeen, Turn, TurnInputs
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
@@ -66,8 +66,10 @@ class _Given:
         taken, obs = turn.taken, turn.observation
         self._taken, self._samples = taken, [taken.samples, taken.late]
         told = None if obs is None else obs.camera_problem
-        if taken.ended and told is not None and told.endswith(ENDED_TEXT):
-            self._name = told.removesuffix(ENDED_TEXT)  # no other record has the flown source's
+        if taken.ended and told is not None and told.endswith(FlightInputs.ENDED_TEXT):
+            self._name = told.removesuffix(
+                FlightInputs.ENDED_TEXT
+            )  # no other record has the flown source's
 
     # As a link.
 
@@ -169,7 +171,7 @@ def _observed(turn: Turn, inputs: FlightInputs) -> Observation | None:
     if turn.observation is None or inputs.history.newest is None:
         return None
     seen = inputs.observation(turn.t_s)
-    return replace(turn.observation, **{name: getattr(seen, name) for name in SENSED})
+    return replace(turn.observation, **{name: getattr(seen, name) for name in FlightInputs.SENSED})
 
 
 @contextlib.contextmanager

@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from statistics import mean, median
 
+import numpy as np
+
 from perchctl.camera import VERDICT_TEXTS, mirrored_note
 from perchctl.check.rehearsal import Rehearsal
 from perchctl.check.row import (
@@ -26,18 +28,15 @@ from perchctl.check.row import (
     worst,
 )
 from perchctl.errors import PerchError
-from perchctl.flight import (
-    out_of_view,
-    place_seen,
-    target_from,
-    too_near_problem,
-)
+from perchctl.flight import out_of_view, too_near_problem
+from perchctl.geometry import Place
 from perchctl.perception import BLENDED, MIRRORED_FRAMES
 from perchctl.profile import Profile
 from perchctl.target import (
     edge_margin,
     offset_text,
     overhead_view,
+    sight_from,
 )
 from perchctl.vision import CameraModel
 
@@ -272,12 +271,17 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
         return warned(found, "nearer, sharper, or more light: see focus")
     if rehearsal.target is None:
         return warned(f"{found}, and not at the end", "see lost frames; once more")
-    place = place_seen(rehearsal.target, profile)
     feet = (0.0, 0.0, profile.safety.ground_z_m)
+    # The world of a level vehicle that stands at the origin, its front along x.
+    gear_m = np.asarray(profile.vehicle.gear_body_m)
+    place = Place(np.array(feet) + rehearsal.target.e_m + gear_m, rehearsal.target.e_yaw_rad)
     problem = out_of_view(place, feet, 0.0, profile, camera)
     if problem is not None:
         return failed(problem.found, problem.advice)
-    sight = target_from(feet, 0.0, place, profile, camera)
+    sight = sight_from(
+        np.array(feet), 0.0, place.position_m, place.yaw_rad,
+        profile.target, camera, profile.camera.mount,
+    )  # fmt: skip
     found += (
         f", {math.hypot(*sight.aside_m):.2f} m aside of the camera's axis "
         f"{sight.height_m:.2f} m above it"

@@ -40,15 +40,8 @@ from perchctl.check.row import (
     warned,
     worst,
 )
-from perchctl.flight import (
-    external_height_problem,
-    millimetres_problem,
-    motion_problem,
-    nearest_axis,
-    tilt_problem,
-    world_problem,
-)
-from perchctl.geometry import Array, rotation_from_rpy, rpy_from_rotation
+from perchctl.flight import GroundCriteria, world_problem
+from perchctl.geometry import Array, nearest_axis, rotation_from_rpy, rpy_from_rotation
 from perchctl.link import vehicle_uri
 from perchctl.perception import History, attitude_at
 from perchctl.positioning import (
@@ -184,12 +177,11 @@ def _place(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
     """Judge the body's place by the criteria of `fly`."""
     newest = heard.telemetry[-1] if heard.telemetry else None
     place = places[-1].external(pose=True)
-    if newest is None:
-        problem = millimetres_problem(place, profile) or external_height_problem(place, profile)
-    elif tilt_problem(newest, profile) or motion_problem(newest):
-        return skipped("the vehicle does not stand level and still")
-    else:
-        problem = world_problem(place, newest, profile)
+    if newest is not None:
+        criteria = GroundCriteria(newest, profile)
+        if criteria.tilt or criteria.motion:
+            return skipped("the vehicle does not stand level and still")
+    problem = world_problem(place, newest, profile)
     if problem is not None:
         return failed(problem.found, problem.advice)
     x, y, z = place.position_m

@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
+from datetime import datetime
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import FrameSource, find_cameras, open_camera, without_password
@@ -14,14 +15,7 @@ from perchctl.check.profile import log_folder_finding, quick_rows
 from perchctl.check.rehearsal import REHEARSED_S, Rehearsal, TakeTelemetry, rehearse
 from perchctl.check.row import Finding, Row, ask, failed, passed, skip_all, skipped
 from perchctl.errors import ConnectionFailed, PerchError, UsageError
-from perchctl.flight import (
-    FlyOptions,
-    WallClock,
-    capture_for_vehicle,
-    check_options,
-    simulated_vehicle,
-    wall_date,
-)
+from perchctl.flight import FlyOptions, WallClock, check_options, simulated_vehicle
 from perchctl.link import ProbeLink, ScanResult, check_uri, find_vehicles
 from perchctl.positioning import CaptureSource, open_capture
 from perchctl.profile import PositioningConfig, Profile
@@ -67,8 +61,10 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
             simulated = stack.enter_context(simulated_vehicle(options, calibrated))
             uri = simulated.uri
             spec = simulated.stream_url if spec.startswith("sim:") else spec
-            positioning = capture_for_vehicle(profile.positioning, simulated.capture)
-            profile = profile.model_copy(update={"positioning": positioning})
+            if simulated.capture is not None:
+                system, host = simulated.capture
+                config = profile.positioning.model_copy(update={"system": system, "host": host})
+                profile = profile.model_copy(update={"positioning": config})
         room = _open_room(profile, scope, stack)
         probe = ProbeLink(uri, profile.link, time.monotonic)
         stack.callback(probe.close)
@@ -178,7 +174,7 @@ class VehicleSession:
     def _compared_rows(self) -> list[Row]:
         simulated = self.uri.startswith("sim://")
         return capture.comparison_rows(
-            self.profile.positioning, self.uri, wall_date(), simulated=simulated
+            self.profile.positioning, self.uri, datetime.now().astimezone(), simulated=simulated
         )
 
     def _lift_rows(self) -> Iterator[Row]:
@@ -189,7 +185,7 @@ class VehicleSession:
             yield Row(vehicle.LIFTED, *lifted)
             if compared:
                 config = self.profile.positioning
-                compared = [capture.save_row(lifted, config, self.uri, wall_date())]
+                compared = [capture.save_row(lifted, config, self.uri, datetime.now().astimezone())]
         else:
             advice = "add --lift, and lift it by hand when told"
             yield from skip_all([vehicle.LIFTED], "not asked for", advice)

@@ -23,23 +23,8 @@ from perchctl.check.row import (
     warned,
     worst,
 )
-from perchctl.flight import (
-    battery_problem,
-    forbidden_problem,
-    height_problem,
-    motion_problem,
-    not_allowed_problem,
-    tilt_deg,
-    unmeasured_problem,
-    unsettled_problem,
-)
-from perchctl.link import (
-    NEEDED_PROTOCOL,
-    UDEV_HELP,
-    Echoes,
-    ProbeLink,
-    ScanResult,
-)
+from perchctl.flight import GroundCriteria, unmeasured_problem
+from perchctl.link import UDEV_HELP, Echoes, ProbeLink, ScanResult
 from perchctl.profile import Profile
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, MeasuredBy, Telemetry
 
@@ -65,7 +50,7 @@ class Vehicle:
     """
 
     uri: str
-    protocol: int = NEEDED_PROTOCOL
+    protocol: int = ProbeLink.NEEDED_PROTOCOL
     missing: tuple[str, ...] = ()
     lacking: tuple[str, ...] = ()
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -194,9 +179,10 @@ def _signal(vehicle: Vehicle, profile: Profile) -> Finding:
 
 def _firmware(vehicle: Vehicle, profile: Profile) -> Finding:
     found = f"protocol {vehicle.protocol}"
-    if vehicle.protocol >= NEEDED_PROTOCOL:
+    if vehicle.protocol >= ProbeLink.NEEDED_PROTOCOL:
         return passed(found)
-    advice = f"update it: protocol {NEEDED_PROTOCOL} or later is needed (release 2026.08)"
+    needed = ProbeLink.NEEDED_PROTOCOL
+    advice = f"update it: protocol {needed} or later is needed (release 2026.08)"
     return failed(found, advice)
 
 
@@ -221,8 +207,8 @@ def _self_test(vehicle: Vehicle, profile: Profile) -> Finding:
 
 def _supervisor(vehicle: Vehicle, profile: Profile) -> Finding:
     t = vehicle.at_rest
-    problem = forbidden_problem(t) or not_allowed_problem(t)
-    return by_problem(problem, f"ready (0x{t.supervisor:04X})")
+    criteria = GroundCriteria(t, profile)
+    return by_problem(criteria.forbidden or criteria.not_allowed, f"ready (0x{t.supervisor:04X})")
 
 
 def _decks(vehicle: Vehicle, profile: Profile) -> Finding:
@@ -249,7 +235,7 @@ def _estimator(vehicle: Vehicle, profile: Profile) -> Finding:
     t = vehicle.at_rest
     if profile.positioning.by != "deck" and not vehicle.position_decks(profile):
         return skipped(BY_FLY)
-    problem = unsettled_problem(t, profile)
+    problem = GroundCriteria(t, profile).unsettled
     if problem is not None:
         return failed(problem.found, "is there a positioning system? wait a little")
     kind = profile.link.parameters.get(ESTIMATOR, vehicle.parameters.get(ESTIMATOR))
@@ -271,19 +257,21 @@ def _ground(vehicle: Vehicle, profile: Profile) -> Finding:
         return skipped(BY_FLY)
     if not all(math.isfinite(v) for v in t.position_m):
         return failed("the position is no number", "restart the vehicle")
-    return by_problem(height_problem(t, profile), f"at {t.position_m[2]:.2f} m")
+    return by_problem(GroundCriteria(t, profile).height, f"at {t.position_m[2]:.2f} m")
 
 
 def _level(vehicle: Vehicle, profile: Profile) -> Finding:
     t, limit_deg = vehicle.at_rest, profile.safety.start_tilt_deg
     found = f"roll {math.degrees(t.roll_rad):.1f}, pitch {math.degrees(t.pitch_rad):.1f} deg"
     advice = "put it on level ground; if that is level, restart it there"
-    return by_limits(tilt_deg(t), min(3.0, limit_deg), limit_deg, found, advice)
+    return by_limits(
+        GroundCriteria(t, profile).tilt_deg, min(3.0, limit_deg), limit_deg, found, advice
+    )
 
 
 def _still(vehicle: Vehicle, profile: Profile) -> Finding:
     t = vehicle.at_rest
-    return by_problem(motion_problem(t), f"{t.acc_z_g:.2f} g")
+    return by_problem(GroundCriteria(t, profile).motion, f"{t.acc_z_g:.2f} g")
 
 
 def _parameters(vehicle: Vehicle, profile: Profile) -> Finding:
@@ -309,7 +297,7 @@ def _battery(vehicle: Vehicle, profile: Profile) -> Finding:
     if not t.battery_v >= NO_BATTERY_READING_V:
         return skipped("no reading", "restart the vehicle")
     found = f"{t.battery_v:.2f} V at rest"
-    if problem := battery_problem(t, profile):
+    if problem := GroundCriteria(t, profile).battery:
         return failed(problem.found, problem.advice)
     if t.battery_state == LOW_POWER:
         return failed(f"{found}, but it reports low power", "charge it")

@@ -9,6 +9,7 @@ import textwrap
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -52,16 +53,13 @@ from perchctl.errors import (
     UsageError,
 )
 from perchctl.flight import (
-    PLAIN_SEED,
     FlyOptions,
     OperatorSwitch,
-    SessionResult,
     check_options,
     fly_session,
     require_comparison,
-    wall_date,
 )
-from perchctl.mission import Event, EventKind, Outcome, Phase, Watcher
+from perchctl.mission import Event, EventKind, FlightReport, Outcome, Phase, Watcher
 from perchctl.profile import (
     PositioningConfig,
     Profile,
@@ -159,7 +157,7 @@ def resolve(
         # An empty URI or source is an unset shell variable: not the profile's, but an error.
         uri=profile.link.uri if uri is None else uri,
         source=profile.camera.source if source is None else source,
-        seed=PLAIN_SEED if seed is None else seed,
+        seed=FlyOptions.seed if seed is None else seed,
         log_dir=log_dir or Path(profile.log.directory),
     )
     options = replace(options, record=not options.simulated if record is None else record)
@@ -213,7 +211,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
     with ignore_signals(), contextlib.ExitStack() as stack:
         try:
             page = stack.enter_context(flight_page(options, port, switch))
-            result = _session(options, log, panel, switch, page, asks)
+            report, miss_m = _session(options, log, panel, switch, page, asks)
         except BaseException as error:
             # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
             if page is not None:
@@ -222,13 +220,12 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
             raise
         finally:
             panel.close()
-        perched = result.report.phase is Phase.PERCHED
-        summary = log.close(result.report, result.miss_m if perched else None)
+        summary = log.close(report, miss_m if report.phase is Phase.PERCHED else None)
         assert summary is not None
         print_lines(summary_text(summary, log.path), stdout=not as_json)
         if page is not None:
             page.end(summary_card(summary, log.path))
-    code = exit_code(result.report.outcome, summary)
+    code = exit_code(report.outcome, summary)
     plot = draw_unless_interrupted(lambda: plot_of(log.path, options.profile))
     if plot is not None:
         print_lines(f"plot:      {plot}", stdout=not as_json)
@@ -281,7 +278,7 @@ def _session(
     switch: OperatorSwitch,
     page: FlightPage | None,
     asks: bool,
-) -> SessionResult:
+) -> tuple[FlightReport, float | None]:
     """Fly the session with the signals on its switch, and with the live page if there is one."""
     watchers: tuple[Watcher, ...] = (log, display)
     watched = log.watched
@@ -340,7 +337,10 @@ def plan(options: FlyOptions) -> dict[str, Any]:
 
 def _compared(options: FlyOptions) -> list[Row]:
     return comparison_rows(
-        options.profile.positioning, options.uri, wall_date(), simulated=options.simulated
+        options.profile.positioning,
+        options.uri,
+        datetime.now().astimezone(),
+        simulated=options.simulated,
     )
 
 

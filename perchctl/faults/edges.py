@@ -10,14 +10,7 @@ import numpy as np
 
 from perchctl.camera import FrameSource
 from perchctl.faults import effects as e
-from perchctl.link import (
-    BLOCKS_DELETED_AFTER_S,
-    RESUME_PERIOD_S,
-    MockLink,
-    Packet,
-    Port,
-    Radio,
-)
+from perchctl.link import MockLink, Packet, Port, Radio
 from perchctl.sim import CommandService, Firmware
 from perchctl.vision import Frame
 
@@ -72,7 +65,7 @@ class FaultyRadio(Radio):
                 self._twice.add(order)
             case e.Reboots(boots_s):
                 self._begun.append((e.Silence(boots_s, up=True, down=True), now_s))
-                unasked_s = boots_s + BLOCKS_DELETED_AFTER_S + RESUME_PERIOD_S
+                unasked_s = boots_s + MockLink.BLOCKS_BACK_AFTER_S
                 self._begun.append((e.Silence(unasked_s, up=False, down=True), now_s))
             case e.Silence() | e.BlockDead() | e.TelemetryDelayed():
                 self._begun.append((effect, now_s))

@@ -33,7 +33,6 @@ from perchctl.flight import (
     feed_lockstep,
     fly,
     lockstep_source,
-    with_positioning,
 )
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link import MockLink, Packet, Port, Radio
@@ -311,15 +310,20 @@ def _sooner_s(effects: Sequence[e.Effect]) -> float:
 def _flown_by(profile: Profile, case: Case) -> Profile:
     """Return the profile with the positioning and the camera latency that the case needs."""
     if any(isinstance(effect, e.ExternalPositions) for effect in case.effects):
-        profile = with_positioning("mocap", profile)
+        profile = _positioned_by("mocap", profile)
     if any(isinstance(effect, e.DeckSilent) for effect in case.effects):
-        profile = with_positioning("deck", profile)
+        profile = _positioned_by("deck", profile)
     more_s = _sooner_s(case.effects)
     if more_s == 0.0:
         return profile
     latency_s = profile.camera.start_latency_s + more_s
     camera = profile.camera.model_copy(update={"latency_s": latency_s})
     return profile.model_copy(update={"camera": camera})
+
+
+def _positioned_by(by: str, profile: Profile) -> Profile:
+    config = profile.positioning.model_copy(update={"by": by})
+    return profile.model_copy(update={"positioning": config})
 
 
 def _parameters(case: Case) -> dict[str, Any]:

@@ -7,7 +7,6 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from datetime import datetime
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
@@ -99,14 +98,9 @@ class SimulatedClock:
             self._shared.limit_s = math.inf
 
     def remarks(self) -> list[str]:
-        """The remark that the flight is slow, once."""
+        """Return the remark that the flight is slow, once."""
         if self._began_s is None or self._slow_told:
             return []
         wall_s, own_s = self._began_s
         self._slow_told = self._wall() - wall_s - (self.now() - own_s) > SLOW_S
         return [SLOW] if self._slow_told else []
-
-
-def wall_date() -> datetime:
-    """Now, in this computer's time zone."""
-    return datetime.now().astimezone()

@@ -1,6 +1,6 @@
 """Criteria for a vehicle on the ground, used by `fly` before it takes off and by `check`. Pure.
 
-Each gives what is wrong, or None. Of a vehicle at rest two things are known without a motion
+Each returns what is wrong, or None. Of a vehicle at rest two things are known without a motion
 capture: where the ground is, and which way is up. A world with another axis up, or a body whose
 axes are turned, shows against the second once the vehicle stands in another heading than the one in
 which its body was defined; a height in millimetres against the first. The rest shows when a hand
@@ -16,7 +16,7 @@ import numpy as np
 
 from perchctl.errors import distinct_figures
 from perchctl.geometry import (
-    Array,
+    nearest_axis,
     rotation_from_quaternion,
     rotation_from_rpy,
     wrap_rad,
@@ -45,7 +45,6 @@ WITHIN_REACH_M = 0.35  # of the gear: a take-off needs more height, so no target
 ROOM_M = 50.0  # no capture is larger: what is farther off is in another unit
 HIGH_M = 4.0  # of a vehicle at its take-off place: what is higher is in another unit
 UPRIGHT_DEG = 20.0  # between attitude and capture: a rigid body's attitude is defined by eye
-AXIS_DEG = 30.0  # within it of an axis, up is that axis
 WANDERED_M = 0.1  # far beyond a capture's noise
 AGREE_M, AGREE_DEG = 0.1, 15.0  # estimate and capture, once positions and heading are fused
 
@@ -60,7 +59,7 @@ _FORBIDDEN = (
 
 @dataclass(frozen=True)
 class Problem:
-    """What was found, with what is allowed, and what to do about it."""
+    """A finding on the ground: what was found, with what is allowed, and what to do about it."""
 
     found: str
     advice: str
@@ -70,46 +69,101 @@ class Problem:
         return f"{self.found}: {self.advice}"
 
 
-def forbidden_problem(telemetry: Telemetry) -> Problem | None:
-    """A supervisor's report that waiting will not mend."""
-    raw = f"0x{telemetry.supervisor:04X}"
-    for bit, what, advice in _FORBIDDEN:
-        if telemetry.has(bit):
-            return Problem(f"the vehicle {what} (supervisor {raw})", advice)
-    if telemetry.supervisor & ~KNOWN_SUPERVISOR_BITS:
+@dataclass(frozen=True)
+class GroundCriteria:
+    """The criteria for a vehicle at rest; each property is the problem that it finds, or None."""
+
+    telemetry: Telemetry
+    profile: Profile
+
+    @property
+    def forbidden(self) -> Problem | None:
+        """A supervisor's report that waiting will not mend."""
+        raw = f"0x{self.telemetry.supervisor:04X}"
+        for bit, what, advice in _FORBIDDEN:
+            if self.telemetry.has(bit):
+                return Problem(f"the vehicle {what} (supervisor {raw})", advice)
+        if self.telemetry.supervisor & ~KNOWN_SUPERVISOR_BITS:
+            return Problem(
+                f"the supervisor reports unknown bits ({raw})",
+                "this firmware is newer than perchctl knows",
+            )
+        return None
+
+    @property
+    def not_allowed(self) -> Problem | None:
+        """A supervisor that does not allow flight (yet)."""
+        if self.telemetry.has(CAN_FLY):
+            return None
+        return Problem(f"0x{self.telemetry.supervisor:04X}", "wait, or restart it")
+
+    @property
+    def battery(self) -> Problem | None:
+        """A battery too low to take off; a missing reading is no problem here."""
+        rests_v, needed_v = self.telemetry.battery_v, self.profile.safety.min_rest_v
+        if not NO_BATTERY_READING_V <= rests_v < needed_v:
+            return None
+        rests, needed = distinct_figures(rests_v, needed_v, 2)
         return Problem(
-            f"the supervisor reports unknown bits ({raw})",
-            "this firmware is newer than perchctl knows",
+            f"the battery rests at {rests} V, at least {needed} V are needed (safety.min_rest_v)",
+            "charge it",
         )
-    return None
 
+    @property
+    def unsettled(self) -> Problem | None:
+        """A state estimate whose variance is too large, or no number."""
+        variance = self.telemetry.position_variance_m2
+        most = self.profile.safety.estimator_variance_m2
+        if variance is None or variance <= most:
+            return None
+        advice = "is there a positioning system?"
+        if self.profile.positioning.by == "target":
+            advice = "do the positions arrive, and does the target stay in view?"
+        found, allowed = distinct_figures(variance, most, 2)
+        return Problem(f"variance {found} m^2, at most {allowed} allowed", advice)
 
-def battery_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
-    """A battery too low to take off; a missing reading is no problem here."""
-    needed_v = profile.safety.min_rest_v
-    if not NO_BATTERY_READING_V <= telemetry.battery_v < needed_v:
-        return None
-    rests, needed = distinct_figures(telemetry.battery_v, needed_v, 2)
-    return Problem(
-        f"the battery rests at {rests} V, at least {needed} V are needed (safety.min_rest_v)",
-        "charge it",
-    )
+    @property
+    def height(self) -> Problem | None:
+        """A vehicle off the ground by its settled estimate: it hangs, or is held."""
+        safety, z_m = self.profile.safety, self.telemetry.position_m[2]
+        if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
+            return None
+        return Problem(
+            f"the state estimate places the vehicle at {z_m:.2f} m, and the ground is at "
+            f"{safety.ground_z_m:.2f} m",
+            "if it hangs, take it down and restart it; if the positioning system's zero is "
+            "elsewhere, set safety.ground_z_m",
+        )
 
+    @property
+    def tilt_deg(self) -> float:
+        """The larger of roll and pitch; NaN if one of them is."""
+        angles_rad = np.abs((self.telemetry.roll_rad, self.telemetry.pitch_rad))
+        return math.degrees(float(angles_rad.max()))
 
-def unsettled_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
-    """A state estimate that is not settled: its variance is too large, or no number."""
-    variance, most = telemetry.position_variance_m2, profile.safety.estimator_variance_m2
-    if variance is None or variance <= most:
-        return None
-    advice = "is there a positioning system?"
-    if profile.positioning.by == "target":
-        advice = "do the positions arrive, and does the target stay in view?"
-    found, allowed = distinct_figures(variance, most, 2)
-    return Problem(f"variance {found} m^2, at most {allowed} allowed", advice)
+    @property
+    def tilt(self) -> Problem | None:
+        """A vehicle that does not stand level enough to take off."""
+        most_deg = self.profile.safety.start_tilt_deg
+        if self.tilt_deg <= most_deg:
+            return None
+        found, allowed = distinct_figures(self.tilt_deg, most_deg, 0)
+        return Problem(
+            f"tilted by {found} deg, at most {allowed} allowed", "put it on level ground"
+        )
+
+    @property
+    def motion(self) -> Problem | None:
+        """A vehicle that is moved or vibrates: its accelerometer does not read one g."""
+        acc_z_g = self.telemetry.acc_z_g
+        if abs(acc_z_g - 1.0) <= REST_ACC_G:
+            return None
+        return Problem(f"its accelerometer reads {acc_z_g:.2f} g", "let it stand still")
 
 
 def unmeasured_problem(by: MeasuredBy, profile: Profile) -> Problem | None:
-    """A vehicle without any position source: it would fly by a sum of accelerations."""
+    """Return the problem of a vehicle without any position source, which would fly by a sum of
+    accelerations."""
     config = profile.positioning
     if config.by != "deck" or by.placed_by(config.decks) or by.external:
         return None
@@ -127,50 +181,8 @@ def unmeasured_problem(by: MeasuredBy, profile: Profile) -> Problem | None:
     return Problem(found, advice)
 
 
-def height_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
-    """A vehicle off the ground by its settled estimate: it hangs, or is held."""
-    safety, z_m = profile.safety, telemetry.position_m[2]
-    if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
-        return None
-    return Problem(
-        f"the state estimate places the vehicle at {z_m:.2f} m, and the ground is at "
-        f"{safety.ground_z_m:.2f} m",
-        "if it hangs, take it down and restart it; if the positioning system's zero is "
-        "elsewhere, set safety.ground_z_m",
-    )
-
-
-def tilt_deg(telemetry: Telemetry) -> float:
-    """The larger of roll and pitch; NaN if one of them is."""
-    roll_rad, pitch_rad = abs(telemetry.roll_rad), abs(telemetry.pitch_rad)
-    return math.degrees(max(roll_rad, pitch_rad) + 0.0 * (roll_rad + pitch_rad))
-
-
-def tilt_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
-    """The vehicle does not stand level enough to take off."""
-    found_deg, most_deg = tilt_deg(telemetry), profile.safety.start_tilt_deg
-    if found_deg <= most_deg:
-        return None
-    found, allowed = distinct_figures(found_deg, most_deg, 0)
-    return Problem(f"tilted by {found} deg, at most {allowed} allowed", "put it on level ground")
-
-
-def motion_problem(telemetry: Telemetry) -> Problem | None:
-    """A vehicle that is moved or vibrates: its accelerometer does not read one g."""
-    if abs(telemetry.acc_z_g - 1.0) <= REST_ACC_G:
-        return None
-    return Problem(f"its accelerometer reads {telemetry.acc_z_g:.2f} g", "let it stand still")
-
-
-def not_allowed_problem(telemetry: Telemetry) -> Problem | None:
-    """A supervisor that does not allow flight (yet)."""
-    if telemetry.has(CAN_FLY):
-        return None
-    return Problem(f"0x{telemetry.supervisor:04X}", "wait, or restart it")
-
-
 def too_near_problem(target: TargetEstimate | None) -> Problem | None:
-    """A target that is too near for a vehicle on the ground."""
+    """Return the problem of a target that is too near for a vehicle on the ground."""
     if target is None or not target.tracked:
         return None
     away_m = math.hypot(*(float(e) for e in target.e_m))
@@ -187,28 +199,33 @@ def too_near_problem(target: TargetEstimate | None) -> Problem | None:
 
 
 def measurer(profile: Profile) -> str:
-    """The source of the external positions, in words."""
+    """Return the source of the external positions, in words."""
     by_target = profile.positioning.by == "target"
     return "the sight of the target" if by_target else "the motion capture"
 
 
 def world_problem(
-    place: ExternalPosition, telemetry: Telemetry, profile: Profile
+    place: ExternalPosition, telemetry: Telemetry | None, profile: Profile
 ) -> Problem | None:
-    """An external position in another unit, with another axis up, or elsewhere, which waiting will
-    not mend. By the target the world is the vehicle's own, so only the fence counts."""
+    """Return the problem of an external position in another unit, with another axis up, or
+    elsewhere, which waiting will not mend.
+
+    Without telemetry the axes are not compared. By the target the world is the vehicle's own, so
+    only the fence counts.
+    """
     if profile.positioning.by == "target":
         return unreachable(place, profile)
     return (
-        millimetres_problem(place, profile)
-        or with_another_up(place, telemetry)
-        or external_height_problem(place, profile)
+        _in_millimetres(place, profile)
+        or (None if telemetry is None else with_another_up(place, telemetry))
+        or _off_the_ground(place, profile)
         or unreachable(place, profile)
     )
 
 
 def unreachable(place: ExternalPosition, profile: Profile) -> Problem | None:
-    """A place from which no flight reaches the expected target: perhaps another vehicle's body."""
+    """Return the problem of a place from which no flight reaches the expected target: perhaps
+    another vehicle's body."""
     target, (x, y, _) = profile.target, place.position_m
     if target.expected_xy_m is None:
         return None
@@ -230,8 +247,8 @@ def unreachable(place: ExternalPosition, profile: Profile) -> Problem | None:
     )
 
 
-def millimetres_problem(place: ExternalPosition, profile: Profile) -> Problem | None:
-    """An external position that seems to be in millimetres."""
+def _in_millimetres(place: ExternalPosition, profile: Profile) -> Problem | None:
+    """Return the problem of an external position that seems to be in millimetres."""
     safety, (x, y, z) = profile.safety, place.position_m
     far_m = max(abs(v) for v in place.position_m)
     on_ground = abs(z / 1000.0 - safety.ground_z_m) <= safety.ground_tolerance_m
@@ -245,10 +262,12 @@ def millimetres_problem(place: ExternalPosition, profile: Profile) -> Problem | 
 
 
 def with_another_up(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
-    """A capture whose up is not the vehicle's, by the vehicle's own attitude."""
+    """Return the problem of a capture whose up is not the vehicle's, by its own attitude."""
     if place.quaternion is None:
         return None
-    up = up_in_capture(place.quaternion, telemetry)
+    # The world's vertical in the capture's axes, if its body's axes are the vehicle's.
+    R_own = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)
+    up = rotation_from_quaternion(place.quaternion) @ R_own.T[:, 2]
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
     if not off_deg > UPRIGHT_DEG:
         return None
@@ -267,22 +286,8 @@ def with_another_up(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
     )
 
 
-def up_in_capture(quaternion: tuple[float, float, float, float], telemetry: Telemetry) -> Array:
-    """The world's vertical in the capture's axes, (3,), if its body's axes are the vehicle's."""
-    R_own = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)
-    return np.asarray(rotation_from_quaternion(quaternion) @ R_own.T[:, 2])
-
-
-def nearest_axis(direction: Array) -> str | None:
-    """The axis within `AXIS_DEG` of a unit vector, such as ``-y``; None for none."""
-    i = int(np.argmax(np.abs(direction)))
-    if abs(float(direction[i])) < math.cos(math.radians(AXIS_DEG)):
-        return None
-    return f"{'-' if direction[i] < 0 else ''}{'xyz'[i]}"
-
-
-def external_height_problem(place: ExternalPosition, profile: Profile) -> Problem | None:
-    """An external height that is not the ground's."""
+def _off_the_ground(place: ExternalPosition, profile: Profile) -> Problem | None:
+    """Return the problem of an external height that is not the ground's."""
     safety, z_m = profile.safety, place.position_m[2]
     if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
         return None
@@ -310,7 +315,9 @@ class AtRest:
         self._from: ExternalPosition | None = None
 
     def strange(self, place: ExternalPosition | None, profile: Profile) -> Problem | None:
-        """To be called in each turn with fresh telemetry and a fresh position; `place` None begins
+        """Return the problem of a body that has moved since the vehicle stands still.
+
+        To be called in each turn with fresh telemetry and a fresh position; `place` None begins
         anew, since the vehicle does not stand still."""
         self._from = None if place is None else self._from or place
         if place is None or self._from is None:
@@ -332,7 +339,7 @@ class AtRest:
 
 
 def missing(status: FeedStatus, profile: Profile) -> Problem | None:
-    """External positions that do not come."""
+    """Return the problem of external positions that do not come."""
     if status.problem is not None:
         return Problem(status.problem, "see perchctl check")
     if status.age_s <= profile.positioning.hold_s:
@@ -342,7 +349,7 @@ def missing(status: FeedStatus, profile: Profile) -> Problem | None:
 
 
 def apart(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
-    """An estimate at another place, or with another heading, than the capture's."""
+    """Return the problem of an estimate at another place, or heading, than the capture's."""
     away_m = math.dist(place.position_m, telemetry.position_m)
     turned_deg = 0.0
     if place.quaternion is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 from perchctl.camera import VERDICT_TEXTS, FrameSource, check_size, mirrored_note
 from perchctl.mission import FrameSeen, Observation, PoseSeen, TurnInputs
@@ -31,13 +31,6 @@ from perchctl.vision import (
 )
 
 HEARD_S = 0.15  # a sight carried on by an older estimate swings the vehicle
-ENDED_TEXT = " has ended"
-SENSED = (
-    "telemetry", "target", "new_frame", "camera_age_s", "camera_problem", "battery_age_s",
-    "jumped", "turned_rad", "disagreeing_frames", "delay_s", "target_refused", "imu",
-    "felt", "mismatch",
-)  # fmt: skip
-"""The fields of an `Observation` that come from here; the others are the loop's."""
 
 
 class GivesTelemetry(Protocol):
@@ -48,7 +41,16 @@ class GivesTelemetry(Protocol):
 
 @dataclass(eq=False)
 class FlightInputs:
-    """What a tick of the loop takes in: telemetry, at most one frame, and what follows."""
+    """Takes in telemetry and at most one frame a tick, and observes what follows from them."""
+
+    SENSED: ClassVar = (
+        "telemetry", "target", "new_frame", "camera_age_s", "camera_problem", "battery_age_s",
+        "jumped", "turned_rad", "disagreeing_frames", "delay_s", "target_refused", "imu",
+        "felt", "mismatch",
+    )  # fmt: skip
+    """The fields of an `Observation` that come from here; the others are the loop's."""
+    ENDED_TEXT: ClassVar = " has ended"
+    """Follows the source's description in the camera's problem of a recording that is over."""
 
     link: GivesTelemetry
     source: FrameSource
@@ -80,7 +82,7 @@ class FlightInputs:
         return self.perception.history
 
     def take_in(self, now_s: float, *, look: bool = True) -> None:
-        """Takes in telemetry and at most one frame. Without `look`, at the ceiling, the frame only
+        """Take in telemetry and at most one frame. Without `look`, at the ceiling, the frame only
         shows that the camera lives."""
         perception, positioning = self.perception, self._positioning
         samples = self.link.telemetry()
@@ -99,7 +101,7 @@ class FlightInputs:
             frame = replace(frame, t_s=frame.t_s - used_s)
         if frame is None:
             if problem is None and self.source.finished:
-                problem = f"{self.source.describe()}{ENDED_TEXT}"
+                problem = f"{self.source.describe()}{self.ENDED_TEXT}"
             if problem is not None:
                 self.camera_problem = problem
             return
@@ -130,7 +132,7 @@ class FlightInputs:
         return newest is not None and now_s - newest.t_s + newest.behind_s <= HEARD_S
 
     def present(self, began_s: float, now_s: float) -> None:
-        """Takes in what has arrived while camera or vision hung, since the tick of `began_s`."""
+        """Take in what has arrived while camera or vision hung, since the tick of `began_s`."""
         late = self.link.telemetry()
         self.perception.history = add_late_samples(self.history, late, self.profile.safety)
         self.taken = replace(self.taken, late=tuple(late))
@@ -138,7 +140,7 @@ class FlightInputs:
             self.last_good_frame_s = now_s  # the picture came: the camera is not gone
 
     def observation(self, now_s: float) -> Observation:
-        """The observation with the fields of `SENSED`; the loop adds the others."""
+        """Return the observation with the fields of `SENSED`; the loop adds the others."""
         perception, newest = self.perception, self.history.newest
         assert newest is not None
         return Observation(
@@ -166,8 +168,8 @@ class FlightInputs:
         return {name: PoseSeen(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
 
     def target(self, now_s: float) -> TargetEstimate | None:
-        """The estimate at the present. The filter coasts by frames: while none are searched, its
-        target is a remembered place, and not tracked."""
+        """Return the target's estimate at the present. The filter coasts by frames: while none are
+        searched, its target is a remembered place, and not tracked."""
         target = self.perception.target(now_s, spread=self.recorded)
         if self._positioning is not None:  # else the estimate runs away
             target = self._positioning.steered(target, self.history)
@@ -177,8 +179,8 @@ class FlightInputs:
         return target
 
     def _rejection(self, frame: Frame, now_s: float) -> str | None:
-        """Why this frame is no measurement: of another size, frozen, no picture at all, or too
-        old."""
+        """Return why this frame is no measurement: of another size, frozen, no picture at all, or
+        too old."""
         height, width = frame.image.shape[:2]
         if (width, height) != (size_px := self.pipeline.camera.size_px):
             return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
@@ -196,7 +198,7 @@ class FlightInputs:
 
 
 def lateness_text(age_s: float, safety: SafetyConfig) -> str | None:
-    """Why a live picture of this age is no measurement; None if it is one."""
+    """Return why a live picture of this age is no measurement; None if it is one."""
     return f"the picture is {age_s:.1f} s late" if age_s > safety.max_frame_age_s else None
 
 
@@ -221,20 +223,21 @@ places a vehicle 1.2 m under the target 12 cm aside."""
 
 
 class TargetPositioning:
-    """The target as the positioning system of one flight; `status` is as a motion capture's."""
+    """The target as the positioning system of one flight."""
 
     def __init__(self, send: SendPosition, pipeline: Pipeline, profile: Profile) -> None:
         self.feed = SightFeed(send, profile, pipeline.pose)
         self._touches = False
 
     def status(self, now_s: float) -> FeedStatus:
+        """Return the status as that of a motion capture's feed."""
         return self.feed.status(now_s)
 
     def begin(self, history: History, now_s: float, *, touches: bool) -> None:
-        """Begins a tick, before its picture. `touches`: contact was proven and has not ended."""
+        """Begin a tick, before its picture. `touches`: contact was proven and has not ended."""
         newest = history.newest
         self._touches = touches
-        if newest is None or not is_carried(history, now_s):
+        if newest is None or not is_supported(history, now_s):
             return
         touching_m = self.feed.touching(newest.yaw_rad)
         if touching_m is None:
@@ -243,24 +246,24 @@ class TargetPositioning:
             self.feed.known(touching_m, now_s)
 
     def see(self, measured: MeasuredMarkers, history: History, now_s: float) -> None:
-        """Sends the position by a picture, unless the vehicle is pressed or hangs."""
+        """Send the position by a picture, unless the vehicle is pressed or hangs."""
         pose = measured.surest
         if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_S:
             return
         then, now = attitude_at(history, pose.t_s), attitude_at(history, now_s)
         if then is not None and now is not None:
-            self.feed.see(pose, then, now, now_s, at_rest=is_carried(history, now_s))
+            self.feed.see(pose, then, now, now_s, at_rest=is_supported(history, now_s))
 
     def steered(self, target: TargetEstimate | None, history: History) -> TargetEstimate | None:
-        """The estimate with the target where it stands; as seen until its place is known."""
+        """Return the estimate with the target where it stands; as seen until its place is known."""
         newest = history.newest
         if target is None or newest is None:
             return target
         return self.feed.steered(target, attitude_of(newest))
 
 
-def is_carried(history: History, now_s: float) -> bool:
-    """True if something has carried the vehicle for the last moments, by fresh samples."""
+def is_supported(history: History, now_s: float) -> bool:
+    """True if something has carried the vehicle's weight for the last moments, by fresh samples."""
     newest = history.newest
     if newest is None or now_s - newest.t_s + newest.behind_s > CARRIED_FOR_S:
         return False

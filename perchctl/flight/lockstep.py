@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -53,7 +53,7 @@ class LockstepClock:
 
 
 def _newest(frames: list[DeliveredFrame]) -> list[DeliveredFrame]:
-    """The last exposures, each as it first came and as it came last."""
+    """Return the last exposures, each as it first came and as it came last."""
     last = sorted({frame.index for frame in frames})[-_QUEUED:]
     ends = [[frame for frame in frames if frame.index == index] for index in last]
     return [frame for same in ends for frame in same[:: max(1, len(same) - 1)]]
@@ -95,7 +95,7 @@ class LockstepSource:
 
 
 def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
-    """The vehicle's camera as the flight sees it by its profile."""
+    """Return the vehicle's camera as the flight sees it by its profile."""
     assert vehicle.camera is not None
     source = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
     return mirrored_as_profiled(source, profile.camera)
@@ -209,19 +209,20 @@ def fly_lockstep(
     return _flown(report, vehicle, truth)
 
 
+_shared_pipelines: dict[Hashable, Pipeline] = {}
+
+
 def _pipeline_of(profile: Profile, camera: CameraModel) -> Pipeline:
-    """A campaign's flights share it: to make one takes as long as 10 pictures."""
+    """Return the pipeline that a campaign's flights share: to make one takes as long as 10
+    pictures. Two profiles may be compared; one with a mask shares none: its file may change."""
     if profile.camera.mask is not None:
-        return make_pipeline(profile, camera)  # from a file that may have changed
-    key = (profile.model_dump_json(), *camera.contents)
-    if key not in _PIPELINES:
-        while len(_PIPELINES) >= 2:
-            _PIPELINES.pop(next(iter(_PIPELINES)))
-        _PIPELINES[key] = make_pipeline(profile, camera)
-    return _PIPELINES[key]
-
-
-_PIPELINES: dict[tuple[object, ...], Pipeline] = {}  # the newest, by what they are made of
+        return make_pipeline(profile, camera)
+    key = profile.model_dump_json(), camera.contents
+    if key not in _shared_pipelines:
+        if len(_shared_pipelines) >= 2:
+            _shared_pipelines.clear()
+        _shared_pipelines[key] = make_pipeline(profile, camera)
+    return _shared_pipelines[key]
 
 
 def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> LockstepFlight:
@@ -262,18 +263,12 @@ class _OperatorAt:
 # --- External positions in lockstep: the simulated motion capture, by the same feed --------------
 
 
-def with_positioning(by: Literal["deck", "mocap"], profile: Profile) -> Profile:
-    """The profile with its position by decks, or by motion capture."""
-    config = profile.positioning.model_copy(update={"by": by})
-    return profile.model_copy(update={"positioning": config})
-
-
 def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
-    """A feed that turns with the link's time; None with decks, and where the target is the
-    positioning system, since the loop feeds then.
+    """Return a feed of the simulated motion capture that is called at the link's time; None with
+    decks, and where the target is the positioning system, since the loop feeds then.
 
-    Lets the time pass until the vehicle's body is seen, and starts the estimate there. Errors:
-    ConnectionFailed if it is not.
+    Lets the time pass until the vehicle's body is seen, and starts the estimate there. Raises
+    ConnectionFailed if it is not seen.
     """
     capture, config = link.vehicle.capture, profile.positioning
     if config.by == "target":

@@ -133,7 +133,7 @@ class SentWatcher(Watcher, Protocol):
 
 
 def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
-    """Passes on what is sent in the loop's place to those who watch it."""
+    """Return a callback that passes on what is sent in the loop's place to those who watch it."""
     told = [watcher for watcher in parts.watchers if isinstance(watcher, SentWatcher)]
 
     def tell(sent: SentCommand) -> None:
@@ -267,14 +267,14 @@ def _mission(
 
 
 def _outside(parts: FlightParts, inputs: FlightInputs, now_s: float) -> FeedStatus | None:
-    """Status of the external positions, or of those by the target; None where decks measure."""
+    """Return the status of the external positions, or of those by the target; None with decks."""
     if inputs.target_positioning is not None:
         return inputs.target_positioning.status(now_s)
     return None if parts.positions is None else parts.positions.status(now_s)
 
 
 def _present(parts: FlightParts, inputs: FlightInputs, began_s: float) -> float:
-    """The turn's time: after a hang of camera or vision the present, with what has arrived
+    """Return the turn's time: after a hang of camera or vision the present, with what has arrived
     meanwhile, since a setpoint for the time before the hang would be stale."""
     now_s = parts.clock.now()
     if now_s - began_s <= HUNG_S:

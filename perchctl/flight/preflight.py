@@ -9,19 +9,13 @@ import numpy as np
 from perchctl.errors import SafetyAbort, TimedOut, distinct_figures
 from perchctl.flight.criteria import (
     AtRest,
+    GroundCriteria,
     Problem,
     apart,
-    battery_problem,
-    forbidden_problem,
-    height_problem,
     measurer,
     missing,
-    motion_problem,
-    not_allowed_problem,
-    tilt_problem,
     too_near_problem,
     unmeasured_problem,
-    unsettled_problem,
     world_problem,
 )
 from perchctl.geometry import Place, rot_z
@@ -42,10 +36,10 @@ from perchctl.vision import CameraModel, TargetEstimate
 
 def refuse(telemetry: Telemetry | None, profile: Profile) -> None:
     """Raises SafetyAbort for what waiting will not mend."""
-    if telemetry is None:
-        return
-    _refuse(forbidden_problem(telemetry))
-    _refuse(battery_problem(telemetry, profile))
+    if telemetry is not None:
+        criteria = GroundCriteria(telemetry, profile)
+        _refuse(criteria.forbidden)
+        _refuse(criteria.battery)
 
 
 def refuse_unmeasured(link: Link, profile: Profile, *, positions: bool) -> None:
@@ -70,7 +64,8 @@ def refuse_strange(
         return
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
         return  # unknown: not judged, and nothing is forgotten
-    stands = tilt_problem(telemetry, profile) is None and motion_problem(telemetry) is None
+    criteria = GroundCriteria(telemetry, profile)
+    stands = criteria.tilt is None and criteria.motion is None
     # The last position before a problem may have been elsewhere.
     sent = status.problem is None and status.age_s <= profile.positioning.hold_s
     if stands and not sent:
@@ -103,8 +98,8 @@ def still_waiting_for(
     outside: FeedStatus | None = None,
     camera: CameraModel | None = None,
 ) -> str:
-    """What is missing yet; empty when ready. Errors: TimedOut past the bound, SafetyAbort off the
-    ground."""
+    """Return what is missing yet; empty when ready. Errors: TimedOut past the bound, SafetyAbort
+    off the ground."""
     limit_s, by_sight = profile.safety.estimator_wait_s, profile.positioning.by == "target"
     if telemetry is None:
         return _bounded("telemetry", waited_s, limit_s)
@@ -112,19 +107,20 @@ def still_waiting_for(
         return _bounded(f"telemetry (the newest is {age_s:.1f} s old)", waited_s, limit_s)
     if outside is not None and not by_sight and (problem := missing(outside, profile)):
         return _bounded(f"positions of the motion capture ({problem.sentence})", waited_s, limit_s)
-    if problem := unsettled_problem(telemetry, profile):
+    criteria = GroundCriteria(telemetry, profile)
+    if problem := criteria.unsettled:
         what = f"the state estimate to settle ({problem.found}; {problem.advice})"
         return _bounded(what, waited_s, limit_s)
     seen = None if outside is None else outside.measured
     if seen is not None and (problem := apart(seen, telemetry)):
         what = f"the state estimate to agree with {measurer(profile)} ({problem.sentence})"
         return _bounded(what, waited_s, limit_s)
-    _refuse(height_problem(telemetry, profile))
-    if problem := tilt_problem(telemetry, profile):
+    _refuse(criteria.height)
+    if problem := criteria.tilt:
         return _bounded(f"the vehicle to stand level (it is {problem.found})", waited_s, limit_s)
-    if problem := motion_problem(telemetry):
+    if problem := criteria.motion:
         return _bounded(f"the vehicle to stand still ({problem.found})", waited_s, limit_s)
-    if problem := not_allowed_problem(telemetry):
+    if problem := criteria.not_allowed:
         return _bounded(f"the supervisor to allow flight ({problem.found})", waited_s, limit_s)
     if not has_frame:
         what = f"a good picture ({camera_problem or 'none has come'})"
@@ -161,9 +157,9 @@ Start = tuple[float, float, float]  # where it stands, in the world of the targe
 def out_of_view(
     target: Place, start_m: Start, yaw_rad: float, profile: Profile, camera: CameraModel
 ) -> Problem | None:
-    """A way up that loses the target: no marker would be wholly in the picture of a vehicle that
-    leans a little, at take-off height over the start or over `planner.approach_xy_m`. `yaw_rad`:
-    its heading at the start."""
+    """Return the problem of a way up that loses the target: no marker would be wholly in the
+    picture of a vehicle that leans a little, at take-off height over the start or over
+    `planner.approach_xy_m`. `yaw_rad`: its heading at the start."""
     planner, (x, y, z) = profile.planner, start_m
     top_m = z + planner.takeoff_height_m
     over = _seen_leaning((x, y, top_m), yaw_rad, target, profile, camera)
@@ -194,7 +190,7 @@ def out_of_view(
 def target_from(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetFromBody:
-    """The target as seen from a level vehicle at a place in its world."""
+    """Return the target as seen from a level vehicle at a place in its world."""
     return sight_from(
         np.array(body_m), yaw_rad, target.position_m, target.yaw_rad,
         profile.target, camera, profile.camera.mount,
@@ -204,8 +200,8 @@ def target_from(
 def _seen_leaning(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetFromBody:
-    """`target_from` of a vehicle that leans so that the target moves to the picture's edge, as if
-    it stood farther away."""
+    """Return the target as `target_from` gives it for a vehicle that leans so that the target moves
+    to the picture's edge, as if it stood farther away."""
     level = target_from(body_m, yaw_rad, target, profile, camera)
     aside_m = math.hypot(*level.aside_m)
     if not (level.whole and aside_m > 1e-9):
@@ -220,15 +216,8 @@ def _leant_m(sight: TargetFromBody) -> float:
     return sight.height_m * math.tan(math.radians(LEAN_DEG))
 
 
-def place_seen(target: TargetEstimate, profile: Profile) -> Place:
-    """Place of a target that a level vehicle sees, in a world with the vehicle at the origin, at
-    the ground's height, its front along x."""
-    feet_m = np.array([0.0, 0.0, profile.safety.ground_z_m])
-    return Place(feet_m + target.e_m + np.asarray(profile.vehicle.gear_body_m), target.e_yaw_rad)
-
-
 def _too_far(sight: TargetFromBody, profile: Profile, camera: CameraModel) -> str:
-    """How far aside the target would be, and how far it may be."""
+    """Return in words how far aside the target would be, and how far it may be."""
     if not sight.height_m > 0.0:
         return "it would be no higher than the camera"
     aside_m, most = math.hypot(*sight.aside_m), ""
@@ -249,7 +238,8 @@ def not_in_view(
     profile: Profile,
     camera: CameraModel | None,
 ) -> Problem:
-    """A target that has not been measured from the ground. `note`: a remark on the pictures."""
+    """Return the problem of a target that was not measured from the ground. `note`: a remark on
+    the pictures."""
     if seen is not None and seen.tracked:
         return Problem(
             f"it is seen, and was not measured at rest yet (the accelerometer reads "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,7 +21,7 @@ from perchctl.errors import (
     no_motion_capture,
     no_simulator,
 )
-from perchctl.flight.clock import Clock, SimulatedClock, WallClock, wall_date
+from perchctl.flight.clock import Clock, SimulatedClock, WallClock
 from perchctl.flight.criteria import AtRest
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
@@ -43,7 +44,6 @@ from perchctl.vision import CameraModel, make_pipeline
 if TYPE_CHECKING:
     from perchctl.sim import SimProcess
 
-PLAIN_SEED = 11  # a newcomer's first flight: nothing goes wrong in it that would need words
 STRANGE_S = 0.5  # external positions are examined for so long before they are used
 
 
@@ -55,25 +55,18 @@ class FlyOptions:
     profile_path: Path
     uri: str
     source: str
-    seed: int = PLAIN_SEED
+    seed: int = 11  # a newcomer's first flight: nothing in it goes wrong that would need words
     log_dir: Path = Path("perchctl-logs")
     record: bool = False
 
     @property
     def simulated(self) -> bool:
+        """True if the URI is that of the simulated vehicle."""
         return self.uri.startswith("sim://")
 
 
-@dataclass(frozen=True)
-class SessionResult:
-    """How the flight ended; `miss_m` where a simulator measures it."""
-
-    report: FlightReport
-    miss_m: float | None = None
-
-
 def check_options(options: FlyOptions) -> None:
-    """Refuses what it can before anything is opened. Errors: InvalidValue, UsageError."""
+    """Refuse what can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
     _check_positioning(options.profile, simulated=options.simulated)
     source = parse_source(options.source)
@@ -98,8 +91,11 @@ def fly_session(
     watch_source: Callable[[FrameSource], FrameSource] = lambda source: source,
     remarks: Callable[[], Sequence[str]] = tuple,
     before_arming: Callable[[], None] | None = None,
-) -> SessionResult:
+) -> tuple[FlightReport, float | None]:
     """Fly once, in real time through cflib. Errors: the tree of `perchctl.errors`.
+
+    Returns the report, and the gear's distance from the target's centre, m, where a simulator
+    measures it.
 
     `switch` carries the operator's commands. `watch_source` may wrap the camera's source, to look
     at its frames. `remarks`: as in `FlightParts`. `before_arming` is called once vehicle and camera
@@ -122,9 +118,10 @@ def fly_session(
         source = open_camera(spec, clock.now, profile.camera, size_px=camera.size_px)
         stack.callback(source.close)
         source = watch_source(source)
-        positioning = capture_for_vehicle(
-            profile.positioning, simulated.capture if simulated else None
-        )
+        positioning = profile.positioning
+        if simulated is not None and simulated.capture is not None:
+            system, host = simulated.capture
+            positioning = positioning.model_copy(update={"system": system, "host": host})
         capture = opened_capture(stack, positioning, clock)
         link = CflibLink(uri, profile.link, clock.now, positioning=positioning)
         try:
@@ -146,11 +143,11 @@ def fly_session(
         finally:
             switch.listening = True  # while closing, Ctrl-C must not cut the wait short
             link.close()
-        return SessionResult(report, miss_m=_true_miss_m(simulated))
+        return report, _true_miss_m(simulated)
 
 
 def _true_miss_m(simulated: SimProcess | None) -> float | None:
-    """By the simulator; None without one, or if it is gone."""
+    """Return the gear's miss by the simulator; None without one, or if it is gone."""
     if simulated is None:
         return None
     with contextlib.suppress(ConnectionFailed, TimedOut):
@@ -159,7 +156,8 @@ def _true_miss_m(simulated: SimProcess | None) -> float | None:
 
 
 def simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
-    """The started vehicle with its camera's stream. Errors: UsageError without the simulator."""
+    """Start the simulated vehicle with its camera's stream. Raises UsageError without
+    the simulator."""
     if find_spec("mujoco") is None:
         raise no_simulator()
     from perchctl.sim import SimProcess, draw_capture, draw_scenario
@@ -173,14 +171,14 @@ def simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
 
 
 def _unexplained(event: Event) -> str:
-    """A real flight has no scenario."""
+    """Explain no event: a real flight has no scenario."""
     return ""
 
 
 def _simulated_clock(
     options: FlyOptions, simulated: SimProcess
 ) -> tuple[SimulatedClock, Callable[[Event], str]]:
-    """The simulated vehicle's time, and what its scenario did at the time of an event."""
+    """Return the simulated vehicle's time, and what its scenario did at the time of an event."""
     from perchctl.sim import CLOCK_MARGIN_S, EventExplainer, draw_scenario
 
     clock = SimulatedClock(simulated.shared_time, CLOCK_MARGIN_S)
@@ -207,7 +205,7 @@ def require_comparison(config: PositioningConfig, uri: str, *, simulated: bool) 
     swapped axes do not show at rest. The simulator's own room is right as it is built."""
     if config.by != "mocap" or simulated:
         return
-    objected = load_comparison(config, vehicle_uri(uri)).objection(wall_date())
+    objected = load_comparison(config, vehicle_uri(uri)).objection(datetime.now().astimezone())
     if objected is not None:
         raise SafetyAbort(": ".join(objected))
 
@@ -215,23 +213,13 @@ def require_comparison(config: PositioningConfig, uri: str, *, simulated: bool) 
 def opened_capture(
     stack: contextlib.ExitStack, config: PositioningConfig, clock: Clock
 ) -> CaptureSource | None:
-    """The open capture; None with decks. Errors: InvalidValue, UsageError, ConnectionFailed."""
+    """Return the open capture; None with decks. Raises InvalidValue, UsageError,
+    ConnectionFailed."""
     if config.by != "mocap":
         return None
     capture = open_capture(config, clock.now)
     stack.callback(capture.close)
     return capture
-
-
-def capture_for_vehicle(
-    config: PositioningConfig, simulated: tuple[str, str] | None
-) -> PositioningConfig:
-    """The configuration with the capture that measures this vehicle: for a simulated one that of
-    `simulated`, its kind and address."""
-    if simulated is None:
-        return config
-    system, host = simulated
-    return config.model_copy(update={"system": system, "host": host})
 
 
 def started_feed(
@@ -242,7 +230,7 @@ def started_feed(
     clock: Clock,
     profile: Profile,
 ) -> PositionFeed | None:
-    """Settles the vehicle's estimate on the capture's positions, and feeds them until `stack` ends:
+    """Settle the vehicle's estimate on the capture's positions, and feed them until `stack` ends:
     the link is closed before that, since a landing vehicle still needs them. None with decks, and
     where the target is the positioning system.
 
@@ -262,7 +250,7 @@ def started_feed(
 
 
 def _settle_standing(link: CflibLink, clock: Clock, profile: Profile) -> None:
-    """Settles the estimate on the ground, at the world's origin."""
+    """Settle the estimate on the ground, at the world's origin."""
     feed = StandingFeed(link.external, profile.safety.ground_z_m)
     thread = FeedThread(feed, clock.now, 1.0 / profile.positioning.rate_hz)
     thread.start()

@@ -32,7 +32,8 @@ Decision = tuple[PlannerState, Command, FeedStatus | None]
 
 
 class Turns:
-    """Counts the turns. In lockstep there are no timings: the same seed gives the same turns."""
+    """Counts the loop's turns, and reports them to their watchers. In lockstep there are no
+    timings: the same seed gives the same turns."""
 
     def __init__(
         self,
@@ -58,12 +59,12 @@ class Turns:
         self.lap()
 
     def lap(self) -> None:
-        """Its next part is done: begun, taken in, decided, sent."""
+        """Note the end of a part of the turn: begun, taken in, decided, sent."""
         if self._wall is not None:
             self._laps_s.append(self._wall())
 
     def waiting(self, inputs: FlightInputs, now_s: float, outside: FeedStatus | None) -> None:
-        """A turn before take-off."""
+        """Report a turn before take-off."""
         turn = Turn(
             self._counted(), "waiting", now_s, now_s, inputs.taken, inputs.poses,
             outside=external_positions(outside),
@@ -71,24 +72,24 @@ class Turns:
         self._report(turn)
 
     def observed(self, obs: Observation) -> None:
-        """The planner is about to decide on this."""
+        """Note what the planner is about to decide on."""
         self._open = obs, None
 
     def decided(
         self, obs: Observation, new: PlannerState, command: Command, outside: FeedStatus | None
     ) -> None:
-        """The planner has done its part: what fails from now on is not its fault."""
+        """Note that the planner has decided: what fails from now on is not its fault."""
         self._open = obs, (new, command, outside)
 
     def redone(
         self, inputs: FlightInputs, obs: Observation, new: PlannerState, command: Command
     ) -> None:
-        """A turn that is not sent, and decided anew in the next one."""
+        """Report a turn that is not sent, and decided anew in the next one."""
         self._report(replace(self.flown(inputs, obs, new, command, None), role="redone"))
 
     def failed(self, inputs: FlightInputs, error: BaseException) -> None:
-        """The flight broke off. If the planner raised, the turn holds what it was given; if it had
-        decided, what: the command may have been sent."""
+        """Report the turn in which the flight broke off. It holds what the planner was given, and
+        what it had decided unless it raised: the command may have been sent."""
         if self._open is None:
             return
         obs, decision = self._open
@@ -111,7 +112,7 @@ class Turns:
         command: Command,
         outside: FeedStatus | None,
     ) -> Turn:
-        """The turn, once its command was sent."""
+        """Return the turn, once its command was sent."""
         self._open = None
         return Turn(
             number=self._counted(),
@@ -152,7 +153,7 @@ class Turns:
 
 
 def external_positions(status: FeedStatus | None) -> ExternalPositions | None:
-    """The feed's status as the log has it."""
+    """Return the feed's status as the log has it."""
     if status is None:
         return None
     return ExternalPositions(status.age_s, status.problem, status.sent, status.rate_hz, status.pose)

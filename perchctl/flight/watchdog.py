@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from perchctl.flight.clock import Clock
-from perchctl.link import Link, SentCallback, ignore_sent
+from perchctl.link import Link
 from perchctl.mission import (
     Observation,
     Operator,
@@ -62,8 +62,10 @@ class LastTick:
 
 
 class Watchdog:
-    """A `perchctl.link.protocol.Guard`. `tick`, `rescuing` and `end` are called by the loop's
-    thread, `poll` by the link's; each writes its own fields.
+    """Decides what the link sends while the loop is silent (`Guard`).
+
+    `tick`, `rescuing` and `end` are called by the loop's thread, `poll` by the link's; each writes
+    its own fields.
 
     `position_age_s` gives the age of the newest external position at a time. `overruled_s` is how
     late the loop was when a landing was decided for it, else 0.
@@ -92,7 +94,7 @@ class Watchdog:
     # --- the loop's side ---------------------------------------------------------------
 
     def tick(self, due_s: float, state: PlannerState, command: Command, obs: Observation) -> None:
-        """A tick of the loop is done, its command on its way."""
+        """Note a tick of the loop whose command is on its way."""
         if isinstance(command, (PositionSetpoint, RawThrust)):
             self._streamed = command
         if isinstance(command, EmergencyStop):
@@ -100,16 +102,16 @@ class Watchdog:
         self._last = LastTick(due_s, state, self._streamed or command, obs)
 
     def rescuing(self) -> None:
-        """The loop has ended by an error: only the operator's stop is left."""
+        """Note that the loop has ended by an error: only the operator's stop is left."""
         self._closing = True
 
     def end(self, *, motors_off: bool) -> None:
-        """The flight is over; `motors_off` where that is proven."""
+        """Note that the flight is over; `motors_off` where that is proven."""
         self._closing, self._motors_off = True, motors_off
 
     @property
     def state(self) -> PlannerState | None:
-        """The planner's, after the last tick that was sent; None before the first."""
+        """The planner's state after the last tick that was sent; None before the first."""
         return None if self._last is None else self._last.state
 
     # --- the link's side ---------------------------------------------------------------
@@ -117,7 +119,7 @@ class Watchdog:
     def poll(
         self, now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
     ) -> Command | None:
-        """The command that has to be sent now in the loop's place; None for none."""
+        """Return the command that has to be sent now in the loop's place; None for none."""
         last = self._last
         if self._cut_ordered:
             return self._cut(now_s, newest)
@@ -142,7 +144,7 @@ class Watchdog:
         return self._hold(now_s, last, newest)
 
     def _cut(self, now_s: float, newest: Telemetry | None) -> Command | None:
-        """The emergency stop, until the vehicle is seen to be locked. Bounded."""
+        """Return the emergency stop until the vehicle is seen to be locked. Bounded."""
         due = now_s - self._cut_s >= CUT_PERIOD_S - 1e-9
         if is_cut(newest, now_s) or not due or self._cuts >= MAX_CUTS:
             return None
@@ -156,7 +158,7 @@ class Watchdog:
         newest: Telemetry | None,
         waiting: Sequence[Telemetry],
     ) -> Observation:
-        """The present observation: the newest telemetry, and no picture."""
+        """Return the present observation: the newest telemetry, and no picture."""
         if self._history is None:
             self._history = History((last.obs.telemetry,), imu=last.obs.imu)
         new = [*waiting, *([] if newest is None else [newest])]
@@ -177,13 +179,13 @@ class Watchdog:
         )
 
     def _land(self, obs: Observation, last: LastTick) -> Command | None:
-        """The way down, from the loop's own state on."""
+        """Return the next command of the way down, from the loop's own state on."""
         state = self._way_down or last.state
         self._way_down, command = step_landing(state, obs, self._profile)
         return None if isinstance(command, Idle) else command
 
     def _hold(self, now_s: float, last: LastTick, newest: Telemetry | None) -> Command | None:
-        """The last safe setpoint."""
+        """Return the last safe setpoint; None where there is none to hold."""
         known = newest if knows_its_position(newest, now_s) else None
         if self._held is None and known is not None:
             match last.command:
@@ -208,7 +210,7 @@ def _is_on_its_way_down(state: PlannerState) -> bool:
 
 
 def _held_place(last: LastTick, known: Telemetry | None) -> PositionSetpoint:
-    """The last setpoint's place, or the vehicle's, and not above where the vehicle is."""
+    """Return the last setpoint's place, or the vehicle's, and not above where the vehicle is."""
     sample = known or last.obs.telemetry
     x, y, z = sample.position_m
     match last.command:
@@ -229,7 +231,7 @@ def rescue(
     state: PlannerState | None,
     history: History,
     position_age_s: Callable[[float], float] = lambda now_s: 0.0,
-    told: SentCallback = ignore_sent,
+    told: Callable[[SentCommand], None] = lambda sent: None,
     felt: VisualInertialMotion | None = None,
 ) -> Rest:
     """Land whatever still flies, without planner, camera and log, bounded by the landing's time.
@@ -280,6 +282,6 @@ def rescue(
 
 
 def _before_take_off(obs: Observation) -> PlannerState:
-    """The state if the planner's first tick was the one that failed."""
+    """Return the planner's state if its first tick was the one that failed."""
     position_m = obs.telemetry.position_m
     return PlannerState(t_s=obs.t_s, started_s=obs.t_s, ground_m=position_m, entry_m=position_m)

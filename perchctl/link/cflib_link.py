@@ -24,7 +24,12 @@ from perchctl.link.crtp import (
     encode,
     encode_external,
 )
-from perchctl.link.external_position import NEEDED_BY, Feed, Settling, estimator_parameters
+from perchctl.link.external_position import (
+    NEEDED_BY,
+    Feed,
+    estimator_parameters,
+    settle_estimate,
+)
 from perchctl.link.firmware import check_firmware, measured_by, set_parameters
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
@@ -113,11 +118,10 @@ class CflibLink:
         `connect`; bounded. Errors: ConnectionFailed, NotFound, InvalidValue, TimedOut."""
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
-        settling = Settling(
-            self.connection.cf, self._uri, self._positioning, lambda: self._blocks.newest,
+        settle_estimate(
+            self.connection.cf, self._uri, self._positioning, feed, lambda: self._blocks.newest,
             self._clock,
         )  # fmt: skip
-        settling.settle(feed)
 
     def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
         self._guard, self._told = guard, told
@@ -154,7 +158,7 @@ class CflibLink:
         self._leave(farewell=farewell)
 
     def _prepare(self, connection: Connection) -> None:
-        """From connected to ready to fly."""
+        """Make a connected vehicle ready to fly."""
         check_firmware(connection.cf, self._uri)
         set_parameters(connection.cf, self._uri, self._config.parameters)
         self._start_logging(connection)
@@ -180,14 +184,14 @@ class CflibLink:
         self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
 
     def _arm_if_needed(self, connection: Connection) -> None:
-        """A Crazyflie 2.1 arms itself; other airframes need a request."""
+        """Request arming where the vehicle is not armed: a Crazyflie 2.1 arms itself."""
         newest = self._blocks.newest
         if newest is None or newest.has(ARMED):
             return
         send_packets(connection.cf, ARM)
 
     def _unlock_thrust(self, connection: Connection) -> None:
-        """On the ground only: its zero thrust cuts the motors."""
+        """Unlock the raw thrust; on the ground only, since its zero thrust cuts the motors."""
         newest, now_s = self._blocks.newest, self._clock()
         if not is_known(newest, now_s):
             raise ConnectionFailed(f"the telemetry of {self._uri} has stopped: not taken over")
@@ -200,13 +204,13 @@ class CflibLink:
             time.sleep(UNLOCK_PERIOD_S)
 
     def _ask_guard(self) -> Command | None:
-        """In the thread of the sender's that never touches cflib."""
+        """Ask the guard, in the thread of the sender's that never touches cflib."""
         if self._guard is None:
             return None
         return self._guard.poll(self._clock(), self._blocks.newest, self._blocks.waiting)
 
     def _hand_over(self, packet: Packet) -> bool:
-        """In the sender's thread."""
+        """Send a packet, in the sender's thread."""
         return self.connection is not None and self.connection.send(packet)
 
     def _tend(self, stuck_s: float, hangs: bool) -> None:
@@ -220,7 +224,7 @@ class CflibLink:
             connection.reopen()
             return
         if self._lost_since_s is not None:
-            sender.again(self._lost_since_s - UNHEARD_S)
+            sender.repeat_order(self._lost_since_s - UNHEARD_S)
             self._lost_since_s = None
         if hangs:
             connection.reopen(f"cflib has held a packet for more than {HANGS_S:g} s")
@@ -228,16 +232,17 @@ class CflibLink:
             connection.reopen(f"the radio has taken nothing for {stuck_s:.1f} s, nor lost anything")
 
     def _may_hear_more(self) -> bool:
-        """A link that is lost is being opened again as long as there is a sender."""
+        """True unless the link is lost for good: with a sender it is being opened again."""
         connection = self.connection
         return connection is not None and (connection.lost is None or self._sender is not None)
 
     def _may_say_farewell(self) -> bool:
-        """Only where a zero setpoint neither drops nor locks the vehicle, by fresh telemetry."""
+        """True where a zero setpoint neither drops nor locks the vehicle, by fresh telemetry."""
         return not may_fly(self._blocks.newest, self._clock())
 
     def _leave(self, *, farewell: bool) -> None:
-        """`farewell`: let cflib send its zero setpoint, which drops a flying vehicle."""
+        """Release the link. `farewell`: let cflib send its zero setpoint, which drops a flying
+        vehicle."""
         connection, self.connection = self.connection, None
         if connection is None:
             return
@@ -249,21 +254,3 @@ class CflibLink:
                     self._told(SentCommand(at_s, "farewell", FAREWELL))
         else:
             connection.abandon()
-
-
-# --- A vehicle's state estimate, read and nothing else: no parameter set, nothing armed --------
-
-
-class EstimateLink(CflibLink):
-    """A `CflibLink` that commands nothing, not even at its end. Errors as there."""
-
-    def close(self) -> None:
-        """Leave at once and without cflib's farewell: the vehicle may fly for another."""
-        self._leave(farewell=False)
-
-    def _may_say_farewell(self) -> bool:
-        return False  # neither when connecting fails half-way
-
-    def _prepare(self, connection: Connection) -> None:
-        check_firmware(connection.cf, self._uri)
-        self._start_logging(connection)

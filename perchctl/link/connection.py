@@ -40,9 +40,10 @@ DEAD_S = 0.5
 
 
 class Connection:
-    """`lost` is None while connected, then the cause in one sentence.
+    """One opened `cflib.crazyflie.Crazyflie`.
 
-    `cf` is cflib's object, for its tables, parameters and log blocks.
+    `lost` is None while connected, then the cause in one sentence. `cf` is cflib's object, for its
+    tables, parameters and log blocks. `claim` is closed when the connection ends.
     """
 
     def __init__(self) -> None:
@@ -56,7 +57,7 @@ class Connection:
             raise cannot_be_written(cache, error, more) from None
         self.cf: Any = Crazyflie(rw_cache=str(cache))
         self.lost: str | None = None
-        self.claimed: Claim | None = None
+        self.claim = contextlib.ExitStack()
         self._settled = threading.Event()  # connected, or failed
         self._change = threading.Lock()  # of what follows; cflib is never called with it
         self._left = False
@@ -73,7 +74,7 @@ class Connection:
         self.cf.connection_lost.add_callback(self._on_failed)
 
     def open(self, uri: str, timeout_s: float) -> bool:
-        """Whether the vehicle is fully connected, or refused (`lost`), within `timeout_s`."""
+        """Return True once the vehicle is connected, or refused (`lost`), within `timeout_s`."""
         # Opening a radio may block in its driver: it gets a thread and a bound.
         _begin("perchctl-open", lambda: self.cf.open_link(uri))
         if not self._settled.wait(timeout_s):
@@ -82,7 +83,7 @@ class Connection:
         return True
 
     def send(self, packet: Packet) -> bool:
-        """Send it now, or not at all: whether the driver has taken it.
+        """Send a packet now, or not at all; return True if the driver has taken it.
 
         Nothing waits here for cflib's lock, or for the one place in its radio's queue. In
         cflib's own `send_packet` it would: for 2 s, with the lock held, and then the driver
@@ -112,8 +113,8 @@ class Connection:
             lock.release()
 
     def is_dead(self) -> bool:
-        """Whether a driver that takes nothing will not take anything any more. Asked again and
-        again while it takes nothing, and only then: it has to be seen for `DEAD_S`.
+        """Return True if a driver that takes nothing will not take anything any more. Asked again
+        and again while it takes nothing, and only then: it has to be seen for `DEAD_S`.
 
         A radio that is only out of reach counts the packets it has lost, and goes on by itself. One
         whose dongle was pulled out counts nothing (cflib repeats that for ever, too).
@@ -151,7 +152,7 @@ class Connection:
         with self._change:
             self._left = True
         _run_bounded([self.cf.close_link])
-        self._release()
+        self.claim.close()
 
     def abandon(self) -> None:
         """Release the driver and clean up, sending nothing more."""
@@ -160,14 +161,12 @@ class Connection:
             # Without its driver, close_link has nowhere to send the zero setpoint.
             driver, self.cf.link = self.cf.link, None
         _run_bounded([self.cf.close_link] if driver is None else [driver.close, self.cf.close_link])
-        self._release()
-
-    def _release(self) -> None:
-        if self.claimed is not None:
-            self.claimed.release()
+        self.claim.close()
 
     def _keep_cflib_from_hanging(self) -> None:
-        """A driver reports its end from inside `send_packet`, where the caller holds cflib's
+        """Replace what cflib does when a driver ends.
+
+        A driver reports its end from inside `send_packet`, where the caller holds cflib's
         lock, or from its own thread. cflib's handler closes the link there, and joins the thread
         of its pings, which waits for that lock: then nothing can be sent ever again. So nothing is
         joined there, and nobody pings (the radio's own null packets keep the link)."""
@@ -175,10 +174,10 @@ class Connection:
         if not hasattr(self.cf, "_send_lock"):  # another cflib's
             self.cf._send_lock = threading.Lock()
         with contextlib.suppress(AttributeError):  # another cflib's
-            self.cf.link_statistics.latency.start = _do_nothing
+            self.cf.link_statistics.latency.start = lambda: None
 
     def _on_error(self, number: int, message: str) -> None:
-        """In any thread, and in the middle of anything: takes note, no more."""
+        """Note a driver's end; called in any thread, and in the middle of anything."""
         with self._change:
             if number == self._number and not self._left:
                 self._give_up(plain_cause(message))
@@ -189,7 +188,7 @@ class Connection:
         self._settled.set()
 
     def _give_up(self, cause: str) -> None:
-        """With `_change` held."""
+        """Close the present driver and put none in its place; called with `_change` held."""
         self._number += 1
         self.lost = cause
         driver, self.cf.link = self.cf.link, _Nowhere()
@@ -203,7 +202,7 @@ class Connection:
             time.sleep(REOPEN_PAUSE_S)
 
     def _is_open_again(self) -> bool:
-        """One attempt."""
+        """Try once to open a new driver; True if it has taken over."""
         import cflib.crtp
 
         with self._change:
@@ -232,9 +231,11 @@ class Connection:
         return False
 
     def _agrees_on_safelink(self, driver: Any) -> bool:
-        """A vehicle that was spoken to by safelink hears one packet of a driver without it, and
-        then none (docs/firmware.md, "Safelink"). A radio that opens while the vehicle is out of
-        reach is such a driver, for as long as it lives."""
+        """Wait, bounded, for a new driver's safelink; True if it has one, or needs none.
+
+        A vehicle that was spoken to by safelink hears one packet of a driver without it, and then
+        none (docs/firmware.md, "Safelink"). A radio that opens while the vehicle is out of reach is
+        such a driver, for as long as it lives."""
         end_s = time.monotonic() + SAFELINK_S
         while self._has_safelink and getattr(driver, "needs_resending", False):
             if self._left or time.monotonic() >= end_s:
@@ -244,8 +245,8 @@ class Connection:
 
 
 class _Nowhere:
-    """In the place of cflib's driver while there is none. By itself cflib looks only once a second
-    whether there is one again, and telemetry would wait for that."""
+    """Stands in the place of cflib's driver while there is none. By itself cflib looks only once a
+    second whether there is one again, and telemetry would wait for that."""
 
     needs_resending = False
 
@@ -260,21 +261,16 @@ class _Nowhere:
 
 
 def open_connection(uri: str, timeout_s: float) -> Connection:
-    """A vehicle's connection with all tables and parameters read.
+    """Open a vehicle's connection with all tables and parameters read.
 
     `timeout_s` is shared by `CONNECT_TRIES` tries, since one lost packet can hang cflib's
     connect for good (docs/firmware.md, "Link"). Raises `ConnectionFailed`, also where another
     program has the vehicle; InvalidValue without a folder for cflib's tables.
     """
-    claimed = claim(uri)
-    try:
+    with claim_vehicle(uri) as claim:
         connection = _opened(uri, timeout_s)
-    except BaseException:
-        if claimed is not None:
-            claimed.release()
-        raise
-    connection.claimed = claimed
-    return connection
+        connection.claim = claim.pop_all()
+        return connection
 
 
 def _opened(uri: str, timeout_s: float) -> Connection:
@@ -309,7 +305,7 @@ def ready_cflib() -> None:
 
 
 def send_packets(cf: Any, packets: Iterable[Packet]) -> None:
-    """Send them as they are, through the lock and the driver of cflib's `Crazyflie`."""
+    """Send packets as they are, through the lock and the driver of cflib's `Crazyflie`."""
     for packet in packets:
         cf.send_packet(_as_cflib(packet))
 
@@ -324,7 +320,7 @@ def _as_cflib(packet: Packet) -> Any:
 
 
 def plain_cause(message: str) -> str:
-    """cflib's message without its traceback, and with the remedy where there is one."""
+    """Return cflib's message without its traceback, and with the remedy where there is one."""
     line = message.strip().splitlines()[0] if message.strip() else "unknown cause"
     line = line.removeprefix("Couldn't load link driver: ")
     if "Resource busy" in message or "[Errno 16]" in message:
@@ -358,18 +354,14 @@ def _run_bounded(calls: Iterable[Callable[[], None]]) -> None:
 
 
 def _begin(name: str, call: Callable[[], object]) -> threading.Thread:
-    """A thread for what may block in a driver."""
+    """Start a thread for what may block in a driver."""
     thread = threading.Thread(target=call, name=name, daemon=True)
     thread.start()
     return thread
 
 
-def _do_nothing() -> None:
-    return None
-
-
 def _forget_dead_dongle(uri: str) -> None:
-    """cflib keeps a dongle's thread for good, also one that the dongle's end has ended."""
+    """Remove a dongle's thread that has ended; cflib would keep it for good."""
     with contextlib.suppress(Exception):  # a URI without a dongle, another cflib
         from cflib.crtp.radiodriver import RadioDriver, RadioManager
 
@@ -379,7 +371,7 @@ def _forget_dead_dongle(uri: str) -> None:
 
 
 def _keep_radio_patient() -> None:
-    """Where this cflib can: a radio is not given up after the first lost packets."""
+    """Keep cflib, where it can, from giving a radio up after the first lost packets."""
     with contextlib.suppress(ImportError, AttributeError):
         from cflib.crtp import radiodriver
 
@@ -387,8 +379,8 @@ def _keep_radio_patient() -> None:
 
 
 def _hush_cflib() -> None:
-    """cflib logs tracebacks of what it reports by callback as well; one sentence is enough.
-    And some of its modules print, on stdout, which is for the result: that is logged, too."""
+    """Silence cflib's log: it has tracebacks of what is reported by callback as well. What some of
+    its modules print on stdout, which is for the result, is logged instead."""
     logger = logging.getLogger("cflib")
     logger.addHandler(logging.NullHandler())
     logger.propagate = bool(os.environ.get("PERCHCTL_DEBUG"))
@@ -407,57 +399,30 @@ def _hush_cflib() -> None:
 # operating system holds the lock and lets it go with the process, however that ends.
 
 
-_TRIES = 5
+def claim_vehicle(uri: str) -> contextlib.ExitStack:
+    """Lock the vehicle at `uri` for this process until the result is closed.
 
-
-class Claim:
-    """A vehicle that this process has for itself, until `release` or its end."""
-
-    def __init__(self, path: Path, fd: int) -> None:
-        self._path = path
-        self._fd: int | None = fd
-
-    def release(self) -> None:
-        """May be called twice."""
-        fd, self._fd = self._fd, None
-        if fd is not None:
-            with contextlib.suppress(OSError):  # Windows removes no open file
-                self._path.unlink()
-            os.close(fd)
-
-
-def claim(uri: str) -> Claim | None:
-    """The vehicle at `uri`, for this process alone; None where no such lock can be kept (no
-    folder to write to), which is no reason not to fly.
-
-    Raises ConnectionFailed, which names the program that has it.
+    Nothing is locked where no lock can be kept (no folder to write to), which is no reason not to
+    fly. Raises ConnectionFailed, which names the program that has it.
     """
-    folder = user_runtime_folder()
-    path = folder / (re.sub(r"[^A-Za-z0-9.]+", "_", vehicle_uri(uri)) + ".lock")
-    for _ in range(_TRIES):
-        try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            fd = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-        except OSError:
-            return None
-        if not _lock(fd):
-            holder = _text(fd)
-            os.close(fd)
-            raise ConnectionFailed(_in_use(uri, holder))
-        if _is_at(fd, path):
-            with contextlib.suppress(OSError):  # a full disk: the lock holds all the same
-                os.ftruncate(fd, 0)
-                os.write(fd, _myself().encode())
-            return Claim(path, fd)
-        os.close(fd)  # its last holder has just removed it
-    return None
-
-
-def _in_use(uri: str, holder: str) -> str:
-    return (
-        f"the vehicle at {uri} is in use by another program ({holder or 'it gives no name'}): two "
-        f"would steer it two ways; end that one, or name another vehicle"
-    )
+    path = user_runtime_folder() / (re.sub(r"[^A-Za-z0-9.]+", "_", vehicle_uri(uri)) + ".lock")
+    claim = contextlib.ExitStack()
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        fd = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError:
+        return claim
+    claim.callback(os.close, fd)
+    if not _lock(fd):
+        with claim:
+            raise ConnectionFailed(
+                f"the vehicle at {uri} is in use by another program ({_holder(fd)}): two would "
+                f"steer it two ways; end that one, or name another vehicle"
+            )
+    with contextlib.suppress(OSError):  # a full disk: the lock holds all the same
+        os.ftruncate(fd, 0)
+        os.write(fd, _myself().encode())
+    return claim
 
 
 def _myself() -> str:
@@ -467,21 +432,16 @@ def _myself() -> str:
     return f"process {os.getpid()}: {' '.join(words)}"[:200]
 
 
-def _text(fd: int) -> str:
+def _holder(fd: int) -> str:
+    text = ""
     with contextlib.suppress(OSError):
-        return os.read(fd, 400).decode(errors="replace").replace("\n", " ").strip()
-    return ""
-
-
-def _is_at(fd: int, path: Path) -> bool:
-    with contextlib.suppress(OSError):
-        return os.path.samestat(os.fstat(fd), path.stat())
-    return False
+        text = os.read(fd, 400).decode(errors="replace").replace("\n", " ").strip()
+    return text or "it gives no name"
 
 
 def _lock(fd: int) -> bool:
-    """True if this process has the lock now. Windows has none of these; nor, for most vehicles,
-    two programs at one radio."""
+    """Take the lock; True if this process has it now, or where no such lock can be kept. Windows
+    has none of these; nor, for most vehicles, two programs at one radio."""
     if sys.platform == "win32":
         return True
     import fcntl

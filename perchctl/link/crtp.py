@@ -8,8 +8,10 @@ protocol 12 and later; degrees leave here, radians stay behind (docs/firmware.md
 
 from __future__ import annotations
 
+import contextlib
 import math
 import struct
+from collections.abc import Iterator
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -53,12 +55,12 @@ class Packet(NamedTuple):
     data: bytes
 
     def encode(self) -> bytes:
-        """The packet's bytes on the air."""
+        """Return the packet's bytes on the air."""
         return bytes((self.port << 4 | 0x0C | self.channel,)) + self.data
 
     @staticmethod
     def decode(datagram: bytes) -> Packet | None:
-        """The packet of these bytes; None for what cannot be one: empty or too long."""
+        """Return the packet of these bytes; None for what cannot be one: empty or too long."""
         if not 1 <= len(datagram) <= 1 + MAX_DATA:
             return None
         return Packet(datagram[0] >> 4, datagram[0] & 0x03, datagram[1:])
@@ -81,14 +83,12 @@ _ARM, _EMERGENCY_STOP = 1, 3
 
 
 def encode(command: Command) -> tuple[Packet, ...]:
-    """The packets in the order in which they are sent; none for `Idle`.
+    """Return a command's packets in the order in which they are sent; none for `Idle`.
 
     Raises InvalidValue for a number that its field cannot hold.
     """
-    try:
+    with _fitting(command):
         return _packets(command)
-    except (struct.error, OverflowError) as error:
-        raise InvalidValue(f"{command} does not fit into a packet: {error}") from None
 
 
 def _packets(command: Command) -> tuple[Packet, ...]:
@@ -113,27 +113,32 @@ def _packets(command: Command) -> tuple[Packet, ...]:
 
 
 def encode_external(place: ExternalPosition) -> Packet:
-    """Raises InvalidValue for a number that its field cannot hold."""
-    try:
+    """Return the packet of a position from outside. Raises InvalidValue as `encode`."""
+    with _fitting(place):
         if place.quaternion is None:
-            return Packet(
-                Port.LOCALIZATION, _EXTERNAL_POSITION, struct.pack("<fff", *place.position_m)
-            )
+            data = struct.pack("<fff", *place.position_m)
+            return Packet(Port.LOCALIZATION, _EXTERNAL_POSITION, data)
         w, x, y, z = place.quaternion
         data = struct.pack("<Bfffffff", _EXTERNAL_POSE, *place.position_m, x, y, z, w)
         return Packet(Port.LOCALIZATION, _LOCALISATION, data)
+
+
+@contextlib.contextmanager
+def _fitting(what: Command | ExternalPosition) -> Iterator[None]:
+    try:
+        yield
     except (struct.error, OverflowError) as error:
-        raise InvalidValue(f"{place} does not fit into a packet: {error}") from None
+        raise InvalidValue(f"{what} does not fit into a packet: {error}") from None
 
 
 def _raw(thrust: int, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> Packet:
-    """Not turning; a setpoint's pitch is negated on its way out."""
+    """Return a raw setpoint without yaw rate; its pitch is negated on its way out."""
     roll_deg, pitch_deg = math.degrees(roll_rad), math.degrees(pitch_rad)
     return Packet(Port.COMMANDER, 0, struct.pack("<fffH", roll_deg, -pitch_deg, 0.0, thrust))
 
 
 def _vertical(kind: int, height_m: float, duration_s: float) -> Packet:
-    """A landing that keeps the heading: cflib's `yaw=None`.
+    """Return a landing that keeps the heading: cflib's `yaw=None`.
 
     With a yaw of its own, 0 by default, the vehicle turns to it on the way.
     """

@@ -33,47 +33,41 @@ def check_firmware(cf: Any, uri: str) -> None:
         )
 
 
+def is_logged(cf: Any, name: str) -> bool:
+    """True if the firmware logs this variable."""
+    return cf.log.toc.get_element_by_complete_name(name) is not None
+
+
 def missing_variables(cf: Any) -> list[str]:
-    """Those of the needed ones that the firmware does not log."""
-    toc = cf.log.toc
-    return [name for name in NEEDED if toc.get_element_by_complete_name(name) is None]
+    """Return the needed variables that the firmware does not log."""
+    return [name for name in NEEDED if not is_logged(cf, name)]
 
 
 def set_parameters(
     cf: Any, uri: str, parameters: Mapping[str, float], needed_by: str | None = None
 ) -> None:
-    """Set each parameter and verify it.
+    """Set each parameter, read it back from the vehicle, and compare.
 
     `needed_by`: what they are for, where they are not the user's own. Raises NotFound for an
     unknown name, InvalidValue for a value that the vehicle does not keep, TimedOut without an
     answer.
     """
     for name, wanted in parameters.items():
-        _check_known(cf, uri, name, needed_by)
-        _set_parameter(cf.param, name, wanted)
+        order_parameter(cf, uri, name, wanted, needed_by)
+        try:
+            kept = _read_back(cf.param, name)
+        except (AttributeError, ValueError, KeyError) as error:
+            raise _unsettable(name, wanted, error) from None
+        if kept is None:
+            raise TimedOut(f"parameter {name} was set to {wanted}, but no answer came")
+        if not math.isclose(float(kept), float(wanted), rel_tol=1e-5, abs_tol=1e-9):
+            raise InvalidValue(
+                f"parameter {name} was set to {wanted}, but the vehicle keeps {kept}"
+            )
 
 
-def order_parameter(cf: Any, uri: str, name: str, value: float, needed_by: str) -> None:
-    """Set one that is an order, and is not to be read back. Raises as `set_parameters`."""
-    _check_known(cf, uri, name, needed_by)
-    try:
-        cf.param.set_value(name, str(value))
-    except (AttributeError, ValueError, KeyError) as error:
-        raise InvalidValue(f"parameter {name} cannot be set to {value}: {error}") from None
-
-
-def _check_known(cf: Any, uri: str, name: str, needed_by: str | None) -> None:
-    if cf.param.toc.get_element_by_complete_name(name) is not None:
-        return
-    if needed_by is None:
-        remedy = ": correct link.parameters in the profile"
-    else:
-        remedy = f", which {needed_by} needs: update the firmware to release 2026.08 or later"
-    raise NotFound(f"the firmware at {uri} has no parameter {name}{remedy}")
-
-
-def _set_parameter(parameters: Any, name: str, wanted: float) -> None:
-    """Set, then read it back from the vehicle and compare."""
+def _read_back(parameters: Any, name: str) -> str | None:
+    """Ask the vehicle for a parameter's value; None without an answer."""
     group, _, short = name.partition(".")
     answered = threading.Event()
     answers: list[str] = []
@@ -82,20 +76,29 @@ def _set_parameter(parameters: Any, name: str, wanted: float) -> None:
         answers.append(value)
         answered.set()
 
+    parameters.add_update_callback(group=group, name=short, cb=on_value)
     try:
-        parameters.set_value(name, str(wanted))
-        parameters.add_update_callback(group=group, name=short, cb=on_value)
         parameters.request_param_update(name)
-        if not answered.wait(PARAMETER_TIMEOUT_S):
-            raise TimedOut(f"parameter {name} was set to {wanted}, but no answer came")
-    except (AttributeError, ValueError, KeyError) as error:
-        raise InvalidValue(f"parameter {name} cannot be set to {wanted}: {error}") from None
+        return answers[-1] if answered.wait(PARAMETER_TIMEOUT_S) else None
     finally:
         parameters.remove_update_callback(group, short, on_value)
-    if not math.isclose(float(answers[-1]), float(wanted), rel_tol=1e-5, abs_tol=1e-9):
-        raise InvalidValue(
-            f"parameter {name} was set to {wanted}, but the vehicle keeps {answers[-1]}"
-        )
+
+
+def order_parameter(cf: Any, uri: str, name: str, value: float, needed_by: str | None) -> None:
+    """Set a parameter without reading it back. Raises NotFound, InvalidValue."""
+    if cf.param.toc.get_element_by_complete_name(name) is None:
+        remedy = ": correct link.parameters in the profile"
+        if needed_by is not None:
+            remedy = f", which {needed_by} needs: update the firmware to release 2026.08 or later"
+        raise NotFound(f"the firmware at {uri} has no parameter {name}{remedy}")
+    try:
+        cf.param.set_value(name, str(value))
+    except (AttributeError, ValueError, KeyError) as error:
+        raise _unsettable(name, value, error) from None
+
+
+def _unsettable(name: str, value: float, error: Exception) -> InvalidValue:
+    return InvalidValue(f"parameter {name} cannot be set to {value}: {error}")
 
 
 # --- What tells the vehicle where it is, and the values of single variables --------------------
@@ -106,11 +109,11 @@ LISTEN_S = 1.0
 """Positions from outside that come less than once a second are none to fly by."""
 EXTERNAL_POSITION_TICK = "locSrvZ.tick"
 """When the newest position from outside came, ms (source): steps with each of them."""
-_BLOCK_BYTES = 26
+_VARIABLES_A_BLOCK = 26 // 4  # whatever their types
 
 
-def parameters(cf: Any) -> dict[str, float]:
-    """All, as they were read when the link was opened."""
+def read_parameters(cf: Any) -> dict[str, float]:
+    """Return all parameters by name, as they were read when the link was opened."""
     return {
         f"{group}.{name}": float(value)
         for group, values in cf.param.values.items()
@@ -119,37 +122,33 @@ def parameters(cf: Any) -> dict[str, float]:
 
 
 def decks_found(parameters: Mapping[str, float]) -> tuple[str, ...]:
-    """The decks that were found at boot, by the firmware's names, sorted."""
+    """Return the decks that were found at boot, by the firmware's names, sorted."""
     names = (n.removeprefix("deck.") for n, v in parameters.items() if v and n.startswith("deck."))
     return tuple(sorted(names))
 
 
 def measured_by(cf: Any, wait: Callable[[float], None] = time.sleep) -> MeasuredBy:
-    """What tells the vehicle where it is. Only one without a positioning deck is listened to."""
-    by = MeasuredBy(decks_found(parameters(cf)))
+    """Return what tells the vehicle where it is; one without a positioning deck is listened to."""
+    by = MeasuredBy(decks_found(read_parameters(cf)))
     if by.position_decks:
         return by
-    before = variables(cf, [EXTERNAL_POSITION_TICK]).get(EXTERNAL_POSITION_TICK)
+    before = read_variables(cf, [EXTERNAL_POSITION_TICK]).get(EXTERNAL_POSITION_TICK)
     wait(LISTEN_S)
-    after = variables(cf, [EXTERNAL_POSITION_TICK]).get(EXTERNAL_POSITION_TICK)
+    after = read_variables(cf, [EXTERNAL_POSITION_TICK]).get(EXTERNAL_POSITION_TICK)
     external = None if before is None or after is None else after != before
     return replace(by, external=external)
 
 
-def has_variable(cf: Any, name: str) -> bool:
-    return cf.log.toc.get_element_by_complete_name(name) is not None
-
-
-def variables(cf: Any, names: Iterable[str]) -> dict[str, float]:
-    """The newest values of log variables; without those that are missing or do not come."""
-    known = [name for name in names if has_variable(cf, name)]
+def read_variables(cf: Any, names: Iterable[str]) -> dict[str, float]:
+    """Return the newest values of log variables, without those that are missing or do not come."""
+    known = [name for name in names if is_logged(cf, name)]
     values: dict[str, float] = {}
-    for block in _blocks(known):
-        values |= _read(cf, block)
+    for at in range(0, len(known), _VARIABLES_A_BLOCK):
+        values |= _read_block(cf, known[at : at + _VARIABLES_A_BLOCK])
     return values
 
 
-def _read(cf: Any, names: list[str]) -> dict[str, float]:
+def _read_block(cf: Any, names: list[str]) -> dict[str, float]:
     arrived = threading.Event()
     values: dict[str, float] = {}
 
@@ -165,9 +164,3 @@ def _read(cf: Any, names: list[str]) -> dict[str, float]:
     block.stop()
     block.delete()
     return values
-
-
-def _blocks(names: list[str]) -> list[list[str]]:
-    """So many as fit into a log block each, whatever their types."""
-    each = _BLOCK_BYTES // 4
-    return [names[at : at + each] for at in range(0, len(names), each)]

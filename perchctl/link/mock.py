@@ -23,7 +23,14 @@ from perchctl.link.external_position import (
 )
 from perchctl.link.firmware import EXTERNAL_POSITION_TICK, LISTEN_S, decks_found
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
-from perchctl.link.telemetry import BLOCKS, FAST_BLOCKS, SLOW_PERIOD_S, Assembler
+from perchctl.link.telemetry import (
+    BLOCKS,
+    BLOCKS_DELETED_AFTER_S,
+    FAST_BLOCKS,
+    RESUME_PERIOD_S,
+    SLOW_PERIOD_S,
+    Assembler,
+)
 from perchctl.mission import SentCommand
 from perchctl.positioning import Placed
 from perchctl.profile import PositioningConfig
@@ -36,14 +43,14 @@ WATCH_PERIOD_S = 0.05
 
 
 class Bursts(Protocol):
-    """When a radio loses what is sent."""
+    """The times at which a radio loses what is sent."""
 
     def lost(self, t_s: float) -> bool:
         """True if a packet of that time is lost. The times never go back."""
 
 
 class Radio:
-    """What becomes of the packets of both directions; loses those of `bursts`, or none."""
+    """Carries the packets of both directions; loses those of `bursts`, or none."""
 
     def __init__(self, bursts: Bursts | None = None) -> None:
         self._bursts = bursts
@@ -53,7 +60,7 @@ class Radio:
         return self._bursts is None or not self._bursts.lost(now_s)
 
     def down(self, block: str, now_s: float) -> float | None:
-        """After how many seconds a log block's packet arrives; None when it is lost."""
+        """Return the seconds after which a log block's packet arrives; None when it is lost."""
         lost = self._bursts is not None and self._bursts.lost(now_s)
         return None if lost else TELEMETRY_DELAY_S
 
@@ -85,6 +92,9 @@ class MockLink:
     """
 
     FAST_BLOCKS = FAST_BLOCKS
+    """The log blocks without which there is no telemetry."""
+    BLOCKS_BACK_AFTER_S = BLOCKS_DELETED_AFTER_S + RESUME_PERIOD_S
+    """Until the real link has started the blocks again that a vehicle has forgotten."""
 
     def __init__(
         self,
@@ -107,30 +117,31 @@ class MockLink:
         self._guard: Guard | None = None
         self._told: SentCallback = ignore_sent
         self._watched_s = -math.inf
-        self._turn: Callable[[float], object] = lambda now_s: None
-        self._turn_due_s = self._turn_period_s = math.inf
+        self._call: Callable[[float], object] = lambda now_s: None
+        self._call_due_s = self._call_period_s = math.inf
 
     @property
     def now_s(self) -> float:
+        """The vehicle's simulated time."""
         return self.vehicle.t_s
 
     def advance_to(self, t_s: float) -> None:
         """Step the vehicle until `t_s`, sending its telemetry on the way."""
-        while (due_s := min(self._turn_due_s, *self._due_s.values())) <= t_s:
+        while (due_s := min(self._call_due_s, *self._due_s.values())) <= t_s:
             self.vehicle.advance_to(due_s)
             for name, block_due_s in self._due_s.items():
                 if block_due_s <= due_s + 1e-9:
                     self._send_down(name)
                     self._due_s[name] = block_due_s + self._periods_s[name]
             self._ask_guard()
-            if self._turn_due_s <= due_s + 1e-9:
-                self._turn_due_s += self._turn_period_s
-                self._turn(self.now_s)
+            if self._call_due_s <= due_s + 1e-9:
+                self._call_due_s += self._call_period_s
+                self._call(self.now_s)
         self.vehicle.advance_to(t_s)
 
-    def each(self, period_s: float, turn: Callable[[float], object]) -> None:
-        """Calls `turn` with the time every `period_s` from now on: a thread's stand-in."""
-        self._turn, self._turn_period_s, self._turn_due_s = turn, period_s, self.now_s
+    def each(self, period_s: float, call: Callable[[float], object]) -> None:
+        """Call `call` with the time every `period_s` from now on: a thread's stand-in."""
+        self._call, self._call_period_s, self._call_due_s = call, period_s, self.now_s
 
     def connect(self) -> None:
         self.advance_to(self.now_s + SETTLE_S)
@@ -182,7 +193,7 @@ class MockLink:
         return True
 
     def settle(self, config: PositioningConfig, start: Placed) -> None:
-        """Set the estimator to positions from outside, and start it there."""
+        """Set the estimator to positions from outside, and start it at `start`."""
         firmware = self.vehicle.firmware
         parameters = estimator_parameters(config) | start_parameters(start)
         for name, value in (parameters | {RESET_PARAMETER: 1}).items():
@@ -193,7 +204,7 @@ class MockLink:
         return None
 
     def close(self) -> None:
-        """As the real one: waits, bounded, until nothing flies any more."""
+        """Wait, bounded, until nothing flies any more, as the real link does."""
         end_s = self.now_s + 6.0
         while self.vehicle.firmware.supervisor_info & FLYING and self.now_s < end_s:
             self.advance_to(self.now_s + 0.1)

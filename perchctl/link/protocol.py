@@ -9,7 +9,7 @@ from perchctl.mission import SentCommand
 from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
 
 SentCallback = Callable[[SentCommand], None]
-"""Given what a link sends of itself; neither waits nor raises."""
+"""Called with what a link sends in the loop's place; neither waits nor raises."""
 
 
 def ignore_sent(sent: SentCommand) -> None:
@@ -18,12 +18,12 @@ def ignore_sent(sent: SentCommand) -> None:
 
 
 class Guard(Protocol):
-    """Who looks after the vehicle while the flight loop is silent."""
+    """Decides what is sent while the flight loop is silent."""
 
     def poll(
         self, now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
     ) -> Command | None:
-        """What the link has to send now of itself, None almost always.
+        """Return what the link has to send now in the loop's place, None almost always.
 
         Called about every 50 ms, in a thread of the link's own where it has one, but not while a
         command waits that cannot go out; `newest` is the newest telemetry that has arrived,
@@ -41,28 +41,28 @@ class Link(Protocol):
         """Connect, check the firmware, set parameters, unlock the thrust. Bounded."""
 
     def measured_by(self) -> MeasuredBy:
-        """What tells the vehicle where it is. Once connected, on the ground: bounded, but it may
+        """Return what tells the connected vehicle, on the ground, where it is. Bounded, but it may
         take a second."""
 
     def telemetry(self) -> list[Telemetry]:
-        """Samples that arrived since the last call, oldest first."""
+        """Return the samples that arrived since the last call, oldest first."""
 
     def send(self, command: Command) -> None:
         """Hand one command to the vehicle. Never blocks for long."""
 
     def external(self, place: ExternalPosition) -> bool:
         """Hand a position from outside to the vehicle's estimator, at once or not at all: it is
-        never queued behind anything, and raises nothing. Whether it went out. Called from a
-        thread of its own."""
+        never queued behind anything, and raises nothing. Returns True if it went out. Called from
+        a thread of its own."""
 
     def problem(self, now_s: float) -> str | None:
-        """None while the link works, otherwise one sentence with the cause."""
+        """Return None while the link works, otherwise one sentence with the cause."""
 
     def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
-        """From now on ask `guard` regularly, until the link is closed. `told` is given, once it
-        is on its way, each command that the link sends of itself: its guard's, an order once more
-        over a link that was lost, and the farewell; from the link's own thread where it has one.
-        """
+        """Ask `guard` regularly from now on, until the link is closed. `told` is called, once it
+        is on its way, with each command that the link sends in the loop's place: its guard's, an
+        order once more over a link that was lost, and the farewell; from the link's own thread
+        where it has one."""
 
     def close(self) -> None:
         """Leave the vehicle safe: closes only when it is not flying (bounded wait)."""

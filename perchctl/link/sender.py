@@ -47,23 +47,20 @@ class _Waiting:
     begun: bool = False
 
 
-def _whole(command: Command) -> Sequence[Any]:
-    return (command,)
-
-
 class Sender:
-    """Runs from its creation to `stop`.
+    """Hands commands to a library, from its creation to `stop`.
 
     `hand_over` gives one piece to the library and returns False where there was no room for it:
-    it is then offered again. `guard` returns the command to send of itself, None almost always.
-    It is asked every `GUARD_PERIOD_S`, but not while something waits that cannot go out: a
-    guard counts its orders. `told` is given what the loop did not put in, once it is handed over.
+    it is then offered again. `guard` returns the command to send in the loop's place, None almost
+    always. It is asked every `GUARD_PERIOD_S`, but not while something waits that cannot go out: a
+    guard counts its orders. `told` is called with what the loop did not put in, once it is handed
+    over.
 
     `pieces` divides a command. `tend` is called as often as the guard is, by the same thread,
     with `stuck_s` and whether the library is to blame for it: it has held one piece, or raised
     errors, for longer than `HANGS_S`. It has to see to the link, and must not block. `spare` is
     called by the first thread when no command waits; it may hand over something of its own, and
-    returns whether it did.
+    returns True if it did.
 
     `problem` is what went wrong for good, in one sentence, else None.
     """
@@ -75,7 +72,7 @@ class Sender:
         clock: Callable[[], float] = time.monotonic,
         told: SentCallback = ignore_sent,
         *,
-        pieces: Callable[[Command], Sequence[Any]] = _whole,
+        pieces: Callable[[Command], Sequence[Any]] = lambda command: (command,),
         tend: Callable[[float, bool], None] = lambda stuck_s, hangs: None,
         spare: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -100,7 +97,7 @@ class Sender:
             self._start_keeper()
 
     def put(self, command: Command, by: SentBy | None = None) -> None:
-        """`by`: who sends it in the loop's place."""
+        """Queue a command. `by`: who sends it in the loop's place."""
         with self._ready:
             if isinstance(command, EmergencyStop):
                 self._queue.clear()  # nothing that was ordered before it matters any more
@@ -112,7 +109,7 @@ class Sender:
             self._ready.notify_all()
         self.look_after()
 
-    def again(self, since_s: float) -> None:
+    def repeat_order(self, since_s: float) -> None:
         """Put the last command once more if it was an order, handed over since then: it may
         have been lost together with the link."""
         with self._ready:
@@ -124,7 +121,8 @@ class Sender:
             self.put(command, "reconnect")
 
     def stuck_s(self) -> float:
-        """Seconds for which the library has taken nothing of what waits; 0 when nothing does."""
+        """Return the seconds for which the library has taken nothing of what waits; 0 when nothing
+        waits."""
         since_s = self._waiting_since_s
         return 0.0 if since_s is None else self._clock() - since_s
 
@@ -191,11 +189,11 @@ class Sender:
                     pause_s = 0.0  # something came meanwhile
 
     def _is_mine(self) -> bool:
-        """Whether the work is still this thread's: it is not once it was found hanging."""
+        """True while the work is this thread's: not once it was found hanging."""
         return self._running and self._worker is threading.current_thread()
 
     def _next(self) -> _Waiting | None:
-        """What comes first; it stays where it is until the library has all of it."""
+        """Return the first command; it stays queued until the library has all of it."""
         while self._queue:
             first = self._queue[0]
             stale = self._clock() - first.put_s > STALE_S
@@ -245,7 +243,8 @@ class Sender:
         self._ready.notify_all()
 
     def _is_replaced(self, last: _Waiting, command: Command) -> bool:
-        """A setpoint by whatever comes, an order of which nothing has gone out by its like."""
+        """True for a setpoint, which anything replaces, and for an order of which nothing has gone
+        out, which its like replaces."""
         if isinstance(last.command, _STREAMED):
             return True
         return not last.begun and type(last.command) is type(command)

@@ -17,14 +17,7 @@ from perchctl.errors import NotFound, TimedOut
 from perchctl.link.crtp import Packet, Port
 from perchctl.vehicle import Telemetry
 
-STATE_BLOCK: dict[str, str] = {
-    "stateEstimate.x": "float",
-    "stateEstimate.y": "float",
-    "stateEstimate.z": "float",
-    "stateEstimate.vx": "float",
-    "stateEstimate.vy": "float",
-    "stateEstimate.vz": "float",
-}
+STATE_BLOCK = {f"stateEstimate.{name}": "float" for name in ("x", "y", "z", "vx", "vy", "vz")}
 """24 of the 26 bytes that a log block holds."""
 
 ATTITUDE_BLOCK: dict[str, str] = {
@@ -42,11 +35,7 @@ ATTITUDE_BLOCK: dict[str, str] = {
 BATTERY_BLOCK: dict[str, str] = {"pm.vbat": "float", "pm.state": "int8_t"}
 """Without it the battery is unknown, which the flight copes with (fault 7)."""
 
-VARIANCE_BLOCK: dict[str, str] = {
-    "kalman.varPX": "float",
-    "kalman.varPY": "float",
-    "kalman.varPZ": "float",
-}
+VARIANCE_BLOCK = {f"kalman.varP{axis}": "float" for axis in "XYZ"}
 """Only where the Kalman estimator runs; a firmware without it is not refused."""
 
 NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
@@ -55,21 +44,14 @@ NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
 def telemetry_from(
     values: Mapping[str, float], t_s: float, behind_s: float = 0.0, start: int = 0
 ) -> Telemetry:
-    """Telemetry from log values by name; `behind_s` and `start` as `Telemetry` has them. KeyError
-    when a needed one is missing."""
+    """Return telemetry from log values by name; `behind_s` and `start` as `Telemetry` has them.
+    Raises KeyError when a needed value is missing."""
+    x_m, y_m, z_m, vx_mps, vy_mps, vz_mps = (values[name] for name in STATE_BLOCK)
     variances = [values[name] for name in VARIANCE_BLOCK if name in values]
     return Telemetry(
         t_s=t_s,
-        position_m=(
-            values["stateEstimate.x"],
-            values["stateEstimate.y"],
-            values["stateEstimate.z"],
-        ),
-        velocity_mps=(
-            values["stateEstimate.vx"],
-            values["stateEstimate.vy"],
-            values["stateEstimate.vz"],
-        ),
+        position_m=(x_m, y_m, z_m),
+        velocity_mps=(vx_mps, vy_mps, vz_mps),
         roll_rad=math.radians(values["stateEstimate.roll"]),
         pitch_rad=-math.radians(values["stateEstimate.pitch"]),
         yaw_rad=math.radians(values["stateEstimate.yaw"]),
@@ -114,6 +96,7 @@ class Timebase:
         self._last_arrival_s = 0.0
 
     def to_loop_s(self, stamp_ms: int, arrival_s: float) -> float:
+        """Return the time of a stamp, ms, that arrived at `arrival_s`."""
         if self._last_ms is None:
             self._unwrapped_ms = stamp_ms
         else:
@@ -166,8 +149,10 @@ class Assembler:
     def accept(
         self, block: str, values: Mapping[str, float], t_s: float, start: int = 0
     ) -> Telemetry | None:
-        """One packet of a block, its stamp on the loop's clock and the vehicle's start that it is
-        from; the sample that it completes. What a vehicle told before it started anew is over."""
+        """Take one packet of a block and return the sample that it completes, if any.
+
+        `t_s` is its stamp on the loop's clock, `start` the vehicle's start that it is from; values
+        from before the newest start are dropped."""
         if start < self._start:
             return None
         if start > self._start:
@@ -181,12 +166,12 @@ class Assembler:
         return telemetry_from(_carried(self._values, behind_s), t_s, max(0.0, behind_s), start)
 
     def missing(self) -> list[str]:
-        """The needed variables of which nothing has come yet."""
+        """Return the needed variables of which nothing has come yet."""
         return [name for name in NEEDED if name not in self._values]
 
 
 def _carried(values: Mapping[str, float], ahead_s: float) -> dict[str, float]:
-    """The position block carried on to the attitude block's time by its velocity."""
+    """Return the values with the position carried on to the attitude block's time."""
     carried = dict(values)
     step_s = max(-MOST_CARRIED_S, min(MOST_CARRIED_S, ahead_s))
     for axis in "xyz":
@@ -212,10 +197,9 @@ _PREFIX = "perch_"
 
 
 class LogBlocks:
-    """Samples on the loop's clock.
+    """cflib's log blocks as samples on the loop's clock.
 
-    The callbacks run in cflib's thread; they take the values and return. `newest` is the
-    last sample, None before the first; `last_arrival_s` is when data last came.
+    `newest` is the last sample, None before the first; `last_arrival_s` is when data last came.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -256,21 +240,18 @@ class LogBlocks:
             )
 
     def take(self) -> list[Telemetry]:
-        """Samples that arrived since the last call, oldest first."""
-        arrived = []
-        while self._samples:
-            arrived.append(self._samples.popleft())
-        return arrived
+        """Return the samples that arrived since the last call, oldest first."""
+        return [self._samples.popleft() for _ in range(len(self._samples))]
 
     @property
     def waiting(self) -> list[Telemetry]:
-        """Samples that the next `take` gives, from any thread."""
+        """Samples that the next `take` returns; may be read from any thread."""
         return list(self._samples.copy())
 
     def resume(self, send: Callable[[Packet], bool]) -> bool:
-        """Start the blocks again that come no more: one packet, whether it went out.
+        """Start the blocks again that come no more: send one packet; True if it went out.
 
-        To be called whenever there is room for one, from one thread. `send` must not wait. A
+        To be called whenever there is room for a packet, from one thread. `send` must not wait. A
         vehicle that still has a block answers that it exists, and starts it again all the same.
         """
         now_s = self._clock()
@@ -285,6 +266,7 @@ class LogBlocks:
         return True
 
     def _on_data(self, stamp: int, data: dict[str, float], block: Any) -> None:
+        """Take a packet, in cflib's thread."""
         now_s = self._clock()
         self.last_arrival_s = now_s
         name = block.name.removeprefix(_PREFIX)
@@ -329,7 +311,7 @@ def start_block(
 
 
 def _starting(log: Any, block: Any) -> list[Packet]:
-    """The packets by which cflib has a new block created and started (docs/firmware.md, "Log
+    """Return the packets by which cflib has a new block created and started (docs/firmware.md, "Log
     blocks"): one each, since none of perchctl's has more than nine variables."""
     variables = b"".join(
         struct.pack(

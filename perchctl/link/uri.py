@@ -6,17 +6,22 @@ import re
 
 from perchctl.errors import InvalidValue
 
+MOST_CHANNEL, RATES = 125, ("250K", "1M", "2M")
+USUAL_ADDRESS = "E7E7E7E7E7"
+_USUAL = ("2", "2M", USUAL_ADDRESS)  # channel, rate and address of a radio's URI that names none
 FORMS = {
     "sim": r"sim://",
-    "radio": r"radio://([0-9]+|[0-9A-Fa-f]{10})((?:/[^/?\s]*){0,3})(\?.+)?",
+    "radio": r"radio://(?:[0-9]+|[0-9A-Fa-f]{10})((?:/[^/?\s]*){0,3})(?:\?.+)?",
     "usb": r"usb://\d+",
     "udp": r"udp://[^/:\s]+:\d{1,5}",
     "tcp": r"tcp://[^/:\s]+:\d{1,5}",
     "serial": r"serial://.+",
 }
-MOST_CHANNEL, RATES = 125, ("250K", "1M", "2M")
-ADDRESS_DIGITS = 10
-_USUAL = ("2", "2M", "E7E7E7E7E7")  # channel, rate and address of a radio's URI that names none
+_RADIO_PARTS = (
+    ("channel", "12[0-5]|1[01][0-9]|0?[0-9]{1,2}", f"0 to {MOST_CHANNEL}"),
+    ("data rate", "|".join(RATES), ", ".join(RATES)),
+    ("address", "[0-9A-Fa-f]{10}", "ten hex digits"),
+)
 EXAMPLES = "sim://, radio://0/80/2M/E7E7E7E7E7, usb://0, udp://127.0.0.1:19850"
 
 UDEV_HELP = """\
@@ -35,52 +40,41 @@ log in again, and plug the radio or the vehicle in again."""
 
 
 def check_uri(uri: str) -> str:
-    """The URI's scheme. Raises InvalidValue, which names what is allowed."""
+    """Return the URI's scheme. Raises InvalidValue, which names what is allowed."""
     scheme = uri.split("://", 1)[0]
     form = re.fullmatch(FORMS[scheme], uri) if scheme in FORMS else None
-    if form is None:
-        raise InvalidValue(f"URI {uri!r} is not one of a vehicle; examples: {EXAMPLES}")
-    wrong = _wrong_with_radio(form[2].split("/")[1:]) if scheme == "radio" else ""
-    if scheme in ("udp", "tcp") and not 0 < int(uri.rpartition(":")[2]) <= 65535:
-        wrong = "has no port of 1 to 65535"
+    wrong = "is not one of a vehicle" if form is None else ""
+    if form is not None and scheme == "radio":
+        for given, (name, allowed, words) in zip(
+            form[1].split("/")[1:], _RADIO_PARTS, strict=False
+        ):
+            if not wrong and not re.fullmatch(allowed, given):
+                wrong = f"has {name} {given!r}; allowed: {words}"
+    if form is not None and scheme in ("udp", "tcp"):
+        wrong = "" if 0 < int(uri.rpartition(":")[2]) <= 65535 else "has no port of 1 to 65535"
     if wrong:
         raise InvalidValue(f"URI {uri!r} {wrong}; examples: {EXAMPLES}")
     return scheme
 
 
-def _wrong_with_radio(parts: list[str]) -> str:
-    """Of channel, rate and address, as far as they are given; empty where all are right."""
-    channel, rate, address, *_ = [*parts, None, None, None]
-    if channel is not None and not _is_channel(channel):
-        return f"has channel {channel!r}; allowed are 0 to {MOST_CHANNEL}"
-    if rate is not None and rate not in RATES:
-        return f"has data rate {rate!r}; allowed are {', '.join(RATES)}"
-    if address is not None and not re.fullmatch(f"[0-9A-Fa-f]{{{ADDRESS_DIGITS}}}", address):
-        return f"has address {address!r}; needed are ten hex digits"
-    return ""
-
-
-def _is_channel(text: str) -> bool:
-    return re.fullmatch("[0-9]{1,3}", text) is not None and int(text) <= MOST_CHANNEL
-
-
 def with_whole_address(uri: str) -> str:
-    """A radio's URI as cflib finds it, which leaves an address's zeros in front away."""
+    """Return a radio's URI as cflib finds it with the zeros in front of its address, which cflib
+    leaves away."""
     return re.sub(
         r"^(radio://[^/]+/[^/]+/[^/]+/)([0-9A-Fa-f]+)",
-        lambda found: found[1] + found[2].zfill(ADDRESS_DIGITS),
+        lambda found: found[1] + found[2].zfill(len(USUAL_ADDRESS)),
         uri,
     )
 
 
 def vehicle_uri(uri: str) -> str:
-    """The URI without what does not tell vehicles apart: a radio's dongle, case, options."""
+    """Return the URI without what does not tell vehicles apart: a radio's dongle, case, options."""
     scheme, _, rest = uri.partition("?")[0].partition("://")
     scheme = scheme.lower()
     if scheme == "radio":
         given = [part for part in rest.split("/")[1:4] if part]
         channel, rate, address = (*given, *_USUAL[len(given) :])
-        return f"radio/{int(channel)}/{rate.upper()}/{address.upper().zfill(len(_USUAL[2]))}"
+        return f"radio/{int(channel)}/{rate.upper()}/{address.upper().zfill(len(USUAL_ADDRESS))}"
     if scheme != "serial":  # whose place is a file, and its case tells
         rest = rest.lower()
     return f"{scheme}/{re.sub('^localhost(?=:|$)', '127.0.0.1', rest)}"

@@ -17,7 +17,7 @@ from perchctl.commands import fly
 from perchctl.commands.fly import flight_page
 from perchctl.display import FlightPage, LivePage, failed_card, summary_card
 from perchctl.errors import Interrupted
-from perchctl.flight import FlyOptions, OperatorSwitch, SessionResult
+from perchctl.flight import FlyOptions, OperatorSwitch
 from perchctl.flight.operator import AGAIN_S, HELD_S
 from perchctl.mission import (
     FlightReport,
@@ -252,7 +252,7 @@ def last_state(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 def test_the_page_of_a_flight_ends_with_its_card(
     options: FlyOptions, monkeypatch: pytest.MonkeyPatch, last_state: dict[str, Any]
 ) -> None:
-    def session(_options: object, log: Watcher, display: Watcher, *more: Any) -> SessionResult:
+    def session(_options: object, log: Watcher, display: Watcher, *more: Any) -> Any:
         _switch, page, asks = more
         assert not asks
         for watcher in (log, display, page):
@@ -261,7 +261,7 @@ def test_the_page_of_a_flight_ends_with_its_card(
         report = FlightReport(
             Phase.LANDED, Outcome.TARGET_NOT_FOUND, "target not found", 0, 9.0, False
         )
-        return SessionResult(report)
+        return report, None
 
     monkeypatch.setattr(fly, "_session", session)
     assert fly.fly_and_report(options, as_json=False, port=0) == 50
@@ -276,7 +276,7 @@ def test_the_page_of_a_flight_ends_with_its_card(
 def test_the_page_of_a_flight_that_failed_says_so(
     options: FlyOptions, monkeypatch: pytest.MonkeyPatch, last_state: dict[str, Any]
 ) -> None:
-    def session(*_: object) -> SessionResult:
+    def session(*_: object) -> Any:
         raise Interrupted("interrupted before take-off: nothing was started")
 
     ended: list[str] = []

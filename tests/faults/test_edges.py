@@ -19,9 +19,10 @@ from perchctl.faults.edges import (
     ProgramKilled,
     order_of,
 )
-from perchctl.link import BLOCKS_DELETED_AFTER_S, Packet
+from perchctl.link import Packet
 from perchctl.link.crtp import UNLOCK_THRUST, encode
 from perchctl.link.mock import TELEMETRY_DELAY_S
+from perchctl.link.telemetry import BLOCKS_DELETED_AFTER_S
 from perchctl.vehicle import EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from perchctl.vision import Frame
 

@@ -13,9 +13,10 @@ from perchctl.link import Link
 from perchctl.perception import perception
 from perchctl.perception.perception import REMARK_PICTURES
 from perchctl.profile import Profile
-from perchctl.vehicle import FLYING, Telemetry
+from perchctl.vehicle import Telemetry
 from perchctl.vision import Frame, make_pipeline
 from tests.helpers.interlaced import Pass
+from tests.helpers.mission import telemetry
 from tests.helpers.target_picture import CAMERA
 
 PERIOD_S = 0.01
@@ -36,20 +37,10 @@ class Vehicle:
             T = self._scene.T_world_cam(self._next_s)
             x, y, z = (float(v) for v in T[:3, 3])
             roll, pitch, yaw = rpy_from_rotation(T[:3, :3])
-            new.append(
-                Telemetry(
-                    t_s=self._next_s,
-                    position_m=(x, y, z),
-                    velocity_mps=(0.0, 0.0, 0.0),
-                    roll_rad=roll,
-                    pitch_rad=pitch,
-                    yaw_rad=yaw,
-                    acc_z_g=1.0,
-                    thrust=3e4,
-                    battery_v=3.9,
-                    supervisor=FLYING,
-                )
+            sample = telemetry(
+                self._next_s, position_m=(x, y, z), roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw
             )
+            new.append(sample)
             self._next_s += PERIOD_S
         return new
 
@@ -113,13 +104,7 @@ def test_both_fields_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
         return real(state, picture, *more)
 
     monkeypatch.setattr(perception, "step", noted)
-    vehicle = Vehicle(scene)
-    inputs = FlightInputs(
-        cast(Link, vehicle), cast(Any, Camera(scene, 10)), make_pipeline(PROFILE, CAMERA), PROFILE
-    )
-    for k in range(1, 60):
-        vehicle.now_s = k * PERIOD_S
-        inputs.take_in(vehicle.now_s)
+    flown_by(scene, 10)
     assert len(seen) >= 16
     assert np.diff(seen)[-6:] == pytest.approx(0.02, abs=1e-3)
 

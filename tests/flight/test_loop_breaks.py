@@ -1,4 +1,5 @@
-"""Something breaks in the air: the flight loop lands first, and a rescue is bounded."""
+"""Something breaks or hangs in the air: the flight loop lands first, a rescue is bounded, and what
+could not be confirmed is said."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ import numpy as np
 import pytest
 
 from perchctl.flight import loop
-from perchctl.mission import Finding, Operator, Phase, Tick
+from perchctl.flight.watchdog import CUT_PERIOD_S
+from perchctl.mission import EventKind, Finding, Operator, Outcome, Phase, Tick
 from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS, PEEL_S
 from perchctl.perception import perception
 from perchctl.profile import Profile
@@ -23,78 +25,79 @@ from perchctl.vehicle import (
     RawThrust,
     StopMotors,
 )
-from tests.helpers.loop_rig import PROFILE, Broken, Camera, Rig, Vehicle, Watcher
+from tests.helpers.loop_rig import (
+    HANG_AT_S,
+    PROFILE,
+    Broken,
+    Camera,
+    Guarded,
+    Rig,
+    Vehicle,
+    Watcher,
+    hung_rig,
+)
 from tests.helpers.mission import AIRBORNE, HOVER_THRUST, telemetry
+
+BREAKS_S = 1.2
+AIRBORNE_TICKS = 60
 
 
 def _break(*_: Any, **__: Any) -> Any:
     raise Broken("by the test")
 
 
-def _later(real: Callable[..., Any], calls: int) -> Callable[..., Any]:
-    """As the real one, until the given number of calls."""
-    left = [calls]
+def breaks_at(t_s: float, error: type[BaseException] = Broken) -> Watcher:
+    """A watcher that raises from then on."""
 
-    def step(*arguments: Any) -> Any:
-        left[0] -= 1
-        return real(*arguments) if left[0] >= 0 else _break()
+    def leave(tick: Tick) -> None:
+        if tick.t_s > t_s:
+            raise error("by the test")
 
-    return step
+    return Watcher(leave)
 
 
-def landed_after_a_break(rig: Rig) -> None:
-    with pytest.raises(Broken):
+def landed_after_a_break(rig: Rig, error: type[BaseException] = Broken) -> None:
+    with pytest.raises(error):
         rig.fly()
     assert rig.link.said(PositionSetpoint)
     orders_s = rig.link.said(Land)
     assert 1 <= len(orders_s) <= MAX_ORDERS
     assert orders_s[0] >= rig.link.said(PositionSetpoint)[0]
-    land = next(c for _, c in rig.link.sent if isinstance(c, Land))
+    land = orders(rig)[0]
     assert land.height_m < 0.0
     assert land.duration_s >= 1.0
     assert rig.link.z_m == 0.0  # it was waited for
     assert not rig.link.motors
 
 
-AIRBORNE_TICKS = 60
+def orders(rig: Rig) -> list[Land]:
+    return [command for _, command in rig.link.sent if isinstance(command, Land)]
 
 
-def test_a_failure_in_vision_lands_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(perception, "step", _later(perception.step, AIRBORNE_TICKS))
+# --- An error ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("module", "name"), [(perception, "step"), (loop, "step_mission")])
+def test_a_failure_in_vision_or_in_the_planner_lands_first(
+    monkeypatch: pytest.MonkeyPatch, module: Any, name: str
+) -> None:
+    real, left = getattr(module, name), [AIRBORNE_TICKS]
+
+    def step(*arguments: Any) -> Any:
+        left[0] -= 1
+        return real(*arguments) if left[0] >= 0 else _break()
+
+    monkeypatch.setattr(module, name, step)
     landed_after_a_break(Rig())
 
 
-def test_a_failure_in_the_planner_lands_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop, "step_mission", _later(loop.step_mission, AIRBORNE_TICKS))
-    landed_after_a_break(Rig())
+@pytest.mark.parametrize("error", [Broken, KeyboardInterrupt, SystemExit])
+def test_a_failure_of_a_watcher_and_even_an_exit_lands_first(error: type[BaseException]) -> None:
+    landed_after_a_break(Rig(watcher=breaks_at(BREAKS_S, error)), error)
 
 
-def test_a_failure_of_a_watcher_lands_first() -> None:
-    rig = Rig()
-    rig.watcher.on_tick = lambda tick: _break() if tick.t_s > 1.2 else None
-    landed_after_a_break(rig)
-
-
-def test_a_failure_of_the_camera_lands_first() -> None:
-    rig = Rig()
-    rig.camera.alter = lambda frame: _break() if frame.t_arrival_s > 1.2 else frame
-    landed_after_a_break(rig)
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
-def test_even_an_exit_lands_first(error: type[BaseException]) -> None:
-    def leave(tick: Tick) -> None:
-        if tick.t_s > 1.2:
-            raise error
-
-    rig = Rig(watcher=Watcher(leave))
-    with pytest.raises(error):
-        rig.fly()
-    assert rig.link.said(Land)
-    assert rig.link.z_m == 0.0
-
-
-def test_a_failure_on_the_ground_starts_nothing() -> None:
+def test_a_failure_of_the_camera_lands_first_and_on_the_ground_starts_nothing() -> None:
+    landed_after_a_break(Rig(camera=Camera(lambda f: _break() if f.t_arrival_s > BREAKS_S else f)))
     rig = Rig(camera=Camera(_break))
     with pytest.raises(Broken):
         rig.fly()
@@ -108,31 +111,52 @@ def test_a_failure_right_after_the_take_off_order_lands(after_s: float) -> None:
     rig = Rig(Vehicle(delay_s=0.15))
 
     def leave(tick: Tick) -> None:
-        orders = rig.link.said(PositionSetpoint)
-        if orders and tick.t_s >= orders[0] + after_s - 1e-9:
+        ordered = rig.link.said(PositionSetpoint)
+        if ordered and tick.t_s >= ordered[0] + after_s - 1e-9:
             raise Broken
 
     rig.watcher.on_tick = leave
     landed_after_a_break(rig)
 
 
-def test_a_failure_while_hanging_with_the_motors_off_starts_nothing() -> None:
-    """The flying bit outlives the motors by two seconds."""
-    hanging = Vehicle(lambda s: replace(s, supervisor=AIRBORNE, thrust=0.0))
-    hanging.advance_to(1.0)
-    rig = Rig(hanging)
-    rig.rescue(telemetry(1.0, 2.0, thrust=0.0))
-    assert {type(command) for _, command in rig.link.sent} <= {StopMotors}
+@pytest.mark.parametrize("heard", [True, False])
+def test_after_an_error_it_is_said_whether_the_landing_was_seen(heard: bool) -> None:
+    link = Guarded(lambda s: s if heard or s.t_s < 1.5 else None)
+    rig = Rig(link, watcher=breaks_at(1.5))
+    with pytest.raises(Broken):
+        rig.fly()
+    assert link.own == []  # no setpoint that would take the landing back
+    said = rig.watcher.events[-1]
+    assert said.kind is EventKind.NOTE
+    assert "Broken in flight" in said.reason
+    assert ("motors are off" in said.reason) is heard
+    assert ("could not be confirmed" in said.reason) is not heard
 
+
+# --- The rescue -------------------------------------------------------------------------------
 
 AT_CEILING = {"phase": Phase.PERCH, "contact_z_m": 2.0}
 
 
-def test_a_rescue_at_the_ceiling_peels_off_first() -> None:
+def rescuing(z_m: float = 0.0, **changes: Any) -> Rig:
+    """A vehicle in the air whose telemetry is changed."""
+    link = Vehicle(lambda s: replace(s, **changes))
+    link.z_m, link.motors = z_m, True
+    return Rig(link)
+
+
+def test_while_hanging_with_the_motors_off_it_starts_nothing() -> None:
+    """The flying bit outlives the motors by two seconds."""
+    rig = rescuing(supervisor=AIRBORNE, thrust=0.0)
+    rig.link.motors = False
+    rig.link.advance_to(1.0)
+    rig.rescue(telemetry(1.0, 2.0, thrust=0.0))
+    assert {type(command) for _, command in rig.link.sent} <= {StopMotors}
+
+
+def test_at_the_ceiling_it_peels_off_first() -> None:
     """The vehicle's own landing would run by its clock and end up there, motors off."""
-    pressed = Vehicle()
-    pressed.z_m, pressed.motors = 2.0, True
-    rig = Rig(pressed)
+    rig = rescuing(2.0)
     assert rig.rescue(telemetry(0.0, 2.0), **AT_CEILING).finding is Finding.STANDS
     first = rig.link.sent[0][1]
     assert isinstance(first, PositionSetpoint)
@@ -141,38 +165,32 @@ def test_a_rescue_at_the_ceiling_peels_off_first() -> None:
     assert rig.link.z_m == 0.0
 
 
-def test_a_rescue_of_what_does_not_peel_off_puts_the_weight_on_the_magnet() -> None:
+def test_what_does_not_peel_off_gets_its_weight_put_on_the_magnet() -> None:
     """A landing ordered to what the magnet holds would drop it when its trajectory ends."""
-    stuck = Vehicle(lambda s: replace(s, position_m=(0.0, 0.0, 2.0)))
-    stuck.z_m, stuck.motors = 2.0, True
-    rig = Rig(stuck)
+    rig = rescuing(2.0, position_m=(0.0, 0.0, 2.0))
     rig.rescue(telemetry(0.0, 2.0), **AT_CEILING)
     assert not rig.link.said(Land)
     assert PEEL_S <= rig.link.said(RawThrust)[0] < PEEL_S + 0.2
 
 
-def test_the_rescue_is_bounded() -> None:
+def test_it_is_bounded() -> None:
     """A vehicle that never says it has landed is not waited for for ever."""
-    rig = Rig(Vehicle(lambda s: replace(s, supervisor=AIRBORNE | HL_ACTIVE)))
+    rig = rescuing(supervisor=AIRBORNE | HL_ACTIVE)
+    rig.link.motors = False
     rig.rescue(telemetry(0.0))
     assert rig.link.now_s == pytest.approx(PROFILE.planner.landing.timeout_s, abs=0.2)
     assert len(rig.link.said(Land)) == LEAST_ORDERS
 
 
-def test_the_rescue_orders_again_what_shows_no_effect() -> None:
-    deaf = Vehicle(lambda s: replace(s, supervisor=AIRBORNE, thrust=HOVER_THRUST))
-    deaf.z_m = 0.2
-    rig = Rig(deaf)
+def test_it_orders_again_what_shows_no_effect() -> None:
+    rig = rescuing(0.2, supervisor=AIRBORNE, thrust=HOVER_THRUST)
+    rig.link.motors = False
     rig.rescue(telemetry(0.0, 0.2))
     assert np.diff(rig.link.said(Land)).min() > 0.3
     assert len(rig.link.said(Land)) == MAX_ORDERS
 
 
-def orders(rig: Rig) -> list[Land]:
-    return [command for _, command in rig.link.sent if isinstance(command, Land)]
-
-
-def test_a_rescue_lands_on_the_ground_that_it_started_from() -> None:
+def test_it_lands_on_the_ground_that_it_started_from_even_without_telemetry() -> None:
     """On a table its own landing would else end below it, or over the floor far above."""
     aims = []
     for ground_z_m in (-1.0, 0.0, 0.75):
@@ -183,33 +201,154 @@ def test_a_rescue_lands_on_the_ground_that_it_started_from() -> None:
     assert -1.0 < aims[0] <= 0.0
 
 
-def test_a_rescue_without_positions_from_outside_comes_down_level() -> None:
-    still = Vehicle(lambda s: replace(s, supervisor=AIRBORNE, thrust=HOVER_THRUST))
-    rig = Rig(still, profile=Profile.model_validate({"positioning": "mocap"}))
+def test_without_positions_from_outside_it_comes_down_level() -> None:
+    rig = rescuing(supervisor=AIRBORNE, thrust=HOVER_THRUST)
+    rig.profile = Profile.model_validate({"positioning": "mocap"})
     rig.rescue(telemetry(0.0, 1.5), 2.0, started_s=0.0)
     assert rig.link.said(RawThrust)
     assert not orders(rig)
 
 
-def test_a_rescue_steers_by_no_number_that_is_none() -> None:
-    rig = Rig(Vehicle(lambda s: replace(s, position_m=(math.nan,) * 3, supervisor=AIRBORNE)))
+def test_it_steers_by_no_number_that_is_none() -> None:
+    rig = rescuing(position_m=(math.nan,) * 3, supervisor=AIRBORNE)
     rig.rescue(telemetry(0.0, 2.0), **AT_CEILING)
     places = [c.z_m for _, c in rig.link.sent if isinstance(c, PositionSetpoint)]
     assert places
     assert all(z_m <= 2.0 for z_m in places)
 
 
-def test_a_rescue_without_telemetry_still_orders_the_landing() -> None:
-    rig = Rig(Vehicle(lambda s: None))
-    rig.rescue(telemetry(-1.0))
-    assert rig.link.said(Land)
-
-
-def test_ctrl_c_twice_stops_a_rescue_too() -> None:
-    rig = Rig(
-        Vehicle(lambda s: replace(s, supervisor=AIRBORNE | HL_ACTIVE)),
-        operator=lambda: Operator.STOP if rig.link.now_s > 0.5 else Operator.NONE,
-    )
+def test_ctrl_c_twice_stops_it_too() -> None:
+    rig = rescuing(supervisor=AIRBORNE | HL_ACTIVE)
+    rig.operator = lambda: Operator.STOP if rig.link.now_s > 0.5 else Operator.NONE
     rig.rescue(telemetry(0.0))
     assert rig.link.said(EmergencyStop)[0] == pytest.approx(0.5, abs=0.05)
     assert rig.link.now_s < 1.0
+
+
+def test_the_operators_stop_in_it_is_repeated() -> None:
+    """Until the vehicle says that it is locked, and also while the link is closing."""
+    link = Guarded()
+    rig = Rig(link, watcher=breaks_at(1.5))
+    rig.operator = lambda: Operator.STOP if link.now_s > 1.8 else Operator.NONE
+    with pytest.raises(Broken):
+        rig.fly()
+    ended_s = link.now_s
+    link.advance_to(ended_s + 1.0)
+    cuts = [t for t in link.said(EmergencyStop) if t > ended_s + 0.01]
+    assert len(cuts) == pytest.approx(1.0 / CUT_PERIOD_S, abs=1)
+
+
+# --- A loop that hangs --------------------------------------------------------------------------
+
+
+def after_the_hang(rig: Rig) -> Tick:
+    return next(t for t in rig.watcher.ticks if t.t_s > HANG_AT_S + 0.1)
+
+
+def landed_s(link: Guarded) -> float:
+    """When the watchdog ordered the landing; nothing stale follows."""
+    at_s = next(t for t, c in link.own if isinstance(c, Land))
+    assert not [t for t in link.said(PositionSetpoint) if t > at_s]
+    return at_s
+
+
+def test_a_loop_that_hangs_in_the_camera_is_landed_and_goes_on_landing() -> None:
+    rig, link = hung_rig(5.0)
+    report = rig.fly()
+    held = [t for t, c in link.own if isinstance(c, PositionSetpoint)]
+    assert held[0] == pytest.approx(HANG_AT_S + 0.3, abs=0.08)
+    assert np.diff(held).max() < 0.06  # at about 20 Hz
+    assert landed_s(link) == pytest.approx(HANG_AT_S + 1.0, abs=0.08)
+    first = after_the_hang(rig)
+    assert first.state.phase is Phase.LANDING
+    assert first.loop_late_s > 4.9
+    assert report.outcome is Outcome.SAFETY
+    assert "the control loop was 5.0 s late" in report.reason
+
+
+def test_a_hang_of_half_a_second_is_held_and_the_flight_goes_on_with_what_is_new() -> None:
+    rig, link = hung_rig(0.6)
+    report = rig.fly()
+    assert link.own
+    assert not [c for _, c in link.own if isinstance(c, Land)]
+    first = after_the_hang(rig)
+    assert first.t_s == pytest.approx(HANG_AT_S + 0.62, abs=0.05)  # not the time before it
+    assert first.telemetry_age_s < 0.05
+    assert "late" in first.state.hold
+    assert report.outcome is Outcome.OPERATOR
+
+
+def test_what_was_decided_before_a_hang_is_not_sent_after_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig, link = hung_rig(0.0)
+    real, stale = loop.step_mission, []
+
+    def step(*arguments: Any) -> Any:
+        new, command = real(*arguments)
+        if not stale and link.now_s > HANG_AT_S:
+            stale.append(command := replace(command, z_m=9.9))  # to be known again
+            link.advance_to(link.now_s + 0.6)
+        return new, command
+
+    monkeypatch.setattr(loop, "step_mission", step)
+    rig.fly()
+    assert stale
+    assert stale[0] not in [c for _, c in link.sent]
+
+
+def test_a_landing_ordered_while_the_planner_thinks_is_not_taken_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The loop is 0.99 s late when its turn begins, and 1.01 s when it would send."""
+    rig, link = hung_rig(0.97)
+    real, slow = loop.step_mission, []
+
+    def step(state: Any, obs: Any, *more: Any) -> Any:
+        if not slow and obs.loop_late_s > 0.5:
+            slow.append(obs.loop_late_s)
+            link.advance_to(link.now_s + 0.1)
+        return real(state, obs, *more)
+
+    monkeypatch.setattr(loop, "step_mission", step)
+    report = rig.fly()
+    assert slow
+    assert slow[0] < PROFILE.safety.loop_late_land_s
+    assert landed_s(link)
+    assert "late" in report.reason
+
+
+# --- The end that nobody saw ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("changed", "words"), [
+    (lambda s: None if s.t_s > 2.0 else s,
+     ["no telemetry for 1.0 s; the landing was ordered but could not",
+      "could not be confirmed: nothing was heard from the vehicle for 3"]),
+    (lambda s: replace(s, thrust=50000.0), ["by its telemetry the vehicle still flies"]),
+], ids=["silent", "flies on"])  # fmt: skip
+def test_a_landing_that_nobody_saw_is_no_landing(
+    changed: Callable[..., Any], words: list[str]
+) -> None:
+    rig = Rig(Vehicle(changed))
+    if len(words) == 1:
+        rig.operator = lambda: Operator.LAND if rig.link.now_s > 2.0 else Operator.NONE
+    report = rig.fly()
+    assert report.phase is Phase.ABORTED
+    assert all(each in report.reason for each in words)
+    assert "motors off" not in report.reason
+
+
+def test_a_log_that_fails_is_said_once_in_the_flight() -> None:
+    rig = Rig(operator=lambda: Operator.LAND if rig.link.now_s > 3.0 else Operator.NONE)
+
+    def fill(tick: Tick) -> None:
+        if tick.t_s > 2.0:
+            rig.watcher.problem = "no space left"
+
+    rig.watcher.on_tick = fill
+    rig.fly()
+    said = [e for e in rig.watcher.events if "incomplete" in e.reason]
+    assert [e.kind for e in said] == [EventKind.NOTE]
+    assert said[0].t_s == pytest.approx(2.02, abs=0.03)
+    assert "no space left" in said[0].reason

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -27,57 +26,47 @@ from perchctl.sim import SimulatedVehicle, draw_hand, draw_scenario, record_hand
 from perchctl.sim.hand import pictures
 from perchctl.sim.host import VehicleHost
 from perchctl.sim.process import HostSetup
-from perchctl.vision import Frame
 from tests.helpers.flights import SEED, fly_short, short_profile
 
-Picture = NDArray[np.uint8]
+Pictures = list[NDArray[np.uint8]]
 PLAIN = short_profile()
 MIRRORED = short_profile({"camera.mirrored": True})
 LOOKED_S = 0.3
 
 
-def polled(source: FrameSource, link: MockLink) -> list[Frame]:
+def polled(source: FrameSource, link: MockLink) -> Pictures:
     frames = []
     while link.now_s < LOOKED_S:
         link.advance_to(link.now_s + 0.02)
         frames.append(source.poll(link.now_s))
-    return [frame for frame in frames if frame is not None]
+    return [frame.image for frame in frames if frame is not None]
 
 
-def same(some: list[Frame], others: list[Frame]) -> bool:
-    pairs = zip(some, others, strict=True)
-    return all((a.image == b.image).all() and a.t_s == b.t_s for a, b in pairs)
-
-
-def flipped(frames: list[Frame]) -> list[Frame]:
-    return [Frame(f.index, f.t_s, f.image[:, ::-1], f.t_arrival_s) for f in frames]
-
-
-def vehicle_of(profile: Profile) -> SimulatedVehicle:
-    return SimulatedVehicle(
-        draw_scenario(profile, SEED), profile_camera(profile.camera), profile.target
+def lockstep(by: Profile, camera: Profile) -> Pictures:
+    """A flight by one profile of a vehicle whose camera is as another says."""
+    vehicle = SimulatedVehicle(
+        draw_scenario(camera, SEED), profile_camera(camera.camera), camera.target
     )
+    return polled(lockstep_source(vehicle, by), MockLink(vehicle))
 
 
-def test_the_lockstep_camera_mirrors_and_the_flight_sees_it_turned_right() -> None:
-    def seen(by: Profile, camera: Profile) -> list[Frame]:
-        vehicle = vehicle_of(camera)
-        return polled(lockstep_source(vehicle, by), MockLink(vehicle))
-
-    plain = seen(PLAIN, PLAIN)
-    assert len(plain) > 3
-    assert same(seen(MIRRORED, MIRRORED), plain)
-    assert same(seen(PLAIN, MIRRORED), flipped(plain)), "the camera itself does mirror"
-    assert same(seen(MIRRORED, PLAIN), flipped(plain))
+def faulty(profile: Profile) -> Pictures:
+    """A flight whose camera mirrors against what the profile says."""
+    scenario = draw_scenario(profile, SEED)
+    case = draw_case(SEED, scenario, [BY_NAME["camera-mirrored"]])
+    flight = FaultyFlight(profile, case, scenario)
+    source = flight._parts.source
+    source.begin(CameraFault("mirrored", FOR_EVER), 0.0)  # type: ignore[attr-defined]
+    return polled(source, flight._link)
 
 
-def published(profile: Profile) -> list[Picture]:
+def published(profile: Profile) -> Pictures:
     """By the simulated vehicle's process, on its way to the stream."""
     setup = HostSetup(
         scenario=draw_scenario(profile, SEED), camera=profile_camera(profile.camera),
         target=profile.target,
     )  # fmt: skip
-    out: list[Picture] = []
+    out: Pictures = []
     with contextlib.closing(VehicleHost(setup)) as host:
         assert host.stream is not None
         host.stream.publish = out.append  # type: ignore[method-assign]
@@ -85,22 +74,47 @@ def published(profile: Profile) -> list[Picture]:
     return out
 
 
-def test_the_stream_of_the_simulated_vehicle_s_process_is_mirrored() -> None:
-    plain, mirrored = published(PLAIN), published(MIRRORED)
+def in_a_hand(profile: Profile) -> Pictures:
+    hand = draw_hand(profile, "carry", SEED, seconds=0.3)
+    return [frame.image for frame in pictures(hand, profile, profile_camera(profile.camera))]
+
+
+def test_each_simulated_camera_mirrors_and_the_flight_sees_it_turned_right() -> None:
+    plain = lockstep(PLAIN, PLAIN)
     assert len(plain) > 3
-    for one, other in zip(plain, mirrored, strict=True):
-        np.testing.assert_array_equal(one[:, ::-1], other)
+    flipped = [image[:, ::-1] for image in plain]
+    assert np.array_equal(lockstep(MIRRORED, MIRRORED), plain)
+    assert np.array_equal(lockstep(PLAIN, MIRRORED), flipped), "the camera itself does mirror"
+    assert np.array_equal(lockstep(MIRRORED, PLAIN), flipped)
+    assert np.array_equal(faulty(PLAIN), flipped)
+    assert np.array_equal(faulty(MIRRORED), flipped)
+    for by in (published, in_a_hand):
+        assert np.array_equal([image[:, ::-1] for image in by(PLAIN)], by(MIRRORED))
 
 
-def test_each_source_that_is_opened_by_a_profile_is_turned_right(tmp_path: Path) -> None:
+def test_what_a_hand_records_is_turned_right() -> None:
+    plain, mirrored = (
+        record_hand(draw_hand(p, "carry", SEED, seconds=0.3), p, profile_camera(p.camera))
+        for p in (PLAIN, MIRRORED)
+    )
+    assert plain.poses
+    assert mirrored.mirrored_pictures == 0
+    for a, b in zip(plain.poses, mirrored.poses, strict=True):
+        np.testing.assert_array_equal(a.position_cam_target_m, b.position_cam_target_m)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_each_source_that_is_opened_by_a_profile_is_turned_right(
+    mirrored: bool, tmp_path: Path
+) -> None:
     image = np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
     cv2.imwrite(f"{tmp_path}/a.png", image)
-    for mirrored in (False, True):
-        config = CameraConfig(mirrored=mirrored)
-        source = open_camera(f"images:{tmp_path}", lambda: 0.0, config)
-        frame = source.poll(0.0)
-        assert frame is not None
-        np.testing.assert_array_equal(frame.image, image[:, ::-1] if mirrored else image)
+    config = CameraConfig(mirrored=mirrored)
+    frame = open_camera(f"images:{tmp_path}", lambda: 0.0, config).poll(0.0)
+    assert frame is not None
+    np.testing.assert_array_equal(frame.image, image[:, ::-1] if mirrored else image)
+    advice = "take camera.mirrored out" if mirrored else "set camera.mirrored"
+    assert advice in mirrored_note(config)
 
 
 @pytest.mark.long
@@ -108,45 +122,3 @@ def test_a_flight_with_a_camera_that_mirrors_perches() -> None:
     flown = fly_short({"camera.mirrored": True})
     assert flown.report.phase is Phase.PERCHED
     assert flown.flight.miss_m < 0.005
-
-
-def test_the_fault_mirrors_against_what_the_profile_says() -> None:
-    def seen(profile: Profile, is_faulty: bool) -> list[Frame]:
-        scenario = draw_scenario(profile, SEED)
-        case = draw_case(SEED, scenario, [BY_NAME["camera-mirrored"]])
-        flight = FaultyFlight(profile, case, scenario)
-        source = flight._parts.source
-        if is_faulty:
-            source.begin(CameraFault("mirrored", FOR_EVER), 0.0)  # type: ignore[attr-defined]
-        return polled(source, flight._link)
-
-    plain = seen(PLAIN, False)
-    assert len(plain) > 3
-    assert same(seen(MIRRORED, False), plain)
-    for profile in (PLAIN, MIRRORED):
-        assert same(seen(profile, True), flipped(plain))
-
-
-def test_a_camera_in_a_hand_mirrors_too() -> None:
-    def shown(mirrored: bool) -> Iterator[Picture]:
-        profile = MIRRORED if mirrored else PLAIN
-        for frame in pictures(hands[mirrored], profile, profile_camera(profile.camera)):
-            yield frame.image
-
-    hands = [draw_hand(p, "carry", SEED, seconds=0.3) for p in (PLAIN, MIRRORED)]
-    for one, other in zip(shown(False), shown(True), strict=True):
-        np.testing.assert_array_equal(one[:, ::-1], other)
-    found = [
-        record_hand(hand, profile, profile_camera(profile.camera))
-        for hand, profile in zip(hands, (PLAIN, MIRRORED), strict=True)
-    ]
-    assert found[0].poses
-    assert found[1].mirrored_pictures == 0
-    for a, b in zip(found[0].poses, found[1].poses, strict=True):
-        np.testing.assert_array_equal(a.position_cam_target_m, b.position_cam_target_m)
-
-
-def test_the_advice_is_the_opposite_of_what_is_set() -> None:
-    notes = [mirrored_note(CameraConfig(mirrored=is_set)) for is_set in (False, True)]
-    assert ["set camera.mirrored" in note for note in notes] == [True, False]
-    assert ["take camera.mirrored out" in note for note in notes] == [False, True]

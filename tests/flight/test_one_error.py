@@ -43,9 +43,10 @@ class Looker(NoLog):
 
 
 @dataclass
-class Counted:
-    """Calls of the pose solver, and of the contexts that the planner decided by."""
+class Watched:
+    """A flight's ticks with the truth, calls of the pose solver, and the planner's contexts."""
 
+    ticks: list[tuple[Tick, Truth]]
     in_step: int = 0
     elsewhere: int = 0
     stepping: bool = False
@@ -53,25 +54,26 @@ class Counted:
 
 
 @pytest.fixture(scope="module")
-def flight() -> Iterator[tuple[list[tuple[Tick, Truth]], Counted]]:
+def flight() -> Iterator[Watched]:
     """One quiet flight, watched from everywhere."""
-    counted, looker = Counted(), Looker()
+    looker = Looker()
+    watched = Watched(looker.ticks)
     solve, step, act = merge.estimate_pose, perception.step, planner.act
 
     def solved(*arguments: Any) -> Any:
-        counted.in_step += counted.stepping
-        counted.elsewhere += not counted.stepping
+        watched.in_step += watched.stepping
+        watched.elsewhere += not watched.stepping
         return solve(*arguments)
 
     def stepped(*arguments: Any) -> Any:
-        counted.stepping = True
+        watched.stepping = True
         try:
             return step(*arguments)
         finally:
-            counted.stepping = False
+            watched.stepping = False
 
     def acted(context: Context) -> Any:
-        counted.contexts.append(context)
+        watched.contexts.append(context)
         return act(context)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -83,16 +85,13 @@ def flight() -> Iterator[tuple[list[tuple[Tick, Truth]], Counted]]:
         for tick, _ in looker.ticks:  # whatever looks at a tick solves nothing
             tick_record(tick)
             status_rows(tick)
-        yield looker.ticks, counted
+        yield watched
 
 
-def test_the_log_and_the_panel_hold_the_planner_s_error(
-    flight: tuple[list[tuple[Tick, Truth]], Counted],
-) -> None:
-    ticks, counted = flight
-    assert len(ticks) == len(counted.contexts)
+def test_the_log_and_the_panel_hold_the_planner_s_error(flight: Watched) -> None:
+    assert len(flight.ticks) == len(flight.contexts)
     seen = 0
-    for (tick, _), context in zip(ticks, counted.contexts, strict=True):
+    for (tick, _), context in zip(flight.ticks, flight.contexts, strict=True):
         record, shown = tick_record(tick), dict(status_rows(tick))["error"]
         target = context.obs.target
         if target is None:
@@ -106,18 +105,16 @@ def test_the_log_and_the_panel_hold_the_planner_s_error(
         assert math.hypot(record["ex_m"], record["ey_m"]) == context.error_xy_m
         assert record["ez_m"] == context.error_z_m
         assert target.t_s == tick.t_s  # at the present, not at the frame's time
-    assert seen > 0.5 * len(ticks)
+    assert seen > 0.5 * len(flight.ticks)
 
 
-def test_the_error_is_the_true_one_at_the_tick(
-    flight: tuple[list[tuple[Tick, Truth]], Counted],
-) -> None:
+def test_the_error_is_the_true_one_at_the_tick(flight: Watched) -> None:
     """Prediction included: in the ascent the frame's own error would be late by the
     camera's 60 ms, at 0.35 m/s that is 2 cm."""
     off: list[Array] = []
     late_z_m: list[float] = []
     yaw_off: list[float] = []
-    climbing = [(tick, truth) for tick, truth in flight[0] if tick.state.phase is Phase.ASCEND]
+    climbing = [(tick, truth) for tick, truth in flight.ticks if tick.state.phase is Phase.ASCEND]
     for tick, (position_m, _) in climbing:
         target, tel = tick.target, tick.telemetry
         assert target is not None
@@ -134,10 +131,7 @@ def test_the_error_is_the_true_one_at_the_tick(
     assert np.abs(yaw_off).max() < 0.03
 
 
-def test_poses_are_solved_in_the_pipeline_only(
-    flight: tuple[list[tuple[Tick, Truth]], Counted],
-) -> None:
-    ticks, counted = flight
-    frames = sum(tick.output is not None for tick, _ in ticks)
-    assert counted.elsewhere == 0
-    assert frames * 0.5 < counted.in_step < frames * 1.2  # one joint solve a frame, mostly
+def test_poses_are_solved_in_the_pipeline_only(flight: Watched) -> None:
+    frames = sum(tick.output is not None for tick, _ in flight.ticks)
+    assert flight.elsewhere == 0
+    assert frames * 0.5 < flight.in_step < frames * 1.2  # one joint solve a frame, mostly

@@ -26,47 +26,40 @@ ROOT = Path(__file__).resolve().parents[2]
 class Pressed:
     """A switch, and presses at given times."""
 
-    def __init__(self) -> None:
+    def __init__(self, *times_s: float) -> None:
         self.now_s = 50.0
         self.switch = OperatorSwitch(listening=True, clock=lambda: self.now_s)
-
-    def press(self, *times_s: float) -> None:
         for t_s in times_s:
-            self.now_s = 50.0 + t_s
-            self.switch.press()
+            self.press(t_s)
+
+    def press(self, t_s: float) -> None:
+        self.now_s = 50.0 + t_s
+        self.switch.press()
 
     def at(self, t_s: float) -> Operator:
         self.now_s = 50.0 + t_s
         return self.switch.read()
 
 
-def test_one_press_lands_for_good() -> None:
-    it = Pressed()
-    assert it.at(0.0) is Operator.NONE
-    it.press(0.0)
-    assert it.at(0.0) is Operator.LAND
-    assert it.at(100.0) is Operator.LAND
-
-
-def test_a_second_press_within_half_a_second_does_not_count() -> None:
-    it = Pressed()
-    it.press(0.0, AGAIN_S - 0.01)
-    assert it.at(9.0) is Operator.LAND
+@pytest.mark.parametrize(("presses_s", "read_s", "order"), [
+    ([], 0.0, Operator.NONE),
+    ([0.0], 0.0, Operator.LAND),
+    ([0.0], 100.0, Operator.LAND),
+    ([0.0, AGAIN_S - 0.01], 9.0, Operator.LAND),  # too soon to count
+    ([0.0, DELAY_S + 0.01], DELAY_S + 0.01, Operator.STOP),  # after a long silence, at once
+])  # fmt: skip
+def test_one_press_lands_for_good_and_two_stop(
+    presses_s: list[float], read_s: float, order: Operator
+) -> None:
+    assert Pressed(*presses_s).at(read_s) is order
 
 
 @given(again_s=st.floats(AGAIN_S, 60.0))
 def test_a_second_press_stops_within_half_a_second(again_s: float) -> None:
     """The loop asks 50 times a second, the link's guard every 50 ms: they need the rest."""
-    it = Pressed()
-    it.press(0.0, again_s)
+    it = Pressed(0.0, again_s)
     assert it.at(again_s + 0.4) is Operator.STOP
     assert it.at(99.0) is Operator.STOP
-
-
-def test_after_a_long_silence_it_stops_at_once() -> None:
-    it = Pressed()
-    it.press(0.0, DELAY_S + 0.01)
-    assert it.at(DELAY_S + 0.01) is Operator.STOP
 
 
 def held(delay_s: float, period_s: float, for_s: float) -> list[float]:
@@ -95,8 +88,7 @@ def test_a_key_held_down_is_one_press(delay_s: float, period_s: float, for_s: fl
 
 @given(DELAYS_S, PERIODS_S)
 def test_two_seconds_of_holding_or_hammering_stop(delay_s: float, period_s: float) -> None:
-    it = Pressed()
-    it.press(*held(delay_s, period_s, INSIST_S + period_s))
+    it = Pressed(*held(delay_s, period_s, INSIST_S + period_s))
     assert it.at(INSIST_S + period_s) is Operator.STOP
 
 
@@ -157,23 +149,21 @@ class Hanging:
     def __init__(self, patience_s: float) -> None:
         self.process = subprocess.Popen(
             [sys.executable, "-c", HANGING, str(patience_s)],
-            cwd=ROOT,
-            env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
+            cwd=ROOT, env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        )  # fmt: skip
         self.next()  # the first setpoint that is repeated: the loop hangs
 
     def next(self) -> list[str]:
         assert self.process.stdout is not None
         return self.process.stdout.readline().split()
 
-    def until(self, command: str) -> list[str]:
+    def sends(self, command: str, order: str) -> None:
+        """It sends this command in the end, under this order, and lives."""
         while (said := self.next()) and said[0] != command:
             assert said[0] != "woke", "nothing was sent while it hung"
-        return said
+        assert said == [command, order]
+        assert self.process.poll() is None
 
     def __enter__(self) -> Hanging:
         return self
@@ -186,11 +176,10 @@ class Hanging:
 def test_ctrl_c_works_while_the_main_thread_hangs_in_a_library() -> None:
     with Hanging(60.0) as flight:
         flight.process.send_signal(signal.SIGINT)
-        assert flight.until("Land") == ["Land", "LAND"]
+        flight.sends("Land", "LAND")
         time.sleep(AGAIN_S)
         flight.process.send_signal(signal.SIGINT)
-        assert flight.until("EmergencyStop") == ["EmergencyStop", "STOP"]
-        assert flight.process.poll() is None
+        flight.sends("EmergencyStop", "STOP")
 
 
 @pytest.mark.parametrize("name", ["SIGHUP", "SIGTERM", "SIGQUIT", "SIGTSTP"])
@@ -198,8 +187,7 @@ def test_signals_that_end_or_suspend_a_program_land(name: str) -> None:
     with Hanging(60.0) as flight:
         for _ in range(2):
             flight.process.send_signal(signal.Signals[name])
-        assert flight.until("Land") == ["Land", "LAND"]
-        assert flight.process.poll() is None
+        flight.sends("Land", "LAND")
         state = Path(f"/proc/{flight.process.pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
         assert state != "T"
         if name == "SIGTSTP":
@@ -209,15 +197,27 @@ def test_signals_that_end_or_suspend_a_program_land(name: str) -> None:
 
 def test_a_hanging_loop_is_landed_without_the_operator() -> None:
     with Hanging(0.02) as flight:
-        assert flight.until("Land") == ["Land", "NONE"]
+        flight.sends("Land", "NONE")
+
+
+def printed(code: str) -> str:
+    """What a program prints that knows the signals and the switch."""
+    known = (
+        "import os, signal, time\n"
+        "from perchctl.commands.interrupt import signals_to_operator\n"
+        "from perchctl.errors import Interrupted\n"
+        "from perchctl.flight import OperatorSwitch\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", known + code], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def test_a_hang_up_that_is_ignored_stays_ignored() -> None:
     """As under nohup."""
-    code = (
-        "import os, signal\n"
-        "from perchctl.commands.interrupt import signals_to_operator\n"
-        "from perchctl.flight.operator import OperatorSwitch\n"
+    said = printed(
         "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
         "switch = OperatorSwitch(listening=True)\n"
         "with signals_to_operator(switch, print):\n"
@@ -225,16 +225,11 @@ def test_a_hang_up_that_is_ignored_stays_ignored() -> None:
         "    print(switch.read().name)\n"
         "print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.stdout.split() == ["NONE", "True"], done.stderr
+    assert said.split() == ["NONE", "True"]
 
 
 def test_before_the_flight_each_signal_leaves_by_one_sentence() -> None:
-    code = (
-        "import os, signal, sys, time\n"
-        "from perchctl.commands.interrupt import signals_to_operator\n"
-        "from perchctl.errors import Interrupted\n"
-        "from perchctl.flight.operator import OperatorSwitch\n"
+    said = printed(
         "for name in ('SIGINT', 'SIGTERM', 'SIGHUP', 'SIGTSTP'):\n"
         "    try:\n"
         "        with signals_to_operator(OperatorSwitch(), print):\n"
@@ -243,17 +238,16 @@ def test_before_the_flight_each_signal_leaves_by_one_sentence() -> None:
         "    except Interrupted as error:\n"
         "        print(error)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.stdout.count("nothing was started") == 4, done.stderr
+    assert said.count("nothing was started") == 4
 
 
 def test_a_terminal_that_is_gone_is_no_failure() -> None:
     """Writes to stderr fail with EIO or EPIPE: nothing is raised, and the exit code stays."""
     code = (
-        "import os, sys\n"
+        "import sys\n"
         "from perchctl.commands.output import print_lines, say\n"
         "from perchctl.display import open_panel\n"
-        "from perchctl.mission.records import Event, EventKind\n"
+        "from perchctl.mission import Event, EventKind\n"
         "say('one'); panel = open_panel(stream=sys.stderr)\n"
         "panel.event(Event(0.0, EventKind.NOTE, 'two'))\n"
         "panel.close(); print_lines('three')\n"
@@ -270,24 +264,18 @@ def test_it_is_asked_once_the_vehicle_has_answered(monkeypatch: pytest.MonkeyPat
     """What a no ends has armed nothing, and is closed."""
     order: list[str] = []
 
-    class Link:
-        def __init__(self, *args: object, **options: object) -> None:
-            pass
-
-        def connect(self) -> None:
-            order.append("connected")
-
-        def close(self) -> None:
-            order.append("closed")
+    def noted(what: str) -> object:
+        return lambda *_, **__: order.append(what)
 
     def ask() -> None:
         order.append("asked")
         raise UsageError("not confirmed: nothing was started")
 
-    camera = SimpleNamespace(close=lambda: order.append("camera closed"))
-    monkeypatch.setattr(session, "CflibLink", Link)
-    monkeypatch.setattr(session, "open_camera", lambda *args, **options: camera)
-    monkeypatch.setattr(session, "fly", lambda parts: order.append("flew"))
+    link = SimpleNamespace(connect=noted("connected"), close=noted("closed"))
+    camera = SimpleNamespace(close=noted("camera closed"))
+    monkeypatch.setattr(session, "CflibLink", lambda *_, **__: link)
+    monkeypatch.setattr(session, "open_camera", lambda *_, **__: camera)
+    monkeypatch.setattr(session, "fly", noted("flew"))
     options = session.FlyOptions(
         load_profile("crazyflie"), Path("crazyflie.yaml"), "radio://0/80/2M", "http://cam/"
     )

@@ -23,27 +23,20 @@ from perchctl.errors import (
     TimedOut,
     UsageError,
 )
-from perchctl.flight import FlyOptions, WallClock, capture_for_vehicle, check_options, session
+from perchctl.flight import FlyOptions, WallClock, check_options, session
 from perchctl.flight.session import opened_capture, started_feed
 from perchctl.link import CflibLink
 from perchctl.positioning import FeedStatus
-from perchctl.profile import LinkConfig, PositioningConfig, Profile, find_profile, load_profile
+from perchctl.profile import LinkConfig, PositioningConfig, find_profile, load_profile
 from perchctl.sim import CaptureFault, CaptureSettings, Scenario, SimProcess
 from perchctl.vehicle import ExternalPosition, Telemetry
-from tests.helpers.mission import READY, telemetry
+from tests.helpers.mission import READY, changed, telemetry
+from tests.helpers.waiting import until
 
 CONFIG = PositioningConfig(by="mocap", body="crazyflie", connect_timeout_s=10.0)
 NO_DECK = Scenario(extra={"external_position": 1.0})
 TURNED = CaptureSettings(heading_rad=2.0, origin_m=(1.5, -0.8, 0.0))
 """The room's world is not the one that a vehicle without positions would begin with."""
-
-
-def until(true: Callable[[], Any], limit_s: float = 20.0) -> Any:
-    end_s = time.monotonic() + limit_s
-    while not (value := true()):
-        assert time.monotonic() < end_s, "waited in vain"
-        time.sleep(0.01)
-    return value
 
 
 class Standing:
@@ -71,12 +64,8 @@ def test_a_body_that_moves_while_the_vehicle_stands_is_refused_before_it_is_used
     speed_mps: float,
 ) -> None:
     it: Any = Standing(speed_mps)
-    refused = contextlib.nullcontext()
-    if speed_mps:
-        refused = pytest.raises(
-            SafetyAbort, match=r"moved by 0\.1\d m in the motion capture, and th"
-        )
-    with refused:
+    refused = pytest.raises(SafetyAbort, match=r"moved by 0\.1\d m in the motion capture, and th")
+    with refused if speed_mps else contextlib.nullcontext():
         session._refuse_strange(it, it, it, load_profile("sim"))
     assert (it.t_s - 100.0 > 0.4) is (speed_mps == 0.0)
 
@@ -95,7 +84,9 @@ def fed(
     """As a flight's session does it."""
     clock = WallClock()
     with contextlib.ExitStack() as stack:
-        config = capture_for_vehicle(config, sim.capture)
+        assert sim.capture is not None
+        system, host = sim.capture
+        config = config.model_copy(update={"system": system, "host": host})
         capture = opened_capture(stack, config, clock)
         link = CflibLink(sim.uri, LinkConfig(), clock.now, positioning=config)
         try:
@@ -156,30 +147,24 @@ def test_what_is_no_position_is_named_on_the_ground(
         pass
 
 
-def mocap(**changes: Any) -> Profile:
-    profile = load_profile("sim")
-    config = profile.positioning.model_copy(update={"by": "mocap", **changes})
-    return profile.model_copy(update={"positioning": config})
-
-
-def options(profile: Profile, uri: str = "udp://127.0.0.1:1") -> FlyOptions:
+def options(changes: dict[str, Any], uri: str = "udp://127.0.0.1:1") -> FlyOptions:
+    profile = changed({"positioning.by": "mocap"} | changes, load_profile("sim"))
     return FlyOptions(profile, find_profile("sim"), uri, "http://127.0.0.1:1/x")
 
 
 def test_what_cannot_be_flown_is_refused_before_anything_is_opened(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    check_options(options(mocap(host="lab")))
-    check_options(options(mocap(), uri="sim://"))
+    lab = {"positioning.host": "lab"}
+    check_options(options(lab))
+    check_options(options({}, uri="sim://"))
     with pytest.raises(InvalidValue, match="the computer of the motion capture"):
-        check_options(options(mocap()))
-    profile = mocap(host="lab")
-    link = profile.link.model_copy(update={"parameters": {"stabilizer.estimator": 1}})
+        check_options(options({}))
     with pytest.raises(InvalidValue, match=r"stabilizer\.estimator to 1"):
-        check_options(options(profile.model_copy(update={"link": link})))
+        check_options(options(lab | {"link.parameters": {"stabilizer.estimator": 1}}))
     monkeypatch.setattr(session, "find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"pip install 'perchctl\[mocap\]'"):
-        check_options(options(mocap(), uri="sim://"))
+        check_options(options({}, uri="sim://"))
 
 
 @pytest.mark.long

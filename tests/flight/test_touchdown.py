@@ -28,15 +28,10 @@ from perchctl.mission.context import Context
 from perchctl.mission.imu import BLOW_MPS, Blow, Reckoning, reckoned
 from perchctl.mission.report import HARD_MPS, touchdown_of
 from perchctl.profile import load_profile
-from perchctl.record import (
-    FlightSummary,
-    read_log,
-    summary_text,
-)
+from perchctl.record import FlightSummary, read_log, summary_text
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
-from tests.flight.test_silent_loop import Guarded, hanging_camera
 from tests.helpers import log
-from tests.helpers.loop_rig import PROFILE, Broken, Rig, Vehicle
+from tests.helpers.loop_rig import PROFILE, Broken, Guarded, Rig, Vehicle, hanging_camera
 from tests.helpers.mission import HANG_Z_M, observation, state_in, telemetry
 
 HARD = Touchdown(0.9, 3.1)
@@ -173,22 +168,17 @@ def striking() -> Callable[[Telemetry], Telemetry]:
     return changed
 
 
-def land_at(clock: Callable[[], float], t_s: float) -> Callable[[], Operator]:
-    return lambda: Operator.LAND if clock() > t_s else Operator.NONE
-
-
-def test_the_planner_s_report_has_it() -> None:
-    link = Vehicle(striking())
-    report = Rig(link, operator=land_at(lambda: link.now_s, 4.0)).fly()
-    assert report.phase is Phase.LANDED
-    assert report.touchdown == HARD
-
-
-def test_what_the_watchdog_brought_down_is_in_the_report() -> None:
+@pytest.mark.parametrize("hung", [False, True])
+def test_the_report_has_it_whether_the_planner_or_the_watchdog_brought_it_down(hung: bool) -> None:
     link = Guarded(striking())
-    rig = Rig(link, hanging_camera(link, 12.0))
+    rig = Rig(link)
+    if hung:
+        rig.camera = hanging_camera(link, 12.0)
+    else:
+        rig.operator = lambda: Operator.LAND if link.now_s > 4.0 else Operator.NONE
     report = rig.fly()
-    assert link.own
+    assert bool(link.own) is hung
+    assert report.phase is Phase.LANDED
     assert report.touchdown == HARD
 
 
@@ -204,23 +194,6 @@ def test_the_rescue_says_so() -> None:
         rig.fly()
     note = next(e for e in rig.watcher.events if e.kind is EventKind.NOTE and "Broken" in e.reason)
     assert note.reason.endswith(f"; it {SENTENCE}")
-
-
-# --- What is told ---------------------------------------------------------------------------------
-
-
-def test_the_summary_tells_a_hard_touchdown_in_one_sentence() -> None:
-    landed = FlightSummary("landed", "the operator asked to land", touchdown=HARD)
-    assert f"\nvehicle:   {SENTENCE}" in summary_text(landed)
-    soft = FlightSummary("landed", "the operator asked to land", touchdown=Touchdown(0.3, 1.9))
-    assert "touched down" not in summary_text(soft)
-    assert soft.as_record()["touchdown_mps"] == 0.3
-
-
-def test_the_summary_tells_the_error_at_the_contact() -> None:
-    hangs = FlightSummary("perched", "hanging", contact=ContactError(1.8e-3, 0.6e-3))
-    assert "\ncontact:   1.8 +- 0.6 mm off centre" in summary_text(hangs)
-    assert hangs.as_record()["contact_sigma_m"] == 0.6e-3
 
 
 def test_an_attempt_that_failed_leaves_no_contact() -> None:
@@ -255,20 +228,27 @@ def test_blind_it_is_the_reckoned_speed_that_counts() -> None:
     assert carried.struck_mps == -0.2
 
 
-def test_log_show_and_log_report_tell_both(tmp_path: Path) -> None:
-    end = log.SUMMARY | FlightSummary(
-        "perched", "r", contact=ContactError(1.8e-3, 0.6e-3), touchdown=HARD
-    ).as_record() | {"outcome": "landed", "attempts": 1}  # fmt: skip
+# --- What is told ---------------------------------------------------------------------------------
+
+
+def test_all_that_tell_of_a_flight_tell_touchdown_and_contact(tmp_path: Path) -> None:
+    """The summary, `log show`, `log report` and the live page; a soft touchdown is not told."""
+    soft = FlightSummary("landed", "the operator asked to land", touchdown=Touchdown(0.3, 1.9))
+    assert "touched down" not in summary_text(soft)
+    assert soft.as_record()["touchdown_mps"] == 0.3
+    told = FlightSummary("perched", "r", contact=ContactError(1.8e-3, 0.6e-3), touchdown=HARD)
+    end = log.SUMMARY | told.as_record() | {"outcome": "landed", "attempts": 1}
     flown = read_log(log.write(tmp_path / "f.jsonl", summary=end))
     flight = FlightAnalysis(flown)
-    record, text, whole = show_record(flight), show_text(flight), ReportedFlight(flight)
-    assert "contact:   1.8 +- 0.6 mm off centre" in text
-    assert f"vehicle:   {SENTENCE}" in text
-    assert (record["contact_aside_m"], record["contact_sigma_m"]) == (1.8e-3, 0.6e-3)
-    assert (record["touchdown_mps"], record["touchdown_g"]) == (0.9, 3.1)
-    page = unescape(page_of([whole])).replace("\xa0", " ")
-    assert "1.8 +- 0.6 mm off centre" in page, page
+    for text in (summary_text(told), show_text(flight)):
+        assert "\ncontact:   1.8 +- 0.6 mm off centre" in text
+        assert f"\nvehicle:   {SENTENCE}" in text
+    for record in (told.as_record(), show_record(flight)):
+        assert (record["contact_aside_m"], record["contact_sigma_m"]) == (1.8e-3, 0.6e-3)
+        assert (record["touchdown_mps"], record["touchdown_g"]) == (0.9, 3.1)
+    whole = ReportedFlight(flight)
+    assert "1.8 +- 0.6 mm off centre" in unescape(page_of([whole])).replace("\xa0", " ")
     assert f"It {SENTENCE}" in [sentence.text for sentence in whole.story]
-    card = summary_card(FlightSummary.of(flown), flown.path)
-    assert ["contact", "1.8 +- 0.6 mm off centre"] in card["rows"]
-    assert ["vehicle", SENTENCE] in card["rows"]
+    rows = summary_card(FlightSummary.of(flown), flown.path)["rows"]
+    assert ["contact", "1.8 +- 0.6 mm off centre"] in rows
+    assert ["vehicle", SENTENCE] in rows

@@ -74,79 +74,71 @@ class Rig:
 # --- a loop that lives ----------------------------------------------------------------------
 
 
-def test_before_the_flight_nothing_is_sent() -> None:
-    dog = Watchdog(PROFILE, lambda: Operator.STOP)
-    assert dog.poll(1e6, telemetry(1e6)) is None
-
-
 @pytest.mark.parametrize("silent_s", [0.0, 0.02, 0.1, 0.29])
-def test_a_loop_that_lives_is_left_alone(silent_s: float) -> None:
+def test_a_loop_that_lives_or_has_not_begun_is_left_alone(silent_s: float) -> None:
     assert Rig().after(silent_s) is None
+    assert Watchdog(PROFILE, lambda: Operator.STOP).poll(1e6, telemetry(1e6)) is None
 
 
 # --- 0.3 s: the last safe setpoint ------------------------------------------------------------
 
-
-def test_the_last_setpoint_is_repeated_from_0_3_s_on_until_the_landing() -> None:
-    rig = Rig()
-    assert [rig.after(s) for s in SILENT_S] == [HOVER] * 3
-
-
-def test_a_setpoint_above_the_vehicle_is_held_at_its_height() -> None:
-    """Neither a climb nor a press goes on, and what is held is not asked anew each time."""
-    rig = Rig(replace(HOVER, z_m=1.8), z_m=1.0)
-    assert rig.after(0.31) == replace(HOVER, z_m=1.0)
-    rig.z_m = 0.7
-    assert rig.after(0.5) == replace(HOVER, z_m=1.0)
-
-
-def test_without_telemetry_it_is_the_height_of_the_last_turn() -> None:
-    rig = Rig(replace(HOVER, z_m=1.8), z_m=1.0)
-    old = telemetry(T_S, 5.0)
-    assert rig.poll(0.35, old) == replace(HOVER, z_m=1.0)
-    assert Rig(replace(HOVER, z_m=1.8), z_m=1.0).poll(0.35, None) == replace(HOVER, z_m=1.0)
-
-
-def test_while_it_sinks_a_setpoint_above_goes_on_braking() -> None:
-    """A catch that the loop has begun."""
-    catching = replace(HOVER, z_m=2.0)
-    rig = Rig(catching, z_m=1.0)
-    assert rig.after(0.31, velocity_mps=(0.0, 0.0, -0.5)) == catching
-    rig.z_m = 0.8
-    assert rig.after(0.5) == replace(HOVER, z_m=0.8)
+HIGH = replace(HOVER, z_m=1.8)
+HELD = replace(HOVER, z_m=1.0)
+"""At the vehicle's height: neither a climb nor a press goes on."""
+PRESSING = replace(AT_CEILING, phase=Phase.PERCH, contact_z_m=None, released_s=None)
+FALLS = {"velocity_mps": (0.0, 0.0, -0.8), "thrust": 1000.0, "acc_z_g": 0.1}
 
 
 @pytest.mark.parametrize("silent_s", SILENT_S)
-def test_what_hangs_still_in_the_release_keeps_its_raw_thrust(silent_s: float) -> None:
-    """By its acceleration, too, where the position's packets come no more."""
-    for behind_s in (0.0, 0.5):
-        rig = Rig(RELEASED, AT_CEILING, CEILING_M)
-        assert rig.after(silent_s, thrust=1000.0, behind_s=behind_s) == RELEASED
+@pytest.mark.parametrize(("command", "state", "z_m", "changes", "held"), [
+    (HOVER, IN_AIR, 1.0, {}, HOVER),
+    (HIGH, IN_AIR, 1.0, {}, HELD),
+    # A catch that the loop has begun goes on braking.
+    (replace(HOVER, z_m=2.0), IN_AIR, 1.0, {"velocity_mps": (0.0, 0.0, -0.5)},
+     replace(HOVER, z_m=2.0)),
+    # What hangs still in the release keeps its raw thrust, by its acceleration, too, where the
+    # position's packets come no more.
+    (RELEASED, AT_CEILING, CEILING_M, {"thrust": 1000.0}, RELEASED),
+    (RELEASED, AT_CEILING, CEILING_M, {"thrust": 1000.0, "behind_s": 0.5}, RELEASED),
+    # A raw press goes on in contact, and becomes a hold in the air.
+    (RawThrust(60000), PRESSING, CEILING_M, {}, RawThrust(60000)),
+    (RawThrust(60000), PRESSING, 1.9, {"velocity_mps": (0.0, 0.0, 0.2)},
+     PositionSetpoint(0.0, 0.0, 1.9, 0.0)),
+])  # fmt: skip
+def test_the_last_safe_setpoint_is_held_until_the_landing(
+    silent_s: float, command: Command, state: PlannerState, z_m: float,
+    changes: dict[str, object], held: Command,
+) -> None:  # fmt: skip
+    assert Rig(command, state, z_m).after(silent_s, **changes) == held
+
+
+def test_what_is_held_is_not_asked_anew_each_time() -> None:
+    rig = Rig(HIGH, z_m=1.0)
+    assert rig.after(0.31) == HELD
+    rig.z_m = 0.7
+    assert rig.after(0.5) == HELD
+
+
+@pytest.mark.parametrize("newest", [None, telemetry(T_S, 5.0)])
+def test_without_telemetry_it_is_the_height_of_the_last_turn(newest: Telemetry | None) -> None:
+    assert Rig(HIGH, z_m=1.0).poll(0.35, newest) == HELD
 
 
 def test_a_slip_while_the_loop_is_silent_is_caught_then_landed() -> None:
     rig = Rig(RELEASED, AT_CEILING, CEILING_M)
     rig.z_m = CEILING_M - 0.05
-    falls = {"velocity_mps": (0.0, 0.0, -0.8), "thrust": 1000.0, "acc_z_g": 0.1}
-    rig.after(0.33, **falls)
-    caught = rig.after(0.35, **falls)
+    rig.after(0.33, **FALLS)
+    caught = rig.after(0.35, **FALLS)
     assert caught == PositionSetpoint(0.0, 0.0, min(rig.z_m + CATCH_STILL_ABOVE_M, 3.0), 0.0)
     rig.z_m = CEILING_M - 0.4
     for i in range(6):
-        assert isinstance(rig.after(0.4 + 0.05 * i, **falls), PositionSetpoint)
+        assert isinstance(rig.after(0.4 + 0.05 * i, **FALLS), PositionSetpoint)
     for i in range(60):
         command = rig.after(0.7 + 0.05 * i)
         if isinstance(command, Land):
             return
         assert isinstance(command, (PositionSetpoint, type(None)))
     raise AssertionError("it was never landed")
-
-
-def test_a_raw_press_goes_on_in_contact_and_becomes_a_hold_in_the_air() -> None:
-    pressing = replace(AT_CEILING, phase=Phase.PERCH, contact_z_m=None, released_s=None)
-    assert Rig(RawThrust(60000), pressing, CEILING_M).after(0.31) == RawThrust(60000)
-    rising = Rig(RawThrust(60000), pressing, 1.9)
-    assert rising.after(0.31, velocity_mps=(0.0, 0.0, 0.2)) == PositionSetpoint(0, 0, 1.9, 0.0)
 
 
 # --- 1.0 s: a landing ---------------------------------------------------------------------------
@@ -181,8 +173,7 @@ def test_what_stands_with_its_motors_off_is_not_started_again() -> None:
 
 def test_from_the_ceiling_it_peels_off_before_it_lands() -> None:
     """A landing that runs by its clock while the magnet holds ends with a fall."""
-    pressing = replace(AT_CEILING, phase=Phase.PERCH, contact_z_m=None, released_s=None)
-    rig = Rig(replace(HOVER, z_m=2.25), pressing, CEILING_M)
+    rig = Rig(replace(HOVER, z_m=2.25), PRESSING, CEILING_M)
     for silent_s in (1.1, 1.15, 1.2):
         command = rig.after(silent_s)
         assert isinstance(command, PositionSetpoint)
@@ -214,16 +205,9 @@ def test_only_stops_after_the_motors_were_stopped_for_good() -> None:
     assert all(command in (None, StopMotors()) for command in sent)
 
 
-def test_nothing_after_the_flight() -> None:
-    for motors_off in (True, False):
-        rig = Rig()
-        rig.dog.end(motors_off=motors_off)
-        assert [rig.after(s) for s in (0.5, 1.1, 9.0)] == [None] * 3
-
-
 def test_a_loop_that_revives_is_believed_and_a_second_silence_begins_anew() -> None:
-    rig = Rig(replace(HOVER, z_m=1.8))
-    assert rig.after(0.5) == replace(HOVER, z_m=1.0)
+    rig = Rig(HIGH)
+    assert rig.after(0.5) == HELD
     rig.turn(T_S + 0.6)
     assert rig.after(0.65) is None
     rig.z_m = 0.6
@@ -264,10 +248,15 @@ def release_in_vain(rig: Rig, from_s: float, to_s: float, **changes: object) -> 
     return sent
 
 
+def in_vain() -> Rig:
+    """A loop that fell silent as it peeled off in vain: what hangs is let go, monitored."""
+    below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
+    return Rig(below, replace(AT_CEILING, released_s=None), CEILING_M)
+
+
 def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
     """A loop that hangs for ever would else leave it there with turning motors."""
-    below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
-    rig = Rig(below, replace(AT_CEILING, released_s=None), CEILING_M)
+    rig = in_vain()
     sent = release_in_vain(rig, 1.1, 9.0)
     raw = [c.thrust for c in sent if isinstance(c, RawThrust)]
     assert raw == sorted(raw, reverse=True)
@@ -279,44 +268,35 @@ def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
 
 
 def test_late_telemetry_stops_nothing_that_was_let_go() -> None:
-    below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
-    rig = Rig(below, replace(AT_CEILING, released_s=None), CEILING_M)
+    rig = in_vain()
     sent = [rig.poll(1.1 + 0.02 * i, telemetry(T_S + 0.9 + 0.02 * i, CEILING_M, thrust=20000.0))
             for i in range(300)]  # fmt: skip
     assert StopMotors() not in sent
 
 
 def test_what_slips_as_it_is_let_go_is_caught() -> None:
-    below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
-    rig = Rig(below, replace(AT_CEILING, released_s=None), CEILING_M)
+    rig = in_vain()
     release_in_vain(rig, 1.1, 2.6)
-    falls = {
-        "position_m": (0.0, 0.0, CEILING_M - 0.02),
-        "velocity_mps": (0.0, 0.0, -0.3),
-        "acc_z_g": 0.1,
-    }
-    caught = rig.after(2.62, thrust=1000.0, **falls)
+    rig.z_m = CEILING_M - 0.02
+    caught = rig.after(2.62, **(FALLS | {"velocity_mps": (0.0, 0.0, -0.3)}))
     assert isinstance(caught, PositionSetpoint)
     assert caught.z_m > CEILING_M
 
 
-@pytest.mark.parametrize("closing", ["rescue", "closing"])
-def test_the_operators_stop_cuts_at_once_after_the_loop(closing: str) -> None:
+# --- after the flight ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("closing", ["rescue", "closing", "motors off"])
+def test_after_the_loop_only_the_operators_stop_cuts_and_at_once(closing: str) -> None:
+    """A perched vehicle is not locked by a late stop."""
     rig = Rig()
     if closing == "rescue":
         rig.dog.rescuing()
     else:
-        rig.dog.end(motors_off=False)
-    assert rig.after(0.01) is None
+        rig.dog.end(motors_off=closing == "motors off")
+    assert [rig.after(s) for s in (0.01, 0.5, 1.1, 9.0)] == [None] * 4
     rig.operator = Operator.STOP
-    assert rig.after(0.02) == EmergencyStop()
-
-
-def test_a_perched_vehicle_is_not_locked_by_a_late_stop() -> None:
-    rig = Rig(StopMotors(), replace(AT_CEILING, stopped_s=T_S), CEILING_M)
-    rig.dog.end(motors_off=True)
-    rig.operator = Operator.STOP
-    assert rig.after(1.0) is None
+    assert rig.after(9.02) == (None if closing == "motors off" else EmergencyStop())
 
 
 @pytest.mark.parametrize("by_planner", [True, False])

@@ -20,6 +20,7 @@ from perchctl.mission import (
     Operator,
     Phase,
     Rest,
+    SentCommand,
     Tick,
     planner,
 )
@@ -124,6 +125,32 @@ class Vehicle(ScriptedLink):
         return [t_s for t_s, command in self.sent if isinstance(command, kind)]
 
 
+HANG_AT_S = 2.5
+
+
+class Guarded(Vehicle):
+    """A scripted vehicle whose link asks the watchdog every 50 ms, as the real ones do."""
+
+    watchdog: Any = None
+
+    def __init__(self, changed: Callable[[Telemetry], Telemetry | None] = lambda s: s) -> None:
+        super().__init__(changed)
+        self.own: list[tuple[float, Command]] = []
+        self._asked_s = 0.0
+
+    def advance_to(self, t_s: float) -> None:
+        while self.now_s < t_s - 1e-9:
+            super().advance_to(min(self.now_s + 0.01, t_s))
+            if self.watchdog is not None and self.now_s >= self._asked_s + 0.05 - 1e-9:
+                self._asked_s = self.now_s
+                arrived = [s for s in self._samples if s.t_s <= self.now_s - 0.01]
+                command = self.watchdog.poll(self.now_s, arrived[-1] if arrived else None)
+                if command is not None:
+                    self.own.append((self.now_s, command))
+                    self.send(command)
+                    self.told(SentCommand(self.now_s, "watchdog", command))
+
+
 class Clock:
     def __init__(self, link: ScriptedLink) -> None:
         self._link = link
@@ -184,6 +211,19 @@ class Camera:
 
     def close(self) -> None:
         return None
+
+
+def hanging_camera(link: Vehicle, for_s: float) -> Camera:
+    """One that takes `for_s` for one of its pictures."""
+    hung: list[bool] = []
+
+    def hang(frame: Frame) -> Frame:
+        if not hung and frame.t_arrival_s > HANG_AT_S:
+            hung.append(True)
+            link.advance_to(link.now_s + for_s)
+        return frame
+
+    return Camera(hang)
 
 
 @dataclass
@@ -251,3 +291,11 @@ class Rig:
         with pytest.raises(error, match=words):
             self.fly()
         assert not [c for _, c in self.link.sent if not isinstance(c, Idle)]
+
+
+def hung_rig(for_s: float) -> tuple[Rig, Guarded]:
+    """A loop whose camera hangs at `HANG_AT_S`, and whose operator lands two seconds later."""
+    link = Guarded()
+    rig = Rig(link, hanging_camera(link, for_s))
+    rig.operator = lambda: Operator.LAND if link.now_s > HANG_AT_S + 2.0 + for_s else Operator.NONE
+    return rig, link

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterable
 
 from perchctl.errors import ConnectionFailed
-from perchctl.link import Guard, SentCallback, ignore_sent
+from perchctl.link.protocol import Guard, SentCallback, ignore_sent
 from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
 
 

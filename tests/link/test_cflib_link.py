@@ -1,4 +1,5 @@
-"""`CflibLink` on an unmodified cflib, against the simulated Crazyflie in real time.
+"""`CflibLink` on an unmodified cflib, against the simulated Crazyflie in real time: connected,
+flown, left, and lost in flight (over a radio: `tests.link.test_radio`).
 
 Waiting is always for the vehicle's own simulated time or state, and bounded.
 """
@@ -6,7 +7,6 @@ Waiting is always for the vehicle's own simulated time or state, and bounded.
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,14 +19,17 @@ from tests.helpers.waiting import until
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
-from perchctl.link import CflibLink
-from perchctl.link.cflib_link import LANDING_WAIT_S, SILENCE_S, EstimateLink
+from perchctl.link import CflibLink, MockLink
+from perchctl.link.cflib_link import LANDING_WAIT_S, SILENCE_S
+from perchctl.link.connection import Connection
+from perchctl.link.listening import ListeningLink
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
-from perchctl.sim import Scenario, SimProcess
+from perchctl.sim import Scenario, SimProcess, SimulatedVehicle
 from perchctl.vehicle import (
     CAN_FLY,
     FLYING,
+    FRESH_S,
     LOCKED,
     EmergencyStop,
     Idle,
@@ -35,14 +38,16 @@ from perchctl.vehicle import (
     RawThrust,
     StopMotors,
     Telemetry,
+    is_cut,
+    may_fly,
 )
+from tests.helpers.mission import AIRBORNE, READY, telemetry
 
 CONFIG = LinkConfig(parameters={"stabilizer.estimator": 2})
 LOW_CEILING = Scenario(mass_kg=0.036, ceiling_z_m=0.9)
-WAIT_S = 20.0
-PAUSE = threading.Event()
-PITCH_PORT = 3  # raw setpoints: attitude and thrust
-COMMAND_PORTS = (PITCH_PORT, 7, 8, 9)
+RAW_PORT = 3  # raw setpoints: attitude and thrust
+COMMAND_PORTS = (RAW_PORT, 7, 8, 9)
+LAND = Land(-0.05, 1.5)
 
 
 def let_pass(sim: SimProcess, dt_s: float, meanwhile: Callable[[], None] = lambda: None) -> None:
@@ -58,6 +63,10 @@ def let_pass(sim: SimProcess, dt_s: float, meanwhile: Callable[[], None] = lambd
 
 def info(sim: SimProcess) -> int:
     return int(sim.truth()["supervisor_info"])
+
+
+def motors_off(sim: SimProcess) -> bool:
+    return max(sim.truth()["motors"]) == 0
 
 
 @pytest.fixture(scope="module")
@@ -93,28 +102,17 @@ def cf(link: CflibLink) -> Any:
     return link.connection.cf
 
 
-def commands_sent(link: CflibLink) -> list[int]:
-    """Collects the ports of the packets that command the vehicle from now on."""
-    ports: list[int] = []
+def commands_sent(link: CflibLink, sim: SimProcess) -> list[tuple[int, int]]:
+    """Collects the port of each packet that commands the vehicle from now on, and the supervisor's
+    bits when it goes out."""
+    sent: list[tuple[int, int]] = []
 
     def note(packet: Any) -> None:
         if packet.port in COMMAND_PORTS:
-            ports.append(packet.port)
+            sent.append((packet.port, info(sim)))
 
     cf(link).packet_sent.add_callback(note)
-    return ports
-
-
-def sent_raw(link: CflibLink, sim: SimProcess) -> list[int]:
-    """Collects the supervisor's bits at each raw setpoint that goes out from now on."""
-    bits: list[int] = []
-
-    def note(packet: Any) -> None:
-        if packet.port == PITCH_PORT:
-            bits.append(info(sim))
-
-    cf(link).packet_sent.add_callback(note)
-    return bits
+    return sent
 
 
 class Nobody:
@@ -139,12 +137,16 @@ def take_off(link: CflibLink, sim: SimProcess) -> None:
 # --- On the ground ----------------------------------------------------------------------------
 
 
-def test_connecting_sets_parameters_and_reads_them_back(sim: SimProcess) -> None:
+def test_connecting_sets_parameters_and_idle_sends_nothing(sim: SimProcess) -> None:
     config = LinkConfig(parameters={"stabilizer.estimator": 1, "ctrlMel.mass": 0.031})
     with linked(sim, config) as link:
         assert cf(link).param.get_value("stabilizer.estimator") == "1"
         assert float(cf(link).param.get_value("ctrlMel.mass")) == pytest.approx(0.031)
         assert link.problem(time.monotonic()) is None
+        sent = commands_sent(link, sim)
+        link.send(Idle())
+        let_pass(sim, 0.2)
+        assert sent == []
 
 
 @pytest.mark.parametrize(
@@ -160,13 +162,18 @@ def test_wrong_parameters_are_refused(
     config = LinkConfig(parameters={name: value})
     with pytest.raises(error, match=words), linked(sim, config):
         pass
-    assert max(sim.truth()["motors"]) == 0
+    assert motors_off(sim)
 
 
-def test_telemetry_is_si_and_right_handed(sim: SimProcess) -> None:
+def test_telemetry_is_si_right_handed_and_in_the_loop_s_time(sim: SimProcess) -> None:
     """Firmware facts, "Signs and units": the Crazyflie's pitch is nose up, ours nose down."""
     with linked(sim) as link:
         assert newest(link).has(CAN_FLY)
+        let_pass(sim, 0.5)
+        times = [sample.t_s for sample in link.telemetry()]
+        assert len(times) > 20
+        assert times == sorted(times)
+        assert max(times) <= time.monotonic()
         sim.set_pose((0.1, -0.2, 0.5), (0.15, 0.25, 0.6), hold=True)
         true = until(lambda: sim.truth())
         assert true["rpy_rad"] == pytest.approx((0.15, 0.25, 0.6), abs=1e-3)
@@ -187,17 +194,6 @@ def test_telemetry_is_si_and_right_handed(sim: SimProcess) -> None:
         assert sample.acc_z_g == pytest.approx(true["specific_force_mps2"][2] / 9.81, abs=0.1)
 
 
-def test_telemetry_comes_in_order_and_in_the_loops_time(sim: SimProcess) -> None:
-    with linked(sim) as link:
-        let_pass(sim, 0.5)
-        samples = link.telemetry()
-        times = [s.t_s for s in samples]
-        assert len(times) > 20
-        assert times == sorted(times)
-        assert max(times) <= time.monotonic()
-        assert link.telemetry() == [] or link.telemetry()[0].t_s > times[-1]
-
-
 @pytest.mark.long
 def test_a_silent_link_is_reported(sim: SimProcess) -> None:
     with linked(sim) as link:
@@ -210,15 +206,37 @@ def test_a_silent_link_is_reported(sim: SimProcess) -> None:
         until(lambda: link.problem(time.monotonic()) is None)
 
 
-def test_idle_sends_nothing(sim: SimProcess) -> None:
+def test_a_vehicle_that_has_started_anew_is_known_by_its_samples(sim: SimProcess) -> None:
+    """By its stamps over the radio; simulated in lockstep, by the firmware's own clock."""
     with linked(sim) as link:
-        sent = commands_sent(link)
-        link.send(Idle())
-        let_pass(sim, 0.2)
-        assert sent == []
+        let_pass(sim, 2.0)
+        assert newest(link).start == 0
+        sim.reboot()
+        until(lambda: any(sample.start == 1 for sample in link.telemetry()))
+    vehicle = SimulatedVehicle(LOW_CEILING)
+    mock = MockLink(vehicle)
+    mock.advance_to(0.5)
+    assert mock.telemetry()[-1].start == 0
+    vehicle.firmware.reboot()
+    mock.advance_to(1.0)
+    assert mock.telemetry()[-1].start == 1
 
 
-# --- In the air -------------------------------------------------------------------------------
+# --- In the air, and left ---------------------------------------------------------------------
+
+
+def test_what_is_unknown_flies() -> None:
+    """Motors off for less than two seconds are no flight, but no reason for a farewell either."""
+    standing = telemetry(10.0, 0.0, supervisor=READY, thrust=0.0)
+    locked = telemetry(10.0, supervisor=LOCKED, thrust=0.0)
+    old_s = 10.0 + FRESH_S + 0.01
+    assert may_fly(None, 10.0)
+    assert may_fly(standing, old_s)
+    assert not may_fly(standing, 10.1)
+    assert may_fly(telemetry(10.0, 2.0, supervisor=AIRBORNE, thrust=0.0), 10.0)
+    assert not is_cut(None, 10.0)
+    assert is_cut(locked, 10.1)
+    assert not is_cut(locked, old_s)
 
 
 @pytest.mark.long
@@ -245,13 +263,13 @@ def test_raw_thrust_works_and_a_perched_vehicle_is_left_unlocked(sim: SimProcess
 
         until(rise)
         link.send(StopMotors())
-        until(lambda: max(sim.truth()["motors"]) == 0)
+        until(lambda: motors_off(sim))
         assert info(sim) & FLYING
-        raw, told = sent_raw(link, sim), told_by(link)
+        sent, told = commands_sent(link, sim), told_by(link)
         link.close()
         assert [(each.by, each.command) for each in told] == [("farewell", RawThrust(0))]
-        until(lambda: raw)  # cflib's farewell: on a busy computer `close` does not wait for it
-        assert not any(bits & FLYING for bits in raw)
+        until(lambda: sent)  # cflib's farewell: on a busy computer `close` does not wait for it
+        assert not any(port == RAW_PORT and bits & FLYING for port, bits in sent)
         let_pass(sim, 2.5)
         assert not info(sim) & LOCKED
         assert sim.truth()["magnet_engaged"]
@@ -261,13 +279,12 @@ def test_raw_thrust_works_and_a_perched_vehicle_is_left_unlocked(sim: SimProcess
 def test_closing_waits_for_the_landing(sim: SimProcess) -> None:
     with linked(sim) as link:
         take_off(link, sim)
-        raw = sent_raw(link, sim)
+        sent = commands_sent(link, sim)
         link.send(Land(-0.05, 1.0))
         link.close()
-        assert not any(bits & FLYING for bits in raw)
-        truth = sim.truth()
-        assert truth["floor_contact"]
-        assert max(truth["motors"]) == 0
+        assert not any(port == RAW_PORT and bits & FLYING for port, bits in sent)
+        assert sim.truth()["floor_contact"]
+        assert motors_off(sim)
         let_pass(sim, 2.2)
         assert not info(sim) & LOCKED
 
@@ -279,16 +296,16 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
     may send one."""
     with linked(sim, landing_wait_s=1.0) as link:
         take_off(link, sim)
-        raw, told = sent_raw(link, sim), told_by(link)
+        sent, told = commands_sent(link, sim), told_by(link)
         link.close()  # nobody lands it: waits, gives up
-        assert (raw, told) == ([], [])
+        assert (sent, told) == ([], [])
         assert sim.truth()["position_m"][2] > 0.3
         second = CflibLink(sim.uri, CONFIG, time.monotonic)
         with pytest.raises(ConnectionFailed, match="flying already: land it"):
             second.connect()
-        listener = EstimateLink(sim.uri, CONFIG, time.monotonic)
+        listener = ListeningLink(sim.uri, CONFIG, time.monotonic)
         listener.connect()
-        sent = commands_sent(listener)
+        sent = commands_sent(listener, sim)
         assert newest(listener).has(FLYING)
         listener.close()
         assert sent == []
@@ -298,8 +315,70 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
 
 
 @pytest.mark.long
-def test_the_emergency_stop_cuts_and_locks(sim: SimProcess) -> None:
+def test_closing_sends_no_zero_setpoint_when_nothing_is_known_any_more(sim: SimProcess) -> None:
+    """The last sample shows a vehicle on the ground; what it does since then is unknown."""
+    with linked(sim, landing_wait_s=0.5) as link:
+        assert not newest(link).has(FLYING)
+        sent = commands_sent(link, sim)
+        sim.silence(2.5)
+        until(lambda: link.problem(time.monotonic()))
+        link.close()
+        assert sent == []
+    let_pass(sim, 1.0)  # for who comes next
+
+
+def test_a_failed_look_at_the_estimate_commands_nothing(sim: SimProcess) -> None:
+    sent: list[list[tuple[int, int]]] = []
+
+    class Failing(ListeningLink):
+        def _prepare(self, connection: Connection) -> None:
+            super()._prepare(connection)
+            sent.append(commands_sent(self, sim))
+            raise ConnectionFailed("by the test")
+
+    with pytest.raises(ConnectionFailed, match="by the test"):
+        Failing(sim.uri, CONFIG, time.monotonic).connect()
+    assert sent == [[]]
+
+
+# --- Lost in flight --------------------------------------------------------------------------
+
+
+def lose(link: CflibLink) -> None:
+    """As a driver ends."""
+    cf(link).link.link_error_callback("unplugged")
+    assert link.problem(time.monotonic()) == "unplugged"
+
+
+@pytest.mark.long
+def test_a_lost_link_is_opened_again_for_the_landing_and_for_the_stop(sim: SimProcess) -> None:
     with linked(sim) as link:
         take_off(link, sim)
+        lose(link)
+        link.send(LAND)
+        until(lambda: sim.truth()["floor_contact"] and motors_off(sim))
+        assert not info(sim) & LOCKED
+        until(lambda: link.problem(time.monotonic()) is None)
+        until(lambda: time.monotonic() - newest(link).t_s < 0.3)  # the blocks go on
+        take_off(link, sim)
+        lose(link)
         link.send(EmergencyStop())
-        until(lambda: max(sim.truth()["motors"]) == 0 and info(sim) & LOCKED)
+        until(lambda: info(sim) & LOCKED)
+        assert motors_off(sim)
+
+
+def test_a_link_that_cannot_be_opened_again_holds_up_nobody(
+    sim: SimProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import cflib.crtp
+
+    def gone(*_: object) -> object:
+        raise OSError("no dongle")
+
+    with linked(sim, landing_wait_s=0.2) as link:
+        monkeypatch.setattr(cflib.crtp, "get_link_driver", gone)
+        lose(link)
+        began_s = time.monotonic()
+        link.send(LAND)
+        assert time.monotonic() - began_s < 0.2
+        assert link.problem(time.monotonic()) == "unplugged"

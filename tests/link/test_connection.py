@@ -1,14 +1,19 @@
-"""What a `Connection` finds out about cflib's driver, without a vehicle.
+"""What a `Connection` finds out about cflib's driver and sends through its lock, without a vehicle;
+and that a vehicle is one program's at a time.
 
 Time is the test's own: the clock that `perchctl.link.connection` reads.
 """
 
 from __future__ import annotations
 
+import contextlib
+import queue
+import socket
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,17 +23,37 @@ import cflib.crtp
 import pytest
 from cflib.crtp import radiodriver
 
-from perchctl.link import Packet, Port
+from perchctl.errors import ConnectionFailed, InvalidValue
+from perchctl.link import CflibLink, Packet, Port
 from perchctl.link import connection as room
-from perchctl.link.connection import DEAD_S, Connection
+from perchctl.link.connection import (
+    DEAD_S,
+    Connection,
+    claim_vehicle,
+    open_connection,
+    plain_cause,
+    send_packets,
+)
+from perchctl.link.crtp import encode_external
+from perchctl.profile import LinkConfig
+from perchctl.vehicle import ExternalPosition
+from tests.helpers.waiting import until
 
 PACKET = Packet(Port.SUPERVISOR, 1, b"\x03")
 STEP_S = 0.05
 LIMIT_S = 5.0
+RADIO = "radio://0/80/2M/E7E7E7E701"
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path
 
 
 class Thread:
-    """Of a driver, as cflib's radio has it."""
+    """The thread of a driver, as cflib's radio has it."""
 
     def __init__(self) -> None:
         self.alive = True
@@ -39,14 +64,28 @@ class Thread:
 
 
 class Driver:
+    """A link of cflib's that can hang, fail, or have no room."""
+
     needs_resending = False
 
     def __init__(self) -> None:
-        self._thread: Thread | None = Thread()
-        self.sent: list[Any] = []
+        self._thread: Any = Thread()
+        self.sent: list[bytes] = []
+        self.out_queue: queue.Queue[Any] = queue.Queue(1)
+        self.entered, self.free, self.listened = (threading.Event() for _ in range(3))
+        self.free.set()
+        self.error: Exception | None = None
 
     def send_packet(self, packet: Any) -> None:
-        self.sent.append(packet)
+        if self.error is not None:
+            raise self.error
+        self.entered.set()
+        assert self.free.wait(LIMIT_S)
+        self.sent.append(bytes(packet.data))
+
+    def receive_packet(self, wait: float) -> None:
+        self.listened.set()
+        time.sleep(min(wait, 0.02))
 
     def close(self) -> None:
         return None
@@ -56,6 +95,7 @@ class Driver:
 class Bench:
     connection: Connection
     driver: Driver
+    link: CflibLink
     now_s: float = 100.0
 
     def is_dead_within(self, for_s: float, lost_packets: int = 0, period_s: float = STEP_S) -> bool:
@@ -63,28 +103,45 @@ class Bench:
         dead = False
         for _ in range(round(for_s / period_s)):
             self.now_s += period_s
-            if self.driver._thread is not None and self.driver._thread._retry_before_disconnect:
-                self.driver._thread._retry_before_disconnect -= lost_packets
+            self.driver._thread._retry_before_disconnect -= lost_packets
             dead = dead or self.connection.is_dead()
         return dead
 
+    def place(self, x_m: float) -> bool:
+        """Hand over a position from outside."""
+        return self.link.external(at(x_m))
+
+
+def at(x_m: float) -> ExternalPosition:
+    return ExternalPosition((x_m, 0.0, 0.5))
+
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    bench = Bench(Connection(), Driver())
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    bench = Bench(Connection(), Driver(), CflibLink("udp://127.0.0.1:1", LinkConfig(), lambda: 0.0))
     bench.connection.cf.link = bench.driver
     bench.connection.cf.link_uri = "radio://0/80/2M/E7E7E7E7E7"
+    bench.link.connection = bench.connection
     clock = SimpleNamespace(monotonic=lambda: bench.now_s, sleep=time.sleep)
     monkeypatch.setattr(room, "time", clock)
     return bench
 
 
-def test_a_radio_that_counts_what_it_loses_is_alive_however_long(bench: Bench) -> None:
+def reopened(bench: Bench, monkeypatch: pytest.MonkeyPatch, driver: Any) -> None:
+    """Gives up the driver, and waits until the connection has the next one."""
+    monkeypatch.setattr(cflib.crtp, "get_link_driver", driver)
+    bench.connection.reopen("unplugged")
+    until(lambda: bench.connection.lost is None, LIMIT_S)
+
+
+# --- A driver that takes nothing ---------------------------------------------------------------
+
+
+def test_a_radio_that_counts_what_it_loses_is_alive_and_one_that_counts_nothing_is_dead(
+    bench: Bench,
+) -> None:
     assert not bench.is_dead_within(100.0, lost_packets=25)
-
-
-def test_one_that_counts_nothing_is_dead(bench: Bench) -> None:
+    bench.now_s += 1.0
     assert not bench.is_dead_within(DEAD_S)
     assert bench.is_dead_within(2 * STEP_S)
 
@@ -95,7 +152,6 @@ def test_between_two_questions_that_lie_far_apart_it_may_have_counted(bench: Ben
 
 
 def test_one_whose_thread_has_ended_is_dead(bench: Bench) -> None:
-    assert bench.driver._thread is not None
     bench.driver._thread.alive = False
     assert bench.connection.is_dead()
 
@@ -118,9 +174,7 @@ def test_a_lock_that_is_never_free_is_a_dead_link_and_a_reopened_one_has_its_own
     bench.now_s += DEAD_S + 0.01
     assert not connection.send(PACKET)
     assert connection.is_dead()
-    monkeypatch.setattr(cflib.crtp, "get_link_driver", lambda *_: after)
-    connection.reopen("stuck")
-    await_open(connection)
+    reopened(bench, monkeypatch, lambda *_: after)
     assert connection.send(PACKET)
     assert (len(bench.driver.sent), len(after.sent)) == (0, 1)
     assert not connection.is_dead()
@@ -130,29 +184,17 @@ def test_cflib_listens_to_a_new_driver_at_once(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By itself it looks for one once a second."""
-    connection, listened, pause = bench.connection, threading.Event(), threading.Event()
+    after = Driver()
 
-    class Heard(Driver):
-        def receive_packet(self, wait: float) -> None:
-            listened.set()
-            pause.wait(wait)
+    def late(*_: Any) -> Driver:
+        time.sleep(0.2)
+        return after
 
-    def driver(*_: Any) -> Driver:
-        pause.wait(0.2)
-        return Heard()
-
-    connection.cf.link = Heard()
-    connection.cf.incoming.start()
-    assert listened.wait(LIMIT_S)
-    monkeypatch.setattr(cflib.crtp, "get_link_driver", driver)
-    connection.reopen("unplugged")
-    pause.set()
-    pause.clear()
-    listened.clear()
-    await_open(connection)
-    assert listened.wait(0.4)
-    connection.cf.incoming.stop()
-    pause.set()
+    bench.connection.cf.incoming.start()
+    assert bench.driver.listened.wait(LIMIT_S)
+    reopened(bench, monkeypatch, late)
+    assert after.listened.wait(0.4)
+    bench.connection.cf.incoming.stop()
 
 
 def test_a_dead_thread_of_a_dongles_is_not_opened_again(
@@ -167,19 +209,157 @@ def test_a_dead_thread_of_a_dongles_is_not_opened_again(
         found.append(radios[0])
         return Driver()
 
-    monkeypatch.setattr(cflib.crtp, "get_link_driver", driver)
-    bench.connection.reopen("unplugged")
-    await_open(bench.connection)
+    reopened(bench, monkeypatch, driver)
     assert found == [None]
 
 
-def await_open(connection: Connection) -> None:
-    pause = threading.Event()
-    for _ in range(int(LIMIT_S / 0.01)):
-        if connection.lost is None:
-            return
-        pause.wait(0.01)
-    raise AssertionError(connection.lost)
+# --- Positions from outside, through cflib's lock ----------------------------------------------
+
+
+def test_a_position_does_not_wait_behind_a_command_that_hangs(bench: Bench) -> None:
+    driver, packets = bench.driver, [encode_external(at(0))]
+    driver.free.clear()
+    hanging = threading.Thread(target=send_packets, args=(bench.connection.cf, packets))
+    hanging.start()
+    assert driver.entered.wait(LIMIT_S)
+    assert [bench.place(1.0), bench.place(2.0)] == [False, False]
+    driver.free.set()
+    hanging.join(LIMIT_S)
+    assert bench.place(3.0) is True
+    assert driver.sent == [encode_external(at(x)).data for x in (0.0, 3.0)]
+
+
+def test_a_position_does_not_wait_in_the_radio_s_queue(bench: Bench) -> None:
+    bench.driver.out_queue.put("what the radio repeats until it is acknowledged")
+    assert bench.place(1.0) is False
+    bench.driver.out_queue.get()
+    assert bench.place(2.0) is True
+    assert bench.driver.sent == [encode_external(at(2.0)).data]
+
+
+def test_an_error_of_the_driver_leaves_the_lock_to_the_commands(bench: Bench) -> None:
+    bench.driver.error = RuntimeError("unplugged")
+    assert bench.place(1.0) is False
+    bench.driver.error = None
+    send_packets(bench.connection.cf, [encode_external(at(2.0))])
+    assert len(bench.driver.sent) == 1
+
+
+def test_no_position_goes_out_without_a_link(bench: Bench) -> None:
+    bench.connection.lost = "gone"
+    assert bench.place(1.0) is False
+    bench.connection.lost, bench.connection.cf.link = None, None
+    assert bench.place(1.0) is False
+    bench.link.connection = None
+    assert bench.place(1.0) is False
+    assert bench.place(1e300) is False
+    assert bench.driver.sent == []
+
+
+# --- One program at a time ----------------------------------------------------------------------
+
+_HOLDS = """
+import sys
+from perchctl.link.connection import claim_vehicle
+held = claim_vehicle(sys.argv[1])
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+@contextlib.contextmanager
+def another_program(uri: str) -> Iterator[subprocess.Popen[str]]:
+    """One that holds the vehicle, until it is killed."""
+    child = subprocess.Popen(
+        [sys.executable, "-c", _HOLDS, uri],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "held\n"
+        yield child
+    finally:
+        child.kill()
+        child.communicate()
+
+
+def test_a_second_program_is_refused_and_told_who_has_it_until_that_one_is_gone() -> None:
+    with another_program(RADIO) as child:
+        with pytest.raises(ConnectionFailed, match=f"process {child.pid}: "):
+            claim_vehicle(RADIO.replace("radio://0", "radio://1"))
+        claim_vehicle("radio://0/80/2M/E7E7E7E702").close()
+        child.kill()  # it has no time to tidy up
+        child.wait()
+        claim_vehicle(RADIO).close()
+
+
+def test_what_was_released_is_free_and_who_holds_it_is_told_without_a_password(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    words = ["/x/perchctl/__main__.py", "fly", "--source", "rtsp://me:secret@cam/s"]
+    monkeypatch.setattr(sys, "argv", words)
+    for _ in range(2):
+        with claim_vehicle(RADIO) as held:
+            with pytest.raises(ConnectionFailed, match="perchctl fly --source rtsp://cam/s"):
+                claim_vehicle(RADIO)
+            held.close()
+            claim_vehicle(RADIO).close()
+
+
+def test_not_one_packet_reaches_a_vehicle_that_is_anothers() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        vehicle.bind(("127.0.0.1", 0))
+        vehicle.settimeout(0.05)
+        uri = f"udp://127.0.0.1:{vehicle.getsockname()[1]}"
+        with another_program(uri):
+            with pytest.raises(ConnectionFailed, match="two would steer it two ways"):
+                open_connection(uri, 5.0)
+            with pytest.raises(TimeoutError):
+                vehicle.recv(64)
+
+
+def test_a_connection_holds_the_vehicle_until_its_end_and_a_failed_one_does_not(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nobody(uri: str, timeout_s: float) -> Connection:
+        raise ConnectionFailed("no answer")
+
+    monkeypatch.setattr(room, "_opened", nobody)
+    for _ in range(2):
+        with pytest.raises(ConnectionFailed, match="no answer"):
+            open_connection(RADIO, 5.0)
+    monkeypatch.setattr(room, "_opened", lambda *_: bench.connection)
+    for end in (bench.connection.abandon, bench.connection.close):
+        open_connection(RADIO, 5.0)
+        with pytest.raises(ConnectionFailed, match="in use"):
+            claim_vehicle(RADIO)
+        end()
+        claim_vehicle(RADIO).close()
+
+
+def test_without_a_place_for_the_lock_it_flies_all_the_same(folder: Path) -> None:
+    (folder / "perchctl").write_text("")
+    claim_vehicle(RADIO).close()
+
+
+def test_a_cache_folder_that_is_a_file_is_told_by_what_chooses_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "file").write_text("")
+    monkeypatch.setattr(room, "user_cache_folder", lambda: folder / "file" / "perchctl")
+    with pytest.raises(InvalidValue, match=r"cannot be written: .*: set XDG_CACHE_HOME to"):
+        Connection()
+
+
+def test_a_radio_that_another_program_has_open_is_named_as_that() -> None:
+    """As cflib reports it: the error, then its traceback, which names the Crazyradio."""
+    said = plain_cause(
+        "Couldn't load link driver: [Errno 16] Resource busy\n\nTraceback ...\n  crazyradio.py, "
+        "line 130, in __init__\n    self.dev.set_configuration(1)\nCrazyradio"
+    )
+    assert "another program has it open" in said
+    assert "radio://1" in said
+    assert "udev" not in said
 
 
 def test_a_real_flight_loads_nothing_of_the_simulator() -> None:
@@ -193,5 +373,4 @@ def test_a_real_flight_loads_nothing_of_the_simulator() -> None:
         "print(*[name for name in sys.modules if name.startswith('perchctl.sim')])\n"
     )
     shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert shown.returncode == 0, shown.stderr
-    assert shown.stdout.split() == []
+    assert (shown.returncode, shown.stdout.split()) == (0, []), shown.stderr

@@ -8,8 +8,6 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-import pytest
-
 from perchctl.link import MockLink, Packet, Radio
 from perchctl.link.crtp import UNLOCK_TIMES
 from perchctl.link.firmware import EXTERNAL_POSITION_TICK
@@ -41,20 +39,13 @@ def test_a_lost_packet_does_not_leave_the_thrust_locked(lost: int) -> None:
     assert link.telemetry()[-1].thrust == pytest.approx(15000, abs=1500)
 
 
-PERIOD_S = 0.01
-
-
 def test_positions_count_while_they_come_by_the_firmware_s_name() -> None:
     # crtp_localization_service.c: the group locSrv has no tick.
     assert EXTERNAL_POSITION_TICK == "locSrvZ.tick"
     link = MockLink(SimulatedVehicle(Scenario(extra={"external_position": 1.0})))
     assert link.measured_by().external is False
-    link.each(PERIOD_S, lambda now_s: link.external(ExternalPosition((0.0, 0.0, 0.0))))
-    assert link.measured_by().external is True
-
-
-def test_positions_that_have_ended_are_none() -> None:
-    link = MockLink(SimulatedVehicle(Scenario(extra={"external_position": 1.0})))
     link.external(ExternalPosition((0.0, 0.0, 0.0)))
     link.advance_to(link.now_s + 0.1)
-    assert link.measured_by().external is False
+    assert link.measured_by().external is False  # those that have ended are none
+    link.each(0.01, lambda now_s: link.external(ExternalPosition((0.0, 0.0, 0.0))))
+    assert link.measured_by().external is True

@@ -4,7 +4,6 @@ that uses it, tests/calibration/test_mount_live.py."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,108 +11,88 @@ import numpy as np
 import pytest
 
 from perchctl.errors import TimedOut
-from perchctl.link import MotionLink, motion
+from perchctl.link import MotionLink, listening
 from perchctl.link.cflib_link import SILENCE_S
-from perchctl.link.motion import MOTORS_BLOCK, TURN_BLOCK, Motions
+from perchctl.link.listening import MOTORS_BLOCK, TURN_BLOCK
 from perchctl.profile import LinkConfig
 from perchctl.vehicle import FLYING
 
+OF_BLOCK = {"turn": "how it is turned", "motors": "whether its motors turn"}
+STILL = dict.fromkeys((*TURN_BLOCK, *MOTORS_BLOCK), 0.0)
+
+
+class Listened(MotionLink):
+    """A link whose blocks send when the test says so; `now_s` is its clock."""
+
+    def __init__(self) -> None:
+        super().__init__("usb://0", LinkConfig(), lambda: self.now_s)
+        self.now_s = 5.0
+
+    def hear(self, block: str, **values: float) -> None:
+        take = self._on_turn if block == "turn" else self._on_motors
+        take(round(1000 * self.now_s), STILL | values)
+
 
 def test_whether_motors_turn_is_the_newest_packet_s() -> None:
-    motions = Motions(lambda: 0.0)
+    link = Listened()
     for bits in (FLYING, 0, FLYING | 0x2):
-        motions.on_motors(0, {"supervisor.info": bits})
-        assert motions.motors_run == bool(bits)
+        link.hear("motors", **{"supervisor.info": bits})
+        assert link.motors_run == bool(bits)
 
 
 def test_samples_are_in_radians_right_handed_and_of_one_moment() -> None:
-    now = [5.0]
-    motions = Motions(lambda: now[0])
+    link = Listened()
     turned = {"stateEstimate.roll": 10.0, "stateEstimate.pitch": 20.0, "stateEstimate.yaw": -30.0}
     rates = {"gyro.x": 1.0, "gyro.y": 2.0, "gyro.z": 3.0}
-    motions.on_turn(1000, turned | rates)
-    now[0] += 0.015
-    motions.on_turn(1015, turned | rates)
-    first, second = motions.take()
+    link.hear("turn", **turned, **rates)
+    link.now_s += 0.015
+    link.hear("turn", **turned, **rates)
+    first, second = link.samples()
     assert second.t_s - first.t_s == pytest.approx(0.015)
     rpy = (second.roll_rad, second.pitch_rad, second.yaw_rad)
     assert rpy == pytest.approx(np.radians([10.0, -20.0, -30.0]))
     assert second.gyro_radps == pytest.approx(np.radians([1.0, 2.0, 3.0]))
-    assert motions.take() == []
+    assert link.samples() == []
 
 
 @pytest.mark.parametrize("name", TURN_BLOCK)
 @pytest.mark.parametrize("number", [math.nan, math.inf])
 def test_a_turn_that_is_no_number_is_dropped_alone(name: str, number: float) -> None:
     """One in a carry would make all of it unsolvable."""
-    motions = Motions(lambda: 5.0)
-    for stamp, broken in ((1000, {}), (1010, {name: number}), (1020, {})):
-        motions.on_turn(stamp, dict.fromkeys(TURN_BLOCK, 1.0) | broken)
-    taken = motions.take()
+    link = Listened()
+    for broken in ({}, {name: number}, {}):
+        link.hear("turn", **broken)
+        link.now_s += 0.01
+    taken = link.samples()
     assert len(taken) == 2
     assert np.isfinite([[a.roll_rad, a.pitch_rad, a.yaw_rad, *a.gyro_radps] for a in taken]).all()
 
 
-def sending(blocks: Iterable[str], monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """In cflib's place: each block that is started comes once, if it is one of these. What
-    takes each block's packets is in the answer then."""
-    started: dict[str, Any] = {}
-
-    def start(_log: Any, _uri: str, name: str, values: Any, _period_s: float, take: Any) -> None:
-        started[name] = take
-        if name in blocks:
-            take(1000, dict.fromkeys(values, 0.0))
-
-    monkeypatch.setattr(motion, "start_block", start)
-    monkeypatch.setattr(motion, "check_firmware", lambda *_: None)
-    monkeypatch.setattr(motion, "FIRST_SAMPLE_TIMEOUT_S", 0.0)
-    return started
-
-
-def connection() -> Any:
-    toc = SimpleNamespace(get_element_by_complete_name=lambda name: name)
-    return SimpleNamespace(cf=SimpleNamespace(log=SimpleNamespace(toc=toc)), lost=None)
-
-
-@pytest.mark.parametrize(
-    ("blocks", "missing"), [(["turn"], "whether its motors turn"), (["motors"], "how it is turned")]
-)
-def test_nothing_begins_before_both_blocks_came(
-    blocks: list[str], missing: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("silent", OF_BLOCK)
+def test_nothing_begins_before_both_blocks_came_and_each_is_missed_by_itself(
+    silent: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of the motors tells one of them only, and what is unknown is not still."""
-    sending(blocks, monkeypatch)
-    link = MotionLink("usb://0", LinkConfig(), lambda: 0.0)
-    with pytest.raises(TimedOut, match=f"does not send {missing}$"):
-        link._prepare(connection())
-
-
-@pytest.mark.parametrize(
-    ("stops", "lost"), [("motors", "whether its motors turn"), ("turn", "how it is turned")]
-)
-def test_a_block_that_ends_is_a_problem_while_the_other_goes_on(
-    stops: str, lost: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    takers = sending(["turn", "motors"], monkeypatch)
-    now = [0.0]
-    link = MotionLink("usb://0", LinkConfig(), lambda: now[0])
-    link._prepare(connection())
-    whole = dict.fromkeys((*TURN_BLOCK, *MOTORS_BLOCK), 0.0)
-    other = "turn" if stops == "motors" else "motors"
-    while now[0] < SILENCE_S:
-        assert link.problem(now[0]) is None
-        now[0] += 0.1
-        takers[other](1000 + round(1000 * now[0]), whole)
-    assert link.problem(now[0]) == f"nothing heard for {now[0]:.1f} s of {lost}"
-    takers[stops](1000 + round(1000 * now[0]), whole)
-    assert link.problem(now[0]) is None
-
-
-def test_both_blocks_are_waited_for_whichever_comes_first() -> None:
-    whole = dict.fromkeys((*TURN_BLOCK, *MOTORS_BLOCK), 0.0)
-    for turn_first in (True, False):
-        motions = Motions(lambda: 0.0)
-        takers = (motions.on_turn, motions.on_motors)
-        for count, take in enumerate(takers if turn_first else takers[::-1], start=1):
-            take(1000, whole)
-            assert motions.both.is_set() == (count == 2)
+    """One of them says nothing of the other, and what is unknown is not still."""
+    monkeypatch.setattr(listening, "start_block", lambda *_: None)
+    monkeypatch.setattr(listening, "check_firmware", lambda *_: None)
+    monkeypatch.setattr(listening, "is_logged", lambda *_: True)
+    monkeypatch.setattr(listening, "FIRST_SAMPLE_TIMEOUT_S", 0.0)
+    cf: Any = SimpleNamespace(log=None)
+    link, other = Listened(), "turn" if silent == "motors" else "motors"
+    link.hear(other)
+    with pytest.raises(TimedOut, match=f"does not send {OF_BLOCK[silent]}$"):
+        link._prepare(SimpleNamespace(cf=cf))  # type: ignore[arg-type]
+    assert not link._heard_both.is_set()  # so it is waited for
+    link.hear(silent)
+    assert link._heard_both.is_set()
+    link._prepare(SimpleNamespace(cf=cf))  # type: ignore[arg-type]
+    end_s = link.now_s + SILENCE_S
+    while link.now_s < end_s:
+        assert link.problem(link.now_s) is None
+        link.now_s += 0.1
+        link.hear(other)
+    assert link.problem(link.now_s) == (
+        f"nothing heard for {link.now_s - 5.0:.1f} s of {OF_BLOCK[silent]}"
+    )
+    link.hear(silent)
+    assert link.problem(link.now_s) is None

@@ -141,18 +141,11 @@ def flown(connected: Flown) -> Iterator[Flown]:
     yield connected
     connected.air.unplugged.clear()
     connected.air.silent.clear()
-    connected.link.guard(Nobody())
-
-
-class Nobody:
-    """A guard that has nothing to send."""
-
-    def poll(self, now_s: float, newest: Telemetry | None, waiting: object = ()) -> Command | None:
-        return None
+    connected.link.guard(Operator())
 
 
 class Operator:
-    """A guard that sends the operator's stop, once it was pressed."""
+    """A guard that sends the operator's stop once it was pressed."""
 
     def __init__(self) -> None:
         self.pressed = False
@@ -171,8 +164,11 @@ by_cflibs_own = behind(radiodriver.RadioDriver)
 # --- Silence ----------------------------------------------------------------------------------
 
 
-def silence_and_back(flown: Flown, silent_s: float) -> None:
-    """A landing that is ordered in the silence, and a stop after it, go out; nothing waits."""
+@pytest.mark.parametrize(
+    "silent_s", [CFLIB_WAITS_S + 0.2, *(pytest.param(s, marks=pytest.mark.long) for s in (5, 10))]
+)
+def test_after_silence_a_landing_and_a_stop_go_out_again(flown: Flown, silent_s: float) -> None:
+    """A landing that is ordered in the silence, and a stop after it; nothing waits."""
     flown.air.silent.set()
     longest_s = flown.stream(silent_s)
     problem = flown.problem()
@@ -184,16 +180,6 @@ def silence_and_back(flown: Flown, silent_s: float) -> None:
     flown.await_telemetry()
     assert longest_s < 0.1
     assert problem is not None
-
-
-def test_after_two_seconds_of_silence_a_landing_and_a_stop_go_out_again(flown: Flown) -> None:
-    silence_and_back(flown, CFLIB_WAITS_S + 0.2)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("silent_s", [5.0, 10.0])
-def test_so_they_do_after_longer_silence(flown: Flown, silent_s: float) -> None:
-    silence_and_back(flown, silent_s)
 
 
 def test_the_operators_stop_goes_out_after_silence_though_the_loop_hangs(flown: Flown) -> None:
@@ -287,13 +273,19 @@ def test_a_driver_that_holds_a_command_for_good_is_given_up_with_its_lock(
     hold.set()
 
 
-def test_a_late_error_of_a_driver_that_was_given_up_does_not_end_the_next(flown: Flown) -> None:
+def goes_on_after_two_ends(flown: Flown) -> None:
+    """The driver tells its end twice, late the second time."""
     late = flown.error_callback()
     late("unplugged")
     assert flown.problem() == "unplugged"
     flown.until(lambda: flown.problem() is None)
     late("once more")
     assert flown.problem() is None
+    flown.await_telemetry()
+
+
+def test_a_late_error_of_a_driver_that_was_given_up_does_not_end_the_next(flown: Flown) -> None:
+    goes_on_after_two_ends(flown)
     began_s = time.monotonic()
     flown.link.send(LAND)
     flown.heard_after_s(LAND, began_s)
@@ -306,18 +298,12 @@ def test_the_end_of_the_first_driver_is_one_of_many(driver: type[Any], cache: An
     asks for again, and a second word of it would end the next driver."""
     with connection_by(driver, cache, OTHER_URI) as flown:
         flown.await_telemetry()
-        first = flown.error_callback()
-        first("unplugged")
-        assert flown.problem() == "unplugged"
-        flown.until(lambda: flown.problem() is None)
-        first("once more")
-        assert flown.problem() is None
-        flown.await_telemetry()
+        goes_on_after_two_ends(flown)
 
 
 def test_an_order_that_may_have_been_lost_with_the_link_is_sent_again(flown: Flown) -> None:
     told: list[SentCommand] = []
-    flown.link.guard(Nobody(), told.append)
+    flown.link.guard(Operator(), told.append)
     began_s = time.monotonic()
     flown.link.send(LAND)
     flown.heard_after_s(LAND, began_s)

@@ -7,7 +7,7 @@ test's own clock.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -33,6 +33,18 @@ class Library:
         self.called, self.free = threading.Event(), threading.Event()
         self.free.set()
         self.now_s = 10.0
+        self.senders: list[Sender] = []
+
+    def sender(self, **how: Any) -> Sender:
+        """A sender that hands over to this library."""
+        self.senders.append(Sender(self.hand_over, clock=lambda: self.now_s, **how))
+        return self.senders[-1]
+
+    def takes(self, *pieces: Any) -> None:
+        """All that waits is taken, and these pieces are all that it has taken since."""
+        assert self.senders[-1].drain(LIMIT_S)
+        assert self.taken == list(pieces)
+        self.taken.clear()
 
     def hand_over(self, piece: Any) -> bool:
         self.offered += 1
@@ -44,85 +56,63 @@ class Library:
             self.taken.append(piece)
         return self.room
 
-    def hang(self) -> None:
+    def hang_with(self, command: Command) -> None:
+        """It does not return from the call with this command."""
         self.called.clear()
         self.free.clear()
-
-
-Make = Callable[..., Sender]
-
-
-@pytest.fixture
-def library() -> Library:
-    return Library()
+        self.senders[-1].put(command)
+        assert self.called.wait(LIMIT_S)
 
 
 @pytest.fixture
-def make(library: Library) -> Iterator[Make]:
-    senders: list[Sender] = []
-
-    def new(**how: Any) -> Sender:
-        senders.append(Sender(library.hand_over, clock=lambda: library.now_s, **how))
-        return senders[-1]
-
-    yield new
+def library() -> Iterator[Library]:
+    library = Library()
+    yield library
     library.free.set()
-    for sender in senders:
+    for sender in library.senders:
         sender.stop()
 
 
 # --- What waits -------------------------------------------------------------------------------
 
 
-def test_orders_keep_their_place_and_of_setpoints_the_newest_counts(
-    library: Library, make: Make
-) -> None:
-    sender = make()
-    library.hang()
-    sender.put(PLACES[0])
-    assert library.called.wait(LIMIT_S)
+def test_orders_keep_their_place_and_of_setpoints_the_newest_counts(library: Library) -> None:
+    sender = library.sender()
+    library.hang_with(PLACES[0])
     for command in (PLACES[1], PLACES[2], StopMotors(), PLACES[3]):
         sender.put(command)
     assert sender.stuck_s() == 0.0
     library.now_s += 0.2
     assert sender.stuck_s() == pytest.approx(0.2)
     library.free.set()
-    assert sender.drain(LIMIT_S)
-    assert library.taken == [PLACES[0], StopMotors(), PLACES[3]]
+    library.takes(PLACES[0], StopMotors(), PLACES[3])
     assert sender.stuck_s() == 0.0
 
 
-def test_a_setpoint_that_waited_too_long_is_dropped_an_order_is_not(
-    library: Library, make: Make
-) -> None:
+def test_a_setpoint_that_waited_too_long_is_dropped_an_order_is_not(library: Library) -> None:
     library.room = False
-    sender = make()
+    sender = library.sender()
     sender.put(LAND)
     sender.put(PLACES[0])
     library.now_s += 100.0
     assert STALE_S < 100.0
     library.room = True
-    assert sender.drain(LIMIT_S)
-    assert library.taken == [LAND]
+    library.takes(LAND)
 
 
-def test_an_order_that_waits_is_replaced_by_its_like_and_all_by_a_stop(
-    library: Library, make: Make
-) -> None:
+def test_an_order_that_waits_is_replaced_by_its_like_and_all_by_a_stop(library: Library) -> None:
     library.room = False
-    sender = make()
+    sender = library.sender()
     newer = Land(-0.05, 3.0)
     for command in (StopMotors(), LAND, newer):
         sender.put(command)
     library.room = True
-    assert sender.drain(LIMIT_S)
-    assert library.taken == [StopMotors(), newer]
+    library.takes(StopMotors(), newer)
     library.room = False
     for command in (LAND, StopMotors(), STOP, STOP):
         sender.put(command)
     library.room = True
-    assert sender.drain(LIMIT_S)
-    assert library.taken[2:] == [STOP]
+    library.takes(STOP)
 
 
 def thirds(command: Command) -> list[Any]:
@@ -130,60 +120,51 @@ def thirds(command: Command) -> list[Any]:
 
 
 def test_without_room_a_piece_is_offered_again_and_nothing_comes_between_the_pieces(
-    library: Library, make: Make
+    library: Library,
 ) -> None:
     library.room = False
-    sender = make(pieces=thirds)
+    sender = library.sender(pieces=thirds)
     sender.put(LAND)
     sender.put(PLACES[0])
     until(lambda: library.offered > 2)
     library.room = True
-    assert sender.drain(LIMIT_S)
-    assert library.taken == thirds(LAND) + thirds(PLACES[0])
+    library.takes(*thirds(LAND), *thirds(PLACES[0]))
 
 
-def test_a_stop_does_not_wait_for_the_rest_of_a_landing(library: Library, make: Make) -> None:
-    sender = make(pieces=thirds)
-    library.hang()
-    sender.put(LAND)
-    assert library.called.wait(LIMIT_S)
+def test_a_stop_does_not_wait_for_the_rest_of_a_landing(library: Library) -> None:
+    sender = library.sender(pieces=thirds)
+    library.hang_with(LAND)
     sender.put(STOP)
     library.free.set()
-    assert sender.drain(LIMIT_S)
-    assert library.taken == [(LAND, 0), *thirds(STOP)]
+    library.takes((LAND, 0), *thirds(STOP))
 
 
-def test_the_last_order_is_sent_again_unless_it_was_followed_or_is_old(
-    library: Library, make: Make
-) -> None:
+def test_the_last_order_is_sent_again_unless_it_was_followed_or_is_old(library: Library) -> None:
     told: list[SentCommand] = []
-    sender = make(told=told.append)
-    sender.again(0.0)  # nothing has been sent
+    sender = library.sender(told=told.append)
+    sender.repeat_order(0.0)  # nothing has been sent
     sender.put(LAND)
-    assert sender.drain(LIMIT_S)
-    sender.again(library.now_s + 0.1)
-    assert sender.drain(LIMIT_S)
-    assert library.taken == [LAND]
-    sender.again(library.now_s - 0.1)
+    library.takes(LAND)
+    sender.repeat_order(library.now_s + 0.1)
+    library.takes()
+    sender.repeat_order(library.now_s - 0.1)
     until(lambda: told)
-    assert (library.taken, told[0].by) == ([LAND, LAND], "reconnect")
+    library.takes(LAND)
+    assert told[0].by == "reconnect"
     sender.put(PLACES[0])
-    assert sender.drain(LIMIT_S)
-    sender.again(0.0)
-    assert sender.drain(LIMIT_S)
-    assert library.taken == [LAND, LAND, PLACES[0]]
+    library.takes(PLACES[0])
+    sender.repeat_order(0.0)
+    library.takes()
 
 
-def test_something_of_its_own_goes_out_only_while_no_command_waits(
-    library: Library, make: Make
-) -> None:
+def test_something_of_its_own_goes_out_only_while_no_command_waits(library: Library) -> None:
     spare = ["first", "second"]
 
     def send_spare() -> bool:
         return bool(spare) and library.hand_over(spare.pop(0))
 
-    library.hang()
-    sender = make(spare=send_spare)
+    library.free.clear()
+    sender = library.sender(spare=send_spare)
     assert library.called.wait(LIMIT_S)
     sender.put(LAND)
     library.free.set()
@@ -194,7 +175,7 @@ def test_something_of_its_own_goes_out_only_while_no_command_waits(
 # --- A library that hangs or fails ------------------------------------------------------------
 
 
-def test_a_library_that_never_returns_holds_up_no_order(library: Library, make: Make) -> None:
+def test_a_library_that_never_returns_holds_up_no_order(library: Library) -> None:
     hung = library.free
 
     def tend(stuck_s: float, hangs: bool) -> None:
@@ -202,28 +183,20 @@ def test_a_library_that_never_returns_holds_up_no_order(library: Library, make: 
             library.free = threading.Event()
             library.free.set()
 
-    sender = make(tend=tend)
-    library.hang()
-    sender.put(LAND)
-    assert library.called.wait(LIMIT_S)
+    sender = library.sender(tend=tend)
+    library.hang_with(LAND)
     sender.put(STOP)
     library.now_s += HANGS_S + 0.01
-    assert sender.drain(LIMIT_S)
-    assert library.taken == [STOP]
+    library.takes(STOP)
     hung.set()  # what returns now has been given up
     until(lambda: LAND in library.taken)
     sender.put(StopMotors())
-    assert sender.drain(LIMIT_S)
-    assert library.taken == [STOP, LAND, StopMotors()]
+    library.takes(LAND, StopMotors())
 
 
-def test_the_order_with_which_the_library_hung_is_handed_over_again(
-    library: Library, make: Make
-) -> None:
-    sender = make()
-    library.hang()
-    sender.put(LAND)
-    assert library.called.wait(LIMIT_S)
+def test_the_order_with_which_the_library_hung_is_handed_over_again(library: Library) -> None:
+    sender = library.sender()
+    library.hang_with(LAND)
     library.called.clear()
     library.now_s += HANGS_S + 0.01
     assert library.called.wait(LIMIT_S)
@@ -232,7 +205,7 @@ def test_the_order_with_which_the_library_hung_is_handed_over_again(
     assert sender.drain(LIMIT_S)
 
 
-def test_a_call_that_the_computer_slept_through_is_no_hang(library: Library, make: Make) -> None:
+def test_a_call_that_the_computer_slept_through_is_no_hang(library: Library) -> None:
     blamed: list[bool] = []
 
     def tend(stuck_s: float, hangs: bool) -> None:
@@ -240,64 +213,53 @@ def test_a_call_that_the_computer_slept_through_is_no_hang(library: Library, mak
         if stuck_s > HANGS_S:
             library.free.set()  # awake, it returns
 
-    sender = make(tend=tend)
-    library.hang()
-    sender.put(LAND)
-    assert library.called.wait(LIMIT_S)
+    sender = library.sender(tend=tend)
+    library.hang_with(LAND)
     library.now_s += 100.0
     assert sender.drain(LIMIT_S)
     assert not any(blamed)
     assert library.taken == [LAND]
 
 
-def test_an_error_of_the_library_is_reported_and_the_order_offered_again(
-    library: Library, make: Make
-) -> None:
+def test_an_error_of_the_library_is_reported_and_the_order_offered_again(library: Library) -> None:
     blamed: list[bool] = []
     library.error = RuntimeError("no radio")
-    sender = make(tend=lambda stuck_s, hangs: blamed.append(hangs))
+    sender = library.sender(tend=lambda stuck_s, hangs: blamed.append(hangs))
     sender.put(LAND)
     until(lambda: library.offered > 1)
     assert "no radio" in str(sender.problem)
     library.now_s += HANGS_S + 0.01
     until(lambda: blamed and blamed[-1])
     library.error = None
-    assert sender.drain(LIMIT_S)
-    assert library.taken == [LAND]
+    library.takes(LAND)
 
 
-def test_a_command_that_cannot_be_divided_is_in_nobodys_way(library: Library, make: Make) -> None:
+def test_a_command_that_cannot_be_divided_is_in_nobodys_way(library: Library) -> None:
     def pieces(command: Command) -> list[Command]:
         if command == LAND:
             raise ValueError("no number")
         return [command]
 
-    sender = make(pieces=pieces)
+    sender = library.sender(pieces=pieces)
     sender.put(LAND)
     sender.put(StopMotors())
-    assert sender.drain(LIMIT_S)
-    assert library.taken == [StopMotors()]
+    library.takes(StopMotors())
     assert "no number" in str(sender.problem)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_thread_that_has_ended_is_noticed_and_its_work_goes_on(
-    library: Library, make: Make
-) -> None:
+def test_a_thread_that_has_ended_is_noticed_and_its_work_goes_on(library: Library) -> None:
     library.error = SystemExit()
-    sender = make()
+    sender = library.sender()
     sender.put(LAND)
     until(lambda: sender.problem is not None)
     library.error = None
     assert "had ended" in str(sender.problem)
-    assert sender.drain(LIMIT_S)
-    assert library.taken == [LAND]
+    library.takes(LAND)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_watchdogs_thread_that_has_ended_is_noticed_and_started_again(
-    library: Library, make: Make
-) -> None:
+def test_a_watchdogs_thread_that_has_ended_is_noticed_and_started_again(library: Library) -> None:
     asked: list[BaseException] = [SystemExit()]
 
     def guard() -> Command | None:
@@ -305,7 +267,7 @@ def test_a_watchdogs_thread_that_has_ended_is_noticed_and_started_again(
             raise asked.pop()
         return STOP
 
-    sender = make(guard=guard)
+    sender = library.sender(guard=guard)
     until(lambda: not asked and sender.look_after() is None and sender.problem is not None)
     assert "watchdog" in str(sender.problem)
     until(lambda: STOP in library.taken)
@@ -314,21 +276,19 @@ def test_a_watchdogs_thread_that_has_ended_is_noticed_and_started_again(
 # --- The guard --------------------------------------------------------------------------------
 
 
-def test_the_guard_is_asked_by_itself_and_what_it_wants_is_told(
-    library: Library, make: Make
-) -> None:
+def test_the_guard_is_asked_by_itself_and_what_it_wants_is_told(library: Library) -> None:
     told: list[SentCommand] = []
-    make(guard=EmergencyStop, told=told.append)
+    library.sender(guard=EmergencyStop, told=told.append)
     until(lambda: len(told) >= 3)
     assert set(library.taken) == {STOP}
     assert {sent.by for sent in told} == {"watchdog"}
 
 
-def test_a_guard_is_not_asked_for_what_cannot_go_out(library: Library, make: Make) -> None:
+def test_a_guard_is_not_asked_for_what_cannot_go_out(library: Library) -> None:
     """It counts its orders, and would have none left when the link is back."""
     stuck: list[float] = []
     polls: list[float] = []
-    sender = make(
+    sender = library.sender(
         guard=lambda: polls.append(library.now_s),
         tend=lambda stuck_s, hangs: stuck.append(stuck_s),
     )

@@ -25,7 +25,7 @@ from perchctl.mission import Condition, Observation, Phase, PlannerState
 from perchctl.mission.conditions import BY_PLACE, PROOFS, conditions_since
 from perchctl.mission.context import Context
 from perchctl.profile import Profile
-from perchctl.vehicle import Telemetry
+from tests.helpers.mission import READY, telemetry
 
 SIZES = {"float": 4, "FP16": 2, "uint16_t": 2, "int8_t": 1}
 
@@ -53,11 +53,8 @@ def test_pitch_and_degrees_turn_at_the_edge() -> None:
     assert sample.position_variance_m2 is None
     assert sample.climb_variance_m2ps2 is None
     assert sample.battery_v == 0.0  # unknown, which to the planner is not empty
-
-
-def test_the_vertical_speed_s_variance_stands_by_itself() -> None:
     variances = {"kalman.varPX": 3e-4, "kalman.varPY": 2e-4, "kalman.varPZ": 1e-4}
-    sample = telemetry_from(dict.fromkeys(NEEDED, 0.0) | variances, 1.5)
+    sample = telemetry_from(values | variances, 1.5)
     assert (sample.position_variance_m2, sample.climb_variance_m2ps2) == (3e-4, 1e-4)
 
 
@@ -122,9 +119,7 @@ def test_what_a_vehicle_told_before_it_started_anew_is_over() -> None:
     assert (sample.start, sample.behind_s) == (1, pytest.approx(0.01))
 
 
-HANGS = Telemetry(
-    1.0, (0.0, 0.0, 2.0), (0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 1.0, 0.0, 3.9, supervisor=0x020E
-)  # fmt: skip
+HANGS = telemetry(1.0, 2.0, thrust=0.0, supervisor=READY)
 HANGING = PlannerState(
     phase=Phase.COMPLETE, released_s=0.0, contact_z_m=2.0, hover_thrust=50000.0,
     ground_m=(0.0, 0.0, 0.0),

@@ -1,4 +1,4 @@
-"""The URIs of vehicles: which are taken, and what a scan gives."""
+"""The URIs of vehicles: which are taken, which are of one vehicle, and what a scan gives."""
 
 from __future__ import annotations
 
@@ -7,50 +7,54 @@ import re
 import pytest
 
 from perchctl.errors import InvalidValue
-from perchctl.link import UDEV_HELP, check_uri
-from perchctl.link import probe as scan_room
+from perchctl.link import UDEV_HELP, check_uri, listening, vehicle_uri
+
+RADIO = "radio://0/80/2M/E7E7E7E701"
 
 
-@pytest.mark.parametrize(
-    "uri",
-    [
-        "sim://",
-        "radio://0/80/2M/E7E7E7E7E7",
-        "radio://0/125/250K",
-        "radio://0/0/1M",
-        "radio://0",
-        "radio://E7E7E7E7E7/80/2M/00000000e7?rate_limit=100",
-        "usb://0",
-        "udp://host:19850",
-    ],
-)
+@pytest.mark.parametrize("uri", [
+    "sim://", "radio://0/80/2M/E7E7E7E7E7", "radio://0/125/250K", "radio://0/0/1M", "radio://0",
+    "radio://E7E7E7E7E7/80/2M/00000000e7?rate_limit=100", "usb://0", "udp://host:19850",
+])  # fmt: skip
 def test_good_uris(uri: str) -> None:
     assert check_uri(uri) == uri.split(":")[0]
 
 
-@pytest.mark.parametrize(
-    "uri", ["", "radio:/0", "radio://0/80/3M/E7E7E7E7E7", "udp://host", "http://host:80", "sim"]
-)
-def test_bad_uris_name_examples(uri: str) -> None:
-    with pytest.raises(InvalidValue, match="radio://0/80/2M"):
+@pytest.mark.parametrize(("uri", "said"), [
+    *((uri, "is not one") for uri in ("", "radio:/0", "udp://host", "http://host:80", "sim")),
+    ("udp://host:0", "has no port of 1 to 65535"),
+    ("tcp://host:65536", "has no port of 1 to 65535"),
+    ("radio://0/200/2M", "has channel '200'; allowed: 0 to 125"),
+    ("radio://0/126", "has channel '126'"),
+    ("radio://0/", "has channel ''"),
+    ("radio://0/x/2M", "has channel 'x'"),
+    ("radio://0/80/3M/E7E7E7E7E7", "has data rate '3M'; allowed: 250K, 1M, 2M"),
+    ("radio://0/80/2M/E7", "has address 'E7'; allowed: ten hex digits"),
+    ("radio://0/80/2M/E7E7E7E7EG", "has address 'E7E7E7E7EG'"),
+    ("radio://0/80/2M/E7?rate_limit=100", "has address 'E7'"),
+])  # fmt: skip
+def test_what_is_wrong_with_a_uri_is_named_with_examples(uri: str, said: str) -> None:
+    with pytest.raises(InvalidValue, match=re.escape(f"URI {uri!r} {said}")) as caught:
         check_uri(uri)
+    assert "radio://0/80/2M/E7E7E7E7E7" in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("uri", "said"),
-    [
-        ("radio://0/200/2M", "has channel '200'; allowed are 0 to 125"),
-        ("radio://0/126", "has channel '126'"),
-        ("radio://0/x/2M", "has channel 'x'"),
-        ("radio://0/80/3M/E7E7E7E7E7", "has data rate '3M'; allowed are 250K, 1M, 2M"),
-        ("radio://0/80/2M/E7", "has address 'E7'; needed are ten hex digits"),
-        ("radio://0/80/2M/E7E7E7E7EG", "has address 'E7E7E7E7EG'"),
-        ("radio://0/80/2M/E7?rate_limit=100", "has address 'E7'"),
-    ],
-)
-def test_a_wrong_part_of_a_radio_s_uri_is_named(uri: str, said: str) -> None:
-    with pytest.raises(InvalidValue, match=re.escape(f"URI {uri!r} {said}")):
-        check_uri(uri)
+@pytest.mark.parametrize(("one", "other", "same"), [
+    (RADIO, "radio://1/80/2M/e7e7e7e701?rate_limit=100", True),  # by another dongle
+    ("radio://0/80/2M/0000000001", "radio://0/80/2M/1", True),
+    ("radio://0", "radio://0/2/2M/E7E7E7E7E7", True),
+    (RADIO, "radio://0/81/2M/E7E7E7E701", False),  # its twin on another channel
+    (RADIO, "radio://0/80/1M/E7E7E7E701", False),
+    (RADIO, "radio://0/80/2M/E7E7E7E702", False),
+    ("udp://LocalHost:19850", "UDP://127.0.0.1:19850", True),
+    ("tcp://Bench:5000", "tcp://bench:5000", True),
+    ("Radio://0/80/2m/E7E7E7E701", RADIO, True),
+    ("serial:///dev/ttyA", "serial:///dev/ttya", False),
+    ("udp://127.0.0.1:19851", "udp://127.0.0.1:19850", False),
+    ("usb://0", "usb://1", False),
+])  # fmt: skip
+def test_which_uris_are_of_one_vehicle(one: str, other: str, same: bool) -> None:
+    assert (vehicle_uri(one) == vehicle_uri(other)) is same
 
 
 def test_a_scan_gives_uris_that_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,9 +66,9 @@ def test_a_scan_gives_uris_that_are_taken(monkeypatch: pytest.MonkeyPatch) -> No
             return [[f"radio://0/80/2M{end}", ""]]
 
     monkeypatch.setattr("cflib.crtp.CLASSES", [Radio])
-    monkeypatch.setattr(scan_room, "ready_cflib", lambda: None)
-    monkeypatch.setattr(scan_room, "_radio_problem", lambda: "")
-    found = scan_room.find_vehicles("radio://0/80/2M/0000000001?rate_limit=100").uris
+    monkeypatch.setattr(listening, "ready_cflib", lambda: None)
+    monkeypatch.setattr(listening, "_radio_problem", lambda: "")
+    found = listening.find_vehicles("radio://0/80/2M/0000000001?rate_limit=100").uris
     assert found == ("radio://0/80/2M", "radio://0/80/2M/0000000001")
     assert list(map(check_uri, found)) == ["radio", "radio"]
 

@@ -152,18 +152,18 @@ def test_a_damaged_record_refuses_in_one_sentence(how: str) -> None:
 ])  # fmt: skip
 def test_what_did_not_pass_ends_an_older_pass(lifted: Any) -> None:
     was_compared(CONFIG, URI)
-    row = save_row(lifted, CONFIG, URI, session.wall_date())
+    row = save_row(lifted, CONFIG, URI, datetime.now().astimezone())
     assert row.verdict is Verdict.WARN
     with pytest.raises(SafetyAbort, match=lifted.found):
         session.require_comparison(CONFIG, URI, simulated=False)
-    again = save_row(passed("fine"), CONFIG, URI, session.wall_date())
+    again = save_row(passed("fine"), CONFIG, URI, datetime.now().astimezone())
     assert again.verdict is Verdict.PASS
     session.require_comparison(CONFIG, URI, simulated=False)
 
 
 def test_a_lift_that_told_nothing_leaves_the_record_as_it_is() -> None:
     for verdict in (Verdict.WARN, Verdict.PASS):
-        row = save_row(skipped("not moved"), CONFIG, URI, session.wall_date())
+        row = save_row(skipped("not moved"), CONFIG, URI, datetime.now().astimezone())
         assert row.verdict is verdict
         was_compared(CONFIG, URI)
 
@@ -183,7 +183,7 @@ def test_an_unwritten_finding_leaves_no_older_pass_unsaid(
     monkeypatch.setattr(compared, "write_files", full)
     if not removable:
         monkeypatch.setattr(Path, "unlink", full)
-    row = save_row(lifted, CONFIG, URI, session.wall_date())
+    row = save_row(lifted, CONFIG, URI, datetime.now().astimezone())
     assert row.verdict is verdict
     assert "No space left" in row.found
     if removable:

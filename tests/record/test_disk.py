@@ -16,7 +16,7 @@ import pytest
 
 from perchctl.commands import fly
 from perchctl.errors import InvalidValue, LogIncomplete
-from perchctl.flight import FlyOptions, SessionResult
+from perchctl.flight import FlyOptions
 from perchctl.mission import FlightReport, Outcome, Phase, Turn, TurnInputs
 from perchctl.profile import changed_profile, load_profile
 from perchctl.record import LogWatcher, exact, read_log, write
@@ -274,10 +274,10 @@ def test_a_full_disk_is_in_the_exit_code_of_a_good_flight(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return real(fd, data)
 
-    def session(options: FlyOptions, log: LogWatcher, *rest: Any) -> SessionResult:
+    def session(options: FlyOptions, log: LogWatcher, *rest: Any) -> Any:
         for record in list(synthetic.ticks())[:5]:
             log.writer.write(record)
-        return SessionResult(FlightReport(Phase.PERCHED, outcome, "hanging still", 1, 9.0, False))
+        return FlightReport(Phase.PERCHED, outcome, "hanging still", 1, 9.0, False), None
 
     quiet = changed_profile(load_profile("sim"), ["log.plot=false"])
     options = FlyOptions(quiet, Path("sim.yaml"), "sim://", "sim:", log_dir=tmp_path)

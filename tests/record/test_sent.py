@@ -25,10 +25,9 @@ from perchctl.record.fields import sent_values
 from perchctl.record.recorder import Recorder
 from perchctl.record.write import FlightLogWriter
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
-from tests.flight.test_silent_loop import HANG_AT_S, hung_rig
 from tests.helpers import log as synthetic
 from tests.helpers import recorded
-from tests.helpers.loop_rig import PROFILE, Clock
+from tests.helpers.loop_rig import HANG_AT_S, PROFILE, Clock, hung_rig
 from tests.helpers.mission import telemetry
 from tests.helpers.recorded import MemoryDisk
 from tests.helpers.scripted_link import ScriptedLink

@@ -1,0 +1,312 @@
+"""Links that read a vehicle and command nothing, and the search for vehicles that answer.
+
+`MotionLink` reads how a vehicle is moved by hand, `ProbeLink` what it holds and how good the radio
+is. Nothing that is sent here flies, arms or turns a motor.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from perchctl.calibration import AttitudeSample
+from perchctl.errors import NotFound, TimedOut
+from perchctl.link.cflib_link import SILENCE_S, CflibLink
+from perchctl.link.connection import Connection, plain_cause, ready_cflib, send_packets
+from perchctl.link.crtp import Packet, Port
+from perchctl.link.firmware import (
+    NEEDED_PROTOCOL,
+    check_firmware,
+    is_logged,
+    missing_variables,
+    read_parameters,
+    read_variables,
+)
+from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S, Timebase, start_block
+from perchctl.link.uri import FORMS, USUAL_ADDRESS, with_whole_address
+from perchctl.profile import LinkConfig
+from perchctl.vehicle import FLYING
+
+
+class ListeningLink(CflibLink):
+    """A `CflibLink` that sets no parameter, arms nothing, and commands nothing, not even at its
+    end: the vehicle may fly for another program."""
+
+    def close(self) -> None:
+        """Leave at once and without cflib's farewell."""
+        self._leave(farewell=False)
+
+    def _may_say_farewell(self) -> bool:
+        return False  # neither when connecting fails half-way
+
+    def _prepare(self, connection: Connection) -> None:
+        check_firmware(connection.cf, self._uri)
+        self._start_logging(connection)
+
+
+# --- How a vehicle is moved by hand: attitude and turn rates of one moment, in one packet --------
+
+
+PERIOD_S = 0.01
+TURN_BLOCK = dict.fromkeys(
+    (
+        "stateEstimate.roll", "stateEstimate.pitch", "stateEstimate.yaw",
+        "gyro.x", "gyro.y", "gyro.z",
+    ),
+    "float",
+)  # fmt: skip
+"""24 of the 26 bytes that a log block holds."""
+MOTORS_BLOCK = {"supervisor.info": "uint16_t"}
+MOST_SAMPLES = 20_000
+ATTITUDE, MOTORS = "how it is turned", "whether its motors turn"
+"""What `TURN_BLOCK` and `MOTORS_BLOCK` tell, and nothing else does."""
+
+
+class MotionLink(ListeningLink):
+    """A `ListeningLink` that collects attitude samples, 100 a second. Errors as `CflibLink`."""
+
+    def __init__(self, uri: str, config: LinkConfig, clock: Callable[[], float]) -> None:
+        super().__init__(uri, config, clock)
+        self._timebase = Timebase()
+        self._samples: deque[AttitudeSample] = deque(maxlen=MOST_SAMPLES)
+        self._heard_s: dict[str, float] = {}  # when each block last came
+        self._heard_both = threading.Event()
+        self._motors_run = False
+
+    @property
+    def motors_run(self) -> bool:
+        """True if the motors turn by the newest packet, and for 2 s after they stopped."""
+        return self._motors_run
+
+    def samples(self) -> list[AttitudeSample]:
+        """Return the samples that arrived since the last call, oldest first."""
+        return [self._samples.popleft() for _ in range(len(self._samples))]
+
+    def problem(self, now_s: float) -> str | None:
+        """Name what came, but comes no more: each block by itself, since motors of which nothing
+        is heard may turn."""
+        if self.connection is not None and self.connection.lost is not None:
+            return self.connection.lost
+        for what, heard_s in self._heard_s.copy().items():
+            if now_s - heard_s > SILENCE_S:
+                return f"nothing heard for {now_s - heard_s:.1f} s of {what}"
+        return None
+
+    def _prepare(self, connection: Connection) -> None:
+        check_firmware(connection.cf, self._uri)
+        for name in TURN_BLOCK:
+            if not is_logged(connection.cf, name):
+                raise NotFound(
+                    f"the firmware at {self._uri} has no log variable {name}, by which the "
+                    f"mounting is measured: update the firmware"
+                )
+        log = connection.cf.log
+        start_block(log, self._uri, "motors", MOTORS_BLOCK, PERIOD_S, self._on_motors)
+        start_block(log, self._uri, "turn", TURN_BLOCK, PERIOD_S, self._on_turn)
+        self._heard_both.wait(FIRST_SAMPLE_TIMEOUT_S)
+        missing = [what for what in (ATTITUDE, MOTORS) if what not in self._heard_s]
+        if missing:
+            raise TimedOut(f"{self._uri} is connected but does not send {' and '.join(missing)}")
+
+    def _on_turn(self, stamp: int, values: Mapping[str, float], _block: Any = None) -> None:
+        """Take a packet of `TURN_BLOCK`, in cflib's thread: degrees, and the Crazyflie's nose-up
+        pitch (docs/firmware.md, "Signs and units"); its gyroscope is right-handed. A packet with a
+        value that is no number is dropped: it would spoil what is solved from the others."""
+        t_s = self._timebase.to_loop_s(stamp, self._clock())
+        if not all(map(math.isfinite, values.values())):
+            return
+        self._samples.append(
+            AttitudeSample(
+                t_s=t_s,
+                roll_rad=math.radians(values["stateEstimate.roll"]),
+                pitch_rad=-math.radians(values["stateEstimate.pitch"]),
+                yaw_rad=math.radians(values["stateEstimate.yaw"]),
+                gyro_radps=np.radians([values[f"gyro.{axis}"] for axis in "xyz"]),
+            )
+        )
+        self._heard(ATTITUDE)
+
+    def _on_motors(self, stamp: int, values: Mapping[str, float], _block: Any = None) -> None:
+        """Take a packet of `MOTORS_BLOCK`, in cflib's thread."""
+        self._motors_run = bool(int(values["supervisor.info"]) & FLYING)
+        self._heard(MOTORS)
+
+    def _heard(self, what: str) -> None:
+        self._heard_s[what] = self._clock()
+        if len(self._heard_s) == 2:
+            self._heard_both.set()
+
+
+# --- What a vehicle holds, and how good the radio is ---------------------------------------------
+
+
+ANSWER_S = 0.5
+ECHO_PERIOD_S = 0.02
+_ECHO = struct.Struct("<BQ")  # as long as cflib's own, which it takes all of them for
+_ECHO_MARK = 1  # cflib's own pings begin with 0
+
+
+@dataclass(frozen=True)
+class Echoes:
+    """Packets that were sent to come back, and the times after which those that did came."""
+
+    sent: int = 0
+    round_trip_s: tuple[float, ...] = ()
+
+    @property
+    def lost(self) -> float:
+        """Share of the packets that did not come back, 0 to 1; 1 if none was sent."""
+        return 1.0 - len(self.round_trip_s) / self.sent if self.sent else 1.0
+
+    @property
+    def p95_s(self) -> float | None:
+        """Time within which 95 of 100 came back; None if none did."""
+        ordered = sorted(self.round_trip_s)
+        return ordered[int(0.95 * (len(ordered) - 1))] if ordered else None
+
+
+class ProbeLink(ListeningLink):
+    """A `ListeningLink` that refuses no firmware: what is wrong with it is what is asked for.
+
+    `quality` is the radio's, %: how few of its packets had to be sent again; None without one.
+    `missing` names the log variables that perchctl needs and the firmware lacks.
+    """
+
+    NEEDED_PROTOCOL = NEEDED_PROTOCOL
+
+    def __init__(self, uri: str, config: LinkConfig, clock: Callable[[], float]) -> None:
+        super().__init__(uri, config, clock)
+        self.quality: float | None = None
+        self.missing: tuple[str, ...] = ()
+
+    def _prepare(self, connection: Connection) -> None:
+        self.missing = tuple(missing_variables(connection.cf))
+        connection.cf.link_statistics.link_quality_updated.add_callback(self._on_quality)
+        if not self.missing:
+            with contextlib.suppress(NotFound, TimedOut):  # then `telemetry` stays empty
+                self._start_logging(connection)
+
+    @property
+    def _cf(self) -> Any:
+        assert self.connection is not None
+        return self.connection.cf
+
+    def protocol(self) -> int:
+        """Return the protocol's version; -1 for a vehicle that is too old to have one."""
+        return int(self._cf.platform.get_protocol_version())
+
+    def parameters(self) -> dict[str, float]:
+        """Return all parameters by name, as they were read when the link was opened."""
+        return read_parameters(self._cf)
+
+    def age_s(self) -> float:
+        """Return the age of the newest sample, of the older of its parts; infinite without one."""
+        newest = self._blocks.newest
+        return math.inf if newest is None else self._clock() - newest.t_s + newest.behind_s
+
+    def lost(self) -> str | None:
+        """Return why the link is gone, None while it is there."""
+        return "it was closed" if self.connection is None else self.connection.lost
+
+    def has_variable(self, name: str) -> bool:
+        """True if the firmware logs this variable."""
+        return is_logged(self._cf, name)
+
+    def variables(self, names: Iterable[str]) -> dict[str, float]:
+        """Return the newest values of log variables, without those that do not come."""
+        return read_variables(self._cf, names)
+
+    def echoes(self, duration_s: float, period_s: float = ECHO_PERIOD_S) -> Echoes:
+        """Send packets to come back for so long, and wait `ANSWER_S` for the last."""
+        sent_s: list[float] = []
+        back_s: dict[int, float] = {}
+        all_back = threading.Event()
+        count = max(1, round(duration_s / period_s))
+
+        def on_packet(packet: Any) -> None:
+            data = bytes(packet.data)
+            if len(data) == _ECHO.size and data[0] == _ECHO_MARK:
+                back_s.setdefault(_ECHO.unpack(data)[1], time.monotonic())
+                if len(back_s) == count:
+                    all_back.set()
+
+        self._cf.add_header_callback(on_packet, Port.LINK, 0)
+        try:
+            start_s = time.monotonic()
+            for number in range(count):
+                sent_s.append(time.monotonic())
+                send_packets(self._cf, [Packet(Port.LINK, 0, _ECHO.pack(_ECHO_MARK, number))])
+                time.sleep(max(0.0, start_s + (number + 1) * period_s - time.monotonic()))
+            all_back.wait(ANSWER_S)
+        finally:
+            self._cf.remove_header_callback(on_packet, Port.LINK, 0)
+        trips = tuple(t_s - sent_s[n] for n, t_s in list(back_s.items()) if n < len(sent_s))
+        return Echoes(count, trips)
+
+    def _on_quality(self, percent: float) -> None:
+        self.quality = float(percent)
+
+
+# --- Which vehicles answer: channels, rates and addresses of the radio, USB, and UDP -----------
+
+
+SCAN_TIMEOUT_S = 20.0
+
+
+@dataclass(frozen=True)
+class ScanResult:
+    """The URIs that answered; `radio` is why no radio was asked, empty where one was."""
+
+    uris: tuple[str, ...]
+    radio: str = ""
+
+
+def find_vehicles(uri: str = "", timeout_s: float = SCAN_TIMEOUT_S) -> ScanResult:
+    """Ask which vehicles answer now, at a radio's usual address and at that of `uri`; sends null
+    packets only.
+
+    A radio's driver may hang: it gets a thread, and what came by then counts.
+    """
+    addresses: list[int | None] = [None]  # the usual one
+    parts = uri.partition("?")[0].split("/")
+    if uri.startswith("radio://") and len(parts) > 5 and parts[5] != USUAL_ADDRESS:
+        addresses.append(int(parts[5], 16))
+    found: list[str] = []
+    why = ["the radio did not answer in time"]
+
+    def run() -> None:
+        from cflib import crtp
+
+        ready_cflib()
+        with contextlib.suppress(Exception):  # whatever the driver raises
+            why[0] = _radio_problem()
+        for driver in crtp.CLASSES:
+            for address in addresses:
+                with contextlib.suppress(Exception):
+                    found.extend(uri for uri, _ in driver().scan_interface(address))
+
+    worker = threading.Thread(target=run, name="perchctl-scan", daemon=True)
+    worker.start()
+    worker.join(timeout_s)
+    uris = (uri for uri in dict.fromkeys(found) if uri.partition("://")[0] in FORMS)
+    return ScanResult(tuple(map(with_whole_address, uris)), why[0])
+
+
+def _radio_problem() -> str:
+    from cflib.drivers.crazyradio import Crazyradio
+
+    try:
+        Crazyradio().close()
+    except Exception as error:
+        cause = plain_cause(str(error) or "Cannot find a Crazyradio Dongle")
+        return cause.partition("\n")[0].rstrip(".")
+    return ""
