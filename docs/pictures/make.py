@@ -47,7 +47,8 @@ from perchctl.display.page import flight_state  # noqa: E402
 from perchctl.display.panel import panel  # noqa: E402
 from perchctl.flight import FlyOptions  # noqa: E402
 from perchctl.geometry import make_T, rotation_from_rpy  # noqa: E402
-from perchctl.mission import BatteryOutlook, Phase, PlannerState, Tick  # noqa: E402
+from perchctl.mission import Phase, PlannerState, Tick  # noqa: E402
+from perchctl.mission.state import BatteryOutlook  # noqa: E402
 from perchctl.plot import (  # noqa: E402
     BLACK,
     BLUE,

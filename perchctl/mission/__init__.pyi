@@ -1,7 +1,3 @@
-from .battery import BatteryFit as BatteryFit
-from .battery import charge_at as charge_at
-from .battery import fit_battery as fit_battery
-from .battery import update_energy as update_energy
 from .imu import ImuMotion as ImuMotion
 from .imu import acceleration_mps2 as acceleration_mps2
 from .imu import integrate_imu as integrate_imu
@@ -34,9 +30,7 @@ from .report import latency_text as latency_text
 from .report import rest_of as rest_of
 from .report import turn_text as turn_text
 from .state import SEVEN_PHASES as SEVEN_PHASES
-from .state import BatteryOutlook as BatteryOutlook
 from .state import Condition as Condition
-from .state import EnergyState as EnergyState
 from .state import Mismatch as Mismatch
 from .state import Observation as Observation
 from .state import Operator as Operator

@@ -1,4 +1,3 @@
-from .base import key_unit as key_unit
 from .dictionaries import aruco_dictionary as aruco_dictionary
 from .dictionaries import check_marker_id as check_marker_id
 from .dictionaries import dictionary_size as dictionary_size

@@ -7,8 +7,6 @@ from .capture import draw_capture as draw_capture
 from .crtp import CommandService as CommandService
 from .firmware import Firmware as Firmware
 from .firmware.controller import Estimate as Estimate
-from .hand import draw_hand as draw_hand
-from .hand import record_hand as record_hand
 from .powertrain import MOTOR_FORCE_N as MOTOR_FORCE_N
 from .powertrain import most_thrust_n as most_thrust_n
 from .process import CLOCK_MARGIN_S as CLOCK_MARGIN_S

@@ -16,7 +16,8 @@ from rich.text import Text
 
 from perchctl.display import open_panel
 from perchctl.display.panel import FlightPanel, PlainSurface, panel, status_rows
-from perchctl.mission import BatteryOutlook, ExternalPositions, Phase, Tick
+from perchctl.mission import ExternalPositions, Phase, Tick
+from perchctl.mission.state import BatteryOutlook
 from perchctl.record import LogWatcher, read_log
 from perchctl.record.fields import tick_record
 from perchctl.record.write import FlightLogWriter

@@ -90,7 +90,7 @@ def test_a_packet_comes_twice() -> None:
     arrived: list[Packet] = []
 
     class Firmware:
-        def notify_setpoint_stop(self, _remain_s: float) -> None:
+        def notify_setpoint_stop(self) -> None:
             arrived.append(NOTIFY)
 
     radio = faulty(e.PacketTwice("notify"))

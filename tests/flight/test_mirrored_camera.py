@@ -22,8 +22,8 @@ from perchctl.flight import lockstep_source
 from perchctl.link import MockLink
 from perchctl.mission import Phase
 from perchctl.profile import CameraConfig, Profile
-from perchctl.sim import SimulatedVehicle, draw_hand, draw_scenario, record_hand
-from perchctl.sim.hand import pictures
+from perchctl.sim import SimulatedVehicle, draw_scenario
+from perchctl.sim.hand import draw_hand, pictures, record_hand
 from perchctl.sim.host import VehicleHost
 from perchctl.sim.process import HostSetup
 from tests.helpers.flights import SEED, fly_short, short_profile

@@ -25,7 +25,7 @@ from perchctl.mission import (
     planner,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.imu import BLOW_MPS, Blow, Reckoning, reckoned
+from perchctl.mission.imu import BLOW_MPS, Blow, Reckoning, advance_reckoning
 from perchctl.mission.report import HARD_MPS, touchdown_of
 from perchctl.profile import load_profile
 from perchctl.record import FlightSummary, read_log, summary_text
@@ -72,7 +72,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, float, Touchdo
                 place = sample.position_m
             motion = integrate_imu(motion, last, sample)
             believed = not blind or t_s < dropped_s
-            carried, last = reckoned(carried, motion, sample, believed=believed), sample
+            carried, last = advance_reckoning(carried, motion, sample, believed=believed), sample
     assert last is not None
     obs = Observation(last.t_s, last, imu=motion)
     blind_s = dropped_s if blind else None
@@ -214,17 +214,17 @@ def test_blind_it_is_the_reckoned_speed_that_counts() -> None:
     blow's own samples nor what stands still on the floor changes that."""
     before = ImuMotion(t_s=8.9, velocity_mps=(0.0, 0.0, -1.3))
     after = ImuMotion(t_s=9.1, velocity_mps=(0.0, 0.0, 0.4), blow=Blow(9.0, -0.2, -1.5, 3.1))
-    carried = reckoned(
+    carried = advance_reckoning(
         Reckoning(before, velocity_mps=(0.0, 0.0, -0.7)), after, telemetry(9.1, 0.4), believed=False
     )
     still = replace(after, t_s=10.0, silent_s=10.0)
-    carried = reckoned(carried, still, telemetry(10.0, 0.4), believed=False)
+    carried = advance_reckoning(carried, still, telemetry(10.0, 0.4), believed=False)
     state = replace(state_in(Phase.LANDED, z_m=0.0), blind_s=5.0, reckoning=carried)
     told = touchdown_of(Context(state, observation(10.0, 0.4, imu=still), PROFILE))
     assert told is not None
     assert (told.speed_mps, told.peak_g) == (pytest.approx(0.9), 3.1)
     silent = replace(after, silent_s=8.95)  # what was reckoned ended there
-    carried = reckoned(Reckoning(before), silent, telemetry(9.1, 0.4), believed=False)
+    carried = advance_reckoning(Reckoning(before), silent, telemetry(9.1, 0.4), believed=False)
     assert carried.struck_mps == -0.2
 
 

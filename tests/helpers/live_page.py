@@ -11,7 +11,8 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from perchctl.display.live import TOKEN_HEADER
-from perchctl.mission import BatteryOutlook, Phase, PlannerState, Tick
+from perchctl.mission import Phase, PlannerState, Tick
+from perchctl.mission.state import BatteryOutlook
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers import log as synthetic
 

@@ -174,7 +174,7 @@ def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None
     (RawThrust(40000, math.pi / 8.0, -math.pi / 4.0),
      [("low_level", (Setpoint.raw(22.5, -45.0, 0.0, 40000),))]),
     (Land(-0.25, 3.0), [*[("high_level", (HlLand(-0.25, 3.0, None),))] * LAND_TIMES,
-                        ("notify_setpoint_stop", (0.0,))]),
+                        ("notify_setpoint_stop", ())]),
     (EmergencyStop(), [("emergency_stop", ())]),
 ])  # fmt: skip
 def test_the_lockstep_vehicle_flies_the_command(command: Command, calls: list[Any]) -> None:

@@ -24,6 +24,7 @@ from perchctl.profile import (
     load_profile,
 )
 from perchctl.record import FlightLog
+from perchctl.sim import scenario
 
 
 def test_shipped_profiles_are_listed_and_load() -> None:
@@ -317,8 +318,8 @@ def keys_of(model: type[BaseModel], name: str = "profile") -> Iterator[tuple[str
 @cache
 def attributes_read() -> set[tuple[str, str]]:
     """Every ``name.key`` and ``x.name.key`` in the package's code, and what is drawn by its name:
-    ``between("key")``."""
-    found: set[tuple[str, str]] = set()
+    ``between("key")``, or copied by its name (`_AS_GIVEN` of the scenario)."""
+    found: set[tuple[str, str]] = {("simulation", key) for key in scenario._AS_GIVEN}
     for path in Path(perchctl.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "between":

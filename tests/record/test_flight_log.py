@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perchctl.mission import BatteryOutlook, ExternalPositions, Phase, PlannerState
+from perchctl.mission import ExternalPositions, Phase, PlannerState
+from perchctl.mission.state import BatteryOutlook
 from perchctl.record import path_beside, read_log, to_plain
 from perchctl.record.fields import FIELDS, tick_record
 from perchctl.record.write import FlightLogWriter, log_path
