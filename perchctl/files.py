@@ -1,4 +1,4 @@
-"""The one way to write a whole file.
+"""The one way to write a whole file, and what a file is by its content.
 
 A file is written under a temporary name beside its place, brought to the disk, and renamed:
 a reader finds the old file or the new one, never a part of one. Logs and sessions, which grow
@@ -11,6 +11,7 @@ asked before any long work; folders that are missing are made.
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,6 +22,45 @@ from pathlib import Path
 from perchctl.errors import InvalidValue
 
 FORMAT = "the format that is written"
+_BEGINNINGS = (
+    (b"\x89PNG", "a picture"),
+    (b"\xff\xd8\xff", "a picture"),
+    (b"GIF8", "a picture"),
+    (b"%PDF", "a PDF"),
+    (b"\x89MCAP0", "a recording"),
+    (b"\x1f\x8b", "a file packed by gzip"),
+    (b"PK\x03\x04", "a ZIP archive"),
+    (b"<!DOCTYPE html", "a page for a browser"),
+)
+_KEYS = (  # of a YAML file, at the beginning of a line
+    (r"image_width|camera_matrix|distortion_model|cam0", "a camera calibration"),
+    (r"extends|vehicle|planner|safety|positioning", "a profile"),
+    (r"weights", "a file of merge weights"),
+)
+_READ_BYTES = 4096
+
+
+def file_kind(path: Path) -> str:
+    """Return what a file seems to be, as in ``a picture``; ``another kind of file`` if unknown.
+
+    For messages about a file of the wrong kind; never raises.
+    """
+    with suppress(OSError, ValueError):
+        with path.open("rb") as stream:
+            head = stream.read(_READ_BYTES)
+        for beginning, kind in _BEGINNINGS:
+            if head.startswith(beginning):
+                return kind
+        if head[4:8] == b"ftyp":
+            return "a video"
+        text = head.decode("utf-8", errors="ignore")
+        if text.startswith("{"):
+            is_campaign = '"perchctl-campaign"' in text.partition("\n")[0]
+            return "a campaign's results" if is_campaign else "a file of JSON lines"
+        for keys, kind in _KEYS:
+            if re.search(rf"^(?:{keys})\s*:", text, re.MULTILINE):
+                return kind
+    return "another kind of file"
 
 
 def check_output(path: Path, suffixes: Sequence[str], force: bool, content: str = FORMAT) -> None:

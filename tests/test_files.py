@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import os
+import shutil
 import stat
 from pathlib import Path
 
 import pytest
 
 from perchctl.errors import InvalidValue
-from perchctl.files import check_output, check_place, mode_of, same_file, whole_file, write_files
+from perchctl.files import (
+    check_output,
+    check_place,
+    file_kind,
+    mode_of,
+    same_file,
+    whole_file,
+    write_files,
+)
+from tests.helpers.commands import run
 from tests.helpers.disk import full_disk
+from tests.helpers.flights import ROOT
 
 
 def names(folder: Path) -> list[str]:
@@ -124,3 +135,45 @@ def test_one_file_by_two_names(tmp_path: Path) -> None:
     assert not same_file(path, link)
     link.symlink_to(path)
     assert same_file(path, link)
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        (b"\x89PNG\r\n", "a picture"),
+        (b"\x00\x00\x00\x18ftypmp42", "a video"),
+        (b"%PDF-1.7", "a PDF"),
+        (b"image_width: 640\ncamera_matrix: {}\n", "a camera calibration"),
+        (b"# mine\nextends: sim\n", "a profile"),
+        (b'{"kind": "header", "format": "perchctl-campaign"}\n', "a campaign's results"),
+        (b"", "another kind of file"),
+    ],
+)
+def test_a_file_is_named_by_its_content(content: bytes, kind: str, tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(content)
+    assert file_kind(file) == kind
+    assert file_kind(tmp_path) == file_kind(tmp_path / "none") == "another kind of file"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("fly", "--dry-run", "-p", "cal.yaml"), "cal.yaml is a camera calibration, no profile"),
+        (("fly", "--dry-run", "-p", "pic.png"), "pic.png is a picture, no profile"),
+        (("track", "pic.png", "--calibration", "pic.png"), "is a picture, no camera calibration"),
+        (("track", "pic.png", "--calibration", "mine.yaml"), "(it is a profile)"),
+        (("log", "show", "cal.yaml"), "is a camera calibration"),
+        (("fly", "--dry-run", "-p", "mine.yaml"), "did you mean planner?"),
+    ],
+)
+def test_a_file_of_the_wrong_kind_is_named_as_what_it_is(
+    words: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copyfile(ROOT / "calib" / "example_640x480.yaml", "cal.yaml")
+    shutil.copyfile(ROOT / "docs" / "pictures" / "calibration.png", "pic.png")
+    Path("mine.yaml").write_text("extends: sim\nplaner: {attempts: 3}\n")
+    result = run(*words)
+    assert result.code == 30
+    assert said in result.stderr

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from perchctl.errors import InvalidValue, Note, NotFound
+from perchctl.files import file_kind
 from perchctl.geometry import Array
 from perchctl.plain_yaml import parse_yaml
 from perchctl.profile import CameraConfig, find_calibration
@@ -49,7 +50,12 @@ def load_calibration(
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise NotFound(f"calibration file {path} does not exist") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise InvalidValue(
+            f"{path} is {file_kind(path)}, no camera calibration: name the .yaml of perchctl "
+            f"calibrate, or one of ROS, OpenCV or Kalibr"
+        ) from None
+    except OSError as error:
         raise InvalidValue(f"{path}: cannot be read as a calibration: {error}") from None
     if "opencv-matrix" in text or "<opencv_storage>" in text:
         _check_no_cam(path, cam)
@@ -76,7 +82,9 @@ def load_calibration(
                 "model": str(raw.get("distortion_model", "plumb_bob")),
             }
     except KeyError as error:
-        raise InvalidValue(f"{path}: key {error.args[0]} is missing") from None
+        kind = file_kind(path)
+        what = "" if "calibration" in kind else f" (it is {kind})"
+        raise InvalidValue(f"{path}: key {error.args[0]} is missing{what}") from None
     except (TypeError, ValueError) as error:
         raise InvalidValue(f"{path}: a value is not a number: {error}") from None
     return _checked(path, values, size_px)

@@ -77,6 +77,7 @@ class VideoSource(Recording):
     def __init__(self, path: Path, latency_s: float = 0.0) -> None:
         if not path.is_file():
             raise NotFound(f"video file {without_password(str(path))} was not found")
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # one sentence is enough
         self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         rate_hz, count = (
             float(self._capture.get(key)) if self._capture.isOpened() else 0.0

@@ -6,6 +6,7 @@ Every fault is one `InvalidValue` sentence of the form ``file: key: what is wron
 
 from __future__ import annotations
 
+import difflib
 import warnings
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_figures
+from perchctl.files import file_kind
 from perchctl.places import data_file, data_folder, file_names
 from perchctl.plain_yaml import clip_text, parse_yaml
 from perchctl.profile.base import without_constants
@@ -44,6 +46,11 @@ def find_profile(name: str) -> Path:
         what = "is a folder" if path.is_dir() else "does not exist"
         raise NotFound(f"profile file {name} {what}; shipped profiles are {_choices()}")
     found = data_file("profiles", name)
+    if found is None and Path(name).is_file():
+        raise InvalidValue(
+            f"{name} is {file_kind(Path(name))}, no profile: profiles end in .yaml; shipped are "
+            f"{_choices()}"
+        )
     if found is None:
         raise NotFound(f"profile {name!r} not found; give a path, or one of {_choices()}")
     return found
@@ -80,6 +87,11 @@ def _checked(path: Path, own: dict[str, Any]) -> Profile:
     try:
         return Profile.model_validate(values)
     except ValidationError as error:
+        kind = file_kind(path)
+        if kind == "a camera calibration":
+            raise InvalidValue(
+                f"{path} is {kind}, no profile: name it in a profile's camera.calibration"
+            ) from None
         raise InvalidValue(_one_sentence(path, error)) from None
 
 
@@ -305,7 +317,9 @@ def first_invalid_key(error: ValidationError) -> tuple[str, str]:
     if first["type"] == "extra_forbidden":
         above = first["loc"][:-1]
         keys = _keys_at(above) if above else ["extends", *_keys_at(above)]
-        text = f"this key is unknown; allowed here are {', '.join(keys)}"
+        close = difflib.get_close_matches(str(first["loc"][-1]), keys, 1)
+        meant = f"did you mean {close[0]}? " if close else ""
+        text = f"this key is unknown; {meant}allowed here are {', '.join(keys)}"
     elif first["type"] == "value_error":
         text = clip_text(str(first["ctx"]["error"]), _MOST_OF_A_FAULT)
     elif first["type"] == "model_type":

@@ -21,6 +21,7 @@ from pydantic import ValidationError
 
 from perchctl import __version__
 from perchctl.errors import InvalidValue, Note, NotFound
+from perchctl.files import file_kind
 from perchctl.geometry import Array
 from perchctl.mission import SentCommand, Turn
 from perchctl.profile import Profile, first_invalid_key
@@ -362,9 +363,13 @@ def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
     except (IndexError, ValueError):
         header = {}
     if header.get("kind") != "header" or header.get("format") != FORMAT:
+        kind = file_kind(path)
+        is_cut = kind in ("a file of JSON lines", "a file packed by gzip", "another kind of file")
+        found = (
+            "not a flight log of perchctl, or cut off in its header" if is_cut else f"it is {kind}"
+        )
         raise InvalidValue(
-            f"{path}: line 1: not a flight log of perchctl, or cut off in its header; logs are the "
-            f"{SUFFIX} files in the profile's log.directory"
+            f"{path}: line 1: {found}; logs are the {SUFFIX} files in the profile's log.directory"
         )
     version = header.get("version")
     if version not in READABLE_VERSIONS:

@@ -195,12 +195,14 @@ def test_what_names_no_source_says_what_is_allowed(spec: str, words: str) -> Non
     assert "sec" not in str(refused.value)
 
 
-def test_videos_that_are_none(tmp_path: Path) -> None:
+def test_videos_that_are_none(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """OpenCV's own warning would stand beside the sentence."""
     with pytest.raises(NotFound, match=r"flight\.avi was not found"):
         VideoSource(tmp_path / "flight.avi")
     (tmp_path / "flight.avi").write_bytes(b"no video at all")
     with pytest.raises(InvalidValue, match="no readable frame"):
         VideoSource(tmp_path / "flight.avi")
+    assert capfd.readouterr().err == ""
 
 
 def test_the_wrong_size_names_both() -> None:
