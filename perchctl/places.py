@@ -32,6 +32,16 @@ def file_names(kind: str) -> list[str]:
     return sorted({p.stem for f in folders if f.is_dir() for p in f.glob("*.yaml")})
 
 
+def is_shipped_example(path: Path) -> bool:
+    """Return whether a calibration is a shipped example by what is in it: a copy under another name
+    fits no other lens."""
+    try:
+        text = path.read_bytes()
+        return any(text == file.read_bytes() for file in data_folder("calib").glob("example_*"))
+    except OSError:
+        return False
+
+
 def user_config_folder() -> Path:
     """Return the folder of the user's own profiles and calibrations, by the XDG rules."""
     return Path(platformdirs.user_config_dir("perchctl", appauthor=False))

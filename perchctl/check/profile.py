@@ -30,7 +30,7 @@ from perchctl.check.row import (
 )
 from perchctl.errors import PerchError, SafetyAbort
 from perchctl.flight import FlyOptions
-from perchctl.places import data_folder
+from perchctl.places import is_shipped_example
 from perchctl.profile import DOUBTFUL, Profile, find_calibration
 from perchctl.target import mm_text, sees_small_marker
 from perchctl.vision import CameraModel
@@ -101,23 +101,13 @@ def _calibration(plan: _Plan) -> Finding:
         path = find_calibration(plan.profile.camera.calibration)
     except PerchError as error:
         return failed(str(error), "make one with perchctl calibrate")
-    if not plan.source.startswith("sim:") and _is_shipped_example(path):
+    if not plan.source.startswith("sim:") and is_shipped_example(path):
         return warned(
             f"{path.name} is the shipped example, and {without_password(plan.source)} a camera of "
             f"your own",
             "calibrate it (perchctl calibrate), and name the file in camera.calibration",
         )
     return passed(path.name)
-
-
-def _is_shipped_example(path: Path) -> bool:
-    """Return whether a calibration is a shipped example by what is in it: a copy under another name
-    fits no other lens."""
-    try:
-        text = path.read_bytes()
-        return any(text == file.read_bytes() for file in data_folder("calib").glob("example_*"))
-    except OSError:
-        return False
 
 
 def _camera_place(plan: _Plan) -> Finding:

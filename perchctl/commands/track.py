@@ -57,6 +57,7 @@ from perchctl.display import AXES_OF_SIDE, live_page
 from perchctl.errors import Interrupted, NotFound, UsageError
 from perchctl.files import check_output, same_file
 from perchctl.perception import BLENDED, INTERLACED, Perception
+from perchctl.places import is_shipped_example
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.target import PrintCheck
 from perchctl.vision import (
@@ -160,6 +161,11 @@ def track(
         rate_hz = count = None
         if isinstance(recording, Recording):
             paths, rate_hz, count = recording.paths, recording.rate_hz, recording.count
+        is_example = is_shipped_example(file)
+        ending = (
+            ", the shipped example: give your camera's with --calibration" if is_example else ""
+        )
+        say(f"calibration: {file.name}{ending}")
         prints = PrintCheck(camera, flown.target)
         tracker = Tracker(flown, camera, live=opened.live, stills=stills)
         add_row = stack.enter_context(csv_file(csv)) if csv else None
@@ -202,8 +208,11 @@ def track(
         if summary.frames == 0 and not stop.requested.is_set():
             raise NotFound(f"{opened.describe()} gave no frame at all")
     say(summary.text(ended_s))
-    if prints.judged:
+    if prints.judged and not is_example:  # another lens would say something of its own
         say(prints.verdict().text)
+    for path in (csv, overlay):
+        if path is not None:
+            say(f"wrote {path}")
     if stop.requested.is_set():
         raise Interrupted("Ctrl-C: stopped; what was written is complete")
 

@@ -15,7 +15,10 @@ from typer.testing import CliRunner
 from perchctl.commands import app
 from tests.helpers.flights import ROOT
 
-ON_THE_WAY = ("perchctl: connecting", "perchctl: check: ", "perchctl: flown ")
+ON_THE_WAY = (
+    "perchctl: connecting", "perchctl: check: ", "perchctl: flown ", "perchctl: calibration: ",
+    "perchctl: wrote ",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

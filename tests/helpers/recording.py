@@ -95,4 +95,5 @@ def make_recording(folder: Path) -> None:
     """`pictures/`, `flight.mp4` and `camera.yaml`, as the README names them."""
     write_pictures(folder / "pictures")
     write_video(folder / "flight.mp4", [picture(moving(i), i) for i in range(10)])
-    (folder / "camera.yaml").write_text(CALIBRATION.read_text(encoding="utf-8"), "utf-8")
+    text = CALIBRATION.read_text(encoding="utf-8")
+    (folder / "camera.yaml").write_text(f"# no copy of the example\n{text}", "utf-8")

@@ -30,6 +30,7 @@ from tests.helpers.recording import (
 )
 from tests.helpers.target_picture import CAMERA
 from tests.helpers.track import (
+    CALIBRATION,
     DISTORTION,
     MOVING,
     PINHOLE,
@@ -311,8 +312,18 @@ def test_a_print_error_is_named(video: Path, tmp_path: Path) -> None:
     profile.write_text(
         "extends: sim\ntarget: {small: {dictionary: DICT_ARUCO_ORIGINAL, id: 5, side_m: 0.024}}\n"
     )
-    assert "print error: the small marker is" in track(video, "-p", profile).stderr
-    assert "print good within its noise" in track(video).stderr
+    own = tmp_path / "camera.yaml"
+    own.write_text(f"# of this camera\n{CALIBRATION.read_text()}")
+    said = track(video, "-p", profile, calibration=own).stderr
+    assert "print error: the small marker is" in said
+    assert "print good within its noise" in track(video, calibration=own).stderr
+
+
+def test_the_calibration_is_named_and_the_example_judges_no_print(video: Path) -> None:
+    """Another camera's lens would call a good print wrong."""
+    said = track(video).stderr
+    assert "calibration: example_640x480.yaml, the shipped example" in said
+    assert "print" not in said
 
 
 class Script:

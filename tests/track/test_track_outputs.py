@@ -53,7 +53,8 @@ def test_csv_and_overlay_can_be_read(video: Path, tmp_path: Path) -> None:
         read += 1
     assert read == MOVING
     assert names(tmp_path) == ["out.csv", "out.mp4"]
-    summary, _prints = tracked.stderr.strip().splitlines()
+    _calibration, summary, *wrote = tracked.stderr.strip().splitlines()
+    assert wrote == [f"perchctl: wrote {table}", f"perchctl: wrote {film}"]
     assert re.fullmatch(rf"perchctl: {MOVING} frames in .* large 100 %, small \d+ %", summary)
 
 
