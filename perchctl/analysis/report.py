@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import os
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 import perchctl
 from perchctl.analysis.advice import Advice, advice_of
+from perchctl.analysis.film import write_film
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
@@ -39,13 +41,14 @@ TITLES = {
 GRADES = {"perched": "good", "landed": "warn"}
 
 
-def write_report(log_paths: Sequence[Path], output: Path) -> Report:
-    """Write the page, whole or not at all; return what is on it.
+def write_report(log_paths: Sequence[Path], output: Path, with_film: bool = False) -> Report:
+    """Write the page, whole or not at all; return what is on it. `with_film` embeds a film of each
+    flight.
 
     Raises NotFound and InvalidValue, as `read_log` and `write_files`.
     """
     report = Report(tuple(reported_flight(path) for path in log_paths))
-    write_files({output: page_of(report.flights).encode("utf-8")})
+    write_files({output: page_of(report.flights, with_film).encode("utf-8")})
     return report
 
 
@@ -171,18 +174,18 @@ class ReportedFlight:
 
 # --- the page ---------------------------------------------------------------------------
 
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
 """No script, nothing from elsewhere: the browser holds the page to it."""
 
 
-def page_of(flights: Sequence[ReportedFlight]) -> str:
+def page_of(flights: Sequence[ReportedFlight], with_film: bool = False) -> str:
     """Return the page of at least one flight as HTML that needs no other file. Raises InvalidValue
     for a value that no flight writes."""
     articles = []
     for number, told in enumerate(flights, start=1):
         with log_values(told.flight.log.path):
             articles.append(_render("flight.html", told=told, flight=told.flight, number=number,
-                                    is_session=len(flights) > 1))  # fmt: skip
+                                    is_session=len(flights) > 1, with_film=with_film))  # fmt: skip
     return _render(
         "page.html",
         flights=flights,
@@ -209,18 +212,30 @@ def _templates() -> jinja2.Environment:
     )
     templates.filters["count"] = count
     templates.globals.update(
-        seven_phases=SEVEN, latency_text=latency_text, turn_text=turn_text, plot_of=plot_address
-    )
+        seven_phases=SEVEN, latency_text=latency_text, turn_text=turn_text, plot_of=plot_address,
+        film_of=film_address,
+    )  # fmt: skip
     return templates
 
 
 def plot_address(flight: FlightAnalysis) -> str:
     """Return the flight's plot as a `data:` address; the log has at least one tick."""
-    return _address("png", flight_png(flight))
+    return _address("image/png", flight_png(flight))
 
 
-def _address(kind: str, image: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(image).decode('ascii')}"
+def film_address(flight: FlightAnalysis) -> str:
+    """Return the flight's film as a `data:` address; the log has at least one tick."""
+    path = flight.log.path
+    is_recorded = path_beside(path, ".mcap").is_file()
+    pictures = recorded_pictures(path, exact=False) if is_recorded else None
+    with tempfile.TemporaryDirectory() as folder:
+        film = Path(folder) / "film.mp4"
+        write_film(flight, pictures, film)
+        return _address("video/mp4", film.read_bytes())
+
+
+def _address(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 # --- What the camera saw when the mission decided: out of the recording beside the log ---------
@@ -263,7 +278,7 @@ class Shown:
 
     @property
     def address(self) -> str:
-        return _address("jpeg", self.jpeg)
+        return _address("image/jpeg", self.jpeg)
 
 
 def decisions_of(flight: FlightAnalysis) -> tuple[Decision, ...]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import re
 from pathlib import Path
 
 import av
@@ -88,3 +90,14 @@ def test_the_command_makes_a_gif_and_refuses_what_is_none(flown: Path, tmp_path:
         assert image.size == (WIDTH_PX, WIDTH_PX * 9 // 16)
     assert run(*words, str(tmp_path / "flight.avi")).code == InvalidValue.exit_code
     assert run(*words, str(out)).code == InvalidValue.exit_code  # it exists
+
+
+@pytest.mark.long
+def test_the_report_embeds_it_where_it_is_asked_for(flown: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    assert run("log", "report", str(flown), "-o", str(page)).code == 0
+    assert "<video" not in page.read_text()
+    assert run("log", "report", str(flown), "-o", str(page), "--film", "--force").code == 0
+    (film,) = re.findall(r'<video controls src="data:video/mp4;base64,([^"]+)"', page.read_text())
+    (tmp_path / "film.mp4").write_bytes(base64.b64decode(film))
+    assert len(pictures_of(tmp_path / "film.mp4")) > 100
