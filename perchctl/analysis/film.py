@@ -105,7 +105,7 @@ class _Shown:
     def __init__(self, pictures: Recorded | None) -> None:
         self._coming = pictures
         self._next = None if pictures is None else next(pictures, None)
-        self._image: Array | None = None
+        self._image = None if self._next is None else np.asarray(self._next[2], dtype=float)
         self._corners: dict[str, Array] = {}
 
     def at(self, record: dict[str, Any]) -> tuple[Array | None, dict[str, Array]]:
@@ -188,7 +188,7 @@ class _Stage:
         low_m, high_m = ways.span_m
         ax.set_xlim(low_m - BESIDE_M, high_m + BESIDE_M)
         ax.set_ylim(0.0, ways.top_m + ABOVE_M)
-        ax.locator_params(axis="x", nbins=2)
+        ax.set_xticks([0.0])
         ax.set_xlabel("beside the target [m]")
         ax.set_ylabel("height [m]")
         if ways.target_z_m is not None:
