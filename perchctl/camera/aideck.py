@@ -84,13 +84,9 @@ class AiDeckSource(StreamSource):
             data = connection.recv(_READ_BYTES)
             now_s = self._clock()
             self.bytes_seen += len(data)
-            try:
-                pictures = splitter.feed(data, now_s)
-            except Damaged:
-                return "its packets broke off" if splitter.pictures else _nothing(splitter)
             if not data:
                 return "the stream ended" if splitter.pictures else _nothing(splitter)
-            for picture in reversed(pictures):
+            for picture in reversed(splitter.feed(data, now_s)):
                 image = decoded(picture)
                 if image is not None:
                     last_s = now_s
@@ -173,12 +169,12 @@ class MosaicFilter:
         return without_mosaic(image) if self._in_a_row else image
 
 
-# --- An AI-deck's pictures, joined from the packets of its TCP stream ---------------------------
+# --- An AI-deck's pictures, cut out of the bytes of its TCP stream ------------------------------
 # The stream is packets of Bitcraze's CPX: 16 bits of length, which counts what follows them, then
 # one byte of routing, one of function, and the data. A picture is a packet with its header,
 # ``<BHHBBI``: magic 0xBC, width, height, depth, format, size; then packets of chunks until `size`
-# bytes have come. The deck may lose packets, and TCP loses no byte. cflib's own reader of these
-# packets blocks for ever when the deck goes away, so it is not used.
+# bytes have come. Nothing has a checksum. cflib's own reader of these packets blocks for ever when
+# the deck goes away and cannot find its way back after a broken length, so it is not used.
 
 
 MAX_PACKET_BYTES = 1022
@@ -193,6 +189,10 @@ _MAGIC, _RAW, _JPEG = 0xBC, 0, 1
 _HOST, _SENDERS, _APP = 3, (1, 2, 4), 5
 _FUNCTIONS = (1, 2, 3, 4, _APP, 14, 15)
 _NOT_RESERVED = 0x7F
+_START_BYTES = _PACKET.size + _HEADER.size
+_START = re.compile(
+    re.escape(struct.pack("<H", 2 + _HEADER.size)) + rb"[\x00-\x7f]\x05\xbc.{10}", re.DOTALL
+)
 
 
 @dataclass(frozen=True)
@@ -218,81 +218,91 @@ class _Header:
 
 
 class CpxSplitter:
-    """Joins packets into whole pictures.
+    """Cuts whole pictures out of the bytes.
 
-    A picture counts only if its packets are complete: no other picture's header amid them, raw
-    chunks of one length but for the last, `size` bytes to the byte, and a JPEG whose structure
-    ends there. Otherwise it is dropped (`damaged`). The packets of other functions are passed
-    over. At most one picture and one packet are held.
+    A picture counts only if its packets are complete: each a packet that the deck may send, no
+    other picture's header amid them, raw chunks of one length but for the last, `size` bytes to
+    the byte, and a JPEG whose structure ends there. Otherwise it is dropped (`damaged`), and the
+    search for the next header begins right behind its own header: a wrong length costs no picture
+    but the one that it is in. The packets of other functions are passed over. The bytes since the
+    current picture's header are held, for `STALLED_S` at most.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self._buffered_s = 0.0  # when the buffer's first byte came
-        self._header: _Header | None = None
-        self._began_s = 0.0
+        self._came: list[tuple[int, float]] = []  # the count of bytes at each time
+        self._at = 0  # how far the packets of the picture at the buffer's start have been read
         self._chunks: list[bytes] = []
         self.damaged = 0
         self.bytes_seen = 0
         self.pictures = 0
 
     def feed(self, data: bytes, t_s: float) -> list[CpxPicture]:
-        """Append bytes that came at `t_s`, and return the pictures now complete, oldest first.
-
-        Raises Damaged where the bytes are no packet, after which only a new connection helps.
-        """
-        self.bytes_seen += len(data)
-        if not self._buffer:
-            self._buffered_s = t_s
+        """Append bytes that came at `t_s`, and return the pictures now complete, oldest first."""
         self._buffer += data
+        self.bytes_seen += len(data)
+        self._came.append((self.bytes_seen, t_s))
         pictures: list[CpxPicture] = []
-        at = 0
-        while len(self._buffer) >= at + _PACKET.size:
-            length, routing, function = _PACKET.unpack_from(self._buffer, at)
-            if not _is_packet(length, routing, function):
-                raise Damaged(at)
-            end = at + 2 + length
-            if len(self._buffer) < end:
+        while (found := _START.search(self._buffer)) is not None:
+            if found.start() > 0:
+                self._drop(found.start())
+            try:
+                picture = self._joined(t_s)
+            except Damaged:
+                self.damaged += 1
+                self._drop(1)
+                continue
+            if picture is None:
                 break
-            if function == _APP:
-                payload = bytes(self._buffer[at + _PACKET.size : end])
-                picture = self._joined(payload, t_s, self._buffered_s if at == 0 else t_s)
-                if picture is not None:
-                    pictures.append(picture)
-            at = end
-        if at:
-            self._buffered_s = t_s
-            del self._buffer[:at]
+            pictures.append(picture)
+            self._drop(self._at)
+        else:
+            self._drop(max(len(self._buffer) - _START_BYTES + 1, 0))
         self.pictures += len(pictures)
         return pictures
 
-    def _joined(self, payload: bytes, t_s: float, came_s: float) -> CpxPicture | None:
-        """Add a packet whose first byte came at `came_s`; return the picture that it completes."""
-        new_header = _header_of(payload)
-        if new_header is not None:
-            self.damaged += self._header is not None
-            self._header, self._began_s, self._chunks = new_header, came_s, []
-            return None
-        header = self._header
-        if header is None or not payload:
-            return None
-        self._chunks.append(payload)
-        have = sum(map(len, self._chunks))
-        if have == header.size:
-            self._header = None
-            picture = b"".join(self._chunks)
-            if t_s - self._began_s <= STALLED_S and (not header.is_jpeg or _is_jpeg(picture)):
-                return CpxPicture(
-                    self._began_s, header.width, header.height, header.is_jpeg, picture
-                )
-            self.damaged += 1
-        elif have > header.size or (
+    def _joined(self, t_s: float) -> CpxPicture | None:
+        """Read on through the packets of the picture at the buffer's start, and return it; None
+        while it is not whole. Raises Damaged."""
+        header = _header_of(bytes(self._buffer[_PACKET.size : _START_BYTES]))
+        began_s = self._came[0][1]
+        if header is None or t_s - began_s > STALLED_S:
+            raise Damaged(0)
+        while len(self._buffer) >= self._at + _PACKET.size:
+            length, routing, function = _PACKET.unpack_from(self._buffer, self._at)
+            if not _is_packet(length, routing, function):
+                raise Damaged(self._at)
+            begin, end = self._at + _PACKET.size, self._at + 2 + length
+            if len(self._buffer) < end:
+                break
+            is_header, self._at = self._at == 0, end
+            payload = bytes(self._buffer[begin:end])
+            if is_header or function != _APP or not payload:
+                continue
+            self._chunks.append(payload)
+            have = sum(map(len, self._chunks))
             # A JPEG is sent in three parts, and its structure shows where one is missing.
-            not header.is_jpeg and len(payload) != len(self._chunks[0])
-        ):
-            self._header = None
-            self.damaged += 1
+            is_odd = not header.is_jpeg and len(payload) != len(self._chunks[0])
+            if (
+                _header_of(payload) is not None
+                or have > header.size
+                or (is_odd and have < header.size)
+            ):
+                raise Damaged(begin)
+            if have == header.size:
+                picture = b"".join(self._chunks)
+                if header.is_jpeg and not _is_jpeg(picture):
+                    raise Damaged(begin)
+                return CpxPicture(began_s, header.width, header.height, header.is_jpeg, picture)
         return None
+
+    def _drop(self, count: int) -> None:
+        """Remove bytes from the buffer's start, and begin anew with what is then there."""
+        del self._buffer[:count]
+        self._at, self._chunks = 0, []
+        dropped = self.bytes_seen - len(self._buffer)
+        while self._came and self._came[0][0] <= dropped:
+            del self._came[0]
 
 
 def _is_jpeg(data: bytes) -> bool:

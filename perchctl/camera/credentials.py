@@ -112,7 +112,7 @@ def _values(text: str) -> dict[str, str]:
 
 
 def _hash_name(challenge: Challenge) -> str:
-    return (challenge.algorithm or "MD5").upper()
+    return (challenge.algorithm or "MD5").upper().removesuffix("-SESS")
 
 
 def _qop(challenge: Challenge) -> str | None:
@@ -138,6 +138,8 @@ def answer(
         return hashed(":".join(words).encode()).hexdigest()
 
     first = h(who.name, challenge.realm, who.password)
+    if challenge.algorithm.upper().endswith("-SESS"):
+        first = h(first, challenge.nonce, cnonce)
     count = "00000001"
     middle = (challenge.nonce, count, cnonce, qop) if qop else (challenge.nonce,)
     values = {

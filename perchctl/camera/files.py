@@ -88,6 +88,13 @@ class VideoSource(Recording):
         self._period_s = 1.0 / rate_hz
         self._last_s = -self._period_s
         name = f"video:{without_password(str(path))}"
+        width, height = (
+            int(self._capture.get(key))
+            for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        )
+        if too_large := _too_large(width, height):
+            self._capture.release()
+            raise InvalidValue(f"{name} {too_large}")
         super().__init__(name, latency_s, rate_hz, round(count) if count > 0 else None)
 
     def _read(self) -> tuple[NDArray[np.uint8], float] | None:
@@ -159,9 +166,8 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
     """
     if is_cut_off(data):
         raise ValueError("is cut off")
-    width, height = _said_size_px(data)
-    if width * height > MOST_FILE_PX:
-        raise ValueError(f"says {width}x{height} px, and at most {MOST_FILE_PX:,} pixels are read")
+    if too_large := _too_large(*_said_size_px(data)):
+        raise ValueError(too_large)
     image = grey_pixels(data)
     if image is None:
         raise ValueError("cannot be read as a picture")
@@ -173,6 +179,13 @@ def _said_size_px(data: bytes) -> tuple[int, int]:
     if data.startswith(b"\x89PNG"):
         return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
     return (data.startswith(b"\xff\xd8") and size_in(data)) or (0, 0)
+
+
+def _too_large(width: int, height: int) -> str:
+    """Say that a picture of that size is not read; an empty string if it is."""
+    if width * height <= MOST_FILE_PX:
+        return ""
+    return f"says {width}x{height} px, and at most {MOST_FILE_PX:,} pixels are read"
 
 
 def is_cut_off(data: bytes) -> bool:

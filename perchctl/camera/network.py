@@ -160,6 +160,8 @@ class MjpegSource(StreamSource):
         while True:
             connection.connect()
             self._socket = connection.sock
+            if self._stop.is_set():  # `close` came before there was a socket to shut down
+                raise ConnectionError("closed")
             connection.request("GET", path, headers=headers)
             response = connection.getresponse()
             who, challenge = credentials_of(parts), _challenge(response)

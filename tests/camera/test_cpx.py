@@ -1,4 +1,4 @@
-"""An AI-deck's pictures out of its packets: whole ones only, whatever is lost between them."""
+"""An AI-deck's pictures out of its bytes: whole ones only, whatever breaks between them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from perchctl.camera.aideck import (
     has_mosaic,
     without_mosaic,
 )
-from perchctl.camera.jpeg import Damaged
 from tests.helpers.aideck import (
     APP,
     CHUNK_BYTES,
@@ -90,33 +89,59 @@ def test_lost_packets_cost_their_own_pictures_alone(
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
-@given(st.floats(0.0, 1.0), st.binary(min_size=1, max_size=64), st.sampled_from([raw, jpeg]))
-def test_damaged_bytes_end_the_connection_or_cost_their_own_picture(
-    where: float, filling: bytes, form: Callable[[Picture], bytes]
+@given(
+    st.sampled_from(["cut", "insert", "change"]),
+    st.floats(0.0, 1.0),
+    st.integers(1, 3000),
+    st.binary(min_size=1, max_size=64),
+    st.sampled_from([raw, jpeg]),
+)
+def test_after_any_damage_the_next_picture_but_one_is_right(
+    how: str, where: float, length: int, filling: bytes, form: Callable[[Picture], bytes]
 ) -> None:
     spoilt = console() + form(A) + console()
     at = int(where * len(spoilt))
-    try:
-        out = split(spoilt[:at] + filling + spoilt[at + len(filling) :] + form(B) + form(C))
-    except Damaged:
-        return
-    assert out[-1:] == split(form(C))
-    assert len(out) <= 3
+    middle = {"cut": b"", "insert": filling + spoilt[at:], "change": filling}[how]
+    rest = {"cut": spoilt[at + length :], "insert": b"", "change": spoilt[at + len(filling) :]}[how]
+    out = split(spoilt[:at] + middle + rest + form(B) + form(C) + form(D))
+    right = split(form(B) + form(C) + form(D))
+    assert out[-2:] == right[1:], "the last two, right behind one another"
+    assert len(out) <= 4
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.binary(max_size=4000))
+def test_noise_neither_raises_nor_piles_up(noise: bytes) -> None:
+    splitter = CpxSplitter()
+    assert splitter.feed(noise * 8, 0.0) == []
+    assert len(splitter._buffer) < 100
 
 
 def without(packets: list[bytes], index: int) -> bytes:
     return b"".join(p for i, p in enumerate(packets) if i != index)
 
 
+def wrong_length(by: int) -> bytes:
+    first, second, *rest = raw_packets(B)
+    length = int.from_bytes(second[:2], "little") + by
+    return first + length.to_bytes(2, "little") + second[2:] + b"".join(rest)
+
+
 FAULTS: dict[str, bytes] = {
+    "cut in the middle": raw(B)[: len(raw(B)) // 2],
     "a chunk lost": without(raw_packets(B), 1),
     "the header lost": without(raw_packets(B), 0),
     "a JPEG's end lost": without(jpeg_packets(B), len(jpeg_packets(B)) - 1),
     "a JPEG whose end is not one": jpeg(B)[:-2] + b"\0\0",
+    "a length too large": wrong_length(+5),
+    "a length beyond any packet": wrong_length(+40000),
     "a size of nonsense": header(*SMALL, 0xFFFFFFFF, 0) + b"".join(raw_packets(B)[1:]),
     "a size of zero": header(*SMALL, 0, 1) + b"".join(jpeg_packets(B)[1:]),
     "an unknown format": header(*SMALL, B.size, 7) + b"".join(raw_packets(B)[1:]),
+    "garbage": bytes(range(256)) * 9,
     "a header twice": raw_packets(B)[0] * 2,
+    "a header and a half": raw_packets(B)[0] + raw_packets(B)[0][:7],
+    "a version that is none": raw_packets(B)[0] + packet(b"abc", APP | 0x40),
     "more than its size": header(*SMALL, B.size, 0) + packet(bytes(B.size + 8)[:CHUNK_BYTES]) * 3,
     "a console that never ends": raw_packets(B)[0] + console("x" * 1000) * 100,
     "empty packets": raw_packets(B)[0] + packet(b"") * 20_000,
@@ -135,12 +160,40 @@ def test_a_fault_costs_its_own_picture_only(fault: str, form: Callable[[Picture]
     assert len(splitter._buffer) < 100
 
 
+@pytest.mark.parametrize("at_once", [True, False])
 @pytest.mark.parametrize("bad", [
     b"HTTP/1.1 400 Bad Request", packet(b"abc", APP | 0x40), b"\x40\x9c\x63\x05",
 ])  # fmt: skip
-def test_what_is_no_packet_ends_the_connection(bad: bytes) -> None:
-    with pytest.raises(Damaged):
-        split(raw(A) + bad)
+def test_what_is_no_packet_costs_only_the_picture_that_it_is_in(bad: bytes, at_once: bool) -> None:
+    """Whole pictures of the same read are kept; a time is that of the picture's own first byte."""
+    splitter = CpxSplitter()
+    start, *rest = raw_packets(B)
+    parts = [raw(A), bad, raw(B), start, bad, b"".join(rest), raw(C)]
+    times_s = [0.0] * 7 if at_once else [0.1 * i for i in range(7)]
+    out = splitter.feed(b"".join(parts), 0.0) if at_once else [
+        p for part, t_s in zip(parts, times_s, strict=True) for p in splitter.feed(part, t_s)
+    ]  # fmt: skip
+    assert [p.data for p in out] == [p.data for p in split(raw(A) + raw(B) + raw(C))]
+    assert [p.began_s for p in out] == [times_s[i] for i in (0, 2, 6)]
+    assert (splitter.pictures, splitter.damaged) == (3, 1)
+
+
+def test_a_picture_that_a_wrong_length_swallowed_is_found_again_with_its_own_time() -> None:
+    splitter = CpxSplitter()
+    assert splitter.feed(raw(B)[: len(raw(B)) // 2], 10.0) == []
+    assert splitter.feed(raw(C)[:500], 10.4) == []
+    (got,) = splitter.feed(raw(C)[500:], 10.6)
+    assert (got.began_s, got.data) == (10.4, C.tobytes())
+    assert splitter.damaged == 1
+
+
+def test_what_is_held_is_bounded_by_the_time_of_a_picture() -> None:
+    splitter = CpxSplitter()
+    splitter.feed(raw_packets(B)[0], 0.0)
+    for i in range(200):
+        splitter.feed(console("x" * 1000), 0.011 * i)
+    assert len(splitter._buffer) < 100
+    assert splitter.damaged == 1
 
 
 def test_a_picture_has_the_time_of_its_first_byte_and_one_that_stalls_is_dropped() -> None:

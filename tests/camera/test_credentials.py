@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 
 from perchctl.camera.credentials import Challenge, Credentials, answer, challenge_of
@@ -35,6 +39,28 @@ def test_the_examples_of_rfc_7616(algorithm: str, response: str) -> None:
     who = Credentials("Mufasa", "Circle of Life")
     text = answer(challenge, who, "GET", "/dir/index.html", CNONCE)
     assert f'response="{response}"' in text
+    assert f"algorithm={algorithm}" in text
+
+
+@pytest.mark.parametrize(("algorithm", "hashed"), [
+    ("MD5-sess", hashlib.md5), ("SHA-256-sess", hashlib.sha256),
+])  # fmt: skip
+def test_a_session_s_digest_goes_before_the_password_in_clear(
+    algorithm: str, hashed: Callable[[bytes], Any]
+) -> None:
+    """RFC 7616, 3.4.2: the nonces belong to the first of the hashed texts."""
+
+    def h(text: str) -> str:
+        return str(hashed(text.encode()).hexdigest())
+
+    challenge = challenge_of([
+        'Basic realm="r"', f'Digest realm="r", nonce="n", algorithm={algorithm}, qop="auth"'
+    ])  # fmt: skip
+    assert challenge is not None
+    text = answer(challenge, Credentials("name", "secret"), "GET", "/a", "c")
+    expected = h(f"{h(h('name:r:secret') + ':n:c')}:n:00000001:c:auth:{h('GET:/a')}")
+    assert text.startswith("Digest ")
+    assert f'response="{expected}"' in text
     assert f"algorithm={algorithm}" in text
 
 

@@ -256,6 +256,19 @@ def test_a_picture_that_says_to_be_too_large_is_not_decoded(
         read_grey(path)
 
 
+def test_a_video_that_says_to_be_too_large_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "flight.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, (64, 48))
+    writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    VideoSource(path).close()
+    monkeypatch.setattr(files, "MOST_FILE_PX", 64 * 48 - 1)
+    with pytest.raises(InvalidValue, match=r"flight\.avi says 64x48 px, and at most 3,071 pixels"):
+        VideoSource(path)
+
+
 @pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8", b"\xff\xd8no", None])
 def test_what_is_no_picture_is_named(tmp_path: Path, data: bytes | None) -> None:
     path = tmp_path / "a.jpg"

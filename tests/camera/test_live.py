@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import http.client
 import queue
+import socket
 import ssl
 import struct
 import threading
@@ -119,6 +121,29 @@ def server() -> Iterator[Server]:
     server = Server()
     yield server
     server.close()
+
+
+def test_close_while_it_connects_ends_the_thread(
+    opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server takes the connection and says nothing; `close` finds no socket to shut down."""
+    connected, woken = threading.Event(), threading.Event()
+    connect = http.client.HTTPConnection.connect
+
+    def connect_and_wait(connection: http.client.HTTPConnection) -> None:
+        connect(connection)
+        connected.set()
+        woken.wait(WAIT_S)
+
+    monkeypatch.setattr(http.client.HTTPConnection, "connect", connect_and_wait)
+    monkeypatch.setattr(MjpegSource, "_wake", lambda self: woken.set())
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        source = MjpegSource(f"http://127.0.0.1:{silent.getsockname()[1]}/", 0.07, Clock())
+        begun(source, opened, connect_timeout_s=1000.0)
+        assert connected.wait(WAIT_S)
+        source.close()
+        assert source._thread is not None
+        assert not source._thread.is_alive()
 
 
 def stream(server: Server, clock: Clock, opened: list[LiveSource], **options: float) -> MjpegSource:
