@@ -249,18 +249,17 @@ def _refuse_repeated(parts: Sequence[Measurements]) -> None:
     """Raises InvalidValue where a row is there twice: it would narrow the intervals and is no more
     evidence, and no test of weights that were fitted to it.
 
-    Data without times are not judged: rounded, rows of a camera at rest may well be equal.
+    Without times, rows of one position of one file may be equal: rounded, of a camera at rest.
     """
-    seen: set[bytes] = set()
-    for part in parts:
-        if float(np.ptp(part.t_s)) == 0.0:
-            continue
+    seen: dict[bytes, tuple[int, int]] = {}  # the file's number and the position of a row
+    for file, part in enumerate(parts):
+        has_times = float(np.ptp(part.t_s)) > 0.0
         rows = np.column_stack([part.t_s, part.large, part.small, part.actual])
         for number, row in enumerate(np.nan_to_num(rows) + 0.0, start=1):  # no zero with a minus
-            key = row.tobytes()
-            if key in seen:
+            key, place = row.tobytes(), (file, int(part.position[number - 1]))
+            if key in seen and (has_times or seen[key] != place):
                 raise InvalidValue(
                     f"{part.name}: its row {number} is there twice, or was in the files before: "
                     f"the same rows are no more evidence, and no test of what was fitted to them"
                 )
-            seen.add(key)
+            seen[key] = place

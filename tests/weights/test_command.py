@@ -218,7 +218,10 @@ def test_the_same_rows_twice_are_refused(session: Path, tmp_path: Path) -> None:
         for pose in (data.large, data.small, data.actual)
     )
     timeless = replace(data, t_s=data.t_s * 0.0, large=large, small=small, actual=actual)
-    assert run(write(timeless, tmp_path / "r.csv")).exit_code == 0
+    rounded = write(timeless, tmp_path / "r.csv")
+    assert run(rounded).exit_code == 0
+    for again in ((rounded, rounded), (rounded, "--test", rounded)):
+        assert run(*again).exit_code == 30
 
 
 def test_other_columns_orders_blanks_and_quotes_are_read(tmp_path: Path) -> None:
