@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
@@ -44,6 +44,7 @@ LEAST_ASIDE_M = 0.05
 LAST_S = 2.0
 """The last picture stays for so long."""
 WIDTH_IN, HEIGHT_IN = 9.6, 5.4
+MOST_GIF_HZ = 50.0
 GIF_GREYS, GIF_TINTS = 64, 4
 """The colours of a GIF: greys, and so many mixtures of each line's colour with white."""
 _H264 = {"preset": "veryfast", "crf": "23"}
@@ -277,12 +278,14 @@ class _Ways:
     def __init__(self, flight: FlightAnalysis) -> None:
         log = flight.log
         profile = log.flown_profile
+        body_m = _columns(log, "{}_m")
+        if not np.isfinite(body_m.sum(axis=1)).any():
+            raise InvalidValue(f"{log.path}: the log knows no position, there is nothing to film")
         self.large_side_m = profile.target.large.side_m
         self._gear_body_m = np.array(profile.vehicle.gear_body_m)
         self._angles_rad = np.column_stack(
             [log.column(f"{name}_rad") for name in ("roll", "pitch", "yaw")]
         )
-        body_m = _columns(log, "{}_m")
         targets_m = _filled(_columns(log, "t{}_m"))
         is_setpoint = np.array([kind == "position" for kind in log.texts("cmd")])
         setpoints_m = np.where(is_setpoint[:, None], _columns(log, "cmd_{}_m"), np.nan)
@@ -352,9 +355,11 @@ def _filled(points_m: Array) -> Array:
 def _writer(path: Path, rate_hz: float) -> Iterator[Callable[[Rgb], None]]:
     """Yield the function that adds a picture; the file is there whole or not at all.
 
-    Errors: InvalidValue if it cannot be written.
+    Errors: InvalidValue if it cannot be written, or is to be faster than its kind can.
     """
     form = _gif if path.suffix.lower() == ".gif" else _mp4
+    if form is _gif and rate_hz > MOST_GIF_HZ:
+        raise InvalidValue(f"a .gif shows at most {MOST_GIF_HZ:g} pictures a second: make an .mp4")
     try:
         with whole_file(path) as part, form(part, rate_hz) as add:
             yield add
@@ -400,9 +405,11 @@ def _gif(path: Path, rate_hz: float) -> Iterator[Callable[[Rgb], None]]:
 
     yield add
     first, *rest = pictures
+    # A GIF counts in hundredths of a second.
+    ends = [round(100.0 * k / rate_hz) for k in range(len(pictures) + 1)]
     first.save(
         path, format="GIF", save_all=True, append_images=rest, loop=0,
-        duration=math.floor(1000.0 / rate_hz),
+        duration=[10 * (end - start) for start, end in pairwise(ends)],
     )  # fmt: skip
 
 

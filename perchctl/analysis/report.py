@@ -6,6 +6,7 @@ import base64
 import os
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -25,7 +26,7 @@ from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
 from perchctl.analysis.story import SEVEN, Sentence, story_of
 from perchctl.analysis.words import count, length
-from perchctl.errors import PerchError
+from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import write_files
 from perchctl.mission import latency_text, turn_text
 from perchctl.record import log_values, path_beside, read_log, recorded_pictures
@@ -224,14 +225,18 @@ def plot_address(flight: FlightAnalysis) -> str:
 
 
 def film_address(flight: FlightAnalysis) -> str:
-    """Return the flight's film as a `data:` address; the log has at least one tick."""
+    """Return the flight's film as a `data:` address; the log has at least one tick. A recording
+    that cannot be read costs the camera's pictures; empty where the log holds too little."""
     path = flight.log.path
     is_recorded = path_beside(path, ".mcap").is_file()
-    pictures = recorded_pictures(path, exact=False) if is_recorded else None
+    recorded = [recorded_pictures(path, exact=False)] if is_recorded else []
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / "film.mp4"
-        write_film(flight, pictures, film)
-        return _address("video/mp4", film.read_bytes())
+        for pictures in (*recorded, None):
+            with suppress(InvalidValue):
+                write_film(flight, pictures, film)
+                return _address("video/mp4", film.read_bytes())
+    return ""
 
 
 def _address(kind: str, content: bytes) -> str:

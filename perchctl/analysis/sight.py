@@ -15,6 +15,8 @@ from perchctl.record import FlightLog, PhaseSpan
 
 BLIND_PHASE = "COMPLETE"
 """Against the ceiling no frame is looked at."""
+SAME_S = 1e-3
+"""Times that differ by less are those of one tick."""
 GAP_PERIODS = 2.5
 """Frames come irregularly: less than that may be a late one."""
 
@@ -187,11 +189,7 @@ def _phase_at(stays: Sequence[PhaseSpan], t_s: float) -> str:
     return next((s.phase for s in reversed(stays) if s.start_s <= t_s), "")
 
 
-SAME_S = 1e-3
-"""Times that differ by less are those of one tick."""
-
-
 def within(times_s: Array, start_s: float, end_s: float) -> slice:
-    """The ticks from one time to another."""
+    """Return the ticks from one time to another."""
     first, last = np.searchsorted(times_s, (start_s - SAME_S / 2, end_s + SAME_S / 2))
     return slice(int(first), int(last))

@@ -334,10 +334,10 @@ def film(
         say(f"there is no recording beside {path}: the film has no camera picture")
     with _opened(path) as log:
         flight = FlightAnalysis(log)
-        pictures = recorded_pictures(path, exact=False) if is_recorded else None
-        from perchctl.analysis import write_film
+    from perchctl.analysis import write_film
 
-        count = write_film(flight, pictures, place, rate_hz, width_px)
+    pictures = recorded_pictures(path, exact=False) if is_recorded else None
+    count = write_film(flight, pictures, place, rate_hz, width_px)
     if as_json:
         print_result({"log": str(path), "film": str(place), "pictures": count})
     else:

@@ -47,10 +47,10 @@ def find_profile(name: str) -> Path:
         raise NotFound(f"profile file {name} {what}; shipped profiles are {_choices()}")
     found = data_file("profiles", name)
     if found is None and Path(name).is_file():
-        raise InvalidValue(
-            f"{name} is {file_kind(Path(name))}, no profile: profiles end in .yaml; shipped are "
-            f"{_choices()}"
-        )
+        kind = file_kind(Path(name))
+        if kind == "a profile":
+            raise InvalidValue(f"{name}: the file of a profile ends in .yaml; rename it")
+        raise InvalidValue(f"{name} is {kind}, no profile; shipped profiles are {_choices()}")
     if found is None:
         raise NotFound(f"profile {name!r} not found; give a path, or one of {_choices()}")
     return found

@@ -45,7 +45,10 @@ class LogConfig(Section):
     directory: str = key("perchctl-logs", "for the log and its plot")
     plot: bool = key(True, "draw the flight after it")
     max_mb: float = key(
-        2000.0, "no more pictures are recorded into a larger recording", gt=0, le=1e6
+        2000.0,
+        "no more pictures are recorded into a larger recording, before it is packed",
+        gt=0,
+        le=1e6,
     )
 
 

@@ -59,9 +59,13 @@ def _fields(log: FlightLog) -> Iterator[_Column]:
         values = [record.get(key) for record in log.records]
         if key in _TIMES:
             values = [None if v is None else round(log.since(v), _DECIMALS) + 0.0 for v in values]
+        if field_kind(key) == "number":
+            log.column(key)  # raises for what is none
         if field_kind(key) != "corners":
             yield key, values
             continue
+        if not all(value is None or len(value) == len(_CORNERS) for value in values):
+            raise ValueError(f"{key} needs {len(_CORNERS)} numbers")
         for at, corner in enumerate(_CORNERS):
             name = f"{key.removesuffix('_px')}_{corner}_px"
             yield name, [None if value is None else value[at] for value in values]

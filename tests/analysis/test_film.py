@@ -14,7 +14,7 @@ from PIL import Image
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.analysis import FlightAnalysis, write_film
-from perchctl.analysis.film import LAST_S, PHASE_WORDS, _Ways
+from perchctl.analysis.film import LAST_S, PHASE_WORDS, _gif, _Ways
 from perchctl.errors import InvalidValue
 from perchctl.flight import fly_lockstep
 from perchctl.mission import Phase
@@ -92,6 +92,21 @@ def test_the_command_makes_a_gif_and_refuses_what_is_none(flown: Path, tmp_path:
     assert run(*words, str(out)).code == InvalidValue.exit_code  # it exists
 
 
+@pytest.mark.parametrize("rate_hz", [6.0, 15.0, 25.0, 50.0])
+def test_a_gif_runs_at_the_flight_s_own_pace(tmp_path: Path, rate_hz: float) -> None:
+    """It counts in hundredths of a second."""
+    path = tmp_path / "two_seconds.gif"
+    with _gif(path, rate_hz) as add:
+        for number in range(round(2.0 * rate_hz)):
+            add(np.full((90, 160, 3), 255 * (number % 2), np.uint8))
+    lasts_ms = 0.0
+    with Image.open(path) as image:
+        for number in range(image.n_frames):
+            image.seek(number)
+            lasts_ms += image.info["duration"]
+    assert lasts_ms == 2000.0
+
+
 @pytest.mark.long
 def test_the_report_embeds_it_where_it_is_asked_for(flown: Path, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
@@ -101,3 +116,14 @@ def test_the_report_embeds_it_where_it_is_asked_for(flown: Path, tmp_path: Path)
     (film,) = re.findall(r'<video controls src="data:video/mp4;base64,([^"]+)"', page.read_text())
     (tmp_path / "film.mp4").write_bytes(base64.b64decode(film))
     assert len(pictures_of(tmp_path / "film.mp4")) > 100
+
+
+@pytest.mark.long
+def test_a_bad_recording_costs_the_report_s_film_its_pictures_only(
+    flown: Path, tmp_path: Path
+) -> None:
+    log, page = tmp_path / "flight.jsonl", tmp_path / "page.html"
+    log.write_bytes(flown.read_bytes())
+    (tmp_path / "flight.mcap").write_bytes(b"no recording")
+    assert run("log", "report", str(log), "-o", str(page), "--film").code == 0
+    assert "<video" in page.read_text()

@@ -233,7 +233,7 @@ def test_the_path_grows_and_corners_lie_on_the_picture(found: dict[str, list[Any
 
 
 def test_the_layout_shows_what_is_there(found: dict[str, list[Any]]) -> None:
-    """Of the layout for Foxglove that docs/recording.md names."""
+    """Of the layout for Foxglove that docs/after-a-flight.md names."""
     shown = json.loads((ROOT / "docs" / "foxglove.json").read_bytes())
     topics = set(found)
     text = json.dumps(shown)
