@@ -34,7 +34,6 @@ MAX_DATA = 30
 class Port(IntEnum):
     """CRTP's ports, by their numbers on the air."""
 
-    CONSOLE = 0
     PARAM = 2
     COMMANDER = 3
     MEM = 4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, TimedOut
@@ -127,13 +127,13 @@ def decks_found(parameters: Mapping[str, float]) -> tuple[str, ...]:
     return tuple(sorted(names))
 
 
-def measured_by(cf: Any, wait: Callable[[float], None] = time.sleep) -> MeasuredBy:
+def measured_by(cf: Any) -> MeasuredBy:
     """Return what tells the vehicle where it is; one without a positioning deck is listened to."""
     by = MeasuredBy(decks_found(read_parameters(cf)))
     if by.position_decks:
         return by
     before = read_variables(cf, [EXTERNAL_POSITION_TICK]).get(EXTERNAL_POSITION_TICK)
-    wait(LISTEN_S)
+    time.sleep(LISTEN_S)
     after = read_variables(cf, [EXTERNAL_POSITION_TICK]).get(EXTERNAL_POSITION_TICK)
     external = None if before is None or after is None else after != before
     return replace(by, external=external)

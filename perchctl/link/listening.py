@@ -225,12 +225,12 @@ class ProbeLink(ListeningLink):
         """Return the newest values of log variables, without those that do not come."""
         return read_variables(self._cf, names)
 
-    def echoes(self, duration_s: float, period_s: float = ECHO_PERIOD_S) -> Echoes:
+    def echoes(self, duration_s: float) -> Echoes:
         """Send packets to come back for so long, and wait `ANSWER_S` for the last."""
         sent_s: list[float] = []
         back_s: dict[int, float] = {}
         all_back = threading.Event()
-        count = max(1, round(duration_s / period_s))
+        count = max(1, round(duration_s / ECHO_PERIOD_S))
 
         def on_packet(packet: Any) -> None:
             data = bytes(packet.data)
@@ -245,7 +245,7 @@ class ProbeLink(ListeningLink):
             for number in range(count):
                 sent_s.append(time.monotonic())
                 send_packets(self._cf, [Packet(Port.LINK, 0, _ECHO.pack(_ECHO_MARK, number))])
-                time.sleep(max(0.0, start_s + (number + 1) * period_s - time.monotonic()))
+                time.sleep(max(0.0, start_s + (number + 1) * ECHO_PERIOD_S - time.monotonic()))
             all_back.wait(ANSWER_S)
         finally:
             self._cf.remove_header_callback(on_packet, Port.LINK, 0)
@@ -270,7 +270,7 @@ class ScanResult:
     radio: str = ""
 
 
-def find_vehicles(uri: str = "", timeout_s: float = SCAN_TIMEOUT_S) -> ScanResult:
+def find_vehicles(uri: str = "") -> ScanResult:
     """Ask which vehicles answer now, at a radio's usual address and at that of `uri`; sends null
     packets only.
 
@@ -278,7 +278,7 @@ def find_vehicles(uri: str = "", timeout_s: float = SCAN_TIMEOUT_S) -> ScanResul
     """
     addresses: list[int | None] = [None]  # the usual one
     parts = uri.partition("?")[0].split("/")
-    if uri.startswith("radio://") and len(parts) > 5 and parts[5] != USUAL_ADDRESS:
+    if uri.startswith("radio://") and len(parts) > 5 and parts[5].upper() != USUAL_ADDRESS:
         addresses.append(int(parts[5], 16))
     found: list[str] = []
     why = ["the radio did not answer in time"]
@@ -296,7 +296,7 @@ def find_vehicles(uri: str = "", timeout_s: float = SCAN_TIMEOUT_S) -> ScanResul
 
     worker = threading.Thread(target=run, name="perchctl-scan", daemon=True)
     worker.start()
-    worker.join(timeout_s)
+    worker.join(SCAN_TIMEOUT_S)
     uris = (uri for uri in dict.fromkeys(found) if uri.partition("://")[0] in FORMS)
     return ScanResult(tuple(map(with_whole_address, uris)), why[0])
 

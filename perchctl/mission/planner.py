@@ -110,7 +110,7 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     since = conditions_since(context)
     if state.hold:
         since = lasting_conditions(since)  # a held vehicle proves nothing: dwell times begin anew
-    # Near the target an ascent may press against a ceiling that is lower_thrust than thought.
+    # Near the target an ascent may press against a ceiling that is lower than thought.
     away = state.phase is not Phase.ASCEND or context.error_z_m > profile.planner.ascend.near_m
     if away and state.phase in _LEARNING and hovers(context):
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
@@ -307,12 +307,12 @@ def _walked(c: Context, goal: PositionSetpoint, up_mps: float, down_mps: float) 
     )
 
 
-def _under_target(c: Context, z_m: float, *, up_mps: float = 0.0, down_mps: float = 0.4) -> Acted:
+def _under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Acted:
     """Walk under the target at height `z_m`, and learn the trim that keeps the gear there."""
     goal = _target_goal(c, z_m)
     trim = integrated(c, (goal.x_m, goal.y_m), c.obs.t_s - c.state.t_s)
     c = c.with_state(replace(c.state, integral_m=trim))
-    return _walk_to(c, goal, up_mps=up_mps, down_mps=down_mps)
+    return _walk_to(c, goal, up_mps=up_mps)
 
 
 def _target_goal(c: Context, z_m: float) -> PositionSetpoint:

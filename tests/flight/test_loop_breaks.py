@@ -335,6 +335,7 @@ def test_a_landing_that_nobody_saw_is_no_landing(
         rig.operator = lambda: Operator.LAND if rig.link.now_s > 2.0 else Operator.NONE
     report = rig.fly()
     assert report.phase is Phase.ABORTED
+    assert report.outcome is Outcome.SAFETY
     assert all(each in report.reason for each in words)
     assert "motors off" not in report.reason
 

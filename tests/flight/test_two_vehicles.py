@@ -159,6 +159,7 @@ def test_two_programs_fly_two_vehicles_at_the_same_time(seed: int, tmp_path: Pat
     path = small_pictures(tmp_path)
     profile = load_profile(path)
     ended: list[tuple[dict[str, Any], dict[str, Any], set[str], Array]] = []
+    too_slow = False
     with ExitStack() as stack:
         flying = []
         for name, scenario in zip("ab", pair(profile, seed, APART_M), strict=True):
@@ -180,7 +181,13 @@ def test_two_programs_fly_two_vehicles_at_the_same_time(seed: int, tmp_path: Pat
         for name, sim, program in flying:
             out, err = program.communicate(timeout=FLIGHT_LIMIT_S)
             assert out, err
-            ended.append((json.loads(out), sim.truth(), *heard(tmp_path / name)))
+            ended.append(
+                (
+                    json.loads(out) | {"code": program.returncode},
+                    sim.truth(),
+                    *heard(tmp_path / name),
+                )
+            )
     assert len({said["log"] for said, *_ in ended}) == 2
     assert len(set.union(*(commanders for *_, commanders, _ in ended))) == 2
     logs = [read_log(Path(said["log"])) for said, *_ in ended]
@@ -198,6 +205,10 @@ def test_two_programs_fly_two_vehicles_at_the_same_time(seed: int, tmp_path: Pat
         assert np.mean(farthest_m(setpoints_m, sent(other)) < SAME_M) < 0.05
         fence_m = own.header["profile"]["safety"]["fence_radius_m"]
         assert np.hypot(setpoints_m[:, 0], setpoints_m[:, 1]).max() < fence_m
-        if max(own.column("late_s").max(), own.column("tel_age_s").max()) < LATEST_S:
-            assert truth["magnet_engaged"], said
-            assert truth["gear_miss_m"] < MISS_M
+        if max(own.column("late_s").max(), own.column("tel_age_s").max()) > LATEST_S:
+            too_slow = True
+            continue
+        assert (said["code"], truth["magnet_engaged"]) == (0, True), said
+        assert truth["gear_miss_m"] < MISS_M
+    if too_slow:
+        pytest.skip("two flights in real time were too much for this machine; nothing was mixed")

@@ -112,6 +112,14 @@ def test_the_last_safe_setpoint_is_held_until_the_landing(
     assert Rig(command, state, z_m).after(silent_s, **changes) == held
 
 
+def test_a_catch_that_the_watchdog_held_ends_with_the_sinking() -> None:
+    catch = replace(HOVER, z_m=2.0)
+    rig = Rig(catch, z_m=1.0)
+    assert rig.after(0.31, velocity_mps=(0.0, 0.0, -0.5)) == catch
+    rig.z_m = 0.8
+    assert rig.after(0.5) == replace(HOVER, z_m=0.8)
+
+
 def test_what_is_held_is_not_asked_anew_each_time() -> None:
     rig = Rig(HIGH, z_m=1.0)
     assert rig.after(0.31) == HELD

@@ -174,6 +174,7 @@ def test_telemetry_is_si_right_handed_and_in_the_loop_s_time(sim: SimProcess) ->
         assert len(times) > 20
         assert times == sorted(times)
         assert max(times) <= time.monotonic()
+        assert all(sample.t_s > times[-1] for sample in link.telemetry())
         sim.set_pose((0.1, -0.2, 0.5), (0.15, 0.25, 0.6), hold=True)
         true = until(lambda: sim.truth())
         assert true["rpy_rad"] == pytest.approx((0.15, 0.25, 0.6), abs=1e-3)

@@ -683,5 +683,6 @@ def test_only_the_lander_orders_a_landing() -> None:
 def test_who_lands_in_the_loop_s_place_has_no_landing_of_its_own() -> None:
     names = imported("flight/watchdog.py")
     assert "step_landing" in names["perchctl.mission"]
+    assert "step_mission" not in names["perchctl.mission"]
     assert not any(module.startswith("perchctl.mission.") for module in names)
     assert not names["perchctl.vehicle"] & {"Land", "StopMotors", "HL_ACTIVE"}

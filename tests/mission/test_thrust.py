@@ -99,9 +99,9 @@ def test_near_the_target_an_ascent_learns_nothing(z_m: float, learns: bool) -> N
     assert (hover > 50000.0) is learns
 
 
-def pressing(hover: float, thrust: float, profile: Profile = PROFILE) -> PlannerState:
+def pressing(hover: float, thrust: float) -> PlannerState:
     start = replace(state_in(Phase.PERCH, z_m=CONTACT_Z_M), hover_thrust=hover)
-    return flown(start, 0.5, CONTACT_Z_M, profile, thrust=thrust)
+    return flown(start, 0.5, CONTACT_Z_M, PROFILE, thrust=thrust)
 
 
 @pytest.mark.parametrize("hover", [56000.0, 63000.0, 64000.0])

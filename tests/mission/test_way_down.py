@@ -480,9 +480,9 @@ def test_a_short_descent_is_enough_to_have_left(descend_m: float) -> None:
 # --- The release -----------------------------------------------------------------------
 
 
-def mid_release(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
+def mid_release(**changes: Any) -> PlannerState:
     """Half a second into the release, the motors on their way down to still."""
-    return hanging(phase, **{"entered_s": 8.0, "released_s": 9.5, "t_s": 9.98, **changes})
+    return hanging(Phase.COMPLETE, **{"entered_s": 8.0, "released_s": 9.5, "t_s": 9.98, **changes})
 
 
 def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:

@@ -78,12 +78,11 @@ def watched(
     turned_rad: float = 0.0,
     offset_g: float = 0.0,
     for_s: float = 1.5,
-    seed: int = 0,
     sway_m: float = 0.0,
     anew: bool = False,
 ) -> VisualInertialWindow:
     """`sway_m`: what the sights wander by for another reason; `anew`: begun anew before them."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     watch = drop_sights(VisualInertialWindow()) if anew else VisualInertialWindow()
     flown = [swing.sample(0.01 * k, offset_g) for k in range(int((for_s + 2.2) * 100) + 1)]
     for i in range(int(for_s * RATE_HZ)):
