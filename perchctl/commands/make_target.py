@@ -202,7 +202,7 @@ def design(
     small_id: SmallIdOption = None,
     small_dict: SmallDictOption = None,
 ) -> None:
-    """Compute from where to where a camera sees each marker, how exactly, and where a gap is."""
+    """Compute from where to where a camera sees each marker, and where a gap is."""
     config = load_profile(profile)
     name, model = _camera(config, camera, cam)
     target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))

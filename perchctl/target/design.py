@@ -17,7 +17,7 @@ from perchctl.errors import InvalidValue
 from perchctl.profile import MarkerConfig, Profile, TargetConfig
 from perchctl.target.drawing import mm_text
 from perchctl.target.page import parse_page
-from perchctl.target.reading import TRIALS, Optics, check_target, smallest_side_px
+from perchctl.target.reading import Optics, check_target, smallest_side_px
 from perchctl.target.sheets import fits, fitting_page
 from perchctl.target.sight import (
     FieldOfView,
@@ -175,14 +175,12 @@ def focal_px(camera: CameraModel) -> float:
     return math.sqrt(float(camera.K[0, 0] * camera.K[1, 1]))
 
 
-def design_ranges(
-    target: TargetConfig, camera: CameraModel, optics: Optics, trials: int = TRIALS
-) -> Ranges:
+def design_ranges(target: TargetConfig, camera: CameraModel, optics: Optics) -> Ranges:
     """Return the ranges: by trial through the detector (far) and by geometry (near)."""
     f, view, ahead = focal_px(camera), FieldOfView(camera), (np.eye(3), np.zeros(3))
     picture_px = max(camera.size_px)
-    large_px = smallest_side_px(target, "large", optics, picture_px, trials)
-    small_px = smallest_side_px(target, "small", optics, picture_px, trials)
+    large_px = smallest_side_px(target, "large", optics, picture_px)
+    small_px = smallest_side_px(target, "small", optics, picture_px)
     large, small = target.large.side_m, target.small.side_m
     return Ranges(
         z1_m=None if large_px is None else f * large / large_px,
@@ -209,12 +207,10 @@ def make_design(
     profile: Profile,
     ceiling_m: float | None = None,
     ranges: Ranges | None = None,
-    trials: int = TRIALS,
 ) -> TargetDesign:
     """Return the ranges, and what is wrong with them for a flight by that profile under a ceiling
-    of that height over the floor (None: unknown). `trials` are the pictures of a side, where the
-    ranges are not given."""
-    ranges = ranges or design_ranges(target, camera, optics, trials)
+    of that height over the floor (None: unknown)."""
+    ranges = ranges or design_ranges(target, camera, optics)
     view, sides = FieldOfView(camera), (target.large.side_m, target.small.side_m)
     large_m, small_m = (
         view.nearest_m(turned_outline(s), *gear_from_camera(profile)) for s in sides

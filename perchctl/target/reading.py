@@ -81,21 +81,18 @@ def smallest_side_px(
     marker: MarkerName,
     optics: Optics,
     picture_px: int,
-    trials: int = TRIALS,
 ) -> float | None:
     """Return the side in px from which on the marker, seen straight on at any turn, is found in
     `FOUND_RATE` of the pictures; None where even `SIDE_RANGE_PX[1]` is not.
 
-    `picture_px` is the larger side of the camera's picture; `trials` are the pictures of a side.
+    `picture_px` is the larger side of the camera's picture.
     """
     drawing, reader = draw_target(target), PlainReader(target)
     count = math.ceil(math.log(SIDE_RANGE_PX[1] / SIDE_RANGE_PX[0]) / math.log(STEP))
 
     @cache
     def rate(i: int) -> float:
-        return _found_share(
-            drawing, reader, marker, SIDE_RANGE_PX[0] * STEP**i, optics, picture_px, trials
-        )
+        return _found_share(drawing, reader, marker, SIDE_RANGE_PX[0] * STEP**i, optics, picture_px)
 
     def found(i: int) -> bool:
         # Three neighbours together: between 0.8 and 1 the rate rises slowly.
@@ -121,17 +118,16 @@ def _found_share(
     side_px: float,
     optics: Optics,
     picture_px: int,
-    trials: int,
 ) -> float:
     side_m = drawing.large_side_m if marker == "large" else drawing.small_side_m
-    pictures = sample_pictures(drawing, side_px / side_m, side_px, optics, trials)
+    pictures = sample_pictures(drawing, side_px / side_m, side_px, optics, TRIALS)
     least_px = _PERIMETER_RATE * picture_px
     hits = 0
     for picture in pictures:
         quad = reader.read(picture).get(marker)
         if quad is not None and cv2.arcLength(quad, True) >= least_px:
             hits += 1
-    return hits / trials
+    return hits / TRIALS
 
 
 def sample_pictures(

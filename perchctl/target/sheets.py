@@ -56,7 +56,6 @@ class SheetLayout:
     width: float
     height: float
     sheet: float
-    quiet: float
     caption: tuple[str, ...]
 
 
@@ -158,7 +157,7 @@ def _layout_on(
     quiet = math.floor(2.0 * min(cell, half - side / 2) + 1e-6) / 2.0
     if quiet < MIN_QUIET_CELLS * cell - 1e-9 or half < _ruler_half(side / 2 + quiet) - 1e-9:
         return None
-    return SheetLayout(width, height, side + 2.0 * quiet, quiet, tuple(lines))
+    return SheetLayout(width, height, side + 2.0 * quiet, tuple(lines))
 
 
 def _side_and_cell(target: TargetConfig) -> tuple[float, float]:

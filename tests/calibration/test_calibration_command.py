@@ -152,7 +152,7 @@ def test_pictures_named_one_by_one_are_the_folder_s(
         (["{board}/board_0[01].png"], 30, ["only 2 pictures", "add 3"]),
         (["images:sizes"], 30, ["480x300", "480x360"]),
         (["images:{board}", "--measured", "249.5"], 30, ["WIDTHxHEIGHT in mm"]),
-        (["images:{board}", "--measured", "24.9x17.4"], 30, ["measure its black area"]),
+        (["images:{board}", "--measured", "24.9x17.4"], 30, ["measure what is black"]),
         (["{one}", "no.png"], 20, ["no.png does not exist"]),
         (["{one}", "{one}", "{board}"], 2, ["{board}"]),
         (["{one}", "{one}", "camera:0"], 20, ["camera:0"]),

@@ -107,11 +107,11 @@ def position_errors_mm(
     return np.array(errors)
 
 
-def _draws(covariance: Array, seed: int = 0) -> Array:
-    """Return lens errors drawn from the covariance, (DRAWS, p); the same for the same seed."""
+def _draws(covariance: Array) -> Array:
+    """Return lens errors drawn from the covariance, (DRAWS, p); always the same."""
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    normal = np.random.default_rng(seed).standard_normal((DRAWS, len(covariance)))
+    normal = np.random.default_rng(0).standard_normal((DRAWS, len(covariance)))
     return np.asarray(normal @ root.T)
 
 

@@ -68,7 +68,7 @@ def inverses(cov: Array, factor: float, along: Array, jitter_s: float) -> Array:
 
 
 def estimate_noise(misfit: Array, cov: Array, along: Array | None = None) -> tuple[float, float]:
-    """Return the estimate_noise factor and jitter in s of misfits (n, 3) with claimed covariances
+    """Return the likeliest factor and jitter in s of misfits (n, 3) with claimed covariances
     (n, 3, 3); `along` (n, 3) is what a second of delay does to each (None: no jitter)."""
     jitters_s = _JITTERS_S if along is not None else _JITTERS_S[:1]
     along = np.zeros_like(misfit) if along is None else along
