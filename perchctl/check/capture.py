@@ -347,14 +347,19 @@ def hand_finding(moved: Moved | None, config: PositioningConfig) -> Finding:
     return _world_finding(turns, moved) or _body_finding(turns, moved, config)
 
 
-def _risen_m(turns: Turns, moved: Moved) -> float:
-    """Return the largest way along the capture's vertical; negative where it goes down."""
-    heights_m = moved.ways_m @ turns.up
-    return float(heights_m[int(np.argmax(np.abs(heights_m)))])
+def _risen_m(turns: Turns, moved: Moved) -> Array:
+    """Return the way (3,) from the first place to the one farthest along the capture's vertical,
+    or, where that is too near for a lift, to the farthest of all."""
+    ways_m = moved.ways_m
+    risen_m = ways_m[int(np.argmax(np.abs(ways_m @ turns.up)))]
+    if float(np.linalg.norm(risen_m)) < LIFTED_M:
+        risen_m = ways_m[int(np.argmax(np.linalg.norm(ways_m, axis=1)))]
+    return np.asarray(risen_m)
 
 
 def _world_finding(turns: Turns, moved: Moved) -> Finding | None:
-    """Return what is wrong with the capture's world: tilted, its axes swapped, or mirrored."""
+    """Return what is wrong with the capture's world: tilted, its axes swapped, or mirrored. Its
+    places may be in other axes than its attitudes."""
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.up[2])))))
     axis = nearest_axis(turns.up)
     if off_deg > UPRIGHT_DEG and axis is None:
@@ -363,10 +368,26 @@ def _world_finding(turns: Turns, moved: Moved) -> Finding | None:
     if off_deg > UPRIGHT_DEG:
         advice = "set its world to z up, and define the rigid body anew with the vehicle level"
         return failed(f"swapped axes: up is {axis} in the motion capture", advice)
-    if _risen_m(turns, moved) < -LIFTED_M:
+    if float(_risen_m(turns, moved) @ turns.up) < -LIFTED_M:
         advice = "its axes are left-handed: calibrate its volume anew, with z up"
         return failed("mirrored: lifted, the body goes down in the capture", advice)
-    return None
+    return _sideways(_risen_m(turns, moved))
+
+
+def _sideways(risen_m: Array) -> Finding | None:
+    """Return the finding on a body that rose by (3,) along another axis than z, None of one that
+    rose along z or hardly moved."""
+    way_m = float(np.linalg.norm(risen_m))
+    if way_m < LIFTED_M:
+        return None
+    axis = nearest_axis(risen_m / way_m)
+    if axis == "z":
+        return None
+    along = f"along its {axis}" if axis else f"by x {risen_m[0]:.2f}, y {risen_m[1]:.2f} m"
+    return failed(
+        f"swapped axes: lifted, the body goes {along} in the motion capture",
+        "set its world to z up; if you carried it aside, once more, straight up",
+    )
 
 
 def _body_finding(turns: Turns, moved: Moved, config: PositioningConfig) -> Finding:
@@ -383,7 +404,7 @@ def _body_finding(turns: Turns, moved: Moved, config: PositioningConfig) -> Find
             f"along x",
         )
     found = f"turns as the vehicle does, within {off_deg:.0f} deg"
-    risen_m = _risen_m(turns, moved)
+    risen_m = float(_risen_m(turns, moved) @ turns.up)
     if risen_m < LIFTED_M:
         return warned(f"{found}; it was not lifted along the capture's z", HOW_TO_TURN)
     return passed(f"{found}; rose by {risen_m:.2f} m")

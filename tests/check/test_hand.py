@@ -43,11 +43,18 @@ def bump(t_s: float, from_s: float, to_s: float) -> float:
     return math.sin(math.pi * (t_s - from_s) / (to_s - from_s)) ** 2
 
 
+STRAIGHT_UP_M = (0.02, 0.01, 0.3)
+
+
 def motion(
-    t_s: float, lift: float = 1.0, turn: float = 1.0, tilt: float = 1.0
+    t_s: float,
+    lift: float = 1.0,
+    turn: float = 1.0,
+    tilt: float = 1.0,
+    way_m: tuple[float, float, float] = STRAIGHT_UP_M,
 ) -> tuple[Array, Array]:
     """Lifted by 30 cm, turned by 80 deg, tilted forward and aside by 30 deg, put back."""
-    place = np.array([0.02, 0.01, 0.3]) * lift * bump(t_s, 1.0, 7.0)
+    place = np.array(way_m) * lift * bump(t_s, 1.0, 7.0)
     yaw = math.radians(80.0) * turn * bump(t_s, 1.5, 4.0)
     pitch = math.radians(30.0) * tilt * bump(t_s, 4.0, 5.5)
     roll = math.radians(30.0) * tilt * bump(t_s, 5.0, 6.5)
@@ -63,6 +70,7 @@ def recorded(
     seen: tuple[float, float, float] | None = None,
     mirror: Array = I3,
     config: PositioningConfig = CONFIG,
+    way_m: tuple[float, float, float] = STRAIGHT_UP_M,
 ) -> Finding:
     """The finding on what a capture says that has the vehicle as ``world R body``, and of what the
     vehicle says itself, from a heading of its own: both with noise, the capture late."""
@@ -80,7 +88,7 @@ def recorded(
             float(t_s), 0.0, roll_rad=roll + noise[0], pitch_rad=pitch + noise[1],
             yaw_rad=yaw + noise[2], acc_z_g=1.0 + shake + 0.5 * noise[3],
         ))  # fmt: skip
-        place, R = motion(t_s - DELAY_S, *(own if seen is None else seen))
+        place, R = motion(t_s - DELAY_S, *(own if seen is None else seen), way_m)
         R = mirror @ R @ mirror.T if np.linalg.det(mirror) < 0 else R
         R_seen = world @ R @ body @ rotation_from_rpy(*rng.normal(0.0, 0.005, 3))
         place = scale * (mirror @ world @ (origin + place + rng.normal(0.0, 0.001, 3)))
@@ -185,9 +193,29 @@ def test_what_too_small_a_motion_cannot_tell_is_no_pass(
 
 
 def test_a_turn_without_a_lift_is_no_pass() -> None:
-    """Nor is a lift along another axis, though the turns are right."""
-    for row in (recorded(7, own=(0.0, 1.0, 1.0)), recorded(7, mirror=Y_UP)):
-        assert (row.verdict, "not lifted" in row.found) == (Verdict.WARN, True), row
+    row = recorded(7, own=(0.0, 1.0, 1.0))
+    assert (row.verdict, "not lifted" in row.found) == (Verdict.WARN, True), row
+
+
+@pytest.mark.parametrize(("places", "way_m", "words"), [
+    (Y_UP, STRAIGHT_UP_M, "lifted, the body goes along its y in"),
+    (Y_UP, (0.02, -0.2, 0.4), "lifted, the body goes along its y in"),
+    (Y_UP, (0.02, -0.3, 0.4), "lifted, the body goes by x 0.02, y 0.40 m in"),
+    (I3, (0.02, 0.3, 0.3), "lifted, the body goes by x 0.02, y 0.30 m in"),
+    (I3, (0.02, 0.3, 0.03), "lifted, the body goes along its y in"),
+])  # fmt: skip
+def test_places_in_other_axes_fail_though_the_turns_are_right(
+    places: Array, way_m: tuple[float, float, float], words: str
+) -> None:
+    """However far the hand drifts aside, which may rise along the capture's z."""
+    row = recorded(7, mirror=places, way_m=way_m)
+    assert row.verdict is Verdict.FAIL, row
+    assert words in row.found
+    assert "straight up" in row.advice
+
+
+def test_a_hand_may_drift_aside() -> None:
+    assert recorded(7, way_m=(0.05, -0.12, 0.3)).verdict is Verdict.PASS
 
 
 def truly_moved(way: Way, from_s: float, to_s: float) -> capture.Moved:

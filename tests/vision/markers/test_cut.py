@@ -38,10 +38,12 @@ from perchctl.vision.markers.cut import (
     fitted,
     is_cut,
     lattice_of,
+    may_be_whole,
     outline_of,
 )
 from perchctl.vision.markers.detect import between, detect_markers, with_ghosts
 from perchctl.vision.markers.partial import seen_edges
+from perchctl.vision.markers.search import Found, search
 from tests.helpers.markers import SETUP, both, corners, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -119,6 +121,23 @@ def test_it_needs_a_target_that_was_measured_lately() -> None:
     assert nothing(look("height", age_s=MOST_AGE_S + 0.01))
 
 
+@pytest.mark.parametrize(("age_s", "searched"), [(MOST_AGE_S, False), (MOST_AGE_S + 0.01, True)])
+def test_nothing_is_searched_for_where_nothing_can_be_whole(
+    age_s: float, searched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So long as that is known: later the target may be anywhere."""
+    passes = []
+
+    def noting(*args: Any, **keys: Any) -> Found:
+        passes.append(args)
+        return search(*args, **keys)
+
+    monkeypatch.setattr("perchctl.vision.markers.detect.search", noting)
+    empty = np.full(SHAPE, 120, np.uint8)
+    assert nothing(look("under", empty, age_s=age_s))
+    assert bool(passes) is searched
+
+
 def test_a_target_that_was_whole_is_searched_for_wherever_it_is_expected() -> None:
     """A prediction by an estimate that has jumped may be anywhere."""
     whole = pose_of(0.0, 0.0, 0.4, 0.3)
@@ -128,6 +147,14 @@ def test_a_target_that_was_whole_is_searched_for_wherever_it_is_expected() -> No
     found = detect_markers(frame(image), before, SETUP, CAMERA, both(POSES["under"]))
     for name, one in (("large", found.large), ("small", found.small)):
         assert np.abs(one.corners_px - at[name]).max() < 0.2
+
+
+def test_what_may_be_whole_if_the_prediction_is_a_little_off_is_searched_for() -> None:
+    square_px = np.array([[0.0, 0.0], [60.0, 0.0], [60.0, 60.0], [0.0, 60.0]])
+    for out_px, may in ((-1.0, True), (30.0, True), (50.0, False)):
+        aside = square_px + np.array([SHAPE[1] - 60.0 + out_px, 100.0])
+        assert may_be_whole({"small": aside, "large": 6.0 * square_px - 900.0}, SHAPE) is may
+    assert not may_be_whole({"small": np.full((4, 2), np.nan)}, SHAPE)
 
 
 def _bare(kind: str) -> NDArray[np.uint8]:
