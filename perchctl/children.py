@@ -120,7 +120,7 @@ def spawn(code: str, output: int | IO[bytes]) -> subprocess.Popen[bytes]:
     )  # fmt: skip
 
 
-def introduce(child: subprocess.Popen[bytes], listener: socket.socket, token: str) -> None:
+def send_address(child: subprocess.Popen[bytes], listener: socket.socket, token: str) -> None:
     """Tell the child on its standard input where to connect, and with which token."""
     assert child.stdin is not None
     with contextlib.suppress(OSError), child.stdin:

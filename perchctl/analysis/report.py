@@ -28,7 +28,6 @@ from perchctl.analysis.story import SEVEN, Sentence, story_of
 from perchctl.analysis.words import count, length
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import write_files
-from perchctl.mission import latency_text, turn_text
 from perchctl.record import log_values, path_beside, read_log, recorded_pictures
 
 UNFINISHED = "unfinished"
@@ -213,7 +212,7 @@ def _templates() -> jinja2.Environment:
     )
     templates.filters["count"] = count
     templates.globals.update(
-        seven_phases=SEVEN, latency_text=latency_text, turn_text=turn_text, plot_of=plot_address,
+        seven_phases=SEVEN, plot_of=plot_address,
         film_of=film_address,
     )  # fmt: skip
     return templates

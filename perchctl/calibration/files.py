@@ -221,7 +221,7 @@ def _checked(
 # ``%YAML 1.0``; PyYAML refuses ``%YAML:1.0`` and OpenCV's tags, and reads ``1e-05`` as a string.
 
 
-def camera_text(
+def calibration_text(
     camera: CameraModel, name: str, notes: Mapping[str, str | float | int | Array]
 ) -> str:
     """Return the file's text; `notes` are further keys (ROS readers pass over them), arrays (n,

@@ -15,7 +15,7 @@ GONE_AFTER_S = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class GuidedFrame:
     """What a guided recording shows a person with a frame.
 
     Attributes:
@@ -36,7 +36,7 @@ class Moment:
     taken: bool = False
 
 
-def polled(
+def poll_frames(
     source: FrameSource, clock: Callable[[], float], sleep: Callable[[float], None]
 ) -> Iterator[tuple[float, Frame | None]]:
     """Yield the time and the new frame, or None, at each poll of a source, until it has ended.

@@ -36,7 +36,7 @@ from perchctl.target import (
     edge_margin,
     offset_text,
     overhead_view,
-    sight_from,
+    view_from,
 )
 from perchctl.vision import CameraModel
 
@@ -278,7 +278,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
     problem = out_of_view(place, feet, 0.0, profile, camera)
     if problem is not None:
         return failed(problem.found, problem.advice)
-    sight = sight_from(
+    sight = view_from(
         np.array(feet), 0.0, place.position_m, place.yaw_rad,
         profile.target, camera, profile.camera.mount,
     )  # fmt: skip

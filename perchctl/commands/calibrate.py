@@ -20,17 +20,17 @@ import typer
 from perchctl.calibration import (
     BoardView,
     Calibration,
-    Moment,
+    GuidedFrame,
     Rejection,
     SizeMissing,
     calibrate_camera,
+    calibration_text,
     camera_record,
-    camera_text,
     capture_views,
     check_calibration,
     learn_gear,
     load_calibration,
-    polled,
+    poll_frames,
     views_of_images,
     views_of_video,
 )
@@ -284,7 +284,7 @@ def convert(
         raise UsageError(f"{file} is the file to convert; name another with --output")
     check_output(file, SUFFIXES, force, CONTENT)
     notes = {"date": _now(), "converted_from": calibration.name}
-    write_files({file: camera_text(model, name, notes).encode()})
+    write_files({file: calibration_text(model, name, notes).encode()})
     say(f"wrote {file} ({model.model}, {model.size_px[0]}x{model.size_px[1]} px)")
     print_result(camera_record(model) | {"file": str(file)} if as_json else file)
 
@@ -395,7 +395,7 @@ def with_size(source: Source, text: str | None) -> Source:
 def _mask_pictures(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]:
     """Yield the pictures of a recording, or of a live camera for `MASK_S`."""
     start_s = time.monotonic()
-    for now_s, frame in polled(source, time.monotonic, time.sleep):
+    for now_s, frame in poll_frames(source, time.monotonic, time.sleep):
         if stopped() or (source.live and now_s - start_s > MASK_S):
             return
         if frame is not None:
@@ -497,7 +497,7 @@ def capture_live_views(
         show = stack.enter_context(guide(page))
         say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
 
-        def seen(moment: Moment) -> None:
+        def seen(moment: GuidedFrame) -> None:
             if moment.taken:
                 keep(moment.image)
             show(moment)

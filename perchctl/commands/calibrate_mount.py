@@ -18,11 +18,11 @@ from typing import Annotated, Literal
 import typer
 
 from perchctl.calibration import (
-    Eye,
     MountingPart,
     MountingRecording,
     MountingReport,
     MountingTape,
+    PoseReader,
     VehicleSensors,
     capture,
     pose_basis,
@@ -288,12 +288,12 @@ def _record_live(
                 sys.stdin.readline()
             tape = MountingTape(part, pose_basis(profile, camera))
             tapes.append(tape)
-            eye = Eye(profile, camera, frames.live)
+            reader = PoseReader(profile, camera, frames.live)
             if frames.live:
                 frames.poll(now())  # from before
             with Stopper().installed() as stop, guide(page) as show:
                 stopped = stop.requested.is_set
-                capture(tape, frames, eye, sensors, show, now, stopped=stopped)
+                capture(tape, frames, reader, sensors, show, now, stopped=stopped)
             if stopped():
                 raise Interrupted("Ctrl-C: nothing was measured")
     return tuple(tape.recording() for tape in tapes)

@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from perchctl.calibration import Moment
+from perchctl.calibration import GuidedFrame
 from perchctl.display import LivePage, Sketch
 
 _BAR_WIDTH = 30
@@ -27,8 +27,8 @@ def page_port(view: bool, port: int) -> int | None:
 @contextlib.contextmanager
 def guide(
     page: LivePage | None, stream: TextIO | None = None
-) -> Iterator[Callable[[Moment], None]]:
-    """Yield the function that shows a moment: as a table on a terminal, in a pipe as a line
+) -> Iterator[Callable[[GuidedFrame], None]]:
+    """Yield the function that shows a guided frame: as a table on a terminal, in a pipe as a line
     whenever that changes, and on the page if there is one."""
     console = Console(file=stream or sys.stderr)
     with contextlib.ExitStack() as stack:
@@ -39,25 +39,25 @@ def guide(
             )
         last_line = ""
 
-        def show(moment: Moment) -> None:
+        def show(guided: GuidedFrame) -> None:
             nonlocal last_line
             if table is not None:
-                table.update(_table(moment))
-            elif moment.line != last_line:
-                last_line = moment.line
-                line = f"perchctl: {moment.line}"
+                table.update(_table(guided))
+            elif guided.line != last_line:
+                last_line = guided.line
+                line = f"perchctl: {guided.line}"
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
             if page is not None:
-                sketch = Sketch(moment.image, moment.outlines, None, (moment.advice,))
-                page.show(moment.index, sketch)
-                page.set_state(lambda: page_state(moment))
+                sketch = Sketch(guided.image, guided.outlines, None, (guided.advice,))
+                page.show(guided.index, sketch)
+                page.set_state(lambda: page_state(guided))
 
         yield show
 
 
-def _table(moment: Moment) -> Table:
+def _table(guided: GuidedFrame) -> Table:
     table = Table.grid(padding=(0, 1))
-    for name, text, share in moment.rows:
+    for name, text, share in guided.rows:
         if share is None:
             table.add_row(name, Text(text), "")
             continue
@@ -65,11 +65,11 @@ def _table(moment: Moment) -> Table:
         colour = "green" if share >= 1.0 else "yellow"
         bar = Text("#" * full, style=colour) + Text("." * (_BAR_WIDTH - full), style="dim")
         table.add_row(name, bar, text)
-    table.add_row("", Text(moment.advice, style="bold"), "")
+    table.add_row("", Text(guided.advice, style="bold"), "")
     return table
 
 
-def page_state(moment: Moment) -> dict[str, Any]:
+def page_state(guided: GuidedFrame) -> dict[str, Any]:
     """Return the page's rows (the shares as numbers, for bars) and its headline."""
-    rows = [[value for value in row if value is not None] for row in moment.rows]
-    return {"rows": rows, "phase": moment.advice}
+    rows = [[value for value in row if value is not None] for row in guided.rows]
+    return {"rows": rows, "phase": guided.advice}

@@ -34,12 +34,12 @@ from perchctl.profile import (
 )
 from perchctl.target import (
     Optics,
+    assess_mounting,
     board_pdf,
     check_target,
     make_design,
     measured_target,
     mm_text,
-    mounted_camera,
     parse_board,
     parse_length,
     suggest_target,
@@ -374,7 +374,7 @@ def _mounting(profile: Profile, target: TargetConfig) -> list[str]:
     except PerchError:
         return []
     name = profile.camera.calibration
-    return [f"{name}: {text}" for text in mounted_camera(target, camera, profile).lines()]
+    return [f"{name}: {text}" for text in assess_mounting(target, camera, profile).lines()]
 
 
 def _check_pdf(path: Path) -> None:

@@ -70,8 +70,8 @@ class FaultyRadio(Radio):
             case e.Silence() | e.BlockDead() | e.TelemetryDelayed():
                 self._begun.append((effect, now_s))
 
-    def up(self, packet: Packet, now_s: float) -> bool:
-        if self.cut or not self._air.up(packet, now_s):
+    def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
+        if self.cut or not self._air.uplink_arrives(packet, now_s):
             return False
         order = order_of(packet)
         if self._left.get(order, 0) > 0:
@@ -85,8 +85,8 @@ class FaultyRadio(Radio):
             self._service.handle(packet)
         return True
 
-    def down(self, block: str, now_s: float) -> float | None:
-        delay_s = self._air.down(block, now_s)
+    def downlink_delay_s(self, block: str, now_s: float) -> float | None:
+        delay_s = self._air.downlink_delay_s(block, now_s)
         if delay_s is None:
             return None
         for effect, begin_s in self._begun:

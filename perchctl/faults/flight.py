@@ -185,7 +185,7 @@ class FaultyFlight:
         if begin_s is not None:
             astray_m -= self._drift.after_m(t_s - begin_s, phase)
             self._touched = self._touched or sample.hanging or world.contacts()[0] > 0.0
-        uplink = not self._is_suspended(t_s) and self._radio.up(PROBE, t_s)
+        uplink = not self._is_suspended(t_s) and self._radio.uplink_arrives(PROBE, t_s)
         overdue = self._descent_bound.is_overdue(
             t_s,
             sample.height_m,
@@ -202,7 +202,7 @@ class FaultyFlight:
             isinstance(effect, e.LogReads) for effect in self._case.effects
         ):
             return False
-        delay_s = self._radio.down(block, t_s)
+        delay_s = self._radio.downlink_delay_s(block, t_s)
         return delay_s is not None and delay_s <= self._profile.safety.proof_age_s
 
     def _is_suspended(self, t_s: float) -> bool:

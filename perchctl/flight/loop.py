@@ -102,7 +102,7 @@ def fly(parts: FlightParts) -> FlightReport:
     if inputs.history.newest is not None:
         inputs.ground_z_m = inputs.history.newest.position_m[2]
     watchdog, told = Watchdog(parts.profile, parts.operator, parts.position_age_s), _teller(parts)
-    parts.link.guard(watchdog, told)
+    parts.link.set_guard(watchdog, told)
     try:
         return _mission(parts, inputs, watchdog, turns)
     except BaseException as error:

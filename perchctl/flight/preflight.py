@@ -23,11 +23,11 @@ from perchctl.link import Link
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.target import (
-    TargetFromBody,
+    TargetView,
     offset_text,
+    overhead_reach,
     overhead_view,
-    reach_at,
-    sight_from,
+    view_from,
 )
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
@@ -189,9 +189,9 @@ def out_of_view(
 
 def target_from(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
-) -> TargetFromBody:
+) -> TargetView:
     """Return the target as seen from a level vehicle at a place in its world."""
-    return sight_from(
+    return view_from(
         np.array(body_m), yaw_rad, target.position_m, target.yaw_rad,
         profile.target, camera, profile.camera.mount,
     )  # fmt: skip
@@ -199,7 +199,7 @@ def target_from(
 
 def _seen_leaning(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
-) -> TargetFromBody:
+) -> TargetView:
     """Return the target as `target_from` gives it for a vehicle that leans so that the target moves
     to the picture's edge, as if it stood farther away."""
     level = target_from(body_m, yaw_rad, target, profile, camera)
@@ -212,18 +212,18 @@ def _seen_leaning(
     return replace(level, whole=leaning.whole)
 
 
-def _leant_m(sight: TargetFromBody) -> float:
+def _leant_m(sight: TargetView) -> float:
     return sight.height_m * math.tan(math.radians(LEAN_DEG))
 
 
-def _too_far(sight: TargetFromBody, profile: Profile, camera: CameraModel) -> str:
+def _too_far(sight: TargetView, profile: Profile, camera: CameraModel) -> str:
     """Return in words how far aside the target would be, and how far it may be."""
     if not sight.height_m > 0.0:
         return "it would be no higher than the camera"
     aside_m, most = math.hypot(*sight.aside_m), ""
     aside = f"{aside_m:.2f}"
     side_m, mount = profile.target.large.side_m, profile.camera.mount
-    reach = reach_at(side_m, camera, mount, sight.height_m)
+    reach = overhead_reach(side_m, camera, mount, sight.height_m)
     if reach is not None:
         room_m = math.floor(100.0 * max(0.0, reach.radius_m - _leant_m(sight))) / 100.0
         aside, room = distinct_figures(aside_m, room_m, 2)

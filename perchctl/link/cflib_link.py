@@ -84,7 +84,7 @@ class CflibLink:
         self._blocks = LogBlocks(clock)
         self._sender: Sender | None = None
         self._guard: Guard | None = None
-        self._told: SentCallback = ignore_sent
+        self._on_sent: SentCallback = ignore_sent
         self._lost_since_s: float | None = None  # last heard, while the link is lost
         self.connection: Connection | None = None
 
@@ -123,8 +123,8 @@ class CflibLink:
             self._clock,
         )  # fmt: skip
 
-    def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
-        self._guard, self._told = guard, told
+    def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
+        self._guard, self._on_sent = guard, on_sent
 
     def problem(self, now_s: float) -> str | None:
         if self.connection is not None and self.connection.lost is not None:
@@ -174,7 +174,7 @@ class CflibLink:
             self._hand_over,
             self._ask_guard,
             self._clock,
-            lambda sent: self._told(sent),
+            lambda sent: self._on_sent(sent),
             pieces=encode,
             tend=self._tend,
             spare=lambda: self._blocks.resume(self._hand_over),
@@ -251,6 +251,6 @@ class CflibLink:
             connection.close()
             if linked:
                 with contextlib.suppress(Exception):  # whatever looks on
-                    self._told(SentCommand(at_s, "farewell", FAREWELL))
+                    self._on_sent(SentCommand(at_s, "farewell", FAREWELL))
         else:
             connection.abandon()

@@ -55,11 +55,11 @@ class Radio:
     def __init__(self, bursts: Bursts | None = None) -> None:
         self._bursts = bursts
 
-    def up(self, packet: Packet, now_s: float) -> bool:
+    def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
         """True if the packet arrives at the vehicle."""
         return self._bursts is None or not self._bursts.lost(now_s)
 
-    def down(self, block: str, now_s: float) -> float | None:
+    def downlink_delay_s(self, block: str, now_s: float) -> float | None:
         """Return the seconds after which a log block's packet arrives; None when it is lost."""
         lost = self._bursts is not None and self._bursts.lost(now_s)
         return None if lost else TELEMETRY_DELAY_S
@@ -115,7 +115,7 @@ class MockLink:
         self._arrived: list[Telemetry] = []
         self._newest: Telemetry | None = None
         self._guard: Guard | None = None
-        self._told: SentCallback = ignore_sent
+        self._on_sent: SentCallback = ignore_sent
         self._watched_s = -math.inf
         self._call: Callable[[float], object] = lambda now_s: None
         self._call_due_s = self._call_period_s = math.inf
@@ -164,8 +164,8 @@ class MockLink:
         samples, self._arrived = self._arrived, []
         return samples
 
-    def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
-        self._guard, self._told = guard, told
+    def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
+        self._guard, self._on_sent = guard, on_sent
 
     def _ask_guard(self) -> None:
         if self._guard is None or self.now_s < self._watched_s + WATCH_PERIOD_S - 1e-9:
@@ -175,7 +175,7 @@ class MockLink:
         command = self._guard.poll(self.now_s, self._newest, self._arrived)
         if command is not None:
             self.send(command)
-            self._told(SentCommand(self.now_s, "watchdog", command))
+            self._on_sent(SentCommand(self.now_s, "watchdog", command))
 
     def _collect(self) -> None:
         while self._under_way and self._under_way[0][0] <= self.now_s + 1e-9:
@@ -211,7 +211,7 @@ class MockLink:
 
     def _hand_over(self, packets: Iterable[Packet]) -> None:
         for packet in packets:
-            if self.radio.up(packet, self.now_s):
+            if self.radio.uplink_arrives(packet, self.now_s):
                 self.vehicle.receive(packet)
 
     def _send_down(self, block: str) -> None:
@@ -219,7 +219,7 @@ class MockLink:
         if firmware.t_s < self._stamp_s:
             self._start += 1
         self._stamp_s = firmware.t_s
-        delay_s = self.radio.down(block, self.now_s)
+        delay_s = self.radio.downlink_delay_s(block, self.now_s)
         if delay_s is not None:
             values = firmware.log_values(BLOCKS[block])
             arrives_s, number = self.now_s + delay_s, next(self._count)

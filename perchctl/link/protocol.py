@@ -58,8 +58,8 @@ class Link(Protocol):
     def problem(self, now_s: float) -> str | None:
         """Return None while the link works, otherwise one sentence with the cause."""
 
-    def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
-        """Ask `guard` regularly from now on, until the link is closed. `told` is called, once it
+    def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
+        """Ask `guard` regularly from now on, until the link is closed. `on_sent` is called, once it
         is on its way, with each command that the link sends in the loop's place: its guard's, an
         order once more over a link that was lost, and the farewell; from the link's own thread
         where it has one."""

@@ -53,8 +53,8 @@ class Sender:
     `hand_over` gives one piece to the library and returns False where there was no room for it:
     it is then offered again. `guard` returns the command to send in the loop's place, None almost
     always. It is asked every `GUARD_PERIOD_S`, but not while something waits that cannot go out: a
-    guard counts its orders. `told` is called with what the loop did not put in, once it is handed
-    over.
+    guard counts its orders. `on_sent` is called with what the loop did not put in, once it is
+    handed over.
 
     `pieces` divides a command. `tend` is called as often as the guard is, by the same thread,
     with `stuck_s` and whether the library is to blame for it: it has held one piece, or raised
@@ -70,7 +70,7 @@ class Sender:
         hand_over: Callable[[Any], bool | None],
         guard: Callable[[], Command | None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
-        told: SentCallback = ignore_sent,
+        on_sent: SentCallback = ignore_sent,
         *,
         pieces: Callable[[Command], Sequence[Any]] = lambda command: (command,),
         tend: Callable[[float, bool], None] = lambda stuck_s, hangs: None,
@@ -79,7 +79,7 @@ class Sender:
         self._hand_over = hand_over
         self._guard = guard
         self._clock = clock
-        self._told = told
+        self._on_sent = on_sent
         self._pieces = pieces
         self._tend = tend
         self._spare = spare
@@ -228,7 +228,7 @@ class Sender:
             self._remove(waiting)
         if waiting.by is not None:
             with suppress(Exception):  # whatever looks on: the next one goes out all the same
-                self._told(SentCommand(at_s, waiting.by, waiting.command))
+                self._on_sent(SentCommand(at_s, waiting.by, waiting.command))
         return 0.0
 
     def _remove(self, waiting: _Waiting) -> None:

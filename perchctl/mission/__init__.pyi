@@ -26,9 +26,7 @@ from .report import FlightReport as FlightReport
 from .report import Rest as Rest
 from .report import Touchdown as Touchdown
 from .report import flight_report as flight_report
-from .report import latency_text as latency_text
 from .report import rest_of as rest_of
-from .report import turn_text as turn_text
 from .state import SEVEN_PHASES as SEVEN_PHASES
 from .state import Condition as Condition
 from .state import Mismatch as Mismatch

@@ -170,6 +170,18 @@ class Findings:
     turn_sigma_deg: tuple[float, float, float]
     advice: tuple[str, ...] = ()
 
+    @property
+    def latency_text(self) -> str:
+        """The latency with its 95 % interval, as in ``92 +- 6 ms``."""
+        return f"{self.latency_s * 1e3:.0f} +- {SURE * self.latency_sigma_s * 1e3:.0f} ms"
+
+    @property
+    def turn_text(self) -> str:
+        """The turn about x, y and z with 95 % intervals, as in
+        ``0.2 +- 0.6, -0.1 +- 0.6, 0.4 +- 1.8 deg``."""
+        each = zip(self.turn_deg, self.turn_sigma_deg, strict=True)
+        return ", ".join(f"{turn:.1f} +- {SURE * sigma:.1f}" for turn, sigma in each) + " deg"
+
 
 def flight_findings(seen: Consistency, camera: CameraConfig) -> Findings:
     """The flight's findings, with advice where the flown profile differs."""
@@ -192,7 +204,7 @@ def _about_latency(found: Findings, camera: CameraConfig) -> list[str]:
     off_s = found.latency_s - used_s
     if not _is_worth_saying(off_s, LATENCY_GATE_S, found.latency_sigma_s):
         return []
-    found_text = f"latency {latency_text(found)}"
+    found_text = f"latency {found.latency_text}"
     if measured:
         return [
             f"{found_text}, and {least_s * 1e3:.0f} to {most_s * 1e3:.0f} are used with "
@@ -219,15 +231,3 @@ def _about_turn(found: Findings) -> list[str]:
 def _is_worth_saying(off: float, gate: float, sigma: float) -> bool:
     """True if it is beyond the gate, and its 95 % interval is narrower than it is itself."""
     return abs(off) > max(gate, 2.0 * SURE * sigma)
-
-
-def latency_text(found: Findings) -> str:
-    """The latency with its 95 % interval, as in ``92 +- 6 ms``."""
-    return f"{found.latency_s * 1e3:.0f} +- {SURE * found.latency_sigma_s * 1e3:.0f} ms"
-
-
-def turn_text(found: Findings) -> str:
-    """The turn about x, y and z with 95 % intervals, as in
-    ``0.2 +- 0.6, -0.1 +- 0.6, 0.4 +- 1.8 deg``."""
-    each = zip(found.turn_deg, found.turn_sigma_deg, strict=True)
-    return ", ".join(f"{turn:.1f} +- {SURE * sigma:.1f}" for turn, sigma in each) + " deg"

@@ -27,9 +27,9 @@ from perchctl.children import (
     accept,
     connect_back,
     end,
-    introduce,
     listen,
     new_token,
+    send_address,
     spawn,
 )
 from perchctl.errors import (
@@ -136,7 +136,7 @@ class MotionCapture:
             child = spawn(_CHILD, subprocess.PIPE)
             capture = cls(child, who, body, setup.partial, clock)
             try:
-                introduce(child, listener, token)
+                send_address(child, listener, token)
                 channel = accept(listener, token, UP_TIMEOUT_S, lambda: child.poll() is None)
                 capture._begin(channel, setup)
             except BaseException:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.mission import ContactError, Findings, Touchdown, latency_text, turn_text
+from perchctl.mission import ContactError, Findings, Touchdown
 from perchctl.record.read import FlightLog, PhaseSpan
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -187,8 +187,8 @@ def summary_text(flight: FlightSummary, log_path: Path | None = None) -> str:
     if flight.battery_min_v is not None:
         lines.append(f"battery:   {flight.battery_min_v:.2f} V at its lowest")
     if flight.findings is not None:  # with 95 % intervals
-        lines.append(f"latency:   {latency_text(flight.findings)}")
-        lines.append(f"mounting:  turned by {turn_text(flight.findings)} (x, y, z)")
+        lines.append(f"latency:   {flight.findings.latency_text}")
+        lines.append(f"mounting:  turned by {flight.findings.turn_text} (x, y, z)")
         lines += [f"advice:    {sentence}" for sentence in flight.findings.advice]
     if flight.locked:
         lines.append("vehicle:   locked by its supervisor: inspect and restart it")

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from perchctl.calibration import (
     AttitudeSample,
-    Eye,
     MountingPart,
     MountingRecording,
+    PoseReader,
     pose_basis,
 )
 from perchctl.camera import unmirror_frame
@@ -318,13 +318,13 @@ def record_hand(
 ) -> MountingRecording:
     """Record the whole part, through renderer and pipeline; `told` is called for each
     picture."""
-    eye = Eye(profile, camera, live=False)
+    reader = PoseReader(profile, camera, live=False)
     poses = []
     for frame in pictures(hand, profile, camera):
         picture = Frame(frame.index, frame.t_arrival_s, frame.image, frame.t_arrival_s, "whole")
         if profile.camera.mirrored:
             picture = unmirror_frame(picture)
-        poses += eye.look(picture)
+        poses += reader.look(picture)
         told()
     felt, by = attitudes(hand), pose_basis(profile, camera)
-    return MountingRecording(hand.part, felt, tuple(poses), eye.mirrored, by)
+    return MountingRecording(hand.part, felt, tuple(poses), reader.mirrored, by)

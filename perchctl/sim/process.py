@@ -25,10 +25,10 @@ from perchctl.children import (
     Channel,
     accept,
     end,
-    introduce,
     last_line,
     listen,
     new_token,
+    send_address,
     spawn,
 )
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
@@ -182,7 +182,7 @@ class SimProcess:
         stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed by stop)
         with listen() as listener:
             child = spawn(_CHILD, stderr)
-            introduce(child, listener, token)
+            send_address(child, listener, token)
             channel = accept(listener, token, timeout_s, lambda: child.poll() is None)
         if channel is None:
             raise _gave_up(child, stderr, f"did not come up within {timeout_s:.0f} s")

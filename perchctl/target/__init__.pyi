@@ -14,11 +14,11 @@ from .reading import Optics as Optics
 from .reading import check_target as check_target
 from .sheets import board_pdf as board_pdf
 from .sheets import target_pdf as target_pdf
-from .sight import TargetFromBody as TargetFromBody
+from .sight import TargetView as TargetView
+from .sight import assess_mounting as assess_mounting
 from .sight import edge_margin as edge_margin
-from .sight import mounted_camera as mounted_camera
 from .sight import offset_text as offset_text
+from .sight import overhead_reach as overhead_reach
 from .sight import overhead_view as overhead_view
-from .sight import reach_at as reach_at
 from .sight import sees_small_marker as sees_small_marker
-from .sight import sight_from as sight_from
+from .sight import view_from as view_from

@@ -151,11 +151,13 @@ def overhead_view(
     highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / least_side_px(plain_px)
     lean = math.degrees(math.atan2(view[0], view[2])), math.degrees(math.atan2(view[1], view[2]))
     heights_m = sorted({min(h, highest_m) for h in (1.0, 2.0)})
-    reaches = (reach_at(side_m, camera, mount, h) for h in heights_m)
+    reaches = (overhead_reach(side_m, camera, mount, h) for h in heights_m)
     return Overhead(highest_m, lean, tuple(r for r in reaches if r is not None))
 
 
-def reach_at(side_m: float, camera: CameraModel, mount: Mounting, height_m: float) -> Reach | None:
+def overhead_reach(
+    side_m: float, camera: CameraModel, mount: Mounting, height_m: float
+) -> Reach | None:
     """Return the area in which the camera sees a marker of that side at that height; None where
     not even one on the camera's axis is wholly in the picture, or the camera does not look up."""
     R = mount.T_body_cam[:3, :3]
@@ -178,7 +180,7 @@ def reach_at(side_m: float, camera: CameraModel, mount: Mounting, height_m: floa
 
 
 @dataclass(frozen=True)
-class TargetFromBody:
+class TargetView:
     """A target as a level vehicle at some place sees it.
 
     Attributes:
@@ -192,7 +194,7 @@ class TargetFromBody:
     aside_m: tuple[float, float]
 
 
-def sight_from(
+def view_from(
     body_m: Array,
     body_yaw_rad: float,
     target_m: Array,
@@ -200,7 +202,7 @@ def sight_from(
     target: TargetConfig,
     camera: CameraModel,
     mount: Mounting,
-) -> TargetFromBody:
+) -> TargetView:
     """Return how a level vehicle sees a level target. Positions (3,) and headings are in one world,
     z up."""
     T, field = mount.T_body_cam, FieldOfView(camera)
@@ -215,7 +217,7 @@ def sight_from(
     readable = float(camera.K[0, 0]) * target.small.side_m >= SURE_PX * float(centre[2])
     view = R[:, 2]
     aside = centre - centre[2] / view[2] * view if view[2] >= LEAST_UP else np.full(3, math.nan)
-    return TargetFromBody(
+    return TargetView(
         whole=large or (small and readable),
         height_m=float(centre[2]),
         aside_m=(float(aside[0]), float(aside[1])),
@@ -310,7 +312,7 @@ class MountingView:
         }
 
 
-def mounted_camera(target: TargetConfig, camera: CameraModel, profile: Profile) -> MountingView:
+def assess_mounting(target: TargetConfig, camera: CameraModel, profile: Profile) -> MountingView:
     """Return from where on the profile's `camera.mount` and `vehicle.gear_body_m` see too
     little."""
     T_body_cam = profile.camera.mount.T_body_cam

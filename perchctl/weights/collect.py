@@ -22,7 +22,7 @@ from typing import Protocol
 
 import numpy as np
 
-from perchctl.calibration import polled
+from perchctl.calibration import poll_frames
 from perchctl.camera import FrameSource, check_size
 from perchctl.errors import ConnectionFailed, Interrupted, InvalidValue, NotFound, PerchError
 from perchctl.files import cannot_be_written
@@ -412,7 +412,7 @@ class Experiment:
         if self.source.live:
             self.source.poll(self.now())  # taken before Enter was pressed
         got = 0
-        for _, frame in polled(self.source, self.now, self.wait):
+        for _, frame in poll_frames(self.source, self.now, self.wait):
             if frame is None or frame.repeated:
                 continue
             if got == 0:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from perchctl.calibration import (
     calibrate_camera,
-    camera_text,
+    calibration_text,
     load_calibration,
     profile_camera,
 )
@@ -37,7 +37,9 @@ def _camera(model: str) -> CameraModel:
 def test_all_numbers_come_back_equal(tmp_path: Path, model: str) -> None:
     camera = _camera(model)
     path = tmp_path / "camera.yaml"
-    path.write_text(camera_text(camera, 'odd "name"\n$', {"date": "2026-01-02", "rms_px": 1e-05}))
+    path.write_text(
+        calibration_text(camera, 'odd "name"\n$', {"date": "2026-01-02", "rms_px": 1e-05})
+    )
     assert path.read_text().splitlines()[0] == "%YAML 1.0"
 
     own = load_calibration(path)
@@ -63,7 +65,7 @@ def test_all_numbers_come_back_equal(tmp_path: Path, model: str) -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_any_number_is_written_as_a_number(value: float) -> None:
-    text = camera_text(_camera("plumb_bob"), "c", {"value": value})
+    text = calibration_text(_camera("plumb_bob"), "c", {"value": value})
     assert yaml.safe_load(text)["value"] == value
 
 
@@ -118,7 +120,7 @@ def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
     chain = _camchain(tmp_path / "camchain.yaml")
     assert load_calibration(chain, cam="cam1").K[0, 0] == 400.0
     again = tmp_path / "again.yaml"
-    again.write_text(camera_text(load_calibration(chain, cam="cam0"), "camera", {}))
+    again.write_text(calibration_text(load_calibration(chain, cam="cam0"), "camera", {}))
     assert parameters_of(load_calibration(again)).tolist() == [
         300.0, 300.0, 320.0, 240.0, -0.2, 0.05, 0.001, -0.002, 0.0,
     ]  # fmt: skip

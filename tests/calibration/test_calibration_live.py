@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration import Moment, capture_views
+from perchctl.calibration import GuidedFrame, capture_views
 from perchctl.calibration.board.capture import (
     Capture,
     Signature,
@@ -101,7 +101,7 @@ def test_guided_capture_takes_still_new_sharp_views_and_ends() -> None:
     for pose in draw_poses(rng, camera, CHESSBOARD, 7):
         image = renderer.render(pose, rng, noise=1.0)
         images += [image, image, image]  # comes in, is still, stays
-    moments: list[Moment] = []
+    moments: list[GuidedFrame] = []
     views = capture_views(_Frames(images), CHESSBOARD, moments.append, _clock(), lambda s: None)
     assert 5 <= len(views) <= 7
     assert sum(m.taken for m in moments) == len(views)
@@ -218,7 +218,7 @@ def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> 
 def test_a_pipe_gets_a_line_whenever_it_changes_and_the_page_its_shares() -> None:
     out = io.StringIO()
     rows = (("x", "50 %", 0.5), ("views", "3", None))
-    moment = Moment(0, np.zeros((4, 4), np.uint8), (), rows, "hold still", "")
+    moment = GuidedFrame(0, np.zeros((4, 4), np.uint8), (), rows, "hold still", "")
     with guide(None, out) as show:
         for line in ("a", "a", "b"):
             show(dataclasses.replace(moment, line=line))

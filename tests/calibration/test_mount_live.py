@@ -18,9 +18,9 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import (
     AttitudeSample,
-    Eye,
-    Moment,
+    GuidedFrame,
     MountingTape,
+    PoseReader,
     VehicleSensors,
     capture,
     load_calibration,
@@ -56,10 +56,10 @@ def press_after(poses: int) -> Callable[[object], contextlib.AbstractContextMana
     """In the guide's place: Ctrl-C once so many poses are there."""
 
     @contextlib.contextmanager
-    def pressing(_page: object) -> Iterator[Callable[[Moment], None]]:
+    def pressing(_page: object) -> Iterator[Callable[[GuidedFrame], None]]:
         pressed: list[bool] = []
 
-        def tell(moment: Moment) -> None:
+        def tell(moment: GuidedFrame) -> None:
             if int(dict(row[:2] for row in moment.rows)["pictures"]) >= poses and not pressed:
                 pressed.append(True)
                 os.kill(os.getpid(), signal.SIGINT)
@@ -167,7 +167,7 @@ class _Film:
         return None
 
 
-class _Looks(Eye):
+class _Looks(PoseReader):
     """Gives the poses of a recording at their times, or none."""
 
     def __init__(self, poses: tuple[SeenPose, ...], mirrored: bool = False) -> None:
@@ -198,9 +198,9 @@ def recorded(
     looks: _Looks,
     sensors: VehicleSensors | None = None,
     until_s: float = np.inf,
-) -> list[Moment]:
+) -> list[GuidedFrame]:
     """Fill the tape from the film, by its own clock; the moments that were shown."""
-    moments: list[Moment] = []
+    moments: list[GuidedFrame] = []
     sensors = sensors or VehicleSensors()
     capture(
         tape, film, looks, sensors, moments.append, film.clock, film.sleep,

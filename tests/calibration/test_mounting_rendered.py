@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perchctl.calibration import (
-    Eye,
     MountingPart,
+    PoseReader,
     profile_camera,
     solve_carry,
     solve_pivot,
@@ -51,10 +51,10 @@ def test_a_mounting_is_measured_from_pictures() -> None:
 @pytest.mark.parametrize("flipped", [False, True])
 def test_a_picture_is_seen_as_it_is_and_mirrored_as_such(flipped: bool) -> None:
     held, camera = _few_pictures("carry", 3.0), profile_camera(profile().camera)
-    eye, poses = Eye(profile(), camera, live=False), []
+    reader, poses = PoseReader(profile(), camera, live=False), []
     for frame in islice(pictures(held, profile(), camera), 4):
         image = np.ascontiguousarray(frame.image[:, ::-1]) if flipped else frame.image
-        found = eye.look(Frame(frame.index, frame.t_arrival_s, image, frame.t_arrival_s))
+        found = reader.look(Frame(frame.index, frame.t_arrival_s, image, frame.t_arrival_s))
         poses += found
         for pose in found:
             T_target_cam = T_target_cam_at(held, frame.t_exposure_s)
@@ -63,9 +63,9 @@ def test_a_picture_is_seen_as_it_is_and_mirrored_as_such(flipped: bool) -> None:
             place_m = -T_target_cam[:3, :3].T @ T_target_cam[:3, 3]
             np.testing.assert_allclose(pose.position_cam_target_m, place_m, atol=4e-3)
             assert pose.covariance is not None
-    assert (eye.mirrored, len(poses)) == ((4, 0) if flipped else (0, 4))
-    assert bool(eye.outlines) is not flipped
+    assert (reader.mirrored, len(poses)) == ((4, 0) if flipped else (0, 4))
+    assert bool(reader.outlines) is not flipped
     again = Frame(frame.index + 1, frame.t_arrival_s + 0.03, image, frame.t_arrival_s + 0.03)
-    live = Eye(profile(), camera, live=True)
+    live = PoseReader(profile(), camera, live=True)
     assert len(live.look(again)) == len(found)
     assert live.look(replace(again, index=99)) == [], "a receiver's repetition is no picture"

@@ -75,14 +75,14 @@ def test_what_passes(
 ) -> None:
     """What starts again is silent, and until its blocks are asked for sends none."""
     radio = faulty() if effect is None else faulty(effect)
-    assert radio.up(SETPOINT, t_s) is up
-    blocks = [radio.down(block, t_s) for block in ("state", "attitude")]
+    assert radio.uplink_arrives(SETPOINT, t_s) is up
+    blocks = [radio.downlink_delay_s(block, t_s) for block in ("state", "attitude")]
     assert blocks == [TELEMETRY_DELAY_S if passes else None for passes in (state, attitude)]
 
 
 def test_packets_of_one_order_are_lost() -> None:
     radio = faulty(e.PacketLost("notify", 2))
-    arrived = [radio.up(packet, 1.1) for packet in (STOP, NOTIFY) * 3]
+    arrived = [radio.uplink_arrives(packet, 1.1) for packet in (STOP, NOTIFY) * 3]
     assert arrived == [True, False, True, False, True, True]
 
 
@@ -95,22 +95,22 @@ def test_a_packet_comes_twice() -> None:
 
     radio = faulty(e.PacketTwice("notify"))
     radio.serves(Firmware())  # type: ignore[arg-type]
-    assert radio.up(NOTIFY, 1.1)
-    assert radio.up(NOTIFY, 1.2)
+    assert radio.uplink_arrives(NOTIFY, 1.1)
+    assert radio.uplink_arrives(NOTIFY, 1.2)
     assert len(arrived) == 1  # beside the ones that arrive by themselves
 
 
 def test_telemetry_comes_late() -> None:
     radio = faulty(e.TelemetryDelayed(0.7, 2.0))
-    assert radio.down("battery", 2.0) == 0.7
-    assert radio.down("battery", 3.5) == TELEMETRY_DELAY_S
+    assert radio.downlink_delay_s("battery", 2.0) == 0.7
+    assert radio.downlink_delay_s("battery", 3.5) == TELEMETRY_DELAY_S
 
 
 def test_a_cut_uplink_is_cut_for_good() -> None:
     radio = faulty()
     radio.cut = True
-    assert not radio.up(SETPOINT, 99.0)
-    assert radio.down("state", 99.0) is not None
+    assert not radio.uplink_arrives(SETPOINT, 99.0)
+    assert radio.downlink_delay_s("state", 99.0) is not None
 
 
 # --- the camera ---------------------------------------------------------------------------------

@@ -51,8 +51,8 @@ class ScriptedLink:
         self.places.append((self.now_s, place))
         return True
 
-    def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
-        self.watchdog, self.told = guard, told
+    def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
+        self.watchdog, self.told = guard, on_sent
 
     def close(self) -> None:
         self.closed = True

@@ -125,7 +125,7 @@ class Nobody:
 def told_by(link: CflibLink) -> list[SentCommand]:
     """Collects what the link sends of itself."""
     told: list[SentCommand] = []
-    link.guard(Nobody(), told.append)
+    link.set_guard(Nobody(), told.append)
     return told
 
 

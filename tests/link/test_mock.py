@@ -22,7 +22,7 @@ class LosesTheFirst(Radio):
         super().__init__()
         self.left = count
 
-    def up(self, packet: Packet, now_s: float) -> bool:
+    def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
         self.left -= 1
         return self.left < 0
 

@@ -141,7 +141,7 @@ def flown(connected: Flown) -> Iterator[Flown]:
     yield connected
     connected.air.unplugged.clear()
     connected.air.silent.clear()
-    connected.link.guard(Operator())
+    connected.link.set_guard(Operator())
 
 
 class Operator:
@@ -184,7 +184,7 @@ def test_after_silence_a_landing_and_a_stop_go_out_again(flown: Flown, silent_s:
 
 def test_the_operators_stop_goes_out_after_silence_though_the_loop_hangs(flown: Flown) -> None:
     operator = Operator()
-    flown.link.guard(operator)
+    flown.link.set_guard(operator)
     flown.air.silent.set()
     flown.stream(0.2)  # and then nothing of the loop's
     PAUSE.wait(CFLIB_WAITS_S)
@@ -303,7 +303,7 @@ def test_the_end_of_the_first_driver_is_one_of_many(driver: type[Any], cache: An
 
 def test_an_order_that_may_have_been_lost_with_the_link_is_sent_again(flown: Flown) -> None:
     told: list[SentCommand] = []
-    flown.link.guard(Operator(), told.append)
+    flown.link.set_guard(Operator(), told.append)
     began_s = time.monotonic()
     flown.link.send(LAND)
     flown.heard_after_s(LAND, began_s)

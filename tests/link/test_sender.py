@@ -141,7 +141,7 @@ def test_a_stop_does_not_wait_for_the_rest_of_a_landing(library: Library) -> Non
 
 def test_the_last_order_is_sent_again_unless_it_was_followed_or_is_old(library: Library) -> None:
     told: list[SentCommand] = []
-    sender = library.sender(told=told.append)
+    sender = library.sender(on_sent=told.append)
     sender.repeat_order(0.0)  # nothing has been sent
     sender.put(LAND)
     library.takes(LAND)
@@ -278,7 +278,7 @@ def test_a_watchdogs_thread_that_has_ended_is_noticed_and_started_again(library:
 
 def test_the_guard_is_asked_by_itself_and_what_it_wants_is_told(library: Library) -> None:
     told: list[SentCommand] = []
-    library.sender(guard=EmergencyStop, told=told.append)
+    library.sender(guard=EmergencyStop, on_sent=told.append)
     until(lambda: len(told) >= 3)
     assert set(library.taken) == {STOP}
     assert {sent.by for sent in told} == {"watchdog"}

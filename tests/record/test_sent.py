@@ -128,7 +128,7 @@ def test_the_sender_tells_of_its_guard_and_not_of_the_loop() -> None:
             enough.set()
         raise OSError("the log's")  # and the next one goes out all the same
 
-    sender = Sender(sent.append, guard=EmergencyStop, told=tell)
+    sender = Sender(sent.append, guard=EmergencyStop, on_sent=tell)
     sender.put(HOLD)
     assert sender.drain(20.0)
     assert enough.wait(20.0)

@@ -149,10 +149,10 @@ def test_both_directions_are_lost_together_and_faults_are_laid_over_the_same_rad
         t_s = step * STEP_S
         lost = same.lost(t_s)
         for each in (radio, faulty):
-            assert each.up(PACKET, t_s) is not lost
-            assert each.down("fast", t_s) == (None if lost else TELEMETRY_DELAY_S)
+            assert each.uplink_arrives(PACKET, t_s) is not lost
+            assert each.downlink_delay_s("fast", t_s) == (None if lost else TELEMETRY_DELAY_S)
     faulty.cut = True
-    assert not faulty.up(PACKET, 21.0)
+    assert not faulty.uplink_arrives(PACKET, 21.0)
 
 
 # --- What explains an event -----------------------------------------------------------------------

@@ -13,12 +13,12 @@ from perchctl.geometry import Array, rot_z
 from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig
 from perchctl.profile.vision import VehicleConfig
 from perchctl.target import (
+    assess_mounting,
     edge_margin,
-    mounted_camera,
     offset_text,
+    overhead_reach,
     overhead_view,
-    reach_at,
-    sight_from,
+    view_from,
 )
 from perchctl.target.sight import SURE_PX, MountingView, least_side_px
 from perchctl.vision import project, square_corners
@@ -51,7 +51,7 @@ def in_picture(mount: Mounting, centre_m: Array, yaw_rad: float) -> bool:
 def test_within_the_reach_the_marker_is_whole_at_any_turn(
     mount: Mounting, height_m: float, towards: float, yaw_rad: float, share: float
 ) -> None:
-    reach = reach_at(SIDE_M, CAMERA, mount, height_m)
+    reach = overhead_reach(SIDE_M, CAMERA, mount, height_m)
     if reach is None:
         return
     away_m = share * reach.radius_m
@@ -63,7 +63,7 @@ def test_within_the_reach_the_marker_is_whole_at_any_turn(
 @settings(max_examples=30, deadline=None)
 @given(mounts, st.floats(0.6, 3.0))
 def test_beyond_the_reach_some_marker_is_cut(mount: Mounting, height_m: float) -> None:
-    reach = reach_at(SIDE_M, CAMERA, mount, height_m)
+    reach = overhead_reach(SIDE_M, CAMERA, mount, height_m)
     if reach is None:
         return
     x, y = reach.axis_xy_m
@@ -90,7 +90,7 @@ def test_a_sight_is_the_lens_s_wherever_the_body_stands(
     body_m, camera_m = np.array([0.4, -1.2, 0.02]), np.array(mount.position_m)
     way = np.array([x, y, height_m])
     target_m = body_m + rot_z(yaw_rad) @ (camera_m + way)
-    seen = sight_from(body_m, yaw_rad, target_m, target_yaw, TARGET, CAMERA, mount)
+    seen = view_from(body_m, yaw_rad, target_m, target_yaw, TARGET, CAMERA, mount)
     assert abs(seen.height_m - height_m) < 1e-9
     near = [in_picture(mount, way + d, target_yaw - yaw_rad) for d in (
         np.array([dx, dy, 0.0]) for dx in (-0.01, 0.01) for dy in (-0.01, 0.01))]  # fmt: skip
@@ -98,7 +98,7 @@ def test_a_sight_is_the_lens_s_wherever_the_body_stands(
         assert seen.whole is all(near)
     # Walking so far brings the target onto the camera's axis.
     there = body_m + rot_z(yaw_rad) @ np.array([*seen.aside_m, 0.0])
-    moved = sight_from(there, yaw_rad, target_m, target_yaw, TARGET, CAMERA, mount)
+    moved = view_from(there, yaw_rad, target_m, target_yaw, TARGET, CAMERA, mount)
     assert math.hypot(*moved.aside_m) < 1e-9
     on_axis = rot_z(yaw_rad).T @ (target_m - there) - camera_m
     assert np.linalg.norm(np.cross(on_axis, mount.T_body_cam[:3, 2])) < 1e-9
@@ -167,7 +167,7 @@ def view_of(gear_m: tuple[float, float, float], yaw_deg: float = 0.0) -> Mountin
         camera=CameraConfig(mount=mount),
         vehicle=VehicleConfig(gear_body_m=(x + 0.01, y, z + 0.005)),
     )
-    return mounted_camera(TargetConfig(), STRAIGHT_CAMERA, profile)
+    return assess_mounting(TargetConfig(), STRAIGHT_CAMERA, profile)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from perchctl.calibration.board.detect import BoardView, Rejection, find_board
-from perchctl.calibration.live import Moment, polled
+from perchctl.calibration.live import GuidedFrame, poll_frames
 from perchctl.camera import BrokenPicture, FrameSource, Grey, VideoSource, image_files, read_grey
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import Array
@@ -234,7 +234,7 @@ _BLUR_SHARE = 2.5 / 640.0
 def capture_views(
     source: FrameSource,
     board: Board,
-    show: Callable[[Moment], None],
+    show: Callable[[GuidedFrame], None],
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
@@ -249,7 +249,7 @@ def capture_views(
     state = Capture()
     ended = f"{source.describe()} has ended"
     try:
-        for _, frame in polled(source, clock, sleep):
+        for _, frame in poll_frames(source, clock, sleep):
             if stopped():
                 return list(state.taken)
             if frame is None or frame.repeated:  # a repeated one would look still
@@ -340,7 +340,7 @@ def next_advice(signatures: Sequence[Signature]) -> str:
     return f"tilt the board's {side} side away"
 
 
-def _moment(frame: Frame, seen: BoardView | str, state: Capture) -> Moment:
+def _moment(frame: Frame, seen: BoardView | str, state: Capture) -> GuidedFrame:
     """Return what to show of a frame."""
     outlines: tuple[tuple[str, Array], ...] = ()
     if isinstance(seen, BoardView):
@@ -351,7 +351,7 @@ def _moment(frame: Frame, seen: BoardView | str, state: Capture) -> Moment:
     }
     shares = ", ".join(f"{name} {text}" for name, (text, _) in covered.items())
     taken = len(state.taken)
-    return Moment(
+    return GuidedFrame(
         frame.index,
         frame.image,
         outlines,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from perchctl.calibration.board.adjust import PARAMETERS, Fit
 from perchctl.calibration.board.detect import BoardView, Rejection
 from perchctl.calibration.board.predict import RangeError, limit_mm
-from perchctl.calibration.files import camera_record, camera_text
+from perchctl.calibration.files import calibration_text, camera_record
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel
 
@@ -152,7 +152,7 @@ class Calibration:
 
     def text(self, name: str, date: str) -> str:
         """Return the calibration file, with its quality and the parameters' covariance."""
-        return camera_text(
+        return calibration_text(
             self.camera,
             name,
             {

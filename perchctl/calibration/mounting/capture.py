@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from perchctl.calibration.live import Moment, polled
-from perchctl.calibration.mounting.eye import Eye
+from perchctl.calibration.live import GuidedFrame, poll_frames
+from perchctl.calibration.mounting.pose_reader import PoseReader
 from perchctl.calibration.mounting.recording import (
     MIRRORED,
     AttitudeSample,
@@ -66,9 +66,9 @@ class VehicleSensors:
 def capture(
     tape: MountingTape,
     source: FrameSource,
-    eye: Eye,
+    reader: PoseReader,
     sensors: VehicleSensors,
-    show: Callable[[Moment], None],
+    show: Callable[[GuidedFrame], None],
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
@@ -81,7 +81,7 @@ def capture(
     """
     oldest_s = clock() - BEFORE_S
     progress = _Progress(tape.part)
-    for now_s, frame in polled(source, clock, sleep):
+    for now_s, frame in poll_frames(source, clock, sleep):
         if (problem := sensors.problem(now_s)) is not None:
             raise TimedOut(f"the vehicle is gone: {problem}")
         tape.attitudes += [a for a in sensors.attitudes() if a.t_s >= oldest_s]
@@ -89,16 +89,16 @@ def capture(
             return
         if frame is None:
             continue
-        poses = eye.look(frame)
+        poses = reader.look(frame)
         progress.advance_time(frame.t_s if not source.live else now_s)
-        if frame.repeated and not eye.trouble:  # no picture without a target: no picture
+        if frame.repeated and not reader.trouble:  # no picture without a target: no picture
             continue
         tape.poses += poses
-        tape.mirrored = eye.mirrored
+        tape.mirrored = reader.mirrored
         if tape.mirrored >= MIRRORED_PICTURES and not tape.poses:
             raise InvalidValue(MIRRORED)
         progress.judge(tape, bool(poses))
-        show(progress.moment(frame, tape, eye))
+        show(progress.guided(frame, tape, reader))
 
 
 class _Progress:
@@ -131,11 +131,11 @@ class _Progress:
             self._judged_s = self._seconds
             self._missing = missing_motion(tape.recording())
 
-    def moment(self, frame: Frame, tape: MountingTape, eye: Eye) -> Moment:
+    def guided(self, frame: Frame, tape: MountingTape, reader: PoseReader) -> GuidedFrame:
         """Return what to show of the newest frame."""
         share = sum(self._with_target) / max(len(self._with_target), 1)
-        if eye.trouble:
-            advice = eye.trouble
+        if reader.trouble:
+            advice = reader.trouble
         elif tape.mirrored > len(tape.poses):
             advice = MIRRORED
         elif share < LEAST_SHARE:
@@ -152,4 +152,4 @@ class _Progress:
             *(("", motion, None) for motion in lacking[1:]),
         )  # fmt: skip
         line = f"{tape.part}: {advice}"
-        return Moment(frame.index, frame.image, eye.outlines, rows, advice, line)
+        return GuidedFrame(frame.index, frame.image, reader.outlines, rows, advice, line)

@@ -60,7 +60,7 @@ class SeenPose:
 class MountingRecording:
     """The recording of one part. `mirrored_pictures` counts those in which the target was seen
     mirrored only; `seen_by` says what else the poses rest on (see
-    `perchctl.calibration.mounting.eye`), empty where that is not known."""
+    `perchctl.calibration.mounting.pose_reader`), empty where that is not known."""
 
     part: MountingPart
     attitudes: tuple[AttitudeSample, ...]

@@ -26,7 +26,7 @@ from perchctl.vision import (
 )
 
 
-class Eye:
+class PoseReader:
     """Reads the target's pose from each frame, and remembers what the pipeline must.
 
     `mirrored` counts the pictures in which a target was seen mirrored only. `outlines` are
