@@ -116,7 +116,9 @@ def refusal(path: Path, content: bytes) -> str:
     ],
 )
 def test_what_is_no_log_is_refused(content: bytes, tmp_path: Path) -> None:
-    assert "not a flight log" in refusal(tmp_path / "x.csv", content)
+    said = refusal(tmp_path / "x.csv", content)
+    assert "logs are the .jsonl files" in said
+    assert ("it is a picture" if content.startswith(b"\x89PNG") else "not a flight log") in said
     log = synthetic.write(tmp_path / "x.jsonl", most=2)
     assert "cut off in its header" in refusal(log, log.read_bytes()[:700])
 
