@@ -121,21 +121,43 @@ def test_it_needs_a_target_that_was_measured_lately() -> None:
     assert nothing(look("height", age_s=MOST_AGE_S + 0.01))
 
 
-@pytest.mark.parametrize(("age_s", "searched"), [(MOST_AGE_S, False), (MOST_AGE_S + 0.01, True)])
-def test_nothing_is_searched_for_where_nothing_can_be_whole(
-    age_s: float, searched: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """So long as that is known: later the target may be anywhere."""
-    passes = []
+@pytest.fixture
+def searches(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The searches that were made."""
+    made = []
 
     def noting(*args: Any, **keys: Any) -> Found:
-        passes.append(args)
+        made.append(args)
         return search(*args, **keys)
 
     monkeypatch.setattr("perchctl.vision.markers.detect.search", noting)
-    empty = np.full(SHAPE, 120, np.uint8)
-    assert nothing(look("under", empty, age_s=age_s))
-    assert bool(passes) is searched
+    return made
+
+
+EMPTY = np.full(SHAPE, 120, np.uint8)
+
+
+@pytest.mark.parametrize(("age_s", "searched"), [(MOST_AGE_S, False), (MOST_AGE_S + 0.01, True)])
+def test_nothing_is_searched_for_where_nothing_can_be_whole(
+    age_s: float, searched: bool, searches: list[Any]
+) -> None:
+    """So long as that is known: later the target may be anywhere."""
+    assert nothing(look("under", EMPTY, age_s=age_s))
+    assert bool(searches) is searched
+
+
+@pytest.mark.parametrize(("out_px", "searched"), [(30.0, True), (50.0, False)])
+def test_what_was_cut_is_searched_for_where_it_may_be_whole_again(
+    out_px: float, searched: bool, searches: list[Any]
+) -> None:
+    square_px = np.array([[0.0, 0.0], [60.0, 0.0], [60.0, 60.0], [0.0, 60.0]])
+    aside = square_px + np.array([SHAPE[1] - 60.0 + out_px, 100.0])
+    expected: dict[MarkerName, Array] = {
+        "small": aside,
+        "large": 12.0 * square_px + [500.0, -200.0],
+    }
+    assert nothing(detect_markers(frame(EMPTY), seen_before("under"), SETUP, CAMERA, expected))
+    assert bool(searches) is searched
 
 
 def test_a_target_that_was_whole_is_searched_for_wherever_it_is_expected() -> None:
