@@ -6,7 +6,6 @@ import base64
 import os
 import tempfile
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -212,8 +211,7 @@ def _templates() -> jinja2.Environment:
     )
     templates.filters["count"] = count
     templates.globals.update(
-        seven_phases=SEVEN, plot_of=plot_address,
-        film_of=film_address,
+        seven_phases=SEVEN, plot_of=plot_address, film_of=film_address,
     )  # fmt: skip
     return templates
 
@@ -223,19 +221,29 @@ def plot_address(flight: FlightAnalysis) -> str:
     return _address("image/png", flight_png(flight))
 
 
-def film_address(flight: FlightAnalysis) -> str:
-    """Return the flight's film as a `data:` address; the log has at least one tick. A recording
-    that cannot be read costs the camera's pictures; empty where the log holds too little."""
+def film_address(flight: FlightAnalysis) -> tuple[str, str]:
+    """Return the flight's film as a `data:` address, and why it, or its camera pictures, are
+    missing; each may be empty. The log has at least one tick."""
     path = flight.log.path
     is_recorded = path_beside(path, ".mcap").is_file()
     recorded = [recorded_pictures(path, exact=False)] if is_recorded else []
+    problem = ""
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / "film.mp4"
         for pictures in (*recorded, None):
-            with suppress(InvalidValue):
+            try:
                 write_film(flight, pictures, film)
-                return _address("video/mp4", film.read_bytes())
-    return ""
+            except InvalidValue as error:
+                problem = _without_folder(error, path)
+                continue
+            return _address("video/mp4", film.read_bytes()), problem
+    return "", problem
+
+
+def _without_folder(error: PerchError, log_path: Path) -> str:
+    """Return the error's text with the bare names of the files beside the log: a page that is sent
+    on names no folder of a computer."""
+    return str(error).replace(f"{log_path.parent}{os.sep}", "")
 
 
 def _address(kind: str, content: bytes) -> str:
@@ -317,7 +325,7 @@ def with_pictures(flight: FlightAnalysis, recording: Path) -> ReportedFlight:
             decisions = wanted.pop(picture.number)
             shown += [Shown(decision, _jpeg(decision, picture.image)) for decision in decisions]
     except PerchError as error:
-        problem = str(error).replace(f"{flight.log.path.parent}{os.sep}", "")
+        problem = _without_folder(error, flight.log.path)
     in_order = tuple(sorted(shown, key=lambda each: each.decision.t_s))
     return ReportedFlight(flight, in_order, problem)
 

@@ -127,3 +127,6 @@ def test_a_bad_recording_costs_the_report_s_film_its_pictures_only(
     (tmp_path / "flight.mcap").write_bytes(b"no recording")
     assert run("log", "report", str(log), "-o", str(page), "--film").code == 0
     assert "<video" in page.read_text()
+    film = page.read_text().partition("<h3>Film</h3>")[2].partition("</section>")[0]
+    assert "flight.mcap" in film.partition("</figure>")[2]
+    assert str(tmp_path) not in film
