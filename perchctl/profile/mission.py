@@ -12,7 +12,8 @@ class SearchConfig(Section):
 
     attempts: int = key(6, "times to wait, before it lands", ge=1, le=100)
     wait_s: float = key(1.5, "at each height", gt=0, le=60)
-    step_m: float = key(0.12, "higher each time", ge=0, le=1)
+    step_m: ClassVar[float] = 0.12
+    """It climbs so far between two looks."""
     max_height_m: float = key(1.3, "never above it to look for the target", gt=0, le=20)
     yaw_step_deg: float = key(
         60.0, "turned each time: the picture is wider than high", ge=0, le=180
@@ -24,10 +25,11 @@ class SearchConfig(Section):
 class EstimateConfig(Section):
     """Phase 3. The pose must stay within `spread_m` for `dwell_s`."""
 
-    dwell_s: float = key(0.4, "for which the pose must be steady", ge=0, le=10)
+    dwell_s: float = key(0.4, "for which the pose must be steady", ge=0, lt=4)
     spread_m: ClassVar[float] = 0.05
     """Within which it must stay."""
-    timeout_s: float = key(4.0, "then back to search", gt=0, le=60)
+    timeout_s: ClassVar[float] = 4.0
+    """A pose that is not steady by then sends it back to search."""
 
 
 class AlignConfig(Section):
@@ -36,7 +38,8 @@ class AlignConfig(Section):
     xy_m: float = key(0.04, "aligned: the gear's distance from the target's axis", gt=0, le=1)
     yaw_deg: float = key(5.0, "aligned: heading", gt=0, le=180)
     dwell_s: float = key(0.4, "for which both must hold", ge=0, le=10)
-    timeout_s: float = key(20.0, "then the attempt counts as failed", gt=0, le=120)
+    timeout_s: ClassVar[float] = 20.0
+    """An attempt that is not aligned by then counts as failed."""
     speed_mps: float = key(0.4, "of the setpoint, sideways", gt=0, le=2)
     yaw_rate_dps: ClassVar[float] = 60.0
     """Of the setpoint."""
@@ -52,7 +55,8 @@ class AscendConfig(Section):
     """
 
     speed_mps: float = key(0.25, "climb, far below", gt=0, le=1)
-    near_speed_mps: float = key(0.12, "climb, nearer than 0.35 m", gt=0, le=1)
+    near_speed_mps: ClassVar[float] = 0.12
+    """Climb nearer than `near_m`."""
     near_m: ClassVar[float] = 0.35
     """From here on it climbs slowly."""
     cone_base_m: ClassVar[float] = 0.05
@@ -67,13 +71,14 @@ class AscendConfig(Section):
     settle_speed_mps: ClassVar[float] = 0.04
     """Settled: speed."""
     settle_dwell_s: float = key(
-        0.3, "settled: for which position, heading and speed must all hold", ge=0, le=10
+        0.3, "settled: for which position, heading and speed must all hold", ge=0, lt=10
     )
     settle_timeout_s: ClassVar[float] = 10.0  # at the stand-off
     fresh_s: float = key(
         0.25, "a target older than this, beyond the latency, is not fresh", gt=0, le=2
     )
-    timeout_s: float = key(40.0, "for the whole ascent", gt=0, le=300)
+    timeout_s: ClassVar[float] = 40.0
+    """An ascent that takes longer counts as failed."""
 
 
 class PerchConfig(Section):
@@ -85,8 +90,9 @@ class PerchConfig(Section):
     )
     thrust: int = key(60000, "of the raw mode", ge=1000, le=65535)
     press_m: ClassVar[float] = 0.25  # the setpoint above the contact
-    climb_mps: float = key(0.2, "of the setpoint", gt=0, le=1)
-    contact_dwell_s: float = key(0.25, "for which contact must hold", gt=0, le=5)
+    climb_mps: ClassVar[float] = 0.2
+    """Climb of the setpoint that presses."""
+    contact_dwell_s: float = key(0.25, "for which contact must hold", gt=0, lt=3)
     contact_z_m: float = key(0.05, "contact: the gear's distance from the target", gt=0, le=0.3)
     contact_xy_m: float = key(
         0.025, "contact: its distance from the axis, the magnet's radius", gt=0, le=0.5
@@ -94,7 +100,8 @@ class PerchConfig(Section):
     contact_speed_mps: ClassVar[float] = 0.06  # contact: vertical speed
     contact_acc_g: ClassVar[float] = 0.12  # contact: off 1 g by at most this
     contact_thrust_ratio: ClassVar[float] = 1.03  # contact: at least, over hover thrust
-    timeout_s: float = key(3.0, "without contact", gt=0, le=20)
+    timeout_s: ClassVar[float] = 3.0
+    """Without a contact by then the attempt counts as failed."""
 
 
 class CompleteConfig(Section):
@@ -106,20 +113,20 @@ class CompleteConfig(Section):
     the stream alive: the whole weight must hang for `hang_s`. `watch_s` after the stop.
     """
 
-    steps: int = key(5, "of the release", ge=1, le=50)
+    steps: ClassVar[int] = 5
+    """Steps of the setpoint in the release."""
     release_s: ClassVar[float] = 0.8
     """Over which the thrust is released."""
     release_drop_m: ClassVar[float] = 0.25
     """The setpoint's last step lies below the contact."""
-    hold_ratio: float = key(0.6, "thrust over the hover thrust that proves the magnet", gt=0, lt=1)
+    hold_ratio: ClassVar[float] = 0.6
+    """The magnet is proven where it holds with this share of the hover thrust."""
     hold_dwell_s: ClassVar[float] = 0.3  # for which it must prove it
-    ramp_s: float = key(
-        0.5, "of raw thrust, from the least of position mode to still motors", gt=0, le=10
-    )
-    hang_s: float = key(
-        1.0, "that the whole weight must hang before the motors stop", ge=0.3, le=10
-    )
-    release_timeout_s: float = key(8.0, "then the attempt counts as failed", gt=0, le=30)
+    ramp_s: ClassVar[float] = 0.5
+    """Raw thrust goes down over this time, from the least of position mode to still motors."""
+    hang_s: ClassVar[float] = 1.0
+    """The whole weight must hang for so long before the motors stop."""
+    release_timeout_s: float = key(8.0, "then the attempt counts as failed", gt=1.8, le=30)
     slip_m: ClassVar[float] = 0.03  # hanging: at most so far below the contact
     slip_mps: ClassVar[float] = 0.12  # a slip: sinking faster
     slip_dwell_s: ClassVar[float] = 0.03  # a slip: for so long; a free fall is answered at once
@@ -131,10 +138,12 @@ class RecoverConfig(Section):
     """After a miss or a slip: descend, steady, back to phase 3."""
 
     descend_m: float = key(0.10, "below where the attempt ended", gt=0, le=1)
-    dwell_s: float = key(0.5, "for which it must be steady", ge=0, le=10)
+    dwell_s: ClassVar[float] = 0.5
+    """It must be steady for so long."""
     steady_mps: ClassVar[float] = 0.1
     """Steady: speed."""
-    timeout_s: float = key(6.0, "then it lands", gt=0, le=60)
+    timeout_s: ClassVar[float] = 6.0
+    """It lands if it is not steady by then."""
 
 
 OVERDUE_SHARE = 0.5
@@ -192,7 +201,8 @@ class SafetyConfig(Section):
     energy_reserve_s: float = key(
         4.0, "of hovering, left after an attempt and a landing", ge=0, le=120
     )
-    battery_stale_s: float = key(90.0, "grace for a reading that stands still", gt=0, le=600)
+    battery_stale_s: ClassVar[float] = 90.0
+    """A battery reading that stands still for longer is stale."""
     telemetry_hold_s: float = key(0.3, "age of telemetry: held", gt=0, le=5)
     telemetry_land_s: float = key(1.0, "age of telemetry: landed", gt=0, le=10)
     proof_age_s: float = key(
@@ -202,11 +212,14 @@ class SafetyConfig(Section):
     camera_land_s: float = key(3.0, "since the last good picture: landed", gt=0, le=60)
     max_frame_age_s: float = key(0.4, "an older picture is no measurement", gt=0, le=5)
     jump_m: float = key(0.25, "a step of the estimate beyond its speed: a jump", gt=0, le=5)
-    jump_z_m: float = key(0.15, "a step of its height", gt=0, le=5)
-    jump_deg: float = key(15.0, "a step of its heading", gt=0, le=180)
+    jump_z_m: ClassVar[float] = 0.15
+    """Such a step of its height."""
+    jump_deg: ClassVar[float] = 15.0
+    """Such a step of its heading."""
     heading_lost_deg: ClassVar[float] = 40.0
     """Step of the heading from which it goes down at once, level, by raw thrust."""
-    jump_mps: float = key(1.0, "a step of its velocity", gt=0, le=10)
+    jump_mps: ClassVar[float] = 1.0
+    """Such a step of its velocity."""
     flight_variance_m2: ClassVar[float] = 0.05  # of the position in flight: above it, held
     variance_land_s: ClassVar[float] = 1.0  # above it for so long: landed
     jump_hold_s: ClassVar[float] = 0.5  # held after a jump, then landed
@@ -216,19 +229,21 @@ class SafetyConfig(Section):
     )
     max_tilt_deg: float = key(55.0, "beyond it the motors are cut", gt=0, le=180)
     tilt_debounce_s: ClassVar[float] = 0.2  # for which it must be tilted
-    loop_late_hold_s: float = key(0.25, "a turn so late: held", gt=0, le=5)
-    loop_late_land_s: float = key(1.0, "a turn so late: landed", gt=0, le=10)
+    loop_late_hold_s: ClassVar[float] = 0.25
+    """With a turn of the loop so late it holds its place."""
+    loop_late_land_s: ClassVar[float] = 1.0
+    """With a turn of the loop so late it lands."""
     estimator_wait_s: float = key(10.0, "on the ground", gt=0, le=60)
-    estimator_variance_m2: float = key(
-        0.01, "of the position, at most, before take-off", gt=0, le=10
-    )
+    estimator_variance_m2: ClassVar[float] = 0.01
+    """A larger variance of the position refuses take-off."""
     ground_z_m: float = key(
         0.0, "height at which the estimate places the ground, where it takes off", ge=-10, le=10
     )
     ground_tolerance_m: float = key(
         0.15, "farther from it the vehicle hangs, or is held: no take-off", gt=0, le=10
     )
-    start_tilt_deg: float = key(10.0, "roll and pitch, at most, before take-off", gt=0, le=45)
+    start_tilt_deg: ClassVar[float] = 10.0
+    """A larger roll or pitch refuses take-off."""
     blocked_s: ClassVar[float] = 0.7  # pressed and not moving: back off down
     blocked_thrust_ratio: ClassVar[float] = 1.1  # of the hover thrust: pressed from here on
     land_on_log_error: bool = key(False, "land when the log cannot be written")

@@ -69,7 +69,8 @@ class SimulationConfig(Section):
     mount_error_m: float = key(
         0.001, "what the profile's mount is wrong by, at most", ge=0, le=0.05
     )
-    estimate_noise_m: float = key(0.002, "of the state estimate", ge=0, le=0.2)
+    estimate_noise_m: ClassVar[float] = 0.002
+    """Noise of the state estimate."""
     estimate_tilt_bias_deg: float = key(0.3, "of the state estimate, at most", ge=0, le=10)
     drift_mps: float = key(0.01, "of the state estimate", ge=0, le=0.2)
     gyro_bias_dps: float = key(
@@ -84,8 +85,10 @@ class SimulationConfig(Section):
         0.1, "share of flights in which the first contact does not hold", ge=0, le=1
     )
     no_target: bool = key(False, "a bare ceiling")
-    capture_delay_s: float = key(0.01, "motion capture: from exposure to arrival", ge=0, le=1)
-    capture_noise_m: float = key(0.001, "motion capture: of a position, one sigma", gt=0, le=0.1)
+    capture_delay_s: ClassVar[float] = 0.01
+    """Time from a motion capture's exposure to arrival."""
+    capture_noise_m: ClassVar[float] = 0.001
+    """Standard deviation of a motion capture's position."""
     neighbours: tuple[tuple[float, float, float], ...] = key(
         (), "other targets beside the own one: x and y (m) in its axes, heading (deg)", max_length=8
     )
