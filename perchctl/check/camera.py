@@ -18,6 +18,7 @@ from perchctl.check.rehearsal import Rehearsal
 from perchctl.check.row import (
     Finding,
     Row,
+    ask,
     ask_all,
     by_limits,
     failed,
@@ -103,7 +104,7 @@ def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) ->
         return [Row(first, *failed(why, _AGAIN)), *skip_all(rest, why)]
     rows = ask_all(PICTURES, rehearsal, profile)
     if profile.positioning.by == "target":
-        rows += ask_all(SIGHT, rehearsal, profile, camera)
+        rows.append(ask(IN_VIEW, _in_view, rehearsal, profile, camera))
     return rows
 
 
@@ -183,18 +184,6 @@ def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
     return by_limits(share, 0.05, 0.5, found, advice)
 
 
-def _light(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    light = rehearsal.light
-    if light is None:
-        return skipped("no picture was looked at")
-    found = f"mean {light.mean:.0f} of 255, {100.0 * light.white:.0f} % white"
-    if light.white > 0.3:
-        return warned(found, "a shorter exposure, no lamp in the picture")
-    if light.mean < 40.0:
-        return warned(found, _LIGHT)
-    return passed(found)
-
-
 def _focus(rehearsal: Rehearsal, profile: Profile) -> Finding:
     blur = rehearsal.blur
     if blur is None:
@@ -250,7 +239,6 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
     "lost frames": _lost,
     "picture age": _age,
     "pictures": _pictures,
-    "light": _light,
     "focus": _focus,
     "mirrored": _mirrored,
     "target": _target,
@@ -294,14 +282,12 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
     return passed(found)
 
 
-SIGHT: dict[str, Callable[[Rehearsal, Profile, CameraModel], Finding]] = {
-    "in view": _in_view,
-}
+IN_VIEW = "in view"
 
 
 def names_of(profile: Profile) -> tuple[str, ...]:
     """Return the names of the pictures' rows, in their order."""
-    return (*PICTURES, *(SIGHT if profile.positioning.by == "target" else ()))
+    return (*PICTURES, *([IN_VIEW] if profile.positioning.by == "target" else ()))
 
 
 # --- The computer that looks at the pictures ----------------------------------------------------

@@ -25,7 +25,6 @@ from perchctl.check.row import (
     by_limits,
     failed,
     passed,
-    skipped,
     warned,
 )
 from perchctl.errors import PerchError, SafetyAbort
@@ -60,7 +59,7 @@ def quick_rows(options: FlyOptions) -> list[Row]:
     """Return the rows that cost no time, of the computer's disk and the profile. It opens no link
     and no camera."""
     return [
-        ask("disk", disk_finding, options.log_dir),
+        ask("log folder", log_finding, options.log_dir),
         *profile_rows(options.profile, source=options.source),
     ]
 
@@ -199,29 +198,19 @@ def _latency(plan: _Plan) -> Finding:
 # --- The computer's disk ------------------------------------------------------------------------
 
 
-def disk_finding(folder: Path) -> Finding:
-    """Judge the free space of the disk that the log's folder is on, or will be."""
-    try:
-        usage = shutil.disk_usage(_existing(folder))
-    except OSError as error:
-        return skipped(f"not known ({error.strerror or error})")
-    if not usage.total:
-        return skipped(f"{_existing(folder)} is on none")
-    free = usage.free
-    found = f"{free / 1e9:.1f} GB free" if free >= 1e9 else f"{free / 1e6:.0f} MB free"
-    advice = "free some space: a flight's log has some 5 MB a minute"
-    return by_limits(-free, -500e6, -50e6, found, advice)
-
-
-def log_folder_finding(folder: Path) -> Finding:
-    """Judge whether logs can be written to the folder, without making it."""
+def log_finding(folder: Path) -> Finding:
+    """Judge whether logs can be written to the folder, without making it, and the free space."""
     there = _existing(folder)
     advice = "name another with --log-dir, or set log.directory"
     if not os.path.isdir(there):
         return failed(f"{there} is a file", advice)
     if not os.access(there, os.W_OK | os.X_OK):
         return failed(f"no right to write in {there}", advice)
-    return passed(f"{folder} can be written" + ("" if there == folder else " (new)"))
+    free = shutil.disk_usage(there).free
+    shown = f"{free / 1e9:.1f} GB free" if free >= 1e9 else f"{free / 1e6:.0f} MB free"
+    found = f"{folder}{'' if there == folder else ' (new)'}, {shown}"
+    advice = "free some space: a flight's log has some 5 MB a minute"
+    return by_limits(-free, -500e6, -50e6, found, advice)
 
 
 def _existing(folder: Path) -> Path:

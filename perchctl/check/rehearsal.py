@@ -37,14 +37,6 @@ class Looked:
 
 
 @dataclass(frozen=True)
-class Light:
-    """Mean grey level, 0 to 255, and the share of pixels that are clipped white."""
-
-    mean: float
-    white: float
-
-
-@dataclass(frozen=True)
 class Blur:
     """Sigma of the edges of the target's markers, px: of the sharpest and the softest side."""
 
@@ -65,7 +57,7 @@ class Rehearsal:
         looked: the newest few; found: of how many pictures there was a target, and mirrored ones.
         silent_s: since the last picture, at the end.
         target: where it was at the end; None where it was not seen then.
-        light, blur: what the pictures are like; None where it could not be measured.
+        blur: None where it could not be measured.
     """
 
     live: bool
@@ -83,9 +75,7 @@ class Rehearsal:
     mirrored: int = 0
     silent_s: float = 0.0
     target: TargetEstimate | None = None
-    height_m: float | None = None
     print_verdict: PrintVerdict | None = None
-    light: Light | None = None
     blur: Blur | None = None
 
     @property
@@ -165,10 +155,8 @@ def rehearse(
     done.remarks = senses.perception.take_remarks()
     target = senses.target(end_s)
     done.target = target if target is not None and target.tracked else None
-    newest = senses.history.newest
-    done.height_m = None if newest is None else newest.position_m[2] - profile.safety.ground_z_m
     done.print_verdict = prints.verdict() if prints.judged else None
-    done.light, done.blur = _light(done.looked), _blur(done.looked, pipeline)
+    done.blur = _blur(done.looked, pipeline)
     return done
 
 
@@ -198,17 +186,6 @@ def _note(
     done.mirrored += seen.mirrored
     prints.add(output)
     done.looked = [*done.looked[1 - KEPT_FRAMES :], Looked(frame, seen)]
-
-
-# --- What the pictures are like -----------------------------------------------------------------
-
-
-def _light(looked: Sequence[Looked]) -> Light | None:
-    """Measure the light of the newest picture."""
-    if not looked:
-        return None
-    image = looked[-1].frame.image[::2, ::2]
-    return Light(float(image.mean()), float(np.mean(image >= 250)))
 
 
 def _blur(looked: Sequence[Looked], pipeline: Pipeline) -> Blur | None:

@@ -11,7 +11,7 @@ from datetime import datetime
 from perchctl.calibration import profile_camera
 from perchctl.camera import FrameSource, find_cameras, open_camera, without_password
 from perchctl.check import camera, capture, vehicle
-from perchctl.check.profile import log_folder_finding, quick_rows
+from perchctl.check.profile import quick_rows
 from perchctl.check.rehearsal import REHEARSED_S, Rehearsal, TakeTelemetry, rehearse
 from perchctl.check.row import Finding, Row, ask, failed, passed, skip_all, skipped
 from perchctl.errors import ConnectionFailed, PerchError, UsageError
@@ -84,7 +84,6 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
             )
             rehearsal = yield from _camera_rows(take, source, pipeline, options.profile, scope)
     yield ask("loop", camera.loop_finding, rehearsal, options.profile)
-    yield ask("log folder", log_folder_finding, options.log_dir)
     yield from quick_rows(options)
 
 

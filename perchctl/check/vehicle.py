@@ -32,9 +32,9 @@ LISTEN_S = 5.0
 MOVED_WARN_M = 0.05
 """At rest, while it is listened to: a flight's estimate drifts by a fifth of it."""
 KALMAN = 2
-RSSI = "radio.rssi"
 SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
-OPTIONAL = {"pm.vbat": "battery", "kalman.varPX": "estimator's variance", RSSI: "radio's strength"}
+OPTIONAL = {"pm.vbat": "battery", "kalman.varPX": "estimator's variance"}
+"""A flight does without these log variables, and is blind to what they say."""
 BY_FLY = "positions are sent by fly, which waits for the estimate to agree"
 """By a motion capture, or by the target."""
 
@@ -59,7 +59,6 @@ class Vehicle:
     telemetry: Telemetry | None = None
     age_s: float = 0.0
     samples_hz: float = 0.0
-    rssi_dbm: float | None = None
     measured_by: MeasuredBy = field(default_factory=MeasuredBy)
     moved_m: float = 0.0
 
@@ -97,7 +96,6 @@ def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
     echoes = link.echoes(listen_s)
     samples = link.telemetry()
     span_s = samples[-1].t_s - samples[0].t_s if len(samples) > 1 else 0.0
-    rssi = link.variables([RSSI]).get(RSSI)
     later = link.telemetry() or samples
     return Vehicle(
         uri=uri,
@@ -110,7 +108,6 @@ def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
         telemetry=later[-1] if later else None,
         age_s=link.age_s(),
         samples_hz=(len(samples) - 1) / span_s if span_s > 0.0 else 0.0,
-        rssi_dbm=-rssi if rssi else None,
         moved_m=moved_m(samples),
         measured_by=measured_by,
     )
@@ -166,43 +163,22 @@ def _telemetry(vehicle: Vehicle, profile: Profile) -> Finding:
     return by_limits(-vehicle.samples_hz / wanted_hz, -0.9, -0.5, found, advice)
 
 
-def _signal(vehicle: Vehicle, profile: Profile) -> Finding:
-    if not vehicle.uri.startswith("radio://"):
-        return skipped(f"no radio in {vehicle.uri.partition('://')[0]}://")
-    if "/250K" in vehicle.uri:
-        return warned("250K is too slow for 100 samples a second", "set the vehicle to 2M")
-    if vehicle.rssi_dbm is None:
-        return skipped("the vehicle reports no strength")
-    advice = "bring the radio nearer, turn its antenna upright"
-    return by_limits(-vehicle.rssi_dbm, 75.0, 90.0, f"{vehicle.rssi_dbm:.0f} dBm", advice)
-
-
 def _firmware(vehicle: Vehicle, profile: Profile) -> Finding:
-    found = f"protocol {vehicle.protocol}"
-    if vehicle.protocol >= ProbeLink.NEEDED_PROTOCOL:
-        return passed(found)
-    needed = ProbeLink.NEEDED_PROTOCOL
-    advice = f"update it: protocol {needed} or later is needed (release 2026.08)"
-    return failed(found, advice)
-
-
-def _variables(vehicle: Vehicle, profile: Profile) -> Finding:
+    """Judge the protocol, the log variables that a flight needs, and the self-test at boot."""
+    found, needed = f"protocol {vehicle.protocol}", ProbeLink.NEEDED_PROTOCOL
+    if vehicle.protocol < needed:
+        advice = f"update it: protocol {needed} or later is needed (release 2026.08)"
+        return failed(found, advice)
     if vehicle.missing:
-        found = f"not logged: {', '.join(vehicle.missing)}"
-        return failed(found, "update the firmware to release 2026.08 or later")
+        found = f"{found}, not logged: {', '.join(vehicle.missing)}"
+        return failed(found, "update it to release 2026.08 or later")
+    if vehicle.parameters.get(SELF_TEST) == 0:
+        found = f"{found}, its self-test failed at boot"
+        return failed(found, "restart it level and at rest; read its console")
     if vehicle.lacking:
-        found = f"not logged: {', '.join(vehicle.lacking)}"
+        found = f"{found}, not logged: {', '.join(vehicle.lacking)}"
         return warned(found, "it flies without, but blind to it")
-    return passed("all that are needed are logged")
-
-
-def _self_test(vehicle: Vehicle, profile: Profile) -> Finding:
-    result = vehicle.parameters.get(SELF_TEST)
-    if result is None:
-        return skipped(f"the firmware has no parameter {SELF_TEST}")
-    if result == 1:
-        return passed("passed at boot")
-    return failed("failed at boot", "restart it level and at rest; read its console")
+    return passed(found)
 
 
 def _supervisor(vehicle: Vehicle, profile: Profile) -> Finding:
@@ -211,17 +187,8 @@ def _supervisor(vehicle: Vehicle, profile: Profile) -> Finding:
     return by_problem(criteria.forbidden or criteria.not_allowed, f"ready (0x{t.supervisor:04X})")
 
 
-def _decks(vehicle: Vehicle, profile: Profile) -> Finding:
-    decks = vehicle.measured_by.decks
-    if not decks and profile.positioning.by != "deck":
-        return passed("none, and none is needed")
-    if not decks:
-        return warned("none", "mounted ones: take them off and put them on again")
-    return passed(", ".join(decks))
-
-
 def _positioning(vehicle: Vehicle, profile: Profile) -> Finding:
-    decks = ", ".join(vehicle.position_decks(profile))
+    decks = ", ".join(vehicle.measured_by.decks)
     found = {
         "mocap": f"by {profile.positioning.label}, see its rows",
         "target": "by the target, see in view",
@@ -261,17 +228,15 @@ def _ground(vehicle: Vehicle, profile: Profile) -> Finding:
 
 
 def _level(vehicle: Vehicle, profile: Profile) -> Finding:
+    """Judge whether it stands level and still."""
     t, limit_deg = vehicle.at_rest, profile.safety.start_tilt_deg
+    criteria = GroundCriteria(t, profile)
     found = f"roll {math.degrees(t.roll_rad):.1f}, pitch {math.degrees(t.pitch_rad):.1f} deg"
     advice = "put it on level ground; if that is level, restart it there"
-    return by_limits(
-        GroundCriteria(t, profile).tilt_deg, min(3.0, limit_deg), limit_deg, found, advice
+    return worst(
+        by_limits(criteria.tilt_deg, 3.0, limit_deg, found, advice),
+        by_problem(criteria.motion, found),
     )
-
-
-def _still(vehicle: Vehicle, profile: Profile) -> Finding:
-    t = vehicle.at_rest
-    return by_problem(GroundCriteria(t, profile).motion, f"{t.acc_z_g:.2f} g")
 
 
 def _parameters(vehicle: Vehicle, profile: Profile) -> Finding:
@@ -309,17 +274,12 @@ def _battery(vehicle: Vehicle, profile: Profile) -> Finding:
 VEHICLE: dict[str, Callable[[Vehicle, Profile], Finding]] = {
     "packets": _packets,
     "telemetry": _telemetry,
-    "signal": _signal,
     "firmware": _firmware,
-    "variables": _variables,
-    "self-test": _self_test,
     "supervisor": _supervisor,
-    "decks": _decks,
     "positioning": _positioning,
     "estimator": _estimator,
     "ground": _ground,
     "level": _level,
-    "still": _still,
     "parameters": _parameters,
     "battery": _battery,
 }

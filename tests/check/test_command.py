@@ -109,7 +109,7 @@ ROWS = [
     Row("battery", Verdict.FAIL, "the battery rests at 3.50 V", "charge it"),
     Row("print", Verdict.SKIPPED, "both markers must be in view", "hold it nearer"),
     Row("radio", Verdict.SKIPPED, "none in sim://"),
-    Row("signal", Verdict.SKIPPED, "the vehicle does not answer"),
+    Row("level", Verdict.SKIPPED, "the vehicle does not answer"),
     Row("packets", Verdict.SKIPPED, "the vehicle does not answer"),
 ]
 
@@ -119,7 +119,7 @@ def test_the_table_fits_80_columns_and_says_what_to_do() -> None:
     assert max(map(len, lines)) <= 80
     text = re.sub(r"\s+", " ", " ".join(lines))
     assert "FAIL battery the battery rests at 3.50 V -> charge it" in text
-    assert "skip signal, packets: the vehicle does not answer" in text
+    assert "skip level, packets: the vehicle does not answer" in text
     assert lines[-1] == "1 pass, 1 warn, 1 FAIL, 4 skip: not fit to fly: battery"
     assert table(ROWS[:2]).splitlines()[-1].endswith("nothing fails")
     assert "not finished" in table(ROWS[:2], finished=False).splitlines()[-1]
@@ -146,7 +146,7 @@ def test_a_flight_is_refused_for_what_the_profile_or_the_disk_fails(
     monkeypatch.setattr("perchctl.check.profile.shutil.disk_usage", lambda path: usage)
     said = CliRunner().invoke(app, ["fly", "-u", NOWHERE, "--source", "camera:97", "--yes"])
     assert said.exit_code == 52
-    assert "disk: 1 MB free" in said.stderr
+    assert "1 MB free" in said.stderr
     assert "connecting" not in said.stderr
 
 
@@ -169,13 +169,12 @@ def test_every_row_is_on_its_page() -> None:
         *CAPTURE,
         COMPARED,
         *camera.PICTURES,
-        *camera.SIGHT,
+        camera.IN_VIEW,
         "capture",
         "body",
         "camera",
         "size",
         "loop",
-        "disk",
         "log folder",
     ):
         assert f"`{name}`" in page, name

@@ -55,7 +55,7 @@ def test_nothing_arms_flies_or_turns(sim: SimProcess, relay: Relay) -> None:
     by_name = {row.name: row for row in rows}
     assert by_name["address"].verdict is Verdict.PASS
     assert [row.name for row in rows][: len(VEHICLE)] == VEHICLE
-    others = {*camera.PICTURES, "camera", "size", "loop", "disk", "log folder", "stand-off"}
+    others = {*camera.PICTURES, "camera", "size", "loop", "log folder", "stand-off"}
     assert others <= set(by_name)
     assert len(relay.up) > 100
     assert relay.commands() == []
@@ -105,7 +105,7 @@ def test_a_link_that_is_lost_on_the_way_is_told() -> None:
         rows = {row.name: row for row in check(options(passing.uri), wanted)}
     assert rows["packets"].verdict is Verdict.FAIL
     assert "the link was lost" in rows["packets"].found
-    assert rows["decks"].verdict is rows["battery"].verdict is Verdict.SKIPPED
+    assert rows["level"].verdict is rows["battery"].verdict is Verdict.SKIPPED
 
 
 @pytest.mark.long

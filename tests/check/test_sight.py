@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from perchctl.check import Row, Verdict, profile_rows
-from perchctl.check.camera import SIGHT, names_of, picture_rows
+from perchctl.check.camera import IN_VIEW, names_of, picture_rows
 from perchctl.check.rehearsal import Blur, Looked, Rehearsal, telemetry_for
 from perchctl.check.row import ask_all
 from perchctl.check.vehicle import BY_FLY, VEHICLE, Vehicle
@@ -38,19 +38,19 @@ def shown(left_px: float) -> Looked:
 def rehearsed(x: float = 0.1, y: float = 0.0, z: float = 2.0, **changes: Any) -> Rehearsal:
     """Under a target that is there from where the vehicle stands."""
     target = target_at(1.0, (x, y, z), (0.0, 0.0, 0.0))
-    made = Rehearsal(live=True, pictures=60, found=60, target=target, height_m=0.0)
+    made = Rehearsal(live=True, pictures=60, found=60, target=target)
     made.looked, made.blur = [shown(300.0)], Blur(0.6, 0.6)
     return replace(made, **changes)
 
 
 def rows_of(done: Rehearsal, profile: Profile = TARGET) -> dict[str, Row]:
     found = picture_rows(done, profile, CAMERA)
-    return {row.name: row for row in found if row.name in SIGHT}
+    return {row.name: row for row in found if row.name == IN_VIEW}
 
 
 def test_under_the_target_both_rows_pass_and_say_from_how_far() -> None:
     rows = rows_of(rehearsed())
-    assert list(rows) == list(SIGHT)
+    assert list(rows) == [IN_VIEW]
     assert {row.verdict for row in rows.values()} == {Verdict.PASS}
     assert "0.07 m aside of the camera's axis 2.00 m above it" in rows["in view"].found
 
@@ -71,7 +71,7 @@ def test_a_sight_makes_its_row(verdict: str, words: str, advice: str, done: Rehe
 
 def test_what_measures_otherwise_has_no_such_rows() -> None:
     assert rows_of(rehearsed(), PROFILE) == {}
-    assert set(names_of(TARGET)) - set(names_of(PROFILE)) == set(SIGHT)
+    assert set(names_of(TARGET)) - set(names_of(PROFILE)) == {IN_VIEW}
     names = {row.name for row in profile_rows(PROFILE)}
     assert {row.name for row in profile_rows(TARGET)} - names == {"latency"}
 
@@ -89,7 +89,6 @@ def test_decks_and_an_estimate_are_not_asked_for() -> None:
     away = replace(AT_REST, position_m=(3.0, -2.0, 9.0), position_variance_m2=50.0)
     vehicle = Vehicle("radio://0/80/2M", telemetry=away, measured_by=MeasuredBy((), False))
     rows = {row.name: row for row in ask_all(VEHICLE, vehicle, TARGET)}
-    assert rows["decks"].verdict is Verdict.PASS
     assert rows["positioning"].found == "by the target, see in view"
     assert rows["estimator"].verdict is rows["ground"].verdict is Verdict.SKIPPED
     assert rows["estimator"].found == BY_FLY
