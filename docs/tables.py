@@ -33,7 +33,7 @@ from perchctl.mission.lander import MANOEUVRES, Evidence, Reach, Stage  # noqa: 
 from perchctl.mission.state import BEFORE_CONTACT, FLYING_PHASES  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
 from perchctl.profile import Profile, load_profile  # noqa: E402
-from perchctl.profile.keys import UNITS, keys  # noqa: E402
+from perchctl.profile.keys import UNITS, Key, keys  # noqa: E402
 from perchctl.record.fields import EVENT_FIELDS, FIELDS  # noqa: E402
 from perchctl.vision import step  # noqa: E402
 
@@ -60,18 +60,26 @@ def profile_keys() -> str:
     for key in keys(Profile()):
         name = key.path.removeprefix(f"{_section(key.path)}.")
         meaning = key.meaning + (f" ({SEE[key.path]})" if key.path in SEE else "")
-        cells = (f"`{name}`", key.unit, _shown(key.default), key.allowed, meaning)
-        sections.setdefault(_section(key.path), []).append(f"| {' | '.join(cells)} |")
-    head = ["", "| key | unit | default | allowed | meaning |", "|---|---|---|---|---|"]
+        row = f"| `{name}` | {_default_and_allowed(key)} | {meaning} |"
+        sections.setdefault(_section(key.path), []).append(row)
+    head = ["", "| key | default; allowed | meaning |", "|---|---|---|"]
     lines: list[str] = []
     for section, rows in sections.items():
         lines += ["", f"### `{section}`" if section else "### At the top", *head, *rows]
     return "\n".join(lines[1:])
 
 
+def _default_and_allowed(key: Key) -> str:
+    default = f"{_shown(key.default)} {key.unit if key.default not in (None, ()) else ''}".strip()
+    allowed = re.sub("^[0-9] numbers(, )?", "", key.allowed)  # the default shows how many
+    if allowed in ("", "text", "text, or none", "true, false"):
+        return default
+    return f"{default}; {allowed}"
+
+
 def _shown(value: Any) -> str:
     match value:
-        case None | {} | "":
+        case None | {} | "" | ():
             return "none"
         case bool():
             return str(value).lower()
