@@ -71,7 +71,9 @@ def profile_keys() -> str:
 
 def _default_and_allowed(key: Key) -> str:
     default = f"{_shown(key.default)} {key.unit if key.default not in (None, ()) else ''}".strip()
-    allowed = re.sub("^[0-9] numbers(, )?", "", key.allowed)  # the default shows how many
+    allowed = key.allowed
+    if key.default is not None:  # which shows how many
+        allowed = re.sub("^[0-9] numbers(, )?", "", allowed)
     if allowed in ("", "text", "text, or none", "true, false"):
         return default
     return f"{default}; {allowed}"
