@@ -60,8 +60,6 @@ class Errors:
         positions: the positions' numbers, (g,); starts: the first row of each, (g,).
         large, small: a and b, (n, 4). joint: (n, 4) with NaN.
         use: False where the row is an outlier on the axis, (n, 4).
-        actual: the truth at each position's first row, (g, 4).
-        single_rows: number of rows left out because only one marker, or none, was seen.
     """
 
     name: str
@@ -71,8 +69,6 @@ class Errors:
     small: Array
     joint: Array
     use: NDArray[np.bool_]
-    actual: Array
-    single_rows: int
 
     def __len__(self) -> int:
         return len(self.large)
@@ -86,16 +82,12 @@ class Errors:
         return np.asarray(np.add.reduceat(parts, self.starts, axis=1))
 
     @property
-    def position_means(self) -> Array:
-        """Mean errors a and b of each position, (2, g, 4)."""
-        return np.asarray(self.sums[1:3] / np.maximum(self.sums[0], 1.0))
-
-    @property
     def biases(self) -> dict[str, tuple[Array, Array]]:
         """Each marker's constant offset from the truth, (4,), and the half width of its 95 %
         interval over positions."""
         found = {}
-        for name, means in zip(SINGLE, self.position_means, strict=True):
+        of_positions = self.sums[1:3] / np.maximum(self.sums[0], 1.0)
+        for name, means in zip(SINGLE, of_positions, strict=True):
             mean, g = means.mean(axis=0), len(means)
             half = t_quantile(g - 1) * means.std(axis=0, ddof=1) / math.sqrt(g)
             mean[YAW] = wrap(mean[YAW])
@@ -123,8 +115,6 @@ def errors_of(data: Measurements) -> Errors:
         small=small,
         joint=joint,
         use=_inliers(large, starts) & _inliers(small, starts),
-        actual=actual[starts],
-        single_rows=len(data) - len(rows),
     )
 
 

@@ -15,7 +15,7 @@ import yaml
 
 from perchctl.files import write_files
 from perchctl.geometry import Array
-from perchctl.weights.data import AXES, YAW, read_data, wrap
+from perchctl.weights.data import AXES, read_data
 from perchctl.weights.fit import (
     FITTED,
     LABELS,
@@ -176,17 +176,16 @@ def write_weights(path: Path, result: Result, date: str, *, anyway: bool) -> Non
 
 
 WIDTH = 80
-MOST_POSITIONS = 20
 _SCALES = np.array([1e6, 1e6, 1e6, 180e3 / math.pi])
 _HEADS = ("x [um]", "y [um]", "z [um]", "yaw [mdeg]")
 
 
 def report_text(result: Result) -> str:
-    """Return the report: verdict, errors, gains, weights, offsets, positions, notes."""
+    """Return the report: verdict, errors, gains, weights, offsets, notes."""
     errors, label = result.errors, LABELS[result.chosen]
-    data = f"{errors.name}: {len(errors)} rows of {len(errors.positions)} positions"
-    if errors.single_rows:
-        data += f" ({errors.single_rows} more rows without both markers do not count)"
+    data = (
+        f"{errors.name}: {len(errors)} rows of {len(errors.positions)} positions show both markers"
+    )
     parts = [_wrapped(data), _verdict(result)]
     judged = [(result.evidence, "on positions left out of the fit")]
     if result.other is not None:
@@ -211,7 +210,7 @@ def report_text(result: Result) -> str:
     offsets = {f"{name} marker": _scaled(*found, "+") for name, found in errors.biases.items()}
     offsets["outliers left out"] = [f"{n}{'':6}" for n in (~errors.use).sum(axis=0)]
     mend = "constant offsets (no weight can mend them: calibration, mounting or print can)"
-    parts += [_table(mend, _HEADS, offsets), _positions_text(result)]
+    parts.append(_table(mend, _HEADS, offsets))
     if result.notes:
         parts.append("\n".join(_wrapped(f"note: {note}") for note in result.notes))
     return "\n\n".join(parts)
@@ -234,28 +233,6 @@ def _verdict(result: Result) -> str:
             else f"the {name} marker alone: no weight is proven to beat it"
         )
         lines.append(f"  {axis:<4} {weight:.3f}  {why}")
-    return "\n".join(lines)
-
-
-def _positions_text(result: Result) -> str:
-    """Return the paper's tables I and II in one: a line for each position, with the mean merged
-    pose's error by weights fitted without it."""
-    a, b = result.errors.position_means
-    folds = result.fits[result.chosen].folds
-    error = folds * a + (1.0 - folds) * b
-    error[:, YAW] = wrap(error[:, YAW])
-    places = result.errors.actual * (100.0, 100.0, 100.0, 180.0 / math.pi)
-    count = len(places)
-    more = f" (the first {MOST_POSITIONS} of {count})" if count > MOST_POSITIONS else ""
-    lines = [
-        f"positions{more}: as they are, and the merged pose's error there (weights fitted",
-        "to the others; Tables I and II of the paper)",
-        "         x [cm]  y [cm]  z [cm]  yaw [deg]   x [um]   y [um]   z [um]   [mdeg]",
-    ]
-    for k in range(min(count, MOST_POSITIONS)):
-        x, y, z, yaw = places[k]
-        cells = "".join(f"{round(value):9}" for value in error[k] * _SCALES)
-        lines.append(f"{result.errors.positions[k]:<7}{x:8.2f}{y:8.2f}{z:8.2f}{yaw:11.1f}{cells}")
     return "\n".join(lines)
 
 
