@@ -33,7 +33,7 @@ from perchctl.mission.lander import MANOEUVRES, Evidence, Reach, Stage  # noqa: 
 from perchctl.mission.state import BEFORE_CONTACT, FLYING_PHASES  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
 from perchctl.profile import Profile, load_profile  # noqa: E402
-from perchctl.profile.keys import UNITS, Key, keys  # noqa: E402
+from perchctl.profile.keys import Key, keys  # noqa: E402
 from perchctl.record.fields import EVENT_FIELDS, FIELDS  # noqa: E402
 from perchctl.vision import step  # noqa: E402
 
@@ -100,19 +100,14 @@ def worlds() -> str:
         values = [getattr(simulation, key.path) for simulation in world.values()]
         if any(value != values[0] for value in values):
             shown = " | ".join(_shown(value) for value in values)
-            rows.append(f"| `{key.path}` | {key.unit} | {shown} | {key.meaning} |")
-    head = f"| key | unit | {' | '.join(f'`{name}`' for name in world)} | meaning |"
-    return "\n".join([head, "|---" * (len(world) + 3) + "|", *rows])
+            rows.append(f"| `{key.path}` | {shown} | {key.meaning} |")
+    head = f"| key | {' | '.join(f'`{name}`' for name in world)} | meaning |"
+    return "\n".join([head, "|---" * (len(world) + 2) + "|", *rows])
 
 
 def log_fields(fields: dict[str, str] = FIELDS) -> str:
-    rows = [f"| `{name}` | {_unit_of_field(name)} | {text} |" for name, text in fields.items()]
-    return "\n".join(["| field | unit | meaning |", "|---|---|---|", *rows])
-
-
-def _unit_of_field(name: str) -> str:
-    last = name.rpartition("_")[2]
-    return UNITS.get(last, "") if "_" in name else ""
+    rows = [f"| `{name}` | {text} |" for name, text in fields.items()]
+    return "\n".join(["| field | meaning |", "|---|---|", *rows])
 
 
 WAY_OF_A_FRAME: tuple[tuple[str, Callable[..., Any]], ...] = (
@@ -232,13 +227,16 @@ def promises() -> str:
 
 
 def manoeuvres() -> str:
-    """A row for each evidence; stages in which all cells say the same stand in one column."""
-    head = [f"{stage.value}, {reach.value}" for stage in Stage for reach in Reach]
+    """A row for each evidence, a column for each stage; the magnet's reach where it matters."""
     rows = []
     for evidence in Evidence:
-        cells = [MANOEUVRES[evidence, reach, stage].value for stage in Stage for reach in Reach]
+        cells = []
+        for stage in Stage:
+            free, near = (MANOEUVRES[evidence, reach, stage].value for reach in Reach)
+            cells.append(free if free == near else f"{free}; near the magnet {near}")
         rows.append(f"| {evidence.value} | {' | '.join(cells)} |")
-    return "\n".join([f"| evidence | {' | '.join(head)} |", "|---" * (len(head) + 1) + "|", *rows])
+    head = " | ".join(stage.value for stage in Stage)
+    return "\n".join([f"| evidence | {head} |", "|---" * (len(Stage) + 1) + "|", *rows])
 
 
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
@@ -267,11 +265,11 @@ def mission_diagram() -> str:
 
 def mission_rows() -> str:
     """Every row in its order, as a Markdown table."""
-    lines = ["| # | row | from | to | severity |", "|---|---|---|---|---|"]
-    for number, row in enumerate(table.TABLE, start=1):
+    lines = ["| row | from | to | severity |", "|---|---|---|---|"]
+    for row in table.TABLE:
         origin = _group(row) or ", ".join(p.value for p in sorted(row.phases, key=_order))
         severity = row.severity.name.lower().replace("_", " ")
-        lines.append(f"| {number} | {row.name} | {origin} | {row.to.value} | {severity} |")
+        lines.append(f"| {row.name} | {origin} | {row.to.value} | {severity} |")
     return "\n".join(lines)
 
 
