@@ -1,15 +1,10 @@
 from .board.capture import capture_views as capture_views
-from .board.capture import views_of_images as views_of_images
-from .board.capture import views_of_video as views_of_video
+from .board.capture import find_views as find_views
 from .board.check import check_calibration as check_calibration
-from .board.detect import BoardView as BoardView
-from .board.detect import Rejection as Rejection
+from .board.detect import FoundViews as FoundViews
 from .board.plot import draw_calibration as draw_calibration
-from .board.result import Calibration as Calibration
 from .board.solve import calibrate_camera as calibrate_camera
-from .files import SizeMissing as SizeMissing
 from .files import calibration_text as calibration_text
-from .files import camera_record as camera_record
 from .files import load_calibration as load_calibration
 from .files import profile_camera as profile_camera
 from .gear import learn_gear as learn_gear

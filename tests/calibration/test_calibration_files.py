@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from perchctl.calibration import (
+    FoundViews,
     calibrate_camera,
     calibration_text,
     load_calibration,
@@ -72,7 +73,7 @@ def test_any_number_is_written_as_a_number(value: float) -> None:
 def test_a_calibration_s_file_holds_its_quality(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     camera = draw_camera(rng)
-    result = calibrate_camera(corner_views(rng, camera), "charuco:10x7:25mm:18mm:DICT_5X5_100")
+    result = calibrate_camera(FoundViews(tuple(corner_views(rng, camera))), "charuco:10x7:25mm")
     path = tmp_path / "camera.yaml"
     path.write_text(result.text("camera", "2026-01-02T03:04:05+00:00"))
     plain = yaml.safe_load(path.read_text())

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from perchctl.calibration import BoardView
+from perchctl.calibration.board.detect import BoardView
 from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.target import Board, parse_board
