@@ -86,7 +86,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # many names it has at most.
 MOST_NAMES = {
     "analysis": 15,
-    "calibration": 30,
+    "calibration": 17,
     "camera": 27,
     "campaign": 25,
     "check": 15,

@@ -19,12 +19,10 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration import (
     AttitudeSample,
     GuidedFrame,
-    MountingTape,
+    MountingRecording,
     PoseReader,
-    VehicleSensors,
-    capture,
     load_calibration,
-    read_recordings,
+    record_mounting,
 )
 from perchctl.calibration.mounting.capture import LEAST_S, MOST_S
 from perchctl.calibration.mounting.recording import SeenPose
@@ -86,7 +84,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     log = Path("calib/mounting_mine.jsonl")
     assert f"kept the recording: {log}" in said.stderr
     assert f"--from {log}" in said.stderr
-    (recording,) = read_recordings(log)
+    (recording,) = MountingRecording.read(log)
     assert len(recording.poses) >= 10
     newest = recording.attitudes[-1]
     rpy_rad = (newest.roll_rad, newest.pitch_rad, newest.yaw_rad)
@@ -170,7 +168,7 @@ class _Film:
 class _Looks(PoseReader):
     """Gives the poses of a recording at their times, or none."""
 
-    def __init__(self, poses: tuple[SeenPose, ...], mirrored: bool = False) -> None:
+    def __init__(self, poses: list[SeenPose], mirrored: bool = False) -> None:
         self._poses, self._is_mirrored = list(poses), mirrored
         self.mirrored, self.outlines, self.trouble = 0, (), ""
 
@@ -181,29 +179,25 @@ class _Looks(PoseReader):
         return found
 
 
-def feed(attitudes: tuple[AttitudeSample, ...], film: _Film) -> Callable[[], list[AttitudeSample]]:
-    left = list(attitudes)
+def recorded(
+    recording: MountingRecording,
+    film: _Film,
+    looks: _Looks,
+    attitudes: list[AttitudeSample] | None = None,
+    problem: Callable[[float], str | None] = lambda now_s: None,
+    until_s: float = np.inf,
+) -> list[GuidedFrame]:
+    """Fill the recording from the film, by its own clock; the moments that were shown."""
+    moments: list[GuidedFrame] = []
+    left = list(attitudes or [])
 
     def arrived() -> list[AttitudeSample]:
         due = [a for a in left if a.t_s <= film.now_s]
         del left[: len(due)]
         return due
 
-    return arrived
-
-
-def recorded(
-    tape: MountingTape,
-    film: _Film,
-    looks: _Looks,
-    sensors: VehicleSensors | None = None,
-    until_s: float = np.inf,
-) -> list[GuidedFrame]:
-    """Fill the tape from the film, by its own clock; the moments that were shown."""
-    moments: list[GuidedFrame] = []
-    sensors = sensors or VehicleSensors()
-    capture(
-        tape, film, looks, sensors, moments.append, film.clock, film.sleep,
+    record_mounting(
+        recording, film, looks, moments.append, arrived, problem, film.clock, film.sleep,
         lambda: film.now_s > until_s,
     )  # fmt: skip
     return moments
@@ -211,24 +205,21 @@ def recorded(
 
 def test_it_ends_when_no_turn_is_missing_and_says_which_is_until_then() -> None:
     whole = seen(hand("carry", seconds=LEAST_S["carry"] + 3.0))
-    film, tape = _Film(), MountingTape("carry")
-    sensors = VehicleSensors(feed(whole.attitudes, film))
-    moments = recorded(tape, film, _Looks(whole.poses), sensors)
+    film, recording = _Film(), MountingRecording("carry")
+    moments = recorded(recording, film, _Looks(whole.poses), whole.attitudes)
     assert film.now_s == pytest.approx(LEAST_S["carry"], abs=0.5)
     assert moments[-1].advice.startswith("enough")
-    assert moments[-1].line == f"carry: {moments[-1].advice}"
     assert ("missing", "nothing", None) in moments[-1].rows
-    texts = [text for moment in moments for _, text, _ in moment.rows]
-    assert any(text.startswith(("yaw:", "longer:")) for text in texts)
-    assert tape.recording().poses[:100] == whole.poses[:100]
+    assert any("turn it about the vertical" in row[1] for m in moments for row in m.rows)
+    assert recording.poses[:100] == whole.poses[:100]
 
 
 @pytest.mark.parametrize(
     ("mirrored", "words"), [(False, "no target in view"), (True, "camera.mirrored")]
 )
 def test_the_advice_names_what_is_in_the_way_first(mirrored: bool, words: str) -> None:
-    looks = _Looks((), mirrored)
-    moments = recorded(MountingTape("pivot"), _Film(), looks, until_s=2.0)
+    looks = _Looks([], mirrored)
+    moments = recorded(MountingRecording("pivot"), _Film(), looks, until_s=2.0)
     assert words in moments[-1].advice
 
 
@@ -251,30 +242,36 @@ class _SeesEachNew(_Looks):
 
 
 def test_a_receivers_repetitions_are_no_pictures_without_the_target() -> None:
-    looks, tape = _SeesEachNew(seen(hand("pivot")).poses), MountingTape("pivot")
-    moments = recorded(tape, _Receiver(), looks, until_s=4.0)
+    looks, recording = _SeesEachNew(seen(hand("pivot")).poses), MountingRecording("pivot")
+    moments = recorded(recording, _Receiver(), looks, until_s=4.0)
     assert {share for m in moments for name, _, share in m.rows if name == "target"} == {1.0}
-    assert len(moments) == len(tape.poses) == pytest.approx(20, abs=2)
+    assert len(moments) == len(recording.poses) == pytest.approx(20, abs=2)
     film = _Receiver(stuck_s=1.0)
-    recorded(MountingTape("pivot"), film, looks)
+    recorded(MountingRecording("pivot"), film, looks)
     assert film.now_s == pytest.approx(MOST_S, abs=1.0), "nobody records for ever"
 
 
 def test_a_mirrored_picture_ends_it_soon() -> None:
     film = _Film()
     with pytest.raises(InvalidValue, match=r"mirrored.*camera\.mirrored"):
-        recorded(MountingTape("carry"), film, _Looks((), mirrored=True))
+        recorded(MountingRecording("carry"), film, _Looks([], mirrored=True))
     assert film.now_s < 5.0
 
 
-def test_a_camera_or_a_vehicle_that_goes_ends_it_and_the_tape_keeps_what_was() -> None:
-    whole = seen(hand("pivot"))
-    tape = MountingTape("pivot")
-    with pytest.raises(TimedOut, match="camera:0 is unplugged"):
-        recorded(tape, _Film(ends_s=3.0), _Looks(whole.poses))
-    assert len(tape.poses) > 20
-    tape = MountingTape("pivot")
-    silent = VehicleSensors(problem=lambda now_s: "nothing heard for 2 s" if now_s > 1.0 else None)
-    with pytest.raises(TimedOut, match="the vehicle is gone: nothing heard for 2 s"):
-        recorded(tape, _Film(flooding=True), _Looks(whole.poses), silent)
-    assert tape
+@pytest.mark.parametrize(
+    ("film", "problem", "said"),
+    [
+        (_Film(ends_s=3.0), None, "camera:0 is unplugged"),
+        (_Film(flooding=True), "nothing heard for 2 s", "the vehicle is gone: nothing heard"),
+    ],
+)
+def test_a_camera_or_a_vehicle_that_goes_ends_it_and_keeps_what_was(
+    film: _Film, problem: str | None, said: str
+) -> None:
+    recording = MountingRecording("pivot")
+    with pytest.raises(TimedOut, match=said):
+        recorded(
+            recording, film, _Looks(seen(hand("pivot")).poses),
+            problem=lambda now_s: problem if now_s > 1.0 else None,
+        )  # fmt: skip
+    assert len(recording.poses) > 5
