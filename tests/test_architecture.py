@@ -101,7 +101,7 @@ MOST_NAMES = {
     "positioning": 15,
     "profile": 35,
     "sim": 23,
-    "target": 24,
+    "target": 15,
     "vision": 38,
     "weights": 9,
 }

@@ -56,7 +56,7 @@ from perchctl.commands.progress import search_bar
 from perchctl.display import live_page
 from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files
-from perchctl.target import NOTABLE_SCALE_ERROR, Board, mm_text, parse_board
+from perchctl.target import Board
 from perchctl.vision import CameraModel
 
 FOLDER = Path("calib")
@@ -382,18 +382,12 @@ def with_size(source: Source, text: str | None) -> Source:
 def _measured_board(notation: str, measured: str | None) -> Board:
     """Return the board with the measured sides of its black area, after a comparison with those
     that it was meant to have. Raises NotFound, InvalidValue."""
-    board = parse_board(notation)
+    board = Board.parse(notation)
     if measured is None:
         return board
-    sides = measured.removesuffix("mm")
-    if not re.fullmatch(r"[\d.]+x[\d.]+", sides):
-        raise InvalidValue(f"--measured {measured}: not WIDTHxHEIGHT in mm, as in 249.3x174.9")
-    board = parse_board(f"{board.notation().partition(':measured=')[0]}:measured={sides}mm")
-    for name, meant_m, scale in zip(("width", "height"), board.size_m, board.scale, strict=True):
-        off = f"{100 * (scale - 1):+.2f} % against {mm_text(meant_m)} mm"
-        say(f"{name}: {mm_text(scale * meant_m)} mm, {off}")
-        if abs(scale - 1) > NOTABLE_SCALE_ERROR:
-            say(f"{name}: more than 1 % off: was the page scaled when it was printed?")
+    board, notes = board.with_sides(measured)
+    for note in notes:
+        say(note)
     return board
 
 

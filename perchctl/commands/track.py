@@ -209,7 +209,7 @@ def track(
             raise NotFound(f"{opened.describe()} gave no frame at all")
     say(summary.text(ended_s))
     if prints.judged and not is_example:  # another lens would say something of its own
-        say(prints.verdict().text)
+        say(prints.verdict()[1])
     for path in (csv, overlay):
         if path is not None:
             say(f"wrote {path}")

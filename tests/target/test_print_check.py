@@ -60,23 +60,23 @@ def claimed(text: str) -> tuple[float, float]:
     ("scale", "wrong"), [(1.0, False), (1.001, False), (0.97, True), (1.02, True)]
 )
 def test_only_an_error_beyond_the_noise_is_named(scale: float, wrong: bool) -> None:
-    found = checked(scale, 0.05, 60, wrong=6).verdict()
-    assert found.wrong is wrong
-    value, sigma = claimed(found.text)
+    named, text = checked(scale, 0.05, 60, wrong=6).verdict()
+    assert named is wrong
+    value, sigma = claimed(text)
     assert value == pytest.approx(scale / 6.0, abs=3.0 * sigma / 6.0 + 1e-4)
-    assert ("--measured-small" in found.text) is wrong
+    assert ("--measured-small" in text) is wrong
 
 
 def test_more_frames_are_surer() -> None:
-    few, many = (claimed(checked(1.02, 1.0, n).verdict().text)[1] for n in (10, 200))
+    few, many = (claimed(checked(1.02, 1.0, n).verdict()[1])[1] for n in (10, 200))
     assert many < 0.4 * few
 
 
 def test_noise_hides_a_small_error_and_few_frames_say_nothing() -> None:
-    assert not checked(1.006, 0.6, 6).verdict().wrong
+    assert not checked(1.006, 0.6, 6).verdict()[0]
     assert not checked(1.05, 0.05, 2).judged
-    assert "not judged" in checked(1.05, 0.05, 2).verdict().text
-    assert "not judged" in PrintCheck(CAMERA, TARGET).verdict().text
+    assert "not judged" in checked(1.05, 0.05, 2).verdict()[1]
+    assert "not judged" in PrintCheck(CAMERA, TARGET).verdict()[1]
 
 
 @pytest.mark.parametrize("bad", ["nan", "one point"])

@@ -12,15 +12,8 @@ from hypothesis import strategies as st
 from perchctl.geometry import Array, rot_z
 from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig
 from perchctl.profile.vision import VehicleConfig
-from perchctl.target import (
-    assess_mounting,
-    edge_margin,
-    offset_text,
-    overhead_reach,
-    overhead_view,
-    view_from,
-)
-from perchctl.target.sight import SURE_PX, MountingView, least_side_px
+from perchctl.target import overhead_text, view_from
+from perchctl.target.sight import BlindRange, blind_range, overhead_reach_m
 from perchctl.vision import project, square_corners
 from tests.target.rig import camera_of
 
@@ -46,16 +39,21 @@ def in_picture(mount: Mounting, centre_m: Array, yaw_rad: float) -> bool:
     return bool((px >= 2.5).all() and (px <= np.array(CAMERA.size_px) - 3.5).all())
 
 
+def axis_m(mount: Mounting, height_m: float) -> tuple[float, float]:
+    """Where the camera's axis is at that height."""
+    x, y, z = mount.T_body_cam[:3, 2].tolist()
+    return x / z * height_m, y / z * height_m
+
+
 @settings(max_examples=60, deadline=None)
 @given(mounts, st.floats(0.6, 3.0), angles, angles, st.floats(0.0, 0.97))
 def test_within_the_reach_the_marker_is_whole_at_any_turn(
     mount: Mounting, height_m: float, towards: float, yaw_rad: float, share: float
 ) -> None:
-    reach = overhead_reach(SIDE_M, CAMERA, mount, height_m)
-    if reach is None:
+    reach_m = overhead_reach_m(SIDE_M, CAMERA, mount, height_m)
+    if reach_m is None:
         return
-    away_m = share * reach.radius_m
-    x, y = reach.axis_xy_m
+    away_m, (x, y) = share * reach_m, axis_m(mount, height_m)
     centre = np.array([x + away_m * math.cos(towards), y + away_m * math.sin(towards), height_m])
     assert in_picture(mount, centre, yaw_rad)
 
@@ -63,11 +61,10 @@ def test_within_the_reach_the_marker_is_whole_at_any_turn(
 @settings(max_examples=30, deadline=None)
 @given(mounts, st.floats(0.6, 3.0))
 def test_beyond_the_reach_some_marker_is_cut(mount: Mounting, height_m: float) -> None:
-    reach = overhead_reach(SIDE_M, CAMERA, mount, height_m)
-    if reach is None:
+    reach_m = overhead_reach_m(SIDE_M, CAMERA, mount, height_m)
+    if reach_m is None:
         return
-    x, y = reach.axis_xy_m
-    away_m = 1.05 * reach.radius_m + 0.01
+    away_m, (x, y) = 1.05 * reach_m + 0.01, axis_m(mount, height_m)
     around = np.linspace(0.0, 2.0 * math.pi, 48)
     turned = (
         (towards, towards + math.pi / 4.0)  # a corner ahead
@@ -104,54 +101,45 @@ def test_a_sight_is_the_lens_s_wherever_the_body_stands(
     assert np.linalg.norm(np.cross(on_axis, mount.T_body_cam[:3, 2])) < 1e-9
 
 
-def test_so_far_the_large_marker_has_the_least_side() -> None:
-    where = overhead_view(TARGET, CAMERA, Mounting())
-    assert abs(F * SIDE_M / where.highest_m - SURE_PX) < 1e-9
-    assert least_side_px(10.0) == SURE_PX, "a sharper picture promises no more"
-    assert least_side_px(30.0) > 30.0
-    blurred = overhead_view(TARGET, CAMERA, Mounting(), plain_px=30.0)
-    assert blurred.highest_m < where.highest_m * SURE_PX / 30.0
-    assert [r.height_m for r in where.reaches] == [1.0, 2.0]
-    assert "the axis points straight up" in where.words
-    assert "than 0.53 m at 1 m above it" in where.words
-
-
-def test_a_lean_is_told_by_the_vehicle_s_own_sides() -> None:
+@pytest.mark.parametrize(
+    ("rpy_deg", "words"),
+    [
+        ((0.0, 0.0, 0.0), "at most 3.2 m above the camera"),
+        ((0.0, 0.0, 0.0), "than 0.53 m at 1 m above it"),
+        ((0.0, 12.0, 0.0), "leans 12 deg forward"),
+        ((0.0, -12.0, 0.0), "leans 12 deg back"),
+        ((0.0, -12.0, 90.0), "leans 12 deg to the right"),
+        ((-10.0, 0.0, 0.0), "leans 10 deg to the left"),
+        ((0.0, 17.0, 45.0), "leans 12 deg forward and 12 deg to the left"),
+        ((1.0, -1.0, 0.0), "points straight up"),
+        ((180.0, 0.0, 0.0), "camera that looks up"),
+        ((0.0, -90.0, 0.0), "camera that looks up"),
+    ],
+)
+def test_where_the_target_is_found_overhead(
+    rpy_deg: tuple[float, float, float], words: str
+) -> None:
     """`rpy_deg` of pitch is nose down: the view goes forward."""
-    leans = {
-        (0.0, 12.0, 0.0): "leans 12 deg forward",
-        (0.0, -12.0, 0.0): "leans 12 deg back",
-        (0.0, -12.0, 90.0): "leans 12 deg to the right",
-        (10.0, 0.0, 0.0): "leans 10 deg to the right",
-        (-10.0, 0.0, 0.0): "leans 10 deg to the left",
-        (0.0, 17.0, 45.0): "leans 12 deg forward and 12 deg to the left",
-        (1.0, -1.0, 0.0): "points straight up",
-    }
-    for rpy_deg, words in leans.items():
-        assert words in overhead_view(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg)).words, rpy_deg
+    assert words in overhead_text(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg))
 
 
-def test_a_camera_that_looks_aside_sees_nothing_overhead() -> None:
-    for rpy_deg in ((180.0, 0.0, 0.0), (0.0, -90.0, 0.0)):
-        where = overhead_view(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg))
-        assert where.reaches == ()
-        assert "camera that looks up" in where.words
+@pytest.mark.parametrize(
+    ("place_m", "words"),
+    [
+        ((0.31, -0.12), "0.31 m forward and 0.12 m to the right"),
+        ((-0.5, 0.004), "0.50 m back"),
+        ((0.0, 0.0), "less than 1 cm"),
+    ],
+)
+def test_a_way_is_named_by_the_vehicle_s_sides(place_m: tuple[float, float], words: str) -> None:
+    mount = Mounting(position_m=(0.0, 0.0, 0.0))
+    target_m = np.array([*place_m, 1.0])
+    seen = view_from(np.zeros(3), 0.0, target_m, 0.0, TARGET, CAMERA, mount)
+    assert seen.aside_text == words
+    assert seen.reach_m == overhead_reach_m(SIDE_M, CAMERA, mount, 1.0)
 
 
-def test_a_way_is_named_by_the_vehicle_s_sides() -> None:
-    assert offset_text((0.31, -0.12)) == "0.31 m forward and 0.12 m to the right"
-    assert offset_text((-0.5, 0.004)) == "0.50 m back"
-    assert offset_text((0.0, 0.2)) == "0.20 m to the left"
-
-
-def test_the_room_is_that_to_the_nearest_edge() -> None:
-    box = np.array([[100.0, 100.0], [200.0, 100.0], [200.0, 200.0], [100.0, 200.0]])
-    assert edge_margin(box, (640, 480)) == (100.5) / 640
-    assert edge_margin(box + np.array([0.0, 275.0]), (640, 480)) == 4.5 / 640
-    assert edge_margin(box - 150.0, (640, 480)) < 0.0
-
-
-# --- near the target: from where on a mounting is blind, and the turn that is advised ---------
+# --- near the target: from where on a mounting is blind ---------------------------------------
 
 
 STRAIGHT_CAMERA = camera_of()
@@ -159,7 +147,7 @@ SMALL_M = 0.0125  # its half side
 WIDE, HIGH = 317 / 380, 237 / 380  # of the picture, from the axis, less the margin
 
 
-def view_of(gear_m: tuple[float, float, float], yaw_deg: float = 0.0) -> MountingView:
+def view_of(gear_m: tuple[float, float, float], yaw_deg: float = 0.0) -> BlindRange:
     """With the gear there from the camera, body axes."""
     mount = Mounting(position_m=(0.01, 0.0, 0.005), rpy_deg=(0.0, 0.0, yaw_deg))
     x, y, z = gear_m
@@ -167,7 +155,7 @@ def view_of(gear_m: tuple[float, float, float], yaw_deg: float = 0.0) -> Mountin
         camera=CameraConfig(mount=mount),
         vehicle=VehicleConfig(gear_body_m=(x + 0.01, y, z + 0.005)),
     )
-    return assess_mounting(TargetConfig(), STRAIGHT_CAMERA, profile)
+    return blind_range(TargetConfig(), STRAIGHT_CAMERA, profile)
 
 
 @pytest.mark.parametrize(
@@ -183,36 +171,19 @@ def view_of(gear_m: tuple[float, float, float], yaw_deg: float = 0.0) -> Mountin
 def test_whole_markers_are_lost_where_geometry_says(
     gear_m: tuple[float, float, float], nearest_m: float
 ) -> None:
-    assert view_of(gear_m).blind.whole_m == pytest.approx(nearest_m, abs=0.001)
+    assert view_of(gear_m).whole_m == pytest.approx(nearest_m, abs=0.001)
 
 
 @pytest.mark.parametrize("gear_m", [(0.0, 0.0, 0.0), (-0.03, 0.0, 0.0), (0.0, 0.03, 0.02)])
 def test_the_rest_of_the_drawing_halves_it(gear_m: tuple[float, float, float]) -> None:
-    blind = view_of(gear_m).blind
+    blind = view_of(gear_m)
     assert blind.whole_m is not None
     assert blind.left_m is not None
     assert blind.left_m <= 0.5 * blind.whole_m
 
 
-def test_the_gear_along_the_picture_s_height_is_advised_against() -> None:
-    mount = view_of((0.0, 0.03, 0.02))
-    assert mount.turned_rpy_deg == (0.0, 0.0, 90.0)
-    assert mount.turned == view_of((0.0, 0.03, 0.02), yaw_deg=90.0).blind
-    first, advice = mount.lines()
-    assert "by whole markers alone: blind from 48 mm" in first
-    assert "turn the camera by 90 degrees" in advice
-    assert "camera.mount.rpy_deg: [0, 0, 90]" in advice
-    assert mount.record()["turned_rpy_deg"] == (0.0, 0.0, 90.0)
-
-
-@pytest.mark.parametrize("gear_m", [(0.03, 0.0, 0.02), (0.0, 0.0, 0.0)])
-def test_a_good_mounting_needs_no_advice(gear_m: tuple[float, float, float]) -> None:
-    mount = view_of(gear_m)
-    assert mount.turned is None
-    assert len(mount.lines()) == 1
-
-
-def test_a_gear_far_aside_is_never_seen() -> None:
-    mount = view_of((0.28, 0.0, 0.0))
-    assert mount.blind.whole_m is None
-    assert "blind in all of the last 10 cm" in mount.lines()[0]
+def test_a_blind_range_is_named() -> None:
+    assert view_of((0.28, 0.0, 0.0)).whole_m is None
+    assert "blind in all of the last 10 cm" in view_of((0.28, 0.0, 0.0)).words
+    assert "by whole markers alone: blind from 48 mm" in view_of((0.0, 0.03, 0.02)).words
+    assert "never blind" in view_of((0.0, 0.0, 0.025)).words
