@@ -77,8 +77,7 @@ BoardOption = Annotated[
     typer.Option(
         "--board",
         "-b",
-        help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 "
-        "(squares; :legacy behind it for OpenCV's old layout).",
+        help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 (squares).",
     ),
 ]
 MeasuredOption = Annotated[

@@ -2,9 +2,8 @@
 
 ``chessboard:9x6:25mm``
     inner corners (columns x rows) and the side of a square; 10x7 squares are printed.
-``charuco:10x7:25mm:18mm:DICT_5X5_100[:legacy]``
-    squares (columns x rows), side of a square, side of a marker, dictionary. ``legacy``
-    is the pattern of OpenCV before 4.6, which differs for an even number of rows.
+``charuco:10x7:25mm:18mm:DICT_5X5_100``
+    squares (columns x rows), side of a square, side of a marker, dictionary.
 
 Both count as OpenCV's own calls do. Behind each ``:measured=249.3x174.6mm`` may say what the
 print's black area measures.
@@ -39,7 +38,7 @@ _MEASURED = ":measured="
 _CHESSBOARD = re.compile(r"chessboard:(?P<columns>\d+)x(?P<rows>\d+):(?P<square>[^:]+)")
 _CHARUCO = re.compile(
     r"charuco:(?P<columns>\d+)x(?P<rows>\d+):(?P<square>[^:]+):(?P<marker>[^:]+)"
-    r":(?P<dictionary>[^:]+)(?P<legacy>:legacy)?"
+    r":(?P<dictionary>[^:]+)"
 )
 
 
@@ -60,7 +59,6 @@ class Board:
     square_m: float
     marker_m: float | None = None
     dictionary: str | None = None
-    legacy: bool = False
     scale: tuple[float, float] = (1.0, 1.0)
 
     @property
@@ -98,7 +96,6 @@ class Board:
         text = f"{self.kind}:{self.columns}x{self.rows}:{mm_text(self.square_m)}mm"
         if self.marker_m is not None:
             text += f":{mm_text(self.marker_m)}mm:{self.dictionary}"
-        text += ":legacy" if self.legacy else ""
         if self.scale == (1.0, 1.0):
             return text
         width, height = (m * s for m, s in zip(self.size_m, self.scale, strict=True))
@@ -114,7 +111,7 @@ class Board:
         found = _CHESSBOARD.fullmatch(whole) or _CHARUCO.fullmatch(whole)
         if found is None:
             raise _wrong(text, "it is neither chessboard:COLUMNSxROWS:SQUARE nor "
-                         "charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY[:legacy]")  # fmt: skip
+                         "charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY")  # fmt: skip
         columns, rows = int(found["columns"]), int(found["rows"])
         if not (3 <= columns <= MAX_COUNT and 3 <= rows <= MAX_COUNT):
             raise _wrong(text, f"3 to {MAX_COUNT} columns and rows are allowed")
@@ -122,8 +119,7 @@ class Board:
         board = cls("chessboard", columns, rows, square_m)
         if found.re is _CHARUCO:
             marker_m = parse_length(found["marker"], f"board {text}: marker")
-            legacy = found["legacy"] is not None
-            board = cls("charuco", columns, rows, square_m, marker_m, found["dictionary"], legacy)
+            board = cls("charuco", columns, rows, square_m, marker_m, found["dictionary"])
             _check_markers(board, text)
         return board.with_sides(measured)[0] if measured else board
 
@@ -146,11 +142,8 @@ class Board:
         if self.kind != "charuco" or self.marker_m is None or self.dictionary is None:
             raise ValueError("only a charuco board is one of OpenCV's own")
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        board = cv2.aruco.CharucoBoard(
-            (self.columns, self.rows), self.square_m, self.marker_m, dictionary
-        )
-        board.setLegacyPattern(self.legacy)
-        return board
+        size = (self.columns, self.rows)
+        return cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
 
 
 def _check_markers(board: Board, text: str) -> None:
@@ -202,6 +195,4 @@ def black_squares(board: Board) -> NDArray[np.bool_]:
     """Return which squares are black, (rows, columns), row 0 at the top; a charuco board's
     markers fill the others, row by row."""
     columns, rows = board.squares
-    # OpenCV's old pattern begins with white where the rows are even in number.
-    first = 1 if board.legacy and rows % 2 == 0 else 0
-    return np.asarray((np.add.outer(np.arange(rows), np.arange(columns)) + first) % 2 == 0)
+    return np.asarray(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)

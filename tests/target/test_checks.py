@@ -96,14 +96,13 @@ boards = st.one_of(
         st.integers(50, 900).map(lambda tenths: tenths / 1e4),
     ),
     st.builds(
-        lambda columns, rows, square, share, legacy: Board(
-            "charuco", columns, rows, square, round(square * share, 5), "DICT_6X6_1000", legacy
+        lambda columns, rows, square, share: Board(
+            "charuco", columns, rows, square, round(square * share, 5), "DICT_6X6_1000"
         ),
         st.integers(3, 20),
         st.integers(3, 20),
         st.integers(50, 900).map(lambda tenths: tenths / 1e4),
         st.floats(0.4, 0.94),
-        st.booleans(),
     ),
 )
 
@@ -143,7 +142,7 @@ def test_a_measured_print_moves_the_corners_along_each_side_for_itself() -> None
         ("charuco:10x7:25mm:25mm:DICT_5X5_100", "needs white around it"),
         ("charuco:10x7:25mm:18mm:DICT_9X9", "is unknown"),
         ("charuco:20x17:25mm:18mm:DICT_5X5_100", "170 markers are needed"),
-        ("charuco:10x7:25mm:18mm:DICT_5X5_100:old", "legacy"),
+        ("charuco:10x7:25mm:18mm:DICT_5X5_100:old", "neither"),
         ("", "neither"),
     ],
 )
@@ -154,10 +153,8 @@ def test_a_wrong_notation_is_one_sentence(text: str, said: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "notation",
-    ["charuco:5x6:20mm:15mm:DICT_4X4_50", "charuco:5x6:20mm:15mm:DICT_4X4_50:legacy",
-     "charuco:6x5:20mm:15mm:DICT_4X4_50:legacy"],
-)  # fmt: skip
+    "notation", ["charuco:5x6:20mm:15mm:DICT_4X4_50", "charuco:6x5:20mm:15mm:DICT_4X4_50"]
+)
 def test_charuco_boards_are_drawn_as_opencv_draws_them(notation: str) -> None:
     board = Board.parse(notation)
     px_per_square = 240  # 30 px a cell of the markers
