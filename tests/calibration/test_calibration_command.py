@@ -56,23 +56,6 @@ def test_pictures_become_a_file_and_a_report(calibrated: Result, rendered: Rende
     assert "GOOD TO FLY" in calibrated.stderr
 
 
-def test_ctrl_c_in_the_drawing_leaves_the_calibration(
-    rendered: Rendered, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is on the disk by then; only its picture is given up."""
-    output = tmp_path / "camera.yaml"
-
-    def draw(_result: object) -> bytes:
-        assert load_calibration(output).size_px == (480, 360)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("perchctl.calibration.draw_calibration", draw)
-    result = calibrate(f"images:{rendered[0]}", "-b", BOARD, "-o", str(output), "--json")
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["report"] is None
-    assert "the plot is not drawn" in result.stderr
-
-
 def test_the_same_pictures_pass_the_check_and_another_camera_s_fail(
     calibrated: Result, rendered: Rendered, tmp_path: Path
 ) -> None:
@@ -128,18 +111,6 @@ def test_a_print_is_measured_along_both_sides(rendered: Rendered, tmp_path: Path
     assert "height: 174.1 mm, -0.51 % against 175 mm" in result.stderr
     board = yaml.safe_load(output.read_text())["board"]
     assert board == f"{BOARD}:measured=246.9x174.1mm"
-
-
-def test_pictures_named_one_by_one_are_the_folder_s(
-    calibrated: Result, rendered: Rendered, tmp_path: Path
-) -> None:
-    """As a shell hands over board*.png; one of them named twice is one picture."""
-    words = [str(p) for p in sorted(rendered[0].iterdir())]
-    result = calibrate(*words, words[3], "-b", BOARD, "-o", f"{tmp_path}/o.yaml", "--json")
-    assert result.exit_code == 0, result.output
-    told, folder = json.loads(result.stdout), json.loads(calibrated.stdout)
-    assert told["views_used"] == folder["views_used"]
-    assert told["fx"] == pytest.approx(folder["fx"], rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -215,30 +186,24 @@ def test_convert(tmp_path: Path) -> None:
         "  intrinsics: [300.5, 301.5, 320.25, 240.75]\n  resolution: [640, 480]\n"
     )
     output = tmp_path / "new" / "camera.yaml"
-    result = calibrate("convert", str(kalibr), "-o", str(output), "--json")
-    assert result.exit_code == 0, result.output
+    assert calibrate("convert", kalibr, "-o", output).exit_code == 0
     camera = load_calibration(output)
     assert camera.model == "fisheye"
     assert camera.dist.tolist() == [0.01, 0.02, -0.01, 0.002]
-    assert "--force" in refused(calibrate("convert", str(kalibr), "-o", str(output)), 30)
-    same = calibrate("convert", str(output), "-o", str(output), "--force")
-    assert "is the file to convert" in refused(same, 2)
+    refused(calibrate("convert", kalibr, "-o", output), 30, "--force")
+    same = calibrate("convert", output, "-o", output, "--force")
+    refused(same, 2, "is the file to convert")
 
 
 def test_a_mask(tmp_path: Path) -> None:
     write_turned_about(tmp_path / "turned")
-    file = tmp_path / "gear.png"
-    result = calibrate("mask", f"images:{tmp_path / 'turned'}", "-o", str(file), "--json")
+    words = ("mask", f"images:{tmp_path / 'turned'}", "-o", tmp_path / "gear.png")
+    result = calibrate(*words, "--json")
     assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
-    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    image = cv2.imread(str(tmp_path / "gear.png"), cv2.IMREAD_UNCHANGED)
     assert image is not None
     assert set(np.unique(image)) == {0, 255}
     assert image.shape == SIZE_PX[::-1]
-    assert told["file"] == str(file)
+    told = json.loads(result.stdout)
     assert told["covered"] == pytest.approx(float((image > 0).mean()), abs=1e-3)
-    again = calibrate("mask", f"images:{tmp_path / 'turned'}", "-o", str(file))
-    assert "--force" in refused(again, 30)
-    files = [str(path) for path in (tmp_path / "turned").iterdir()]
-    assert calibrate("mask", *files, "-o", str(file), "--force").exit_code == 0
-    assert (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) == image).all()
+    refused(calibrate(*words), 30, "--force")

