@@ -14,7 +14,7 @@ from typer.testing import Result
 from perchctl.calibration import load_calibration
 from perchctl.calibration.board.adjust import parameters_of
 from perchctl.vision import CameraModel
-from tests.helpers.boards import CHARUCO
+from tests.helpers.boards import CHARUCO, draw_camera, render_folder
 from tests.helpers.calibrating import calibrate, refused
 from tests.helpers.gear import SIZE_PX, write_turned_about
 
@@ -25,6 +25,15 @@ BOARD = CHARUCO.notation()
 
 
 Rendered = tuple[Path, CameraModel]
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Rendered:
+    """A folder of ten pictures of a ChArUco board, and the camera that took them."""
+    camera = draw_camera(np.random.default_rng(5), (480, 360))
+    folder = tmp_path_factory.mktemp("board")
+    render_folder(folder, camera, CHARUCO, 10, seed=5)
+    return folder, camera
 
 
 @pytest.fixture(scope="module")
@@ -99,18 +108,6 @@ def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Pa
     assert told["views_used"] == 6
     named = [picture["name"] for picture in told["pictures_without_board"]]
     assert named == ["board_02b.png", "board_99.png"]
-
-
-def test_a_print_is_measured_along_both_sides(rendered: Rendered, tmp_path: Path) -> None:
-    output = tmp_path / "o.yaml"
-    words = (f"images:{rendered[0]}", "-b", BOARD, "-o", str(output), "--measured")
-    result = calibrate(*words, "246.9x174.1mm")
-    assert result.exit_code == 0, result.output
-    assert "width: 246.9 mm, -1.24 % against 250 mm" in result.stderr
-    assert "was the page scaled" in result.stderr
-    assert "height: 174.1 mm, -0.51 % against 175 mm" in result.stderr
-    board = yaml.safe_load(output.read_text())["board"]
-    assert board == f"{BOARD}:measured=246.9x174.1mm"
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from perchctl.calibration import (
     FoundViews,
@@ -20,7 +19,6 @@ from perchctl.calibration import (
     profile_camera,
 )
 from perchctl.calibration.board.adjust import MODEL_NAMES, PARAMETERS, parameters_of
-from perchctl.commands import app
 from perchctl.errors import InvalidValue
 from perchctl.profile import CameraConfig
 from perchctl.vision import CameraModel
@@ -132,14 +130,3 @@ def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
         load_calibration(chain, cam="cam2")
     with pytest.raises(InvalidValue, match="is no Kalibr file"):
         load_calibration("example_640x480.yaml", cam="cam0")
-
-
-def test_a_command_that_reads_kalibr_s_file_takes_the_camera(tmp_path: Path) -> None:
-    """And says which there are where none is named."""
-    words = ["calibrate", "convert", str(_camchain(tmp_path / "chain.yaml"))]
-    words += ["-o", str(tmp_path / "out.yaml")]
-    without = CliRunner().invoke(app, words)
-    assert without.exit_code == 30
-    assert "holds 2 cameras (cam0, cam1)" in without.stderr
-    assert CliRunner().invoke(app, [*words, "--cam", "cam1"]).exit_code == 0
-    assert load_calibration(tmp_path / "out.yaml").K[0, 0] == 400.0

@@ -19,13 +19,13 @@ from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel
 from tests.helpers.boards import (
-    CHARUCO,
     CHESSBOARD,
     corner_views,
     draw_camera,
 )
 
 pytestmark = pytest.mark.long
+PHOTOGRAPHS = Path(__file__).resolve().parents[3] / "shared" / "data" / "chessboard"
 
 
 def drawn(seed: int, **options: float) -> tuple[list[BoardView], CameraModel]:
@@ -44,9 +44,10 @@ def moved(view: BoardView, which: Array, by: tuple[float, float]) -> BoardView:
     return dataclasses.replace(view, corners_px=corners)
 
 
-def test_photographs(chessboard_folder: Path) -> None:
+@pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason=f"{PHOTOGRAPHS} is absent")
+def test_photographs() -> None:
     """Of two of them OpenCV's own corners are off by pixels: RMS 0.41 px."""
-    found = find_views(image_files(str(chessboard_folder)), CHESSBOARD)
+    found = find_views(image_files(str(PHOTOGRAPHS)), CHESSBOARD)
     result = calibrate_camera(list(found.views))
     assert len(result.views) >= 11
     assert result.fit.rms_px <= 0.24
@@ -57,16 +58,6 @@ def test_photographs(chessboard_folder: Path) -> None:
     named = {r.view for r in result.rejections}
     for faulty in ("left02.jpg", "left13.jpg"):
         assert rms.get(faulty, 1.0) < 0.25 or faulty in named
-
-
-def test_more_views_do_not_look_worse() -> None:
-    """A refusal is the worst verdict."""
-    views, _ = drawn(5, views=14, noise_px=0.2)
-    levels = [calibrate_camera(views[:n]).level for n in (6, 9, 14)]
-    assert levels == sorted(levels, key=["stop", "care", "fly"].index)
-    assert levels[-1] == "fly"
-    with pytest.raises(InvalidValue, match="only 4 pictures show the board"):
-        calibrate_camera(views[:4])
 
 
 def test_what_boards_did_not_cover_is_not_good_to_fly_with() -> None:
@@ -202,24 +193,3 @@ def test_a_check_by_frontal_views_says_that_it_cannot_tell() -> None:
         check_calibration(camera, FoundViews(tuple(views)))
     with pytest.raises(InvalidValue, match="at least 3"):
         check_calibration(camera, FoundViews(tuple(views[:2])))
-
-
-def test_a_print_stretched_along_one_side_is_mended_by_its_measured_sides() -> None:
-    """A printer's feed is off by 0.5 %, and the board is held upright: as it was meant it
-    bends the lens; one that is larger as a whole changes nothing."""
-    rng = np.random.default_rng(3)
-    camera = draw_camera(rng)
-    printed, _ = CHARUCO.with_sides("250x175.875")
-    views = corner_views(rng, camera, printed, noise_px=0.03)
-    meant = [dataclasses.replace(v, object_m=CHARUCO.corners_m()[v.ids]) for v in views]
-    larger = [dataclasses.replace(v, object_m=1.004 * v.object_m) for v in views]
-    known, wrong, scaled = (fit_camera(v, "plumb_bob") for v in (views, meant, larger))
-    assert known.rms_px < 0.06
-    assert wrong.rms_px > 2 * known.rms_px
-    truth = parameters_of(camera)
-    off, mended = (np.abs(parameters_of(c.camera) - truth)[:2].max() for c in (wrong, known))
-    assert mended < 0.3
-    assert off > 3 * mended
-    assert parameters_of(scaled.camera) == pytest.approx(
-        parameters_of(known.camera), rel=1e-4, abs=1e-6
-    )

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from perchctl.calibration import MountingRecording, PoseReader, profile_camera
 from perchctl.calibration.mounting.carry import CarrySolution, solve_carry
 from perchctl.calibration.mounting.pivot import solve_pivot
-from perchctl.calibration.mounting.recording import missing_motion
+from perchctl.calibration.mounting.recording import MountingPart, missing_motion
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.sim.hand import Hand, T_target_cam_at, draw_hand, pictures, record_hand
@@ -183,13 +183,10 @@ def test_a_carry_that_contradicts_itself_is_refused(
 # --- through renderer, camera and pipeline -------------------------------------------------
 
 
-def _few_pictures(part: str, seconds: float) -> Hand:
-    drawn = draw_hand(profile(), "carry" if part == "carry" else "pivot", 4, seconds)
-    rate_hz = 7.3 if part == "carry" else 8.2
-    scenario = replace(
-        drawn.scenario, camera_rate_hz=rate_hz, camera_drop_rate=0.0, camera_burst=None
-    )
-    return replace(drawn, scenario=scenario)
+def _few_pictures(part: MountingPart, seconds: float) -> Hand:
+    drawn = draw_hand(profile(), part, 4, seconds)
+    few = {"camera_rate_hz": 8.2, "camera_drop_rate": 0.0, "camera_burst": None}
+    return replace(drawn, scenario=replace(drawn.scenario, **few))  # type: ignore[arg-type]
 
 
 @pytest.mark.long

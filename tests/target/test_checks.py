@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import re
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue
-from perchctl.target import Board, parse_length
-from perchctl.target.boards import black_squares, board_rectangles
-from perchctl.target.reading import check_target
+from perchctl.profile import MarkerConfig, TargetConfig
+from perchctl.target import Board, draw_target, parse_length
+from perchctl.target.boards import black_squares
+from perchctl.target.drawing import marker_corners_m
+from perchctl.target.prints import PrintCheck, size_ratio
+from perchctl.target.reading import PlainReader, check_target
 from perchctl.target.sheets import parse_page
+from perchctl.vision import CameraModel
 from tests.target.rig import target_of
 
 REFUSED = {
@@ -140,28 +148,141 @@ def test_a_wrong_notation_is_one_sentence(text: str, said: str) -> None:
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    "notation", ["charuco:5x6:20mm:15mm:DICT_4X4_50", "charuco:6x5:20mm:15mm:DICT_4X4_50"]
-)
-def test_charuco_boards_are_drawn_as_opencv_draws_them(notation: str) -> None:
-    board = Board.parse(notation)
-    px_per_square = 240  # 30 px a cell of the markers
-    columns, rows = board.squares
-    size = (columns * px_per_square, rows * px_per_square)
-    theirs = np.asarray(board.cv2_board().generateImage(size))
-    scale = px_per_square / board.square_m
-    width, height = board.size_m
-    mine = np.full_like(theirs, 255)
-    for r in board_rectangles(board):
-        across = slice(*(round((x + width / 2) * scale) for x in (r.x0_m, r.x1_m)))
-        down = slice(*(round((height / 2 - y) * scale) for y in (r.y1_m, r.y0_m)))
-        mine[down, across] = 0
-    assert np.array_equal(mine, theirs)
-    assert board.corners_m() == pytest.approx(board.cv2_board().getChessboardCorners(), abs=1e-7)
-
-
 def test_a_chessboard_has_one_more_square_than_corners() -> None:
     board = Board.parse("chessboard:9x6:25mm")
     assert black_squares(board).shape == (7, 10)
     assert board.corners_m().shape == (54, 3)
     assert board.corners_m()[0] == pytest.approx([0.0, 0.0, 0.0])
+
+
+# --- the drawing: cells, rectangles and bitmaps agree --------------------------------------------
+
+targets = st.builds(
+    lambda large_id, small_id, large_m, ratio: TargetConfig(
+        large=MarkerConfig(dictionary="DICT_4X4_1000", id=large_id, side_m=large_m),
+        small=MarkerConfig(
+            dictionary="DICT_ARUCO_ORIGINAL", id=small_id, side_m=max(large_m * ratio, 0.004)
+        ),
+    ),
+    st.integers(0, 999),
+    st.integers(0, 1023),
+    st.floats(0.05, 0.5),
+    st.floats(0.1, 0.18),
+)
+
+
+def test_the_papers_target_in_millimetres() -> None:
+    """And its rectangles lie where the bitmap is black."""
+    drawing = draw_target(TargetConfig())
+    assert drawing.sheet_side_m == pytest.approx(0.200)
+    assert drawing.ring_m == pytest.approx(0.025 / 7)
+    image = drawing.bitmap(1000.0)
+    assert image.shape == (200, 200)
+    black = image < 128
+    assert not black[:25].any()
+    assert black[25:175, 25:50].all(), "left border"
+    centre = black[75:125, 75:125]
+    assert not centre[:12].any(), "12.5 mm of quiet zone above the small marker"
+    assert centre[13:37, 13:16].all(), "left border of the small marker"
+    image = drawing.bitmap(2800.0)  # whole pixels for both markers' cells
+    painted = np.full(image.shape, 255, np.uint8)
+    for r in drawing.rectangles():
+        across = np.rint(np.array([r.x0_m, r.x1_m]) * 2800.0 + len(image) / 2).astype(int)
+        down = np.rint(len(image) / 2 - np.array([r.y1_m, r.y0_m]) * 2800.0).astype(int)
+        painted[slice(*down), slice(*across)] = 0
+    assert np.array_equal(painted, image)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(targets, st.floats(200.0, 3000.0))
+def test_rectangles_are_disjoint_and_the_area_is_the_raster_s_at_any_resolution(
+    target: TargetConfig, px_per_m: float
+) -> None:
+    drawing = draw_target(target)
+    rectangles = drawing.rectangles()
+    widths = np.diff(drawing.edges_m)
+    area = float(widths @ drawing.black @ widths)
+    assert sum((r.x1_m - r.x0_m) * (r.y1_m - r.y0_m) for r in rectangles) == pytest.approx(area)
+    for i, a in enumerate(rectangles):
+        for b in rectangles[:i]:
+            apart_x = a.x1_m <= b.x0_m + 1e-12 or b.x1_m <= a.x0_m + 1e-12
+            assert apart_x or a.y1_m <= b.y0_m + 1e-12 or b.y1_m <= a.y0_m + 1e-12
+    size = int(np.ceil(drawing.sheet_side_m * px_per_m)) + 4
+    for window_px in (1.0, 2.0):
+        ink = drawing.ink_coverage(px_per_m, size, window_px)
+        assert ink.min() >= -1e-12
+        assert ink.max() <= 1.0 + 1e-12
+        assert ink.sum() / px_per_m**2 == pytest.approx(area)
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(targets)
+def test_any_two_ids_are_both_read_from_the_bitmap(target: TargetConfig) -> None:
+    """The white ring leaves the large marker readable and makes the small one so."""
+    image = draw_target(target).bitmap(480.0 / target.large.side_m)
+    assert set(PlainReader(target).read(image)) == {"large", "small"}
+
+
+# --- the ratio of the two prints, and when it is named an error ----------------------------------
+
+TARGET = TargetConfig()
+K = np.array([[380.0, 0.0, 321.5], [0.0, 380.6, 238.2], [0.0, 0.0, 1.0]])
+CAMERA = CameraModel((640, 480), K, np.array([-0.17, 0.04, 0.0004, -0.0007, -0.003]))
+
+
+def corners(
+    scale: float, z_m: float, rng: np.random.Generator, sigma_px: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Both markers, the small one printed `scale` times too large, tilted and turned."""
+    rvec = np.array([np.pi, 0.0, 0.0]) + rng.normal(0.0, 0.08, 3)
+    tvec = np.array([*rng.uniform(-0.02, 0.02, 2), z_m])
+    quads = []
+    for side in (TARGET.large.side_m, scale * TARGET.small.side_m):
+        image, _ = cv2.projectPoints(marker_corners_m(side), rvec, tvec, CAMERA.K, CAMERA.dist)
+        quads.append(image.reshape(-1, 2) + rng.normal(0.0, sigma_px, (4, 2)))
+    return quads[0], quads[1]
+
+
+def checked(scale: float, sigma_px: float, count: int, wrong: int = 0) -> PrintCheck:
+    """A check of so many pictures, of which the last `wrong` show something else."""
+    rng, check = np.random.default_rng(1), PrintCheck(CAMERA, TARGET)
+    for k in range(count):
+        large, small = corners(scale, float(rng.uniform(0.18, 0.26)), rng, sigma_px)
+        check.add_corners(large, small + 3.0 * rng.normal(size=2) * (k >= count - wrong))
+    return check
+
+
+@pytest.mark.parametrize("scale", [0.97, 1.0, 1.02])
+def test_exact_corners_give_the_exact_ratio(scale: float) -> None:
+    large, small = corners(scale, 0.2, np.random.default_rng(4), 0.0)
+    ratio = size_ratio(large, small, CAMERA, TARGET)
+    assert ratio is not None
+    assert ratio[0] == pytest.approx(scale, abs=1e-5)
+    assert size_ratio(large, np.full((4, 2), np.nan), CAMERA, TARGET) is None
+    assert size_ratio(*np.full((2, 4, 2), 300.0), CAMERA, TARGET) is None
+
+
+def claimed(text: str) -> tuple[float, float]:
+    """The ratio of the sides and its sigma, a share."""
+    found = re.search(r"is ([0-9.]+) of the large one.*sigma ([0-9.]+) %", text)
+    assert found is not None, text
+    return float(found[1]), float(found[2]) / 100
+
+
+@pytest.mark.parametrize(
+    ("scale", "wrong"), [(1.0, False), (1.001, False), (0.97, True), (1.02, True)]
+)
+def test_only_an_error_beyond_the_noise_is_named(scale: float, wrong: bool) -> None:
+    named, text = checked(scale, 0.05, 60, wrong=6).verdict()
+    assert named is wrong
+    value, sigma = claimed(text)
+    assert value == pytest.approx(scale / 6.0, abs=3.0 * sigma / 6.0 + 1e-4)
+    assert ("--measured-small" in text) is wrong
+
+
+def test_noise_hides_a_small_error_more_frames_are_surer_and_few_say_nothing() -> None:
+    few, many = (claimed(checked(1.02, 1.0, n).verdict()[1])[1] for n in (10, 200))
+    assert many < 0.4 * few
+    assert not checked(1.006, 0.6, 6).verdict()[0]
+    assert not checked(1.05, 0.05, 2).judged
+    assert "not judged" in checked(1.05, 0.05, 2).verdict()[1]

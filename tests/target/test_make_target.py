@@ -41,14 +41,6 @@ def test_the_plain_call_writes_the_pdf_alone_and_twice_the_same() -> None:
     assert json.loads(out) == {"files": ["board.pdf"], "board": "chessboard:9x6:25mm"}
 
 
-def test_the_profile_s_own_date_is_on_the_sheet() -> None:
-    Path("mine.yaml").write_text("extends: sim\ndate: 2026-03-01\n")
-    call("-p", "mine.yaml")
-    assert b"D:20260301" in Path("target.pdf").read_bytes()
-    call("-p", "mine.yaml", "--large", "140mm", "--force")
-    assert b"D:2026" not in Path("target.pdf").read_bytes()
-
-
 @pytest.mark.long
 def test_the_design_and_a_suggestion_write_nothing() -> None:
     out, _ = call("design", CAMERA, "--ceiling", "2.4", "--blur", "2.0")

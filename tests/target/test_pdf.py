@@ -7,12 +7,12 @@ import itertools
 import re
 from collections.abc import Iterator
 
-import cv2
 import numpy as np
 import pypdfium2  # type: ignore[import-untyped]
 import pytest
 from numpy.typing import NDArray
 
+from perchctl.calibration.board.detect import BoardView, find_board
 from perchctl.errors import InvalidValue
 from perchctl.profile import TargetConfig
 from perchctl.target import Board, board_pdf, target_pdf
@@ -189,34 +189,16 @@ def test_a_printed_board_is_found_and_true_to_size(notation: str) -> None:
     board = Board.parse(notation)
     picture = page_picture(board_pdf(board, "a4"), 0, 200)
     assert picture.shape[1] > picture.shape[0], "turned, as it fits"
-    corners = board_corners(board, picture)
-    expected = board.corners_m()[:, :2] * 1e3
+    view = find_board(picture, board)
+    assert isinstance(view, BoardView)
+    columns, rows = board.corner_count
+    assert len(view) == columns * rows
+    corners, expected = view.corners_px * 25.4 / 200, view.object_m[:, :2] * 1e3
+    if corners[0, 0] > corners[-1, 0]:  # a chessboard found from its other end
+        corners = corners[::-1]
     shift = np.median(corners - expected, axis=0)
     assert np.abs(corners - expected - shift).max() < TOLERANCE_MM
-
-
-def board_corners(board: Board, picture: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """All inner corners in the board's order, mm on the page."""
-    if board.kind == "charuco":
-        found, ids, _, _ = cv2.aruco.CharucoDetector(board.cv2_board()).detectBoard(picture)
-        order = np.argsort(np.asarray(ids).ravel())
-        corners = np.asarray(found, np.float32).reshape(-1, 2)[order]
-    else:
-        ok, found = cv2.findChessboardCorners(picture, board.corner_count)
-        assert ok
-        corners = np.asarray(found, np.float32).reshape(-1, 2)
-        if corners[0, 0] > corners[-1, 0]:
-            corners = corners[::-1]
-    columns, rows = board.corner_count
-    assert len(corners) == columns * rows
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
-    start = np.ascontiguousarray(corners).reshape(-1, 1, 2)
-    fine = cv2.cornerSubPix(picture, start, (9, 9), (-1, -1), criteria)
-    return np.asarray(fine, np.float64).reshape(-1, 2) * 25.4 / 200
-
-
-def test_a_board_too_large_for_the_page_is_refused_with_one_that_holds_it() -> None:
-    board = Board.parse("charuco:10x7:30mm:22mm:DICT_5X5_100")
+    large = Board.parse("charuco:10x7:30mm:22mm:DICT_5X5_100")
     with pytest.raises(InvalidValue, match="--page a3 holds it"):
-        board_pdf(board, "a4")
-    assert board_pdf(board, "a3")
+        board_pdf(large, "a4")
+    assert board_pdf(large, "a3")

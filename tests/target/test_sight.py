@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
 import math
+from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +15,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.geometry import Array, rot_z
-from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig
+from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig, load_profile
 from perchctl.profile.vision import VehicleConfig
-from perchctl.target import overhead_text, view_from
-from perchctl.target.sight import BlindRange, blind_range, overhead_reach_m
+from perchctl.target import make_design, overhead_text, suggest_target, view_from
+from perchctl.target.design import TargetDesign
+from perchctl.target.reading import check_target
+from perchctl.target.sheets import fits
+from perchctl.target.sight import (
+    SURE_PX,
+    BlindRange,
+    FieldOfView,
+    blind_range,
+    overhead_reach_m,
+    square_outline,
+    turned_outline,
+)
 from perchctl.vision import project, square_corners
-from tests.target.rig import camera_of
+from tests.helpers.flights import short_profile
+from tests.target.rig import camera_of, sized
 
 TARGET = TargetConfig()
 SIDE_M = TARGET.large.side_m
@@ -47,35 +64,23 @@ def axis_m(mount: Mounting, height_m: float) -> tuple[float, float]:
 
 @settings(max_examples=60, deadline=None)
 @given(mounts, st.floats(0.6, 3.0), angles, angles, st.floats(0.0, 0.97))
-def test_within_the_reach_the_marker_is_whole_at_any_turn(
+def test_within_the_reach_the_marker_is_whole_at_any_turn_and_beyond_it_some_is_cut(
     mount: Mounting, height_m: float, towards: float, yaw_rad: float, share: float
 ) -> None:
     reach_m = overhead_reach_m(SIDE_M, CAMERA, mount, height_m)
     if reach_m is None:
         return
-    away_m, (x, y) = share * reach_m, axis_m(mount, height_m)
-    centre = np.array([x + away_m * math.cos(towards), y + away_m * math.sin(towards), height_m])
-    assert in_picture(mount, centre, yaw_rad)
+    x, y = axis_m(mount, height_m)
 
+    def seen(away_m: float, way_rad: float, turn_rad: float) -> bool:
+        to_x, to_y = away_m * math.cos(way_rad), away_m * math.sin(way_rad)
+        return in_picture(mount, np.array([x + to_x, y + to_y, height_m]), turn_rad)
 
-@settings(max_examples=30, deadline=None)
-@given(mounts, st.floats(0.6, 3.0))
-def test_beyond_the_reach_some_marker_is_cut(mount: Mounting, height_m: float) -> None:
-    reach_m = overhead_reach_m(SIDE_M, CAMERA, mount, height_m)
-    if reach_m is None:
-        return
-    away_m, (x, y) = 1.05 * reach_m + 0.01, axis_m(mount, height_m)
+    assert seen(share * reach_m, towards, yaw_rad)
     around = np.linspace(0.0, 2.0 * math.pi, 48)
-    turned = (
-        (towards, towards + math.pi / 4.0)  # a corner ahead
-        for towards in around
-    )
-    assert not all(
-        in_picture(
-            mount, np.array([x + away_m * math.cos(a), y + away_m * math.sin(a), height_m]), yaw
-        )
-        for a, yaw in turned
-    )
+    beyond_m = 1.05 * reach_m + 0.01
+    ahead = (0.0, math.pi / 4.0)  # a corner ahead
+    assert not all(seen(beyond_m, way, way + turn) for way in around for turn in ahead)
 
 
 @settings(max_examples=60, deadline=None)
@@ -174,16 +179,114 @@ def test_whole_markers_are_lost_where_geometry_says(
     assert view_of(gear_m).whole_m == pytest.approx(nearest_m, abs=0.001)
 
 
-@pytest.mark.parametrize("gear_m", [(0.0, 0.0, 0.0), (-0.03, 0.0, 0.0), (0.0, 0.03, 0.02)])
-def test_the_rest_of_the_drawing_halves_it(gear_m: tuple[float, float, float]) -> None:
-    blind = view_of(gear_m)
-    assert blind.whole_m is not None
-    assert blind.left_m is not None
-    assert blind.left_m <= 0.5 * blind.whole_m
-
-
 def test_a_blind_range_is_named() -> None:
     assert view_of((0.28, 0.0, 0.0)).whole_m is None
     assert "blind in all of the last 10 cm" in view_of((0.28, 0.0, 0.0)).words
     assert "by whole markers alone: blind from 48 mm" in view_of((0.0, 0.03, 0.02)).words
     assert "never blind" in view_of((0.0, 0.0, 0.025)).words
+
+
+# --- the designer against the renderer and the paper ---------------------------------------------
+
+TARGET = TargetConfig()
+ROOT = Path(__file__).resolve().parents[2]
+PAPER_CAMERA = camera_of(380.0)
+AHEAD = (np.eye(3), np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def profile() -> Profile:
+    return load_profile("sim")
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The benchmark of the ranges, from beyond what may be wrong on, and quick."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    module = importlib.import_module("ranges_by_design")
+    monkeypatch.setattr(module, "START", 1.2)
+    return module
+
+
+@pytest.fixture(scope="module")
+def paper_design(profile: Profile) -> TargetDesign:
+    return make_design(TARGET, PAPER_CAMERA, 2.5, profile, 2.4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("focal_px", "blur_px"), [(250.0, 2.5), (380.0, 1.5)])
+def test_ranges_agree_with_the_renderer(bench: ModuleType, focal_px: float, blur_px: float) -> None:
+    """The other cameras and blurs: benchmarks/ranges_by_design.py."""
+    for name, designed, measured in bench.measure(focal_px, blur_px, TARGET):
+        assert designed == pytest.approx(measured, rel=0.15), name
+
+
+def test_the_paper_s_ranges_and_where_they_differ(paper_design: TargetDesign) -> None:
+    """z2 and z3 agree; a blur that explains z1 = 115 cm would be 3.5 px, not 2.5."""
+    design = paper_design
+    assert design.z2_m == pytest.approx(0.25, rel=0.15)
+    assert design.z3_upright_m == pytest.approx(0.12, rel=0.05)
+    assert design.z3_m == pytest.approx(0.17, rel=0.05), "facing across, it needs more room"
+    assert design.z1_m is not None
+    assert 1.15 < design.z1_m < 1.75
+    assert f"z1        {100 * design.z1_m:.3g} cm" in design.text("camera.yaml")
+    assert design.record()["warnings"] == []
+
+
+def test_z3_is_the_geometry_s() -> None:
+    view = FieldOfView(PAPER_CAMERA, margin_px=0.0)
+    upright, turned = square_outline(0.15), turned_outline(0.15)
+    nearest_m = 0.15 * 380.0 / 480.0
+    assert view.nearest_m(upright, *AHEAD) == pytest.approx(nearest_m, rel=2e-3)
+    assert view.nearest_m(turned, *AHEAD) == pytest.approx(math.sqrt(2.0) * nearest_m, rel=2e-3)
+    barrel = FieldOfView(camera_of(380.0, (-0.17, 0.04, 0.0, 0.0, 0.0)), margin_px=0.0)
+    shown = barrel.nearest_m(turned, *AHEAD)
+    assert shown is not None
+    assert shown < 0.99 * math.sqrt(2.0) * nearest_m, "barrel distortion shows more"
+    behind = np.diag([1.0, -1.0, -1.0])
+    assert view.nearest_m(turned, behind, np.zeros(3)) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, ""),
+        ({"z1_m": 0.9}, "gap at the start"),
+        ({"z2_m": 0.15}, "gap between the markers"),
+        ({"z1_m": None}, "never read"),
+        ({"small_nearest_m": 0.2}, "gap before contact"),
+        ({"small_nearest_m": None}, "gap before contact"),
+    ],
+)
+def test_gaps_are_named(paper_design: TargetDesign, changes: dict[str, Any], said: str) -> None:
+    warnings = dataclasses.replace(paper_design, **changes).warnings
+    assert len(warnings) == bool(said)
+    assert said in "".join(warnings)
+
+
+def test_a_gap_on_the_ground_is_named_where_the_target_is_the_position(
+    paper_design: TargetDesign,
+) -> None:
+    """From the search height it would be near enough."""
+    ground = short_profile({"positioning": "target"}, base="sim")
+    sure_m = 380.0 * 0.150 / SURE_PX
+    for ceiling_m, gap in ((0.9 * sure_m, False), (1.1 * sure_m, True)):
+        design = make_design(TARGET, PAPER_CAMERA, 0.6, ground, ceiling_m)
+        assert any("gap at the start" in text for text in design.warnings) is gap
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("focal_px", "blur_px", "ceiling_m"), [(380.0, 2.0, 2.4), (250.0, 0.6, None)]
+)
+def test_what_is_suggested_covers_the_way(
+    profile: Profile, focal_px: float, blur_px: float, ceiling_m: float | None
+) -> None:
+    found, page = suggest_target(camera_of(focal_px), blur_px, profile, 0.05, ceiling_m)
+    assert page == "a4"
+    assert found.warnings == ()
+    assert found.z1_m is not None
+    assert found.z1_m >= (1.15 if ceiling_m is None else ceiling_m - 1.3)
+    check_target(found.target, 0.05)
+    assert fits(found.target, "a4")
+    assert not fits(sized(1e3 * found.target.large.side_m + 5, 25.0), "a4")
