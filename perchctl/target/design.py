@@ -217,14 +217,13 @@ def suggest_target(
     magnet that is smaller than what the small marker needs.
     """
     ground = profile.positioning.by == "target"
+    search_m = start_range_m(profile, ceiling_m or DEFAULT_CEILING_M)
     if ceiling_m is None and not ground:
         search_m = DEFAULT_SEARCH_M
-    else:
-        search_m = start_range_m(profile, ceiling_m or DEFAULT_CEILING_M)
     if search_m <= 0.0:
         raise InvalidValue(
             f"--ceiling {ceiling_m:g} is below the highest search position "
-            f"({profile.planner.search.max_height_m:g} m): lower planner.search.max_height_m"
+            f"({start_height_m(profile):g} m): lower planner.search.max_height_m"
         )
     large_px, small_px = (
         smallest_side_px(_sized(0.150, 0.025), name, blur_px, max(camera.size_px))

