@@ -19,9 +19,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from perchctl.calibration import BoardView, calibrate_camera
+from perchctl.calibration import FoundViews, calibrate_camera
 from perchctl.calibration.board.adjust import parameters_of
-from perchctl.calibration.board.detect import find_board
+from perchctl.calibration.board.detect import BoardView, find_board
 from perchctl.calibration.board.predict import position_errors_mm
 from tests.helpers.boards import (
     CHARUCO,
@@ -62,7 +62,7 @@ def main() -> None:
     for seed in range(options.seeds):
         start_s = time.perf_counter()
         views, truth = views_of(seed, options.corners)
-        result = calibrate_camera(views, "synthetic")
+        result = calibrate_camera(FoundViews(tuple(views)), "synthetic")
         off = (result.fit.parameters - parameters_of(truth)) / result.std
         line = (
             f"seed {seed:2d}: {len(result.views)} of {len(views)} views, "

@@ -17,11 +17,10 @@ from collections.abc import Callable
 import numpy as np
 
 from perchctl.geometry import make_T, rotation_from_rpy
-from perchctl.profile import TargetConfig
+from perchctl.profile import Profile, TargetConfig
 from perchctl.sim import Renderer, Scenario
-from perchctl.target import Optics
-from perchctl.target.design import design_ranges
-from perchctl.target.reading import FOUND_RATE, TRIALS, PlainReader
+from perchctl.target import make_design
+from perchctl.target.reading import FOUND_RATE, NOISE, TRIALS, PlainReader
 from perchctl.vision import CameraModel, MarkerName
 
 FOCAL_PX = (250.0, 380.0, 600.0)
@@ -40,11 +39,11 @@ def camera_of(focal_px: float) -> CameraModel:
 class Bench:
     """Renders and reads; the same seed for every camera."""
 
-    def __init__(self, camera: CameraModel, optics: Optics, target: TargetConfig) -> None:
+    def __init__(self, camera: CameraModel, blur_px: float, target: TargetConfig) -> None:
         scenario = Scenario(
             ceiling_z_m=CEILING_M,
-            camera_noise_sigma=optics.noise,
-            camera_defocus_px=optics.blur_px,
+            camera_noise_sigma=NOISE,
+            camera_defocus_px=blur_px,
             large_side_m=target.large.side_m,
             small_side_m=target.small.side_m,
         )
@@ -98,9 +97,9 @@ def measure(
     focal_px: float, blur_px: float, target: TargetConfig
 ) -> list[tuple[str, float, float]]:
     """(name, designed, measured) of z1, z2, z3 in metres."""
-    camera, optics = camera_of(focal_px), Optics(blur_px)
-    designed = design_ranges(target, camera, optics)
-    bench = Bench(camera, optics, target)
+    camera = camera_of(focal_px)
+    designed = make_design(target, camera, blur_px, Profile())
+    bench = Bench(camera, blur_px, target)
     assert designed.z1_m is not None
     assert designed.z2_m is not None
     assert designed.z3_m is not None

@@ -86,7 +86,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # many names it has at most.
 MOST_NAMES = {
     "analysis": 15,
-    "calibration": 30,
+    "calibration": 17,
     "camera": 27,
     "campaign": 25,
     "check": 15,
@@ -101,7 +101,7 @@ MOST_NAMES = {
     "positioning": 15,
     "profile": 35,
     "sim": 23,
-    "target": 24,
+    "target": 15,
     "vision": 38,
     "weights": 9,
 }

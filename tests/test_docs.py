@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration import load_calibration, write_recordings
+from perchctl.calibration import MountingRecording, load_calibration
 from perchctl.commands import app
 from perchctl.commands.command_line import COMMANDS
 from perchctl.flight import fly_lockstep
@@ -142,7 +142,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_recording(folder)
     render_folder(folder / "board", load_calibration(folder / "camera.yaml"), CHARUCO, 8, seed=1)
     write_turned_about(folder / "turned")
-    write_recordings(folder / "hand.jsonl", [seen(hand("pivot"))])
+    MountingRecording.write(folder / "hand.jsonl", [seen(hand("pivot"))])
     write_session(known(positions=4, per=20), folder / "session.csv")
     (folder / "camchain.yaml").write_text(CAMCHAIN, encoding="utf-8")
     packed = ROOT / "tests" / "data" / "flights" / "searched-out.jsonl.gz"

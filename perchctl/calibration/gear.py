@@ -6,16 +6,19 @@ is connected with the picture's edge, as legs and guards are, is the vehicle.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.camera import Grey
+from perchctl.calibration.live import poll_frames
+from perchctl.camera import FrameSource
 from perchctl.errors import InvalidValue
 
+LIVE_S = 20.0
+"""How long a live camera is watched."""
 LEAST_PICTURES = 20
 MOST_COVERED = 0.6
 _LEAST_MOTION_GREY = 8.0  # spread of a pixel that sees the room go by
@@ -24,33 +27,23 @@ _LEAST_SHARE = 5e-4  # of the picture, for a part of the gear
 _CLOSED_PX, _EDGE_PX = 7, 3  # gaps that are gear; blur around it
 
 
-@dataclass(frozen=True, eq=False)
-class Gear:
-    """The vehicle's own gear: `covered` (h, w), and the number of pictures it was learned from."""
-
-    covered: NDArray[np.bool_]
-    pictures: int
-
-    @property
-    def share(self) -> float:
-        """Share of the picture that the vehicle covers."""
-        return float(self.covered.mean())
-
-    def png(self) -> bytes:
-        """Return the mask as `camera.mask` has it: white is what the vehicle covers."""
-        return bytes(cv2.imencode(".png", np.where(self.covered, np.uint8(255), np.uint8(0)))[1])
-
-
-def learn_gear(pictures: Iterable[Grey]) -> Gear:
-    """Learn the gear from grey pictures (h, w) of one size, in which everything else moves.
+def learn_gear(
+    source: FrameSource, stopped: Callable[[], bool] = lambda: False
+) -> NDArray[np.bool_]:
+    """Return which pixels (h, w) the vehicle covers, by the pictures of a recording, or of a live
+    camera for `LIVE_S` or until `stopped`.
 
     Raises:
         InvalidValue: too few pictures, unequal sizes, too little motion, or nothing found.
     """
-    count = 0
+    count, start_s = 0, time.monotonic()
     total = squares = np.zeros((0, 0))
-    for picture in pictures:
-        soft = cv2.blur(picture, (3, 3)).astype(np.float64)
+    for now_s, frame in poll_frames(source, time.monotonic, time.sleep):
+        if stopped() or (source.live and now_s - start_s > LIVE_S):
+            break
+        if frame is None:
+            continue
+        soft = cv2.blur(frame.image, (3, 3)).astype(np.float64)
         if count and soft.shape != total.shape:
             raise InvalidValue(
                 f"picture {count + 1} is {soft.shape[1]}x{soft.shape[0]} px, the first "
@@ -65,25 +58,19 @@ def learn_gear(pictures: Iterable[Grey]) -> Gear:
         )
     spread = np.sqrt(np.maximum(squares / count - (total / count) ** 2, 0.0))
     motion = float(np.percentile(spread, 75.0))
-    if motion < _LEAST_MOTION_GREY:
-        raise InvalidValue(
-            f"the pictures hardly change (by {motion:.1f} grey levels, at least "
-            f"{_LEAST_MOTION_GREY:g} are needed): turn the vehicle about in front of something "
-            f"with strong patterns, not a plain wall"
-        )
     covered = _connected(spread < _STILL * motion)
     share = float(covered.mean())
+    if motion < _LEAST_MOTION_GREY or share > MOST_COVERED:
+        raise InvalidValue(
+            "the pictures hardly change: turn the vehicle about in front of something with strong "
+            "patterns all over the picture, not a plain wall"
+        )
     if share == 0.0:
         raise InvalidValue(
             "nothing stays the same in the pictures: the vehicle covers nothing, and "
             "camera.mask is not needed"
         )
-    if share > MOST_COVERED:
-        raise InvalidValue(
-            f"{100 * share:.0f} % of the picture stay the same: turn the vehicle about in front "
-            f"of something with strong patterns all over the picture"
-        )
-    return Gear(covered, count)
+    return covered
 
 
 def _connected(still: NDArray[np.bool_]) -> NDArray[np.bool_]:

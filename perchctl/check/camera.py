@@ -34,9 +34,7 @@ from perchctl.geometry import Place
 from perchctl.perception import BLENDED, MIRRORED_FRAMES
 from perchctl.profile import Profile
 from perchctl.target import (
-    edge_margin,
-    offset_text,
-    overhead_view,
+    overhead_text,
     view_from,
 )
 from perchctl.vision import CameraModel
@@ -230,8 +228,9 @@ def _print(rehearsal: Rehearsal, profile: Profile) -> Finding:
     verdict = rehearsal.print_verdict
     if verdict is None:
         return skipped("both markers must be in view", "hold it nearer to the target")
-    found, _, advice = verdict.text.partition("; ")
-    return failed(found, advice) if verdict.wrong else passed(found)
+    wrong, text = verdict
+    found, _, advice = text.partition("; ")
+    return failed(found, advice) if wrong else passed(found)
 
 
 PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
@@ -252,7 +251,7 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
 def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
     """Judge the view from where the vehicle stands, and on its way up: what `fly` refuses fails."""
     if not rehearsal.found:
-        where = overhead_view(profile.target, camera, profile.camera.mount).words
+        where = overhead_text(profile.target, camera, profile.camera.mount)
         return failed("no, and fly refuses", f"put the vehicle under the target: {where}")
     found = _share_found(rehearsal)
     if rehearsal.found < SEEN_WARN * rehearsal.pictures:
@@ -275,10 +274,14 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
         f"{sight.height_m:.2f} m above it"
     )
     shown = [each.detections.large for each in rehearsal.looked if each.detections.large]
-    room = edge_margin(shown[-1].corners_px, camera.size_px) if shown else 1.0
+    room = 1.0
+    if shown:
+        far_edge = np.array(camera.size_px) - 0.5
+        least_px = np.minimum(shown[-1].corners_px + 0.5, far_edge - shown[-1].corners_px).min()
+        room = float(least_px) / max(camera.size_px)
     if room < ROOM_WARN:
         found += f", only {100.0 * max(0.0, room):.0f} % of the picture's width from its edge"
-        return warned(found, f"put the vehicle {offset_text(sight.aside_m)} from here")
+        return warned(found, f"put the vehicle {sight.aside_text} from here")
     return passed(found)
 
 

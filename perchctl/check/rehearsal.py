@@ -15,7 +15,7 @@ import numpy as np
 from perchctl.camera import FrameSource, WrappedSource
 from perchctl.flight import Clock, FlightInputs
 from perchctl.profile import Profile
-from perchctl.target import PrintCheck, PrintVerdict
+from perchctl.target import PrintCheck
 from perchctl.vehicle import Telemetry
 from perchctl.vision import MARKERS, Detections, Frame, Pipeline, TargetEstimate, refine_lines
 
@@ -75,7 +75,7 @@ class Rehearsal:
     mirrored: int = 0
     silent_s: float = 0.0
     target: TargetEstimate | None = None
-    print_verdict: PrintVerdict | None = None
+    print_verdict: tuple[bool, str] | None = None
     blur: Blur | None = None
 
     @property

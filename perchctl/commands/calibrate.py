@@ -8,7 +8,7 @@ import datetime
 import itertools
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,21 +18,15 @@ import numpy as np
 import typer
 
 from perchctl.calibration import (
-    BoardView,
-    Calibration,
+    FoundViews,
     GuidedFrame,
-    Rejection,
-    SizeMissing,
     calibrate_camera,
     calibration_text,
-    camera_record,
     capture_views,
     check_calibration,
+    find_views,
     learn_gear,
     load_calibration,
-    poll_frames,
-    views_of_images,
-    views_of_video,
 )
 from perchctl.camera import (
     IMAGE_SUFFIXES,
@@ -62,15 +56,12 @@ from perchctl.commands.progress import search_bar
 from perchctl.display import live_page
 from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files
-from perchctl.target import NOTABLE_SCALE_ERROR, Board, mm_text, parse_board
+from perchctl.target import Board
 from perchctl.vision import CameraModel
 
 FOLDER = Path("calib")
 SUFFIXES, CONTENT = (".yaml", ".yml"), "the format of a calibration"
 DEFAULT_BOARD = "charuco:10x7:25mm:18mm:DICT_5X5_100"
-MASK_S = 20.0
-"""How long a live camera is watched to learn a mask."""
-
 DETAILS = "Details"
 """Heading of the options that are not of every day."""
 
@@ -86,8 +77,7 @@ BoardOption = Annotated[
     typer.Option(
         "--board",
         "-b",
-        help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 "
-        "(squares; :legacy behind it for OpenCV's old layout).",
+        help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 (squares).",
     ),
 ]
 MeasuredOption = Annotated[
@@ -137,7 +127,7 @@ def camera(
     measured: MeasuredOption = None,
     size: SizeOption = None,
     model: Annotated[
-        Literal["auto", "plumb_bob", "rational_polynomial", "fisheye"],
+        Literal["auto", "plumb_bob", "fisheye"],
         typer.Option(
             "--model",
             help="Lens model; auto takes the simplest one that follows the lens.",
@@ -165,17 +155,27 @@ def camera(
         return _free_folder(file)
 
     port = page_port(view, view_port)
-    views, missing = _find_views(pictures, layout, kept_in, port)
-    file = _file(output, name, views[0].size_px)
+    found = _find_views(pictures, layout, kept_in, port)
+    file = _file(output, name, found.views[0].size_px)
     _check_output(file, force)
-    say(f"{len(views)} views of the board" + (f", {len(missing)} without" if missing else ""))
-    result = calibrate_camera(views, layout.notation(), model, missing)
+    without = f", {len(found.missing)} without" if found.missing else ""
+    say(f"{len(found.views)} views of the board{without}")
+    result = calibrate_camera(found, layout.notation(), model)
     write_files({file: result.text(name, _now()).encode()})
     for line in result.lines():
         say(line)
-    report = draw_unless_interrupted(lambda: _draw(result, file.with_suffix(".png")))
+
+    def draw() -> Path:
+        from perchctl.calibration import draw_calibration
+
+        picture = file.with_suffix(".png")
+        write_files({picture: draw_calibration(result)})
+        return picture
+
+    report = draw_unless_interrupted(draw)
     say(f"wrote {file}" + ("" if report is None else f" and {report}"))
-    print_result(result.record(file, report) if as_json else file)
+    record = result.record() | {"file": str(file), "report": report and str(report)}
+    print_result(record if as_json else file)
 
 
 command(
@@ -209,19 +209,13 @@ def mask(
         stack.callback(frames.close)
         stop = stack.enter_context(Stopper().installed())
         if frames.live:
-            say(f"turn the vehicle about for {MASK_S:g} s (Ctrl-C ends and writes the mask)")
-        gear = learn_gear(_mask_pictures(frames, stop.requested.is_set))
-    write_files({output: gear.png()})
-    say(
-        f"wrote {output}: the vehicle covers {100 * gear.share:.1f} % of the picture, by "
-        f"{gear.pictures} pictures; set camera.mask to it"
-    )
-    if as_json:
-        height, width = gear.covered.shape
-        record = {"file": str(output), "covered": round(gear.share, 4)}
-        print_result(record | {"pictures": gear.pictures, "size_px": [width, height]})
-    else:
-        print(output)
+            say("turn the vehicle about for 20 s (Ctrl-C ends and writes the mask)")
+        covered = learn_gear(frames, stop.requested.is_set)
+    write_files({output: cv2.imencode(".png", 255 * covered.astype(np.uint8))[1].tobytes()})
+    share = float(covered.mean())
+    say(f"wrote {output}: the vehicle covers {100 * share:.1f} % of the picture; set camera.mask")
+    record = {"file": str(output), "covered": round(share, 4)}
+    print_result(record if as_json else output)
 
 
 @command(
@@ -244,16 +238,12 @@ def check(
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
     pictures = _source(source, size, view)
     layout = _measured_board(board, measured)
-    model: CameraModel | None = None
-    with contextlib.suppress(SizeMissing):  # then the pictures' own is taken
-        model = load_calibration(calibration, cam=cam)
+    model = load_calibration(calibration, cam=cam)
     port = page_port(view, view_port)
-    views, missing = _find_views(pictures, layout, lambda _: None, port)
-    size_px = views[0].size_px
-    model = model or load_calibration(calibration, size_px, cam)
-    check_size(size_px, model, str(pictures))
-    result = check_calibration(model, views)
-    for item in missing:
+    found = _find_views(pictures, layout, lambda _: None, port)
+    check_size(found.views[0].size_px, model, str(pictures))
+    result = check_calibration(model, found)
+    for item in found.missing:
         say(f"{item.view}: {item.reason}")
     for item in result.rejections:
         say(f"left out {item.view}: {item.reason}")
@@ -286,7 +276,7 @@ def convert(
     notes = {"date": _now(), "converted_from": calibration.name}
     write_files({file: calibration_text(model, name, notes).encode()})
     say(f"wrote {file} ({model.model}, {model.size_px[0]}x{model.size_px[1]} px)")
-    print_result(camera_record(model) | {"file": str(file)} if as_json else file)
+    print_result({"file": str(file)} if as_json else file)
 
 
 # -- files --------------------------------------------------------------------
@@ -314,13 +304,6 @@ def _free_folder(file: Path) -> Path:
 
 def _now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-
-
-def _draw(result: Calibration, picture: Path) -> Path:
-    from perchctl.calibration import draw_calibration
-
-    write_files({picture: draw_calibration(result)})
-    return picture
 
 
 # -- the source ---------------------------------------------------------------
@@ -392,34 +375,18 @@ def with_size(source: Source, text: str | None) -> Source:
     return replace(source, size_px=(int(found[1]), int(found[2])))
 
 
-def _mask_pictures(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]:
-    """Yield the pictures of a recording, or of a live camera for `MASK_S`."""
-    start_s = time.monotonic()
-    for now_s, frame in poll_frames(source, time.monotonic, time.sleep):
-        if stopped() or (source.live and now_s - start_s > MASK_S):
-            return
-        if frame is not None:
-            yield frame.image
-
-
 # -- the board and its views ----------------------------------------------------
 
 
 def _measured_board(notation: str, measured: str | None) -> Board:
     """Return the board with the measured sides of its black area, after a comparison with those
     that it was meant to have. Raises NotFound, InvalidValue."""
-    board = parse_board(notation)
+    board = Board.parse(notation)
     if measured is None:
         return board
-    sides = measured.removesuffix("mm")
-    if not re.fullmatch(r"[\d.]+x[\d.]+", sides):
-        raise InvalidValue(f"--measured {measured}: not WIDTHxHEIGHT in mm, as in 249.3x174.9")
-    board = parse_board(f"{board.notation().partition(':measured=')[0]}:measured={sides}mm")
-    for name, meant_m, scale in zip(("width", "height"), board.size_m, board.scale, strict=True):
-        off = f"{100 * (scale - 1):+.2f} % against {mm_text(meant_m)} mm"
-        say(f"{name}: {mm_text(scale * meant_m)} mm, {off}")
-        if abs(scale - 1) > NOTABLE_SCALE_ERROR:
-            say(f"{name}: more than 1 % off: was the page scaled when it was printed?")
+    board, notes = board.with_sides(measured)
+    for note in notes:
+        say(note)
     return board
 
 
@@ -428,7 +395,7 @@ def _find_views(
     board: Board,
     kept_in: Callable[[tuple[int, int]], Path | None],
     port: int | None,
-) -> tuple[list[BoardView], list[Rejection]]:
+) -> FoundViews:
     """Return the views, at least one, and the pictures without a board.
 
     Args:
@@ -440,26 +407,25 @@ def _find_views(
         frames = source.open()
         with contextlib.closing(frames):
             assert frames.size_px is not None  # the first frame is there
-            return capture_live_views(frames, board, kept_in(frames.size_px), port), []
+            return capture_live_views(frames, board, kept_in(frames.size_px), port)
     with search_bar("searching the board") as progress:
         if source.scheme == "images":
-            files = image_files(source.files or source.place)
-            views, missing = views_of_images(files, board, progress)
+            found = find_views(image_files(source.files or source.place), board, progress)
         else:
-            views, missing = views_of_video(Path(source.place), board, progress)
-    if not views:
-        count = f"{len(missing)} pictures" if source.scheme == "images" else missing[0].view
+            found = find_views(Path(source.place), board, progress)
+    if not found.views:
+        first, count = found.missing[0], f"{len(found.missing)} pictures"
         raise InvalidValue(
-            f"none of {count} of {source} shows the board {board.notation()} "
-            f"({missing[0].view}: {missing[0].reason}); is it wholly in view, sharp, and --board "
-            f"its true layout?"
+            f"none of {count if source.scheme == 'images' else first.view} of {source} shows the "
+            f"board {board.notation()} ({first.view}: {first.reason}); is it wholly in view, "
+            f"sharp, and --board its true layout?"
         )
-    return views, missing
+    return found
 
 
 def capture_live_views(
     source: FrameSource, board: Board, folder: Path | None, port: int | None
-) -> list[BoardView]:
+) -> FoundViews:
     """Return views of a live camera, taken until all is covered or Ctrl-C ends it.
 
     Args:
@@ -502,9 +468,9 @@ def capture_live_views(
                 keep(moment.image)
             show(moment)
 
-        views = capture_views(source, board, seen, stopped=stop.requested.is_set)
-    if not views:
+        found = capture_views(source, board, seen, stopped=stop.requested.is_set)
+    if not found.views:
         raise InvalidValue(
             f"no view of the board {board.notation()} was taken from {source.describe()}"
         )
-    return views
+    return found

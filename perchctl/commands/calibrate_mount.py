@@ -18,19 +18,12 @@ from typing import Annotated, Literal
 import typer
 
 from perchctl.calibration import (
-    MountingPart,
+    AttitudeSample,
     MountingRecording,
-    MountingReport,
-    MountingTape,
     PoseReader,
-    VehicleSensors,
-    capture,
-    pose_basis,
     profile_camera,
-    read_recordings,
-    solve_carry,
-    solve_pivot,
-    write_recordings,
+    record_mounting,
+    solve_mounting,
 )
 from perchctl.camera import (
     check_size,
@@ -66,7 +59,10 @@ from perchctl.profile import (
 from perchctl.vision import CameraModel
 
 FOLDER = Path("calib")
-HOW: dict[MountingPart, str] = {
+Part = Literal["carry", "pivot"]
+Sensors = tuple[Callable[[], list[AttitudeSample]], Callable[[float], str | None]]
+"""What a recording reads of the vehicle: its new samples, and what is wrong with it by a time."""
+HOW: dict[str, str] = {
     "carry": "carry: hold the vehicle under the target (or the target before its camera); turn it "
     "about all its axes and move it, the target in view",
     "pivot": "pivot: stand the tip of the gear on one point that does not move, the target in "
@@ -93,7 +89,7 @@ def mount(
         typer.Option("--source", help="Its camera; else the profile's."),
     ] = None,
     part: Annotated[
-        Literal["carry", "pivot"] | None,
+        Part | None,
         typer.Option(
             "--part",
             help="Only the carry (turn and latency), or only the pivot (the gear's tip, by the "
@@ -136,9 +132,9 @@ def mount(
     recordings: Sequence[MountingRecording]
     if logs:
         recordings = _read_parts(logs, part)
-        _check_seen_by(recordings, pose_basis(vehicle, camera))
+        _check_seen_by(recordings, PoseReader.basis(vehicle, camera))
     else:
-        parts: tuple[MountingPart, ...] = ("carry", "pivot") if part is None else (part,)
+        parts: tuple[Part, ...] = ("carry", "pivot") if part is None else (part,)
         frames, link_uri = _live_sources(source, uri, vehicle, parts)
         log = _recording_place(output, find_profile(profile).stem, force)
         recordings = _record_live(vehicle, camera, frames, link_uri, parts, log, port)
@@ -175,7 +171,7 @@ def mount(
 
 
 def _live_sources(
-    source: str | None, uri: str | None, profile: Profile, parts: tuple[MountingPart, ...]
+    source: str | None, uri: str | None, profile: Profile, parts: tuple[Part, ...]
 ) -> tuple[str, str | None]:
     """Return the camera, and the vehicle where the carry needs it (or it was named)."""
     given = profile.camera.source if source is None else source
@@ -212,8 +208,8 @@ def _recording_place(output: Path | None, name: str, force: bool) -> Path:
 
 def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecording]:
     """Return each part once, or the one that is asked for. Errors: NotFound, InvalidValue."""
-    named = [(path, recording) for path in logs for recording in read_recordings(path)]
-    places: dict[MountingPart, Path] = {}
+    named = [(path, recording) for path in logs for recording in MountingRecording.read(path)]
+    places: dict[str, Path] = {}
     for path, recording in named:
         if part not in (None, recording.part):
             continue
@@ -252,10 +248,10 @@ def _record_live(
     camera: CameraModel,
     source: str,
     uri: str | None,
-    parts: Sequence[MountingPart],
+    parts: Sequence[Part],
     log: Path,
     port: int | None,
-) -> tuple[MountingRecording, ...]:
+) -> list[MountingRecording]:
     """Record the parts live, also into a file. What was recorded is kept, however it ends.
 
     Args:
@@ -263,44 +259,46 @@ def _record_live(
 
     Raises:
         Interrupted: Ctrl-C. SafetyAbort: the motors turn.
-        Those of `open_camera`, `MotionLink.connect` and `capture`.
+        Those of `open_camera`, `MotionLink.connect` and `record_mounting`.
     """
     start_s = time.monotonic()
 
     def now() -> float:
         return time.monotonic() - start_s
 
-    tapes: list[MountingTape] = []
+    recordings: list[MountingRecording] = []
     with contextlib.ExitStack() as stack:
         # Its pictures keep the camera's own time: what is taken off it is what is measured.
         frames = open_camera(source, now, profile.camera, size_px=camera.size_px, latency_s=0.0)
         stack.callback(frames.close)
         check_size(frames.size_px, camera, frames.describe())
-        sensors = VehicleSensors()
+        sensors: Sensors = (list, lambda now_s: None)
         if uri is not None:
             sensors = stack.enter_context(_vehicle(uri, profile, now))
         page = stack.enter_context(live_page(camera, "perchctl calibrate mount", port, say))
-        stack.callback(_keep, tapes, log)
+        stack.callback(_keep, recordings, log)
         for part in parts:
             say(HOW[part])
             if sys.stdin.isatty():  # Ctrl-C ends at once here
                 print("press Enter when it is held so: ", end="", file=sys.stderr, flush=True)
                 sys.stdin.readline()
-            tape = MountingTape(part, pose_basis(profile, camera))
-            tapes.append(tape)
+            recording = MountingRecording(part, seen_by=PoseReader.basis(profile, camera))
+            recordings.append(recording)
             reader = PoseReader(profile, camera, frames.live)
             if frames.live:
                 frames.poll(now())  # from before
             with Stopper().installed() as stop, guide(page) as show:
                 stopped = stop.requested.is_set
-                capture(tape, frames, reader, sensors, show, now, stopped=stopped)
+                record_mounting(
+                    recording, frames, reader, show, *sensors, clock=now, stopped=stopped
+                )
             if stopped():
                 raise Interrupted("Ctrl-C: nothing was measured")
-    return tuple(tape.recording() for tape in tapes)
+    return recordings
 
 
 @contextlib.contextmanager
-def _vehicle(uri: str, profile: Profile, now: Callable[[], float]) -> Iterator[VehicleSensors]:
+def _vehicle(uri: str, profile: Profile, now: Callable[[], float]) -> Iterator[Sensors]:
     """Yield a connected vehicle's samples and problems. Raises SafetyAbort if its motors turn."""
     link = MotionLink(uri, profile.link, now)
     say(f"connecting to {uri}, to read from it and nothing else")
@@ -316,17 +314,18 @@ def _vehicle(uri: str, profile: Profile, now: Callable[[], float]) -> Iterator[V
 
     with contextlib.closing(link):
         problem(now())
-        yield VehicleSensors(link.samples, problem)
+        yield link.samples, problem
 
 
-def _keep(tapes: Sequence[MountingTape], log: Path) -> None:
+def _keep(recordings: Sequence[MountingRecording], log: Path) -> None:
     """Write the recording. Never raises: if it cannot be kept, it is measured from all the
     same."""
-    if not any(tapes):
+    held = [recording for recording in recordings if recording.attitudes or recording.poses]
+    if not held:
         return
     try:
         with ignore_signals():
-            write_recordings(log, [tape.recording() for tape in tapes if tape])
+            MountingRecording.write(log, held)
     except InvalidValue as error:
         say(f"the recording is not kept: {error}")
         return
@@ -334,23 +333,6 @@ def _keep(tapes: Sequence[MountingTape], log: Path) -> None:
 
 
 # -- the result -------------------------------------------------------------------
-
-
-def solve_mounting(profile: Profile, recordings: Sequence[MountingRecording]) -> MountingReport:
-    """Return the measured mounting, of each part there is. Errors: InvalidValue."""
-    by_part = {recording.part: recording for recording in recordings}
-    carry, pivot = by_part.get("carry"), by_part.get("pivot")
-    carried, pivoted = None, None
-    try:
-        carried = None if carry is None else solve_carry(carry)
-        if pivot is not None:
-            pivoted = solve_pivot(pivot, profile.target.size_sigma)
-    except InvalidValue as error:
-        if len(by_part) < 2:
-            raise
-        other = "pivot" if carried is None else "carry"
-        raise InvalidValue(f"{error} (--part {other} takes the {other} alone)") from None
-    return MountingReport(profile, carried, pivoted)
 
 
 def _check_unchanged(name: str, then: Profile) -> None:

@@ -71,7 +71,7 @@ from perchctl.profile import (
     read_weights,
 )
 from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log, summary_text
-from perchctl.target import mm_text, overhead_view
+from perchctl.target import mm_text, overhead_text
 
 EXIT_CODE_OF: dict[Outcome, int] = {
     Outcome.PERCHED: 0,
@@ -430,8 +430,8 @@ def _energy_gate(profile: Profile) -> str:
 def _positioning(options: FlyOptions) -> str:
     profile, config = options.profile, options.profile.positioning
     if config.by == "target":
-        view = overhead_view(profile.target, profile_camera(profile.camera), profile.camera.mount)
-        return f"the target itself, by the camera, from the ground on: {view.words}"
+        view = overhead_text(profile.target, profile_camera(profile.camera), profile.camera.mount)
+        return f"the target itself, by the camera, from the ground on: {view}"
     if config.by != "mocap":
         return "the vehicle's own deck"
     where = "the simulated room's" if options.simulated else f"{config.system}:{config.host}"

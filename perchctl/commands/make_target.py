@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from perchctl.calibration import load_calibration, profile_camera
+from perchctl.calibration import load_calibration
 from perchctl.commands.command_line import (
     CamOption,
     ForceOption,
@@ -21,7 +21,7 @@ from perchctl.commands.command_line import (
     new_app,
 )
 from perchctl.commands.output import print_result
-from perchctl.errors import InvalidValue, PerchError, UsageError
+from perchctl.errors import InvalidValue, UsageError
 from perchctl.files import check_place, write_files
 from perchctl.profile import (
     MarkerConfig,
@@ -33,14 +33,11 @@ from perchctl.profile import (
     write_profile_values,
 )
 from perchctl.target import (
-    Optics,
-    assess_mounting,
+    Board,
     board_pdf,
-    check_target,
     make_design,
     measured_target,
     mm_text,
-    parse_board,
     parse_length,
     suggest_target,
     target_pdf,
@@ -109,7 +106,7 @@ app = new_app(Group)
     app,
     "perchctl make-target -p crazyflie -o target.pdf",
     "perchctl make-target --large 120mm --small 20mm --page letter",
-    "perchctl make-target --large 355mm --small 35mm --page 442x470mm",
+    "perchctl make-target --large 355mm --small 35mm --page 442x478mm",
     short_help="Print the target true to size, front and back.",
 )
 def sheet(
@@ -135,14 +132,12 @@ def sheet(
     config = load_profile(profile)
     target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
     magnet_m = parse_length(magnet, "--magnet")
-    check_target(target, magnet_m)
     _check_pdf(output)
     pdf = target_pdf(target, page, magnet_m, *_origin(config, target))
     lines = [
         f"wrote {output}",
         "both markers are read from the drawing",
         "print at 100 % and measure both rulers: 100 mm each",
-        *_mounting(config, target),
     ]
     record = {"target": target.model_dump(mode="json")}
     _write({output: pdf}, lines, record, force, as_json)
@@ -170,7 +165,7 @@ def board(
     as_json: JsonOption = False,
 ) -> None:
     """Print a calibration board, in the notation that calibrate reads."""
-    printed = parse_board(notation)
+    printed = Board.parse(notation)
     if printed.scale != (1.0, 1.0):
         raise UsageError(f"{notation}: a board is printed as meant; leave out :measured=")
     _check_pdf(output)
@@ -206,7 +201,7 @@ def design(
     config = load_profile(profile)
     name, model = _camera(config, camera, cam)
     target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
-    found = make_design(target, model, Optics(blur), config, ceiling)
+    found = make_design(target, model, blur, config, ceiling)
     record = found.record() | {"target": target.model_dump(mode="json")}
     _write({}, [found.text(name)], record, False, as_json)
 
@@ -231,7 +226,7 @@ def suggest(
     config = load_profile(profile)
     name, model = _camera(config, camera, cam)
     magnet_m = parse_length(magnet, "--magnet")
-    found, held_by = suggest_target(model, Optics(blur), config, magnet_m, ceiling, page)
+    found, held_by = suggest_target(model, blur, config, magnet_m, ceiling, page)
     large, small = found.target.large, found.target.small
     command = (
         f"perchctl make-target --large {large.side_m * 1e3:g}mm --large-id {large.id} "
@@ -287,16 +282,16 @@ def measured(
         for name, text in (("large", measured_large), ("small", measured_small))
         if text is not None
     }
-    found = measured_target(nominal, sides_m)
-    values = _changed_values(found.target, config.target)
+    found, notes = measured_target(nominal, sides_m)
+    values = _changed_values(found, config.target)
     before = write_profile_values(path, values) if values else None
-    lines = [*found.notes, f"changed {path}: fly -p {path}"]
+    lines = [*notes, f"changed {path}: fly -p {path}"]
     if before is not None:
         lines.append(f"as it was before it is {before}")
     record = {
         "files": [str(path)],
-        "target": found.target.model_dump(mode="json"),
-        "notes": list(found.notes),
+        "target": found.model_dump(mode="json"),
+        "notes": notes,
         "profile_before": before and str(before),
     }
     print_result(record if as_json else "\n".join(lines))
@@ -364,17 +359,6 @@ def _origin(profile: Profile, target: TargetConfig) -> tuple[str, datetime.date 
     if target == profile.target:
         return f"profile {profile.name}", profile.date
     return "sizes from the command line", None
-
-
-def _mounting(profile: Profile, target: TargetConfig) -> list[str]:
-    """Return lines on what the profile's camera sees of that target to the end; none without a
-    calibration, as a sheet needs none."""
-    try:
-        camera = profile_camera(profile.camera)
-    except PerchError:
-        return []
-    name = profile.camera.calibration
-    return [f"{name}: {text}" for text in assess_mounting(target, camera, profile).lines()]
 
 
 def _check_pdf(path: Path) -> None:

@@ -17,7 +17,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.calibration import SizeMissing, load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.camera import (
     FrameSource,
     Recording,
@@ -209,7 +209,7 @@ def track(
             raise NotFound(f"{opened.describe()} gave no frame at all")
     say(summary.text(ended_s))
     if prints.judged and not is_example:  # another lens would say something of its own
-        say(prints.verdict().text)
+        say(prints.verdict()[1])
     for path in (csv, overlay):
         if path is not None:
             say(f"wrote {path}")
@@ -226,14 +226,9 @@ def _open(
     now: Callable[[], float],
 ) -> tuple[FrameSource, CameraModel]:
     """Return the open source, and its camera. Errors: NotFound, InvalidValue."""
-    camera = None
-    with contextlib.suppress(SizeMissing):  # then the first picture's is taken
-        camera = load_calibration(calibration, cam=cam)
-    size_px = None if camera is None else camera.size_px
-    pictures_hz = STILLS_HZ if stills else None
-    opened = open_camera(source, now, profile.camera, size_px=size_px, pictures_hz=pictures_hz)
-    if camera is None:
-        camera = load_calibration(calibration, opened.size_px, cam)
+    camera = load_calibration(calibration, cam=cam)
+    hz = STILLS_HZ if stills else None
+    opened = open_camera(source, now, profile.camera, size_px=camera.size_px, pictures_hz=hz)
     return opened, camera
 
 

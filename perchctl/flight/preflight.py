@@ -24,9 +24,7 @@ from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.target import (
     TargetView,
-    offset_text,
-    overhead_reach,
-    overhead_view,
+    overhead_text,
     view_from,
 )
 from perchctl.values import replace
@@ -166,9 +164,9 @@ def out_of_view(
     if not over.whole:
         return Problem(
             f"the target is the positioning system, and would leave the picture as the vehicle "
-            f"takes off: {_too_far(over, profile, camera)} at {planner.takeoff_height_m:g} m of "
+            f"takes off: {_too_far(over)} at {planner.takeoff_height_m:g} m of "
             f"height",
-            f"put the vehicle {offset_text(over.aside_m)} from where it stands, or lower "
+            f"put the vehicle {over.aside_text} from where it stands, or lower "
             f"planner.takeoff_height_m",
         )
     if planner.approach_xy_m is None:
@@ -180,7 +178,7 @@ def out_of_view(
     u, v = (float(part) for part in target.position_m[:2])
     return Problem(
         f"the target is the positioning system, and from planner.approach_xy_m (x {to_x:g}, "
-        f"y {to_y:g} m) the vehicle would not see it: {_too_far(there, profile, camera)}, and "
+        f"y {to_y:g} m) the vehicle would not see it: {_too_far(there)}, and "
         f"without it nothing brings the vehicle back",
         f"leave planner.approach_xy_m out, since the target is in view from where it stands, or "
         f"set it near the target's x {u:.2f}, y {v:.2f} m",
@@ -216,16 +214,14 @@ def _leant_m(sight: TargetView) -> float:
     return sight.height_m * math.tan(math.radians(LEAN_DEG))
 
 
-def _too_far(sight: TargetView, profile: Profile, camera: CameraModel) -> str:
+def _too_far(sight: TargetView) -> str:
     """Return in words how far aside the target would be, and how far it may be."""
     if not sight.height_m > 0.0:
         return "it would be no higher than the camera"
     aside_m, most = math.hypot(*sight.aside_m), ""
     aside = f"{aside_m:.2f}"
-    side_m, mount = profile.target.large.side_m, profile.camera.mount
-    reach = overhead_reach(side_m, camera, mount, sight.height_m)
-    if reach is not None:
-        room_m = math.floor(100.0 * max(0.0, reach.radius_m - _leant_m(sight))) / 100.0
+    if sight.reach_m is not None:
+        room_m = math.floor(100.0 * max(0.0, sight.reach_m - _leant_m(sight))) / 100.0
         aside, room = distinct_figures(aside_m, room_m, 2)
         most = f", {room} m at most,"
     return f"{aside} m aside of the camera's axis{most} {sight.height_m:.2f} m over the camera"
@@ -249,5 +245,5 @@ def not_in_view(
     found = "it is not in view" if note is None else f"it is not in view; {note}"
     if camera is None:
         return Problem(found, "put the vehicle under it")
-    where = overhead_view(profile.target, camera, profile.camera.mount)
-    return Problem(found, f"put the vehicle under it: {where.words}")
+    where = overhead_text(profile.target, camera, profile.camera.mount)
+    return Problem(found, f"put the vehicle under it: {where}")

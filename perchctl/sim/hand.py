@@ -10,17 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perchctl.calibration import (
-    AttitudeSample,
-    MountingPart,
-    MountingRecording,
-    PoseReader,
-    pose_basis,
-)
+from perchctl.calibration import AttitudeSample, MountingRecording, PoseReader
 from perchctl.camera import unmirror_frame
 from perchctl.geometry import Array, invert_T, make_T, rotation_from_rpy, rpy_from_rotation
 from perchctl.profile import Profile
@@ -29,8 +24,9 @@ from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import Scenario, draw_scenario
 from perchctl.vision import CameraModel, Frame
 
+Part = Literal["carry", "pivot"]
 HAND_STREAM = 430
-SECONDS: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
+SECONDS: dict[Part, float] = {"carry": 30.0, "pivot": 20.0}
 LATENCY_S = (0.02, 0.15)
 MOVED_M, MOVED_UP_M = 0.06, (-0.02, 0.01)
 MOUNT_TILT_DEG, TARGET_TILT_DEG = 5.0, 5.0
@@ -79,7 +75,7 @@ class Hand:
     """
 
     seed: int
-    part: MountingPart
+    part: Part
     scenario: Scenario
     R_world_target: Array
     seconds: float
@@ -113,9 +109,7 @@ class Hand:
         return np.asarray(T[:3, :3].T @ (np.array(self.scenario.gear_body_m) - T[:3, 3]))
 
 
-def draw_hand(
-    profile: Profile, part: MountingPart, seed: int, seconds: float | None = None
-) -> Hand:
+def draw_hand(profile: Profile, part: Part, seed: int, seconds: float | None = None) -> Hand:
     """Return the hand of that seed; both parts of one seed have the same vehicle."""
     rng = np.random.default_rng([seed, HAND_STREAM])
     yaw, *tilt = np.radians(rng.uniform(-1.0, 1.0, 3) * (180.0, MOUNT_TILT_DEG, MOUNT_TILT_DEG))
@@ -163,7 +157,7 @@ def draw_hand(
     return replace(hand, point_target_m=point - (0.0, 0.0, high_m))
 
 
-def _turns(rng: np.random.Generator, part: MountingPart) -> Waves:
+def _turns(rng: np.random.Generator, part: Part) -> Waves:
     """Return tilts about the camera's x and y, and its heading, in rad."""
     slow_deg, round_deg, quick_deg = (27.0, 200.0, 6.0) if part == "carry" else (25.0, 40.0, 2.0)
     slow = _waves(rng, np.radians([slow_deg, slow_deg, 0.0]), (0.12, 0.3))
@@ -243,7 +237,7 @@ def T_target_cam_at(hand: Hand, t_s: float) -> Array:
 # --- what the sensors make of it ---------------------------------------------------------
 
 
-def attitudes(hand: Hand, errors: bool = True) -> tuple[AttitudeSample, ...]:
+def attitudes(hand: Hand, errors: bool = True) -> list[AttitudeSample]:
     """Return the vehicle's samples without those that the radio loses; or, without `errors`, the
     truth."""
     rng = np.random.default_rng([hand.seed, HAND_STREAM, 2, ("carry", "pivot").index(hand.part)])
@@ -268,7 +262,7 @@ def attitudes(hand: Hand, errors: bool = True) -> tuple[AttitudeSample, ...]:
         rpy = rpy + hand.attitude_bias_rad + slow
         kept = rng.random(len(t_s)) >= LOST_TELEMETRY
     rpy = (rpy + math.pi) % (2.0 * math.pi) - math.pi
-    return tuple(
+    return [
         AttitudeSample(
             t_s=float(t_s[k]),
             roll_rad=float(rpy[k, 0]),
@@ -277,7 +271,7 @@ def attitudes(hand: Hand, errors: bool = True) -> tuple[AttitudeSample, ...]:
             gyro_radps=rate[k],
         )
         for k in np.flatnonzero(kept)
-    )
+    ]
 
 
 def _slow_noise(rng: np.random.Generator, n: int, memory_s: float) -> Array:
@@ -326,5 +320,5 @@ def record_hand(
             picture = unmirror_frame(picture)
         poses += reader.look(picture)
         told()
-    felt, by = attitudes(hand), pose_basis(profile, camera)
-    return MountingRecording(hand.part, felt, tuple(poses), reader.mirrored, by)
+    felt, by = attitudes(hand), PoseReader.basis(profile, camera)
+    return MountingRecording(hand.part, felt, poses, reader.mirrored, by)

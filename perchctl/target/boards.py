@@ -2,9 +2,8 @@
 
 ``chessboard:9x6:25mm``
     inner corners (columns x rows) and the side of a square; 10x7 squares are printed.
-``charuco:10x7:25mm:18mm:DICT_5X5_100[:legacy]``
-    squares (columns x rows), side of a square, side of a marker, dictionary. ``legacy``
-    is the pattern of OpenCV before 4.6, which differs for an even number of rows.
+``charuco:10x7:25mm:18mm:DICT_5X5_100``
+    squares (columns x rows), side of a square, side of a marker, dictionary.
 
 Both count as OpenCV's own calls do. Behind each ``:measured=249.3x174.6mm`` may say what the
 print's black area measures.
@@ -36,6 +35,11 @@ BoardKind = Literal["chessboard", "charuco"]
 EXAMPLES = "chessboard:9x6:25mm or charuco:10x7:25mm:18mm:DICT_5X5_100"
 MAX_COUNT = 100
 _MEASURED = ":measured="
+_CHESSBOARD = re.compile(r"chessboard:(?P<columns>\d+)x(?P<rows>\d+):(?P<square>[^:]+)")
+_CHARUCO = re.compile(
+    r"charuco:(?P<columns>\d+)x(?P<rows>\d+):(?P<square>[^:]+):(?P<marker>[^:]+)"
+    r":(?P<dictionary>[^:]+)"
+)
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,6 @@ class Board:
     square_m: float
     marker_m: float | None = None
     dictionary: str | None = None
-    legacy: bool = False
     scale: tuple[float, float] = (1.0, 1.0)
 
     @property
@@ -89,108 +92,72 @@ class Board:
         return np.stack([xs.ravel(), ys.ravel(), np.zeros(xs.size)], axis=1)
 
     def notation(self) -> str:
-        """Return the text from which `parse_board` makes this very board."""
+        """Return the text from which `parse` makes this very board."""
         text = f"{self.kind}:{self.columns}x{self.rows}:{mm_text(self.square_m)}mm"
         if self.marker_m is not None:
             text += f":{mm_text(self.marker_m)}mm:{self.dictionary}"
-        text += ":legacy" if self.legacy else ""
         if self.scale == (1.0, 1.0):
             return text
         width, height = (m * s for m, s in zip(self.size_m, self.scale, strict=True))
         return f"{text}{_MEASURED}{mm_text(width)}x{mm_text(height)}mm"
 
-    def measured(self, width_m: float, height_m: float) -> Board:
-        """Return the same board with the black area's measured sides. Raises InvalidValue where
-        they cannot be this board's."""
-        across, down = (
-            measured_scale(f"the board's {name}", is_m, meant_m, self.notation())
-            for name, is_m, meant_m in zip(
-                ("width", "height"), (width_m, height_m), self.size_m, strict=True
-            )
+    @classmethod
+    def parse(cls, text: str) -> Board:
+        """Return the board of a notation such as ``charuco:10x7:25mm:18mm:DICT_5X5_100``.
+
+        Raises InvalidValue, which names the wrong part.
+        """
+        whole, _, measured = text.strip().partition(_MEASURED)
+        found = _CHESSBOARD.fullmatch(whole) or _CHARUCO.fullmatch(whole)
+        if found is None:
+            raise _wrong(text, "it is neither chessboard:COLUMNSxROWS:SQUARE nor "
+                         "charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY")  # fmt: skip
+        columns, rows = int(found["columns"]), int(found["rows"])
+        if not (3 <= columns <= MAX_COUNT and 3 <= rows <= MAX_COUNT):
+            raise _wrong(text, f"3 to {MAX_COUNT} columns and rows are allowed")
+        square_m = parse_length(found["square"], f"board {text}: square")
+        board = cls("chessboard", columns, rows, square_m)
+        if found.re is _CHARUCO:
+            marker_m = parse_length(found["marker"], f"board {text}: marker")
+            board = cls("charuco", columns, rows, square_m, marker_m, found["dictionary"])
+            _check_markers(board, text)
+        return board.with_sides(measured)[0] if measured else board
+
+    def with_sides(self, text: str) -> tuple[Board, list[str]]:
+        """Return the same board with its black area's sides as measured, ``249.3x174.6mm``, and
+        what to say of them. Raises InvalidValue."""
+        sides = re.fullmatch(r"([\d.]+)x([\d.]+)(mm)?", text)
+        if sides is None:
+            raise InvalidValue(f"{text!r} is not WIDTHxHEIGHT in mm, as in 249.3x174.6mm")
+        width_m, height_m = (parse_length(f"{s}mm", "the board's side") for s in sides.groups()[:2])
+        given = (("width", width_m), ("height", height_m))
+        (across, first), (down, second) = (
+            measured_scale(name, f"the board's {name}", is_m, meant_m, self.notation())
+            for (name, is_m), meant_m in zip(given, self.size_m, strict=True)
         )
-        return replace(self, scale=(across, down))
+        return replace(self, scale=(across, down)), first + second
 
     def cv2_board(self) -> Any:
         """Return a `cv2.aruco.CharucoBoard` for a detector. Raises ValueError for a chessboard."""
         if self.kind != "charuco" or self.marker_m is None or self.dictionary is None:
             raise ValueError("only a charuco board is one of OpenCV's own")
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        board = cv2.aruco.CharucoBoard(
-            (self.columns, self.rows), self.square_m, self.marker_m, dictionary
-        )
-        board.setLegacyPattern(self.legacy)
-        return board
+        size = (self.columns, self.rows)
+        return cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
 
 
-def parse_board(text: str) -> Board:
-    """Return the board of a notation such as ``charuco:10x7:25mm:18mm:DICT_5X5_100``.
-
-    Raises InvalidValue, which names the wrong part.
-    """
-    whole, _, measured = text.strip().partition(_MEASURED)
-    kind, *parts = whole.split(":")
-    if kind == "chessboard":
-        board = _parse_chessboard(whole, parts)
-    elif kind == "charuco":
-        board = _parse_charuco(whole, parts)
-    else:
-        kalibr = kind == "aprilgrid" or kind.endswith((".yaml", ".yml"))
-        instead = " (Kalibr calibrates by its own boards, and perchctl reads its camchain.yaml)"
-        raise _wrong(
-            text,
-            f"kind {kind!r} is unknown; allowed are chessboard and charuco"
-            f"{instead if kalibr else ''}",
-        )
-    if not measured:
-        return board
-    sides = re.fullmatch(r"([\d.]+)x([\d.]+)mm", measured)
-    if sides is None:
-        raise _wrong(text, f"{measured!r} is not WIDTHxHEIGHT in mm, as in 249.3x174.6mm")
-    width, height = (parse_length(f"{s}mm", f"board {text}: measured") for s in sides.groups())
-    return board.measured(width, height)
-
-
-def _parse_chessboard(text: str, parts: list[str]) -> Board:
-    if len(parts) != 2:
-        raise _wrong(text, "a chessboard is chessboard:COLUMNSxROWS:SQUARE")
-    columns, rows = _counts(text, parts[0])
-    return Board("chessboard", columns, rows, parse_length(parts[1], f"board {text}: square"))
-
-
-def _parse_charuco(text: str, parts: list[str]) -> Board:
-    if len(parts) not in (4, 5):
-        raise _wrong(
-            text, "a charuco board is charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY[:legacy]"
-        )
-    if len(parts) == 5 and parts[4] != "legacy":
-        raise _wrong(text, f"{parts[4]!r} is unknown; the last part may only be 'legacy'")
-    columns, rows = _counts(text, parts[0])
-    square = parse_length(parts[1], f"board {text}: square")
-    marker = parse_length(parts[2], f"board {text}: marker")
-    if marker > 0.95 * square:
-        raise _wrong(
-            text,
-            f"the marker ({mm_text(marker)} mm) needs white around it: at most "
-            f"{mm_text(0.95 * square)} mm in a square of {mm_text(square)} mm",
-        )
+def _check_markers(board: Board, text: str) -> None:
+    """Raises InvalidValue where a ChArUco board's markers are too large, or too many for their
+    dictionary."""
+    largest_m, needed = 0.95 * board.square_m, board.columns * board.rows // 2
+    if board.marker_m is not None and board.marker_m > largest_m:
+        raise _wrong(text, f"the marker needs white around it: at most {mm_text(largest_m)} mm")
     try:
-        held = dictionary_size(parts[3])
+        held = dictionary_size(str(board.dictionary))
     except ValueError as error:
         raise _wrong(text, str(error)) from None
-    needed = columns * rows // 2
     if held < needed:
-        raise _wrong(text, f"{needed} markers are needed, and {parts[3]} holds {held}")
-    return Board("charuco", columns, rows, square, marker, parts[3], len(parts) == 5)
-
-
-def _counts(text: str, part: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d+)x(\d+)", part)
-    if match is None:
-        raise _wrong(text, f"{part!r} is not COLUMNSxROWS, for example 9x6")
-    columns, rows = int(match[1]), int(match[2])
-    if not (3 <= columns <= MAX_COUNT and 3 <= rows <= MAX_COUNT):
-        raise _wrong(text, f"{part}: 3 to {MAX_COUNT} columns and rows are allowed")
-    return columns, rows
+        raise _wrong(text, f"{needed} markers are needed, and {board.dictionary} holds {held}")
 
 
 def _wrong(text: str, why: str) -> InvalidValue:
@@ -228,6 +195,4 @@ def black_squares(board: Board) -> NDArray[np.bool_]:
     """Return which squares are black, (rows, columns), row 0 at the top; a charuco board's
     markers fill the others, row by row."""
     columns, rows = board.squares
-    # OpenCV's old pattern begins with white where the rows are even in number.
-    first = 1 if board.legacy and rows % 2 == 0 else 0
-    return np.asarray((np.add.outer(np.arange(rows), np.arange(columns)) + first) % 2 == 0)
+    return np.asarray(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)

@@ -16,221 +16,114 @@ import numpy as np
 from perchctl.errors import InvalidValue
 from perchctl.profile import MarkerConfig, Profile, TargetConfig
 from perchctl.target.drawing import mm_text
-from perchctl.target.page import parse_page
-from perchctl.target.reading import Optics, check_target, smallest_side_px
+from perchctl.target.reading import check_target, smallest_side_px
 from perchctl.target.sheets import fits, fitting_page
 from perchctl.target.sight import (
+    BlindRange,
     FieldOfView,
-    MountingView,
-    assess_mounting,
+    blind_range,
     gear_from_camera,
     least_side_px,
     raised,
     square_outline,
     turned_outline,
 )
-from perchctl.vision import CameraModel
-
-
-@dataclass(frozen=True)
-class Ranges:
-    """Ranges from the camera's centre to a target on its axis, straight on, m; None where
-    the marker is never read.
-
-    Attributes:
-        z1_m, z2_m: farthest of the large and of the small marker, at any turn.
-        z3_m: nearest of the whole large marker, at any turn; z3_upright_m where its sides
-            are parallel to the picture's.
-        z4_m: nearest of the whole small marker, at any turn.
-        large_px, small_px: the smallest sides that are read.
-    """
-
-    z1_m: float | None
-    z2_m: float | None
-    z3_m: float | None
-    z3_upright_m: float | None
-    z4_m: float | None
-    large_px: float | None
-    small_px: float | None
-    focal_px: float
+from perchctl.vision import MARKERS, CameraModel
 
 
 @dataclass(frozen=True)
 class TargetDesign:
-    """A target, a camera and a profile, and what follows from them.
+    """A target, a camera and a profile, and what follows from them. Ranges are from the camera's
+    centre to a target on its axis, straight on, m; None where the marker is never read.
 
     Attributes:
-        gear_nearest_m: nearest range from the gear's tip to the target at which the large and the
-            small marker are whole at any turn, the gear right under the target's centre.
-        search_range_m: from the camera to the target at the highest search position, where the
-            ceiling's height is known.
+        blur_px: sigma of the picture's blur.
+        large_px, small_px: the smallest sides that are read through it, found by trial.
+        z1_m, z2_m: farthest range of the large and of the small marker, at any turn.
+        z3_m: nearest of the whole large marker, at any turn; z3_upright_m where its sides
+            are parallel to the picture's.
+        small_nearest_m: nearest range from the gear's tip to the target at which the small marker
+            is whole at any turn, the gear right under the target's centre.
+        start_range_m: from the camera to the target at the start of the search, at the height
+            `start_height_m`, where the ceiling's height is known; on the ground the target has to
+            be seen surely.
     """
 
     target: TargetConfig
     camera: CameraModel
-    optics: Optics
-    ranges: Ranges
-    gear_nearest_m: tuple[float | None, float | None]
-    mount: MountingView
-    search_range_m: float | None
-    search_height_m: float
-    ceiling_m: float | None
+    blur_px: float
+    large_px: float | None
+    small_px: float | None
+    z1_m: float | None
+    z2_m: float | None
+    z3_m: float | None
+    z3_upright_m: float | None
+    small_nearest_m: float | None
+    blind: BlindRange
+    start_range_m: float | None
+    start_height_m: float
     standoff_m: float
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each gap."""
         found: list[str] = []
-        ranges, search_m, height_m = self.ranges, self.search_range_m, self.search_height_m
-        if ranges.z1_m is None or ranges.z2_m is None or ranges.z3_m is None:
-            return (
-                "a marker is never read through this blur and noise: a sharper picture is needed",
-            )
-        if search_m is not None and height_m == 0.0:
-            sure_m = ranges.focal_px * self.target.large.side_m / least_side_px(ranges.large_px)
-            if search_m > sure_m:
-                found.append(
-                    f"gap on the ground: under a ceiling of {self.ceiling_m:g} m the target is "
-                    f"{search_m:.2f} m from the camera, and is surely found up to {sure_m:.2f} m"
-                )
-        elif search_m is not None and search_m > ranges.z1_m:
+        start_m, far_m = self.start_range_m, self.z1_m
+        if far_m is None or self.z2_m is None or self.z3_m is None:
+            return ("a marker is never read through this blur: a sharper picture is needed",)
+        if self.start_height_m == 0.0:
+            sure_px = least_side_px(self.large_px)
+            far_m = focal_px(self.camera) * self.target.large.side_m / sure_px
+        if start_m is not None and start_m > far_m:
             found.append(
-                f"gap at the search height: from {height_m:g} m the target under a ceiling of "
-                f"{self.ceiling_m:g} m is {search_m:.2f} m away, and is seen from "
-                f"{ranges.z1_m:.2f} m on"
+                f"gap at the start: from {self.start_height_m:g} m over the floor the target is "
+                f"{start_m:.2f} m from the camera, and is found up to {far_m:.2f} m"
             )
-        if search_m is not None and search_m < 0.3 and height_m > 0.0:
+        if self.z2_m <= self.z3_m:
             found.append(
-                f"the ceiling ({self.ceiling_m:g} m) is hardly above the search height "
-                f"({height_m:g} m): lower planner.search.max_height_m"
+                f"gap between the markers: the small one is read up to {_cm(self.z2_m)}, and "
+                f"the large one is whole at any turn only from {_cm(self.z3_m)} on"
             )
-        if ranges.z2_m <= ranges.z3_m:
-            found.append(
-                f"gap between the markers: the small one is read up to {_cm(ranges.z2_m)}, and "
-                f"the large one is whole at any turn only from {_cm(ranges.z3_m)} on"
-            )
-        elif ranges.z2_m < 1.15 * ranges.z3_m:
-            found.append("the overlap is short: less than 15 % of the range")
-        nearest_m = self.gear_nearest_m[1]
+        nearest_m = self.small_nearest_m
         if nearest_m is None or nearest_m > self.standoff_m:
-            at = "" if nearest_m is None else f" (only from {_cm(nearest_m)} on)"
             found.append(
                 f"gap before contact: with the gear {_cm(self.standoff_m)} under the target the "
-                f"small marker is not wholly in the picture{at}; mount the camera nearer to the "
-                f"gear"
+                f"small marker is not wholly in the picture, but from {_cm(nearest_m)} on; mount "
+                f"the camera nearer to the gear"
             )
         return tuple(found)
 
     def record(self) -> dict[str, object]:
         """Return ranges, gaps and blind range for machines; metres."""
-        return {
-            **vars(self.ranges),
-            "gear_large_nearest_m": self.gear_nearest_m[0],
-            "gear_small_nearest_m": self.gear_nearest_m[1],
-            "blind": self.mount.record(),
-            "search_range_m": self.search_range_m,
-            "warnings": list(self.warnings),
-        }
+        names = ("z1_m", "z2_m", "z3_m", "z3_upright_m", "large_px", "small_px", "small_nearest_m")
+        ranges = {name: getattr(self, name) for name in (*names, "start_range_m")}
+        return ranges | {"blind": vars(self.blind), "warnings": list(self.warnings)}
 
     def text(self, camera_name: str) -> str:
-        """Return ranges, overlap, mounting and warnings for people; several lines."""
-        r, optics, target = self.ranges, self.optics, self.target
+        """Return ranges, mounting and warnings for people; several lines."""
         width, height = self.camera.size_px
-        large, small = target.large, target.small
-        both = "none: the two markers are never seen together at every turn"
-        if r.z2_m is not None and r.z3_m is not None and r.z2_m > r.z3_m:
-            both = f"{_cm(r.z3_m)} to {_cm(r.z2_m)}, both markers at any turn"
-        blind, *advice = self.mount.lines()
-        lines = [
-            f"camera    {camera_name}, {width}x{height}, f {r.focal_px:.0f} px",
-            f"optics    blur sigma {optics.blur_px:g} px, noise sigma {optics.noise:g}",
-            f"target    {mm_text(large.side_m)} mm {large.dictionary}/{large.id} around "
+        large, small = self.target.large, self.target.small
+        rows = {
+            "camera": f"{camera_name}, {width}x{height}, f {focal_px(self.camera):.0f} px",
+            "blur": f"sigma {self.blur_px:g} px",
+            "target": f"{mm_text(large.side_m)} mm {large.dictionary}/{large.id} around "
             f"{mm_text(small.side_m)} mm {small.dictionary}/{small.id}",
-            f"z1        {_cm(r.z1_m):<9} large marker from here on inwards "
-            f"(side {_px(r.large_px)})",
-            f"z2        {_cm(r.z2_m):<9} small marker from here on inwards "
-            f"(side {_px(r.small_px)})",
-            f"z3        {_cm(r.z3_m):<9} whole large marker down to here at any turn; "
-            f"{_cm(r.z3_upright_m)} where it is upright",
-            f"z4        {_cm(r.z4_m):<9} whole small marker down to here at any turn",
-            f"overlap   {both}",
-            f"at gear   whole large marker down to {_cm(self.gear_nearest_m[0])}, small down to "
-            f"{_cm(self.gear_nearest_m[1])} between gear and target, the gear under its centre",
-            f"mounting  {blind}",
-            *(f"advice    {text}" for text in advice),
-        ]
-        if self.search_range_m is not None:
-            where = f"at the highest search position ({self.search_height_m:g} m)"
-            if self.search_height_m == 0.0:
-                where = "on the ground, from where it has to be seen"
-            lines.append(f"search    target {_cm(self.search_range_m)} away {where}")
-        lines += ["", *(f"warning: {text}" for text in self.warnings)]
-        if not self.warnings:
-            lines.append("no gap from search to stand-off")
-        return "\n".join(lines)
-
-
-def focal_px(camera: CameraModel) -> float:
-    """Return the mean focal length in px."""
-    return math.sqrt(float(camera.K[0, 0] * camera.K[1, 1]))
-
-
-def design_ranges(target: TargetConfig, camera: CameraModel, optics: Optics) -> Ranges:
-    """Return the ranges: by trial through the detector (far) and by geometry (near)."""
-    f, view, ahead = focal_px(camera), FieldOfView(camera), (np.eye(3), np.zeros(3))
-    picture_px = max(camera.size_px)
-    large_px = smallest_side_px(target, "large", optics, picture_px)
-    small_px = smallest_side_px(target, "small", optics, picture_px)
-    large, small = target.large.side_m, target.small.side_m
-    return Ranges(
-        z1_m=None if large_px is None else f * large / large_px,
-        z2_m=None if small_px is None else f * small / small_px,
-        z3_m=view.nearest_m(turned_outline(large), *ahead),
-        z3_upright_m=view.nearest_m(square_outline(large), *ahead),
-        z4_m=view.nearest_m(turned_outline(small), *ahead),
-        large_px=large_px,
-        small_px=small_px,
-        focal_px=f,
-    )
-
-
-def is_seen_from_ground(profile: Profile) -> bool:
-    """Return true where the target is the positioning system, so that it must be seen from the
-    ground."""
-    return profile.positioning.by == "target"
-
-
-def make_design(
-    target: TargetConfig,
-    camera: CameraModel,
-    optics: Optics,
-    profile: Profile,
-    ceiling_m: float | None = None,
-    ranges: Ranges | None = None,
-) -> TargetDesign:
-    """Return the ranges, and what is wrong with them for a flight by that profile under a ceiling
-    of that height over the floor (None: unknown)."""
-    ranges = ranges or design_ranges(target, camera, optics)
-    view, sides = FieldOfView(camera), (target.large.side_m, target.small.side_m)
-    large_m, small_m = (
-        view.nearest_m(turned_outline(s), *gear_from_camera(profile)) for s in sides
-    )
-    height = 0.0 if is_seen_from_ground(profile) else profile.planner.search.max_height_m
-    search = None
-    if ceiling_m is not None:
-        search = ceiling_m - height - profile.camera.mount.position_m[2]
-    return TargetDesign(
-        target=target,
-        camera=camera,
-        optics=optics,
-        ranges=ranges,
-        gear_nearest_m=(large_m, small_m),
-        mount=assess_mounting(target, camera, profile),
-        search_range_m=search,
-        search_height_m=height,
-        ceiling_m=ceiling_m,
-        standoff_m=profile.planner.ascend.standoff_m,
-    )
+            "z1": f"{_cm(self.z1_m):<9} large marker from here on (side {_px(self.large_px)})",
+            "z2": f"{_cm(self.z2_m):<9} small marker from here on (side {_px(self.small_px)})",
+            "z3": f"{_cm(self.z3_m):<9} whole large marker down to here at any turn; "
+            f"{_cm(self.z3_upright_m)} where it is upright",
+            "at gear": f"{_cm(self.small_nearest_m):<9} whole small marker down to here between "
+            f"gear and target",
+            "mounting": self.blind.words,
+        }
+        if self.start_range_m is not None:
+            rows["search"] = (
+                f"{_cm(self.start_range_m):<9} to the target from {self.start_height_m:g} m over "
+                f"the floor, where the search begins"
+            )
+        lines = [f"{name:<10}{text}" for name, text in rows.items()]
+        warnings = [f"warning: {text}" for text in self.warnings]
+        return "\n".join([*lines, "", *(warnings or ["no gap from search to stand-off"])])
 
 
 def _cm(length_m: float | None) -> str:
@@ -239,6 +132,56 @@ def _cm(length_m: float | None) -> str:
 
 def _px(side_px: float | None) -> str:
     return "never" if side_px is None else f"{side_px:.0f} px"
+
+
+def focal_px(camera: CameraModel) -> float:
+    """Return the mean focal length in px."""
+    return math.sqrt(float(camera.K[0, 0] * camera.K[1, 1]))
+
+
+def start_height_m(profile: Profile) -> float:
+    """Return from where over the floor the target has to be seen: the highest search position, or
+    the ground where the target is the positioning system."""
+    ground = profile.positioning.by == "target"
+    return 0.0 if ground else profile.planner.search.max_height_m
+
+
+def start_range_m(profile: Profile, ceiling_m: float) -> float:
+    """Return the metres from the camera there to the target."""
+    return ceiling_m - start_height_m(profile) - profile.camera.mount.position_m[2]
+
+
+def make_design(
+    target: TargetConfig,
+    camera: CameraModel,
+    blur_px: float,
+    profile: Profile,
+    ceiling_m: float | None = None,
+) -> TargetDesign:
+    """Return the ranges, by trial through the detector (far) and by geometry (near), and what is
+    wrong with them for a flight by that profile under a ceiling of that height over the floor
+    (None: unknown)."""
+    f, view, ahead = focal_px(camera), FieldOfView(camera), (np.eye(3), np.zeros(3))
+    large_px, small_px = (
+        smallest_side_px(target, name, blur_px, max(camera.size_px)) for name in MARKERS
+    )
+    large, small = target.large.side_m, target.small.side_m
+    return TargetDesign(
+        target=target,
+        camera=camera,
+        blur_px=blur_px,
+        large_px=large_px,
+        small_px=small_px,
+        z1_m=None if large_px is None else f * large / large_px,
+        z2_m=None if small_px is None else f * small / small_px,
+        z3_m=view.nearest_m(turned_outline(large), *ahead),
+        z3_upright_m=view.nearest_m(square_outline(large), *ahead),
+        small_nearest_m=view.nearest_m(turned_outline(small), *gear_from_camera(profile)),
+        blind=blind_range(target, camera, profile),
+        start_range_m=None if ceiling_m is None else start_range_m(profile, ceiling_m),
+        start_height_m=start_height_m(profile),
+        standoff_m=profile.planner.ascend.standoff_m,
+    )
 
 
 # --- Sizes and ids that cover the way from the search height to the contact ----------------------
@@ -260,7 +203,7 @@ _LARGE_LIMITS_M = (0.03, 1.0)
 
 def suggest_target(
     camera: CameraModel,
-    optics: Optics,
+    blur_px: float,
     profile: Profile,
     magnet_m: float,
     ceiling_m: float | None = None,
@@ -273,23 +216,36 @@ def suggest_target(
     Raises InvalidValue where the blur leaves nothing to read, for a ceiling too low, or for a
     magnet that is smaller than what the small marker needs.
     """
-    search_m = _search_range_m(profile, ceiling_m)
-    base, picture_px = _sized(0.150, 0.025), max(camera.size_px)
-    large_px = smallest_side_px(base, "large", optics, picture_px)
-    small_px = smallest_side_px(base, "small", optics, picture_px)
+    ground = profile.positioning.by == "target"
+    search_m = start_range_m(profile, ceiling_m or DEFAULT_CEILING_M)
+    if ceiling_m is None and not ground:
+        search_m = DEFAULT_SEARCH_M
+    if search_m <= 0.0:
+        raise InvalidValue(
+            f"--ceiling {ceiling_m:g} is below the highest search position "
+            f"({start_height_m(profile):g} m): lower planner.search.max_height_m"
+        )
+    large_px, small_px = (
+        smallest_side_px(_sized(0.150, 0.025), name, blur_px, max(camera.size_px))
+        for name in MARKERS
+    )
     if large_px is None or small_px is None:
         raise InvalidValue(
-            f"no marker is read through a blur of {optics.blur_px:g} px and noise "
-            f"{optics.noise:g}: a sharper picture is needed"
+            f"no marker is read through a blur of {blur_px:g} px: a sharper picture is needed"
         )
     f, view = focal_px(camera), FieldOfView(camera)
-    far_px = least_side_px(large_px) if is_seen_from_ground(profile) else FAR_MARGIN * large_px
+    far_px = least_side_px(large_px) if ground else FAR_MARGIN * large_px
     needed_m = math.ceil(search_m * far_px / f / _LARGE_STEP_M) * _LARGE_STEP_M
     needed_m = min(max(needed_m, _LARGE_LIMITS_M[0]), _LARGE_LIMITS_M[1])
-    most_m = min(
-        magnet_m / math.sqrt(2.0),
-        NEAR_MARGIN * _largest_at_standoff_m(view, profile),
+    R, gear = gear_from_camera(profile)
+    standoff_m = profile.planner.ascend.standoff_m
+    # The largest side whose circle is in the picture with the gear at the stand-off.
+    near_m = next(
+        side_m
+        for side_m in np.arange(1.0, 0.0, -_SMALL_STEP_M).tolist()
+        if view.holds(raised(turned_outline(side_m), standoff_m) @ R.T + gear)
     )
+    most_m = min(magnet_m / math.sqrt(2.0), NEAR_MARGIN * near_m)
 
     def target_of(large_m: float) -> TargetConfig:
         """Return the target with the largest small marker."""
@@ -304,27 +260,11 @@ def suggest_target(
 
     count = int((_LARGE_LIMITS_M[1] - needed_m) / _LARGE_STEP_M)
     larger = (target_of(needed_m + k * _LARGE_STEP_M) for k in range(count, 0, -1))
-    held = (each for each in larger if fits(each, parse_page(page)) and takes_over(each))
+    held = (each for each in larger if fits(each, page) and takes_over(each))
     target = next(held, target_of(needed_m))
     check_target(target, magnet_m)
-    held_by = page if fits(target, parse_page(page)) else fitting_page(target)
-    return make_design(target, camera, optics, profile, ceiling_m), held_by
-
-
-def _search_range_m(profile: Profile, ceiling_m: float | None) -> float:
-    """Return the metres from camera to target at the highest search position, or on the ground
-    where it has to be seen from there."""
-    if is_seen_from_ground(profile):
-        return (ceiling_m or DEFAULT_CEILING_M) - profile.camera.mount.position_m[2]
-    if ceiling_m is None:
-        return DEFAULT_SEARCH_M
-    range_m = ceiling_m - profile.planner.search.max_height_m
-    if range_m <= 0.0:
-        raise InvalidValue(
-            f"--ceiling {ceiling_m:g} is below the highest search position "
-            f"({profile.planner.search.max_height_m:g} m): lower planner.search.max_height_m"
-        )
-    return range_m
+    held_by = page if fits(target, page) else fitting_page(target)
+    return make_design(target, camera, blur_px, profile, ceiling_m), held_by
 
 
 def _sized(large_m: float, small_m: float) -> TargetConfig:
@@ -332,14 +272,3 @@ def _sized(large_m: float, small_m: float) -> TargetConfig:
         large=MarkerConfig(dictionary=_LARGE[0], id=_LARGE[1], side_m=large_m),
         small=MarkerConfig(dictionary=_SMALL[0], id=_SMALL[1], side_m=small_m),
     )
-
-
-def _largest_at_standoff_m(view: FieldOfView, profile: Profile) -> float:
-    """Return the largest side, m, whose circle is in the picture with the gear at the stand-off."""
-    R, gear = gear_from_camera(profile)
-    low, high = 0.0, 1.0
-    while high - low > 1e-4:
-        middle = (low + high) / 2.0
-        points = raised(turned_outline(middle), profile.planner.ascend.standoff_m)
-        low, high = (middle, high) if view.holds(points @ R.T + gear) else (low, middle)
-    return low

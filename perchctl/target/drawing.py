@@ -216,6 +216,8 @@ def merged_rectangles(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> lis
 
 
 MAX_SCALE_ERROR = 0.1
+NOTABLE_SCALE_ERROR = 0.01
+"""Printers err by some 0.3 %; from here on a viewer has scaled the page."""
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _LENGTH = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*([a-zA-Z]*)\s*")
 
@@ -243,19 +245,26 @@ def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float
     return float(f"{value:.12g}")
 
 
-def measured_scale(what: str, measured_m: float, meant_m: float, source: str) -> float:
-    """Return a print's measured length over the length that it was meant to have by `source`.
+def measured_scale(
+    name: str, option: str, measured_m: float, meant_m: float, source: str
+) -> tuple[float, list[str]]:
+    """Return a print's measured length over the length that it was meant to have by `source`, and
+    what to say of it; `name` and `option` name the length.
 
-    Raises InvalidValue, which begins with `what`, for a scale that no printer makes: the length
-    was not measured in the unit that was meant.
+    Raises InvalidValue for a scale that no printer makes: the length was not measured in the unit
+    that was meant.
     """
-    off = measured_m / meant_m - 1.0
+    scale = measured_m / meant_m
+    off = scale - 1.0
     if abs(off) > MAX_SCALE_ERROR:
         raise InvalidValue(
-            f"{what}: {mm_text(measured_m)} mm is {100 * off:+.0f} % off the {mm_text(meant_m)} mm "
-            f"of {source}: measure what is black, in mm"
+            f"{option}: {mm_text(measured_m)} mm is {100 * off:+.0f} % off the {mm_text(meant_m)} "
+            f"mm of {source}: measure what is black, in mm"
         )
-    return measured_m / meant_m
+    notes = [f"{name}: {mm_text(measured_m)} mm, {100 * off:+.2f} % against {mm_text(meant_m)} mm"]
+    if abs(off) > NOTABLE_SCALE_ERROR:
+        notes.append(f"{name}: more than 1 % off: was the page scaled when it was printed?")
+    return scale, notes
 
 
 def mm_text(length_m: float) -> str:

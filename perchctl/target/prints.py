@@ -13,29 +13,20 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target.drawing import marker_corners_m, measured_scale, mm_text
+from perchctl.target.drawing import marker_corners_m, measured_scale
 from perchctl.vision import CameraModel, PipelineOutput, undistort_px
 
 MEASURED_SIGMA = 0.001
 """What measured sizes may be off by, relative: 0.15 mm of a large marker."""
-NOTABLE_SCALE_ERROR = 0.01
-"""Printers err by some 0.3 %; from here on a viewer has scaled the page."""
 
 
-@dataclass(frozen=True)
-class Measured:
-    """The target with its measured sizes, and what follows for the print."""
-
-    target: TargetConfig
-    notes: tuple[str, ...]
-
-
-def measured_target(nominal: TargetConfig, sides_m: Mapping[str, float]) -> Measured:
-    """Return the target with the sides of ``large`` and ``small``, as far as they were measured.
-    Both together make its sizes count as measured.
+def measured_target(
+    nominal: TargetConfig, sides_m: Mapping[str, float]
+) -> tuple[TargetConfig, list[str]]:
+    """Return the target with the sides of ``large`` and ``small``, as far as they were measured,
+    and what to say of the print. Both together make its sizes count as measured.
 
     Raises InvalidValue for a size that cannot be this marker's.
     """
@@ -43,27 +34,19 @@ def measured_target(nominal: TargetConfig, sides_m: Mapping[str, float]) -> Meas
     target = nominal
     for name, side_m in sides_m.items():
         marker: MarkerConfig = getattr(nominal, name)
-        scale = measured_scale(f"--measured-{name}", side_m, marker.side_m, "the profile")
-        off = scales[name] = scale - 1.0
-        notes.append(
-            f"{name}: {mm_text(side_m)} mm, {100 * off:+.2f} % against {mm_text(marker.side_m)} mm"
+        scales[name], said = measured_scale(
+            name, f"--measured-{name}", side_m, marker.side_m, "the profile"
         )
-        if abs(off) > NOTABLE_SCALE_ERROR:
-            notes.append(f"{name}: more than 1 % off: was the page scaled when it was printed?")
+        notes += said
         target = target.model_copy(update={name: marker.model_copy(update={"side_m": side_m})})
     if len(scales) == 2:
         between = scales["small"] - scales["large"]
         notes.append(f"small against large: {100 * between:+.2f} %")
         sigma = min(nominal.size_sigma, MEASURED_SIGMA)
         target = target.model_copy(update={"size_sigma": sigma})
-    if target.small.side_m >= target.large.side_m / 2:
-        raise InvalidValue(
-            f"the small marker ({mm_text(target.small.side_m)} mm) must be less than half of the "
-            f"large one ({mm_text(target.large.side_m)} mm): measure both black squares"
-        )
     if target.size_sigma > MEASURED_SIGMA:
         notes.append("measure both markers: distances claim less until both sizes are known")
-    return Measured(target, tuple(notes))
+    return target, notes
 
 
 # --- The proportion of the two prints, as a camera sees it ---------------------------------------
@@ -79,14 +62,6 @@ SIGMAS = 3.0
 MIN_FRAMES = 5
 _MEDIAN_TO_SIGMA = 1.2533  # the standard error of a median, in that of a mean
 _MAD_TO_SIGMA = 1.4826
-
-
-@dataclass(frozen=True)
-class PrintVerdict:
-    """`wrong` names a print error beyond the noise; `text` is one sentence."""
-
-    wrong: bool
-    text: str
 
 
 def size_ratio(
@@ -136,13 +111,13 @@ class PrintCheck:
         """True when enough frames showed both markers."""
         return len(self._ratios) >= MIN_FRAMES
 
-    def verdict(self) -> PrintVerdict:
-        """Return the verdict: an error only where the median frame's is beyond noise and bias."""
+    def verdict(self) -> tuple[bool, str]:
+        """Return whether there is an error of the print beyond noise and bias, by the median frame,
+        and a sentence."""
         if not self.judged:
-            return PrintVerdict(
-                False,
+            return False, (
                 f"print not judged: both markers were seen in {len(self._ratios)} frames, "
-                f"{MIN_FRAMES} needed",
+                f"{MIN_FRAMES} needed"
             )
         values, biases = np.array(self._ratios).T
         value = float(np.median(values))
@@ -155,9 +130,8 @@ class PrintCheck:
             f"{nominal:.4f} ({100 * off:+.2f} %, sigma {100 * total:.2f} %)"
         )
         if abs(off) <= max(SIGMAS * total, MIN_ERROR):
-            return PrintVerdict(False, f"print good within its noise: {ratio_text}")
-        return PrintVerdict(
-            True,
+            return False, f"print good within its noise: {ratio_text}"
+        return True, (
             f"print error: {ratio_text}; measure both black squares and give them to "
-            f"perchctl make-target measured --measured-large MM --measured-small MM",
+            f"perchctl make-target measured --measured-large MM --measured-small MM"
         )

@@ -9,7 +9,7 @@ target at hand.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any
 
@@ -28,10 +28,7 @@ class PlainReader:
     its id (the other ids of a nested dictionary are not searched)."""
 
     def __init__(self, target: TargetConfig) -> None:
-        dictionaries = [
-            _single_marker_dictionary(target.large),
-            _single_marker_dictionary(target.small),
-        ]
+        dictionaries = [_single_marker_dictionary(m) for m in (target.large, target.small)]
         self._detector: Any = cv2.aruco.ArucoDetector(dictionaries, cv2.aruco.DetectorParameters())
 
     def read(self, image: NDArray[np.uint8]) -> dict[MarkerName, NDArray[np.float32]]:
@@ -56,6 +53,8 @@ def _single_marker_dictionary(marker: MarkerConfig) -> Any:
 
 
 FOUND_RATE = 0.9
+NOISE = 5.0
+"""Sigma of the grey levels (0..255)."""
 TRIALS = 24
 STEP = 1.04
 """Ratio of neighbouring sides that are tried."""
@@ -66,33 +65,29 @@ _MIN_PICTURE_PX = 64
 _PERIMETER_RATE = 0.03  # cv2.aruco's least perimeter, per side of the picture
 
 
-@dataclass(frozen=True)
-class Optics:
-    """What the picture suffers: `blur_px` is the sigma of lens, focus and link together,
-    `noise` the sigma of the grey levels (0..255)."""
-
-    blur_px: float = 1.0
-    noise: float = 5.0
-
-
 @cache
 def smallest_side_px(
-    target: TargetConfig,
-    marker: MarkerName,
-    optics: Optics,
-    picture_px: int,
+    target: TargetConfig, marker: MarkerName, blur_px: float, picture_px: int
 ) -> float | None:
     """Return the side in px from which on the marker, seen straight on at any turn, is found in
     `FOUND_RATE` of the pictures; None where even `SIDE_RANGE_PX[1]` is not.
 
-    `picture_px` is the larger side of the camera's picture.
+    Args:
+        blur_px: sigma of lens, focus and link together.
+        picture_px: the larger side of the camera's picture.
     """
     drawing, reader = draw_target(target), PlainReader(target)
+    side_m = drawing.large_side_m if marker == "large" else drawing.small_side_m
     count = math.ceil(math.log(SIDE_RANGE_PX[1] / SIDE_RANGE_PX[0]) / math.log(STEP))
 
     @cache
     def rate(i: int) -> float:
-        return _found_share(drawing, reader, marker, SIDE_RANGE_PX[0] * STEP**i, optics, picture_px)
+        side_px = SIDE_RANGE_PX[0] * STEP**i
+        hits = 0
+        for picture in sample_pictures(drawing, side_px / side_m, side_px, blur_px):
+            quad = reader.read(picture).get(marker)
+            hits += quad is not None and cv2.arcLength(quad, True) >= _PERIMETER_RATE * picture_px
+        return hits / TRIALS
 
     def found(i: int) -> bool:
         # Three neighbours together: between 0.8 and 1 the rate rises slowly.
@@ -111,49 +106,28 @@ def smallest_side_px(
     return float(SIDE_RANGE_PX[0] * STEP**high)
 
 
-def _found_share(
-    drawing: TargetDrawing,
-    reader: PlainReader,
-    marker: MarkerName,
-    side_px: float,
-    optics: Optics,
-    picture_px: int,
-) -> float:
-    side_m = drawing.large_side_m if marker == "large" else drawing.small_side_m
-    pictures = sample_pictures(drawing, side_px / side_m, side_px, optics, TRIALS)
-    least_px = _PERIMETER_RATE * picture_px
-    hits = 0
-    for picture in pictures:
-        quad = reader.read(picture).get(marker)
-        if quad is not None and cv2.arcLength(quad, True) >= least_px:
-            hits += 1
-    return hits / TRIALS
-
-
 def sample_pictures(
-    drawing: TargetDrawing, px_per_m: float, side_px: float, optics: Optics, count: int
-) -> list[NDArray[np.uint8]]:
-    """Return `count` pictures around the target's centre, 3 times `side_px` wide, at any turn and
+    drawing: TargetDrawing, px_per_m: float, side_px: float, blur_px: float
+) -> Iterator[NDArray[np.uint8]]:
+    """Yield `TRIALS` pictures around the target's centre, 3 times `side_px` wide, at any turn and
     any place between the pixels."""
-    fine = 2 if optics.blur_px >= 1.0 else 4
+    fine = 2 if blur_px >= 1.0 else 4
     size = max(_MIN_PICTURE_PX, math.ceil(3.0 * side_px))
     n = size * fine
     ink = drawing.ink_coverage(px_per_m * fine, n)
     sheet = drawing.sheet_coverage(px_per_m * fine, n)
     flat = (_CEILING * (1.0 - sheet) + _PAPER * (sheet - ink) + _INK * ink).astype(np.float32)
     rng = np.random.default_rng([_STREAM, round(1e3 * side_px)])
-    pictures = []
-    for _ in range(count):
+    for _ in range(TRIALS):
         shift = rng.uniform(-0.5, 0.5, 2)
         turn = cv2.getRotationMatrix2D(((n - 1) / 2.0, (n - 1) / 2.0), rng.uniform(0.0, 360.0), 1.0)
         turn = np.asarray(turn, np.float64) + np.outer(shift * fine, (0.0, 0.0, 1.0))
         turned = cv2.warpAffine(flat, turn, (n, n), borderMode=cv2.BORDER_REPLICATE)
-        if optics.blur_px > 0.05:
-            turned = cv2.GaussianBlur(turned, (0, 0), optics.blur_px * fine)
+        if blur_px > 0.05:
+            turned = cv2.GaussianBlur(turned, (0, 0), blur_px * fine)
         picture = cv2.resize(turned, (size, size), interpolation=cv2.INTER_AREA)
-        noisy = np.asarray(picture, np.float64) + rng.normal(0.0, optics.noise, picture.shape)
-        pictures.append(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
-    return pictures
+        noisy = np.asarray(picture, np.float64) + rng.normal(0.0, NOISE, picture.shape)
+        yield np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
 # --- What is checked before ink is spent ---------------------------------------------------------
@@ -167,15 +141,26 @@ _READ_SIDE_PX = 480.0
 
 def check_target(target: TargetConfig, magnet_m: float) -> None:
     """Raises InvalidValue, in one sentence, for the first thing that is wrong."""
-    _check_magnet(target, magnet_m)
-    for name, marker in (("large", target.large), ("small", target.small)):
-        if _turns_onto_itself(marker):
+    large, small = target.large, target.small
+    if magnet_m > large.side_m:
+        raise InvalidValue(
+            f"the magnet ({mm_text(magnet_m)} mm) does not fit behind the large marker "
+            f"({mm_text(large.side_m)} mm): take a smaller one (--magnet)"
+        )
+    diagonal = math.sqrt(2.0) * small.side_m
+    if diagonal > magnet_m:
+        raise InvalidValue(
+            f"the small marker's diagonal ({diagonal * 1e3:.1f} mm) is not inside the magnet "
+            f"({mm_text(magnet_m)} mm), so the gear could touch where no magnet is: at most "
+            f"--small {math.floor(magnet_m * 1e4 / math.sqrt(2.0)) / 10:g}mm, or a larger --magnet"
+        )
+    for name, marker in (("large", large), ("small", small)):
+        if _cells_apart(marker, marker, turns=(1, 2, 3)) == 0:
             raise InvalidValue(
                 f"{name} marker: id {marker.id} of {marker.dictionary} looks the same when turned, "
                 f"so that its heading is ambiguous: take another id"
             )
-    if _pattern_distance(target.large, target.small) < MIN_DISTANCE:
-        large, small = target.large, target.small
+    if _cells_apart(large, small) < MIN_DISTANCE:
         raise InvalidValue(
             f"id {large.id} of {large.dictionary} and id {small.id} of {small.dictionary} are "
             f"nearly the same pattern, so one marker would be taken for the other: take another "
@@ -184,24 +169,13 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
     _check_reading(target)
 
 
-def _check_magnet(target: TargetConfig, magnet_m: float) -> None:
-    if magnet_m > target.large.side_m:
-        raise InvalidValue(
-            f"the magnet ({mm_text(magnet_m)} mm) does not fit behind the large marker "
-            f"({mm_text(target.large.side_m)} mm): take a smaller one (--magnet)"
-        )
-    diagonal = math.sqrt(2.0) * target.small.side_m
-    if diagonal > magnet_m:
-        raise InvalidValue(
-            f"the small marker's diagonal ({diagonal * 1e3:.1f} mm) is not inside the magnet "
-            f"({mm_text(magnet_m)} mm), so the gear could touch where no magnet is: at most "
-            f"--small {math.floor(magnet_m * 1e4 / math.sqrt(2.0)) / 10:g}mm, or a larger --magnet"
-        )
-
-
-def _turns_onto_itself(marker: MarkerConfig) -> bool:
-    cells = marker_cells(marker)
-    return any(np.array_equal(cells, np.rot90(cells, turn)) for turn in (1, 2, 3))
+def _cells_apart(a: MarkerConfig, b: MarkerConfig, turns: Sequence[int] = (0, 1, 2, 3)) -> int:
+    """Return the fewest cells in which one, in any of the quarter turns, differs from the other;
+    patterns of another size differ in all."""
+    first, second = marker_cells(a), marker_cells(b)
+    if first.shape != second.shape:
+        return first.size
+    return min(int((np.rot90(first, turn) != second).sum()) for turn in turns)
 
 
 def _check_reading(target: TargetConfig) -> None:
@@ -216,12 +190,9 @@ def _check_reading(target: TargetConfig) -> None:
                 f"the {name} marker cannot be read from this drawing: take a smaller --small, or "
                 f"a --large-id that is white in the middle, such as 997 of DICT_4X4_1000"
             )
-    same_size = (
-        aruco_dictionary(large.dictionary).markerSize
-        == aruco_dictionary(small.dictionary).markerSize
-    )
-    for marker, other in ((large, small), (small, large)):
-        ids = {marker.id, other.id} if same_size else {marker.id}
+    sizes = {aruco_dictionary(marker.dictionary).markerSize for marker in (large, small)}
+    for marker in (large, small):
+        ids = {large.id, small.id} if len(sizes) == 1 else {marker.id}
         extra = _ids_read(image, aruco_dictionary(marker.dictionary)) - ids
         if extra:
             raise InvalidValue(
@@ -235,12 +206,3 @@ def _ids_read(image: NDArray[np.uint8], dictionary: Any) -> set[int]:
     parameters.minMarkerDistanceRate = 0.01
     _, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
     return set() if ids is None else {int(i) for i in np.asarray(ids).ravel()}
-
-
-def _pattern_distance(a: MarkerConfig, b: MarkerConfig) -> int:
-    """Return the fewest cells in which one, in any turn, differs from the other; patterns of
-    another size differ in all."""
-    first, second = marker_cells(a), marker_cells(b)
-    if first.shape != second.shape:
-        return first.size
-    return min(int((np.rot90(first, turn) != second).sum()) for turn in range(4))

@@ -1,42 +1,44 @@
-"""Where things lie on the printed pages: the target's front and back, a board.
+"""The printed pages, true to size: the target's front and back, a board.
 
-The target's centre is the page's centre, so that the back's cross lies over the
-front's centre whichever way the sheet is turned.
+The target's centre is the page's centre, so that the back's cross lies over the front's centre
+whichever way the sheet is turned. Page axes: origin at the top left corner of the paper, x right, y
+down, mm.
 """
 
 from __future__ import annotations
 
 import datetime
+import itertools
 import math
-from dataclasses import dataclass
+import re
+from collections.abc import Sequence
+from typing import cast
+
+from fpdf import FPDF
+from fpdf.enums import MethodReturnValue, PathPaintRule
+from fpdf.prefs import ViewerPreferences
 
 from perchctl.errors import InvalidValue
 from perchctl.profile import MarkerConfig, TargetConfig
 from perchctl.target.boards import Board, board_rectangles
-from perchctl.target.drawing import draw_target, marker_cells, mm_text
-from perchctl.target.page import (
-    PAGES_MM,
-    UNPRINTABLE,
-    Circle,
-    Item,
-    Line,
-    Page,
-    Polygon,
-    Text,
-    filled,
-    page_name,
-    parse_page,
-    pdf_bytes,
-    text_width,
-    wrapped,
-)
+from perchctl.target.drawing import Rectangle, draw_target, marker_cells, mm_text, parse_length
+from perchctl.target.reading import check_target
 
+PAGES_MM: dict[str, tuple[float, float]] = {
+    "a4": (210.0, 297.0),
+    "letter": (215.9, 279.4),
+    "a3": (297.0, 420.0),
+}
+"""Named pages, portrait, in the order in which one that fits is proposed."""
+UNPRINTABLE = 5.0
+"""mm at the paper's edges that many printers leave white."""
 MIN_QUIET_CELLS = 0.5
 """White around the large marker, in its cells. One cell is printed where the page has
 room; down to half a cell the range stays the same even on a black ceiling (measured: side
 found in 11 of 12 pictures, blur sigma 2 px: 32 px at 1.0, 0.68 and 0.5 cells, 36 px at
 0.3, 46 px at 0.15)."""
 
+_PT_PER_MM = 72.0 / 25.4
 RULER = 100.0
 _GAP = 1.5  # between the sheet's edge and a ruler
 _TICK, _HALF_TICK, _FINE_TICK = 3.5, 2.4, 1.4
@@ -44,19 +46,8 @@ _LABEL = 2.5
 _RULER_DEPTH = _GAP + _TICK + 0.6 + _LABEL
 _RULER_REACH = RULER / 2 + 7.0  # with the label at its end
 _MARK_GAP, _MARK = 1.0, 5.0
-_CORNER_TICK = 2.5
 _TEXT, _LINE = 2.8, 4.0
-_ARROW = 10.0
-
-
-@dataclass(frozen=True)
-class SheetLayout:
-    """The sheet that is cut out of the page: its side, and the white in it, mm."""
-
-    width: float
-    height: float
-    sheet: float
-    caption: tuple[str, ...]
+_ARROW = ((0.0, 10.0), (2.5, 5.5), (0.6, 5.5), (0.6, 0.0), (-0.6, 0.0), (-0.6, 5.5), (-2.5, 5.5))
 
 
 def target_pdf(
@@ -66,89 +57,129 @@ def target_pdf(
     origin: str = "",
     date: datetime.date | None = None,
 ) -> bytes:
-    """Return the target's sheet, front and back, as a PDF.
+    """Return the target's sheet, front and back, as a PDF; the same bytes for the same target.
+
+    The quiet zone is the largest, up to one cell, that leaves room for rulers and caption.
 
     Args:
         page: ``a4``, ``letter``, ``a3`` or a size such as ``220x240mm``.
         origin: where the sizes come from, for the caption.
 
-    Raises InvalidValue where the page is too small, with the page that fits.
+    Raises InvalidValue for a target that cannot be read, and where the page is too small, with the
+    page that fits.
     """
-    pages = target_pages(target, parse_page(page), magnet_m, origin, date)
-    return pdf_bytes(pages, f"perchctl target, {mm_text(target.large.side_m)} mm", date)
-
-
-def board_pdf(board: Board, page: str) -> bytes:
-    """Return the board as a PDF; `page` as in `target_pdf`. Raises InvalidValue where it does not
-    fit."""
-    sheet = board_page(board, parse_page(page))
-    return pdf_bytes([sheet], f"perchctl {board.notation()}")
-
-
-def target_pages(
-    target: TargetConfig,
-    page: tuple[float, float],
-    magnet_m: float,
-    origin: str = "",
-    date: datetime.date | None = None,
-) -> tuple[Page, Page]:
-    """Return front and back, with the largest quiet zone, up to one cell, that leaves room for
-    rulers and caption. Raises InvalidValue where the page is too small."""
-    texts = _caption(target, origin, date)
-    place = _layout_on(target, page, texts)
+    check_target(target, magnet_m)
+    size, texts = parse_page(page), _caption(target, origin, date)
+    place = _layout_on(target, size, texts)
     if place is None:
         raise InvalidValue(
             f"a target of {1e3 * target.large.side_m:g} mm with its white and its rulers does not "
-            f"fit on {page_name(*page)}; --page {_fitting_page(target, texts)} holds it"
+            f"fit on {page}; --page {fitting_page(target, texts)} holds it"
         )
-    return _front(target, place), _back(target, place, magnet_m)
+    pdf = _Paper(*size, f"perchctl target, {mm_text(target.large.side_m)} mm", 2, date)
+    _draw_front(pdf, target, *place)
+    _draw_back(pdf, place[0], magnet_m)
+    return bytes(pdf.output())
 
 
-def board_page(board: Board, page: tuple[float, float]) -> Page:
-    """Return a board in the middle of the page, upright or across as it fits; the caption above,
-    rulers left and below. Raises InvalidValue where it does not fit."""
+def board_pdf(board: Board, page: str) -> bytes:
+    """Return a board in the middle of the page, upright or across as it fits, with its rulers, as a
+    PDF; `page` as in `target_pdf`. Raises InvalidValue where it does not fit."""
     width, height = (1e3 * side for side in board.size_m)
     side = UNPRINTABLE + _RULER_DEPTH
     needed = (max(width, 2 * _RULER_REACH) + 2 * side, max(height, 2 * _RULER_REACH) + 2 * side)
-    for w, h in (page, page[::-1]):
-        if w >= needed[0] - 1e-9 and h >= needed[1] - 1e-9:
-            break
-    else:
+    size = parse_page(page)
+    held = _holding(needed, size)
+    if held is None:
+        named = next((name for name, size in PAGES_MM.items() if _holding(needed, size)), None)
         raise InvalidValue(
             f"a board of {width:g} x {height:g} mm with its rulers does not fit on "
-            f"{page_name(*page)}; {_page_for(needed)} holds it"
+            f"{page}; --page {named or _page_text(*needed)} holds it"
         )
-    cx, cy = w / 2, h / 2
+    pdf = _Paper(*held, f"perchctl {board.notation()}", 1, None)
+    pdf.start()
+    pdf.fill(board_rectangles(board))
     texts = (
         f"perchctl {board.notation()}   print at 100 %, not scaled: both rulers must measure "
         f"100 mm",
         f"Then measure the black area ({width:g} x {height:g} mm) and give its sides to perchctl "
         f"calibrate --measured WIDTHxHEIGHT.",
     )
-    left = max(UNPRINTABLE, cx - width / 2)
-    lines = wrapped(texts, _LABEL, w - UNPRINTABLE - left)
-    base = cy - height / 2 - 2.5 - 3.2 * (len(lines) - 1)
-    items: list[Item] = [filled(board_rectangles(board), cx, cy)]
-    items += [Text(left, base + 3.2 * i, line, _LABEL) for i, line in enumerate(lines)]
-    items += _rulers(cx, cy, max(width / 2, _RULER_REACH), max(height / 2, _RULER_REACH))
-    return Page(w, h, tuple(items))
+    left = max(UNPRINTABLE, pdf.cx - width / 2)
+    lines = wrapped(texts, _LABEL, held[0] - UNPRINTABLE - left)
+    base = pdf.cy - height / 2 - 2.5 - 3.2 * (len(lines) - 1)
+    for i, line in enumerate(lines):
+        pdf.write_line(left, base + 3.2 * i, line, _LABEL)
+    _draw_rulers(pdf, max(width / 2, _RULER_REACH), max(height / 2, _RULER_REACH))
+    return bytes(pdf.output())
 
 
-def fits(target: TargetConfig, page: tuple[float, float]) -> bool:
-    """Return true if the page, in mm, holds the target with its white and its rulers."""
+def fits(target: TargetConfig, page: str) -> bool:
+    """Return true if the page holds the target with its white and its rulers."""
+    return _layout_on(target, parse_page(page), _caption(target)) is not None
+
+
+# --- Pages and their texts ----------------------------------------------------------------------
+
+
+def parse_page(text: str) -> tuple[float, float]:
+    """Return width and height in mm of ``a4``, ``letter``, ``a3`` or ``220x240mm``.
+
+    Raises InvalidValue.
+    """
+    named = PAGES_MM.get(text.strip().lower())
+    if named is not None:
+        return named
+    match = re.fullmatch(r"\s*([0-9.]+)\s*x\s*([0-9.]+)\s*([a-zA-Z]*)\s*", text)
+    if match is None:
+        raise InvalidValue(
+            f"page {text!r} is unknown; allowed are {', '.join(PAGES_MM)}, or a size such as "
+            f"220x240mm"
+        )
+    width, height = (
+        round(1e3 * parse_length(number + match[3], f"page {text}"), 6)
+        for number in match.groups()[:2]
+    )
+    return width, height
+
+
+def _page_text(width: float, height: float) -> str:
+    return f"{math.ceil(width)}x{math.ceil(height)}mm"
+
+
+def _holding(needed: tuple[float, float], page: tuple[float, float]) -> tuple[float, float] | None:
+    """Return the page upright or across, as it holds what is needed; None if it does not."""
+    for width, height in (page, page[::-1]):
+        if width >= needed[0] - 1e-9 and height >= needed[1] - 1e-9:
+            return width, height
+    return None
+
+
+def _caption(
+    target: TargetConfig,
+    origin: str = "sizes from the command line",
+    date: datetime.date | None = None,
+) -> tuple[str, ...]:
+    def named(marker: MarkerConfig) -> str:
+        return f"{mm_text(marker.side_m)} mm {marker.dictionary} id {marker.id}"
+
+    dated = f", {date.isoformat()}" if date else ""
     return (
-        _layout_on(target, page, _caption(target, "sizes from the command line", None)) is not None
+        f"perchctl target:  large {named(target.large)},  small {named(target.small)}"
+        + (f"  ({origin}{dated})" if origin else ""),
+        "FRONT: this side faces the floor. Its x axis points right, y down.",
+        "Print at 100 %, not scaled: both rulers must measure 100 mm. Cut along the corner marks, "
+        "glue the magnet to the back.",
+        "Then measure the black squares and give their sides to perchctl make-target measured "
+        "--measured-large and --measured-small.",
     )
 
 
-def fitting_page(target: TargetConfig) -> str:
-    """Return the page, for --page, that holds the target: a named one, or a size."""
-    return _fitting_page(target, _caption(target, "sizes from the command line", None))
-
-
 def _layout_on(
-    target: TargetConfig, page: tuple[float, float], texts: tuple[str, ...]
-) -> SheetLayout | None:
+    target: TargetConfig, page: tuple[float, float], texts: Sequence[str]
+) -> tuple[float, list[str]] | None:
+    """Return half the side of the sheet that is cut out of the page, mm, and the caption's lines;
+    None where the target does not fit."""
     side, cell = _side_and_cell(target)
     width, height = page
     lines, below = _caption_room(texts, width)
@@ -157,7 +188,7 @@ def _layout_on(
     quiet = math.floor(2.0 * min(cell, half - side / 2) + 1e-6) / 2.0
     if quiet < MIN_QUIET_CELLS * cell - 1e-9 or half < _ruler_half(side / 2 + quiet) - 1e-9:
         return None
-    return SheetLayout(width, height, side + 2.0 * quiet, tuple(lines))
+    return side / 2 + quiet, lines
 
 
 def _side_and_cell(target: TargetConfig) -> tuple[float, float]:
@@ -173,134 +204,159 @@ def _ruler_half(half: float) -> float:
     return max(half + _MARK_GAP + _MARK, _RULER_REACH)
 
 
-def _caption_room(texts: tuple[str, ...], width: float) -> tuple[list[str], float]:
+def _caption_room(texts: Sequence[str], width: float) -> tuple[list[str], float]:
     """Return the caption's lines, and the room for rulers and caption below the sheet, mm."""
     lines = wrapped(texts, _TEXT, width - 2 * (UNPRINTABLE + _RULER_DEPTH))
     return lines, _RULER_DEPTH + 2.0 + _LINE * len(lines)
 
 
-def _fitting_page(target: TargetConfig, texts: tuple[str, ...]) -> str:
+def fitting_page(target: TargetConfig, texts: Sequence[str] = ()) -> str:
+    """Return the page, for --page, that holds the target: a named one, or a size."""
+    texts = texts or _caption(target)
     for name, size in PAGES_MM.items():
         if _layout_on(target, size, texts):
             return name
     side, cell = _side_and_cell(target)
     half = _ruler_half(side / 2 + math.ceil(2.0 * MIN_QUIET_CELLS * cell) / 2.0) + UNPRINTABLE
     width = math.ceil(2.0 * (half + _RULER_DEPTH))
-    height = math.ceil(2.0 * (half + _caption_room(texts, width)[1]))
-    return f"{width}x{height}mm"
+    return _page_text(width, 2.0 * (half + _caption_room(texts, width)[1]))
 
 
-def _page_for(needed: tuple[float, float]) -> str:
-    for name, (w, h) in PAGES_MM.items():
-        if (w >= needed[0] and h >= needed[1]) or (h >= needed[0] and w >= needed[1]):
-            return f"--page {name}"
-    return f"--page {math.ceil(needed[0])}x{math.ceil(needed[1])}mm"
+# --- Drawing ------------------------------------------------------------------------------------
 
 
-def _caption(target: TargetConfig, origin: str, date: datetime.date | None) -> tuple[str, ...]:
-    def named(marker: MarkerConfig) -> str:
-        return f"{mm_text(marker.side_m)} mm {marker.dictionary} id {marker.id}"
+class _Paper(FPDF):
+    """Pages of one size, drawn in mm; print scaling is switched off in the viewer's preferences."""
 
-    dated = f", {date.isoformat()}" if date else ""
-    return (
-        f"perchctl target:  large {named(target.large)},  small {named(target.small)}"
-        + (f"  ({origin}{dated})" if origin else ""),
-        "Print at 100 %, not scaled: both rulers must measure 100 mm. Cut along the corner marks, "
-        "glue the magnet to the back.",
-        "Then measure the black squares and give their sides to perchctl make-target measured "
-        "--measured-large and --measured-small.",
-    )
-
-
-def _front(target: TargetConfig, place: SheetLayout) -> Page:
-    cx, cy, half = place.width / 2, place.height / 2, place.sheet / 2
-    items: list[Item] = [filled(draw_target(target).rectangles(), cx, cy)]
-    items += _cut_marks(cx, cy, half)
-    items += _corner_ticks(cx, cy, half, 500.0 * target.large.side_m)
-    ruler_half = _ruler_half(half)
-    items += _rulers(cx, cy, ruler_half, ruler_half)
-    items += _up_arrow(cx, cy - half - 2.0)
-    top = cy + ruler_half + _RULER_DEPTH + 2.0 + _TEXT
-    longest = max(text_width(line, _TEXT) for line in place.caption)
-    left = max(min(cx - ruler_half, place.width - UNPRINTABLE - longest), UNPRINTABLE)
-    items += [Text(left, top + _LINE * i, line, _TEXT) for i, line in enumerate(place.caption)]
-    return Page(place.width, place.height, tuple(items))
-
-
-def _back(target: TargetConfig, place: SheetLayout, magnet_m: float) -> Page:
-    """Return the page as seen from the back, the sheet turned about its upright axis: all of it is
-    symmetric."""
-    cx, cy, half = place.width / 2, place.height / 2, place.sheet / 2
-    radius = 500.0 * magnet_m
-    items: list[Item] = [*_cut_marks(cx, cy, half), *_up_arrow(cx, cy - half - 2.0)]
-    for a, b in (((-1, -1), (1, -1)), ((1, -1), (1, 1)), ((1, 1), (-1, 1)), ((-1, 1), (-1, -1))):
-        items.append(
-            Line(cx + a[0] * half, cy + a[1] * half, cx + b[0] * half, cy + b[1] * half, 0.15, 2.0)
+    def __init__(
+        self, width: float, height: float, title: str, pages: int, date: datetime.date | None
+    ) -> None:
+        super().__init__(unit="mm", format=(width, height))
+        self.cx, self.cy = width / 2.0, height / 2.0
+        self._format = (width, height)
+        self.set_auto_page_break(False)
+        self.set_margin(0.0)
+        self.set_title(title)
+        self.set_producer("perchctl")
+        day = date or datetime.date(2000, 1, 1)  # never the clock's
+        self.set_creation_date(datetime.datetime.combine(day, datetime.time(), datetime.UTC))
+        # Portrait pages turn about their long edge, which is the upright one.
+        duplex = "DuplexFlipLongEdge" if height >= width else "DuplexFlipShortEdge"
+        self.viewer_preferences = ViewerPreferences(
+            print_scaling="None", duplex=duplex if pages == 2 else None
         )
+
+    def start(self) -> None:
+        """Begin the next page."""
+        self.add_page(orientation="portrait", format=self._format)
+
+    def fill(self, rectangles: Sequence[Rectangle]) -> None:
+        """Draw rectangles (metres, y up, about the page's centre) black, as one path: where two of
+        them touch, no viewer draws a hair line between them."""
+        with self.new_path(paint_rule=PathPaintRule.FILL_NONZERO) as path:
+            path.style.fill_color = "#000000"
+            path.style.stroke_color = None
+            for r in rectangles:
+                x, y = self.cx + 1e3 * r.x0_m, self.cy - 1e3 * r.y1_m
+                path.rectangle(x, y, 1e3 * (r.x1_m - r.x0_m), 1e3 * (r.y1_m - r.y0_m))
+
+    def stroke(
+        self, x0: float, y0: float, x1: float, y1: float, width: float = 0.2, dash: float = 0.0
+    ) -> None:
+        """Draw a straight line; `dash` is the length of dashes and gaps, 0 is solid."""
+        self.set_line_width(width)
+        self.set_dash_pattern(dash=dash, gap=dash)
+        self.line(x0, y0, x1, y1)
+
+    def write_line(
+        self, x: float, y: float, text: str, size: float = _TEXT, back: float = 0.0,
+        turn_deg: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Write a line of text on the base line y, turned about its place. `back` of its width
+        (0..1) lies before x."""
+        self.set_font("helvetica", size=size * _PT_PER_MM)
+        with self.rotation(turn_deg, x, y):
+            self.text(x - back * self.get_string_width(text), y, text)
+
+
+def wrapped(texts: Sequence[str], size: float, width: float) -> list[str]:
+    """Return every text in as many lines as `width` mm needs; words are never cut."""
+    pdf = FPDF(unit="mm")
+    pdf.add_page()
+    pdf.set_font("helvetica", size=size * _PT_PER_MM)
+    pdf.c_margin = 0.0
+    lines: list[str] = []
+    for text in texts:
+        broken = pdf.multi_cell(width, text=text, dry_run=True, output=MethodReturnValue.LINES)
+        lines += cast(list[str], broken)
+    return lines
+
+
+def _draw_front(pdf: _Paper, target: TargetConfig, half: float, caption: list[str]) -> None:
+    pdf.start()
+    pdf.fill(draw_target(target).rectangles())
+    _draw_cut_marks(pdf, half)
+    ruler_half = _ruler_half(half)
+    _draw_rulers(pdf, ruler_half, ruler_half)
+    _draw_up_arrow(pdf, half)
+    top = pdf.cy + ruler_half + _RULER_DEPTH + 2.0 + _TEXT
+    for i, line in enumerate(caption):
+        pdf.write_line(UNPRINTABLE + _RULER_DEPTH, top + _LINE * i, line)
+
+
+def _draw_back(pdf: _Paper, half: float, magnet_m: float) -> None:
+    """Draw the page as seen from the back, the sheet turned about its upright axis: all of it is
+    symmetric."""
+    pdf.start()
+    cx, cy = pdf.cx, pdf.cy
+    _draw_cut_marks(pdf, half)
+    _draw_up_arrow(pdf, half)
+    corners = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
+    for (ax, ay), (bx, by) in itertools.pairwise(corners):
+        pdf.stroke(cx + ax * half, cy + ay * half, cx + bx * half, cy + by * half, 0.15, 2.0)
+    radius = 500.0 * magnet_m
     reach = radius + 6.0
-    items += [
-        Circle(cx, cy, radius),
-        Line(cx - reach, cy, cx + reach, cy, 0.2),
-        Line(cx, cy - reach, cx, cy + reach, 0.2),
-    ]
+    pdf.stroke(cx - reach, cy, cx + reach, cy)
+    pdf.stroke(cx, cy - reach, cx, cy + reach)
+    pdf.set_line_width(0.3)
+    pdf.circle(cx, cy, radius)
     texts = (
-        f"BACK: glue the magnet ({mm_text(magnet_m)} mm across) into the circle.",
-        "The cross lies over the centre of both markers.",
+        "BACK: this side faces the ceiling. Its x axis points left, y down.",
+        f"Glue the magnet ({mm_text(magnet_m)} mm across) into the circle. The cross lies over the "
+        f"centre of both markers.",
     )
     base = cy + half + _MARK_GAP + _MARK + 2.0 + _TEXT
-    for i, line in enumerate(wrapped(texts, _TEXT, place.width - 2 * UNPRINTABLE)):
-        items.append(Text(cx, base + _LINE * i, line, _TEXT, "middle"))
-    return Page(place.width, place.height, tuple(items))
+    for i, line in enumerate(wrapped(texts, _TEXT, pdf.w - 2 * UNPRINTABLE)):
+        pdf.write_line(cx, base + _LINE * i, line, back=0.5)
 
 
-def _rulers(cx: float, cy: float, half_x: float, half_y: float) -> list[Item]:
-    """Return two rulers of 100 mm: below, from left to right, and at the left, upwards."""
-    y, x = cy + half_y + _GAP, cx - half_x - _GAP
-    start = RULER / 2
-    items: list[Item] = [
-        Line(cx - start, y, cx + start, y, 0.2),
-        Line(x, cy - start, x, cy + start, 0.2),
-    ]
+def _draw_rulers(pdf: _Paper, half_x: float, half_y: float) -> None:
+    """Draw two rulers of 100 mm: below, from left to right, and at the left, upwards."""
+    y, x = pdf.cy + half_y + _GAP, pdf.cx - half_x - _GAP
+    left, low = pdf.cx - RULER / 2, pdf.cy + RULER / 2
+    pdf.stroke(left, y, left + RULER, y)
+    pdf.stroke(x, low, x, low - RULER)
     for mm in range(int(RULER) + 1):
         tick = _TICK if mm % 10 == 0 else _HALF_TICK if mm % 5 == 0 else _FINE_TICK
         thick = 0.2 if mm % 5 == 0 else 0.12
-        items.append(Line(cx - start + mm, y, cx - start + mm, y + tick, thick))
-        items.append(Line(x, cy + start - mm, x - tick, cy + start - mm, thick))
+        pdf.stroke(left + mm, y, left + mm, y + tick, thick)
+        pdf.stroke(x, low - mm, x - tick, low - mm, thick)
         if mm % 10 == 0:
             label = f"{mm} mm" if mm == RULER else str(mm)
-            items.append(
-                Text(cx - start + mm, y + _TICK + 0.4 + 0.75 * _LABEL, label, _LABEL, "middle")
-            )
-            items.append(Text(x - _TICK - 0.8, cy + start - mm, label, _LABEL, "middle", True))
-    return items
+            pdf.write_line(left + mm, y + _TICK + 0.4 + 0.75 * _LABEL, label, _LABEL, 0.5)
+            pdf.write_line(x - _TICK - 0.8, low - mm, label, _LABEL, 0.5, 90.0)
 
 
-def _cut_marks(cx: float, cy: float, half: float) -> list[Item]:
-    items: list[Item] = []
+def _draw_cut_marks(pdf: _Paper, half: float) -> None:
     near, far = half + _MARK_GAP, half + _MARK_GAP + _MARK
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            x, y = cx + sx * half, cy + sy * half
-            items.append(Line(cx + sx * near, y, cx + sx * far, y, 0.2))
-            items.append(Line(x, cy + sy * near, x, cy + sy * far, 0.2))
-    return items
+    for sx, sy in itertools.product((-1, 1), repeat=2):
+        x, y = pdf.cx + sx * half, pdf.cy + sy * half
+        pdf.stroke(pdf.cx + sx * near, y, pdf.cx + sx * far, y)
+        pdf.stroke(x, pdf.cy + sy * near, x, pdf.cy + sy * far)
 
 
-def _corner_ticks(cx: float, cy: float, half: float, side_half: float) -> list[Item]:
-    """Return short ticks in line with the large marker's sides (and its centre, at the right),
-    where no ruler is."""
-    near, far = half + _MARK_GAP, half + _MARK_GAP + _CORNER_TICK
-    items: list[Item] = [Line(cx + near, cy, cx + far, cy, 0.2)]
-    for s in (-side_half, side_half):
-        for sign, has_ruler in ((1, False), (-1, True)):
-            if not has_ruler or side_half > _RULER_REACH:
-                items.append(Line(cx + sign * near, cy + s, cx + sign * far, cy + s, 0.2))
-                items.append(Line(cx + s, cy - sign * near, cx + s, cy - sign * far, 0.2))
-    return items
-
-
-def _up_arrow(x: float, tail_y: float) -> list[Item]:
-    tip = tail_y - _ARROW
-    points = [(0.0, 0.0), (2.5, 4.5), (0.6, 4.5), (0.6, _ARROW), (-0.6, _ARROW), (-0.6, 4.5)]
-    shape = tuple((x + dx, tip + dy) for dx, dy in [*points, (-2.5, 4.5)])
-    return [Polygon(shape), Text(x + 4.0, tail_y - 2.0, "up", 4.0)]
+def _draw_up_arrow(pdf: _Paper, half: float) -> None:
+    tail = pdf.cy - half - 2.0
+    pdf.set_fill_color(0)
+    pdf.polygon([(pdf.cx + x, tail - y) for x, y in _ARROW], style="F")
+    pdf.write_line(pdf.cx + 4.0, tail - 2.0, "up", 4.0)

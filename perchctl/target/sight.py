@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.geometry import R_MARKER_TARGET, Array, rot_z, rpy_from_rotation
+from perchctl.geometry import R_MARKER_TARGET, Array, rot_z
 from perchctl.profile import DetectorConfig, Mounting, Profile, TargetConfig
 from perchctl.vision import (
     CameraModel,
@@ -101,65 +101,37 @@ LEAST_UP = 0.2
 """Of the view's upward part: a camera that looks farther aside sees no target over it."""
 
 
-@dataclass(frozen=True)
-class Reach:
-    """The area at one height above the camera in which a large marker at any turn is seen: centres
-    within `radius_m` of where the camera's axis goes, `axis_xy_m` from the camera."""
-
-    height_m: float
-    axis_xy_m: tuple[float, float]
-    radius_m: float
-
-
-@dataclass(frozen=True)
-class Overhead:
-    """Where the large marker is surely found: at most `highest_m` above the camera, and within
-    `reaches`, at some heights. `lean_deg` of the camera's axis: forward, left."""
-
-    highest_m: float
-    lean_deg: tuple[float, float]
-    reaches: tuple[Reach, ...]
-
-    @property
-    def words(self) -> str:
-        """Where the target has to be, in words."""
-        lean = _directions(self.lean_deg, STRAIGHT_DEG, ".0f", "deg")
-        axis = f"leans {lean}" if lean else "points straight up"
-        if not self.reaches:
-            return f"in the picture of a camera that looks up, not {axis}"
-        within = ", ".join(
-            f"{r.radius_m:.2g} m at {r.height_m:.2g} m above it" for r in self.reaches
-        )
-        return (
-            f"at most {self.highest_m:.1f} m above the camera, and its centre no farther from the "
-            f"camera's axis than {within}; the axis {axis}"
-        )
-
-
 def least_side_px(plain_px: float | None = None) -> float:
     """Return the side in px from which on the ground's search finds the large marker surely.
     `plain_px`: what a plain one reads through the camera's own blur, where that was measured."""
     return SURE_PX if plain_px is None else max(SURE_PX, BLURRED * plain_px)
 
 
-def overhead_view(
-    target: TargetConfig, camera: CameraModel, mount: Mounting, plain_px: float | None = None
-) -> Overhead:
-    """Return from where on the ground the large marker is surely found; `plain_px` as in
-    `least_side_px`."""
+def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) -> str:
+    """Return in words from where on the ground the large marker is surely found: how far above the
+    camera at most, and how far aside of its axis at some heights."""
     side_m, view = target.large.side_m, mount.T_body_cam[:3, 2]
-    highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / least_side_px(plain_px)
+    highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / least_side_px()
     lean = math.degrees(math.atan2(view[0], view[2])), math.degrees(math.atan2(view[1], view[2]))
+    axis = _directions(lean, STRAIGHT_DEG, ".0f", "deg")
+    axis = f"leans {axis}" if axis else "points straight up"
     heights_m = sorted({min(h, highest_m) for h in (1.0, 2.0)})
-    reaches = (overhead_reach(side_m, camera, mount, h) for h in heights_m)
-    return Overhead(highest_m, lean, tuple(r for r in reaches if r is not None))
+    reaches = [(h, overhead_reach_m(side_m, camera, mount, h)) for h in heights_m]
+    within = [f"{r:.2g} m at {h:.2g} m above it" for h, r in reaches if r is not None]
+    if not within:
+        return f"in the picture of a camera that looks up, not {axis}"
+    return (
+        f"at most {highest_m:.1f} m above the camera, and its centre no farther from the "
+        f"camera's axis than {', '.join(within)}; the axis {axis}"
+    )
 
 
-def overhead_reach(
+def overhead_reach_m(
     side_m: float, camera: CameraModel, mount: Mounting, height_m: float
-) -> Reach | None:
-    """Return the area in which the camera sees a marker of that side at that height; None where
-    not even one on the camera's axis is wholly in the picture, or the camera does not look up."""
+) -> float | None:
+    """Return how far from the camera's axis the centre of a marker of that side may be at that
+    height above the camera, so that it is wholly in the picture at any turn; None where it is not
+    even on the axis, or the camera does not look up."""
     R = mount.T_body_cam[:3, :3]
     view, field = R[:, 2], FieldOfView(camera)
     if view[2] < LEAST_UP:
@@ -176,7 +148,7 @@ def overhead_reach(
     while high_m - low_m > 1e-3:
         middle_m = (low_m + high_m) / 2.0
         low_m, high_m = (middle_m, high_m) if seen(middle_m) else (low_m, middle_m)
-    return Reach(height_m, (float(axis[0]), float(axis[1])), low_m)
+    return low_m
 
 
 @dataclass(frozen=True)
@@ -187,11 +159,19 @@ class TargetView:
         whole: whether one of its markers is wholly in the picture.
         height_m: above the camera.
         aside_m: from the camera's axis, forward and left; NaN for a camera that does not look up.
+        reach_m: how far aside a large marker may be there at any turn; None where it cannot be
+            whole in the picture at all.
     """
 
     whole: bool
     height_m: float
     aside_m: tuple[float, float]
+    reach_m: float | None
+
+    @property
+    def aside_text(self) -> str:
+        """`aside_m` in words: ``0.31 m forward and 0.12 m to the right``."""
+        return _directions(self.aside_m, 0.01, ".2f", "m") or "less than 1 cm"
 
 
 def view_from(
@@ -208,33 +188,21 @@ def view_from(
     T, field = mount.T_body_cam, FieldOfView(camera)
     R, camera_m = T[:3, :3], T[:3, 3]
     centre = rot_z(body_yaw_rad).T @ (target_m - body_m) - camera_m
+    height_m = float(centre[2])
     turn = rot_z(target_yaw_rad - body_yaw_rad)
     large, small = (
         field.holds((square_corners(side_m) @ turn.T + centre) @ R)
         for side_m in (target.large.side_m, target.small.side_m)
     )
     # The small marker by its size alone.
-    readable = float(camera.K[0, 0]) * target.small.side_m >= SURE_PX * float(centre[2])
+    readable = float(camera.K[0, 0]) * target.small.side_m >= SURE_PX * height_m
     view = R[:, 2]
-    aside = centre - centre[2] / view[2] * view if view[2] >= LEAST_UP else np.full(3, math.nan)
-    return TargetView(
-        whole=large or (small and readable),
-        height_m=float(centre[2]),
-        aside_m=(float(aside[0]), float(aside[1])),
-    )
-
-
-def edge_margin(points_px: Array, size_px: tuple[int, int]) -> float:
-    """Return the least way of points (n, 2) px to the picture's edge, a share of its larger
-    side."""
-    size = np.array(size_px, dtype=np.float64)
-    least_px = np.minimum(points_px + 0.5, size - 0.5 - points_px).min()
-    return float(least_px) / max(size_px)
-
-
-def offset_text(aside_m: tuple[float, float]) -> str:
-    """Return an offset in words: ``0.31 m forward and 0.12 m to the right``."""
-    return _directions(aside_m, 0.01, ".2f", "m") or "less than 1 cm"
+    aside = centre - height_m / view[2] * view if view[2] >= LEAST_UP else np.full(3, math.nan)
+    reach_m = None
+    if height_m > 0.0:
+        reach_m = overhead_reach_m(target.large.side_m, camera, mount, height_m)
+    aside_m = (float(aside[0]), float(aside[1]))
+    return TargetView(large or (small and readable), height_m, aside_m, reach_m)
 
 
 def _directions(values: tuple[float, float], least: float, figures: str, unit: str) -> str:
@@ -256,8 +224,7 @@ def _directions(values: tuple[float, float], least: float, figures: str, unit: s
 
 FROM_M = 0.10
 """The last stretch that is judged, from gear to target."""
-_STEP_M, _FINE_M = 0.005, 0.0005
-_WORTH_M = 0.002  # less is no reason to turn a camera
+_STEP_M = 0.0005
 _OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its axes
 
 
@@ -270,10 +237,11 @@ class BlindRange:
     whole_m: float | None
     left_m: float | None
 
+    @property
     def words(self) -> str:
-        """Return both ranges in words."""
+        """Both ranges in words."""
         left, whole = (_blind_words(range_m) for range_m in (self.left_m, self.whole_m))
-        return f"{left} (by whole markers alone: {whole})"
+        return f"{left} (by whole markers alone: {whole}), the gear under the target's centre"
 
 
 def _blind_words(nearest_m: float | None) -> str:
@@ -282,75 +250,10 @@ def _blind_words(nearest_m: float | None) -> str:
     return "never blind" if nearest_m == 0.0 else f"blind from {1e3 * nearest_m:.0f} mm to contact"
 
 
-@dataclass(frozen=True)
-class MountingView:
-    """A mounting's blind range, and, where the camera should rather be turned by 90 degrees about
-    its view, its mounting's `rpy_deg` and blind range then."""
-
-    blind: BlindRange
-    turned: BlindRange | None = None
-    turned_rpy_deg: tuple[float, float, float] | None = None
-
-    def lines(self) -> list[str]:
-        """Return the mounting's blind range and the advice in words, a line each."""
-        lines = [f"{self.blind.words()}, the gear under the target's centre"]
-        if self.turned is not None and self.turned_rpy_deg is not None:
-            turn = ", ".join(f"{a:g}" for a in self.turned_rpy_deg)
-            lines.append(
-                "turn the camera by 90 degrees about its view, so that the gear is beside it along "
-                f"the picture's width (camera.mount.rpy_deg: [{turn}]): {self.turned.words()}"
-            )
-        return lines
-
-    def record(self) -> dict[str, object]:
-        """Return the same for machines; metres."""
-        return {
-            "whole_m": self.blind.whole_m,
-            "left_m": self.blind.left_m,
-            "turned_left_m": None if self.turned is None else self.turned.left_m,
-            "turned_rpy_deg": self.turned_rpy_deg,
-        }
-
-
-def assess_mounting(target: TargetConfig, camera: CameraModel, profile: Profile) -> MountingView:
+def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> BlindRange:
     """Return from where on the profile's `camera.mount` and `vehicle.gear_body_m` see too
     little."""
-    T_body_cam = profile.camera.mount.T_body_cam
-    gear_m = np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3]
-    here = _blind_range(target, camera, T_body_cam[:3, :3], gear_m)
-    R_turned = T_body_cam[:3, :3] @ rot_z(math.pi / 2.0)
-    turned = _blind_range(target, camera, R_turned, gear_m)
-    gain_m, whole_gain_m = (
-        (FROM_M if old is None else old) - (FROM_M if new is None else new)
-        for old, new in ((here.left_m, turned.left_m), (here.whole_m, turned.whole_m))
-    )
-    # A whole marker is the surer sight.
-    if gain_m >= _WORTH_M or (gain_m >= 0.0 and whole_gain_m >= _WORTH_M):
-        roll, pitch, yaw = (round(math.degrees(a), 1) + 0.0 for a in rpy_from_rotation(R_turned))
-        return MountingView(here, turned, (roll, pitch, yaw))
-    return MountingView(here)
-
-
-def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> bool:
-    """Return true if the whole small marker is in the picture with the gear's tip so far under
-    it."""
-    R, gear = gear_from_camera(profile)
-    outline = raised(square_outline(profile.target.small.side_m), range_m)
-    return FieldOfView(camera).holds(outline @ R.T + gear)
-
-
-def gear_from_camera(profile: Profile) -> tuple[Array, Array]:
-    """Return the rotation from body to camera axes, and the gear's tip in the camera's, m."""
-    T_body_cam = profile.camera.mount.T_body_cam
-    R = T_body_cam[:3, :3].T
-    return R, R @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])
-
-
-def _blind_range(
-    target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m: Array
-) -> BlindRange:
-    """Return the blind range of a camera turned so; `gear_m` is the gear from it, body axes."""
-    R, offset = R_body_cam.T, R_body_cam.T @ gear_m
+    R, offset = gear_from_camera(profile)
     view, patterns = FieldOfView(camera), make_aruco_detector(DetectorConfig(), target).patterns
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
 
@@ -368,15 +271,23 @@ def _blind_range(
 
 def _lost_at_m(seen: Callable[[float], bool]) -> float | None:
     """Return the range down to which the target is seen from `FROM_M` on; None if not there."""
-    low = FROM_M
-    for step_m in (_STEP_M, _FINE_M):
-        for k in range(round(FROM_M / step_m) + 1):
-            range_m = low - k * step_m
-            if range_m < 0.5 * _FINE_M:
-                return 0.0
-            if not seen(range_m):
-                if range_m == FROM_M:
-                    return None
-                low = range_m + step_m
-                break
-    return low
+    count = round(FROM_M / _STEP_M)
+    lost = next((k for k in range(count, 0, -1) if not seen(k * _STEP_M)), 0)
+    if lost == count:
+        return None
+    return 0.0 if lost == 0 else (lost + 1) * _STEP_M
+
+
+def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> bool:
+    """Return true if the whole small marker is in the picture with the gear's tip so far under
+    it."""
+    R, gear = gear_from_camera(profile)
+    outline = raised(square_outline(profile.target.small.side_m), range_m)
+    return FieldOfView(camera).holds(outline @ R.T + gear)
+
+
+def gear_from_camera(profile: Profile) -> tuple[Array, Array]:
+    """Return the rotation from body to camera axes, and the gear's tip in the camera's, m."""
+    T_body_cam = profile.camera.mount.T_body_cam
+    R = T_body_cam[:3, :3].T
+    return R, R @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])

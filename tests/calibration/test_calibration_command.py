@@ -14,7 +14,7 @@ from typer.testing import Result
 from perchctl.calibration import load_calibration
 from perchctl.calibration.board.adjust import parameters_of
 from perchctl.vision import CameraModel
-from tests.helpers.boards import CHARUCO
+from tests.helpers.boards import CHARUCO, draw_camera, render_folder
 from tests.helpers.calibrating import calibrate, refused
 from tests.helpers.gear import SIZE_PX, write_turned_about
 
@@ -25,6 +25,15 @@ BOARD = CHARUCO.notation()
 
 
 Rendered = tuple[Path, CameraModel]
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Rendered:
+    """A folder of ten pictures of a ChArUco board, and the camera that took them."""
+    camera = draw_camera(np.random.default_rng(5), (480, 360))
+    folder = tmp_path_factory.mktemp("board")
+    render_folder(folder, camera, CHARUCO, 10, seed=5)
+    return folder, camera
 
 
 @pytest.fixture(scope="module")
@@ -40,37 +49,16 @@ def test_pictures_become_a_file_and_a_report(calibrated: Result, rendered: Rende
     truth = rendered[1]
     camera = load_calibration(Path(told["file"]))
     assert [told["fx"], told["fy"]] == [camera.K[0, 0], camera.K[1, 1]]
-    assert told["distortion"] == camera.dist.tolist()
     assert (told["model"], told["size_px"]) == ("plumb_bob", [480, 360])
     error = np.abs(parameters_of(camera) - parameters_of(truth))
     assert (error < 3.5 * np.array(list(told["std"].values()))).all()
     assert error[:2].max() < 0.5
     assert told["views_used"] == 10
     assert told["views_rejected"] == []
-    assert all(e["mm95"] > 0 and e["axis_mm95"] > 0 for e in told["error_mm"])
-    assert (told["error_mm"][0]["z_m"], told["error_mm"][-1]["z_m"]) == (0.05, 1.5)
+    assert all(0 < e["axis_mm95"] <= e["mm95"] for e in told["error_mm"])
     assert told["verdict"] == "fly"
-    report = cv2.imread(told["report"])
-    assert report is not None
-    assert min(report.shape[:2]) > 800
+    assert cv2.imread(told["report"]) is not None
     assert "GOOD TO FLY" in calibrated.stderr
-
-
-def test_ctrl_c_in_the_drawing_leaves_the_calibration(
-    rendered: Rendered, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is on the disk by then; only its picture is given up."""
-    output = tmp_path / "camera.yaml"
-
-    def draw(_result: object) -> bytes:
-        assert load_calibration(output).size_px == (480, 360)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("perchctl.calibration.draw_calibration", draw)
-    result = calibrate(f"images:{rendered[0]}", "-b", BOARD, "-o", str(output), "--json")
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["report"] is None
-    assert "the plot is not drawn" in result.stderr
 
 
 def test_the_same_pictures_pass_the_check_and_another_camera_s_fail(
@@ -97,9 +85,7 @@ def test_the_same_pictures_pass_the_check_and_another_camera_s_fail(
     for key in ("image_width", "image_height"):
         del raw[key]
     other.write_text(yaml.safe_dump(raw))
-    unsized = calibrate("check", str(other), source, "-b", BOARD)
-    assert unsized.exit_code == 1
-    assert "image size is missing; " in unsized.stderr
+    assert "image size is missing" in refused(calibrate("check", str(other), source), 30)
 
 
 def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Path) -> None:
@@ -118,31 +104,6 @@ def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Pa
     assert told["views_used"] == 6
     named = [picture["name"] for picture in told["pictures_without_board"]]
     assert named == ["board_02b.png", "board_99.png"]
-
-
-def test_a_print_is_measured_along_both_sides(rendered: Rendered, tmp_path: Path) -> None:
-    output = tmp_path / "o.yaml"
-    words = (f"images:{rendered[0]}", "-b", BOARD, "-o", str(output), "--measured")
-    result = calibrate(*words, "245.8x174.1mm")
-    assert result.exit_code == 0, result.output
-    assert "width: 245.8 mm, -1.68 % against 250 mm" in result.stderr
-    assert "was the page scaled" in result.stderr
-    assert "height: 174.1 mm, -0.51 % against 175 mm" in result.stderr
-    board = yaml.safe_load(output.read_text())["board"]
-    assert board == f"{BOARD}:measured=245.8x174.1mm"
-
-
-def test_pictures_named_one_by_one_are_the_folder_s(
-    calibrated: Result, rendered: Rendered, tmp_path: Path
-) -> None:
-    """As a shell hands over board*.png; one of them named twice is one picture."""
-    words = [str(p) for p in sorted(rendered[0].iterdir())]
-    result = calibrate(*words, words[3], "-b", BOARD, "-o", f"{tmp_path}/o.yaml", "--json")
-    assert result.exit_code == 0, result.output
-    told, folder = json.loads(result.stdout), json.loads(calibrated.stdout)
-    assert {k: told[k] for k in ("fx", "views_used", "rms_px")} == {
-        k: folder[k] for k in ("fx", "views_used", "rms_px")
-    }
 
 
 @pytest.mark.parametrize(
@@ -191,13 +152,10 @@ def test_pictures_that_will_not_do_are_refused(
         (["images:.", "--name", "a/b"], 2),
         (["images:.", "--view"], 2),
         (["images:.", "--size", "640x480"], 2),
-        (["images:.", "--check", "camera.yaml"], 2),
-        (["check", "camera.yaml"], 2),
         (["check", "no.yaml", "images:."], 20),
         (["convert", "no.yaml"], 20),
         (["mask", "images:turned", "-o", "gear.jpg"], 30),
         (["mask", "images:nothing"], 20),
-        (["mask"], 2),
     ],
 )
 def test_wrong_usage_writes_nothing(
@@ -218,32 +176,24 @@ def test_convert(tmp_path: Path) -> None:
         "  intrinsics: [300.5, 301.5, 320.25, 240.75]\n  resolution: [640, 480]\n"
     )
     output = tmp_path / "new" / "camera.yaml"
-    result = calibrate("convert", str(kalibr), "-o", str(output), "--json")
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["fx"] == 300.5
+    assert calibrate("convert", kalibr, "-o", output).exit_code == 0
     camera = load_calibration(output)
     assert camera.model == "fisheye"
     assert camera.dist.tolist() == [0.01, 0.02, -0.01, 0.002]
-    assert "--force" in refused(calibrate("convert", str(kalibr), "-o", str(output)), 30)
-    same = calibrate("convert", str(output), "-o", str(output), "--force")
-    assert "is the file to convert" in refused(same, 2)
+    refused(calibrate("convert", kalibr, "-o", output), 30, "--force")
+    same = calibrate("convert", output, "-o", output, "--force")
+    refused(same, 2, "is the file to convert")
 
 
 def test_a_mask(tmp_path: Path) -> None:
     write_turned_about(tmp_path / "turned")
-    file = tmp_path / "gear.png"
-    result = calibrate("mask", f"images:{tmp_path / 'turned'}", "-o", str(file), "--json")
+    words = ("mask", f"images:{tmp_path / 'turned'}", "-o", tmp_path / "gear.png")
+    result = calibrate(*words, "--json")
     assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
-    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    image = cv2.imread(str(tmp_path / "gear.png"), cv2.IMREAD_UNCHANGED)
     assert image is not None
     assert set(np.unique(image)) == {0, 255}
     assert image.shape == SIZE_PX[::-1]
-    assert told["file"] == str(file)
-    assert told["size_px"] == list(SIZE_PX)
+    told = json.loads(result.stdout)
     assert told["covered"] == pytest.approx(float((image > 0).mean()), abs=1e-3)
-    again = calibrate("mask", f"images:{tmp_path / 'turned'}", "-o", str(file))
-    assert "--force" in refused(again, 30)
-    files = [str(path) for path in (tmp_path / "turned").iterdir()]
-    assert calibrate("mask", *files, "-o", str(file), "--force").exit_code == 0
-    assert (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) == image).all()
+    refused(calibrate(*words), 30, "--force")

@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration import BoardView
+from perchctl.calibration import learn_gear
 from perchctl.calibration.board.capture import sharpness
-from perchctl.calibration.board.detect import find_board, fit_saddles
+from perchctl.calibration.board.detect import BoardView, find_board, fit_saddles
 from perchctl.camera import Grey
+from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.target import Board
 from perchctl.vision import is_combed, project
@@ -20,14 +21,15 @@ from tests.helpers.boards import (
     draw_camera,
     draw_poses,
 )
+from tests.helpers.gear import SIZE_PX, Pictures, legs, turned_about
 
 CAMERA = draw_camera(np.random.default_rng(1), (480, 360))
 
 
 def crossing(
     at: tuple[float, float], square_px: float, angle_deg: float, slant_deg: float, blur_px: float
-) -> tuple[Grey, Array, Array]:
-    """A checker of that square around one corner, drawn at 12 samples a pixel."""
+) -> tuple[Grey, Array]:
+    """A checker of that square around one corner, drawn at 12 samples a pixel, and its sides."""
     n, s = 64, 12
     t = (np.arange(n * s) + 0.5) / s - 0.5
     x, y = np.meshgrid(t - at[0], t - at[1])
@@ -39,7 +41,8 @@ def crossing(
     fine = np.where(white, 200.0, 40.0)
     picture = fine.reshape(n, s, n, s).mean(axis=(1, 3))
     picture = cv2.GaussianBlur(picture, (0, 0), blur_px)
-    return np.rint(picture).astype(np.uint8), along * square_px, down * square_px
+    sides = np.column_stack([along, down]) * square_px
+    return np.rint(picture).astype(np.uint8), sides[None]
 
 
 @pytest.mark.parametrize("square_px", [7.0, 12.0, 30.0])
@@ -48,9 +51,9 @@ def test_a_corner_is_found_without_bias(square_px: float, slant_deg: float) -> N
     errors = []
     for k in range(8):
         at = (31.0 + 0.13 * k, 32.4 - 0.11 * k)
-        image, along, down = crossing(at, square_px, 7.0 + 11.0 * k, slant_deg, 0.8)
+        image, sides = crossing(at, square_px, 7.0 + 11.0 * k, slant_deg, 0.8)
         start = np.array([at]) + 0.4 * np.array([np.cos(k), np.sin(k)])
-        fit = fit_saddles(image, start, along[None], down[None])
+        fit = fit_saddles(image, start, sides)
         assert fit.ok.all()
         errors.append(fit.corners_px[0] - at)
     assert np.abs(errors).max() < (0.12 if square_px < 10 else 0.03)
@@ -58,16 +61,15 @@ def test_a_corner_is_found_without_bias(square_px: float, slant_deg: float) -> N
 
 def test_a_flat_patch_is_refused() -> None:
     image = np.full((64, 64), 120, np.uint8)
-    axes = np.array([[12.0, 0.0]]), np.array([[0.0, 12.0]])
-    fit = fit_saddles(image, np.array([[32.0, 32.0]]), *axes)
+    fit = fit_saddles(image, np.array([[32.0, 32.0]]), 12.0 * np.eye(2)[None])
     assert not fit.ok.any()
 
 
 def test_light_that_falls_off_does_not_pull() -> None:
-    image, along, down = crossing((32.3, 31.6), 20.0, 20.0, 0.0, 1.2)
+    image, sides = crossing((32.3, 31.6), 20.0, 20.0, 0.0, 1.2)
     fall = 1.0 - 0.01 * np.arange(64)
     shaded = np.rint(image * fall).astype(np.uint8)
-    fit = fit_saddles(shaded, np.array([[32.0, 32.0]]), along[None], down[None])
+    fit = fit_saddles(shaded, np.array([[32.0, 32.0]]), sides)
     assert fit.corners_px[0] == pytest.approx((32.3, 31.6), abs=0.02)
 
 
@@ -118,26 +120,17 @@ def test_a_large_picture_keeps_the_places_of_its_pixels() -> None:
 
 # --- interlaced pictures -------------------------------------------------------------------
 
-FIELDS_S = 0.02
-SPEED = np.array([0.15, 0.15, 0.3, 0.08, 0.08, 0.08])  # rad/s and m/s of a hand, one sigma
 
-
-def test_corners_of_an_interlaced_picture_are_half_way_between_its_fields() -> None:
-    """Or those of the one field that shows the board."""
-    rng = np.random.default_rng(3)
-    renderer = BoardRenderer(CAMERA, CHARUCO)
-    combed = 0
-    for pose in draw_poses(rng, CAMERA, CHARUCO, 8):
-        step = rng.normal(0.0, 1.0, 6) * SPEED * FIELDS_S / 2.0
-        poses = pose - step, pose + step
-        picture, bottom = (renderer.render(each, rng, noise=2.0) for each in poses)
+def test_the_corners_of_an_interlaced_picture_are_its_first_fields() -> None:
+    rng, renderer = np.random.default_rng(3), BoardRenderer(CAMERA, CHARUCO)
+    for pose in draw_poses(rng, CAMERA, CHARUCO, 4):
+        after = pose + np.array([0.0, 0.0, 0.0, 0.004, 0.001, 0.0])
+        picture, bottom = (renderer.render(each, rng, noise=2.0) for each in (pose, after))
         picture[1::2] = bottom[1::2]
-        combed += is_combed(picture)
+        assert is_combed(picture)
         view = _view(CHARUCO, picture)
-        there = [project(CHARUCO.corners_m(), p[:3], p[3:], CAMERA)[view.ids] for p in poses]
-        moments = [(there[0] + there[1]) / 2.0, *there]
-        assert min(rms(view.corners_px - moment) for moment in moments) < 0.1
-    assert combed >= 5
+        there = project(CHARUCO.corners_m(), pose[:3], pose[3:], CAMERA)[view.ids]
+        assert rms(view.corners_px - there) < 0.1
 
 
 def test_a_comb_is_no_sharpness() -> None:
@@ -149,3 +142,36 @@ def test_a_comb_is_no_sharpness() -> None:
     combed[1::2] = np.roll(still, 3, axis=1)[1::2]
     assert is_combed(combed)
     assert sharpness(combed) < 1.2 * sharpness(still)
+
+
+# --- the vehicle's own gear, learned from pictures that move -------------------------------------
+
+
+def test_what_stays_the_same_is_the_gear() -> None:
+    covered = learn_gear(Pictures(turned_about()))
+    inner = cv2.erode(legs().astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    outer = cv2.dilate(legs().astype(np.uint8), np.ones((13, 13), np.uint8)) > 0
+    assert covered[inner].all()
+    assert not covered[~outer].any()
+
+
+def test_what_does_not_reach_the_edge_is_no_gear() -> None:
+    spot = legs()
+    spot[100:130, 200:230] = True
+    assert not learn_gear(Pictures(turned_about(covered=spot)))[110:120, 210:220].any()
+
+
+@pytest.mark.parametrize(
+    ("pictures", "told"),
+    [
+        (turned_about(5), "5 pictures are too few"),
+        (turned_about(contrast=2.0), "hardly change"),
+        (turned_about(covered=np.zeros(SIZE_PX[::-1], np.bool_)), "covers nothing"),
+        ([*turned_about(3), np.zeros((10, 10), np.uint8)], "belongs to one size"),
+    ],
+)
+def test_pictures_that_do_not_show_it_are_refused(
+    pictures: list[np.ndarray[tuple[int, int], np.dtype[np.uint8]]], told: str
+) -> None:
+    with pytest.raises(InvalidValue, match=told):
+        learn_gear(Pictures(pictures))

@@ -10,16 +10,15 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from perchctl.calibration import (
+    FoundViews,
     calibrate_camera,
     calibration_text,
     load_calibration,
     profile_camera,
 )
 from perchctl.calibration.board.adjust import MODEL_NAMES, PARAMETERS, parameters_of
-from perchctl.commands import app
 from perchctl.errors import InvalidValue
 from perchctl.profile import CameraConfig
 from perchctl.vision import CameraModel
@@ -72,7 +71,7 @@ def test_any_number_is_written_as_a_number(value: float) -> None:
 def test_a_calibration_s_file_holds_its_quality(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     camera = draw_camera(rng)
-    result = calibrate_camera(corner_views(rng, camera), "charuco:10x7:25mm:18mm:DICT_5X5_100")
+    result = calibrate_camera(FoundViews(tuple(corner_views(rng, camera))), "charuco:10x7:25mm")
     path = tmp_path / "camera.yaml"
     path.write_text(result.text("camera", "2026-01-02T03:04:05+00:00"))
     plain = yaml.safe_load(path.read_text())
@@ -131,43 +130,3 @@ def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
         load_calibration(chain, cam="cam2")
     with pytest.raises(InvalidValue, match="is no Kalibr file"):
         load_calibration("example_640x480.yaml", cam="cam0")
-
-
-@pytest.mark.parametrize("words", [
-    ("calibrate", "convert", "{chain}", "-o", "{out}.yaml"),
-    ("calibrate", "check", "{chain}", "{pictures}"),
-    ("make-target", "design", "{chain}"),
-    ("track", "{pictures}", "--stills", "--json", "--calibration", "{chain}"),
-    ("track", "{pictures}", "--stills", "--json", "-p", "{profile}"),
-])  # fmt: skip
-def test_every_command_that_reads_kalibr_s_file_takes_the_camera(
-    tmp_path: Path, words: tuple[str, ...]
-) -> None:
-    """And says which there are where none is named."""
-    (tmp_path / "pictures").mkdir()
-    cv2.imwrite(str(tmp_path / "pictures" / "grey.png"), np.full((480, 640), 90, np.uint8))
-    profile = tmp_path / "mine.yaml"
-    profile.write_text("extends: sim\ncamera: {calibration: camchain.yaml}\n")
-    places = {
-        "chain": str(_camchain(tmp_path / "camchain.yaml")),
-        "pictures": f"images:{tmp_path / 'pictures'}",
-        "profile": str(profile),
-        "out": str(tmp_path / "out"),
-    }
-    command = [word.format(**places) for word in words]
-    without = CliRunner().invoke(app, command)
-    named = CliRunner().invoke(app, [*command, "--cam", "cam1"])
-    assert without.exit_code == 30
-    assert "holds 2 cameras (cam0, cam1)" in without.stderr
-    assert "cameras" not in named.stderr
-    if "check" not in words:  # which goes on to find no board
-        assert named.exit_code == 0, named.output
-    wrong = CliRunner().invoke(app, [*command, "--cam", "cam7"])
-    assert wrong.exit_code == 30
-    assert "its cameras are cam0, cam1" in wrong.stderr
-
-
-def test_a_camera_of_no_file_is_refused() -> None:
-    result = CliRunner().invoke(app, ["make-target", "--cam", "cam0"])
-    assert result.exit_code == 2
-    assert "--cam" in result.stderr

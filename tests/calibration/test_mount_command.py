@@ -14,12 +14,9 @@ from typer.testing import Result
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration import (
-    MountingReport,
-    read_recordings,
-    write_recordings,
-)
+from perchctl.calibration import MountingRecording
 from perchctl.calibration.mounting.carry import CarrySolution
+from perchctl.calibration.mounting.report import MountingReport
 from perchctl.commands import calibrate_mount
 from perchctl.geometry import Array
 from perchctl.profile import Mounting, load_profile
@@ -46,8 +43,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Recordings of both parts, of each one, and of what will not do."""
     folder = tmp_path_factory.mktemp("logs")
     carry, pivot = seen(hand("carry", SEED)), seen(hand("pivot", SEED))
-    still = replace(pivot, attitudes=(), poses=(pivot.poses[0],) * 200)
-    mirrored = replace(pivot, attitudes=(), poses=(), mirrored_pictures=200)
+    still = replace(pivot, attitudes=[], poses=[pivot.poses[0]] * 200)
+    mirrored = replace(pivot, attitudes=[], poses=[], mirrored_pictures=200)
     brief = replace(carry, attitudes=carry.attitudes[:300], poses=carry.poses[:40])
     paths = {}
     for name, parts in {
@@ -55,7 +52,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "mirrored": (mirrored,), "brief": (brief,),
     }.items():  # fmt: skip
         paths[name] = folder / f"{name}.jsonl"
-        write_recordings(paths[name], parts)
+        MountingRecording.write(paths[name], parts)
     whole = paths["pivot"].read_text(encoding="utf-8")
     paths["cut"] = folder / "cut.jsonl"
     paths["cut"].write_text(whole[: len(whole) // 2], encoding="utf-8")
@@ -264,7 +261,7 @@ def test_a_latency_that_flights_measure_stays_so() -> None:
 def carried(R: Array) -> CarrySolution:
     """A solution with that turn."""
     known = np.eye(3) * np.radians(0.05) ** 2
-    return CarrySolution(R, known, 0.0803, 0.001, np.zeros(3))
+    return CarrySolution(R, known, 0.0803, 0.001)
 
 
 def test_a_recording_goes_with_the_sizes_and_the_lens_that_it_was_seen_by(
@@ -278,8 +275,8 @@ def test_a_recording_goes_with_the_sizes_and_the_lens_that_it_was_seen_by(
         "seen by markers of 150 and 25 mm", "the profile has markers of 160 and 25 mm",
     )  # fmt: skip
     assert "rpy_deg" not in (place / "larger.yaml").read_text()
-    (pivot,) = read_recordings(logs["pivot"])
-    write_recordings(place / "old.jsonl", [replace(pivot, seen_by="")])
+    (pivot,) = MountingRecording.read(logs["pivot"])
+    MountingRecording.write(place / "old.jsonl", [replace(pivot, seen_by="")])
     unnamed = mount("-p", "mine.yaml", "--from", "old.jsonl")
     assert unnamed.exit_code == 0
     assert "unchecked" in unnamed.stderr

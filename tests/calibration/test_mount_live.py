@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import socket
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,21 +13,19 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-
 from perchctl.calibration import (
     AttitudeSample,
     GuidedFrame,
-    MountingTape,
+    MountingRecording,
     PoseReader,
-    VehicleSensors,
-    capture,
     load_calibration,
-    read_recordings,
+    record_mounting,
 )
 from perchctl.calibration.mounting.capture import LEAST_S, MOST_S
 from perchctl.calibration.mounting.recording import SeenPose
 from perchctl.commands import calibrate_mount
-from perchctl.errors import InvalidValue, TimedOut
+from perchctl.errors import InvalidValue, NotFound, TimedOut
+from perchctl.geometry import rotation_from_rpy
 from perchctl.link import MotionLink
 from perchctl.sim import Scenario, SimProcess
 from perchctl.vision import Frame
@@ -86,7 +82,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     log = Path("calib/mounting_mine.jsonl")
     assert f"kept the recording: {log}" in said.stderr
     assert f"--from {log}" in said.stderr
-    (recording,) = read_recordings(log)
+    (recording,) = MountingRecording.read(log)
     assert len(recording.poses) >= 10
     newest = recording.attitudes[-1]
     rpy_rad = (newest.roll_rad, newest.pitch_rad, newest.yaw_rad)
@@ -97,24 +93,6 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     again = calibrate("mount", "-p", "mine.yaml", "--from", log)
     assert again.exit_code == 30
     assert "lacks motion" in again.stderr
-
-
-@pytest.mark.long
-def test_a_vehicle_that_does_not_answer(
-    sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mute:
-        mute.bind(("127.0.0.1", 0))
-        uri = f"udp://127.0.0.1:{mute.getsockname()[1]}"
-        Path("mine.yaml").write_text(
-            "extends: crazyflie\nlink: {connect_timeout_s: 0.5}\n", encoding="utf-8"
-        )
-        words = ["-p", "mine.yaml", "-u", uri, "--source", sim.stream_url]
-        said = calibrate("mount", *words)
-    assert said.exit_code == 10
-    assert f"no Crazyflie at {uri}: no answer" in said.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
 
 
 def test_turning_motors_end_it(
@@ -134,28 +112,23 @@ def test_turning_motors_end_it(
 
 
 class _Film:
-    """A live source that runs by `now`: one picture each 1/15 s, until `ends_s`."""
+    """A live source that runs by its own clock: one picture each 1/15 s, until `ends_s`, each
+    given `times` times."""
 
-    live = True
-    finished = False
-    size_px = (640, 480)
+    live, finished, size_px = True, False, (640, 480)
 
-    def __init__(self, ends_s: float = np.inf, flooding: bool = False) -> None:
-        self.now_s, self._ends_s, self._count = 0.0, ends_s, 0
-        self._flooding = flooding  # pictures faster than they are looked at
-
-    def clock(self) -> float:
-        return self.now_s
+    def __init__(self, ends_s: float = np.inf, times: int = 1) -> None:
+        self.now_s, self._ends_s, self._times, self._count = 0.0, ends_s, times, 0
 
     def sleep(self, seconds: float) -> None:
         self.now_s += seconds
 
     def poll(self, now_s: float) -> Frame | None:
-        if now_s > self._ends_s or (now_s * 15.0 < self._count and not self._flooding):
+        if now_s > self._ends_s or now_s * 15.0 * self._times < self._count:
             return None
         self._count += 1
-        self.now_s += 0.01 * self._flooding
-        return Frame(self._count, now_s, np.zeros((480, 640), np.uint8), now_s)
+        again = self._count % self._times != 1 % self._times
+        return Frame(self._count, now_s, np.zeros((480, 640), np.uint8), now_s, repeated=again)
 
     def problem(self, now_s: float) -> str | None:
         return "camera:0 is unplugged" if now_s > self._ends_s else None
@@ -170,40 +143,36 @@ class _Film:
 class _Looks(PoseReader):
     """Gives the poses of a recording at their times, or none."""
 
-    def __init__(self, poses: tuple[SeenPose, ...], mirrored: bool = False) -> None:
+    def __init__(self, poses: list[SeenPose], mirrored: bool = False) -> None:
         self._poses, self._is_mirrored = list(poses), mirrored
         self.mirrored, self.outlines, self.trouble = 0, (), ""
 
     def look(self, frame: Frame) -> list[SeenPose]:
         self.mirrored += self._is_mirrored
-        found = [pose for pose in self._poses if pose.t_s <= frame.t_s]
-        del self._poses[: len(found)]
-        return found
+        due = [] if frame.repeated else [pose for pose in self._poses if pose.t_s <= frame.t_s]
+        del self._poses[: len(due)]
+        return due
 
 
-def feed(attitudes: tuple[AttitudeSample, ...], film: _Film) -> Callable[[], list[AttitudeSample]]:
-    left = list(attitudes)
+def recorded(
+    recording: MountingRecording,
+    film: _Film,
+    looks: _Looks,
+    attitudes: list[AttitudeSample] | None = None,
+    problem: Callable[[float], str | None] = lambda now_s: None,
+    until_s: float = np.inf,
+) -> list[GuidedFrame]:
+    """Fill the recording from the film, by its own clock; the moments that were shown."""
+    moments: list[GuidedFrame] = []
+    left = list(attitudes or [])
 
     def arrived() -> list[AttitudeSample]:
         due = [a for a in left if a.t_s <= film.now_s]
         del left[: len(due)]
         return due
 
-    return arrived
-
-
-def recorded(
-    tape: MountingTape,
-    film: _Film,
-    looks: _Looks,
-    sensors: VehicleSensors | None = None,
-    until_s: float = np.inf,
-) -> list[GuidedFrame]:
-    """Fill the tape from the film, by its own clock; the moments that were shown."""
-    moments: list[GuidedFrame] = []
-    sensors = sensors or VehicleSensors()
-    capture(
-        tape, film, looks, sensors, moments.append, film.clock, film.sleep,
+    record_mounting(
+        recording, film, looks, moments.append, arrived, problem, lambda: film.now_s, film.sleep,
         lambda: film.now_s > until_s,
     )  # fmt: skip
     return moments
@@ -211,70 +180,119 @@ def recorded(
 
 def test_it_ends_when_no_turn_is_missing_and_says_which_is_until_then() -> None:
     whole = seen(hand("carry", seconds=LEAST_S["carry"] + 3.0))
-    film, tape = _Film(), MountingTape("carry")
-    sensors = VehicleSensors(feed(whole.attitudes, film))
-    moments = recorded(tape, film, _Looks(whole.poses), sensors)
+    film, recording = _Film(), MountingRecording("carry")
+    moments = recorded(recording, film, _Looks(whole.poses), whole.attitudes)
     assert film.now_s == pytest.approx(LEAST_S["carry"], abs=0.5)
     assert moments[-1].advice.startswith("enough")
-    assert moments[-1].line == f"carry: {moments[-1].advice}"
     assert ("missing", "nothing", None) in moments[-1].rows
-    texts = [text for moment in moments for _, text, _ in moment.rows]
-    assert any(text.startswith(("yaw:", "longer:")) for text in texts)
-    assert tape.recording().poses[:100] == whole.poses[:100]
-
-
-@pytest.mark.parametrize(
-    ("mirrored", "words"), [(False, "no target in view"), (True, "camera.mirrored")]
-)
-def test_the_advice_names_what_is_in_the_way_first(mirrored: bool, words: str) -> None:
-    looks = _Looks((), mirrored)
-    moments = recorded(MountingTape("pivot"), _Film(), looks, until_s=2.0)
-    assert words in moments[-1].advice
-
-
-class _Receiver(_Film):
-    """Gives each picture three times, and from `stuck_s` on the last one again and again."""
-
-    def __init__(self, stuck_s: float = np.inf) -> None:
-        super().__init__()
-        self._stuck_s = stuck_s
-
-    def poll(self, now_s: float) -> Frame | None:
-        frame = super().poll(now_s)
-        again = self._count % 3 != 1 or now_s > self._stuck_s
-        return frame if frame is None else replace(frame, repeated=again)
-
-
-class _SeesEachNew(_Looks):
-    def look(self, frame: Frame) -> list[SeenPose]:
-        return [] if frame.repeated else [replace(self._poses[0], t_s=frame.t_s)]
+    assert any("turn it about the vertical" in row[1] for m in moments for row in m.rows)
+    assert recording.poses[:100] == whole.poses[:100]
 
 
 def test_a_receivers_repetitions_are_no_pictures_without_the_target() -> None:
-    looks, tape = _SeesEachNew(seen(hand("pivot")).poses), MountingTape("pivot")
-    moments = recorded(tape, _Receiver(), looks, until_s=4.0)
-    assert {share for m in moments for name, _, share in m.rows if name == "target"} == {1.0}
-    assert len(moments) == len(tape.poses) == pytest.approx(20, abs=2)
-    film = _Receiver(stuck_s=1.0)
-    recorded(MountingTape("pivot"), film, looks)
+    recording = MountingRecording("pivot")
+    film, poses = _Film(times=3), seen(hand("pivot")).poses
+    moments = recorded(recording, film, _Looks(poses), until_s=4.0)
+    assert len(moments) == pytest.approx(60, abs=3)
+    assert next(share for name, _, share in moments[-1].rows if name == "target") > 0.8
+    film = _Film()
+    moments = recorded(MountingRecording("pivot"), film, _Looks([]))
+    assert moments[-1].advice == "no target in view"
     assert film.now_s == pytest.approx(MOST_S, abs=1.0), "nobody records for ever"
 
 
-def test_a_mirrored_picture_ends_it_soon() -> None:
-    film = _Film()
-    with pytest.raises(InvalidValue, match=r"mirrored.*camera\.mirrored"):
-        recorded(MountingTape("carry"), film, _Looks((), mirrored=True))
-    assert film.now_s < 5.0
+@pytest.mark.parametrize(
+    ("film", "looks", "error", "said"),
+    [
+        (_Film(ends_s=3.0), _Looks([]), TimedOut, "camera:0 is unplugged"),
+        (_Film(), _Looks([]), TimedOut, "the vehicle is gone: nothing heard"),
+        (_Film(), _Looks([], mirrored=True), InvalidValue, r"mirrored.*camera\.mirrored"),
+    ],
+)
+def test_what_ends_it_early_is_named_and_what_was_recorded_is_kept(
+    film: _Film, looks: _Looks, error: type[Exception], said: str
+) -> None:
+    recording = MountingRecording("pivot")
+    samples = seen(hand("pivot")).attitudes
+    with pytest.raises(error, match=said):
+        recorded(
+            recording, film, looks, samples,
+            lambda now_s: "nothing heard for 2 s" if now_s > 4.5 and "gone" in said else None,
+        )  # fmt: skip
+    assert film.now_s < 7.0
+    assert len(recording.attitudes) > 200
 
 
-def test_a_camera_or_a_vehicle_that_goes_ends_it_and_the_tape_keeps_what_was() -> None:
-    whole = seen(hand("pivot"))
-    tape = MountingTape("pivot")
-    with pytest.raises(TimedOut, match="camera:0 is unplugged"):
-        recorded(tape, _Film(ends_s=3.0), _Looks(whole.poses))
-    assert len(tape.poses) > 20
-    tape = MountingTape("pivot")
-    silent = VehicleSensors(problem=lambda now_s: "nothing heard for 2 s" if now_s > 1.0 else None)
-    with pytest.raises(TimedOut, match="the vehicle is gone: nothing heard for 2 s"):
-        recorded(tape, _Film(flooding=True), _Looks(whole.poses), silent)
-    assert tape
+# --- the recording's file ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def recordings() -> list[MountingRecording]:
+    rng = np.random.default_rng(1)
+    attitudes = [
+        AttitudeSample(1.25, 0.1, -0.2, 3.0, rng.normal(size=3)),
+        AttitudeSample(1.26, 0.1, -0.2, -3.1, np.array([0.02, 1.0, 2.0])),
+    ]
+    root, R = rng.normal(size=(6, 6)) * 1e-4, rotation_from_rpy(3.0, 0.4, -2.0)
+    poses = [SeenPose(t_s, R, rng.normal(size=3), root @ root.T) for t_s in (1.3, 1.33)]
+    return [
+        MountingRecording("carry", attitudes, poses, 3, "by"),
+        MountingRecording("pivot", [], poses[:1]),
+    ]
+
+
+@pytest.fixture
+def path(tmp_path: Path, recordings: list[MountingRecording]) -> Path:
+    MountingRecording.write(tmp_path / "mount.jsonl", recordings)
+    return tmp_path / "mount.jsonl"
+
+
+def test_what_is_written_is_read(path: Path, recordings: list[MountingRecording]) -> None:
+    read = MountingRecording.read(path)
+    told = [(r.part, r.mirrored_pictures, r.seen_by) for r in read]
+    assert told == [("carry", 3, "by"), ("pivot", 0, "")]
+    for one, other in zip(recordings, read, strict=True):
+        pairs = zip((*one.attitudes, *one.poses), (*other.attitudes, *other.poses), strict=True)
+        for a, b in pairs:
+            for name, value in vars(a).items():
+                np.testing.assert_allclose(getattr(b, name), value, rtol=1e-8, atol=1e-9)
+
+
+def test_what_would_not_be_read_is_not_written(path: Path) -> None:
+    """Nor does it take the place of a file that can be."""
+    before = path.read_text()
+    broken = AttitudeSample(1.25, np.nan, -0.2, 3.0, np.zeros(3))
+    with pytest.raises(InvalidValue, match=r"mount.jsonl is not written: a sample"):
+        MountingRecording.write(path, [MountingRecording("carry", [broken])])
+    assert path.read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("line", "found", "put"),
+    [
+        (1, '"carry"', '"walk"'),
+        (1, '"format":1', '"format":7'),
+        (1, '"part"', '"port"'),
+        (2, '"gyro_radps"', '"gyro"'),
+        (3, "0.02", "NaN"),
+        (4, '"rotation_cam_target":[[', '"rotation_cam_target":[[2.5,'),
+        (4, "{", ""),
+    ],
+)
+def test_a_wrong_line_is_named(path: Path, line: int, found: str, put: str) -> None:
+    lines = path.read_text().splitlines()
+    assert found in lines[line - 1]
+    lines[line - 1] = lines[line - 1].replace(found, put, 1)
+    path.write_text("\n".join(lines))
+    with pytest.raises(InvalidValue, match=f"line {line} is no line of a recording"):
+        MountingRecording.read(path)
+
+
+def test_what_is_no_file_or_empty_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty").write_text("")
+    (tmp_path / "flip").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(NotFound, match="not there"):
+        MountingRecording.read(tmp_path / "none.jsonl")
+    for name in (".", "empty", "flip"):
+        with pytest.raises(InvalidValue, match=r"cannot be read|is empty"):
+            MountingRecording.read(tmp_path / name)

@@ -13,7 +13,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration import MountingReport, solve_carry, solve_pivot
+from perchctl.calibration.mounting.carry import solve_carry
+from perchctl.calibration.mounting.pivot import solve_pivot
+from perchctl.calibration.mounting.report import MountingReport
 from perchctl.campaign.flights import fly_seed
 from perchctl.errors import ConnectionFailed, PerchError, SafetyAbort
 from perchctl.faults import FAULTS

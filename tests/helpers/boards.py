@@ -7,15 +7,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from perchctl.calibration import BoardView
+from perchctl.calibration.board.detect import BoardView
 from perchctl.camera import Grey
 from perchctl.geometry import Array
-from perchctl.target import Board, parse_board
+from perchctl.target import Board
 from perchctl.target.boards import black_squares
 from perchctl.vision import CameraModel, project, undistort
 
-CHARUCO = parse_board("charuco:10x7:25mm:18mm:DICT_5X5_100")
-CHESSBOARD = parse_board("chessboard:9x6:25mm")
+CHARUCO = Board.parse("charuco:10x7:25mm:18mm:DICT_5X5_100")
+CHESSBOARD = Board.parse("chessboard:9x6:25mm")
 _SUPER = 3  # samples across a pixel
 _SQUARE_PX = 50  # of the drawn board; a marker of 18 in 25 mm is 36 px, in the middle
 

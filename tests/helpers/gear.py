@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from perchctl.vision import Frame
+
 SIZE_PX = (320, 240)
 
 
@@ -36,6 +38,31 @@ def turned_about(
         soft = cv2.GaussianBlur(picture, (0, 0), 0.8) + rng.normal(0.0, 3.0, (h, w))
         pictures.append(np.clip(soft, 0, 255).astype(np.uint8))
     return pictures
+
+
+class Pictures:
+    """A recording of these pictures."""
+
+    live, size_px = False, SIZE_PX
+
+    def __init__(self, pictures: list[NDArray[np.uint8]]) -> None:
+        self._left = [Frame(k, k / 10.0, picture) for k, picture in enumerate(pictures)]
+
+    @property
+    def finished(self) -> bool:
+        return not self._left
+
+    def poll(self, now_s: float) -> Frame | None:
+        return self._left.pop(0) if self._left else None
+
+    def problem(self, now_s: float) -> str | None:
+        return None
+
+    def describe(self) -> str:
+        return "pictures"
+
+    def close(self) -> None:
+        pass
 
 
 def write_turned_about(folder: Path) -> None:

@@ -8,13 +8,8 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perchctl.calibration import (
-    MountingPart,
-    MountingRecording,
-    pose_basis,
-    profile_camera,
-)
-from perchctl.calibration.mounting.recording import SeenPose
+from perchctl.calibration import MountingRecording, PoseReader, profile_camera
+from perchctl.calibration.mounting.recording import MountingPart, SeenPose
 from perchctl.profile import Profile, load_profile
 from perchctl.sim.hand import Hand, R_target_cam, attitudes, cam_target_m, draw_hand
 
@@ -71,9 +66,9 @@ def seen(
     for k in np.flatnonzero(rng.random(len(p)) < wrong):
         R[k] = Rotation.from_rotvec(rng.normal(size=3) * 0.5).as_matrix() @ R[k]
         p[k] = p[k] + rng.normal(size=3) * 0.02
-    poses = tuple(
+    poses = [
         SeenPose(float(t), R[k], p[k], np.diag(claimed * sigma[k] ** 2))
         for k, t in enumerate(stamped_s)
-    )
-    by = pose_basis(profile(), profile_camera(profile().camera))
+    ]
+    by = PoseReader.basis(profile(), profile_camera(profile().camera))
     return MountingRecording(held.part, attitudes(held, errors), poses, seen_by=by)

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
 import math
+from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,19 +15,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.geometry import Array, rot_z
-from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig
+from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig, load_profile
 from perchctl.profile.vision import VehicleConfig
-from perchctl.target import (
-    assess_mounting,
-    edge_margin,
-    offset_text,
-    overhead_reach,
-    overhead_view,
-    view_from,
+from perchctl.target import make_design, overhead_text, suggest_target, view_from
+from perchctl.target.design import TargetDesign
+from perchctl.target.reading import check_target
+from perchctl.target.sheets import fits
+from perchctl.target.sight import (
+    SURE_PX,
+    BlindRange,
+    FieldOfView,
+    blind_range,
+    overhead_reach_m,
+    square_outline,
+    turned_outline,
 )
-from perchctl.target.sight import SURE_PX, MountingView, least_side_px
 from perchctl.vision import project, square_corners
-from tests.target.rig import camera_of
+from tests.helpers.flights import short_profile
+from tests.target.rig import camera_of, sized
 
 TARGET = TargetConfig()
 SIDE_M = TARGET.large.side_m
@@ -46,39 +56,31 @@ def in_picture(mount: Mounting, centre_m: Array, yaw_rad: float) -> bool:
     return bool((px >= 2.5).all() and (px <= np.array(CAMERA.size_px) - 3.5).all())
 
 
+def axis_m(mount: Mounting, height_m: float) -> tuple[float, float]:
+    """Where the camera's axis is at that height."""
+    x, y, z = mount.T_body_cam[:3, 2].tolist()
+    return x / z * height_m, y / z * height_m
+
+
 @settings(max_examples=60, deadline=None)
 @given(mounts, st.floats(0.6, 3.0), angles, angles, st.floats(0.0, 0.97))
-def test_within_the_reach_the_marker_is_whole_at_any_turn(
+def test_within_the_reach_the_marker_is_whole_at_any_turn_and_beyond_it_some_is_cut(
     mount: Mounting, height_m: float, towards: float, yaw_rad: float, share: float
 ) -> None:
-    reach = overhead_reach(SIDE_M, CAMERA, mount, height_m)
-    if reach is None:
+    reach_m = overhead_reach_m(SIDE_M, CAMERA, mount, height_m)
+    if reach_m is None:
         return
-    away_m = share * reach.radius_m
-    x, y = reach.axis_xy_m
-    centre = np.array([x + away_m * math.cos(towards), y + away_m * math.sin(towards), height_m])
-    assert in_picture(mount, centre, yaw_rad)
+    x, y = axis_m(mount, height_m)
 
+    def seen(away_m: float, way_rad: float, turn_rad: float) -> bool:
+        to_x, to_y = away_m * math.cos(way_rad), away_m * math.sin(way_rad)
+        return in_picture(mount, np.array([x + to_x, y + to_y, height_m]), turn_rad)
 
-@settings(max_examples=30, deadline=None)
-@given(mounts, st.floats(0.6, 3.0))
-def test_beyond_the_reach_some_marker_is_cut(mount: Mounting, height_m: float) -> None:
-    reach = overhead_reach(SIDE_M, CAMERA, mount, height_m)
-    if reach is None:
-        return
-    x, y = reach.axis_xy_m
-    away_m = 1.05 * reach.radius_m + 0.01
+    assert seen(share * reach_m, towards, yaw_rad)
     around = np.linspace(0.0, 2.0 * math.pi, 48)
-    turned = (
-        (towards, towards + math.pi / 4.0)  # a corner ahead
-        for towards in around
-    )
-    assert not all(
-        in_picture(
-            mount, np.array([x + away_m * math.cos(a), y + away_m * math.sin(a), height_m]), yaw
-        )
-        for a, yaw in turned
-    )
+    beyond_m = 1.05 * reach_m + 0.01
+    ahead = (0.0, math.pi / 4.0)  # a corner ahead
+    assert not all(seen(beyond_m, way, way + turn) for way in around for turn in ahead)
 
 
 @settings(max_examples=60, deadline=None)
@@ -104,54 +106,33 @@ def test_a_sight_is_the_lens_s_wherever_the_body_stands(
     assert np.linalg.norm(np.cross(on_axis, mount.T_body_cam[:3, 2])) < 1e-9
 
 
-def test_so_far_the_large_marker_has_the_least_side() -> None:
-    where = overhead_view(TARGET, CAMERA, Mounting())
-    assert abs(F * SIDE_M / where.highest_m - SURE_PX) < 1e-9
-    assert least_side_px(10.0) == SURE_PX, "a sharper picture promises no more"
-    assert least_side_px(30.0) > 30.0
-    blurred = overhead_view(TARGET, CAMERA, Mounting(), plain_px=30.0)
-    assert blurred.highest_m < where.highest_m * SURE_PX / 30.0
-    assert [r.height_m for r in where.reaches] == [1.0, 2.0]
-    assert "the axis points straight up" in where.words
-    assert "than 0.53 m at 1 m above it" in where.words
-
-
-def test_a_lean_is_told_by_the_vehicle_s_own_sides() -> None:
+@pytest.mark.parametrize(
+    ("rpy_deg", "words"),
+    [
+        ((0.0, 0.0, 0.0), "at most 3.2 m above the camera"),
+        ((0.0, 0.0, 0.0), "than 0.53 m at 1 m above it"),
+        ((0.0, 12.0, 0.0), "leans 12 deg forward"),
+        ((0.0, -12.0, 90.0), "leans 12 deg to the right"),
+        ((0.0, 17.0, 45.0), "leans 12 deg forward and 12 deg to the left"),
+        ((1.0, -1.0, 0.0), "points straight up"),
+        ((0.0, -90.0, 0.0), "camera that looks up"),
+    ],
+)
+def test_where_the_target_is_found_overhead(
+    rpy_deg: tuple[float, float, float], words: str
+) -> None:
     """`rpy_deg` of pitch is nose down: the view goes forward."""
-    leans = {
-        (0.0, 12.0, 0.0): "leans 12 deg forward",
-        (0.0, -12.0, 0.0): "leans 12 deg back",
-        (0.0, -12.0, 90.0): "leans 12 deg to the right",
-        (10.0, 0.0, 0.0): "leans 10 deg to the right",
-        (-10.0, 0.0, 0.0): "leans 10 deg to the left",
-        (0.0, 17.0, 45.0): "leans 12 deg forward and 12 deg to the left",
-        (1.0, -1.0, 0.0): "points straight up",
-    }
-    for rpy_deg, words in leans.items():
-        assert words in overhead_view(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg)).words, rpy_deg
-
-
-def test_a_camera_that_looks_aside_sees_nothing_overhead() -> None:
-    for rpy_deg in ((180.0, 0.0, 0.0), (0.0, -90.0, 0.0)):
-        where = overhead_view(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg))
-        assert where.reaches == ()
-        assert "camera that looks up" in where.words
+    assert words in overhead_text(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg))
 
 
 def test_a_way_is_named_by_the_vehicle_s_sides() -> None:
-    assert offset_text((0.31, -0.12)) == "0.31 m forward and 0.12 m to the right"
-    assert offset_text((-0.5, 0.004)) == "0.50 m back"
-    assert offset_text((0.0, 0.2)) == "0.20 m to the left"
+    mount, target_m = Mounting(position_m=(0.0, 0.0, 0.0)), np.array([0.31, -0.12, 1.0])
+    seen = view_from(np.zeros(3), 0.0, target_m, 0.0, TARGET, CAMERA, mount)
+    assert seen.aside_text == "0.31 m forward and 0.12 m to the right"
+    assert seen.reach_m == overhead_reach_m(SIDE_M, CAMERA, mount, 1.0)
 
 
-def test_the_room_is_that_to_the_nearest_edge() -> None:
-    box = np.array([[100.0, 100.0], [200.0, 100.0], [200.0, 200.0], [100.0, 200.0]])
-    assert edge_margin(box, (640, 480)) == (100.5) / 640
-    assert edge_margin(box + np.array([0.0, 275.0]), (640, 480)) == 4.5 / 640
-    assert edge_margin(box - 150.0, (640, 480)) < 0.0
-
-
-# --- near the target: from where on a mounting is blind, and the turn that is advised ---------
+# --- near the target: from where on a mounting is blind ---------------------------------------
 
 
 STRAIGHT_CAMERA = camera_of()
@@ -159,7 +140,7 @@ SMALL_M = 0.0125  # its half side
 WIDE, HIGH = 317 / 380, 237 / 380  # of the picture, from the axis, less the margin
 
 
-def view_of(gear_m: tuple[float, float, float], yaw_deg: float = 0.0) -> MountingView:
+def view_of(gear_m: tuple[float, float, float], yaw_deg: float = 0.0) -> BlindRange:
     """With the gear there from the camera, body axes."""
     mount = Mounting(position_m=(0.01, 0.0, 0.005), rpy_deg=(0.0, 0.0, yaw_deg))
     x, y, z = gear_m
@@ -167,7 +148,7 @@ def view_of(gear_m: tuple[float, float, float], yaw_deg: float = 0.0) -> Mountin
         camera=CameraConfig(mount=mount),
         vehicle=VehicleConfig(gear_body_m=(x + 0.01, y, z + 0.005)),
     )
-    return assess_mounting(TargetConfig(), STRAIGHT_CAMERA, profile)
+    return blind_range(TargetConfig(), STRAIGHT_CAMERA, profile)
 
 
 @pytest.mark.parametrize(
@@ -183,36 +164,117 @@ def view_of(gear_m: tuple[float, float, float], yaw_deg: float = 0.0) -> Mountin
 def test_whole_markers_are_lost_where_geometry_says(
     gear_m: tuple[float, float, float], nearest_m: float
 ) -> None:
-    assert view_of(gear_m).blind.whole_m == pytest.approx(nearest_m, abs=0.001)
+    assert view_of(gear_m).whole_m == pytest.approx(nearest_m, abs=0.001)
 
 
-@pytest.mark.parametrize("gear_m", [(0.0, 0.0, 0.0), (-0.03, 0.0, 0.0), (0.0, 0.03, 0.02)])
-def test_the_rest_of_the_drawing_halves_it(gear_m: tuple[float, float, float]) -> None:
-    blind = view_of(gear_m).blind
-    assert blind.whole_m is not None
-    assert blind.left_m is not None
-    assert blind.left_m <= 0.5 * blind.whole_m
+def test_a_blind_range_is_named() -> None:
+    assert view_of((0.28, 0.0, 0.0)).whole_m is None
+    assert "blind in all of the last 10 cm" in view_of((0.28, 0.0, 0.0)).words
+    assert "by whole markers alone: blind from 48 mm" in view_of((0.0, 0.03, 0.02)).words
+    assert "never blind" in view_of((0.0, 0.0, 0.025)).words
 
 
-def test_the_gear_along_the_picture_s_height_is_advised_against() -> None:
-    mount = view_of((0.0, 0.03, 0.02))
-    assert mount.turned_rpy_deg == (0.0, 0.0, 90.0)
-    assert mount.turned == view_of((0.0, 0.03, 0.02), yaw_deg=90.0).blind
-    first, advice = mount.lines()
-    assert "by whole markers alone: blind from 48 mm" in first
-    assert "turn the camera by 90 degrees" in advice
-    assert "camera.mount.rpy_deg: [0, 0, 90]" in advice
-    assert mount.record()["turned_rpy_deg"] == (0.0, 0.0, 90.0)
+# --- the designer against the renderer and the paper ---------------------------------------------
+
+TARGET = TargetConfig()
+ROOT = Path(__file__).resolve().parents[2]
+PAPER_CAMERA = camera_of(380.0)
+AHEAD = (np.eye(3), np.zeros(3))
 
 
-@pytest.mark.parametrize("gear_m", [(0.03, 0.0, 0.02), (0.0, 0.0, 0.0)])
-def test_a_good_mounting_needs_no_advice(gear_m: tuple[float, float, float]) -> None:
-    mount = view_of(gear_m)
-    assert mount.turned is None
-    assert len(mount.lines()) == 1
+@pytest.fixture(scope="module")
+def profile() -> Profile:
+    return load_profile("sim")
 
 
-def test_a_gear_far_aside_is_never_seen() -> None:
-    mount = view_of((0.28, 0.0, 0.0))
-    assert mount.blind.whole_m is None
-    assert "blind in all of the last 10 cm" in mount.lines()[0]
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The benchmark of the ranges, from beyond what may be wrong on, and quick."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    module = importlib.import_module("ranges_by_design")
+    monkeypatch.setattr(module, "START", 1.2)
+    return module
+
+
+@pytest.fixture(scope="module")
+def paper_design(profile: Profile) -> TargetDesign:
+    return make_design(TARGET, PAPER_CAMERA, 2.5, profile, 2.4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("focal_px", "blur_px"), [(250.0, 2.5), (380.0, 1.5)])
+def test_ranges_agree_with_the_renderer(bench: ModuleType, focal_px: float, blur_px: float) -> None:
+    """The other cameras and blurs: benchmarks/ranges_by_design.py."""
+    for name, designed, measured in bench.measure(focal_px, blur_px, TARGET):
+        assert designed == pytest.approx(measured, rel=0.15), name
+
+
+def test_the_paper_s_ranges_and_where_they_differ(paper_design: TargetDesign) -> None:
+    """z2 and z3 agree; a blur that explains z1 = 115 cm would be 3.5 px, not 2.5."""
+    design = paper_design
+    assert design.z2_m == pytest.approx(0.25, rel=0.15)
+    assert design.z3_upright_m == pytest.approx(0.12, rel=0.05)
+    assert design.z3_m == pytest.approx(0.17, rel=0.05), "facing across, it needs more room"
+    assert design.z1_m is not None
+    assert 1.15 < design.z1_m < 1.75
+    assert f"z1        {100 * design.z1_m:.3g} cm" in design.text("camera.yaml")
+    assert design.record()["warnings"] == []
+
+
+def test_z3_is_the_geometry_s() -> None:
+    view = FieldOfView(PAPER_CAMERA, margin_px=0.0)
+    upright, turned = square_outline(0.15), turned_outline(0.15)
+    nearest_m = 0.15 * 380.0 / 480.0
+    assert view.nearest_m(upright, *AHEAD) == pytest.approx(nearest_m, rel=2e-3)
+    assert view.nearest_m(turned, *AHEAD) == pytest.approx(math.sqrt(2.0) * nearest_m, rel=2e-3)
+    barrel = FieldOfView(camera_of(380.0, (-0.17, 0.04, 0.0, 0.0, 0.0)), margin_px=0.0)
+    shown = barrel.nearest_m(turned, *AHEAD)
+    assert shown is not None
+    assert shown < 0.99 * math.sqrt(2.0) * nearest_m, "barrel distortion shows more"
+    behind = np.diag([1.0, -1.0, -1.0])
+    assert view.nearest_m(turned, behind, np.zeros(3)) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, ""),
+        ({"z1_m": 0.9}, "gap at the start"),
+        ({"z2_m": 0.15}, "gap between the markers"),
+        ({"z1_m": None}, "never read"),
+        ({"small_nearest_m": 0.2}, "gap before contact"),
+        ({"small_nearest_m": None}, "gap before contact"),
+    ],
+)
+def test_gaps_are_named(paper_design: TargetDesign, changes: dict[str, Any], said: str) -> None:
+    warnings = dataclasses.replace(paper_design, **changes).warnings
+    assert len(warnings) == bool(said)
+    assert said in "".join(warnings)
+
+
+def test_a_gap_on_the_ground_is_named_where_the_target_is_the_position(
+    paper_design: TargetDesign,
+) -> None:
+    """From the search height it would be near enough."""
+    ground = short_profile({"positioning": "target"}, base="sim")
+    sure_m = 380.0 * 0.150 / SURE_PX
+    for ceiling_m, gap in ((0.9 * sure_m, False), (1.1 * sure_m, True)):
+        design = make_design(TARGET, PAPER_CAMERA, 0.6, ground, ceiling_m)
+        assert any("gap at the start" in text for text in design.warnings) is gap
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("focal_px", "blur_px", "ceiling_m"), [(380.0, 2.0, 2.4), (250.0, 0.6, None)]
+)
+def test_what_is_suggested_covers_the_way(
+    profile: Profile, focal_px: float, blur_px: float, ceiling_m: float | None
+) -> None:
+    found, page = suggest_target(camera_of(focal_px), blur_px, profile, 0.05, ceiling_m)
+    assert page == "a4"
+    assert found.warnings == ()
+    assert found.z1_m is not None
+    assert found.z1_m >= (1.15 if ceiling_m is None else ceiling_m - 1.3)
+    check_target(found.target, 0.05)
+    assert fits(found.target, "a4")
+    assert not fits(sized(1e3 * found.target.large.side_m + 5, 25.0), "a4")

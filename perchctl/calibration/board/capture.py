@@ -1,67 +1,66 @@
-"""Views of a board: from pictures, from videos, and from a live camera that a person is guided in
+"""Views of a board: from pictures, from a video, and from a live camera that a person is guided in
 front of; and how alike two views are, which decides which of many are kept."""
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from perchctl.calibration.board.detect import BoardView, Rejection, find_board
+from perchctl.calibration.board.detect import BoardView, FoundViews, Rejection, find_board
+from perchctl.calibration.board.solve import MIN_VIEWS
 from perchctl.calibration.live import GuidedFrame, poll_frames
-from perchctl.camera import BrokenPicture, FrameSource, Grey, VideoSource, image_files, read_grey
+from perchctl.camera import BrokenPicture, FrameSource, Grey, VideoSource, read_grey
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import Array
 from perchctl.target import Board
-from perchctl.vision import Frame, field_picture, is_combed
+from perchctl.vision import Frame
 
-MIN_VIEWS = 5
 VIDEO_WINDOW = 8
 """Of so many frames in a row only the sharpest is searched for the board."""
-_SHARPNESS_WIDTH = 480
+_BATCH = 32
+"""So many frames of a video are searched at once: a whole one would not fit into the memory."""
 Progress = Callable[[int, int | None], None]
 """Called with the number of pictures done, and of all where it is known."""
 
 
-# --- Pictures ------------------------------------------------------------------------------
+# --- Pictures and videos -------------------------------------------------------------------
 
 
-def views_of_images(
-    where: str | Sequence[Path],
-    board: Board,
-    progress: Progress = lambda done, total: None,
-) -> tuple[list[BoardView], list[Rejection]]:
-    """Search every picture of a folder or glob (or those given); return the views of the board, and
-    the pictures that are broken or show none.
+def find_views(
+    pictures: Sequence[Path] | Path, board: Board, progress: Progress = lambda done, total: None
+) -> FoundViews:
+    """Return the views of the board in picture files, or the sharp and different ones of a video's
+    frames; and the pictures that are broken or show none.
 
     Raises:
-        NotFound: no pictures. InvalidValue: unequal sizes.
+        NotFound: no such file. InvalidValue: unequal sizes, or no video.
     """
-    paths = image_files(where)
-    names = [path.name for path in paths]
+    if isinstance(pictures, Path):
+        return _views_of_video(pictures, board, progress)
+    names = [path.name for path in pictures]
     if len(set(names)) < len(names):  # a glob reached into several folders
-        names = [str(path) for path in paths]
+        names = [str(path) for path in pictures]
 
-    def search(job: tuple[str, Path]) -> tuple[str, tuple[int, int] | None, BoardView | str]:
-        name, path = job
+    def search(name: str, path: Path) -> BoardView | tuple[str, tuple[int, int] | None]:
         try:
             image = read_grey(path)
         except BrokenPicture as error:
-            return name, None, error.reason
-        return name, (image.shape[1], image.shape[0]), find_board(image, board, name)
+            return error.reason, None
+        found = find_board(image, board, name)
+        return found if isinstance(found, BoardView) else (found, (image.shape[1], image.shape[0]))
 
     views: list[BoardView] = []
     missing: list[Rejection] = []
     first: tuple[str, tuple[int, int]] | None = None
-    with ThreadPoolExecutor(_workers()) as pool:
-        found = pool.map(search, zip(names, paths, strict=True))
-        for done, (name, size_px, seen) in enumerate(found, start=1):
+    with ThreadPoolExecutor() as pool:
+        found = pool.map(search, names, pictures)
+        for done, (name, seen) in enumerate(zip(names, found, strict=True), start=1):
+            size_px = seen.size_px if isinstance(seen, BoardView) else seen[1]
             if size_px is not None:
                 first = first or (name, size_px)
                 if size_px != first[1]:
@@ -74,18 +73,13 @@ def views_of_images(
             if isinstance(seen, BoardView):
                 views.append(seen)
             else:
-                missing.append(Rejection(name, seen))
-            progress(done, len(paths))
-    return views, missing
+                missing.append(Rejection(name, seen[0]))
+            progress(done, len(pictures))
+    return FoundViews(tuple(views), tuple(missing))
 
 
-def views_of_video(
-    path: Path, board: Board, progress: Progress = lambda done, total: None
-) -> tuple[list[BoardView], list[Rejection]]:
-    """Return the sharp and different views of a video, and why there are none.
-
-    Raises NotFound or InvalidValue for a file that is none.
-    """
+def _views_of_video(path: Path, board: Board, progress: Progress) -> FoundViews:
+    """Return the sharp and different views of a video, or why there are none."""
 
     def search(frame: Frame) -> BoardView | str:
         return find_board(frame.image, board, f"frame {frame.index}")
@@ -94,10 +88,9 @@ def views_of_video(
     found: list[BoardView] = []
     searched = 0
     try:
-        with ThreadPoolExecutor(_workers()) as pool:
+        with ThreadPoolExecutor() as pool:
             sharpest = _sharpest_frames(source)
-            # A whole video at once would not fit into the memory.
-            while batch := [frame for frame, _ in zip(sharpest, range(4 * _workers()))]:  # noqa: B905
+            while batch := [frame for frame, _ in zip(sharpest, range(_BATCH))]:  # noqa: B905
                 seen = list(pool.map(search, batch))
                 found += [view for view in seen if isinstance(view, BoardView)]
                 searched += len(batch)
@@ -105,8 +98,8 @@ def views_of_video(
     finally:
         source.close()
     if not found:
-        return [], [Rejection(f"{searched} frames", "no board found")]
-    return select_views(found, board), []
+        return FoundViews((), (Rejection(f"{searched} frames", "no board found"),))
+    return FoundViews(tuple(select_views(found, board)))
 
 
 def _sharpest_frames(source: VideoSource) -> Iterator[Frame]:
@@ -122,18 +115,9 @@ def _sharpest_frames(source: VideoSource) -> Iterator[Frame]:
 
 
 def sharpness(image: Grey) -> float:
-    """Return the variance of a picture's second derivative; of one field where there are two: the
-    comb of a moving picture is no sharpness."""
-    if is_combed(image):
-        image = field_picture(image, 0)
-    step = max(1, image.shape[1] // _SHARPNESS_WIDTH)
-    small = np.ascontiguousarray(image[::step, ::step])
-    return float(cv2.Laplacian(small, cv2.CV_32F).var())
-
-
-def _workers() -> int:
-    """Return the number of threads: OpenCV and numpy leave the interpreter free at work."""
-    return max(1, min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2))
+    """Return the variance of a picture's second derivative; of every second row, as the comb of an
+    interlaced picture that moves is no sharpness."""
+    return float(cv2.Laplacian(np.ascontiguousarray(image[::2, ::2]), cv2.CV_32F).var())
 
 
 # --- How alike two views are ---------------------------------------------------------------
@@ -145,83 +129,54 @@ GOALS = {"x": 0.5, "y": 0.5, "size": 0.3, "tilt": 0.4}
 NEW_BEYOND = 0.18
 ENOUGH_VIEWS = 15
 MOST_VIEWS = 40
+_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.7, 0.7])
 _TILT_GAIN = 2.0
 _BLUR_FACTOR = 1.7
 
 
-@dataclass(frozen=True)
-class Signature:
-    """Where and how a view shows the board: middle of its corners as a part of the width
-    and the height, size as a part of the picture, and by how much its right and its lower side
-    are farther away than the others."""
-
-    x: float
-    y: float
-    size: float
-    tilt_x: float
-    tilt_y: float
-
-    def distance(self, other: Signature) -> float:
-        """Return how different two views are; beyond `NEW_BEYOND` one is new."""
-        return float(np.abs(self._vector() - other._vector()).sum())
-
-    def _vector(self) -> Array:
-        return np.array([self.x, self.y, self.size, 0.7 * self.tilt_x, 0.7 * self.tilt_y])
-
-
-def signature(view: BoardView, board: Board) -> Signature:
-    """Return a view's signature, from the homography board -> picture; tilt is the change of scale
-    across the board."""
+def signature(view: BoardView, board: Board) -> Array:
+    """Return where and how a view shows the board, (5,): the middle of its corners as a part of the
+    picture's width and height, its size as a part of the picture, and by how much its right and
+    its lower side are farther away than the others."""
     w, h = view.size_px
-    x, y = (view.corners_px.mean(axis=0) / (w, h)).tolist()
+    x, y = view.corners_px.mean(axis=0) / (w, h)
     squares = view.object_m[:, :2] / board.square_m
     H, _ = cv2.findHomography(squares - squares.mean(axis=0), view.corners_px)
     if H is None:
-        return Signature(x, y, 0.0, 0.0, 0.0)
+        return np.array([x, y, 0.0, 0.0, 0.0])
     H = H / H[2, 2]
     affine = H[:2, :2] - np.outer(H[:2, 2], H[2, :2])
-    columns, rows = (side / board.square_m for side in board.size_m)
-    area = abs(float(np.linalg.det(affine))) * columns * rows
-    size = min(1.0, float(np.sqrt(area / (w * h))))
+    columns, rows = board.squares
+    size = np.sqrt(abs(np.linalg.det(affine)) * columns * rows / (w * h))
     # Brought from the board's axes to the picture's.
     rotation = affine / max(float(np.linalg.norm(affine[:, 0])), 1e-9)
     tilt = _TILT_GAIN * 0.5 * max(columns, rows) * (rotation @ H[2, :2])
-    tilt_x, tilt_y = np.clip(tilt, -1.0, 1.0).tolist()
-    return Signature(x, y, size, tilt_x, tilt_y)
+    return np.array([x, y, min(1.0, size), *np.clip(tilt, -1.0, 1.0)])
 
 
-def covered_shares(signatures: Sequence[Signature]) -> dict[str, float]:
+def distance(one: Array, other: Array) -> float:
+    """Return how different two signatures are; beyond `NEW_BEYOND` a view is new."""
+    return float(np.abs(one - other) @ _WEIGHTS)
+
+
+def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
     """Return how far each of `AXES` is covered, 0..1."""
-    if not signatures:
-        return dict.fromkeys(AXES, 0.0)
-    shown = np.array([(s.x, s.y, s.size, s.tilt_x, s.tilt_y) for s in signatures])
-    x, y, size, tilt_x, tilt_y = np.ptp(shown, axis=0)
-    spread = {"x": x, "y": y, "size": size, "tilt": (tilt_x + tilt_y) / 2.0}
+    x, y, size, *tilts = np.ptp(signatures, axis=0) if signatures else np.zeros(5)
+    spread = {"x": x, "y": y, "size": size, "tilt": sum(tilts) / 2.0}
     return {axis: float(min(1.0, spread[axis] / GOALS[axis])) for axis in AXES}
 
 
 def select_views(views: Sequence[BoardView], board: Board) -> list[BoardView]:
-    """Return the sharp and different ones of a video's views, at most `MOST_VIEWS`, in order.
-
-    The one most unlike those taken is taken next (the sharper the better), until what is
-    left repeats them.
-    """
-    blur = np.array([v.blur_px for v in views])
-    limit = _BLUR_FACTOR * max(float(np.median(blur)), 1e-9)
-    sharp = [i for i in range(len(views)) if blur[i] <= limit]
-    signatures = {i: signature(views[i], board) for i in sharp}
-    taken = [min(sharp, key=lambda i: blur[i])]
-    while len(taken) < min(MOST_VIEWS, len(sharp)):
-        apart = {
-            i: min(signatures[i].distance(signatures[j]) for j in taken)
-            for i in sharp
-            if i not in taken
-        }
-        best = max(apart, key=lambda i: apart[i] / (0.5 + blur[i] / limit))
-        if apart[best] < 0.4 * NEW_BEYOND:
-            break
-        taken.append(best)
-    return [views[i] for i in sorted(taken)]
+    """Return the sharp and different ones of a video's views, at most `MOST_VIEWS`, the sharpest
+    first."""
+    limit_px = _BLUR_FACTOR * float(np.median([view.blur_px for view in views]))
+    taken: dict[int, Array] = {}
+    for k in sorted(range(len(views)), key=lambda k: views[k].blur_px):
+        here = signature(views[k], board)
+        is_new = all(distance(here, there) > 0.4 * NEW_BEYOND for there in taken.values())
+        if is_new and views[k].blur_px <= limit_px and len(taken) < MOST_VIEWS:
+            taken[k] = here
+    return [views[k] for k in taken]
 
 
 # --- Guided capture ------------------------------------------------------------------------
@@ -229,6 +184,14 @@ def select_views(views: Sequence[BoardView], board: Board) -> list[BoardView]:
 
 _STILL_SHARE = 1.5 / 640.0  # of the width, between two frames
 _BLUR_SHARE = 2.5 / 640.0
+_ADVICE = (
+    (0.5, "move the board to the right rim", "move the board to the left rim"),
+    (0.5, "move the board to the bottom rim", "move the board to the top rim"),
+    (0.5, "come nearer", "go farther away"),
+    (0.0, "tilt the board's right side away", "tilt the board's left side away"),
+    (0.0, "tilt the board's lower side away", "tilt the board's upper side away"),
+)
+"""The middle of each part of a signature, and what brings more and less of it."""
 
 
 def capture_views(
@@ -238,7 +201,7 @@ def capture_views(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
-) -> list[BoardView]:
+) -> FoundViews:
     """Take views of a live camera until all is covered or `stopped`, whenever the view is new,
     sharp and still. `show` gets each frame's moment.
 
@@ -246,118 +209,100 @@ def capture_views(
 
     Raises TimedOut: the camera is gone before that.
     """
-    state = Capture()
+    capture = Capture(board)
     ended = f"{source.describe()} has ended"
     try:
         for _, frame in poll_frames(source, clock, sleep):
             if stopped():
-                return list(state.taken)
+                return FoundViews(tuple(capture.taken))
             if frame is None or frame.repeated:  # a repeated one would look still
                 continue
-            seen = find_board(frame.image, board, f"view {len(state.taken) + 1}")
-            state = update_capture(state, seen, board)
-            show(_moment(frame, seen, state))
-            if state.finished:
-                return list(state.taken)
+            seen = find_board(frame.image, board, f"view {len(capture.taken) + 1}")
+            taken = capture.update(seen)
+            show(capture.guided(frame, seen, taken))
+            if capture.finished:
+                return FoundViews(tuple(capture.taken))
     except TimedOut as gone:
         ended = str(gone)
-    if len(state.taken) < MIN_VIEWS:
+    if len(capture.taken) < MIN_VIEWS:
         raise TimedOut(
-            f"{ended}; only {len(state.taken)} views were taken, at least {MIN_VIEWS} are needed"
+            f"{ended}; only {len(capture.taken)} views were taken, at least {MIN_VIEWS} are needed"
         )
-    return list(state.taken)
+    return FoundViews(tuple(capture.taken))
 
 
-@dataclass(frozen=True, eq=False)
 class Capture:
-    """Memory of a guided capture; `Capture()` is a fresh start.
+    """The memory of a guided capture: the views `taken`, and what to do next, `advice`."""
 
-    advice: what to do next, for the person with the board.
-    """
-
-    taken: tuple[BoardView, ...] = ()
-    signatures: tuple[Signature, ...] = ()
-    last: BoardView | None = None
-    advice: str = "show the board to the camera"
-    shot: bool = False  # the newest frame was taken
+    def __init__(self, board: Board) -> None:
+        self._board = board
+        self._signatures: list[Array] = []
+        self._last: BoardView | None = None
+        self.taken: list[BoardView] = []
+        self.advice = "show the board to the camera"
 
     @property
     def finished(self) -> bool:
         """Enough of everything, or so many views that more would not change the solution."""
-        covered = min(covered_shares(self.signatures).values()) >= 1.0
-        return len(self.signatures) >= (ENOUGH_VIEWS if covered else MOST_VIEWS)
+        covered = min(covered_shares(self._signatures).values()) >= 1.0
+        return len(self.taken) >= (ENOUGH_VIEWS if covered else MOST_VIEWS)
+
+    def update(self, seen: BoardView | str) -> bool:
+        """Judge one more picture, by its view of the board or why there is none; return true if the
+        view was taken: it is new, sharp and still."""
+        before, self._last = self._last, seen if isinstance(seen, BoardView) else None
+        if isinstance(seen, str):
+            self.advice = seen
+            return False
+        width = seen.size_px[0]
+        sharpest_px = min((view.blur_px for view in self.taken), default=np.inf)
+        here = signature(seen, self._board)
+        if before is None or _moved_px(before, seen) > _STILL_SHARE * width:
+            self.advice = "hold still"
+        elif seen.blur_px > min(max(_BLUR_SHARE * width, 1.0), 2.5 * sharpest_px):
+            self.advice = "too blurred: more light, or hold still"
+        elif any(distance(here, there) <= NEW_BEYOND for there in self._signatures):
+            self.advice = next_advice(self._signatures)
+        else:
+            self.taken.append(seen)
+            self._signatures.append(here)
+            self.advice = f"taken, {len(self.taken)} views"
+            return True
+        return False
+
+    def guided(self, frame: Frame, seen: BoardView | str, taken: bool) -> GuidedFrame:
+        """Return what to show of a frame."""
+        outlines: tuple[tuple[str, Array], ...] = ()
+        if isinstance(seen, BoardView):
+            hull = cv2.convexHull(seen.corners_px.astype(np.float32)).reshape(-1, 2)
+            outlines = (("small" if taken else "large", hull.astype(np.float64)),)
+        shares = covered_shares(self._signatures).items()
+        rows = [(name, f"{100 * share:.0f} %", share) for name, share in shares]
+        line = f"{len(self.taken)} views; {', '.join(f'{name} {text}' for name, text, _ in rows)}"
+        views = ("views", str(len(self.taken)), None)
+        return GuidedFrame(
+            frame.index, frame.image, outlines, (*rows, views), self.advice, line, taken
+        )
 
 
-def update_capture(capture: Capture, seen: BoardView | str, board: Board) -> Capture:
-    """Return the capture after one more picture: the automatic shutter takes a view that is new,
-    sharp and still. `seen` is the board's view, or why there is none."""
-    taken, signatures = capture.taken, capture.signatures
-    if isinstance(seen, str):
-        return Capture(taken, signatures, None, seen)
-    width = seen.size_px[0]
-    if _moved_px(capture.last, seen) > _STILL_SHARE * width:
-        return Capture(taken, signatures, seen, "hold still")
-    sharpest = min((v.blur_px for v in taken), default=np.inf)
-    if seen.blur_px > max(_BLUR_SHARE * width, 1.0) or seen.blur_px > 2.5 * sharpest:
-        return Capture(taken, signatures, seen, "too blurred: more light, or hold still")
-    here = signature(seen, board)
-    if any(here.distance(s) <= NEW_BEYOND for s in signatures):
-        return Capture(taken, signatures, seen, next_advice(signatures))
-    grown = (*signatures, here)
-    return Capture((*taken, seen), grown, seen, f"taken, {len(grown)} views", True)
-
-
-def _moved_px(before: BoardView | None, now: BoardView) -> float:
+def _moved_px(before: BoardView, now: BoardView) -> float:
     """Return the median motion in px of the corners that both views show; infinite without any."""
-    if before is None:
-        return float("inf")
     _, a, b = np.intersect1d(before.ids, now.ids, return_indices=True)
-    if len(a) == 0:
-        return float("inf")
-    return float(np.median(np.linalg.norm(before.corners_px[a] - now.corners_px[b], axis=1)))
+    ways = np.linalg.norm(before.corners_px[a] - now.corners_px[b], axis=1)
+    return float(np.median(ways)) if len(a) else float("inf")
 
 
-def next_advice(signatures: Sequence[Signature]) -> str:
+def next_advice(signatures: Sequence[Array]) -> str:
     """Return one thing to do, in the picture's directions: towards where the least was shown so far
     of what is covered least."""
     done = covered_shares(signatures)
     least = min(AXES, key=lambda axis: done[axis])
     if done[least] >= 1.0:
         return "show the board somewhere new"
-    if least != "tilt":
-        shown = [getattr(s, least) for s in signatures]
-        more = min(shown) + max(shown) < 1.0
-        return {
-            "x": f"move the board to the {'right' if more else 'left'} rim",
-            "y": f"move the board to the {'bottom' if more else 'top'} rim",
-            "size": "come nearer" if more else "go farther away",
-        }[least]
-    across, down = [s.tilt_x for s in signatures], [s.tilt_y for s in signatures]
-    if np.ptp(across) <= np.ptp(down):
-        side = "right" if min(across) + max(across) < 0.0 else "left"
-    else:
-        side = "lower" if min(down) + max(down) < 0.0 else "upper"
-    return f"tilt the board's {side} side away"
-
-
-def _moment(frame: Frame, seen: BoardView | str, state: Capture) -> GuidedFrame:
-    """Return what to show of a frame."""
-    outlines: tuple[tuple[str, Array], ...] = ()
-    if isinstance(seen, BoardView):
-        hull = cv2.convexHull(seen.corners_px.astype(np.float32)).reshape(-1, 2)
-        outlines = (("small" if state.shot else "large", hull.astype(np.float64)),)
-    covered = {
-        name: (f"{100 * s:.0f} %", s) for name, s in covered_shares(state.signatures).items()
-    }
-    shares = ", ".join(f"{name} {text}" for name, (text, _) in covered.items())
-    taken = len(state.taken)
-    return GuidedFrame(
-        frame.index,
-        frame.image,
-        outlines,
-        (*((name, text, share) for name, (text, share) in covered.items()),
-         ("views", str(taken), None)),
-        state.advice,
-        f"{taken} views; {shares}",
-        state.shot,
-    )  # fmt: skip
+    k = AXES.index(least)
+    if least == "tilt":
+        across, down = np.ptp(signatures, axis=0)[3:]
+        k = 3 if across <= down else 4
+    shown = [part[k] for part in signatures]
+    middle, more, less = _ADVICE[k]
+    return more if min(shown) + max(shown) < 2.0 * middle else less

@@ -1,12 +1,12 @@
 """The check of an existing calibration by new pictures.
 
 The new views give two solutions: the file's camera with only the boards' poses fitted,
-and a camera of the same model fitted to these views alone. The first's reprojection
+and a camera fitted to these views alone. The first's reprojection
 error shows a wrong lens; but poses take up a wrong focal length, so the two cameras
 are compared at the target as well, in mm. The check fails
 
 - when the file's RMS is more than twice that of the free camera and above 0.3 px, or
-- when the two put the target further apart, straight ahead, than half of the limit
+- when the two put the target farther apart, straight ahead, than half of the limit
   (1 mm, or 1 % of the distance) and than the 95 % line of the new pictures themselves.
 
 Pictures whose own 95 % line is above twice the limit cannot judge, and the check is refused.
@@ -21,18 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.calibration.board.adjust import (
-    Fit,
-    NoSolution,
-    lens_covariance,
-    poses_only,
-    reject_outliers,
-    weighted_fit,
-)
-from perchctl.calibration.board.detect import BoardView, Rejection
+from perchctl.calibration.board.adjust import Fit, fit_poses, lens_covariance
+from perchctl.calibration.board.detect import FoundViews, Rejection
 from perchctl.calibration.board.predict import limit_mm, position_errors_mm, predict_errors
-from perchctl.calibration.board.result import rejected_views
-from perchctl.calibration.board.solve import tilts_deg
+from perchctl.calibration.board.solve import rejected_views, robust_fit, tilts_deg
 from perchctl.errors import InvalidValue
 from perchctl.vision import CameraModel
 
@@ -61,17 +53,16 @@ class Deviation:
 class CheckResult:
     """The verdict on a calibration by new pictures, and why.
 
-    rms_px is with the file's camera (infinite: it cannot see the boards), as are the `views`,
-    by name; free_rms_px that of the camera which fits the pictures best.
+    rms_px is with the file's camera (infinite: it cannot see the boards), free_rms_px that of the
+    camera which fits the pictures best.
     """
 
     passed: bool
     reason: str
     rms_px: float
     free_rms_px: float
-    views: tuple[tuple[str, float], ...]
-    rejections: tuple[Rejection, ...]
     deviations: tuple[Deviation, ...]
+    rejections: tuple[Rejection, ...]
 
     def record(self, file: Path) -> dict[str, Any]:
         """Return the object of `calibrate check --json`."""
@@ -81,47 +72,35 @@ class CheckResult:
             "file": str(file),
             "rms_px": self.rms_px if np.isfinite(self.rms_px) else None,
             "best_rms_px": self.free_rms_px,
-            "views": [{"name": name, "rms_px": rms} for name, rms in self.views],
             "views_rejected": rejected_views(self.rejections),
             "error_mm": [vars(d) for d in self.deviations if np.isfinite(d.mm)],
         }
 
 
-def check_calibration(camera: CameraModel, views: Sequence[BoardView]) -> CheckResult:
+def check_calibration(camera: CameraModel, found: FoundViews) -> CheckResult:
     """Judge a calibration by new views of a board.
 
     Raises InvalidValue for too few views, or views that do not fix it.
     """
-    if len(views) < MIN_CHECK_VIEWS:
+    if len(found.views) < MIN_CHECK_VIEWS:
         raise InvalidValue(
-            f"{len(views)} pictures show the board, a check needs at least {MIN_CHECK_VIEWS}: add "
-            f"some with the board tilted by 20 to 45 deg and near the picture's rims"
+            f"{len(found.views)} pictures show the board, a check needs at least "
+            f"{MIN_CHECK_VIEWS}: add some with the board tilted by 20 to 45 deg and near the "
+            f"picture's rims"
         )
-    try:
-        robust = reject_outliers(views, weighted_fit(views, camera.model)[0])
-    except NoSolution:
-        raise InvalidValue(
-            "no camera fits these pictures: is --board the true layout of the board?"
-        ) from None
-    free = robust.fit
-    fixed = poses_only(robust.views, camera)
+    free, kept, rejections = robust_fit(found.views)
+    fixed = fit_poses(kept, camera)
     if fixed is None:
         reason = "the calibration cannot see the boards where they are: it is another camera's"
-        return CheckResult(False, reason, np.inf, free.rms_px, (), robust.rejections, ())
-    covariance = lens_covariance(free)
-    known = predict_errors(free.camera, covariance) if np.isfinite(covariance).all() else ()
+        return CheckResult(False, reason, np.inf, free.rms_px, (), tuple(rejections))
     deviations = tuple(
         Deviation(e.z_m, float(position_errors_mm(camera, free.camera, e.z_m)[0]), e.axis_mm95)
-        for e in known
+        for e in predict_errors(free.camera, lens_covariance(kept, free))
     )
     passed, reason = _verdict(fixed, free, deviations)
     if passed:
         _check_evidence(free, deviations)
-    names = [view.name for view in robust.views]
-    by_view = tuple(zip(names, fixed.view_rms_px().tolist(), strict=True))
-    return CheckResult(
-        passed, reason, fixed.rms_px, free.rms_px, by_view, robust.rejections, deviations
-    )
+    return CheckResult(passed, reason, fixed.rms_px, free.rms_px, deviations, tuple(rejections))
 
 
 def _verdict(fixed: Fit, free: Fit, deviations: Sequence[Deviation]) -> tuple[bool, str]:

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from perchctl.calibration.board.predict import limit_mm
-from perchctl.calibration.board.result import Calibration, Level
+from perchctl.calibration.board.solve import Calibration, Level
 from perchctl.plot import BLACK, BLUE, GREEN, GREY, GRID, VERMILLION, new_figure, save_png
 
 BANNER: dict[Level, str] = {"fly": GREEN, "care": "#B36B00", "stop": "#B00020"}
@@ -31,7 +31,7 @@ def draw_calibration(calibration: Calibration) -> bytes:
 
 def report_figure(calibration: Calibration) -> Figure:
     """Return the verdict in a banner, coverage, residuals, and the error at the target."""
-    sentences = [calibration.sentence, *map(str, calibration.lacks)]
+    sentences = [calibration.sentence, *calibration.lacks]
     lines = [line for sentence in sentences for line in wrap(sentence, _LINE_CHARS)]
     banner_in = LINE_IN * (len(lines) + 1)
     figure = new_figure(WIDTH_IN, banner_in + PANELS_IN, dpi=DPI)

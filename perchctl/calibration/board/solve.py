@@ -1,8 +1,11 @@
-"""From views of a board to a camera, and whether they are enough; if not, what to add."""
+"""From views of a board to a camera with its verdict, and whether they are enough; if not, what to
+add."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -10,109 +13,231 @@ from numpy.typing import NDArray
 
 from perchctl.calibration.board.adjust import (
     MODEL_NAMES,
+    PARAMETERS,
     Fit,
     NoSolution,
-    Robust,
+    fit_camera,
     lens_covariance,
-    pixel_grid,
     reject_outliers,
-    weighted_fit,
 )
-from perchctl.calibration.board.capture import MIN_VIEWS
-from perchctl.calibration.board.detect import BoardView, Rejection
-from perchctl.calibration.board.predict import coverage, predict_errors
-from perchctl.calibration.board.result import Calibration, Lack
+from perchctl.calibration.board.detect import BoardView, FoundViews, Rejection
+from perchctl.calibration.board.predict import RangeError, coverage, limit_mm, predict_errors
+from perchctl.calibration.files import calibration_text
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.vision import distort, undistort
+from perchctl.vision import CameraModel, distort, undistort
 
-FOLDS_BACK = "folds back inside of the picture"
+Level = Literal["fly", "care", "stop"]
+TITLES: dict[Level, str] = {
+    "fly": "GOOD TO FLY",
+    "care": "FLY WITH CARE",
+    "stop": "DO NOT FLY WITH THIS",
+}
+CARE_FACTOR = 3.0
+ASIDE_FACTOR = 2.0
 _EASIER = 0.95  # a richer model must leave at most this part of the simpler one's spread
+_MOST_MISSING = 8
+"""Pictures without a board that are named one by one."""
 
 
-def calibrate_camera(
-    views: Sequence[BoardView],
-    board: str,
-    model: str = "auto",
-    missing: Sequence[Rejection] = (),
-) -> Calibration:
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The result of a calibration.
+
+    Attributes:
+        fit: the camera, and the poses and residuals of the `views`.
+        covariance: of its lens parameters, (p, p).
+        views: those used, without rejected corners.
+        missing: pictures without a board, and why.
+        errors: what the covariance means at the target, by distance.
+        covered: the picture's cells (rows, columns) that boards were seen in.
+        lacks: what keeps it from being a good one, whatever its error, and what would mend it.
+    """
+
+    board: str
+    fit: Fit
+    covariance: Array
+    views: tuple[BoardView, ...]
+    rejections: tuple[Rejection, ...]
+    missing: tuple[Rejection, ...]
+    errors: tuple[RangeError, ...]
+    covered: NDArray[np.bool_]
+    lacks: tuple[str, ...]
+
+    @property
+    def camera(self) -> CameraModel:
+        """The camera model."""
+        return self.fit.camera
+
+    @property
+    def std(self) -> Array:
+        """Standard deviation of each lens parameter, (p,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def level(self) -> Level:
+        """Verdict by the predicted error straight ahead of the camera, where perching happens;
+        aside, where the search may see the target first, twice the limit will do. Of what the
+        boards did not cover nothing is known: a calibration that lacks coverage is no good one."""
+        ahead = max(e.axis_mm95 / limit_mm(e.z_m) for e in self.errors)
+        aside = max(e.mm95 / limit_mm(e.z_m) for e in self.errors)
+        if ahead <= 1.0 and aside <= ASIDE_FACTOR and not self.lacks:
+            return "fly"
+        return "care" if ahead <= CARE_FACTOR else "stop"
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words, with the two distances that matter."""
+        near, far = (e for e in self.errors if e.z_m in (0.1, 1.0))
+        text = (
+            f"{TITLES[self.level]}: the target's centre is within {near.axis_mm95:.2g} mm at "
+            f"10 cm and {far.axis_mm95:.2g} mm at 1 m (95 %)"
+        )
+        aside = max(self.errors, key=lambda e: e.mm95 / limit_mm(e.z_m))
+        if aside.mm95 > ASIDE_FACTOR * limit_mm(aside.z_m):
+            text += f", aside {aside.mm95:.2g} mm at {aside.z_m * 100:.0f} cm"
+        return text
+
+    def lines(self) -> list[str]:
+        """Return what was left out, the lens, what it lacks, and the verdict at the end."""
+        lines = [f"left out {r.view}: {r.reason}" for r in self.missing[:_MOST_MISSING]]
+        if len(self.missing) > _MOST_MISSING:
+            left = len(self.missing) - _MOST_MISSING
+            lines.append(f"left out {left} more pictures without a board")
+        for r in self.rejections:
+            what = f"corners {', '.join(map(str, r.corners))} of {r.view}" if r.corners else r.view
+            lines.append(f"rejected {what}: {r.reason}")
+        values = zip(("fx", "fy", "cx", "cy"), self.fit.parameters, self.std, strict=False)
+        lens = ", ".join(f"{name} {value:.2f} +- {std:.2f}" for name, value, std in values)
+        lines.append(
+            f"{len(self.views)} views, RMS {self.fit.rms_px:.3f} px, {self.camera.model}, {lens} px"
+        )
+        return [*lines, *self.lacks, self.sentence]
+
+    def record(self) -> dict[str, Any]:
+        """Return the measured part of the object of `calibrate --json`."""
+        names, values = PARAMETERS[self.camera.model], self.fit.parameters.tolist()
+        return {
+            **dict(zip(names[:4], values[:4], strict=True)),
+            "distortion": self.camera.dist.tolist(),
+            "model": self.camera.model,
+            "size_px": list(self.camera.size_px),
+            "board": self.board,
+            "rms_px": self.fit.rms_px,
+            "views_used": len(self.views),
+            "views_rejected": rejected_views(self.rejections),
+            "pictures_without_board": rejected_views(self.missing),
+            "std": dict(zip(names, self.std.tolist(), strict=True)),
+            "error_mm": [vars(e) | {"limit_mm": limit_mm(e.z_m)} for e in self.errors],
+            "coverage": float(self.covered.mean()),
+            "warnings": list(self.lacks),
+            "verdict": self.level,
+        }
+
+    def text(self, name: str, date: str) -> str:
+        """Return the calibration file, with its quality and the parameters' covariance."""
+        return calibration_text(
+            self.camera,
+            name,
+            {
+                "date": date,
+                "board": self.board,
+                "rms_px": self.fit.rms_px,
+                "views_used": len(self.views),
+                "views_rejected": len(rejected_views(self.rejections)),
+                "parameters": " ".join(PARAMETERS[self.camera.model]),
+                "parameter_std": self.std[None],
+                "parameter_covariance": self.covariance,
+                "target_error_columns": "distance in m; 95 % lines in mm wherever boards were "
+                "seen, and straight ahead",
+                "target_error": np.array([[e.z_m, e.mm95, e.axis_mm95] for e in self.errors]),
+            },
+        )
+
+
+def rejected_views(rejections: Iterable[Rejection]) -> list[dict[str, str]]:
+    """Return the whole views that were left out, as a record has them."""
+    return [{"name": r.view, "reason": r.reason} for r in rejections if not r.corners]
+
+
+def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Calibration:
     """Solve for the camera, leave outliers out, and predict the error at the target.
 
     Args:
-        model: ``plumb_bob``, ``rational_polynomial`` or ``fisheye``; ``auto`` for the simplest one
-            that follows the lens.
-        missing: pictures in which no board was found, for the report.
+        board: its notation, for the file.
+        model: ``plumb_bob`` or ``fisheye``; ``auto`` for the simplest one that follows the lens.
 
     Raises:
         InvalidValue: too few views, all frontal, most of the image empty, focal length
         not fixed, or too many views that fit no camera.
     """
-    pictures = len(views) + len(missing)
-    _check_count(views, pictures)
-    robust, tried = _robust_fit(views, MODEL_NAMES if model == "auto" else (model,))
-    _check_count(robust.views, pictures)
+    pictures = len(found.views) + len(found.missing)
+    _check_count(found.views, pictures)
+    models = MODEL_NAMES if model == "auto" else (model,)
+    fit, kept, rejections = robust_fit(found.views, models)
+    _check_count(kept, pictures)
     # Tilt and coverage first: their messages name best what to add.
-    covered, fit = coverage(robust.views), robust.fit
-    _check_variety(robust, covered)
-    covariance = lens_covariance(fit)
+    covered = coverage(kept)
+    _check_variety(fit, covered)
+    covariance = lens_covariance(kept, fit)
     _check_focal(fit.parameters, np.sqrt(np.diag(covariance)))
     return Calibration(
         board=board,
         fit=fit,
         covariance=covariance,
-        views=robust.views,
-        rejections=robust.rejections,
-        missing=tuple(missing),
-        tried=tried,
-        errors=predict_errors(fit.camera, covariance, covered=covered),
+        views=tuple(kept),
+        rejections=tuple(rejections),
+        missing=found.missing,
+        errors=predict_errors(fit.camera, covariance, covered),
         covered=covered,
-        lacks=tuple(_lacks(fit, len(robust.views), covered)),
+        lacks=tuple(_lacks(fit, len(kept), covered)),
     )
 
 
-def _robust_fit(
-    views: Sequence[BoardView], models: Sequence[str]
-) -> tuple[Robust, dict[str, float]]:
-    """Return the views without outliers and their fit, by the simplest of `models` that follows the
-    lens (one that cannot would call the views at the picture's rim outliers); and the spread of
-    the residuals that each model leaves, in px.
+def robust_fit(
+    views: Sequence[BoardView], models: Sequence[str] = MODEL_NAMES
+) -> tuple[Fit, list[BoardView], list[Rejection]]:
+    """Return the fit of the views without outliers, by the simplest of `models` that follows the
+    lens (one that cannot would call the views at the picture's rim outliers); those views, and
+    what was left out.
 
     Raises InvalidValue: the views fit no camera.
     """
-    fits: dict[str, tuple[Fit, float]] = {}
-    for name in models:
+    best: Fit | None = None
+    for model in models:
         try:
-            fits[name] = weighted_fit(views, name)
-        except NoSolution as error:
-            if name == models[0]:
-                hint = "is --board the true layout of the board?"
-                raise InvalidValue(f"{error}: {hint}") from None
-    best, best_spread = fits[models[0]]
-    for fit, spread in fits.values():
-        if spread < _EASIER * best_spread and _is_usable(fit):
-            best, best_spread = fit, spread
-    return reject_outliers(views, best), {name: spread for name, (_, spread) in fits.items()}
+            fit = fit_camera(views, model)
+        except NoSolution:
+            continue
+        follows = best is not None and fit.spread_px < _EASIER * best.spread_px
+        if best is None or (follows and _is_usable(fit.camera)):
+            best = fit
+    try:
+        if best is not None:
+            return reject_outliers(views, best)
+    except NoSolution:
+        pass
+    raise InvalidValue("no camera fits these pictures: is --board the true layout of the board?")
 
 
-def _is_usable(fit: Fit) -> bool:
+def _is_usable(camera: CameraModel) -> bool:
     """Return true if the lens is one-to-one over the image and its centre lies inside."""
-    camera = fit.camera
     w, h = camera.size_px
-    grid = pixel_grid(camera.size_px)
-    rays = undistort(grid, camera)
+    grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 17), np.linspace(0, h - 1, 13)), axis=-1)
+    pixels = grid.reshape(-1, 2)
+    rays = undistort(pixels, camera)
     if not (0 < camera.K[0, 2] < w and 0 < camera.K[1, 2] < h and np.isfinite(rays).all()):
         return False
-    return bool(np.abs(distort(rays, camera) - grid).max() < 0.05)
+    return bool(np.abs(distort(rays, camera) - pixels).max() < 0.05)
 
 
 # --- Whether there is enough to calibrate from; if not, what to add ----------------------------
 
 
-GOOD_VIEWS = 10
+MIN_VIEWS, GOOD_VIEWS = 5, 10
 MIN_TILT_DEG = 12.0
 MIN_TILTED = 3
-MIN_COVERED = 0.3
-GOOD_COVERED = 0.7
+MIN_COVERED, GOOD_COVERED = 0.3, 0.7
 MAX_FOCAL_ERROR = 0.01
 _NAMES = (
     ("top left", "top", "top right"),
@@ -132,9 +257,9 @@ def _check_count(views: Sequence[BoardView], pictures: int) -> None:
         )
 
 
-def _check_variety(robust: Robust, covered: NDArray[np.bool_]) -> None:
+def _check_variety(fit: Fit, covered: NDArray[np.bool_]) -> None:
     """Raises InvalidValue when views are all frontal or leave most of the image empty."""
-    tilts = tilts_deg(robust.fit.poses)
+    tilts = tilts_deg(fit.poses)
     tilted = int((tilts >= MIN_TILT_DEG).sum())
     if tilted < MIN_TILTED:
         raise InvalidValue(
@@ -154,26 +279,26 @@ def _check_focal(parameters: Array, std: Array) -> None:
     """Raises InvalidValue when the focal length remains unknown."""
     share = float((std[:2] / parameters[:2]).max())
     if not share <= MAX_FOCAL_ERROR:
-        known = f"+-{100 * share:.1f} %" if np.isfinite(share) and share < 1 else "not at all"
         raise InvalidValue(
-            f"the views fix the focal length only to {known} (at most "
+            f"the views fix the focal length only to +-{100 * share:.1f} % (at most "
             f"{100 * MAX_FOCAL_ERROR:g} % is accepted): add sharp views with the board tilted by "
             f"20 to 45 deg about both axes and filling half of the picture"
         )
 
 
-def _lacks(fit: Fit, views: int, covered: NDArray[np.bool_]) -> list[Lack]:
-    """Return what keeps it from being a good calibration, whatever its error, and goes with more
-    pictures."""
+def _lacks(fit: Fit, views: int, covered: NDArray[np.bool_]) -> list[str]:
+    """Return what keeps it from being a good calibration, whatever its error, and what would mend
+    it."""
     lacks = []
-    if not _is_usable(fit):
-        advice = "no corners were seen there, add views at its rims"
-        lacks.append(Lack(f"the lens model {FOLDS_BACK}", advice))
+    if not _is_usable(fit.camera):
+        lacks.append("the lens model folds back inside of the picture: add views at its rims")
     if views < GOOD_VIEWS:
-        lacks.append(Lack(f"only {views} views", f"add {GOOD_VIEWS - views} or more"))
+        lacks.append(f"only {views} views: add {GOOD_VIEWS - views} or more")
     if covered.mean() < GOOD_COVERED:
-        what = f"{100 * (1 - covered.mean()):.0f} % of the picture is uncovered"
-        lacks.append(Lack(what, f"add views with the board {_uncovered_text(covered)}"))
+        lacks.append(
+            f"{100 * (1 - covered.mean()):.0f} % of the picture is uncovered: add views with the "
+            f"board {_uncovered_text(covered)}"
+        )
     return lacks
 
 
@@ -191,6 +316,4 @@ def _uncovered_text(covered: NDArray[np.bool_]) -> str:
         for cell, name in zip(np.array_split(row, 3, axis=1), names, strict=True)
     ]
     empty = [name for share, name in sorted(thirds) if share < 0.6][:4]
-    if not empty:
-        return "at the rims"
-    return "at the " + (", ".join(empty[:-1]) + " and " + empty[-1] if empty[1:] else empty[0])
+    return f"at the {' and '.join(empty) or 'rims'}"

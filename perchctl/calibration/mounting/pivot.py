@@ -7,11 +7,10 @@ its own covariance, and wrong ones count little. No attitude and no time is need
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from perchctl.calibration.mounting.carry import COUNTS_LITTLE, MOST_LEFT_OUT
 from perchctl.calibration.mounting.recording import (
     HOW_TO_RECORD,
     MountingRecording,
@@ -19,12 +18,7 @@ from perchctl.calibration.mounting.recording import (
     check_recording,
     pose_arrays,
 )
-from perchctl.calibration.mounting.robust import (
-    covariance,
-    estimate_noise,
-    robust_least_squares,
-    squared_distance,
-)
+from perchctl.calibration.mounting.robust import MOST_LEFT_OUT, Rows, weighed_rows
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 
@@ -32,8 +26,7 @@ MOST_TIP_SIGMA_M = 1e-3
 SLIPPED_M, SLIP_EXPLAINS = 4e-4, 0.1
 """Of the misfit; of a tip that stays where it is a jump explains 4 % at most."""
 FLOOR_M = 5e-5  # of the tip on its point
-_START_SIGMA_M = 1e-3
-_ROUNDS, _SPLITS, _SLIP_ROUNDS = 4, 19, 4
+_STEPS, _SPLITS, _SLIP_STEPS = 12, 19, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,17 +61,20 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
     poses = pose_arrays(recording)
     n, R, p_m = len(poses.t_s), poses.R_cam_target, poses.p_cam_target_m
     design = np.concatenate([np.broadcast_to(np.eye(3), (n, 3, 3)), -R], axis=2)
-    inverse: Array = np.broadcast_to(np.eye(3) / _START_SIGMA_M**2, (n, 3, 3))
-    for k in range(_ROUNDS + 1):
-        found, misfit, counted = robust_least_squares(design, p_m, inverse, 3)
-        if k < _ROUNDS:
-            cov = _misfit_covariance(poses, found[3:])
-            factor, _ = estimate_noise(misfit, cov)
-            inverse = np.asarray(np.linalg.inv(cov)) / factor**2
-    tip_m = found[:3]
-    cov_m2 = covariance(design, misfit, inverse, counted, np.zeros((6, 6)), 3)
-    _check_slip(poses, design, misfit, inverse)
-    _check_known(cov_m2, counted)
+    found, cov = np.zeros(6), np.broadcast_to(np.eye(3), (n, 3, 3))
+    for _ in range(_STEPS):
+        rows = weighed_rows(design, design @ found - p_m, cov, np.zeros((6, 6)))
+        found = found + rows.step()
+        cov = _misfit_covariance(poses, found[3:])
+    tip_m, cov_m2 = found[:3], rows.covariance()[:3, :3]
+    _check_slip(poses, rows)
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov_m2)[-1]))
+    if rows.left_out > MOST_LEFT_OUT or not sigma_m <= MOST_TIP_SIGMA_M:
+        raise InvalidValue(
+            f"the tip is known to {1e3 * sigma_m:.1f} mm only, at most "
+            f"{1e3 * MOST_TIP_SIGMA_M:g} is accepted, and {100 * rows.left_out:.0f} % of the "
+            f"pictures do not fit: {HOW_TO_RECORD['pivot']}"
+        )
     return PivotSolution(
         gear_cam_m=tip_m,
         covariance_m2=cov_m2 + size_sigma**2 * np.outer(tip_m, tip_m),
@@ -94,32 +90,22 @@ def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
     return np.asarray(J @ poses.cov @ J.transpose(0, 2, 1) + np.eye(3) * FLOOR_M**2)
 
 
-def _check_known(cov_m2: Array, counted: Array) -> None:
-    """Raises InvalidValue if the tip is not known well enough."""
-    left_out = float((counted < COUNTS_LITTLE).mean())
-    sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov_m2)[-1]))
-    if left_out > MOST_LEFT_OUT or not sigma_m <= MOST_TIP_SIGMA_M:
-        raise InvalidValue(
-            f"the tip is known to {1e3 * sigma_m:.1f} mm only, at most "
-            f"{1e3 * MOST_TIP_SIGMA_M:g} is accepted, and {100 * left_out:.0f} % of the pictures "
-            f"do not fit: {HOW_TO_RECORD['pivot']}"
-        )
-
-
-def _check_slip(poses: PoseArrays, design: Array, misfit: Array, inverse: Array) -> None:
+def _check_slip(poses: PoseArrays, rows: Rows) -> None:
     """Raises InvalidValue if the tip jumped from one point to another at some moment.
 
     For moments all over the recording, each with a point before and one after: that with the
     least misfit, counted robustly.
     """
-    n = len(misfit)
-    alone = _size(misfit, inverse)
+    n, alone = len(rows.misfit), _size(rows)
     explains, moved_m, at_s = 0.0, 0.0, 0.0
     for k in np.unique(np.linspace(0, n, _SPLITS + 2).astype(np.intp))[1:-1]:
-        after = (np.arange(n) >= k)[:, None, None] * design[:, :, 3:]
-        two = np.concatenate([design, after], axis=2)
-        found, with_two, _ = robust_least_squares(two, poses.p_cam_target_m, inverse, _SLIP_ROUNDS)
-        share = 1.0 - _size(with_two, inverse) / alone
+        after = (np.arange(n) >= k)[:, None, None] * rows.design[:, :, 3:]
+        design, found = np.concatenate([rows.design, after], axis=2), np.zeros(9)
+        two = replace(rows, design=design, known=np.zeros((9, 9)))
+        for _ in range(_SLIP_STEPS):
+            step = two.step()
+            found, two = found + step, two.moved(step)
+        share = 1.0 - _size(two) / alone
         if share > explains:
             explains, moved_m = share, float(np.linalg.norm(found[6:]))
             at_s = float(poses.t_s[k] - poses.t_s[0])
@@ -130,6 +116,6 @@ def _check_slip(poses: PoseArrays, design: Array, misfit: Array, inverse: Array)
         )
 
 
-def _size(misfit: Array, inverse: Array) -> float:
+def _size(rows: Rows) -> float:
     """Return the size of all misfits together; single wrong ones add little."""
-    return float(np.log1p(squared_distance(misfit, inverse) / 3.0).mean())
+    return float(np.log1p(rows.distance2 / 3.0).mean())

@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import zlib
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.camera import HealthState, assess_frame
 from perchctl.geometry import R_MARKER_TARGET, Array
+from perchctl.perception import Perception
 from perchctl.profile import Profile
 from perchctl.vision import (
     MARKERS,
     CameraModel,
-    FieldState,
     Frame,
     MarkerPose,
     PipelineOutput,
-    PipelineState,
     camera_profile,
     make_pipeline,
-    pictures,
-    step,
 )
 
 
 class PoseReader:
-    """Reads the target's pose from each frame, and remembers what the pipeline must.
+    """Reads the target's pose from each frame of a stream.
 
     `mirrored` counts the pictures in which a target was seen mirrored only. `outlines` are
     those of the newest picture, a marker's name and corners (4, 2) px; `trouble` is what keeps
@@ -37,29 +33,31 @@ class PoseReader:
     def __init__(self, profile: Profile, camera: CameraModel, live: bool) -> None:
         # A pipeline that knows nothing of how the camera is mounted.
         bare = camera_profile(profile).model_copy(update={"pose": profile.pose})
-        self._pipeline = make_pipeline(bare, camera)
+        self._perception = Perception(make_pipeline(bare, camera), bare)
         self._live = live
-        self._state = PipelineState()
-        self._fields = FieldState()
-        self._health = HealthState()
         self.mirrored = 0
         self.outlines: tuple[tuple[str, Array], ...] = ()
         self.trouble = ""
 
+    @staticmethod
+    def basis(profile: Profile, camera: CameraModel) -> str:
+        """Return what poses rest on beside the pictures, in words: printed sizes and lens."""
+        sides_mm = [f"{1e3 * m.side_m:g}" for m in (profile.target.large, profile.target.small)]
+        K = camera.K
+        lens = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(camera.dist)]
+        number = zlib.crc32(np.round(np.array(lens, dtype=np.float64), 6).tobytes())
+        return f"markers of {' and '.join(sides_mm)} mm, calibration {number:08x}"
+
     def look(self, frame: Frame) -> list[SeenPose]:
         """Return the target's poses in a frame: one, or one in each of its two fields."""
-        self._health, judged = assess_frame(self._health, frame, self._live)
+        judged = self._perception.assess(frame, self._live)
         if judged.kind == "repeated":
             return []
-        self.outlines, self.trouble = (), ""
-        if not judged.usable:
-            self.trouble = judged.text
-            if judged.kind in ("frozen", "snow"):
-                return []
-        self._fields, found = pictures(self._fields, frame, self._pipeline)
+        self.outlines, self.trouble = (), "" if judged.usable else judged.text
+        if judged.kind in ("frozen", "snow"):
+            return []
         seen = []
-        for picture in found:
-            self._state, output = step(self._state, picture, None, self._pipeline)
+        for picture, output in self._perception.look(frame):
             self.mirrored += output.detections.mirrored and not output.poses
             named = ((name, output.detections.get(name)) for name in MARKERS)
             self.outlines = tuple((name, d.corners_px) for name, d in named if d is not None)
@@ -69,50 +67,18 @@ class PoseReader:
         return seen
 
 
-def pose_basis(profile: Profile, camera: CameraModel) -> str:
-    """Return what poses rest on beside the pictures, in words: the printed sizes and the lens."""
-    sides_mm = [f"{1e3 * m.side_m:g}" for m in (profile.target.large, profile.target.small)]
-    K = camera.K
-    lens = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(camera.dist)]
-    number = zlib.crc32(np.round(np.array(lens, dtype=np.float64), 6).tobytes())
-    return f"markers of {' and '.join(sides_mm)} mm, calibration {number:08x}"
-
-
 def _best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
-    """Return the surest of a picture's poses, None without one.
-
-    Args:
-        t_s: the camera's own timestamp of the picture.
-    """
-    joint = output.poses.get("joint")
-    single = [pose for pose in output.poses.values() if pose.camera_cov is not None]
-    pose = joint or min(single, key=_uncertainty, default=None)
-    if pose is None:
+    """Return the surest of a picture's poses, None without one; `t_s` is the camera's own timestamp
+    of the picture."""
+    pose = output.poses.get("joint") or min(output.poses.values(), key=_uncertainty, default=None)
+    if pose is None or pose.camera_cov is None or not np.isfinite(pose.camera_cov).all():
         return None
-    cov = pose.camera_cov
-    if cov is not None:
-        J = np.eye(6)
-        J[:3, :3] = _left_jacobian(pose.rvec_rad)
-        cov = J @ cov @ J.T
-    return SeenPose(
-        t_s=t_s,
-        rotation_cam_target=Rotation.from_rotvec(pose.rvec_rad).as_matrix() @ R_MARKER_TARGET,
-        position_cam_target_m=pose.tvec_m,
-        covariance=cov if cov is not None and np.isfinite(cov).all() else None,
-    )
+    R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(pose.rvec_rad))
+    turns = dR.reshape(3, 3, 3) @ R.T  # of each component of the rotation vector, skew-symmetric
+    J = np.eye(6)
+    J[:3, :3] = turns[:, (2, 0, 1), (1, 2, 0)].T
+    return SeenPose(t_s, R @ R_MARKER_TARGET, pose.tvec_m, J @ pose.camera_cov @ J.T)
 
 
 def _uncertainty(pose: MarkerPose) -> float:
     return float("inf") if pose.camera_cov is None else float(np.trace(pose.camera_cov[:3, :3]))
-
-
-def _left_jacobian(v: Array) -> Array:
-    """Return the change (3, 3) of a small rotation on the left of the one with the vector v
-    (3,)."""
-    angle = float(np.linalg.norm(v))
-    K = np.cross(np.eye(3), v)
-    if angle < 1e-6:
-        return np.asarray(np.eye(3) + 0.5 * K)
-    a = (1.0 - np.cos(angle)) / angle**2
-    b = (angle - np.sin(angle)) / angle**3
-    return np.asarray(np.eye(3) + a * K + b * (K @ K))

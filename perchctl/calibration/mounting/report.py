@@ -4,20 +4,51 @@ profile's keys."""
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perchctl.calibration.mounting.carry import CarrySolution
-from perchctl.calibration.mounting.pivot import PivotSolution
-from perchctl.calibration.mounting.robust import SIGMAS_95
+from perchctl.calibration.jackknife import SIGMAS_95
+from perchctl.calibration.mounting.carry import CarrySolution, solve_carry
+from perchctl.calibration.mounting.pivot import PivotSolution, solve_pivot
+from perchctl.calibration.mounting.recording import MountingRecording
+from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.profile import Profile
 
 NOTABLE_TURN_DEG = 1.0
-_DEG_DECIMALS, _S_DECIMALS, _M_DECIMALS = 2, 4, 5
+
+
+@dataclass(frozen=True, eq=False)
+class _Value:
+    """One measured number or three, their sigmas, and what the profile says, empty where it says
+    no number."""
+
+    name: str
+    key: str
+    unit: str
+    measured: Array
+    sigma: Array
+    written: Array
+    decimals: int
+
+    def lines(self) -> list[str]:
+        """Return the value with its 95 % interval, and what the profile says instead."""
+        interval = " ".join(f"{SIGMAS_95 * sigma:.{self.decimals}f}" for sigma in self.sigma)
+        lines = [f"{self.name:<12}{self._text(self.measured)} +- {interval} {self.unit} (95 %)"]
+        if not len(self.written):
+            return [*lines, f"{'':<12}you wrote measured: each flight measures it, and it stays so"]
+        apart = self.measured - self.written
+        apart = (apart + 180.0) % 360.0 - 180.0 if self.unit == "deg" else apart
+        within = (np.abs(apart) <= SIGMAS_95 * self.sigma).all()
+        away = "within that" if within else f"{np.linalg.norm(apart):.1f} {self.unit} away"
+        return [*lines, f"{'':<12}you wrote {self._text(self.written)}: {away}"]
+
+    def _text(self, values: Array) -> str:
+        return " ".join(f"{v:g}" for v in _rounded(values, self.decimals))
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +69,6 @@ class MountingReport:
         return np.asarray(T[:3, 3] + R_body_cam @ self.pivoted.gear_cam_m)
 
     @property
-    def written_latency_s(self) -> float | None:
-        """Latency by the profile; None where each flight is to measure it."""
-        latency_s: object = self.profile.camera.latency_s
-        return float(latency_s) if isinstance(latency_s, (int, float)) else None
-
-    @property
     def written_gear_cam_m(self) -> Array:
         """The tip in the camera's frame, by the profile, (3,)."""
         T = self.profile.camera.mount.T_body_cam
@@ -54,12 +79,11 @@ class MountingReport:
         latency that each flight is to measure."""
         values: dict[str, float | tuple[float, ...]] = {}
         if self.carried is not None:
-            values["camera.mount.rpy_deg"] = _rounded(self.carried.rpy_deg, _DEG_DECIMALS)
-            if self.written_latency_s is not None:
-                latency_s = max(self.carried.latency_s, 0.0)
-                values["camera.latency_s"] = round(latency_s, _S_DECIMALS)
+            values["camera.mount.rpy_deg"] = _rounded(self.carried.rpy_deg, 2)
+            if self.profile.camera.latency_s != "measured":
+                values["camera.latency_s"] = round(max(self.carried.latency_s, 0.0), 4)
         if self.pivoted is not None:
-            values["vehicle.gear_body_m"] = _rounded(self.gear_body_m, _M_DECIMALS)
+            values["vehicle.gear_body_m"] = _rounded(self.gear_body_m, 5)
         return values
 
     def keys_text(self) -> str:
@@ -71,78 +95,72 @@ class MountingReport:
             lines.append(f"{key}: [{text}]" if isinstance(value, tuple) else f"{key}: {text}")
         return "\n".join(lines)
 
+    def _values(self) -> list[_Value]:
+        """Return what was measured, in the units of the lines."""
+        camera, values = self.profile.camera, []
+        if (carried := self.carried) is not None:
+            angles, sigmas = np.array(carried.rpy_deg), np.array(carried.rpy_sigma_deg)
+            written = np.array(camera.mount.rpy_deg)
+            values.append(_Value("turn", "rpy_deg", "deg", angles, sigmas, written, 2))
+            late, sigma = 1e3 * np.array([[carried.latency_s], [carried.latency_sigma_s]])
+            known = np.array([] if camera.latency_s == "measured" else [1e3 * camera.latency_s])
+            values.append(_Value("latency", "latency_s", "ms", late, sigma, known, 1))
+        if (pivoted := self.pivoted) is not None:
+            tip, sigma = 1e3 * pivoted.gear_cam_m, 1e3 * pivoted.gear_cam_sigma_m
+            known = 1e3 * self.written_gear_cam_m
+            values.append(_Value("gear's tip", "gear_cam_m", "mm", tip, sigma, known, 2))
+        return values
+
     def record(self) -> dict[str, Any]:
         """Return the measured part of the object of `calibrate mount --json`; null is not
         measured."""
-        measured: dict[str, Any] = dict.fromkeys(("rpy_deg", "latency_s", "gear_cam_m"))
-        sigma = measured.copy()
-        if (carried := self.carried) is not None:
-            measured |= {"rpy_deg": list(carried.rpy_deg), "latency_s": carried.latency_s}
-            sigma |= {
-                "rpy_deg": list(carried.rpy_sigma_deg),
-                "latency_s": carried.latency_sigma_s,
-            }
-        if (pivoted := self.pivoted) is not None:
-            measured["gear_cam_m"] = pivoted.gear_cam_m.tolist()
-            sigma["gear_cam_m"] = pivoted.gear_cam_sigma_m.tolist()
-        written = {
-            "rpy_deg": list(self.profile.camera.mount.rpy_deg),
-            "latency_s": self.written_latency_s,
-            "gear_cam_m": self.written_gear_cam_m.tolist(),
+        found: dict[str, dict[str, Any]] = {
+            group: dict.fromkeys(("rpy_deg", "latency_s", "gear_cam_m"))
+            for group in ("measured", "sigma", "written")
         }
+        for value in self._values():
+            unit = 1.0 if value.unit == "deg" else 1e-3
+            for group, record in found.items():
+                numbers = (unit * getattr(value, group)).tolist()
+                single = value.key == "latency_s"
+                record[value.key] = (*numbers, None)[0] if single else numbers
         values = {key: np.asarray(v).tolist() for key, v in self.profile_values().items()}
-        return measured | {"sigma": sigma, "written": written, "profile_values": values}
+        return found.pop("measured") | found | {"profile_values": values}
 
     def lines(self) -> list[str]:
         """Return each number, its 95 % interval, and what the profile says instead."""
-        lines = []
-        if (carried := self.carried) is not None:
-            written = self.profile.camera.mount
-            turned = Rotation.from_matrix(written.T_body_cam[:3, :3].T @ carried.R_body_cam)
-            off_deg = math.degrees(turned.magnitude())
-            most_deg = math.degrees(SIGMAS_95 * math.sqrt(float(np.trace(carried.turn_cov_rad2))))
-            away = f"{off_deg:.1f} deg away" if off_deg > most_deg else ""
-            angles = (carried.rpy_deg, carried.rpy_sigma_deg)
-            lines += _value_lines("turn", *angles, 2, "deg", written.rpy_deg, away)
-            late_ms, sigma_ms = 1e3 * carried.latency_s, 1e3 * carried.latency_sigma_s
-            if self.written_latency_s is None:
-                written_ms: tuple[float, ...] = ()
-                away = "each flight measures it, and it stays so"
-            else:
-                written_ms = (1e3 * self.written_latency_s,)
-                off_ms = abs(late_ms - written_ms[0])
-                away = f"{off_ms:.1f} ms away" if off_ms > SIGMAS_95 * sigma_ms else ""
-            lines += _value_lines("latency", (late_ms,), (sigma_ms,), 1, "ms", written_ms, away)
-            if self.pivoted is None and off_deg > NOTABLE_TURN_DEG:
+        lines = [line for value in self._values() for line in value.lines()]
+        if self.carried is None:
+            lines.append("the gear's place in the body rests on the profile's camera.mount.rpy_deg")
+        elif self.pivoted is None:
+            R = self.profile.camera.mount.T_body_cam[:3, :3]
+            turned = Rotation.from_matrix(R.T @ self.carried.R_body_cam)
+            if math.degrees(turned.magnitude()) > NOTABLE_TURN_DEG:
                 lines.append(
                     "the gear's place in the camera changes with the turn: do the pivot as well"
                 )
-        if (pivoted := self.pivoted) is not None:
-            tip_mm, sigma_mm = 1e3 * pivoted.gear_cam_m, 1e3 * pivoted.gear_cam_sigma_m
-            written_mm = 1e3 * self.written_gear_cam_m
-            apart_mm = tip_mm - written_mm
-            far = (np.abs(apart_mm) > SIGMAS_95 * sigma_mm).any()
-            away = f"{np.linalg.norm(apart_mm):.1f} mm away" if far else ""
-            tip = ("gear's tip", tip_mm, sigma_mm, 2, "mm in camera axes", written_mm, away)
-            lines += _value_lines(*tip)
-        if self.carried is None:
-            lines.append("the gear's place in the body rests on the profile's camera.mount.rpy_deg")
         return lines
-
-
-def _value_lines(
-    name: str, values: Any, sigmas: Any, decimals: int, unit: str, written: Any, away: str
-) -> list[str]:
-    """Return the two lines of a value; `written` is what the profile says, empty where it has no
-    number."""
-    found = " ".join(f"{v:g}" for v in _rounded(values, decimals))
-    interval = " ".join(f"{SIGMAS_95 * float(sigma):.{decimals}f}" for sigma in sigmas)
-    before = " ".join(f"{v:g}" for v in _rounded(written, decimals)) or "measured"
-    return [
-        f"{name:<12}{found} +- {interval} {unit} (95 %)",
-        f"{'':<12}you wrote {before}: {away or 'within that'}",
-    ]
 
 
 def _rounded(values: Any, decimals: int) -> tuple[float, ...]:
     return tuple(round(float(v), decimals) + 0.0 for v in values)
+
+
+def solve_mounting(profile: Profile, recordings: Sequence[MountingRecording]) -> MountingReport:
+    """Return the measured mounting, of each part there is.
+
+    Raises InvalidValue: a recording is too little or contradicts itself, with what to do.
+    """
+    by_part = {recording.part: recording for recording in recordings}
+    carry, pivot = by_part.get("carry"), by_part.get("pivot")
+    carried, pivoted = None, None
+    try:
+        carried = None if carry is None else solve_carry(carry)
+        if pivot is not None:
+            pivoted = solve_pivot(pivot, profile.target.size_sigma)
+    except InvalidValue as error:
+        if len(by_part) < 2:
+            raise
+        other = "pivot" if carried is None else "carry"
+        raise InvalidValue(f"{error} (--part {other} takes the {other} alone)") from None
+    return MountingReport(profile, carried, pivoted)
