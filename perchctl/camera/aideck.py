@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.camera.credentials import without_password
-from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_end, size_in
+from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_extent
 from perchctl.camera.network import StreamSource
 from perchctl.camera.source import Clock
 from perchctl.errors import InvalidValue
@@ -88,9 +88,11 @@ class _Picture:
             return None
         if not self.is_jpeg:
             return np.frombuffer(data, np.uint8).reshape(shape)
-        if not _is_jpeg(data) or size_in(data) != (self.width, self.height):
+        try:
+            is_whole = jpeg_extent(data) == (len(data), (self.width, self.height))
+        except Damaged:
             return None
-        image = grey_pixels(data)
+        image = grey_pixels(data) if is_whole else None
         return image if image is not None and image.shape == shape else None
 
 
@@ -157,14 +159,6 @@ class AiDeckSource(StreamSource):
         as_came = picture.is_jpeg and grey is image  # no mosaic was taken out of it
         encoded = bytes(picture.data) if as_came else None
         self._put(grey, began_s=picture.began_s, encoded=encoded)
-
-
-def _is_jpeg(data: bytes) -> bool:
-    """Return whether the bytes are one JPEG from its start to its end."""
-    try:
-        return data.startswith(b"\xff\xd8") and jpeg_end(data) == len(data)
-    except Damaged:
-        return False
 
 
 def _header_of(data: bytes, came_s: float) -> _Picture | None:

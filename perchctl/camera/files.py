@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.camera.credentials import without_password
-from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_end, size_in
+from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_extent
 from perchctl.camera.source import to_grey
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.vision import Frame
@@ -178,7 +178,11 @@ def _said_size_px(data: bytes) -> tuple[int, int]:
     """Return width and height that a JPEG or PNG says before its pixels; zeros of another file."""
     if data.startswith(b"\x89PNG"):
         return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-    return (data.startswith(b"\xff\xd8") and size_in(data)) or (0, 0)
+    try:
+        extent = jpeg_extent(data) if data.startswith(b"\xff\xd8") else None
+    except Damaged:
+        return 0, 0
+    return (0, 0) if extent is None else extent.size_px
 
 
 def _too_large(width: int, height: int) -> str:
@@ -194,7 +198,7 @@ def is_cut_off(data: bytes) -> bool:
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data
     try:
-        return data.startswith(b"\xff\xd8") and jpeg_end(data) is None
+        return data.startswith(b"\xff\xd8") and jpeg_extent(data) is None
     except Damaged:
         return False
 

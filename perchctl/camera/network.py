@@ -23,8 +23,7 @@ from perchctl.camera.credentials import (
     credentials_of,
     without_password,
 )
-from perchctl.camera.health import Grey
-from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, grey_pixels, size_in
+from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, grey_pixels
 from perchctl.camera.source import Clock, LiveSource, one_line
 
 MAX_FAILED_CONNECTIONS = 5
@@ -183,28 +182,14 @@ class MjpegSource(StreamSource):
             if not data:
                 return
             # If the network delivered several at once only the newest is worth decoding.
-            for picture in reversed(splitter.feed(data)):
-                image = self._decoded(picture)
+            for picture, extent in reversed(splitter.feed(data)):
+                width, height = extent.size_px
+                image = grey_pixels(picture) if width * height <= MOST_STREAM_PX else None
                 if image is not None:
                     self._put(image, encoded=picture)
                     break
                 splitter.damaged += 1
             self.damaged = earlier + splitter.damaged
-
-    def _decoded(self, picture: bytes) -> Grey | None:
-        """Return the JPEG's pixels; None if it is damaged, or says a size above
-        `MOST_STREAM_PX`."""
-        size_px = size_in(picture)
-        if size_px is None:
-            return None
-        width, height = size_px
-        if width * height > MOST_STREAM_PX:
-            self._why_silent = (
-                f"its pictures say {width}x{height} px, and at most {MOST_STREAM_PX:,} pixels are "
-                f"decoded; set the camera to a smaller size"
-            )
-            return None
-        return grey_pixels(picture)
 
 
 def _challenge(response: http.client.HTTPResponse) -> Challenge | None:
