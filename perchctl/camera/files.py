@@ -18,8 +18,6 @@ from perchctl.errors import InvalidValue, NotFound
 from perchctl.vision import Frame
 
 DEFAULT_RATE_HZ = 30.0
-MOST_FILE_PX = 1 << 27
-"""Of a picture in a file: more than any camera of today takes, and decoded within 3 s."""
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp"})
 
 
@@ -88,13 +86,6 @@ class VideoSource(Recording):
         self._period_s = 1.0 / rate_hz
         self._last_s = -self._period_s
         name = f"video:{without_password(str(path))}"
-        width, height = (
-            int(self._capture.get(key))
-            for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-        )
-        if too_large := _too_large(width, height):
-            self._capture.release()
-            raise InvalidValue(f"{name} {too_large}")
         super().__init__(name, latency_s, rate_hz, round(count) if count > 0 else None)
 
     def _read(self) -> tuple[NDArray[np.uint8], float] | None:
@@ -147,7 +138,7 @@ class BrokenPicture(InvalidValue):
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """Return a picture file as grey; raises BrokenPicture if it is none, cut off or too large."""
+    """Return a picture file as grey; raises BrokenPicture if it is none or cut off."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -161,35 +152,15 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
 def decode_picture(data: bytes) -> NDArray[np.uint8]:
     """Return the grey picture of a file's bytes.
 
-    Raises ValueError with what stands behind the file's name: it is cut off, a JPEG or PNG of
-    more than `MOST_FILE_PX`, or none that OpenCV reads.
+    Raises ValueError with what stands behind the file's name: it is cut off, or none that OpenCV
+    reads.
     """
     if is_cut_off(data):
         raise ValueError("is cut off")
-    if too_large := _too_large(*_said_size_px(data)):
-        raise ValueError(too_large)
     image = grey_pixels(data)
     if image is None:
         raise ValueError("cannot be read as a picture")
     return to_grey(image)
-
-
-def _said_size_px(data: bytes) -> tuple[int, int]:
-    """Return width and height that a JPEG or PNG says before its pixels; zeros of another file."""
-    if data.startswith(b"\x89PNG"):
-        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-    try:
-        extent = jpeg_extent(data) if data.startswith(b"\xff\xd8") else None
-    except Damaged:
-        return 0, 0
-    return (0, 0) if extent is None else extent.size_px
-
-
-def _too_large(width: int, height: int) -> str:
-    """Say that a picture of that size is not read; an empty string if it is."""
-    if width * height <= MOST_FILE_PX:
-        return ""
-    return f"says {width}x{height} px, and at most {MOST_FILE_PX:,} pixels are read"
 
 
 def is_cut_off(data: bytes) -> bool:

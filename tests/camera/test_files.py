@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import cv2
@@ -15,7 +14,6 @@ from perchctl.camera import (
     Recording,
     VideoSource,
     check_size,
-    files,
     open_camera,
     parse_source,
     profile_record,
@@ -239,34 +237,6 @@ def test_a_picture_that_is_cut_off_is_named_before_a_decoder_speaks_of_it(
             with pytest.raises(BrokenPicture, match=rf"{name} is cut off.*remove or replace it"):
                 read_grey(path)
     assert capfd.readouterr().err == ""
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_a_picture_that_says_to_be_too_large_is_not_decoded(
-    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    image = np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
-    data = cv2.imencode(suffix, image)[1].tobytes()
-    at = 16 if suffix == ".png" else data.index(b"\xff\xc0") + 5
-    said = struct.pack(">II", 1 << 14, (1 << 13) + 1) if at == 16 else b"\x7d\x00\x7d\x00"
-    path = tmp_path / f"a{suffix}"
-    path.write_bytes(data[:at] + said + data[at + len(said) :])
-    monkeypatch.setattr(files, "grey_pixels", lambda data: pytest.fail("decoded"))
-    with pytest.raises(BrokenPicture, match=rf"a{suffix} says \d+x\d+ px"):
-        read_grey(path)
-
-
-def test_a_video_that_says_to_be_too_large_is_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "flight.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, (64, 48))
-    writer.write(np.zeros((48, 64, 3), np.uint8))
-    writer.release()
-    VideoSource(path).close()
-    monkeypatch.setattr(files, "MOST_FILE_PX", 64 * 48 - 1)
-    with pytest.raises(InvalidValue, match=r"flight\.avi says 64x48 px, and at most 3,071 pixels"):
-        VideoSource(path)
 
 
 @pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8", b"\xff\xd8no", None])
