@@ -220,8 +220,6 @@ def _refusal(response: http.client.HTTPResponse, parts: SplitResult) -> str:
 # FFmpeg says neither.
 
 
-RTSP_PORT = 554
-MOST_ANSWER_BYTES = 65536
 MAX_DAMAGED = 100
 """Packets in a row that cannot be decoded before it connects anew."""
 WINDOW_S = 10.0
@@ -283,13 +281,6 @@ class RtspSource(StreamSource):
         import av  # late: most flights have another camera
         import av.error
 
-        # Before the first picture is before the flight: later it would cost pictures.
-        if self._count == 0 and (target := redirect_of(self._url, self.connect_timeout_s)):
-            self.not_found = True
-            return (
-                f"the server redirects to {without_password(target)}, which would get the name "
-                f"and password; name that address in camera.source"
-            )
         try:
             timeouts_s = (self.connect_timeout_s, self.read_timeout_s)
             with av.open(self._url, options=_OPTIONS, timeout=timeouts_s) as stream:
@@ -324,41 +315,6 @@ class RtspSource(StreamSource):
             for image, time_s in frames:
                 self._put(image, waited_s=delay.waited_s(time_s, self._clock()))
         return "the stream ended"
-
-
-def redirect_of(url: str, timeout_s: float) -> str:
-    """Return the other host or port to which the server redirects a URL with name and password; an
-    empty string if there is none. FFmpeg would follow, and take name and password along."""
-    parts = urlsplit(url)
-    who = credentials_of(parts)
-    if who is None or parts.hostname is None:
-        return ""
-    asked = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
-    challenge: Challenge | None = None
-    failures = (OSError, ValueError, IndexError, http.client.HTTPException)
-    with (
-        contextlib.suppress(*failures),  # FFmpeg will say why
-        socket.create_connection((parts.hostname, parts.port or RTSP_PORT), timeout_s) as server,
-        server.makefile("rb") as answers,
-    ):
-        # Once more with name and password, if they are asked for.
-        for number, method in enumerate(("OPTIONS", "DESCRIBE", "DESCRIBE"), start=1):
-            request = f"{method} {asked} RTSP/1.0\r\nCSeq: {number}\r\n"
-            if challenge is not None:
-                request += f"Authorization: {answer(challenge, who, method, asked)}\r\n"
-            server.sendall(f"{request}\r\n".encode())
-            status = int(answers.readline(MOST_ANSWER_BYTES).split()[1])
-            headers = http.client.parse_headers(answers)
-            answers.read(min(int(headers.get("Content-Length", 0)), MOST_ANSWER_BYTES))
-            if 300 <= status < 400:
-                target = urlsplit(headers.get("Location", ""))
-                same = (target.hostname, target.port or RTSP_PORT) == (
-                    parts.hostname, parts.port or RTSP_PORT
-                )  # fmt: skip
-                return "" if same else urlunsplit(target)
-            if status == 401 and challenge is None:
-                challenge = challenge_of(headers.get_all("WWW-Authenticate") or [])
-    return ""
 
 
 def _gone(errors: Any) -> tuple[type[Exception], ...]:

@@ -163,35 +163,6 @@ def test_what_trying_again_would_not_mend_is_told_at_once(
     assert "secret" not in str(caught.value)
 
 
-@pytest.mark.parametrize("asks_first", [False, True])
-def test_name_and_password_do_not_go_where_the_server_redirects(
-    server: RtspServer, asks_first: bool
-) -> None:
-    other = RtspServer(who=("me", "secret"))
-    server.redirect = other.url()
-    server.who = ("me", "secret") if asks_first else None
-    try:
-        with pytest.raises(NotFound, match=r"redirects to rtsp://127") as caught:
-            open_camera(server.url("me:secret@"), Clock(), timeout_s=WAIT_S)
-        assert other.asked == []
-        assert "secret" not in str(caught.value)
-    finally:
-        other.close()
-
-
-def test_a_redirect_of_a_url_without_a_password_is_followed(
-    server: RtspServer, opened: list[LiveSource]
-) -> None:
-    never, other = threading.Event(), RtspServer()
-    server.redirect = other.url()
-    other.scripts.put([*seconds(20, 60, 80), never])
-    try:
-        next_frame(started(server, opened))
-    finally:
-        never.set()
-        other.close()
-
-
 @pytest.mark.parametrize(("host", "words"), [
     ("", "gave no picture in 5 attempts: connection refused"),
     ("a..b", "the host cannot be reached, or its name is unknown"),
