@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-import http.client
 import queue
-import socket
+import re
 import ssl
 import threading
 import time
 from collections.abc import Callable, Iterator
+from hashlib import md5
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import Request
 
 import cv2
 import numpy as np
 import pytest
 
 from perchctl.camera import open_camera
+from perchctl.camera.credentials import authorization
 from perchctl.camera.device import (
     LOST_AFTER_FAILURES,
     Asked,
@@ -45,20 +48,20 @@ class Server:
 
     def __init__(self) -> None:
         self.scripts: queue.Queue[Script] = queue.Queue()
-        self.status, self.refusal, self.redirect = 200, 401, ""
+        self.status, self.redirect = 200, ""
         self.nonce = "n1"
         self.authorization: list[str | None] = []
         self.challenges: list[str] = []
+        self.closing = threading.Event()
         outer = self
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
                 given = self.headers["Authorization"]
                 outer.authorization.append(given)
-                asked = outer.challenges or outer.refusal == 403
                 known = given and (given.startswith("Basic") or f'nonce="{outer.nonce}"' in given)
-                if asked and not known:
-                    self.send_response(outer.refusal)
+                if outer.challenges and not known:
+                    self.send_response(401)
                     for challenge in outer.challenges:
                         self.send_header("WWW-Authenticate", challenge)
                     self.end_headers()
@@ -71,7 +74,7 @@ class Server:
                 with contextlib.suppress(OSError):
                     for step in script:
                         if isinstance(step, threading.Event):
-                            step.wait(WAIT_S)
+                            until(lambda step=step: step.is_set() or outer.closing.is_set())
                         else:
                             self.wfile.write(step)
 
@@ -92,39 +95,18 @@ class Server:
         self._server.socket = context.wrap_socket(self._server.socket, server_side=True)
 
     def close(self) -> None:
+        self.closing.set()
         self._server.shutdown()
         self._server.server_close()
         self._thread.join(WAIT_S)
 
 
 @pytest.fixture
-def server() -> Iterator[Server]:
+def server(opened: list[LiveSource]) -> Iterator[Server]:
+    """It ends before the sources that read from it."""
     server = Server()
     yield server
     server.close()
-
-
-def test_close_while_it_connects_ends_the_thread(
-    opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The server takes the connection and says nothing; `close` finds no socket to shut down."""
-    connected, woken = threading.Event(), threading.Event()
-    connect = http.client.HTTPConnection.connect
-
-    def connect_and_wait(connection: http.client.HTTPConnection) -> None:
-        connect(connection)
-        connected.set()
-        woken.wait(WAIT_S)
-
-    monkeypatch.setattr(http.client.HTTPConnection, "connect", connect_and_wait)
-    monkeypatch.setattr(MjpegSource, "_wake", lambda self: woken.set())
-    with socket.create_server(("127.0.0.1", 0)) as silent:
-        source = MjpegSource(f"http://127.0.0.1:{silent.getsockname()[1]}/", 0.07, Clock())
-        begun(source, opened, connect_timeout_s=1000.0)
-        assert connected.wait(WAIT_S)
-        source.close()
-        assert source._thread is not None
-        assert not source._thread.is_alive()
 
 
 def stream(server: Server, clock: Clock, opened: list[LiveSource], **options: float) -> MjpegSource:
@@ -294,15 +276,22 @@ def test_a_certificate_that_nobody_vouches_for(
     assert level(next_frame(source)) == 60
 
 
-@pytest.mark.parametrize(("refusal", "challenges", "answered"), [
-    (401, ['Basic realm="camera"'], "Basic bWU6cEBzcw=="),
-    (403, [], "Basic bWU6cEBzcw=="),
-    (401, DIGEST, 'Digest username="me", realm="camera"'),
+BASIC = "Basic bWU6cEBzcw=="
+BY_DIGEST = 'Digest username="me", realm="camera"'
+SHA_256 = 'Digest realm="camera", nonce="n1", algorithm=SHA-256'
+
+
+@pytest.mark.parametrize(("challenges", "answered"), [
+    (['Basic realm="camera"'], BASIC),
+    (DIGEST, BY_DIGEST),
+    ([", ".join(DIGEST)], BY_DIGEST),
+    ([SHA_256, *DIGEST], BY_DIGEST),
+    (['digest realm="camera", nonce="n1", opaque="o"'], BY_DIGEST),
 ])  # fmt: skip
 def test_name_and_password_are_sent_once_they_are_asked_for_digest_first(
-    refusal: int, challenges: list[str], answered: str, server: Server, opened: list[LiveSource]
+    challenges: list[str], answered: str, server: Server, opened: list[LiveSource]
 ) -> None:
-    server.refusal, server.challenges = refusal, challenges
+    server.challenges = challenges
     server.scripts.put([part(jpeg(60))])
     server.scripts.put([part(jpeg(100)), threading.Event()])
     url = server.url.replace("http://", "http://me:p%40ss@")
@@ -312,20 +301,39 @@ def test_name_and_password_are_sent_once_they_are_asked_for_digest_first(
     assert "p%40ss" not in source.describe()
 
 
+def test_a_digest_is_that_of_rfc_2617() -> None:
+    asked = (
+        'Digest realm="testrealm@host.com", qop="auth,auth-int", '
+        'nonce="dcd98b7102dd2f0e8b11d0f600bfb0c093", opaque="5ccc069c403ebaf9f0171e9517f40e41"'
+    )
+    url = "http://Mufasa:Circle%20Of%20Life@host/dir/index.html"
+    given = authorization([asked], Request("http://host/dir/index.html"), urlsplit(url))
+    values = dict(re.findall(r'(\w+)="?([^",]*)', str(given)))
+
+    def h(*words: str) -> str:
+        return md5(":".join(words).encode()).hexdigest()
+
+    first = h("Mufasa", "testrealm@host.com", "Circle Of Life")
+    middle = (values["nonce"], values["nc"], values["cnonce"], "auth")
+    assert values["response"] == h(first, *middle, h("GET", "/dir/index.html"))
+    assert values["opaque"] == "5ccc069c403ebaf9f0171e9517f40e41"
+
+
 @pytest.mark.parametrize(("changes", "who", "requests", "words"), [
     ({"status": 404}, "", 1, "404"),
-    ({"status": 403}, "", 1, "403"),
-    ({"status": 403}, "me:wrong@", 2, "403"),
-    ({"challenges": DIGEST}, "", 1, "wants a name and a password, as in http://NAME:PASSWORD"),
-    ({"challenges": DIGEST}, "me:wrong@", 2, "check the name and the password in the URL"),
-    ({"challenges": ["Negotiate"]}, "me:wrong@", 1, "no basic or digest authentication"),
+    ({"status": 403}, "me:wrong@", 1, "403"),
+    ({"challenges": DIGEST}, "", 1, "write a name and a password .*, as in http://NAME:PASSWORD"),
+    ({"challenges": DIGEST}, "me:wrong@", 2, "write a name and a password"),
+    *(({"challenges": [*of]}, "me:wrong@", 1, "for basic or digest authentication by MD5")
+      for of in (("Negotiate",), (SHA_256, 'Basic realm="camera"'), ("\xff=",))),
     *(({"redirect": to}, "me:wrong@", 1, "redirects to .*name that address in camera.source")
       for to in ("/elsewhere.mjpg", "http://me:wrong@127.0.0.1:1/x", "rtsp://127.0.0.1/live")),
 ])  # fmt: skip
 def test_what_trying_again_would_not_mend_is_said_at_once(
     changes: dict[str, Any], who: str, requests: int, words: str, server: Server
 ) -> None:
-    """Nothing follows a redirect: nobody can ask for the password in the camera's place."""
+    """Nothing follows a redirect: nobody can ask for the password in the camera's place. Nor is a
+    password shown where a digest was asked for that is not known."""
     server.nonce = "none of mine"
     for name, value in changes.items():
         setattr(server, name, value)
