@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import struct
 import sys
@@ -21,8 +20,6 @@ LOST_AFTER_FAILURES = 25
 RETRY_S = 0.04
 REOPEN_EVERY_S = 1.0
 """Between two attempts to open a camera that was lost: an attempt takes a driver some 0.1 s."""
-RATE_TOLERANCE = 0.02
-"""29.97 Hz are 30."""
 
 
 @dataclass(frozen=True)
@@ -100,28 +97,7 @@ class DeviceSource(LiveSource):
         self._retry_s = retry_s
         self._reopen_every_s = reopen_every_s
         self._capture = open_number(number, asked)
-        self._format, self._rate_hz = "", 0.0
-        with contextlib.suppress(cv2.error, AttributeError):  # before a thread reads from it
-            code = int(self._capture.get(cv2.CAP_PROP_FOURCC))
-            self._format = _fourcc_text(code) if code > 0 else ""
-            self._rate_hz = float(self._capture.get(cv2.CAP_PROP_FPS))
         self._start(self._grab)
-
-    def remarks(self) -> list[str]:
-        """Return a sentence for each thing that the driver did not do as it was asked."""
-        asked, got = self._asked, f"{self._name} was asked for"
-        said = []
-        if asked.format is not None and self._format not in ("", asked.format):
-            said.append(f"{got} {asked.format} (camera.format) and gives {self._format}")
-        if asked.size_px is not None and self.size_px not in (None, asked.size_px):
-            wanted, given = ("{}x{} px".format(*size) for size in (asked.size_px, self.size_px))
-            said.append(f"{got} {wanted}, the calibration's, and gives {given}")
-        if asked.rate_hz is not None and self._rate_hz > 0.0:
-            off_hz = abs(asked.rate_hz - self._rate_hz)
-            if off_hz > RATE_TOLERANCE * asked.rate_hz:
-                gives = f"{self._rate_hz:.3g} Hz"
-                said.append(f"{got} {asked.rate_hz:g} Hz (camera.rate_hz) and gives {gives}")
-        return said
 
     def _grab(self) -> None:
         try:
@@ -166,11 +142,6 @@ class DeviceSource(LiveSource):
             except Exception as error:
                 reason = str(error) if isinstance(error, PerchError) else one_line(error)
                 self._why_silent = f"{lost}; the last attempt: {reason}"
-
-
-def _fourcc_text(code: int) -> str:
-    """Return a pixel format's name of its number: ``MJPG``, ``YUYV``, ..."""
-    return code.to_bytes(4, "little").decode("ascii", "replace").rstrip("\0 ")
 
 
 # --- The cameras of this computer: their numbers, names and lasting paths

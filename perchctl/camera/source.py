@@ -167,10 +167,6 @@ class LiveSource:
         self._first.wait(timeout_s)
         return self._count > 0
 
-    def remarks(self) -> list[str]:
-        """Return a sentence for each thing worth telling once the first frame has come."""
-        return []
-
     @property
     def _count(self) -> int:
         """The number of pictures so far, each counted once."""

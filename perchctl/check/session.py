@@ -70,18 +70,16 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
         stack.callback(probe.close)
         session = VehicleSession(probe, options.uri, profile, room, scope)
         take = yield from session.rows()
-        shown, remarks = without_password(options.source), list[str]()
+        shown = without_password(options.source)
         scope.tell(f"opening the camera {shown}")
         rehearsal: Rehearsal | None = None
         try:
-            source = _open_camera(spec, options, remarks)
+            source = _open_camera(spec, options)
         except PerchError as error:
             yield from camera.refused_rows(error, list(map(str, find_cameras())), options.profile)
         else:
             stack.callback(source.close)
-            yield Row(
-                "camera", *camera.opened_finding(shown, list(map(str, find_cameras())), remarks)
-            )
+            yield Row("camera", *camera.opened_finding(shown, list(map(str, find_cameras()))))
             rehearsal = yield from _camera_rows(take, source, pipeline, options.profile, scope)
     yield ask("loop", camera.loop_finding, rehearsal, options.profile)
     yield ask("log folder", log_folder_finding, options.log_dir)
@@ -218,10 +216,10 @@ def _not_answering(names: list[str]) -> list[Row]:
     return skip_all(names, "the vehicle does not answer")
 
 
-def _open_camera(spec: str, options: FlyOptions, remarks: list[str]) -> FrameSource:
+def _open_camera(spec: str, options: FlyOptions) -> FrameSource:
     config = options.profile.camera
     size_px = profile_camera(config).size_px
-    return open_camera(spec, time.monotonic, config, size_px=size_px, tell=remarks.append)
+    return open_camera(spec, time.monotonic, config, size_px=size_px)
 
 
 def _camera_rows(
