@@ -1,7 +1,6 @@
 from .credentials import profile_record as profile_record
 from .credentials import without_password as without_password
 from .credentials import without_passwords as without_passwords
-from .device import ConnectedCamera as ConnectedCamera
 from .device import find_cameras as find_cameras
 from .files import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from .files import BrokenPicture as BrokenPicture

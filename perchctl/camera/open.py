@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from perchctl.camera.aideck import FORM, AiDeckSource, aideck_address
 from perchctl.camera.credentials import without_password
-from perchctl.camera.device import DeviceSource, asked_of, camera_number, finder_of
+from perchctl.camera.device import DeviceSource, open_capture
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.network import MjpegSource, RtspSource, StreamSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource, mirrored_as_profiled
@@ -132,9 +133,8 @@ def _live(
 ) -> LiveSource:
     """Open a camera or stream whose first frame is still to come."""
     if name.scheme == "camera":
-        asked = asked_of(config, size_px)
-        number = camera_number(name.place)
-        return DeviceSource(number, latency_s, asked, clock, find=finder_of(number))
+        opener = partial(open_capture, name.place, size_px, config)
+        return DeviceSource(str(name), latency_s, clock, opener)
     stream: StreamSource | None = None
     if name.scheme == "aideck":
         stream = AiDeckSource(*aideck_address(name.spec), latency_s, clock)

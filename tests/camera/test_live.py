@@ -1,4 +1,4 @@
-"""Live sources: Motion-JPEG from a local server, and a camera of the computer behind a stand-in."""
+"""Motion-JPEG from a local server, and what all streams share."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import queue
 import re
 import ssl
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from hashlib import md5
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -22,12 +21,6 @@ import pytest
 
 from perchctl.camera import open_camera
 from perchctl.camera.credentials import authorization
-from perchctl.camera.device import (
-    LOST_AFTER_FAILURES,
-    Asked,
-    DeviceSource,
-    open_capture,
-)
 from perchctl.camera.network import MAX_FAILED_CONNECTIONS, MjpegSource, StreamSource
 from perchctl.camera.source import SILENT_AFTER_S, LiveSource
 from perchctl.errors import NotFound, TimedOut
@@ -343,138 +336,3 @@ def test_what_trying_again_would_not_mend_is_said_at_once(
     assert "wrong" not in str(caught.value)
     if "redirect" in changes:
         assert changes["redirect"].rpartition("/")[2] in str(caught.value)
-
-
-# -- the device -----------------------------------------------------------------
-
-
-def grey(value: int) -> np.ndarray[Any, Any]:
-    return np.full((48, 64), value, np.uint8)
-
-
-class Capture:
-    """Stands for cv2.VideoCapture; gives pictures, raises errors among them, and fails at the end
-    and while it is unplugged."""
-
-    def __init__(self, *pictures: np.ndarray[Any, Any] | Exception) -> None:
-        self.pictures = [*pictures]
-        self.unplugged = False
-        self.released = threading.Event()
-        self.reads = 0
-
-    def read(self) -> tuple[bool, Any]:
-        self.reads += 1
-        if self.unplugged or not self.pictures:
-            threading.Event().wait(0.01 * (not self.unplugged))
-            return False, None
-        image = self.pictures.pop(0)
-        if isinstance(image, Exception):
-            raise image
-        return True, image
-
-    def release(self) -> None:
-        self.released.set()
-
-
-class Bus:
-    """Where a camera is plugged in and out; `numbers` has one for each attempt to open it."""
-
-    def __init__(self, capture: Capture) -> None:
-        self.capture: Capture | None = capture
-        self.numbers: list[int] = []
-
-    def open(self, number: int, asked: Asked) -> Capture:
-        self.numbers.append(number)
-        if self.capture is None:
-            raise NotFound(f"camera:{number} was not found; no /dev/video* exists")
-        return self.capture
-
-
-def device(
-    opened: list[LiveSource],
-    open_number: Callable[[int, Asked], Capture],
-    clock: Clock | None = None,
-    reopen_every_s: float = 0.001,
-) -> DeviceSource:
-    """Camera 2, which is camera 5 when it comes back."""
-    source = DeviceSource(
-        2, 0.05, Asked(), clock or Clock(), open_number, retry_s=0.0,
-        reopen_every_s=reopen_every_s, find=lambda: 5,
-    )  # fmt: skip
-    opened.append(source)
-    return source
-
-
-def test_a_device_delivers_grey_frames_drops_a_damaged_one_and_is_released(
-    opened: list[LiveSource],
-) -> None:
-    colour = np.full((48, 64, 3), 160, np.uint8)
-    capture = Capture(grey(60), cv2.error("damaged"), colour)
-    source = device(opened, Bus(capture).open)
-    until(lambda: source._count == 2)
-    frame = next_frame(source)
-    assert (level(frame), frame.image.shape) == (160, (48, 64))
-    assert frame.t_s == pytest.approx(99.95)
-    assert source.describe() == "camera:2 (64x48 px)"
-    assert source.problem(100.0) is None
-    assert not capture.released.is_set()
-    source.close()
-    assert capture.released.wait(WAIT_S)
-
-
-def test_a_device_that_never_gives_a_picture_fails(opened: list[LiveSource]) -> None:
-    capture = Capture()
-    capture.unplugged = True
-    source = device(opened, Bus(capture).open)
-    assert not source.wait_first(WAIT_S)
-    assert "stopped delivering" in str(source.problem(float("-inf")))
-    assert capture.reads == LOST_AFTER_FAILURES
-    assert capture.released.wait(WAIT_S)
-
-
-def test_a_device_that_comes_back_is_opened_again(opened: list[LiveSource]) -> None:
-    first, clock = Capture(grey(60)), Clock()
-    bus = Bus(first)
-    source = device(opened, bus.open, clock)
-    assert level(next_frame(source)) == 60
-    bus.capture, first.unplugged = None, True
-    until(lambda: len(bus.numbers) > 3)
-    assert first.released.is_set()
-    clock.t_s = 102.0
-    assert "camera:5 was not found" in str(source.problem(102.0))
-    assert bus.numbers[:2] == [2, 5]
-    assert source.problem(float("-inf")) is None, "it is not the end"
-    bus.capture = again = Capture(grey(160))
-    frame = next_frame(source)
-    assert (level(frame), frame.index, frame.t_arrival_s) == (160, 1, 102.0)
-    assert source.problem(102.0) is None
-    assert not again.released.is_set()
-
-
-def test_attempts_to_open_a_lost_device_are_bounded_in_rate(opened: list[LiveSource]) -> None:
-    bus = Bus(capture := Capture(grey(60)))
-    source = device(opened, bus.open, reopen_every_s=0.1)
-    assert source.wait_first(WAIT_S)
-    bus.capture, capture.unplugged = None, True
-    until(lambda: len(bus.numbers) == 2)
-    began_s = time.monotonic()
-    until(lambda: len(bus.numbers) == 6)
-    assert time.monotonic() - began_s > 0.35
-
-
-def test_a_device_that_flaps_is_never_given_up(opened: list[LiveSource]) -> None:
-    captures: list[Capture] = []
-
-    def one_picture(number: int, asked: Asked) -> Capture:
-        captures.append(Capture(grey(len(captures))))
-        return captures[-1]
-
-    source = device(opened, one_picture, reopen_every_s=0.0)
-    until(lambda: len(captures) > 3 and source._count > 3)
-    assert all(each.released.is_set() for each in captures[:-2])
-
-
-def test_a_missing_device_says_what_there_is() -> None:
-    assert not Path("/dev/video97").exists()
-    with pytest.raises(NotFound, match=r"camera:97 was not found; (there are|no /dev/video)"):
-        open_capture(97, Asked())
