@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import struct
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -125,11 +124,6 @@ class DeviceSource(LiveSource):
 DEVICES = Path("/dev")
 NAMES = Path("/sys/class/video4linux")
 
-# VIDIOC_QUERYCAP of videodev2.h, and its structure's two words of capabilities.
-_QUERYCAP = 0x80685600
-_CAPABILITY = struct.Struct("=84xII12x")
-_HAS_DEVICE_CAPS, _VIDEO_CAPTURE = 0x80000000, 1
-
 
 @dataclass(frozen=True)
 class ConnectedCamera:
@@ -156,7 +150,7 @@ def find_cameras(devices: Path = DEVICES, names: Path = NAMES) -> list[Connected
             stable.setdefault(number, str(link))
     found = []
     for number in sorted(_video_numbers(devices.glob("video*"))):
-        if _gives_pictures(number, devices, names):
+        if _of_system(number, "index", names) in ("", "0"):
             may = os.access(devices / f"video{number}", os.R_OK | os.W_OK)
             problem = "" if may else "you may not open it: Permission denied"
             name = _of_system(number, "name", names)
@@ -168,24 +162,6 @@ def _video_numbers(paths: Iterable[Path]) -> list[int]:
     """Return the N of each path that is a videoN."""
     numbers = (path.name.removeprefix("video") for path in paths)
     return [int(n) for n in numbers if n.isascii() and n.isdigit()]
-
-
-def _gives_pictures(number: int, devices: Path, names: Path) -> bool:
-    """Return whether a node's driver says that it captures video. Of a camera whose driver cannot
-    be asked only the first node counts."""
-    data = bytearray(_CAPABILITY.size)
-    try:
-        import fcntl  # late: Windows has none
-
-        node = os.open(devices / f"video{number}", os.O_RDWR | os.O_NONBLOCK)
-        try:
-            fcntl.ioctl(node, _QUERYCAP, data, True)
-        finally:
-            os.close(node)
-    except (ImportError, OSError):
-        return _of_system(number, "index", names) in ("", "0")
-    of_all_nodes, of_this = _CAPABILITY.unpack(data)
-    return bool((of_this if of_all_nodes & _HAS_DEVICE_CAPS else of_all_nodes) & _VIDEO_CAPTURE)
 
 
 def _of_system(number: int, attribute: str, names: Path) -> str:

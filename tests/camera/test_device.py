@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import os
-import struct
 import threading
 import time
 from collections.abc import Callable
@@ -75,33 +74,6 @@ def test_a_camera_is_named_by_number_name_part_of_it_or_path(plugged: Callable[.
     for text in ("", '""', " ", "-1"):
         with pytest.raises(InvalidValue, match="as in camera:0 or camera:USB Video"):
             number(text)
-
-
-def test_a_second_node_with_pictures_is_a_camera_and_one_without_is_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As of a stereo camera: the driver's answer counts, and not the node's index."""
-    fcntl = pytest.importorskip("fcntl")
-
-    def query(node: int, request: int, data: bytearray, mutate: bool) -> None:
-        assert request == (2 << 30) | (104 << 16) | (ord("V") << 8)  # VIDIOC_QUERYCAP
-        data[:] = os.read(node, 104)
-
-    monkeypatch.setattr(fcntl, "ioctl", query)
-    names = tmp_path / "names"
-    whole, video, metadata = 0x84A00001, 0x04200001, 0x04A00000
-    # Old drivers say nothing of a single node.
-    for index, words in enumerate([(whole, video), (whole, metadata), (whole, video), (1, 0)]):
-        (tmp_path / f"video{index}").write_bytes(struct.pack("=84xII12x", *words))
-        (names / f"video{index}").mkdir(parents=True)
-        (names / f"video{index}" / "index").write_text(f"{index}\n")
-        (names / f"video{index}" / "name").write_text(f"Depth {index}\n")
-    (tmp_path / "v4l" / "by-id").mkdir(parents=True)
-    path = tmp_path / "v4l" / "by-id" / "usb-depth-video-index2"
-    path.symlink_to(tmp_path / "video2")
-    assert [camera.number for camera in find_cameras(tmp_path, names)] == [0, 2, 3]
-    assert camera_number(str(path), tmp_path, names) == 2
-    assert camera_number("Depth 2", tmp_path, names) == 2
 
 
 def test_the_list_for_people_and_for_programs(
