@@ -18,9 +18,7 @@ from .open import open_camera as open_camera
 from .open import parse_source as parse_source
 from .source import FrameSource as FrameSource
 from .source import NewestSlot as NewestSlot
-from .source import WatchedSource as WatchedSource
 from .source import WrappedSource as WrappedSource
 from .source import check_size as check_size
-from .source import mirrored_as_profiled as mirrored_as_profiled
 from .source import mirrored_note as mirrored_note
 from .source import unmirror_frame as unmirror_frame

@@ -13,7 +13,7 @@ from perchctl.camera.credentials import without_password
 from perchctl.camera.device import DeviceSource, open_capture
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.network import MjpegSource, RtspSource, StreamSource
-from perchctl.camera.source import Clock, FrameSource, LiveSource, mirrored_as_profiled
+from perchctl.camera.source import Clock, FrameSource, LiveSource, WrappedSource, unmirror_frame
 from perchctl.errors import InvalidValue, NotFound, TimedOut
 from perchctl.profile import CameraConfig
 
@@ -121,7 +121,8 @@ def open_camera(
         else:
             live = _live(name, latency_s, size_px, clock, config)
             opened = _started(live, timeout_s)
-    return opened if config is None else mirrored_as_profiled(opened, config)
+    is_mirrored = config is not None and config.mirrored
+    return WrappedSource(opened, unmirror_frame) if is_mirrored else opened
 
 
 def _live(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import FrameSource, NewestSlot, mirrored_as_profiled
+from perchctl.camera import FrameSource, NewestSlot, WrappedSource, unmirror_frame
 from perchctl.errors import ConnectionFailed
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.link import MockLink, Radio
@@ -98,7 +98,7 @@ def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
     """Return the vehicle's camera as the flight sees it by its profile."""
     assert vehicle.camera is not None
     source = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
-    return mirrored_as_profiled(source, profile.camera)
+    return WrappedSource(source, unmirror_frame) if profile.camera.mirrored else source
 
 
 class Truth:
