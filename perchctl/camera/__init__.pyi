@@ -10,10 +10,8 @@ from .files import decode_picture as decode_picture
 from .files import image_files as image_files
 from .files import read_grey as read_grey
 from .health import VERDICT_TEXTS as VERDICT_TEXTS
+from .health import FrameHealth as FrameHealth
 from .health import Grey as Grey
-from .health import HealthState as HealthState
-from .health import HealthVerdict as HealthVerdict
-from .health import assess_frame as assess_frame
 from .open import open_camera as open_camera
 from .open import parse_source as parse_source
 from .source import FrameSource as FrameSource

@@ -109,9 +109,7 @@ def test_no_camera_at_all(plugged: Callable[..., Path], monkeypatch: pytest.Monk
 
 def test_a_missing_device_says_what_there_is() -> None:
     assert not Path("/dev/video97").exists()
-    with pytest.raises(
-        NotFound, match=r"camera:97 was not found; th(ere are|is computer)"
-    ):
+    with pytest.raises(NotFound, match=r"camera:97 was not found; th(ere are|is computer)"):
         open_capture("97", None, None)
 
 

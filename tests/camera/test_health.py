@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from perchctl.camera import HealthState, HealthVerdict, NewestSlot, assess_frame
-from perchctl.camera.health import content
+from perchctl.camera import FrameHealth, NewestSlot
+from perchctl.camera.health import HealthVerdict, content
 from perchctl.geometry import make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
@@ -89,11 +89,8 @@ def test_sensor_noise_alone_is_not_snow(seed: int, sigma: float, level: float) -
 
 
 def judge(images: list[NDArray[np.uint8]], live: bool = True) -> list[HealthVerdict]:
-    state, verdicts = HealthState(), []
-    for k, image in enumerate(images):
-        state, verdict = assess_frame(state, frame(image, k / 30.0), live)
-        verdicts.append(verdict)
-    return verdicts
+    health = FrameHealth()
+    return [health.assess(frame(image, k / 30.0), live) for k, image in enumerate(images)]
 
 
 def test_a_frozen_picture_first_repeats_then_is_frozen() -> None:
@@ -121,13 +118,12 @@ def test_over_any_source_equal_bytes_are_a_repetition_and_not_frozen_until_it_is
     frames = list(Pass(camera_receiver_hz=60.0).frames(60))
     truth = [False] + [a.index == b.index for a, b in zip(frames[1:], frames, strict=False)]
     assert 30 < sum(truth) < 40
-    slot, state, taken, kinds = NewestSlot(), HealthState(), [], []
+    slot, health, taken, kinds = NewestSlot(), FrameHealth(), [], []
     for k, frame in enumerate(frames + [frames[-1]] * 40):
         slot.put(frame.image, k / 60, k / 60)
         taken.append(slot.take())
         assert taken[-1] is not None
-        state, verdict = assess_frame(state, taken[-1])
-        kinds.append(verdict.kind)
+        kinds.append(health.assess(taken[-1]).kind)
     assert [each.repeated for each in taken[: len(frames)] if each] == truth
     assert set(kinds[: len(frames)]) == {"ok", "repeated"}
     stuck = kinds[len(frames) :]

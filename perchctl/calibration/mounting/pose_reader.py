@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.camera import HealthState, assess_frame
+from perchctl.camera import FrameHealth
 from perchctl.geometry import R_MARKER_TARGET, Array
 from perchctl.profile import Profile
 from perchctl.vision import (
@@ -41,14 +41,14 @@ class PoseReader:
         self._live = live
         self._state = PipelineState()
         self._fields = FieldState()
-        self._health = HealthState()
+        self._health = FrameHealth()
         self.mirrored = 0
         self.outlines: tuple[tuple[str, Array], ...] = ()
         self.trouble = ""
 
     def look(self, frame: Frame) -> list[SeenPose]:
         """Return the target's poses in a frame: one, or one in each of its two fields."""
-        self._health, judged = assess_frame(self._health, frame, self._live)
+        judged = self._health.assess(frame, self._live)
         if judged.kind == "repeated":
             return []
         self.outlines, self.trouble = (), ""
