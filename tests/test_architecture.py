@@ -87,7 +87,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 MOST_NAMES = {
     "analysis": 15,
     "calibration": 30,
-    "camera": 27,
+    "camera": 17,
     "campaign": 25,
     "check": 15,
     "commands": 15,

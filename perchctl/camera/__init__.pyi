@@ -1,14 +1,9 @@
 from .credentials import profile_record as profile_record
 from .credentials import without_password as without_password
-from .credentials import without_passwords as without_passwords
 from .device import find_cameras as find_cameras
-from .files import IMAGE_SUFFIXES as IMAGE_SUFFIXES
-from .files import BrokenPicture as BrokenPicture
 from .files import Recording as Recording
-from .files import VideoSource as VideoSource
 from .files import decode_picture as decode_picture
 from .files import image_files as image_files
-from .files import read_grey as read_grey
 from .health import VERDICT_TEXTS as VERDICT_TEXTS
 from .health import FrameHealth as FrameHealth
 from .health import Grey as Grey

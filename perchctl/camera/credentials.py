@@ -47,16 +47,12 @@ def _without_name(rest: str) -> str:
     return after if ":" in before else rest  # a slash within the password
 
 
-def without_passwords(profile: Profile) -> Profile:
-    """Return the profile as it may be shown; it opens no camera that wants a password."""
-    camera = profile.camera.model_copy(update={"source": without_password(profile.camera.source)})
-    described = without_password(profile.description)
-    return profile.model_copy(update={"camera": camera, "description": described})
-
-
 def profile_record(profile: Profile) -> dict[str, Any]:
-    """Return every key of the profile, for JSON that is kept and shown, without a password."""
-    return without_passwords(profile).model_dump(mode="json")
+    """Return every key of the profile, for JSON that is kept and shown, without a password: it
+    opens no camera that wants one."""
+    record = profile.model_dump(mode="json")
+    record["camera"]["source"] = without_password(profile.camera.source)
+    return record | {"description": without_password(profile.description)}
 
 
 def authorization(asked: Sequence[str], request: Request, url: SplitResult) -> str | None:

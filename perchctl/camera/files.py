@@ -126,34 +126,16 @@ class ImagesSource(Recording):
             return None
         path, t_s = self.paths[self._next], self._next / self.rate_hz
         self._next += 1
-        return read_grey(path), t_s
-
-
-class BrokenPicture(InvalidValue):
-    """A file that is no picture, or a part of one; `reason` goes behind its name."""
-
-    def __init__(self, path: Path, reason: str) -> None:
-        super().__init__(f"{path} {reason}; remove or replace it")
-        self.reason = reason
-
-
-def read_grey(path: Path) -> NDArray[np.uint8]:
-    """Return a picture file as grey; raises BrokenPicture if it is none or cut off."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise BrokenPicture(path, f"cannot be read: {error.strerror or error}") from None
-    try:
-        return decode_picture(data)
-    except ValueError as error:
-        raise BrokenPicture(path, str(error)) from None
+        try:
+            return decode_picture(path.read_bytes()), t_s
+        except (OSError, ValueError) as error:
+            raise InvalidValue(f"{path} cannot be used ({error}); remove or replace it") from None
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8]:
     """Return the grey picture of a file's bytes.
 
-    Raises ValueError with what stands behind the file's name: it is cut off, or none that OpenCV
-    reads.
+    Raises ValueError for one that is cut off, or that OpenCV does not read.
     """
     if is_cut_off(data):
         raise ValueError("is cut off")

@@ -9,15 +9,12 @@ import numpy as np
 import pytest
 
 from perchctl.camera import (
-    BrokenPicture,
     FrameSource,
     Recording,
-    VideoSource,
     check_size,
     open_camera,
     parse_source,
     profile_record,
-    read_grey,
     without_password,
 )
 from perchctl.camera.source import to_grey
@@ -196,10 +193,10 @@ def test_what_names_no_source_says_what_is_allowed(spec: str, words: str) -> Non
 def test_videos_that_are_none(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """OpenCV's own warning would stand beside the sentence."""
     with pytest.raises(NotFound, match=r"flight\.avi was not found"):
-        VideoSource(tmp_path / "flight.avi")
+        open_camera(f"video:{tmp_path}/flight.avi", clock)
     (tmp_path / "flight.avi").write_bytes(b"no video at all")
     with pytest.raises(InvalidValue, match="no readable frame"):
-        VideoSource(tmp_path / "flight.avi")
+        open_camera(f"video:{tmp_path}/flight.avi", clock)
     assert capfd.readouterr().err == ""
 
 
@@ -231,21 +228,20 @@ def test_a_picture_that_is_cut_off_is_named_before_a_decoder_speaks_of_it(
     for name, data in {"a.jpg": jpeg, "b.png": png, "c.jpg": jpeg[:2] + inside + jpeg[2:]}.items():
         path = tmp_path / name
         path.write_bytes(data + b"more behind it")
-        assert read_grey(path).shape == (90, 120)
+        assert open_camera(f"images:{path}", clock).size_px == (120, 90)
         for kept in (len(data) // 2, len(data) - 6 if name == "b.png" else len(data) - 1, 300):
             path.write_bytes(data[:kept])
-            with pytest.raises(BrokenPicture, match=rf"{name} is cut off.*remove or replace it"):
-                read_grey(path)
+            with pytest.raises(InvalidValue, match=rf"{name} .*is cut off.*remove or replace it"):
+                open_camera(f"images:{path}", clock)
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8", b"\xff\xd8no", None])
-def test_what_is_no_picture_is_named(tmp_path: Path, data: bytes | None) -> None:
+@pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8", b"\xff\xd8no"])
+def test_what_is_no_picture_is_named(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "a.jpg"
-    if data is not None:
-        path.write_bytes(data)
-    with pytest.raises(BrokenPicture, match=r"a\.jpg (cannot be read|is cut off)"):
-        read_grey(path)
+    path.write_bytes(data)
+    with pytest.raises(InvalidValue, match=r"a\.jpg .*(cannot be read|is cut off)"):
+        open_camera(f"images:{path}", clock)
 
 
 def test_the_size_of_a_calibration_is_asked_of_a_camera_of_this_computer_only() -> None:

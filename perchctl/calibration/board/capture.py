@@ -15,7 +15,7 @@ import numpy as np
 
 from perchctl.calibration.board.detect import BoardView, Rejection, find_board
 from perchctl.calibration.live import GuidedFrame, poll_frames
-from perchctl.camera import BrokenPicture, FrameSource, Grey, VideoSource, image_files, read_grey
+from perchctl.camera import FrameSource, Grey, decode_picture, image_files, open_camera
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import Array
 from perchctl.target import Board
@@ -51,9 +51,9 @@ def views_of_images(
     def search(job: tuple[str, Path]) -> tuple[str, tuple[int, int] | None, BoardView | str]:
         name, path = job
         try:
-            image = read_grey(path)
-        except BrokenPicture as error:
-            return name, None, error.reason
+            image = decode_picture(path.read_bytes())
+        except (OSError, ValueError) as error:
+            return name, None, str(error)
         return name, (image.shape[1], image.shape[0]), find_board(image, board, name)
 
     views: list[BoardView] = []
@@ -90,7 +90,7 @@ def views_of_video(
     def search(frame: Frame) -> BoardView | str:
         return find_board(frame.image, board, f"frame {frame.index}")
 
-    source = VideoSource(path)
+    source = open_camera(f"video:{path}", time.monotonic)
     found: list[BoardView] = []
     searched = 0
     try:
@@ -109,7 +109,7 @@ def views_of_video(
     return select_views(found, board), []
 
 
-def _sharpest_frames(source: VideoSource) -> Iterator[Frame]:
+def _sharpest_frames(source: FrameSource) -> Iterator[Frame]:
     """Yield the sharpest frame of each window."""
     window: list[Frame] = []
     while (frame := source.poll(0.0)) is not None:
