@@ -57,18 +57,15 @@ class ListeningLink(CflibLink):
 
 
 PERIOD_S = 0.01
-TURN_BLOCK = dict.fromkeys(
+MOTION_BLOCK = dict.fromkeys(
     (
         "stateEstimate.roll", "stateEstimate.pitch", "stateEstimate.yaw",
         "gyro.x", "gyro.y", "gyro.z",
     ),
     "float",
-)  # fmt: skip
-"""24 of the 26 bytes that a log block holds."""
-MOTORS_BLOCK = {"supervisor.info": "uint16_t"}
+) | {"supervisor.info": "uint16_t"}  # fmt: skip
+"""All 26 bytes that a log block holds."""
 MOST_SAMPLES = 20_000
-ATTITUDE, MOTORS = "how it is turned", "whether its motors turn"
-"""What `TURN_BLOCK` and `MOTORS_BLOCK` tell, and nothing else does."""
 
 
 class MotionLink(ListeningLink):
@@ -78,8 +75,8 @@ class MotionLink(ListeningLink):
         super().__init__(uri, config, clock)
         self._timebase = Timebase()
         self._samples: deque[AttitudeSample] = deque(maxlen=MOST_SAMPLES)
-        self._heard_s: dict[str, float] = {}  # when each block last came
-        self._heard_both = threading.Event()
+        self._heard = threading.Event()
+        self._heard_s = 0.0
         self._motors_run = False
 
     @property
@@ -92,58 +89,42 @@ class MotionLink(ListeningLink):
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
     def problem(self, now_s: float) -> str | None:
-        """Name what came, but comes no more: each block by itself, since motors of which nothing
-        is heard may turn."""
         if self.connection is not None and self.connection.lost is not None:
             return self.connection.lost
-        for what, heard_s in self._heard_s.copy().items():
-            if now_s - heard_s > SILENCE_S:
-                return f"nothing heard for {now_s - heard_s:.1f} s of {what}"
-        return None
+        silent_s = now_s - self._heard_s
+        return f"nothing heard for {silent_s:.1f} s" if silent_s > SILENCE_S else None
 
     def _prepare(self, connection: Connection) -> None:
         check_firmware(connection.cf, self._uri)
-        for name in TURN_BLOCK:
+        for name in MOTION_BLOCK:
             if not is_logged(connection.cf, name):
                 raise NotFound(
                     f"the firmware at {self._uri} has no log variable {name}, by which the "
                     f"mounting is measured: update the firmware"
                 )
         log = connection.cf.log
-        start_block(log, self._uri, "motors", MOTORS_BLOCK, PERIOD_S, self._on_motors)
-        start_block(log, self._uri, "turn", TURN_BLOCK, PERIOD_S, self._on_turn)
-        self._heard_both.wait(FIRST_SAMPLE_TIMEOUT_S)
-        missing = [what for what in (ATTITUDE, MOTORS) if what not in self._heard_s]
-        if missing:
-            raise TimedOut(f"{self._uri} is connected but does not send {' and '.join(missing)}")
+        start_block(log, self._uri, "motion", MOTION_BLOCK, PERIOD_S, self._on_motion)
+        if not self._heard.wait(FIRST_SAMPLE_TIMEOUT_S):
+            raise TimedOut(f"{self._uri} is connected but sends no telemetry")
 
-    def _on_turn(self, stamp: int, values: Mapping[str, float], _block: Any = None) -> None:
-        """Take a packet of `TURN_BLOCK`, in cflib's thread: degrees, and the Crazyflie's nose-up
-        pitch (docs/firmware.md, "Signs and units"); its gyroscope is right-handed. A packet with a
+    def _on_motion(self, stamp: int, values: Mapping[str, float], _block: Any = None) -> None:
+        """Take a packet of `MOTION_BLOCK`, in cflib's thread: degrees, and the Crazyflie's nose-up
+        pitch (docs/firmware.md, "Signs and units"); its gyroscope is right-handed. A sample with a
         value that is no number is dropped: it would spoil what is solved from the others."""
-        t_s = self._timebase.to_loop_s(stamp, self._clock())
-        if not all(map(math.isfinite, values.values())):
-            return
-        self._samples.append(
-            AttitudeSample(
-                t_s=t_s,
-                roll_rad=math.radians(values["stateEstimate.roll"]),
-                pitch_rad=-math.radians(values["stateEstimate.pitch"]),
-                yaw_rad=math.radians(values["stateEstimate.yaw"]),
-                gyro_radps=np.radians([values[f"gyro.{axis}"] for axis in "xyz"]),
-            )
-        )
-        self._heard(ATTITUDE)
-
-    def _on_motors(self, stamp: int, values: Mapping[str, float], _block: Any = None) -> None:
-        """Take a packet of `MOTORS_BLOCK`, in cflib's thread."""
+        self._heard_s = self._clock()
+        t_s = self._timebase.to_loop_s(stamp, self._heard_s)
         self._motors_run = bool(int(values["supervisor.info"]) & FLYING)
-        self._heard(MOTORS)
-
-    def _heard(self, what: str) -> None:
-        self._heard_s[what] = self._clock()
-        if len(self._heard_s) == 2:
-            self._heard_both.set()
+        self._heard.set()
+        if all(map(math.isfinite, values.values())):
+            self._samples.append(
+                AttitudeSample(
+                    t_s=t_s,
+                    roll_rad=math.radians(values["stateEstimate.roll"]),
+                    pitch_rad=-math.radians(values["stateEstimate.pitch"]),
+                    yaw_rad=math.radians(values["stateEstimate.yaw"]),
+                    gyro_radps=np.radians([values[f"gyro.{axis}"] for axis in "xyz"]),
+                )
+            )
 
 
 # --- What a vehicle holds, and how good the radio is ---------------------------------------------
