@@ -13,7 +13,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -136,25 +135,6 @@ _ECHO = struct.Struct("<BQ")  # as long as cflib's own, which it takes all of th
 _ECHO_MARK = 1  # cflib's own pings begin with 0
 
 
-@dataclass(frozen=True)
-class Echoes:
-    """Packets that were sent to come back, and the times after which those that did came."""
-
-    sent: int = 0
-    round_trip_s: tuple[float, ...] = ()
-
-    @property
-    def lost(self) -> float:
-        """Share of the packets that did not come back, 0 to 1; 1 if none was sent."""
-        return 1.0 - len(self.round_trip_s) / self.sent if self.sent else 1.0
-
-    @property
-    def p95_s(self) -> float | None:
-        """Time within which 95 of 100 came back; None if none did."""
-        ordered = sorted(self.round_trip_s)
-        return ordered[int(0.95 * (len(ordered) - 1))] if ordered else None
-
-
 class ProbeLink(ListeningLink):
     """A `ListeningLink` that refuses no firmware: what is wrong with it is what is asked for.
 
@@ -206,8 +186,9 @@ class ProbeLink(ListeningLink):
         """Return the newest values of log variables, without those that do not come."""
         return read_variables(self._cf, names)
 
-    def echoes(self, duration_s: float) -> Echoes:
-        """Send packets to come back for so long, and wait `ANSWER_S` for the last."""
+    def echoes(self, duration_s: float) -> list[float]:
+        """Send packets to come back for so long, and wait `ANSWER_S` for the last. Returns the time
+        after which each came back, s; infinite for one that did not."""
         sent_s: list[float] = []
         back_s: dict[int, float] = {}
         all_back = threading.Event()
@@ -230,8 +211,7 @@ class ProbeLink(ListeningLink):
             all_back.wait(ANSWER_S)
         finally:
             self._cf.remove_header_callback(on_packet, Port.LINK, 0)
-        trips = tuple(t_s - sent_s[n] for n, t_s in list(back_s.items()) if n < len(sent_s))
-        return Echoes(count, trips)
+        return [back_s.get(number, math.inf) - at_s for number, at_s in enumerate(sent_s)]
 
     def _on_quality(self, percent: float) -> None:
         self.quality = float(percent)
@@ -243,17 +223,10 @@ class ProbeLink(ListeningLink):
 SCAN_TIMEOUT_S = 20.0
 
 
-@dataclass(frozen=True)
-class ScanResult:
-    """The URIs that answered; `radio` is why no radio was asked, empty where one was."""
-
-    uris: tuple[str, ...]
-    radio: str = ""
-
-
-def find_vehicles(uri: str = "") -> ScanResult:
+def find_vehicles(uri: str = "") -> tuple[list[str], str]:
     """Ask which vehicles answer now, at a radio's usual address and at that of `uri`; sends null
-    packets only.
+    packets only. Returns their URIs, and why no radio was asked: empty where one was, else the
+    cause and, in lines of its own, what to do.
 
     A radio's driver may hang: it gets a thread, and what came by then counts.
     """
@@ -279,7 +252,7 @@ def find_vehicles(uri: str = "") -> ScanResult:
     worker.start()
     worker.join(SCAN_TIMEOUT_S)
     uris = (uri for uri in dict.fromkeys(found) if uri.partition("://")[0] in FORMS)
-    return ScanResult(tuple(map(with_whole_address, uris)), why[0])
+    return [with_whole_address(uri) for uri in uris], why[0]
 
 
 def _radio_problem() -> str:
@@ -288,6 +261,5 @@ def _radio_problem() -> str:
     try:
         Crazyradio().close()
     except Exception as error:
-        cause = plain_cause(str(error) or "Cannot find a Crazyradio Dongle")
-        return cause.partition("\n")[0].rstrip(".")
+        return plain_cause(str(error) or "Cannot find a Crazyradio Dongle")
     return ""

@@ -7,7 +7,8 @@ import re
 import pytest
 
 from perchctl.errors import InvalidValue
-from perchctl.link import UDEV_HELP, check_uri, listening, vehicle_uri
+from perchctl.link import check_uri, listening, vehicle_uri
+from perchctl.link.uri import UDEV_HELP
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
 
@@ -68,8 +69,8 @@ def test_a_scan_gives_uris_that_are_taken(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("cflib.crtp.CLASSES", [Radio])
     monkeypatch.setattr(listening, "ready_cflib", lambda: None)
     monkeypatch.setattr(listening, "_radio_problem", lambda: "")
-    found = listening.find_vehicles("radio://0/80/2M/0000000001?rate_limit=100").uris
-    assert found == ("radio://0/80/2M", "radio://0/80/2M/0000000001")
+    found = listening.find_vehicles("radio://0/80/2M/0000000001?rate_limit=100")[0]
+    assert found == ["radio://0/80/2M", "radio://0/80/2M/0000000001"]
     assert list(map(check_uri, found)) == ["radio", "radio"]
 
 
