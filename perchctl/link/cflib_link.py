@@ -131,7 +131,6 @@ class CflibLink:
             return self.connection.lost
         sender = self._sender
         if sender is not None:
-            sender.look_after()
             if sender.problem is not None:
                 return sender.problem
             if (stuck_s := sender.stuck_s()) > HANGS_S:
