@@ -12,10 +12,8 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from perchctl.camera import without_password
 from perchctl.errors import ConnectionFailed
 from perchctl.files import cannot_be_written
 from perchctl.link.crtp import Packet
@@ -402,54 +400,21 @@ def _hush_cflib() -> None:
 def claim_vehicle(uri: str) -> contextlib.ExitStack:
     """Lock the vehicle at `uri` for this process until the result is closed.
 
-    Nothing is locked where no lock can be kept (no folder to write to), which is no reason not to
-    fly. Raises ConnectionFailed, which names the program that has it.
+    Nothing is locked where no lock can be kept (no folder to write to, Windows), which is no reason
+    not to fly. Raises ConnectionFailed if another program has it.
     """
     path = user_runtime_folder() / (re.sub(r"[^A-Za-z0-9.]+", "_", vehicle_uri(uri)) + ".lock")
-    claim = contextlib.ExitStack()
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        fd = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-    except OSError:
-        return claim
-    claim.callback(os.close, fd)
-    if not _lock(fd):
-        with claim:
-            raise ConnectionFailed(
-                f"the vehicle at {uri} is in use by another program ({_holder(fd)}): two would "
-                f"steer it two ways; end that one, or name another vehicle"
-            )
-    with contextlib.suppress(OSError):  # a full disk: the lock holds all the same
-        os.ftruncate(fd, 0)
-        os.write(fd, _myself().encode())
-    return claim
+    with contextlib.ExitStack() as claim:
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
 
-
-def _myself() -> str:
-    name, *words = sys.argv or [""]
-    name = Path(name).name
-    words = ["perchctl" if name in ("", "__main__.py") else name, *map(without_password, words)]
-    return f"process {os.getpid()}: {' '.join(words)}"[:200]
-
-
-def _holder(fd: int) -> str:
-    text = ""
-    with contextlib.suppress(OSError):
-        text = os.read(fd, 400).decode(errors="replace").replace("\n", " ").strip()
-    return text or "it gives no name"
-
-
-def _lock(fd: int) -> bool:
-    """Take the lock; True if this process has it now, or where no such lock can be kept. Windows
-    has none of these; nor, for most vehicles, two programs at one radio."""
-    if sys.platform == "win32":
-        return True
-    import fcntl
-
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        return True
-    return True
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            file = claim.enter_context(path.open("a"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ConnectionFailed(
+                    f"the vehicle at {uri} is in use by another program: two would steer it two "
+                    f"ways; end that one, or name another vehicle"
+                ) from None
+        return claim.pop_all()
