@@ -97,7 +97,7 @@ def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
     echoes = link.echoes(listen_s)
     samples = link.telemetry()
     span_s = samples[-1].t_s - samples[0].t_s if len(samples) > 1 else 0.0
-    rssi = link.variables([RSSI]).get(RSSI)
+    rssi = link.variable(RSSI)
     later = link.telemetry() or samples
     return Vehicle(
         uri=uri,

@@ -32,7 +32,6 @@ from perchctl.positioning import (
     CaptureSource,
     FeedThread,
     PositionFeed,
-    StandingFeed,
     check_reachable,
     load_comparison,
     open_capture,
@@ -236,7 +235,7 @@ def started_feed(
 
     Errors: those of `CflibLink.settle`, and SafetyAbort for positions of another world."""
     if config.by == "target":
-        _settle_standing(link, clock, profile)
+        link.settle(profile.safety.ground_z_m)
         return None  # what follows is seen, and sent, by the loop
     if capture is None:
         return None
@@ -247,17 +246,6 @@ def started_feed(
     _refuse_strange(feed, link, clock, profile)
     link.settle(feed)
     return feed
-
-
-def _settle_standing(link: CflibLink, clock: Clock, profile: Profile) -> None:
-    """Settle the estimate on the ground, at the world's origin."""
-    feed = StandingFeed(link.external, profile.safety.ground_z_m)
-    thread = FeedThread(feed, clock.now, 1.0 / profile.positioning.rate_hz)
-    thread.start()
-    try:
-        link.settle(feed)
-    finally:
-        thread.close()
 
 
 def _refuse_strange(feed: PositionFeed, link: CflibLink, clock: Clock, profile: Profile) -> None:

@@ -27,8 +27,9 @@ from perchctl.link.crtp import (
 from perchctl.link.external_position import (
     NEEDED_BY,
     Feed,
+    Settling,
+    Standing,
     estimator_parameters,
-    settle_estimate,
 )
 from perchctl.link.firmware import check_firmware, measured_by, set_parameters
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
@@ -113,15 +114,20 @@ class CflibLink:
         except Exception:  # the library's; commands report their own
             return False
 
-    def settle(self, feed: Feed) -> None:
-        """Start the estimator where `feed` says that the vehicle is. On the ground, after
-        `connect`; bounded. Errors: ConnectionFailed, NotFound, InvalidValue, TimedOut."""
+    def settle(self, feed: Feed | float) -> None:
+        """Start the estimator where `feed` says that the vehicle is; a number: at the world's
+        origin, so many metres high. On the ground, after `connect`; bounded. Errors:
+        ConnectionFailed, NotFound, InvalidValue, TimedOut."""
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
-        settle_estimate(
+        wait: Callable[[float], None] = time.sleep
+        if isinstance(feed, float):
+            feed = Standing(self.external, feed, self._clock)
+            wait = feed.wait
+        Settling(
             self.connection.cf, self._uri, self._positioning, feed, lambda: self._blocks.newest,
-            self._clock,
-        )  # fmt: skip
+            self._clock, wait,
+        ).run()  # fmt: skip
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
         self._guard, self._on_sent = guard, on_sent

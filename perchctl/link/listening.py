@@ -12,7 +12,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from perchctl.link.firmware import (
     is_logged,
     missing_variables,
     read_parameters,
-    read_variables,
+    read_variable,
 )
 from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S, Timebase, start_block
 from perchctl.link.uri import FORMS, USUAL_ADDRESS, with_whole_address
@@ -182,9 +182,9 @@ class ProbeLink(ListeningLink):
         """True if the firmware logs this variable."""
         return is_logged(self._cf, name)
 
-    def variables(self, names: Iterable[str]) -> dict[str, float]:
-        """Return the newest values of log variables, without those that do not come."""
-        return read_variables(self._cf, names)
+    def variable(self, name: str) -> float | None:
+        """Return a log variable's value; None for one that is missing or does not come."""
+        return read_variable(self._cf, name)
 
     def echoes(self, duration_s: float) -> list[float]:
         """Send packets to come back for so long, and wait `ANSWER_S` for the last. Returns the time

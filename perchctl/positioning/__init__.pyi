@@ -11,5 +11,4 @@ from .feed import FeedStatus as FeedStatus
 from .feed import FeedThread as FeedThread
 from .feed import Placed as Placed
 from .feed import PositionFeed as PositionFeed
-from .feed import StandingFeed as StandingFeed
 from .sight import SightFeed as SightFeed

@@ -208,39 +208,6 @@ class PositionFeed:
         return f"no frame has come from {who} for {now_s - self._framed_s:.1f} s"
 
 
-class StandingFeed:
-    """Sends the origin for a vehicle that stands there while its estimator is reset, where the
-    target is the positioning system and has not been measured yet.
-
-    `turn` by a `FeedThread`; `status` and `place` from any thread."""
-
-    def __init__(self, send: SendPosition, ground_z_m: float) -> None:
-        self._send, self._place = send, ExternalPosition((0.0, 0.0, ground_z_m))
-        self._lock = threading.Lock()
-        self._sent_s, self._count = -math.inf, 0
-        self._problem: str | None = None
-
-    def turn(self, now_s: float) -> None:
-        """Raises nothing: what goes wrong is the status's problem."""
-        try:
-            problem = BUSY if self._send(self._place) is False else None
-        except Exception as error:  # of the link
-            problem = f"the position cannot be passed on: {type(error).__name__}: {error}"
-        with self._lock:
-            self._problem = problem
-            if problem is None:
-                self._sent_s, self._count = now_s, self._count + 1
-
-    def status(self, now_s: float) -> FeedStatus:
-        with self._lock:
-            age_s = now_s - self._sent_s
-            return FeedStatus(age_s, self._problem, self._count, self._place)
-
-    def place(self) -> Placed:
-        """Return the origin, level, with the front along x: so the world is defined."""
-        return Placed(self._sent_s, np.array(self._place.position_m), np.eye(3))
-
-
 class Turned(Protocol):
     """A feed that a thread turns; `turn` raises nothing."""
 

@@ -19,8 +19,8 @@ from perchctl.link.external_position import (
     AGREE_WITHIN_S,
     RESET_PARAMETER,
     RESETS,
+    Settling,
     estimator_parameters,
-    settle_estimate,
 )
 from perchctl.positioning import FeedStatus, Placed
 from perchctl.profile import PositioningConfig
@@ -100,9 +100,7 @@ class Bench:
         return Placed(self.now_s, np.array(self.place_m), rot_z(self.heading_rad))
 
     def settle(self) -> None:
-        settle_estimate(
-            self.cf, "udp://x", CONFIG, self, self.newest, lambda: self.now_s, self.wait
-        )  # type: ignore[arg-type]
+        Settling(self.cf, "udp://x", CONFIG, self, self.newest, lambda: self.now_s, self.wait).run()
 
     def refused(self, kind: type[PerchError]) -> str:
         """The one sentence by which it is refused, within the bound."""
