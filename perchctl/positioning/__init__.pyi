@@ -1,7 +1,5 @@
 from .capture import check_reachable as check_reachable
 from .capture import open_capture as open_capture
-from .compared import Comparison as Comparison
-from .compared import ComparisonRecord as ComparisonRecord
 from .compared import load_comparison as load_comparison
 from .compared import save_comparison as save_comparison
 from .feed import BodyPose as BodyPose

@@ -10,7 +10,7 @@ import numpy as np
 
 from perchctl.geometry import Array
 from perchctl.link import vehicle_uri
-from perchctl.positioning import Comparison, save_comparison
+from perchctl.positioning import save_comparison
 from perchctl.profile import PositioningConfig
 
 
@@ -47,7 +47,7 @@ def compared(
 ) -> None:
     """As if `perchctl check --lift` had found that, so long ago."""
     at = datetime.now(UTC) - timedelta(seconds=ago_s)
-    assert save_comparison(config, vehicle_uri(uri), Comparison(at, passed, found)) is None
+    assert save_comparison(config, vehicle_uri(uri), at, passed, found) is None
 
 
 Rows = tuple[tuple[float, ...], ...]
