@@ -98,7 +98,7 @@ MOST_NAMES = {
     "record": 18,
     "mission": 42,
     "perception": 15,
-    "positioning": 15,
+    "positioning": 10,
     "profile": 35,
     "sim": 23,
     "target": 24,

@@ -30,9 +30,7 @@ from perchctl.link import CflibLink, check_estimator_parameters, check_uri, vehi
 from perchctl.mission import Event, FlightReport, Watcher
 from perchctl.positioning import (
     CaptureSource,
-    FeedThread,
     PositionFeed,
-    check_reachable,
     load_comparison,
     open_capture,
 )
@@ -194,7 +192,7 @@ def _check_positioning(profile: Profile, *, simulated: bool) -> None:
     if config.by != "mocap":
         return
     if not simulated:
-        check_reachable(config)
+        PositionFeed.check_reachable(config)
     elif find_spec("motioncapture") is None:  # the simulated room has a capture of its own
         raise no_motion_capture()
 
@@ -240,9 +238,8 @@ def started_feed(
     if capture is None:
         return None
     feed = PositionFeed(capture, link.external, config)
-    thread = FeedThread(feed, clock.now)
-    stack.callback(thread.close)
-    thread.start()
+    stack.callback(feed.close)
+    feed.start(clock.now)
     _refuse_strange(feed, link, clock, profile)
     link.settle(feed)
     return feed

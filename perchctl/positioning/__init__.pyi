@@ -1,4 +1,3 @@
-from .capture import check_reachable as check_reachable
 from .capture import open_capture as open_capture
 from .compared import load_comparison as load_comparison
 from .compared import save_comparison as save_comparison
@@ -6,7 +5,6 @@ from .feed import BodyPose as BodyPose
 from .feed import CaptureFrame as CaptureFrame
 from .feed import CaptureSource as CaptureSource
 from .feed import FeedStatus as FeedStatus
-from .feed import FeedThread as FeedThread
 from .feed import Placed as Placed
 from .feed import PositionFeed as PositionFeed
 from .sight import SightFeed as SightFeed

@@ -22,7 +22,6 @@ from perchctl.positioning import (
     BodyPose,
     CaptureFrame,
     FeedStatus,
-    FeedThread,
     Placed,
     PositionFeed,
 )
@@ -334,15 +333,15 @@ def test_a_thread_that_hangs_in_the_link_is_named_and_holds_nobody_up(
         return True
 
     feed = PositionFeed(capture, hang, CONFIG)
-    turning = FeedThread(feed, time.monotonic)
-    turning.start()
+    feed.start(time.monotonic)
     assert entered.wait(10.0)
     status = feed.status(time.monotonic() + 1.0)
     assert status.sent == 0
     assert status.problem is not None
-    turning.close()
+    feed.close()
     assert sent == []
     capture.frame = CaptureFrame(time.monotonic(), {"cf": BodyPose((1.1, 0.0, 0.5), LEVEL)})
     free.set()
-    turning._thread.join(10.0)
+    assert feed._thread is not None
+    feed._thread.join(10.0)
     assert len(sent) == 1  # after `close` no other follows
