@@ -233,7 +233,7 @@ def started_feed(
 
     Errors: those of `CflibLink.settle`, and SafetyAbort for positions of another world."""
     if config.by == "target":
-        link.settle(profile.safety.ground_z_m)
+        link.settle(None, profile.safety.ground_z_m)
         return None  # what follows is seen, and sent, by the loop
     if capture is None:
         return None

@@ -13,14 +13,14 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.link.firmware import set_parameters
-from perchctl.positioning import FeedStatus, Placed
+from perchctl.positioning import FeedStatus, Placed, PositionFeed
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import (
     ExternalPosition,
@@ -73,39 +73,38 @@ def check_estimator_parameters(own: Mapping[str, float], config: PositioningConf
             )
 
 
-class Feed(Protocol):
-    """What sends the positions, and says which."""
-
-    def status(self, now_s: float) -> FeedStatus:
-        """Return the state of the sending."""
-
-    def place(self) -> Placed | None:
-        """Return the newest place that was sent, with its attitude; None before the first."""
-
-
 @dataclass
 class Settling:
     """The start of one vehicle's estimator on the ground, where `feed` places it.
 
-    `newest` gives the vehicle's newest telemetry, `wait` lets seconds pass. A vehicle whose
-    positioning system is the target has no feed yet: it stands at the world's origin, `ground_z_m`
-    high, which `wait` sends (`standing`).
+    `newest` gives the vehicle's newest telemetry, `wait` lets seconds pass.
     """
 
     cf: Any
     uri: str
     config: PositioningConfig
-    feed: Feed
+    feed: PositionFeed | Standing
     newest: Callable[[], Telemetry | None]
     clock: Callable[[], float]
     wait: Callable[[float], None] = time.sleep
+
+    def __post_init__(self) -> None:
+        if isinstance(self.feed, Standing):
+            self.wait = self.feed.wait
 
     def run(self) -> None:
         """Reset the estimator until it agrees with the feed. Bounded.
 
         Raises ConnectionFailed for a vehicle that may fly, NotFound, InvalidValue, TimedOut.
         """
-        self._await_positions()
+        end_s = self.clock() + self.config.connect_timeout_s
+        while (status := self.feed.status(self.clock())).problem is not None or not status.sent:
+            if self.clock() >= end_s:
+                raise TimedOut(
+                    f"no position from outside within {self.config.connect_timeout_s:g} s: "
+                    f"{status.problem or 'none was sent'}"
+                )
+            self.wait(POLL_S)
         found = ""
         for _ in range(RESETS):
             if may_fly(self.newest(), self.clock()):
@@ -114,7 +113,7 @@ class Settling:
                     f"only"
                 )
             start = self.feed.place()
-            assert start is not None  # `_await_positions` has seen one
+            assert start is not None  # one was sent
             self._reset(start)
             found = self._disagreement(start)
             if not found:
@@ -125,16 +124,6 @@ class Settling:
             f"the estimate of {self.uri} does not come to {where}: {found}; do positions arrive, "
             f"and of this vehicle?"
         )
-
-    def _await_positions(self) -> None:
-        end_s = self.clock() + self.config.connect_timeout_s
-        while (status := self.feed.status(self.clock())).problem is not None or not status.sent:
-            if self.clock() >= end_s:
-                raise TimedOut(
-                    f"no position from outside within {self.config.connect_timeout_s:g} s: "
-                    f"{status.problem or 'none was sent'}"
-                )
-            self.wait(POLL_S)
 
     def _reset(self, start: Placed) -> None:
         set_parameters(self.cf, self.uri, start_parameters(start), NEEDED_BY)

@@ -49,7 +49,7 @@ class ListeningLink(CflibLink):
 
     def _prepare(self, connection: Connection) -> None:
         check_firmware(connection.cf, self._uri)
-        self._start_logging(connection)
+        self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
 
 
 # --- How a vehicle is moved by hand: attitude and turn rates of one moment, in one packet --------
@@ -154,7 +154,7 @@ class ProbeLink(ListeningLink):
         connection.cf.link_statistics.link_quality_updated.add_callback(self._on_quality)
         if not self.missing:
             with contextlib.suppress(NotFound, TimedOut):  # then `telemetry` stays empty
-                self._start_logging(connection)
+                self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
 
     @property
     def _cf(self) -> Any:

@@ -305,23 +305,21 @@ def test_not_one_packet_reaches_a_vehicle_that_is_anothers() -> None:
                 vehicle.recv(64)
 
 
+@pytest.mark.parametrize("farewell", [True, False])
 def test_a_connection_holds_the_vehicle_until_its_end_and_a_failed_one_does_not(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    farewell: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def nobody(uri: str, timeout_s: float) -> Connection:
-        raise ConnectionFailed("no answer")
-
-    monkeypatch.setattr(room, "_opened", nobody)
+    monkeypatch.setattr(room, "ready_cflib", lambda: None)
+    monkeypatch.setattr(Connection, "open", lambda *_: False)
     for _ in range(2):
         with pytest.raises(ConnectionFailed, match="no answer"):
             open_connection(RADIO, 5.0)
-    monkeypatch.setattr(room, "_opened", lambda *_: bench.connection)
-    for end in (bench.connection.abandon, bench.connection.close):
-        open_connection(RADIO, 5.0)
-        with pytest.raises(ConnectionFailed, match="in use"):
-            claim_vehicle(RADIO)
-        end()
-        claim_vehicle(RADIO).close()
+    monkeypatch.setattr(Connection, "open", lambda *_: True)
+    connection = open_connection(RADIO, 5.0)
+    with pytest.raises(ConnectionFailed, match="in use"):
+        claim_vehicle(RADIO)
+    connection.close(farewell=farewell)
+    claim_vehicle(RADIO).close()
 
 
 def test_without_a_place_for_the_lock_it_flies_all_the_same(folder: Path) -> None:
