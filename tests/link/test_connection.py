@@ -146,22 +146,18 @@ def test_a_radio_that_counts_what_it_loses_is_alive_and_one_that_counts_nothing_
     assert bench.is_dead_within(2 * STEP_S)
 
 
-def test_between_two_questions_that_lie_far_apart_it_may_have_counted(bench: Bench) -> None:
-    """It counts anew after each packet that was answered; and a computer may have slept."""
+def test_a_driver_whose_thread_has_ended_is_dead_and_one_that_tells_nothing_is_not(
+    bench: Bench,
+) -> None:
+    # Between two questions that lie far apart it may have counted, or the computer slept.
     assert not bench.is_dead_within(100.0, period_s=2 * DEAD_S)
-
-
-def test_one_whose_thread_has_ended_is_dead(bench: Bench) -> None:
-    bench.driver._thread.alive = False
+    for thread in (None, SimpleNamespace(is_alive=lambda: True)):
+        bench.driver._thread = thread
+        assert not any(bench.connection.is_dead() for _ in range(3))
+        bench.now_s += 2 * DEAD_S
+        assert not bench.connection.is_dead()
+    bench.driver._thread = SimpleNamespace(is_alive=lambda: False)
     assert bench.connection.is_dead()
-
-
-@pytest.mark.parametrize("thread", [None, SimpleNamespace(is_alive=lambda: True)])
-def test_of_a_driver_that_tells_nothing_nothing_is_said(bench: Bench, thread: Any) -> None:
-    bench.driver._thread = thread
-    assert not any(bench.connection.is_dead() for _ in range(3))
-    bench.now_s += 2 * DEAD_S
-    assert not bench.connection.is_dead()
 
 
 def test_a_lock_that_is_never_free_is_a_dead_link_and_a_reopened_one_has_its_own(
@@ -229,31 +225,23 @@ def test_a_position_does_not_wait_behind_a_command_that_hangs(bench: Bench) -> N
     assert driver.sent == [encode_external(at(x)).data for x in (0.0, 3.0)]
 
 
-def test_a_position_does_not_wait_in_the_radio_s_queue(bench: Bench) -> None:
+def test_a_position_goes_out_at_once_or_not_at_all(bench: Bench) -> None:
     bench.driver.out_queue.put("what the radio repeats until it is acknowledged")
     assert bench.place(1.0) is False
     bench.driver.out_queue.get()
-    assert bench.place(2.0) is True
-    assert bench.driver.sent == [encode_external(at(2.0)).data]
-
-
-def test_an_error_of_the_driver_leaves_the_lock_to_the_commands(bench: Bench) -> None:
     bench.driver.error = RuntimeError("unplugged")
     assert bench.place(1.0) is False
     bench.driver.error = None
-    send_packets(bench.connection.cf, [encode_external(at(2.0))])
-    assert len(bench.driver.sent) == 1
-
-
-def test_no_position_goes_out_without_a_link(bench: Bench) -> None:
+    assert bench.place(2.0) is True  # the lock is free
+    assert bench.driver.sent == [encode_external(at(2.0)).data]
+    assert bench.place(1e300) is False
     bench.connection.lost = "gone"
     assert bench.place(1.0) is False
     bench.connection.lost, bench.connection.cf.link = None, None
     assert bench.place(1.0) is False
     bench.link.connection = None
     assert bench.place(1.0) is False
-    assert bench.place(1e300) is False
-    assert bench.driver.sent == []
+    assert len(bench.driver.sent) == 1
 
 
 # --- One program at a time ----------------------------------------------------------------------
@@ -284,25 +272,20 @@ def another_program(uri: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def test_a_second_program_is_refused_until_the_first_is_gone() -> None:
-    with another_program(RADIO) as child:
-        with pytest.raises(ConnectionFailed, match="in use by another program"):
-            claim_vehicle(RADIO.replace("radio://0", "radio://1"))
-        claim_vehicle("radio://0/80/2M/E7E7E7E702").close()
-        child.kill()  # it has no time to tidy up
-        child.wait()
-        claim_vehicle(RADIO).close()
-
-
-def test_not_one_packet_reaches_a_vehicle_that_is_anothers() -> None:
+    """Not one packet reaches a vehicle that is another's."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
         vehicle.bind(("127.0.0.1", 0))
         vehicle.settimeout(0.05)
         uri = f"udp://127.0.0.1:{vehicle.getsockname()[1]}"
-        with another_program(uri):
+        with another_program(uri) as child:
             with pytest.raises(ConnectionFailed, match="two would steer it two ways"):
                 open_connection(uri, 5.0)
             with pytest.raises(TimeoutError):
                 vehicle.recv(64)
+            claim_vehicle(RADIO).close()
+            child.kill()  # it has no time to tidy up
+            child.wait()
+            claim_vehicle(uri).close()
 
 
 @pytest.mark.parametrize("farewell", [True, False])
@@ -345,17 +328,3 @@ def test_a_radio_that_another_program_has_open_is_named_as_that() -> None:
     assert "another program has it open" in said
     assert "radio://1" in said
     assert "udev" not in said
-
-
-def test_a_real_flight_loads_nothing_of_the_simulator() -> None:
-    """Neither does its link: the mock takes a simulated vehicle as an argument."""
-    program = (
-        "import sys, time\n"
-        "import perchctl.flight.session\n"
-        "from perchctl.link import CflibLink, MockLink, Packet, ProbeLink\n"
-        "from perchctl.profile import LinkConfig\n"
-        "CflibLink('radio://0/80/2M', LinkConfig(), time.monotonic)\n"
-        "print(*[name for name in sys.modules if name.startswith('perchctl.sim')])\n"
-    )
-    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (shown.returncode, shown.stdout.split()) == (0, []), shown.stderr
