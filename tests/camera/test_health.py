@@ -14,7 +14,6 @@ from perchctl.camera.health import HealthVerdict, content
 from perchctl.geometry import make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
-from perchctl.sim.camera import BLUE_GREY
 from perchctl.vision import CameraModel, Frame
 from tests.helpers.interlaced import Pass
 
@@ -150,17 +149,3 @@ def test_a_repetition_takes_no_new_pictures_place() -> None:
     assert new is not None
     assert (new.index, new.t_s, new.repeated) == (1, 1.06, False)
     assert slot.take() is None
-
-
-@pytest.mark.long
-def test_blue_screens_come_by_the_seed_and_change_no_other_picture() -> None:
-    plain = list(Pass().frames(25))
-    blanks = list(Pass(camera_blank_rate=0.3).frames(25))
-    blue = [float(f.image.std()) < 1.5 for f in blanks]
-    assert 2 < sum(blue) < 15
-    for p, b, is_blue in zip(plain, blanks, blue, strict=True):
-        assert p.t_arrival_s == b.t_arrival_s
-        if is_blue:
-            assert float(b.image.mean()) == pytest.approx(BLUE_GREY, abs=0.5)
-        else:
-            assert np.array_equal(p.image, b.image)

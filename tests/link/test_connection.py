@@ -21,7 +21,6 @@ from typing import Any
 
 import cflib.crtp
 import pytest
-from cflib.crtp import radiodriver
 
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.link import CflibLink, Packet, Port
@@ -52,27 +51,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-class Thread:
-    """The thread of a driver, as cflib's radio has it."""
-
-    def __init__(self) -> None:
-        self.alive = True
-        self._retry_before_disconnect: int | None = 100_000
-
-    def is_alive(self) -> bool:
-        return self.alive
-
-
 class Driver:
     """A link of cflib's that can hang, fail, or have no room."""
 
     needs_resending = False
 
     def __init__(self) -> None:
-        self._thread: Any = Thread()
         self.sent: list[bytes] = []
         self.out_queue: queue.Queue[Any] = queue.Queue(1)
-        self.entered, self.free, self.listened = (threading.Event() for _ in range(3))
+        self.entered, self.free = threading.Event(), threading.Event()
         self.free.set()
         self.error: Exception | None = None
 
@@ -84,7 +71,6 @@ class Driver:
         self.sent.append(bytes(packet.data))
 
     def receive_packet(self, wait: float) -> None:
-        self.listened.set()
         time.sleep(min(wait, 0.02))
 
     def close(self) -> None:
@@ -97,15 +83,6 @@ class Bench:
     driver: Driver
     link: CflibLink
     now_s: float = 100.0
-
-    def is_dead_within(self, for_s: float, lost_packets: int = 0, period_s: float = STEP_S) -> bool:
-        """Asked all the time, while the driver counts so many lost packets each time."""
-        dead = False
-        for _ in range(round(for_s / period_s)):
-            self.now_s += period_s
-            self.driver._thread._retry_before_disconnect -= lost_packets
-            dead = dead or self.connection.is_dead()
-        return dead
 
     def place(self, x_m: float) -> bool:
         """Hand over a position from outside."""
@@ -134,32 +111,6 @@ def reopened(bench: Bench, monkeypatch: pytest.MonkeyPatch, driver: Any) -> None
     until(lambda: bench.connection.lost is None, LIMIT_S)
 
 
-# --- A driver that takes nothing ---------------------------------------------------------------
-
-
-def test_a_radio_that_counts_what_it_loses_is_alive_and_one_that_counts_nothing_is_dead(
-    bench: Bench,
-) -> None:
-    assert not bench.is_dead_within(100.0, lost_packets=25)
-    bench.now_s += 1.0
-    assert not bench.is_dead_within(DEAD_S)
-    assert bench.is_dead_within(2 * STEP_S)
-
-
-def test_a_driver_whose_thread_has_ended_is_dead_and_one_that_tells_nothing_is_not(
-    bench: Bench,
-) -> None:
-    # Between two questions that lie far apart it may have counted, or the computer slept.
-    assert not bench.is_dead_within(100.0, period_s=2 * DEAD_S)
-    for thread in (None, SimpleNamespace(is_alive=lambda: True)):
-        bench.driver._thread = thread
-        assert not any(bench.connection.is_dead() for _ in range(3))
-        bench.now_s += 2 * DEAD_S
-        assert not bench.connection.is_dead()
-    bench.driver._thread = SimpleNamespace(is_alive=lambda: False)
-    assert bench.connection.is_dead()
-
-
 def test_a_lock_that_is_never_free_is_a_dead_link_and_a_reopened_one_has_its_own(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -174,39 +125,6 @@ def test_a_lock_that_is_never_free_is_a_dead_link_and_a_reopened_one_has_its_own
     assert connection.send(PACKET)
     assert (len(bench.driver.sent), len(after.sent)) == (0, 1)
     assert not connection.is_dead()
-
-
-def test_cflib_listens_to_a_new_driver_at_once(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By itself it looks for one once a second."""
-    after = Driver()
-
-    def late(*_: Any) -> Driver:
-        time.sleep(0.2)
-        return after
-
-    bench.connection.cf.incoming.start()
-    assert bench.driver.listened.wait(LIMIT_S)
-    reopened(bench, monkeypatch, late)
-    assert after.listened.wait(0.4)
-    bench.connection.cf.incoming.stop()
-
-
-def test_a_dead_thread_of_a_dongles_is_not_opened_again(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """cflib would hand it out for ever, and wait for its answers."""
-    radios: list[Any] = [SimpleNamespace(is_alive=lambda: False)]
-    monkeypatch.setattr(radiodriver.RadioManager, "_radios", radios)
-    found: list[Any] = []
-
-    def driver(*_: Any) -> Driver:
-        found.append(radios[0])
-        return Driver()
-
-    reopened(bench, monkeypatch, driver)
-    assert found == [None]
 
 
 # --- Positions from outside, through cflib's lock ----------------------------------------------

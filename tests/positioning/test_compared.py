@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
@@ -85,18 +84,6 @@ def test_what_is_written_is_read(found: str, passes: bool, at: datetime) -> None
     assert compared.save_comparison(CONFIG, VEHICLE, at, passes, found) is None
     back = compared.load_comparison(CONFIG, VEHICLE)
     assert (back.at, back.passed, back.found) == (at, passes, found)
-
-
-@given(st.one_of(st.binary(), st.recursive(
-    st.none() | st.booleans() | st.floats() | st.text(),
-    lambda inner: st.lists(inner) | st.dictionaries(
-        st.sampled_from(["at", "passed", "found", "set_up", "x"]), inner
-    ),
-).map(lambda value: json.dumps(value).encode())))  # fmt: skip
-def test_what_is_no_record_is_none(data: bytes) -> None:
-    was_compared(CONFIG, URI)
-    compared.path_of(CONFIG, VEHICLE).write_bytes(data)
-    assert compared.load_comparison(CONFIG, VEHICLE).at is None
 
 
 @pytest.mark.parametrize("how", ["cut", "no zone", "folder"])
