@@ -94,7 +94,7 @@ MOST_NAMES = {
     "display": 15,
     "faults": 15,
     "flight": 22,
-    "link": 12,
+    "link": 11,
     "record": 18,
     "mission": 42,
     "perception": 15,

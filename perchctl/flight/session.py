@@ -26,7 +26,7 @@ from perchctl.flight.criteria import AtRest
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.preflight import refuse_strange
-from perchctl.link import CflibLink, check_estimator_parameters, check_uri, vehicle_uri
+from perchctl.link import CflibLink, check_uri, vehicle_uri
 from perchctl.mission import Event, FlightReport, Watcher
 from perchctl.positioning import (
     CaptureSource,
@@ -188,7 +188,6 @@ def _simulated_clock(
 
 def _check_positioning(profile: Profile, *, simulated: bool) -> None:
     config = profile.positioning
-    check_estimator_parameters(profile.link.parameters, config)
     if config.by != "mocap":
         return
     if not simulated:

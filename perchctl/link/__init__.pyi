@@ -1,7 +1,6 @@
 from .cflib_link import CflibLink as CflibLink
 from .crtp import Packet as Packet
 from .crtp import Port as Port
-from .external_position import check_estimator_parameters as check_estimator_parameters
 from .listening import MotionLink as MotionLink
 from .listening import ProbeLink as ProbeLink
 from .listening import find_vehicles as find_vehicles

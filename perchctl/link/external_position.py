@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
+from perchctl.errors import ConnectionFailed, TimedOut
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.link.firmware import set_parameters
 from perchctl.positioning import FeedStatus, Placed, PositionFeed
@@ -46,7 +46,8 @@ NEEDED_BY = "positioning from outside"
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
-    """Return what the firmware has to be set to for positions from outside; none with decks."""
+    """Return what the firmware has to be set to for positions from outside, after the user's own
+    parameters; none with decks."""
     if config.by == "deck":
         return {}
     return {
@@ -61,16 +62,6 @@ def start_parameters(start: Placed) -> dict[str, float]:
     x, y, z = (float(part) for part in start.position_m)
     values = {"X": x, "Y": y, "Z": z, "Yaw": yaw_of(start.R)}
     return {f"kalman.initial{name}": value for name, value in values.items()}
-
-
-def check_estimator_parameters(own: Mapping[str, float], config: PositioningConfig) -> None:
-    """Raises InvalidValue if the user's own `link.parameters` contradict `positioning`."""
-    for name, wanted in estimator_parameters(config).items():
-        if name in own and not math.isclose(own[name], wanted, rel_tol=1e-6):
-            raise InvalidValue(
-                f"link.parameters sets {name} to {own[name]:g}, but with positioning: {config.by} "
-                f"it is {wanted:g}: take it out of link.parameters"
-            )
 
 
 @dataclass

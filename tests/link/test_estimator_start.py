@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, PerchError, TimedOut
+from perchctl.errors import ConnectionFailed, NotFound, PerchError, TimedOut
 from perchctl.geometry import rot_z
-from perchctl.link import check_estimator_parameters
 from perchctl.link.external_position import (
     AGREE_WITHIN_S,
     RESET_PARAMETER,
     RESETS,
     Settling,
-    estimator_parameters,
 )
 from perchctl.positioning import FeedStatus, Placed
 from perchctl.profile import PositioningConfig
@@ -183,13 +181,3 @@ def test_agreement_counts_over_fresh_telemetry_only() -> None:
 
     bench.at_reset(fall_silent)
     bench.refused(PerchError)
-
-
-def test_the_user_s_own_parameters_may_not_contradict() -> None:
-    assert estimator_parameters(PositioningConfig()) == {}
-    check_estimator_parameters({"stabilizer.estimator": 2, "ctrlMel.mass": 0.03}, CONFIG)
-    check_estimator_parameters({"stabilizer.estimator": 1}, PositioningConfig())
-    with pytest.raises(InvalidValue, match=r"stabilizer\.estimator to 1, but .* it is 2"):
-        check_estimator_parameters({"stabilizer.estimator": 1}, CONFIG)
-    with pytest.raises(InvalidValue, match=r"take it out of link\.parameters"):
-        check_estimator_parameters({"locSrv.extPosStdDev": 0.01}, CONFIG)
