@@ -31,7 +31,7 @@ from perchctl.link.firmware import (
     read_variable,
 )
 from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S, Timebase, start_block
-from perchctl.link.uri import FORMS, USUAL_ADDRESS, with_whole_address
+from perchctl.link.uri import FORMS, USUAL_ADDRESS
 from perchctl.profile import LinkConfig
 from perchctl.vehicle import FLYING
 
@@ -252,7 +252,7 @@ def find_vehicles(uri: str = "") -> tuple[list[str], str]:
     worker.start()
     worker.join(SCAN_TIMEOUT_S)
     uris = (uri for uri in dict.fromkeys(found) if uri.partition("://")[0] in FORMS)
-    return [with_whole_address(uri) for uri in uris], why[0]
+    return list(uris), why[0]
 
 
 def _radio_problem() -> str:

@@ -8,19 +8,19 @@ from perchctl.errors import InvalidValue
 
 USUAL_ADDRESS = "E7E7E7E7E7"
 _USUAL = ("2", "2M", USUAL_ADDRESS)  # channel, rate and address of a radio's URI that names none
-_CHANNEL, _RATE, _ADDRESS = "(12[0-5]|1[01][0-9]|0?[0-9]{1,2})", "(250K|1M|2M)", "[0-9A-Fa-f]{10}"
+_CHANNEL, _RATE, _ADDRESS = "(12[0-5]|1[01][0-9]|0?[0-9]{1,2})", "(250K|1M|2M)", "[0-9A-Fa-f]{1,10}"
 _HOST_AND_PORT = r"[^/:\s]+:0*[1-9]\d{0,4}"
 FORMS = {
     "sim": "",
-    "radio": rf"([0-9]+|{_ADDRESS})(/{_CHANNEL}(/{_RATE}(/{_ADDRESS})?)?)?(\?.+)?",
+    "radio": rf"([0-9]+|[0-9A-Fa-f]{{10}})(/{_CHANNEL}(/{_RATE}(/{_ADDRESS})?)?)?(\?.+)?",
     "usb": r"\d+",
     "udp": _HOST_AND_PORT,
     "tcp": _HOST_AND_PORT,
     "serial": ".+",
 }
 EXAMPLES = (
-    "sim://, radio://0/80/2M/E7E7E7E7E7 (channel 0 to 125; 250K, 1M or 2M; an address of ten hex "
-    "digits), usb://0, udp://127.0.0.1:19850"
+    "sim://, radio://0/80/2M/E7E7E7E7E7 (channel 0 to 125; 250K, 1M or 2M; an address of at "
+    "most ten hex digits), usb://0, udp://127.0.0.1:19850"
 )
 
 UDEV_HELP = """\
@@ -46,16 +46,6 @@ def check_uri(uri: str) -> str:
     return scheme
 
 
-def with_whole_address(uri: str) -> str:
-    """Return a radio's URI as cflib finds it with the zeros in front of its address, which cflib
-    leaves away."""
-    return re.sub(
-        r"^(radio://[^/]+/[^/]+/[^/]+/)([0-9A-Fa-f]+)",
-        lambda found: found[1] + found[2].zfill(len(USUAL_ADDRESS)),
-        uri,
-    )
-
-
 def vehicle_uri(uri: str) -> str:
     """Return the URI without what does not tell vehicles apart: a radio's dongle, case, options."""
     scheme, _, rest = uri.partition("?")[0].partition("://")
@@ -65,5 +55,5 @@ def vehicle_uri(uri: str) -> str:
         channel, rate, address = (*given, *_USUAL[len(given) :])
         return f"radio/{int(channel)}/{rate.upper()}/{address.upper().zfill(len(USUAL_ADDRESS))}"
     if scheme != "serial":  # whose place is a file, and its case tells
-        rest = rest.lower()
-    return f"{scheme}/{re.sub('^localhost(?=:|$)', '127.0.0.1', rest)}"
+        rest = rest.lower().replace("localhost:", "127.0.0.1:")
+    return f"{scheme}/{rest}"
