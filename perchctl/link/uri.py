@@ -20,7 +20,7 @@ FORMS = {
 }
 EXAMPLES = (
     "sim://, radio://0/80/2M/E7E7E7E7E7 (channel 0 to 125; 250K, 1M or 2M; an address of at "
-    "most ten hex digits), usb://0, udp://127.0.0.1:19850"
+    "most ten hex digits), usb://0, udp://127.0.0.1:19850 (port 1 to 65535)"
 )
 
 UDEV_HELP = """\
@@ -41,7 +41,8 @@ log in again, and plug the radio or the vehicle in again."""
 def check_uri(uri: str) -> str:
     """Return the URI's scheme. Raises InvalidValue, which names what is allowed."""
     scheme, _, rest = uri.partition("://")
-    if "://" not in uri or scheme not in FORMS or not re.fullmatch(FORMS[scheme], rest):
+    fits = "://" in uri and scheme in FORMS and re.fullmatch(FORMS[scheme], rest)
+    if not fits or (scheme in ("udp", "tcp") and int(rest.rpartition(":")[2]) > 65535):
         raise InvalidValue(f"URI {uri!r} is not one of a vehicle; examples: {EXAMPLES}")
     return scheme
 

@@ -20,7 +20,7 @@ def test_good_uris(uri: str) -> None:
 
 
 @pytest.mark.parametrize("uri", [
-    "", "radio:/0", "udp://host", "http://host:80", "sim", "sim://1", "udp://host:0",
+    "", "radio:/0", "udp://host", "http://host:80", "sim", "sim://1", "udp://host:0", "tcp://host:65536",
     "radio://0/200/2M", "radio://0/126", "radio://0/", "radio://0/x/2M",
     "radio://0/80/3M/E7E7E7E7E7", "radio://0/80/2M/E7E7E7E7EG", "radio://0/80/2M/E7E7E7E7E7E",
 ])  # fmt: skip
