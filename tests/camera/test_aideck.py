@@ -127,6 +127,7 @@ WHOLE = raw_packets(picture(80))
     b"".join(WHOLE[:20]),
     b"".join(WHOLE[:20] + WHOLE[21:]),
     b"".join(WHOLE[1:]),
+    b"".join(WHOLE[:-1]) + packet(bytes(1020)),
     WHOLE[0] * 2,
     WHOLE[0] + console("x" * 1000) * 100,
     b"".join(jpeg_packets(picture(80))[:-1]),
@@ -136,7 +137,7 @@ WHOLE = raw_packets(picture(80))
     header(324, 244, 0xFFFFFFFF, 0) + b"".join(WHOLE[1:]),
     header(324, 244, 324 * 244, 7) + b"".join(WHOLE[1:]),
     header(65000, 65000, 500, 1) + packet(bytes(500)),
-], ids=["cut", "chunk lost", "header lost", "two headers", "console", "JPEG's end lost",
+], ids=["cut", "chunk lost", "header lost", "too long", "two headers", "console", "JPEG's end lost",
         "JPEG without end", "no JPEG", "JPEG of another size", "size of nonsense",
         "unknown format", "sides of nonsense"])  # fmt: skip
 def test_a_fault_costs_its_own_picture_and_no_connection(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -106,8 +108,10 @@ def test_a_frozen_picture_first_repeats_then_is_frozen() -> None:
     assert [v.kind for v in judge([a] * 30 + [b, a])[29:]] == ["frozen", "ok", "ok"], "one pixel"
 
 
-def test_recordings_may_repeat() -> None:
+def test_recordings_may_repeat_and_what_a_source_calls_repeated_is() -> None:
     assert all(v.usable for v in judge([noisy(120, 5.0)] * 30, live=False))
+    repeated = replace(frame(noisy(120, 5.0)), repeated=True)
+    assert FrameHealth().assess(repeated).kind == "repeated"
 
 
 # --- Pictures that a receiver gives out again ---------------------------------------------

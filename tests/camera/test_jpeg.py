@@ -67,6 +67,8 @@ def test_a_tear_in_the_pixels_costs_its_own_picture_alone() -> None:
         for more in (20, 21, 200):
             torn = picture[: picture.index(b"\xff\xda") + more]
             assert fed([part(torn) + part(PICTURES[0])]) == ([PICTURES[0]], 1)
+    bare = PICTURES[0]
+    assert fed([bare + bare[:1], bare[1:]]) == ([bare, bare], 0), "a start that two pieces share"
 
 
 @pytest.mark.parametrize("hostile", [
