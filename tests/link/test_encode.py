@@ -1,4 +1,5 @@
-"""Commands as bytes: those of an unmodified cflib, on the real link and in lockstep alike."""
+"""Commands as bytes: those of an unmodified cflib, on the real link and in lockstep alike; the
+lockstep link over a radio that loses packets, and without a deck."""
 
 from __future__ import annotations
 
@@ -15,16 +16,20 @@ from cflib.crtp.crtpstack import CRTPPacket
 from hypothesis import given
 from hypothesis import strategies as st
 
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
 from perchctl.errors import InvalidValue
-from perchctl.link import MockLink, Packet
+from perchctl.link import MockLink, Packet, Radio
 from perchctl.link.connection import send_packets
-from perchctl.link.crtp import ARM, LAND_TIMES, MAX_DATA, UNLOCK_THRUST, encode
-from perchctl.sim import CommandService
+from perchctl.link.crtp import ARM, LAND_TIMES, MAX_DATA, UNLOCK_THRUST, UNLOCK_TIMES, encode
+from perchctl.link.firmware import EXTERNAL_POSITION_TICK
+from perchctl.sim import CommandService, Scenario, SimulatedVehicle
 from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.planner import HlLand
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
+    ExternalPosition,
     Idle,
     Land,
     PositionSetpoint,
@@ -163,3 +168,39 @@ def test_a_number_that_does_not_fit_is_refused(command: Command) -> None:
 def test_the_lockstep_vehicle_flies_the_command(command: Command, calls: list[Any]) -> None:
     """Values that a float of four bytes holds exactly; what is no number it does not fly."""
     assert in_lockstep(command) == calls
+
+
+class LosesTheFirst(Radio):
+    """So many of the packets sent up are lost at the beginning."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.left = count
+
+    def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
+        self.left -= 1
+        return self.left < 0
+
+
+@pytest.mark.parametrize("lost", [0, 1, 3, 2 * UNLOCK_TIMES - 2])
+def test_a_lost_packet_does_not_leave_the_thrust_locked(lost: int) -> None:
+    """The first raw thrust of the flight would be a cut: nothing in the air may unlock it."""
+    vehicle = SimulatedVehicle(Scenario())
+    link = MockLink(vehicle, radio=LosesTheFirst(lost))
+    link.connect()
+    for _ in range(20):
+        link.send(RawThrust(15000))
+        link.advance_to(link.now_s + 0.02)
+    assert link.telemetry()[-1].thrust == pytest.approx(15000, abs=1500)
+
+
+def test_positions_count_while_they_come_by_the_firmware_s_name() -> None:
+    # crtp_localization_service.c: the group locSrv has no tick.
+    assert EXTERNAL_POSITION_TICK == "locSrvZ.tick"
+    link = MockLink(SimulatedVehicle(Scenario(extra={"external_position": 1.0})))
+    assert link.measured_by().external is False
+    link.external(ExternalPosition((0.0, 0.0, 0.0)))
+    link.advance_to(link.now_s + 0.1)
+    assert link.measured_by().external is False  # those that have ended are none
+    link.each(0.01, lambda now_s: link.external(ExternalPosition((0.0, 0.0, 0.0))))
+    assert link.measured_by().external is True
