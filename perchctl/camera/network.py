@@ -112,7 +112,8 @@ class MjpegSource(StreamSource):
                 self._read(response)
         except HTTPError as refused:
             self.not_found = self._count == 0 and refused.code in (401, 403, 404, 410, *_REDIRECTS)
-            return _refusal(refused, self._url)
+            with refused:
+                return _refusal(refused, self._url)
         except URLError as error:
             if not isinstance(error.reason, ssl.SSLCertVerificationError):
                 raise
@@ -137,6 +138,7 @@ class MjpegSource(StreamSource):
             given = authorization(asked, request, parts) if refused.code == 401 else None
             if given is None:
                 raise
+            refused.close()
             request.add_unredirected_header("Authorization", given)
             response = opener.open(request, timeout=self.read_timeout_s)
         return response
