@@ -6,14 +6,10 @@ Time is the test's own: the clock that `perchctl.link.connection` reads.
 
 from __future__ import annotations
 
-import contextlib
 import queue
 import socket
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -164,30 +160,6 @@ def test_a_position_goes_out_at_once_or_not_at_all(bench: Bench) -> None:
 
 # --- One program at a time ----------------------------------------------------------------------
 
-_HOLDS = """
-import sys
-from perchctl.link.connection import claim_vehicle
-held = claim_vehicle(sys.argv[1])
-print("held", flush=True)
-sys.stdin.read()
-"""
-
-
-@contextlib.contextmanager
-def another_program(uri: str) -> Iterator[subprocess.Popen[str]]:
-    """One that holds the vehicle, until it is killed."""
-    child = subprocess.Popen(
-        [sys.executable, "-c", _HOLDS, uri],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        assert child.stdout is not None
-        assert child.stdout.readline() == "held\n"
-        yield child
-    finally:
-        child.kill()
-        child.communicate()
-
 
 def test_a_second_program_is_refused_until_the_first_is_gone() -> None:
     """Not one packet reaches a vehicle that is another's."""
@@ -195,15 +167,13 @@ def test_a_second_program_is_refused_until_the_first_is_gone() -> None:
         vehicle.bind(("127.0.0.1", 0))
         vehicle.settimeout(0.05)
         uri = f"udp://127.0.0.1:{vehicle.getsockname()[1]}"
-        with another_program(uri) as child:
+        with claim_vehicle(uri):
             with pytest.raises(ConnectionFailed, match="two would steer it two ways"):
                 open_connection(uri, 5.0)
             with pytest.raises(TimeoutError):
                 vehicle.recv(64)
             claim_vehicle(RADIO).close()
-            child.kill()  # it has no time to tidy up
-            child.wait()
-            claim_vehicle(uri).close()
+        claim_vehicle(uri).close()
 
 
 @pytest.mark.parametrize("farewell", [True, False])
