@@ -32,9 +32,8 @@ PARTS: dict[str, tuple[str, ...]] = {
         "perchctl.perception.perception:estimate",
     ),
     "judging pictures": (
-        "perchctl.perception.perception:assess_frame",
+        "perchctl.camera.health:FrameHealth.assess",
         "perchctl.camera.source:same_bytes",
-        "perchctl.camera.source:repeated",
     ),
     "physics, firmware": ("perchctl.sim.vehicle:SimulatedVehicle.advance_to",),
     "link": (

@@ -122,10 +122,6 @@ class Note(UserWarning):
     """One sentence for people; the command line prints each once."""
 
 
-class CameraNote(Note):
-    """Says that a camera was opened, and does not do all that it was asked."""
-
-
 class ProfileNote(Note):
     """Says that a profile was read, but one of its keys has another name by now, or is not used."""
 

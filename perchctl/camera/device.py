@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import struct
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,51 +19,34 @@ LOST_AFTER_FAILURES = 25
 RETRY_S = 0.04
 REOPEN_EVERY_S = 1.0
 """Between two attempts to open a camera that was lost: an attempt takes a driver some 0.1 s."""
-RATE_TOLERANCE = 0.02
-"""29.97 Hz are 30."""
 
 
-@dataclass(frozen=True)
-class Asked:
-    """Picture size, format and rate that are asked of the driver; None leaves it as it is."""
-
-    size_px: tuple[int, int] | None = None
-    format: str | None = None
-    rate_hz: float | None = None
-
-
-def asked_of(config: CameraConfig | None, size_px: tuple[int, int] | None) -> Asked:
-    """Return what the profile asks of a driver, at the calibration's size."""
-    return Asked(size_px) if config is None else Asked(size_px, config.format, config.rate_hz)
-
-
-def open_capture(number: int, asked: Asked) -> Any:
-    """Return an opened cv2.VideoCapture; raises NotFound with the cameras that exist."""
-    linux = sys.platform.startswith("linux")
-    if not linux or Path(f"/dev/video{number}").exists():
-        capture = cv2.VideoCapture(number, cv2.CAP_V4L2 if linux else cv2.CAP_ANY)
-        if capture.isOpened():
-            set_up(capture, asked)
-            return capture
+def open_capture(place: str, size_px: tuple[int, int] | None, config: CameraConfig | None) -> Any:
+    """Return an opened cv2.VideoCapture of `camera_number(place)`, set to that size and to the
+    profile's format and rate. Raises NotFound with the cameras that exist."""
+    number, linux = camera_number(place), sys.platform.startswith("linux")
+    if linux and not Path(f"/dev/video{number}").exists():
+        raise NotFound(f"camera:{number} was not found; {_there(find_cameras())}")
+    capture = cv2.VideoCapture(number, cv2.CAP_V4L2 if linux else cv2.CAP_ANY)
+    if not capture.isOpened():
         capture.release()
         raise NotFound(
             f"camera:{number} exists but cannot be opened; close other programs that use it "
             f"and check that you may read /dev/video{number}"
         )
-    known = find_cameras()
-    there = f"there are {listed(known)}" if known else "no /dev/video* exists"
-    raise NotFound(f"camera:{number} was not found; {there}; plug in the receiver or camera")
+    set_up(capture, size_px, config)
+    return capture
 
 
-def set_up(capture: Any, asked: Asked) -> None:
+def set_up(capture: Any, size_px: tuple[int, int] | None, config: CameraConfig | None) -> None:
     """Set format, then size, then rate, as what each may be hangs on the one before."""
-    if asked.format is not None:
-        capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*asked.format.ljust(4)))
-    if asked.size_px is not None:
-        capture.set(cv2.CAP_PROP_FRAME_WIDTH, asked.size_px[0])
-        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, asked.size_px[1])
-    if asked.rate_hz is not None:
-        capture.set(cv2.CAP_PROP_FPS, asked.rate_hz)
+    if config is not None and config.format is not None:
+        capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.format.ljust(4)))
+    if size_px is not None:
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, size_px[0])
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size_px[1])
+    if config is not None and config.rate_hz is not None:
+        capture.set(cv2.CAP_PROP_FPS, config.rate_hz)
     capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # old frames waiting would add latency
 
 
@@ -74,54 +55,25 @@ class DeviceSource(LiveSource):
 
     A picture that cannot be read or decoded is dropped. After `LOST_AFTER_FAILURES` in a row the
     camera counts as lost: it is released, and opened again as soon as it is back. One that has
-    never given a picture fails at once. `open_number` replaces the real camera by anything with
-    read(), get(), set() and release().
-
-    Errors: NotFound.
+    never given a picture fails at once. `opener` returns anything with read() and release(), as
+    `open_capture` does, and its errors.
     """
 
     def __init__(
         self,
-        number: int,
+        name: str,
         latency_s: float,
-        asked: Asked,
         clock: Clock,
-        open_number: Callable[[int, Asked], Any] = open_capture,
+        opener: Callable[[], Any],
         retry_s: float = RETRY_S,
         reopen_every_s: float = REOPEN_EVERY_S,
-        find: Callable[[], int] | None = None,
     ) -> None:
-        """`find` gives the camera's number once it is back; without it that is the same one."""
-        super().__init__(f"camera:{number}", latency_s, clock)
-        self._number = number
-        self._find = find
-        self._asked = asked
-        self._open_number = open_number
+        super().__init__(name, latency_s, clock)
+        self._opener = opener
         self._retry_s = retry_s
         self._reopen_every_s = reopen_every_s
-        self._capture = open_number(number, asked)
-        self._format, self._rate_hz = "", 0.0
-        with contextlib.suppress(cv2.error, AttributeError):  # before a thread reads from it
-            code = int(self._capture.get(cv2.CAP_PROP_FOURCC))
-            self._format = _fourcc_text(code) if code > 0 else ""
-            self._rate_hz = float(self._capture.get(cv2.CAP_PROP_FPS))
+        self._capture = opener()
         self._start(self._grab)
-
-    def remarks(self) -> list[str]:
-        """Return a sentence for each thing that the driver did not do as it was asked."""
-        asked, got = self._asked, f"{self._name} was asked for"
-        said = []
-        if asked.format is not None and self._format not in ("", asked.format):
-            said.append(f"{got} {asked.format} (camera.format) and gives {self._format}")
-        if asked.size_px is not None and self.size_px not in (None, asked.size_px):
-            wanted, given = ("{}x{} px".format(*size) for size in (asked.size_px, self.size_px))
-            said.append(f"{got} {wanted}, the calibration's, and gives {given}")
-        if asked.rate_hz is not None and self._rate_hz > 0.0:
-            off_hz = abs(asked.rate_hz - self._rate_hz)
-            if off_hz > RATE_TOLERANCE * asked.rate_hz:
-                gives = f"{self._rate_hz:.3g} Hz"
-                said.append(f"{got} {asked.rate_hz:g} Hz (camera.rate_hz) and gives {gives}")
-        return said
 
     def _grab(self) -> None:
         try:
@@ -159,18 +111,11 @@ class DeviceSource(LiveSource):
         self._why_silent = lost
         while not self._stop.wait(self._reopen_every_s):
             try:
-                if self._find is not None:
-                    self._number = self._find()
-                self._capture = self._open_number(self._number, self._asked)
+                self._capture = self._opener()
                 return
             except Exception as error:
                 reason = str(error) if isinstance(error, PerchError) else one_line(error)
                 self._why_silent = f"{lost}; the last attempt: {reason}"
-
-
-def _fourcc_text(code: int) -> str:
-    """Return a pixel format's name of its number: ``MJPG``, ``YUYV``, ..."""
-    return code.to_bytes(4, "little").decode("ascii", "replace").rstrip("\0 ")
 
 
 # --- The cameras of this computer: their numbers, names and lasting paths
@@ -178,11 +123,6 @@ def _fourcc_text(code: int) -> str:
 
 DEVICES = Path("/dev")
 NAMES = Path("/sys/class/video4linux")
-
-# VIDIOC_QUERYCAP of videodev2.h, and its structure's two words of capabilities.
-_QUERYCAP = 0x80685600
-_CAPABILITY = struct.Struct("=84xII12x")
-_HAS_DEVICE_CAPS, _VIDEO_CAPTURE = 0x80000000, 1
 
 
 @dataclass(frozen=True)
@@ -195,32 +135,26 @@ class ConnectedCamera:
     stable_path: str = ""
     problem: str = ""
 
-    @property
-    def source(self) -> str:
-        return f"camera:{self.number}"
-
     def __str__(self) -> str:
-        return f"{self.source} ({self.name})" if self.name else self.source
+        name = f" ({self.name})" if self.name else ""
+        path = f" at {self.stable_path}" if self.stable_path else ""
+        return f"camera:{self.number}{name}{path}"
 
 
 def find_cameras(devices: Path = DEVICES, names: Path = NAMES) -> list[ConnectedCamera]:
-    """Return this computer's cameras by their numbers.
-
-    A camera may have nodes that give no pictures: they are left out. Opens each node for a moment,
-    and streams from none.
-    """
+    """Return this computer's cameras by their numbers: of each its first node, as the others often
+    give no pictures. Nothing is opened."""
     stable: dict[int, str] = {}
     for link in sorted((devices / "v4l" / "by-id").glob("*")):
         for number in _video_numbers([link.resolve()]):
             stable.setdefault(number, str(link))
     found = []
     for number in sorted(_video_numbers(devices.glob("video*"))):
-        if not _gives_pictures(number, devices, names):
-            continue
-        may = os.access(devices / f"video{number}", os.R_OK | os.W_OK)
-        problem = "" if may else "you may not open it: Permission denied"
-        name = _of_system(number, "name", names)
-        found.append(ConnectedCamera(number, name, stable.get(number, ""), problem))
+        if _of_system(number, "index", names) in ("", "0"):
+            may = os.access(devices / f"video{number}", os.R_OK | os.W_OK)
+            problem = "" if may else "you may not open it: Permission denied"
+            name = _of_system(number, "name", names)
+            found.append(ConnectedCamera(number, name, stable.get(number, ""), problem))
     return found
 
 
@@ -228,24 +162,6 @@ def _video_numbers(paths: Iterable[Path]) -> list[int]:
     """Return the N of each path that is a videoN."""
     numbers = (path.name.removeprefix("video") for path in paths)
     return [int(n) for n in numbers if n.isascii() and n.isdigit()]
-
-
-def _gives_pictures(number: int, devices: Path, names: Path) -> bool:
-    """Return whether a node's driver says that it captures video. Of a camera whose driver cannot
-    be asked only the first node counts."""
-    data = bytearray(_CAPABILITY.size)
-    try:
-        import fcntl  # late: Windows has none
-
-        node = os.open(devices / f"video{number}", os.O_RDWR | os.O_NONBLOCK)
-        try:
-            fcntl.ioctl(node, _QUERYCAP, data, True)
-        finally:
-            os.close(node)
-    except (ImportError, OSError):
-        return _of_system(number, "index", names) in ("", "0")
-    of_all_nodes, of_this = _CAPABILITY.unpack(data)
-    return bool((of_this if of_all_nodes & _HAS_DEVICE_CAPS else of_all_nodes) & _VIDEO_CAPTURE)
 
 
 def _of_system(number: int, attribute: str, names: Path) -> str:
@@ -271,57 +187,23 @@ def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> in
             f"camera:USB Video; perchctl check --cameras lists them"
         )
     known = find_cameras(devices, names)
-    fitting = _fitting(wanted, known)
+    low = wanted.casefold()
+    if wanted.startswith("/"):
+        fitting = [c for c in known if c.number in _video_numbers([Path(wanted).resolve()])]
+    else:
+        fitting = [c for c in known if c.name.casefold() == low] or [
+            c for c in known if low in f"{c.name} {Path(c.stable_path).name}".casefold()
+        ]
     if len(fitting) == 1:
         return fitting[0].number
     if fitting:
         raise InvalidValue(
-            f"camera:{wanted} fits {len(fitting)} cameras: {listed(fitting, paths=True)}; give "
+            f"camera:{wanted} fits {len(fitting)} cameras: {', '.join(map(str, fitting))}; give "
             f"more of the name, the path, or the number"
         )
-    there = f"there are {listed(known)}" if known else "this computer has no camera"
-    raise NotFound(f"camera:{wanted} was not found; {there}; plug in the receiver or camera")
+    raise NotFound(f"camera:{wanted} was not found; {_there(known)}")
 
 
-def finder_of(number: int, devices: Path = DEVICES, names: Path = NAMES) -> Callable[[], int]:
-    """Return a function that finds the camera of that number again after it was unplugged: by its
-    lasting path, else by its name, as the system may give it another number.
-
-    Errors of that function: NotFound.
-    """
-    before = next((c for c in find_cameras(devices, names) if c.number == number), None)
-
-    def find() -> int:
-        if before is None or not (before.stable_path or before.name):
-            return number
-        known = find_cameras(devices, names)
-        back = [c.number for c in known if c.stable_path and c.stable_path == before.stable_path]
-        if not back and not before.stable_path:
-            back = [c.number for c in known if c.name == before.name]
-        if number in back:
-            return number
-        if len(back) == 1:
-            return back[0]
-        there = f"there are {listed(known, paths=True)}" if known else "no camera is there"
-        raise NotFound(f"{before} is not back; {there}")
-
-    return find
-
-
-def _fitting(wanted: str, known: Sequence[ConnectedCamera]) -> list[ConnectedCamera]:
-    """Return those that fit by the whole name, else by a part of it or of the path."""
-    low = wanted.casefold()
-    if wanted.startswith("/"):
-        device = Path(wanted).resolve().name
-        return [c for c in known if wanted == c.stable_path or device == f"video{c.number}"]
-    whole = [c for c in known if c.name.casefold() == low]
-    return whole or [
-        c for c in known if low in c.name.casefold() or low in Path(c.stable_path).name.casefold()
-    ]
-
-
-def listed(known: Sequence[ConnectedCamera], paths: bool = False) -> str:
-    """Name the cameras in a sentence."""
-    return ", ".join(
-        f"{c} at {c.stable_path}" if paths and c.stable_path else str(c) for c in known
-    )
+def _there(known: list[ConnectedCamera]) -> str:
+    there = f"there are {', '.join(map(str, known))}" if known else "this computer has no camera"
+    return f"{there}; plug in the receiver or camera"

@@ -12,14 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.camera.credentials import without_password
-from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_end, size_in
+from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_extent
 from perchctl.camera.source import to_grey
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.vision import Frame
 
 DEFAULT_RATE_HZ = 30.0
-MOST_FILE_PX = 1 << 27
-"""Of a picture in a file: more than any camera of today takes, and decoded within 3 s."""
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp"})
 
 
@@ -88,13 +86,6 @@ class VideoSource(Recording):
         self._period_s = 1.0 / rate_hz
         self._last_s = -self._period_s
         name = f"video:{without_password(str(path))}"
-        width, height = (
-            int(self._capture.get(key))
-            for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-        )
-        if too_large := _too_large(width, height):
-            self._capture.release()
-            raise InvalidValue(f"{name} {too_large}")
         super().__init__(name, latency_s, rate_hz, round(count) if count > 0 else None)
 
     def _read(self) -> tuple[NDArray[np.uint8], float] | None:
@@ -135,57 +126,23 @@ class ImagesSource(Recording):
             return None
         path, t_s = self.paths[self._next], self._next / self.rate_hz
         self._next += 1
-        return read_grey(path), t_s
-
-
-class BrokenPicture(InvalidValue):
-    """A file that is no picture, or a part of one; `reason` goes behind its name."""
-
-    def __init__(self, path: Path, reason: str) -> None:
-        super().__init__(f"{path} {reason}; remove or replace it")
-        self.reason = reason
-
-
-def read_grey(path: Path) -> NDArray[np.uint8]:
-    """Return a picture file as grey; raises BrokenPicture if it is none, cut off or too large."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise BrokenPicture(path, f"cannot be read: {error.strerror or error}") from None
-    try:
-        return decode_picture(data)
-    except ValueError as error:
-        raise BrokenPicture(path, str(error)) from None
+        try:
+            return decode_picture(path.read_bytes()), t_s
+        except (OSError, ValueError) as error:
+            raise InvalidValue(f"{path} cannot be used ({error}); remove or replace it") from None
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8]:
     """Return the grey picture of a file's bytes.
 
-    Raises ValueError with what stands behind the file's name: it is cut off, a JPEG or PNG of
-    more than `MOST_FILE_PX`, or none that OpenCV reads.
+    Raises ValueError for one that is cut off, or that OpenCV does not read.
     """
     if is_cut_off(data):
         raise ValueError("is cut off")
-    if too_large := _too_large(*_said_size_px(data)):
-        raise ValueError(too_large)
     image = grey_pixels(data)
     if image is None:
         raise ValueError("cannot be read as a picture")
     return to_grey(image)
-
-
-def _said_size_px(data: bytes) -> tuple[int, int]:
-    """Return width and height that a JPEG or PNG says before its pixels; zeros of another file."""
-    if data.startswith(b"\x89PNG"):
-        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-    return (data.startswith(b"\xff\xd8") and size_in(data)) or (0, 0)
-
-
-def _too_large(width: int, height: int) -> str:
-    """Say that a picture of that size is not read; an empty string if it is."""
-    if width * height <= MOST_FILE_PX:
-        return ""
-    return f"says {width}x{height} px, and at most {MOST_FILE_PX:,} pixels are read"
 
 
 def is_cut_off(data: bytes) -> bool:
@@ -194,7 +151,7 @@ def is_cut_off(data: bytes) -> bool:
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data
     try:
-        return data.startswith(b"\xff\xd8") and jpeg_end(data) is None
+        return data.startswith(b"\xff\xd8") and jpeg_extent(data) is None
     except Damaged:
         return False
 

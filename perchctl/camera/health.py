@@ -1,7 +1,6 @@
 """Whether a frame can be a measurement at all: frozen, snow, uniform, dark, or the same once more.
 
-Pure: `assess_frame` is ``(state, frame) -> (state, verdict)``. A frame judged bad
-gives no measurement; the detector need not search it.
+A frame judged bad gives no measurement; the detector need not search it.
 """
 
 from __future__ import annotations
@@ -40,14 +39,6 @@ SNOW_SIGMA, SNOW_ROUGHNESS, SNOW_GRAIN = 35.0, 0.7, 0.3
 (1 = unrelated); columns less so, because a receiver's bandwidth smooths along lines."""
 
 
-@dataclass(frozen=True, eq=False)
-class HealthState:
-    """Memory of the last picture; `HealthState()` is a fresh start."""
-
-    picture: NDArray[np.uint8] | None = None
-    changed_at_s: float = 0.0
-
-
 @dataclass(frozen=True)
 class HealthVerdict:
     """What a picture is like; a measurement only if it is `usable`."""
@@ -63,23 +54,29 @@ class HealthVerdict:
         return VERDICT_TEXTS[self.kind]
 
 
-def assess_frame(
-    state: HealthState, frame: Frame, live: bool = True
-) -> tuple[HealthState, HealthVerdict]:
-    """Judge one frame.
+class FrameHealth:
+    """Judges the frames of one source in their order; it remembers the last picture."""
 
-    A camera's noise makes each live picture differ from the last, so equal bytes
-    mean that the receiver or the stream repeats an old one; so does what the source
-    has found to be one (`Frame.repeated`), which is never frozen for that alone. In
-    recordings (`live` false) equal pictures are taken as they are.
-    """
-    image = frame.image
-    if live and state.picture is not None and same_bytes(state.picture, image):
-        frozen = frame.t_s - state.changed_at_s >= FROZEN_AFTER_S
-        return state, HealthVerdict("frozen" if frozen else "repeated")
-    if live and frame.repeated:
-        return HealthState(image, state.changed_at_s), HealthVerdict("repeated")
-    return HealthState(image, frame.t_s), HealthVerdict(content(image))
+    def __init__(self) -> None:
+        self._picture: NDArray[np.uint8] | None = None
+        self._changed_s = 0.0
+
+    def assess(self, frame: Frame, live: bool = True) -> HealthVerdict:
+        """Judge the next frame.
+
+        A camera's noise makes each live picture differ from the last, so equal bytes
+        mean that the receiver or the stream repeats an old one; so does what the source
+        has found to be one (`Frame.repeated`), which is never frozen for that alone. In
+        recordings (`live` false) equal pictures are taken as they are.
+        """
+        before, self._picture = self._picture, frame.image
+        if live and before is not None and same_bytes(before, frame.image):
+            frozen = frame.t_s - self._changed_s >= FROZEN_AFTER_S
+            return HealthVerdict("frozen" if frozen else "repeated")
+        if live and frame.repeated:
+            return HealthVerdict("repeated")
+        self._changed_s = frame.t_s
+        return HealthVerdict(content(frame.image))
 
 
 def content(image: NDArray[np.uint8]) -> Kind:

@@ -7,6 +7,7 @@ cost a decoder gigabytes and minutes, so the size is read before anything is dec
 from __future__ import annotations
 
 import re
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,16 +18,10 @@ MAX_PICTURE_BYTES = 8_000_000
 MOST_STREAM_PX = 4096 * 4096
 """Of a picture in a stream: more than any camera that flies gives, and decoded within 0.2 s."""
 
-_START = re.compile(rb"\xff\xd8\xff[\xc0-\xcf\xda-\xff]")
-"""The start of a picture, and the marker of a segment or a fill byte behind it."""
 _SCAN_END = re.compile(rb"\xff[^\x00\x01\xd0-\xd7\xff]")
 """The first marker behind entropy-coded bytes, in which FF is followed by 00 or a restart."""
-_NO_FILL = re.compile(rb"[^\xff]")
-"""A marker's code: any number of fill bytes FF may stand in front of it."""
-_MARKER = re.compile(rb"\xff[^\x00\xff]")
+_START, _END = b"\xff\xd8\xff", b"\xff\xd9"
 _SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
-_STANDALONE = frozenset({0x01, *range(0xD0, 0xD8)})
-"""Markers without a length."""
 _SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Start of frame: behind its length and precision stand height and width."""
 
@@ -34,61 +29,44 @@ _SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 class Damaged(Exception):
     """The bytes at a start-of-image marker are no whole JPEG; `at`: where its structure breaks."""
 
-    def __init__(self, at: int = 0) -> None:
+    def __init__(self, at: int) -> None:
         super().__init__(at)
         self.at = at
 
 
-class JpegWalk:
-    """Follows the structure of one JPEG whose bytes come in pieces, and touches each byte once."""
+class Extent(NamedTuple):
+    """The length of a JPEG in bytes, and the width and height that it says."""
 
-    def __init__(self, start: int = 0) -> None:
-        """`start`: place of the picture's first byte."""
-        self.start = start
-        self._at = start + 2
-        self._in_scan = False
+    end: int
+    size_px: tuple[int, int]
 
-    def moved(self, by: int) -> None:
-        """Shift all places after so many bytes in front of the picture were taken away."""
-        self.start -= by
-        self._at -= by
 
-    def end(self, data: bytes | bytearray, until: int) -> int | None:
-        """Place behind the picture's last byte; None if that does not lie before `until`.
+def jpeg_extent(data: bytes | bytearray) -> Extent | None:
+    """Return the extent of the JPEG at the start of `data`; None if it is incomplete.
 
-        Raises Damaged where a segment is followed by no marker, or another picture begins.
-        """
-        while True:
-            if self._in_scan:
-                found = _SCAN_END.search(data, self._at, until)
-                if found is None:
-                    self._at = max(self._at, until - 1)  # half a marker may stand there
-                    return None
-                self._at, self._in_scan = found.start(), False
-            if self._at + 2 > until:
-                return None
-            if data[self._at] != 0xFF:
-                raise Damaged(self._at)
-            found = _NO_FILL.search(data, self._at + 1, until)
+    Raises Damaged where a segment is followed by no marker, or another picture begins.
+    """
+    at, size_px, in_scan = 2, (0, 0), False
+    while True:
+        if in_scan:
+            found = _SCAN_END.search(data, at)
             if found is None:
-                self._at = until - 1
                 return None
-            code, behind = data[found.start()], found.end()
-            if code == _EOI:
-                return behind
-            if code in _STANDALONE:
-                self._at = behind
-                continue
-            if code < 0xC0 or code == _SOI:
-                raise Damaged(behind - 2)
-            if behind + 2 > until:
-                self._at = behind - 2
-                return None
-            length = int.from_bytes(data[behind : behind + 2], "big")
-            if length < 2:
-                raise Damaged(behind)
-            self._at = behind + length
-            self._in_scan = code == _SOS
+            at = found.start()
+        if at + 2 > len(data):
+            return None
+        code = data[at + 1]
+        if data[at] != 0xFF or code < 0xC0 or code == _SOI:
+            raise Damaged(at)
+        if code == _EOI:
+            return Extent(at + 2, size_px)
+        if at + 9 > len(data):
+            return None
+        if code in _SIZES:
+            height, width = (int.from_bytes(data[at + k : at + k + 2], "big") for k in (5, 7))
+            size_px = width, height
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        in_scan = code == _SOS
 
 
 class JpegSplitter:
@@ -96,84 +74,47 @@ class JpegSplitter:
 
     It follows the JPEG's own structure instead of the multipart headers. Wrong lengths, odd
     boundaries and missing headers therefore do no harm, and a picture is out with its last byte.
-    The pictures do not depend on the pieces in which the bytes come. A damaged picture is dropped,
-    and the search goes on where its structure breaks: up to 64 kB later if the damage is in a
-    segment's length. So no byte is read twice. At most `MAX_PICTURE_BYTES` and one piece are held.
-    `damaged` counts the pictures that were dropped.
+    A damaged picture is dropped, and the search goes on where its structure breaks: up to 64 kB
+    later if the damage is in a segment's length. `damaged` counts the pictures that were dropped.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self._walk: JpegWalk | None = None
         self.damaged = 0
 
-    def feed(self, data: bytes) -> list[bytes]:
+    def feed(self, data: bytes) -> list[tuple[bytes, Extent]]:
         """Append bytes; return the pictures that are complete now, oldest first."""
         self._buffer += data
-        pictures: list[bytes] = []
-        done = 0
-        while (walk := self._walk or self._found(done)) is not None:
-            most = walk.start + MAX_PICTURE_BYTES
+        pictures: list[tuple[bytes, Extent]] = []
+        if self._buffer.find(_END, max(len(self._buffer) - len(data) - 1, 0)) < 0:
+            self._bound()
+            return pictures  # no picture ends in what is new
+        while (start := self._buffer.find(_START)) >= 0:
+            del self._buffer[:start]
             try:
-                end = walk.end(self._buffer, min(len(self._buffer), most))
+                extent = jpeg_extent(self._buffer)
             except Damaged as damage:
                 # The start of the next picture may be what broke this one's structure.
-                done = max(damage.at - 2, walk.start + 2)
+                del self._buffer[: damage.at]
                 self.damaged += 1
-                self._walk = None
                 continue
-            if end is not None:
-                pictures.append(bytes(self._buffer[walk.start : end]))
-                done = end
-            elif len(self._buffer) >= most:
-                self.damaged += 1
-                done = most
-            else:
-                self._walk = walk
-                self._drop(walk.start)
-                return pictures
-            self._walk = None
-        # The next start may stand half in this piece.
-        self._drop(max(len(self._buffer) - 3, done))
+            if extent is None:
+                break
+            pictures.append((bytes(self._buffer[: extent.end]), extent))
+            del self._buffer[: extent.end]
+        else:
+            del self._buffer[:-2]  # the next start may stand half in this piece
+        self._bound()
         return pictures
 
-    def _found(self, since: int) -> JpegWalk | None:
-        found = _START.search(self._buffer, since)
-        return None if found is None else JpegWalk(found.start())
-
-    def _drop(self, count: int) -> None:
-        del self._buffer[:count]
-        if self._walk is not None:
-            self._walk.moved(count)
+    def _bound(self) -> None:
+        """Give up a picture that never ends."""
+        if len(self._buffer) > MAX_PICTURE_BYTES:
+            self._buffer.clear()
+            self.damaged += 1
 
 
-def jpeg_end(data: bytes | bytearray) -> int | None:
-    """Return the length of the JPEG at the start of `data`; None if it is incomplete. Raises
-    Damaged."""
-    return JpegWalk().end(data, len(data))
-
-
-def size_in(data: bytes | bytearray) -> tuple[int, int] | None:
-    """Return width and height that a JPEG says in front of its pixels; None if it says none."""
-    at = 2
-    # As the decoder: what is no marker is passed over.
-    while (marker := _MARKER.search(data, at)) is not None:
-        code, behind = data[marker.end() - 1], marker.end()
-        if code in (_EOI, _SOS):
-            return None
-        if code in _SIZES:
-            if behind + 7 > len(data):
-                return None
-            height = int.from_bytes(data[behind + 3 : behind + 5], "big")
-            return int.from_bytes(data[behind + 5 : behind + 7], "big"), height
-        if code in _STANDALONE or code == _SOI:
-            at = behind
-        else:
-            at = behind + max(int.from_bytes(data[behind : behind + 2], "big"), 2)
-    return None
-
-
-def grey_pixels(data: bytes | bytearray) -> NDArray[np.uint8] | None:
+def grey_pixels(data: bytes) -> NDArray[np.uint8] | None:
     """Return the grey picture of any file's bytes; None if OpenCV cannot decode them. Whatever the
     bytes are, it raises nothing."""
     if not data:

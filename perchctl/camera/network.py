@@ -7,24 +7,18 @@ next one's first bytes, a whole period late (41 ms instead of 0.2 ms at 25 Hz).
 
 from __future__ import annotations
 
-import contextlib
-import http.client
 import math
-import socket
 import ssl
 from collections import deque
+from contextlib import closing
+from http.client import HTTPResponse
 from typing import Any
-from urllib.parse import SplitResult, urljoin, urlsplit, urlunsplit
+from urllib.error import HTTPError, URLError
+from urllib.parse import urljoin, urlsplit, urlunsplit
+from urllib.request import HTTPRedirectHandler, ProxyHandler, Request, build_opener
 
-from perchctl.camera.credentials import (
-    Challenge,
-    answer,
-    challenge_of,
-    credentials_of,
-    without_password,
-)
-from perchctl.camera.health import Grey
-from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, grey_pixels, size_in
+from perchctl.camera.credentials import authorization, without_password
+from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, grey_pixels
 from perchctl.camera.source import Clock, LiveSource, one_line
 
 MAX_FAILED_CONNECTIONS = 5
@@ -36,8 +30,8 @@ class StreamSource(LiveSource):
     `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when the server
     answers that there is no such stream before the first picture came (`not_found`).
 
-    It connects from `begin` until `close`. A subclass has `_connection`, and sets `_socket` in it.
-    `damaged` counts the pictures that were dropped.
+    It connects from `begin` until `close`, which waits for the end of a read. A subclass has
+    `_connection`. `damaged` counts the pictures that were dropped.
     """
 
     connect_timeout_s = 3.0
@@ -47,7 +41,6 @@ class StreamSource(LiveSource):
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
         super().__init__(without_password(url), latency_s, clock)
         self._url = url
-        self._socket: socket.socket | None = None
         self.not_found = False
         self.connections = 0
         self.damaged = 0
@@ -55,18 +48,6 @@ class StreamSource(LiveSource):
     def begin(self) -> None:
         """Connect, and read in a thread."""
         self._start(self._run)
-
-    def close(self) -> None:
-        self._stop.set()
-        self._wake()
-        super().close()
-
-    def _wake(self) -> None:
-        """End a read that waits for bytes."""
-        current = self._socket
-        if current is not None:
-            with contextlib.suppress(OSError):
-                current.shutdown(socket.SHUT_RDWR)
 
     def _connection(self) -> str:
         """Read one connection until it ends; return why it ended. It may raise any Exception."""
@@ -93,12 +74,12 @@ class StreamSource(LiveSource):
 
 
 def _reason(error: Exception) -> str:
+    if isinstance(error, URLError) and isinstance(error.reason, Exception):
+        error = error.reason
     if isinstance(error, TimeoutError):
         return "no answer in time"
     if isinstance(error, ConnectionRefusedError):
         return "connection refused"
-    if isinstance(error, (OSError, http.client.HTTPException, ValueError)):
-        return str(error) or type(error).__name__
     return one_line(error)
 
 
@@ -106,9 +87,15 @@ def _reason(error: Exception) -> str:
 
 
 READ_BYTES = 65536
-
-_HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*", "Connection": "close"}
+_HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*"}
 _REDIRECTS = (301, 302, 303, 307, 308)
+
+
+class _NoRedirects(HTTPRedirectHandler):
+    """Takes a redirect for a refusal: another host would get the name and the password."""
+
+    def redirect_request(self, *_: Any) -> None:
+        return None
 
 
 class MjpegSource(StreamSource):
@@ -120,62 +107,43 @@ class MjpegSource(StreamSource):
     """
 
     def _connection(self) -> str:
-        parts = urlsplit(self._url)
-        kind = (
-            http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
-        )
-        timeout_s = self.read_timeout_s if self._count else self.connect_timeout_s
-        connection = kind(parts.hostname or "", parts.port, timeout=timeout_s)
         try:
-            response = self._answered(connection, parts)
-            if self._stop.is_set():
-                return "closed"
-            refusal = _refusal(response, parts)
-            if response.status in (401, 403, 404, 410, *_REDIRECTS):
-                self.not_found = self._count == 0
-            if refusal:
-                return refusal
-            if self._socket is not None:
-                self._socket.settimeout(self.read_timeout_s)
-            self._read(response)
-            return "the stream ended"
-        except ssl.SSLCertVerificationError as error:
+            with closing(self._opened()) as response:
+                self._read(response)
+        except HTTPError as refused:
+            self.not_found = self._count == 0 and refused.code in (401, 403, 404, 410, *_REDIRECTS)
+            with refused:
+                return _refusal(refused, self._url)
+        except URLError as error:
+            if not isinstance(error.reason, ssl.SSLCertVerificationError):
+                raise
             self.not_found = self._count == 0
             return (
-                f"its certificate is not trusted ({error.verify_message or 'not verified'}); name "
-                f"a file with that certificate in the environment variable SSL_CERT_FILE, or use "
-                f"http://"
+                f"its certificate is not trusted ({error.reason.verify_message}); name a file with "
+                f"that certificate in the environment variable SSL_CERT_FILE, or use http://"
             )
-        finally:
-            self._socket = None
-            connection.close()
+        return "the stream ended"
 
-    def _answered(
-        self, connection: http.client.HTTPConnection, parts: SplitResult
-    ) -> http.client.HTTPResponse:
-        """Return the response, with name and password once the server has asked for them, or has
-        refused the nameless without asking (403)."""
-        path = urlunsplit(("", "", parts.path or "/", parts.query, ""))
-        headers = dict(_HEADERS)
-        while True:
-            connection.connect()
-            self._socket = connection.sock
-            if self._stop.is_set():  # `close` came before there was a socket to shut down
-                raise ConnectionError("closed")
-            connection.request("GET", path, headers=headers)
-            response = connection.getresponse()
-            who, challenge = credentials_of(parts), _challenge(response)
-            if (
-                response.status not in (401, 403)
-                or who is None
-                or challenge is None
-                or "Authorization" in headers
-            ):
-                return response
-            headers["Authorization"] = answer(challenge, who, "GET", path)
-            connection.close()
+    def _opened(self) -> HTTPResponse:
+        """Return the stream's response, with name and password once the server has asked for them.
+        Raises HTTPError for any other answer."""
+        parts = urlsplit(self._url)
+        bare = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
+        opener = build_opener(ProxyHandler({}), _NoRedirects)
+        request = Request(bare, headers=_HEADERS)
+        try:
+            response: HTTPResponse = opener.open(request, timeout=self.read_timeout_s)
+        except HTTPError as refused:
+            asked = refused.headers.get_all("WWW-Authenticate") or []
+            given = authorization(asked, request, parts) if refused.code == 401 else None
+            if given is None:
+                raise
+            refused.close()
+            request.add_unredirected_header("Authorization", given)
+            response = opener.open(request, timeout=self.read_timeout_s)
+        return response
 
-    def _read(self, response: http.client.HTTPResponse) -> None:
+    def _read(self, response: HTTPResponse) -> None:
         splitter = JpegSplitter()
         earlier = self.damaged
         while not self._stop.is_set():
@@ -183,60 +151,34 @@ class MjpegSource(StreamSource):
             if not data:
                 return
             # If the network delivered several at once only the newest is worth decoding.
-            for picture in reversed(splitter.feed(data)):
-                image = self._decoded(picture)
+            for picture, extent in reversed(splitter.feed(data)):
+                width, height = extent.size_px
+                image = grey_pixels(picture) if width * height <= MOST_STREAM_PX else None
                 if image is not None:
                     self._put(image, encoded=picture)
                     break
                 splitter.damaged += 1
             self.damaged = earlier + splitter.damaged
 
-    def _decoded(self, picture: bytes) -> Grey | None:
-        """Return the JPEG's pixels; None if it is damaged, or says a size above
-        `MOST_STREAM_PX`."""
-        size_px = size_in(picture)
-        if size_px is None:
-            return None
-        width, height = size_px
-        if width * height > MOST_STREAM_PX:
-            self._why_silent = (
-                f"its pictures say {width}x{height} px, and at most {MOST_STREAM_PX:,} pixels are "
-                f"decoded; set the camera to a smaller size"
-            )
-            return None
-        return grey_pixels(picture)
 
-
-def _challenge(response: http.client.HTTPResponse) -> Challenge | None:
-    """Return what the server asks for; one that does not name it gets the simplest."""
-    headers = response.headers.get_all("WWW-Authenticate")
-    return challenge_of(headers) if headers else Challenge(digest=False)
-
-
-def _refusal(response: http.client.HTTPResponse, parts: SplitResult) -> str:
-    """Say why an answer holds no stream; an empty string if it holds one."""
-    if response.status == 200:
-        return ""
-    location = response.getheader("Location")
-    if response.status in _REDIRECTS and location:
-        shown = without_password(urljoin(parts.geturl(), location))
-        return f"the server redirects to {shown}; name that address in camera.source"
+def _refusal(refused: HTTPError, url: str) -> str:
+    """Say why an answer holds no stream."""
     hint = ""
-    if response.status == 401 and parts.username is None:
-        hint = "; it wants a name and a password, as in http://NAME:PASSWORD@HOST/PATH"
-    elif response.status == 401 and _challenge(response) is None:
-        hint = ", and asks for no basic or digest authentication; others are not known here"
-    elif response.status == 401:
-        hint = "; check the name and the password in the URL (@ is %40 there, : is %3A)"
-    return f"the server answers {response.status} {response.reason}{hint}"
+    if refused.code in _REDIRECTS:
+        to = without_password(urljoin(url, refused.headers.get("Location", "")))
+        hint = f": it redirects to {to}; name that address in camera.source"
+    elif refused.code == 401:
+        hint = (
+            "; write a name and a password that it takes, for basic or digest authentication by "
+            "MD5, as in http://NAME:PASSWORD@HOST/PATH (@ is %40 there, : is %3A)"
+        )
+    return f"the server answers {refused.code} {refused.reason}{hint}"
 
 
 # --- RTSP, decoded by PyAV: its open and read end in time, and say why they failed; OpenCV's
 # FFmpeg says neither.
 
 
-RTSP_PORT = 554
-MOST_ANSWER_BYTES = 65536
 MAX_DAMAGED = 100
 """Packets in a row that cannot be decoded before it connects anew."""
 WINDOW_S = 10.0
@@ -298,20 +240,16 @@ class RtspSource(StreamSource):
         import av  # late: most flights have another camera
         import av.error
 
-        # Before the first picture is before the flight: later it would cost pictures.
-        if self._count == 0 and (target := redirect_of(self._url, self.connect_timeout_s)):
-            self.not_found = True
-            return (
-                f"the server redirects to {without_password(target)}, which would get the name "
-                f"and password; name that address in camera.source"
-            )
         try:
             timeouts_s = (self.connect_timeout_s, self.read_timeout_s)
             with av.open(self._url, options=_OPTIONS, timeout=timeouts_s) as stream:
                 return self._read(stream)
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            self.not_found = self._count == 0 and isinstance(error, _gone(av.error))
-            return _ffmpeg_reason(error)
+            # Without FFmpeg's own texts, which hold the URL with its password.
+            name = type(error).__name__
+            self.not_found = self._count == 0 and name in _FINAL
+            reason = (_FINAL | _PASSING).get(name) or getattr(error, "strerror", None)
+            return str(reason or name)
 
     def _read(self, stream: Any) -> str:
         """Read one connection until it ends, and return why. Raises PyAV's errors."""
@@ -341,64 +279,16 @@ class RtspSource(StreamSource):
         return "the stream ended"
 
 
-def redirect_of(url: str, timeout_s: float) -> str:
-    """Return the other host or port to which the server redirects a URL with name and password; an
-    empty string if there is none. FFmpeg would follow, and take name and password along."""
-    parts = urlsplit(url)
-    who = credentials_of(parts)
-    if who is None or parts.hostname is None:
-        return ""
-    asked = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
-    challenge: Challenge | None = None
-    failures = (OSError, ValueError, IndexError, http.client.HTTPException)
-    with (
-        contextlib.suppress(*failures),  # FFmpeg will say why
-        socket.create_connection((parts.hostname, parts.port or RTSP_PORT), timeout_s) as server,
-        server.makefile("rb") as answers,
-    ):
-        # Once more with name and password, if they are asked for.
-        for number, method in enumerate(("OPTIONS", "DESCRIBE", "DESCRIBE"), start=1):
-            request = f"{method} {asked} RTSP/1.0\r\nCSeq: {number}\r\n"
-            if challenge is not None:
-                request += f"Authorization: {answer(challenge, who, method, asked)}\r\n"
-            server.sendall(f"{request}\r\n".encode())
-            status = int(answers.readline(MOST_ANSWER_BYTES).split()[1])
-            headers = http.client.parse_headers(answers)
-            answers.read(min(int(headers.get("Content-Length", 0)), MOST_ANSWER_BYTES))
-            if 300 <= status < 400:
-                target = urlsplit(headers.get("Location", ""))
-                same = (target.hostname, target.port or RTSP_PORT) == (
-                    parts.hostname, parts.port or RTSP_PORT
-                )  # fmt: skip
-                return "" if same else urlunsplit(target)
-            if status == 401 and challenge is None:
-                challenge = challenge_of(headers.get_all("WWW-Authenticate") or [])
-    return ""
-
-
-def _gone(errors: Any) -> tuple[type[Exception], ...]:
-    """Return the errors of PyAV that another attempt would not mend."""
-    return (
-        errors.HTTPUnauthorizedError,
-        errors.HTTPForbiddenError,
-        errors.HTTPNotFoundError,
-        errors.HTTPBadRequestError,
-        errors.ProtocolNotFoundError,
-        errors.DecoderNotFoundError,
-    )
-
-
-def _ffmpeg_reason(error: Exception) -> str:
-    """Say what went wrong without FFmpeg's own texts, which hold the URL with its password."""
-    name = type(error).__name__
-    return _REASONS.get(name) or str(getattr(error, "strerror", None) or name)
-
-
-_REASONS = {
+_FINAL = {
     "HTTPUnauthorizedError": "it wants another name or password (401), as in "
     "rtsp://NAME:PASSWORD@HOST/PATH (@ is %40 there, : is %3A)",
     "HTTPForbiddenError": "this name may not see the stream (403)",
     "HTTPNotFoundError": "there is no such stream (404); look for the path in its manual",
+    "HTTPBadRequestError": "it does not understand the request (400)",
+    "DecoderNotFoundError": "its pictures are in a form that FFmpeg cannot decode",
+}
+"""PyAV's errors that another attempt would not mend, by name."""
+_PASSING = {
     "ConnectionRefusedError": "connection refused",
     "OSError": "the host cannot be reached, or its name is unknown: correct it",
     "ExitError": "no answer in time",

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from perchctl.camera.aideck import FORM, AiDeckSource, aideck_address
 from perchctl.camera.credentials import without_password
-from perchctl.camera.device import DeviceSource, asked_of, camera_number, finder_of
+from perchctl.camera.device import DeviceSource, open_capture
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.network import MjpegSource, RtspSource, StreamSource
-from perchctl.camera.source import Clock, FrameSource, LiveSource, mirrored_as_profiled
-from perchctl.errors import CameraNote, InvalidValue, NotFound, TimedOut
+from perchctl.camera.source import Clock, FrameSource, LiveSource, WrappedSource, unmirror_frame
+from perchctl.errors import InvalidValue, NotFound, TimedOut
 from perchctl.profile import CameraConfig
 
 REAL = (
@@ -76,11 +76,6 @@ def parse_source(text: str, *, files: bool = False) -> SourceName:
     raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED}")
 
 
-def note(sentence: str) -> None:
-    """Warn with a sentence, which the command line prints and a program may catch."""
-    warnings.warn(sentence, CameraNote, stacklevel=3)
-
-
 def open_camera(
     source: str | Sequence[Path],
     clock: Clock,
@@ -90,7 +85,6 @@ def open_camera(
     latency_s: float | None = None,
     pictures_hz: float | None = None,
     timeout_s: float | None = None,
-    tell: Callable[[str], None] = note,
 ) -> FrameSource:
     """Open any source and wait for its first frame.
 
@@ -104,7 +98,6 @@ def open_camera(
         latency_s: from exposure to arrival, instead of the profile's (0 without one).
         pictures_hz: pictures count as taken at this rate (``images:`` only; 30 by default).
         timeout_s: how long the first frame of a live source may take, instead of the profile's.
-        tell: gets a sentence for each thing that the camera does not do as asked.
 
     Raises:
         NotFound: no such camera, file or stream. InvalidValue: unknown scheme,
@@ -127,8 +120,9 @@ def open_camera(
             opened = ImagesSource(str(Path(name.place).expanduser()), latency_s, pictures_hz)
         else:
             live = _live(name, latency_s, size_px, clock, config)
-            opened = _started(live, timeout_s, tell)
-    return opened if config is None else mirrored_as_profiled(opened, config)
+            opened = _started(live, timeout_s)
+    is_mirrored = config is not None and config.mirrored
+    return WrappedSource(opened, unmirror_frame) if is_mirrored else opened
 
 
 def _live(
@@ -140,9 +134,8 @@ def _live(
 ) -> LiveSource:
     """Open a camera or stream whose first frame is still to come."""
     if name.scheme == "camera":
-        asked = asked_of(config, size_px)
-        number = camera_number(name.place)
-        return DeviceSource(number, latency_s, asked, clock, find=finder_of(number))
+        opener = partial(open_capture, name.place, size_px, config)
+        return DeviceSource(str(name), latency_s, clock, opener)
     stream: StreamSource | None = None
     if name.scheme == "aideck":
         stream = AiDeckSource(*aideck_address(name.spec), latency_s, clock)
@@ -179,11 +172,9 @@ def _check_address(name: SourceName) -> None:
         )
 
 
-def _started(source: LiveSource, timeout_s: float, tell: Callable[[str], None]) -> FrameSource:
+def _started(source: LiveSource, timeout_s: float) -> FrameSource:
     """Wait for the first frame. Raises NotFound or TimedOut without one, with the source closed."""
     if source.wait_first(timeout_s):
-        for sentence in source.remarks():
-            tell(sentence)
         return source
     problem = source.problem(float("-inf"))
     described = source.describe()

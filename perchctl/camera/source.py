@@ -167,10 +167,6 @@ class LiveSource:
         self._first.wait(timeout_s)
         return self._count > 0
 
-    def remarks(self) -> list[str]:
-        """Return a sentence for each thing worth telling once the first frame has come."""
-        return []
-
     @property
     def _count(self) -> int:
         """The number of pictures so far, each counted once."""
@@ -227,11 +223,13 @@ class LiveSource:
 
 
 class WrappedSource:
-    """A source around another one: everything is the inner one's, but for what a subclass
-    does to its frames."""
+    """A source around another one: everything is the inner one's. Each frame is shown to `change`,
+    which must not raise; the frame that it returns is given instead, where it returns one."""
 
-    def __init__(self, source: FrameSource) -> None:
-        self._source = source
+    def __init__(
+        self, source: FrameSource, change: Callable[[Frame], Frame | None] = lambda frame: None
+    ) -> None:
+        self._source, self._change = source, change
 
     @property
     def inner(self) -> FrameSource:
@@ -250,7 +248,8 @@ class WrappedSource:
         return self._source.size_px
 
     def poll(self, now_s: float) -> Frame | None:
-        return self._source.poll(now_s)
+        frame = self._source.poll(now_s)
+        return None if frame is None else self._change(frame) or frame
 
     def problem(self, now_s: float) -> str | None:
         return self._source.problem(now_s)
@@ -260,24 +259,6 @@ class WrappedSource:
 
     def close(self) -> None:
         self._source.close()
-
-
-class WatchedSource(WrappedSource):
-    """The same source; each frame that it gives is shown to `seen`, which must not raise."""
-
-    def __init__(self, source: FrameSource, seen: Callable[[Frame], None]) -> None:
-        super().__init__(source)
-        self._seen = seen
-
-    def poll(self, now_s: float) -> Frame | None:
-        frame = super().poll(now_s)
-        if frame is not None:
-            self._seen(frame)
-        return frame
-
-
-# --- A source whose pictures arrive mirrored, turned right again (`camera.mirrored`); what to do
-# about a target that is seen mirrored all the same.
 
 
 def mirrored_note(config: CameraConfig) -> str:
@@ -291,19 +272,3 @@ def mirrored_note(config: CameraConfig) -> str:
 def unmirror_frame(frame: Frame) -> Frame:
     """Return the frame flipped left to right; it is no longer the JPEG that came."""
     return replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]), encoded=None)
-
-
-def mirrored_as_profiled(source: FrameSource, config: CameraConfig) -> FrameSource:
-    """Return the source, with each picture turned right if `camera.mirrored` is set."""
-    return UnmirroredSource(source) if config.mirrored else source
-
-
-class UnmirroredSource(WrappedSource):
-    """Flips each picture left to right."""
-
-    def poll(self, now_s: float) -> Frame | None:
-        frame = super().poll(now_s)
-        return None if frame is None else unmirror_frame(frame)
-
-    def describe(self) -> str:
-        return f"{super().describe()}, mirrored"

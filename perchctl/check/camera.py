@@ -7,7 +7,7 @@ it is in view.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 from statistics import mean, median
 
@@ -74,11 +74,9 @@ def refused_rows(error: PerchError, devices: list[str], profile: Profile) -> lis
     return [Row("camera", *failed(found, advice)), *skip_all(names, "no picture comes")]
 
 
-def opened_finding(described: str, devices: list[str], remarks: Sequence[str] = ()) -> Finding:
-    """Judge a camera that opens; `remarks`: what it does not do as it was asked."""
+def opened_finding(described: str, devices: list[str]) -> Finding:
+    """Return the row of a camera that opens."""
     found = f"{described} gives pictures"
-    if remarks:
-        return warned(f"{found}; {'; '.join(remarks)}", "see perchctl check --cameras")
     return passed(f"{found}; there are {', '.join(devices)}" if devices else found)
 
 

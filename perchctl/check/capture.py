@@ -47,8 +47,6 @@ from perchctl.perception import History, attitude_at
 from perchctl.positioning import (
     CaptureFrame,
     CaptureSource,
-    Comparison,
-    ComparisonRecord,
     Placed,
     load_comparison,
     save_comparison,
@@ -422,21 +420,19 @@ def comparison_rows(
     decks, nor for the simulator's own vehicle, whose room is right as it is built."""
     if config.by != "mocap" or simulated:
         return []
-    return [_record_row(load_comparison(config, vehicle_uri(uri)), now)]
+    return [_record_row(config, uri, now)]
 
 
 def save_row(lifted: Finding, config: PositioningConfig, uri: str, now: datetime) -> Row:
     """Write down what the hand found, and return its row. A lift that showed nothing is not
     written."""
-    vehicle = vehicle_uri(uri)
+    passes, vehicle = lifted.verdict is Verdict.PASS, vehicle_uri(uri)
     if lifted.verdict is Verdict.SKIPPED:
-        return _record_row(load_comparison(config, vehicle), now)
-    record = Comparison(now, lifted.verdict is Verdict.PASS, lifted.found)
-    why = save_comparison(config, vehicle, record)
+        return _record_row(config, uri, now)
+    why = save_comparison(config, vehicle, now, passes, lifted.found)
     if why is None:
-        return _record_row(record, now)
-    standing = load_comparison(config, vehicle)
-    if not record.passed and standing.objection(now) is None:
+        return _record_row(config, uri, now)
+    if not passes and load_comparison(config, vehicle).objection(now) is None:
         found = f"what was found could not be written, and fly goes by an older pass: {why}"
         advice = "free some space, or give back the right to write there; do not fly before"
         return Row(COMPARED, *failed(found, advice))
@@ -445,10 +441,10 @@ def save_row(lifted: Finding, config: PositioningConfig, uri: str, now: datetime
     )
 
 
-def _record_row(record: ComparisonRecord, now: datetime) -> Row:
+def _record_row(config: PositioningConfig, uri: str, now: datetime) -> Row:
+    record = load_comparison(config, vehicle_uri(uri))
     objection = record.objection(now)
     if objection is None:
-        assert isinstance(record, Comparison)
         return Row(COMPARED, *passed(record.text(now)))
     found, advice = objection
     return Row(COMPARED, *warned(f"{found}; fly refuses", advice))

@@ -16,7 +16,7 @@ from perchctl.check.rehearsal import REHEARSED_S, Rehearsal, TakeTelemetry, rehe
 from perchctl.check.row import Finding, Row, ask, failed, passed, skip_all, skipped
 from perchctl.errors import ConnectionFailed, PerchError, UsageError
 from perchctl.flight import FlyOptions, WallClock, check_options, simulated_vehicle
-from perchctl.link import ProbeLink, ScanResult, check_uri, find_vehicles
+from perchctl.link import ProbeLink, check_uri, find_vehicles
 from perchctl.positioning import CaptureSource, open_capture
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vision import Pipeline, make_pipeline
@@ -37,7 +37,7 @@ class CheckScope:
     tell: Callable[[str], None] = lambda text: None
     open_capture: Callable[[PositioningConfig], CaptureSource] = open_capture
     capture_s: float = capture.CAPTURE_S
-    other_vehicles: Callable[[str], ScanResult] = find_vehicles
+    other_vehicles: Callable[[str], tuple[list[str], str]] = find_vehicles
 
 
 def scan_rows(uri: str | None) -> list[Row]:
@@ -45,7 +45,7 @@ def scan_rows(uri: str | None) -> list[Row]:
     InvalidValue."""
     if uri is not None:
         check_uri(uri)
-    return vehicle.answering_rows(find_vehicles(uri or ""))
+    return vehicle.answering_rows(*find_vehicles(uri or ""))
 
 
 def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
@@ -70,18 +70,16 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
         stack.callback(probe.close)
         session = VehicleSession(probe, options.uri, profile, room, scope)
         take = yield from session.rows()
-        shown, remarks = without_password(options.source), list[str]()
+        shown = without_password(options.source)
         scope.tell(f"opening the camera {shown}")
         rehearsal: Rehearsal | None = None
         try:
-            source = _open_camera(spec, options, remarks)
+            source = _open_camera(spec, options)
         except PerchError as error:
             yield from camera.refused_rows(error, list(map(str, find_cameras())), options.profile)
         else:
             stack.callback(source.close)
-            yield Row(
-                "camera", *camera.opened_finding(shown, list(map(str, find_cameras())), remarks)
-            )
+            yield Row("camera", *camera.opened_finding(shown, list(map(str, find_cameras()))))
             rehearsal = yield from _camera_rows(take, source, pipeline, options.profile, scope)
     yield ask("loop", camera.loop_finding, rehearsal, options.profile)
     yield from quick_rows(options)
@@ -133,7 +131,7 @@ class VehicleSession:
         found, _, advice = str(error).partition("\n")
         if not advice:
             self.scope.tell("nothing answers there: looking who else does")
-            advice = vehicle.advice_for_silent(self.uri, self.scope.other_vehicles(self.uri))
+            advice = vehicle.advice_for_silent(self.uri, self.scope.other_vehicles(self.uri)[0])
         yield Row("address", *failed(found, advice))
         yield from _not_answering([*vehicle.VEHICLE, vehicle.LIFTED])
         yield from self._room_rows(list)
@@ -217,10 +215,10 @@ def _not_answering(names: list[str]) -> list[Row]:
     return skip_all(names, "the vehicle does not answer")
 
 
-def _open_camera(spec: str, options: FlyOptions, remarks: list[str]) -> FrameSource:
+def _open_camera(spec: str, options: FlyOptions) -> FrameSource:
     config = options.profile.camera
     size_px = profile_camera(config).size_px
-    return open_camera(spec, time.monotonic, config, size_px=size_px, tell=remarks.append)
+    return open_camera(spec, time.monotonic, config, size_px=size_px)
 
 
 def _camera_rows(

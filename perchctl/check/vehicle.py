@@ -24,7 +24,7 @@ from perchctl.check.row import (
     worst,
 )
 from perchctl.flight import GroundCriteria, unmeasured_problem
-from perchctl.link import UDEV_HELP, Echoes, ProbeLink, ScanResult
+from perchctl.link import ProbeLink
 from perchctl.profile import Profile
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, MeasuredBy, Telemetry
 
@@ -54,7 +54,7 @@ class Vehicle:
     missing: tuple[str, ...] = ()
     lacking: tuple[str, ...] = ()
     parameters: Mapping[str, float] = field(default_factory=dict)
-    echoes: Echoes = field(default_factory=Echoes)
+    echoes: Sequence[float] = ()
     quality: float | None = None
     telemetry: Telemetry | None = None
     age_s: float = 0.0
@@ -132,10 +132,12 @@ def moved_m(samples: Sequence[Telemetry]) -> float:
 def _packets(vehicle: Vehicle, profile: Profile) -> Finding:
     """Judge the link by its echoes. From 10 % on one lost notify has locked a vehicle that hung
     well."""
-    echoes, quality, p95_s = vehicle.echoes, vehicle.quality, vehicle.echoes.p95_s
-    if p95_s is None:
+    sent, quality = len(vehicle.echoes), vehicle.quality
+    back_s = sorted(filter(math.isfinite, vehicle.echoes))
+    if not back_s:
         return failed("no packet came back", "restart the vehicle, bring the radio nearer")
-    found = f"{100.0 * echoes.lost:.1f} % of {echoes.sent} lost, 95 % back in {1e3 * p95_s:.1f} ms"
+    lost, p95_s = 1.0 - len(back_s) / sent, back_s[int(0.95 * (len(back_s) - 1))]
+    found = f"{100.0 * lost:.1f} % of {sent} lost, 95 % back in {1e3 * p95_s:.1f} ms"
     if quality is not None:
         found += f", link quality {quality:.0f} %"
     advice = (
@@ -144,7 +146,7 @@ def _packets(vehicle: Vehicle, profile: Profile) -> Finding:
     )
     limit_s = profile.safety.proof_age_s
     return worst(
-        by_limits(echoes.lost, 0.01, 0.05, found, advice),
+        by_limits(lost, 0.01, 0.05, found, advice),
         by_limits(p95_s, min(0.03, limit_s), limit_s, found, advice),
         # A radio sends again by itself: its losses show in its quality only.
         by_limits(-100.0 if quality is None else -quality, -90.0, -60.0, found, advice),
@@ -336,12 +338,14 @@ def lift_finding(seen: Sequence[Telemetry]) -> Finding:
 # --- Which vehicles answer ----------------------------------------------------------------------
 
 
-def answering_rows(answering: ScanResult) -> list[Row]:
-    """Return one row for the radio, and one for each vehicle that answers."""
+def answering_rows(uris: Sequence[str], radio_problem: str) -> list[Row]:
+    """Return one row for the radio, and one for each vehicle that answers: what `find_vehicles`
+    found."""
     radio = passed("scanned: channels 0 to 125 at 250K, 1M, 2M")
-    if answering.radio:
-        radio = skipped(answering.radio, UDEV_HELP)
-    found = [passed(f"{uri} answers") for uri in answering.uris]
+    if radio_problem:
+        cause, _, advice = radio_problem.partition("\n")
+        radio = skipped(cause.rstrip("."), advice)
+    found = [passed(f"{uri} answers") for uri in uris]
     nobody = failed(
         "nothing answers",
         "switch the vehicle on; a radio's address other than E7E7E7E7E7 goes with -u",
@@ -349,9 +353,9 @@ def answering_rows(answering: ScanResult) -> list[Row]:
     return [Row("radio", *radio), *(Row("address", *each) for each in found or [nobody])]
 
 
-def advice_for_silent(uri: str, answering: ScanResult) -> str:
+def advice_for_silent(uri: str, answering: Sequence[str]) -> str:
     """Say what to do about a vehicle that does not answer, given those that do."""
-    there = [each for each in answering.uris if each != uri]
+    there = [each for each in answering if each != uri]
     if there:
         return f"these answer: {', '.join(there)}; give one with -u, or set link.uri"
     return "switch it on, look at its address; perchctl check --scan shows what answers"

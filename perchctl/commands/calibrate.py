@@ -29,7 +29,6 @@ from perchctl.calibration import (
     load_calibration,
 )
 from perchctl.camera import (
-    IMAGE_SUFFIXES,
     FrameSource,
     Grey,
     check_size,
@@ -356,7 +355,7 @@ def _source(words: Sequence[str], size: str | None, view: bool = False) -> Sourc
 def _check_picture(file: Path) -> None:
     if not file.exists():
         raise NotFound(f"{file} does not exist; several sources are picture files, one by one")
-    if not file.is_file() or file.suffix.lower() not in IMAGE_SUFFIXES:
+    if not file.is_file() or parse_source(str(file), files=True).scheme != "images":
         raise UsageError(
             f"{file} is no picture file: several sources must all be pictures, as in "
             f"left*.jpg; a folder, a video or a camera stands alone"

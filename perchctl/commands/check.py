@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.camera import ConnectedCamera, find_cameras
+from perchctl.camera import find_cameras
 from perchctl.check import CheckScope, Row, Verdict, scan_rows
 from perchctl.check import check as check_rows
 from perchctl.commands.command_line import (
@@ -183,24 +183,19 @@ def _wrapped(text: str, first: str, others: str) -> list[str]:
 NONE = "this computer has no camera: plug in the receiver or camera (Linux lists /dev/videoN)"
 
 
-def list_cameras(as_json: bool, known: Sequence[ConnectedCamera] | None = None) -> int:
-    """Print them; returns the exit code. Nothing is set, and no picture taken. `known` takes the
-    place of this computer's. Errors: NotFound where there are none."""
-    known = find_cameras() if known is None else known
+def list_cameras(as_json: bool) -> int:
+    """Print them; returns the exit code. Nothing is set, and no picture taken. Errors: NotFound
+    where there are none."""
+    known = find_cameras()
     if not known:
         raise NotFound(NONE)
     if as_json:
-        print(json.dumps([{"source": camera.source, **asdict(camera)} for camera in known]))
-    else:
-        print("\n".join(line for camera in known for line in camera_lines(camera)))
+        print(json.dumps([{"source": f"camera:{c.number}", **asdict(c)} for c in known]))
+        return 0
+    for camera in known:
+        print(f"camera:{camera.number}  {camera.name or '(no name)'}")
+        if camera.stable_path:
+            print(f"  {camera.stable_path}")
+        if camera.problem:
+            print(f"  {camera.problem}; get the right to it, as by the group video")
     return 0
-
-
-def camera_lines(camera: ConnectedCamera) -> list[str]:
-    """Return the lines that describe a camera to people."""
-    lines = [f"{camera.source}  {camera.name or '(no name)'}"]
-    if camera.stable_path:
-        lines.append(f"  {camera.stable_path}")
-    if camera.problem:
-        lines.append(f"  {camera.problem}; get the right to it, as by the group video")
-    return lines

@@ -271,7 +271,7 @@ class Tracker:
     def results(self, frame: Frame, name: str | int) -> list[Tracked]:
         """Return the frame's result, or those of its two fields; none for a live source's
         repetition of the last picture."""
-        judged = self._perception.assess(frame, self._live or not self._stills)
+        judged = self._perception.health.assess(frame, self._live or not self._stills)
         if self._live and judged.kind == "repeated":
             return []
         about = () if judged.kind in ("ok", "repeated") else (judged.text,)

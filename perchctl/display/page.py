@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from perchctl.camera import FrameSource, WatchedSource
+from perchctl.camera import FrameSource, WrappedSource
 from perchctl.display.live import LivePage, PageState
 from perchctl.display.panel import status_rows
 from perchctl.display.sketch import Sketch
@@ -45,7 +45,7 @@ class FlightPage:
 
     def watched(self, source: FrameSource) -> FrameSource:
         """Return the same source; each frame it gives is remembered for the page."""
-        return WatchedSource(source, self._seen)
+        return WrappedSource(source, self._seen)
 
     def tick(self, tick: Tick) -> None:
         try:

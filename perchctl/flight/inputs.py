@@ -185,7 +185,7 @@ class FlightInputs:
         if (width, height) != (size_px := self.pipeline.camera.size_px):
             return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
         live = self.source.live
-        verdict = self.perception.assess(frame, live)
+        verdict = self.perception.health.assess(frame, live)
         if self.recorded and self.taken.frame is not None:
             seen = replace(self.taken.frame, checksum=zlib.crc32(frame.image.tobytes()))
             self.taken = replace(self.taken, frame=seen)

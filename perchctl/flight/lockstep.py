@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import FrameSource, NewestSlot, mirrored_as_profiled
+from perchctl.camera import FrameSource, NewestSlot, WrappedSource, unmirror_frame
 from perchctl.errors import ConnectionFailed
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.link import MockLink, Radio
 from perchctl.mission import Event, FlightReport, Operator, Phase, Tick, Watcher
-from perchctl.positioning import FeedThread, Placed, PositionFeed
+from perchctl.positioning import Placed, PositionFeed
 from perchctl.profile import Profile
 from perchctl.record import LogWatcher
 from perchctl.sim import (
@@ -98,7 +98,7 @@ def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
     """Return the vehicle's camera as the flight sees it by its profile."""
     assert vehicle.camera is not None
     source = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
-    return mirrored_as_profiled(source, profile.camera)
+    return WrappedSource(source, unmirror_frame) if profile.camera.mirrored else source
 
 
 class Truth:
@@ -279,12 +279,12 @@ def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
         return None
     config = config.model_copy(update={"system": capture.SYSTEM, "host": "sim"})
     feed = PositionFeed(capture, link.external, config)
-    link.each(FeedThread.PERIOD_S, feed.turn)
+    link.each(PositionFeed.PERIOD_S, feed.turn)
     end_s = link.now_s + FIRST_FRAME_S
     while (place := feed.place()) is None:
         if link.now_s >= end_s:
             why = feed.status(link.now_s).problem or f"nothing comes from {config.label}"
             raise ConnectionFailed(f"no position within {FIRST_FRAME_S:g} s: {why}")
-        link.advance_to(link.now_s + FeedThread.PERIOD_S)
+        link.advance_to(link.now_s + PositionFeed.PERIOD_S)
     link.settle(config, place)
     return feed

@@ -26,14 +26,11 @@ from perchctl.flight.criteria import AtRest
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.preflight import refuse_strange
-from perchctl.link import CflibLink, check_estimator_parameters, check_uri, vehicle_uri
+from perchctl.link import CflibLink, check_uri, vehicle_uri
 from perchctl.mission import Event, FlightReport, Watcher
 from perchctl.positioning import (
     CaptureSource,
-    FeedThread,
     PositionFeed,
-    StandingFeed,
-    check_reachable,
     load_comparison,
     open_capture,
 )
@@ -191,11 +188,10 @@ def _simulated_clock(
 
 def _check_positioning(profile: Profile, *, simulated: bool) -> None:
     config = profile.positioning
-    check_estimator_parameters(profile.link.parameters, config)
     if config.by != "mocap":
         return
     if not simulated:
-        check_reachable(config)
+        PositionFeed.check_reachable(config)
     elif find_spec("motioncapture") is None:  # the simulated room has a capture of its own
         raise no_motion_capture()
 
@@ -236,28 +232,16 @@ def started_feed(
 
     Errors: those of `CflibLink.settle`, and SafetyAbort for positions of another world."""
     if config.by == "target":
-        _settle_standing(link, clock, profile)
+        link.settle(None, profile.safety.ground_z_m)
         return None  # what follows is seen, and sent, by the loop
     if capture is None:
         return None
     feed = PositionFeed(capture, link.external, config)
-    thread = FeedThread(feed, clock.now)
-    stack.callback(thread.close)
-    thread.start()
+    stack.callback(feed.close)
+    feed.start(clock.now)
     _refuse_strange(feed, link, clock, profile)
     link.settle(feed)
     return feed
-
-
-def _settle_standing(link: CflibLink, clock: Clock, profile: Profile) -> None:
-    """Settle the estimate on the ground, at the world's origin."""
-    feed = StandingFeed(link.external, profile.safety.ground_z_m)
-    thread = FeedThread(feed, clock.now, 1.0 / profile.positioning.rate_hz)
-    thread.start()
-    try:
-        link.settle(feed)
-    finally:
-        thread.close()
 
 
 def _refuse_strange(feed: PositionFeed, link: CflibLink, clock: Clock, profile: Profile) -> None:

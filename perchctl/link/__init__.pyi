@@ -1,15 +1,11 @@
 from .cflib_link import CflibLink as CflibLink
 from .crtp import Packet as Packet
 from .crtp import Port as Port
-from .external_position import check_estimator_parameters as check_estimator_parameters
-from .listening import Echoes as Echoes
 from .listening import MotionLink as MotionLink
 from .listening import ProbeLink as ProbeLink
-from .listening import ScanResult as ScanResult
 from .listening import find_vehicles as find_vehicles
 from .mock import MockLink as MockLink
 from .mock import Radio as Radio
 from .protocol import Link as Link
-from .uri import UDEV_HELP as UDEV_HELP
 from .uri import check_uri as check_uri
 from .uri import vehicle_uri as vehicle_uri

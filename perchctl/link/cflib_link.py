@@ -26,9 +26,9 @@ from perchctl.link.crtp import (
 )
 from perchctl.link.external_position import (
     NEEDED_BY,
-    Feed,
+    Settling,
+    Standing,
     estimator_parameters,
-    settle_estimate,
 )
 from perchctl.link.firmware import check_firmware, measured_by, set_parameters
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
@@ -36,6 +36,7 @@ from perchctl.link.sender import HANGS_S, Sender
 from perchctl.link.telemetry import LogBlocks
 from perchctl.link.uri import check_uri
 from perchctl.mission import SentCommand
+from perchctl.positioning import PositionFeed
 from perchctl.profile import LinkConfig, PositioningConfig
 from perchctl.vehicle import (
     ARMED,
@@ -113,15 +114,17 @@ class CflibLink:
         except Exception:  # the library's; commands report their own
             return False
 
-    def settle(self, feed: Feed) -> None:
-        """Start the estimator where `feed` says that the vehicle is. On the ground, after
-        `connect`; bounded. Errors: ConnectionFailed, NotFound, InvalidValue, TimedOut."""
+    def settle(self, feed: PositionFeed | None, ground_z_m: float = 0.0) -> None:
+        """Start the estimator where `feed` says that the vehicle is; without one at the world's
+        origin, `ground_z_m` high. On the ground, after `connect`; bounded. Errors:
+        ConnectionFailed, NotFound, InvalidValue, TimedOut."""
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
-        settle_estimate(
-            self.connection.cf, self._uri, self._positioning, feed, lambda: self._blocks.newest,
-            self._clock,
-        )  # fmt: skip
+        Settling(
+            self.connection.cf, self._uri, self._positioning,
+            feed or Standing(self.external, ground_z_m, self._clock),
+            lambda: self._blocks.newest, self._clock,
+        ).run()  # fmt: skip
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
         self._guard, self._on_sent = guard, on_sent
@@ -131,7 +134,6 @@ class CflibLink:
             return self.connection.lost
         sender = self._sender
         if sender is not None:
-            sender.look_after()
             if sender.problem is not None:
                 return sender.problem
             if (stuck_s := sender.stuck_s()) > HANGS_S:
@@ -161,8 +163,10 @@ class CflibLink:
         """Make a connected vehicle ready to fly."""
         check_firmware(connection.cf, self._uri)
         set_parameters(connection.cf, self._uri, self._config.parameters)
-        self._start_logging(connection)
-        self._arm_if_needed(connection)
+        self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
+        newest = self._blocks.newest
+        if newest is not None and not newest.has(ARMED):  # a Crazyflie 2.1 arms itself
+            send_packets(connection.cf, ARM)
         self._unlock_thrust(connection)  # from here on it is known to be on the ground
         set_parameters(
             connection.cf,
@@ -179,16 +183,6 @@ class CflibLink:
             tend=self._tend,
             spare=lambda: self._blocks.resume(self._hand_over),
         )
-
-    def _start_logging(self, connection: Connection) -> None:
-        self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
-
-    def _arm_if_needed(self, connection: Connection) -> None:
-        """Request arming where the vehicle is not armed: a Crazyflie 2.1 arms itself."""
-        newest = self._blocks.newest
-        if newest is None or newest.has(ARMED):
-            return
-        send_packets(connection.cf, ARM)
 
     def _unlock_thrust(self, connection: Connection) -> None:
         """Unlock the raw thrust; on the ground only, since its zero thrust cuts the motors."""
@@ -246,11 +240,8 @@ class CflibLink:
         connection, self.connection = self.connection, None
         if connection is None:
             return
-        if farewell:
-            at_s, linked = self._clock(), connection.lost is None
-            connection.close()
-            if linked:
-                with contextlib.suppress(Exception):  # whatever looks on
-                    self._on_sent(SentCommand(at_s, "farewell", FAREWELL))
-        else:
-            connection.abandon()
+        at_s, linked = self._clock(), connection.lost is None
+        connection.close(farewell=farewell)
+        if farewell and linked:
+            with contextlib.suppress(Exception):  # whatever looks on
+                self._on_sent(SentCommand(at_s, "farewell", FAREWELL))

@@ -12,10 +12,8 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from perchctl.camera import without_password
 from perchctl.errors import ConnectionFailed
 from perchctl.files import cannot_be_written
 from perchctl.link.crtp import Packet
@@ -68,7 +66,12 @@ class Connection:
         self._refused_since_s: float | None = None  # by the lock
         self._asked_s = self._counted_s = 0.0  # `is_dead`, and since when it finds the same
         self._counted: object = None
-        self._keep_cflib_from_hanging()
+        # A driver reports its end from inside `send_packet`, where the caller holds cflib's lock,
+        # or from its own thread. cflib's handler closes the link there, and joins the thread of its
+        # pings, which waits for that lock: then nothing can be sent ever again. So nothing is
+        # joined there, and nobody pings (the radio's own null packets keep the link).
+        self.cf._link_error_cb = partial(self._on_error, self._number)
+        self.cf.link_statistics.latency.start = lambda: None
         self.cf.fully_connected.add_callback(lambda _uri: self._settled.set())
         self.cf.connection_failed.add_callback(self._on_failed)
         self.cf.connection_lost.add_callback(self._on_failed)
@@ -147,34 +150,18 @@ class Connection:
                 self._give_up(cause)
             self._opener = _begin("perchctl-reconnect", self._open_again)
 
-    def close(self) -> None:
-        """Close with cflib's farewell, a zero setpoint: only when nothing flies."""
+    def close(self, *, farewell: bool) -> None:
+        """Release the driver and clean up. `farewell`: let cflib send its zero setpoint, which
+        drops a vehicle that flies; else nothing more is sent."""
+        calls = [self.cf.close_link]
         with self._change:
             self._left = True
-        _run_bounded([self.cf.close_link])
+            if not farewell and self.cf.link is not None:
+                # Without its driver, close_link has nowhere to send the zero setpoint.
+                calls.insert(0, self.cf.link.close)
+                self.cf.link = None
+        _run_bounded(calls)
         self.claim.close()
-
-    def abandon(self) -> None:
-        """Release the driver and clean up, sending nothing more."""
-        with self._change:
-            self._left = True
-            # Without its driver, close_link has nowhere to send the zero setpoint.
-            driver, self.cf.link = self.cf.link, None
-        _run_bounded([self.cf.close_link] if driver is None else [driver.close, self.cf.close_link])
-        self.claim.close()
-
-    def _keep_cflib_from_hanging(self) -> None:
-        """Replace what cflib does when a driver ends.
-
-        A driver reports its end from inside `send_packet`, where the caller holds cflib's
-        lock, or from its own thread. cflib's handler closes the link there, and joins the thread
-        of its pings, which waits for that lock: then nothing can be sent ever again. So nothing is
-        joined there, and nobody pings (the radio's own null packets keep the link)."""
-        self.cf._link_error_cb = partial(self._on_error, self._number)
-        if not hasattr(self.cf, "_send_lock"):  # another cflib's
-            self.cf._send_lock = threading.Lock()
-        with contextlib.suppress(AttributeError):  # another cflib's
-            self.cf.link_statistics.latency.start = lambda: None
 
     def _on_error(self, number: int, message: str) -> None:
         """Note a driver's end; called in any thread, and in the middle of anything."""
@@ -267,28 +254,22 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
     connect for good (docs/firmware.md, "Link"). Raises `ConnectionFailed`, also where another
     program has the vehicle; InvalidValue without a folder for cflib's tables.
     """
-    with claim_vehicle(uri) as claim:
-        connection = _opened(uri, timeout_s)
-        connection.claim = claim.pop_all()
-        return connection
-
-
-def _opened(uri: str, timeout_s: float) -> Connection:
-    ready_cflib()
-    _keep_radio_patient()
     share_s = timeout_s / CONNECT_TRIES
-    for _ in range(CONNECT_TRIES):
-        connection = Connection()
-        try:
-            answered = connection.open(uri, share_s)
-        except BaseException:
-            connection.abandon()
-            raise
-        if answered and connection.lost is None:
-            return connection
-        connection.abandon()
-        if answered:
-            raise ConnectionFailed(f"no Crazyflie at {uri}: {connection.lost}")
+    with claim_vehicle(uri) as claim:
+        ready_cflib()
+        for _ in range(CONNECT_TRIES):
+            connection = Connection()
+            answered = False
+            try:
+                answered = connection.open(uri, share_s)
+            finally:
+                if not answered or connection.lost is not None:
+                    connection.close(farewell=False)
+            if answered and connection.lost is not None:
+                raise ConnectionFailed(f"no Crazyflie at {uri}: {connection.lost}")
+            if answered:
+                connection.claim = claim.pop_all()
+                return connection
     raise ConnectionFailed(
         f"no Crazyflie at {uri}: no answer within {share_s:.0f} s "
         f"(is it switched on, is the address right?)"
@@ -296,10 +277,23 @@ def _opened(uri: str, timeout_s: float) -> Connection:
 
 
 def ready_cflib() -> None:
-    """Register cflib's radio drivers, and silence its log output."""
+    """Register cflib's drivers, keep its radio from giving up after the first lost packets, and
+    silence it: its log has tracebacks of what is reported by callback as well, and what some of its
+    modules print on stdout, which is for the result, is logged instead."""
     import cflib.crtp
+    from cflib.crtp import radiodriver
 
-    _hush_cflib()
+    logger = logging.getLogger("cflib")
+    logger.addHandler(logging.NullHandler())
+    logger.propagate = bool(os.environ.get("PERCHCTL_DEBUG"))
+
+    def log(*words: object, **_how: object) -> None:
+        logger.info(" ".join(map(str, words)))
+
+    for name, module in list(sys.modules.items()):
+        if name.startswith(("cflib.crtp", "cflib.cpx")):
+            vars(module).setdefault("print", log)
+    radiodriver.set_retries_before_disconnect(RADIO_RETRIES)
     if not cflib.crtp.CLASSES:  # init_drivers() extends this list at each call
         cflib.crtp.init_drivers()
 
@@ -329,20 +323,16 @@ def plain_cause(message: str) -> str:
             f"program at a time; end that one, or plug in another Crazyradio and name it as "
             f"radio://1/..."
         )
-    if "Crazyradio" in message or "Access denied" in message or "insufficient" in message.lower():
-        missing = "Cannot find" in message
-        what = "no Crazyradio is plugged in, or " if missing else ""
-        return f"{what}there is no permission to use it ({line}).\n{UDEV_HELP}"
-    if "Could not open usb" in message:
-        return (
-            f"no Crazyflie is plugged in by USB and switched on, or there is no permission to use "
-            f"it ({line}).\n{UDEV_HELP}"
-        )
     if "Connection refused" in message:
         return "nothing listens there (connection refused)"
-    if "No driver found" in message:
-        return "cflib has no driver for this kind of URI"
-    return line
+    missing = ""
+    if "Could not open usb" in message:
+        missing = "no Crazyflie is plugged in by USB and switched on, or "
+    elif "Cannot find" in message:
+        missing = "no Crazyradio is plugged in, or "
+    elif "Crazyradio" not in message and "Access denied" not in message:
+        return line
+    return f"{missing}there is no permission to use it ({line}).\n{UDEV_HELP}"
 
 
 def _run_bounded(calls: Iterable[Callable[[], None]]) -> None:
@@ -370,29 +360,6 @@ def _forget_dead_dongle(uri: str) -> None:
             RadioManager.remove(number)
 
 
-def _keep_radio_patient() -> None:
-    """Keep cflib, where it can, from giving a radio up after the first lost packets."""
-    with contextlib.suppress(ImportError, AttributeError):
-        from cflib.crtp import radiodriver
-
-        radiodriver.set_retries_before_disconnect(RADIO_RETRIES)
-
-
-def _hush_cflib() -> None:
-    """Silence cflib's log: it has tracebacks of what is reported by callback as well. What some of
-    its modules print on stdout, which is for the result, is logged instead."""
-    logger = logging.getLogger("cflib")
-    logger.addHandler(logging.NullHandler())
-    logger.propagate = bool(os.environ.get("PERCHCTL_DEBUG"))
-
-    def log(*words: object, **_how: object) -> None:
-        logger.info(" ".join(map(str, words)))
-
-    for name, module in list(sys.modules.items()):
-        if name.startswith(("cflib.crtp", "cflib.cpx")):
-            vars(module).setdefault("print", log)
-
-
 # --- One program at a time for each vehicle: a lock that this user's programs on this computer
 # share. A second connection would do harm without a word: cflib's connect resets the log blocks of
 # a vehicle that flies for another program, and two streams of setpoints would pull it two ways. The
@@ -402,54 +369,21 @@ def _hush_cflib() -> None:
 def claim_vehicle(uri: str) -> contextlib.ExitStack:
     """Lock the vehicle at `uri` for this process until the result is closed.
 
-    Nothing is locked where no lock can be kept (no folder to write to), which is no reason not to
-    fly. Raises ConnectionFailed, which names the program that has it.
+    Nothing is locked where no lock can be kept (no folder to write to, Windows), which is no reason
+    not to fly. Raises ConnectionFailed if another program has it.
     """
     path = user_runtime_folder() / (re.sub(r"[^A-Za-z0-9.]+", "_", vehicle_uri(uri)) + ".lock")
-    claim = contextlib.ExitStack()
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        fd = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-    except OSError:
-        return claim
-    claim.callback(os.close, fd)
-    if not _lock(fd):
-        with claim:
-            raise ConnectionFailed(
-                f"the vehicle at {uri} is in use by another program ({_holder(fd)}): two would "
-                f"steer it two ways; end that one, or name another vehicle"
-            )
-    with contextlib.suppress(OSError):  # a full disk: the lock holds all the same
-        os.ftruncate(fd, 0)
-        os.write(fd, _myself().encode())
-    return claim
+    with contextlib.ExitStack() as claim:
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
 
-
-def _myself() -> str:
-    name, *words = sys.argv or [""]
-    name = Path(name).name
-    words = ["perchctl" if name in ("", "__main__.py") else name, *map(without_password, words)]
-    return f"process {os.getpid()}: {' '.join(words)}"[:200]
-
-
-def _holder(fd: int) -> str:
-    text = ""
-    with contextlib.suppress(OSError):
-        text = os.read(fd, 400).decode(errors="replace").replace("\n", " ").strip()
-    return text or "it gives no name"
-
-
-def _lock(fd: int) -> bool:
-    """Take the lock; True if this process has it now, or where no such lock can be kept. Windows
-    has none of these; nor, for most vehicles, two programs at one radio."""
-    if sys.platform == "win32":
-        return True
-    import fcntl
-
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        return True
-    return True
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            file = claim.enter_context(path.open("a"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ConnectionFailed(
+                    f"the vehicle at {uri} is in use by another program: two would steer it two "
+                    f"ways; end that one, or name another vehicle"
+                ) from None
+        return claim.pop_all()

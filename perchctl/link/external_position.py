@@ -11,15 +11,24 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
+import numpy as np
+
+from perchctl.errors import ConnectionFailed, TimedOut
 from perchctl.geometry import wrap_rad, yaw_of
-from perchctl.link.firmware import order_parameter, set_parameters
-from perchctl.positioning import Placed, PositionFeed, StandingFeed
+from perchctl.link.firmware import set_parameters
+from perchctl.positioning import FeedStatus, Placed, PositionFeed
 from perchctl.profile import PositioningConfig
-from perchctl.vehicle import Telemetry, knows_its_position, may_fly
+from perchctl.vehicle import (
+    ExternalPosition,
+    SendPosition,
+    Telemetry,
+    knows_its_position,
+    may_fly,
+)
 
 ESTIMATOR = "stabilizer.estimator"
 KALMAN = 2
@@ -32,15 +41,13 @@ AGREE_M, AGREE_RAD = 0.05, math.radians(5.0)
 """Ten times what a capture is trusted for, and what half a metre of climb can bear."""
 STILL_M = 0.05
 """From the reset until they agree: a vehicle that moves farther is being carried."""
-_POLL_S = 0.02
+POLL_S = 0.02
 NEEDED_BY = "positioning from outside"
-
-Feed = PositionFeed | StandingFeed
-"""What sends the positions, and says which."""
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
-    """Return what the firmware has to be set to for positions from outside; none with decks."""
+    """Return what the firmware has to be set to for positions from outside, after the user's own
+    parameters; none with decks."""
     if config.by == "deck":
         return {}
     return {
@@ -57,101 +64,109 @@ def start_parameters(start: Placed) -> dict[str, float]:
     return {f"kalman.initial{name}": value for name, value in values.items()}
 
 
-def check_estimator_parameters(own: Mapping[str, float], config: PositioningConfig) -> None:
-    """Raises InvalidValue if the user's own `link.parameters` contradict `positioning`."""
-    for name, wanted in estimator_parameters(config).items():
-        if name in own and not math.isclose(own[name], wanted, rel_tol=1e-6):
-            raise InvalidValue(
-                f"link.parameters sets {name} to {own[name]:g}, but with positioning: {config.by} "
-                f"it is {wanted:g}: take it out of link.parameters"
-            )
+@dataclass
+class Settling:
+    """The start of one vehicle's estimator on the ground, where `feed` places it.
 
-
-def settle_estimate(
-    cf: Any,
-    uri: str,
-    config: PositioningConfig,
-    feed: Feed,
-    newest: Callable[[], Telemetry | None],
-    clock: Callable[[], float],
-    wait: Callable[[float], None] = time.sleep,
-) -> None:
-    """Reset the vehicle's estimator to where `feed` places it, until both agree. Bounded.
-
-    `newest` gives the vehicle's newest telemetry. Raises ConnectionFailed for a vehicle that may
-    fly, NotFound, InvalidValue, TimedOut.
+    `newest` gives the vehicle's newest telemetry, `wait` lets seconds pass.
     """
-    _await_positions(config, feed, clock, wait)
-    found = ""
-    for _ in range(RESETS):
-        if may_fly(newest(), clock()):
-            raise ConnectionFailed(
-                f"the vehicle at {uri} may be flying: its estimate is set on the ground only"
-            )
-        start = feed.place()
-        assert start is not None  # `_await_positions` has seen one
-        set_parameters(cf, uri, start_parameters(start), needed_by=NEEDED_BY)
-        # Whether it was heard shows in the estimate: the firmware may clear it by itself.
-        order_parameter(cf, uri, RESET_PARAMETER, 1, needed_by=NEEDED_BY)
-        wait(RESET_PULSE_S)
-        order_parameter(cf, uri, RESET_PARAMETER, 0, needed_by=NEEDED_BY)
-        found = _disagreement(feed, start, newest, clock, wait)
-        if not found:
-            return
-    if config.by == "target":
+
+    cf: Any
+    uri: str
+    config: PositioningConfig
+    feed: PositionFeed | Standing
+    newest: Callable[[], Telemetry | None]
+    clock: Callable[[], float]
+    wait: Callable[[float], None] = time.sleep
+
+    def __post_init__(self) -> None:
+        if isinstance(self.feed, Standing):
+            self.wait = self.feed.wait
+
+    def run(self) -> None:
+        """Reset the estimator until it agrees with the feed. Bounded.
+
+        Raises ConnectionFailed for a vehicle that may fly, NotFound, InvalidValue, TimedOut.
+        """
+        end_s = self.clock() + self.config.connect_timeout_s
+        while (status := self.feed.status(self.clock())).problem is not None or not status.sent:
+            if self.clock() >= end_s:
+                raise TimedOut(
+                    f"no position from outside within {self.config.connect_timeout_s:g} s: "
+                    f"{status.problem or 'none was sent'}"
+                )
+            self.wait(POLL_S)
+        found = ""
+        for _ in range(RESETS):
+            if may_fly(self.newest(), self.clock()):
+                raise ConnectionFailed(
+                    f"the vehicle at {self.uri} may be flying: its estimate is set on the ground "
+                    f"only"
+                )
+            start = self.feed.place()
+            assert start is not None  # one was sent
+            self._reset(start)
+            found = self._disagreement(start)
+            if not found:
+                return
+        by_target = self.config.by == "target"
+        where = "the origin, where it stands" if by_target else f"where {self.config.label} sees it"
         raise TimedOut(
-            f"the estimate of {uri} does not come to the origin, where the vehicle is "
-            f"told that it stands: {found}; do positions arrive?"
+            f"the estimate of {self.uri} does not come to {where}: {found}; do positions arrive, "
+            f"and of this vehicle?"
         )
-    raise TimedOut(
-        f"the estimate of {uri} does not come to where {config.label} sees the "
-        f"vehicle: {found}; do positions arrive, and is this its rigid body?"
-    )
+
+    def _reset(self, start: Placed) -> None:
+        set_parameters(self.cf, self.uri, start_parameters(start), NEEDED_BY)
+        # Whether it was heard shows in the estimate: the firmware may clear it by itself.
+        for value in (1, 0):
+            order = {RESET_PARAMETER: value}
+            set_parameters(self.cf, self.uri, order, NEEDED_BY, read_back=False)
+            self.wait(RESET_PULSE_S * value)
+
+    def _disagreement(self, start: Placed) -> str:
+        """Return an empty string once feed and estimate have agreed over fresh samples of both for
+        `AGREE_FOR_S`; otherwise what has been in the way."""
+        found = "no fresh telemetry has come"
+        end_s = self.clock() + AGREE_WITHIN_S
+        since_s: float | None = None
+        while (now_s := self.clock()) < end_s:
+            status, placed, sample = self.feed.status(now_s), self.feed.place(), self.newest()
+            if status.problem is not None or placed is None:
+                found, since_s = str(status.problem), None
+            elif sample is None or not knows_its_position(sample, now_s):
+                since_s = None
+            else:
+                found = _difference(placed, sample)
+                if math.dist(placed.position_m, start.position_m) > STILL_M:
+                    found = "it is being moved"
+                since_s = None if found else (now_s if since_s is None else since_s)
+            if since_s is not None and now_s - since_s >= AGREE_FOR_S:
+                return ""
+            self.wait(POLL_S)
+        return found or "it has not stayed there"
 
 
-def _await_positions(
-    config: PositioningConfig,
-    feed: Feed,
-    clock: Callable[[], float],
-    wait: Callable[[float], None],
-) -> None:
-    end_s = clock() + config.connect_timeout_s
-    while (status := feed.status(clock())).problem is not None or not status.sent:
-        if clock() >= end_s:
-            raise TimedOut(
-                f"no position from outside within {config.connect_timeout_s:g} s: "
-                f"{status.problem or 'none was sent'}"
-            )
-        wait(_POLL_S)
+class Standing:
+    """Feed of a vehicle that stands at the world's origin, level, with its front along x: so the
+    world is defined. `wait` sends that place all the time."""
 
+    def __init__(self, send: SendPosition, ground_z_m: float, clock: Callable[[], float]) -> None:
+        self._send, self._place = send, ExternalPosition((0.0, 0.0, ground_z_m))
+        self._clock, self._count = clock, 0
 
-def _disagreement(
-    feed: Feed,
-    start: Placed,
-    newest: Callable[[], Telemetry | None],
-    clock: Callable[[], float],
-    wait: Callable[[float], None],
-) -> str:
-    """Return an empty string once capture and estimate have agreed over fresh samples of both for
-    `AGREE_FOR_S`; otherwise what has been in the way."""
-    found = "no fresh telemetry has come"
-    end_s = clock() + AGREE_WITHIN_S
-    since_s: float | None = None
-    while (now_s := clock()) < end_s:
-        status, placed, sample = feed.status(now_s), feed.place(), newest()
-        if status.problem is not None or placed is None:
-            found, since_s = str(status.problem), None
-        elif sample is None or not knows_its_position(sample, now_s):
-            since_s = None
-        else:
-            found = _difference(placed, sample)
-            if math.dist(placed.position_m, start.position_m) > STILL_M:
-                found = "it is being moved"
-            since_s = None if found else (now_s if since_s is None else since_s)
-        if since_s is not None and now_s - since_s >= AGREE_FOR_S:
-            return ""
-        wait(_POLL_S)
-    return found or "it has not stayed there"
+    def wait(self, duration_s: float) -> None:
+        """Let the time pass."""
+        end_s = self._clock() + duration_s
+        while self._clock() < end_s:
+            self._count += self._send(self._place) is not False
+            time.sleep(POLL_S)
+
+    def status(self, now_s: float) -> FeedStatus:
+        return FeedStatus(0.0, None, self._count, self._place)
+
+    def place(self) -> Placed:
+        return Placed(self._clock(), np.array(self._place.position_m), np.eye(3))
 
 
 def _difference(placed: Placed, newest: Telemetry) -> str:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import threading
+import queue
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, TimedOut
@@ -44,20 +44,32 @@ def missing_variables(cf: Any) -> list[str]:
 
 
 def set_parameters(
-    cf: Any, uri: str, parameters: Mapping[str, float], needed_by: str | None = None
+    cf: Any,
+    uri: str,
+    parameters: Mapping[str, float],
+    needed_by: str | None = None,
+    *,
+    read_back: bool = True,
 ) -> None:
-    """Set each parameter, read it back from the vehicle, and compare.
+    """Set each parameter, read it back from the vehicle where `read_back` is set, and compare.
 
     `needed_by`: what they are for, where they are not the user's own. Raises NotFound for an
     unknown name, InvalidValue for a value that the vehicle does not keep, TimedOut without an
     answer.
     """
     for name, wanted in parameters.items():
-        order_parameter(cf, uri, name, wanted, needed_by)
+        if cf.param.toc.get_element_by_complete_name(name) is None:
+            remedy = ": correct link.parameters in the profile"
+            if needed_by is not None:
+                remedy = f", which {needed_by} needs: update the firmware to 2026.08 or later"
+            raise NotFound(f"the firmware at {uri} has no parameter {name}{remedy}")
+        kept: str | None = str(wanted)
         try:
-            kept = _read_back(cf.param, name)
+            cf.param.set_value(name, kept)
+            if read_back:
+                kept = _read_back(cf.param, name)
         except (AttributeError, ValueError, KeyError) as error:
-            raise _unsettable(name, wanted, error) from None
+            raise InvalidValue(f"parameter {name} cannot be set to {wanted}: {error}") from None
         if kept is None:
             raise TimedOut(f"parameter {name} was set to {wanted}, but no answer came")
         if not math.isclose(float(kept), float(wanted), rel_tol=1e-5, abs_tol=1e-9):
@@ -69,39 +81,22 @@ def set_parameters(
 def _read_back(parameters: Any, name: str) -> str | None:
     """Ask the vehicle for a parameter's value; None without an answer."""
     group, _, short = name.partition(".")
-    answered = threading.Event()
-    answers: list[str] = []
+    answers: queue.SimpleQueue[str] = queue.SimpleQueue()
 
     def on_value(_name: str, value: str) -> None:
-        answers.append(value)
-        answered.set()
+        answers.put(value)
 
     parameters.add_update_callback(group=group, name=short, cb=on_value)
     try:
         parameters.request_param_update(name)
-        return answers[-1] if answered.wait(PARAMETER_TIMEOUT_S) else None
+        return answers.get(timeout=PARAMETER_TIMEOUT_S)
+    except queue.Empty:
+        return None
     finally:
         parameters.remove_update_callback(group, short, on_value)
 
 
-def order_parameter(cf: Any, uri: str, name: str, value: float, needed_by: str | None) -> None:
-    """Set a parameter without reading it back. Raises NotFound, InvalidValue."""
-    if cf.param.toc.get_element_by_complete_name(name) is None:
-        remedy = ": correct link.parameters in the profile"
-        if needed_by is not None:
-            remedy = f", which {needed_by} needs: update the firmware to release 2026.08 or later"
-        raise NotFound(f"the firmware at {uri} has no parameter {name}{remedy}")
-    try:
-        cf.param.set_value(name, str(value))
-    except (AttributeError, ValueError, KeyError) as error:
-        raise _unsettable(name, value, error) from None
-
-
-def _unsettable(name: str, value: float, error: Exception) -> InvalidValue:
-    return InvalidValue(f"parameter {name} cannot be set to {value}: {error}")
-
-
-# --- What tells the vehicle where it is, and the values of single variables --------------------
+# --- What tells the vehicle where it is, and the value of a single variable ---------------------
 
 
 ANSWER_S = 1.5
@@ -109,7 +104,6 @@ LISTEN_S = 1.0
 """Positions from outside that come less than once a second are none to fly by."""
 EXTERNAL_POSITION_TICK = "locSrvZ.tick"
 """When the newest position from outside came, ms (source): steps with each of them."""
-_VARIABLES_A_BLOCK = 26 // 4  # whatever their types
 
 
 def read_parameters(cf: Any) -> dict[str, float]:
@@ -132,35 +126,29 @@ def measured_by(cf: Any) -> MeasuredBy:
     by = MeasuredBy(decks_found(read_parameters(cf)))
     if by.position_decks:
         return by
-    before = read_variables(cf, [EXTERNAL_POSITION_TICK]).get(EXTERNAL_POSITION_TICK)
+    before = read_variable(cf, EXTERNAL_POSITION_TICK)
     time.sleep(LISTEN_S)
-    after = read_variables(cf, [EXTERNAL_POSITION_TICK]).get(EXTERNAL_POSITION_TICK)
+    after = read_variable(cf, EXTERNAL_POSITION_TICK)
     external = None if before is None or after is None else after != before
     return replace(by, external=external)
 
 
-def read_variables(cf: Any, names: Iterable[str]) -> dict[str, float]:
-    """Return the newest values of log variables, without those that are missing or do not come."""
-    known = [name for name in names if is_logged(cf, name)]
-    values: dict[str, float] = {}
-    for at in range(0, len(known), _VARIABLES_A_BLOCK):
-        values |= _read_block(cf, known[at : at + _VARIABLES_A_BLOCK])
-    return values
-
-
-def _read_block(cf: Any, names: list[str]) -> dict[str, float]:
-    arrived = threading.Event()
-    values: dict[str, float] = {}
+def read_variable(cf: Any, name: str) -> float | None:
+    """Return a log variable's value; None for one that is missing or does not come."""
+    if not is_logged(cf, name):
+        return None
+    arrived: queue.SimpleQueue[float] = queue.SimpleQueue()
 
     def on_data(_stamp: int, data: Mapping[str, float], _block: Any) -> None:
-        values.update(data)
-        arrived.set()
+        arrived.put(data[name])
 
     try:
-        block = start_block(cf.log, "it", "probe", dict.fromkeys(names), 0.05, on_data)
+        block = start_block(cf.log, "it", "probe", {name: None}, 0.05, on_data)
+        value: float | None = arrived.get(timeout=ANSWER_S)
     except (NotFound, KeyError, AttributeError):  # cflib's ways to say that the link is gone
-        return {}
-    arrived.wait(ANSWER_S)
+        return None
+    except queue.Empty:
+        value = None
     block.stop()
     block.delete()
-    return values
+    return value

@@ -12,8 +12,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -29,10 +28,10 @@ from perchctl.link.firmware import (
     is_logged,
     missing_variables,
     read_parameters,
-    read_variables,
+    read_variable,
 )
 from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S, Timebase, start_block
-from perchctl.link.uri import FORMS, USUAL_ADDRESS, with_whole_address
+from perchctl.link.uri import FORMS, USUAL_ADDRESS
 from perchctl.profile import LinkConfig
 from perchctl.vehicle import FLYING
 
@@ -50,25 +49,22 @@ class ListeningLink(CflibLink):
 
     def _prepare(self, connection: Connection) -> None:
         check_firmware(connection.cf, self._uri)
-        self._start_logging(connection)
+        self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
 
 
 # --- How a vehicle is moved by hand: attitude and turn rates of one moment, in one packet --------
 
 
 PERIOD_S = 0.01
-TURN_BLOCK = dict.fromkeys(
+MOTION_BLOCK = dict.fromkeys(
     (
         "stateEstimate.roll", "stateEstimate.pitch", "stateEstimate.yaw",
         "gyro.x", "gyro.y", "gyro.z",
     ),
     "float",
-)  # fmt: skip
-"""24 of the 26 bytes that a log block holds."""
-MOTORS_BLOCK = {"supervisor.info": "uint16_t"}
+) | {"supervisor.info": "uint16_t"}  # fmt: skip
+"""All 26 bytes that a log block holds."""
 MOST_SAMPLES = 20_000
-ATTITUDE, MOTORS = "how it is turned", "whether its motors turn"
-"""What `TURN_BLOCK` and `MOTORS_BLOCK` tell, and nothing else does."""
 
 
 class MotionLink(ListeningLink):
@@ -78,8 +74,8 @@ class MotionLink(ListeningLink):
         super().__init__(uri, config, clock)
         self._timebase = Timebase()
         self._samples: deque[AttitudeSample] = deque(maxlen=MOST_SAMPLES)
-        self._heard_s: dict[str, float] = {}  # when each block last came
-        self._heard_both = threading.Event()
+        self._heard = threading.Event()
+        self._heard_s = 0.0
         self._motors_run = False
 
     @property
@@ -92,58 +88,42 @@ class MotionLink(ListeningLink):
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
     def problem(self, now_s: float) -> str | None:
-        """Name what came, but comes no more: each block by itself, since motors of which nothing
-        is heard may turn."""
         if self.connection is not None and self.connection.lost is not None:
             return self.connection.lost
-        for what, heard_s in self._heard_s.copy().items():
-            if now_s - heard_s > SILENCE_S:
-                return f"nothing heard for {now_s - heard_s:.1f} s of {what}"
-        return None
+        silent_s = now_s - self._heard_s
+        return f"nothing heard for {silent_s:.1f} s" if silent_s > SILENCE_S else None
 
     def _prepare(self, connection: Connection) -> None:
         check_firmware(connection.cf, self._uri)
-        for name in TURN_BLOCK:
+        for name in MOTION_BLOCK:
             if not is_logged(connection.cf, name):
                 raise NotFound(
                     f"the firmware at {self._uri} has no log variable {name}, by which the "
                     f"mounting is measured: update the firmware"
                 )
         log = connection.cf.log
-        start_block(log, self._uri, "motors", MOTORS_BLOCK, PERIOD_S, self._on_motors)
-        start_block(log, self._uri, "turn", TURN_BLOCK, PERIOD_S, self._on_turn)
-        self._heard_both.wait(FIRST_SAMPLE_TIMEOUT_S)
-        missing = [what for what in (ATTITUDE, MOTORS) if what not in self._heard_s]
-        if missing:
-            raise TimedOut(f"{self._uri} is connected but does not send {' and '.join(missing)}")
+        start_block(log, self._uri, "motion", MOTION_BLOCK, PERIOD_S, self._on_motion)
+        if not self._heard.wait(FIRST_SAMPLE_TIMEOUT_S):
+            raise TimedOut(f"{self._uri} is connected but sends no telemetry")
 
-    def _on_turn(self, stamp: int, values: Mapping[str, float], _block: Any = None) -> None:
-        """Take a packet of `TURN_BLOCK`, in cflib's thread: degrees, and the Crazyflie's nose-up
-        pitch (docs/firmware.md, "Signs and units"); its gyroscope is right-handed. A packet with a
+    def _on_motion(self, stamp: int, values: Mapping[str, float], _block: Any = None) -> None:
+        """Take a packet of `MOTION_BLOCK`, in cflib's thread: degrees, and the Crazyflie's nose-up
+        pitch (docs/firmware.md, "Signs and units"); its gyroscope is right-handed. A sample with a
         value that is no number is dropped: it would spoil what is solved from the others."""
-        t_s = self._timebase.to_loop_s(stamp, self._clock())
-        if not all(map(math.isfinite, values.values())):
-            return
-        self._samples.append(
-            AttitudeSample(
-                t_s=t_s,
-                roll_rad=math.radians(values["stateEstimate.roll"]),
-                pitch_rad=-math.radians(values["stateEstimate.pitch"]),
-                yaw_rad=math.radians(values["stateEstimate.yaw"]),
-                gyro_radps=np.radians([values[f"gyro.{axis}"] for axis in "xyz"]),
-            )
-        )
-        self._heard(ATTITUDE)
-
-    def _on_motors(self, stamp: int, values: Mapping[str, float], _block: Any = None) -> None:
-        """Take a packet of `MOTORS_BLOCK`, in cflib's thread."""
+        self._heard_s = self._clock()
+        t_s = self._timebase.to_loop_s(stamp, self._heard_s)
         self._motors_run = bool(int(values["supervisor.info"]) & FLYING)
-        self._heard(MOTORS)
-
-    def _heard(self, what: str) -> None:
-        self._heard_s[what] = self._clock()
-        if len(self._heard_s) == 2:
-            self._heard_both.set()
+        self._heard.set()
+        if all(map(math.isfinite, values.values())):
+            self._samples.append(
+                AttitudeSample(
+                    t_s=t_s,
+                    roll_rad=math.radians(values["stateEstimate.roll"]),
+                    pitch_rad=-math.radians(values["stateEstimate.pitch"]),
+                    yaw_rad=math.radians(values["stateEstimate.yaw"]),
+                    gyro_radps=np.radians([values[f"gyro.{axis}"] for axis in "xyz"]),
+                )
+            )
 
 
 # --- What a vehicle holds, and how good the radio is ---------------------------------------------
@@ -153,25 +133,6 @@ ANSWER_S = 0.5
 ECHO_PERIOD_S = 0.02
 _ECHO = struct.Struct("<BQ")  # as long as cflib's own, which it takes all of them for
 _ECHO_MARK = 1  # cflib's own pings begin with 0
-
-
-@dataclass(frozen=True)
-class Echoes:
-    """Packets that were sent to come back, and the times after which those that did came."""
-
-    sent: int = 0
-    round_trip_s: tuple[float, ...] = ()
-
-    @property
-    def lost(self) -> float:
-        """Share of the packets that did not come back, 0 to 1; 1 if none was sent."""
-        return 1.0 - len(self.round_trip_s) / self.sent if self.sent else 1.0
-
-    @property
-    def p95_s(self) -> float | None:
-        """Time within which 95 of 100 came back; None if none did."""
-        ordered = sorted(self.round_trip_s)
-        return ordered[int(0.95 * (len(ordered) - 1))] if ordered else None
 
 
 class ProbeLink(ListeningLink):
@@ -193,7 +154,7 @@ class ProbeLink(ListeningLink):
         connection.cf.link_statistics.link_quality_updated.add_callback(self._on_quality)
         if not self.missing:
             with contextlib.suppress(NotFound, TimedOut):  # then `telemetry` stays empty
-                self._start_logging(connection)
+                self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
 
     @property
     def _cf(self) -> Any:
@@ -221,12 +182,13 @@ class ProbeLink(ListeningLink):
         """True if the firmware logs this variable."""
         return is_logged(self._cf, name)
 
-    def variables(self, names: Iterable[str]) -> dict[str, float]:
-        """Return the newest values of log variables, without those that do not come."""
-        return read_variables(self._cf, names)
+    def variable(self, name: str) -> float | None:
+        """Return a log variable's value; None for one that is missing or does not come."""
+        return read_variable(self._cf, name)
 
-    def echoes(self, duration_s: float) -> Echoes:
-        """Send packets to come back for so long, and wait `ANSWER_S` for the last."""
+    def echoes(self, duration_s: float) -> list[float]:
+        """Send packets to come back for so long, and wait `ANSWER_S` for the last. Returns the time
+        after which each came back, s; infinite for one that did not."""
         sent_s: list[float] = []
         back_s: dict[int, float] = {}
         all_back = threading.Event()
@@ -249,8 +211,7 @@ class ProbeLink(ListeningLink):
             all_back.wait(ANSWER_S)
         finally:
             self._cf.remove_header_callback(on_packet, Port.LINK, 0)
-        trips = tuple(t_s - sent_s[n] for n, t_s in list(back_s.items()) if n < len(sent_s))
-        return Echoes(count, trips)
+        return [back_s.get(number, math.inf) - at_s for number, at_s in enumerate(sent_s)]
 
     def _on_quality(self, percent: float) -> None:
         self.quality = float(percent)
@@ -262,17 +223,10 @@ class ProbeLink(ListeningLink):
 SCAN_TIMEOUT_S = 20.0
 
 
-@dataclass(frozen=True)
-class ScanResult:
-    """The URIs that answered; `radio` is why no radio was asked, empty where one was."""
-
-    uris: tuple[str, ...]
-    radio: str = ""
-
-
-def find_vehicles(uri: str = "") -> ScanResult:
+def find_vehicles(uri: str = "") -> tuple[list[str], str]:
     """Ask which vehicles answer now, at a radio's usual address and at that of `uri`; sends null
-    packets only.
+    packets only. Returns their URIs, and why no radio was asked: empty where one was, else the
+    cause and, in lines of its own, what to do.
 
     A radio's driver may hang: it gets a thread, and what came by then counts.
     """
@@ -298,7 +252,7 @@ def find_vehicles(uri: str = "") -> ScanResult:
     worker.start()
     worker.join(SCAN_TIMEOUT_S)
     uris = (uri for uri in dict.fromkeys(found) if uri.partition("://")[0] in FORMS)
-    return ScanResult(tuple(map(with_whole_address, uris)), why[0])
+    return list(uris), why[0]
 
 
 def _radio_problem() -> str:
@@ -307,6 +261,5 @@ def _radio_problem() -> str:
     try:
         Crazyradio().close()
     except Exception as error:
-        cause = plain_cause(str(error) or "Cannot find a Crazyradio Dongle")
-        return cause.partition("\n")[0].rstrip(".")
+        return plain_cause(str(error) or "Cannot find a Crazyradio Dongle")
     return ""

@@ -6,7 +6,7 @@ import heapq
 import itertools
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from typing import Any
 
 from perchctl.link.crtp import (
     UNLOCK_PERIOD_S,
@@ -42,17 +42,11 @@ SETTLE_S = 1.0
 WATCH_PERIOD_S = 0.05
 
 
-class Bursts(Protocol):
-    """The times at which a radio loses what is sent."""
-
-    def lost(self, t_s: float) -> bool:
-        """True if a packet of that time is lost. The times never go back."""
-
-
 class Radio:
-    """Carries the packets of both directions; loses those of `bursts`, or none."""
+    """Carries the packets of both directions; loses those of a simulated radio's `bursts`, or
+    none."""
 
-    def __init__(self, bursts: Bursts | None = None) -> None:
+    def __init__(self, bursts: Any = None) -> None:
         self._bursts = bursts
 
     def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
@@ -65,30 +59,12 @@ class Radio:
         return None if lost else TELEMETRY_DELAY_S
 
 
-class MockVehicle(Protocol):
-    """A vehicle on simulated time: packets in, log variables out (`perchctl.sim`)."""
-
-    firmware: Any
-    """Its model: log variables and parameters by name."""
-    capture: Any
-    """Its motion capture, None without one."""
-
-    @property
-    def t_s(self) -> float:
-        """Simulated time since the start."""
-
-    def advance_to(self, t_s: float) -> None:
-        """Let the time pass until then."""
-
-    def receive(self, packet: Packet) -> None:
-        """Take a packet as it comes from the radio."""
-
-
 class MockLink:
     """The simulated vehicle in lockstep; `advance_to` is the flight's clock.
 
-    Commands reach it as bytes, through the decoder of the simulated link's server, and its
-    telemetry comes in the same log blocks, through the same assembler, as by radio.
+    `vehicle` is a `perchctl.sim.SimulatedVehicle`, of which nothing is imported here. Commands
+    reach it as bytes, through the decoder of the simulated link's server, and its telemetry comes
+    in the same log blocks, through the same assembler, as by radio.
     """
 
     FAST_BLOCKS = FAST_BLOCKS
@@ -98,7 +74,7 @@ class MockLink:
 
     def __init__(
         self,
-        vehicle: MockVehicle,
+        vehicle: Any,
         telemetry_period_s: float = 0.01,
         radio: Radio | None = None,
     ) -> None:
@@ -123,7 +99,7 @@ class MockLink:
     @property
     def now_s(self) -> float:
         """The vehicle's simulated time."""
-        return self.vehicle.t_s
+        return float(self.vehicle.t_s)
 
     def advance_to(self, t_s: float) -> None:
         """Step the vehicle until `t_s`, sending its telemetry on the way."""

@@ -2,8 +2,8 @@
 
 Two threads. The first hands the commands over, in pieces (a landing is four packets), and may
 hang in the library with one. The second never touches the library: it asks the `guard` what has
-to be sent while the loop hangs, and gives the work to a new first thread where the old one hangs
-or has ended.
+to be sent while the loop hangs, and gives the work to a new first thread where the old one hangs.
+No error ends a thread.
 
 Setpoints coalesce (only the newest counts), and one that has waited too long is dropped. Orders
 keep their place until the library has taken them, however long that takes; an emergency stop
@@ -94,7 +94,8 @@ class Sender:
         self.problem: str | None = None
         with self._ready:
             self._start_worker()
-            self._start_keeper()
+        self._keeper = threading.Thread(target=self._keep, name="perchctl-guard", daemon=True)
+        self._keeper.start()
 
     def put(self, command: Command, by: SentBy | None = None) -> None:
         """Queue a command. `by`: who sends it in the loop's place."""
@@ -107,7 +108,6 @@ class Sender:
             if self._waiting_since_s is None:
                 self._waiting_since_s = self._clock()
             self._ready.notify_all()
-        self.look_after()
 
     def repeat_order(self, since_s: float) -> None:
         """Put the last command once more if it was an order, handed over since then: it may
@@ -125,16 +125,6 @@ class Sender:
         waits."""
         since_s = self._waiting_since_s
         return 0.0 if since_s is None else self._clock() - since_s
-
-    def look_after(self) -> None:
-        """Start the second thread again where it has ended; it does the same for the first. For
-        the loop's thread."""
-        if self._keeper.is_alive():
-            return
-        with self._ready:
-            if self._running and not self._keeper.is_alive():
-                self.problem = "the thread of the watchdog had ended, and was started again"
-                self._start_keeper()
 
     def drain(self, timeout_s: float) -> bool:
         """Wait until everything is handed over; False when that takes too long."""
@@ -178,7 +168,7 @@ class Sender:
                 elif not self._spare():
                     pause_s = GUARD_PERIOD_S
                 self._raised = False
-            except Exception as error:  # the library's, whatever it is: reported by `problem`
+            except BaseException as error:  # the library's, whatever it is: this thread goes on
                 self.problem = f"a command could not be sent: {error}"
                 self._raised, pause_s = True, GUARD_PERIOD_S
             with self._ready:
@@ -251,10 +241,6 @@ class Sender:
 
     # --- the second thread -----------------------------------------------------------------
 
-    def _start_keeper(self) -> None:
-        self._keeper = threading.Thread(target=self._keep, name="perchctl-guard", daemon=True)
-        self._keeper.start()
-
     def _keep(self) -> None:
         while True:
             with self._ready:
@@ -264,7 +250,7 @@ class Sender:
             for part in (self._look_after_worker, self._ask_guard):
                 try:
                     part()
-                except Exception as error:  # the other part goes on
+                except BaseException as error:  # this thread goes on, whatever it is
                     self.problem = f"the link is not looked after: {error}"
 
     def _look_after_worker(self) -> None:
@@ -277,10 +263,7 @@ class Sender:
             self._tend(stuck_s, hangs or (self._raised and stuck_s > HANGS_S))
         finally:
             with self._ready:
-                if self._running and not self._worker.is_alive():
-                    self.problem = "the thread that sends had ended, and was started again"
-                    self._start_worker()
-                elif self._running and hangs and self._called_s == called_s:
+                if self._running and hangs and self._called_s == called_s:
                     self._start_worker()
 
     def _ask_guard(self) -> None:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from perchctl.camera import HealthState, HealthVerdict, assess_frame
+from perchctl.camera import FrameHealth
 from perchctl.perception.history import History, attitude_at, attitude_of
 from perchctl.perception.online_calibration import (
     OnlineCalibration,
@@ -62,6 +62,7 @@ class Perception:
         calibration, motion: what pictures and telemetry tell of latency and mounting, and of the
             vehicle's motion sideways.
         refused: why the last target was another vehicle's; None: none was.
+        health: whether a frame can be a measurement at all.
     """
 
     pipeline: Pipeline
@@ -72,17 +73,11 @@ class Perception:
     calibration: OnlineCalibration = field(default_factory=OnlineCalibration)
     motion: VisualInertialWindow = field(default_factory=VisualInertialWindow)
     refused: str | None = None
-    _health: HealthState = field(default_factory=HealthState)
+    health: FrameHealth = field(default_factory=FrameHealth)
     _fields: FieldState = field(default_factory=FieldState)
     _mirrored: int = 0
     _shown: dict[str, int] = field(default_factory=dict)
     _remarks: list[str] = field(default_factory=list)
-
-    def assess(self, frame: Frame, live: bool) -> HealthVerdict:
-        """Judge whether a frame can be a measurement at all; called once for each frame, in order.
-        Of a `live` source, a frame that repeats the one before is an old one."""
-        self._health, verdict = assess_frame(self._health, frame, live)
-        return verdict
 
     def look(self, frame: Frame, later_s: float = 0.0) -> Iterator[tuple[Frame, PipelineOutput]]:
         """Yield each picture of the frame with what the pipeline finds in it: one picture, or the

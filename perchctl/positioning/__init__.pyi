@@ -1,15 +1,10 @@
-from .capture import check_reachable as check_reachable
 from .capture import open_capture as open_capture
-from .compared import Comparison as Comparison
-from .compared import ComparisonRecord as ComparisonRecord
 from .compared import load_comparison as load_comparison
 from .compared import save_comparison as save_comparison
 from .feed import BodyPose as BodyPose
 from .feed import CaptureFrame as CaptureFrame
 from .feed import CaptureSource as CaptureSource
 from .feed import FeedStatus as FeedStatus
-from .feed import FeedThread as FeedThread
 from .feed import Placed as Placed
 from .feed import PositionFeed as PositionFeed
-from .feed import StandingFeed as StandingFeed
 from .sight import SightFeed as SightFeed

@@ -13,13 +13,11 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from typing import Any
 
 from perchctl.children import (
@@ -32,13 +30,8 @@ from perchctl.children import (
     send_address,
     spawn,
 )
-from perchctl.errors import (
-    ConnectionFailed,
-    InvalidValue,
-    broken_motion_capture,
-    no_motion_capture,
-)
-from perchctl.positioning.feed import BodyPose, CaptureFrame
+from perchctl.errors import ConnectionFailed, broken_motion_capture
+from perchctl.positioning.feed import BodyPose, CaptureFrame, PositionFeed
 from perchctl.profile import PositioningConfig
 
 SILENT_S = 0.3
@@ -51,36 +44,35 @@ motion capture that does not answer."""
 _END_TIMEOUT_S = 2.0
 _PORT_OPTION = {"qualisys": "port", "optitrack": "port_command"}
 _CHILD = "from perchctl.positioning.capture import serve_parent; serve_parent()"
-# One clock for all processes. Elsewhere the moment at which this one reads a frame is its time.
-_SHARED_CLOCK = sys.platform == "linux"
 
 
-def check_reachable(config: PositioningConfig) -> None:
-    """Raise InvalidValue or UsageError for what can be refused before anything is opened."""
-    if not config.host.strip():
-        raise InvalidValue(
-            "positioning.host, the computer of the motion capture, is not given: write it into "
-            "the profile, as in positioning: {by: mocap, system: vicon, host: 192.168.1.2, body: "
-            "crazyflie}; system is one of vicon, optitrack, qualisys, vrpn, body the vehicle's "
-            "rigid body there"
-        )
-    if find_spec("motioncapture") is None:
-        raise no_motion_capture()
+@dataclass(frozen=True)
+class CaptureSetup:
+    """What the child connects to. `partial`: a frame without a body is no frame, since the
+    library's loop turns by its own clock, whether or not anything has arrived."""
+
+    kind: str
+    options: dict[str, str] = field(default_factory=dict)
+    partial: bool = False
+    timeout_s: float = 5.0
+
+
+@dataclass(frozen=True)
+class Failed:
+    """The library has given up, with its words; with `is_loaded` False Python cannot import it."""
+
+    text: str
+    is_loaded: bool = True
 
 
 def setup_of(config: PositioningConfig) -> CaptureSetup:
     """Return what the child connects to: Vicon and VRPN take a port with the name, the others want
     it apart."""
-    host, options = config.host.strip(), {}
-    name, colon, port = host.rpartition(":")
+    options = {"hostname": config.host.strip()}
+    name, colon, port = options["hostname"].rpartition(":")
     if colon and config.system in _PORT_OPTION and port.isdecimal():
-        host, options = name, {_PORT_OPTION[config.system]: port}
-    return CaptureSetup(
-        config.system,
-        {"hostname": host, **options},
-        partial=config.system == "vrpn",
-        timeout_s=config.connect_timeout_s,
-    )
+        options = {"hostname": name, _PORT_OPTION[config.system]: port}
+    return CaptureSetup(config.system, options, config.system == "vrpn", config.connect_timeout_s)
 
 
 def open_capture(
@@ -91,58 +83,38 @@ def open_capture(
     Errors: InvalidValue, UsageError without a library that loads, ConnectionFailed
     without an answer in `config.connect_timeout_s`.
     """
-    check_reachable(config)
-    return MotionCapture.start(setup_of(config), config.label, config.body, clock)
+    PositionFeed.check_reachable(config)
+    return MotionCapture(setup_of(config), config.label, config.body, clock)
 
 
 class MotionCapture:
-    """`perchctl.positioning.feed.CaptureSource`; its process ends with it."""
+    """`perchctl.positioning.feed.CaptureSource`; its process ends with it.
+
+    `who` names the capture in sentences; a frame that shows `body` goes before one that does not.
+    Creating it waits for the first frame. Errors: ConnectionFailed, UsageError for a library that
+    does not load.
+    """
 
     def __init__(
-        self,
-        child: subprocess.Popen[bytes],
-        who: str,
-        body: str,
-        partial: bool,
-        clock: Callable[[], float],
+        self, setup: CaptureSetup, who: str, body: str, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._child, self._who, self._body = child, who, body
-        self._partial, self._clock = partial, clock
-        self._channel: Channel | None = None
+        self._setup, self._who, self._body, self._clock = setup, who, body, clock
         self._frames: deque[CaptureFrame] = deque(maxlen=KEPT)
         self._framed_s: float | None = None
-        self._settled = threading.Event()
-        self._connected, self._closed = False, False
+        self._settled = threading.Event()  # by a first frame, or an end before it
+        self._closed = False
         self._ended: str | None = None
-        self._is_loaded, self._failure = True, ""
+        self._failed: Failed | None = None
         self._last_line = ""
-        self._printing = threading.Thread(target=self._read_output, daemon=True)
-        self._printing.start()
-        self._reading = threading.Thread(
-            target=self._read_frames, name="perchctl-capture", daemon=True
-        )
-
-    @classmethod
-    def start(
-        cls, setup: CaptureSetup, who: str, body: str, clock: Callable[[], float] = time.monotonic
-    ) -> MotionCapture:
-        """Start the child and wait for the first frame. `who` names the capture in sentences; a
-        frame that shows `body` goes before one that does not.
-
-        Errors: ConnectionFailed, UsageError for a library that does not load.
-        """
-        token = new_token()
-        with listen() as listener:
-            child = spawn(_CHILD, subprocess.PIPE)
-            capture = cls(child, who, body, setup.partial, clock)
-            try:
-                send_address(child, listener, token)
-                channel = accept(listener, token, UP_TIMEOUT_S, lambda: child.poll() is None)
-                capture._begin(channel, setup)
-            except BaseException:
-                capture.close()
-                raise
-        return capture
+        self._child = spawn(_CHILD, subprocess.PIPE)
+        self._channel: Channel | None = None
+        self._threads = [threading.Thread(target=self._read_output, daemon=True)]
+        self._threads[0].start()
+        try:
+            self._begin()
+        except BaseException:
+            self.close()
+            raise
 
     def poll(self, now_s: float) -> CaptureFrame | None:
         """Return the newest frame since the last call that shows the body; without one, the
@@ -162,7 +134,7 @@ class MotionCapture:
         silent_s = 0.0 if self._framed_s is None else now_s - self._framed_s
         if silent_s <= SILENT_S:
             return None
-        what = "no body" if self._partial else "no frame"
+        what = "no body" if self._setup.partial else "no frame"
         return f"{self._who} has sent {what} for {silent_s:.1f} s"
 
     def close(self) -> None:
@@ -171,60 +143,63 @@ class MotionCapture:
         if self._child.poll() is None:
             self._child.kill()
         end(self._child, _END_TIMEOUT_S)
-        for thread in (self._printing, self._reading):
-            if thread.ident is not None:
-                thread.join(_END_TIMEOUT_S)
+        for thread in self._threads:
+            thread.join(_END_TIMEOUT_S)
         if self._channel is not None:
             self._channel.close()
         for pipe in (self._child.stdin, self._child.stdout):
-            if pipe is not None and not self._printing.is_alive():
+            if pipe is not None and not self._threads[0].is_alive():
                 pipe.close()
 
-    def _begin(self, channel: Channel | None, setup: CaptureSetup) -> None:
-        if channel is None:
-            raise ConnectionFailed(f"no {self._who}: its reader did not start{self._words()}")
-        self._channel = channel
-        channel.send(setup)
-        self._reading.start()
-        if not self._settled.wait(setup.timeout_s):
-            connected = self._connected and not setup.partial
-            raise ConnectionFailed(
-                f"no {self._who}: {'connected, but no frame' if connected else 'no answer'} within "
-                f"{setup.timeout_s:g} s (does it stream, is the address right?){self._words()}"
+    def _begin(self) -> None:
+        token = new_token()
+        with listen() as listener:
+            send_address(self._child, listener, token)
+            self._channel = accept(
+                listener, token, UP_TIMEOUT_S, lambda: self._child.poll() is None
             )
-        if self._ended is not None and not self._is_loaded:
-            raise broken_motion_capture(self._failure)
+        if self._channel is None:
+            raise ConnectionFailed(f"no {self._who}: its reader did not start{self._words()}")
+        self._channel.send(self._setup)
+        reading = threading.Thread(
+            target=self._read_frames, args=(self._channel,), name="perchctl-capture", daemon=True
+        )
+        self._threads.append(reading)
+        reading.start()
+        if not self._settled.wait(self._setup.timeout_s):
+            raise ConnectionFailed(
+                f"no {self._who}: no frame within {self._setup.timeout_s:g} s (does it stream, is "
+                f"the address right?){self._words()}"
+            )
+        if self._failed is not None and not self._failed.is_loaded:
+            raise broken_motion_capture(self._failed.text)
         if self._ended is not None:
             raise ConnectionFailed(self._ended)
 
-    def _read_frames(self) -> None:
-        assert self._channel is not None
-        while True:
-            try:
-                message = self._channel.receive()
-            except (EOFError, OSError):
-                break
-            match message:
-                case Arrived(t_s, bodies):
-                    now_s = self._clock()
-                    t_s = min(t_s, now_s) if _SHARED_CLOCK else now_s
-                    poses = {name: BodyPose(*body) for name, body in bodies.items()}
-                    self._frames.append(CaptureFrame(t_s, poses))
-                    self._framed_s = now_s
-                    self._settled.set()
-                case Connected():
-                    self._connected = True
-                case Failed(text, is_loaded):
-                    self._is_loaded, self._failure = is_loaded, text
-                    self._ended = self._gone("" if self._framed_s is None else " failed", text)
+    def _read_frames(self, channel: Channel) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                message: tuple[float, Bodies] | Failed = channel.receive()
+                if isinstance(message, Failed):
+                    self._failed = message
+                    failed = "" if self._framed_s is None else " failed"
+                    self._ended = f"{self._gone()}{failed}: {message.text}"
+                    continue
+                now_s = self._clock()
+                poses = {name: BodyPose(*body) for name, body in message[1].items()}
+                self._frames.append(CaptureFrame(min(message[0], now_s), poses))
+                self._framed_s = now_s
+                self._settled.set()
         if self._ended is None and not self._closed:
             end(self._child, _END_TIMEOUT_S)
-            self._printing.join(_END_TIMEOUT_S)
-            self._ended = self._gone("", f"its reader ended{_code(self._child)}{self._words()}")
+            self._threads[0].join(_END_TIMEOUT_S)
+            code = self._child.poll()
+            how = "" if code is None else f" with code {code}"
+            self._ended = f"{self._gone()}: its reader ended{how}{self._words()}"
         self._settled.set()
 
-    def _gone(self, how: str, why: str) -> str:
-        return f"{'no ' if self._framed_s is None else ''}{self._who}{how}: {why}"
+    def _gone(self) -> str:
+        return f"{'no ' if self._framed_s is None else ''}{self._who}"
 
     def _read_output(self) -> None:
         """Read all output, so that the child never waits; keep its last line for a message."""
@@ -238,11 +213,6 @@ class MotionCapture:
         return f": {self._last_line}" if self._last_line else ""
 
 
-def _code(child: subprocess.Popen[bytes]) -> str:
-    code = child.poll()
-    return "" if code is None else f" with code {code}"
-
-
 # --- The child process in which the library of motion capture runs, away from the flight -------
 # Some of its systems wait in `connect` for ever, without letting any other thread of their process
 # run, and some end the process without a word (docs/positioning.md). Here that stops nobody.
@@ -254,39 +224,9 @@ MOST_HZ = 500.0
 AFTER_PARENT_S = 1.0
 PAUSE_S, AT_ONCE_S = 0.1, 2e-4
 
-Body = tuple[tuple[float, float, float], tuple[float, float, float, float]]
-"""Position and quaternion (w, x, y, z): plain numbers, so that nothing of the library travels."""
-
-
-@dataclass(frozen=True)
-class CaptureSetup:
-    """What the child connects to. `partial`: a frame without a body is no frame, since the
-    library's loop turns by its own clock, whether or not anything has arrived."""
-
-    kind: str
-    options: dict[str, str] = field(default_factory=dict)
-    partial: bool = False
-    timeout_s: float = 5.0
-
-
-@dataclass(frozen=True)
-class Arrived:
-    """`t_s`: on this process's monotonic clock."""
-
-    t_s: float
-    bodies: dict[str, Body]
-
-
-@dataclass(frozen=True)
-class Failed:
-    """The library has given up, with its words; with `is_loaded` False Python cannot import it."""
-
-    text: str
-    is_loaded: bool = True
-
-
-class Connected:
-    """The library has returned from its connecting; whether frames come is another matter."""
+Bodies = dict[str, tuple[tuple[float, float, float], tuple[float, float, float, float]]]
+"""Position and quaternion (w, x, y, z) by name: plain numbers, so that nothing of the library
+travels. They are sent with the time of their arrival, on the monotonic clock of all processes."""
 
 
 def serve_parent() -> None:
@@ -301,7 +241,6 @@ def serve_parent() -> None:
 
             is_loaded = True
             client = motioncapture.connect(setup.kind, _by_address(setup))
-        channel.send(Connected())
         threading.Thread(target=_end_with, args=(channel,), daemon=True).start()
         _pass_on(client, channel, setup.partial)
     except Exception as error:  # whatever the library, or the loading of its own modules, raises
@@ -350,16 +289,13 @@ def _pass_on(client: Any, channel: Channel, partial: bool) -> None:
         behind = now_s - asked_s > PAUSE_S or (behind and now_s - asked_s < AT_ONCE_S)
         if behind or now_s - sent_s < 1.0 / MOST_HZ:
             continue
-        bodies = {str(name): _body(body) for name, body in client.rigidBodies.items()}
+        bodies: Bodies = {}
+        for name, body in client.rigidBodies.items():
+            (x, y, z), q = map(float, body.position), body.rotation
+            bodies[str(name)] = (x, y, z), (float(q.w), float(q.x), float(q.y), float(q.z))
         if bodies or not partial:
             sent_s = now_s
-            channel.send(Arrived(now_s, bodies))
-
-
-def _body(body: Any) -> Body:
-    x, y, z = (float(part) for part in body.position)
-    q = body.rotation
-    return (x, y, z), (float(q.w), float(q.x), float(q.y), float(q.z))
+            channel.send((now_s, bodies))
 
 
 def _end_with(channel: Channel) -> None:

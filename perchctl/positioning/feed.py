@@ -12,11 +12,12 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Protocol
 
 import numpy as np
 
-from perchctl.errors import distinct_figures
+from perchctl.errors import InvalidValue, distinct_figures, no_motion_capture
 from perchctl.geometry import (
     Array,
     quaternion_from_rotation,
@@ -125,8 +126,10 @@ class SendingRate:
 
 
 class PositionFeed:
-    """No thread and no clock: `turn` is called about 100 times a second, by a `FeedThread` or
-    in lockstep; `status` from any thread."""
+    """Hands on the positions of a capture. `turn` is called every `PERIOD_S`: by a thread from
+    `start` until `close`, or in lockstep; `status` from any thread."""
+
+    PERIOD_S = 0.01
 
     def __init__(
         self, source: CaptureSource, send: SendPosition, config: PositioningConfig
@@ -143,6 +146,41 @@ class PositionFeed:
         self._pose: ExternalPosition | None = None
         self._problem: str | None = None
         self._stopped = False
+        self._thread: threading.Thread | None = None
+        self._closed = threading.Event()
+
+    @staticmethod
+    def check_reachable(config: PositioningConfig) -> None:
+        """Raise InvalidValue or UsageError for what can be refused before anything is opened."""
+        if not config.host.strip():
+            raise InvalidValue(
+                "positioning.host, the computer of the motion capture, is not given: write it into "
+                "the profile, as in positioning: {by: mocap, system: vicon, host: 192.168.1.2, "
+                "body: crazyflie}; system is one of vicon, optitrack, qualisys, vrpn, body the "
+                "vehicle's rigid body there"
+            )
+        if find_spec("motioncapture") is None:
+            raise no_motion_capture()
+
+    def start(self, clock: Callable[[], float]) -> None:
+        """Turn by a thread from now on. `clock`: the flight loop's, s. A turn may hang in the
+        library of the link; then `status` says so."""
+
+        def run() -> None:
+            due_s = clock()
+            while not self._closed.is_set():
+                self.turn(clock())
+                due_s = max(due_s + self.PERIOD_S, clock() - self.PERIOD_S)
+                self._closed.wait(max(0.0, due_s - clock()))
+
+        self._thread = threading.Thread(target=run, name="perchctl-positions", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop turning: no position is sent any more. Does not wait for long."""
+        self._closed.set()
+        if self._thread is not None:
+            self._thread.join(END_TIMEOUT_S)
 
     def stop(self) -> None:
         """Send nothing from here on: the positions contradict what the vehicle feels."""
@@ -206,78 +244,6 @@ class PositionFeed:
         if self._framed_s == -math.inf:
             return f"no frame has come from {who} yet"
         return f"no frame has come from {who} for {now_s - self._framed_s:.1f} s"
-
-
-class StandingFeed:
-    """Sends the origin for a vehicle that stands there while its estimator is reset, where the
-    target is the positioning system and has not been measured yet.
-
-    `turn` by a `FeedThread`; `status` and `place` from any thread."""
-
-    def __init__(self, send: SendPosition, ground_z_m: float) -> None:
-        self._send, self._place = send, ExternalPosition((0.0, 0.0, ground_z_m))
-        self._lock = threading.Lock()
-        self._sent_s, self._count = -math.inf, 0
-        self._problem: str | None = None
-
-    def turn(self, now_s: float) -> None:
-        """Raises nothing: what goes wrong is the status's problem."""
-        try:
-            problem = BUSY if self._send(self._place) is False else None
-        except Exception as error:  # of the link
-            problem = f"the position cannot be passed on: {type(error).__name__}: {error}"
-        with self._lock:
-            self._problem = problem
-            if problem is None:
-                self._sent_s, self._count = now_s, self._count + 1
-
-    def status(self, now_s: float) -> FeedStatus:
-        with self._lock:
-            age_s = now_s - self._sent_s
-            return FeedStatus(age_s, self._problem, self._count, self._place)
-
-    def place(self) -> Placed:
-        """Return the origin, level, with the front along x: so the world is defined."""
-        return Placed(self._sent_s, np.array(self._place.position_m), np.eye(3))
-
-
-class Turned(Protocol):
-    """A feed that a thread turns; `turn` raises nothing."""
-
-    def turn(self, now_s: float) -> None: ...
-
-
-class FeedThread:
-    """Turns `feed` every `period_s` from `start` until `close`.
-
-    `clock`: seconds, monotonic, the flight loop's. A turn may hang in the library of the link;
-    then `PositionFeed.status` says so, and `close` does not wait for it for long.
-    """
-
-    PERIOD_S = 0.01
-
-    def __init__(
-        self, feed: Turned, clock: Callable[[], float], period_s: float = PERIOD_S
-    ) -> None:
-        self._feed, self._clock, self._period_s = feed, clock, period_s
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="perchctl-positions", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop turning: no position is sent any more."""
-        self._ended.set()
-        if self._thread.ident is not None:
-            self._thread.join(END_TIMEOUT_S)
-
-    def _run(self) -> None:
-        due_s = self._clock()
-        while not self._ended.is_set():
-            self._feed.turn(self._clock())
-            due_s = max(due_s + self._period_s, self._clock() - self._period_s)
-            self._ended.wait(max(0.0, due_s - self._clock()))
 
 
 # --- Which of a capture's frames may be believed, and where the vehicle's body is in them ------

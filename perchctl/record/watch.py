@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from perchctl.camera import FrameSource, WatchedSource
+from perchctl.camera import FrameSource, WrappedSource
 from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
 from perchctl.profile import Profile
 from perchctl.record.fields import event_record, sent_values, tick_record
@@ -84,7 +84,7 @@ class LogWatcher:
 
     def watched(self, source: FrameSource) -> FrameSource:
         """Return the same source; the frames that it gives are recorded, where that is wanted."""
-        return source if self._recorder is None else WatchedSource(source, self._recorder.frame)
+        return source if self._recorder is None else WrappedSource(source, self._recorder.frame)
 
     def remarks(self) -> list[str]:
         """Return what is new about the recording and about records that no line could be made of,

@@ -1,4 +1,4 @@
-"""The AI-deck's source on a deck that the test scripts, and the commands through it."""
+"""The AI-deck's source on a deck that the test scripts, and a command through it."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ import numpy as np
 import pytest
 
 from perchctl.calibration import load_calibration
-from perchctl.camera import aideck as aideck_module
 from perchctl.camera import open_camera
 from perchctl.camera.aideck import (
+    STALLED_S,
     AiDeckSource,
-    CpxPicture,
+    MosaicFilter,
     aideck_address,
-    decoded,
+    has_mosaic,
+    without_mosaic,
 )
 from perchctl.camera.network import MAX_FAILED_CONNECTIONS
+from perchctl.camera.source import LiveSource
 from perchctl.errors import InvalidValue
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
-from tests.camera.test_live import resized
 from tests.helpers.aideck import (
     AiDeck,
     Pause,
@@ -36,150 +37,152 @@ from tests.helpers.aideck import (
     packet,
     picture,
     raw,
+    raw_packets,
 )
 from tests.helpers.commands import run
 from tests.helpers.live import Clock, begun, level, next_frame
 from tests.helpers.waiting import until
 
 CAMERA = load_calibration("example_aideck_324x244.yaml")
+NEVER = threading.Event()
 
 
 @pytest.fixture
-def deck() -> Iterator[AiDeck]:
+def deck(opened: list[LiveSource]) -> Iterator[AiDeck]:
     with aideck() as deck:
         yield deck
 
 
 @pytest.fixture
-def opened() -> Iterator[Callable[..., AiDeckSource]]:
-    sources: list[AiDeckSource] = []
+def read(deck: AiDeck, opened: list[LiveSource]) -> Callable[..., AiDeckSource]:
+    """Opens the deck's source."""
 
-    def make(deck: AiDeck, clock: Clock | None = None, **options: float) -> AiDeckSource:
+    def make(clock: Clock | None = None, **options: float) -> AiDeckSource:
         source = AiDeckSource(*aideck_address(deck.url), 0.06, clock or Clock())
-        sources.append(begun(source, reconnect_wait_s=0.0, **options))
-        return source
+        return begun(source, opened, reconnect_wait_s=0.0, **options)
 
-    yield make
-    for source in sources:
-        source.close()
+    return make
 
 
-Opened = Callable[..., AiDeckSource]
+Read = Callable[..., AiDeckSource]
 
 
-def test_a_frame_is_of_its_first_byte_and_arrives_with_its_last(
-    deck: AiDeck, opened: Opened
+@pytest.mark.parametrize("size_px", [(324, 244), (162, 122), (160, 102)])
+def test_raw_and_jpeg_pictures_of_each_size(
+    size_px: tuple[int, int], deck: AiDeck, read: Read
 ) -> None:
+    """The last one fills its chunks to the byte: the streamer then sends an empty packet."""
+    image, go = picture(120, size_px), threading.Event()
+    deck.scripts.put([console(), raw(image), console(), go, jpeg(image), NEVER])
+    source = read()
+    first = next_frame(source)
+    assert first.encoded is None
+    assert (first.image == image).all()
+    go.set()
+    second = next_frame(source)
+    assert second.encoded is not None
+    as_sent = cv2.imdecode(np.frombuffer(second.encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(as_sent, second.image)
+    assert np.abs(second.image.astype(float) - image).mean() < 4.0
+
+
+def test_a_frame_is_of_its_first_byte_and_arrives_with_its_last(deck: AiDeck, read: Read) -> None:
     clock, come, go = Clock(), threading.Event(), threading.Event()
     whole = raw(picture(160))
-    deck.scripts.put([jpeg(picture(60)), come, whole[:3000], go, whole[3000:], threading.Event()])
-    source = opened(deck, clock)
+    deck.scripts.put([jpeg(picture(60)), come, whole[:3000], go, whole[3000:], NEVER])
+    source = read(clock)
     first = next_frame(source)
     assert (first.index, level(first), first.t_arrival_s) == (0, 60, 100.0)
     assert source.size_px == (324, 244)
-    before, clock.t_s = source.bytes_seen, 100.1
+    clock.t_s = 100.1
     come.set()
-    until(lambda: source.bytes_seen > before)
+    until(lambda: source._picture is not None)
     clock.t_s = 100.3
     go.set()
     second = next_frame(source)
     assert (second.index, level(second), second.t_arrival_s) == (1, 160, 100.3)
+    # The packet's first bytes may have been waited for since before 100.1.
     assert second.t_s == pytest.approx(100.1 - 0.06)
+
+
+def test_a_picture_that_stalls_is_dropped(deck: AiDeck, read: Read) -> None:
+    """Its end would be taken for its time of arrival by the flight's guards."""
+    clock, go = Clock(), threading.Event()
+    whole = raw(picture(60))
+    deck.scripts.put([whole[:3000], go, whole[3000:], raw(picture(160)), NEVER])
+    source = read(clock)
+    until(lambda: source._picture is not None)
+    clock.t_s += STALLED_S + 0.1
+    go.set()
+    assert level(next_frame(source)) == 160
+    assert source.damaged == 1
 
 
 SMALLER = jpeg_packets(picture(80, (162, 122)))
 SIZE = int.from_bytes(SMALLER[0][-4:], "little")
+WHOLE = raw_packets(picture(80))
 
 
 @pytest.mark.parametrize("fault", [
-    raw(picture(80))[:50_000],
-    b"\x40\x9c\x63\x05",
+    b"".join(WHOLE[:20]),
+    b"".join(WHOLE[:20] + WHOLE[21:]),
+    b"".join(WHOLE[1:]),
+    b"".join(WHOLE[:-1]) + packet(bytes(1020)),
+    WHOLE[0] * 2,
+    WHOLE[0] + console("x" * 1000) * 100,
+    b"".join(jpeg_packets(picture(80))[:-1]),
+    jpeg(picture(80))[:-2] + b"\0\0",
     header(324, 244, 500, 1) + packet(b"\xff\xd8" + bytes(498)),
     header(324, 244, SIZE, 1) + b"".join(SMALLER[1:]),
-], ids=["cut", "no packet", "JPEG that is none", "JPEG of another size"])  # fmt: skip
-def test_frames_go_on_after_a_fault(fault: bytes, deck: AiDeck, opened: Opened) -> None:
-    """On the same connection, with no wrong picture between."""
-    go, end = threading.Event(), threading.Event()
-    deck.scripts.put([raw(picture(60)), go, fault + console() + raw(picture(160)), end])
-    source = opened(deck)
+    header(324, 244, 0xFFFFFFFF, 0) + b"".join(WHOLE[1:]),
+    header(324, 244, 324 * 244, 7) + b"".join(WHOLE[1:]),
+    header(65000, 65000, 500, 1) + packet(bytes(500)),
+], ids=["cut", "chunk lost", "header lost", "too long", "two headers", "console", "JPEG's end lost",
+        "JPEG without end", "no JPEG", "JPEG of another size", "size of nonsense",
+        "unknown format", "sides of nonsense"])  # fmt: skip
+def test_a_fault_costs_its_own_picture_and_no_connection(
+    fault: bytes, deck: AiDeck, read: Read
+) -> None:
+    go = threading.Event()
+    deck.scripts.put([raw(picture(60)), go, fault + console() + raw(picture(160)), NEVER])
+    source = read()
     assert level(next_frame(source)) == 60
     go.set()
     after = next_frame(source)
     assert (level(after), after.index) == (160, 1)
     assert source.connections == 1
-    end.set()
 
 
-@pytest.mark.parametrize("said", [(65_000, 65_000), (325, 244), (0, 244)])
-def test_a_jpeg_whose_size_bytes_are_damaged_is_not_decoded(
-    said: tuple[int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = b"".join(p[4:] for p in jpeg_packets(picture(80))[1:])
-    assert decoded(CpxPicture(0.0, 324, 244, True, whole)) is not None
-    monkeypatch.setattr(aideck_module, "grey_pixels", lambda data: pytest.fail("decoded"))
-    assert decoded(CpxPicture(0.0, 324, 244, True, resized(whole, *said))) is None
-
-
-def test_it_reconnects_when_the_deck_restarts_or_stalls(deck: AiDeck, opened: Opened) -> None:
-    never = threading.Event()
-    whole = raw(picture(80))
-    deck.scripts.put([raw(picture(60)), whole[:40_000]])  # broken off
-    deck.scripts.put([whole[40_000:], never])  # the rest of it, and then nothing
-    deck.scripts.put([raw(picture(160)), never])
-    source = opened(deck, read_timeout_s=0.2)
-    assert level(next_frame(source)) == 60
-    after = next_frame(source)
-    assert (level(after), after.index) == (160, 1)
-    assert source.connections == 3
+@pytest.mark.parametrize("end", [
+    [raw(picture(80))[:40_000]], [raw(picture(80))[:40_000], NEVER], [b"\x40\x9c\x63\x05", NEVER],
+], ids=["broken off", "stalls", "no packet"])  # fmt: skip
+def test_it_connects_anew(end: list[bytes | threading.Event], deck: AiDeck, read: Read) -> None:
+    deck.scripts.put([raw(picture(60)), *end])
+    deck.scripts.put([raw(picture(160)), NEVER])
+    source = read(read_timeout_s=0.2)
+    until(lambda: source._count == 2)
+    assert level(next_frame(source)) == 160
+    assert source.connections >= 2
 
 
 @pytest.mark.parametrize(("sent", "words"), [
-    ([b"HTTP/1.1 400 Bad Request\r\n\r\n"], "28 bytes came, and no whole picture"),
-    ([], "sent nothing; switch the Crazyflie off and on"),
+    ([b"HTTP/1.1 400 Bad Request\r\n\r\n"], "not of Bitcraze's wifi-img-streamer"),
+    ([], "switch the Crazyflie off and on"),
 ])  # fmt: skip
 def test_reconnects_are_bounded_and_the_reason_is_given(
-    sent: list[bytes], words: str, deck: AiDeck, opened: Opened
+    sent: list[bytes], words: str, deck: AiDeck, read: Read
 ) -> None:
     for _ in range(MAX_FAILED_CONNECTIONS):
         deck.scripts.put([*sent])
-    source = opened(deck)
-    until(lambda: "gave no picture" in (source.problem(100.0) or ""))
-    assert "in 5 attempts: " in str(source.problem(100.0))
+    source = read()
+    until(lambda: "in 5 attempts: " in (source.problem(100.0) or ""))
     assert words in str(source.problem(100.0))
     assert deck.connections == MAX_FAILED_CONNECTIONS
 
 
-def test_bytes_without_pictures_end_the_connection(deck: AiDeck, opened: Opened) -> None:
-    """A camera that hangs, while its console goes on talking."""
-    clock, said, never = Clock(), threading.Event(), threading.Event()
-    deck.scripts.put([raw(picture(60)), said, console(), never])
-    deck.scripts.put([raw(picture(160)), never])
-    source = opened(deck, clock, read_timeout_s=1000.0)
-    next_frame(source)
-    clock.t_s += AiDeckSource.no_picture_s + 0.1
-    said.set()
-    assert level(next_frame(source)) == 160
-    assert source.connections == 2
-
-
-@pytest.mark.parametrize(("sent", "is_as_sent"), [
-    (jpeg(picture(60)), True), (raw(picture(60)), False), (jpeg(bayer(picture(150))), False),
-])  # fmt: skip
-def test_a_frame_has_the_jpeg_that_it_came_as_unless_a_mosaic_was_taken_out(
-    sent: bytes, is_as_sent: bool, deck: AiDeck, opened: Opened
-) -> None:
-    deck.forever = [sent]
-    frame = next_frame(opened(deck))
-    assert (frame.encoded is not None) is is_as_sent
-    if frame.encoded is not None:
-        as_sent = cv2.imdecode(np.frombuffer(frame.encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
-        np.testing.assert_array_equal(as_sent, frame.image)
-
-
 @pytest.mark.parametrize(("spec", "address"), [
     ("aideck://192.168.4.1", ("192.168.4.1", 5000)),
-    ("aideck://192.168.4.1:5000/", ("192.168.4.1", 5000)),
-    ("aideck://aideck-4E4BDC.local:81", ("aideck-4e4bdc.local", 81)),
+    ("aideck://aideck-4E4BDC.local:81/", ("aideck-4e4bdc.local", 81)),
     ("aideck://[::1]:5001", ("::1", 5001)),
 ])  # fmt: skip
 def test_an_address(spec: str, address: tuple[str, int]) -> None:
@@ -196,7 +199,33 @@ def test_a_wrong_address_is_one_sentence(spec: str) -> None:
         open_camera(spec, Clock())
 
 
-# -- a command through it -------------------------------------------------------
+# --- A colour camera ----------------------------------------------------------------------
+
+
+def test_a_mosaic_is_known_from_grey_and_goes_whatever_its_order() -> None:
+    scene = np.asarray(cv2.GaussianBlur(picture(130), (0, 0), 3.0), np.uint8)
+    for image in (scene, bayer(scene, (1.0, 1.0, 1.0))):
+        assert not has_mosaic(image)
+    for gains in ((0.55, 1.0, 0.7), (0.9, 1.0, 0.95)):
+        assert has_mosaic(bayer(scene, gains))
+    flat = np.full((40, 60), 150, np.uint8)
+    for flip in (flat, flat[::-1], flat[:, ::-1]):
+        smooth = without_mosaic(np.ascontiguousarray(bayer(flip)))
+        assert int(smooth.max()) - int(smooth.min()) <= 1
+
+
+def test_a_colour_camera_is_found_once_and_stays_one(deck: AiDeck, read: Read) -> None:
+    mosaic, plain = bayer(picture(150)), picture(150)
+    found = MosaicFilter()
+    for _ in range(3):
+        assert (found(mosaic) == without_mosaic(mosaic)).all()
+    assert (found(plain) == without_mosaic(plain)).all(), "a scene that hides it changes nothing"
+    assert (MosaicFilter()(plain) == plain).all()
+    deck.forever = [jpeg(mosaic)]
+    assert next_frame(read()).encoded is None, "it is not the JPEG that came any more"
+
+
+# --- A command through it -----------------------------------------------------------------
 
 
 RANGES_M = np.linspace(0.8, 0.1, 8)

@@ -1,13 +1,14 @@
-"""Cameras of this computer: their names, lasting paths and numbers, and what a driver grants."""
+"""Cameras of this computer: their names, lasting paths and numbers; one that fails or is unplugged
+behind a stand-in."""
 
 from __future__ import annotations
 
 import json
 import os
-import re
-import struct
+import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,25 +17,25 @@ from typer.testing import CliRunner
 
 from perchctl.camera import find_cameras
 from perchctl.camera.device import (
-    Asked,
+    LOST_AFTER_FAILURES,
+    ConnectedCamera,
     DeviceSource,
-    asked_of,
     camera_number,
-    finder_of,
+    open_capture,
     set_up,
 )
+from perchctl.camera.source import LiveSource
 from perchctl.commands import app, check
-from perchctl.commands.check import camera_lines, list_cameras
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
-
-WAIT_S = 10.0
+from tests.helpers.live import WAIT_S, Clock, level, next_frame
+from tests.helpers.waiting import until
 
 
 @pytest.fixture
 def plugged(tmp_path: Path) -> Callable[..., Path]:
     """A folder as /dev and as the system's list of names: cameras by number with their names, of
-    which one that begins with / gives no pictures, and lasting paths."""
+    which one that begins with / is no camera's first node, and lasting paths."""
 
     def make(cameras: dict[int, str], **by_id: int) -> Path:
         (tmp_path / "v4l" / "by-id").mkdir(parents=True, exist_ok=True)
@@ -48,10 +49,6 @@ def plugged(tmp_path: Path) -> Callable[..., Path]:
         return tmp_path
 
     return make
-
-
-def unplug(devices: Path, number: int) -> None:
-    (devices / f"video{number}").rename(devices / f"gone{number}")
 
 
 def test_a_camera_is_named_by_number_name_part_of_it_or_path(plugged: Callable[..., Path]) -> None:
@@ -78,142 +75,153 @@ def test_a_camera_is_named_by_number_name_part_of_it_or_path(plugged: Callable[.
             number(text)
 
 
-def test_a_second_node_with_pictures_is_a_camera_and_one_without_is_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As of a stereo camera: the driver's answer counts, and not the node's index."""
-    fcntl = pytest.importorskip("fcntl")
-
-    def query(node: int, request: int, data: bytearray, mutate: bool) -> None:
-        assert request == (2 << 30) | (104 << 16) | (ord("V") << 8)  # VIDIOC_QUERYCAP
-        data[:] = os.read(node, 104)
-
-    monkeypatch.setattr(fcntl, "ioctl", query)
-    names = tmp_path / "names"
-    whole, video, metadata = 0x84A00001, 0x04200001, 0x04A00000
-    # Old drivers say nothing of a single node.
-    for index, words in enumerate([(whole, video), (whole, metadata), (whole, video), (1, 0)]):
-        (tmp_path / f"video{index}").write_bytes(struct.pack("=84xII12x", *words))
-        (names / f"video{index}").mkdir(parents=True)
-        (names / f"video{index}" / "index").write_text(f"{index}\n")
-        (names / f"video{index}" / "name").write_text(f"Depth {index}\n")
-    (tmp_path / "v4l" / "by-id").mkdir(parents=True)
-    path = tmp_path / "v4l" / "by-id" / "usb-depth-video-index2"
-    path.symlink_to(tmp_path / "video2")
-    assert [camera.number for camera in find_cameras(tmp_path, names)] == [0, 2, 3]
-    assert camera_number(str(path), tmp_path, names) == 2
-    assert camera_number("Depth 2", tmp_path, names) == 2
-
-
-def test_two_of_one_name_are_known_by_their_path(plugged: Callable[..., Path]) -> None:
-    devices = plugged({0: "USB Video", 2: "USB Video"}, port_1=0, port_2=2)
-    with pytest.raises(InvalidValue, match=r"fits 2 cameras: .*port_1, .*port_2; give"):
-        camera_number("USB Video", devices, devices)
-    assert camera_number("port_2", devices, devices) == 2
-
-
 def test_the_list_for_people_and_for_programs(
-    plugged: Callable[..., Path], capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    plugged: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     devices = plugged({0: "USB Video"}, usb_grabber=0)
-    known = find_cameras(devices, devices)
-    assert list_cameras(False, known) == 0
-    said = capsys.readouterr().out
-    assert said.startswith("camera:0  USB Video\n")
-    assert "usb_grabber" in said
-    assert list_cameras(True, known) == 0
-    (record,) = json.loads(capsys.readouterr().out)
+    monkeypatch.setattr(check, "find_cameras", lambda: find_cameras(devices, devices))
+
+    def listed(*words: str) -> str:
+        done = CliRunner().invoke(app, ["check", "--cameras", *words])
+        assert done.exit_code == 0
+        return done.stdout
+
+    assert listed().startswith("camera:0  USB Video\n")
+    assert "usb_grabber" in listed()
+    (record,) = json.loads(listed("--json"))
     assert (record["source"], record["problem"]) == ("camera:0", "")
     monkeypatch.setattr(os, "access", lambda *_: False)
-    (locked,) = find_cameras(devices, devices)
-    assert "Permission denied" in "\n".join(camera_lines(locked))
+    assert "Permission denied" in listed()
 
 
 def test_no_camera_at_all(plugged: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
     devices = plugged({})
     with pytest.raises(NotFound, match="this computer has no camera"):
         camera_number("USB", devices, devices)
-    monkeypatch.setattr(check, "find_cameras", lambda: [])
+    monkeypatch.setattr(check, "find_cameras", list[ConnectedCamera])
     done = CliRunner().invoke(app, ["check", "--cameras", "--json"])
     assert done.exit_code == NotFound.exit_code
     said = json.loads(done.stdout)  # an object, as of every failure
     assert said["exit_code"] == NotFound.exit_code
-    assert "has no camera" in said["error"]
     assert "has no camera" in done.stderr
 
 
-def test_a_camera_that_was_unplugged_is_found_by_path_or_name(plugged: Callable[..., Path]) -> None:
-    devices = plugged({0: "Webcam", 1: "USB Video", 2: "USB Video"}, usb_grabber=1)
-    by_path, by_name, by_number = (finder_of(n, devices, devices) for n in (1, 2, 7))
-    assert (by_path(), by_name(), by_number()) == (1, 2, 7)
-
-    link = devices / "v4l" / "by-id" / "usb_grabber"
-    link.unlink()
-    for number in (1, 2):
-        unplug(devices, number)
-    for find in (by_path, by_name):
-        with pytest.raises(NotFound, match=r"USB Video.*not back"):
-            find()
-
-    plugged({5: "USB Video"}, usb_grabber=5)
-    assert by_path() == 5
-    assert by_name() == 5, "the only one of its name"
-    plugged({1: "Webcam"})
-    assert by_path() == 5, "another camera has its number now"
-
-
-# --- what a driver grants -------------------------------------------------------------
-
-
-class Driver:
-    """An OpenCV capture whose driver grants what it likes; `set` is noted."""
-
-    def __init__(self, format: str, rate_hz: float, size: tuple[int, int]) -> None:
-        self.format, self.rate_hz, self.size = format, rate_hz, size
-        self.asked: list[tuple[int, float]] = []
-
-    def set(self, prop: int, value: float) -> None:
-        self.asked.append((prop, value))
-
-    def get(self, prop: int) -> float:
-        code = int.from_bytes(self.format.ljust(4).encode(), "little") if self.format else 0
-        return {cv2.CAP_PROP_FOURCC: float(code), cv2.CAP_PROP_FPS: self.rate_hz}[prop]
-
-    def read(self) -> tuple[bool, np.ndarray]:
-        return True, np.random.default_rng().integers(0, 255, self.size[::-1], np.uint8)
-
-    def release(self) -> None:
-        return None
-
-
-@pytest.mark.parametrize(("driver", "said"), [
-    (Driver("YUYV", 15.0, (640, 480)),
-     ["MJPG .* gives YUYV", "720x576 px, the cal.* 640x480", "25 Hz .* gives 15 Hz"]),
-    (Driver("MJPG", 25.1, (720, 576)), []),
-    (Driver("", 0.0, (720, 576)), []),
-])  # fmt: skip
-def test_what_is_delivered_otherwise_is_named(driver: Driver, said: list[str]) -> None:
-    """What OpenCV does not know is no news."""
-    asked = Asked((720, 576), "MJPG", 25.0)
-    source = DeviceSource(0, 0.05, asked, lambda: 100.0, lambda n, asked: driver)
-    try:
-        assert source.wait_first(WAIT_S)
-        remarks = source.remarks()
-    finally:
-        source.close()
-    assert len(remarks) == len(said)
-    for remark, words in zip(remarks, said, strict=True):
-        assert re.search(f"^camera:0 was asked for {words}", remark)
+def test_a_missing_device_says_what_there_is() -> None:
+    assert not Path("/dev/video97").exists()
+    with pytest.raises(NotFound, match=r"camera:97 was not found; th(ere are|is computer)"):
+        open_capture("97", None, None)
 
 
 def test_opencv_is_asked_for_format_then_size_then_rate() -> None:
-    driver = Driver("", 0.0, (0, 0))
-    asked = asked_of(CameraConfig(format="MJPG", rate_hz=25), (720, 576))
-    assert asked == Asked((720, 576), "MJPG", 25.0)
-    set_up(driver, asked)
-    assert [prop for prop, _ in driver.asked] == [
+    class Driver:
+        def set(self, prop: int, value: float) -> None:
+            asked.append((prop, value))
+
+    asked: list[tuple[int, float]] = []
+    set_up(Driver(), (720, 576), CameraConfig(format="MJPG", rate_hz=25))
+    assert [prop for prop, _ in asked] == [
         cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT,
         cv2.CAP_PROP_FPS, cv2.CAP_PROP_BUFFERSIZE,
     ]  # fmt: skip
-    assert int(driver.asked[0][1]) == int.from_bytes(b"MJPG", "little")
+    assert int(asked[0][1]) == int.from_bytes(b"MJPG", "little")
+
+
+# --- One that fails, and one that is unplugged --------------------------------------------
+
+
+def grey(value: int) -> np.ndarray[Any, Any]:
+    return np.full((48, 64), value, np.uint8)
+
+
+class Capture:
+    """Stands for cv2.VideoCapture; gives pictures, raises errors among them, and fails at the end
+    and while it is unplugged."""
+
+    def __init__(self, *pictures: np.ndarray[Any, Any] | Exception) -> None:
+        self.pictures = [*pictures]
+        self.unplugged = False
+        self.released = threading.Event()
+        self.reads = 0
+
+    def read(self) -> tuple[bool, Any]:
+        self.reads += 1
+        if self.unplugged or not self.pictures:
+            threading.Event().wait(0.01 * (not self.unplugged))
+            return False, None
+        image = self.pictures.pop(0)
+        if isinstance(image, Exception):
+            raise image
+        return True, image
+
+    def release(self) -> None:
+        self.released.set()
+
+
+class Bus:
+    """Where a camera is plugged in and out; `attempts` counts those to open it."""
+
+    def __init__(self, capture: Capture) -> None:
+        self.capture: Capture | None = capture
+        self.attempts = 0
+
+    def open(self) -> Capture:
+        self.attempts += 1
+        if self.capture is None:
+            raise NotFound("camera:2 was not found; this computer has no camera")
+        return self.capture
+
+
+def device(
+    opened: list[LiveSource],
+    opener: Callable[[], Capture],
+    clock: Clock | None = None,
+    reopen_every_s: float = 0.001,
+) -> DeviceSource:
+    source = DeviceSource("camera:2", 0.05, clock or Clock(), opener, 0.0, reopen_every_s)
+    opened.append(source)
+    return source
+
+
+def test_a_device_delivers_grey_frames_drops_a_damaged_one_and_is_released(
+    opened: list[LiveSource],
+) -> None:
+    colour = np.full((48, 64, 3), 160, np.uint8)
+    capture = Capture(grey(60), cv2.error("damaged"), colour)
+    source = device(opened, Bus(capture).open)
+    until(lambda: source._count == 2)
+    frame = next_frame(source)
+    assert (level(frame), frame.image.shape) == (160, (48, 64))
+    assert frame.t_s == pytest.approx(99.95)
+    assert source.describe() == "camera:2 (64x48 px)"
+    assert source.problem(100.0) is None
+    assert not capture.released.is_set()
+    source.close()
+    assert capture.released.wait(WAIT_S)
+
+
+def test_a_device_that_never_gives_a_picture_fails(opened: list[LiveSource]) -> None:
+    capture = Capture()
+    capture.unplugged = True
+    source = device(opened, Bus(capture).open)
+    assert not source.wait_first(WAIT_S)
+    assert "stopped delivering" in str(source.problem(float("-inf")))
+    assert capture.reads == LOST_AFTER_FAILURES
+    assert capture.released.wait(WAIT_S)
+
+
+def test_a_device_that_comes_back_is_opened_again(opened: list[LiveSource]) -> None:
+    first, clock = Capture(grey(60)), Clock()
+    bus = Bus(first)
+    source = device(opened, bus.open, clock)
+    assert level(next_frame(source)) == 60
+    bus.capture, first.unplugged = None, True
+    until(lambda: bus.attempts > 3)
+    assert first.released.is_set()
+    clock.t_s = 102.0
+    assert "was not found" in str(source.problem(102.0))
+    assert source.problem(float("-inf")) is None, "it is not the end"
+    bus.capture = again = Capture(grey(160))
+    frame = next_frame(source)
+    assert (level(frame), frame.index, frame.t_arrival_s) == (160, 1, 102.0)
+    assert source.problem(102.0) is None
+    assert not again.released.is_set()

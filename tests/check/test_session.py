@@ -18,7 +18,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.check import CheckScope, Verdict, camera, check, session, vehicle
 from perchctl.commands.check import exit_code
 from perchctl.errors import UsageError, broken_motion_capture
-from perchctl.link import ProbeLink, ScanResult, find_vehicles
+from perchctl.link import ProbeLink, find_vehicles
 from perchctl.profile import LinkConfig, PositioningConfig, Profile
 from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options, wait_for
@@ -70,7 +70,7 @@ def nobody(**profile: Any) -> Profile:
 
 
 def test_a_vehicle_that_does_not_answer_leaves_its_rows_skipped() -> None:
-    there = ScanResult(("radio://0/60/2M", NOWHERE))
+    there = (["radio://0/60/2M", NOWHERE], "")
     wanted = CheckScope(**(QUICK | {"other_vehicles": lambda uri: there}))
     rows = list(check(options(NOWHERE, profile=nobody()), wanted))
     assert [row.name for row in rows][: len(VEHICLE)] == VEHICLE
@@ -153,14 +153,14 @@ def test_a_scan_names_what_answers() -> None:
     """cflib leaves the sockets of its scan open."""
     answering, uri = answerer()
     try:
-        found = find_vehicles("radio://0/80/2M/E7E7E7E701")
+        uris, radio_problem = find_vehicles("radio://0/80/2M/E7E7E7E701")
         rows = {row.found: row for row in session.scan_rows(None)}
     finally:
         answering.close()
-    assert uri in found.uris
+    assert uri in uris
     assert rows[f"{uri} answers"].verdict is Verdict.PASS
     radio = next(row for row in rows.values() if row.name == "radio")
-    if found.radio:  # where there is none, it is said
+    if radio_problem:  # where there is none, it is said
         assert radio.verdict is Verdict.SKIPPED
         assert "Crazyradio" in radio.found
         assert "udev" in radio.advice

@@ -16,7 +16,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.check import Row, Verdict
 from perchctl.check.row import ask_all
 from perchctl.check.vehicle import VEHICLE, Vehicle, look, moved_m
-from perchctl.link import Echoes, ProbeLink
+from perchctl.link import ProbeLink
 from perchctl.profile import LinkConfig, Profile
 from perchctl.sim import Scenario, SimProcess
 from perchctl.sim.crtp import LinkOptions
@@ -135,7 +135,7 @@ GOOD = Vehicle(
     parameters={
         "system.selftestPassed": 1, "stabilizer.estimator": 2,
     },
-    echoes=Echoes(100, (0.004,) * 100),
+    echoes=[0.004] * 100,
     quality=99.0,
     telemetry=AT_REST,
     age_s=0.01,
@@ -150,13 +150,13 @@ def parameters(**changes: float | None) -> dict[str, float]:
 
 
 ALONE: list[tuple[str, str, dict[str, Any]]] = [
-    ("packets", "warn", {"echoes": Echoes(100, (0.004,) * 97)}),
-    ("packets", "fail", {"echoes": Echoes(100, (0.004,) * 80)}),
+    ("packets", "warn", {"echoes": [0.004] * 97 + [math.inf] * 3}),
+    ("packets", "fail", {"echoes": [0.004] * 80 + [math.inf] * 20}),
     ("packets", "warn", {"quality": 80.0}),
     ("packets", "fail", {"quality": 40.0}),
-    ("packets", "warn", {"echoes": Echoes(100, (0.05,) * 100)}),
-    ("packets", "fail", {"echoes": Echoes(100, (0.2,) * 100)}),
-    ("packets", "fail", {"echoes": Echoes(100, ())}),
+    ("packets", "warn", {"echoes": [0.05] * 100}),
+    ("packets", "fail", {"echoes": [0.2] * 100}),
+    ("packets", "fail", {"echoes": [math.inf] * 100}),
     ("telemetry", "warn", {"samples_hz": 80.0}),
     ("telemetry", "fail", {"samples_hz": 40.0}),
     ("telemetry", "fail", {"age_s": 0.5}),

@@ -155,13 +155,10 @@ def options(changes: dict[str, Any], uri: str = "udp://127.0.0.1:1") -> FlyOptio
 def test_what_cannot_be_flown_is_refused_before_anything_is_opened(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    lab = {"positioning.host": "lab"}
-    check_options(options(lab))
+    check_options(options({"positioning.host": "lab"}))
     check_options(options({}, uri="sim://"))
     with pytest.raises(InvalidValue, match="the computer of the motion capture"):
         check_options(options({}))
-    with pytest.raises(InvalidValue, match=r"stabilizer\.estimator to 1"):
-        check_options(options(lab | {"link.parameters": {"stabilizer.estimator": 1}}))
     monkeypatch.setattr(session, "find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"pip install 'perchctl\[mocap\]'"):
         check_options(options({}, uri="sim://"))

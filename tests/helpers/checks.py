@@ -9,7 +9,6 @@ from typing import Any
 from perchctl.check.vehicle import LIFTED
 from perchctl.check.vehicle import VEHICLE as ANSWERING
 from perchctl.flight import FlyOptions
-from perchctl.link import ScanResult
 from perchctl.profile import Profile, find_profile, load_profile
 from perchctl.sim import SimProcess
 from perchctl.vehicle import Telemetry
@@ -20,7 +19,7 @@ NOWHERE = "udp://127.0.0.1:9"
 NO_CAMERA = "camera:97"
 QUICK: dict[str, Any] = {
     "listen_s": 0.1, "rehearse_s": 0.2, "lift_s": 0.2,
-    "other_vehicles": lambda uri: ScanResult((), "no Crazyradio is plugged in"),
+    "other_vehicles": lambda uri: ([], "no Crazyradio is plugged in"),
 }  # fmt: skip
 VEHICLE = ["address", *ANSWERING, LIFTED]
 AT_REST = telemetry(

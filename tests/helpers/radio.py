@@ -18,8 +18,6 @@ from typing import Any
 import cflib.crtp
 import pytest
 from cflib.crtp import radiodriver
-from cflib.crtp.crtpdriver import CRTPDriver
-from cflib.crtp.exceptions import WrongUriType
 from cflib.drivers.crazyradio import Crazyradio, _radio_ack
 
 from perchctl.link import Packet, Port
@@ -139,38 +137,8 @@ class Dongle(Crazyradio):  # type: ignore[misc]
         self._gone = True
 
 
-class OpaqueRadio(CRTPDriver):  # type: ignore[misc]
-    """cflib's radio driver as one of another make: its queue cannot be looked at, so that whoever
-    sends may be held for 2 s, and is then called back from inside. `hold` keeps it in there for as
-    long as a test wants."""
-
-    def __init__(self) -> None:
-        self.inner = radiodriver.RadioDriver()
-        self.hold: threading.Event | None = None
-
-    @property
-    def needs_resending(self) -> bool:
-        return bool(self.inner.needs_resending)
-
-    def connect(self, uri: str, statistics: Any, error: Any) -> None:
-        if not uri.startswith("radio://"):
-            raise WrongUriType("not a radio's")
-        self.inner.connect(uri, statistics, error)
-
-    def send_packet(self, packet: Any) -> Any:
-        if self.hold is not None:
-            self.hold.wait()
-        return self.inner.send_packet(packet)
-
-    def receive_packet(self, wait: float = 0) -> Any:
-        return self.inner.receive_packet(wait)
-
-    def close(self) -> None:
-        self.inner.close()
-
-
-def plug_in(air: Air, patch: pytest.MonkeyPatch, driver: type[CRTPDriver]) -> None:
-    """From now on cflib finds this dongle, and this driver for ``radio://``."""
+def plug_in(air: Air, patch: pytest.MonkeyPatch) -> None:
+    """From now on cflib finds this dongle, and its driver alone."""
 
     class Found(Dongle):
         def __init__(self, devid: int = 0) -> None:
@@ -178,4 +146,4 @@ def plug_in(air: Air, patch: pytest.MonkeyPatch, driver: type[CRTPDriver]) -> No
 
     patch.setattr(radiodriver, "Crazyradio", Found)
     patch.setattr(radiodriver.RadioManager, "_radios", [])
-    patch.setattr(cflib.crtp, "CLASSES", [driver])
+    patch.setattr(cflib.crtp, "CLASSES", [radiodriver.RadioDriver])

@@ -30,13 +30,11 @@ Step = tuple[float, int] | threading.Event
 
 @dataclass(eq=False)
 class RtspServer:
-    """Plays one script a connection, then ends it. `who`: name and password that it wants.
-    `redirect`: where it sends whoever asks for the stream."""
+    """Plays one script a connection, then ends it. `who`: name and password that it wants."""
 
     path: str = "/live"
     who: tuple[str, str] | None = None
     status: str = ""
-    redirect: str = ""
     scripts: queue.Queue[list[Step]] = field(default_factory=queue.Queue)
     plays: int = 0
     asked: list[str] = field(default_factory=list)
@@ -89,8 +87,6 @@ class RtspServer:
         elif not self._may(method, headers.get("authorization", "")):
             status = "401 Unauthorized"
             more = f'WWW-Authenticate: Digest realm="camera", nonce="{_NONCE}"\r\n'
-        elif self.redirect:
-            status, more = "302 Moved Temporarily", f"Location: {self.redirect}\r\n"
         elif self.path not in url:
             status = "404 Not Found"
         elif method == "DESCRIBE":

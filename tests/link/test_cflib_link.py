@@ -6,7 +6,6 @@ Waiting is always for the vehicle's own simulated time or state, and bounded.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,8 +19,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
 from perchctl.link import CflibLink, MockLink
-from perchctl.link.cflib_link import LANDING_WAIT_S, SILENCE_S
-from perchctl.link.connection import Connection
+from perchctl.link.cflib_link import LANDING_WAIT_S
 from perchctl.link.listening import ListeningLink
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
@@ -31,7 +29,6 @@ from perchctl.vehicle import (
     FLYING,
     FRESH_S,
     LOCKED,
-    EmergencyStop,
     Idle,
     Land,
     PositionSetpoint,
@@ -165,48 +162,6 @@ def test_wrong_parameters_are_refused(
     assert motors_off(sim)
 
 
-def test_telemetry_is_si_right_handed_and_in_the_loop_s_time(sim: SimProcess) -> None:
-    """Firmware facts, "Signs and units": the Crazyflie's pitch is nose up, ours nose down."""
-    with linked(sim) as link:
-        assert newest(link).has(CAN_FLY)
-        let_pass(sim, 0.5)
-        times = [sample.t_s for sample in link.telemetry()]
-        assert len(times) > 20
-        assert times == sorted(times)
-        assert max(times) <= time.monotonic()
-        assert all(sample.t_s > times[-1] for sample in link.telemetry())
-        sim.set_pose((0.1, -0.2, 0.5), (0.15, 0.25, 0.6), hold=True)
-        true = until(lambda: sim.truth())
-        assert true["rpy_rad"] == pytest.approx((0.15, 0.25, 0.6), abs=1e-3)
-
-        def arrived() -> bool:
-            sample = newest(link)
-            return (
-                math.dist(sample.position_m, true["position_m"]) < 0.02
-                # The estimate of a vehicle turned by hand follows slowly, but the right way.
-                and 0.03 < sample.roll_rad < 0.18
-                and 0.06 < sample.pitch_rad < 0.28
-                and 0.12 < sample.yaw_rad < 0.65
-            )
-
-        until(arrived)
-        sample = newest(link)
-        assert sample.battery_v == pytest.approx(true["battery_v"], abs=0.02)
-        assert sample.acc_z_g == pytest.approx(true["specific_force_mps2"][2] / 9.81, abs=0.1)
-
-
-@pytest.mark.long
-def test_a_silent_link_is_reported(sim: SimProcess) -> None:
-    with linked(sim) as link:
-        assert link.problem(time.monotonic()) is None
-        sim.silence(SILENCE_S + 1.0)
-        began_s = time.monotonic()
-        problem = until(lambda: link.problem(time.monotonic()))
-        assert "nothing heard for" in problem
-        assert time.monotonic() - began_s >= SILENCE_S - 0.2
-        until(lambda: link.problem(time.monotonic()) is None)
-
-
 def test_a_vehicle_that_has_started_anew_is_known_by_its_samples(sim: SimProcess) -> None:
     """By its stamps over the radio; simulated in lockstep, by the firmware's own clock."""
     with linked(sim) as link:
@@ -326,60 +281,3 @@ def test_closing_sends_no_zero_setpoint_when_nothing_is_known_any_more(sim: SimP
         link.close()
         assert sent == []
     let_pass(sim, 1.0)  # for who comes next
-
-
-def test_a_failed_look_at_the_estimate_commands_nothing(sim: SimProcess) -> None:
-    sent: list[list[tuple[int, int]]] = []
-
-    class Failing(ListeningLink):
-        def _prepare(self, connection: Connection) -> None:
-            super()._prepare(connection)
-            sent.append(commands_sent(self, sim))
-            raise ConnectionFailed("by the test")
-
-    with pytest.raises(ConnectionFailed, match="by the test"):
-        Failing(sim.uri, CONFIG, time.monotonic).connect()
-    assert sent == [[]]
-
-
-# --- Lost in flight --------------------------------------------------------------------------
-
-
-def lose(link: CflibLink) -> None:
-    """As a driver ends."""
-    cf(link).link.link_error_callback("unplugged")
-    assert link.problem(time.monotonic()) == "unplugged"
-
-
-@pytest.mark.long
-def test_a_lost_link_is_opened_again_for_the_landing_and_for_the_stop(sim: SimProcess) -> None:
-    with linked(sim) as link:
-        take_off(link, sim)
-        lose(link)
-        link.send(LAND)
-        until(lambda: sim.truth()["floor_contact"] and motors_off(sim))
-        assert not info(sim) & LOCKED
-        until(lambda: link.problem(time.monotonic()) is None)
-        until(lambda: time.monotonic() - newest(link).t_s < 0.3)  # the blocks go on
-        take_off(link, sim)
-        lose(link)
-        link.send(EmergencyStop())
-        until(lambda: info(sim) & LOCKED)
-        assert motors_off(sim)
-
-
-def test_a_link_that_cannot_be_opened_again_holds_up_nobody(
-    sim: SimProcess, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import cflib.crtp
-
-    def gone(*_: object) -> object:
-        raise OSError("no dongle")
-
-    with linked(sim, landing_wait_s=0.2) as link:
-        monkeypatch.setattr(cflib.crtp, "get_link_driver", gone)
-        lose(link)
-        began_s = time.monotonic()
-        link.send(LAND)
-        assert time.monotonic() - began_s < 0.2
-        assert link.problem(time.monotonic()) == "unplugged"

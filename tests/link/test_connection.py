@@ -6,14 +6,10 @@ Time is the test's own: the clock that `perchctl.link.connection` reads.
 
 from __future__ import annotations
 
-import contextlib
 import queue
 import socket
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +17,6 @@ from typing import Any
 
 import cflib.crtp
 import pytest
-from cflib.crtp import radiodriver
 
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.link import CflibLink, Packet, Port
@@ -52,27 +47,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-class Thread:
-    """The thread of a driver, as cflib's radio has it."""
-
-    def __init__(self) -> None:
-        self.alive = True
-        self._retry_before_disconnect: int | None = 100_000
-
-    def is_alive(self) -> bool:
-        return self.alive
-
-
 class Driver:
     """A link of cflib's that can hang, fail, or have no room."""
 
     needs_resending = False
 
     def __init__(self) -> None:
-        self._thread: Any = Thread()
         self.sent: list[bytes] = []
         self.out_queue: queue.Queue[Any] = queue.Queue(1)
-        self.entered, self.free, self.listened = (threading.Event() for _ in range(3))
+        self.entered, self.free = threading.Event(), threading.Event()
         self.free.set()
         self.error: Exception | None = None
 
@@ -84,7 +67,6 @@ class Driver:
         self.sent.append(bytes(packet.data))
 
     def receive_packet(self, wait: float) -> None:
-        self.listened.set()
         time.sleep(min(wait, 0.02))
 
     def close(self) -> None:
@@ -97,15 +79,6 @@ class Bench:
     driver: Driver
     link: CflibLink
     now_s: float = 100.0
-
-    def is_dead_within(self, for_s: float, lost_packets: int = 0, period_s: float = STEP_S) -> bool:
-        """Asked all the time, while the driver counts so many lost packets each time."""
-        dead = False
-        for _ in range(round(for_s / period_s)):
-            self.now_s += period_s
-            self.driver._thread._retry_before_disconnect -= lost_packets
-            dead = dead or self.connection.is_dead()
-        return dead
 
     def place(self, x_m: float) -> bool:
         """Hand over a position from outside."""
@@ -134,36 +107,6 @@ def reopened(bench: Bench, monkeypatch: pytest.MonkeyPatch, driver: Any) -> None
     until(lambda: bench.connection.lost is None, LIMIT_S)
 
 
-# --- A driver that takes nothing ---------------------------------------------------------------
-
-
-def test_a_radio_that_counts_what_it_loses_is_alive_and_one_that_counts_nothing_is_dead(
-    bench: Bench,
-) -> None:
-    assert not bench.is_dead_within(100.0, lost_packets=25)
-    bench.now_s += 1.0
-    assert not bench.is_dead_within(DEAD_S)
-    assert bench.is_dead_within(2 * STEP_S)
-
-
-def test_between_two_questions_that_lie_far_apart_it_may_have_counted(bench: Bench) -> None:
-    """It counts anew after each packet that was answered; and a computer may have slept."""
-    assert not bench.is_dead_within(100.0, period_s=2 * DEAD_S)
-
-
-def test_one_whose_thread_has_ended_is_dead(bench: Bench) -> None:
-    bench.driver._thread.alive = False
-    assert bench.connection.is_dead()
-
-
-@pytest.mark.parametrize("thread", [None, SimpleNamespace(is_alive=lambda: True)])
-def test_of_a_driver_that_tells_nothing_nothing_is_said(bench: Bench, thread: Any) -> None:
-    bench.driver._thread = thread
-    assert not any(bench.connection.is_dead() for _ in range(3))
-    bench.now_s += 2 * DEAD_S
-    assert not bench.connection.is_dead()
-
-
 def test_a_lock_that_is_never_free_is_a_dead_link_and_a_reopened_one_has_its_own(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -178,39 +121,6 @@ def test_a_lock_that_is_never_free_is_a_dead_link_and_a_reopened_one_has_its_own
     assert connection.send(PACKET)
     assert (len(bench.driver.sent), len(after.sent)) == (0, 1)
     assert not connection.is_dead()
-
-
-def test_cflib_listens_to_a_new_driver_at_once(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By itself it looks for one once a second."""
-    after = Driver()
-
-    def late(*_: Any) -> Driver:
-        time.sleep(0.2)
-        return after
-
-    bench.connection.cf.incoming.start()
-    assert bench.driver.listened.wait(LIMIT_S)
-    reopened(bench, monkeypatch, late)
-    assert after.listened.wait(0.4)
-    bench.connection.cf.incoming.stop()
-
-
-def test_a_dead_thread_of_a_dongles_is_not_opened_again(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """cflib would hand it out for ever, and wait for its answers."""
-    radios: list[Any] = [SimpleNamespace(is_alive=lambda: False)]
-    monkeypatch.setattr(radiodriver.RadioManager, "_radios", radios)
-    found: list[Any] = []
-
-    def driver(*_: Any) -> Driver:
-        found.append(radios[0])
-        return Driver()
-
-    reopened(bench, monkeypatch, driver)
-    assert found == [None]
 
 
 # --- Positions from outside, through cflib's lock ----------------------------------------------
@@ -229,112 +139,58 @@ def test_a_position_does_not_wait_behind_a_command_that_hangs(bench: Bench) -> N
     assert driver.sent == [encode_external(at(x)).data for x in (0.0, 3.0)]
 
 
-def test_a_position_does_not_wait_in_the_radio_s_queue(bench: Bench) -> None:
+def test_a_position_goes_out_at_once_or_not_at_all(bench: Bench) -> None:
     bench.driver.out_queue.put("what the radio repeats until it is acknowledged")
     assert bench.place(1.0) is False
     bench.driver.out_queue.get()
-    assert bench.place(2.0) is True
-    assert bench.driver.sent == [encode_external(at(2.0)).data]
-
-
-def test_an_error_of_the_driver_leaves_the_lock_to_the_commands(bench: Bench) -> None:
     bench.driver.error = RuntimeError("unplugged")
     assert bench.place(1.0) is False
     bench.driver.error = None
-    send_packets(bench.connection.cf, [encode_external(at(2.0))])
-    assert len(bench.driver.sent) == 1
-
-
-def test_no_position_goes_out_without_a_link(bench: Bench) -> None:
+    assert bench.place(2.0) is True  # the lock is free
+    assert bench.driver.sent == [encode_external(at(2.0)).data]
+    assert bench.place(1e300) is False
     bench.connection.lost = "gone"
     assert bench.place(1.0) is False
     bench.connection.lost, bench.connection.cf.link = None, None
     assert bench.place(1.0) is False
     bench.link.connection = None
     assert bench.place(1.0) is False
-    assert bench.place(1e300) is False
-    assert bench.driver.sent == []
+    assert len(bench.driver.sent) == 1
 
 
 # --- One program at a time ----------------------------------------------------------------------
 
-_HOLDS = """
-import sys
-from perchctl.link.connection import claim_vehicle
-held = claim_vehicle(sys.argv[1])
-print("held", flush=True)
-sys.stdin.read()
-"""
 
-
-@contextlib.contextmanager
-def another_program(uri: str) -> Iterator[subprocess.Popen[str]]:
-    """One that holds the vehicle, until it is killed."""
-    child = subprocess.Popen(
-        [sys.executable, "-c", _HOLDS, uri],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        assert child.stdout is not None
-        assert child.stdout.readline() == "held\n"
-        yield child
-    finally:
-        child.kill()
-        child.communicate()
-
-
-def test_a_second_program_is_refused_and_told_who_has_it_until_that_one_is_gone() -> None:
-    with another_program(RADIO) as child:
-        with pytest.raises(ConnectionFailed, match=f"process {child.pid}: "):
-            claim_vehicle(RADIO.replace("radio://0", "radio://1"))
-        claim_vehicle("radio://0/80/2M/E7E7E7E702").close()
-        child.kill()  # it has no time to tidy up
-        child.wait()
-        claim_vehicle(RADIO).close()
-
-
-def test_what_was_released_is_free_and_who_holds_it_is_told_without_a_password(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    words = ["/x/perchctl/__main__.py", "fly", "--source", "rtsp://me:secret@cam/s"]
-    monkeypatch.setattr(sys, "argv", words)
-    for _ in range(2):
-        with claim_vehicle(RADIO) as held:
-            with pytest.raises(ConnectionFailed, match="perchctl fly --source rtsp://cam/s"):
-                claim_vehicle(RADIO)
-            held.close()
-            claim_vehicle(RADIO).close()
-
-
-def test_not_one_packet_reaches_a_vehicle_that_is_anothers() -> None:
+def test_a_second_program_is_refused_until_the_first_is_gone() -> None:
+    """Not one packet reaches a vehicle that is another's."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
         vehicle.bind(("127.0.0.1", 0))
         vehicle.settimeout(0.05)
         uri = f"udp://127.0.0.1:{vehicle.getsockname()[1]}"
-        with another_program(uri):
+        with claim_vehicle(uri):
             with pytest.raises(ConnectionFailed, match="two would steer it two ways"):
                 open_connection(uri, 5.0)
             with pytest.raises(TimeoutError):
                 vehicle.recv(64)
+            claim_vehicle(RADIO).close()
+        claim_vehicle(uri).close()
 
 
+@pytest.mark.parametrize("farewell", [True, False])
 def test_a_connection_holds_the_vehicle_until_its_end_and_a_failed_one_does_not(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    farewell: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def nobody(uri: str, timeout_s: float) -> Connection:
-        raise ConnectionFailed("no answer")
-
-    monkeypatch.setattr(room, "_opened", nobody)
+    monkeypatch.setattr(room, "ready_cflib", lambda: None)
+    monkeypatch.setattr(Connection, "open", lambda *_: False)
     for _ in range(2):
         with pytest.raises(ConnectionFailed, match="no answer"):
             open_connection(RADIO, 5.0)
-    monkeypatch.setattr(room, "_opened", lambda *_: bench.connection)
-    for end in (bench.connection.abandon, bench.connection.close):
-        open_connection(RADIO, 5.0)
-        with pytest.raises(ConnectionFailed, match="in use"):
-            claim_vehicle(RADIO)
-        end()
-        claim_vehicle(RADIO).close()
+    monkeypatch.setattr(Connection, "open", lambda *_: True)
+    connection = open_connection(RADIO, 5.0)
+    with pytest.raises(ConnectionFailed, match="in use"):
+        claim_vehicle(RADIO)
+    connection.close(farewell=farewell)
+    claim_vehicle(RADIO).close()
 
 
 def test_without_a_place_for_the_lock_it_flies_all_the_same(folder: Path) -> None:
@@ -360,17 +216,3 @@ def test_a_radio_that_another_program_has_open_is_named_as_that() -> None:
     assert "another program has it open" in said
     assert "radio://1" in said
     assert "udev" not in said
-
-
-def test_a_real_flight_loads_nothing_of_the_simulator() -> None:
-    """Neither does its link: the mock takes a simulated vehicle as an argument."""
-    program = (
-        "import sys, time\n"
-        "import perchctl.flight.session\n"
-        "from perchctl.link import CflibLink, MockLink, Packet, ProbeLink\n"
-        "from perchctl.profile import LinkConfig\n"
-        "CflibLink('radio://0/80/2M', LinkConfig(), time.monotonic)\n"
-        "print(*[name for name in sys.modules if name.startswith('perchctl.sim')])\n"
-    )
-    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (shown.returncode, shown.stdout.split()) == (0, []), shown.stderr

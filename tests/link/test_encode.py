@@ -1,11 +1,12 @@
-"""Commands as bytes: those of an unmodified cflib, on the real link and in lockstep alike."""
+"""Commands as bytes: those of an unmodified cflib, on the real link and in lockstep alike; the
+lockstep link over a radio that loses packets, and without a deck."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 from cflib.crazyflie.commander import Commander
@@ -15,16 +16,20 @@ from cflib.crtp.crtpstack import CRTPPacket
 from hypothesis import given
 from hypothesis import strategies as st
 
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
 from perchctl.errors import InvalidValue
-from perchctl.link import MockLink, Packet
+from perchctl.link import MockLink, Packet, Radio
 from perchctl.link.connection import send_packets
-from perchctl.link.crtp import ARM, LAND_TIMES, MAX_DATA, UNLOCK_THRUST, encode
-from perchctl.sim import CommandService
+from perchctl.link.crtp import ARM, LAND_TIMES, MAX_DATA, UNLOCK_THRUST, UNLOCK_TIMES, encode
+from perchctl.link.firmware import EXTERNAL_POSITION_TICK
+from perchctl.sim import CommandService, Scenario, SimulatedVehicle
 from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.planner import HlLand
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
+    ExternalPosition,
     Idle,
     Land,
     PositionSetpoint,
@@ -126,6 +131,7 @@ def test_packets_are_cflibs_and_sent_as_they_are(command: Command) -> None:
     recorder = Recorder()
     send_packets(recorder, encode(command))
     assert datagrams(encode(command)) == recorder.datagrams == by_cflib(command)
+    assert all(0 < len(packet.data) <= MAX_DATA for packet in encode(command))
 
 
 def test_arming_and_the_thrust_unlock_are_cflibs() -> None:
@@ -134,13 +140,6 @@ def test_arming_and_the_thrust_unlock_are_cflibs() -> None:
     arm.supervisor.send_arming_request(True)
     assert datagrams(UNLOCK_THRUST) == unlock.datagrams
     assert datagrams(ARM) == arm.datagrams
-
-
-@pytest.mark.parametrize("kind", [kind for kind in get_args(Command) if kind is not Idle])
-def test_every_command_has_packets_of_at_most_30_bytes(kind: type[Any]) -> None:
-    packets = encode(kind(*(1 for _ in kind.__match_args__)))
-    assert packets
-    assert all(0 < len(packet.data) <= MAX_DATA for packet in packets)
 
 
 @pytest.mark.parametrize(
@@ -152,17 +151,6 @@ def test_a_number_that_does_not_fit_is_refused(command: Command) -> None:
 
 
 # --- The lockstep link ------------------------------------------------------------------------
-
-
-@given(commands(st.floats(width=32, allow_nan=False)))
-def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None:
-    firmware = Calls()
-    server = CommandService(firmware, PROTOCOL)  # type: ignore[arg-type]
-    for datagram in by_cflib(command):
-        packet = Packet.decode(datagram)
-        assert packet is not None
-        server.handle(packet)
-    assert in_lockstep(command) == firmware.made
 
 
 @pytest.mark.parametrize(("command", "calls"), [
@@ -180,3 +168,39 @@ def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None
 def test_the_lockstep_vehicle_flies_the_command(command: Command, calls: list[Any]) -> None:
     """Values that a float of four bytes holds exactly; what is no number it does not fly."""
     assert in_lockstep(command) == calls
+
+
+class LosesTheFirst(Radio):
+    """So many of the packets sent up are lost at the beginning."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.left = count
+
+    def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
+        self.left -= 1
+        return self.left < 0
+
+
+@pytest.mark.parametrize("lost", [0, 1, 3, 2 * UNLOCK_TIMES - 2])
+def test_a_lost_packet_does_not_leave_the_thrust_locked(lost: int) -> None:
+    """The first raw thrust of the flight would be a cut: nothing in the air may unlock it."""
+    vehicle = SimulatedVehicle(Scenario())
+    link = MockLink(vehicle, radio=LosesTheFirst(lost))
+    link.connect()
+    for _ in range(20):
+        link.send(RawThrust(15000))
+        link.advance_to(link.now_s + 0.02)
+    assert link.telemetry()[-1].thrust == pytest.approx(15000, abs=1500)
+
+
+def test_positions_count_while_they_come_by_the_firmware_s_name() -> None:
+    # crtp_localization_service.c: the group locSrv has no tick.
+    assert EXTERNAL_POSITION_TICK == "locSrvZ.tick"
+    link = MockLink(SimulatedVehicle(Scenario(extra={"external_position": 1.0})))
+    assert link.measured_by().external is False
+    link.external(ExternalPosition((0.0, 0.0, 0.0)))
+    link.advance_to(link.now_s + 0.1)
+    assert link.measured_by().external is False  # those that have ended are none
+    link.each(0.01, lambda now_s: link.external(ExternalPosition((0.0, 0.0, 0.0))))
+    assert link.measured_by().external is True

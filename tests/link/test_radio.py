@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +27,7 @@ from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
 from perchctl.sim import Scenario
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, Telemetry
-from tests.helpers.radio import FORGETS_LOGS_S, URI, Air, OpaqueRadio, plug_in
+from tests.helpers.radio import FORGETS_LOGS_S, URI, Air, plug_in
 
 OTHER_URI = "radio://0/81/2M/E7E7E7E7E7"
 FLOOR = Scenario(mass_kg=0.036, ceiling_z_m=0.9)
@@ -56,8 +56,7 @@ class Flown:
 
     def error_callback(self) -> Callable[[str], None]:
         """What the driver calls with the reason of its end."""
-        driver = self.cf.link
-        callback: Callable[[str], None] = getattr(driver, "inner", driver).link_error_callback
+        callback: Callable[[str], None] = self.cf.link.link_error_callback
         return callback
 
     def problem(self) -> str | None:
@@ -109,11 +108,11 @@ class Flown:
 
 
 @contextmanager
-def connection_by(driver: type[Any], cache: Any, uri: str = URI) -> Iterator[Flown]:
+def connection(cache: Any, uri: str = URI) -> Iterator[Flown]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(cache))
         air = Air(FLOOR)
-        plug_in(air, patch, driver)
+        plug_in(air, patch)
         link = CflibLink(uri, CONFIG, time.monotonic, landing_wait_s=0.2)
         link.connect()
         yield Flown(air, link)
@@ -125,12 +124,9 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return tmp_path_factory.getbasetemp() / "cache"
 
 
-@pytest.fixture(
-    scope="module",
-    params=[radiodriver.RadioDriver, pytest.param(OpaqueRadio, marks=pytest.mark.long)],
-)
-def connected(request: pytest.FixtureRequest, cache: Any) -> Iterator[Flown]:
-    with connection_by(request.param, cache) as flown:
+@pytest.fixture(scope="module")
+def connected(cache: Any) -> Iterator[Flown]:
+    with connection(cache) as flown:
         yield flown
 
 
@@ -152,13 +148,6 @@ class Operator:
 
     def poll(self, now_s: float, newest: Telemetry | None, waiting: object = ()) -> Command | None:
         return EmergencyStop() if self.pressed else None
-
-
-def behind(driver: type[Any]) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize("connected", [driver], indirect=True, scope="module")
-
-
-by_cflibs_own = behind(radiodriver.RadioDriver)
 
 
 # --- Silence ----------------------------------------------------------------------------------
@@ -199,7 +188,6 @@ def test_half_a_second_without_room_is_a_problem_and_less_is_none(flown: Flown) 
     assert 0.5 <= passed_s < 1.0
 
 
-@by_cflibs_own
 def test_a_radio_that_is_only_out_of_reach_is_waited_for(flown: Flown) -> None:
     """Opening it again would reset the dongle. The vehicle forgets its log blocks meanwhile, and is
     told what cflib had told it."""
@@ -237,7 +225,6 @@ def test_a_driver_that_gives_the_radio_up_is_replaced_by_one_that_is_heard(
     flown.await_telemetry()
 
 
-@by_cflibs_own
 def test_an_error_inside_a_call_of_cflibs_leaves_its_lock_free(flown: Flown) -> None:
     """Whoever calls: cflib's own threads do, with their answers to the vehicle."""
     cf = flown.cf
@@ -253,15 +240,14 @@ def test_an_error_inside_a_call_of_cflibs_leaves_its_lock_free(flown: Flown) -> 
     assert flown.heard_after_s(LAND, back_s) < BACK_S
 
 
-@behind(OpaqueRadio)
 def test_a_driver_that_holds_a_command_for_good_is_given_up_with_its_lock(
     flown: Flown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     connection, causes = flown.link.connection, list[str]()
     assert connection is not None
-    reopen = connection.reopen
+    reopen, hold = connection.reopen, threading.Event()
     monkeypatch.setattr(connection, "reopen", lambda *why: (causes.extend(why), reopen(*why)))
-    hold = flown.cf.link.hold = threading.Event()
+    monkeypatch.setattr(flown.cf.link, "send_packet", lambda packet: hold.wait())
     lock = flown.cf._send_lock
     began_s = time.monotonic()
     flown.link.send(LAND)
@@ -273,32 +259,24 @@ def test_a_driver_that_holds_a_command_for_good_is_given_up_with_its_lock(
     hold.set()
 
 
-def goes_on_after_two_ends(flown: Flown) -> None:
-    """The driver tells its end twice, late the second time."""
-    late = flown.error_callback()
-    late("unplugged")
-    assert flown.problem() == "unplugged"
-    flown.until(lambda: flown.problem() is None)
-    late("once more")
-    assert flown.problem() is None
-    flown.await_telemetry()
-
-
-def test_a_late_error_of_a_driver_that_was_given_up_does_not_end_the_next(flown: Flown) -> None:
-    goes_on_after_two_ends(flown)
-    began_s = time.monotonic()
-    flown.link.send(LAND)
-    flown.heard_after_s(LAND, began_s)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("driver", [radiodriver.RadioDriver, OpaqueRadio])
-def test_the_end_of_the_first_driver_is_one_of_many(driver: type[Any], cache: Any) -> None:
-    """The one that cflib opened, with cflib's own word for its end: what cflib then forgets, nobody
-    asks for again, and a second word of it would end the next driver."""
-    with connection_by(driver, cache, OTHER_URI) as flown:
+@pytest.mark.parametrize("is_first", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_a_late_error_of_a_driver_that_was_given_up_does_not_end_the_next(
+    is_first: bool, flown: Flown, cache: Any
+) -> None:
+    """The driver tells its end twice, late the second time; also the one that cflib opened itself,
+    with cflib's own word for its end."""
+    with connection(cache, OTHER_URI) if is_first else nullcontext(flown) as flown:
         flown.await_telemetry()
-        goes_on_after_two_ends(flown)
+        late = flown.error_callback()
+        late("unplugged")
+        assert flown.problem() == "unplugged"
+        flown.until(lambda: flown.problem() is None)
+        late("once more")
+        assert flown.problem() is None
+        flown.await_telemetry()
+        began_s = time.monotonic()
+        flown.link.send(LAND)
+        flown.heard_after_s(LAND, began_s)
 
 
 def test_an_order_that_may_have_been_lost_with_the_link_is_sent_again(flown: Flown) -> None:
@@ -326,7 +304,7 @@ def test_a_dongle_that_was_pulled_out_and_put_in_again_goes_on(flown: Flown) -> 
 
 
 def test_closing_in_silence_is_bounded_and_says_no_farewell(cache: Any) -> None:
-    with connection_by(radiodriver.RadioDriver, cache, OTHER_URI) as flown:
+    with connection(cache, OTHER_URI) as flown:
         flown.stream(0.1)
         heard = len(flown.air.heard)
         flown.air.silent.set()
@@ -341,7 +319,6 @@ def test_closing_in_silence_is_bounded_and_says_no_farewell(cache: Any) -> None:
 # --- What perchctl relies on in cflib ---------------------------------------------------------
 
 
-@by_cflibs_own
 def test_the_installed_cflib_has_what_the_link_looks_at(flown: Flown) -> None:
     """All of it is private or may change; where it is missing, the link goes on without."""
     cf, driver = flown.cf, flown.cf.link

@@ -247,30 +247,22 @@ def test_a_command_that_cannot_be_divided_is_in_nobodys_way(library: Library) ->
     assert "no number" in str(sender.problem)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_thread_that_has_ended_is_noticed_and_its_work_goes_on(library: Library) -> None:
-    library.error = SystemExit()
-    sender = library.sender()
-    sender.put(LAND)
-    until(lambda: sender.problem is not None)
-    library.error = None
-    assert "had ended" in str(sender.problem)
-    library.takes(LAND)
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_watchdogs_thread_that_has_ended_is_noticed_and_started_again(library: Library) -> None:
-    asked: list[BaseException] = [SystemExit()]
+def test_no_error_ends_a_thread(library: Library) -> None:
+    """Not even one that is meant to: the watchdog's goes on, and so does the sender's."""
+    asked: list[BaseException] = [SystemExit("of the guard")]
 
     def guard() -> Command | None:
         if asked:
             raise asked.pop()
         return STOP
 
+    library.error = SystemExit("of the library")
     sender = library.sender(guard=guard)
-    until(lambda: not asked and sender.look_after() is None and sender.problem is not None)
-    assert "watchdog" in str(sender.problem)
+    sender.put(LAND)
+    until(lambda: "of the library" in str(sender.problem))
+    library.error = None
     until(lambda: STOP in library.taken)
+    assert not asked
 
 
 # --- The guard --------------------------------------------------------------------------------

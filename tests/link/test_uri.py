@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
-
 import pytest
 
 from perchctl.errors import InvalidValue
-from perchctl.link import UDEV_HELP, check_uri, listening, vehicle_uri
+from perchctl.link import check_uri, listening, vehicle_uri
+from perchctl.link.uri import UDEV_HELP
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
 
@@ -20,23 +19,15 @@ def test_good_uris(uri: str) -> None:
     assert check_uri(uri) == uri.split(":")[0]
 
 
-@pytest.mark.parametrize(("uri", "said"), [
-    *((uri, "is not one") for uri in ("", "radio:/0", "udp://host", "http://host:80", "sim")),
-    ("udp://host:0", "has no port of 1 to 65535"),
-    ("tcp://host:65536", "has no port of 1 to 65535"),
-    ("radio://0/200/2M", "has channel '200'; allowed: 0 to 125"),
-    ("radio://0/126", "has channel '126'"),
-    ("radio://0/", "has channel ''"),
-    ("radio://0/x/2M", "has channel 'x'"),
-    ("radio://0/80/3M/E7E7E7E7E7", "has data rate '3M'; allowed: 250K, 1M, 2M"),
-    ("radio://0/80/2M/E7", "has address 'E7'; allowed: ten hex digits"),
-    ("radio://0/80/2M/E7E7E7E7EG", "has address 'E7E7E7E7EG'"),
-    ("radio://0/80/2M/E7?rate_limit=100", "has address 'E7'"),
+@pytest.mark.parametrize("uri", [
+    "", "radio:/0", "udp://host", "http://host:80", "sim", "sim://1", "udp://host:0", "tcp://host:65536",
+    "radio://0/200/2M", "radio://0/126", "radio://0/", "radio://0/x/2M",
+    "radio://0/80/3M/E7E7E7E7E7", "radio://0/80/2M/E7E7E7E7EG", "radio://0/80/2M/E7E7E7E7E7E",
 ])  # fmt: skip
-def test_what_is_wrong_with_a_uri_is_named_with_examples(uri: str, said: str) -> None:
-    with pytest.raises(InvalidValue, match=re.escape(f"URI {uri!r} {said}")) as caught:
+def test_a_wrong_uri_is_refused_with_what_is_allowed(uri: str) -> None:
+    with pytest.raises(InvalidValue, match=r"channel 0 to 125.*ten hex digits") as caught:
         check_uri(uri)
-    assert "radio://0/80/2M/E7E7E7E7E7" in str(caught.value)
+    assert repr(uri) in str(caught.value)
 
 
 @pytest.mark.parametrize(("one", "other", "same"), [
@@ -68,8 +59,8 @@ def test_a_scan_gives_uris_that_are_taken(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("cflib.crtp.CLASSES", [Radio])
     monkeypatch.setattr(listening, "ready_cflib", lambda: None)
     monkeypatch.setattr(listening, "_radio_problem", lambda: "")
-    found = listening.find_vehicles("radio://0/80/2M/0000000001?rate_limit=100").uris
-    assert found == ("radio://0/80/2M", "radio://0/80/2M/0000000001")
+    found = listening.find_vehicles("radio://0/80/2M/0000000001?rate_limit=100")[0]
+    assert found == ["radio://0/80/2M", "radio://0/80/2M/1"]
     assert list(map(check_uri, found)) == ["radio", "radio"]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from perchctl.calibration.board.detect import BoardView, FoundViews, Rejection, find_board
 from perchctl.calibration.board.solve import MIN_VIEWS
 from perchctl.calibration.live import GuidedFrame, poll_frames
-from perchctl.camera import BrokenPicture, FrameSource, Grey, VideoSource, read_grey
+from perchctl.camera import FrameSource, Grey, decode_picture, open_camera
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import Array
 from perchctl.target import Board
@@ -48,9 +48,9 @@ def find_views(
 
     def search(name: str, path: Path) -> BoardView | tuple[str, tuple[int, int] | None]:
         try:
-            image = read_grey(path)
-        except BrokenPicture as error:
-            return error.reason, None
+            image = decode_picture(path.read_bytes())
+        except (OSError, ValueError) as error:
+            return str(error), None
         found = find_board(image, board, name)
         return found if isinstance(found, BoardView) else (found, (image.shape[1], image.shape[0]))
 
@@ -84,7 +84,7 @@ def _views_of_video(path: Path, board: Board, progress: Progress) -> FoundViews:
     def search(frame: Frame) -> BoardView | str:
         return find_board(frame.image, board, f"frame {frame.index}")
 
-    source = VideoSource(path)
+    source = open_camera(f"video:{path}", time.monotonic)
     found: list[BoardView] = []
     searched = 0
     try:
@@ -102,7 +102,7 @@ def _views_of_video(path: Path, board: Board, progress: Progress) -> FoundViews:
     return FoundViews(tuple(select_views(found, board)))
 
 
-def _sharpest_frames(source: VideoSource) -> Iterator[Frame]:
+def _sharpest_frames(source: FrameSource) -> Iterator[Frame]:
     """Yield the sharpest frame of each window."""
     window: list[Frame] = []
     while (frame := source.poll(0.0)) is not None:

@@ -50,7 +50,7 @@ class PoseReader:
 
     def look(self, frame: Frame) -> list[SeenPose]:
         """Return the target's poses in a frame: one, or one in each of its two fields."""
-        judged = self._perception.assess(frame, self._live)
+        judged = self._perception.health.assess(frame, self._live)
         if judged.kind == "repeated":
             return []
         self.outlines, self.trouble = (), "" if judged.usable else judged.text
