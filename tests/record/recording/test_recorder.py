@@ -7,19 +7,12 @@ import io
 import os
 import threading
 import time
-import tracemalloc
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import lz4.frame
 import pytest
-import zstandard
-from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, Header, Message, Schema
-from mcap.writer import MCAP0_MAGIC
 
 from perchctl.errors import InvalidValue
 from perchctl.mission import FlightReport, Outcome, Phase
@@ -32,7 +25,6 @@ from perchctl.record import (
     recording_file,
     summary_text,
 )
-from perchctl.record import recorded as reading
 from perchctl.record import recorder as recording_module
 from perchctl.record.recorder import Recorder
 from perchctl.record.write import FlightLogWriter
@@ -255,63 +247,6 @@ def test_a_file_that_was_cut_gives_what_is_whole(tmp_path: Path) -> None:
     assert counts[0] == 0
     assert counts[-1] == 120
     assert len(set(counts)) > 3  # chunk by chunk, about one a second
-
-
-def with_chunk(compression: str, unfolded: bytes, packed: bytes) -> bytes:
-    """An MCAP file of one chunk, as far as it is read."""
-    builder = RecordBuilder()
-    Header(profile="", library="").write(builder)
-    Chunk(compression, packed, 0, 0, zlib.crc32(unfolded), len(unfolded)).write(builder)
-    return bytes(MCAP0_MAGIC + builder.end())
-
-
-@pytest.mark.parametrize("compression", ["lz4", "zstd"])
-def test_a_chunk_that_unfolds_without_bound_is_refused(
-    compression: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bomb = bytes(40_000_000)
-    packed = lz4.frame.compress(bomb) if compression == "lz4" else zstandard.compress(bomb)
-    path = tmp_path / "bomb.mcap"
-    path.write_bytes(with_chunk(compression, bomb, packed))
-    monkeypatch.setattr(reading, "MOST_CHUNK_BYTES", 1_000_000)
-    tracemalloc.start()
-    with pytest.raises(InvalidValue, match="more than 1 MB"):
-        list(recorded_pictures(path))
-    peak_bytes = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak_bytes < 6_000_000
-
-
-@pytest.mark.parametrize("compression", ["", "zstd"])  # lz4 is what a recorder writes
-def test_a_chunk_of_each_compression_is_read(compression: str, tmp_path: Path) -> None:
-    builder = RecordBuilder()
-    Schema(id=1, data=b"", encoding="", name="x").write(builder)
-    Channel(id=1, topic="/tick", message_encoding="json", metadata={}, schema_id=1).write(builder)
-    Message(channel_id=1, log_time=5, data=b"{}", publish_time=5, sequence=7).write(builder)
-    plain = builder.end()
-    packed = zstandard.compress(plain) if compression else plain
-    path = tmp_path / "one.mcap"
-    path.write_bytes(with_chunk(compression, plain, packed))
-    ((topic, message),) = reading._messages(path, ("/tick",))
-    assert (topic, message.sequence, message.data) == ("/tick", 7, b"{}")
-    path.write_bytes(with_chunk(compression, plain, packed[: len(plain) // 2]))
-    assert list(reading._messages(path, ("/tick",))) == [], "torn"
-
-
-def test_a_record_too_large_is_refused_and_one_behind_the_end_is_torn(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(reading, "MOST_CHUNK_BYTES", 1_000)
-    path = tmp_path / "x.mcap"
-    builder = RecordBuilder()
-    Header(profile="", library="").write(builder)
-    Attachment(log_time=0, create_time=0, name="", media_type="", data=bytes(2_000)).write(builder)
-    whole = bytes(MCAP0_MAGIC + builder.end())
-    path.write_bytes(whole)
-    with pytest.raises(InvalidValue, match="more than"):
-        list(reading._messages(path, ("/tick",)))
-    path.write_bytes(whole[:-1])
-    assert list(reading._messages(path, ("/tick",))) == []
 
 
 def test_a_killed_program_leaves_what_is_older_than_a_second(tmp_path: Path) -> None:
