@@ -248,7 +248,7 @@ def list_log(path: Path) -> dict[str, Any]:
     """Return one log of a folder, by its header and end. Never raises for a file that is bad."""
     found: dict[str, Any] = dict.fromkeys(_LISTED) | {"log": str(path)}
     try:
-        log = read_log(path, ends_suffice=True)
+        log = read_log(path)
         end = FlightSummary.of(log)
     except PerchError as error:
         return found | {"problem": str(error).removeprefix(f"{path}: ")}

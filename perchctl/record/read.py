@@ -6,7 +6,6 @@ import base64
 import contextlib
 import gzip
 import math
-import os
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping
@@ -41,13 +40,9 @@ Exact = TypeVar("Exact", Turn, SentCommand)
 SUFFIX = ".jsonl"
 KINDS = ("tick", "turn", "sent", "event", "summary", "recording")
 """Of a log's records behind its header."""
-MOST_LOG_BYTES = 300_000_000
-"""Of a log, unpacked: three quarters of an hour of flight at 0.115 MB/s. What a packed file of a
-megabyte unfolds to may otherwise fill the memory."""
 SAME_S = 1e-3
 """Times that differ by less are those of one tick."""
 _GZIP = b"\x1f\x8b"
-_TAIL_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -230,9 +225,7 @@ class FlightLog:
             return None
         width, height = camera.size_px
         try:
-            # No more than the mask: what a damaged text unfolds to has no bound.
-            most = width * height // 8 + 1
-            packed = zlib.decompressobj().decompress(base64.b64decode(text), most)
+            packed = zlib.decompress(base64.b64decode(text))
             bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8))
             return bits[: width * height].reshape(height, width).astype(bool)
         except (ValueError, TypeError, zlib.error) as error:
@@ -255,16 +248,13 @@ class FlightLog:
 # --- the file -----------------------------------------------------------------------------
 
 
-def read_log(path: Path | str, *, ends_suffice: bool = False) -> FlightLog:
+def read_log(path: Path | str) -> FlightLog:
     """Read a flight log, packed by gzip or not; an unreadable tail is ignored and counted.
 
-    With `ends_suffice` it may hold header and summary alone, which is quick. Raises NotFound when
-    there is no such file, and InvalidValue, with the line, when it is not a flight log or is
-    damaged elsewhere than at its end.
+    Raises NotFound when there is no such file, and InvalidValue, with the line, when it is not a
+    flight log or is damaged elsewhere than at its end.
     """
     path = Path(path)
-    if ends_suffice and (ends := _ends_of(path)) is not None:
-        return ends
     lines = _lines(path)
     header = _header(path, lines)
     good: list[dict[str, Any]] = []
@@ -299,23 +289,6 @@ def read_log(path: Path | str, *, ends_suffice: bool = False) -> FlightLog:
     )
 
 
-def _ends_of(path: Path) -> FlightLog | None:
-    """Read header and summary alone; None where the file does not end with its summary."""
-    try:
-        with path.open("rb") as stream:
-            first = stream.readline()
-            stream.seek(max(len(first), os.fstat(stream.fileno()).st_size - _TAIL_BYTES))
-            last = stream.read().splitlines()[-2:]
-        header, end = _header(path, [first]), decode_line(last[-1])
-        if end.get("kind") == "recording":
-            end = decode_line(last[0]) | _without_kind(end)
-    except (OSError, ValueError, IndexError, InvalidValue):
-        return None
-    if end.get("kind") != "summary":
-        return None
-    return FlightLog(path, header, [], [], end, truncated=False)
-
-
 @contextlib.contextmanager
 def log_values(path: Path) -> Iterator[None]:
     """Raise InvalidValue where the code within meets a value of the log that no flight writes."""
@@ -333,27 +306,19 @@ def _lines(path: Path) -> list[bytes]:
     """Read the lines of a file; none of what cannot be a log, as it may be a video of gigabytes.
     The end of a packed file that was cut is lost."""
     lines: list[bytes] = []
-    left = MOST_LOG_BYTES + 1
     try:
         with path.open("rb") as file:
             is_packed = file.peek(len(_GZIP)).startswith(_GZIP)
             stream = gzip.GzipFile(fileobj=file) if is_packed else file
             with contextlib.suppress(gzip.BadGzipFile, EOFError, zlib.error):
                 if stream.peek(1).startswith(b"{"):
-                    while left and (line := stream.readline(left)):
-                        lines.append(line)
-                        left -= len(line)
+                    lines.extend(stream)
     except FileNotFoundError:
         raise NotFound(f"flight log {path} does not exist") from None
     except IsADirectoryError:
         raise NotFound(f"flight log {path} is a folder; name one of its .jsonl files") from None
     except OSError as error:
         raise NotFound(f"flight log {path} cannot be read: {error.strerror}") from None
-    if not left:
-        raise InvalidValue(
-            f"{path}: it has more than {MOST_LOG_BYTES / 1e6:g} MB, and no flight's log has so "
-            f"much: take the original, or cut it off behind some line"
-        )
     return lines
 
 
