@@ -37,7 +37,6 @@ class _Turn:
 
     frame: Frame | None = None
     events: list[Mapping[str, Any]] = field(default_factory=list)
-    sent: Mapping[str, Any] | None = None
     tick: Mapping[str, Any] | None = None
 
     @property
@@ -108,15 +107,6 @@ class Recorder:
         if not self._closed:
             self._turn.events.append(record)
 
-    def sent(self, values: Mapping[str, Any]) -> None:
-        """Record what was sent in the loop's place (`perchctl.record.fields.sent_values`), from any
-        thread: the loop hangs, perhaps, and its turn is left alone. Never raises."""
-        if self._closed or self._over:
-            return
-        alone = _Turn(sent=values)
-        if not self._writer.put(partial(self._write, alone)):
-            self._note_lag("turns are missing in it")
-
     def tick(self, record: Mapping[str, Any]) -> None:
         """Record a tick (`perchctl.record.fields.tick_record`), which ends a turn. Never raises."""
         if not self._closed:
@@ -182,8 +172,6 @@ class Recorder:
             file.frame(frame_record(turn.frame), kept)
         for event in turn.events:
             file.event(event)
-        if turn.sent is not None:
-            file.sent(turn.sent)
         if turn.tick is not None:
             file.tick(turn.tick)
         now_s = file.newest_s

@@ -55,7 +55,7 @@ TARGET, SETPOINT = "target", "setpoint"
 
 IMAGE, FRAME, CALIBRATION = "/camera/image", "/camera/frame", "/camera/calibration"
 CORNERS, TF, PATH = "/camera/corners", "/tf", "/vehicle/path"
-LOG, TICK, SENT = "/log", "/tick", "/sent"
+LOG, TICK = "/log", "/tick"
 
 HEADER_NAME = "header.json"
 CHUNK_BYTES = 4_000_000
@@ -143,11 +143,6 @@ class RecordingFile:
             exposed_ns = epoch.ns(float(record["frame_t_s"]))
             self._add(CORNERS, ns, corners_message(exposed_ns, record))
         self._add(TICK, ns, encode(self._since_first(record))[:-1])
-
-    def sent(self, values: Mapping[str, Any]) -> None:
-        """Write what was sent in the loop's place (`perchctl.record.fields.sent_values`)."""
-        ns = self._ns_of(float(values["t_s"]))
-        self._add(SENT, ns, encode(self._since_first(values))[:-1])
 
     def event(self, record: Mapping[str, Any]) -> None:
         """Write an event's record (`perchctl.record.fields.event_record`)."""
@@ -281,12 +276,6 @@ def _schema(
 
 SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     TICK: _schema("perchctl.Tick", "One turn of the flight loop, as the flight log has it", FIELDS),
-    SENT: _schema(
-        "perchctl.Sent",
-        "What was sent to the vehicle in the flight loop's place",
-        ("t_s", *(key for key in FIELDS if key.split("_")[0] == "cmd")),
-        by=("string", "watchdog, rescue, reconnect or farewell"),
-    ),
     FRAME: _schema(
         "perchctl.Frame",
         "A frame that the camera gave",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from perchctl.camera import FrameSource, WatchedSource
 from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
 from perchctl.profile import Profile
-from perchctl.record.fields import event_record, sent_values, tick_record
+from perchctl.record.fields import event_record, tick_record
 from perchctl.record.header import make_header
 from perchctl.record.read import PhaseSpan
 from perchctl.record.summary import FlightSummary, RecordingEnd
@@ -125,8 +125,6 @@ class LogWatcher:
     def sent(self, sent: SentCommand) -> None:
         """Write what was sent in the loop's place; from any thread, and without waiting."""
         self.writer.sent(sent)
-        if self._recorder is not None:
-            self._recorder.sent(sent_values(sent))
 
     def event(self, event: Event) -> None:
         self.writer.event(event)

@@ -19,11 +19,8 @@ from perchctl.geometry import (
     rot_z,
     rotation_from_rpy,
 )
-from perchctl.mission import SentCommand
 from perchctl.record import recorded_pictures
-from perchctl.record.fields import sent_values
 from perchctl.record.recording_file import SCHEMAS, calibration_message
-from perchctl.vehicle import Land
 from perchctl.vision import CameraModel
 from tests.helpers import recorded
 from tests.helpers.flights import ROOT
@@ -39,7 +36,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "flight.mcap"
     recorder = recorded.recorder(path, started=STARTED, t0_s=1.0)
     recorded.fly(recorder, FLIGHT)
-    recorder.sent(sent_values(SentCommand(FLIGHT.ticks[-1]["t_s"], "watchdog", Land(-0.05, 2.0))))
     end = recorder.close()
     assert (end.pictures, end.missing, end.problem) == (len(FLIGHT.frames), 0, None)
     return path
