@@ -29,8 +29,6 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Point2_pb2 import Point2
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
-from foxglove_schemas_protobuf.Pose_pb2 import Pose
-from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.message import Message
@@ -54,7 +52,7 @@ WORLD, BODY, GEAR, CAMERA = "world", "body", "gear", "camera"
 TARGET, SETPOINT = "target", "setpoint"
 
 IMAGE, FRAME, CALIBRATION = "/camera/image", "/camera/frame", "/camera/calibration"
-CORNERS, TF, PATH = "/camera/corners", "/tf", "/vehicle/path"
+CORNERS, TF = "/camera/corners", "/tf"
 LOG, TICK = "/log", "/tick"
 
 HEADER_NAME = "header.json"
@@ -63,9 +61,6 @@ PNG_LEVEL = 1
 """Fast; the next levels cost twice the time for a twentieth of the size."""
 LOOP_TIMES = ("t_s", "frame_t_s")
 """Of a tick's record: in the recording they count from the first flown turn."""
-PATH_PERIOD_S = 1.0
-"""The whole path so far is written so often: who jumps into the middle sees what was flown."""
-PATH_STEP_S = 0.1
 BODY_KEYS = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
 TARGET_KEYS = ("tx_m", "ty_m", "tz_m", "tyaw_rad")
 SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
@@ -96,8 +91,6 @@ class RecordingFile:
         self._epoch: Epoch | None = None
         self._first_s: float | None = None
         self._target: FrameTransform | None = None  # where it was last
-        self._path = PosesInFrame(frame_id=WORLD)
-        self._path_s = self._point_s = -math.inf
         self._stream = stream
         self._writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)  # type: ignore[arg-type]
         self._channels: dict[str, int] = {}
@@ -135,8 +128,6 @@ class RecordingFile:
         for still in (*self._mounts, self._target):
             if still is not None:
                 still.timestamp.CopyFrom(stamp(ns))
-        if body is not None:
-            self._add_path(body, t_s, ns)
         moving = [each for each in (body, self._target, setpoint) if each is not None]
         self._add(TF, ns, FrameTransforms(transforms=[*self._mounts, *moving]))
         if record.get("frame_t_s") is not None:
@@ -178,15 +169,6 @@ class RecordingFile:
             self._stream.flush()
         with suppress(OSError):
             self._stream.close()
-
-    def _add_path(self, body: FrameTransform, t_s: float, ns: int) -> None:
-        if t_s - self._point_s >= PATH_STEP_S:
-            self._point_s = t_s
-            self._path.poses.append(Pose(position=body.translation, orientation=body.rotation))
-        if t_s - self._path_s >= PATH_PERIOD_S:
-            self._path_s = t_s
-            self._path.timestamp.CopyFrom(stamp(ns))
-            self._add(PATH, ns, self._path)
 
     def _since_first(self, record: Mapping[str, Any]) -> dict[str, Any]:
         """Return the record with its times counted from the first flown turn, as every output
