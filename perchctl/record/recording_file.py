@@ -20,7 +20,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
@@ -40,19 +39,18 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
 import perchctl
-from perchctl.calibration import profile_camera
 from perchctl.geometry import quaternion_from_rotation, quaternion_from_rpy
 from perchctl.profile import Profile
 from perchctl.record.disk import Stream
 from perchctl.record.exact import encode
 from perchctl.record.fields import FIELDS, field_kind
-from perchctl.vision import CameraModel, Frame
+from perchctl.vision import Frame
 
 WORLD, BODY, GEAR, CAMERA = "world", "body", "gear", "camera"
 TARGET, SETPOINT = "target", "setpoint"
 
-IMAGE, FRAME, CALIBRATION = "/camera/image", "/camera/frame", "/camera/calibration"
-CORNERS, TF = "/camera/corners", "/tf"
+IMAGE, FRAME, CORNERS = "/camera/image", "/camera/frame", "/camera/corners"
+TF = "/tf"
 LOG, TICK = "/log", "/tick"
 
 HEADER_NAME = "header.json"
@@ -81,13 +79,11 @@ class RecordingFile:
     def __init__(
         self, stream: Stream, header: Mapping[str, Any], profile: Profile | None = None
     ) -> None:
-        """Begin the file. Without a profile it has neither mounting nor calibration. Raises
-        NotFound and InvalidValue for the profile's calibration."""
+        """Begin the file. Without a profile it has no mounting."""
         self.pictures = self.size_bytes = 0
         self.newest_s = 0.0
         self._header = header
         self._mounts = () if profile is None else mounts_of(profile)
-        self._camera = None if profile is None else profile_camera(profile.camera)
         self._epoch: Epoch | None = None
         self._first_s: float | None = None
         self._target: FrameTransform | None = None  # where it was last
@@ -192,8 +188,6 @@ class RecordingFile:
             ns = epoch.ns(epoch.t0_s)
             text = json.dumps(self._header).encode()
             self._writer.add_attachment(ns, ns, HEADER_NAME, "application/json", text)
-            if self._camera is not None:
-                self._add(CALIBRATION, ns, calibration_message(ns, self._camera))
         return self._epoch
 
     def _add(self, topic: str, ns: int, message: Message | bytes, sequence: int = 0) -> None:
@@ -274,8 +268,6 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
 
 # --- Foxglove's messages ----------------------------------------------------------------------
 
-_MODELS = {"fisheye": "kannala_brandt"}
-"""Foxglove's name of OpenCV's fisheye; the others are called alike."""
 _LEVELS = {"hold": Log.WARNING, "back off": Log.WARNING, "land": Log.ERROR, "stop": Log.FATAL}
 _OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)
 
@@ -283,24 +275,6 @@ _OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)
 def stamp(ns: int) -> Timestamp:
     """Return nanoseconds since 1970 as protobuf's time stamp."""
     return Timestamp(seconds=ns // NS, nanos=ns % NS)
-
-
-def calibration_message(ns: int, camera: CameraModel) -> CameraCalibration:
-    """Return the calibration with its distortion. One camera needs no rectification: R is 1 and P
-    holds K."""
-    width, height = camera.size_px
-    P = np.hstack([camera.K, np.zeros((3, 1))])
-    return CameraCalibration(
-        timestamp=stamp(ns),
-        frame_id=CAMERA,
-        width=width,
-        height=height,
-        distortion_model=_MODELS.get(camera.model, camera.model),
-        D=[float(v) for v in np.ravel(camera.dist)],
-        K=[float(v) for v in np.ravel(camera.K)],
-        R=[float(v) for v in np.eye(3).ravel()],
-        P=[float(v) for v in P.ravel()],
-    )
 
 
 def log_message(ns: int, record: Mapping[str, Any]) -> Log:

@@ -12,7 +12,6 @@ import pytest
 from foxglove_schemas_protobuf import Log_pb2
 from mcap.reader import make_reader
 
-from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import (
     make_T,
@@ -20,8 +19,7 @@ from perchctl.geometry import (
     rotation_from_rpy,
 )
 from perchctl.record import recorded_pictures
-from perchctl.record.recording_file import SCHEMAS, calibration_message
-from perchctl.vision import CameraModel
+from perchctl.record.recording_file import SCHEMAS
 from tests.helpers import recorded
 from tests.helpers.flights import ROOT
 
@@ -81,7 +79,6 @@ def test_no_recording_and_none_of_ours(tmp_path: Path) -> None:
 
 FOXGLOVE_S = {
     "/camera/image": "CompressedImage",
-    "/camera/calibration": "CameraCalibration",
     "/camera/corners": "ImageAnnotations",
     "/tf": "FrameTransforms",
     "/log": "Log",
@@ -195,19 +192,6 @@ def test_values_that_are_no_numbers_make_no_transform(tmp_path: Path) -> None:
     assert set(recorded.transforms(found["/tf"][0])) == {"body camera", "body gear"}
 
 
-def test_the_calibration_is_the_flights(found: dict[str, list[Any]]) -> None:
-    (said,) = found["/camera/calibration"]
-    camera = profile_camera(recorded.PROFILE.camera)
-    assert (said.width, said.height, said.frame_id) == (*camera.size_px, "camera")
-    assert said.distortion_model == "plumb_bob"
-    assert list(said.D) == list(camera.dist)
-    np.testing.assert_array_equal(np.reshape(said.K, (3, 3)), camera.K)
-    np.testing.assert_array_equal(np.reshape(said.R, (3, 3)), np.eye(3))
-    np.testing.assert_array_equal(np.reshape(said.P, (3, 4))[:, :3], camera.K)
-    fisheye = CameraModel((8, 6), np.eye(3), np.zeros(4), "fisheye")
-    assert calibration_message(0, fisheye).distortion_model == "kannala_brandt"
-
-
 def test_events_are_log_lines_with_their_gravity(found: dict[str, list[Any]]) -> None:
     (said,) = found["/log"]
     assert said.message == "LANDING: target not found"
@@ -229,7 +213,7 @@ def test_the_layout_shows_what_is_there(found: dict[str, list[Any]]) -> None:
     text = json.dumps(shown)
     named = {word for word in text.replace(".", '"').split('"') if word.startswith("/")}
     assert named <= topics
-    assert {"/camera/image", "/camera/calibration"} <= named
+    assert {"/camera/image", "/camera/corners"} <= named
     plotted = {
         path["value"].removeprefix("/tick.")
         for panel in shown["configById"].values()
