@@ -28,7 +28,6 @@ from perchctl.record import (
     decode_line,
     from_exact,
     json_line,
-    make_log_folder,
     path_beside,
     to_exact,
 )
@@ -98,7 +97,7 @@ def campaign_results(
     `open_results`). `failed_logs_only`: of the logs in `log_dir` only those of bad flights stay.
     Errors: InvalidValue."""
     if log_dir is not None:
-        make_log_folder(log_dir)
+        check_place(log_dir / "flight.jsonl", force=True)
     if out is None:
         yield CampaignResults(seeds, None, failed_logs_only)
         return

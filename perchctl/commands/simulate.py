@@ -44,7 +44,7 @@ from perchctl.errors import (
     no_simulator,
 )
 from perchctl.profile import Profile, load_profile
-from perchctl.record import make_log_folder, summary_text, to_plain
+from perchctl.record import summary_text, to_plain
 
 R = TypeVar("R", bound="_Flown")
 C = TypeVar("C", bound="campaigns.CampaignFlight")
@@ -168,8 +168,6 @@ def run(
     if out is not None and out.suffix != ".jsonl":
         raise InvalidValue(f"{out} must end in .jsonl: a result is one line of JSON")
     flown = with_positioning(load_profile(profile), positioning)
-    if only is not None and log_dir is not None:
-        make_log_folder(log_dir)
     if cluster is not None and log_dir is not None:
         log_dir = log_dir.absolute()  # workers are started in other folders
     seeds = _seeds(flights, seed)

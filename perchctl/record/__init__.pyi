@@ -14,5 +14,4 @@ from .summary import FlightSummary as FlightSummary
 from .summary import summary_text as summary_text
 from .table import log_table as log_table
 from .watch import LogWatcher as LogWatcher
-from .write import make_log_folder as make_log_folder
 from .write import path_beside as path_beside

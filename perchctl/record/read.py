@@ -274,14 +274,13 @@ def read_log(path: Path | str) -> FlightLog:
             )
         good.append(record)
     summary = next((r for r in good if r["kind"] == "summary"), None)
-    recording = next((r for r in good if r["kind"] == "recording"), {})
     blank = dict.fromkeys(FIELDS)
     return FlightLog(
         path=path,
         header=header,
         records=[blank | _without_kind(r) for r in good if r["kind"] == "tick"],
         events=[_without_kind(r) for r in good if r["kind"] == "event"],
-        summary=None if summary is None else _without_kind(summary | recording),
+        summary=None if summary is None else _without_kind(summary),
         truncated=summary is None or ignored > 0,
         ignored_bytes=ignored,
         turn_records=[r for r in good if r["kind"] == "turn"],

@@ -36,7 +36,7 @@ class RecordingEnd:
         return f"{told} ({self.problem})" if self.problem else told
 
     def as_record(self) -> dict[str, Any]:
-        """Return the record for the log, beside which the recording lies: its name is enough."""
+        """Return the record for programs."""
         return {
             "recording": self.path.name,
             "pictures": self.pictures,
@@ -57,7 +57,7 @@ class FlightSummary:
         contact: the program's own error, of what hangs.
         touchdown: how the floor was met, as far as that was felt.
         lost_records, log_problem: what the log lacks, and why; 0 and None for a whole one.
-        recording: what became of it, None of a flight without one.
+        recording: what became of it; None of a flight without one, and of one that is read back.
     """
 
     outcome: str
@@ -105,7 +105,6 @@ class FlightSummary:
             touchdown=_part_in(end, Touchdown, _TOUCHDOWN),
             lost_records=int(end.get("lost_records") or 0),
             log_problem=end.get("problem"),
-            recording=_recording_in(end, log.path),
         )
 
     def as_record(self) -> dict[str, Any]:
@@ -150,18 +149,6 @@ def _part_in(end: Mapping[str, Any], kind: Any, keys: Mapping[str, str]) -> Any:
     if next(iter(keys.values())) not in known:
         return None
     return kind(**{n: tuple(v) if isinstance(v, list) else v for n, v in known.items()})
-
-
-def _recording_in(end: Mapping[str, Any], beside: Path) -> RecordingEnd | None:
-    name = end.get("recording")
-    if not name:
-        return None
-    return RecordingEnd(
-        beside.parent / Path(str(name)).name,
-        int(end.get("pictures") or 0),
-        int(end.get("pictures_missing") or 0),
-        end.get("recording_problem"),
-    )
 
 
 def _last_known(log: FlightLog) -> str:

@@ -1,4 +1,4 @@
-"""What goes to the vehicle in the loop's place is in the log, in its recording, and is told."""
+"""What goes to the vehicle in the loop's place is in the log, and is told."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import os
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -16,19 +15,15 @@ from perchctl.analysis.story import story_of
 from perchctl.flight import fly
 from perchctl.flight.watchdog import rescue
 from perchctl.link.sender import Sender
-from perchctl.mission import FlightReport, Operator, Outcome, Phase, SentCommand
+from perchctl.mission import Operator, SentCommand
 from perchctl.perception import History
 from perchctl.record import LogWatcher, read_log
-from perchctl.record import recorder as recording_module
 from perchctl.record.fields import sent_values
-from perchctl.record.recorder import Recorder
 from perchctl.record.write import FlightLogWriter
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers import log as synthetic
-from tests.helpers import recorded
 from tests.helpers.loop_rig import HANG_AT_S, PROFILE, Clock, hung_rig
 from tests.helpers.mission import telemetry
-from tests.helpers.recorded import MemoryDisk
 from tests.helpers.scripted_link import ScriptedLink
 
 HOLD, LAND = PositionSetpoint(0.1, 0.2, 1.0 / 3.0, 0.0), Land(-0.05, 2.0)
@@ -131,20 +126,10 @@ def test_the_sender_tells_of_its_guard_and_not_of_the_loop() -> None:
 # --- never in the flight's way ----------------------------------------------------------------
 
 
-def hung_recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[LogWatcher, MemoryDisk]:
-    disk = MemoryDisk()
-    monkeypatch.setattr(recording_module, "CLOSE_TIMEOUT_S", 0.3)
-    header = synthetic.header()
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", header, live=True)
-    recorder = Recorder(tmp_path / "f.mcap", disk, header, recorded.PROFILE, True)
-    watcher = LogWatcher(writer, recorder)
-    watcher.sent(TOLD[0])
-    disk.gate.clear()
-    return watcher, disk
-
-
 def test_the_guard_waits_for_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    watcher, disk = hung_recorder(tmp_path, monkeypatch)
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
+    watcher = LogWatcher(writer)
+    watcher.sent(TOLD[0])
     gate, real = threading.Event(), os.write
     monkeypatch.setattr(os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
     spent_s = time.thread_time()
@@ -154,39 +139,5 @@ def test_the_guard_waits_for_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert time.monotonic() - began_s < 5.0  # a disk that were waited for takes 20
     assert time.thread_time() - spent_s < 1.0
     gate.set()
-    disk.gate.set()
     watcher.close()
     assert len(read_log(watcher.path).sent) == 51
-
-
-REPORT = FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging still", 1, 9.0, False)
-
-
-def test_the_summary_is_safe_before_the_recording_s_end_is_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    watcher, disk = hung_recorder(tmp_path, monkeypatch)
-    recorder: Any = watcher._recorder
-    seen: list[Any] = []
-    close = recorder.close
-
-    def looked() -> Any:
-        end_s = time.monotonic() + 20.0
-        while (found := read_log(watcher.path).summary) is None and time.monotonic() < end_s:
-            time.sleep(0.005)  # the log's thread writes it meanwhile
-        seen.append(found)
-        return close()
-
-    recorder.close = looked
-    summary = watcher.close(REPORT)
-    assert seen[0] is not None
-    assert seen[0]["outcome"] == "perched"
-    assert "pictures" not in seen[0]
-    assert summary is not None
-    assert summary.recording is not None
-    assert "does not answer" in (summary.recording.problem or "")
-    end = read_log(watcher.path).summary
-    assert end is not None
-    assert end["recording_problem"] == summary.recording.problem
-    assert (summary.lost_records, summary.log_problem) == (0, None)
-    disk.gate.set()

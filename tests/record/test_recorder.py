@@ -1,30 +1,21 @@
-"""A recording that is spoilt: the disk full, hung or too slow, the flight killed. The flight goes
-on, what is there can be read, and what is missing is said."""
+"""The recorder never costs the flight anything: not when its disk is full, fails, hangs or is too
+slow, and what it wrote by then is readable."""
 
 from __future__ import annotations
 
-import io
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
 
 from perchctl.errors import InvalidValue
 from perchctl.mission import FlightReport, Outcome, Phase
-from perchctl.profile import Profile
-from perchctl.record import (
-    FlightSummary,
-    LogWatcher,
-    read_log,
-    recorded_pictures,
-    recording_file,
-    summary_text,
-)
+from perchctl.record import LogWatcher, read_log, recorded_pictures, recording_file, summary_text
 from perchctl.record import recorder as recording_module
 from perchctl.record.recorder import Recorder
 from perchctl.record.write import FlightLogWriter
@@ -36,8 +27,8 @@ from tests.helpers.recorded import MemoryDisk
 WAIT_S = 20.0
 
 
-def onto(disk: MemoryDisk, live: bool = False, profile: Profile = recorded.PROFILE) -> Recorder:
-    return Recorder(Path("f.mcap"), disk, synthetic.header(), profile, live)
+def onto(disk: Any, live: bool = False) -> Recorder:
+    return Recorder(Path("f.mcap"), disk, synthetic.header(), recorded.PROFILE, live)
 
 
 def pictures_on(disk: MemoryDisk, tmp_path: Path) -> list[int]:
@@ -53,71 +44,42 @@ def until(met: Callable[[], object]) -> None:
         time.sleep(0.005)
 
 
-# -- a disk that is full --------------------------------------------------------------------
+# -- what ends a recording ------------------------------------------------------------------
 
 
-def test_a_full_disk_ends_the_recording_with_one_sentence(tmp_path: Path) -> None:
-    disk, flight = MemoryDisk(room=110_000), recorded.flown(120)
-    recorder = onto(disk)
-    recorded.fly(recorder, flight)
-    (said,) = recorder.take_remarks()
-    assert "No space left on device" in said
-    assert "the flight and its log go on" in said
-    assert recorder.take_remarks() == []
-    end = recorder.close()
-    assert (end.problem, recorder.take_remarks()) == (said, [])
-    assert end.pictures + end.missing == len(flight.frames)
-    assert 0 < end.pictures < 60
-    assert disk.closed
-    assert pictures_on(disk, tmp_path)[: end.pictures] == list(range(end.pictures))
-    # There was room for the end's few bytes, as there is where a great chunk was refused.
-    reader = make_reader(io.BytesIO(bytes(disk.data)), validate_crcs=True)
-    assert len(list(reader.iter_messages(topics=["/tick"]))) > 40
-
-
-def test_the_disk_s_last_is_left_to_the_log(tmp_path: Path) -> None:
-    disk = MemoryDisk()
-    recorder, flight = onto(disk), recorded.flown(120)
-    recorded.fly(recorder, recorded.Flown(flight.frames[:60], flight.ticks[:120]))
-    disk.free = recording_module.RESERVE_BYTES - 1
-    recorded.fly(recorder, recorded.Flown(flight.frames[60:], flight.ticks[120:]))
-    (said,) = recorder.take_remarks()
-    assert "200 MB are left" in said
-    assert "kept for the log" in said
-    end = recorder.close()
-    assert 60 < end.pictures < 120
-    summary = make_reader(io.BytesIO(bytes(disk.data))).get_summary()
-    assert summary is not None  # it was ended well, with its index
-    assert len(pictures_on(disk, tmp_path)) == end.pictures
-
-
-def test_beyond_its_size_it_goes_on_without_pictures(tmp_path: Path) -> None:
-    profile = recorded.PROFILE
-    small = profile.model_copy(update={"log": profile.log.model_copy(update={"max_mb": 0.15})})
+@pytest.mark.parametrize(
+    ("change", "said", "whole"),
+    [
+        ({"room": 110_000}, "No space left on device", False),
+        ({"free": recording_module.RESERVE_BYTES - 1}, "are left to the log", True),
+        ({"max_mb": 0.15}, "log.max_mb in the profile is 0.15", True),
+        ({"tick": {"t_s": 1.9, "phase": object()}}, "TypeError", False),
+    ],
+)
+def test_what_ends_the_recording_is_one_sentence_and_the_flight_goes_on(
+    tmp_path: Path, change: dict[str, Any], said: str, whole: bool
+) -> None:
+    """A full disk, a disk with the log's last room, a recording as large as it may be, and what
+    cannot be encoded."""
     disk, flight = MemoryDisk(), recorded.flown(120)
-    recorder = onto(disk, profile=small)
-    recorded.fly(recorder, flight)
-    (said,) = recorder.take_remarks()
-    assert "log.max_mb" in said
-    assert "0.15" in said
+    recorder = onto(disk)
+    recorded.fly(recorder, recorded.Flown(flight.frames[:60], flight.ticks[:120]))
+    disk.room, disk.free = change.get("room"), change.get("free", 10**12)
+    recorder._most_bytes = change.get("max_mb", 1000) * 1e6
+    if "tick" in change:
+        recorder.tick(change["tick"])
+    recorded.fly(recorder, recorded.Flown(flight.frames[60:], flight.ticks[120:]))
     end = recorder.close()
-    assert end.pictures == len(pictures_on(disk, tmp_path)) < 120
-    assert end.missing == 120 - end.pictures
-    found = recorded.messages(tmp_path / "f.mcap")
-    assert len(found["/tick"]) == len(flight.ticks)
-    assert len(found["/camera/frame"]) == 120
-    pictures_bytes = sum(len(image.data) for image in found["/camera/image"])
-    assert pictures_bytes < 150_000
-
-
-def test_what_cannot_be_encoded_ends_it_and_nothing_else() -> None:
-    recorder, flight = onto(MemoryDisk()), recorded.flown(4)
-    recorder.frame(flight.frames[0])
-    recorder.tick({"t_s": 1.2, "phase": object()})
-    (said,) = recorder.take_remarks()
-    assert "TypeError" in said
-    recorded.fly(recorder, flight)
-    assert recorder.close().missing == 5
+    assert said in (end.problem or "")
+    assert "the flight and its log go on" in (end.problem or "")
+    assert end.pictures + end.missing == len(flight.frames)
+    assert 0 < end.pictures < 120
+    assert disk.closed
+    assert pictures_on(disk, tmp_path) == list(range(end.pictures))
+    with (tmp_path / "f.mcap").open("rb") as stream:
+        assert whole is (len(disk.data) > 8 and disk.data[-8:] == b"\x89MCAP0\r\n")
+        if whole:
+            assert make_reader(stream, validate_crcs=True).get_summary() is not None
 
 
 def test_a_place_that_cannot_be_written_is_refused_before_the_flight(tmp_path: Path) -> None:
@@ -148,38 +110,25 @@ def hung(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryDisk]:
 def test_a_disk_that_hangs_holds_up_nobody(
     hung: MemoryDisk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The queue's place for pictures is used up, and then its place for turns."""
-    held_bytes = recording_module._Turn(recorded.frame(0, 1.0, as_jpeg=True)).held_bytes
-    monkeypatch.setattr(recording_module, "MOST_PICTURE_BYTES", 10 * held_bytes)
+    """What may wait is used up; it goes on with the next turn that there is room for."""
+    monkeypatch.setattr(recording_module, "MOST_WAITING_BYTES", 300_000)
     monkeypatch.setattr(recording_file, "CHUNK_BYTES", 1)
     recorder, flight = onto(hung, live=True), recorded.flown(120)
     hung.gate.clear()
     began_s = time.monotonic()
     recorded.fly(recorder, flight)
     assert time.monotonic() - began_s < 2.0  # 240 turns; the disk answers none of them
-    (said,) = recorder.take_remarks()
-    assert "does not keep up" in said
+    assert "does not keep up" in (recorder.problem or "")
     hung.gate.set()
-    until(lambda: recorder._done_bytes == recorder._handed_bytes)
+    until(lambda: recorder._writer._left == 0)
     recorder.frame(recorded.frame(200, 20.0, as_jpeg=True))
     recorder.tick({**flight.ticks[-1], "t_s": 20.0})
     end = recorder.close()
     kept = pictures_on(hung, tmp_path)
     assert end.pictures == len(kept)
     assert end.pictures + end.missing == 121
-    assert 10 <= len(kept) <= 13  # and it goes on with the next that there is room for
+    assert 10 <= len(kept) <= 15
     assert kept[-1] == 200
-
-
-def test_a_queue_that_is_full_drops_turns(
-    hung: MemoryDisk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recording_module, "MOST_BEHIND", 20)
-    recorder = onto(hung, live=True)
-    hung.gate.clear()
-    recorded.fly(recorder, recorded.flown(60))
-    (said,) = recorder.take_remarks()
-    assert "turns are missing" in said
 
 
 def test_closing_does_not_wait_for_ever(hung: MemoryDisk, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,11 +139,10 @@ def test_closing_does_not_wait_for_ever(hung: MemoryDisk, monkeypatch: pytest.Mo
     began_s = time.monotonic()
     end = recorder.close()
     assert time.monotonic() - began_s < 5.0
-    assert end.problem is not None
-    assert "does not answer" in end.problem
+    assert "does not answer" in (end.problem or "")
     assert end.missing == 10 - end.pictures > 0
     hung.gate.set()
-    until(lambda: hung.closed)  # should the disk ever answer, nothing stays open
+    until(lambda: hung.closed)  # should the disk ever answer, it is ended
 
 
 # -- live and in lockstep -----------------------------------------------------------------------
@@ -228,44 +176,34 @@ def test_frames_before_the_first_tick_are_kept_and_repetitions_are_not(tmp_path:
 # -- a flight that is killed -------------------------------------------------------------------
 
 
-def test_a_file_that_was_cut_gives_what_is_whole(tmp_path: Path) -> None:
-    """Wherever it is cut: what a killed process leaves is a beginning of its file."""
-    whole = tmp_path / "whole.mcap"
-    recorder, flight = recorded.recorder(whole), recorded.flown(120)
-    recorded.fly(recorder, flight)
-    recorder.close()
-    data = whole.read_bytes()
-    counts = []
-    for cut in [*range(64, len(data), len(data) // 25), len(data) - 20]:
-        path = tmp_path / "cut.mcap"
-        path.write_bytes(data[:cut])
-        found = list(recorded_pictures(path))
-        assert [p.number for p in found] == list(range(len(found)))
-        assert all((p.image == flight.frames[p.number].image).all() for p in found)
-        counts.append(len(found))
-    assert counts == sorted(counts)
-    assert counts[0] == 0
-    assert counts[-1] == 120
-    assert len(set(counts)) > 3  # chunk by chunk, about one a second
-
-
-def test_a_killed_program_leaves_what_is_older_than_a_second(tmp_path: Path) -> None:
-    """The system has every chunk that was flushed, without the file being closed."""
-    path = tmp_path / "f.mcap"
+def test_what_is_left_by_a_killed_flight_gives_what_is_whole(tmp_path: Path) -> None:
+    """Wherever the file ends: it is a beginning, and about a second is lost."""
+    path, cut_path = tmp_path / "f.mcap", tmp_path / "cut.mcap"
     recorder, flight = recorded.recorder(path), recorded.flown(120)
     recorded.fly(recorder, flight)
     found = [p.t_s for p in recorded_pictures(path)]  # as another program sees it now
     last_s = flight.frames[-1].t_s
     assert last_s - 1.2 < found[-1] < last_s
-    assert os.path.getsize(path) > 0
     recorder.close()
+    data, counts = path.read_bytes(), []
+    for cut in [*range(64, len(data), len(data) // 25), len(data) - 20]:
+        cut_path.write_bytes(data[:cut])
+        pictures = list(recorded_pictures(cut_path))
+        assert [p.number for p in pictures] == list(range(len(pictures)))
+        assert all((p.image == flight.frames[p.number].image).all() for p in pictures)
+        counts.append(len(pictures))
+    assert counts == sorted(counts)
+    assert (counts[0], counts[-1]) == (0, 120)
+    assert len(set(counts)) > 3  # chunk by chunk, about one a second
+
+
+# -- beside the log -----------------------------------------------------------------------------
 
 
 def test_what_is_wrong_with_it_is_no_problem_of_the_log_s(tmp_path: Path) -> None:
     """For which the vehicle would land."""
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
     disk = MemoryDisk()
-    log = LogWatcher(writer, onto(disk))
+    log = LogWatcher(FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header()), onto(disk))
     disk.room = 0
     log.event(recorded.EVENT)
     for tick in recorded.flown(1).ticks:
@@ -279,10 +217,30 @@ def test_what_is_wrong_with_it_is_no_problem_of_the_log_s(tmp_path: Path) -> Non
     assert summary is not None
     assert summary.log_problem is None
     assert f"0 pictures in f.mcap ({said})" in summary_text(summary)
-    read = FlightSummary.of(read_log(tmp_path / "f.jsonl")).recording
-    assert read is not None
-    assert (read.pictures, read.problem) == (0, said)
-    assert read.path == tmp_path / "f.mcap"
+
+
+def test_the_log_is_whole_before_the_recording_s_end_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hung: MemoryDisk
+) -> None:
+    monkeypatch.setattr(recording_module, "CLOSE_TIMEOUT_S", 0.1)
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
+    log = LogWatcher(writer, onto(hung, live=True))
+    log.event(recorded.EVENT)
+    hung.gate.clear()
+    recorder: Any = log._recorder
+    close = recorder.close
+
+    def closed() -> Any:
+        assert read_log(log.path).summary is not None
+        return close()
+
+    recorder.close = closed
+    report = FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging still", 1, 9.0, False)
+    summary = log.close(report)
+    assert summary is not None
+    assert summary.recording is not None
+    assert "does not answer" in (summary.recording.problem or "")
+    assert (summary.lost_records, summary.log_problem) == (0, None)
 
 
 def test_a_flight_that_never_began_leaves_no_file(tmp_path: Path) -> None:
