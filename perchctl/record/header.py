@@ -25,19 +25,7 @@ from perchctl.camera import profile_record, without_password
 from perchctl.errors import PerchError
 from perchctl.profile import Profile, read_mask
 from perchctl.record.exact import to_exact
-from perchctl.record.fields import EVENT_FIELDS, FIELDS, FORMAT, SCHEMA_VERSION
-
-TURN_NOTE = (
-    "records of kind turn: all that a turn of the loop took in, knew and decided, not rounded; "
-    "their times are on the loop's clock"
-)
-
-
-SENT_NOTE = (
-    "records of kind sent: a command that went to the vehicle in the loop's place, not rounded: "
-    "the watchdog's (the loop was silent, or the operator's stop), a rescue's after an error, an "
-    "order once more over a link that was lost, and the link's farewell"
-)
+from perchctl.record.fields import FIELDS, FORMAT, SCHEMA_VERSION
 
 
 def make_header(
@@ -68,9 +56,6 @@ def make_header(
         **camera_record(profile),
         **computer_record(),
         "fields": FIELDS,
-        "event_fields": EVENT_FIELDS,
-        "turns": TURN_NOTE,
-        "sent": SENT_NOTE,
     }
 
 
