@@ -36,7 +36,6 @@ from perchctl.files import check_output, same_file, write_files
 from perchctl.profile import Profile, changed_profile, load_profile
 from perchctl.record import (
     FlightLog,
-    log_table,
     log_values,
     path_beside,
     read_log,
@@ -195,9 +194,9 @@ def export(
     place = output or path_beside(path, ".csv")
     check_output(place, EXPORTS, force, "what a log is exported to")
     with _opened(path) as log:
-        table = log_table(log)
-    write_files({place: table.csv().encode("utf-8", errors="backslashreplace")})
-    rows, columns = len(table.rows), len(table.columns)
+        table = log.csv()
+    write_files({place: table.encode("utf-8", errors="backslashreplace")})
+    rows, columns = len(log.records), table.partition("\n")[0].count(",") + 1
     if as_json:
         found = {"log": str(path), "output": str(place), "format": "csv"}
         print_result(found | {"rows": rows, "columns": columns})

@@ -12,6 +12,5 @@ from .read import read_log as read_log
 from .recorded import recorded_pictures as recorded_pictures
 from .summary import FlightSummary as FlightSummary
 from .summary import summary_text as summary_text
-from .table import log_table as log_table
 from .watch import LogWatcher as LogWatcher
 from .write import path_beside as path_beside

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import csv
 import gzip
 import math
 import warnings
@@ -11,6 +12,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,6 +32,7 @@ from perchctl.record.fields import (
     FORMAT,
     READABLE_VERSIONS,
     SCHEMA_VERSION,
+    field_kind,
     sent_values,
 )
 from perchctl.record.header import computer_record
@@ -145,6 +148,23 @@ class FlightLog:
                 spans.append(PhaseSpan(phase, at_s, at_s, *words))
         return tuple(spans)
 
+    def csv(self) -> str:
+        """Return the ticks as CSV: a line of names, then a line each tick with times from 0 and the
+        markers' corners as columns of their own; a missing value is empty, a flag 0 or 1.
+
+        Errors: InvalidValue for a log without ticks; what `log_values` takes for a value that no
+        flight writes.
+        """
+        if not self.records:
+            raise InvalidValue(f"{self.path}: the log holds no ticks, there is nothing to export")
+        text = StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(name for key in FIELDS for name in _columns_of(key))
+        for record in self.records:
+            times = {key: self.since(record[key]) for key in TIMES if record[key] is not None}
+            writer.writerow(cell for key in FIELDS for cell in _cells(key, {**record, **times}))
+        return text.getvalue()
+
     # --- times
 
     @property
@@ -243,6 +263,33 @@ class FlightLog:
             for key in here
             if key in was and was[key] != here[key]
         )
+
+
+TIMES = ("t_s", "frame_t_s")
+"""On the loop's clock in the log, from the flight's first turn in a table."""
+
+
+def _columns_of(key: str) -> list[str]:
+    """Return the names of the columns of a field in a table."""
+    if field_kind(key) != "corners":
+        return [key]
+    corners = ("tl", "tr", "br", "bl")
+    return [f"{key.removesuffix('_px')}_{corner}_{axis}_px" for corner in corners for axis in "xy"]
+
+
+def _cells(key: str, record: Mapping[str, Any]) -> list[Any]:
+    """Return the values of those columns in a record."""
+    value, kind = record[key], field_kind(key)
+    if kind == "corners":
+        cells = [None] * 8 if value is None else list(value)
+        if len(cells) != 8:
+            raise ValueError(f"{key} needs 8 numbers")
+        return cells
+    if kind == "flag" and value is not None:
+        return [int(value)]
+    if kind == "number" and value is not None:
+        return [round(value + 0.0, 6)]
+    return [value]
 
 
 # --- the file -----------------------------------------------------------------------------
