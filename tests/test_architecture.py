@@ -95,7 +95,7 @@ MOST_NAMES = {
     "faults": 15,
     "flight": 22,
     "link": 15,
-    "record": 18,
+    "record": 13,
     "mission": 42,
     "perception": 15,
     "positioning": 15,

@@ -11,7 +11,7 @@ from typing import Any
 
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.errors import NotFound, PerchError
-from perchctl.record import FlightLog, FlightSummary, read_log, summary_text
+from perchctl.record import FlightLog, FlightSummary, read_log
 
 COLUMNS = 79
 _HANG = 11
@@ -119,7 +119,7 @@ def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
     """Yield the lines that `fly` ends with, but for the phases, which come as a table."""
     log = flight.log
     end = replace(flight.summary, phases=(), battery_min_v=None)
-    first, *others = summary_text(end).splitlines()
+    first, *others = end.text().splitlines()
     yield from wrap(plain(first), COLUMNS, subsequent_indent="  ")
     for line in others:
         name, _, text = line.partition(":")

@@ -25,7 +25,6 @@ from perchctl.files import cannot_be_written, check_place
 from perchctl.profile import Profile
 from perchctl.record import (
     camera_record,
-    decode_line,
     from_exact,
     json_line,
     path_beside,
@@ -298,7 +297,9 @@ def _read_line(
 ) -> str | None:
     """Add the flight of a line to `flights`, or return the program's source that a header names.
     Raises ValueError for any other line, and InvalidValue for the header of another campaign."""
-    record = decode_line(line)
+    record = json.loads(line)
+    if not isinstance(record, dict):
+        raise ValueError("not an object")
     what = record.pop("kind", None)
     if what == "flight":
         result = result_from(record, kind)

@@ -44,7 +44,7 @@ from perchctl.errors import (
     no_simulator,
 )
 from perchctl.profile import Profile, load_profile
-from perchctl.record import summary_text, to_plain
+from perchctl.record import to_exact
 
 R = TypeVar("R", bound="_Flown")
 C = TypeVar("C", bound="campaigns.CampaignFlight")
@@ -499,7 +499,7 @@ def _report_flight(
         start_s = flight.events[0].t_s
         for event in flight.events:
             print(timed_event_text(event, start_s))
-        print(summary_text(summary, flight.log), flush=True)
+        print(summary.text(flight.log), flush=True)
     plot = _plot(flight.log, profile)
     if as_json:
         lacks = {"lost_records": summary.lost_records, "log_problem": summary.log_problem}
@@ -523,7 +523,7 @@ def _report_fault(
     assert result.log is not None
     plot = _plot(result.log, profile)
     if as_json:
-        print_result(to_plain({**known, "plot": plot}))
+        print_result(to_exact({**known, "plot": plot}))
     elif plot is not None:
         print(f"{'plot':<18} {plot}")
 

@@ -28,8 +28,8 @@ from perchctl.mission import (
     TurnInputs,
     TurnTiming,
 )
-from perchctl.record import decode_line, from_exact, to_exact, to_plain
-from perchctl.record.exact import encode
+from perchctl.record import from_exact, to_exact
+from perchctl.record.exact import decode_line, encode, to_plain
 from perchctl.record.read import sent_of, turn_of
 from perchctl.record.write import sent_line, turn_line
 from perchctl.vehicle import (

@@ -12,7 +12,8 @@ import pytest
 
 from perchctl.mission import ExternalPositions, Phase, PlannerState
 from perchctl.mission.state import BatteryOutlook
-from perchctl.record import FlightSummary, path_beside, read_log, summary_text, to_plain
+from perchctl.record import FlightSummary, path_beside, read_log
+from perchctl.record.exact import to_plain
 from perchctl.record.fields import FIELDS, tick_record
 from perchctl.record.write import FlightLogWriter, log_path
 from perchctl.vehicle import (
@@ -141,8 +142,8 @@ def test_the_recording_is_found_by_the_log_the_packed_log_and_itself(name: str) 
 
 def test_the_summary_says_what_the_log_lacks() -> None:
     whole = FlightSummary("perched", "hanging still")
-    assert "log lost" not in summary_text(whole)
+    assert "log lost" not in whole.text()
     lost = replace(whole, lost_records=7, log_problem="disk full")
-    assert "log lost:  7 records (disk full)" in summary_text(lost)
+    assert "log lost:  7 records (disk full)" in lost.text()
     unsynced = replace(whole, log_problem="I/O error")
-    assert "log lost:  perhaps its last records (I/O error)" in summary_text(unsynced)
+    assert "log lost:  perhaps its last records (I/O error)" in unsynced.text()

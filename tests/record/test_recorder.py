@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from perchctl.errors import InvalidValue
 from perchctl.mission import FlightReport, Outcome, Phase
-from perchctl.record import LogWatcher, read_log, recorded_pictures, recording_file, summary_text
+from perchctl.record import LogWatcher, read_log, recorded_pictures, recording_file
 from perchctl.record import recorder as recording_module
 from perchctl.record.recorder import Recorder
 from perchctl.record.write import FlightLogWriter
@@ -216,7 +216,7 @@ def test_what_is_wrong_with_it_is_no_problem_of_the_log_s(tmp_path: Path) -> Non
     summary = log.close(FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False))
     assert summary is not None
     assert summary.log_problem is None
-    assert f"0 pictures in f.mcap ({said})" in summary_text(summary)
+    assert f"0 pictures in f.mcap ({said})" in summary.text()
 
 
 def test_the_log_is_whole_before_the_recording_s_end_is_waited_for(
