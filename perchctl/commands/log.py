@@ -12,11 +12,8 @@ import typer
 from perchctl.analysis import (
     Comparison,
     FlightAnalysis,
-    check_readable,
     list_text,
     newest_logs,
-    replay_lines,
-    replay_record,
     show_record,
     show_text,
     write_report,
@@ -247,17 +244,16 @@ def replay(
         if profile is not None or settings:
             base = log.flown_profile if profile is None else load_profile(profile)
             wanted = changed_profile(base, settings or ())
-        check_readable(log)
     is_recorded = pictures and path_beside(path, ".mcap").is_file()
     found = replay_flight(log, recorded_pictures(path) if is_recorded else None, wanted)
     if wanted is not None and not found.changed:
         say("nothing was changed: that is what was flown")
     if as_json:
-        print_result(replay_record(found))
+        print_result(found.record())
     else:
         for note in found.notes:
             say(note)
-        print("\n".join(replay_lines(found)))
+        print("\n".join(found.lines()))
     return 0 if found.same else ReplayDiffers.exit_code
 
 
