@@ -85,7 +85,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # Packages with a face: the others take its names, and nothing from behind it. The number is how
 # many names it has at most.
 MOST_NAMES = {
-    "analysis": 15,
+    "analysis": 12,
     "calibration": 30,
     "camera": 27,
     "campaign": 25,

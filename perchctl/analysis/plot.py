@@ -12,11 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.sight import Frames
-from perchctl.analysis.words import times
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.plot import (
@@ -42,6 +40,8 @@ Span = tuple[str, float, float]
 """A phase's name, and from when to when on the axis."""
 NAME_GAP = 0.02
 """Share of the time axis between the names of two phases, so that they do not overlap."""
+LOST_SHARE = 0.05
+"""Of a panel's height, in which lost frames are marked."""
 FULL_THRUST_PERCENT = 1 / 655.35
 RAW = (("j", "s", GREEN, "both, raw"), ("l", "o", SKY, "large, raw"), ("s", "^", ORANGE,
        "small, raw"))  # fmt: skip
@@ -72,18 +72,17 @@ def flight_png(flight: FlightAnalysis) -> bytes:
 
 
 def flight_figure(flight: FlightAnalysis) -> Figure:
-    """Draw errors, detections against the filtered track (as the paper's figure 6), where frames
-    were lost, height, thrust and battery, over the named phases; and the last seconds with the
-    target in millimetres."""
-    figure = new_figure(11.0, 17.0)
-    *axes, last_ax = figure.subplots(9, 1, height_ratios=(1.7, 1, 1, 1, 1, 0.25, 1.1, 1.1, 2.0))
-    _draw_errors(axes[0], flight)
-    for ax, (key, scale, label) in zip(axes[1:5], TRACKS, strict=True):
+    """Draw detections against the filtered track (as the paper's figure 6), height, thrust and
+    battery, over the named phases; and the last seconds with the target in millimetres. Where the
+    pipeline had nothing to measure is marked at the bottom."""
+    figure = new_figure(11.0, 14.0)
+    *axes, last_ax = figure.subplots(7, 1, height_ratios=(1, 1, 1, 1, 1.1, 1.1, 2.0))
+    for ax, (key, scale, label) in zip(axes[:4], TRACKS, strict=True):
         _draw_raw_and_filtered(ax, flight, key, scale, label)
-    axes[1].legend(handles=_track_legend(), loc="best", ncols=5, fontsize=8)
-    _draw_lost(axes[5], flight.frames)
-    _draw_height(axes[6], flight)
-    _draw_power(axes[7], flight)
+        _mark_lost(ax, flight.frames)
+    axes[0].legend(handles=_track_legend(), loc="best", ncols=6, fontsize=8)
+    _draw_height(axes[4], flight)
+    _draw_power(axes[5], flight)
     shown_s = _draw_last_seconds(last_ax, flight)
     spans = [(stay.phase, stay.start_s, stay.end_s) for stay in flight.log.phases]
     whole_s = (float(flight.t_s[0]), float(max(flight.t_s[-1], flight.t_s[0] + 1e-3)))
@@ -118,19 +117,6 @@ def title_of(flight: FlightAnalysis) -> str:
 # --- panels -------------------------------------------------------------------------------
 
 
-def _draw_errors(ax: Axes, flight: FlightAnalysis) -> None:
-    """The target relative to the gear: horizontally, and its height on an axis of its own."""
-    for axis, colour in (("x", BLUE), ("y", ORANGE)):
-        e_cm = 100.0 * flight.tracked(f"e{axis}_m")
-        ax.plot(flight.t_s, e_cm, color=colour, linewidth=1.3, label=f"e{axis}")
-    ax.axhline(0.0, color=GREY, linewidth=0.8)
-    ax.set_ylabel("aside [cm]")
-    up_ax = ax.twinx()
-    up_ax.plot(flight.t_s, flight.tracked("ez_m"), color=BLACK, linewidth=1.0,
-               linestyle="--", label="ez [m], right")  # fmt: skip
-    _add_legend(ax, up_ax)
-
-
 def _draw_raw_and_filtered(
     ax: Axes, flight: FlightAnalysis, key: str, scale: float, label: str
 ) -> None:
@@ -158,21 +144,8 @@ def _track_legend() -> list[Line2D]:
             for _, marker, colour, text in RAW
         ),
         Line2D([], [], color=BLACK, linewidth=1.4, label="filtered"),
-        Line2D([], [], color=VERMILLION, linewidth=2.4, label="filtered, unseen"),
+        Line2D([], [], color=VERMILLION, linewidth=2.4, label="unseen, or no frame"),
     ]
-
-
-def _draw_lost(ax: Axes, frames: Frames) -> None:
-    """Where the pipeline had nothing to measure: no frame, or none with the target."""
-    _mark_lost(ax, frames, 1.0, GREY)
-    ax.set_yticks([])
-    ax.set_ylabel("lost", rotation=0, ha="right", va="center")
-    gaps = times(len(frames.gaps_s)) if len(frames.gaps_s) else "never"
-    handles = [
-        Rectangle((0, 0), 1, 1, color=VERMILLION, label=f"no frame ({gaps})"),
-        Line2D([], [], color=GREY, label=f"frame without target ({len(frames.unseen_s)})"),
-    ]
-    ax.legend(handles=handles, loc="lower right", ncols=2, fontsize=8, bbox_to_anchor=(1.0, 0.9))
 
 
 def _draw_height(ax: Axes, flight: FlightAnalysis) -> None:
@@ -236,19 +209,18 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
     ax.set_ylim(-1.15 * max(span_mm), 1.15 * max(span_mm))
     ax.set_ylabel("last 5 s with\nthe target [mm]")
     _add_legend(ax, up_ax)
-    _mark_lost(ax, frames, 0.05, BLACK)
+    _mark_lost(ax, frames)
     ax.set_xlim(low_s, high_s)
     return low_s, high_s
 
 
-def _mark_lost(ax: Axes, frames: Frames, height: float, colour: str) -> None:
-    """Mark frames without the target, and times without any frame, at the panel's bottom, up to
-    a share of its height."""
+def _mark_lost(ax: Axes, frames: Frames) -> None:
+    """Mark frames without the target, and times without any frame, at the panel's bottom."""
     if frames.unseen_s.size:
-        ax.vlines(frames.unseen_s, 0.0, height, transform=ax.get_xaxis_transform(), color=colour,
-                  linewidth=0.7)  # fmt: skip
+        ax.vlines(frames.unseen_s, 0.0, LOST_SHARE, transform=ax.get_xaxis_transform(),
+                  color=BLACK, linewidth=0.7)  # fmt: skip
     for start_s, end_s in frames.gaps_s:
-        ax.axvspan(start_s, end_s, 0.0, height, color=VERMILLION, linewidth=0.0)
+        ax.axvspan(start_s, end_s, 0.0, LOST_SHARE, color=VERMILLION, linewidth=0.0)
 
 
 def _add_legend(ax: Axes, twin: Axes | None = None) -> None:
