@@ -71,7 +71,7 @@ def write_film(
     period = 1 / Fraction(rate_hz).limit_denominator(1001)
     if path.suffix.lower() == ".gif":
         period = Fraction(max(2, round(100 * period)), 100)
-    times_s = np.arange(0.0, flight.end_s + LAST_S, float(period))
+    times_s = np.arange(0.0, flight.log.end_s + LAST_S, float(period))
     try:
         with whole_file(path) as part:
             _write_video(_film_pictures(flight, pictures, times_s, width_px), part, 1 / period)
@@ -86,7 +86,7 @@ def _film_pictures(
     stage = _Stage(flight, width_px)
     shown = _Shown(recorded)
     for t_s in times_s:
-        index = flight.index_at(float(t_s))
+        index = flight.log.index_at(float(t_s))
         yield stage.drawn(index, *shown.at(flight.log.records[index]))
 
 
@@ -185,22 +185,22 @@ class _Stage:
     def _set_traces(self, ax: Axes) -> None:
         flight = self._flight
         aside_m = np.hypot(flight.tracked("ex_m"), flight.tracked("ey_m"))
-        ax.plot(flight.t_s, 100.0 * aside_m, color=PURPLE, linewidth=1.2)
+        ax.plot(flight.log.t_s, 100.0 * aside_m, color=PURPLE, linewidth=1.2)
         ax.set_ylabel("off centre [cm]", color=PURPLE)
         ax.set_ylim(bottom=0.0)
-        ax.set_xlim(0.0, max(flight.end_s, 0.1))
+        ax.set_xlim(0.0, max(flight.log.end_s, 0.1))
         ax.set_xlabel("time [s]")
         ax.grid(True, color=GRID, linewidth=0.6)
         thrust_ax: Axes = ax.twinx()
         thrust = flight.log.column("thrust") * FULL_THRUST_PERCENT
-        thrust_ax.plot(flight.t_s, thrust, color=ORANGE, linewidth=1.0)
+        thrust_ax.plot(flight.log.t_s, thrust, color=ORANGE, linewidth=1.0)
         thrust_ax.set_ylabel("thrust [%]", color=ORANGE)
         thrust_ax.set_ylim(0.0, 105.0)
         self._cursor = self._add(thrust_ax.axvline(0.0, color=BLACK, linewidth=1.0))
 
     def _move(self, index: int, image: Array | None, corners: dict[str, Array]) -> None:
         flight, ways = self._flight, self._ways
-        record, t_s = flight.log.records[index], float(flight.t_s[index])
+        record, t_s = flight.log.records[index], float(flight.log.t_s[index])
         if image is not None:
             self._image.set_data(image)
             for key, line in self._outlines.items():

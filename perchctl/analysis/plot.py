@@ -85,7 +85,7 @@ def flight_figure(flight: FlightAnalysis) -> Figure:
     _draw_power(axes[5], flight)
     shown_s = _draw_last_seconds(last_ax, flight)
     spans = [(stay.phase, stay.start_s, stay.end_s) for stay in flight.log.phases]
-    whole_s = (float(flight.t_s[0]), float(max(flight.t_s[-1], flight.t_s[0] + 1e-3)))
+    whole_s = (float(flight.log.t_s[0]), float(max(flight.log.t_s[-1], flight.log.t_s[0] + 1e-3)))
     for ax in axes:
         ax.set_xlim(whole_s)
         ax.tick_params(labelbottom=ax is axes[-1])
@@ -130,10 +130,10 @@ def _draw_raw_and_filtered(
     if key == "yaw_rad":  # a gap, not a line across the panel, where it wraps
         filtered[np.flatnonzero(np.abs(np.diff(filtered)) > math.pi)] = np.nan
     filtered = scale * filtered
-    ax.plot(flight.t_s, filtered, color=BLACK, linewidth=1.1)
+    ax.plot(flight.log.t_s, filtered, color=BLACK, linewidth=1.1)
     coasting = np.array([record.get("measured") is False for record in log.records])
     unseen = np.where(coasting, filtered, np.nan)
-    ax.plot(flight.t_s, unseen, color=VERMILLION, linewidth=2.4)
+    ax.plot(flight.log.t_s, unseen, color=VERMILLION, linewidth=2.4)
     ax.set_ylabel(label)
 
 
@@ -153,14 +153,14 @@ def _draw_height(ax: Axes, flight: FlightAnalysis) -> None:
     log = flight.log
     is_setpoint = np.array([kind == "position" for kind in log.texts("cmd")])
     is_sent = np.array([not note for note in log.texts("pos_note")])
-    ax.plot(flight.t_s, log.column("z_m"), color=BLUE, linewidth=1.4, label="estimate")
+    ax.plot(flight.log.t_s, log.column("z_m"), color=BLUE, linewidth=1.4, label="estimate")
     for values, colour, dashes, name in (
         (np.where(is_setpoint, log.column("cmd_z_m"), np.nan), VERMILLION, "--", "setpoint"),
         (np.where(is_sent, log.column("pos_z_m"), np.nan), ORANGE, "-", "external"),
         (log.column("true_z_m"), BLACK, ":", "truth"),
     ):
         if np.isfinite(values).any():
-            ax.plot(flight.t_s, values, color=colour, linestyle=dashes, linewidth=1.0, label=name)
+            ax.plot(log.t_s, values, color=colour, linestyle=dashes, linewidth=1.0, label=name)
     ax.set_ylabel("height [m]")
     _add_legend(ax)
 
@@ -169,13 +169,13 @@ def _draw_power(ax: Axes, flight: FlightAnalysis) -> None:
     """The battery's voltage as it was read and at rest; thrust on an axis of its own."""
     volts = flight.log.column("battery_v")
     volts = np.where(volts > 0, volts, np.nan)
-    ax.plot(flight.t_s, volts, color=BLACK, linewidth=1.2, label="read")
+    ax.plot(flight.log.t_s, volts, color=BLACK, linewidth=1.2, label="read")
     rest_v = flight.log.column("battery_rest_v")
-    ax.plot(flight.t_s, rest_v, color=GREEN, linewidth=1.2, linestyle="--", label="at rest, est.")
+    ax.plot(flight.log.t_s, rest_v, color=GREEN, linestyle="--", label="at rest, est.")
     ax.set_ylabel("battery [V]")
     thrust_ax = ax.twinx()
     thrust = flight.log.column("thrust") * FULL_THRUST_PERCENT
-    thrust_ax.plot(flight.t_s, thrust, color=ORANGE, linewidth=1.0, label="thrust [%], right")
+    thrust_ax.plot(flight.log.t_s, thrust, color=ORANGE, linewidth=1.0, label="thrust [%], right")
     thrust_ax.set_ylim(0.0, 105.0)
     _add_legend(ax, thrust_ax)
 
@@ -184,10 +184,10 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
     """The contact's approach in millimetres: single frames and the estimate, up to the last frame
     with the target, and the height on an axis of its own. Returns from when to when."""
     log, frames = flight.log, flight.frames
-    end_s = float(frames.seen_s[-1]) if frames.seen_s.size else flight.end_s
-    low_s, high_s = max(0.0, end_s - LAST_S), min(end_s + AFTER_S, max(flight.end_s, 0.1))
-    inside = (flight.t_s >= low_s) & (flight.t_s <= high_s)
-    t_s, frame_s = flight.t_s[inside], log.since(log.column("frame_t_s"))
+    end_s = float(frames.seen_s[-1]) if frames.seen_s.size else flight.log.end_s
+    low_s, high_s = max(0.0, end_s - LAST_S), min(end_s + AFTER_S, max(flight.log.end_s, 0.1))
+    inside = (flight.log.t_s >= low_s) & (flight.log.t_s <= high_s)
+    t_s, frame_s = flight.log.t_s[inside], log.since(log.column("frame_t_s"))
     near = (frame_s >= low_s) & (frame_s <= high_s)
     span_mm = [LEAST_SPAN_MM]
     for axis, colour in (("x", BLUE), ("y", ORANGE)):

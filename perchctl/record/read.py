@@ -178,7 +178,7 @@ class FlightLog:
         """Count times on the loop's clock from the first flown turn, as all outputs do."""
         return t_s - self.start_s
 
-    @property
+    @cached_property
     def t_s(self) -> Array:
         """Times of the ticks since the flight's first turn, shape (n,)."""
         return self.since(self.column("t_s"))
@@ -187,6 +187,15 @@ class FlightLog:
     def end_s(self) -> float:
         """Time of the last tick since the flight's first turn; 0 without any."""
         return self.since(float(self.records[-1]["t_s"])) if self.records else 0.0
+
+    def index_at(self, t_s: float) -> int:
+        """Return the index of the newest tick at that time since the first turn."""
+        return max(0, int(np.searchsorted(self.t_s, t_s + SAME_S / 2, side="right")) - 1)
+
+    def within(self, start_s: float, end_s: float) -> slice:
+        """Return the ticks from one time since the first turn up to another, without that."""
+        first, last = np.searchsorted(self.t_s, (start_s - SAME_S / 2, end_s - SAME_S / 2))
+        return slice(int(first), int(last))
 
     # --- the setup that was flown
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from perchctl.analysis import FlightAnalysis, show_record, show_text
-from perchctl.analysis.flight import takeovers_of
 from perchctl.analysis.story import story_of
 from perchctl.flight import fly
 from perchctl.flight.watchdog import rescue
@@ -18,7 +17,6 @@ from perchctl.link.sender import Sender
 from perchctl.mission import Operator, SentCommand
 from perchctl.perception import History
 from perchctl.record import LogWatcher, read_log
-from perchctl.record.fields import sent_values
 from perchctl.record.write import FlightLogWriter
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers import log as synthetic
@@ -31,6 +29,7 @@ TOLD = (
     SentCommand(4.0, "watchdog", HOLD),
     SentCommand(4.05, "watchdog", HOLD),
     SentCommand(4.7, "watchdog", LAND),
+    SentCommand(6.8, "watchdog", StopMotors()),
     SentCommand(9.0, "rescue", EmergencyStop()),
     SentCommand(9.5, "farewell", RawThrust(0)),
 )
@@ -50,24 +49,24 @@ def log(tmp_path: Path) -> Path:
 
 def test_what_one_sends_in_one_go_is_told_together(log: Path) -> None:
     assert tuple(read_log(log).sent) == TOLD
-    goes = takeovers_of([*map(sent_values, TOLD)])
-    assert [(go.by, go.start_s, go.end_s) for go in goes] == [
-        ("watchdog", 4.0, 4.7), ("rescue", 9.0, 9.0), ("farewell", 9.5, 9.5),
-    ]  # fmt: skip
+    goes, start_s = FlightAnalysis(read_log(log)).takeovers, read_log(log).start_s
+    assert [go.by for go in goes] == ["watchdog", "watchdog", "rescue", "farewell"]
+    assert [go.start_s + start_s for go in goes] == pytest.approx([4.0, 6.8, 9.0, 9.5])
+    assert [go.end_s + start_s for go in goes] == pytest.approx([4.7, 6.8, 9.0, 9.5])
     assert goes[0].text == "position setpoints (2), landing ordered (1)"
-    later = SentCommand(4.7 + 2.1, "watchdog", StopMotors())
-    assert len(takeovers_of([*map(sent_values, (*TOLD[:3], later))])) == 2
 
 
 def test_show_and_story_tell_who_took_over(log: Path) -> None:
     read = read_log(log)
     text = show_text(FlightAnalysis(read))
-    assert "watchdog   position setpoints (2), landing ordered (1)" in text
+    assert "watchdog  position setpoints (2), landing ordered (1)" in text
     assert show_record(FlightAnalysis(read))["sent"][0]["commands"] == {"position": 2, "land": 1}
     told = [s for s in story_of(FlightAnalysis(read)) if "took over" in s.text]
-    assert [s.t_s for s in told] == pytest.approx([4.0 - read.start_s, 9.0 - read.start_s])
-    assert told[0].text.endswith("for 0.7 s: it gave it a place to hold and it ordered a landing")
-    assert told[1].grade == "bad"
+    assert [s.t_s for s in told] == pytest.approx(
+        [4.0 - read.start_s, 6.8 - read.start_s, 9.0 - read.start_s]
+    )
+    assert told[0].text.endswith("for 0.7 s: position setpoints (2), landing ordered (1)")
+    assert told[2].grade == "bad"
 
 
 # --- who sends --------------------------------------------------------------------------------
@@ -81,9 +80,9 @@ def test_a_hung_loop_s_log_says_what_the_watchdog_sent(tmp_path: Path) -> None:
     watcher.close(report)
     read = read_log(watcher.path)
     assert [(each.t_s, each.command) for each in read.sent] == link.own
-    (go,) = takeovers_of(read.sent_values)
-    assert go.start_s == pytest.approx(HANG_AT_S + 0.3, abs=0.08)
-    assert dict(go.sent)["land"] > 0
+    (go,) = FlightAnalysis(read).takeovers
+    assert go.start_s + read.start_s == pytest.approx(HANG_AT_S + 0.3, abs=0.08)
+    assert go.commands["land"] > 0
     assert not read.truncated
 
 
