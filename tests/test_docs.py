@@ -220,8 +220,9 @@ def test_every_command_line_runs(
     if "short.jsonl" in words:
         shutil.copyfile(request.getfixturevalue("short_log"), tmp_path / "short.jsonl")
     if words[:2] == ["perchctl", "log"]:
-        (tmp_path / "perchctl-logs").mkdir()
-        shutil.copy(request.getfixturevalue("short_log"), tmp_path / "perchctl-logs")
+        log = tmp_path / "perchctl-logs" / "flight_short.jsonl"
+        log.parent.mkdir()
+        shutil.copyfile(request.getfixturevalue("short_log"), log)
     before = set(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
     if "--cluster" in words:
