@@ -85,7 +85,6 @@ class RecordingFile:
         self._started_ns = NS * round(datetime.fromisoformat(started).timestamp()) if started else 0
         self._mounts = () if profile is None else mounts_of(profile)
         self._first_s: float | None = None
-        self._target: FrameTransform | None = None  # where it was last
         self._stream = stream
         self._writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)  # type: ignore[arg-type]
         self._channels: dict[str, int] = {}
@@ -111,21 +110,19 @@ class RecordingFile:
 
     def tick(self, record: Mapping[str, Any]) -> None:
         """Write a tick's record (`perchctl.record.fields.FIELDS`) with its times since the first
-        flown turn, and what it shows in space.
-
-        What stands still is written with every tick: who jumps into the middle of a flight gets
-        the newest message of each topic, and no older one."""
+        flown turn, and what it shows in space."""
         t_s, exposed_s = float(record["t_s"]), record.get("frame_t_s")
         self.newest_s, ns = t_s, self._ns(t_s)
         first_s = self._first_s = t_s if self._first_s is None else self._first_s
-        body_ns = self._ns(t_s - (_number(record, "tel_age_s") or 0.0))
-        body = _transform_to(BODY, body_ns, record, BODY_KEYS)
-        setpoint = _transform_to(SETPOINT, ns, record, SETPOINT_KEYS)
-        self._target = _transform_to(TARGET, ns, record, TARGET_KEYS) or self._target
-        transforms = [each for each in (*self._mounts, body, self._target, setpoint) if each]
-        for still in transforms:
-            if still is not body:
-                still.timestamp.CopyFrom(stamp(ns))
+        for mount in self._mounts:
+            mount.timestamp.CopyFrom(stamp(ns))
+        sampled_ns = self._ns(t_s - (record.get("tel_age_s") or 0.0))
+        moving = [
+            _transform_to(BODY, sampled_ns, record, BODY_KEYS),
+            _transform_to(TARGET, ns, record, TARGET_KEYS),
+            _transform_to(SETPOINT, ns, record, SETPOINT_KEYS),
+        ]
+        transforms = [*self._mounts, *(each for each in moving if each is not None)]
         self._add(TF, ns, FrameTransforms(transforms=transforms))
         shown = {**record, "t_s": t_s - first_s}
         if exposed_s is not None:
@@ -285,20 +282,13 @@ def _transform_to(
     child: str, ns: int, record: Mapping[str, Any], keys: Sequence[str]
 ) -> FrameTransform | None:
     """Return the transform from the world, by three keys of a position and one of a heading or
-    three of an attitude; None where one of them is missing."""
-    values = [_number(record, key) for key in keys]
-    if any(value is None for value in values):
+    three of an attitude; None where one of them is missing or not finite."""
+    values: list[Any] = [record.get(key) for key in keys]
+    if any(value is None or not math.isfinite(value) for value in values):
         return None
-    x, y, z, *angles = (float(v) for v in values if v is not None)
+    x, y, z, *angles = values
     roll, pitch, yaw = angles if len(angles) == 3 else (0.0, 0.0, *angles)
     return _transform(ns, WORLD, child, (x, y, z), quaternion_from_rpy(roll, pitch, yaw))
-
-
-def _number(record: Mapping[str, Any], key: str) -> float | None:
-    """Return a number of the record; None for one that is missing or not finite, which no view
-    could show."""
-    value = record.get(key)
-    return float(value) if value is not None and math.isfinite(value) else None
 
 
 def _transform(

@@ -75,15 +75,6 @@ def test_the_same_flight_gives_the_same_bytes(tmp_path: Path) -> None:
     assert b"started_utc" not in files[0]
 
 
-def test_each_record_is_in_the_file_at_once(tmp_path: Path) -> None:
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
-    for i in range(3):
-        writer.write({"t_s": float(i)})
-        assert len(read_log(writer.path).records) == i + 1
-    writer.close()
-    assert read_log(writer.path).truncated  # closed, but without a summary
-
-
 def test_names_and_no_overwriting(tmp_path: Path) -> None:
     path = log_path(tmp_path, "my profile/€", STARTED)
     assert path.name == "flight_20240301_140509_my-profile.jsonl"

@@ -108,12 +108,6 @@ def test_a_disk_that_fills_up_ends_the_recording_and_not_the_flight(
     assert 0 < kept < len(list(recorded_pictures(flown[0])))
 
 
-def test_simulate_records_beside_a_log_only(tmp_path: Path) -> None:
-    said = run("simulate", "-n", "1", "--record")
-    assert said.code == 2
-    assert "--log-dir" in said.complaint
-
-
 @pytest.mark.parametrize(
     ("arguments", "recorded"),
     [
