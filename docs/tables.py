@@ -34,7 +34,7 @@ from perchctl.mission.state import BEFORE_CONTACT, FLYING_PHASES  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
 from perchctl.profile import Profile, load_profile  # noqa: E402
 from perchctl.profile.keys import Key, keys  # noqa: E402
-from perchctl.record.fields import EVENT_FIELDS, FIELDS  # noqa: E402
+from perchctl.record.fields import FIELDS  # noqa: E402
 from perchctl.vision import step  # noqa: E402
 
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -105,8 +105,8 @@ def worlds() -> str:
     return "\n".join([head, "|---" * (len(world) + 2) + "|", *rows])
 
 
-def log_fields(fields: dict[str, str] = FIELDS) -> str:
-    rows = [f"| `{name}` | {text} |" for name, text in fields.items()]
+def log_fields() -> str:
+    rows = [f"| `{name}` | {text} |" for name, text in FIELDS.items()]
     return "\n".join(["| field | meaning |", "|---|---|", *rows])
 
 
@@ -292,7 +292,6 @@ PARTS: dict[str, Callable[[], str]] = {
     "profile-keys": profile_keys,
     "worlds": worlds,
     "log-fields": log_fields,
-    "event-fields": lambda: log_fields(EVENT_FIELDS),
     "exit-codes": exit_codes,
     "fault-catalogue": fault_catalogue,
     "expected-outcomes": expected_outcomes,

@@ -85,7 +85,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # Packages with a face: the others take its names, and nothing from behind it. The number is how
 # many names it has at most.
 MOST_NAMES = {
-    "analysis": 15,
+    "analysis": 12,
     "calibration": 17,
     "camera": 17,
     "campaign": 25,
@@ -95,7 +95,7 @@ MOST_NAMES = {
     "faults": 15,
     "flight": 22,
     "link": 11,
-    "record": 18,
+    "record": 13,
     "mission": 42,
     "perception": 15,
     "positioning": 10,

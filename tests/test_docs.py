@@ -4,6 +4,7 @@ are the code's."""
 from __future__ import annotations
 
 import gzip
+import json
 import re
 import runpy
 import shlex
@@ -25,7 +26,6 @@ from perchctl.flight import fly_lockstep
 from perchctl.mission.table import TABLE
 from perchctl.profile import Profile, load_profile
 from perchctl.profile.keys import keys
-from perchctl.record import decode_line
 from tests.helpers.boards import CHARUCO, render_folder
 from tests.helpers.flights import ROOT, SEED, short_profile
 from tests.helpers.gear import write_turned_about
@@ -220,8 +220,9 @@ def test_every_command_line_runs(
     if "short.jsonl" in words:
         shutil.copyfile(request.getfixturevalue("short_log"), tmp_path / "short.jsonl")
     if words[:2] == ["perchctl", "log"]:
-        (tmp_path / "perchctl-logs").mkdir()
-        shutil.copy(request.getfixturevalue("short_log"), tmp_path / "perchctl-logs")
+        log = tmp_path / "perchctl-logs" / "flight_short.jsonl"
+        log.parent.mkdir()
+        shutil.copyfile(request.getfixturevalue("short_log"), log)
     before = set(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
     if "--cluster" in words:
@@ -451,5 +452,5 @@ def test_pictures_are_small_made_by_the_command_and_shown() -> None:
 
 def test_a_log_s_first_line_explains_its_fields(short_log: Path) -> None:
     """As the page of the log says."""
-    header = decode_line(short_log.read_bytes().splitlines()[0])
+    header = json.loads(short_log.read_bytes().splitlines()[0])
     assert {"profile", "fields", "seed"} <= set(header)

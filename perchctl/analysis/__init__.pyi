@@ -3,9 +3,6 @@ from .compare import profile_differences as profile_differences
 from .film import write_film as write_film
 from .flight import FlightAnalysis as FlightAnalysis
 from .plot import plot_flight as plot_flight
-from .replay_text import replay_lines as replay_lines
-from .replay_text import replay_record as replay_record
-from .replayer import check_readable as check_readable
 from .replayer import replay as replay
 from .report import write_report as write_report
 from .show import list_logs as list_logs

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
-
 from perchctl.errors import InvalidValue
 from perchctl.mission import Observation, PlannerState, Turn, start_mission, step_mission
 from perchctl.profile import Profile
 from perchctl.record import FlightLog, to_exact
 from perchctl.vehicle import Command
+
+FieldDifference = tuple[str, Any, Any]
+"""The whole name of a field, and its recorded and replayed value in their exact form."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +36,8 @@ class Decided:
     command: Command | None
     error: str | None = None
 
-    @property
-    def differs(self) -> bool:
-        return self.difference is not None
-
     @cached_property
-    def difference(self) -> tuple[str, Any, Any] | None:
+    def difference(self) -> FieldDifference | None:
         """The first field in which the turn differs; None without one. Where the planner raised,
         that is what it raised; a log before version 4 does not hold that, and has no difference."""
         turn, state = self.turn, self.state
@@ -48,34 +45,27 @@ class Decided:
             return first_differing("error", turn.error, self.error)
         if turn.command is None or state is None:
             return None
-        told: tuple[tuple[str, Any, Any], ...] = ()
+        replayed = {
+            "phase": state.phase,
+            "row": state.row,
+            "held": bool(state.hold),
+            "attempts": state.attempts,
+            "command": self.command,
+        }
         if turn.reason is not None:
-            told = (
-                ("outcome", turn.outcome, state.outcome),
-                ("reason", turn.reason, state.reason),
-            )
-        return next(
-            (
-                found
-                for name, recorded, replayed in (
-                    ("phase", turn.phase, state.phase),
-                    ("row", turn.row, state.row),
-                    ("held", turn.held, bool(state.hold)),
-                    ("attempts", turn.attempts, state.attempts),
-                    ("command", turn.command, self.command),
-                    *told,
-                )
-                if (found := first_differing(name, recorded, replayed)) is not None
-            ),
-            None,
-        )
+            replayed |= {"outcome": state.outcome, "reason": state.reason}
+        return first_differing_of((n, getattr(turn, n), value) for n, value in replayed.items())
 
 
 def whole_turns(log: FlightLog) -> tuple[list[Turn], str]:
     """Return what can be replayed of a log: its turns up to the first that is missing, and a
     sentence about that one, empty where none is. Errors: InvalidValue."""
     if not log.turn_records:
-        raise InvalidValue(_why_no_turns(log))
+        made_by = f"perchctl {log.header.get('perchctl', 'of unknown version')}"
+        raise InvalidValue(
+            f"{log.path}: it holds no whole turn of a flight and cannot be replayed; {made_by} "
+            f"wrote it, in version {log.header.get('version')}, and turns are written since 3"
+        )
     for number, turn in enumerate(log.turns):
         if turn.number != number:
             return log.turns[:number], (
@@ -109,82 +99,35 @@ def decide(
             state, tick = new, tick + 1
 
 
-def first_of(decided: Iterable[Decided], t0_s: float) -> Difference | None:
-    """Return the first turn that was decided otherwise than it was flown; None without one."""
-    for each in decided:
-        found = each.difference
-        if found is not None:
-            return Difference(each.tick, each.turn.t_s - t0_s, *found)
-    return None
+# --- In which field two values first differ, to the bit: 0.0 is not -0.0, and NaN is NaN ---------
 
 
-def _why_no_turns(log: FlightLog) -> str:
-    made_by = f"perchctl {log.header.get('perchctl', 'of unknown version')}"
-    if log.header.get("version") in (1, 2):
-        return (
-            f"{log.path}: {made_by} wrote it, which did not record whole turns: it cannot be "
-            f"replayed (perchctl log show and log plot read it)"
-        )
-    return f"{log.path}: it holds no turn of a flight: there is nothing to replay"
+def first_differing(name: str, one: Any, other: Any) -> FieldDifference | None:
+    """Return the first field in which two values differ; None where nothing does. Of two kinds of
+    command the whole values are shown, with their class."""
+    if type(one) is not type(other):
+        return name, _shown(one), _shown(other)
+    return _first_differing(name, to_exact(one), to_exact(other))
 
 
-# --- True if two values are the same to the bit, and in which field they first are not ----------
+def first_differing_of(fields: Iterable[FieldDifference]) -> FieldDifference | None:
+    """Return the first difference among the fields, each with its recorded and replayed value."""
+    return next((d for field in fields if (d := first_differing(*field)) is not None), None)
 
 
-@dataclass(frozen=True)
-class Difference:
-    """The first difference of a replay from its flight.
-
-    `tick` counts the turns from take-off from 0, as the log's ticks do; of a turn before that
-    it is negative. `t_s`: since the log began. `recorded`, `replayed`: as JSON has them.
-    """
-
-    tick: int
-    t_s: float
-    field: str
-    recorded: Any
-    replayed: Any
-
-
-def first_differing(name: str, one: Any, other: Any) -> tuple[str, Any, Any] | None:
-    """Return the first differing field's whole name, and both values in their exact form; None
-    where nothing differs."""
-    if same(one, other):
+def _first_differing(name: str, one: Any, other: Any) -> FieldDifference | None:
+    if json.dumps(one) == json.dumps(other):
         return None
-    parts: list[tuple[str, Any, Any]] = []
-    if dataclasses.is_dataclass(one) and type(one) is type(other):
-        names = [f.name for f in dataclasses.fields(one)]
-        parts = [(f"{name}.{n}", getattr(one, n), getattr(other, n)) for n in names]
-    elif isinstance(one, dict) and isinstance(other, dict):
-        keys = [*one, *(key for key in other if key not in one)]
-        parts = [(f"{name}.{_key(k)}", one.get(k), other.get(k)) for k in keys]
-    elif _is_row(one) and _is_row(other) and len(one) == len(other):
+    parts: list[FieldDifference] = []
+    if isinstance(one, dict) and isinstance(other, dict):
+        parts = [(f"{name}.{key}", one.get(key), other.get(key)) for key in {**one, **other}]
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
         pairs = zip(one, other, strict=True)
         parts = [(f"{name}[{k}]", a, b) for k, (a, b) in enumerate(pairs)]
-    within = next((d for part in parts if (d := first_differing(*part)) is not None), None)
-    return within or (name, _shown(one), _shown(other))
-
-
-def same(one: Any, other: Any) -> bool:
-    """True if both are the same to the bit: 0.0 is not -0.0, and NaN is NaN. Two kinds of command
-    without a field are two."""
-    if dataclasses.is_dataclass(one) and type(one) is not type(other):
-        return False
-    return json.dumps(to_exact(one)) == json.dumps(to_exact(other))
-
-
-def _is_row(value: Any) -> bool:
-    if isinstance(value, np.ndarray):
-        return value.ndim > 0
-    return isinstance(value, (list, tuple))
-
-
-def _key(key: Any) -> str:
-    return str(getattr(key, "value", key))
+    within = next((d for part in parts if (d := _first_differing(*part)) is not None), None)
+    return within or (name, one, other)
 
 
 def _shown(value: Any) -> Any:
     exact = to_exact(value)
-    if dataclasses.is_dataclass(value):  # which of several is the difference
-        return {type(value).__name__: exact}
-    return exact
+    return {type(value).__name__: exact} if dataclasses.is_dataclass(value) else exact

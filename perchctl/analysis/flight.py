@@ -13,17 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.analysis.sight import (
-    SAME_S,
-    Frames,
-    Loss,
-    frames_of,
-    losses_of,
-    percentile,
-    within,
-)
+from perchctl.analysis.sight import Frames, Loss, frames_of, losses_of, percentile
 from perchctl.geometry import Array
-from perchctl.mission import Findings, SentBy
+from perchctl.mission import SentBy
 from perchctl.record import FlightLog, FlightSummary, PhaseSpan
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -83,9 +75,6 @@ class Measures:
     turns: int | None = _number("turns of the loop")
     late_p99_s: float | None = _number("turn late, 99 %", "ms", 1e3, 1)
     telemetry_age_p99_s: float | None = _number("telemetry's age, 99 %", "ms", 1e3, 0)
-    external_sent: int | None = _number("external positions sent")
-    external_age_p99_s: float | None = _number("their age, 99 %", "ms", 1e3, 0)
-    external_apart_p95_m: float | None = _number("off the own estimate, 95 %", "mm", 1e3, 1)
 
     def text(self, name: str) -> str:
         """Return a number as people read it, without its unit; ``-`` where it is not known."""
@@ -121,16 +110,6 @@ class FlightAnalysis:
         """How it ended."""
         return FlightSummary.of(self.log)
 
-    @cached_property
-    def t_s(self) -> Array:
-        """Times of the ticks, (n,)."""
-        return self.log.t_s
-
-    @property
-    def end_s(self) -> float:
-        """Time of the last tick."""
-        return self.log.end_s
-
     # --- holds and notes
 
     @cached_property
@@ -140,7 +119,7 @@ class FlightAnalysis:
         found: list[Hold] = []
         before: tuple[str, str] | None = None
         phases, reasons = self.log.texts("phase"), self.log.texts("hold")
-        for t_s, phase, reason in zip(map(float, self.t_s), phases, reasons, strict=True):
+        for t_s, phase, reason in zip(map(float, self.log.t_s), phases, reasons, strict=True):
             this = (phase, _NUMBER.sub("", reason)) if reason else None
             if before is not None:
                 last = found[-1]
@@ -173,15 +152,10 @@ class FlightAnalysis:
         """When the target was out of sight while it was needed."""
         return losses_of(self.log, self.frames)
 
-    @property
-    def findings(self) -> Findings | None:
-        """Latency and mounting as the flight showed them; None where it did not."""
-        return self.summary.findings
-
     @cached_property
     def takeovers(self) -> tuple[Takeover, ...]:
         """What was sent in the loop's place, each go by itself."""
-        return takeovers_of(self.log.sent_values)
+        return takeovers_of(self.log)
 
     @cached_property
     def measures(self) -> Measures:
@@ -216,30 +190,14 @@ class FlightAnalysis:
             turns=len(log.records),
             late_p99_s=_known(percentile(log.column("late_s"), 99)),
             telemetry_age_p99_s=_known(percentile(log.column("tel_age_s"), 99)),
-            **self._external(),
         )
-
-    def _external(self) -> dict[str, Any]:
-        """Compute the numbers of external positions; empty where the decks measured it."""
-        log, sent = self.log, self.log.column("pos_sent")
-        if not np.isfinite(sent).any():
-            return {}
-        offsets_m = [log.column(f"pos_{axis}_m") - log.column(f"{axis}_m") for axis in "xyz"]
-        stopped = np.array([bool(text) for text in log.texts("pos_note")])
-        apart_m = np.where(stopped, np.nan, np.linalg.norm(offsets_m, axis=0))
-        return {
-            "external_sent": int(np.nanmax(sent)),
-            "external_age_p99_s": _known(percentile(log.column("pos_age_s"), 99)),
-            "external_apart_p95_m": _known(percentile(apart_m, 95)),
-        }
 
     def _settled(self) -> tuple[float | None, float | None]:
         """Compute the RMS errors before the last contact: horizontal (m) and heading (rad)."""
         ascent = last_ascent(self.log.phases)
         if ascent is None:
             return None, None
-        start_s = max(ascent.start_s, ascent.end_s - SETTLED_S) - SAME_S / 2
-        inside = (self.t_s >= start_s) & (self.t_s < ascent.end_s - SAME_S / 2)
+        inside = self.log.within(max(ascent.start_s, ascent.end_s - SETTLED_S), ascent.end_s)
         x_m, y_m, yaw_rad = (self.log.column(k)[inside] for k in ("ex_m", "ey_m", "eyaw_rad"))
         known = np.isfinite(x_m + y_m + yaw_rad)
         if not known.any():
@@ -256,24 +214,12 @@ class FlightAnalysis:
         remembered = [record.get("tracked") is False for record in self.log.records]
         return np.where(remembered, np.nan, self.log.column(key))
 
-    def index_at(self, t_s: float) -> int:
-        """Return the index of the newest tick at that time."""
-        return max(0, int(np.searchsorted(self.t_s, t_s + SAME_S / 2, side="right")) - 1)
-
     def at(self, t_s: float, key: str) -> float:
         """Return a field at that time; NaN where it is missing or no number."""
-        value = self.log.records[self.index_at(t_s)].get(key) if self.log.records else None
+        value = self.log.records[self.log.index_at(t_s)].get(key) if self.log.records else None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return math.nan
         return float(value)
-
-    def height_m(self, t_s: float) -> float:
-        """Return the height at that time above the place of the first tick."""
-        return self.at(t_s, "z_m") - self.at(0.0, "z_m")
-
-    def within(self, start_s: float, end_s: float) -> slice:
-        """Return the ticks from one time to another as a slice."""
-        return within(self.t_s, start_s, end_s)
 
 
 def last_ascent(spans: Sequence[PhaseSpan]) -> PhaseSpan | None:
@@ -284,20 +230,6 @@ def last_ascent(spans: Sequence[PhaseSpan]) -> PhaseSpan | None:
 
 def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def runs_of(log: FlightLog, key: str) -> list[tuple[float, float, str]]:
-    """Find the stretches over which a text field stayed the same: from, to, text. Empty texts make
-    no stretch."""
-    found: list[tuple[float, float, str]] = []
-    began_s, text = 0.0, ""
-    for t_s, now in zip((*log.t_s, log.end_s), (*log.texts(key), None), strict=True):
-        if now == text:
-            continue
-        if text:
-            found.append((began_s, float(t_s), text))
-        began_s, text = float(t_s), now or ""
-    return found
 
 
 # --- what was sent in the loop's place ------------------------------------------------------
@@ -315,30 +247,34 @@ _TELLS = {
 
 @dataclass(frozen=True)
 class Takeover:
-    """What one sender sent in one go. Times are on the loop's clock; `sent` counts the commands by
-    their name in a tick's `cmd`, in the order of their first."""
+    """What one sender sent in one go. Times are since the flight's first turn; `commands` counts
+    the commands by their name in a tick's `cmd`, in the order of their first."""
 
     by: SentBy
     start_s: float
     end_s: float
-    sent: tuple[tuple[str, int], ...]
+    commands: dict[str, int]
 
     @property
     def text(self) -> str:
         """``position setpoints (14), landing ordered (2)``"""
-        return ", ".join(f"{_TELLS[name]} ({count})" for name, count in self.sent)
+        return ", ".join(f"{_TELLS[name]} ({count})" for name, count in self.commands.items())
 
 
-def takeovers_of(sent: Sequence[Mapping[str, Any]]) -> tuple[Takeover, ...]:
-    """Group what was sent by sender and time, oldest first; `sent` are a log's `sent_values`."""
+def takeovers_of(log: FlightLog) -> tuple[Takeover, ...]:
+    """Group what was sent in the loop's place by sender and time, oldest first."""
     goes: list[list[Mapping[str, Any]]] = []
-    for each in sorted(sent, key=lambda one: float(one["t_s"])):
+    for each in sorted(log.sent_values, key=lambda one: float(one["t_s"])):
         last = goes[-1][-1] if goes else None
         if last is None or last["by"] != each["by"] or each["t_s"] - last["t_s"] > APART_S:
             goes.append([])
         goes[-1].append(each)
     return tuple(
-        Takeover(go[0]["by"], go[0]["t_s"], go[-1]["t_s"],
-                 tuple(Counter(each["cmd"] for each in go).items()))
+        Takeover(
+            go[0]["by"],
+            log.since(go[0]["t_s"]),
+            log.since(go[-1]["t_s"]),
+            dict(Counter(each["cmd"] for each in go)),
+        )
         for go in goes
-    )  # fmt: skip
+    )

@@ -12,11 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.sight import Frames
-from perchctl.analysis.words import times
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.plot import (
@@ -42,6 +40,8 @@ Span = tuple[str, float, float]
 """A phase's name, and from when to when on the axis."""
 NAME_GAP = 0.02
 """Share of the time axis between the names of two phases, so that they do not overlap."""
+LOST_SHARE = 0.05
+"""Of a panel's height, in which lost frames are marked."""
 FULL_THRUST_PERCENT = 1 / 655.35
 RAW = (("j", "s", GREEN, "both, raw"), ("l", "o", SKY, "large, raw"), ("s", "^", ORANGE,
        "small, raw"))  # fmt: skip
@@ -72,21 +72,20 @@ def flight_png(flight: FlightAnalysis) -> bytes:
 
 
 def flight_figure(flight: FlightAnalysis) -> Figure:
-    """Draw errors, detections against the filtered track (as the paper's figure 6), where frames
-    were lost, height, thrust and battery, over the named phases; and the last seconds with the
-    target in millimetres."""
-    figure = new_figure(11.0, 17.0)
-    *axes, last_ax = figure.subplots(9, 1, height_ratios=(1.7, 1, 1, 1, 1, 0.25, 1.1, 1.1, 2.0))
-    _draw_errors(axes[0], flight)
-    for ax, (key, scale, label) in zip(axes[1:5], TRACKS, strict=True):
+    """Draw detections against the filtered track (as the paper's figure 6), height, thrust and
+    battery, over the named phases; and the last seconds with the target in millimetres. Where the
+    pipeline had nothing to measure is marked at the bottom."""
+    figure = new_figure(11.0, 14.0)
+    *axes, last_ax = figure.subplots(7, 1, height_ratios=(1, 1, 1, 1, 1.1, 1.1, 2.0))
+    for ax, (key, scale, label) in zip(axes[:4], TRACKS, strict=True):
         _draw_raw_and_filtered(ax, flight, key, scale, label)
-    axes[1].legend(handles=_track_legend(), loc="best", ncols=5, fontsize=8)
-    _draw_lost(axes[5], flight.frames)
-    _draw_height(axes[6], flight)
-    _draw_power(axes[7], flight)
+        _mark_lost(ax, flight.frames)
+    axes[0].legend(handles=_track_legend(), loc="best", ncols=6, fontsize=8)
+    _draw_height(axes[4], flight)
+    _draw_power(axes[5], flight)
     shown_s = _draw_last_seconds(last_ax, flight)
     spans = [(stay.phase, stay.start_s, stay.end_s) for stay in flight.log.phases]
-    whole_s = (float(flight.t_s[0]), float(max(flight.t_s[-1], flight.t_s[0] + 1e-3)))
+    whole_s = (float(flight.log.t_s[0]), float(max(flight.log.t_s[-1], flight.log.t_s[0] + 1e-3)))
     for ax in axes:
         ax.set_xlim(whole_s)
         ax.tick_params(labelbottom=ax is axes[-1])
@@ -118,19 +117,6 @@ def title_of(flight: FlightAnalysis) -> str:
 # --- panels -------------------------------------------------------------------------------
 
 
-def _draw_errors(ax: Axes, flight: FlightAnalysis) -> None:
-    """The target relative to the gear: horizontally, and its height on an axis of its own."""
-    for axis, colour in (("x", BLUE), ("y", ORANGE)):
-        e_cm = 100.0 * flight.tracked(f"e{axis}_m")
-        ax.plot(flight.t_s, e_cm, color=colour, linewidth=1.3, label=f"e{axis}")
-    ax.axhline(0.0, color=GREY, linewidth=0.8)
-    ax.set_ylabel("aside [cm]")
-    up_ax = ax.twinx()
-    up_ax.plot(flight.t_s, flight.tracked("ez_m"), color=BLACK, linewidth=1.0,
-               linestyle="--", label="ez [m], right")  # fmt: skip
-    _add_legend(ax, up_ax)
-
-
 def _draw_raw_and_filtered(
     ax: Axes, flight: FlightAnalysis, key: str, scale: float, label: str
 ) -> None:
@@ -144,10 +130,10 @@ def _draw_raw_and_filtered(
     if key == "yaw_rad":  # a gap, not a line across the panel, where it wraps
         filtered[np.flatnonzero(np.abs(np.diff(filtered)) > math.pi)] = np.nan
     filtered = scale * filtered
-    ax.plot(flight.t_s, filtered, color=BLACK, linewidth=1.1)
+    ax.plot(flight.log.t_s, filtered, color=BLACK, linewidth=1.1)
     coasting = np.array([record.get("measured") is False for record in log.records])
     unseen = np.where(coasting, filtered, np.nan)
-    ax.plot(flight.t_s, unseen, color=VERMILLION, linewidth=2.4)
+    ax.plot(flight.log.t_s, unseen, color=VERMILLION, linewidth=2.4)
     ax.set_ylabel(label)
 
 
@@ -158,21 +144,8 @@ def _track_legend() -> list[Line2D]:
             for _, marker, colour, text in RAW
         ),
         Line2D([], [], color=BLACK, linewidth=1.4, label="filtered"),
-        Line2D([], [], color=VERMILLION, linewidth=2.4, label="filtered, unseen"),
+        Line2D([], [], color=VERMILLION, linewidth=2.4, label="unseen, or no frame"),
     ]
-
-
-def _draw_lost(ax: Axes, frames: Frames) -> None:
-    """Where the pipeline had nothing to measure: no frame, or none with the target."""
-    _mark_lost(ax, frames, 1.0, GREY)
-    ax.set_yticks([])
-    ax.set_ylabel("lost", rotation=0, ha="right", va="center")
-    gaps = times(len(frames.gaps_s)) if len(frames.gaps_s) else "never"
-    handles = [
-        Rectangle((0, 0), 1, 1, color=VERMILLION, label=f"no frame ({gaps})"),
-        Line2D([], [], color=GREY, label=f"frame without target ({len(frames.unseen_s)})"),
-    ]
-    ax.legend(handles=handles, loc="lower right", ncols=2, fontsize=8, bbox_to_anchor=(1.0, 0.9))
 
 
 def _draw_height(ax: Axes, flight: FlightAnalysis) -> None:
@@ -180,14 +153,14 @@ def _draw_height(ax: Axes, flight: FlightAnalysis) -> None:
     log = flight.log
     is_setpoint = np.array([kind == "position" for kind in log.texts("cmd")])
     is_sent = np.array([not note for note in log.texts("pos_note")])
-    ax.plot(flight.t_s, log.column("z_m"), color=BLUE, linewidth=1.4, label="estimate")
+    ax.plot(flight.log.t_s, log.column("z_m"), color=BLUE, linewidth=1.4, label="estimate")
     for values, colour, dashes, name in (
         (np.where(is_setpoint, log.column("cmd_z_m"), np.nan), VERMILLION, "--", "setpoint"),
         (np.where(is_sent, log.column("pos_z_m"), np.nan), ORANGE, "-", "external"),
         (log.column("true_z_m"), BLACK, ":", "truth"),
     ):
         if np.isfinite(values).any():
-            ax.plot(flight.t_s, values, color=colour, linestyle=dashes, linewidth=1.0, label=name)
+            ax.plot(log.t_s, values, color=colour, linestyle=dashes, linewidth=1.0, label=name)
     ax.set_ylabel("height [m]")
     _add_legend(ax)
 
@@ -196,13 +169,13 @@ def _draw_power(ax: Axes, flight: FlightAnalysis) -> None:
     """The battery's voltage as it was read and at rest; thrust on an axis of its own."""
     volts = flight.log.column("battery_v")
     volts = np.where(volts > 0, volts, np.nan)
-    ax.plot(flight.t_s, volts, color=BLACK, linewidth=1.2, label="read")
+    ax.plot(flight.log.t_s, volts, color=BLACK, linewidth=1.2, label="read")
     rest_v = flight.log.column("battery_rest_v")
-    ax.plot(flight.t_s, rest_v, color=GREEN, linewidth=1.2, linestyle="--", label="at rest, est.")
+    ax.plot(flight.log.t_s, rest_v, color=GREEN, linestyle="--", label="at rest, est.")
     ax.set_ylabel("battery [V]")
     thrust_ax = ax.twinx()
     thrust = flight.log.column("thrust") * FULL_THRUST_PERCENT
-    thrust_ax.plot(flight.t_s, thrust, color=ORANGE, linewidth=1.0, label="thrust [%], right")
+    thrust_ax.plot(flight.log.t_s, thrust, color=ORANGE, linewidth=1.0, label="thrust [%], right")
     thrust_ax.set_ylim(0.0, 105.0)
     _add_legend(ax, thrust_ax)
 
@@ -211,10 +184,10 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
     """The contact's approach in millimetres: single frames and the estimate, up to the last frame
     with the target, and the height on an axis of its own. Returns from when to when."""
     log, frames = flight.log, flight.frames
-    end_s = float(frames.seen_s[-1]) if frames.seen_s.size else flight.end_s
-    low_s, high_s = max(0.0, end_s - LAST_S), min(end_s + AFTER_S, max(flight.end_s, 0.1))
-    inside = (flight.t_s >= low_s) & (flight.t_s <= high_s)
-    t_s, frame_s = flight.t_s[inside], log.since(log.column("frame_t_s"))
+    end_s = float(frames.seen_s[-1]) if frames.seen_s.size else flight.log.end_s
+    low_s, high_s = max(0.0, end_s - LAST_S), min(end_s + AFTER_S, max(flight.log.end_s, 0.1))
+    inside = (flight.log.t_s >= low_s) & (flight.log.t_s <= high_s)
+    t_s, frame_s = flight.log.t_s[inside], log.since(log.column("frame_t_s"))
     near = (frame_s >= low_s) & (frame_s <= high_s)
     span_mm = [LEAST_SPAN_MM]
     for axis, colour in (("x", BLUE), ("y", ORANGE)):
@@ -236,19 +209,18 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
     ax.set_ylim(-1.15 * max(span_mm), 1.15 * max(span_mm))
     ax.set_ylabel("last 5 s with\nthe target [mm]")
     _add_legend(ax, up_ax)
-    _mark_lost(ax, frames, 0.05, BLACK)
+    _mark_lost(ax, frames)
     ax.set_xlim(low_s, high_s)
     return low_s, high_s
 
 
-def _mark_lost(ax: Axes, frames: Frames, height: float, colour: str) -> None:
-    """Mark frames without the target, and times without any frame, at the panel's bottom, up to
-    a share of its height."""
+def _mark_lost(ax: Axes, frames: Frames) -> None:
+    """Mark frames without the target, and times without any frame, at the panel's bottom."""
     if frames.unseen_s.size:
-        ax.vlines(frames.unseen_s, 0.0, height, transform=ax.get_xaxis_transform(), color=colour,
-                  linewidth=0.7)  # fmt: skip
+        ax.vlines(frames.unseen_s, 0.0, LOST_SHARE, transform=ax.get_xaxis_transform(),
+                  color=BLACK, linewidth=0.7)  # fmt: skip
     for start_s, end_s in frames.gaps_s:
-        ax.axvspan(start_s, end_s, 0.0, height, color=VERMILLION, linewidth=0.0)
+        ax.axvspan(start_s, end_s, 0.0, LOST_SHARE, color=VERMILLION, linewidth=0.0)
 
 
 def _add_legend(ax: Axes, twin: Axes | None = None) -> None:

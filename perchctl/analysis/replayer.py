@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-import math
+import json
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import perchctl
 from perchctl.analysis.compare import profile_differences
-from perchctl.analysis.decide import (
-    Decided,
-    Difference,
-    decide,
-    first_differing,
-    first_of,
-    whole_turns,
-)
-from perchctl.analysis.sense import (
-    Picture,
-    PictureMissing,
-    Sensed,
-    one_thread,
-    sense,
-)
+from perchctl.analysis.decide import Decided, decide, first_differing_of, whole_turns
+from perchctl.analysis.sense import Picture, PictureMissing, Sensed, one_thread, sense
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
 from perchctl.flight import FlightInputs
@@ -30,6 +18,39 @@ from perchctl.mission import Observation, Turn
 from perchctl.profile import Profile
 from perchctl.record import FlightLog
 from perchctl.vision import Pipeline, make_pipeline
+
+CAUTION = (
+    "after the first difference the world would have answered differently: from there on this is "
+    "what the planner would have said to another flight's telemetry and pictures"
+)
+NOTHING_SHOWN = (
+    "what acts on the link, the telemetry or external positions, or is asked before take-off, "
+    "changes nothing in a replay, nor does what acts on pictures where none are recorded"
+)
+SHOWN_DIGITS = 6
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The first difference of a replay from its flight.
+
+    `tick` counts the turns from take-off from 0, as the log's ticks do; of a turn before that
+    it is negative. `t_s`: since the first flown turn. `recorded`, `replayed`: as JSON has them.
+    """
+
+    tick: int
+    t_s: float
+    field: str
+    recorded: Any
+    replayed: Any
+
+    @property
+    def text(self) -> str:
+        """``tick 512 at 10.24 s: command.z_m was 1.25, the replay has 1.26``"""
+        was, now = (json.dumps(_rounded(v)) for v in (self.recorded, self.replayed))
+        if was == now:  # they differ in the last bits
+            was, now = json.dumps(self.recorded), json.dumps(self.replayed)
+        return f"tick {self.tick} at {self.t_s:.2f} s: {self.field} was {was}, the replay has {now}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +67,9 @@ class Seen:
     turns: Sequence[Sensed]
     differences: int
     first: Difference | None
-    frames: int = 0
-    frames_flown: int = 0
-    missing: PictureMissing | None = None
+    frames: int
+    frames_flown: int
+    missing: PictureMissing | None
 
     @property
     def ended(self) -> str:
@@ -79,11 +100,9 @@ class Replay:
         seen: what the pictures show; None without any.
         changed: the keys in which the profile is another than the flown one's.
         gap: which turn is the first that the log has lost, or empty.
-        notes: what limits the replay, in sentences.
     """
 
     log: FlightLog
-    profile: Profile
     decided: Sequence[Decided]
     ticks: int
     differences: int
@@ -91,12 +110,100 @@ class Replay:
     seen: Seen | None = None
     changed: tuple[str, ...] = ()
     gap: str = ""
-    notes: tuple[str, ...] = ()
 
     @property
     def same(self) -> bool:
         """True if no decision and nothing that was seen differs."""
         return self.first is None and (self.seen is None or self.seen.same)
+
+    @property
+    def notes(self) -> list[str]:
+        """What limits the replay, a sentence each."""
+        made_by, elsewhere = self.log.header.get("perchctl"), self.log.computer_differences
+        found = []
+        if made_by != perchctl.__version__:
+            found.append(
+                f"perchctl {made_by} flew it, and this is {perchctl.__version__}: what differs may "
+                f"be what has been changed on purpose since"
+            )
+        if elsewhere:
+            found.append(
+                f"it was flown with {elsewhere}: the last bits of a number may differ for that"
+            )
+        if self.log.truncated:
+            found.append("the log ends in the flight, without its summary: replayed is its rest")
+        ended = "" if self.seen is None else self.seen.ended
+        found += [note for note in (self.gap, ended) if note]
+        if self.changed:
+            found.append(NOTHING_SHOWN if self.same else CAUTION)
+        for each in self.decided:
+            if each.error is not None:
+                found.append(f"the planner breaks down on turn {each.turn.number}: {each.error}")
+        return found
+
+    def record(self) -> dict[str, Any]:
+        """Return the replay as JSON's own types.
+
+        `ticks`, `differences` and `first_difference` are the planner's; `pictures` is None without
+        any, `changed` empty where the profile is the flown one.
+        """
+        seen = self.seen
+        return {
+            "log": str(self.log.path),
+            "same": self.same,
+            "ticks": self.ticks,
+            **_differences(self),
+            "gap": self.gap or None,
+            "pictures": None
+            if seen is None
+            else {
+                "frames": seen.frames,
+                "frames_flown": seen.frames_flown,
+                "ended": seen.ended or None,
+                **_differences(seen),
+            },
+            "changed": list(self.changed),
+            "notes": self.notes,
+        }
+
+    def lines(self) -> list[str]:
+        """Return the replay's lines for people, without `notes`."""
+        lines = [f"changed:   {', '.join(self.changed)}"] if self.changed else []
+        text = "all with the same commands"
+        if self.first is not None:
+            text = f"{self.differences or 'what was not sent'} decided otherwise"
+        elif self.gap:
+            text += ", up to where the log has lost a turn"
+        lines.append(f"planner:   {self.ticks} turns, {text}")
+        if self.first is not None:
+            lines.append(f"first:     {self.first.text}")
+        seen = self.seen
+        if seen is None:
+            return lines
+        text = f"{seen.frames} frames"
+        if seen.ended:
+            text = f"seen up to frame {seen.frames} of {seen.frames_flown}"
+        if seen.first is not None:
+            lines.append(f"pictures:  {text}, {seen.differences} turns see something else")
+            return [*lines, f"first:     {seen.first.text}"]
+        poses = ", all with the same poses, to the bit" if seen.frames else ""
+        return [*lines, f"pictures:  {text}{poses}"]
+
+
+def _differences(found: Replay | Seen) -> dict[str, Any]:
+    first = None if found.first is None else asdict(found.first)
+    return {"differences": found.differences, "first_difference": first}
+
+
+def _rounded(value: Any) -> Any:
+    """JSON's own types with every number to `SHOWN_DIGITS`."""
+    if isinstance(value, float):
+        return float(f"{value:.{SHOWN_DIGITS}g}")
+    if isinstance(value, list):
+        return [_rounded(each) for each in value]
+    if isinstance(value, dict):
+        return {key: _rounded(each) for key, each in value.items()}
+    return value
 
 
 def replay(
@@ -120,42 +227,29 @@ def replay(
     if pictures is not None:
         pipeline = pipeline or pipeline_of(log, used, changed)
         seen = _seen(log, turns, flown, used, pictures, pipeline)
-    is_seen = seen is not None and (seen.frames > 0 or seen.is_another)
     observations: dict[int, Observation | None] = {}
-    if is_seen and seen is not None and changed:
+    if seen is not None and changed and (seen.frames > 0 or seen.is_another):
         observations = {each.turn.number: each.observation for each in seen.turns}
         turns = turns[: len(seen.turns)]
     decided = list(
         decide(turns, used, lambda turn: observations.get(turn.number, turn.observation))
     )
-    ended = "" if seen is None else seen.ended
+    flown_turns = [each for each in decided if each.turn.role == "flown"]
+    firsts = (
+        Difference(each.tick, log.since(each.turn.t_s), *each.difference)
+        for each in decided
+        if each.difference is not None
+    )
     return Replay(
         log=log,
-        profile=used,
         decided=decided,
-        ticks=sum(each.turn.role == "flown" for each in decided),
-        differences=sum(each.differs for each in decided if each.turn.role == "flown"),
-        first=first_of(decided, log.start_s),
+        ticks=len(flown_turns),
+        differences=sum(each.difference is not None for each in flown_turns),
+        first=next(firsts, None),
         seen=seen,
         changed=changed,
         gap=gap,
-        notes=(
-            *notes_of(log, gap, ended, changed, pictures=is_seen),
-            *_failures(decided),
-        ),
     )
-
-
-def check_readable(log: FlightLog) -> None:
-    """Decode all that a replay takes from the log. Errors: InvalidValue, and those of a value that
-    no flight writes."""
-    whole_turns(log)
-    _ = log.flown_profile
-    camera = log.flown_camera
-    if camera is not None:
-        log.flown_mask(camera)
-    if not math.isfinite(log.start_s):
-        raise ValueError("the first turn has no time")
 
 
 def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:
@@ -179,6 +273,9 @@ def pipeline_of(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -
         raise InvalidValue(f"{log.path}: its mask does not fit its calibration: {error}") from None
 
 
+# --- What the pictures show ------------------------------------------------------------------
+
+
 def _seen(
     log: FlightLog,
     turns: Sequence[Turn],
@@ -197,9 +294,11 @@ def _seen(
                 found.append(each)
         except PictureMissing as error:
             missing = error
+    differences = list(_differing(log, turns, found))
     return Seen(
         found,
-        *_differing(log, turns, found),
+        len(differences),
+        next(iter(differences), None),
         frames=_frames_of(each.turn for each in found),
         frames_flown=_frames_of(turns),
         missing=missing,
@@ -208,96 +307,20 @@ def _seen(
 
 def _differing(
     log: FlightLog, turns: Sequence[Turn], found: Iterable[Sensed]
-) -> tuple[int, Difference | None]:
-    """Count the turns in which something else is seen than was, and find the first."""
-    start = next((t.number for t in turns if t.role != "waiting"), len(turns))
-    differing = [(each.turn, d) for each in found if (d := _unlike(each)) is not None]
-    if not differing:
-        return 0, None
-    turn, difference = differing[0]
-    tick = turn.number - start
-    if tick > 0:
-        tick = sum(t.role == "flown" for t in turns[start : turn.number])
-    return len(differing), Difference(tick, turn.t_s - log.start_s, *difference)
-
-
-def _failures(decided: Sequence[Decided]) -> Iterator[str]:
-    for each in decided:
-        if each.error is not None:
-            as_flown = ", as in flight" if each.error == each.turn.error else ""
-            yield f"the planner breaks down on turn {each.turn.number}{as_flown}: {each.error}"
+) -> Iterator[Difference]:
+    """Yield the turns in which something else is seen than was: a pose, or what the planner
+    sees."""
+    tick = -sum(turn.role == "waiting" for turn in turns)
+    for each in found:
+        was, seen = each.turn.observation, each.observation
+        fields: list[tuple[str, Any, Any]] = [("poses", each.turn.poses, each.poses)]
+        if was is not None and seen is not None:
+            fields += [(n, getattr(was, n), getattr(seen, n)) for n in FlightInputs.SENSED]
+        difference = first_differing_of(fields)
+        if difference is not None:
+            yield Difference(tick, log.since(each.turn.t_s), *difference)
+        tick += each.turn.role in ("waiting", "flown")
 
 
 def _frames_of(turns: Iterable[Turn]) -> int:
     return sum(turn.taken.frame is not None and turn.taken.look for turn in turns)
-
-
-def _unlike(sensed: Sensed) -> tuple[str, object, object] | None:
-    """Return the first field in which what is seen is not what was seen; None without one."""
-    was, seen = sensed.turn.observation, sensed.observation
-    found = first_differing("poses", sensed.turn.poses, sensed.poses)
-    if found is None and was is not None and seen is not None:
-        names = FlightInputs.SENSED
-        each = (first_differing(n, getattr(was, n), getattr(seen, n)) for n in names)
-        found = next((difference for difference in each if difference is not None), None)
-    return found
-
-
-# --- What limits a replay, in sentences --------------------------------------------------------
-
-ON_PICTURES = (
-    "camera", "detector", "pose", "kalman", "merge", "target", "vehicle",
-    "safety.max_frame_age_s", "safety.camera_hold_s",
-)  # fmt: skip
-BEFORE_TAKEOFF = (
-    "safety.min_rest_v", "safety.estimator_wait_s", "safety.estimator_variance_m2",
-    "safety.ground_z_m", "safety.ground_tolerance_m", "safety.start_tilt_deg",
-    "positioning.connect_timeout_s",
-)  # fmt: skip
-ON_TELEMETRY = ("safety.jump_m", "safety.jump_z_m", "safety.jump_deg", "safety.jump_mps")
-"""They act on what the loop makes of telemetry, which is made anew with pictures only."""
-ON_AGES = ("positioning.hold_s", "positioning.land_s")
-"""Of `positioning` these act on the positions' ages, which are recorded; the others on which
-positions the vehicle is given."""
-
-
-def notes_of(
-    log: FlightLog, gap: str, ended: str, changed: Sequence[str], *, pictures: bool
-) -> Iterator[str]:
-    """Yield what limits a replay, a sentence each. `ended` says why the pictures end before the
-    flight; `pictures` is True if some were looked at."""
-    made_by = log.header.get("perchctl")
-    if made_by != perchctl.__version__:
-        yield (
-            f"perchctl {made_by} flew it, and this is {perchctl.__version__}: what differs may be "
-            f"what has been changed on purpose since"
-        )
-    elsewhere = log.computer_differences
-    if elsewhere:
-        yield f"it was flown with {elsewhere}: the last bits of a number may differ for that alone"
-    if log.truncated:
-        yield "the log ends in the flight, without its summary: replayed is what is there"
-    yield from (note for note in (gap, ended) if note)
-    limits: dict[str, list[str]] = {}
-    for key in changed:
-        limits.setdefault(_limit_of(key, pictures), []).append(key)
-    yield from (f"{', '.join(keys)}: {text}" for text, keys in limits.items() if text)
-
-
-def _limit_of(key: str, pictures: bool) -> str:
-    """Return what a replay cannot tell of a key; empty where it tells all."""
-    section = key.split(".")[0]
-    if key in BEFORE_TAKEOFF:
-        return "it is asked before take-off only, and a replay begins with the flight"
-    if not pictures and (section in ON_PICTURES or key in ON_PICTURES):
-        return "what it would change in the pictures cannot be shown, as there are none to look at"
-    if not pictures and key in ON_TELEMETRY:
-        return "what it would change in the telemetry is shown by a replay with pictures only"
-    if section == "positioning" and key not in ON_AGES:
-        return (
-            "which positions the vehicle would have been given, and where it would have taken "
-            "itself to be, cannot be shown: a log has only those that it was given"
-        )
-    if section in ("link", "simulation", "log"):
-        return "a replay has nothing that it acts on"
-    return ""

@@ -23,10 +23,11 @@ from perchctl.analysis.film import write_film
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
-from perchctl.analysis.story import SEVEN, Sentence, story_of
+from perchctl.analysis.story import Sentence, story_of
 from perchctl.analysis.words import count, length
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import write_files
+from perchctl.mission import SEVEN_PHASES
 from perchctl.record import log_values, path_beside, read_log, recorded_pictures
 
 UNFINISHED = "unfinished"
@@ -59,12 +60,10 @@ class Report:
 
     @property
     def counts_text(self) -> str:
-        """``one flight: perched``, ``4 flights: 3 perched, 1 landed``."""
+        """``1 flight: 1 perched``, ``4 flights: 3 perched, 1 landed``."""
         outcomes = [told.outcome for told in self.flights]
-        if len(outcomes) == 1:
-            return f"one flight: {outcomes[0]}"
         each = ", ".join(f"{outcomes.count(name)} {name}" for name in dict.fromkeys(outcomes))
-        return f"{len(outcomes)} flights: {each}"
+        return f"{count(len(outcomes), 'flight')}: {each}"
 
     def record(self) -> list[dict[str, Any]]:
         """The flights as JSON's own types."""
@@ -74,24 +73,10 @@ class Report:
                 "outcome": told.outcome,
                 "miss_m": told.flight.summary.miss_m,
                 "used_mah": told.flight.measures.battery_used_mah,
-                "pictures": None if told.pictures is None else len(told.pictures),
                 "advice": [f"{a.about}: {a.text} ({a.evidence})" for a in told.advice],
             }
             for told in self.flights
         ]
-
-
-def reported_flight(log_path: Path) -> ReportedFlight:
-    """Read one flight, with what was recorded beside its log. A recording that cannot be read
-    costs the pictures only.
-
-    Raises NotFound and InvalidValue for the log, as `read_log`.
-    """
-    flight, recording = FlightAnalysis(read_log(log_path)), path_beside(log_path, ".mcap")
-    if not recording.is_file():
-        return ReportedFlight(flight)
-    with log_values(log_path):
-        return with_pictures(flight, recording)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,23 +116,10 @@ class ReportedFlight:
         return title if miss_m is None else f"{title}, {length(miss_m)} off centre"
 
     @property
-    def name(self) -> str:
-        """The log's file name, without its folder: a page that is sent on does not name those of a
-        computer."""
-        return self.flight.log.path.name
-
-    @property
-    def profile(self) -> str:
-        """The profile's name."""
-        return self.flight.log.profile_name or "?"
-
-    @property
     def when(self) -> str:
         """When the flight began, in UTC; a simulated flight in lockstep has no date."""
-        header = self.flight.log.header
-        if header.get("started_utc"):
-            return utc_text(header["started_utc"])
-        return "simulated, without a date" if header.get("lockstep") else "not known"
+        started = self.flight.log.header.get("started_utc")
+        return utc_text(started) if started else "without a date"
 
     @property
     def faults(self) -> list[str]:
@@ -163,11 +135,8 @@ class ReportedFlight:
             )
         if log.ignored_bytes:
             found.append(f"Its last {log.ignored_bytes} bytes could not be read and are left out.")
-        if end.lost_records:
-            why = end.log_problem or "no reason is known"
-            found.append(f"The log lacks {count(end.lost_records, 'record')}: {why}.")
-        elif end.log_problem:
-            found.append(f"The log may lack its last records: {end.log_problem}.")
+        if end.log_problem:
+            found.append(f"The log lacks {count(end.lost_records, 'record')}: {end.log_problem}.")
         return found
 
 
@@ -209,16 +178,12 @@ def _templates() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    templates.filters["count"] = count
     templates.globals.update(
-        seven_phases=SEVEN, plot_of=plot_address, film_of=film_address,
-    )  # fmt: skip
+        seven_phases=[phase.value for phase in SEVEN_PHASES],
+        plot_of=lambda flight: _address("image/png", flight_png(flight)),
+        film_of=film_address,
+    )
     return templates
-
-
-def plot_address(flight: FlightAnalysis) -> str:
-    """Return the flight's plot as a `data:` address; the log has at least one tick."""
-    return _address("image/png", flight_png(flight))
 
 
 def film_address(flight: FlightAnalysis) -> tuple[str, str]:
@@ -253,39 +218,16 @@ def _address(kind: str, content: bytes) -> str:
 # --- What the camera saw when the mission decided: out of the recording beside the log ---------
 
 DECIDED = {"ESTIMATE": "found", "ASCEND": "aligned", "PERCH": "settled", "COMPLETE": "contact"}
-OLD_S = 0.2
-"""An older picture shows another moment, and its caption says which."""
-MOST = 16
-"""Of a flight with many attempts the first and the last ones."""
 WIDEST_PX, JPEG_QUALITY = 480, 80
 LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 
 
 @dataclass(frozen=True)
-class Decision:
-    """A moment worth a picture; `frame`: the number of the newest frame then, which the loop
-    had at `seen_s`."""
-
-    t_s: float
-    name: str
-    frame: int
-    record: dict[str, Any]
-    seen_s: float
-
-    @property
-    def caption(self) -> str:
-        text = f"{self.name}, {self.t_s:.1f} s"
-        if self.t_s - self.seen_s > OLD_S:  # the last centimetres are flown without a picture
-            text += f"; the picture is from {self.seen_s:.1f} s"
-        up_m = self.record.get("ez_m")
-        return text if up_m is None else f"{text}, {length(float(up_m))} below"
-
-
-@dataclass(frozen=True)
 class Shown:
-    """A decision with its picture as a JPEG, the markers drawn as they were found."""
+    """The picture of a decision as a JPEG, with the markers drawn as they were found. The last
+    centimetres are flown without one: the caption has the time of the picture."""
 
-    decision: Decision
+    caption: str
     jpeg: bytes
 
     @property
@@ -293,53 +235,51 @@ class Shown:
         return _address("image/jpeg", self.jpeg)
 
 
-def decisions_of(flight: FlightAnalysis) -> tuple[Decision, ...]:
-    """Find in order where the mission went on because of what was seen, and where sight was
-    lost."""
-    moments = [(s.start_s, DECIDED[s.phase]) for s in flight.log.phases if s.phase in DECIDED]
-    for loss in flight.losses:
-        moments.append((loss.start_s + min(loss.duration_s, 0.5), "lost"))
-    found = []
-    for t_s, name in sorted(moments):
-        until_then = flight.log.records[flight.index_at(t_s) :: -1]
-        record = next((r for r in until_then if r.get("frame") is not None), None)
-        if record is not None:
-            seen_s = flight.log.since(float(record["t_s"]))
-            found.append(Decision(t_s, name, int(record["frame"]), record, seen_s))
-    if len(found) > MOST:
-        found = found[: MOST // 2] + found[-MOST // 2 :]
-    return tuple(found)
+def reported_flight(log_path: Path) -> ReportedFlight:
+    """Read one flight, with what was recorded beside its log. A recording that cannot be read
+    costs the pictures only.
 
-
-def with_pictures(flight: FlightAnalysis, recording: Path) -> ReportedFlight:
-    """Return the flight with the pictures of its decisions, as far as the recording can be
-    read."""
-    wanted: dict[int, list[Decision]] = {}
-    for decision in decisions_of(flight):
-        wanted.setdefault(decision.frame, []).append(decision)
+    Raises NotFound and InvalidValue for the log, as `read_log`.
+    """
+    flight = FlightAnalysis(read_log(log_path))
+    if not path_beside(log_path, ".mcap").is_file():
+        return ReportedFlight(flight)
     shown: list[Shown] = []
-    problem = ""
     try:
-        pictures = recorded_pictures(recording, exact=False, numbers=wanted.keys())
-        while wanted and (picture := next(pictures, None)) is not None:
-            decisions = wanted.pop(picture.number)
-            shown += [Shown(decision, _jpeg(decision, picture.image)) for decision in decisions]
+        with log_values(log_path):
+            decisions = decisions_of(flight)
+        for picture in recorded_pictures(log_path, exact=False, numbers=decisions):
+            caption, record = decisions[picture.number]
+            shown.append(Shown(caption, _jpeg(record, picture.image)))
     except PerchError as error:
-        problem = _without_folder(error, flight.log.path)
-    in_order = tuple(sorted(shown, key=lambda each: each.decision.t_s))
-    return ReportedFlight(flight, in_order, problem)
+        return ReportedFlight(flight, tuple(shown), _without_folder(error, log_path))
+    return ReportedFlight(flight, tuple(shown))
 
 
-def _jpeg(decision: Decision, image: NDArray[np.uint8]) -> bytes:
+def decisions_of(flight: FlightAnalysis) -> dict[int, tuple[str, dict[str, Any]]]:
+    """Find where the mission went on because of what was seen: by the number of the newest frame
+    then, a caption and the record of the frame's tick."""
+    log = flight.log
+    found = {}
+    for stay in log.phases:
+        until_then = log.records[log.index_at(stay.start_s) :: -1]
+        record = next((r for r in until_then if r.get("frame") is not None), None)
+        if stay.phase in DECIDED and record is not None:
+            caption = f"{DECIDED[stay.phase]}, {log.since(float(record['t_s'])):.1f} s"
+            if record.get("ez_m") is not None:
+                caption += f", {length(float(record['ez_m']))} below"
+            found[int(record["frame"])] = caption, record
+    return found
+
+
+def _jpeg(record: dict[str, Any], image: NDArray[np.uint8]) -> bytes:
     drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     scale = min(1.0, WIDEST_PX / drawn.shape[1])
-    if scale < 1.0:
-        drawn = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    drawn = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     for key, colour in (("large_px", LARGE_BGR), ("small_px", SMALL_BGR)):
-        corners = decision.record.get(key)
-        if corners and len(corners) == 8:
+        if record.get(key) is not None:
             # A pixel's centre is a whole number; shrunk, too.
-            points = (np.array(corners, dtype=np.float64).reshape(4, 2) + 0.5) * scale - 0.5
+            points = (np.array(record[key], dtype=np.float64).reshape(4, 2) + 0.5) * scale - 0.5
             fixed = np.round(points * 16).astype(np.int32)
             cv2.polylines(drawn, [fixed], True, colour, 2, cv2.LINE_AA, 4)
     _, data = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])

@@ -15,8 +15,6 @@ from perchctl.record import FlightLog, PhaseSpan
 
 BLIND_PHASE = "COMPLETE"
 """Against the ceiling no frame is looked at."""
-SAME_S = 1e-3
-"""Times that differ by less are those of one tick."""
 GAP_PERIODS = 2.5
 """Frames come irregularly: less than that may be a late one."""
 
@@ -116,8 +114,6 @@ LEAST_LOSS_S = 0.3
 """A shorter gap is coasted through and changes nothing."""
 NEEDED_IN = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH", "RECOVER"})
 AT_THE_CEILING = frozenset({"COMPLETE", "PERCHED"})
-BEGINNING_S = 1.0
-"""How fast the vehicle was is looked for in the first second of a loss."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +123,6 @@ class Loss:
 
     Attributes:
         frames: how many came without the target; 0: no picture came at all.
-        speed_mps: the vehicle's highest speed at its beginning; NaN where unknown.
         phase: the one in which it went out of sight.
     """
 
@@ -135,7 +130,6 @@ class Loss:
     end_s: float
     regained: bool
     frames: int
-    speed_mps: float
     phase: str
 
     @property
@@ -146,7 +140,6 @@ class Loss:
 def losses_of(log: FlightLog, frames: Frames) -> tuple[Loss, ...]:
     """Find all losses in order. A vehicle at the ceiling looks at nothing, and loses nothing."""
     stays = log.phases
-    speed_mps = np.linalg.norm([log.column(f"v{axis}_mps") for axis in "xyz"], axis=0)
     starts_s = [float(t_s) for t_s in frames.seen_s]
     ends_s = [*starts_s[1:], log.end_s]
     found = []
@@ -154,14 +147,12 @@ def losses_of(log: FlightLog, frames: Frames) -> tuple[Loss, ...]:
         end_s = _end_of_loss(start_s, next_s, stays)
         if end_s is not None:
             unseen = (frames.unseen_s > start_s) & (frames.unseen_s < end_s)
-            beginning = within(log.t_s, start_s, min(end_s, start_s + BEGINNING_S))
             found.append(
                 Loss(
                     start_s,
                     end_s,
                     start_s != starts_s[-1],
                     int(np.count_nonzero(unseen)),
-                    percentile(speed_mps[beginning], 100),
                     _phase_at(stays, start_s + LEAST_LOSS_S / 2),
                 )
             )
@@ -187,9 +178,3 @@ def _end_of_loss(start_s: float, end_s: float, stays: Sequence[PhaseSpan]) -> fl
 
 def _phase_at(stays: Sequence[PhaseSpan], t_s: float) -> str:
     return next((s.phase for s in reversed(stays) if s.start_s <= t_s), "")
-
-
-def within(times_s: Array, start_s: float, end_s: float) -> slice:
-    """Return the ticks from one time to another."""
-    first, last = np.searchsorted(times_s, (start_s - SAME_S / 2, end_s + SAME_S / 2))
-    return slice(int(first), int(last))

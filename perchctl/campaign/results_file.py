@@ -25,10 +25,8 @@ from perchctl.files import cannot_be_written, check_place
 from perchctl.profile import Profile
 from perchctl.record import (
     camera_record,
-    decode_line,
     from_exact,
     json_line,
-    make_log_folder,
     path_beside,
     to_exact,
 )
@@ -98,7 +96,7 @@ def campaign_results(
     `open_results`). `failed_logs_only`: of the logs in `log_dir` only those of bad flights stay.
     Errors: InvalidValue."""
     if log_dir is not None:
-        make_log_folder(log_dir)
+        check_place(log_dir / "flight.jsonl", force=True)
     if out is None:
         yield CampaignResults(seeds, None, failed_logs_only)
         return
@@ -299,7 +297,9 @@ def _read_line(
 ) -> str | None:
     """Add the flight of a line to `flights`, or return the program's source that a header names.
     Raises ValueError for any other line, and InvalidValue for the header of another campaign."""
-    record = decode_line(line)
+    record = json.loads(line)
+    if not isinstance(record, dict):
+        raise ValueError("not an object")
     what = record.pop("kind", None)
     if what == "flight":
         result = result_from(record, kind)

@@ -70,7 +70,7 @@ from perchctl.profile import (
     load_profile,
     read_weights,
 )
-from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log, summary_text
+from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log
 from perchctl.target import mm_text, overhead_text
 
 EXIT_CODE_OF: dict[Outcome, int] = {
@@ -222,7 +222,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
             panel.close()
         summary = log.close(report, miss_m if report.phase is Phase.PERCHED else None)
         assert summary is not None
-        print_lines(summary_text(summary, log.path), stdout=not as_json)
+        print_lines(summary.text(log.path), stdout=not as_json)
         if page is not None:
             page.end(summary_card(summary, log.path))
     code = exit_code(report.outcome, summary)

@@ -12,11 +12,8 @@ import typer
 from perchctl.analysis import (
     Comparison,
     FlightAnalysis,
-    check_readable,
     list_text,
     newest_logs,
-    replay_lines,
-    replay_record,
     show_record,
     show_text,
     write_report,
@@ -36,7 +33,6 @@ from perchctl.files import check_output, same_file, write_files
 from perchctl.profile import Profile, changed_profile, load_profile
 from perchctl.record import (
     FlightLog,
-    log_table,
     log_values,
     path_beside,
     read_log,
@@ -144,7 +140,7 @@ def plot(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw a flight: errors, detections, lost frames, height, battery, the last seconds."""
+    """Draw a flight: detections, lost frames, height, battery, the last seconds."""
     path = _log_file(file)
     picture = output or path_beside(path, ".png")
     with _opened(path) as log:
@@ -195,9 +191,9 @@ def export(
     place = output or path_beside(path, ".csv")
     check_output(place, EXPORTS, force, "what a log is exported to")
     with _opened(path) as log:
-        table = log_table(log)
-    write_files({place: table.csv().encode("utf-8", errors="backslashreplace")})
-    rows, columns = len(table.rows), len(table.columns)
+        table = log.csv()
+    write_files({place: table.encode("utf-8", errors="backslashreplace")})
+    rows, columns = len(log.records), table.partition("\n")[0].count(",") + 1
     if as_json:
         found = {"log": str(path), "output": str(place), "format": "csv"}
         print_result(found | {"rows": rows, "columns": columns})
@@ -248,17 +244,16 @@ def replay(
         if profile is not None or settings:
             base = log.flown_profile if profile is None else load_profile(profile)
             wanted = changed_profile(base, settings or ())
-        check_readable(log)
     is_recorded = pictures and path_beside(path, ".mcap").is_file()
     found = replay_flight(log, recorded_pictures(path) if is_recorded else None, wanted)
     if wanted is not None and not found.changed:
         say("nothing was changed: that is what was flown")
     if as_json:
-        print_result(replay_record(found))
+        print_result(found.record())
     else:
         for note in found.notes:
             say(note)
-        print("\n".join(replay_lines(found)))
+        print("\n".join(found.lines()))
     return 0 if found.same else ReplayDiffers.exit_code
 
 

@@ -44,7 +44,7 @@ from perchctl.errors import (
     no_simulator,
 )
 from perchctl.profile import Profile, load_profile
-from perchctl.record import make_log_folder, summary_text, to_plain
+from perchctl.record import to_exact
 
 R = TypeVar("R", bound="_Flown")
 C = TypeVar("C", bound="campaigns.CampaignFlight")
@@ -168,8 +168,6 @@ def run(
     if out is not None and out.suffix != ".jsonl":
         raise InvalidValue(f"{out} must end in .jsonl: a result is one line of JSON")
     flown = with_positioning(load_profile(profile), positioning)
-    if only is not None and log_dir is not None:
-        make_log_folder(log_dir)
     if cluster is not None and log_dir is not None:
         log_dir = log_dir.absolute()  # workers are started in other folders
     seeds = _seeds(flights, seed)
@@ -501,7 +499,7 @@ def _report_flight(
         start_s = flight.events[0].t_s
         for event in flight.events:
             print(timed_event_text(event, start_s))
-        print(summary_text(summary, flight.log), flush=True)
+        print(summary.text(flight.log), flush=True)
     plot = _plot(flight.log, profile)
     if as_json:
         lacks = {"lost_records": summary.lost_records, "log_problem": summary.log_problem}
@@ -525,7 +523,7 @@ def _report_fault(
     assert result.log is not None
     plot = _plot(result.log, profile)
     if as_json:
-        print_result(to_plain({**known, "plot": plot}))
+        print_result(to_exact({**known, "plot": plot}))
     elif plot is not None:
         print(f"{'plot':<18} {plot}")
 

@@ -13,7 +13,7 @@ from perchctl.display.live import LivePage, PageState
 from perchctl.display.panel import status_rows
 from perchctl.display.sketch import Sketch
 from perchctl.mission import RESCUE, Event, EventKind, Tick
-from perchctl.record import FlightSummary, summary_text
+from perchctl.record import FlightSummary
 from perchctl.vision import MARKERS, Frame, PipelineOutput
 
 Card = dict[str, Any]
@@ -110,7 +110,7 @@ def flight_state(tick: Tick) -> PageState:
 
 def summary_card(summary: FlightSummary, log: Path) -> Card:
     """Return the card that says how the flight ended, and where to look next."""
-    first, *lines = summary_text(summary).splitlines()
+    first, *lines = summary.text().splitlines()
     rows = [[part.strip() for part in line.split(":", maxsplit=1)] for line in lines]
     return _card(summary.outcome, first.partition(": ")[2], rows, log)
 

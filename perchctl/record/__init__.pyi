@@ -1,8 +1,6 @@
-from .exact import decode_line as decode_line
 from .exact import from_exact as from_exact
 from .exact import json_line as json_line
 from .exact import to_exact as to_exact
-from .exact import to_plain as to_plain
 from .header import arithmetic_fingerprint as arithmetic_fingerprint
 from .header import camera_record as camera_record
 from .read import FlightLog as FlightLog
@@ -11,8 +9,5 @@ from .read import log_values as log_values
 from .read import read_log as read_log
 from .recorded import recorded_pictures as recorded_pictures
 from .summary import FlightSummary as FlightSummary
-from .summary import summary_text as summary_text
-from .table import log_table as log_table
 from .watch import LogWatcher as LogWatcher
-from .write import make_log_folder as make_log_folder
 from .write import path_beside as path_beside

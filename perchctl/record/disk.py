@@ -2,49 +2,27 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
 import threading
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Protocol
+from queue import SimpleQueue
 
-Job = Callable[[], None]
-
-
-class Stream(Protocol):
-    """What a recording is written to. All methods but `tell` may raise OSError."""
-
-    def write(self, data: bytes) -> int: ...
-
-    def tell(self) -> int: ...
-
-    def flush(self) -> None: ...
-
-    def free_bytes(self) -> int: ...
-
-    def close(self) -> None: ...
+Job = Callable[[], object]
 
 
 class DiskFile:
     """A file that holds whole records only: a write that fails leaves nothing of itself."""
 
-    def __init__(self, path: Path, fd: int, sync: bool) -> None:
-        """`fd`: the open file of that path; `sync`: what is flushed is on the disk, not only with
-        the system."""
+    def __init__(self, path: Path, sync: bool = True) -> None:
+        """Create the file; `sync`: what is flushed is on the disk, not only with the system.
+        Raises OSError, FileExistsError where there is one already."""
         self._path = path
-        self._fd = fd
         self._sync = sync
         self._good_bytes = 0
-
-    @classmethod
-    def new(cls, path: Path, sync: bool = True) -> DiskFile:
-        """Create a file. Raises OSError, where one is there already, too."""
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_BINARY", 0)
-        return cls(path, os.open(path, flags, 0o644), sync)
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
 
     def write(self, data: bytes) -> int:
         """Append the whole record; return its length. Raises OSError."""
@@ -65,21 +43,16 @@ class DiskFile:
         return self._good_bytes
 
     def flush(self) -> None:
-        """Bring what was written to the disk, where `sync` asks for that."""
-        if not self._sync:
-            return
-        try:
+        """Bring what was written to the disk, where `sync` asks for that. Raises OSError."""
+        if self._sync:
             os.fsync(self._fd)
-        except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a pipe, a special file
-                raise
 
     def free_bytes(self) -> int:
-        """Return the bytes that are left on its disk."""
+        """Return the bytes that are left on its disk. Raises OSError."""
         return shutil.disk_usage(self._path).free
 
     def close(self) -> None:
-        """Close the file; a second call does nothing."""
+        """Close the file; a second call does nothing. Raises OSError."""
         fd, self._fd = self._fd, -1  # the number may be another file's by the second time
         if fd >= 0:
             os.close(fd)
@@ -88,62 +61,59 @@ class DiskFile:
 class BackgroundWriter:
     """Does jobs in their order: at once, or `live` by a thread of its own, out of a bounded queue.
 
-    What a job raises is dropped: it has to remember itself what failed."""
+    What a job raises is dropped: it has to remember itself what failed.
+
+    Attributes:
+        refused: how many jobs were not taken.
+    """
 
     def __init__(self, most: int, name: str, live: bool) -> None:
-        """Begin with room for `most` jobs; `name` is the thread's."""
+        """Begin with room for jobs that weigh `most` together; `name` is the thread's."""
+        self.refused = 0
         self._most = most
-        self._jobs: deque[Job] = deque()
-        self._changed = threading.Condition()
-        self._last = False
+        self._jobs: SimpleQueue[tuple[Job, int] | None] = SimpleQueue()
+        self._counting = threading.Lock()
+        self._weight = self._left = 0
         self._thread: threading.Thread | None = None
         if live:
             self._thread = threading.Thread(target=self._run, name=name, daemon=True)
             self._thread.start()
 
-    def put(self, job: Job, share: float = 1.0) -> bool:
-        """Hand over a job; False when that share of the queue is full, and the job is not done. A
-        share of infinity is never full."""
+    def put(self, job: Job, weight: int = 1) -> bool:
+        """Hand over a job, from any thread; False where the queue is full, and the job is not
+        done."""
         if self._thread is None:
             _do(job)
             return True
-        with self._changed:
-            if len(self._jobs) >= share * self._most or self._last:
+        with self._counting:
+            if self._weight + weight > self._most:
+                self.refused += 1
                 return False
-            self._jobs.append(job)
-            self._changed.notify()
+            self._weight += weight
+            self._left += 1
+        self._jobs.put((job, weight))
         return True
 
-    def finish(self, job: Job, timeout_s: float, late: Job) -> int:
-        """Hand over a last job and wait for it. Return how many jobs were not done by then; 0 is
-        all done.
-
-        `late` is done instead of them should the thread ever get on: it frees what they held."""
+    def finish(self, job: Job, timeout_s: float) -> int:
+        """Hand over the last job and wait for it. Return how many jobs were not done by then; 0 is
+        all done. The thread goes on with them, should the disk ever answer."""
         if self._thread is None:
             _do(job)
             return 0
-        with self._changed:
-            self._jobs.append(job)
-            self._last = True
-            self._changed.notify()
+        with self._counting:
+            self._left += 1
+        self._jobs.put((job, 0))
+        self._jobs.put(None)
         self._thread.join(timeout_s)
-        with self._changed:
-            alive = self._thread.is_alive()
-            left = len(self._jobs) + int(alive)
-            self._jobs.clear()  # what comes too late is not done at all
-            if alive:
-                self._jobs.append(late)
-        return left
+        return self._left
 
     def _run(self) -> None:
-        while True:
-            with self._changed:
-                while not self._jobs:
-                    if self._last:
-                        return
-                    self._changed.wait()
-                job = self._jobs.popleft()
+        while (entry := self._jobs.get()) is not None:
+            job, weight = entry
             _do(job)
+            with self._counting:
+                self._weight -= weight
+                self._left -= 1
 
 
 def _do(job: Job) -> None:

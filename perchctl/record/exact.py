@@ -14,11 +14,12 @@ the same values.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from enum import Enum
 from functools import cache
 from pathlib import Path, PurePath
@@ -27,7 +28,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 T = TypeVar("T")
-_Plan = Callable[[Any], Any]
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 
@@ -36,10 +36,56 @@ def to_exact(value: Any) -> Any:
 
     Raises TypeError for what has no exact form.
     """
-    write = _WRITERS.get(type(value))
-    if write is None:
-        write = _WRITERS[type(value)] = _writer_for(type(value))
-    return write(value)
+    if isinstance(value, float):  # numpy's float64, too
+        return float(value) if math.isfinite(value) else repr(float(value))
+    if value is None or type(value) in (bool, int, str):
+        return value
+    if isinstance(value, (list, tuple)):
+        return [to_exact(v) for v in value]
+    if dataclasses.is_dataclass(value):
+        return _exact_fields(value)
+    if isinstance(value, Enum):
+        return to_exact(value.value)
+    if isinstance(value, dict):
+        if all(type(key) is str for key in value):
+            return {key: to_exact(v) for key, v in value.items()}
+        return [[to_exact(key), to_exact(v)] for key, v in value.items()]
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "fiub":
+        flat = [to_exact(v) for v in value.ravel().tolist()]
+        if value.dtype == np.float64 and value.ndim == 1:
+            return flat
+        return {"dtype": value.dtype.str, "shape": list(value.shape), "data": flat}
+    raise TypeError(f"{type(value).__name__} has no exact form in a flight log")
+
+
+def _exact_fields(value: Any) -> dict[str, Any]:
+    kind: Any = type(value)
+    found: dict[str, Any] = {}
+    for name, default, members in _fields_of(kind):
+        part = getattr(value, name)
+        if part is None and default is None:
+            continue
+        exact = to_exact(part)
+        is_named = part is not None and len(members) > 1
+        found[name] = [type(part).__name__, exact] if is_named else exact
+    return found
+
+
+@cache
+def _fields_of(kind: type) -> list[tuple[str, Any, tuple[Any, ...]]]:
+    """Return each field of a dataclass: its name, its default, and the types that it may hold."""
+    hints = typing.get_type_hints(kind)
+    return [(f.name, f.default, _members(hints[f.name])) for f in dataclasses.fields(kind)]
+
+
+@cache
+def _members(hint: Any) -> tuple[Any, ...]:
+    """Return the members of a union, but None; of any other type itself."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return tuple(part for part in typing.get_args(hint) if part is not types.NoneType)
+    return (hint,)
 
 
 def from_exact(kind: type[T], data: Any) -> T:
@@ -47,162 +93,74 @@ def from_exact(kind: type[T], data: Any) -> T:
 
     Raises ValueError, with the way to it, for data that is none.
     """
-    return typing.cast(T, _decoder(typing.cast(Any, kind))(data))
+    return typing.cast(T, _from_exact(kind, data))
 
 
-# --- out ----------------------------------------------------------------------------
-
-
-def _as_it_is(value: Any) -> Any:
-    return value
-
-
-def _float_to(value: float) -> float | str:
-    value = float(value)
-    return value if math.isfinite(value) else repr(value)
-
-
-def _list_to(value: Any) -> list[Any]:
-    return [to_exact(v) for v in value]
-
-
-def _dict_to(value: dict[Any, Any]) -> Any:
-    if all(type(key) is str for key in value):
-        return {key: to_exact(v) for key, v in value.items()}
-    return [[to_exact(key), to_exact(v)] for key, v in value.items()]
-
-
-def _array_to(array: Any) -> Any:
-    array = np.asarray(array)
-    flat = _list_to(array.ravel().tolist())
-    if array.dtype == np.float64 and array.ndim == 1:
-        return flat
-    if array.dtype.kind not in "fiub":
-        raise TypeError(f"an array of {array.dtype} has no exact form in a flight log")
-    return {"dtype": array.dtype.str, "shape": list(array.shape), "data": flat}
-
-
-def _fields_writer(kind: Any) -> _Plan:
-    hints = typing.get_type_hints(kind)
-    plan = [
-        (field.name, field.default is None, len(_classes_in(hints[field.name])) > 1)
-        for field in dataclasses.fields(kind)
-    ]
-
-    def write(value: Any) -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for name, left_out, named in plan:
-            part = getattr(value, name)
-            if part is None:
-                if not left_out:
-                    found[name] = None
-            else:
-                exact = to_exact(part)
-                found[name] = [type(part).__name__, exact] if named else exact
-        return found
-
-    return write
-
-
-_WRITERS: dict[type, _Plan] = {
-    type(None): _as_it_is,
-    bool: _as_it_is,
-    int: _as_it_is,
-    str: _as_it_is,
-    float: _float_to,
-    np.float64: _float_to,
-    np.ndarray: _array_to,
-    list: _list_to,
-    tuple: _list_to,
-    dict: _dict_to,
-}
-
-
-def _writer_for(kind: Any) -> _Plan:
-    if issubclass(kind, Enum):
-        return lambda value: to_exact(value.value)
-    if dataclasses.is_dataclass(kind):
-        return _fields_writer(kind)
-    if issubclass(kind, np.generic):
-        return _array_to
-    if issubclass(kind, PurePath):
-        return str
-    raise TypeError(f"{kind.__name__} has no exact form in a flight log")
-
-
-def _classes_in(hint: Any) -> list[Any]:
-    """Return the dataclasses that a field may hold."""
-    return [part for part in _members(hint) if dataclasses.is_dataclass(part)]
-
-
-def _members(hint: Any) -> tuple[Any, ...]:
-    """Return the members of a union; of any other type itself."""
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return typing.get_args(hint)
-    return (hint,)
-
-
-# --- back ---------------------------------------------------------------------------
-
-
-@cache
-def _decoder(hint: Any) -> _Plan:
-    members = [part for part in _members(hint) if part is not type(None)]
-    if len(members) < len(_members(hint)):
-        inner = _decoder_of(members)
-        return lambda data: None if data is None else inner(data)
-    return _decoder_of(members)
-
-
-def _decoder_of(members: list[Any]) -> _Plan:
+def _from_exact(hint: Any, data: Any) -> Any:
+    members = _members(hint)
+    if members != (hint,) and data is None:
+        return None
     if len(members) > 1:
-        by_name = {part.__name__: _decoder(part) for part in members}
-        return lambda data: _named_from(data, by_name)
-    hint = members[0]
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
+        by_name = {part.__name__: part for part in members}
+        if not isinstance(data, list) or len(data) != 2 or data[0] not in by_name:
+            raise ValueError(f"one of {', '.join(by_name)} is needed")
+        return _from_exact(by_name[data[0]], data[1])
+    (kind,) = members
+    if kind is Any:
+        return data
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin is np.ndarray:
-        return _array_from
+        return _array_from(data)
     if origin is typing.Literal:
-        return lambda data: _one_of(data, args)
+        if data not in args:
+            raise ValueError(f"{data!r} is none of {', '.join(map(str, args))}")
+        return data
     if origin is tuple:
-        return _tuple_decoder(args)
+        if not isinstance(data, list) or not (args[-1] is Ellipsis or len(data) == len(args)):
+            raise ValueError(f"a list is needed, found {data!r:.60}")
+        kinds = itertools.repeat(args[0]) if args[-1] is Ellipsis else args
+        return tuple(map(_from_exact, kinds, data))
     if origin is dict:
-        return _dict_decoder(*args)
-    if dataclasses.is_dataclass(hint):
-        return _dataclass_decoder(typing.cast(type, hint))
-    if isinstance(hint, type) and issubclass(hint, Enum):
-        return hint
-    if hint in (bool, int, float, str):
-        return lambda data: _plain_from(data, hint)
-    if hint is Path:
-        return lambda data: Path(_plain_from(data, str))
-    if hint is Any:
-        return _as_it_is
-    raise TypeError(f"{hint} has no exact form in a flight log")
+        if not isinstance(data, (dict, list)):
+            raise ValueError(f"keys and values are needed, found {data!r:.60}")
+        pairs = data.items() if isinstance(data, dict) else data
+        return {_from_exact(args[0], key): _from_exact(args[1], v) for key, v in pairs}
+    if dataclasses.is_dataclass(kind):
+        return _dataclass_from(kind, data)
+    if issubclass(kind, Enum):
+        return kind(data)
+    if kind is Path:
+        return Path(_plain_from(data, str))
+    return _plain_from(data, kind)
 
 
-def _named_from(data: Any, by_name: dict[str, _Plan]) -> Any:
-    if not isinstance(data, list) or len(data) != 2 or data[0] not in by_name:
-        raise ValueError(f"one of {', '.join(by_name)} is needed")
-    return by_name[data[0]](data[1])
+def _dataclass_from(kind: Any, data: Any) -> Any:
+    if not isinstance(data, dict):
+        raise ValueError(f"{kind.__name__} is needed, found {data!r:.60}")
+    hints, values = _hints(kind), {}
+    for name, part in data.items():
+        if name not in hints:
+            raise ValueError(f"{kind.__name__} has no field {name}")
+        try:
+            values[name] = _from_exact(hints[name], part)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{name}: {error}") from None
+    try:
+        return kind(**values)
+    except TypeError as error:
+        raise ValueError(str(error)) from None
 
 
-def _one_of(data: Any, allowed: tuple[Any, ...]) -> Any:
-    if data not in allowed:
-        raise ValueError(f"{data!r} is none of {', '.join(map(str, allowed))}")
-    return data
+_hints = cache(typing.get_type_hints)
 
 
 def _plain_from(data: Any, kind: type) -> Any:
-    if isinstance(data, dict) and kind is not str:  # a number of numpy's
+    if isinstance(data, dict):  # a number of numpy's
         return _array_from(data)[()]
-    if kind is float:
-        if isinstance(data, str) and data in _NOT_FINITE:
-            return _NOT_FINITE[data]
-        kinds: tuple[type, ...] = (float, int)
-    else:
-        kinds = (kind,)
-    if not isinstance(data, kinds) or (isinstance(data, bool) and kind is not bool):
+    if kind is float and isinstance(data, str) and data in _NOT_FINITE:
+        return _NOT_FINITE[data]
+    kinds = (float, int) if kind is float else (kind,)
+    if type(data) not in kinds:
         raise ValueError(f"{kind.__name__} is needed, found {data!r:.60}")
     return data
 
@@ -212,61 +170,8 @@ def _array_from(data: Any) -> Any:
         return np.array([_plain_from(v, float) for v in data], dtype=np.float64)
     if not isinstance(data, dict) or {*data} != {"dtype", "shape", "data"}:
         raise ValueError(f"an array is needed, found {data!r:.60}")
-    try:
-        dtype = np.dtype(data["dtype"])
-        flat = [_NOT_FINITE.get(v, v) if isinstance(v, str) else v for v in data["data"]]
-        return np.array(flat, dtype=dtype).reshape(data["shape"])
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"no array: {error}") from None
-
-
-def _tuple_decoder(args: tuple[Any, ...]) -> _Plan:
-    endless = len(args) == 2 and args[1] is Ellipsis
-    plans = [_decoder(part) for part in (args[:1] if endless else args)]
-
-    def decode(data: Any) -> tuple[Any, ...]:
-        if not isinstance(data, list) or not (endless or len(data) == len(plans)):
-            raise ValueError(f"a list is needed, found {data!r:.60}")
-        if endless:
-            return tuple(plans[0](v) for v in data)
-        return tuple(plan(v) for plan, v in zip(plans, data, strict=True))
-
-    return decode
-
-
-def _dict_decoder(key_hint: Any, value_hint: Any) -> _Plan:
-    key_of, value_of = _decoder(key_hint), _decoder(value_hint)
-
-    def decode(data: Any) -> dict[Any, Any]:
-        pairs = data.items() if isinstance(data, dict) else data
-        if not isinstance(data, (dict, list)):
-            raise ValueError(f"keys and values are needed, found {data!r:.60}")
-        return {key_of(key): value_of(value) for key, value in pairs}
-
-    return decode
-
-
-def _dataclass_decoder(kind: type) -> _Plan:
-    hints = typing.get_type_hints(kind)
-    plans = {field.name: _decoder(hints[field.name]) for field in dataclasses.fields(kind)}
-
-    def decode(data: Any) -> Any:
-        if not isinstance(data, dict):
-            raise ValueError(f"{kind.__name__} is needed, found {data!r:.60}")
-        values = {}
-        for name, part in data.items():
-            if name not in plans:
-                raise ValueError(f"{kind.__name__} has no field {name}")
-            try:
-                values[name] = plans[name](part)
-            except (ValueError, TypeError) as error:
-                raise ValueError(f"{name}: {error}") from None
-        try:
-            return kind(**values)
-        except TypeError as error:
-            raise ValueError(str(error)) from None
-
-    return decode
+    flat = [_NOT_FINITE.get(v, v) if isinstance(v, str) else v for v in data["data"]]
+    return np.array(flat, dtype=np.dtype(data["dtype"])).reshape(data["shape"])
 
 
 # --- rounded, and as lines ------------------------------------------------------------

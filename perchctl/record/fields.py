@@ -156,19 +156,8 @@ def field_kind(key: str) -> Kind:
     return next((kind for kind, keys in _KINDS.items() if key in keys), "number")
 
 
-EVENT_FIELDS: dict[str, str] = {
-    "t_s": "time on the loop's clock",
-    "event": "phase (one was entered), hold (the vehicle is held in place) or note",
-    "phase": "the phase entered, or the one that was flown",
-    "row": "row of the mission's table that was taken",
-    "severity": "continue, hold, back off, land or stop",
-    "reason": "why",
-    "simulated": "what the simulated scenario did that led to it",
-}
-
-
 def event_record(event: Event) -> dict[str, Any]:
-    """Return an event as a flat record with the keys of `EVENT_FIELDS`."""
+    """Return an event as a flat record. Severities are continue, hold, back off, land and stop."""
     return {
         "t_s": event.t_s,
         "event": event.kind.value,

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import csv
 import gzip
 import math
-import os
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,6 +32,7 @@ from perchctl.record.fields import (
     FORMAT,
     READABLE_VERSIONS,
     SCHEMA_VERSION,
+    field_kind,
     sent_values,
 )
 from perchctl.record.header import computer_record
@@ -41,13 +43,9 @@ Exact = TypeVar("Exact", Turn, SentCommand)
 SUFFIX = ".jsonl"
 KINDS = ("tick", "turn", "sent", "event", "summary", "recording")
 """Of a log's records behind its header."""
-MOST_LOG_BYTES = 300_000_000
-"""Of a log, unpacked: three quarters of an hour of flight at 0.115 MB/s. What a packed file of a
-megabyte unfolds to may otherwise fill the memory."""
 SAME_S = 1e-3
 """Times that differ by less are those of one tick."""
 _GZIP = b"\x1f\x8b"
-_TAIL_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -150,6 +148,23 @@ class FlightLog:
                 spans.append(PhaseSpan(phase, at_s, at_s, *words))
         return tuple(spans)
 
+    def csv(self) -> str:
+        """Return the ticks as CSV: a line of names, then a line each tick with times from 0 and the
+        markers' corners as columns of their own; a missing value is empty, a flag 0 or 1.
+
+        Errors: InvalidValue for a log without ticks; what `log_values` takes for a value that no
+        flight writes.
+        """
+        if not self.records:
+            raise InvalidValue(f"{self.path}: the log holds no ticks, there is nothing to export")
+        text = StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(name for key in FIELDS for name in _columns_of(key))
+        for record in self.records:
+            times = {key: self.since(record[key]) for key in TIMES if record[key] is not None}
+            writer.writerow(cell for key in FIELDS for cell in _cells(key, {**record, **times}))
+        return text.getvalue()
+
     # --- times
 
     @property
@@ -163,7 +178,7 @@ class FlightLog:
         """Count times on the loop's clock from the first flown turn, as all outputs do."""
         return t_s - self.start_s
 
-    @property
+    @cached_property
     def t_s(self) -> Array:
         """Times of the ticks since the flight's first turn, shape (n,)."""
         return self.since(self.column("t_s"))
@@ -172,6 +187,15 @@ class FlightLog:
     def end_s(self) -> float:
         """Time of the last tick since the flight's first turn; 0 without any."""
         return self.since(float(self.records[-1]["t_s"])) if self.records else 0.0
+
+    def index_at(self, t_s: float) -> int:
+        """Return the index of the newest tick at that time since the first turn."""
+        return max(0, int(np.searchsorted(self.t_s, t_s + SAME_S / 2, side="right")) - 1)
+
+    def within(self, start_s: float, end_s: float) -> slice:
+        """Return the ticks from one time since the first turn up to another, without that."""
+        first, last = np.searchsorted(self.t_s, (start_s - SAME_S / 2, end_s - SAME_S / 2))
+        return slice(int(first), int(last))
 
     # --- the setup that was flown
 
@@ -230,9 +254,7 @@ class FlightLog:
             return None
         width, height = camera.size_px
         try:
-            # No more than the mask: what a damaged text unfolds to has no bound.
-            most = width * height // 8 + 1
-            packed = zlib.decompressobj().decompress(base64.b64decode(text), most)
+            packed = zlib.decompress(base64.b64decode(text))
             bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8))
             return bits[: width * height].reshape(height, width).astype(bool)
         except (ValueError, TypeError, zlib.error) as error:
@@ -252,19 +274,43 @@ class FlightLog:
         )
 
 
+TIMES = ("t_s", "frame_t_s")
+"""On the loop's clock in the log, from the flight's first turn in a table."""
+
+
+def _columns_of(key: str) -> list[str]:
+    """Return the names of the columns of a field in a table."""
+    if field_kind(key) != "corners":
+        return [key]
+    corners = ("tl", "tr", "br", "bl")
+    return [f"{key.removesuffix('_px')}_{corner}_{axis}_px" for corner in corners for axis in "xy"]
+
+
+def _cells(key: str, record: Mapping[str, Any]) -> list[Any]:
+    """Return the values of those columns in a record."""
+    value, kind = record[key], field_kind(key)
+    if kind == "corners":
+        cells = [None] * 8 if value is None else list(value)
+        if len(cells) != 8:
+            raise ValueError(f"{key} needs 8 numbers")
+        return cells
+    if kind == "flag" and value is not None:
+        return [int(value)]
+    if kind == "number" and value is not None:
+        return [round(value + 0.0, 6)]
+    return [value]
+
+
 # --- the file -----------------------------------------------------------------------------
 
 
-def read_log(path: Path | str, *, ends_suffice: bool = False) -> FlightLog:
+def read_log(path: Path | str) -> FlightLog:
     """Read a flight log, packed by gzip or not; an unreadable tail is ignored and counted.
 
-    With `ends_suffice` it may hold header and summary alone, which is quick. Raises NotFound when
-    there is no such file, and InvalidValue, with the line, when it is not a flight log or is
-    damaged elsewhere than at its end.
+    Raises NotFound when there is no such file, and InvalidValue, with the line, when it is not a
+    flight log or is damaged elsewhere than at its end.
     """
     path = Path(path)
-    if ends_suffice and (ends := _ends_of(path)) is not None:
-        return ends
     lines = _lines(path)
     header = _header(path, lines)
     good: list[dict[str, Any]] = []
@@ -284,36 +330,18 @@ def read_log(path: Path | str, *, ends_suffice: bool = False) -> FlightLog:
             )
         good.append(record)
     summary = next((r for r in good if r["kind"] == "summary"), None)
-    recording = next((r for r in good if r["kind"] == "recording"), {})
     blank = dict.fromkeys(FIELDS)
     return FlightLog(
         path=path,
         header=header,
         records=[blank | _without_kind(r) for r in good if r["kind"] == "tick"],
         events=[_without_kind(r) for r in good if r["kind"] == "event"],
-        summary=None if summary is None else _without_kind(summary | recording),
+        summary=None if summary is None else _without_kind(summary),
         truncated=summary is None or ignored > 0,
         ignored_bytes=ignored,
         turn_records=[r for r in good if r["kind"] == "turn"],
         sent_records=[r for r in good if r["kind"] == "sent"],
     )
-
-
-def _ends_of(path: Path) -> FlightLog | None:
-    """Read header and summary alone; None where the file does not end with its summary."""
-    try:
-        with path.open("rb") as stream:
-            first = stream.readline()
-            stream.seek(max(len(first), os.fstat(stream.fileno()).st_size - _TAIL_BYTES))
-            last = stream.read().splitlines()[-2:]
-        header, end = _header(path, [first]), decode_line(last[-1])
-        if end.get("kind") == "recording":
-            end = decode_line(last[0]) | _without_kind(end)
-    except (OSError, ValueError, IndexError, InvalidValue):
-        return None
-    if end.get("kind") != "summary":
-        return None
-    return FlightLog(path, header, [], [], end, truncated=False)
 
 
 @contextlib.contextmanager
@@ -333,27 +361,19 @@ def _lines(path: Path) -> list[bytes]:
     """Read the lines of a file; none of what cannot be a log, as it may be a video of gigabytes.
     The end of a packed file that was cut is lost."""
     lines: list[bytes] = []
-    left = MOST_LOG_BYTES + 1
     try:
         with path.open("rb") as file:
             is_packed = file.peek(len(_GZIP)).startswith(_GZIP)
             stream = gzip.GzipFile(fileobj=file) if is_packed else file
             with contextlib.suppress(gzip.BadGzipFile, EOFError, zlib.error):
                 if stream.peek(1).startswith(b"{"):
-                    while left and (line := stream.readline(left)):
-                        lines.append(line)
-                        left -= len(line)
+                    lines.extend(stream)
     except FileNotFoundError:
         raise NotFound(f"flight log {path} does not exist") from None
     except IsADirectoryError:
         raise NotFound(f"flight log {path} is a folder; name one of its .jsonl files") from None
     except OSError as error:
         raise NotFound(f"flight log {path} cannot be read: {error.strerror}") from None
-    if not left:
-        raise InvalidValue(
-            f"{path}: it has more than {MOST_LOG_BYTES / 1e6:g} MB, and no flight's log has so "
-            f"much: take the original, or cut it off behind some line"
-        )
     return lines
 
 

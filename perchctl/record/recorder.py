@@ -1,4 +1,4 @@
-"""Records a flight while it flies: pictures, calibration, transforms, ticks and events.
+"""Records a flight while it flies: pictures, transforms, ticks and events.
 
 The flight hands over what it has and goes on: a thread of its own encodes and writes. The
 recording is not the log: what it loses is counted and said, and nothing lands for it.
@@ -6,45 +6,27 @@ recording is not the log: what it loses is counted and said, and nothing lands f
 
 from __future__ import annotations
 
-from collections import deque
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from perchctl.errors import InvalidValue
 from perchctl.profile import Profile
-from perchctl.record.disk import BackgroundWriter, DiskFile, Stream
+from perchctl.record.disk import BackgroundWriter, DiskFile, Job
 from perchctl.record.recording_file import RecordingFile, encoded, frame_record
 from perchctl.record.summary import RecordingEnd
 from perchctl.vision import Frame
 
 CLOSE_TIMEOUT_S = 5.0
-MOST_BEHIND = 1500
-"""Turns that may wait for the disk, half a minute of a flight."""
-MOST_PICTURE_BYTES = 64_000_000
-"""That the pictures among them may hold in memory."""
+MOST_WAITING_BYTES = 64_000_000
+"""What may wait for the disk holds so much memory."""
+TURN_BYTES = 10_000
+"""Of a turn without its picture."""
 FLUSH_PERIOD_S = 1.0
 RESERVE_BYTES = 200_000_000
 """Left free on the disk: it is the flight log's, without which the vehicle would have to land."""
-GOES_ON = "the flight and its log go on"
-
-
-@dataclass(eq=False)
-class _Turn:
-    """What one turn of the loop hands over to the thread that writes."""
-
-    frame: Frame | None = None
-    events: list[Mapping[str, Any]] = field(default_factory=list)
-    sent: Mapping[str, Any] | None = None
-    tick: Mapping[str, Any] | None = None
-
-    @property
-    def held_bytes(self) -> int:
-        """Bytes in memory while it waits; a frame that repeats holds its picture too."""
-        frame = self.frame
-        return 0 if frame is None else frame.image.nbytes + len(frame.encoded or b"")
 
 
 class Recorder:
@@ -53,82 +35,65 @@ class Recorder:
 
     Live, a turn is handed over at its end, with its frame: the thread works while the loop
     sleeps. Otherwise (lockstep) everything is written at once, and nothing is ever dropped.
+
+    Attributes:
+        problem: None, or one sentence about the first thing that the recording lacks.
     """
 
     def __init__(
-        self, path: Path, stream: Stream, header: Mapping[str, Any], profile: Profile, live: bool
+        self, path: Path, stream: DiskFile, header: Mapping[str, Any], profile: Profile, live: bool
     ) -> None:
-        """Begin the file. Raises OSError; NotFound and InvalidValue for the calibration."""
+        """Begin the file. Raises OSError."""
         self.path = path
-        self._most_bytes = profile.log.max_mb * 1_000_000
-        self._remarks: deque[str] = deque()
-        self._problem: str | None = None
+        self.problem: str | None = None
         # Of the loop's thread.
-        self._writer = BackgroundWriter(MOST_BEHIND, "perchctl-recording", live)
-        self._turn = _Turn()
+        self._writer = BackgroundWriter(MOST_WAITING_BYTES, "perchctl-recording", live)
+        self._turn: list[Job] = []
+        self._turn_bytes = TURN_BYTES
         self._pictures = 0
-        self._handed_bytes = 0
         self._closed = False
         # Of the thread that writes.
         self._file = RecordingFile(stream, header, profile)
-        self._over = self._full = False
-        self._done_bytes = 0
-        self._flushed_s: float | None = None
+        self._most_bytes = profile.log.max_mb * 1_000_000
+        self._over = False
+        self._flushed_s = -math.inf
         self._flushed_pictures = 0
 
     @classmethod
     def open(
         cls, path: Path, header: Mapping[str, Any], profile: Profile, live: bool = False
     ) -> Recorder:
-        """Begin a new file beside the log. Errors: NotFound, InvalidValue, before the flight."""
+        """Begin a new file beside the log. Errors: InvalidValue, before the flight."""
         try:
-            stream = DiskFile.new(path, sync=live)
+            stream = DiskFile(path, sync=live)
+            try:
+                return cls(path, stream, header, profile, live)
+            except BaseException:
+                stream.close()
+                path.unlink(missing_ok=True)
+                raise
         except OSError as error:
-            raise _cannot_begin(path, error) from None
-        try:
-            return cls(path, stream, header, profile, live)
-        except BaseException as error:
-            stream.close()
-            path.unlink(missing_ok=True)
-            if isinstance(error, OSError):
-                raise _cannot_begin(path, error) from None
-            raise
+            raise InvalidValue(
+                f"{path}: the recording cannot be begun ({error.strerror or error}): free the "
+                f"place, or fly with --no-record"
+            ) from None
 
     def frame(self, frame: Frame) -> None:
         """Record a frame that the source gave. Never raises."""
-        if self._closed:
-            return
+        self._hand_over()  # before take-off no tick does
         self._pictures += not frame.repeated
-        if self._turn.frame is not None:  # before take-off no tick hands it over
-            self._hand_over()
-        self._turn.frame = frame
+        self._turn.append(partial(self._store, frame))
+        # A frame that repeats holds its picture too.
+        self._turn_bytes += frame.image.nbytes + len(frame.encoded or b"")
 
     def event(self, record: Mapping[str, Any]) -> None:
         """Record an event (`perchctl.record.fields.event_record`). Never raises."""
-        if not self._closed:
-            self._turn.events.append(record)
-
-    def sent(self, values: Mapping[str, Any]) -> None:
-        """Record what was sent in the loop's place (`perchctl.record.fields.sent_values`), from any
-        thread: the loop hangs, perhaps, and its turn is left alone. Never raises."""
-        if self._closed or self._over:
-            return
-        alone = _Turn(sent=values)
-        if not self._writer.put(partial(self._write, alone)):
-            self._note_lag("turns are missing in it")
+        self._turn.append(partial(self._file.event, record))
 
     def tick(self, record: Mapping[str, Any]) -> None:
         """Record a tick (`perchctl.record.fields.tick_record`), which ends a turn. Never raises."""
-        if not self._closed:
-            self._turn.tick = record
-            self._hand_over()
-
-    def take_remarks(self) -> list[str]:
-        """Return what went wrong since the last call, a sentence each, each once a flight."""
-        new = []
-        while self._remarks:
-            new.append(self._remarks.popleft())
-        return new
+        self._turn.append(partial(self._file.tick, record))
+        self._hand_over()
 
     def close(self) -> RecordingEnd:
         """End the file and return what became of it; a second call only returns that. Waits for a
@@ -136,99 +101,60 @@ class Recorder:
         if not self._closed:
             self._hand_over()
             self._closed = True
-            if self._writer.finish(self._end, CLOSE_TIMEOUT_S, self._file.give_up):
-                self._over = True
+            if self._writer.finish(partial(self._attempt, self._finish), CLOSE_TIMEOUT_S):
                 self._remember("the disk does not answer: the recording lacks its end")
         kept = self._flushed_pictures
-        return RecordingEnd(self.path, kept, self._pictures - kept, self._problem)
+        return RecordingEnd(self.path, kept, self._pictures - kept, self.problem)
 
     def _hand_over(self) -> None:
-        turn, self._turn = self._turn, _Turn()
-        if self._over:
-            return
-        size = turn.held_bytes
-        if self._handed_bytes - self._done_bytes + size > MOST_PICTURE_BYTES:
-            turn.frame, size = None, 0
-            self._note_lag("pictures are missing in it")
-        self._handed_bytes += size
-        if not self._writer.put(partial(self._write, turn)):
-            self._handed_bytes -= size
-            self._note_lag("turns are missing in it")
+        turn, size = self._turn, self._turn_bytes
+        self._turn, self._turn_bytes = [], TURN_BYTES
+        if turn and not self._writer.put(partial(self._attempt, *turn, self._flush), size):
+            self._remember("the disk does not keep up with the recording: parts of it are missing")
 
-    def _note_lag(self, what: str) -> None:
-        self._remember(f"the disk does not keep up with the recording: {what}")
+    def _remember(self, sentence: str) -> None:
+        self.problem = self.problem or sentence
 
     # The thread that writes, or lockstep.
 
-    def _write(self, turn: _Turn) -> None:
-        self._done_bytes += turn.held_bytes
+    def _attempt(self, *jobs: Job) -> None:
+        """Do the jobs unless the recording has ended; it ends with one that fails."""
         if self._over:
             return
         try:
-            self._written(turn)
+            for job in jobs:
+                job()
         except Exception as error:  # whatever it is, it is no matter of the flight's
-            self._fail(error)
+            why = f"{type(error).__name__}: {error}"
+            if isinstance(error, OSError):
+                why = error.strerror or str(error)
+            self._end(why)
+            self._file.close()
 
-    def _written(self, turn: _Turn) -> None:
-        file = self._file
-        if turn.frame is not None:
-            kept = None if self._full or turn.frame.repeated else encoded(turn.frame)
-            if kept is not None and file.size_bytes + len(kept[0]) > self._most_bytes:
-                self._full, kept = True, None
-                self._remember(
-                    f"the recording is full (log.max_mb in the profile, "
-                    f"{self._most_bytes / 1e6:g}): it goes on without pictures"
-                )
-            file.frame(frame_record(turn.frame), kept)
-        for event in turn.events:
-            file.event(event)
-        if turn.sent is not None:
-            file.sent(turn.sent)
-        if turn.tick is not None:
-            file.tick(turn.tick)
-        now_s = file.newest_s
-        if self._flushed_s is None or now_s - self._flushed_s >= FLUSH_PERIOD_S:
-            self._flushed_s = now_s
-            self._flush()
+    def _store(self, frame: Frame) -> None:
+        self._file.frame(frame_record(frame), None if frame.repeated else encoded(frame))
 
     def _flush(self) -> None:
-        self._file.flush()
-        self._flushed_pictures = self._file.pictures
-        free = self._file.free_bytes()
-        if free < RESERVE_BYTES:
-            self._over = True
-            self._remember(
-                f"the recording has ended: {free / 1e6:.0f} MB are left on its disk, and "
-                f"{RESERVE_BYTES / 1e6:.0f} are kept for the log; {GOES_ON}"
-            )
-            self._file.finish()
-
-    def _fail(self, error: Exception) -> None:
-        self._over = True
-        why = f"{type(error).__name__}: {error}"
-        if isinstance(error, OSError):
-            why = error.strerror or str(error)
-        self._remember(f"the recording has ended ({why}): {GOES_ON}")
-        self._file.give_up()
-
-    def _end(self) -> None:
-        if self._over:
+        """Bring to the disk, once a second, what was written; end a recording that is too large."""
+        file = self._file
+        if file.newest_s - self._flushed_s < FLUSH_PERIOD_S:
             return
-        try:
-            self._file.finish()
-            self._flushed_pictures = self._file.pictures
-        except Exception as error:
-            self._fail(error)
+        self._flushed_s = file.newest_s
+        file.flush()
+        self._flushed_pictures = file.pictures
+        free_bytes = file.free_bytes()
+        if file.size_bytes > self._most_bytes:
+            self._end(f"it is full: log.max_mb in the profile is {self._most_bytes / 1e6:g}")
+        elif free_bytes < RESERVE_BYTES:
+            self._end(f"its disk's last {free_bytes / 1e6:.0f} MB are left to the log")
+        if self._over:
+            file.finish()
+
+    def _finish(self) -> None:
+        self._file.finish()
+        self._flushed_pictures = self._file.pictures
         self._over = True
 
-    def _remember(self, sentence: str) -> None:
-        if self._problem is None:
-            self._problem = sentence
-            self._remarks.append(sentence)
-
-
-def _cannot_begin(path: Path, error: OSError) -> InvalidValue:
-    return InvalidValue(
-        f"{path}: the recording cannot be begun ({error.strerror or error}): free the place, or "
-        f"fly with --no-record"
-    )
+    def _end(self, why: str) -> None:
+        self._over = True
+        self._remember(f"the recording has ended ({why}): the flight and its log go on")

@@ -12,15 +12,13 @@ from __future__ import annotations
 import json
 import math
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
 import cv2
 import numpy as np
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
@@ -29,43 +27,34 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Point2_pb2 import Point2
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
-from foxglove_schemas_protobuf.Pose_pb2 import Pose
-from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap.data_stream import RecordBuilder
-from mcap.records import DataEnd, Footer
 from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
 import perchctl
-from perchctl.calibration import profile_camera
 from perchctl.geometry import quaternion_from_rotation, quaternion_from_rpy
 from perchctl.profile import Profile
-from perchctl.record.disk import Stream
+from perchctl.record.disk import DiskFile
 from perchctl.record.exact import encode
 from perchctl.record.fields import FIELDS, field_kind
-from perchctl.vision import CameraModel, Frame
+from perchctl.vision import Frame
 
 WORLD, BODY, GEAR, CAMERA = "world", "body", "gear", "camera"
 TARGET, SETPOINT = "target", "setpoint"
 
-IMAGE, FRAME, CALIBRATION = "/camera/image", "/camera/frame", "/camera/calibration"
-CORNERS, TF, PATH = "/camera/corners", "/tf", "/vehicle/path"
-LOG, TICK, SENT = "/log", "/tick", "/sent"
+IMAGE, FRAME, CORNERS = "/camera/image", "/camera/frame", "/camera/corners"
+TF = "/tf"
+LOG, TICK = "/log", "/tick"
 
+NS = 1_000_000_000
 HEADER_NAME = "header.json"
 CHUNK_BYTES = 4_000_000
 PNG_LEVEL = 1
 """Fast; the next levels cost twice the time for a twentieth of the size."""
-LOOP_TIMES = ("t_s", "frame_t_s")
-"""Of a tick's record: in the recording they count from the first flown turn."""
-PATH_PERIOD_S = 1.0
-"""The whole path so far is written so often: who jumps into the middle sees what was flown."""
-PATH_STEP_S = 0.1
 BODY_KEYS = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
 TARGET_KEYS = ("tx_m", "ty_m", "tz_m", "tyaw_rad")
 SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
@@ -76,7 +65,10 @@ SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
 
 class RecordingFile:
     """A recording that grows, in the order in which a flight gives it; one thread's. Every method
-    but `give_up` may raise OSError.
+    but `close` may raise OSError.
+
+    Its times are nanoseconds since 1970. A flight in lockstep has no wall clock: its recording
+    begins in 1970, at 0.
 
     Attributes:
         pictures: how many were written; `newest_s`: the loop's time of what was written last.
@@ -84,34 +76,32 @@ class RecordingFile:
     """
 
     def __init__(
-        self, stream: Stream, header: Mapping[str, Any], profile: Profile | None = None
+        self, stream: DiskFile, header: Mapping[str, Any], profile: Profile | None = None
     ) -> None:
-        """Begin the file. Without a profile it has neither mounting nor calibration. Raises
-        NotFound and InvalidValue for the profile's calibration."""
+        """Begin the file with the log's header. Without a profile it has no mounting."""
         self.pictures = self.size_bytes = 0
-        self.newest_s = 0.0
-        self._header = header
+        self.newest_s = self._t0_s = float(header["t0_s"])
+        started = header.get("started_utc")
+        self._started_ns = NS * round(datetime.fromisoformat(started).timestamp()) if started else 0
         self._mounts = () if profile is None else mounts_of(profile)
-        self._camera = None if profile is None else profile_camera(profile.camera)
-        self._epoch: Epoch | None = None
         self._first_s: float | None = None
-        self._target: FrameTransform | None = None  # where it was last
-        self._path = PosesInFrame(frame_id=WORLD)
-        self._path_s = self._point_s = -math.inf
         self._stream = stream
         self._writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)  # type: ignore[arg-type]
         self._channels: dict[str, int] = {}
-        self._closed = False
         self._writer.start(library=f"perchctl {perchctl.__version__}")
+        text = json.dumps(header).encode()
+        start_ns = self._ns(self._t0_s)
+        self._writer.add_attachment(start_ns, start_ns, HEADER_NAME, "application/json", text)
 
     def frame(self, about: Mapping[str, Any], picture: tuple[bytes, str] | None) -> None:
         """Write a frame as its source gave it (`frame_record`), and its picture with its format
         (`encoded`) where it is to be kept."""
-        ns = self._ns_of(about["t_arrival_s"])
+        ns = self._ns(about["t_arrival_s"])
+        self.newest_s = about["t_arrival_s"]
         number = about["number"] & 0xFFFFFFFF
         if picture is not None:
             data, form = picture
-            taken = stamp(self._epoch_at(about["t_s"]).ns(about["t_s"]))
+            taken = stamp(self._ns(about["t_s"]))
             image = CompressedImage(timestamp=taken, frame_id=CAMERA, data=data, format=form)
             self._add(IMAGE, ns, image, number)
             self.pictures += 1
@@ -119,39 +109,30 @@ class RecordingFile:
         self._add(FRAME, ns, json.dumps(about).encode(), number)
 
     def tick(self, record: Mapping[str, Any]) -> None:
-        """Write a tick's record (`perchctl.record.fields.FIELDS`), and what it shows in space.
-
-        What stands still is written with every tick: who jumps into the middle of a flight gets
-        the newest message of each topic, and no older one."""
-        t_s = float(record["t_s"])
-        ns = self._ns_of(t_s)
-        epoch = self._epoch_at(t_s)
-        if self._first_s is None:
-            self._first_s = t_s
-        body_ns = epoch.ns(t_s - (_number(record, "tel_age_s") or 0.0))
-        body = _transform_to(BODY, body_ns, record, BODY_KEYS)
-        setpoint = _transform_to(SETPOINT, ns, record, SETPOINT_KEYS)
-        self._target = _transform_to(TARGET, ns, record, TARGET_KEYS) or self._target
-        for still in (*self._mounts, self._target):
-            if still is not None:
-                still.timestamp.CopyFrom(stamp(ns))
-        if body is not None:
-            self._add_path(body, t_s, ns)
-        moving = [each for each in (body, self._target, setpoint) if each is not None]
-        self._add(TF, ns, FrameTransforms(transforms=[*self._mounts, *moving]))
-        if record.get("frame_t_s") is not None:
-            exposed_ns = epoch.ns(float(record["frame_t_s"]))
-            self._add(CORNERS, ns, corners_message(exposed_ns, record))
-        self._add(TICK, ns, encode(self._since_first(record))[:-1])
-
-    def sent(self, values: Mapping[str, Any]) -> None:
-        """Write what was sent in the loop's place (`perchctl.record.fields.sent_values`)."""
-        ns = self._ns_of(float(values["t_s"]))
-        self._add(SENT, ns, encode(self._since_first(values))[:-1])
+        """Write a tick's record (`perchctl.record.fields.FIELDS`) with its times since the first
+        flown turn, and what it shows in space."""
+        t_s, exposed_s = float(record["t_s"]), record.get("frame_t_s")
+        self.newest_s, ns = t_s, self._ns(t_s)
+        first_s = self._first_s = t_s if self._first_s is None else self._first_s
+        for mount in self._mounts:
+            mount.timestamp.CopyFrom(stamp(ns))
+        sampled_ns = self._ns(t_s - (record.get("tel_age_s") or 0.0))
+        moving = [
+            _transform_to(BODY, sampled_ns, record, BODY_KEYS),
+            _transform_to(TARGET, ns, record, TARGET_KEYS),
+            _transform_to(SETPOINT, ns, record, SETPOINT_KEYS),
+        ]
+        transforms = [*self._mounts, *(each for each in moving if each is not None)]
+        self._add(TF, ns, FrameTransforms(transforms=transforms))
+        shown = {**record, "t_s": t_s - first_s}
+        if exposed_s is not None:
+            self._add(CORNERS, ns, corners_message(self._ns(exposed_s), record))
+            shown["frame_t_s"] = exposed_s - first_s
+        self._add(TICK, ns, encode(shown)[:-1])
 
     def event(self, record: Mapping[str, Any]) -> None:
         """Write an event's record (`perchctl.record.fields.event_record`)."""
-        ns = self._ns_of(float(record["t_s"]))
+        ns = self._ns(float(record["t_s"]))
         self._add(LOG, ns, log_message(ns, record))
 
     def flush(self) -> None:
@@ -166,61 +147,20 @@ class RecordingFile:
         """End the file with its index; nothing can be added any more."""
         self._writer.finish()
         self._stream.flush()
-        self._closed = True
         self._stream.close()
 
-    def give_up(self) -> None:
-        """End the file where its last whole record ends, without an index: the disk failed.
-        One that was ended stays as it is. Never raises."""
-        if self._closed:
-            return
-        self._closed = True
-        end = RecordBuilder()
-        DataEnd(0).write(end)
-        Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(end)
-        with suppress(OSError):
-            self._stream.write(end.end() + MCAP0_MAGIC)
-            self._stream.flush()
+    def close(self) -> None:
+        """Close the file without an index, where its last whole record ends. Never raises."""
         with suppress(OSError):
             self._stream.close()
 
-    def _add_path(self, body: FrameTransform, t_s: float, ns: int) -> None:
-        if t_s - self._point_s >= PATH_STEP_S:
-            self._point_s = t_s
-            self._path.poses.append(Pose(position=body.translation, orientation=body.rotation))
-        if t_s - self._path_s >= PATH_PERIOD_S:
-            self._path_s = t_s
-            self._path.timestamp.CopyFrom(stamp(ns))
-            self._add(PATH, ns, self._path)
-
-    def _since_first(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the record with its times counted from the first flown turn, as every output
-        does; before that turn without them."""
-        first_s = self._first_s
-        times = [key for key in LOOP_TIMES if record.get(key) is not None]
-        return {
-            **record,
-            **{key: None if first_s is None else record[key] - first_s for key in times},
-        }
-
-    def _ns_of(self, t_s: float) -> int:
-        self.newest_s = t_s
-        return self._epoch_at(t_s).ns(t_s)
-
-    def _epoch_at(self, t_s: float) -> Epoch:
-        """Return the start's epoch, which is known by the first record at the latest; with it goes
-        what is written once."""
-        if self._epoch is None:
-            self._epoch = epoch = epoch_of(self._header, t_s)
-            ns = epoch.ns(epoch.t0_s)
-            text = json.dumps(self._header).encode()
-            self._writer.add_attachment(ns, ns, HEADER_NAME, "application/json", text)
-            if self._camera is not None:
-                self._add(CALIBRATION, ns, calibration_message(ns, self._camera))
-        return self._epoch
+    def _ns(self, t_s: float) -> int:
+        """Return a time on the loop's clock as nanoseconds since 1970; what was before that is at
+        0, which MCAP begins at."""
+        return max(0, self._started_ns + round((t_s - self._t0_s) * NS))
 
     def _add(self, topic: str, ns: int, message: Message | bytes, sequence: int = 0) -> None:
-        """Add a message of Foxglove's, or the JSON of one of `SCHEMAS`."""
+        """Add a message of Foxglove's, or JSON."""
         channel = self._channels.get(topic)
         if channel is None:
             channel = self._channels[topic] = self._new_channel(topic, message)
@@ -230,9 +170,9 @@ class RecordingFile:
 
     def _new_channel(self, topic: str, message: Message | bytes) -> int:
         if isinstance(message, bytes):
-            name, schema = SCHEMAS[topic]
-            text = json.dumps(schema).encode()
-            number = self._writer.register_schema(name, SchemaEncoding.JSONSchema, text)
+            schema = json.dumps(TICK_SCHEMA if topic == TICK else {"type": "object"}).encode()
+            name = f"perchctl.{topic.rpartition('/')[2].capitalize()}"
+            number = self._writer.register_schema(name, SchemaEncoding.JSONSchema, schema)
             return self._writer.register_channel(topic, MessageEncoding.JSON, number)
         number = register_schema(self._writer, type(message))
         return self._writer.register_channel(topic, MessageEncoding.Protobuf, number)
@@ -259,8 +199,6 @@ def encoded(frame: Frame) -> tuple[bytes, str]:
     return data.tobytes(), "png"
 
 
-# --- perchctl's own messages, for which Foxglove has no schema: JSON ------------------------------
-
 _JSON_TYPES: dict[str, dict[str, Any]] = {
     "number": {"type": "number"},
     "integer": {"type": "number"},
@@ -268,43 +206,18 @@ _JSON_TYPES: dict[str, dict[str, Any]] = {
     "text": {"type": "string"},
     "corners": {"type": "array", "items": {"type": "number"}},
 }
-
-
-def _schema(
-    name: str, title: str, keys: Iterable[str], **own: tuple[str, str]
-) -> tuple[str, dict[str, Any]]:
-    """Return a JSON schema of the log's fields `keys`, and of `own` ones by type and meaning."""
-    properties = {k: {"type": kind, "description": text} for k, (kind, text) in own.items()}
-    properties |= {k: {**_JSON_TYPES[field_kind(k)], "description": FIELDS[k]} for k in keys}
-    return name, {"type": "object", "title": title, "properties": properties}
-
-
-SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
-    TICK: _schema("perchctl.Tick", "One turn of the flight loop, as the flight log has it", FIELDS),
-    SENT: _schema(
-        "perchctl.Sent",
-        "What was sent to the vehicle in the flight loop's place",
-        ("t_s", *(key for key in FIELDS if key.split("_")[0] == "cmd")),
-        by=("string", "watchdog, rescue, reconnect or farewell"),
-    ),
-    FRAME: _schema(
-        "perchctl.Frame",
-        "A frame that the camera gave",
-        (),
-        number=("integer", "number of the frame, as the message's sequence number and the log's"),
-        t_s=("number", "exposure on the loop's clock, as the source gave it"),
-        t_arrival_s=("number", "arrival on the loop's clock"),
-        repeated=("boolean", "the source gave out the picture before once more: it is not kept"),
-        crc32=("integer", "of the grey pixels that the pipeline saw"),
-    ),
+TICK_SCHEMA = {
+    "type": "object",
+    "title": "One turn of the flight loop, as the flight log has it",
+    "properties": {
+        key: {**_JSON_TYPES[field_kind(key)], "description": text} for key, text in FIELDS.items()
+    },
 }
-"""By topic: name and JSON schema."""
+"""JSON schema of the ticks, for which Foxglove has none."""
 
 
 # --- Foxglove's messages ----------------------------------------------------------------------
 
-_MODELS = {"fisheye": "kannala_brandt"}
-"""Foxglove's name of OpenCV's fisheye; the others are called alike."""
 _LEVELS = {"hold": Log.WARNING, "back off": Log.WARNING, "land": Log.ERROR, "stop": Log.FATAL}
 _OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)
 
@@ -312,24 +225,6 @@ _OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)
 def stamp(ns: int) -> Timestamp:
     """Return nanoseconds since 1970 as protobuf's time stamp."""
     return Timestamp(seconds=ns // NS, nanos=ns % NS)
-
-
-def calibration_message(ns: int, camera: CameraModel) -> CameraCalibration:
-    """Return the calibration with its distortion. One camera needs no rectification: R is 1 and P
-    holds K."""
-    width, height = camera.size_px
-    P = np.hstack([camera.K, np.zeros((3, 1))])
-    return CameraCalibration(
-        timestamp=stamp(ns),
-        frame_id=CAMERA,
-        width=width,
-        height=height,
-        distortion_model=_MODELS.get(camera.model, camera.model),
-        D=[float(v) for v in np.ravel(camera.dist)],
-        K=[float(v) for v in np.ravel(camera.K)],
-        R=[float(v) for v in np.eye(3).ravel()],
-        P=[float(v) for v in P.ravel()],
-    )
 
 
 def log_message(ns: int, record: Mapping[str, Any]) -> Log:
@@ -387,20 +282,13 @@ def _transform_to(
     child: str, ns: int, record: Mapping[str, Any], keys: Sequence[str]
 ) -> FrameTransform | None:
     """Return the transform from the world, by three keys of a position and one of a heading or
-    three of an attitude; None where one of them is missing."""
-    values = [_number(record, key) for key in keys]
-    if any(value is None for value in values):
+    three of an attitude; None where one of them is missing or not finite."""
+    values: list[Any] = [record.get(key) for key in keys]
+    if any(value is None or not math.isfinite(value) for value in values):
         return None
-    x, y, z, *angles = (float(v) for v in values if v is not None)
+    x, y, z, *angles = values
     roll, pitch, yaw = angles if len(angles) == 3 else (0.0, 0.0, *angles)
     return _transform(ns, WORLD, child, (x, y, z), quaternion_from_rpy(roll, pitch, yaw))
-
-
-def _number(record: Mapping[str, Any], key: str) -> float | None:
-    """Return a number of the record; None for one that is missing or not finite, which no view
-    could show."""
-    value = record.get(key)
-    return float(value) if value is not None and math.isfinite(value) else None
 
 
 def _transform(
@@ -414,36 +302,3 @@ def _transform(
         translation=Vector3(x=x, y=y, z=z),
         rotation=Quaternion(w=w, x=qx, y=qy, z=qz),
     )
-
-
-# --- The loop's clock on the wall's, in which a recording has its times ------------------------
-
-NS = 1_000_000_000
-
-
-@dataclass(frozen=True)
-class Epoch:
-    """The moment at which the wall's clock has `started_ns`, since 1970, and the loop's `t0_s`.
-
-    A flight in lockstep has no wall clock: its recording begins in 1970, at 0.
-    """
-
-    started_ns: int
-    t0_s: float
-
-    def ns(self, t_s: float) -> int:
-        """Return nanoseconds since 1970; what was before that is at 0, which MCAP begins at."""
-        return max(0, self.started_ns + round((t_s - self.t0_s) * NS))
-
-
-def epoch_of(header: Mapping[str, Any], first_s: float) -> Epoch:
-    """Return the epoch by a log's header; `first_s` is the loop's time of the first record, which
-    counts as the start where the header does not say more."""
-    t0_s = header.get("t0_s")
-    if not isinstance(t0_s, (int, float)) or not math.isfinite(t0_s):
-        t0_s = first_s
-    try:  # whole seconds, with their time zone
-        started_ns = round(datetime.fromisoformat(header["started_utc"]).timestamp()) * NS
-    except (KeyError, TypeError, ValueError):
-        started_ns = 0
-    return Epoch(started_ns, float(t0_s))

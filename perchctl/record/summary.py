@@ -36,7 +36,7 @@ class RecordingEnd:
         return f"{told} ({self.problem})" if self.problem else told
 
     def as_record(self) -> dict[str, Any]:
-        """Return the record for the log, beside which the recording lies: its name is enough."""
+        """Return the record for programs."""
         return {
             "recording": self.path.name,
             "pictures": self.pictures,
@@ -57,7 +57,7 @@ class FlightSummary:
         contact: the program's own error, of what hangs.
         touchdown: how the floor was met, as far as that was felt.
         lost_records, log_problem: what the log lacks, and why; 0 and None for a whole one.
-        recording: what became of it, None of a flight without one.
+        recording: what became of it; None of a flight without one, and of one that is read back.
     """
 
     outcome: str
@@ -105,7 +105,6 @@ class FlightSummary:
             touchdown=_part_in(end, Touchdown, _TOUCHDOWN),
             lost_records=int(end.get("lost_records") or 0),
             log_problem=end.get("problem"),
-            recording=_recording_in(end, log.path),
         )
 
     def as_record(self) -> dict[str, Any]:
@@ -126,6 +125,41 @@ class FlightSummary:
             **_keys_of(self.findings, _FINDINGS),
             **({} if self.recording is None else self.recording.as_record()),
         }
+
+    def text(self, log_path: Path | None = None) -> str:
+        """Return a few lines about the flight, without colour and a last line break."""
+        lines = [f"{self.outcome.upper()}: {self.reason}".rstrip(": ")]
+        if self.cause and self.cause != self.outcome:
+            lines[0] += f" [{self.cause}]"
+        if self.miss_m is not None:
+            lines.append(f"miss:      {self.miss_m * 1e3:.1f} mm")
+        if self.contact is not None:
+            lines.append(f"contact:   {self.contact.text}")
+        attempts = f"{self.attempts} attempt{'' if self.attempts == 1 else 's'}"
+        lines.append(f"flight:    {self.duration_s:.1f} s, {attempts}")
+        if self.phases:
+            lines.append(f"phases:    {phases_text(self.phases)}")
+        if self.battery_min_v is not None:
+            lines.append(f"battery:   {self.battery_min_v:.2f} V at its lowest")
+        if self.findings is not None:  # with 95 % intervals
+            lines.append(f"latency:   {self.findings.latency_text}")
+            lines.append(f"mounting:  turned by {self.findings.turn_text} (x, y, z)")
+            lines += [f"advice:    {sentence}" for sentence in self.findings.advice]
+        if self.locked:
+            lines.append("vehicle:   locked by its supervisor: inspect and restart it")
+        if self.touchdown is not None and self.touchdown.is_hard:
+            lines.append(f"vehicle:   {self.touchdown.text}")
+        if self.fell:
+            lines.append("vehicle:   fell")
+        if self.lost_records:
+            lines.append(f"log lost:  {self.lost_records} records ({self.log_problem})")
+        elif self.log_problem is not None:
+            lines.append(f"log lost:  perhaps its last records ({self.log_problem})")
+        if self.recording is not None:
+            lines.append(f"recording: {self.recording.text}")
+        if log_path is not None:
+            lines.append(f"log:       {log_path}")
+        return "\n".join(lines)
 
 
 # A part of the summary by the record's keys and its own fields, in their order.
@@ -152,59 +186,11 @@ def _part_in(end: Mapping[str, Any], kind: Any, keys: Mapping[str, str]) -> Any:
     return kind(**{n: tuple(v) if isinstance(v, list) else v for n, v in known.items()})
 
 
-def _recording_in(end: Mapping[str, Any], beside: Path) -> RecordingEnd | None:
-    name = end.get("recording")
-    if not name:
-        return None
-    return RecordingEnd(
-        beside.parent / Path(str(name)).name,
-        int(end.get("pictures") or 0),
-        int(end.get("pictures_missing") or 0),
-        end.get("recording_problem"),
-    )
-
-
 def _last_known(log: FlightLog) -> str:
     if log.phases:
         return f"the log ends in {log.phases[-1].phase}"
     phases = [r["phase"] for r in log.turn_records if r.get("role") == "flown" and r.get("phase")]
     return f"the log ends in {phases[-1]}" if phases else "the log holds no flight"
-
-
-def summary_text(flight: FlightSummary, log_path: Path | None = None) -> str:
-    """Return a few lines about a flight, without colour and without a line break at the end."""
-    lines = [f"{flight.outcome.upper()}: {flight.reason}".rstrip(": ")]
-    if flight.cause and flight.cause != flight.outcome:
-        lines[0] += f" [{flight.cause}]"
-    if flight.miss_m is not None:
-        lines.append(f"miss:      {flight.miss_m * 1e3:.1f} mm")
-    if flight.contact is not None:
-        lines.append(f"contact:   {flight.contact.text}")
-    attempts = f"{flight.attempts} attempt{'' if flight.attempts == 1 else 's'}"
-    lines.append(f"flight:    {flight.duration_s:.1f} s, {attempts}")
-    if flight.phases:
-        lines.append(f"phases:    {phases_text(flight.phases)}")
-    if flight.battery_min_v is not None:
-        lines.append(f"battery:   {flight.battery_min_v:.2f} V at its lowest")
-    if flight.findings is not None:  # with 95 % intervals
-        lines.append(f"latency:   {flight.findings.latency_text}")
-        lines.append(f"mounting:  turned by {flight.findings.turn_text} (x, y, z)")
-        lines += [f"advice:    {sentence}" for sentence in flight.findings.advice]
-    if flight.locked:
-        lines.append("vehicle:   locked by its supervisor: inspect and restart it")
-    if flight.touchdown is not None and flight.touchdown.is_hard:
-        lines.append(f"vehicle:   {flight.touchdown.text}")
-    if flight.fell:
-        lines.append("vehicle:   fell")
-    if flight.lost_records:
-        lines.append(f"log lost:  {flight.lost_records} records ({flight.log_problem})")
-    elif flight.log_problem is not None:
-        lines.append(f"log lost:  perhaps its last records ({flight.log_problem})")
-    if flight.recording is not None:
-        lines.append(f"recording: {flight.recording.text}")
-    if log_path is not None:
-        lines.append(f"log:       {log_path}")
-    return "\n".join(lines)
 
 
 def phases_text(phases: Sequence[PhaseSpan]) -> str:

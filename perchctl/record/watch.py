@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 from perchctl.camera import FrameSource, WrappedSource
 from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
 from perchctl.profile import Profile
-from perchctl.record.fields import event_record, sent_values, tick_record
+from perchctl.record.fields import event_record, tick_record
 from perchctl.record.header import make_header
 from perchctl.record.read import PhaseSpan
 from perchctl.record.summary import FlightSummary, RecordingEnd
-from perchctl.record.write import RECORDING_SUFFIX, FlightLogWriter, log_path, recording_path
+from perchctl.record.write import FlightLogWriter, log_path, recording_path
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class LogWatcher:
         self.truth: Callable[[], Truth] | None = None
         self._battery_min_v: float | None = None
         self._ticks = 0
-        self._formless_told = False
+        self._has_remarked = False
 
     @classmethod
     def lockstep(cls, path: Path, profile: Profile, seed: int, record: bool = False) -> LogWatcher:
@@ -69,8 +69,7 @@ class LogWatcher:
     def _opened(
         cls, path: Path, header: Mapping[str, Any], profile: Profile, record: bool, live: bool
     ) -> LogWatcher:
-        taken = (RECORDING_SUFFIX,) if record else ()
-        writer = FlightLogWriter.open(path, header, live, taken, profile.link.loop_hz)
+        writer = FlightLogWriter.open(path, header, live)
         if not record:
             return cls(writer)
         from perchctl.record.recorder import Recorder
@@ -87,13 +86,12 @@ class LogWatcher:
         return source if self._recorder is None else WrappedSource(source, self._recorder.frame)
 
     def remarks(self) -> list[str]:
-        """Return what is new about the recording and about records that no line could be made of,
-        a sentence each."""
-        new = [] if self._recorder is None else self._recorder.take_remarks()
-        if self.writer.formless is not None and not self._formless_told:
-            self._formless_told = True
-            new.append(self.writer.formless)
-        return new
+        """Return what is new about the recording, a sentence, once a flight."""
+        problem = None if self._recorder is None else self._recorder.problem
+        if problem is None or self._has_remarked:
+            return []
+        self._has_remarked = True
+        return [problem]
 
     @property
     def path(self) -> Path:
@@ -125,8 +123,6 @@ class LogWatcher:
     def sent(self, sent: SentCommand) -> None:
         """Write what was sent in the loop's place; from any thread, and without waiting."""
         self.writer.sent(sent)
-        if self._recorder is not None:
-            self._recorder.sent(sent_values(sent))
 
     def event(self, event: Event) -> None:
         self.writer.event(event)
@@ -139,7 +135,7 @@ class LogWatcher:
         """Write the summary and close; without a report (the flight raised) only close. Return the
         summary.
 
-        The summary comes first: a recording's disk that hangs holds up its own end only."""
+        The log comes first: a recording's disk that hangs holds up its own end only."""
         if report is None:
             self.writer.close()
             self._ended_recording()
@@ -159,11 +155,13 @@ class LogWatcher:
             contact=report.contact,
             touchdown=report.touchdown,
         )
-        self.writer.conclude(summary.as_record())
-        recording = self._ended_recording()
-        self.writer.close(recording=None if recording is None else recording.as_record())
-        lost, problem = self.writer.lost_records, self.writer.lacks
-        return replace(summary, lost_records=lost, log_problem=problem, recording=recording)
+        self.writer.close(summary.as_record())
+        return replace(
+            summary,
+            lost_records=self.writer.lost_records,
+            log_problem=self.writer.lacks,
+            recording=self._ended_recording(),
+        )
 
     def abandon(self, reason: str) -> None:
         """Close the log of a flight that failed. One that never began leaves no file."""

@@ -14,19 +14,16 @@ from PIL import Image
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.analysis import FlightAnalysis, write_film
-from perchctl.analysis.film import LAST_S, PHASE_WORDS, _gif, _Ways
+from perchctl.analysis.film import LAST_S, Ways
 from perchctl.errors import InvalidValue
 from perchctl.flight import fly_lockstep
-from perchctl.mission import Phase
 from perchctl.record import LogWatcher, read_log, recorded_pictures
 from tests.helpers.commands import run
 from tests.helpers.flights import SEED, short_profile
 
+pytestmark = pytest.mark.long
+
 WIDTH_PX = 320
-
-
-def test_each_phase_has_its_words() -> None:
-    assert set(PHASE_WORDS) == {phase.value for phase in Phase}
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +42,6 @@ def pictures_of(path: Path) -> list[np.ndarray]:
         return [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
 
 
-@pytest.mark.long
 def test_it_lasts_as_long_as_the_flight_and_shows_the_recorded_pictures(
     flown: Path, tmp_path: Path
 ) -> None:
@@ -58,19 +54,17 @@ def test_it_lasts_as_long_as_the_flight_and_shows_the_recorded_pictures(
         assert len(films[-1]) == count == pytest.approx(2.0 * (flight.end_s + LAST_S), abs=2)
         assert films[-1][0].shape == (WIDTH_PX * 9 // 16, WIDTH_PX, 3)
     middle = len(films[0]) // 2
-    left = np.s_[30:110, 30:140]  # where the camera's picture is
+    left = np.s_[30:100, 60:160]  # where the camera's picture is
     seen, black = (film[middle][left].mean() for film in films)
     assert seen > black + 30.0
-    # The near view changes while it presses, what stands still does not.
-    near, corner = np.s_[20:110, 230:310], np.s_[120:, :10]
-    assert np.abs(films[0][0][near].astype(int) - films[0][-1][near]).max() > 50
+    # What stands still does not change.
+    corner = np.s_[120:, :10]
     assert np.abs(films[0][0][corner].astype(int) - films[0][-1][corner]).max() < 50
 
 
-@pytest.mark.long
 def test_the_gear_of_a_vehicle_that_hangs_is_at_the_target(flown: Path) -> None:
     flight = FlightAnalysis(read_log(flown))
-    ways = _Ways(flight)
+    ways = Ways(flight)
     assert flight.summary.outcome == "perched"
     tip_m = ways.place_m[-1] + ways.body_m(-1)[1]
     assert ways.target_z_m is not None
@@ -79,46 +73,31 @@ def test_the_gear_of_a_vehicle_that_hangs_is_at_the_target(flown: Path) -> None:
     assert ways.span_m[0] <= 0.0 <= ways.span_m[1]
 
 
-@pytest.mark.long
-def test_the_command_makes_a_gif_and_refuses_what_is_none(flown: Path, tmp_path: Path) -> None:
+def test_the_command_makes_a_gif_at_the_flight_s_pace(flown: Path, tmp_path: Path) -> None:
+    """A GIF counts in hundredths of a second."""
     out = tmp_path / "flight.gif"
-    words = ("log", "film", str(flown), "--rate", "1", "--width", str(WIDTH_PX), "-o")
-    done = run(*words, str(out))
-    assert done.code == 0
+    words = ("log", "film", str(flown), "--rate", "6", "--width", str(WIDTH_PX), "-o")
+    assert run(*words, str(out)).code == 0
+    lasts_ms = 0.0
     with Image.open(out) as image:
-        assert image.n_frames > 3
         assert image.size == (WIDTH_PX, WIDTH_PX * 9 // 16)
+        for number in range(image.n_frames):
+            image.seek(number)
+            lasts_ms += image.info["duration"]
+    flown_s = FlightAnalysis(read_log(flown)).end_s
+    assert lasts_ms == pytest.approx(1000.0 * (flown_s + LAST_S), abs=200.0)
     assert run(*words, str(tmp_path / "flight.avi")).code == InvalidValue.exit_code
     assert run(*words, str(out)).code == InvalidValue.exit_code  # it exists
 
 
-@pytest.mark.parametrize("rate_hz", [6.0, 15.0, 25.0, 50.0])
-def test_a_gif_runs_at_the_flight_s_own_pace(tmp_path: Path, rate_hz: float) -> None:
-    """It counts in hundredths of a second."""
-    path = tmp_path / "two_seconds.gif"
-    with _gif(path, rate_hz) as add:
-        for number in range(round(2.0 * rate_hz)):
-            add(np.full((90, 160, 3), 255 * (number % 2), np.uint8))
-    lasts_ms = 0.0
-    with Image.open(path) as image:
-        for number in range(image.n_frames):
-            image.seek(number)
-            lasts_ms += image.info["duration"]
-    assert lasts_ms == 2000.0
-
-
-@pytest.mark.long
 def test_the_report_embeds_it_where_it_is_asked_for(flown: Path, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
-    assert run("log", "report", str(flown), "-o", str(page)).code == 0
-    assert "<video" not in page.read_text()
-    assert run("log", "report", str(flown), "-o", str(page), "--film", "--force").code == 0
+    assert run("log", "report", str(flown), "-o", str(page), "--film").code == 0
     (film,) = re.findall(r'<video controls src="data:video/mp4;base64,([^"]+)"', page.read_text())
     (tmp_path / "film.mp4").write_bytes(base64.b64decode(film))
     assert len(pictures_of(tmp_path / "film.mp4")) > 100
 
 
-@pytest.mark.long
 def test_a_bad_recording_costs_the_report_s_film_its_pictures_only(
     flown: Path, tmp_path: Path
 ) -> None:

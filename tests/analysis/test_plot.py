@@ -13,7 +13,6 @@ import pytest
 from perchctl.analysis import FlightAnalysis, plot_flight
 from perchctl.analysis.plot import title_of
 from perchctl.errors import InvalidValue
-from perchctl.geometry import Array
 from perchctl.record import FlightLog
 from tests.helpers.told import made
 
@@ -28,50 +27,23 @@ def log() -> FlightLog:
     return made(change)
 
 
-def picture(log: FlightLog, path: Path) -> Array:
+def picture(log: FlightLog, path: Path) -> np.ndarray:
     plot_flight(log, path)
     image = cv2.imread(str(path))
     assert image is not None
     return image.astype(np.float64)
 
 
-@pytest.fixture(scope="module")
-def plain(log: FlightLog, tmp_path_factory: pytest.TempPathFactory) -> Array:
-    return picture(log, tmp_path_factory.mktemp("plain") / "f.png")
-
-
-def share_of(image: Array, hex_colour: str) -> float:
-    """Share of the pixels that have that colour (BGR image)."""
-    rgb = [int(hex_colour[i : i + 2], 16) for i in (1, 3, 5)]
-    return float((np.abs(image - np.array(rgb[::-1])).max(axis=2) < 12).mean())
-
-
-def test_the_picture_holds_the_flight(plain: Array) -> None:
-    assert plain.shape[0] > 1200
-    for colour in ("#56B4E9", "#E69F00", "#0072B2", "#CC79A7", "#009E73", "#D55E00"):
-        assert share_of(plain, colour) > 2e-4, colour
-
-
-def test_raw_points_come_from_the_detections(log: FlightLog, plain: Array, tmp_path: Path) -> None:
-    """Without the small marker's poses its colour is left in the legend only."""
-    blind = [r | dict.fromkeys(("sx_m", "sy_m", "sz_m", "syaw_rad")) for r in log.records]
-    without = replace(log, records=blind)
-    upper = slice(0, int(0.75 * len(plain)))  # below it is a line of that colour
-    full = share_of(plain[upper], "#E69F00")
-    assert share_of(picture(without, tmp_path / "b.png")[upper], "#E69F00") < full / 5
-
-
-def test_the_last_seconds_are_in_millimetres(log: FlightLog, plain: Array, tmp_path: Path) -> None:
-    """A millimetre is seen in the last panel, and not in those of the whole flight."""
+def test_a_millimetre_is_seen_in_the_last_panel_alone(log: FlightLog, tmp_path: Path) -> None:
     start_s = log.records[-1]["t_s"] - 8.0
     moved = [
         r | {"ex_m": r["ex_m"] + 0.001} if r["ex_m"] is not None and r["t_s"] > start_s else r
         for r in log.records
     ]
-    other = replace(log, records=moved)
-    changed = plain != picture(other, tmp_path / "b.png")
-    rows = changed.any(axis=2).sum(axis=1)
-    last = int(0.8 * len(rows))
+    plain, other = picture(log, tmp_path / "a.png"), picture(replace(log, records=moved),
+                                                            tmp_path / "b.png")  # fmt: skip
+    rows = (plain != other).any(axis=2).sum(axis=1)
+    last = int(0.75 * len(rows))
     assert rows[last:].sum() > 1000
     assert rows[last:].sum() > 5 * rows[:last].sum()
 
@@ -100,9 +72,5 @@ def test_title(log: FlightLog) -> None:
 
 
 def test_nothing_to_plot(log: FlightLog, tmp_path: Path) -> None:
-    empty = replace(log, records=[])
     with pytest.raises(InvalidValue, match="no ticks"):
-        plot_flight(empty, tmp_path / "f.png")
-    (tmp_path / "no").write_text("in the way")
-    with pytest.raises(InvalidValue, match=r"no is a file, not a folder"):
-        plot_flight(log, tmp_path / "no" / "folder.png")
+        plot_flight(replace(log, records=[]), tmp_path / "f.png")

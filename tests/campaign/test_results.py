@@ -27,7 +27,7 @@ from perchctl.campaign.compare import FIGURES
 from perchctl.campaign.results import ENDS, rate_interval, worst_first
 from perchctl.campaign.results_file import flown_record, result_from, result_record
 from perchctl.errors import SafetyAbort
-from perchctl.record import FlightSummary, read_log, summary_text
+from perchctl.record import FlightSummary, read_log
 from perchctl.record.write import FlightLogWriter
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
@@ -127,7 +127,7 @@ def test_words_from_a_log(tmp_path: Path) -> None:
         writer.write(record)
     cut = read_log(writer.path)
     writer.close(synthetic.SUMMARY)
-    text = summary_text(FlightSummary.of(read_log(writer.path)))
+    text = FlightSummary.of(read_log(writer.path)).text()
     assert text.startswith("PERCHED: hanging still with the motors off\nmiss:      3.1 mm\n")
     assert "SEARCH 0.5 s > ESTIMATE 0.5 s" in text
     unfinished = FlightSummary.of(cut)

@@ -28,7 +28,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.imu import BLOW_MPS, Blow, Reckoning, advance_reckoning
 from perchctl.mission.report import HARD_MPS, touchdown_of
 from perchctl.profile import load_profile
-from perchctl.record import FlightSummary, read_log, summary_text
+from perchctl.record import FlightSummary, read_log
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
 from tests.helpers import log
 from tests.helpers.loop_rig import PROFILE, Broken, Guarded, Rig, Vehicle, hanging_camera
@@ -234,13 +234,13 @@ def test_blind_it_is_the_reckoned_speed_that_counts() -> None:
 def test_all_that_tell_of_a_flight_tell_touchdown_and_contact(tmp_path: Path) -> None:
     """The summary, `log show`, `log report` and the live page; a soft touchdown is not told."""
     soft = FlightSummary("landed", "the operator asked to land", touchdown=Touchdown(0.3, 1.9))
-    assert "touched down" not in summary_text(soft)
+    assert "touched down" not in soft.text()
     assert soft.as_record()["touchdown_mps"] == 0.3
     told = FlightSummary("perched", "r", contact=ContactError(1.8e-3, 0.6e-3), touchdown=HARD)
     end = log.SUMMARY | told.as_record() | {"outcome": "landed", "attempts": 1}
     flown = read_log(log.write(tmp_path / "f.jsonl", summary=end))
     flight = FlightAnalysis(flown)
-    for text in (summary_text(told), show_text(flight)):
+    for text in (told.text(), show_text(flight)):
         assert "\ncontact:   1.8 +- 0.6 mm off centre" in text
         assert f"\nvehicle:   {SENTENCE}" in text
     for record in (told.as_record(), show_record(flight)):

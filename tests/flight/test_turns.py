@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from perchctl.analysis.decide import decide, first_of
+from perchctl.analysis.decide import decide
 from perchctl.flight import FlightInputs, WallClock, fly
 from perchctl.flight.turns import Turns, TurnWatcher
 from perchctl.mission import Observation, Operator, Outcome, PlannerState, Tick, Turn, step_mission
@@ -88,10 +88,10 @@ def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     assert (last.role, last.command, last.error) == ("failed", None, "ZeroDivisionError")
     turns = [*told.of_ticks, last]
     assert last.number == turns[-2].number + 1
-    assert not any(each.differs for each in decide(turns, rig.profile))
+    assert not any(each.difference for each in decide(turns, rig.profile))
     plan_by(monkeypatch, step_mission)  # mended
     *others, again = decide(turns, rig.profile)
-    assert not any(each.differs for each in others)
+    assert not any(each.difference for each in others)
     assert again.difference == ("error", "ZeroDivisionError", None)
 
 
@@ -105,7 +105,7 @@ def test_a_planner_that_fails_on_the_first_turn_fails_again(
         monkeypatch.setattr(f"{module}.start_mission", fails)
     rig = Rig()
     (again,) = decide(broken(rig, ValueError).turns, rig.profile)
-    assert (again.turn.role, again.error, again.differs) == ("failed", "ValueError", False)
+    assert (again.turn.role, again.error, again.difference) == ("failed", "ValueError", None)
 
 
 def test_what_fails_behind_the_planner_is_not_the_planner_s() -> None:
@@ -123,7 +123,7 @@ def test_what_fails_behind_the_planner_is_not_the_planner_s() -> None:
     last = told.turns[-1]
     assert (last.role, last.error) == ("flown", None)
     assert (last.t_s, last.command) in rig.link.sent
-    assert not any(each.differs for each in decide([*told.of_ticks, last], rig.profile))
+    assert not any(each.difference for each in decide([*told.of_ticks, last], rig.profile))
 
 
 def test_an_interrupted_planner_did_not_fail_and_no_turn_is_told_twice(
@@ -153,11 +153,12 @@ def test_a_planner_that_changes_only_what_it_says_is_found_out(
     rig = Rig()
     turns = flown(rig).of_ticks
     turns[7] = replace(turns[7], **changes)
-    found = first_of(decide(turns, rig.profile), 0.0)
+    found = next((each for each in decide(turns, rig.profile) if each.difference), None)
     assert found is not None
-    assert (found.tick, found.field) == (7, field)
+    assert found.difference is not None
+    assert (found.tick, found.difference[0]) == (7, field)
     turns[7] = replace(turns[7], reason=None)  # of before version 4
-    assert first_of(decide(turns, rig.profile), 0.0) is None
+    assert not any(each.difference for each in decide(turns, rig.profile))
 
 
 def test_all_that_is_taken_in_is_in_the_turns_and_a_watcher_of_ticks_gets_no_others() -> None:

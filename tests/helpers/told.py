@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.mission import Event, EventKind, Phase
-from perchctl.record import FlightLog, to_plain
+from perchctl.record import FlightLog
+from perchctl.record.exact import to_plain
 from perchctl.record.fields import event_record
 from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic

@@ -8,7 +8,7 @@ import pytest
 
 from perchctl.mission.report import flight_findings
 from perchctl.profile import CameraConfig
-from perchctl.record import FlightSummary, summary_text
+from perchctl.record import FlightSummary
 from perchctl.vision import Consistency
 
 
@@ -62,7 +62,7 @@ def test_a_turn_is_named_by_its_axis() -> None:
 
 def test_the_summary_tells_them_with_intervals() -> None:
     found = flight_findings(_seen(0.032, turn_deg=(0.2, -0.1, 0.4)), CAMERA)
-    lines = summary_text(FlightSummary("perched", "hanging", findings=found)).splitlines()
+    lines = FlightSummary("perched", "hanging", findings=found).text().splitlines()
     assert "latency:   92 +- 6 ms" in lines
     assert "mounting:  turned by 0.2 +- 0.8, -0.1 +- 0.8, 0.4 +- 0.8 deg (x, y, z)" in lines
     assert f"advice:    {found.advice[0]}" in lines

@@ -1,35 +1,27 @@
-"""What goes to the vehicle in the loop's place is in the log, in its recording, and is told."""
+"""What goes to the vehicle in the loop's place is in the log, and is told."""
 
 from __future__ import annotations
 
-import json
 import os
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from perchctl.analysis import FlightAnalysis, show_record, show_text
-from perchctl.analysis.flight import takeovers_of
 from perchctl.analysis.story import story_of
 from perchctl.flight import fly
 from perchctl.flight.watchdog import rescue
 from perchctl.link.sender import Sender
-from perchctl.mission import FlightReport, Operator, Outcome, Phase, SentCommand
+from perchctl.mission import Operator, SentCommand
 from perchctl.perception import History
 from perchctl.record import LogWatcher, read_log
-from perchctl.record import recorder as recording_module
-from perchctl.record.fields import sent_values
-from perchctl.record.recorder import Recorder
 from perchctl.record.write import FlightLogWriter
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers import log as synthetic
-from tests.helpers import recorded
 from tests.helpers.loop_rig import HANG_AT_S, PROFILE, Clock, hung_rig
 from tests.helpers.mission import telemetry
-from tests.helpers.recorded import MemoryDisk
 from tests.helpers.scripted_link import ScriptedLink
 
 HOLD, LAND = PositionSetpoint(0.1, 0.2, 1.0 / 3.0, 0.0), Land(-0.05, 2.0)
@@ -37,6 +29,7 @@ TOLD = (
     SentCommand(4.0, "watchdog", HOLD),
     SentCommand(4.05, "watchdog", HOLD),
     SentCommand(4.7, "watchdog", LAND),
+    SentCommand(6.8, "watchdog", StopMotors()),
     SentCommand(9.0, "rescue", EmergencyStop()),
     SentCommand(9.5, "farewell", RawThrust(0)),
 )
@@ -45,50 +38,35 @@ TOLD = (
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
-    recorder = recorded.recorder(tmp_path / "f.mcap")
     left = list(TOLD)
     for tick in synthetic.ticks():
         while left and left[0].t_s < tick["t_s"]:
-            writer.sent(left[0])
-            recorder.sent(sent_values(left.pop(0)))
+            writer.sent(left.pop(0))
         writer.write(tick)
-        recorder.tick(tick)
     writer.close(synthetic.SUMMARY)
-    recorder.close()
     return writer.path
 
 
-def test_the_recording_says_it_too(log: Path, tmp_path: Path) -> None:
+def test_what_one_sends_in_one_go_is_told_together(log: Path) -> None:
     assert tuple(read_log(log).sent) == TOLD
-    own = recorded.messages(tmp_path / "f.mcap")["/sent"]
-    first = json.loads(own[0])
-    start_s = read_log(log).start_s
-    assert first["t_s"] == pytest.approx(4.0 - start_s)
-    assert (first["by"], first["cmd"], first["cmd_z_m"]) == ("watchdog", "position", 0.333333)
-    assert [json.loads(each)["cmd"] for each in own] == [
-        "position", "position", "land", "emergency", "thrust",
-    ]  # fmt: skip
-
-
-def test_what_one_sends_in_one_go_is_told_together() -> None:
-    goes = takeovers_of([*map(sent_values, TOLD)])
-    assert [(go.by, go.start_s, go.end_s) for go in goes] == [
-        ("watchdog", 4.0, 4.7), ("rescue", 9.0, 9.0), ("farewell", 9.5, 9.5),
-    ]  # fmt: skip
+    goes, start_s = FlightAnalysis(read_log(log)).takeovers, read_log(log).start_s
+    assert [go.by for go in goes] == ["watchdog", "watchdog", "rescue", "farewell"]
+    assert [go.start_s + start_s for go in goes] == pytest.approx([4.0, 6.8, 9.0, 9.5])
+    assert [go.end_s + start_s for go in goes] == pytest.approx([4.7, 6.8, 9.0, 9.5])
     assert goes[0].text == "position setpoints (2), landing ordered (1)"
-    later = SentCommand(4.7 + 2.1, "watchdog", StopMotors())
-    assert len(takeovers_of([*map(sent_values, (*TOLD[:3], later))])) == 2
 
 
 def test_show_and_story_tell_who_took_over(log: Path) -> None:
     read = read_log(log)
     text = show_text(FlightAnalysis(read))
-    assert "watchdog   position setpoints (2), landing ordered (1)" in text
+    assert "watchdog  position setpoints (2), landing ordered (1)" in text
     assert show_record(FlightAnalysis(read))["sent"][0]["commands"] == {"position": 2, "land": 1}
     told = [s for s in story_of(FlightAnalysis(read)) if "took over" in s.text]
-    assert [s.t_s for s in told] == pytest.approx([4.0 - read.start_s, 9.0 - read.start_s])
-    assert told[0].text.endswith("for 0.7 s: it gave it a place to hold and it ordered a landing")
-    assert told[1].grade == "bad"
+    assert [s.t_s for s in told] == pytest.approx(
+        [4.0 - read.start_s, 6.8 - read.start_s, 9.0 - read.start_s]
+    )
+    assert told[0].text.endswith("for 0.7 s: position setpoints (2), landing ordered (1)")
+    assert told[2].grade == "bad"
 
 
 # --- who sends --------------------------------------------------------------------------------
@@ -102,9 +80,9 @@ def test_a_hung_loop_s_log_says_what_the_watchdog_sent(tmp_path: Path) -> None:
     watcher.close(report)
     read = read_log(watcher.path)
     assert [(each.t_s, each.command) for each in read.sent] == link.own
-    (go,) = takeovers_of(read.sent_values)
-    assert go.start_s == pytest.approx(HANG_AT_S + 0.3, abs=0.08)
-    assert dict(go.sent)["land"] > 0
+    (go,) = FlightAnalysis(read).takeovers
+    assert go.start_s + read.start_s == pytest.approx(HANG_AT_S + 0.3, abs=0.08)
+    assert go.commands["land"] > 0
     assert not read.truncated
 
 
@@ -147,20 +125,10 @@ def test_the_sender_tells_of_its_guard_and_not_of_the_loop() -> None:
 # --- never in the flight's way ----------------------------------------------------------------
 
 
-def hung_recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[LogWatcher, MemoryDisk]:
-    disk = MemoryDisk()
-    monkeypatch.setattr(recording_module, "CLOSE_TIMEOUT_S", 0.3)
-    header = synthetic.header()
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", header, live=True)
-    recorder = Recorder(tmp_path / "f.mcap", disk, header, recorded.PROFILE, True)
-    watcher = LogWatcher(writer, recorder)
-    watcher.sent(TOLD[0])
-    disk.gate.clear()
-    return watcher, disk
-
-
 def test_the_guard_waits_for_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    watcher, disk = hung_recorder(tmp_path, monkeypatch)
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
+    watcher = LogWatcher(writer)
+    watcher.sent(TOLD[0])
     gate, real = threading.Event(), os.write
     monkeypatch.setattr(os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
     spent_s = time.thread_time()
@@ -170,39 +138,5 @@ def test_the_guard_waits_for_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert time.monotonic() - began_s < 5.0  # a disk that were waited for takes 20
     assert time.thread_time() - spent_s < 1.0
     gate.set()
-    disk.gate.set()
     watcher.close()
     assert len(read_log(watcher.path).sent) == 51
-
-
-REPORT = FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging still", 1, 9.0, False)
-
-
-def test_the_summary_is_safe_before_the_recording_s_end_is_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    watcher, disk = hung_recorder(tmp_path, monkeypatch)
-    recorder: Any = watcher._recorder
-    seen: list[Any] = []
-    close = recorder.close
-
-    def looked() -> Any:
-        end_s = time.monotonic() + 20.0
-        while (found := read_log(watcher.path).summary) is None and time.monotonic() < end_s:
-            time.sleep(0.005)  # the log's thread writes it meanwhile
-        seen.append(found)
-        return close()
-
-    recorder.close = looked
-    summary = watcher.close(REPORT)
-    assert seen[0] is not None
-    assert seen[0]["outcome"] == "perched"
-    assert "pictures" not in seen[0]
-    assert summary is not None
-    assert summary.recording is not None
-    assert "does not answer" in (summary.recording.problem or "")
-    end = read_log(watcher.path).summary
-    assert end is not None
-    assert end["recording_problem"] == summary.recording.problem
-    assert (summary.lost_records, summary.log_problem) == (0, None)
-    disk.gate.set()

@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 from perchctl.analysis import replay
-from perchctl.analysis.replay_text import difference_text
 from perchctl.analysis.replayer import Replay
 from perchctl.mission import Phase
 from perchctl.record import FlightLog, read_log
@@ -39,8 +38,8 @@ def test_the_planner_decides_as_it_did(name: str) -> None:
     if found.first is None:
         assert found.ticks > 50
         return
-    assert found.log.computer_differences, f"{difference_text(found.first)}; {ANEW}"
-    assert not _beyond_last_bits(found), f"{difference_text(found.first)}; {ANEW}"
+    assert found.log.computer_differences, f"{found.first.text}; {ANEW}"
+    assert not _beyond_last_bits(found), f"{found.first.text}; {ANEW}"
 
 
 def test_the_corpus_is_worth_its_place() -> None:

@@ -22,7 +22,6 @@ from typing import Any
 import pytest
 
 from perchctl.analysis import replay
-from perchctl.analysis.replay_text import difference_text
 from perchctl.analysis.replayer import Replay
 from perchctl.record import recorded_pictures, to_exact
 from perchctl.vision import filter as the_filter
@@ -86,7 +85,7 @@ def test_the_pictures_show_what_they_showed() -> None:
     assert not beyond(found), f"{beyond(found)[:1]}; {ANEW}"
     if not found.log.computer_differences:
         first = found.seen.first
-        assert first is None, f"{difference_text(first)}; {ANEW}"
+        assert first is None, f"{first.text}; {ANEW}"
 
 
 def test_they_show_all_that_matters() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.analysis import replay, replay_lines, replay_record
+from perchctl.analysis import replay
 from perchctl.analysis.replayer import Replay
 from perchctl.analysis.sense import Picture
 from perchctl.errors import InvalidValue, NotFound
@@ -158,7 +158,7 @@ def test_where_no_picture_is_left_nothing_is_the_same(
     found = seen_again(log, [])
     assert found.first is None
     assert not found.same
-    record, lines = replay_record(found), replay_lines(found)
+    record, lines = found.record(), found.lines()
     assert (record["pictures"]["frames"], record["gap"]) == (0, None)
     assert record["pictures"]["frames_flown"] > 20
     assert "was not recorded" in record["pictures"]["ended"]
@@ -195,7 +195,7 @@ def test_a_missing_picture_ends_it(flight: tuple[FlightLog, list[Picture]]) -> N
         assert f"frame {pictures[20][0]} was not recorded" in found.seen.ended
         assert 0 < len(found.seen.turns) < len(log.turns)
         assert found.same  # what was compared
-        line = replay_lines(found)[-1]
+        line = found.lines()[-1]
         assert f"up to frame {found.seen.frames} of {found.seen.frames_flown}, all with" in line
         assert not found.seen.differences
         assert len(found.decided) > len(found.seen.turns)  # the planner needs no picture

@@ -147,7 +147,7 @@ def _packed(data: bytes) -> bytes:
 def _keep_pictures(recording: Path, path: Path) -> None:
     """Of a recording, what a replay takes from it."""
     path.unlink(missing_ok=True)
-    kept = RecordingFile(DiskFile.new(path), {"t0_s": 0.0})
+    kept = RecordingFile(DiskFile(path), {"t0_s": 0.0})
     for frame, picture in islice(recorded_frames(recording), PICTURES):
         kept.frame(frame, None if picture is None else (_packed(picture.data), "png"))
     kept.finish()

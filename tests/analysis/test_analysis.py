@@ -1,8 +1,9 @@
-"""The numbers of a flight, and how they are told."""
+"""The numbers of a flight, and how they are shown and listed."""
 
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from perchctl.analysis import (
     show_text,
 )
 from perchctl.analysis.flight import last_ascent
-from perchctl.analysis.show import COLUMNS, list_log
+from perchctl.analysis.show import COLUMNS
 from perchctl.mission import Event, EventKind, Phase
 from perchctl.record import FlightLog, read_log
 from tests.helpers import log as synthetic
@@ -25,14 +26,6 @@ from tests.helpers.mission import note
 
 def log_of(records: list[dict[str, object]]) -> FlightLog:
     return FlightLog(Path("f.jsonl"), {}, records, [], None, True)  # type: ignore[arg-type]
-
-
-@pytest.fixture
-def flown(tmp_path: Path) -> FlightLog:
-    path = synthetic.write(
-        tmp_path / "f.jsonl", summary=synthetic.SUMMARY, events=[note(1.2, "a \x1b[31mnote")]
-    )
-    return read_log(path)
 
 
 def test_settled_is_the_last_second_before_the_last_contact() -> None:
@@ -46,38 +39,28 @@ def test_settled_is_the_last_second_before_the_last_contact() -> None:
         *(tick(4.0 + 0.1 * i, "ASCEND", 9.0 if i < 10 else 0.003) for i in range(20)),
         tick(6.0, "PERCH", 9.0),
     ]
-    log = log_of(records)
-    contact = last_ascent(log.phases)
+    contact = last_ascent(log_of(records).phases)
     assert contact is not None
     assert contact.start_s == 4.0
-    found = FlightAnalysis(log).measures
+    found = FlightAnalysis(log_of(records)).measures
     assert found.settled_xy_rms_m == pytest.approx(0.003 * math.sqrt(2))
     assert found.settled_yaw_rms_rad == pytest.approx(0.006)
-    assert found.text("settled_xy_rms_m") == "4.2"
-    assert found.text("miss_m") == "-"
-
-
-def test_no_contact_is_nothing_settled() -> None:
-    found = FlightAnalysis(log_of([{"t_s": 0.0, "phase": "ASCEND", "ex_m": 0.1}])).measures
-    assert found.settled_xy_rms_m is None
+    assert (found.text("settled_xy_rms_m"), found.text("miss_m")) == ("4.2", "-")
+    assert FlightAnalysis(log_of(records[:3])).measures.settled_xy_rms_m is None
 
 
 def test_a_hold_whose_numbers_grow_is_one() -> None:
-    def tick(t_s: float, hold: str | None, phase: str = "ALIGN") -> dict[str, object]:
-        return {"t_s": t_s, "phase": phase, "hold": hold}
-
-    log = log_of(
-        [
-            tick(0.0, None),
-            tick(0.1, "no picture for 0.5 s"),
-            tick(0.2, "no picture for 0.6 s"),
-            tick(0.3, "telemetry is old"),
-            tick(0.4, None),
-            tick(0.5, "telemetry is old"),
-            tick(0.6, "telemetry is old", "ASCEND"),
-            tick(0.7, None, "ASCEND"),
-        ]
-    )
+    holds = [
+        (0.0, "ALIGN", None),
+        (0.1, "ALIGN", "no picture for 0.5 s"),
+        (0.2, "ALIGN", "no picture for 0.6 s"),
+        (0.3, "ALIGN", "telemetry is old"),
+        (0.4, "ALIGN", None),
+        (0.5, "ALIGN", "telemetry is old"),
+        (0.6, "ASCEND", "telemetry is old"),
+        (0.7, "ASCEND", None),
+    ]
+    log = log_of([{"t_s": t_s, "phase": phase, "hold": hold} for t_s, phase, hold in holds])
     found = [(h.start_s, h.end_s, h.phase, h.reason) for h in FlightAnalysis(log).holds]
     assert found == [
         (0.1, 0.3, "ALIGN", "no picture for 0.6 s"),
@@ -87,15 +70,18 @@ def test_a_hold_whose_numbers_grow_is_one() -> None:
     ]
 
 
-def test_the_text_fits_a_terminal_and_obeys_nothing(flown: FlightLog) -> None:
-    text = show_text(FlightAnalysis(flown))
+def test_the_text_fits_a_terminal_and_obeys_nothing(tmp_path: Path) -> None:
+    path = synthetic.write(
+        tmp_path / "f.jsonl", summary=synthetic.SUMMARY, events=[note(1.2, "a \x1b[31mnote")]
+    )
+    flight = FlightAnalysis(read_log(path))
+    text, record = show_text(flight), show_record(flight)
     assert text.startswith("PERCHED: hanging still with the motors off\nmiss:      3.1 mm\n")
     assert max(map(len, text.splitlines())) <= COLUMNS
     assert "a ?[31mnote" in text
     assert "\x1b" not in text
-    record = show_record(FlightAnalysis(flown))
     assert [p["phase"] for p in record["phases"]] == [phase for phase, _, _ in synthetic.PLAN]
-    assert record["phases"][0]["start_s"] == 0.0
+    assert (record["phases"][0]["start_s"], record["phases"][0]["duration_s"]) == (0.0, 3.0)
     assert record["notes"] == [{"t_s": 0.1, "note": "a \x1b[31mnote"}]
     assert record["whole"]
 
@@ -123,34 +109,24 @@ def test_the_rows_that_were_taken_and_an_end_without_a_tick_are_told(tmp_path: P
     assert (before.phase, before.end_s) == ("ESTIMATE", log.end_s)
 
 
-# --- a folder of logs ------------------------------------------------------------------
-
-
-def test_the_newest_is_by_its_last_record_and_bad_ones_are_named(tmp_path: Path) -> None:
-    import os
-
+def test_the_newest_log_is_by_its_last_record_and_bad_ones_are_named(tmp_path: Path) -> None:
     old = synthetic.write(tmp_path / "flight_old.jsonl", summary=synthetic.SUMMARY, most=5)
-    killed = synthetic.write(tmp_path / "killed.jsonl", most=80)
-    empty = tmp_path / "flight_empty.jsonl"
+    killed = synthetic.write(tmp_path / "flight_killed.jsonl", most=80)
+    other = synthetic.write(tmp_path / "flight_new.jsonl", {"version": 99}, most=5)
+    gone, empty = tmp_path / "flight_gone.jsonl", tmp_path / "flight_empty.jsonl"
     empty.write_bytes(b"")
+    gone.symlink_to(tmp_path / "nowhere.jsonl")
     (tmp_path / "hand.jsonl").write_text('{"part": "carry"}\n')
-    (tmp_path / "gone.jsonl").symlink_to(tmp_path / "nowhere.jsonl")
-    (tmp_path / "flight_gone.jsonl").symlink_to(tmp_path / "nowhere.jsonl")
-    for age, path in enumerate((empty, killed, old)):
+    for age, path in enumerate((empty, killed, other, old)):
         os.utime(path, (1000 - age, 1000 - age))
-    assert newest_logs(tmp_path) == [empty, killed, old, tmp_path / "flight_gone.jsonl"]
+    assert newest_logs(tmp_path) == [empty, killed, other, old, gone]
     assert newest_logs(tmp_path, 1) == [empty]
-    lines = list_text(list_logs(tmp_path)).splitlines()
-    assert [line.split()[0] for line in lines] == [
-        "log", "flight_empty.jsonl", "killed.jsonl", "flight_old.jsonl",
-        "flight_gone.jsonl",
-    ]  # fmt: skip
-    assert "not a flight log" in lines[1]
-    assert "unknown: the log ends in APPROACH" in lines[2]
-    assert lines[3].endswith("18.6  perched, 3.1 mm")
-    assert max(map(len, lines)) <= COLUMNS
-
-
-def test_the_end_of_a_log_of_another_version_is_not_believed(tmp_path: Path) -> None:
-    path = synthetic.write(tmp_path / "f.jsonl", {"version": 99}, synthetic.SUMMARY, most=5)
-    assert "schema version 99" in list_log(path)["problem"]
+    _, *lines = list_text(list_logs(tmp_path)).splitlines()
+    for line, words in zip(
+        lines,
+        ("not a flight log", "unknown: the log ends in APPROACH", "schema version 99",
+         "18.6  perched, 3.1 mm", "-  flight log "),
+        strict=True,
+    ):  # fmt: skip
+        assert words in line
+        assert len(line) <= COLUMNS

@@ -14,8 +14,6 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from mcap.reader import make_reader
-
 from perchctl.calibration import profile_camera
 from perchctl.campaign.flights import fly_seed
 from perchctl.flight import lockstep
@@ -55,10 +53,6 @@ def test_every_frame_of_a_flight_is_there_to_the_bit(flown: tuple[Path, list[Fra
     found = list(recorded_pictures(path))
     assert [(p.number, p.t_s) for p in found] == [(f.index, f.t_s) for f in new]
     assert all(np.array_equal(p.image, f.image) for p, f in zip(found, new, strict=True))
-    summary = read_log(path).summary
-    assert summary is not None
-    assert summary["recording"] == "flight.mcap"
-    assert summary["pictures"] == len(new)
 
 
 @pytest.mark.long
@@ -110,17 +104,8 @@ def test_a_disk_that_fills_up_ends_the_recording_and_not_the_flight(
     notes = [event["reason"] for event in here.events if event not in whole.events]
     (note,) = notes
     assert "the recording has ended (No space left on device)" in note
-    assert here.summary is not None
-    assert 0 < here.summary["pictures"] == len(list(recorded_pictures(path)))
-    assert here.summary["pictures_missing"] > 0
-    with path.with_suffix(".mcap").open("rb") as stream:
-        list(make_reader(stream, validate_crcs=True).iter_messages())
-
-
-def test_simulate_records_beside_a_log_only(tmp_path: Path) -> None:
-    said = run("simulate", "-n", "1", "--record")
-    assert said.code == 2
-    assert "--log-dir" in said.complaint
+    kept = len(list(recorded_pictures(path)))
+    assert 0 < kept < len(list(recorded_pictures(flown[0])))
 
 
 @pytest.mark.parametrize(
