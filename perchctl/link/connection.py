@@ -74,12 +74,11 @@ class Connection:
         self.cf.link_statistics.latency.start = lambda: None
         self.cf.fully_connected.add_callback(lambda _uri: self._settled.set())
         self.cf.connection_failed.add_callback(self._on_failed)
-        self.cf.connection_lost.add_callback(self._on_failed)
 
     def open(self, uri: str, timeout_s: float) -> bool:
         """Return True once the vehicle is connected, or refused (`lost`), within `timeout_s`."""
         # Opening a radio may block in its driver: it gets a thread and a bound.
-        _begin("perchctl-open", lambda: self.cf.open_link(uri))
+        begin_thread("perchctl-open", lambda: self.cf.open_link(uri))
         if not self._settled.wait(timeout_s):
             return False
         self._has_safelink = not getattr(self.cf.link, "needs_resending", True)
@@ -148,7 +147,7 @@ class Connection:
                 if cause is None:
                     return
                 self._give_up(cause)
-            self._opener = _begin("perchctl-reconnect", self._open_again)
+            self._opener = begin_thread("perchctl-reconnect", self._open_again)
 
     def close(self, *, farewell: bool) -> None:
         """Release the driver and clean up. `farewell`: let cflib send its zero setpoint, which
@@ -180,7 +179,7 @@ class Connection:
         self.lost = cause
         driver, self.cf.link = self.cf.link, _Nowhere()
         if driver is not None:
-            self._closer = _begin("perchctl-close", driver.close)
+            self._closer = begin_thread("perchctl-close", driver.close)
 
     def _open_again(self) -> None:
         if self._closer is not None:
@@ -340,10 +339,10 @@ def _run_bounded(calls: Iterable[Callable[[], None]]) -> None:
         for call in calls:
             call()
 
-    _begin("perchctl-close", run).join(CLOSE_TIMEOUT_S)
+    begin_thread("perchctl-close", run).join(CLOSE_TIMEOUT_S)
 
 
-def _begin(name: str, call: Callable[[], object]) -> threading.Thread:
+def begin_thread(name: str, call: Callable[[], object]) -> threading.Thread:
     """Start a thread for what may block in a driver."""
     thread = threading.Thread(target=call, name=name, daemon=True)
     thread.start()

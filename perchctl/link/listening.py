@@ -20,7 +20,13 @@ import numpy as np
 from perchctl.calibration import AttitudeSample
 from perchctl.errors import NotFound, TimedOut
 from perchctl.link.cflib_link import SILENCE_S, CflibLink
-from perchctl.link.connection import Connection, plain_cause, ready_cflib, send_packets
+from perchctl.link.connection import (
+    Connection,
+    begin_thread,
+    plain_cause,
+    ready_cflib,
+    send_packets,
+)
 from perchctl.link.crtp import Packet, Port
 from perchctl.link.firmware import (
     NEEDED_PROTOCOL,
@@ -248,9 +254,7 @@ def find_vehicles(uri: str = "") -> tuple[list[str], str]:
                 with contextlib.suppress(Exception):
                     found.extend(uri for uri, _ in driver().scan_interface(address))
 
-    worker = threading.Thread(target=run, name="perchctl-scan", daemon=True)
-    worker.start()
-    worker.join(SCAN_TIMEOUT_S)
+    begin_thread("perchctl-scan", run).join(SCAN_TIMEOUT_S)
     uris = (uri for uri in dict.fromkeys(found) if uri.partition("://")[0] in FORMS)
     return list(uris), why[0]
 
