@@ -76,7 +76,8 @@ def smallest_side_px(
         blur_px: sigma of lens, focus and link together.
         picture_px: the larger side of the camera's picture.
     """
-    drawing, reader = draw_target(target), PlainReader(target)
+    drawing = draw_target(target)
+    reader = PlainReader(target)
     side_m = drawing.large_side_m if marker == "large" else drawing.small_side_m
     count = math.ceil(math.log(SIDE_RANGE_PX[1] / SIDE_RANGE_PX[0]) / math.log(STEP))
 
@@ -97,7 +98,9 @@ def smallest_side_px(
     # then bisection.
     low, high, stride = -1, 0, 4
     while not found(high):
-        low, high, stride = high, high + stride, min(2 * stride, 16)
+        low = high
+        high = high + stride
+        stride = min(2 * stride, 16)
         if high > count:
             return None
     while high - low > 1:
@@ -172,7 +175,8 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
 def _cells_apart(a: MarkerConfig, b: MarkerConfig, turns: Sequence[int] = (0, 1, 2, 3)) -> int:
     """Return the fewest cells in which one, in any of the quarter turns, differs from the other;
     patterns of another size differ in all."""
-    first, second = marker_cells(a), marker_cells(b)
+    first = marker_cells(a)
+    second = marker_cells(b)
     if first.shape != second.shape:
         return first.size
     return min(int((np.rot90(first, turn) != second).sum()) for turn in turns)
