@@ -153,7 +153,9 @@ def _checked(size: Any, K: NDArray[Any], dist: NDArray[Any], model: str) -> Came
             "the image size is missing: add image_width and image_height, in px, of the "
             "pictures that the camera was calibrated with"
         )
-    width, height, dist = int(width), int(height), dist.ravel()
+    width = int(width)
+    height = int(height)
+    dist = dist.ravel()
     if model not in MODELS:
         raise InvalidValue(
             f"distortion_model {model!r} is unknown; allowed are {', '.join(MODELS)}"

@@ -112,7 +112,8 @@ class Board:
         if found is None:
             raise _wrong(text, "it is neither chessboard:COLUMNSxROWS:SQUARE nor "
                          "charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY")  # fmt: skip
-        columns, rows = int(found["columns"]), int(found["rows"])
+        columns = int(found["columns"])
+        rows = int(found["rows"])
         if not (3 <= columns <= MAX_COUNT and 3 <= rows <= MAX_COUNT):
             raise _wrong(text, f"3 to {MAX_COUNT} columns and rows are allowed")
         square_m = parse_length(found["square"], f"board {text}: square")
@@ -149,7 +150,8 @@ class Board:
 def _check_markers(board: Board, text: str) -> None:
     """Raises InvalidValue where a ChArUco board's markers are too large, or too many for their
     dictionary."""
-    largest_m, needed = 0.95 * board.square_m, board.columns * board.rows // 2
+    largest_m = 0.95 * board.square_m
+    needed = board.columns * board.rows // 2
     if board.marker_m is not None and board.marker_m > largest_m:
         raise _wrong(text, f"the marker needs white around it: at most {mm_text(largest_m)} mm")
     try:
@@ -176,7 +178,8 @@ def board_rectangles(board: Board) -> list[Rectangle]:
     for row in range(rows):
         for column in range(columns):
             if black[row, column]:
-                x, y = column * board.square_m - width / 2, height / 2 - row * board.square_m
+                x = column * board.square_m - width / 2
+                y = height / 2 - row * board.square_m
                 found.append(Rectangle(x, y - board.square_m, x + board.square_m, y))
     if board.marker_m is None or board.dictionary is None:
         return found

@@ -68,7 +68,8 @@ class TargetDesign:
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each gap."""
         found: list[str] = []
-        start_m, far_m = self.start_range_m, self.z1_m
+        start_m = self.start_range_m
+        far_m = self.z1_m
         if far_m is None or self.z2_m is None or self.z3_m is None:
             return ("a marker is never read through this blur: a sharper picture is needed",)
         if self.start_height_m == 0.0:
@@ -102,7 +103,8 @@ class TargetDesign:
     def text(self, camera_name: str) -> str:
         """Return ranges, mounting and warnings for people; several lines."""
         width, height = self.camera.size_px
-        large, small = self.target.large, self.target.small
+        large = self.target.large
+        small = self.target.small
         rows = {
             "camera": f"{camera_name}, {width}x{height}, f {focal_px(self.camera):.0f} px",
             "blur": f"sigma {self.blur_px:g} px",
@@ -161,11 +163,14 @@ def make_design(
     """Return the ranges, by trial through the detector (far) and by geometry (near), and what is
     wrong with them for a flight by that profile under a ceiling of that height over the floor
     (None: unknown)."""
-    f, view, ahead = focal_px(camera), FieldOfView(camera), (np.eye(3), np.zeros(3))
+    f = focal_px(camera)
+    view = FieldOfView(camera)
+    ahead = (np.eye(3), np.zeros(3))
     large_px, small_px = (
         smallest_side_px(target, name, blur_px, max(camera.size_px)) for name in MARKERS
     )
-    large, small = target.large.side_m, target.small.side_m
+    large = target.large.side_m
+    small = target.small.side_m
     return TargetDesign(
         target=target,
         camera=camera,

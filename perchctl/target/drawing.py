@@ -111,8 +111,10 @@ def draw_target(target: TargetConfig) -> TargetDrawing:
     white already (id 997 of DICT_4X4_1000) the ring changes nothing. With a 4x4
     dictionary any two ids stay readable up to a small side of 0.18 of the large.
     """
-    large, small = marker_cells(target.large), marker_cells(target.small)
-    large_side, small_side = target.large.side_m, target.small.side_m
+    large = marker_cells(target.large)
+    small = marker_cells(target.small)
+    large_side = target.large.side_m
+    small_side = target.small.side_m
     least = RING_MIN_PER_LARGE_SIDE * large_side
     for ring in np.linspace(max(small_side / len(small), least), least, 16):
         edges, black = _nested(large, small, large_side, small_side, float(ring))

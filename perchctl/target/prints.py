@@ -96,7 +96,8 @@ class PrintCheck:
         """Count one more picture if both markers are in it, and refined."""
         if output is None:
             return
-        large, small = output.detections.large, output.detections.small
+        large = output.detections.large
+        small = output.detections.small
         if large is not None and small is not None and large.refined and small.refined:
             self.add_corners(large.corners_px, small.corners_px)
 
@@ -123,7 +124,8 @@ class PrintCheck:
         value = float(np.median(values))
         spread = _MAD_TO_SIGMA * float(np.median(np.abs(values - value)))
         sigma = _MEDIAN_TO_SIGMA * spread / math.sqrt(len(values))
-        off, total = value - 1.0, math.hypot(sigma, float(np.median(biases)))
+        off = value - 1.0
+        total = math.hypot(sigma, float(np.median(biases)))
         nominal = self.target.small.side_m / self.target.large.side_m
         ratio_text = (
             f"the small marker is {value * nominal:.4f} of the large one, the profile says "

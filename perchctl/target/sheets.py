@@ -69,7 +69,8 @@ def target_pdf(
     page that fits.
     """
     check_target(target, magnet_m)
-    size, texts = parse_page(page), _caption(target, origin, date)
+    size = parse_page(page)
+    texts = _caption(target, origin, date)
     place = _layout_on(target, size, texts)
     if place is None:
         raise InvalidValue(
@@ -232,7 +233,8 @@ class _Paper(FPDF):
         self, width: float, height: float, title: str, pages: int, date: datetime.date | None
     ) -> None:
         super().__init__(unit="mm", format=(width, height))
-        self.cx, self.cy = width / 2.0, height / 2.0
+        self.cx = width / 2.0
+        self.cy = height / 2.0
         self._format = (width, height)
         self.set_auto_page_break(False)
         self.set_margin(0.0)
@@ -257,7 +259,8 @@ class _Paper(FPDF):
             path.style.fill_color = "#000000"
             path.style.stroke_color = None
             for r in rectangles:
-                x, y = self.cx + 1e3 * r.x0_m, self.cy - 1e3 * r.y1_m
+                x = self.cx + 1e3 * r.x0_m
+                y = self.cy - 1e3 * r.y1_m
                 path.rectangle(x, y, 1e3 * (r.x1_m - r.x0_m), 1e3 * (r.y1_m - r.y0_m))
 
     def stroke(
@@ -332,8 +335,10 @@ def _draw_back(pdf: _Paper, half: float, magnet_m: float) -> None:
 
 def _draw_rulers(pdf: _Paper, half_x: float, half_y: float) -> None:
     """Draw two rulers of 100 mm: below, from left to right, and at the left, upwards."""
-    y, x = pdf.cy + half_y + _GAP, pdf.cx - half_x - _GAP
-    left, low = pdf.cx - RULER / 2, pdf.cy + RULER / 2
+    y = pdf.cy + half_y + _GAP
+    x = pdf.cx - half_x - _GAP
+    left = pdf.cx - RULER / 2
+    low = pdf.cy + RULER / 2
     pdf.stroke(left, y, left + RULER, y)
     pdf.stroke(x, low, x, low - RULER)
     for mm in range(int(RULER) + 1):
@@ -348,9 +353,11 @@ def _draw_rulers(pdf: _Paper, half_x: float, half_y: float) -> None:
 
 
 def _draw_cut_marks(pdf: _Paper, half: float) -> None:
-    near, far = half + _MARK_GAP, half + _MARK_GAP + _MARK
+    near = half + _MARK_GAP
+    far = half + _MARK_GAP + _MARK
     for sx, sy in itertools.product((-1, 1), repeat=2):
-        x, y = pdf.cx + sx * half, pdf.cy + sy * half
+        x = pdf.cx + sx * half
+        y = pdf.cy + sy * half
         pdf.stroke(pdf.cx + sx * near, y, pdf.cx + sx * far, y)
         pdf.stroke(x, pdf.cy + sy * near, x, pdf.cy + sy * far)
 

@@ -41,7 +41,8 @@ class FieldOfView:
         rays = rays[np.isfinite(rays).all(axis=1)]
         angle = np.arctan2(rays[:, 1], rays[:, 0])
         order = np.argsort(angle)
-        self._angle, self._reach = angle[order], np.hypot(*rays.T)[order]
+        self._angle = angle[order]
+        self._reach = np.hypot(*rays.T)[order]
 
     def holds(self, points_cam_m: Array) -> bool:
         """Return true if all points (n, 3) of the camera frame are in the picture."""
@@ -110,7 +111,8 @@ def least_side_px(plain_px: float | None = None) -> float:
 def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) -> str:
     """Return in words from where on the ground the large marker is surely found: how far above the
     camera at most, and how far aside of its axis at some heights."""
-    side_m, view = target.large.side_m, mount.T_body_cam[:3, 2]
+    side_m = target.large.side_m
+    view = mount.T_body_cam[:3, 2]
     highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / least_side_px()
     lean = math.degrees(math.atan2(view[0], view[2])), math.degrees(math.atan2(view[1], view[2]))
     axis = _directions(lean, STRAIGHT_DEG, ".0f", "deg")
@@ -185,7 +187,8 @@ def view_from(
 ) -> TargetView:
     """Return how a level vehicle sees a level target. Positions (3,) and headings are in one world,
     z up."""
-    T, field = mount.T_body_cam, FieldOfView(camera)
+    T = mount.T_body_cam
+    field = FieldOfView(camera)
     R, camera_m = T[:3, :3], T[:3, 3]
     centre = rot_z(body_yaw_rad).T @ (target_m - body_m) - camera_m
     height_m = float(centre[2])
@@ -254,7 +257,8 @@ def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> 
     """Return from where on the profile's `camera.mount` and `vehicle.gear_body_m` see too
     little."""
     R, offset = gear_from_camera(profile)
-    view, patterns = FieldOfView(camera), make_aruco_detector(DetectorConfig(), target).patterns
+    view = FieldOfView(camera)
+    patterns = make_aruco_detector(DetectorConfig(), target).patterns
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
 
     def whole(range_m: float) -> bool:

@@ -276,6 +276,7 @@ def test_what_would_not_be_read_is_not_written(path: Path) -> None:
         (2, '"gyro_radps"', '"gyro"'),
         (3, "0.02", "NaN"),
         (4, '"rotation_cam_target":[[', '"rotation_cam_target":[[2.5,'),
+        (4, '"rotation_cam_target":[[-0', '"rotation_cam_target":[[-9'),
         (4, "{", ""),
     ],
 )

@@ -120,7 +120,9 @@ def _fit_of(views: Sequence[BoardView], camera: CameraModel, poses: Array) -> Fi
 def derivatives(camera: CameraModel, pose: Array, points_m: Array) -> tuple[Array, Array]:
     """Return the derivatives of the pixels of points (n, 3) at a pose (rvec and tvec, (6,)) by the
     lens parameters (2 n, p) and by the pose (2 n, 6)."""
-    rvec, tvec, p = pose[:3].copy(), pose[3:].copy(), len(parameters_of(camera))
+    rvec = pose[:3].copy()
+    tvec = pose[3:].copy()
+    p = len(parameters_of(camera))
     if camera.model == "fisheye":
         points = points_m.reshape(-1, 1, 3)
         _, J = cv2.fisheye.projectPoints(points, rvec, tvec, camera.K, camera.dist)
@@ -213,7 +215,8 @@ def _find_outliers(
     limit = max(VIEW_FACTOR * median, VIEW_FLOOR_PX, max(rms) / 2.0)
     reasons = {}
     for view, mask, view_rms in zip(views, masks, rms, strict=True):
-        left, had = int(mask.sum()), len(whole[view.name])
+        left = int(mask.sum())
+        had = len(whole[view.name])
         if view_rms > limit:
             reasons[view.name] = f"RMS {view_rms:.2f} px, the median view has {median:.2f}"
         elif had - left > MAX_CORNERS_OUT * had or left < MIN_CORNERS:

@@ -250,7 +250,8 @@ class Capture:
     def update(self, seen: BoardView | str) -> bool:
         """Judge one more picture, by its view of the board or why there is none; return true if the
         view was taken: it is new, sharp and still."""
-        before, self._last = self._last, seen if isinstance(seen, BoardView) else None
+        before = self._last
+        self._last = seen if isinstance(seen, BoardView) else None
         if isinstance(seen, str):
             self.advice = seen
             return False

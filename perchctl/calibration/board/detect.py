@@ -145,7 +145,8 @@ def _local_axes(cells: Array, corners: Array) -> Array:
     if H is None:
         H, _ = cv2.findHomography(cells, corners)
     homogeneous = np.column_stack([cells, np.ones(len(cells))]) @ H.T
-    at, w = homogeneous[:, :2, None] / homogeneous[:, 2:, None], homogeneous[:, 2:, None]
+    at = homogeneous[:, :2, None] / homogeneous[:, 2:, None]
+    w = homogeneous[:, 2:, None]
     return np.asarray((H[:2, :2] - at * H[2, :2]) / w)
 
 
@@ -262,12 +263,15 @@ def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Ar
     y = offsets[..., 1] - state[:, 1, None]
     parts = []
     for k in (0, 1):
-        c, s = np.cos(state[:, 2 + k, None]), np.sin(state[:, 2 + k, None])
+        c = np.cos(state[:, 2 + k, None])
+        s = np.sin(state[:, 2 + k, None])
         w = np.exp(state[:, 4 + k, None])
         d = c * x + s * y
         parts.append((c, s, w, d, np.tanh(d / w), -s * x + c * y))
     (c1, s1, w1, d1, t1, e1), (c2, s2, w2, d2, t2, e2) = parts
-    u, v, cross = offsets[..., 0], offsets[..., 1], t1 * t2
+    u = offsets[..., 0]
+    v = offsets[..., 1]
+    cross = t1 * t2
     # In a window of few pixels the contrast's slope cannot be distinguished from a shift.
     slope = cross * (np.abs(offsets).max(axis=(1, 2)) > _MIN_SLOPE_PX)[:, None]
     base = np.stack([np.ones_like(x), u, v, cross, u * slope, v * slope], axis=2)
@@ -276,7 +280,8 @@ def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Ar
     project = np.linalg.solve(turned @ base + 1e-9 * np.eye(6), turned)
     wanted = (weight * grey)[..., None]
     linear = project @ wanted
-    q1, q2 = (1.0 - t1 * t1) * t2 / w1, (1.0 - t2 * t2) * t1 / w2
+    q1 = (1.0 - t1 * t1) * t2 / w1
+    q2 = (1.0 - t2 * t2) * t1 / w2
     gain = linear[:, 3] + linear[:, 4] * u + linear[:, 5] * v
     J = (gain * weight)[..., None] * np.stack(
         [-(c1 * q1 + c2 * q2), -(s1 * q1 + s2 * q2), e1 * q1, e2 * q2, -d1 * q1, -d2 * q2], axis=2

@@ -36,7 +36,8 @@ def report_figure(calibration: Calibration) -> Figure:
     banner_in = LINE_IN * (len(lines) + 1)
     figure = new_figure(WIDTH_IN, banner_in + PANELS_IN, dpi=DPI)
     halves = figure.add_gridspec(2, 1, height_ratios=(banner_in, PANELS_IN))
-    banner, panels = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
+    banner = figure.add_subfigure(halves[0])
+    panels = figure.add_subfigure(halves[1])
     banner.set_facecolor(BANNER[calibration.level])
     banner.text(
         0.012, 0.5, _plain("\n".join(lines)), fontsize=13, color="white", weight="bold",

@@ -87,7 +87,8 @@ def position_errors_mm(
 ) -> Array:
     """Return how far a target seen by `truth` is from where `camera` puts it, at each of the
     places of `truth`; the first is on the axis, (n,) mm."""
-    corners_m, places = _marker_m(truth, z_m), _places(truth, z_m, covered)
+    corners_m = _marker_m(truth, z_m)
+    places = _places(truth, z_m, covered)
     views = [
         BoardView("", truth.size_px, np.arange(4), corners_m, project(corners_m, _FACING, p, truth))
         for p in places
@@ -116,7 +117,8 @@ def _places(camera: CameraModel, z_m: float, covered: NDArray[np.bool_] | None) 
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 9), np.linspace(0, h - 1, 7)), axis=-1)
     rays = undistort(grid.reshape(-1, 2), camera)
     rays = rays[np.isfinite(rays).all(axis=1)]
-    corners_m, places = _marker_m(camera, z_m), [np.array([0.0, 0.0, z_m])]
+    corners_m = _marker_m(camera, z_m)
+    places = [np.array([0.0, 0.0, z_m])]
     for place in np.column_stack([rays, np.ones(len(rays))]) * z_m:
         cells = _cells(camera, place, corners_m)
         if cells is not None and (covered is None or covered[cells[:, 1], cells[:, 0]].all()):

@@ -116,7 +116,8 @@ class Calibration:
 
     def record(self) -> dict[str, Any]:
         """Return the measured part of the object of `calibrate --json`."""
-        names, values = PARAMETERS[self.camera.model], self.fit.parameters.tolist()
+        names = PARAMETERS[self.camera.model]
+        values = self.fit.parameters.tolist()
         return {
             **dict(zip(names[:4], values[:4], strict=True)),
             "distortion": self.camera.dist.tolist(),

@@ -85,12 +85,15 @@ def solve_carry(recording: MountingRecording) -> CarrySolution:
     check_recording(recording, "carry")
     t_s, first = np.unique([a.t_s for a in recording.attitudes], return_index=True)
     gyro = np.array([recording.attitudes[k].gyro_radps for k in first])
-    poses, bias, scale = pose_arrays(recording), np.zeros(3), np.zeros(3)
+    poses = pose_arrays(recording)
+    bias = np.zeros(3)
+    scale = np.zeros(3)
     body = integrate(t_s, gyro, bias, scale)
     R_body_cam, latency_s = first_guess(body, poses)
     R_world_target = _middle_target(body, poses, R_body_cam, latency_s)
     knots_s = np.linspace(t_s[0], t_s[-1], 1 + max(1, round((t_s[-1] - t_s[0]) / KNOT_S)))
-    walk, known = np.zeros((len(knots_s) - 1, 3)), _known(knots_s)
+    walk = np.zeros((len(knots_s) - 1, 3))
+    known = _known(knots_s)
     cov_rad2 = poses.cov[:, :3, :3] + np.eye(3) * FLOOR_RAD**2
     for _ in range(_STEPS):
         at = interpolate(integrate(t_s, gyro, bias, scale), poses.t_s - latency_s)
@@ -101,13 +104,15 @@ def solve_carry(recording: MountingRecording) -> CarrySolution:
         late = -at.rate_radps @ R_body_cam
         turned = np.broadcast_to(R_body_cam.T, R_cam_world.shape)
         walked = np.einsum("nk,nij->nikj", hats, R_cam_world).reshape(len(hats), 3, -1)
-        of_bias, of_scale = R_cam_world @ at.of_bias, R_cam_world @ at.of_scale
+        of_bias = R_cam_world @ at.of_bias
+        of_scale = R_cam_world @ at.of_scale
         parts = (turned, -R_cam_world, of_bias, of_scale, late[:, :, None], walked)
         rows = weighed_rows(np.concatenate(parts, axis=2), misfit, cov_rad2, known, late)
         step = rows.step(np.concatenate([np.zeros(6), bias, scale, [0.0], walk.ravel()]))
         R_body_cam = _turns(step[TURN]) @ R_body_cam
         R_world_target = _turns(step[TARGET]) @ R_world_target
-        bias, scale = bias + step[BIAS], scale + step[SCALE]
+        bias = bias + step[BIAS]
+        scale = scale + step[SCALE]
         latency_s = float(np.clip(latency_s + step[LATENCY], -0.5, 1.5))
         walk = walk + step[KNOTS:].reshape(-1, 3)
     cov = rows.covariance()
@@ -148,7 +153,8 @@ def _check(rows: Rows, latency_s: float, cov: Array) -> None:
             f"then {HOW_TO_RECORD['carry']}"
         )
     sigma = np.sqrt(np.diagonal(cov))
-    turn_deg, sigma_s = math.degrees(sigma[TURN].max()), float(sigma[LATENCY])
+    turn_deg = math.degrees(sigma[TURN].max())
+    sigma_s = float(sigma[LATENCY])
     if not turn_deg <= MOST_TURN_SIGMA_DEG:
         raise InvalidValue(
             f"the camera's turn is known to {turn_deg:.1f} deg only (at most "

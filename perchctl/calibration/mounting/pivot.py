@@ -59,14 +59,18 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
     """
     check_recording(recording, "pivot")
     poses = pose_arrays(recording)
-    n, R, p_m = len(poses.t_s), poses.R_cam_target, poses.p_cam_target_m
+    n = len(poses.t_s)
+    R = poses.R_cam_target
+    p_m = poses.p_cam_target_m
     design = np.concatenate([np.broadcast_to(np.eye(3), (n, 3, 3)), -R], axis=2)
-    found, cov = np.zeros(6), np.broadcast_to(np.eye(3), (n, 3, 3))
+    found = np.zeros(6)
+    cov = np.broadcast_to(np.eye(3), (n, 3, 3))
     for _ in range(_STEPS):
         rows = weighed_rows(design, design @ found - p_m, cov, np.zeros((6, 6)))
         found = found + rows.step()
         cov = _misfit_covariance(poses, found[3:])
-    tip_m, cov_m2 = found[:3], rows.covariance()[:3, :3]
+    tip_m = found[:3]
+    cov_m2 = rows.covariance()[:3, :3]
     _check_slip(poses, rows)
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov_m2)[-1]))
     if rows.left_out > MOST_LEFT_OUT or not sigma_m <= MOST_TIP_SIGMA_M:
@@ -100,14 +104,17 @@ def _check_slip(poses: PoseArrays, rows: Rows) -> None:
     explains, moved_m, at_s = 0.0, 0.0, 0.0
     for k in np.unique(np.linspace(0, n, _SPLITS + 2).astype(np.intp))[1:-1]:
         after = (np.arange(n) >= k)[:, None, None] * rows.design[:, :, 3:]
-        design, found = np.concatenate([rows.design, after], axis=2), np.zeros(9)
+        design = np.concatenate([rows.design, after], axis=2)
+        found = np.zeros(9)
         two = replace(rows, design=design, known=np.zeros((9, 9)))
         for _ in range(_SLIP_STEPS):
             step = two.step()
-            found, two = found + step, two.moved(step)
+            found = found + step
+            two = two.moved(step)
         share = 1.0 - _size(two) / alone
         if share > explains:
-            explains, moved_m = share, float(np.linalg.norm(found[6:]))
+            explains = share
+            moved_m = float(np.linalg.norm(found[6:]))
             at_s = float(poses.t_s[k] - poses.t_s[0])
     if moved_m > SLIPPED_M and explains > SLIP_EXPLAINS:
         raise InvalidValue(

@@ -53,7 +53,8 @@ class PoseReader:
         judged = self._perception.health.assess(frame, self._live)
         if judged.kind == "repeated":
             return []
-        self.outlines, self.trouble = (), "" if judged.usable else judged.text
+        self.outlines = ()
+        self.trouble = "" if judged.usable else judged.text
         if judged.kind in ("frozen", "snow"):
             return []
         seen = []

@@ -118,7 +118,8 @@ class MountingRecording:
                 if "part" in record:
                     if record["format"] != _FORMAT or record["part"] not in get_args(MountingPart):
                         raise ValueError("the part or its format is unknown")
-                    mirrored, seen_by = int(record["mirrored_pictures"]), str(record["seen_by"])
+                    mirrored = int(record["mirrored_pictures"])
+                    seen_by = str(record["seen_by"])
                     parts.append(MountingRecording(record["part"], [], [], mirrored, seen_by))
                 elif "rotation_cam_target" in record:
                     parts[-1].poses.append(_pose(record))
@@ -140,7 +141,8 @@ def _plain(value: Any) -> Any:
 
 def _attitude(record: Mapping[str, Any]) -> AttitudeSample:
     roll, pitch, yaw = _numbers(record, "rpy_rad", 3).tolist()
-    t_s, gyro_radps = float(_numbers(record, "t_s")), _numbers(record, "gyro_radps", 3)
+    t_s = float(_numbers(record, "t_s"))
+    gyro_radps = _numbers(record, "gyro_radps", 3)
     return AttitudeSample(t_s, roll, pitch, yaw, gyro_radps)
 
 
@@ -205,13 +207,15 @@ MOST_LATE_S = 1.0
 
 def check_recording(recording: MountingRecording, part: MountingPart) -> None:
     """Raises InvalidValue where a solve would be in vain, with what to do."""
-    attitudes, poses = recording.attitudes, recording.poses
+    attitudes = recording.attitudes
+    poses = recording.poses
     if recording.part != part:
         raise InvalidValue(f"this is a recording of the {recording.part}, not of the {part}")
     if recording.mirrored_pictures > max(5, len(poses)):
         raise InvalidValue(MIRRORED)
     if part == "carry" and attitudes and poses:
-        begin_s, end_s = min(a.t_s for a in attitudes), max(a.t_s for a in attitudes)
+        begin_s = min(a.t_s for a in attitudes)
+        end_s = max(a.t_s for a in attitudes)
         together = sum(begin_s <= p.t_s <= end_s + MOST_LATE_S for p in poses)
         if together < 0.5 * len(poses):
             raise InvalidValue(
@@ -224,7 +228,9 @@ def check_recording(recording: MountingRecording, part: MountingPart) -> None:
 
 def missing_motion(recording: MountingRecording) -> list[str]:
     """Return which motion is still missing, in a few words each; empty when it is enough."""
-    part, poses, attitudes = recording.part, recording.poses, recording.attitudes
+    part = recording.part
+    poses = recording.poses
+    attitudes = recording.attitudes
     if part == "carry" and len(attitudes) < 2:
         return ["wait for the vehicle"]
     if len(poses) < 2:

@@ -99,14 +99,16 @@ class MountingReport:
         """Return what was measured, in the units of the lines."""
         camera, values = self.profile.camera, []
         if (carried := self.carried) is not None:
-            angles, sigmas = np.array(carried.rpy_deg), np.array(carried.rpy_sigma_deg)
+            angles = np.array(carried.rpy_deg)
+            sigmas = np.array(carried.rpy_sigma_deg)
             written = np.array(camera.mount.rpy_deg)
             values.append(_Value("turn", "rpy_deg", "deg", angles, sigmas, written, 2))
             late, sigma = 1e3 * np.array([[carried.latency_s], [carried.latency_sigma_s]])
             known = np.array([] if camera.latency_s == "measured" else [1e3 * camera.latency_s])
             values.append(_Value("latency", "latency_s", "ms", late, sigma, known, 1))
         if (pivoted := self.pivoted) is not None:
-            tip, sigma = 1e3 * pivoted.gear_cam_m, 1e3 * pivoted.gear_cam_sigma_m
+            tip = 1e3 * pivoted.gear_cam_m
+            sigma = 1e3 * pivoted.gear_cam_sigma_m
             known = 1e3 * self.written_gear_cam_m
             values.append(_Value("gear's tip", "gear_cam_m", "mm", tip, sigma, known, 2))
         return values
@@ -152,7 +154,8 @@ def solve_mounting(profile: Profile, recordings: Sequence[MountingRecording]) ->
     Raises InvalidValue: a recording is too little or contradicts itself, with what to do.
     """
     by_part = {recording.part: recording for recording in recordings}
-    carry, pivot = by_part.get("carry"), by_part.get("pivot")
+    carry = by_part.get("carry")
+    pivot = by_part.get("pivot")
     carried, pivoted = None, None
     try:
         carried = None if carry is None else solve_carry(carry)

@@ -47,7 +47,8 @@ class Rows:
     def normal_equations(self, some: slice | NDArray[np.intp] = slice(None)) -> tuple[Array, Array]:
         """Return information (p, p) and gradient (p,) of some of the poses."""
         p = self.design.shape[2]
-        design, counted = self.design[some], self.counted[some, None, None]
+        design = self.design[some]
+        counted = self.counted[some, None, None]
         weighted = ((self.inverse[some] * counted) @ design).reshape(-1, p)
         return design.reshape(-1, p).T @ weighted, -weighted.T @ self.misfit[some].ravel()
 
@@ -90,7 +91,8 @@ def weighed_rows(
         tail = (FREEDOM + 3) * np.log1p(distance2 / factor2 / FREEDOM)
         cost = float((size + tail).sum())
         if cost < best_cost:
-            best_cost, best = cost, inverse / factor2
+            best_cost = cost
+            best = inverse / factor2
     return Rows(design, misfit, best, _weights(_distance2(misfit, best)), known)
 
 
