@@ -31,7 +31,7 @@ from perchctl.calibration import (
 from perchctl.calibration.mounting.robust import SIGMAS_95
 from perchctl.errors import InvalidValue
 from perchctl.profile import load_profile
-from perchctl.sim.hand import Hand, draw_hand, record_hand
+from tests.helpers.hand import Hand, draw_hand, record_hand
 from tests.helpers.mounting import seen
 
 GOALS = {"turn, deg": (0.15, 0.5), "latency, ms": (3.0, 8.0), "gear's tip, mm": (0.4, 1.2)}

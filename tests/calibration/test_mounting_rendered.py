@@ -16,8 +16,8 @@ from perchctl.calibration import (
     solve_carry,
     solve_pivot,
 )
-from perchctl.sim.hand import Hand, T_target_cam_at, draw_hand, pictures, record_hand
 from perchctl.vision import Frame
+from tests.helpers.hand import Hand, T_target_cam_at, draw_hand, pictures, record_hand
 from tests.helpers.mounting import profile
 
 SEED = 4

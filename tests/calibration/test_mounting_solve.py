@@ -21,7 +21,7 @@ from perchctl.calibration.mounting.carry import CarrySolution
 from perchctl.calibration.mounting.recording import SeenPose, missing_motion
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, make_T, rotation_from_rpy
-from perchctl.sim.hand import Hand
+from tests.helpers.hand import Hand
 from tests.helpers.mounting import hand, seen
 
 ANGLE = st.floats(-np.pi, np.pi)
