@@ -108,7 +108,7 @@ class Renderer:
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
         lens = lens_of(camera)
-        self._coarse, self._pixels, self.shade = lens.coarse, lens.pixels, lens.shade
+        self._coarse, self._pixels, self._shade = lens.coarse, lens.pixels, lens.shade
         self._places, self._focal_px = lens.places, lens.focal_px
         self._ceiling_px = 4 if scenario.camera_noise_sigma >= _COVERING_SIGMA else 2
         self._noise, self._noise_at = self._noise_bank()
@@ -194,30 +194,23 @@ class Renderer:
         count = sample_count(length_px)
         by_row = [plane_map(spread(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
-        picture, box = self._optical(maps, motion_px, length_px)
-        lens = math.sqrt(max(sigma_px**2 - SAMPLING_SIGMA_PX**2, 0.0))
-        if lens > _PLAIN_PX:
-            picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), lens), np.uint8)
-        elif lens > 0.05 and box is not None:
-            defocused(picture, lens, box)
-        width, height = self.camera.size_px
-        seen = picture[:height, :width]
-        return np.asarray(cv2.multiply(seen, self.shade, seen, scale=1.0 / 255.0), np.uint8)
-
-    def _optical(
-        self, maps: Array, motion_px: Array, length_px: float
-    ) -> tuple[Picture, Box | None]:
-        """Return the picture before defocus, at the ray grids' padded size, and the blocks among
-        which there is a sheet, None without one."""
-        middle = maps[len(maps) // 2]
-        if len(maps) % 2 == 0:
-            middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
+        middle = maps[count // 2]
+        if count % 2 == 0:
+            middle = (maps[count // 2 - 1] + middle) / 2.0
         nodes, misses = trace(self._coarse, middle)
         views = [view for s in self._sheets if (view := s.view(nodes, length_px)) is not None]
+        # At the ray grids' padded size.
         picture = self._background(nodes, misses, motion_px, length_px)
         for view in views:
             self._add_sheet(picture, view, maps)
-        return picture, box_around([view.box for view in views])
+        lens = math.sqrt(max(sigma_px**2 - SAMPLING_SIGMA_PX**2, 0.0))
+        if lens > _PLAIN_PX:
+            picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), lens), np.uint8)
+        elif lens > 0.05 and views:
+            defocused(picture, lens, box_around([view.box for view in views]))
+        width, height = self.camera.size_px
+        seen = picture[:height, :width]
+        return np.asarray(cv2.multiply(seen, self._shade, seen, scale=1.0 / 255.0), np.uint8)
 
     def _background(
         self,
@@ -231,20 +224,20 @@ class Renderer:
         mid = nodes[rows // 2, cols // 2]
         px_per_m = local_px_per_m(nodes, rows // 2, cols // 2, COARSE_PX)
         step = self._ceiling_px
-        texture = self._ceiling.texture(px_per_m / step)
+        texture, texels_per_m = self._ceiling.texture(px_per_m / step)
         # Whole tiles, to have the view in the middle of the texture.
         tile = np.clip(np.round(mid / TILE_M), -1e3, 1e3) * TILE_M
-        texels = nodes * np.float32(texture.px_per_m)
-        texels += (_CENTER_TEXEL - tile * texture.px_per_m).astype(np.float32)
+        texels = nodes * np.float32(texels_per_m)
+        texels += (_CENTER_TEXEL - tile * texels_per_m).astype(np.float32)
         crop = COARSE_PX // step
         wider = cv2.resize(texels, None, fx=crop, fy=crop)
-        picture = sample(texture.image, wider[crop:-crop, crop:-crop], cv2.BORDER_WRAP)
+        picture = sample(texture, wider[crop:-crop, crop:-crop], cv2.BORDER_WRAP)
         if misses.any():
             mask = cv2.resize(misses[1:-1, 1:-1].astype(np.uint8), picture.shape[::-1],
                               interpolation=cv2.INTER_NEAREST)  # fmt: skip
             picture[mask > 0] = FLOOR_GREY
-        kernel = line_kernel(motion_px / step) if length_px >= SHARP_MOTION_PX else None
-        if kernel is not None:
+        kernel = line_kernel(motion_px / step)
+        if length_px >= SHARP_MOTION_PX and kernel is not None:
             picture = np.asarray(cv2.filter2D(picture, -1, kernel), np.uint8)
         return np.asarray(cv2.resize(picture, None, fx=step, fy=step), np.uint8)
 

@@ -20,6 +20,7 @@ from tests.helpers.crtp_rig import (
     READY,
     TUMBLED_BIT,
     Pilot,
+    height,
     locked,
     notify,
     off,
@@ -33,8 +34,11 @@ UPDATE_S = 0.04  # 25 Hz
 
 
 def test_values_of_the_states(pilot: Pilot) -> None:
-    """Row "supervisor.info": 0x020E, 0x011E, 0x031E, 0x021E, 0x0244, on port 9 and as a log."""
+    """Row "supervisor.info": 0x020E, 0x011E, 0x031E, 0x021E, 0x0244, on port 9 and as a log; the
+    getters of cflib read the same bits."""
     assert pilot.supervisor_info() == pilot.info == READY
+    states = pilot.cf.supervisor.decode_bitfield(pilot.supervisor_info())
+    assert states == ["Is armed", "Is auto armed", "Can fly", "Finished HL trajectory"]
     pilot.unlock()
     pilot.cf.high_level_commander.takeoff(0.6, 2.0)
     pilot.advance(1.9)
@@ -46,13 +50,6 @@ def test_values_of_the_states(pilot: Pilot) -> None:
     pilot.cf.supervisor.send_emergency_stop()
     pilot.advance(3.0)
     assert pilot.supervisor_info() == pilot.info == LOCKED
-
-
-def test_cflib_names_the_bits(pilot: Pilot) -> None:
-    """Row "supervisor.info": cflib's getters read the same bits."""
-    pilot.supervisor_info()
-    states = pilot.cf.supervisor.decode_bitfield(pilot.supervisor_info())
-    assert states == ["Is armed", "Is auto armed", "Can fly", "Finished HL trajectory"]
 
 
 def test_updates_at_25_hz(pilot: Pilot) -> None:
@@ -92,9 +89,12 @@ def test_disarm_in_flight_cuts_without_locking(pilot: Pilot) -> None:
     pilot.cf.supervisor.send_arming_request(False)
     assert pilot.until(off, 0.2) <= UPDATE_S + 0.002
     pilot.advance(6.0)
-    seen = {int(v) for _, v in pilot.log("supervisor.info", since_s)}
-    assert not any(v & LOCKED_BIT for v in seen)
+    assert not any(int(v) & LOCKED_BIT for _, v in pilot.log("supervisor.info", since_s))
     assert pilot.info == READY
+    assert pilot.motors_off()
+    pilot.cf.high_level_commander.takeoff(0.5, 2.0)
+    pilot.advance(2.5)
+    assert height(pilot) > 0.3
 
 
 @pytest.mark.long
@@ -132,7 +132,7 @@ def test_silence_levels_out_then_cuts_and_locks(pilot: Pilot) -> None:
     assert abs(pilot.sim.truth()["rpy_rad"][1]) > math.radians(2.0)  # still under way
     pilot.advance(1.0)
     assert abs(pilot.sim.truth()["rpy_rad"][1]) < math.radians(2.0)
-    assert pilot.sim.truth()["position_m"][2] > 0.6
+    assert height(pilot) > 0.6
     pilot.until(off, 1.0)
     assert pilot.t_s - silent_s == pytest.approx(2.02, abs=0.06)
     pilot.advance(1.0)
@@ -152,7 +152,7 @@ def test_silence_of_1200_ms_recovers(pilot: Pilot) -> None:
     pilot.advance(1.2)
     pilot.stream(5.0, lambda: pilot.hold(0.8))
     assert pilot.info == LOW_LEVEL
-    assert pilot.sim.truth()["position_m"][2] == pytest.approx(0.8, abs=0.1)
+    assert height(pilot) == pytest.approx(0.8, abs=0.1)
 
 
 @pytest.mark.parametrize("perched", [False, True])
@@ -184,7 +184,7 @@ def test_stop_and_notify_is_ready_again(pilot: Pilot) -> None:
     pilot.cf.high_level_commander.takeoff(0.5, 2.0)
     pilot.advance(4.0)
     assert pilot.info == HL_DONE
-    assert pilot.sim.truth()["position_m"][2] > 0.4
+    assert height(pilot) > 0.4
 
 
 def test_the_farewell_packet_drops_a_flying_vehicle(pilot: Pilot) -> None:
@@ -242,29 +242,28 @@ def test_emergency_stop_watchdog(pilot: Pilot) -> None:
     assert pilot.info == LOCKED
 
 
-def test_hl_without_notify_is_not_flown(pilot: Pilot) -> None:
-    """Row "HL command after low-level without notify": HL active, not flown, locks after 2 s."""
+@pytest.mark.parametrize("notified", [False, True])
+def test_hl_after_low_level_flies_only_with_notify(pilot: Pilot, notified: bool) -> None:
+    """Rows "HL command after low-level without notify: HL active, not flown, locks after 2 s" and
+    "With notify first it flies"."""
     pilot.fly_to(0.8, 1.0, AIRBORNE_S)
     last_s = pilot.t_s
-    pilot.cf.high_level_commander.go_to(0, 0, 1.4, 0, 1.5)
+    if notified:
+        notify(pilot)
+    pilot.cf.high_level_commander.go_to(0, 0, 1.2, 0, 1.5)
     pilot.advance(0.3)
     assert pilot.info == HL_RUNNING
     pilot.advance(1.4)
-    assert pilot.sim.truth()["position_m"][2] < 0.9
+    if notified:
+        pilot.advance(4.0)
+        assert pilot.info == HL_DONE
+        assert height(pilot) == pytest.approx(1.2, abs=0.08)
+        return
+    assert height(pilot) < 0.9
     pilot.until(off, 1.0)
     assert pilot.t_s - last_s == pytest.approx(2.0, abs=0.1)
     pilot.advance(0.2)
     assert pilot.info & LOCKED_BIT
-
-
-def test_hl_after_notify_flies(pilot: Pilot) -> None:
-    """Row "With notify first it flies"."""
-    pilot.fly_to(0.8, 1.0, AIRBORNE_S)
-    notify(pilot)
-    pilot.cf.high_level_commander.go_to(0, 0, 1.2, 0, 2.0)
-    pilot.advance(6.0)
-    assert pilot.info == HL_DONE
-    assert pilot.sim.truth()["position_m"][2] == pytest.approx(1.2, abs=0.08)
 
 
 # --- Contact, tumble, crash -------------------------------------------------------
@@ -303,3 +302,5 @@ def test_upside_down_crashes_and_recovers(pilot: Pilot) -> None:
     assert pilot.info & CRASHED_BIT
     pilot.cf.supervisor.send_crash_recovery_request()
     assert pilot.until(lambda t: t["supervisor_info"] == READY, 1.0) <= 0.2
+    pilot.advance(5.0)
+    assert pilot.motors_off()  # the setpoints of the flight that crashed spin nothing

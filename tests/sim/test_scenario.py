@@ -23,7 +23,7 @@ from perchctl.mission import Event, EventKeeper, EventKind, Phase
 from perchctl.mission.state import Severity
 from perchctl.profile import Profile, load_profile
 from perchctl.record import read_log
-from perchctl.sim import EventExplainer, Scenario, draw_capture, draw_scenario, radio_bursts
+from perchctl.sim import EventExplainer, Scenario, draw_capture, draw_scenario
 from perchctl.sim.scenario import CONNECTED_S, LOSSES, Bursts
 from tests.helpers.flights import SEED, short_profile
 
@@ -52,22 +52,6 @@ def test_the_nominal_scenarios_stay_as_they_are() -> None:
         told = {key: rounded(value) for key, value in drawn.items() if value != plain[key]}
         digest.update(json.dumps(told, sort_keys=True).encode())
     assert digest.hexdigest() == NOMINAL_SHA256
-
-
-@pytest.mark.parametrize("name", ["rough", "extreme"])
-def test_a_harder_world_is_drawn_within_its_ranges(name: str) -> None:
-    profile = load_profile(name)
-    sim = profile.simulation
-    for seed in range(12):
-        drawn = draw_scenario(profile, seed)
-        assert drawn == draw_scenario(profile, seed)
-        assert sim.mass_kg[0] <= drawn.mass_kg <= sim.mass_kg[1]
-        assert math.hypot(*drawn.draught_mps) <= sim.draught_mps[1]
-        tilt_deg = math.degrees(math.hypot(*drawn.target_tilt_rad))
-        assert sim.target_tilt_deg[0] - 1e-9 <= tilt_deg <= sim.target_tilt_deg[1] + 1e-9
-        assert drawn.cell_resistance_ohm is not None
-        assert drawn.cell_charge <= sim.cell_charge[1]
-        assert sim.radio_loss[0] <= drawn.radio_loss <= sim.radio_loss[1]
 
 
 @pytest.mark.parametrize(
@@ -120,8 +104,10 @@ PACKET = Packet(7, 0, b"\x07")
 
 @pytest.mark.parametrize(("share", "mean_s"), [(0.03, 0.1), (0.2, 0.3)])
 def test_share_and_length_of_bursts_are_what_is_asked_for(share: float, mean_s: float) -> None:
-    until_s, bursts = 2000.0, Bursts(3, share, mean_s, 0.0)
-    lost = [bursts.lost(step * STEP_S) for step in range(round(until_s / STEP_S))]
+    until_s, bursts = 2000.0, Bursts(3, share, mean_s)
+    assert not any(bursts.lost(step * STEP_S) for step in range(round(CONNECTED_S / STEP_S)))
+    times_s = [CONNECTED_S + step * STEP_S for step in range(round(until_s / STEP_S))]
+    lost = [bursts.lost(t_s) for t_s in times_s]
     runs = [sum(run) * STEP_S for is_lost, run in itertools.groupby(lost) if is_lost]
     spread = 4.0 / math.sqrt(len(runs))
     assert sum(runs) / until_s == pytest.approx(share, rel=1.5 * spread)
@@ -129,22 +115,14 @@ def test_share_and_length_of_bursts_are_what_is_asked_for(share: float, mean_s: 
     # Not all alike: as many are longer than twice the mean as an exponential has.
     long = sum(length_s > 2.0 * mean_s for length_s in runs) / len(runs)
     assert long == pytest.approx(math.exp(-2.0), rel=0.35)
-    seldom = Bursts(3, share, mean_s, 0.0)
-    assert lost[::40] == [seldom.lost(step * STEP_S) for step in range(0, len(lost), 40)]
-
-
-def test_nothing_is_lost_before_the_take_off_nor_without_a_share() -> None:
-    bursts, none = Bursts(1, 0.5, 0.5), Bursts(1, 0.0, 0.1)
-    assert not any(bursts.lost(step * STEP_S) for step in range(int(CONNECTED_S / STEP_S)))
-    assert not none.lost(1e6)
-    assert none.newest is None
-    assert radio_bursts(Scenario()) is None
+    seldom = Bursts(3, share, mean_s)
+    assert lost[::40] == [seldom.lost(t_s) for t_s in times_s[::40]]
 
 
 def test_both_directions_are_lost_together_and_faults_are_laid_over_the_same_radio() -> None:
     scenario = Scenario(seed=2, radio_loss=0.3, radio_burst_s=0.3)
-    radio, same = Radio(radio_bursts(scenario)), Bursts(2, 0.3, 0.3)
-    faulty = FaultyRadio(Radio(radio_bursts(scenario)))
+    radio, same = Radio(scenario.radio_bursts()), Bursts(2, 0.3, 0.3)
+    faulty = FaultyRadio(Radio(scenario.radio_bursts()))
     for step in range(4000):
         t_s = step * STEP_S
         lost = same.lost(t_s)
@@ -186,37 +164,29 @@ OLD = hold("telemetry is 0.3 s old")
     [
         *((BURST, phase(row), 10.6, "15 frames lost") for row in LOSSES),
         (BURST, hold("no picture for 0.5 s"), 10.6, "15 frames lost"),
+        (BURST, phase("ascend-lost"), 9.9, ""),
+        (BURST, phase("ascend-lost"), 12.0, ""),
+        (BURST, OLD, 10.6, ""),
+        (BURST, phase("slipped"), 10.6, ""),
         (WEAK, phase("slipped"), 5.0, "20 % of the weight"),
         (Scenario(no_target=True), phase("searched-out"), 9.0, "no target"),
         (HIDDEN, phase("position-lost"), 9.5, "for 1.0 s"),
+        (HIDDEN, phase("position-lost"), 11.0, ""),
         (SILENT, OLD, silent_s() + 0.3, "the radio"),
         (SILENT, phase("link-lost"), silent_s() + 0.3, "the radio"),
+        (SILENT, OLD, silent_s() - 0.1, ""),
+        (SILENT, phase("slipped"), silent_s() + 0.3, ""),
     ],
 )
 def test_a_condition_is_named_with_the_event_that_it_led_to(
     scenario: Scenario, event: Event, t_s: float, words: str
 ) -> None:
     explain = EventExplainer(scenario)
-    assert words in explain(event, t_s)
+    text = explain(event, t_s)
+    assert words in text if words else not text
     assert EventExplainer(Scenario())(event, t_s) == ""
     if event.row == "slipped":  # only the first contact is weak
         assert explain(event, t_s) == ""
-
-
-@pytest.mark.parametrize(
-    ("scenario", "event", "t_s"),
-    [
-        (BURST, phase("ascend-lost"), 9.9),
-        (BURST, phase("ascend-lost"), 12.0),
-        (BURST, OLD, 10.6),
-        (BURST, phase("slipped"), 10.6),
-        (HIDDEN, phase("position-lost"), 11.0),
-        (SILENT, OLD, silent_s() - 0.1),
-        (SILENT, phase("slipped"), silent_s() + 0.3),
-    ],
-)
-def test_a_condition_is_not_named_with_others(scenario: Scenario, event: Event, t_s: float) -> None:
-    assert EventExplainer(scenario)(event, t_s) == ""
 
 
 @pytest.mark.long

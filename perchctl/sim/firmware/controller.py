@@ -60,12 +60,9 @@ class Setpoint:
     def raw(cls, roll_deg: float, pitch_deg: float, yaw_rate_dps: float, thrust: float) -> Setpoint:
         """Return that of `commander.send_setpoint`: pitch +10 is nose down, yaw rate clockwise."""
         return cls(
-            MODE_RAW,
-            roll_deg=roll_deg,
-            pitch_deg=-pitch_deg,
-            yaw_rate_dps=-yaw_rate_dps,
+            MODE_RAW, roll_deg=roll_deg, pitch_deg=-pitch_deg, yaw_rate_dps=-yaw_rate_dps,
             thrust=float(thrust),
-        )
+        )  # fmt: skip
 
     @classmethod
     def position(cls, x_m: float, y_m: float, z_m: float, yaw_deg: float) -> Setpoint:
@@ -75,22 +72,16 @@ class Setpoint:
     @classmethod
     def velocity(cls, vx_mps: float, vy_mps: float, vz_mps: float, yaw_rate_dps: float) -> Setpoint:
         """Return that of `send_velocity_world_setpoint`: yaw rate counter-clockwise positive."""
-        return cls(
-            MODE_VELOCITY, vx_mps=vx_mps, vy_mps=vy_mps, vz_mps=vz_mps, yaw_rate_dps=yaw_rate_dps
-        )
+        return cls(MODE_VELOCITY, 0.0, 0.0, 0.0, vx_mps, vy_mps, vz_mps, yaw_rate_dps=yaw_rate_dps)
 
     @classmethod
     def hover(cls, vx_mps: float, vy_mps: float, yaw_rate_dps: float, z_m: float) -> Setpoint:
         """Return that of `send_hover_setpoint`: velocity in body axes, yaw rate, absolute
         height."""
         return cls(
-            MODE_HOVER,
-            z_m=z_m,
-            vx_mps=vx_mps,
-            vy_mps=vy_mps,
-            yaw_rate_dps=yaw_rate_dps,
+            MODE_HOVER, z_m=z_m, vx_mps=vx_mps, vy_mps=vy_mps, yaw_rate_dps=yaw_rate_dps,
             body_velocity=True,
-        )
+        )  # fmt: skip
 
     @classmethod
     def z_distance(
@@ -98,12 +89,9 @@ class Setpoint:
     ) -> Setpoint:
         """Return that of `send_zdistance_setpoint`: attitude, yaw rate, absolute height."""
         return cls(
-            MODE_Z_DISTANCE,
-            z_m=z_m,
-            roll_deg=roll_deg,
-            pitch_deg=pitch_deg,
+            MODE_Z_DISTANCE, z_m=z_m, roll_deg=roll_deg, pitch_deg=pitch_deg,
             yaw_rate_dps=yaw_rate_dps,
-        )
+        )  # fmt: skip
 
     def levelled(self) -> Setpoint:
         """Return what the supervisor flies while setpoints are missing: level, no turn, same z."""
@@ -123,50 +111,36 @@ _THRUST_SCALE = 1000.0
 
 
 class Pid:
-    """One PID loop; the derivative acts on the measurement. Limits of 0 mean none."""
+    """One PID loop; the derivative acts on the measurement. `kp`, `ki`, `kd` are its gains; a
+    `limit` of 0 means none."""
 
-    __slots__ = ("_i_limit", "_integral", "_limit", "_measured", "_period", "kd", "ki", "kp")
+    __slots__ = ("_i_limit", "_integral", "_measured", "_period", "kd", "ki", "kp", "limit")
 
-    def __init__(
-        self, kp: float, ki: float, kd: float, period_s: float, i_limit: float, limit: float = 0.0
-    ) -> None:
-        self.kp, self.ki, self.kd = kp, ki, kd
+    def __init__(self, period_s: float, i_limit: float, limit: float = 0.0) -> None:
+        self.kp = self.ki = self.kd = 0.0
+        self.limit = limit
         self._period = period_s
         self._i_limit = i_limit
-        self._limit = limit
-        self._integral = 0.0
-        self._measured = 0.0
+        self._integral = self._measured = 0.0
 
     def reset(self, measured: float) -> None:
         self._integral = 0.0
         self._measured = measured
-
-    def set_limit(self, limit: float) -> None:
-        self._limit = limit
 
     def update(self, desired: float, measured: float, turning: bool = False) -> float:
         """Return the output after one period; `turning`: on the circle of 360 degrees."""
         error, change = desired - measured, measured - self._measured
         if turning:
             error, change = cap_deg(error), cap_deg(change)
-        integral = self._integral + error * self._period
         bound = self._i_limit
-        if integral > bound:
-            integral = bound
-        elif integral < -bound:
-            integral = -bound
+        integral = max(-bound, min(bound, self._integral + error * self._period))
         self._integral = integral
         self._measured = measured
         output = self.kp * error + self.ki * integral
         if self.kd != 0.0:
             output -= self.kd * change / self._period
-        limit = self._limit
-        if limit > 0.0:
-            if output > limit:
-                return limit
-            if output < -limit:
-                return -limit
-        return output
+        limit = self.limit
+        return max(-limit, min(limit, output)) if limit > 0.0 else output
 
 
 def cap_deg(angle: float) -> float:
@@ -179,8 +153,6 @@ def cap_deg(angle: float) -> float:
 
 
 def _saturated(value: float) -> float:
-    if -INT16_MAX <= value <= INT16_MAX:
-        return value
     return max(-INT16_MAX, min(INT16_MAX, value))
 
 
@@ -203,44 +175,37 @@ class Estimate:
 
 
 class Controller:
-    """Setpoint and estimate in, four thrust requests out, in units of the thrust command."""
+    """Setpoint and estimate in, four thrust requests out, in units of the thrust command.
+
+    Gains and limits are 0 until the firmware's parameters are put in at boot.
+    """
 
     def __init__(self) -> None:
         dt, pt = ATTITUDE_DT_S, POSITION_DT_S
-        self.roll_rate = Pid(250.0, 500.0, 2.5, dt, 33.3)
-        self.pitch_rate = Pid(250.0, 500.0, 2.5, dt, 33.3)
-        self.yaw_rate = Pid(120.0, 16.7, 0.0, dt, 166.7)
-        self.roll = Pid(6.0, 3.0, 0.0, dt, 20.0)
-        self.pitch = Pid(6.0, 3.0, 0.0, dt, 20.0)
-        self.yaw = Pid(6.0, 1.0, 0.35, dt, 360.0)
-        self.x = Pid(2.0, 0.0, 0.0, pt, 5000.0)
-        self.y = Pid(2.0, 0.0, 0.0, pt, 5000.0)
-        self.z = Pid(2.0, 0.5, 0.0, pt, 5000.0)
-        self.vx = Pid(25.0, 1.0, 0.0, pt, 5000.0)
-        self.vy = Pid(25.0, 1.0, 0.0, pt, 5000.0)
-        self.vz = Pid(25.0, 15.0, 0.0, pt, 5000.0, UINT16_MAX / 2.0 / _THRUST_SCALE)
-        self.thrust_base = 36000.0
-        self.thrust_min = 20000.0
-        self.roll_max_deg = 20.0
-        self.pitch_max_deg = 20.0
-        self.x_speed_max_mps = 1.0
-        self.y_speed_max_mps = 1.0
-        self.z_speed_max_mps = 1.0
-        self.limits_changed()
+        self.roll_rate, self.pitch_rate, self.yaw_rate = (
+            Pid(dt, 33.3),
+            Pid(dt, 33.3),
+            Pid(dt, 166.7),
+        )
+        self.roll, self.pitch, self.yaw = Pid(dt, 20.0), Pid(dt, 20.0), Pid(dt, 360.0)
+        self.x, self.y, self.z = Pid(pt, 5000.0), Pid(pt, 5000.0), Pid(pt, 5000.0)
+        self.vx, self.vy = Pid(pt, 5000.0), Pid(pt, 5000.0)
+        self.vz = Pid(pt, 5000.0, UINT16_MAX / 2.0 / _THRUST_SCALE)
+        self.thrust_base = self.thrust_min = 0.0
+        self.roll_max_deg = self.pitch_max_deg = 0.0
+        self.x_speed_max_mps = self.y_speed_max_mps = self.z_speed_max_mps = 0.0
         self._mode: Mode = MODE_OFF
         self._position_in = 1
         self.thrust = 0.0
-        self.desired_roll_deg = 0.0
-        self.desired_pitch_deg = 0.0
-        self.desired_yaw_deg = 0.0
+        self.desired_roll_deg = self.desired_pitch_deg = self.desired_yaw_deg = 0.0
 
     def limits_changed(self) -> None:
         """Hand the limits to the loops that keep them."""
-        self.x.set_limit(self.x_speed_max_mps * _OVERHEAD)
-        self.y.set_limit(self.y_speed_max_mps * _OVERHEAD)
-        self.z.set_limit(max(self.z_speed_max_mps, 0.5) * _OVERHEAD)
-        self.vx.set_limit(self.pitch_max_deg * _OVERHEAD)
-        self.vy.set_limit(self.roll_max_deg * _OVERHEAD)
+        self.x.limit = self.x_speed_max_mps * _OVERHEAD
+        self.y.limit = self.y_speed_max_mps * _OVERHEAD
+        self.z.limit = max(self.z_speed_max_mps, 0.5) * _OVERHEAD
+        self.vx.limit = self.pitch_max_deg * _OVERHEAD
+        self.vy.limit = self.roll_max_deg * _OVERHEAD
 
     def update(self, setpoint: Setpoint, now: Estimate) -> Motors:
         mode = setpoint.mode
@@ -248,9 +213,8 @@ class Controller:
             self._mode = mode
             self._reset(now)
         if mode[5] == VELOCITY:
-            self.desired_yaw_deg = cap_deg(
-                self.desired_yaw_deg + setpoint.yaw_rate_dps * ATTITUDE_DT_S
-            )
+            turned_deg = setpoint.yaw_rate_dps * ATTITUDE_DT_S
+            self.desired_yaw_deg = cap_deg(self.desired_yaw_deg + turned_deg)
         elif mode[5] == ABSOLUTE:
             self.desired_yaw_deg = cap_deg(setpoint.yaw_deg)
         self._position_in -= 1
@@ -266,22 +230,15 @@ class Controller:
             self._reset(now)
             self.desired_yaw_deg = now.yaw_deg
             return MOTORS_OFF
-        roll = _saturated(
-            self.roll_rate.update(
-                self.roll.update(self.desired_roll_deg, now.roll_deg), now.gyro_x_dps
-            )
-        )
-        pitch = _saturated(
-            self.pitch_rate.update(
-                self.pitch.update(self.desired_pitch_deg, now.pitch_deg), -now.gyro_y_dps
-            )
-        )
-        yaw = -_saturated(
-            self.yaw_rate.update(
-                self.yaw.update(self.desired_yaw_deg, now.yaw_deg, True), now.gyro_z_dps
-            )
-        )
-        return _distribute(self.thrust, 0.5 * roll, 0.5 * pitch, yaw)
+        roll_dps = self.roll.update(self.desired_roll_deg, now.roll_deg)
+        pitch_dps = self.pitch.update(self.desired_pitch_deg, now.pitch_deg)
+        yaw_dps = self.yaw.update(self.desired_yaw_deg, now.yaw_deg, True)
+        r = 0.5 * _saturated(self.roll_rate.update(roll_dps, now.gyro_x_dps))
+        p = 0.5 * _saturated(self.pitch_rate.update(pitch_dps, -now.gyro_y_dps))
+        y = -_saturated(self.yaw_rate.update(yaw_dps, now.gyro_z_dps))
+        # Neither bounded above nor below (see `MotorDriver`).
+        f = self.thrust
+        return (f - r + p + y, f - r - p - y, f + r - p + y, f + r + p - y)
 
     def _position(self, setpoint: Setpoint, now: Estimate) -> None:
         mode = setpoint.mode
@@ -305,24 +262,16 @@ class Controller:
         self.thrust = min(UINT16_MAX, max(self.thrust_min, thrust))
 
     def _reset(self, now: Estimate) -> None:
-        for pid, measured in (
-            (self.x, now.x_m),
-            (self.y, now.y_m),
-            (self.z, now.z_m),
-            (self.roll, now.roll_deg),
-            (self.pitch, now.pitch_deg),
-            (self.yaw, now.yaw_deg),
-        ):
-            pid.reset(measured)
+        self.x.reset(now.x_m)
+        self.y.reset(now.y_m)
+        self.z.reset(now.z_m)
+        self.roll.reset(now.roll_deg)
+        self.pitch.reset(now.pitch_deg)
+        self.yaw.reset(now.yaw_deg)
         for pid in (self.vx, self.vy, self.vz, self.roll_rate, self.pitch_rate, self.yaw_rate):
             pid.reset(0.0)
         self.desired_roll_deg = now.roll_deg
         self.desired_pitch_deg = now.pitch_deg
-
-
-def _distribute(thrust: float, r: float, p: float, y: float) -> Motors:
-    """Return thrust requests of M1..M4; neither bounded above nor below (see `MotorDriver`)."""
-    return (thrust - r + p + y, thrust - r - p - y, thrust + r - p + y, thrust + r + p - y)
 
 
 # --- Power distribution: four thrust requests in, four duty cycles (PWM) out -------------------
