@@ -1,7 +1,7 @@
 """The cascaded PID controller: position and velocity at 100 Hz, attitude and rate at 500 Hz.
 
-Gains and limits are the firmware's defaults for the Crazyflie 2.x; they can be changed
-through the parameters of the same names. Angles in degrees, pitch nose up, as inside
+Gains and limits are the firmware's defaults for the Crazyflie 2.x, whatever is written into the
+parameters of the same names. Angles in degrees, pitch nose up, as inside
 the firmware. Every change of setpoint mode resets all integrators (docs/firmware.md,
 "Setpoint modes"), so the thrust starts again from `thrustBase`. The loops request
 thrust; `MotorDriver` turns these requests into duty cycles.
@@ -104,6 +104,8 @@ class Setpoint:
 ATTITUDE_DT_S = 0.002
 POSITION_DT_S = 0.01
 POSITION_EVERY = 5
+TILT_MAX_DEG, SPEED_MAX_MPS = 20.0, 1.0  # posCtlPid.rLimit, pLimit, xVelMax, yVelMax, zVelMax
+THRUST_BASE, THRUST_LEAST = 36000.0, 20000.0  # posCtlPid.thrustBase, thrustMin
 INT16_MAX = 32767.0
 UINT16_MAX = 65535.0
 _OVERHEAD = 1.1  # a loop may request a little more than its successor's limit
@@ -111,13 +113,12 @@ _THRUST_SCALE = 1000.0
 
 
 class Pid:
-    """One PID loop; the derivative acts on the measurement. `kp`, `ki`, `kd` are its gains; a
-    `limit` of 0 means none."""
+    """One PID loop; the derivative acts on the measurement. A `limit` of 0 means none."""
 
-    __slots__ = ("_i_limit", "_integral", "_measured", "_period", "kd", "ki", "kp", "limit")
-
-    def __init__(self, period_s: float, i_limit: float, limit: float = 0.0) -> None:
-        self.kp = self.ki = self.kd = 0.0
+    def __init__(
+        self, kp: float, ki: float, kd: float, period_s: float, i_limit: float, limit: float = 0.0
+    ) -> None:
+        self.kp, self.ki, self.kd = kp, ki, kd
         self.limit = limit
         self._period = period_s
         self._i_limit = i_limit
@@ -175,37 +176,26 @@ class Estimate:
 
 
 class Controller:
-    """Setpoint and estimate in, four thrust requests out, in units of the thrust command.
-
-    Gains and limits are 0 until the firmware's parameters are put in at boot.
-    """
+    """Setpoint and estimate in, four thrust requests out, in units of the thrust command."""
 
     def __init__(self) -> None:
-        dt, pt = ATTITUDE_DT_S, POSITION_DT_S
-        self.roll_rate, self.pitch_rate, self.yaw_rate = (
-            Pid(dt, 33.3),
-            Pid(dt, 33.3),
-            Pid(dt, 166.7),
-        )
-        self.roll, self.pitch, self.yaw = Pid(dt, 20.0), Pid(dt, 20.0), Pid(dt, 360.0)
-        self.x, self.y, self.z = Pid(pt, 5000.0), Pid(pt, 5000.0), Pid(pt, 5000.0)
-        self.vx, self.vy = Pid(pt, 5000.0), Pid(pt, 5000.0)
-        self.vz = Pid(pt, 5000.0, UINT16_MAX / 2.0 / _THRUST_SCALE)
-        self.thrust_base = self.thrust_min = 0.0
-        self.roll_max_deg = self.pitch_max_deg = 0.0
-        self.x_speed_max_mps = self.y_speed_max_mps = self.z_speed_max_mps = 0.0
+        dt, pt, tilt = ATTITUDE_DT_S, POSITION_DT_S, TILT_MAX_DEG * _OVERHEAD
+        self.roll_rate = Pid(250.0, 500.0, 2.5, dt, 33.3)
+        self.pitch_rate = Pid(250.0, 500.0, 2.5, dt, 33.3)
+        self.yaw_rate = Pid(120.0, 16.7, 0.0, dt, 166.7)
+        self.roll = Pid(6.0, 3.0, 0.0, dt, 20.0)
+        self.pitch = Pid(6.0, 3.0, 0.0, dt, 20.0)
+        self.yaw = Pid(6.0, 1.0, 0.35, dt, 360.0)
+        self.x = Pid(2.0, 0.0, 0.0, pt, 5000.0, SPEED_MAX_MPS * _OVERHEAD)
+        self.y = Pid(2.0, 0.0, 0.0, pt, 5000.0, SPEED_MAX_MPS * _OVERHEAD)
+        self.z = Pid(2.0, 0.5, 0.0, pt, 5000.0, SPEED_MAX_MPS * _OVERHEAD)
+        self.vx = Pid(25.0, 1.0, 0.0, pt, 5000.0, tilt)
+        self.vy = Pid(25.0, 1.0, 0.0, pt, 5000.0, tilt)
+        self.vz = Pid(25.0, 15.0, 0.0, pt, 5000.0, UINT16_MAX / 2.0 / _THRUST_SCALE)
         self._mode: Mode = MODE_OFF
         self._position_in = 1
         self.thrust = 0.0
         self.desired_roll_deg = self.desired_pitch_deg = self.desired_yaw_deg = 0.0
-
-    def limits_changed(self) -> None:
-        """Hand the limits to the loops that keep them."""
-        self.x.limit = self.x_speed_max_mps * _OVERHEAD
-        self.y.limit = self.y_speed_max_mps * _OVERHEAD
-        self.z.limit = max(self.z_speed_max_mps, 0.5) * _OVERHEAD
-        self.vx.limit = self.pitch_max_deg * _OVERHEAD
-        self.vy.limit = self.roll_max_deg * _OVERHEAD
 
     def update(self, setpoint: Setpoint, now: Estimate) -> Motors:
         mode = setpoint.mode
@@ -256,10 +246,10 @@ class Controller:
             want_z = self.z.update(setpoint.z_m, now.z_m)
         pitch = -self.vx.update(want_x, now.vx_mps * c + now.vy_mps * s)
         roll = -self.vy.update(want_y, now.vy_mps * c - now.vx_mps * s)
-        self.desired_pitch_deg = max(-self.pitch_max_deg, min(self.pitch_max_deg, pitch))
-        self.desired_roll_deg = max(-self.roll_max_deg, min(self.roll_max_deg, roll))
-        thrust = self.vz.update(want_z, now.vz_mps) * _THRUST_SCALE + self.thrust_base
-        self.thrust = min(UINT16_MAX, max(self.thrust_min, thrust))
+        self.desired_pitch_deg = max(-TILT_MAX_DEG, min(TILT_MAX_DEG, pitch))
+        self.desired_roll_deg = max(-TILT_MAX_DEG, min(TILT_MAX_DEG, roll))
+        thrust = self.vz.update(want_z, now.vz_mps) * _THRUST_SCALE + THRUST_BASE
+        self.thrust = min(UINT16_MAX, max(THRUST_LEAST, thrust))
 
     def _reset(self, now: Estimate) -> None:
         self.x.reset(now.x_m)

@@ -24,7 +24,6 @@ from perchctl.sim.firmware.variables import (
     LOG_VARIABLES,
     PARAMETERS,
     Parameter,
-    apply_parameter,
 )
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
@@ -239,8 +238,6 @@ class Firmware:
             self.estimator.set_outside(name, value)
         elif name == "stabilizer.stop":
             self.supervisor.emergency = self.supervisor.emergency or value != 0.0
-        else:
-            apply_parameter(self.controller, name, value)
 
     def _consult_planner(self, t_s: float) -> None:
         planner = self.planner
