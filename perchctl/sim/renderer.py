@@ -111,7 +111,9 @@ class Renderer:
         self._coarse, self._pixels, self._shade = lens.coarse, lens.pixels, lens.shade
         self._places, self._focal_px = lens.places, lens.focal_px
         self._ceiling_px = 4 if scenario.camera_noise_sigma >= _COVERING_SIGMA else 2
-        self._noise, self._noise_at = self._noise_bank()
+        self._noise: NDArray[np.int16] | None = None
+        if scenario.camera_noise_sigma > 0.0:
+            self._noise, self._noise_at = self._noise_bank(scenario.camera_noise_sigma)
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
@@ -148,21 +150,22 @@ class Renderer:
         """Return the frame of one shot, or of two fields in their order of time; which rows are
         the first one's, and whether they are blended, is the scenario's. Otherwise as
         `render`."""
-        scene = self.scenario
-        top_first = scene.camera_fields != "bottom"
-        picture = woven([self._exposed(shot, defocus_px) for shot in shots], top_first)
-        if len(shots) > 1 and scene.camera_blended:
-            picture = blended(picture)
+        exposed = [self._exposed(shot, defocus_px) for shot in shots]
+        picture = exposed[0].copy()
+        if len(shots) > 1:
+            later = 0 if self.scenario.camera_fields == "bottom" else 1  # the second field's rows
+            picture[later::2] = exposed[1][later::2]
+            if self.scenario.camera_blended:
+                picture = blended(picture)
         if self._noise is not None:
             width, height = self.camera.size_px
             r, c = self._noise_at[frame_index % len(self._noise_at)]
-            more, less = (bank[r : r + height, c : c + width] for bank in self._noise)
-            picture = np.asarray(cv2.add(picture, more), np.uint8)
-            cv2.subtract(picture, less, picture)
+            noise = self._noise[r : r + height, c : c + width]
+            picture = np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), np.uint8)
         if self._analogue > 0.0:
             rng = np.random.default_rng([self.seed, FRAME_STREAM, frame_index])
             picture = spoil(picture, self._analogue, rng)
-        return picture.copy()
+        return picture
 
     def _exposed(self, shot: Shot, defocus_px: float | None) -> Picture:
         """Return what falls onto the sensor in one shot, before noise. Not to be written into."""
@@ -265,21 +268,15 @@ class Renderer:
         path = cam[:, :2] * (self._focal_px / np.maximum(cam[:, 2:], 1e-3))
         return np.asarray(path.transpose(2, 0, 1))
 
-    def _noise_bank(self) -> tuple[tuple[Picture, Picture] | None, list[tuple[int, int]]]:
-        """Return what is added to a picture, and what is taken off, one of them being 0 at each
-        place: such sums of bytes cost a third of one with signed numbers. And from which row and
-        column on for each frame."""
-        sigma = self.scenario.camera_noise_sigma
-        if sigma <= 0.0:
-            return None, []
+    def _noise_bank(self, sigma: float) -> tuple[NDArray[np.int16], list[tuple[int, int]]]:
+        """Return what is added to pictures, and from which row and column on for each frame."""
         width, height = self.camera.size_px
         size = (height + _NOISE_ROOM_PX, width + _NOISE_ROOM_PX)
         rng = np.random.default_rng([self.seed, NOISE_STREAM])
         bank = np.rint(rng.standard_normal(size, np.float32) * np.float32(sigma))
         across = _NOISE_ROOM_PX + 1
         places = np.stack(np.divmod(rng.permutation(across**2), across), axis=1).tolist()
-        more, less = (np.clip(grey, 0.0, 255.0).astype(np.uint8) for grey in (bank, -bank))
-        return (more, less), places
+        return np.clip(bank, -255.0, 255.0).astype(np.int16), places
 
 
 # --- Sums, look-ups and shading of whole pictures ------------------------------------------------
@@ -287,8 +284,6 @@ class Renderer:
 
 def mean_of(pictures: Sequence[Picture]) -> Picture:
     """Return the mean of the pictures, rounded once."""
-    if len(pictures) == 1:
-        return pictures[0]
     total: Any = pictures[0].astype(np.uint16)
     for picture in pictures[1:]:
         total = cv2.add(total, picture, dtype=cv2.CV_16U)
@@ -315,16 +310,6 @@ def lit(picture: Picture, light: NDArray[np.float64]) -> Picture:
     """Return the picture with each row's brightness multiplied by `light` (height,)."""
     factor = np.broadcast_to(light.astype(np.float32)[:, None], picture.shape)
     return np.asarray(cv2.multiply(picture, np.ascontiguousarray(factor), dtype=cv2.CV_8U))
-
-
-def woven(pictures: Sequence[Picture], top_first: bool) -> Picture:
-    """Return the frame of two fields in their order of time; a single picture is the frame."""
-    if len(pictures) == 1:
-        return pictures[0]
-    top, bottom = pictures if top_first else (pictures[1], pictures[0])
-    frame = top.copy()
-    frame[1::2] = bottom[1::2]
-    return frame
 
 
 def blended(frame: Picture) -> Picture:
