@@ -357,7 +357,6 @@ class EventExplainer:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        self._slips = 0
         self._bursts = scenario.radio_bursts()
 
     def __call__(self, event: Event, t_s: float) -> str:
@@ -369,14 +368,6 @@ class EventExplainer:
             start_s, frames = scenario.camera_burst or (math.inf, 0)
             if _is_felt(t_s, start_s, frames / scenario.camera_rate_hz):
                 return f"{frames} frames lost"
-        elif event.row == "slipped":
-            self._slips += 1
-            force_n = scenario.first_contact_force_n
-            if force_n is not None and self._slips == 1:
-                part = force_n / (scenario.mass_kg * GRAVITY_MPS2)
-                return f"the first contact holds {100 * part:.0f} % of the weight"
-        elif event.row == "searched-out" and scenario.no_target:
-            return "there is no target"
         elif event.row in UNHEARD or event.reason.startswith("telemetry is"):
             if self._bursts is not None:
                 self._bursts.lost(t_s)
