@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import time
@@ -19,11 +18,10 @@ import pytest
 
 from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, InvalidValue
-from perchctl.link import Packet, Port
 from perchctl.places import data_file
 from perchctl.sim import CONTROL_PERIOD_S, Scenario, SimProcess
 from perchctl.sim.host import MAX_LAG_S, Runner
-from tests.helpers.crtp_rig import ROOT, Client, pictures_of, wired
+from tests.helpers.crtp_rig import ROOT, Client, pictures_of
 from tests.helpers.waiting import until
 
 
@@ -56,30 +54,6 @@ def test_stepped_time_passes_only_by_advance(stepped: SimProcess) -> None:
     assert stepped.truth()["t_s"] == pytest.approx(start_s + 0.5)
     with pytest.raises(AttributeError):
         stepped.no_such_request()
-
-
-def test_the_same_scenario_gives_the_same_flight(stepped: SimProcess) -> None:
-    """In a process of its own, and as a new vehicle in one that has flown others."""
-    scenario = Scenario(seed=11)
-
-    def flight(sim: SimProcess) -> dict[str, object]:
-        sim.advance(1.0)
-        with wired(sim.uri) as mine:
-            data = struct.pack("<BBff?f", 7, 0, 0.5, 0.0, True, 2.0)  # takeoff_2
-            mine.send(Packet(Port.HIGH_LEVEL, 0, data).encode())
-            sim.advance(4.0)
-        truth = sim.truth()
-        assert truth["position_m"][2] > 0.3
-        return truth
-
-    start_s = stepped.truth()["t_s"]
-    stepped.replace_vehicle(scenario)
-    replaced = flight(stepped)
-    assert replaced.pop("t_s") == pytest.approx(start_s + 5.0)
-    with SimProcess.start(scenario, "stepped") as sim:
-        new = flight(sim)
-    assert new.pop("t_s") == pytest.approx(5.0)
-    assert new == replaced
 
 
 class _Steps:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 
@@ -155,19 +156,33 @@ def test_silence_of_1200_ms_recovers(pilot: Pilot) -> None:
     assert height(pilot) == pytest.approx(0.8, abs=0.1)
 
 
+def send_stop(pilot: Pilot) -> None:
+    pilot.cf.commander.send_stop_setpoint()
+
+
+def send_farewell(pilot: Pilot) -> None:
+    raw(pilot, 0)
+
+
 @pytest.mark.parametrize("perched", [False, True])
-def test_stop_alone_cuts_at_once_and_locks(pilot: Pilot, perched: bool) -> None:
-    """Row "send_stop_setpoint once and then silence": off within 7 ms, locked at +2.0 s."""
+@pytest.mark.parametrize("send", [send_stop, send_farewell])
+def test_a_lone_last_packet_cuts_at_once_and_locks(
+    pilot: Pilot, perched: bool, send: Callable[[Pilot], None]
+) -> None:
+    """Rows "send_stop_setpoint once and then silence: off within 7 ms, locked at +2.0 s",
+    "close_link() sends send_setpoint(0,0,0,0): falls at once and locks", and "a zero packet in
+    flight is itself a cut"."""
     if perched:
         pilot.perch()
     else:
         pilot.fly_to(0.8, 0.5, AIRBORNE_S)
-    pilot.cf.commander.send_stop_setpoint()
+    send(pilot)
     start_s = pilot.t_s
     assert pilot.until(off, 0.1) <= 0.007
     pilot.until(locked, 3.0)
     assert pilot.t_s - start_s == pytest.approx(2.06, abs=0.07)
     assert pilot.sim.truth()["magnet_engaged"] == perched
+    assert pilot.sim.truth()["floor_contact"] != perched
 
 
 def test_stop_and_notify_is_ready_again(pilot: Pilot) -> None:
@@ -185,17 +200,6 @@ def test_stop_and_notify_is_ready_again(pilot: Pilot) -> None:
     pilot.advance(4.0)
     assert pilot.info == HL_DONE
     assert height(pilot) > 0.4
-
-
-def test_the_farewell_packet_drops_a_flying_vehicle(pilot: Pilot) -> None:
-    """Rows "close_link() sends send_setpoint(0,0,0,0)": falls at once and locks; "a zero packet in
-    flight is itself a cut"."""
-    pilot.fly_to(0.8, 0.5, AIRBORNE_S)
-    raw(pilot, 0)
-    assert pilot.until(off, 0.1) <= 0.007
-    pilot.advance(3.0)
-    assert pilot.sim.truth()["floor_contact"]
-    assert pilot.info & LOCKED_BIT
 
 
 @pytest.mark.parametrize(("wait_s", "locks"), [(1.0, True), (4.0, False)])
@@ -222,17 +226,15 @@ def test_hl_hover_never_times_out(pilot: Pilot) -> None:
     assert truth["position_m"][2] == pytest.approx(0.8, abs=0.05)
 
 
-def test_emergency_stop(pilot: Pilot) -> None:
-    """Row "Emergency stop: motors off in 25 ms, locked" (within one update)."""
+def test_emergency_stop_and_its_watchdog(pilot: Pilot) -> None:
+    """Rows "Emergency stop: motors off in 25 ms, locked" (within one update) and "Emergency-stop
+    watchdog: starts with its first packet; a gap over 1 s locks"."""
     pilot.take_off(0.6, settle_s=1.0)
     pilot.cf.supervisor.send_emergency_stop()
     assert pilot.until(off, 0.1) <= UPDATE_S + 0.002
     pilot.advance(3.0)
     assert pilot.info == LOCKED
-
-
-def test_emergency_stop_watchdog(pilot: Pilot) -> None:
-    """Row "Emergency-stop watchdog": starts with its first packet; a gap over 1 s locks."""
+    pilot.fresh()
     pilot.take_off(0.6, settle_s=1.0)
     pilot.stream(3.0, pilot.cf.supervisor.send_emergency_stop_watchdog, 0.9)
     assert pilot.info == HL_DONE

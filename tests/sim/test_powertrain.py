@@ -12,7 +12,6 @@ from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.firmware.controller import MOTORS_OFF, THRUST_MIN, MotorDriver
 from perchctl.sim.firmware.firmware import _LEVELS_V
 from perchctl.sim.powertrain import (
-    FULL_COMMAND,
     MOTOR_FORCE_N,
     STANDSTILL_V,
     Cell,
@@ -42,27 +41,6 @@ def test_the_dead_band() -> None:
     assert thrust_n(motor_v(MOTOR_FORCE_N)) == pytest.approx(MOTOR_FORCE_N)
     assert settled(4.1).pwm((6999.0,) * 4, 4.1) is MOTORS_OFF
     assert pytest.approx(7000, abs=1) == THRUST_MIN
-
-
-def test_a_sagging_battery_is_met_late() -> None:
-    driver = settled(4.0)
-    at_once = driver.pwm((40000.0,) * 4, 3.6)[0]
-    for _ in range(49):
-        later = driver.pwm((40000.0,) * 4, 3.6)[0]
-    for _ in range(500):
-        settled_pwm = driver.pwm((40000.0,) * 4, 3.6)[0]
-    assert settled_pwm / at_once == pytest.approx(4.0 / 3.6, rel=0.005)
-    assert (settled_pwm - later) / (settled_pwm - at_once) == pytest.approx(0.37, abs=0.03)
-
-
-def test_the_cap_takes_the_excess_off_all_four_duty_cycles() -> None:
-    driver = settled(3.2)
-    pwm = driver.pwm((30000.0, 90000.0, 30000.0, 90000.0), 3.2)
-    requested = driver.requested
-    assert requested[1] > FULL_COMMAND
-    assert pwm[1] == FULL_COMMAND
-    assert requested[0] - pwm[0] == pytest.approx(requested[1] - pwm[1])
-    assert driver.pwm((7001.0, 150000.0, 7001.0, 150000.0), 3.2)[0] == 0.0
 
 
 def after(cell: Cell, seconds: float, current_a: float = HOVER_A) -> float:

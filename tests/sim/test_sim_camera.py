@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from perchctl.geometry import Array, make_T, rot_z
 from perchctl.profile import TargetConfig
 from perchctl.sim import CONTROL_PERIOD_S, Renderer, Scenario, SimulatedVehicle
-from perchctl.sim.camera import DeliveredFrame, Shutter, SimCamera
+from perchctl.sim.camera import DeliveredFrame, SimCamera
 from perchctl.sim.optics import Picture
 from perchctl.sim.renderer import Shot
 from perchctl.vision import CameraModel
@@ -202,14 +202,3 @@ def test_lamps_make_bands_of_a_rolling_shutter() -> None:
     depth = 2.0 * abs((measured * swing).mean())
     assert depth == pytest.approx(0.2, abs=0.02)
     assert measured.mean() == pytest.approx(1.0, abs=0.02)
-
-
-def test_a_hunting_exposure_changes_whole_pictures_slowly() -> None:
-    shutter = Shutter(replace(STILL, camera_pumping=0.3))
-    times = np.arange(0.0, 5.0, 0.04)
-    light = [shutter.shots(float(t), lambda t: np.eye(4), 480)[0].light for t in times]
-    assert all(rows is not None and np.ptp(rows) < 1e-9 for rows in light)
-    level = np.array([rows[0] for rows in light if rows is not None])
-    assert 1.25 < level.max() <= 1.3
-    assert 0.7 <= level.min() < 0.75
-    assert np.abs(np.diff(level)).max() < 0.2
