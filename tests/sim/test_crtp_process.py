@@ -19,8 +19,7 @@ import pytest
 from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.places import data_file
-from perchctl.sim import CONTROL_PERIOD_S, Scenario, SimProcess
-from perchctl.sim.host import MAX_LAG_S, Runner
+from perchctl.sim import Scenario, SimProcess
 from tests.helpers.crtp_rig import ROOT, Client, pictures_of
 from tests.helpers.waiting import until
 
@@ -54,39 +53,6 @@ def test_stepped_time_passes_only_by_advance(stepped: SimProcess) -> None:
     assert stepped.truth()["t_s"] == pytest.approx(start_s + 0.5)
     with pytest.raises(AttributeError):
         stepped.no_such_request()
-
-
-class _Steps:
-    """Counts steps; stands in for a vehicle where only the pace matters."""
-
-    elapsed_s = 0.0
-
-    def __getattr__(self, _: str) -> object:
-        return self
-
-    def step(self) -> None:
-        self.elapsed_s += CONTROL_PERIOD_S
-
-
-def test_real_time_catches_up_and_cuts_long_hiccups() -> None:
-    now_s = [100.0]
-    host = _Steps()
-    runner = Runner(host, None, realtime=True, linger_s=0.0, clock=lambda: now_s[0])  # type: ignore[arg-type]
-
-    def settle() -> float:
-        while (wait_s := runner.catch_up()) == 0.0:
-            assert host.elapsed_s <= now_s[0] - 100.0 + 1e-9
-        return wait_s
-
-    now_s[0] += 0.0101
-    assert settle() == pytest.approx(0.0019)
-    assert host.elapsed_s == pytest.approx(0.010)
-    now_s[0] += 0.7  # a hiccup
-    settle()
-    assert host.elapsed_s == pytest.approx(0.710)
-    now_s[0] += 3600.0  # a suspended computer
-    settle()
-    assert host.elapsed_s == pytest.approx(0.710 + MAX_LAG_S, abs=0.003)
 
 
 def test_a_child_that_ends_or_does_not_come_up_is_a_clear_error(

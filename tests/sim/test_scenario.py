@@ -15,13 +15,12 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.display.panel import event_text
-from perchctl.faults.edges import FaultyRadio
 from perchctl.flight import fly_lockstep
 from perchctl.link import Packet, Radio
 from perchctl.link.mock import TELEMETRY_DELAY_S
 from perchctl.mission import Event, EventKeeper, EventKind, Phase
 from perchctl.mission.state import Severity
-from perchctl.profile import Profile, load_profile
+from perchctl.profile import PositioningConfig, Profile, load_profile
 from perchctl.record import read_log
 from perchctl.sim import EventExplainer, Scenario, draw_capture, draw_scenario
 from perchctl.sim.scenario import CONNECTED_S, LOSSES, Bursts
@@ -81,18 +80,14 @@ def test_one_range_moves_no_other_value_of_a_seed(
 
 def test_a_motion_capture_has_the_scenarios_holes() -> None:
     profile = changed("extreme", capture_hole_every_s=5.0)
-    values = profile.model_dump(mode="json")
-    values["positioning"] |= {"by": "mocap", "system": "optitrack", "host": "127.0.0.1"}
-    by_mocap = Profile.model_validate(values)
+    assert draw_capture(profile, 4) is None
+    by_mocap = profile.model_copy(update={"positioning": PositioningConfig(by="mocap", host="lab")})
     settings, holes = draw_capture(by_mocap, 4), draw_scenario(by_mocap, 4).capture_holes_s
     assert settings is not None
-    assert holes
-    assert [(a, b - a) for a, b, _ in settings.faults] == [
-        (begin_s, pytest.approx(length_s)) for begin_s, length_s in holes
-    ]
-    assert all(fault.occluded for *_, fault in settings.faults)
+    assert [fault.occluded for *_, fault in settings.faults] == [True] * len(holes)
+    for (from_s, to_s, _), (begin_s, length_s) in zip(settings.faults, holes, strict=True):
+        assert (from_s, to_s - from_s) == (begin_s, pytest.approx(length_s))
     assert all(b[0] > a[0] + a[1] for a, b in itertools.pairwise(holes))
-    assert draw_capture(profile, 4) is None
 
 
 # --- A radio that fails by bursts -----------------------------------------------------------------
@@ -119,18 +114,14 @@ def test_share_and_length_of_bursts_are_what_is_asked_for(share: float, mean_s: 
     assert lost[::40] == [seldom.lost(t_s) for t_s in times_s[::40]]
 
 
-def test_both_directions_are_lost_together_and_faults_are_laid_over_the_same_radio() -> None:
+def test_both_directions_are_lost_together() -> None:
     scenario = Scenario(seed=2, radio_loss=0.3, radio_burst_s=0.3)
     radio, same = Radio(scenario.radio_bursts()), Bursts(2, 0.3, 0.3)
-    faulty = FaultyRadio(Radio(scenario.radio_bursts()))
     for step in range(4000):
         t_s = step * STEP_S
         lost = same.lost(t_s)
-        for each in (radio, faulty):
-            assert each.uplink_arrives(PACKET, t_s) is not lost
-            assert each.downlink_delay_s("fast", t_s) == (None if lost else TELEMETRY_DELAY_S)
-    faulty.cut = True
-    assert not faulty.uplink_arrives(PACKET, 21.0)
+        assert radio.uplink_arrives(PACKET, t_s) is not lost
+        assert radio.downlink_delay_s("fast", t_s) == (None if lost else TELEMETRY_DELAY_S)
 
 
 # --- What explains an event -----------------------------------------------------------------------
