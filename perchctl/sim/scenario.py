@@ -314,8 +314,6 @@ class Bursts:
     Args:
         share: of the time that is lost, above 0 and below 1.
         mean_s: a burst's mean length.
-
-    `newest`: begin and end of the last burst that has begun; None before the first.
     """
 
     def __init__(self, seed: int, share: float, mean_s: float) -> None:
@@ -323,18 +321,14 @@ class Bursts:
         self._bad_s = mean_s
         self._good_s = mean_s * (1.0 - share) / share
         self._bad = False
-        self.newest: tuple[float, float] | None = None
         self._until_s = CONNECTED_S + float(self._rng.exponential(self._good_s))
 
     def lost(self, t_s: float) -> bool:
         """True if a packet sent at that time is lost."""
         while t_s >= self._until_s:
             self._bad = not self._bad
-            began_s = self._until_s
             mean_s = self._bad_s if self._bad else self._good_s
             self._until_s += float(self._rng.exponential(mean_s))
-            if self._bad:
-                self.newest = (began_s, self._until_s)
         return self._bad
 
 
@@ -344,42 +338,30 @@ class Bursts:
 
 LOSSES = ("estimate-lost", "align-lost", "ascend-lost", "camera-gone")
 """Rows of the mission's table that lost pictures lead to."""
-UNHEARD = ("link-lost", "telemetry-stale")
-UNSEEN = ("estimate-unsure", "position-astray", "estimator-jump", "fence", "position-lost",
-          "heading-lost")  # fmt: skip
-"""Rows that a motion capture leads to which sees nothing."""
 FELT_FOR_S = 1.2
 """After the last lost frame: a second of no track, and the latency of the next picture."""
 
 
 class EventExplainer:
-    """Explains the events of one flight; call it with each of them, in order."""
+    """Explains the events of one flight that lost frames or a weak first contact led to; call it
+    with each of them, in order."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        self._bursts = scenario.radio_bursts()
+        self._slips = 0
 
     def __call__(self, event: Event, t_s: float) -> str:
         """Return what the scenario did, in a few words, or the empty string. `t_s` is the event's
         time in the simulation."""
-        scenario = self._scenario
+        scenario, force_n = self._scenario, self._scenario.first_contact_force_n
         held = event.reason if event.kind is EventKind.HOLD else ""
         if event.row in LOSSES or held.startswith(NO_PICTURE_TEXT):
             start_s, frames = scenario.camera_burst or (math.inf, 0)
-            if _is_felt(t_s, start_s, frames / scenario.camera_rate_hz):
+            if 0.0 <= t_s - start_s <= frames / scenario.camera_rate_hz + FELT_FOR_S:
                 return f"{frames} frames lost"
-        elif event.row in UNHEARD or event.reason.startswith("telemetry is"):
-            if self._bursts is not None:
-                self._bursts.lost(t_s)
-                begin_s, end_s = self._bursts.newest or (math.inf, math.inf)
-                if _is_felt(t_s, begin_s, end_s - begin_s):
-                    return f"the radio passed nothing for {end_s - begin_s:.1f} s"
-        elif event.row in UNSEEN:
-            for begin_s, length_s in scenario.capture_holes_s:
-                if _is_felt(t_s, begin_s, length_s):
-                    return f"the motion capture did not see it for {length_s:.1f} s"
+        if event.row == "slipped" and force_n is not None:
+            self._slips += 1
+            if self._slips == 1:
+                part = force_n / (scenario.mass_kg * GRAVITY_MPS2)
+                return f"the first contact holds {100 * part:.0f} % of the weight"
         return ""
-
-
-def _is_felt(t_s: float, begin_s: float, length_s: float) -> bool:
-    return 0.0 <= t_s - begin_s <= length_s + FELT_FOR_S
