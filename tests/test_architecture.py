@@ -100,7 +100,7 @@ MOST_NAMES = {
     "perception": 15,
     "positioning": 15,
     "profile": 35,
-    "sim": 23,
+    "sim": 14,
     "target": 24,
     "vision": 38,
     "weights": 9,
