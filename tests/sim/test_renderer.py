@@ -211,6 +211,18 @@ def test_motion_blur_is_the_mean_of_the_views_on_the_way(renderer: Renderer) -> 
     assert difference.mean() < 1.0
 
 
+def test_a_fast_tilt_is_followed_to_the_edge_of_the_blur(renderer: Renderer) -> None:
+    """20 px of motion: the sheet is not cut off where it moves out of its middle place."""
+    poses = [camera_pose(1.0, rpy=(0.0, a, 0.0)) for a in (-0.026, 0.0, 0.026)]
+    bare = Renderer(scenario(no_target=True), PLUMB_BOB, TARGET)
+    touched = np.abs(renderer.render(poses).astype(int) - bare.render(poses)) > 3
+    cols = np.flatnonzero(touched.any(axis=0))
+    ends = [project(PLUMB_BOB, scenario(), T, marker_corners_m(0.2)) for T in (poses[0], poses[-1])]
+    x = np.concatenate(ends)[:, 0]
+    assert abs(cols[0] - x.min()) < 3.0
+    assert abs(cols[-1] - x.max()) < 3.0
+
+
 def test_a_camera_that_looks_down_sees_no_target(renderer: Renderer) -> None:
     upside_down = camera_pose(1.0, rpy=(math.pi, 0.0, 0.0))
     above = camera_pose(-0.1)
