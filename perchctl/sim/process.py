@@ -174,9 +174,6 @@ class SimProcess:
         """
         return cls(HostSetup(scenario or Scenario(), pace, **settings), timeout_s)
 
-    def is_running(self) -> bool:
-        return self._child.poll() is None
-
     def advance(self, dt_s: float) -> float:
         """Let `dt_s` pass (stepped pace only); the simulated time since the start."""
         allowed_s = ANSWER_TIMEOUT_S + SLOWEST_PACE * dt_s

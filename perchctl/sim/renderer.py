@@ -177,7 +177,11 @@ class Renderer:
             picture = self._at_rest(rounded(rows[0][len(rows[0]) // 2]), sigma)
         else:
             picture = self._projected(rows, motion_px, length_px, sigma)
-        return picture if shot.light is None else lit(picture, shot.light)
+        if shot.light is None:
+            return picture
+        factor = np.broadcast_to(shot.light.astype(np.float32)[:, None], picture.shape)
+        lit = cv2.multiply(picture, np.ascontiguousarray(factor), dtype=cv2.CV_8U)
+        return np.asarray(lit, np.uint8)
 
     def _at_rest(self, pose: Array, sigma_px: float) -> Picture:
         """Return the picture of a camera that does not move. The last one is kept: under the magnet
@@ -304,12 +308,6 @@ def defocused(picture: Picture, sigma_px: float, box: Box) -> None:
     top, left = (a.start - b.start for a, b in zip(near, far, strict=True))
     into = picture[near]
     into[:] = blurred[top : top + into.shape[0], left : left + into.shape[1]]
-
-
-def lit(picture: Picture, light: NDArray[np.float64]) -> Picture:
-    """Return the picture with each row's brightness multiplied by `light` (height,)."""
-    factor = np.broadcast_to(light.astype(np.float32)[:, None], picture.shape)
-    return np.asarray(cv2.multiply(picture, np.ascontiguousarray(factor), dtype=cv2.CV_8U))
 
 
 def blended(frame: Picture) -> Picture:

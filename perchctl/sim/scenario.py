@@ -194,6 +194,9 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     bias_x, bias_y = (rng.uniform(-1, 1, size=2) * tilt_bias_rad).tolist()
     fails = rng.uniform() < sim.first_contact_fails
     weak_part = between("first_contact_share")
+    extra = {"analogue": sim.camera_analogue} if sim.camera_analogue else {}
+    if profile.positioning.by != "deck":
+        extra["external_position"] = 1.0  # and no deck
     return Scenario(
         seed=seed,
         mass_kg=mass_kg,
@@ -215,7 +218,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
         **_imu_errors(sim, seed),
         **{name: getattr(sim, name) for name in _AS_GIVEN},
-        extra=_extra(profile),
+        extra=extra,
         neighbours=tuple(
             Neighbour((x_m, y_m), math.radians(yaw_deg), *(sim.neighbour_ids or ()))
             for x_m, y_m, yaw_deg in sim.neighbours
@@ -242,15 +245,6 @@ def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
     p, q, r = (math.radians(sim.gyro_bias_dps) * rng.uniform(-1.0, 1.0, size=3)).tolist()
     x, y = (GRAVITY_MPS2 * sim.acc_bias_g * rng.uniform(-1.0, 1.0, size=2)).tolist()
     return {"gyro_bias_radps": (p, q, r), "acc_bias_mps2": (x, y, 0.0)}
-
-
-def _extra(profile: Profile) -> dict[str, float]:
-    extra = {}
-    if profile.simulation.camera_analogue:
-        extra["analogue"] = profile.simulation.camera_analogue
-    if profile.positioning.by != "deck":
-        extra["external_position"] = 1.0  # and no deck
-    return extra
 
 
 def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:

@@ -81,20 +81,6 @@ def test_log_units() -> None:
         log("stateEstimate.w")
 
 
-def test_parameters_read_write_and_refuse() -> None:
-    firmware = make_rig().firmware
-    assert firmware.get_parameter("posCtlPid.thrustBase") == 36000
-    firmware.set_parameter("posCtlPid.thrustBase", 52000)
-    assert firmware.get_parameter("posCtlPid.thrustBase") == 52000
-    with pytest.raises(KeyError):
-        firmware.set_parameter("posCtlPid.none", 1)
-    with pytest.raises(PermissionError):
-        firmware.set_parameter("deck.bcFlow2", 0)
-    own = make_rig(parameters={"deck.bcFlow2": 0}, rssi_dbm=-88.0).firmware
-    assert own.get_parameter("deck.bcFlow2") == 0
-    assert own.log_value("radio.rssi") == 88.0
-
-
 def test_a_reboot_keeps_persistent_parameters_and_no_unlock() -> None:
     rig = make_rig()
     firmware = rig.firmware
