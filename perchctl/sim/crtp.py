@@ -43,8 +43,11 @@ class Status(IntEnum):
 
 
 _SETPOINTS: dict[int, Callable[..., Setpoint]] = {
-    7: Setpoint.position, 8: Setpoint.velocity, 9: Setpoint.z_distance, 10: Setpoint.hover,
-}  # fmt: skip
+    7: Setpoint.position,
+    8: Setpoint.velocity,
+    9: Setpoint.z_distance,
+    10: Setpoint.hover,
+}
 """Port 7: setpoints of four numbers by their type, as cflib sends them since protocol 11."""
 
 

@@ -60,9 +60,12 @@ class Setpoint:
     def raw(cls, roll_deg: float, pitch_deg: float, yaw_rate_dps: float, thrust: float) -> Setpoint:
         """Return that of `commander.send_setpoint`: pitch +10 is nose down, yaw rate clockwise."""
         return cls(
-            MODE_RAW, roll_deg=roll_deg, pitch_deg=-pitch_deg, yaw_rate_dps=-yaw_rate_dps,
+            MODE_RAW,
+            roll_deg=roll_deg,
+            pitch_deg=-pitch_deg,
+            yaw_rate_dps=-yaw_rate_dps,
             thrust=float(thrust),
-        )  # fmt: skip
+        )
 
     @classmethod
     def position(cls, x_m: float, y_m: float, z_m: float, yaw_deg: float) -> Setpoint:
@@ -79,9 +82,13 @@ class Setpoint:
         """Return that of `send_hover_setpoint`: velocity in body axes, yaw rate, absolute
         height."""
         return cls(
-            MODE_HOVER, z_m=z_m, vx_mps=vx_mps, vy_mps=vy_mps, yaw_rate_dps=yaw_rate_dps,
+            MODE_HOVER,
+            z_m=z_m,
+            vx_mps=vx_mps,
+            vy_mps=vy_mps,
+            yaw_rate_dps=yaw_rate_dps,
             body_velocity=True,
-        )  # fmt: skip
+        )
 
     @classmethod
     def z_distance(
@@ -89,9 +96,12 @@ class Setpoint:
     ) -> Setpoint:
         """Return that of `send_zdistance_setpoint`: attitude, yaw rate, absolute height."""
         return cls(
-            MODE_Z_DISTANCE, z_m=z_m, roll_deg=roll_deg, pitch_deg=pitch_deg,
+            MODE_Z_DISTANCE,
+            z_m=z_m,
+            roll_deg=roll_deg,
+            pitch_deg=pitch_deg,
             yaw_rate_dps=yaw_rate_dps,
-        )  # fmt: skip
+        )
 
     def levelled(self) -> Setpoint:
         """Return what the supervisor flies while setpoints are missing: level, no turn, same z."""
