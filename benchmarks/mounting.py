@@ -28,7 +28,7 @@ from perchctl.calibration.mounting.carry import solve_carry
 from perchctl.calibration.mounting.pivot import solve_pivot
 from perchctl.errors import InvalidValue
 from perchctl.profile import load_profile
-from perchctl.sim.hand import Hand, draw_hand, record_hand
+from tests.helpers.hand import Hand, draw_hand, record_hand
 from tests.helpers.mounting import seen
 
 GOALS = {"turn, deg": (0.15, 0.5), "latency, ms": (3.0, 8.0), "gear's tip, mm": (0.4, 1.2)}

@@ -100,7 +100,7 @@ MOST_NAMES = {
     "perception": 15,
     "positioning": 10,
     "profile": 35,
-    "sim": 23,
+    "sim": 14,
     "target": 15,
     "vision": 38,
     "weights": 9,

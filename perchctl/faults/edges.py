@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -11,7 +12,6 @@ import numpy as np
 from perchctl.camera import FrameSource
 from perchctl.faults import effects as e
 from perchctl.link import MockLink, Packet, Port, Radio
-from perchctl.sim import CommandService, Firmware
 from perchctl.vision import Frame
 
 # --- The radio: what arrives, what does not, and what comes late -------------------------------
@@ -50,11 +50,11 @@ class FaultyRadio(Radio):
         self._begun: list[tuple[e.Silence | e.BlockDead | e.TelemetryDelayed, float]] = []
         self._left: dict[str, int] = {}  # packets of an order still to be lost
         self._twice: set[str] = set()
-        self._service: CommandService | None = None
+        self._receive: Callable[[Packet], None] | None = None
 
-    def serves(self, firmware: Firmware) -> None:
-        """Name the firmware that receives the second copy of a packet."""
-        self._service = CommandService(firmware)
+    def serves(self, receive: Callable[[Packet], None]) -> None:
+        """Name what receives the second copy of a packet."""
+        self._receive = receive
 
     def begin(self, effect: e.RadioEffect, now_s: float) -> None:
         """Begin an effect."""
@@ -80,9 +80,9 @@ class FaultyRadio(Radio):
         for effect, begin_s in self._begun:
             if isinstance(effect, e.Silence) and effect.up and now_s < begin_s + effect.for_s:
                 return False
-        if order in self._twice and self._service is not None:
+        if order in self._twice and self._receive is not None:
             self._twice.remove(order)
-            self._service.handle(packet)
+            self._receive(packet)
         return True
 
     def downlink_delay_s(self, block: str, now_s: float) -> float | None:

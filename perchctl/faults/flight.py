@@ -39,7 +39,7 @@ from perchctl.link import MockLink, Packet, Port, Radio
 from perchctl.mission import Event, FlightReport, Phase, Tick, Watcher
 from perchctl.profile import Profile
 from perchctl.record import LogWatcher, to_exact
-from perchctl.sim import Scenario, draw_capture, radio_bursts
+from perchctl.sim import Scenario, draw_capture
 from perchctl.vision import make_pipeline
 
 AFTER_S, AFTER_IN_THE_AIR_S = 6.0, 10.0
@@ -78,8 +78,8 @@ class FaultyFlight:
         camera = profile_camera(profile.camera)
         capture = draw_capture(profile, scenario.seed)
         self._vehicle = vehicle = WatchedVehicle(scenario, camera, profile.target, capture)
-        self._radio = radio = FaultyRadio(Radio(radio_bursts(scenario)))
-        radio.serves(vehicle.firmware)
+        self._radio = radio = FaultyRadio(Radio(scenario.radio_bursts()))
+        radio.serves(vehicle.receive)
         self._link = MockLink(vehicle, profile.link.telemetry_period_s, radio)
         source = FaultyCamera(lockstep_source(vehicle, profile), scenario.seed)
         source.late_s = sooner_s

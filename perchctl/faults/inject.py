@@ -11,13 +11,14 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 from perchctl.faults import effects as e
 from perchctl.faults.edges import FaultyCamera, FaultyClock, FaultyRadio
 from perchctl.faults.truth import SAMPLE_S, WatchedVehicle
 from perchctl.geometry import GRAVITY_MPS2, rot_z
 from perchctl.mission import Event, Phase, Tick
-from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, Estimate, Neighbour, Scenario
+from perchctl.sim import CaptureFault, Neighbour, Scenario
 
 LIGHTHOUSE = "deck.bcLighthouse4"
 CAPTURE_FAULTS = {
@@ -25,7 +26,7 @@ CAPTURE_FAULTS = {
     "silent": CaptureFault(gone=True),
     "occluded": CaptureFault(occluded=True),
     "swapped": CaptureFault(swapped=True),
-    "millimetres": CaptureFault(scale=MILLIMETRES_PER_M),
+    "millimetres": CaptureFault(scale=1000.0),
     "mirrored": CaptureFault(mirrored=True),
     "late": CaptureFault(),
 }
@@ -236,7 +237,7 @@ class Injector:
         x_m, y_m, z_m = (p + noise.gauss(0.0, sigma_m) for p in (world.x_m, world.y_m, world.z_m))
         firmware.estimator.external_position((x_m, y_m, z_m))
 
-    def _spoil(self, error: e.EstimateError, begin_s: float, now: Estimate) -> None:
+    def _spoil(self, error: e.EstimateError, begin_s: float, now: Any) -> None:
         t_s = self._edges.vehicle.t_s - begin_s
         x, y, z = error.step_m
         vx, vy, vz = error.drift_mps

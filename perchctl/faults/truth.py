@@ -14,7 +14,6 @@ from perchctl.profile import Profile, TargetConfig
 from perchctl.sim import (
     CONTROL_PERIOD_S,
     MOTOR_FORCE_N,
-    REST_HEIGHT_M,
     CaptureSettings,
     Scenario,
     SimulatedVehicle,
@@ -73,7 +72,7 @@ def sample_of(vehicle: SimulatedVehicle) -> Sample:
         vehicle.t_s,
         world.x_m,
         world.y_m,
-        world.z_m - REST_HEIGHT_M,
+        world.height_m,
         world.vz_mps,
         up_z,
         math.sqrt(fx * fx + fy * fy + fz * fz) / GRAVITY_MPS2,

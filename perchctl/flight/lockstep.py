@@ -19,14 +19,11 @@ from perchctl.profile import Profile
 from perchctl.record import LogWatcher
 from perchctl.sim import (
     CaptureSettings,
-    DeliveredFrame,
     EventExplainer,
     Scenario,
-    SimCamera,
     SimulatedVehicle,
     draw_capture,
     draw_scenario,
-    radio_bursts,
 )
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
@@ -52,27 +49,21 @@ class LockstepClock:
             self._link.advance_to(t_s)
 
 
-def _newest(frames: list[DeliveredFrame]) -> list[DeliveredFrame]:
-    """Return the last exposures, each as it first came and as it came last."""
-    last = sorted({frame.index for frame in frames})[-_QUEUED:]
-    ends = [[frame for frame in frames if frame.index == index] for index in last]
-    return [frame for same in ends for frame in same[:: max(1, len(same) - 1)]]
-
-
 class LockstepSource:
     """The simulated camera's delivered frames; the newest wins, as for a live camera."""
 
     live = True
     finished = False
 
-    def __init__(self, camera: SimCamera, latency_s: float) -> None:
-        self._camera = camera
+    def __init__(self, vehicle: SimulatedVehicle, latency_s: float) -> None:
+        assert vehicle.camera is not None
+        self._camera = vehicle.camera
         self._latency_s = latency_s
         self._slot = NewestSlot()
         self._count = 0
 
     def poll(self, now_s: float) -> Frame | None:
-        for each in _newest(self._camera.take()):
+        for each in self._camera.take_newest(_QUEUED):
             self._slot.put(each.image, each.t_arrival_s - self._latency_s, each.t_arrival_s)
         frame = self._slot.take()
         if frame is None:
@@ -96,8 +87,7 @@ class LockstepSource:
 
 def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
     """Return the vehicle's camera as the flight sees it by its profile."""
-    assert vehicle.camera is not None
-    source = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
+    source = LockstepSource(vehicle, profile.camera.start_latency_s)
     return WrappedSource(source, unmirror_frame) if profile.camera.mirrored else source
 
 
@@ -184,7 +174,7 @@ def fly_lockstep(
     camera = profile_camera(profile.camera)
     capture = capture or draw_capture(profile, scenario.seed)
     vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
-    link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(radio_bursts(scenario)))
+    link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(scenario.radio_bursts()))
     positions = feed_lockstep(link, profile)
     source = lockstep_source(vehicle, profile)
     truth = Truth(vehicle)
@@ -226,7 +216,7 @@ def _pipeline_of(profile: Profile, camera: CameraModel) -> Pipeline:
 
 
 def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> LockstepFlight:
-    hanging = bool(vehicle.world.state().magnet_engaged)
+    hanging = vehicle.world.magnet_engaged
     fell = truth.fell or (report.phase is Phase.PERCHED and not hanging)
     return LockstepFlight(
         report=report,

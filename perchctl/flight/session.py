@@ -176,9 +176,9 @@ def _simulated_clock(
     options: FlyOptions, simulated: SimProcess
 ) -> tuple[SimulatedClock, Callable[[Event], str]]:
     """Return the simulated vehicle's time, and what its scenario did at the time of an event."""
-    from perchctl.sim import CLOCK_MARGIN_S, EventExplainer, draw_scenario
+    from perchctl.sim import EventExplainer, draw_scenario
 
-    clock = SimulatedClock(simulated.shared_time, CLOCK_MARGIN_S)
+    clock = SimulatedClock(simulated.shared_time, simulated.shared_time.MARGIN_S)
     explain = EventExplainer(draw_scenario(options.profile, options.seed))
     return clock, lambda event: explain(event, event.t_s - clock.zero_s)
 

@@ -1,15 +1,8 @@
-from .camera import DeliveredFrame as DeliveredFrame
-from .camera import SimCamera as SimCamera
-from .capture import MILLIMETRES_PER_M as MILLIMETRES_PER_M
 from .capture import CaptureFault as CaptureFault
 from .capture import CaptureSettings as CaptureSettings
 from .capture import draw_capture as draw_capture
-from .crtp import CommandService as CommandService
-from .firmware import Firmware as Firmware
-from .firmware.controller import Estimate as Estimate
 from .powertrain import MOTOR_FORCE_N as MOTOR_FORCE_N
 from .powertrain import most_thrust_n as most_thrust_n
-from .process import CLOCK_MARGIN_S as CLOCK_MARGIN_S
 from .process import SharedTime as SharedTime
 from .process import SimProcess as SimProcess
 from .renderer import Renderer as Renderer
@@ -18,6 +11,4 @@ from .scenario import EventExplainer as EventExplainer
 from .scenario import Neighbour as Neighbour
 from .scenario import Scenario as Scenario
 from .scenario import draw_scenario as draw_scenario
-from .scenario import radio_bursts as radio_bursts
 from .vehicle import SimulatedVehicle as SimulatedVehicle
-from .world import REST_HEIGHT_M as REST_HEIGHT_M

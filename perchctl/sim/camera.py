@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,13 +14,28 @@ from perchctl.sim.optics import Picture
 from perchctl.sim.renderer import Renderer, Shot
 from perchctl.sim.scenario import Scenario
 
-SCHEDULE_STREAM = 411
+SCHEDULE_STREAM, STREAM = 411, 412
+"""Numbers of random streams: the schedule's; that of the light, the receiver and blue screens."""
+_BLANKS = 1
 
 JITTER_LIMIT_SIGMAS = 2.5
+BLUE_GREY, BLUE_NOISE = 41.0, 0.6
+"""A blue screen, in grey, as it comes out of a converter."""
 
 
 PoseAt = Callable[[float], Array]
-"""The body's pose T_world_body (4, 4) at a time."""
+"""A pose, of the body or of the camera in the world (4, 4), at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class DeliveredFrame:
+    """A frame that has arrived; `t_exposure_s` is the middle of its exposure: between the
+    two fields of an interlaced one."""
+
+    t_arrival_s: float
+    t_exposure_s: float
+    image: Picture
+    index: int  # of the exposure: gaps are lost frames
 
 
 class SimCamera:
@@ -37,8 +52,7 @@ class SimCamera:
     - frozen: exposures from `camera_freeze_at_s` on show the last picture before;
     - mirrored: with `camera_mirrored` flipped left to right;
     - blank: with `camera_blank_rate` a blue screen in the place of the picture;
-    - given out again: at the receiver's own rate, where it has one (`Receiver`);
-    - gone: nothing arrives at or after `camera_gone_at_s`.
+    - given out again: at `camera_receiver_hz`, where the receiver has a rate of its own.
     """
 
     def __init__(self, scenario: Scenario, renderer: Renderer) -> None:
@@ -55,7 +69,10 @@ class SimCamera:
         self._last: Picture | None = None
         self._t_s = -np.inf
         self._under_way: deque[DeliveredFrame] = deque()
-        self._receiver = Receiver(scenario)
+        rng = np.random.default_rng([scenario.seed, STREAM])
+        self._first_output_s = float(rng.random()) / (scenario.camera_receiver_hz or 1.0)
+        self._outputs = 0
+        self._newest: DeliveredFrame | None = None  # that the receiver gives out again
 
     @property
     def exposed_s(self) -> float:
@@ -65,8 +82,8 @@ class SimCamera:
     def advance(self, t_s: float, pose_at: PoseAt) -> None:
         """Take all exposures that end at or before `t_s`.
 
-        `pose_at` is called with times within the exposures that ended since the last
-        call: with calls every control period, no older than one exposure and period.
+        `pose_at`, the body's pose, is called with times within the exposures that ended since the
+        last call: with calls every control period, no older than one exposure and period.
         """
         self._t_s = t_s
         while True:
@@ -78,10 +95,31 @@ class SimCamera:
 
     def take(self) -> list[DeliveredFrame]:
         """Return the frames that arrived by the time of the last `advance`, oldest first, once."""
-        out = []
+        arrived = []
         while self._under_way and self._under_way[0].t_arrival_s <= self._t_s:
-            out.append(self._under_way.popleft())
-        return list(self._receiver.deliver(out, self._t_s))
+            arrived.append(self._under_way.popleft())
+        rate_hz = self.scenario.camera_receiver_hz
+        if rate_hz is None:
+            return arrived
+        given_out = []
+        while self._outputs <= math.floor((self._t_s - self._first_output_s) * rate_hz):
+            at_s = self._first_output_s + self._outputs / rate_hz
+            while arrived and arrived[0].t_arrival_s <= at_s:
+                self._newest = arrived.pop(0)
+            if self._newest is not None:
+                given_out.append(replace(self._newest, t_arrival_s=at_s))
+            self._outputs += 1
+        if arrived:
+            self._newest = arrived[-1]
+        return given_out
+
+    def take_newest(self, count: int) -> list[DeliveredFrame]:
+        """Return of the frames that `take` gives the last `count` exposures, each as it first came
+        and as it came last."""
+        frames = self.take()
+        last = sorted({frame.index for frame in frames})[-count:]
+        ends = [[frame for frame in frames if frame.index == index] for index in last]
+        return [frame for same in ends for frame in same[:: max(1, len(same) - 1)]]
 
     def _expose(self, middle_s: float, pose_at: PoseAt) -> None:
         s = self.scenario
@@ -92,32 +130,38 @@ class SimCamera:
             dropped = True
         delay_s = max(s.camera_latency_s + jitter * s.camera_jitter_s, self._half_s)
         arrival_s = max(middle_s + delay_s, self._last_arrival_s)
-        if dropped or (s.camera_gone_at_s is not None and arrival_s >= s.camera_gone_at_s):
+        if dropped:
             return
         self._last_arrival_s = arrival_s
         frozen = s.camera_freeze_at_s is not None and middle_s >= s.camera_freeze_at_s
         if self._last is None or not frozen:
-            self._last = self._picture(middle_s, pose_at)
+
+            def T_world_cam_at(t_s: float) -> Array:
+                return np.asarray(pose_at(t_s) @ self._T_body_cam)
+
+            height = self.renderer.camera.size_px[1]
+            shots = self._shutter.shots(middle_s, T_world_cam_at, height)
+            self._last = self.renderer.expose(shots, frame_index=self._index)
             if s.camera_mirrored:
                 self._last = np.ascontiguousarray(self._last[:, ::-1])
-        image = blanked(s, self._index, self._last)
+        image = self._blanked(self._last)
         self._under_way.append(DeliveredFrame(arrival_s, middle_s, image, self._index))
 
-    def _picture(self, middle_s: float, pose_at: PoseAt) -> Picture:
-        def T_world_cam_at(t_s: float) -> Array:
-            return np.asarray(pose_at(t_s) @ self._T_body_cam)
-
-        height = self.renderer.camera.size_px[1]
-        shots = self._shutter.shots(middle_s, T_world_cam_at, height)
-        return self.renderer.expose(shots, frame_index=self._index)
+    def _blanked(self, picture: Picture) -> Picture:
+        """Return the picture, or the blue screen in its place."""
+        if not self.scenario.camera_blank_rate:
+            return picture
+        rng = np.random.default_rng([self.scenario.seed, STREAM, _BLANKS, self._index])
+        if float(rng.random()) >= self.scenario.camera_blank_rate:
+            return picture
+        noise = rng.standard_normal(picture.shape, dtype=np.float32)
+        return np.asarray(np.rint(BLUE_GREY + BLUE_NOISE * noise), np.uint8)
 
 
 # --- When each row of a frame is exposed and in what light ---------------------------------------
 # A rolling shutter exposes its rows one after the other within the read-out time; an interlaced
 # camera takes two pictures a frame, half the frame's period apart, each with its own rows.
 
-
-LIGHT_STREAM = 412
 
 POSES_PER_EXPOSURE = 3
 READOUT_MOMENTS = 5
@@ -128,43 +172,44 @@ PUMPING_HZ = (0.4, 2.0)
 
 
 class Shutter:
-    """The scenario's shutter; same seed, same light."""
+    """The scenario's shutter; same seed, same light.
+
+    `half_s`: half the time from the first light on the frame to the last.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         self._s = scenario
-        exposure_s = max(scenario.camera_exposure_s, 0.0)
-        self._half_exposure_s = exposure_s / 2.0
+        half_exposure_s = max(scenario.camera_exposure_s, 0.0) / 2.0
         self._steps_s = (0.0,)  # of one row's exposure, from its middle
-        if self._half_exposure_s:
-            ends_s = -self._half_exposure_s, self._half_exposure_s
-            self._steps_s = tuple(np.linspace(*ends_s, POSES_PER_EXPOSURE).tolist())
+        if half_exposure_s:
+            steps_s = np.linspace(-half_exposure_s, half_exposure_s, POSES_PER_EXPOSURE)
+            self._steps_s = tuple(steps_s.tolist())
         self._apart_s = 0.0
         if scenario.camera_fields != "progressive":
             self._apart_s = 0.5 / scenario.camera_rate_hz
-        self.half_s = self._half_exposure_s + scenario.camera_readout_s / 2.0 + self._apart_s / 2.0
-        """Half the time from the first light on the frame to the last."""
-        rng = np.random.default_rng([scenario.seed, LIGHT_STREAM])
+        self.half_s = half_exposure_s + scenario.camera_readout_s / 2.0 + self._apart_s / 2.0
+        rng = np.random.default_rng([scenario.seed, STREAM])
         self._lamp_phase, self._hunt_phase = rng.uniform(0.0, 2.0 * math.pi, size=2)
         self._hunt_hz = float(rng.uniform(*PUMPING_HZ))
         # An exposure averages over the lamp's swing.
-        self._flicker = scenario.camera_flicker * float(np.sinc(FLICKER_HZ * exposure_s))
+        swing = float(np.sinc(FLICKER_HZ * 2.0 * half_exposure_s))
+        self._flicker = scenario.camera_flicker * swing
 
-    def shots(
-        self, middle_s: float, T_world_cam_at: Callable[[float], Array], height: int
-    ) -> list[Shot]:
+    def shots(self, middle_s: float, T_world_cam_at: PoseAt, height: int) -> list[Shot]:
         """Return the frame's pictures in their order of time: two fields, or one."""
-        if not self._apart_s:
-            return [self._shot(middle_s, T_world_cam_at, height)]
         half_s = self._apart_s / 2.0
-        return [self._shot(middle_s + d, T_world_cam_at, height) for d in (-half_s, half_s)]
+        moments = (middle_s - half_s, middle_s + half_s) if half_s else (middle_s,)
+        return [self._shot(moment_s, T_world_cam_at, height) for moment_s in moments]
 
-    def _shot(self, middle_s: float, T_world_cam_at: Callable[[float], Array], height: int) -> Shot:
+    def _shot(self, middle_s: float, T_world_cam_at: PoseAt, height: int) -> Shot:
         readout_s = self._s.camera_readout_s
-        moments = [middle_s]
+        delays_s = [0.0]
         if readout_s:
-            delays = np.linspace(-readout_s / 2.0, readout_s / 2.0, READOUT_MOMENTS)
-            moments = [middle_s + float(d) for d in delays]
-        rows = tuple(tuple(T_world_cam_at(m + step_s) for step_s in self._steps_s) for m in moments)
+            delays_s = np.linspace(-readout_s / 2.0, readout_s / 2.0, READOUT_MOMENTS).tolist()
+        rows = tuple(
+            tuple(T_world_cam_at(middle_s + delay_s + step_s) for step_s in self._steps_s)
+            for delay_s in delays_s
+        )
         row_times = middle_s + readout_s * (np.arange(height) / (height - 1) - 0.5)
         return Shot(rows, self._light(row_times))
 
@@ -175,65 +220,3 @@ class Shutter:
         lamp = np.cos(2.0 * math.pi * FLICKER_HZ * t_s + self._lamp_phase)
         hunt = np.sin(2.0 * math.pi * self._hunt_hz * t_s + self._hunt_phase)
         return np.asarray((1.0 + self._flicker * lamp) * (1.0 + s.camera_pumping * hunt))
-
-
-# --- What a video receiver makes of the pictures that reach it: it repeats, and blanks, them ---
-
-
-STREAM = 412
-BLUE_GREY, BLUE_NOISE = 41.0, 0.6
-"""A blue screen, in grey, as it comes out of a converter."""
-_BLANKS = 1  # the stream of random numbers
-
-
-@dataclass(frozen=True, eq=False)
-class DeliveredFrame:
-    """A frame that has arrived; `t_exposure_s` is the middle of its exposure: between the
-    two fields of an interlaced one."""
-
-    t_arrival_s: float
-    t_exposure_s: float
-    image: Picture
-    index: int  # of the exposure: gaps are lost frames
-
-
-class Receiver:
-    """Delivers its newest picture at `camera_receiver_hz`, again and again; without a rate of its
-    own it delivers each picture once, as it comes."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._rate_hz = scenario.camera_receiver_hz
-        self._newest: DeliveredFrame | None = None
-        rng = np.random.default_rng([scenario.seed, STREAM])
-        self._first_s = float(rng.random()) / (scenario.camera_receiver_hz or 1.0)
-        self._given = 0
-
-    def deliver(self, arrived: list[DeliveredFrame], t_s: float) -> Iterator[DeliveredFrame]:
-        """Yield the frames delivered until `t_s`, oldest first, given those that have arrived since
-        the last call."""
-        rate_hz = self._rate_hz
-        if rate_hz is None:
-            yield from arrived
-            return
-        waiting = list(arrived)
-        last = math.floor((t_s - self._first_s) * rate_hz)
-        while self._given <= last:
-            at_s = self._first_s + self._given / rate_hz
-            while waiting and waiting[0].t_arrival_s <= at_s:
-                self._newest = waiting.pop(0)
-            if self._newest is not None:
-                yield replace(self._newest, t_arrival_s=at_s)
-            self._given += 1
-        if waiting:
-            self._newest = waiting[-1]
-
-
-def blanked(scenario: Scenario, index: int, picture: Picture) -> Picture:
-    """Return the picture, or the blue screen in its place."""
-    if not scenario.camera_blank_rate:
-        return picture
-    rng = np.random.default_rng([scenario.seed, STREAM, _BLANKS, index])
-    if float(rng.random()) >= scenario.camera_blank_rate:
-        return picture
-    noise = rng.standard_normal(picture.shape, dtype=np.float32)
-    return np.asarray(np.rint(BLUE_GREY + BLUE_NOISE * noise), np.uint8)

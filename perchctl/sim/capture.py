@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perchctl.errors import InvalidValue
 from perchctl.geometry import (
     Array,
     quaternion_from_rotation,
@@ -33,15 +32,6 @@ if TYPE_CHECKING:
 _STREAM = 13
 _JITTER_LIMIT_SIGMAS = 3.0
 TRUE_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-MILLIMETRES_PER_M = 1000.0
-
-
-@dataclass(frozen=True)
-class OtherBody:
-    """A rigid body that is not the vehicle, and stands still."""
-
-    name: str
-    position_m: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -75,6 +65,7 @@ class CaptureSettings:
 
     Attributes:
         body: the vehicle's rigid body, `body_*` its axes and origin in the vehicle's axes.
+        others: rigid bodies that stand still, by name and place.
         rate_hz: of its cameras.
         delay_s, jitter_s: from an exposure to the frame's arrival; one sigma of it.
         position_noise_m, attitude_noise_rad: one sigma, each axis.
@@ -85,7 +76,7 @@ class CaptureSettings:
     body: str = "crazyflie"
     body_rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     body_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    others: tuple[OtherBody, ...] = (OtherBody("wand", (1.2, -0.9, 0.05)),)
+    others: tuple[tuple[str, tuple[float, float, float]], ...] = (("wand", (1.2, -0.9, 0.05)),)
     rate_hz: float = 120.0
     delay_s: float = 0.01
     jitter_s: float = 0.0005
@@ -96,16 +87,10 @@ class CaptureSettings:
     faults: tuple[tuple[float, float, CaptureFault], ...] = ()
     seed: int = 0
 
-    def __post_init__(self) -> None:
-        if not self.rate_hz > 0.0:
-            raise InvalidValue(f"a motion capture at {self.rate_hz:g} Hz sees nothing")
-        if len(set(self.names)) < len(self.names):
-            raise InvalidValue(f"two rigid bodies have one name: {', '.join(self.names)}")
-
     @property
     def names(self) -> tuple[str, ...]:
         """The names of all rigid bodies, the vehicle's first."""
-        return (self.body, *(other.name for other in self.others))
+        return (self.body, *(name for name, _ in self.others))
 
 
 def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
@@ -128,7 +113,8 @@ def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
 
 
 class SimCapture:
-    """Exposes at `rate_hz`; same settings and flight, same frames.
+    """Exposes at `rate_hz`; same settings and flight, same frames. A flight in lockstep has it as
+    its `CaptureSource`.
 
     Each exposure draws the same random numbers whatever is wrong, so a fault changes no frame
     outside its time. Frames never overtake each other.
@@ -142,9 +128,7 @@ class SimCapture:
         self._rng = np.random.default_rng([settings.seed, _STREAM])
         self._faults = list(settings.faults)
         self._R_body_rigid = rotation_from_rpy(*settings.body_rpy_rad)
-        self._p_body_rigid = np.asarray(settings.body_position_m)
         self._R_capture_world = rot_z(settings.heading_rad)
-        self._origin_m = np.asarray(settings.origin_m)
         self._due_s = float(self._rng.random()) / settings.rate_hz
         self._t_s = 0.0
         self._arrival_s = -math.inf
@@ -164,18 +148,20 @@ class SimCapture:
         self._t_s = t_s = world.t_s
         if t_s < self._due_s - 1e-9:
             return
-        self._due_s += 1.0 / self.settings.rate_hz
-        noise = self._rng.standard_normal((len(self.settings.names), 6))
+        settings = self.settings
+        self._due_s += 1.0 / settings.rate_hz
+        noise = self._rng.standard_normal((len(settings.names), 6))
         jitter = float(np.clip(self._rng.normal(), -_JITTER_LIMIT_SIGMAS, _JITTER_LIMIT_SIGMAS))
         faults = [fault for since_s, to_s, fault in self._faults if since_s <= t_s < to_s]
-        bodies = self._bodies(world, noise, faults)
+        if not (self._before and any(fault.frozen for fault in faults)):
+            self._before = self._bodies(world, noise, faults)
         if any(fault.gone for fault in faults):
             return
-        delay_s = self.settings.delay_s + jitter * self.settings.jitter_s
-        arrival_s = t_s + max(0.0, delay_s) + sum(fault.late_s for fault in faults)
-        self._arrival_s = max(arrival_s, self._arrival_s)
+        arrival_s = t_s + max(0.0, settings.delay_s + jitter * settings.jitter_s)
+        self._arrival_s = max(arrival_s + sum(f.late_s for f in faults), self._arrival_s)
+        bodies = dict(self._before)
         if any(fault.occluded for fault in faults):
-            bodies = {n: pose for n, pose in bodies.items() if n != self.settings.body}
+            del bodies[settings.body]
         self._under_way.append(CaptureFrame(self._arrival_s, bodies))
 
     def take(self) -> list[CaptureFrame]:
@@ -186,8 +172,7 @@ class SimCapture:
         return arrived
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """Return the newest frame that has arrived since the last call: a flight in lockstep has
-        this capture as its `CaptureSource`."""
+        """Return the newest frame that has arrived since the last call."""
         arrived = self.take()
         return arrived[-1] if arrived else None
 
@@ -202,25 +187,23 @@ class SimCapture:
         self, world: World, noise: Array, faults: list[CaptureFault]
     ) -> dict[str, BodyPose]:
         """All bodies by the name under which the capture has them."""
-        if self._before and any(fault.frozen for fault in faults):
-            return self._before
         settings = self.settings
         R = rotation_from_quaternion(world.quaternion)
-        place = np.array((world.x_m, world.y_m, world.z_m)) + R @ self._p_body_rigid
-        seen = [self._pose(place, R @ self._R_body_rigid, noise[0], faults)]
-        seen += [
-            self._pose(np.asarray(other.position_m), np.eye(3), white, faults)
-            for other, white in zip(settings.others, noise[1:], strict=True)
+        place = np.array((world.x_m, world.y_m, world.z_m)) + R @ settings.body_position_m
+        poses = [(place, R @ self._R_body_rigid)]
+        poses += [(np.asarray(position_m), np.eye(3)) for _, position_m in settings.others]
+        seen = [
+            self._pose(place, R, white, faults)
+            for (place, R), white in zip(poses, noise, strict=True)
         ]
         names = list(settings.names)
-        if any(fault.swapped for fault in faults) and len(names) > 1:
-            names[:2] = names[1], names[0]
-        self._before = dict(zip(names, seen, strict=True))
-        return self._before
+        if any(fault.swapped for fault in faults):
+            names[:2] = reversed(names[:2])
+        return dict(zip(names, seen, strict=True))
 
     def _pose(self, place: Array, R: Array, noise: Array, faults: list[CaptureFault]) -> BodyPose:
         settings = self.settings
-        place = self._R_capture_world @ place + self._origin_m
+        place = self._R_capture_world @ place + settings.origin_m
         place = place + settings.position_noise_m * noise[:3]
         a, b, c = (float(v) for v in settings.attitude_noise_rad * noise[3:])
         R = self._R_capture_world @ R @ rotation_from_rpy(a, b, c)
@@ -234,77 +217,28 @@ class SimCapture:
         return BodyPose((x, y, z), quaternion_from_rotation(turn @ R @ turn.T))
 
 
-# --- NatNet 3.1, in which OptiTrack's server speaks: what a client asks, and the answers --------
+# --- The server on loopback --------------------------------------------------------------------
+# It speaks NatNet 3.1, as OptiTrack's server does, so `motioncapture` reads it. Of the systems
+# which that package reads without a vendor's machine this one hands a frame on the soonest: VRPN's
+# client looks only every 10 ms, Qualisys's binds one fixed port.
+#
 # Little-endian; each message begins with its kind and the length of what follows. Of a frame only
 # the rigid bodies are filled in; a client steps over the empty lists.
 
 
 CONNECT, SERVER_INFO, ASK_MODELS, MODELS, FRAME = 0, 1, 4, 5, 7
+_HOST = "127.0.0.1"
+_POLL_S = 0.2
 _VERSION = bytes((3, 1, 0, 0))
 _NAME_BYTES = 256
 _TICKS_HZ = 1_000_000
-_RIGID_BODY = 1
-_TRACKED = 1
-_NO_PARENT = -1
+_RIGID_BODY, _NO_PARENT = 1, -1
 _EMPTY = struct.pack("<i", 0)
 _UNSEEN = BodyPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
-def message(kind: int, body: bytes) -> bytes:
-    return struct.pack("<HH", kind, len(body)) + body
-
-
-def kind_of(request: bytes) -> int | None:
-    """Return the kind of a message; None for what is too short to be one."""
-    return int.from_bytes(request[:2], "little") if len(request) >= 4 else None
-
-
-def server_info(data_port: int) -> bytes:
-    """Return the answer to `CONNECT`: frames will come to that port of the client's, by unicast."""
-    name = b"perchctl".ljust(_NAME_BYTES, b"\0")
-    where = struct.pack("<QH?4B", _TICKS_HZ, data_port, False, 0, 0, 0, 0)
-    return message(SERVER_INFO, name + _VERSION + _VERSION + where)
-
-
-def models(names: Sequence[str]) -> bytes:
-    """Return the answer to `ASK_MODELS`: rigid bodies, numbered from 1, their origins unmoved."""
-    body = struct.pack("<i", len(names))
-    for number, name in enumerate(names, 1):
-        body += struct.pack("<i", _RIGID_BODY) + name.encode() + b"\0"
-        body += struct.pack("<ii3f", number, _NO_PARENT, 0.0, 0.0, 0.0) + _EMPTY  # no markers
-    return message(MODELS, body)
-
-
-def frame_message(number: int, names: Sequence[str], seen: CaptureFrame) -> bytes:
-    """One frame; a body that is not in it is marked as not tracked."""
-    parts = [struct.pack("<i", number), _EMPTY, _EMPTY]  # marker sets, other markers
-    parts.append(struct.pack("<i", len(names)))
-    for index, name in enumerate(names, 1):
-        pose = seen.bodies.get(name)
-        w, x, y, z = (pose or _UNSEEN).quaternion
-        place = (pose or _UNSEEN).position_m
-        tracked = 0 if pose is None else _TRACKED
-        parts.append(struct.pack("<i3f4ffh", index, *place, x, y, z, w, 0.0, tracked))
-    parts += [_EMPTY] * 4  # skeletons, labelled markers, force plates, devices
-    ticks = round(seen.t_s * _TICKS_HZ)
-    parts.append(struct.pack("<IId3Qh", 0, 0, seen.t_s, ticks, ticks, ticks, 0) + _EMPTY)
-    return message(FRAME, b"".join(parts))
-
-
-# --- The server on loopback --------------------------------------------------------------------
-# The simulated motion capture's server on loopback, read by `motioncapture` as OptiTrack's.
-#
-# Of the systems that package reads without a vendor's machine this one hands a frame on the
-# soonest: VRPN's client looks only every 10 ms, Qualisys's binds one fixed port, so that a second
-# client on the same computer cannot connect.
-
-
-_HOST = "127.0.0.1"
-_POLL_S = 0.2
-
-
 class CaptureServer:
-    """Answers clients in a thread of its own; `publish` sends a frame to each at once."""
+    """Answers in a thread of its own; `publish` sends a frame to the newest client at once."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
@@ -312,60 +246,36 @@ class CaptureServer:
         self._socket.settimeout(_POLL_S)
         self._socket.bind((_HOST, 0))
         self.host = f"{_HOST}:{self._socket.getsockname()[1]}"
-        self._clients: list[socket.socket] = []
-        self._lock = threading.Lock()
+        self._client: tuple[str, int] | None = None
         self._count = 0
         self._closed = False
         self._thread = threading.Thread(target=self._answer, name="capture-server", daemon=True)
         self._thread.start()
 
     def publish(self, seen: CaptureFrame) -> None:
-        """Send a frame to each client; nothing is sent while nobody is connected. A client that has
-        gone, and a full buffer, lose a frame, as on any network."""
+        """Send a frame; nothing is sent while nobody is connected. A client that has gone, and a
+        full buffer, lose a frame, as on any network."""
         self._count += 1
-        with self._lock:
-            if not self._clients:
-                return
-            datagram = frame_message(self._count, self._names, seen)
-            for client in self._clients:
-                for _ in range(2):  # the first time may tell of the frame before: not bound yet
-                    with contextlib.suppress(OSError):
-                        client.send(datagram)
-                        break
+        if self._client is not None:
+            with contextlib.suppress(OSError):
+                self._socket.sendto(frame_message(self._count, self._names, seen), self._client)
 
     def close(self) -> None:
         self._closed = True
         self._thread.join()
         self._socket.close()
-        with self._lock:
-            for client in self._clients:
-                client.close()
-            self._clients.clear()
 
     def _answer(self) -> None:
         while not self._closed:
-            try:
-                request, address = self._socket.recvfrom(2048)
-            except OSError:  # nothing for a while, or a client that has gone
-                continue
-            kind = kind_of(request)
+            # There may be nothing for a while, or a client that has gone.
             with contextlib.suppress(OSError):
+                request, address = self._socket.recvfrom(2048)
+                kind = int.from_bytes(request[:2], "little") if len(request) >= 4 else None
                 if kind == CONNECT:
-                    self._socket.sendto(server_info(self._admit(address[0])), address)
+                    self._client = address[0], _free_port()
+                    self._socket.sendto(_server_info(self._client[1]), address)
                 elif kind == ASK_MODELS:
-                    self._socket.sendto(models(self._names), address)
-
-    def _admit(self, host: str) -> int:
-        """Return a port of the client's own: several on one computer could not share one."""
-        with self._lock:
-            taken = {client.getpeername()[1] for client in self._clients}
-            while (port := _free_port()) in taken:
-                pass
-            client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            client.setblocking(False)
-            client.connect((host, port))
-            self._clients.append(client)
-        return port
+                    self._socket.sendto(_models(self._names), address)
 
 
 def _free_port() -> int:
@@ -373,3 +283,39 @@ def _free_port() -> int:
         probe.bind(("", 0))
         port: int = probe.getsockname()[1]
         return port
+
+
+def _message(kind: int, *parts: bytes) -> bytes:
+    body = b"".join(parts)
+    return struct.pack("<HH", kind, len(body)) + body
+
+
+def _server_info(data_port: int) -> bytes:
+    """Return the answer to `CONNECT`: frames will come to that port of the client's, by unicast."""
+    name = b"perchctl".ljust(_NAME_BYTES, b"\0")
+    where = struct.pack("<QH?4B", _TICKS_HZ, data_port, False, 0, 0, 0, 0)
+    return _message(SERVER_INFO, name, _VERSION, _VERSION, where)
+
+
+def _models(names: Sequence[str]) -> bytes:
+    """Return the answer to `ASK_MODELS`: rigid bodies, numbered from 1, their origins unmoved."""
+    parts = [struct.pack("<i", len(names))]
+    for number, name in enumerate(names, 1):
+        parts += [struct.pack("<i", _RIGID_BODY), name.encode() + b"\0"]
+        parts += [struct.pack("<ii3f", number, _NO_PARENT, 0.0, 0.0, 0.0), _EMPTY]  # no markers
+    return _message(MODELS, *parts)
+
+
+def frame_message(number: int, names: Sequence[str], seen: CaptureFrame) -> bytes:
+    """Return one frame; a body that is not in it is marked as not tracked."""
+    parts = [struct.pack("<i", number), _EMPTY, _EMPTY]  # marker sets, other markers
+    parts.append(struct.pack("<i", len(names)))
+    for index, name in enumerate(names, 1):
+        pose = seen.bodies.get(name, _UNSEEN)
+        w, x, y, z = pose.quaternion
+        tracked = name in seen.bodies
+        parts.append(struct.pack("<i3f4ffh", index, *pose.position_m, x, y, z, w, 0.0, tracked))
+    parts += [_EMPTY] * 4  # skeletons, labelled markers, force plates, devices
+    ticks = round(seen.t_s * _TICKS_HZ)
+    parts.append(struct.pack("<IId3Qh", 0, 0, seen.t_s, ticks, ticks, ticks, 0) + _EMPTY)
+    return _message(FRAME, *parts)

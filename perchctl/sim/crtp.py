@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -26,13 +26,205 @@ MAX_DATA = 30
 PROTOCOL_VERSION = 12
 FIRMWARE_VERSION = "2026.08"
 DEVICE_TYPE = "C21B"
-_ECHO, _SOURCE, _SINK, _NULL = 0, 1, 2, 3
-_BOOTLOADER = 0xFE
-_SYSTEM_ON, _RESET = 0x03, 0xF0
-_COMMAND, _VERSION = 0, 1
-_ARM, _RECOVER = 1, 2
-_GET_PROTOCOL, _GET_FIRMWARE, _GET_DEVICE = 0, 1, 2
+
+
+class Status(IntEnum):
+    """What the firmware answers: the numbers of C's errno."""
+
+    OK = 0
+    ENOENT = 2
+    E2BIG = 7
+    ENOEXEC = 8
+    ENOMEM = 12
+    EEXIST = 17
+
+
+# --- Packets that command the vehicle, turned into the firmware model's calls ------------------
+
+
+_SETPOINTS: dict[int, Callable[..., Setpoint]] = {
+    7: Setpoint.position,
+    8: Setpoint.velocity,
+    9: Setpoint.z_distance,
+    10: Setpoint.hover,
+}
+"""Port 7: setpoints of four numbers by their type, as cflib sends them since protocol 11."""
+
+
+def execute(firmware: Firmware, packet: Packet) -> bytes | None:
+    """Let the firmware do what a packet commands; the answer's data, None for no answer.
+
+    Raises struct.error for one that is too short for its command.
+    """
+    data = packet.data
+    match packet.port, packet.channel, data[0] if data else None:
+        case _, _, None:
+            return None
+        case Port.COMMANDER, 0, _:
+            _fly(firmware, _raw(data))
+        case Port.COMMANDER_GENERIC, 0, 0:
+            _fly(firmware, Setpoint())
+        case Port.COMMANDER_GENERIC, 0, 11:  # manual, by angles
+            _fly(firmware, _raw(data[1:]))
+        case Port.COMMANDER_GENERIC, 0, kind if kind in _SETPOINTS:
+            _fly(firmware, _SETPOINTS[kind](*struct.unpack_from("<ffff", data, 1)))
+        case Port.COMMANDER_GENERIC, 1, 0:
+            firmware.notify_setpoint_stop()
+        case Port.HIGH_LEVEL, 0, _:
+            return data[:3].ljust(3, b"\0") + bytes((_plan(firmware, data),))
+        case Port.LOCALIZATION, 0, _:
+            firmware.external_position(struct.unpack_from("<fff", data))
+        case Port.LOCALIZATION, 1, 8:
+            x, y, z, qx, qy, qz, qw = struct.unpack_from("<fffffff", data, 1)
+            firmware.external_pose((x, y, z), (qx, qy, qz, qw))
+        case ((Port.LOCALIZATION | Port.SUPERVISOR), 1, 3):
+            firmware.emergency_stop()
+        case ((Port.LOCALIZATION | Port.SUPERVISOR), 1, 4):
+            firmware.emergency_stop_watchdog()
+        case Port.SUPERVISOR, 0, 0x0C:
+            return struct.pack("<BH", 0x8C, firmware.supervisor_info)
+        case Port.SUPERVISOR, 1, 1 if len(data) > 1:
+            return bytes((0x81, *firmware.arm(bool(data[1]))))
+        case Port.SUPERVISOR, 1, 2:
+            return bytes((0x82, *firmware.recover_from_crash()))
+        case Port.PLATFORM, 0, 1 if len(data) > 1:
+            return bytes((1, *firmware.arm(bool(data[1]))))
+        case Port.PLATFORM, 0, 2:
+            return bytes((2, *firmware.recover_from_crash()))
+    return None
+
+
+def _raw(data: bytes) -> Setpoint:
+    """Return the setpoint of a packet on port 3; cflib negates the pitch on its way out."""
+    roll, pitch, yaw_rate, thrust = struct.unpack_from("<fffH", data)
+    return Setpoint.raw(roll, -pitch, yaw_rate, thrust)
+
+
+def _fly(firmware: Firmware, setpoint: Setpoint) -> None:
+    """Pass on finite numbers. Others would poison the controller for good."""
+    values = (getattr(setpoint, name) for name in Setpoint.__slots__)
+    if all(math.isfinite(value) for value in values if isinstance(value, float)):
+        firmware.low_level(setpoint)
+
+
+def _plan(firmware: Firmware, data: bytes) -> Status:
+    """Pass on a command of port 8. Trajectories and spirals are not simulated."""
+    match data[0]:
+        case 3:
+            order: HighLevelCommand = HlStop()
+        case 7 | 8 as kind:
+            height, yaw, keep_yaw, duration = struct.unpack_from("<ff?f", data, 2)
+            vertical = HlTakeoff if kind == 7 else HlLand
+            order = vertical(height, duration, None if keep_yaw else yaw)
+        case 12:  # data[3] is a flag for straight lines
+            x, y, z, yaw, duration = struct.unpack_from("<fffff", data, 4)
+            order = HlGoTo(x, y, z, yaw, duration, bool(data[2]))
+        case _:
+            return Status.ENOEXEC
+    is_finite = all(math.isfinite(value) for value in vars(order).values() if value is not None)
+    if is_finite and data[1:2] == b"\0":  # for all groups; this vehicle is in none
+        firmware.high_level(order)
+    return Status.OK
+
+
+# --- C numbers --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Number:
+    """A C number type: its `struct` letter, and its codes in the two tables."""
+
+    letter: str
+    log_code: int
+    param_code: int
+
+    @property
+    def size(self) -> int:
+        return struct.calcsize("<" + self.letter)
+
+    def pack(self, value: float) -> bytes:
+        """Return the bytes as C stores the value: integers truncated and wrapped, floats
+        rounded."""
+        if self.letter in "ef":
+            try:
+                return struct.pack("<" + self.letter, value)
+            except OverflowError:
+                return struct.pack("<" + self.letter, math.copysign(math.inf, value))
+        whole = int(value) if math.isfinite(value) else 0
+        return (whole & ((1 << 8 * self.size) - 1)).to_bytes(self.size, "little")
+
+    def unpack(self, data: bytes) -> float:
+        """Raises struct.error when `data` has another length."""
+        return float(struct.unpack("<" + self.letter, data)[0])
+
+
+BY_CTYPE = {
+    "uint8_t": Number("B", 0x01, 0x08),
+    "uint16_t": Number("H", 0x02, 0x09),
+    "uint32_t": Number("I", 0x03, 0x0A),
+    "int8_t": Number("b", 0x04, 0x00),
+    "int16_t": Number("h", 0x05, 0x01),
+    "int32_t": Number("i", 0x06, 0x02),
+    "float": Number("f", 0x07, 0x06),
+    "FP16": Number("e", 0x08, 0x05),
+}
+BY_LOG_CODE = {number.log_code: number for number in BY_CTYPE.values()}
+
+
+# --- Tables of contents: which log variables and parameters there are, by number ---------------
+# cflib keeps a table in a file named after its CRC, so the CRC follows from the contents and
+# nothing else: the same table has the same CRC in every process.
+
+
+class Toc:
+    """One table. `codes` maps a complete name ("group.name") to its type byte."""
+
+    _ITEM, _INFO = 2, 3
+
+    def __init__(self, port: int, codes: Mapping[str, int], info_tail: bytes = b"") -> None:
+        self._names = list(codes)
+        self._items = []
+        for name, code in codes.items():
+            item = bytes((code,)) + name.replace(".", "\0").encode() + b"\0"
+            assert len(item) + 3 <= MAX_DATA, f"the name {name} does not fit into a packet"
+            self._items.append(item)
+        crc = zlib.crc32(bytes((port,)) + b"".join(self._items))
+        self._info = struct.pack("<BHI", self._INFO, len(codes), crc) + info_tail
+
+    def name(self, ident: bytes) -> str | None:
+        """Return the name that has this number, two bytes; None where no name has it."""
+        number = int.from_bytes(ident, "little")
+        return self._names[number] if len(ident) == 2 and number < len(self._names) else None
+
+    def answer(self, data: bytes) -> bytes | None:
+        """Return the answer to a request on channel 0."""
+        if data[0] == self._INFO:
+            return self._info
+        if data[0] != self._ITEM or len(data) < 3:
+            return None
+        number = int.from_bytes(data[1:3], "little")
+        return data[:3] + self._items[number] if number < len(self._items) else data[:1]
+
+
+# --- The server --------------------------------------------------------------------------------
+# Limits of log blocks as measured: 26 bytes a block, period 10 ms x 1..254, 16 blocks,
+# 128 variables (docs/firmware.md, "Link").
+
+
+MAX_BLOCK_BYTES = 26
+MAX_BLOCKS = 16
+MAX_VARIABLES = 128
+PERIOD_UNIT_S = 0.010
+_DELETE, _START, _STOP, _CLEAR, _CREATE_V2, _APPEND_V2 = range(2, 8)
+_LOG_DATA = 2  # channel
+_ENTRY_BYTES = 3
+_EPS_S = 1e-6
+_EXTENDED, _READ_ONLY = 0x10, 0x40
+_EXTENDED_TYPE_V2 = 7
+_IS_PERSISTENT = 1
+_EEPROM = struct.pack("<BI", 0x00, 8192) + bytes(8)  # type I2C, size, address
 _LINK_SOURCE = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")
+_RESTARTS = (b"\xfe\xf0\x01", b"\xfe\x03")  # the radio chip's: reset to the firmware, system on
 
 
 @dataclass(frozen=True)
@@ -48,382 +240,6 @@ class LinkOptions:
     missing_log_variables: tuple[str, ...] = ()
 
 
-class CrtpServer:
-    """Serves one firmware to one peer at a time."""
-
-    def __init__(self, firmware: Firmware, options: LinkOptions | None = None) -> None:
-        options = options or LinkOptions()
-        version = options.protocol_version
-        self._firmware = firmware
-        self._version = version
-        self._log = LogService(firmware, options.missing_log_variables)
-        self._param = ParamService(firmware)
-        self._commands = CommandService(firmware, version)
-
-    def handle(self, packet: Packet) -> list[Packet]:
-        """Return the answers to one packet, in order."""
-        match packet.port:
-            case Port.LINK:
-                return self._link(packet)
-            case Port.LOG:
-                return self._log.handle(packet)
-            case Port.PARAM:
-                return self._param.handle(packet)
-            case Port.MEM:
-                return _memories(packet)
-            case Port.PLATFORM:
-                return self._platform(packet)
-            case _:
-                return self._commands.handle(packet)
-
-    def due(self) -> list[Packet]:
-        """Return the log data that the vehicle sends by itself by now."""
-        return self._log.due()
-
-    def reboot(self) -> None:
-        """Start the firmware again; log blocks are lost."""
-        self._firmware.reboot()
-        self._restarted(keep_blocks=False)
-
-    def replace_firmware(self, firmware: Firmware, *, keep_blocks: bool) -> None:
-        """Serve another firmware from now on (a test's short cut for a new vehicle)."""
-        self._firmware = firmware
-        self._restarted(keep_blocks=keep_blocks)
-
-    def _restarted(self, *, keep_blocks: bool) -> None:
-        self._log.rebooted(self._firmware, keep_blocks=keep_blocks)
-        self._param.firmware = self._firmware
-        self._commands.firmware = self._firmware
-
-    def _link(self, packet: Packet) -> list[Packet]:
-        if packet.channel == _ECHO:
-            return [packet]
-        if packet.channel == _SOURCE:
-            return [Packet(Port.LINK, _SOURCE, _LINK_SOURCE)]
-        if packet.channel == _SINK:
-            return []
-        # Null packets: a scan's probe, and the power commands of the radio chip.
-        if packet.data[:1] == bytes((_BOOTLOADER,)):
-            restart = packet.data[1:] == bytes((_RESET, 1)) or packet.data[1:2] == bytes(
-                (_SYSTEM_ON,)
-            )
-            if restart:
-                self.reboot()
-        return [Packet(Port.LINK, _NULL, packet.data)]
-
-    def _platform(self, packet: Packet) -> list[Packet]:
-        if not packet.data:
-            return []
-        command = packet.data[0]
-        answer: bytes | None = None
-        if packet.channel == _VERSION:
-            if command == _GET_PROTOCOL:
-                answer = bytes((self._version,))
-            elif command == _GET_FIRMWARE:
-                answer = FIRMWARE_VERSION.encode() + b"\0"
-            elif command == _GET_DEVICE:
-                answer = DEVICE_TYPE.encode() + b"\0"
-        elif packet.channel == _COMMAND:
-            if command == _ARM and len(packet.data) > 1:
-                answer = self._commands.arm(bool(packet.data[1]))
-            elif command == _RECOVER:
-                answer = self._commands.recover()
-        if answer is None:
-            return []
-        return [Packet(Port.PLATFORM, packet.channel, bytes((command,)) + answer)]
-
-
-# --- The memory port: one EEPROM, whose contents no client of this vehicle reads ---------------
-
-
-_MEM_INFO = 0
-_MEM_VERSION, _MEM_COUNT, _MEM_DETAILS = 0, 1, 2
-_I2C, _EEPROM_BYTES = 0x00, 8192
-
-
-def _memories(packet: Packet) -> list[Packet]:
-    data = packet.data
-    if packet.channel != _MEM_INFO or not data:
-        return []
-    if data[0] in (_MEM_VERSION, _MEM_COUNT):
-        answer = bytes((data[0], 1))
-    elif data[0] == _MEM_DETAILS:
-        details = struct.pack("<BI", _I2C, _EEPROM_BYTES) + bytes(8)
-        answer = data[:2] + (details if data[1:2] == b"\0" else b"")
-    else:
-        return []
-    return [Packet(Port.MEM, _MEM_INFO, answer)]
-
-
-# --- Packets that command the vehicle, turned into the firmware model's calls ------------------
-
-
-# Port 8.
-HL_STOP, HL_TAKEOFF_2, HL_LAND_2, HL_GO_TO_2 = 3, 7, 8, 12
-# Port 9.
-GET_STATE, ARM, RECOVER, EMERGENCY_STOP, WATCHDOG = 0x0C, 0x01, 0x02, 0x03, 0x04
-REPLY = 0x80
-# Port 6, channel 1.
-_LOC_EMERGENCY_STOP, _LOC_WATCHDOG, _LOC_POSE = 3, 4, 8
-_NOTIFY_STOP = 0
-
-
-def _raw(data: bytes) -> Setpoint:
-    """Return the setpoint of a packet on port 3 (``<fffH``); cflib negates the pitch on its way
-    out."""
-    roll, pitch, yaw_rate, thrust = struct.unpack_from("<fffH", data)
-    return Setpoint.raw(roll, -pitch, yaw_rate, thrust)
-
-
-_GENERIC: dict[int, Callable[[bytes], Setpoint]] = {
-    0: lambda data: Setpoint(),
-    7: lambda data: Setpoint.position(*struct.unpack_from("<ffff", data)),
-    8: lambda data: Setpoint.velocity(*struct.unpack_from("<ffff", data)),
-    9: lambda data: Setpoint.z_distance(*struct.unpack_from("<ffff", data)),
-    10: lambda data: Setpoint.hover(*struct.unpack_from("<ffff", data)),
-    11: _raw,  # manual, by angles
-}
-"""Port 7: setpoints by their type, as cflib sends them since protocol 11."""
-
-
-class CommandService:
-    """Serve the ports that command."""
-
-    def __init__(self, firmware: Firmware, protocol_version: int = PROTOCOL_VERSION) -> None:
-        self.firmware = firmware
-        self._has_supervisor_port = protocol_version >= 12
-        self._handlers: dict[int, Callable[[Packet], list[Packet]]] = {
-            Port.COMMANDER: self._commander,
-            Port.COMMANDER_GENERIC: self._generic,
-            Port.HIGH_LEVEL: self._high_level,
-            Port.LOCALIZATION: self._localization,
-            Port.SUPERVISOR: self._supervisor,
-        }
-
-    def handle(self, packet: Packet) -> list[Packet]:
-        """Return the answers to one packet. What is too short for its command is passed over, as
-        the firmware does."""
-        handler = self._handlers.get(packet.port)
-        if handler is None or not packet.data:
-            return []
-        try:
-            return handler(packet)
-        except struct.error:
-            return []
-
-    def arm(self, do_arm: bool) -> bytes:
-        """Return (success, armed) as bytes, shared with the platform port."""
-        return bytes(self.firmware.arm(do_arm))
-
-    def recover(self) -> bytes:
-        """Return (success, recovered) as bytes, shared with the platform port."""
-        return bytes(self.firmware.recover_from_crash())
-
-    def _commander(self, packet: Packet) -> list[Packet]:
-        if packet.channel == 0:
-            self._low_level(_raw(packet.data))
-        return []
-
-    def _generic(self, packet: Packet) -> list[Packet]:
-        data = packet.data
-        if packet.channel == 0 and data[0] in _GENERIC:
-            self._low_level(_GENERIC[data[0]](data[1:]))
-        elif packet.channel == 1 and data[0] == _NOTIFY_STOP:
-            self.firmware.notify_setpoint_stop()
-        return []
-
-    def _low_level(self, setpoint: Setpoint) -> None:
-        values = (getattr(setpoint, name) for name in Setpoint.__slots__)
-        if _all_finite(value for value in values if isinstance(value, float)):
-            self.firmware.low_level(setpoint)
-
-    def _high_level(self, packet: Packet) -> list[Packet]:
-        data, status = packet.data, Status.OK
-        command = _high_level(data)
-        if command is None:
-            status = Status.ENOEXEC
-        elif data[1] == 0:  # for all groups; this vehicle is in none
-            values = vars(command).values()
-            if _all_finite(value for value in values if value is not None):
-                self.firmware.high_level(command)
-        return [Packet(Port.HIGH_LEVEL, 0, data[:3].ljust(3, b"\0") + bytes((status,)))]
-
-    def _localization(self, packet: Packet) -> list[Packet]:
-        data = packet.data
-        if packet.channel == 0:
-            self.firmware.external_position(struct.unpack_from("<fff", data))
-        elif packet.channel == 1 and data[0] == _LOC_EMERGENCY_STOP:
-            self.firmware.emergency_stop()
-        elif packet.channel == 1 and data[0] == _LOC_WATCHDOG:
-            self.firmware.emergency_stop_watchdog()
-        elif packet.channel == 1 and data[0] == _LOC_POSE:
-            x, y, z, *quaternion = struct.unpack_from("<fffffff", data, 1)
-            qx, qy, qz, qw = quaternion
-            self.firmware.external_pose((x, y, z), (qx, qy, qz, qw))
-        return []
-
-    def _supervisor(self, packet: Packet) -> list[Packet]:
-        if not self._has_supervisor_port:
-            return []
-        command = packet.data[0]
-        answer: bytes | None = None
-        if packet.channel == 0 and command == GET_STATE:
-            answer = struct.pack("<H", self.firmware.supervisor_info)
-        elif packet.channel == 1 and command == ARM and len(packet.data) > 1:
-            answer = self.arm(bool(packet.data[1]))
-        elif packet.channel == 1 and command == RECOVER:
-            answer = self.recover()
-        elif packet.channel == 1 and command == EMERGENCY_STOP:
-            self.firmware.emergency_stop()
-        elif packet.channel == 1 and command == WATCHDOG:
-            self.firmware.emergency_stop_watchdog()
-        if answer is None:
-            return []
-        return [Packet(Port.SUPERVISOR, packet.channel, bytes((REPLY | command,)) + answer)]
-
-
-def _high_level(data: bytes) -> HighLevelCommand | None:
-    """Return the command of a packet on port 8; None for one that this vehicle does not have
-    (trajectories, spirals)."""
-    command = data[0]
-    if command == HL_STOP:
-        return HlStop()
-    if command in (HL_TAKEOFF_2, HL_LAND_2):
-        height, yaw, keep_yaw, duration = struct.unpack_from("<ff?f", data, 2)
-        kind = HlTakeoff if command == HL_TAKEOFF_2 else HlLand
-        return kind(height, duration, None if keep_yaw else yaw)
-    if command == HL_GO_TO_2:  # data[3] is a flag for straight lines
-        x, y, z, yaw, duration = struct.unpack_from("<fffff", data, 4)
-        return HlGoTo(x, y, z, yaw, duration, bool(data[2]))
-    return None
-
-
-def _all_finite(values: Iterable[float]) -> bool:
-    """Return whether all values are finite. Others would poison the controller for good."""
-    return all(map(math.isfinite, values))
-
-
-# --- C numbers, and the status codes of answers ---------------------------------------------------
-
-
-class Status(IntEnum):
-    """What the firmware answers: the numbers of C's errno."""
-
-    OK = 0
-    ENOENT = 2
-    E2BIG = 7
-    ENOEXEC = 8
-    ENOMEM = 12
-    EEXIST = 17
-
-
-@dataclass(frozen=True)
-class Number:
-    """A C number type: its codes in the two tables and its `struct` letter."""
-
-    ctype: str
-    letter: str
-    log_code: int | None
-    param_code: int | None
-
-    @property
-    def size(self) -> int:
-        return struct.calcsize("<" + self.letter)
-
-    def pack(self, value: float) -> bytes:
-        """Return the bytes as C stores the value: integers truncated and wrapped, floats
-        rounded."""
-        if self.letter in "efd":
-            return _pack_float(self.letter, value)
-        bits = 8 * self.size
-        whole = int(value) & ((1 << bits) - 1) if math.isfinite(value) else 0
-        return whole.to_bytes(self.size, "little")
-
-    def unpack(self, data: bytes) -> float:
-        """Raises struct.error when `data` has another length."""
-        return float(struct.unpack("<" + self.letter, data)[0])
-
-
-def _pack_float(letter: str, value: float) -> bytes:
-    try:
-        return struct.pack("<" + letter, value)
-    except OverflowError:
-        return struct.pack("<" + letter, math.copysign(math.inf, value))
-
-
-_NUMBERS = (
-    Number("uint8_t", "B", 0x01, 0x08),
-    Number("uint16_t", "H", 0x02, 0x09),
-    Number("uint32_t", "I", 0x03, 0x0A),
-    Number("int8_t", "b", 0x04, 0x00),
-    Number("int16_t", "h", 0x05, 0x01),
-    Number("int32_t", "i", 0x06, 0x02),
-    Number("float", "f", 0x07, 0x06),
-    Number("FP16", "e", 0x08, None),
-)
-BY_CTYPE = {number.ctype: number for number in _NUMBERS}
-BY_LOG_CODE = {n.log_code: n for n in _NUMBERS if n.log_code is not None}
-
-
-# --- Tables of contents: which log variables and parameters there are, by number ---------------
-# cflib keeps a table in a file named after its CRC, so the CRC follows from the contents and
-# nothing else: the same table has the same CRC in every process.
-
-
-_TOC = 0  # channel, on both ports
-_ITEM, _INFO = 2, 3
-
-
-class Toc:
-    """One table. `codes` maps a complete name ("group.name") to its type byte."""
-
-    def __init__(self, port: int, codes: Mapping[str, int | None], info_tail: bytes = b"") -> None:
-        self._port = port
-        self._names = list(codes)
-        self._items = [_item(name, code) for name, code in codes.items()]
-        crc = zlib.crc32(bytes((port,)) + b"".join(self._items))
-        self._info = struct.pack("<BHI", _INFO, len(codes), crc) + info_tail
-
-    def name(self, ident: bytes) -> str | None:
-        """Return the name that has this number, two bytes; None where no name has it."""
-        number = int.from_bytes(ident, "little")
-        return self._names[number] if len(ident) == 2 and number < len(self._names) else None
-
-    def handle(self, packet: Packet) -> list[Packet]:
-        """Return the reply to a request on channel 0."""
-        data = packet.data
-        if data[:1] == bytes((_INFO,)):
-            return [Packet(self._port, 0, self._info)]
-        if data[:1] != bytes((_ITEM,)) or len(data) < 3:
-            return []
-        number = int.from_bytes(data[1:3], "little")
-        found = number < len(self._items)
-        return [Packet(self._port, 0, data[:3] + self._items[number] if found else data[:1])]
-
-
-def _item(name: str, code: int | None) -> bytes:
-    assert code is not None, f"{name} has a type that its table does not know"
-    group, _, short = name.partition(".")
-    item = bytes((code,)) + group.encode() + b"\0" + short.encode() + b"\0"
-    assert len(item) + 3 <= MAX_DATA, f"the name {name} does not fit into a packet"
-    return item
-
-
-# --- The log port: blocks of variables, sent with their period while they run ------------------
-# Limits as measured: 26 bytes a block, period 10 ms x 1..254, 16 blocks, 128 variables
-# (docs/firmware.md, "Link").
-
-
-MAX_BLOCK_BYTES = 26
-MAX_BLOCKS = 16
-MAX_VARIABLES = 128
-PERIOD_UNIT_S = 0.010
-_SETTINGS, _DATA = 1, 2
-_DELETE, _START, _STOP, _CLEAR, _CREATE_V2, _APPEND_V2 = range(2, 8)
-_ENTRY_BYTES = 3
-_EPS_S = 1e-6
-
-
 @dataclass
 class _Block:
     variables: list[tuple[str, Number]] = field(default_factory=list)
@@ -435,40 +251,41 @@ class _Block:
         return sum(number.size for _, number in self.variables)
 
 
-class LogService:
-    """Serves the log port of one firmware; `missing` names are left out of the table."""
+class CrtpServer:
+    """Serves one firmware to one peer at a time."""
 
-    def __init__(self, firmware: Firmware, missing: Collection[str] = ()) -> None:
+    def __init__(self, firmware: Firmware, options: LinkOptions | None = None) -> None:
+        options = options or LinkOptions()
         self._firmware = firmware
-        codes = {
+        self._version = options.protocol_version
+        self._blocks: dict[int, _Block] = {}
+        log_codes = {
             name: BY_CTYPE[ctype].log_code
             for name, ctype in firmware.LOG_VARIABLES.items()
-            if name not in missing
+            if name not in options.missing_log_variables
         }
-        self.toc = Toc(Port.LOG, codes, bytes((MAX_BLOCKS, MAX_VARIABLES)))
-        self._blocks: dict[int, _Block] = {}
-
-    def rebooted(self, firmware: Firmware, *, keep_blocks: bool = False) -> None:
-        """Begin at time 0 again. The blocks are lost unless kept (a test's short cut)."""
-        self._firmware = firmware
-        if not keep_blocks:
-            self._blocks.clear()
-        for block in self._blocks.values():
-            if block.due_s is not None:
-                block.due_s = firmware.t_s + block.period_s
+        self._log_toc = Toc(Port.LOG, log_codes, bytes((MAX_BLOCKS, MAX_VARIABLES)))
+        parameters = firmware.PARAMETERS.items()
+        self._numbers = {name: BY_CTYPE[parameter.ctype] for name, parameter in parameters}
+        param_codes = {
+            name: self._numbers[name].param_code
+            | (_EXTENDED if parameter.persistent else 0)
+            | (_READ_ONLY if parameter.readonly else 0)
+            for name, parameter in parameters
+        }
+        self._param_toc = Toc(Port.PARAM, param_codes)
 
     def handle(self, packet: Packet) -> list[Packet]:
-        """Return the answers to one packet."""
-        if packet.channel == _TOC:
-            return self.toc.handle(packet)
-        if packet.channel != _SETTINGS or not packet.data:
+        """Return the answers to one packet, at most one. What is too short for its command is
+        passed over, as the firmware does."""
+        try:
+            answer = self._answer(packet)
+        except struct.error:
             return []
-        command, ident = packet.data[0], packet.data[1] if len(packet.data) > 1 else 0
-        status, extra = self._settings(command, ident, packet.data[2:])
-        return [Packet(Port.LOG, _SETTINGS, bytes((command, ident, status))), *extra]
+        return [] if answer is None else [Packet(packet.port, packet.channel, answer)]
 
     def due(self) -> list[Packet]:
-        """Return the data packets whose time has come."""
+        """Return the log data that the vehicle sends by itself by now."""
         now_s = self._firmware.t_s
         packets = []
         for ident, block in self._blocks.items():
@@ -477,30 +294,88 @@ class LogService:
                 block.due_s = max(block.due_s + block.period_s, now_s)
         return packets
 
-    def _settings(self, command: int, ident: int, rest: bytes) -> tuple[Status, list[Packet]]:
+    def reboot(self) -> None:
+        """Start the firmware again; log blocks are lost."""
+        self._firmware.reboot()
+        self._blocks.clear()
+
+    def replace_firmware(self, firmware: Firmware) -> None:
+        """Serve another firmware from now on, with the same log blocks (a test's short cut for a
+        new vehicle)."""
+        self._firmware = firmware
+        for block in self._blocks.values():
+            if block.due_s is not None:
+                block.due_s = firmware.t_s + block.period_s
+
+    def _answer(self, packet: Packet) -> bytes | None:
+        data = packet.data
+        match packet.port, packet.channel:
+            case Port.LINK, 0:
+                return data
+            case Port.LINK, 1:
+                return _LINK_SOURCE
+            case Port.LINK, 3:  # a scan's probe, and the power commands of the radio chip
+                if data.startswith(_RESTARTS):
+                    self.reboot()
+                return data
+            case _ if not data:
+                return None
+            case Port.LOG, 0:
+                return self._log_toc.answer(data)
+            case Port.LOG, 1:
+                ident = data[1] if len(data) > 1 else 0
+                return bytes((data[0], ident, self._set_block(data[0], ident, data[2:])))
+            case Port.PARAM, 0:
+                return self._param_toc.answer(data)
+            case Port.PARAM, 1:
+                return self._read(data)
+            case Port.PARAM, 2:
+                return self._write(data)
+            case Port.PARAM, 3 if data[0] == _EXTENDED_TYPE_V2:
+                name = self._param_toc.name(data[1:3])
+                persistent = name is not None and self._firmware.PARAMETERS[name].persistent
+                status = (Status.OK, _IS_PERSISTENT) if persistent else (Status.ENOENT,)
+                return data[:3] + bytes(status)
+            case Port.MEM, 0:  # one EEPROM, whose contents no client of this vehicle reads
+                if data[0] == 2:
+                    return data[:2] + (_EEPROM if data[1:2] == b"\0" else b"")
+                return bytes((data[0], 1)) if data[0] < 2 else None
+            case Port.PLATFORM, 1 if data[0] < 3:
+                version = bytes((self._version,))
+                names = (FIRMWARE_VERSION.encode() + b"\0", DEVICE_TYPE.encode() + b"\0")
+                return data[:1] + (version, *names)[data[0]]
+            case Port.SUPERVISOR, _ if self._version < PROTOCOL_VERSION:
+                return None
+            case _:
+                return execute(self._firmware, packet)
+
+    # Log blocks ---------------------------------------------------------------------
+
+    def _set_block(self, request: int, ident: int, rest: bytes) -> Status:
         block = self._blocks.get(ident)
-        if command == _CLEAR:
+        if request == _CLEAR:
             self._blocks.clear()
-            return Status.OK, []
-        if command == _CREATE_V2:
+            return Status.OK
+        if request == _CREATE_V2:
             if block is not None:
-                return Status.EEXIST, []
+                return Status.EEXIST
             if len(self._blocks) >= MAX_BLOCKS:
-                return Status.ENOMEM, []
+                return Status.ENOMEM
             self._blocks[ident] = _Block()
-            return self._append(self._blocks[ident], rest), []
-        if command not in (_APPEND_V2, _DELETE, _START, _STOP):
-            return Status.ENOEXEC, []
+            return self._append(self._blocks[ident], rest)
+        if request not in (_APPEND_V2, _DELETE, _START, _STOP):
+            return Status.ENOEXEC
         if block is None:
-            return Status.ENOENT, []
-        if command == _APPEND_V2:
-            return self._append(block, rest), []
-        if command == _START:
-            return Status.OK, self._start(ident, block, rest[0] if rest else 0)
+            return Status.ENOENT
+        if request == _APPEND_V2:
+            return self._append(block, rest)
         block.due_s = None
-        if command == _DELETE:
+        if request == _START and rest[:1] > b"\0":
+            block.period_s = rest[0] * PERIOD_UNIT_S
+            block.due_s = self._firmware.t_s + block.period_s
+        elif request == _DELETE:
             del self._blocks[ident]
-        return Status.OK, []
+        return Status.OK
 
     def _append(self, block: _Block, rest: bytes) -> Status:
         """Add variables until one does not fit; an incomplete last entry is ignored.
@@ -509,7 +384,7 @@ class LogService:
         """
         for at in range(0, len(rest) - _ENTRY_BYTES + 1, _ENTRY_BYTES):
             number = BY_LOG_CODE.get(rest[at] & 0x0F)
-            name = self.toc.name(rest[at + 1 : at + _ENTRY_BYTES])
+            name = self._log_toc.name(rest[at + 1 : at + _ENTRY_BYTES])
             if name is None or number is None:
                 return Status.ENOENT
             if block.size + number.size > MAX_BLOCK_BYTES:
@@ -519,84 +394,29 @@ class LogService:
             block.variables.append((name, number))
         return Status.OK
 
-    def _start(self, ident: int, block: _Block, period: int) -> list[Packet]:
-        if period == 0:  # the firmware sends once
-            return [self._data(ident, block)]
-        block.period_s = period * PERIOD_UNIT_S
-        block.due_s = self._firmware.t_s + block.period_s
-        return []
-
     def _data(self, ident: int, block: _Block) -> Packet:
         stamp_ms = round(self._firmware.t_s * 1000.0) & 0xFFFFFF
-        head = struct.pack("<I", ident | stamp_ms << 8)
         read = self._firmware.log_value
         body = b"".join(number.pack(read(name)) for name, number in block.variables)
-        return Packet(Port.LOG, _DATA, head + body)
+        return Packet(Port.LOG, _LOG_DATA, struct.pack("<I", ident | stamp_ms << 8) + body)
 
-
-# --- The parameter port: table, values, and which of them are persistent -----------------------
-
-
-_READ, _WRITE = 1, 2
-_EXTENDED_TYPE_V2 = 7
-_EXTENDED, _READ_ONLY = 0x10, 0x40
-_IS_PERSISTENT = 1
-
-
-class ParamService:
-    """Serves the parameter port of one firmware."""
-
-    def __init__(self, firmware: Firmware) -> None:
-        self.firmware = firmware
-        self._numbers = {name: BY_CTYPE[p.ctype] for name, p in firmware.PARAMETERS.items()}
-        codes = {}
-        for name, parameter in firmware.PARAMETERS.items():
-            code = self._numbers[name].param_code
-            assert code is not None, f"{parameter.ctype} is no type of a parameter"
-            extended = _EXTENDED if parameter.persistent else 0
-            codes[name] = code | extended | (_READ_ONLY if parameter.readonly else 0)
-        self.toc = Toc(Port.PARAM, codes)
-
-    def handle(self, packet: Packet) -> list[Packet]:
-        """Return the answers to one packet; a command that is not simulated has none."""
-        if packet.channel == _TOC:
-            return self.toc.handle(packet)
-        if not packet.data:
-            return []
-        if packet.channel == _READ:
-            answer = self._read(packet.data)
-        elif packet.channel == _WRITE:
-            answer = self._write(packet.data)
-        else:
-            answer = self._misc(packet.data)
-        return [Packet(Port.PARAM, packet.channel, answer)] if answer else []
+    # Parameters ---------------------------------------------------------------------
 
     def _value(self, name: str) -> bytes:
-        return self._numbers[name].pack(self.firmware.get_parameter(name))
+        return self._numbers[name].pack(self._firmware.get_parameter(name))
 
     def _read(self, data: bytes) -> bytes:
-        name = self.toc.name(data[:2])
+        name = self._param_toc.name(data[:2])
         if name is None:
             return data[:2] + bytes((Status.ENOENT,))
         return data[:2] + bytes((Status.OK,)) + self._value(name)
 
-    def _write(self, data: bytes) -> bytes:
+    def _write(self, data: bytes) -> bytes | None:
         """Answers with the value that is kept; a read-only one is passed over in silence."""
-        name = self.toc.name(data[:2])
+        name = self._param_toc.name(data[:2])
         if name is None:
             return data[:2] + bytes((Status.ENOENT,))
-        if self.firmware.PARAMETERS[name].readonly:
-            return b""
-        try:
-            self.firmware.set_parameter(name, self._numbers[name].unpack(data[2:]))
-        except struct.error:
-            return b""
+        if self._firmware.PARAMETERS[name].readonly:
+            return None
+        self._firmware.set_parameter(name, self._numbers[name].unpack(data[2:]))
         return data[:2] + self._value(name)
-
-    def _misc(self, data: bytes) -> bytes:
-        if data[0] != _EXTENDED_TYPE_V2:
-            return b""
-        name, head = self.toc.name(data[1:3]), data[:3]
-        if name is None or not self.firmware.PARAMETERS[name].persistent:
-            return head + bytes((Status.ENOENT,))
-        return head + bytes((Status.OK, _IS_PERSISTENT))

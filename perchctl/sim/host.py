@@ -10,66 +10,68 @@ import os
 import select
 import signal
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any, TextIO
 
 import cv2
 
 from perchctl.children import Channel, connect_back
 from perchctl.errors import PerchError
-from perchctl.geometry import rpy_from_rotation
+from perchctl.geometry import rotation_from_quaternion, rpy_from_rotation
 from perchctl.link import Packet
 from perchctl.sim.capture import CaptureFault, CaptureServer, SimCapture
 from perchctl.sim.crtp import CrtpServer
 from perchctl.sim.optics import Picture
-from perchctl.sim.process import (
-    CLOCK_MARGIN_S,
-    LOOP_PATIENCE_S,
-    START_TIMEOUT_S,
-    HostSetup,
-    SharedTime,
-)
-from perchctl.sim.scenario import CONTROL_PERIOD_S, Bursts, Scenario, radio_bursts
+from perchctl.sim.process import LOOP_PATIENCE_S, START_TIMEOUT_S, HostSetup, SharedTime
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.vehicle import SimulatedVehicle
 
 Address = tuple[str, int]
 TRUTH_EVERY = 10  # control periods between two lines of the truth file
+_RECEIVE_BYTES = 1 << 20
+_NULL_HEADER = 0xFF
+_EPS_S = 1e-9
 
 
 class VehicleHost:
-    """One vehicle, its CRTP endpoint, its video stream and the server of a motion capture."""
+    """One vehicle, its CRTP endpoint, its video stream and the server of a motion capture.
+
+    The endpoint is a socket on loopback: one CRTP packet a UDP datagram, as cflib's `udp://`
+    driver sends them. Answers go to the address that asked. What the vehicle sends by itself goes
+    to the last address that sent anything but a scan's probe.
+    """
 
     def __init__(self, setup: HostSetup) -> None:
         self._setup = setup
         self._steps = 0
+        self._peer: Address | None = None
+        self._silent_s = (math.inf, math.inf)
+        self._bursts = setup.scenario.radio_bursts()
         self.vehicle = self._new_vehicle(setup.scenario)
         self.server = CrtpServer(self.vehicle.firmware, setup.link)
+        self.stream: MjpegServer | None = None
+        self.positions: CaptureServer | None = None
         with contextlib.ExitStack() as opened:
             use = opened.enter_context
-            bursts = radio_bursts(setup.scenario)
-            self.endpoint = use(contextlib.closing(UdpEndpoint(bursts)))
-            self.stream: MjpegServer | None = None
+            self.socket = use(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            self.socket.setblocking(False)
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
+            self.socket.bind(("127.0.0.1", 0))
+            self.uri = f"udp://127.0.0.1:{self.socket.getsockname()[1]}"
             if setup.camera is not None:
                 self.stream = use(contextlib.closing(MjpegServer()))
-            self.positions: CaptureServer | None = None
             if setup.capture is not None:
                 self.positions = use(contextlib.closing(CaptureServer(setup.capture.names)))
-            self._truth: TextIO | None = None
-            if setup.truth_file is not None:
-                self._truth = use(setup.truth_file.open("w", encoding="utf-8"))
-            self._heard: TextIO | None = None
-            if setup.heard_file is not None:
-                self._heard = use(setup.heard_file.open("w", encoding="utf-8"))
-                self.endpoint.heard = self._write_heard
-            self._opened = opened.pop_all()
 
-    @property
-    def uri(self) -> str:
-        return f"udp://127.0.0.1:{self.endpoint.port}"
+            def lines(file: Path | None) -> TextIO | None:
+                return None if file is None else use(file.open("w", encoding="utf-8"))
+
+            self._truth, self._heard = lines(setup.truth_file), lines(setup.heard_file)
+            self._opened = opened.pop_all()
 
     @property
     def capture(self) -> tuple[str, str] | None:
@@ -83,11 +85,23 @@ class VehicleHost:
 
     def serve(self) -> None:
         """Answer what has arrived, without time passing; log data waits for the next step."""
-        self.endpoint.serve(self.server, self.elapsed_s)
+        while True:
+            try:
+                datagram, address = self.socket.recvfrom(64)
+            except (BlockingIOError, InterruptedError):
+                return
+            packet = Packet.decode(datagram)
+            if packet is None or not self._passes():
+                continue
+            if self._heard is not None:
+                _write(self._heard, {"from": address, "packet": datagram.hex()})
+            if datagram[0] != _NULL_HEADER:
+                self._peer = address
+            self._send(self.server.handle(packet), address)
 
     def step(self) -> None:
         """Serve what has arrived, advance by one control period, and send what is due."""
-        self.endpoint.serve(self.server, self.elapsed_s)
+        self.serve()
         vehicle = self.vehicle
         vehicle.step()
         if vehicle.camera is not None and self.stream is not None:
@@ -97,10 +111,10 @@ class VehicleHost:
             for frame in vehicle.capture.take():
                 self.positions.publish(frame)
         self._steps += 1
-        self.endpoint.send_due(self.server, self.elapsed_s)
+        if self._peer is not None:
+            self._send(self.server.due(), self._peer)
         if self._truth is not None and self._steps % TRUTH_EVERY == 0:
-            self._truth.write(json.dumps(self.truth()) + "\n")
-            self._truth.flush()
+            _write(self._truth, self.truth())
 
     def advance(self, dt_s: float) -> float:
         """Let `dt_s` pass; the simulated time since the start."""
@@ -120,17 +134,15 @@ class VehicleHost:
 
     def silence(self, duration_s: float) -> None:
         """Let the link receive and send nothing for `duration_s` of simulated time."""
-        self.endpoint.silence(self.elapsed_s, duration_s)
+        self._silent_s = (self.elapsed_s, self.elapsed_s + duration_s)
 
     def capture_fault(self, fault: CaptureFault | None, for_s: float = math.inf) -> None:
         """Begin a fault of the motion capture for so long; None ends all faults."""
-        capture = self.vehicle.capture
-        if capture is None:
-            raise RuntimeError("it was started without a motion capture")
+        assert self.vehicle.capture is not None, "it was started without a motion capture"
         if fault is None:
-            capture.heal()
+            self.vehicle.capture.heal()
         else:
-            capture.lay(fault, for_s)
+            self.vehicle.capture.lay(fault, for_s)
 
     def reboot(self) -> None:
         """Restart the firmware, as the power button does; log blocks are lost."""
@@ -140,40 +152,52 @@ class VehicleHost:
         """Return the true state, SI and radians, and the firmware's outputs: no Crazyflie reports
         it."""
         world, firmware = self.vehicle.world, self.vehicle.firmware
-        state = world.state()
+        ceiling_n, floor = world.contacts()
         return {
             "t_s": self.elapsed_s,
-            "position_m": tuple(state.position_m.tolist()),
-            "velocity_mps": tuple(state.velocity_mps.tolist()),
-            "rpy_rad": rpy_from_rotation(state.R_world_body),
-            "specific_force_mps2": tuple(state.specific_force_mps2.tolist()),
+            "position_m": (world.x_m, world.y_m, world.z_m),
+            "velocity_mps": (world.vx_mps, world.vy_mps, world.vz_mps),
+            "rpy_rad": rpy_from_rotation(rotation_from_quaternion(world.quaternion)),
+            "specific_force_mps2": (world.fx_mps2, world.fy_mps2, world.fz_mps2),
             "battery_v": world.battery_v,
-            "motors": tuple(int(firmware.log_value(f"motor.m{i}")) for i in (1, 2, 3, 4)),
+            "motors": tuple(map(int, firmware.motors)),
             "supervisor_info": firmware.supervisor_info,
-            "floor_contact": state.floor_contact,
-            "ceiling_force_n": state.ceiling_force_n,
-            "magnet_engaged": state.magnet_engaged,
+            "floor_contact": floor,
+            "ceiling_force_n": ceiling_n,
+            "magnet_engaged": world.magnet_engaged,
             "gear_miss_m": world.gear_miss_m(),
         }
 
     def replace_vehicle(self, scenario: Scenario) -> None:
         """Put a new vehicle under the same link: connection and log blocks stay."""
         self.vehicle = self._new_vehicle(scenario)
-        self.server.replace_firmware(self.vehicle.firmware, keep_blocks=True)
+        self.server.replace_firmware(self.vehicle.firmware)
 
     def close(self) -> None:
         """Free the ports and close the files."""
         self._opened.close()
 
-    def _write_heard(self, t_s: float, address: Address, datagram: bytes) -> None:
-        assert self._heard is not None
-        heard = {"t_s": t_s, "from": f"{address[0]}:{address[1]}", "packet": datagram.hex()}
-        self._heard.write(json.dumps(heard) + "\n")
-        self._heard.flush()
-
     def _new_vehicle(self, scenario: Scenario) -> SimulatedVehicle:
         setup = self._setup
         return SimulatedVehicle(scenario, setup.camera, setup.target, setup.capture)
+
+    def _send(self, packets: Iterable[Packet], address: Address) -> None:
+        for packet in packets:
+            if self._passes():
+                with contextlib.suppress(OSError):  # lost like over the air
+                    self.socket.sendto(packet.encode(), address)
+
+    def _passes(self) -> bool:
+        """Return whether the link carries a packet now."""
+        t_s = self.elapsed_s + _EPS_S
+        if self._silent_s[0] <= t_s < self._silent_s[1]:
+            return False
+        return self._bursts is None or not self._bursts.lost(self.elapsed_s)
+
+
+def _write(file: TextIO, record: dict[str, Any]) -> None:
+    file.write(json.dumps(record) + "\n")
+    file.flush()
 
 
 # --- The child process: runs the vehicle that the parent describes ------------------------------
@@ -184,17 +208,17 @@ def serve_parent() -> None:
     cv2.setNumThreads(1)  # the picture must not take the physics' core
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = connect_back()
-    setup = channel.receive(START_TIMEOUT_S)
-    realtime = setup.pace == "realtime"
+    setup: HostSetup = channel.receive(START_TIMEOUT_S)
     try:
-        shared = SharedTime(setup.time_file)
+        file = setup.time_file
+        shared = SharedTime.free() if file is None else SharedTime.mapped(file)
         host = VehicleHost(setup)
     except (PerchError, OSError, ValueError) as error:
         channel.send(f"{type(error).__name__}: {error}")
         return
     with contextlib.closing(host):
-        stream_url = host.stream.url if host.stream is not None else ""
-        channel.send((host.uri, stream_url, host.capture))
+        channel.send((host.uri, "" if host.stream is None else host.stream.url, host.capture))
+        realtime = setup.pace == "realtime"
         Runner(host, channel, realtime=realtime, linger_s=setup.linger_s, shared=shared).run()
 
 
@@ -232,25 +256,23 @@ class Runner:
         self._realtime = realtime
         self._linger_s = linger_s
         self._clock = clock
-        self._shared = shared or SharedTime()
+        self._shared = shared or SharedTime.free()
         self._waiting_since_s: float | None = None
         self._limit_s = math.inf
         self._parent = os.getppid()
-        self._end_s: float | None = None
-        self._stopped = False
+        self._end_s = math.inf
         self._origin_s = clock() - host.elapsed_s
 
     def run(self) -> None:
-        while not self._stopped and not self._is_over():
+        while self._clock() < self._end_s:
             self._wait(self.catch_up() if self._realtime else _IDLE_S)
-
-    def _restart_clock(self) -> None:
-        self._origin_s = self._clock() - self._host.elapsed_s
+            if self._channel is not None and os.getppid() != self._parent:
+                self._lose_parent()
 
     def catch_up(self) -> float:
         """Step up to now, some steps at most at once; how long to wait for the next step."""
         now_s = self._clock() - self._origin_s
-        max_lag_s = MAX_LAG_S if math.isinf(self._shared.limit_s) else CLOCK_MARGIN_S
+        max_lag_s = MAX_LAG_S if math.isinf(self._shared.limit_s) else SharedTime.MARGIN_S
         if now_s - self._host.elapsed_s > max_lag_s:
             self._origin_s += now_s - self._host.elapsed_s - max_lag_s
             now_s = self._clock() - self._origin_s
@@ -277,11 +299,11 @@ class Runner:
         return now_s - self._waiting_since_s < LOOP_PATIENCE_S
 
     def _wait(self, timeout_s: float) -> None:
-        sockets = [self._host.endpoint.socket]
+        sockets = [self._host.socket]
         if self._channel is not None:
             sockets.append(self._channel.socket)
         ready, _, _ = select.select(sockets, [], [], timeout_s)
-        if self._host.endpoint.socket in ready:
+        if self._host.socket in ready:
             self._host.serve()
         if self._channel is not None and self._channel.socket in ready:
             self._answer(self._channel)
@@ -291,138 +313,53 @@ class Runner:
         (False, text)."""
         try:
             name, arguments, named = channel.receive()
-        except EOFError:
-            self._lose_parent()
-            return
-        answer: tuple[bool, Any] = True, None
-        try:
-            if name == "stop":
-                self._stopped = True
-            elif name == "advance" and self._realtime:
-                raise RuntimeError("only a stepped vehicle can be advanced")
-            else:
-                answer = True, self._host.answer(name, *arguments, **named)
-        except Exception as error:
-            answer = False, f"{type(error).__name__}: {error}"
-        try:
+            answer: tuple[bool, Any] = True, None
+            try:
+                if name == "stop":
+                    self._end_s = -math.inf
+                elif name == "advance" and self._realtime:
+                    answer = False, "only a stepped vehicle can be advanced"
+                else:
+                    answer = True, self._host.answer(name, *arguments, **named)
+            except Exception as error:
+                answer = False, f"{type(error).__name__}: {error}"
             channel.send(answer)
-        except OSError:
+        except (EOFError, OSError):
             self._lose_parent()
-
-    def _is_over(self) -> bool:
-        if self._channel is not None and os.getppid() != self._parent:
-            self._lose_parent()
-        return self._end_s is not None and self._clock() >= self._end_s
 
     def _lose_parent(self) -> None:
         if self._channel is not None:
             self._channel.close()
             self._channel = None
+        self._realtime, self._shared = True, SharedTime.free()
         self._end_s = self._clock() + self._linger_s
-        self._realtime = True
-        self._shared = SharedTime()
-        self._restart_clock()
-
-
-# --- The link's carrier: one CRTP packet a UDP datagram, as cflib's `udp://` driver sends them ---
-
-
-_RECEIVE_BYTES = 1 << 20
-_NULL_HEADER = 0xFF
-_EPS_S = 1e-9
-
-
-class UdpEndpoint:
-    """The socket of a simulated vehicle, bound to loopback.
-
-    Answers go to the requesting address. What the vehicle sends by itself goes to the
-    peer: the last address that sent anything but a scan's probe. `heard` is called with each
-    datagram that is a packet, before anything is made of it: time, sender, bytes.
-    """
-
-    def __init__(self, bursts: Bursts | None = None) -> None:
-        """Open the socket; nothing passes in `bursts`."""
-        self._bursts = bursts
-        self._peer: Address | None = None
-        self.heard: Callable[[float, Address, bytes], None] | None = None
-        self._silent = (math.inf, math.inf)
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.setblocking(False)
-        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
-        self.socket.bind(("127.0.0.1", 0))
-        self.port = int(self.socket.getsockname()[1])
-
-    def close(self) -> None:
-        self.socket.close()
-
-    def silence(self, from_s: float, duration_s: float) -> None:
-        """Receive and send nothing for a while of simulated time."""
-        self._silent = (from_s, from_s + duration_s)
-
-    def serve(self, server: CrtpServer, t_s: float) -> None:
-        """Handle every datagram that has arrived. `t_s`: simulated time, for the silence."""
-        while True:
-            try:
-                datagram, address = self.socket.recvfrom(64)
-            except (BlockingIOError, InterruptedError):
-                return
-            if not self._passes(t_s):
-                continue
-            packet = Packet.decode(datagram)
-            if packet is None:
-                continue
-            if self.heard is not None:
-                self.heard(t_s, address, datagram)
-            if datagram[0] != _NULL_HEADER:
-                self._peer = address
-            self._send(server.handle(packet), address, t_s)
-
-    def send_due(self, server: CrtpServer, t_s: float) -> None:
-        """Send what the vehicle sends by itself; nothing is kept for a missing peer."""
-        if self._peer is not None:
-            self._send(server.due(), self._peer, t_s)
-
-    def _send(self, packets: Iterable[Packet], address: Address, t_s: float) -> None:
-        for packet in packets:
-            if not self._passes(t_s):
-                continue
-            try:
-                self.socket.sendto(packet.encode(), address)
-            except OSError:  # full buffer or a peer that is gone: lost like over the air
-                continue
-
-    def _passes(self, t_s: float) -> bool:
-        """Return whether the link carries a packet at that time."""
-        if self._silent[0] - _EPS_S <= t_s < self._silent[1] - _EPS_S:
-            return False
-        return self._bursts is None or not self._bursts.lost(t_s)
+        self._origin_s = self._clock() - self._host.elapsed_s
 
 
 # --- The simulated camera's picture over HTTP, as a network camera would send it ---------------
 # One part of a multipart answer is one JPEG; a slow client skips frames, the newest wins.
 
 
-PATH = "/stream.mjpg"
 JPEG_QUALITY = 92
 _BOUNDARY = "perchctlframe"
 _WAIT_S = 0.5
 _CLIENT_TIMEOUT_S = 5.0
 
 
-class MjpegServer:
-    """Serves the newest of the published pictures on loopback."""
+class MjpegServer(ThreadingHTTPServer):
+    """Serves the newest of the published pictures on loopback, whatever the path."""
+
+    daemon_threads = True
+    block_on_close = False
 
     def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
         self._changed = threading.Condition()
         self._image: Picture | None = None
         self._number = 0
         self.closed = False
-        self._server = _HttpServer(self)
-        self.url = f"http://127.0.0.1:{self._server.server_address[1]}{PATH}"
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True
-        )
-        self._thread.start()
+        self.url = f"http://127.0.0.1:{self.server_address[1]}/stream.mjpg"
+        threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True).start()
 
     def publish(self, image: Picture) -> None:
         """Publish a picture, grey uint8 (h, w). It costs nothing while nobody watches."""
@@ -442,54 +379,28 @@ class MjpegServer:
 
     def close(self) -> None:
         """End all streams and free the port."""
-        with self._changed:
-            self.closed = True
-            self._changed.notify_all()
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
-
-
-class _HttpServer(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-    allow_reuse_address = True
-
-    def __init__(self, pictures: MjpegServer) -> None:
-        self.pictures = pictures
-        super().__init__(("127.0.0.1", 0), _Handler)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Report all errors but a client that goes away."""
-        if not isinstance(sys.exception(), OSError):
-            super().handle_error(request, client_address)
+        self.closed = True
+        self.shutdown()
+        self.server_close()
 
 
 class _Handler(BaseHTTPRequestHandler):
     timeout = _CLIENT_TIMEOUT_S
-    server: _HttpServer
+    server: MjpegServer
 
     def do_GET(self) -> None:
-        if self.path.split("?", 1)[0] != PATH:
-            self.send_error(404, f"the stream is at {PATH}")
-            return
-        self.send_response(200)
-        self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
-        self.send_header("Cache-Control", "no-store")
-        self.end_headers()
-        self.wfile.flush()
-        pictures, number = self.server.pictures, 0
-        while not pictures.closed:
-            newer = pictures.after(number)
-            if newer is None:
-                continue
-            number, image = newer
-            _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-            jpeg = encoded.tobytes()
-            head = (
-                f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-            )
-            self.wfile.write(head.encode() + jpeg + b"\r\n")
+        number = 0
+        with contextlib.suppress(OSError):  # a client that goes away
+            self.send_response(200)
+            self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
+            self.end_headers()
+            while not self.server.closed:
+                if (newer := self.server.after(number)) is None:
+                    continue
+                number, image = newer
+                _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+                head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}"
+                self.wfile.write(f"{head}\r\n\r\n".encode() + jpeg.tobytes() + b"\r\n")
 
     def log_message(self, format: str, *args: Any) -> None:
         """Print nothing: requests are not worth a line on the terminal."""

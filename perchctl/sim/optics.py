@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +27,6 @@ FAR_AWAY_M = 1e4
 """The coordinates given to rays that miss the plane."""
 LEAST_RISE = 0.02
 """z of a ray (target axes, depth 1 in the view) that still meets the plane."""
-_NOTHING = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,32 +38,14 @@ class RayGrid:
     cv2.resize by `stride` puts its sample centres.
     """
 
-    stride: int
     xy: NDArray[np.float32]  # (rows, cols, 2)
     down: NDArray[np.float32]  # (rows,), 0 in the picture's first row, 1 in its last
     outline: NDArray[np.float32]  # (n, 2), rays around all of them
 
-    @property
-    def rays(self) -> NDArray[np.float32]:
-        """(x, y, 1), shape (3, rows, cols)."""
-        x, y = self.xy[..., 0], self.xy[..., 1]
-        return np.stack([x, y, np.ones_like(x)])
-
     def window(self, rows: slice, cols: slice) -> RayGrid:
         """Return a part of the grid, whose outline stays that of the whole."""
         xy = np.ascontiguousarray(self.xy[rows, cols])
-        return RayGrid(self.stride, xy, self.down[rows], self.outline)
-
-
-def undistorted_rays(camera: CameraModel, pixels: Array) -> Array:
-    """Return view rays (x, y) at depth one of pixels (n, 2), shape (n, 2)."""
-    points = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
-    criteria = (3, 100, 1e-12)  # by default OpenCV stops early, 0.12 px off in the corners
-    if camera.model == "fisheye":
-        rays = cv2.fisheye.undistortPoints(points, camera.K, camera.dist, criteria=criteria)
-    else:
-        rays = cv2.undistortPoints(points, camera.K, camera.dist, criteria=criteria)
-    return np.asarray(rays, np.float64).reshape(-1, 2)
+        return RayGrid(xy, self.down[rows], self.outline)
 
 
 def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
@@ -71,12 +53,15 @@ def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
     cols, rows = (-(-side // COARSE_PX) * (COARSE_PX // stride) + 2 for side in camera.size_px)
     u = stride * (np.arange(cols) - 1) + (stride - 1) / 2.0
     v = stride * (np.arange(rows) - 1) + (stride - 1) / 2.0
-    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    xy = undistorted_rays(camera, pixels)
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 1, 2)
+    undistort: Any = cv2.undistortPoints
+    if camera.model == "fisheye":
+        undistort = cv2.fisheye.undistortPoints
+    criteria = (3, 100, 1e-12)  # by default OpenCV stops early, 0.12 px off in the corners
+    xy = undistort(pixels, camera.K, camera.dist, criteria=criteria)
+    rays = np.ascontiguousarray(np.reshape(xy, (rows, cols, 2)), np.float32)
     down = np.asarray(v / (camera.size_px[1] - 1.0), np.float32)
-    rays = np.ascontiguousarray(xy.reshape(rows, cols, 2), np.float32)
-    outline = np.concatenate([rays[0], rays[-1], rays[:, 0], rays[:, -1]])
-    return RayGrid(stride, rays, down, outline)
+    return RayGrid(rays, down, np.concatenate([rays[0], rays[-1], rays[:, 0], rays[:, -1]]))
 
 
 def plane_map(T_target_cam: Array) -> Array:
@@ -89,8 +74,7 @@ def plane_map(T_target_cam: Array) -> Array:
     R, t = T_target_cam[..., :3, :3], T_target_cam[..., :3, 3:]
     H = np.empty(R.shape)
     H[..., :2, :] = t[..., :2, :] * R[..., 2:, :] - t[..., 2:, :] * R[..., :2, :]
-    above = t[..., 2, :] >= 0.0
-    H[..., 2, :] = np.where(above, _NOTHING, R[..., 2, :]) if above.any() else R[..., 2, :]
+    H[..., 2, :] = np.where(t[..., 2, :] >= 0.0, (0.0, 0.0, -1.0), R[..., 2, :])
     return H
 
 
@@ -100,39 +84,27 @@ def trace(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDArray[
     `to_plane` is the map (3, 3), or with a rolling shutter those of rows at equal distances
     from the picture's first to its last, (n, 3, 3).
     """
-    if to_plane.ndim == 3:
-        return _trace_by_row(grid, to_plane)
-    if _all_rise(grid, to_plane):
-        points = cv2.perspectiveTransform(grid.xy, to_plane)
-        return np.asarray(points, np.float32), np.zeros(grid.xy.shape[:2], np.bool_)
-    rays = grid.rays
-    q = to_plane.astype(np.float32) @ rays.reshape(3, -1)
-    return _met(q.reshape(3, *rays.shape[1:]))
-
-
-def _trace_by_row(grid: RayGrid, maps: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    at = np.clip(grid.down, 0.0, 1.0) * (len(maps) - 1)
-    low = np.minimum(at.astype(int), len(maps) - 2)
-    share = (at - low)[:, None, None]
-    H = ((1.0 - share) * maps[low] + share * maps[low + 1]).astype(np.float32)  # (rows, 3, 3)
     x, y = grid.xy[..., 0], grid.xy[..., 1]
-    return _met(np.stack([H[:, i, :1] * x + H[:, i, 1:2] * y + H[:, i, 2:] for i in range(3)]))
-
-
-def _met(q: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return points of (X w, Y w, w), shape (3, rows, cols)."""
+    if to_plane.ndim == 2:
+        # The rise is linear over the rays, so it is least on the outline.
+        rise = to_plane[2].astype(np.float32)
+        if grid.outline.dot(rise[:2]).min() + rise[2] >= LEAST_RISE:
+            points = cv2.perspectiveTransform(grid.xy, to_plane)
+            return np.asarray(points, np.float32), np.zeros(x.shape, np.bool_)
+        rays = np.stack([x, y, np.ones_like(x)]).reshape(3, -1)
+        q = (to_plane.astype(np.float32) @ rays).reshape(3, *x.shape)
+    else:
+        at = np.clip(grid.down, 0.0, 1.0) * (len(to_plane) - 1)
+        low = np.minimum(at.astype(int), len(to_plane) - 2)
+        share = (at - low)[:, None, None]
+        H = (1.0 - share) * to_plane[low] + share * to_plane[low + 1]  # (rows, 3, 3)
+        H = H.astype(np.float32)
+        q = np.stack([H[:, i, :1] * x + H[:, i, 1:2] * y + H[:, i, 2:] for i in range(3)])
     misses = q[2] < LEAST_RISE
     q[2, misses] = 1.0
     points = np.stack([q[0] / q[2], q[1] / q[2]], axis=-1)
     points[misses] = FAR_AWAY_M
     return np.asarray(points, np.float32), np.asarray(misses)
-
-
-def _all_rise(grid: RayGrid, to_plane: Array) -> bool:
-    """True if every ray meets the plane. The rise is linear over the rays, so it is least
-    on the outline."""
-    rise = to_plane[2].astype(np.float32)
-    return bool(grid.outline.dot(rise[:2]).min() + rise[2] >= LEAST_RISE)
 
 
 def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) -> float:
@@ -150,13 +122,6 @@ def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) 
 VIGNETTING_EXPONENT = 0.6
 """Relative light is (1 + tan^2(angle))^-exponent; 2 would be the cos^4 law of a
 bare lens, real ones correct most of it."""
-
-
-def pixel_rays(fine: RayGrid) -> RayGrid:
-    """Return the rays of all pixels; between the nodes they are interpolated (1e-4 px)."""
-    xy = cv2.resize(fine.xy, None, fx=FINE_PX, fy=FINE_PX)[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX]
-    down = np.arange(len(xy)) * ((fine.down[2] - fine.down[1]) / FINE_PX)
-    return RayGrid(1, np.asarray(xy, np.float32), np.asarray(down, np.float32), fine.outline)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,22 +146,21 @@ def lens_of(camera: CameraModel) -> Lens:
 def _lens(size_px: tuple[int, int], model: str, K: bytes, dist: bytes) -> Lens:
     camera = CameraModel(size_px, np.frombuffer(K).reshape(3, 3), np.frombuffer(dist), model)
     fine, coarse = ray_grid(camera, FINE_PX), ray_grid(camera, COARSE_PX)
-    focal_px = float(camera.K[0, 0] + camera.K[1, 1]) / 2.0
-    shade = vignetting(fine, size_px)
-    return Lens(coarse, pixel_rays(fine), shade, _five_places(coarse), focal_px)
 
+    def finer(nodes: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Interpolate between the fine nodes (1e-4 px)."""
+        pixels = cv2.resize(nodes, None, fx=FINE_PX, fy=FINE_PX)
+        return np.asarray(pixels[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX], np.float32)
 
-def _five_places(coarse: RayGrid) -> Array:
+    xy = finer(fine.xy)
+    down = np.arange(len(xy)) * ((fine.down[2] - fine.down[1]) / FINE_PX)
+    pixels = RayGrid(xy, np.asarray(down, np.float32), fine.outline)
+    r2 = (fine.xy[..., 0] ** 2) + (fine.xy[..., 1] ** 2)
+    light = finer((255.0 * (1.0 + r2) ** -VIGNETTING_EXPONENT).astype(np.float32))
+    shade = np.asarray(np.rint(light[: size_px[1], : size_px[0]]), np.uint8)
     rows, cols = coarse.xy.shape[:2]
     places = [(rows // 2, cols // 2)] + [
         (r, c) for r in (rows // 5, 4 * rows // 5) for c in (cols // 5, 4 * cols // 5)
     ]
-    return np.array([[*coarse.xy[r, c], 1.0] for r, c in places], np.float64).T
-
-
-def vignetting(fine: RayGrid, size_px: tuple[int, int]) -> Picture:
-    """Return the lens's relative light, 255 for all of it; (height, width)."""
-    r2 = (fine.rays[:2] ** 2).sum(axis=0)
-    light = (255.0 * (1.0 + r2) ** -VIGNETTING_EXPONENT).astype(np.float32)
-    full = cv2.resize(light, None, fx=FINE_PX, fy=FINE_PX)[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX]
-    return np.asarray(np.rint(full[: size_px[1], : size_px[0]]), np.uint8)
+    rays = np.array([[*coarse.xy[place], 1.0] for place in places], np.float64).T
+    return Lens(coarse, pixels, shade, rays, float(camera.K[0, 0] + camera.K[1, 1]) / 2.0)

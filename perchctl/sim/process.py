@@ -8,18 +8,16 @@ real vehicle would.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import math
-import subprocess
+import mmap
 import tempfile
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Literal, get_args
-
-import numpy as np
+from typing import IO, Any, ClassVar, Literal
 
 from perchctl.children import (
     Channel,
@@ -38,80 +36,65 @@ from perchctl.sim.crtp import LinkOptions
 from perchctl.sim.scenario import Scenario
 from perchctl.vision import CameraModel
 
-CLOCK_MARGIN_S = 0.02
-"""Simulated time may run so far past the moment that the flight loop waits for."""
 LOOP_PATIENCE_S = 2.0
 """The simulator waits so long, on the wall's clock, for a loop that gives no sign of life."""
 
 
-class SharedTime:
-    """Two numbers in a file that both processes map.
+class SharedTime(ctypes.Structure):
+    """How far simulated time has come and may go, where both processes see it.
 
-    `reached_s` is how far simulated time has come; the simulator writes it. `limit_s` is how far
-    it may go; the flight writes it, and infinity lets time run freely. Without a file they belong
-    to one process.
+    Attributes:
+        reached_s: written by the simulator.
+        limit_s: written by the flight; infinity lets time run freely.
     """
 
-    def __init__(self, file: Path | None = None) -> None:
-        if file is None:
-            self._values = np.array([0.0, math.inf])
-        else:
-            self._values = np.memmap(file, np.float64, "r+")
+    MARGIN_S: ClassVar = 0.02
+    """Simulated time may run so far past the moment that the flight loop waits for."""
+
+    reached_s: float
+    limit_s: float
+    _fields_ = (("reached_s", ctypes.c_double), ("limit_s", ctypes.c_double))
 
     @classmethod
-    def create(cls, file: Path) -> SharedTime:
-        np.array([0.0, math.inf]).tofile(file)
-        return cls(file)
+    def free(cls) -> SharedTime:
+        """Return a time of one process, without a limit."""
+        return cls(0.0, math.inf)
 
-    @property
-    def reached_s(self) -> float:
-        return float(self._values[0])
-
-    @reached_s.setter
-    def reached_s(self, t_s: float) -> None:
-        self._values[0] = t_s
-
-    @property
-    def limit_s(self) -> float:
-        return float(self._values[1])
-
-    @limit_s.setter
-    def limit_s(self, t_s: float) -> None:
-        self._values[1] = t_s
+    @classmethod
+    def mapped(cls, file: Path) -> SharedTime:
+        """Return the time that the file holds, for each process that maps it."""
+        with file.open("r+b") as opened:
+            return cls.from_buffer(mmap.mmap(opened.fileno(), ctypes.sizeof(cls)))
 
 
-# --- Messages between the process that flies and the simulated vehicle's, and their settings ---
-
-
-Pace = Literal["realtime", "stepped"]
 START_TIMEOUT_S = 30.0
-LINGER_S = 12.0
 
 
 @dataclass(frozen=True)
 class HostSetup:
     """How the simulated vehicle's process is set up.
 
-    `camera` None: no camera and no stream; `capture` None: no motion capture.
-    `truth_file`: JSON lines of the true state, 50 a simulated second, also after the
-    parent has ended. `heard_file`: JSON lines of every packet that arrived, and who had sent it.
-    `linger_s`: how long the vehicle then runs on, in wall-clock time. `time_file`: a
-    `SharedTime` of the parent's; None: time runs freely.
+    Attributes:
+        pace: "realtime", or "stepped": time passes by `SimProcess.advance` only.
+        camera: None: no camera and no stream.
+        capture: None: no motion capture.
+        truth_file: JSON lines of the true state, 50 a simulated second, also after the parent has
+            ended.
+        heard_file: JSON lines of every packet that arrived, and who had sent it.
+        linger_s: time on the wall's clock for which the vehicle then runs on.
+        time_file: a `SharedTime` of the parent's; None: time runs freely.
     """
 
     scenario: Scenario = field(default_factory=Scenario)
-    pace: Pace = "realtime"
+    pace: Literal["realtime", "stepped"] = "realtime"
     camera: CameraModel | None = None
     target: TargetConfig | None = None
     capture: CaptureSettings | None = None
     link: LinkOptions = field(default_factory=LinkOptions)
     truth_file: Path | None = None
     heard_file: Path | None = None
-    linger_s: float = LINGER_S
+    linger_s: float = 12.0
     time_file: Path | None = None
-
-
-# --- The handle --------------------------------------------------------------------------------
 
 
 ANSWER_TIMEOUT_S = 15.0
@@ -130,35 +113,56 @@ class SimProcess:
     """Handle of a running simulated vehicle; a context manager. It has the methods `REQUESTS` of
     `perchctl.sim.host.VehicleHost` and its `World`.
 
-    `uri` is for cflib, `stream_url` for a network camera ("" without a camera), `capture` the
-    motion capture's kind and address for `motioncapture` (None without one). `shared_time`
-    is how far simulated time has come in real time, and how far it may go. All methods may be
-    called from any thread; they raise `ConnectionFailed` when the child is gone and `TimedOut`
-    when it does not answer.
+    All methods may be called from any thread; they raise `ConnectionFailed` when the child is gone
+    and `TimedOut` when it does not answer.
+
+    Attributes:
+        uri: for cflib.
+        stream_url: for a network camera; "" without a camera.
+        capture: the motion capture's kind and address for `motioncapture`; None without one.
+        shared_time: how far simulated time has come in real time, and how far it may go.
+        pid: of the child.
     """
 
-    def __init__(
-        self,
-        child: subprocess.Popen[bytes],
-        channel: Channel,
-        stderr: IO[bytes],
-        shared_time: SharedTime,
-    ) -> None:
-        self._child = child
-        self._channel = channel
-        self._stderr = stderr
-        self.shared_time = shared_time
+    uri = stream_url = ""
+    capture: tuple[str, str] | None = None
+
+    def __init__(self, setup: HostSetup, timeout_s: float) -> None:
         self._lock = threading.Lock()
         self._stopped = False
-        self.uri = ""
-        self.stream_url = ""
-        self.capture: tuple[str, str] | None = None
+        self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed by stop)
+        # Both processes have mapped the file once the child has answered.
+        with (
+            listen() as listener,
+            tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
+        ):
+            file = Path(folder, "time")
+            file.write_bytes(bytes(SharedTime.free()))
+            self.shared_time = SharedTime.mapped(file)
+            self._child = spawn(_CHILD, self._stderr)
+            token = new_token()
+            send_address(self._child, listener, token)
+            channel = accept(listener, token, timeout_s, lambda: self._child.poll() is None)
+            if channel is None:
+                raise self._gave_up(f"did not come up within {timeout_s:.0f} s")
+            self._channel: Channel = channel
+            try:
+                channel.send(replace(setup, time_file=file))
+                answer = channel.receive(timeout_s)
+            except (EOFError, OSError):
+                channel.close()
+                raise self._gave_up("gave no answer") from None
+        self.pid = self._child.pid
+        if isinstance(answer, str):
+            self.stop()
+            raise ConnectionFailed(f"the simulated vehicle could not start: {answer}")
+        self.uri, self.stream_url, self.capture = answer
 
     @classmethod
     def start(
         cls,
         scenario: Scenario | None = None,
-        pace: Pace = "realtime",
+        pace: Literal["realtime", "stepped"] = "realtime",
         *,
         timeout_s: float = START_TIMEOUT_S,
         **settings: Any,
@@ -166,50 +170,12 @@ class SimProcess:
         """Start the vehicle and wait, for at most `timeout_s`, until it answers.
 
         `settings` are further fields of `HostSetup`. Raises `ConnectionFailed` when the child
-        ends or does not come up, `InvalidValue` for an unknown pace.
+        ends or does not come up.
         """
-        if pace not in get_args(Pace):
-            raise InvalidValue(f"pace {pace!r} is unknown, choose 'realtime' or 'stepped'")
-        setup = HostSetup(scenario or Scenario(), pace, **settings)
-        # Both processes have mapped the file once the child has answered.
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            shared = SharedTime.create(file := Path(folder, "time"))
-            return cls._with(replace(setup, time_file=file), shared, timeout_s)
-
-    @classmethod
-    def _with(cls, setup: HostSetup, shared: SharedTime, timeout_s: float) -> SimProcess:
-        token = new_token()
-        stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed by stop)
-        with listen() as listener:
-            child = spawn(_CHILD, stderr)
-            send_address(child, listener, token)
-            channel = accept(listener, token, timeout_s, lambda: child.poll() is None)
-        if channel is None:
-            raise _gave_up(child, stderr, f"did not come up within {timeout_s:.0f} s")
-        process = cls(child, channel, stderr, shared)
-        try:
-            channel.send(setup)
-            answer = channel.receive(timeout_s)
-        except (EOFError, OSError):
-            channel.close()
-            raise _gave_up(child, stderr, "gave no answer") from None
-        if isinstance(answer, str):
-            process.stop()
-            raise ConnectionFailed(f"the simulated vehicle could not start: {answer}")
-        process.uri, process.stream_url, process.capture = answer
-        return process
-
-    @property
-    def pid(self) -> int:
-        return self._child.pid
-
-    def is_running(self) -> bool:
-        return self._child.poll() is None
+        return cls(HostSetup(scenario or Scenario(), pace, **settings), timeout_s)
 
     def advance(self, dt_s: float) -> float:
         """Let `dt_s` pass (stepped pace only); the simulated time since the start."""
-        if dt_s < 0.0:
-            raise InvalidValue(f"time cannot go back ({dt_s} s)")
         allowed_s = ANSWER_TIMEOUT_S + SLOWEST_PACE * dt_s
         return float(self._ask("advance", dt_s, timeout_s=allowed_s))
 
@@ -232,12 +198,7 @@ class SimProcess:
     def __enter__(self) -> SimProcess:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def _ask(
@@ -259,12 +220,10 @@ class SimProcess:
             raise InvalidValue(f"the simulated vehicle refused {name!r}: {result}")
         return result
 
-
-def _gave_up(child: subprocess.Popen[bytes], stderr: IO[bytes], why: str) -> ConnectionFailed:
-    code = child.poll()
-    child.kill()
-    child.wait()
-    what = f"ended with code {code}" if code is not None else why
-    error = ConnectionFailed(f"the simulated vehicle {what}{last_line(stderr)}")
-    stderr.close()
-    return error
+    def _gave_up(self, why: str) -> ConnectionFailed:
+        code = self._child.poll()
+        end(self._child, 0.0)
+        what = f"ended with code {code}" if code is not None else why
+        error = ConnectionFailed(f"the simulated vehicle {what}{last_line(self._stderr)}")
+        self._stderr.close()
+        return error

@@ -108,10 +108,12 @@ class Renderer:
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
         lens = lens_of(camera)
-        self._coarse, self._pixels, self.shade = lens.coarse, lens.pixels, lens.shade
+        self._coarse, self._pixels, self._shade = lens.coarse, lens.pixels, lens.shade
         self._places, self._focal_px = lens.places, lens.focal_px
         self._ceiling_px = 4 if scenario.camera_noise_sigma >= _COVERING_SIGMA else 2
-        self._noise, self._noise_at = self._noise_bank()
+        self._noise: NDArray[np.int16] | None = None
+        if scenario.camera_noise_sigma > 0.0:
+            self._noise, self._noise_at = self._noise_bank(scenario.camera_noise_sigma)
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
@@ -148,21 +150,22 @@ class Renderer:
         """Return the frame of one shot, or of two fields in their order of time; which rows are
         the first one's, and whether they are blended, is the scenario's. Otherwise as
         `render`."""
-        scene = self.scenario
-        top_first = scene.camera_fields != "bottom"
-        picture = woven([self._exposed(shot, defocus_px) for shot in shots], top_first)
-        if len(shots) > 1 and scene.camera_blended:
-            picture = blended(picture)
+        exposed = [self._exposed(shot, defocus_px) for shot in shots]
+        picture = exposed[0].copy()
+        if len(shots) > 1:
+            later = 0 if self.scenario.camera_fields == "bottom" else 1  # the second field's rows
+            picture[later::2] = exposed[1][later::2]
+            if self.scenario.camera_blended:
+                picture = blended(picture)
         if self._noise is not None:
             width, height = self.camera.size_px
             r, c = self._noise_at[frame_index % len(self._noise_at)]
-            more, less = (bank[r : r + height, c : c + width] for bank in self._noise)
-            picture = np.asarray(cv2.add(picture, more), np.uint8)
-            cv2.subtract(picture, less, picture)
+            noise = self._noise[r : r + height, c : c + width]
+            picture = np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), np.uint8)
         if self._analogue > 0.0:
             rng = np.random.default_rng([self.seed, FRAME_STREAM, frame_index])
             picture = spoil(picture, self._analogue, rng)
-        return picture.copy()
+        return picture
 
     def _exposed(self, shot: Shot, defocus_px: float | None) -> Picture:
         """Return what falls onto the sensor in one shot, before noise. Not to be written into."""
@@ -174,7 +177,11 @@ class Renderer:
             picture = self._at_rest(rounded(rows[0][len(rows[0]) // 2]), sigma)
         else:
             picture = self._projected(rows, motion_px, length_px, sigma)
-        return picture if shot.light is None else lit(picture, shot.light)
+        if shot.light is None:
+            return picture
+        factor = np.broadcast_to(shot.light.astype(np.float32)[:, None], picture.shape)
+        lit = cv2.multiply(picture, np.ascontiguousarray(factor), dtype=cv2.CV_8U)
+        return np.asarray(lit, np.uint8)
 
     def _at_rest(self, pose: Array, sigma_px: float) -> Picture:
         """Return the picture of a camera that does not move. The last one is kept: under the magnet
@@ -194,30 +201,23 @@ class Renderer:
         count = sample_count(length_px)
         by_row = [plane_map(spread(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
-        picture, box = self._optical(maps, motion_px, length_px)
-        lens = math.sqrt(max(sigma_px**2 - SAMPLING_SIGMA_PX**2, 0.0))
-        if lens > _PLAIN_PX:
-            picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), lens), np.uint8)
-        elif lens > 0.05 and box is not None:
-            defocused(picture, lens, box)
-        width, height = self.camera.size_px
-        seen = picture[:height, :width]
-        return np.asarray(cv2.multiply(seen, self.shade, seen, scale=1.0 / 255.0), np.uint8)
-
-    def _optical(
-        self, maps: Array, motion_px: Array, length_px: float
-    ) -> tuple[Picture, Box | None]:
-        """Return the picture before defocus, at the ray grids' padded size, and the blocks among
-        which there is a sheet, None without one."""
-        middle = maps[len(maps) // 2]
-        if len(maps) % 2 == 0:
-            middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
+        middle = maps[count // 2]
+        if count % 2 == 0:
+            middle = (maps[count // 2 - 1] + middle) / 2.0
         nodes, misses = trace(self._coarse, middle)
         views = [view for s in self._sheets if (view := s.view(nodes, length_px)) is not None]
+        # At the ray grids' padded size.
         picture = self._background(nodes, misses, motion_px, length_px)
         for view in views:
             self._add_sheet(picture, view, maps)
-        return picture, box_around([view.box for view in views])
+        lens = math.sqrt(max(sigma_px**2 - SAMPLING_SIGMA_PX**2, 0.0))
+        if lens > _PLAIN_PX:
+            picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), lens), np.uint8)
+        elif lens > 0.05 and views:
+            defocused(picture, lens, box_around([view.box for view in views]))
+        width, height = self.camera.size_px
+        seen = picture[:height, :width]
+        return np.asarray(cv2.multiply(seen, self._shade, seen, scale=1.0 / 255.0), np.uint8)
 
     def _background(
         self,
@@ -231,20 +231,20 @@ class Renderer:
         mid = nodes[rows // 2, cols // 2]
         px_per_m = local_px_per_m(nodes, rows // 2, cols // 2, COARSE_PX)
         step = self._ceiling_px
-        texture = self._ceiling.texture(px_per_m / step)
+        texture, texels_per_m = self._ceiling.texture(px_per_m / step)
         # Whole tiles, to have the view in the middle of the texture.
         tile = np.clip(np.round(mid / TILE_M), -1e3, 1e3) * TILE_M
-        texels = nodes * np.float32(texture.px_per_m)
-        texels += (_CENTER_TEXEL - tile * texture.px_per_m).astype(np.float32)
+        texels = nodes * np.float32(texels_per_m)
+        texels += (_CENTER_TEXEL - tile * texels_per_m).astype(np.float32)
         crop = COARSE_PX // step
         wider = cv2.resize(texels, None, fx=crop, fy=crop)
-        picture = sample(texture.image, wider[crop:-crop, crop:-crop], cv2.BORDER_WRAP)
+        picture = sample(texture, wider[crop:-crop, crop:-crop], cv2.BORDER_WRAP)
         if misses.any():
             mask = cv2.resize(misses[1:-1, 1:-1].astype(np.uint8), picture.shape[::-1],
                               interpolation=cv2.INTER_NEAREST)  # fmt: skip
             picture[mask > 0] = FLOOR_GREY
-        kernel = line_kernel(motion_px / step) if length_px >= SHARP_MOTION_PX else None
-        if kernel is not None:
+        kernel = line_kernel(motion_px / step)
+        if length_px >= SHARP_MOTION_PX and kernel is not None:
             picture = np.asarray(cv2.filter2D(picture, -1, kernel), np.uint8)
         return np.asarray(cv2.resize(picture, None, fx=step, fy=step), np.uint8)
 
@@ -272,21 +272,15 @@ class Renderer:
         path = cam[:, :2] * (self._focal_px / np.maximum(cam[:, 2:], 1e-3))
         return np.asarray(path.transpose(2, 0, 1))
 
-    def _noise_bank(self) -> tuple[tuple[Picture, Picture] | None, list[tuple[int, int]]]:
-        """Return what is added to a picture, and what is taken off, one of them being 0 at each
-        place: such sums of bytes cost a third of one with signed numbers. And from which row and
-        column on for each frame."""
-        sigma = self.scenario.camera_noise_sigma
-        if sigma <= 0.0:
-            return None, []
+    def _noise_bank(self, sigma: float) -> tuple[NDArray[np.int16], list[tuple[int, int]]]:
+        """Return what is added to pictures, and from which row and column on for each frame."""
         width, height = self.camera.size_px
         size = (height + _NOISE_ROOM_PX, width + _NOISE_ROOM_PX)
         rng = np.random.default_rng([self.seed, NOISE_STREAM])
         bank = np.rint(rng.standard_normal(size, np.float32) * np.float32(sigma))
         across = _NOISE_ROOM_PX + 1
         places = np.stack(np.divmod(rng.permutation(across**2), across), axis=1).tolist()
-        more, less = (np.clip(grey, 0.0, 255.0).astype(np.uint8) for grey in (bank, -bank))
-        return (more, less), places
+        return np.clip(bank, -255.0, 255.0).astype(np.int16), places
 
 
 # --- Sums, look-ups and shading of whole pictures ------------------------------------------------
@@ -294,8 +288,6 @@ class Renderer:
 
 def mean_of(pictures: Sequence[Picture]) -> Picture:
     """Return the mean of the pictures, rounded once."""
-    if len(pictures) == 1:
-        return pictures[0]
     total: Any = pictures[0].astype(np.uint16)
     for picture in pictures[1:]:
         total = cv2.add(total, picture, dtype=cv2.CV_16U)
@@ -316,22 +308,6 @@ def defocused(picture: Picture, sigma_px: float, box: Box) -> None:
     top, left = (a.start - b.start for a, b in zip(near, far, strict=True))
     into = picture[near]
     into[:] = blurred[top : top + into.shape[0], left : left + into.shape[1]]
-
-
-def lit(picture: Picture, light: NDArray[np.float64]) -> Picture:
-    """Return the picture with each row's brightness multiplied by `light` (height,)."""
-    factor = np.broadcast_to(light.astype(np.float32)[:, None], picture.shape)
-    return np.asarray(cv2.multiply(picture, np.ascontiguousarray(factor), dtype=cv2.CV_8U))
-
-
-def woven(pictures: Sequence[Picture], top_first: bool) -> Picture:
-    """Return the frame of two fields in their order of time; a single picture is the frame."""
-    if len(pictures) == 1:
-        return pictures[0]
-    top, bottom = pictures if top_first else (pictures[1], pictures[0])
-    frame = top.copy()
-    frame[1::2] = bottom[1::2]
-    return frame
 
 
 def blended(frame: Picture) -> Picture:

@@ -65,8 +65,7 @@ class Scenario:
         magnet_force_n: pull the magnet can hold.
         first_contact_force_n: pull at the first contact; None means the same.
         no_target: the ceiling is bare.
-        camera_freeze_at_s, camera_gone_at_s: faults; None means never.
-        motor_strength: what is left of each motor's thrust, M1..M4.
+        camera_freeze_at_s: from then on it gives its last picture; None means never.
         cell_resistance_ohm: of the battery; None means a good one.
         cell_slow_ohm: more of it, that an old or cold cell shows within seconds.
         cell_charge: what an old cell still holds, as a share of a new one's.
@@ -122,7 +121,6 @@ class Scenario:
     draught_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     magnet_force_n: float = 1.2
     first_contact_force_n: float | None = None
-    motor_strength: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     cell_resistance_ohm: float | None = None
     cell_slow_ohm: float = 0.0
     cell_charge: float = 1.0
@@ -131,7 +129,6 @@ class Scenario:
     parameters: dict[str, float] = field(default_factory=dict)
     no_target: bool = False
     camera_freeze_at_s: float | None = None
-    camera_gone_at_s: float | None = None
     target_above_ceiling_m: float = 0.0
     neighbours: tuple[Neighbour, ...] = ()
     ceiling_suction: float = 0.10
@@ -142,6 +139,10 @@ class Scenario:
     gyro_bias_radps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     acc_bias_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     extra: dict[str, float] = field(default_factory=dict)
+
+    def radio_bursts(self) -> Bursts | None:
+        """Return the times at which the flight's radio is silent; None where it loses nothing."""
+        return Bursts(self.seed, self.radio_loss, self.radio_burst_s) if self.radio_loss else None
 
 
 # --- From a profile's ranges and a seed to a scenario --------------------------------------------
@@ -173,40 +174,42 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     def between(key: str) -> float:
         return float(rng.uniform(*getattr(sim, key)))
 
-    def direction() -> Array:
-        vector = rng.normal(size=3)
-        return np.asarray(vector / np.linalg.norm(vector))
-
     offset = rng.uniform(-sim.start_offset_m, sim.start_offset_m, size=2)
-    target_xy_m = (float(offset[0]), float(offset[1]))
     yaw_rad = math.radians(between("target_yaw_deg"))
     ceiling_z_m = between("ceiling_z_m")
     mass_kg = between("mass_kg")
     battery_v = between("battery_rest_v")
     latency_s = between("camera_latency_s")
     noise_sigma = between("camera_noise_sigma")
-    burst = _burst(sim, rng, between("camera_burst_start_s"))
-    T_body_cam = profile.camera.mount.T_body_cam @ _mounting_error(profile, rng)
-    drift_x, drift_y, drift_z = (direction() * sim.drift_mps).tolist()
+    burst_s, frames = between("camera_burst_start_s"), sim.camera_burst_frames or (0, 0)
+    if frames[0] == frames[1]:
+        rng.integers(2)  # numpy draws none of one number, and what comes later must stay
+    burst = burst_s, int(rng.integers(frames[0], frames[1] + 1))
+    T_body_cam = profile.camera.mount.T_body_cam @ _mounting_error(sim, rng)
+    direction = rng.normal(size=3)
+    drift_x, drift_y, drift_z = (direction / np.linalg.norm(direction) * sim.drift_mps).tolist()
     wind_angle = float(rng.uniform(-math.pi, math.pi))
     wind_mps = between("draught_mps")
     tilt_bias_rad = math.radians(sim.estimate_tilt_bias_deg)
     bias_x, bias_y = (rng.uniform(-1, 1, size=2) * tilt_bias_rad).tolist()
     fails = rng.uniform() < sim.first_contact_fails
     weak_part = between("first_contact_share")
+    extra = {"analogue": sim.camera_analogue} if sim.camera_analogue else {}
+    if profile.positioning.by != "deck":
+        extra["external_position"] = 1.0  # and no deck
     return Scenario(
         seed=seed,
         mass_kg=mass_kg,
         battery_rest_v=battery_v,
         ceiling_z_m=ceiling_z_m,
-        target_xy_m=target_xy_m,
+        target_xy_m=(float(offset[0]), float(offset[1])),
         target_yaw_rad=yaw_rad,
         large_side_m=profile.target.large.side_m,
         small_side_m=profile.target.small.side_m,
         gear_body_m=profile.vehicle.gear_body_m,
         T_body_cam_true=tuple(tuple(float(v) for v in row) for row in T_body_cam),
         camera_latency_s=latency_s,
-        camera_burst=burst,
+        camera_burst=None if sim.camera_burst_frames is None else burst,
         camera_noise_sigma=noise_sigma,
         camera_mirrored=profile.camera.mirrored,
         estimate_tilt_bias_rad=(bias_x, bias_y),
@@ -215,29 +218,24 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
         **_imu_errors(sim, seed),
         **{name: getattr(sim, name) for name in _AS_GIVEN},
-        extra=_extra(profile),
-        neighbours=_neighbours(sim),
+        extra=extra,
+        neighbours=tuple(
+            Neighbour((x_m, y_m), math.radians(yaw_deg), *(sim.neighbour_ids or ()))
+            for x_m, y_m, yaw_deg in sim.neighbours
+        ),
         **_groups(sim, seed),
     )
 
 
-def _burst(
-    sim: SimulationConfig, rng: np.random.Generator, start_s: float
-) -> tuple[float, int] | None:
-    """Start and number of the frames that are lost in one go."""
-    low, high = sim.camera_burst_frames or (0, 0)
-    if low == high:
-        rng.integers(2)  # numpy draws none of one number, and what comes later must stay
-    frames = int(rng.integers(low, high + 1))
-    return None if sim.camera_burst_frames is None else (start_s, frames)
-
-
-def _neighbours(sim: SimulationConfig) -> tuple[Neighbour, ...]:
-    large_id, small_id = sim.neighbour_ids or (None, None)
-    return tuple(
-        Neighbour((x_m, y_m), math.radians(yaw_deg), large_id, small_id)
-        for x_m, y_m, yaw_deg in sim.neighbours
-    )
+def _mounting_error(sim: SimulationConfig, rng: np.random.Generator) -> Array:
+    """Return a turn and a shift that the profile lacks: up to `mount_error_deg` and
+    `mount_error_m`."""
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    turn = axis * math.radians(rng.uniform(0, sim.mount_error_deg))
+    way = rng.normal(size=3)
+    way *= rng.uniform(0, sim.mount_error_m) / np.linalg.norm(way)
+    return make_T(rotation_from_rpy(*(float(a) for a in turn)), way)
 
 
 def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
@@ -249,91 +247,51 @@ def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
     return {"gyro_bias_radps": (p, q, r), "acc_bias_mps2": (x, y, 0.0)}
 
 
-def _extra(profile: Profile) -> dict[str, float]:
-    extra = {}
-    if profile.simulation.camera_analogue:
-        extra["analogue"] = profile.simulation.camera_analogue
-    if profile.positioning.by != "deck":
-        extra["external_position"] = 1.0  # and no deck
-    return extra
-
-
-def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
-    """Return a turn and a shift that the profile lacks: up to `mount_error_deg` and
-    `mount_error_m`."""
-    sim = profile.simulation
-    axis = rng.normal(size=3)
-    axis /= np.linalg.norm(axis)
-    turn = axis * math.radians(rng.uniform(0, sim.mount_error_deg))
-    way = rng.normal(size=3)
-    way *= rng.uniform(0, sim.mount_error_m) / np.linalg.norm(way)
-    return make_T(rotation_from_rpy(*(float(a) for a in turn)), way)
-
-
-# --- What harder worlds draw beyond that ---------------------------------------------------------
-
-
 def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
-    """Return the fields of the scenario; where the ranges are those of `sim`, its defaults."""
+    """Return what harder worlds draw; where the ranges are those of `sim`, its defaults."""
     air, cell, tilt, radio, capture = (
-        _Draws(seed, group) for group in (_AIR, _CELL, _TILT, _RADIO, _CAPTURE)
+        np.random.default_rng([seed, _GROUPS_STREAM, group])
+        for group in (_AIR, _CELL, _TILT, _RADIO, _CAPTURE)
     )
     ohm = sim.cell_resistance_ohm
     return {
-        "ceiling_suction": air.between(sim.ceiling_suction),
-        "cell_resistance_ohm": None if ohm is None else cell.between(ohm),
-        "cell_slow_ohm": cell.between(sim.cell_slow_ohm),
-        "cell_charge": cell.between(sim.cell_charge),
-        "cell_knee": cell.between(sim.cell_knee),
+        "ceiling_suction": float(air.uniform(*sim.ceiling_suction)),
+        "cell_resistance_ohm": None if ohm is None else float(cell.uniform(*ohm)),
+        "cell_slow_ohm": float(cell.uniform(*sim.cell_slow_ohm)),
+        "cell_charge": float(cell.uniform(*sim.cell_charge)),
+        "cell_knee": float(cell.uniform(*sim.cell_knee)),
         "target_tilt_rad": _tilt(sim, tilt),
-        "radio_loss": radio.between(sim.radio_loss),
-        "radio_burst_s": radio.between(sim.radio_burst_s),
+        "radio_loss": float(radio.uniform(*sim.radio_loss)),
+        "radio_burst_s": float(radio.uniform(*sim.radio_burst_s)),
         "capture_holes_s": _capture_holes(sim, capture),
     }
 
 
-class _Draws:
-    """One group's random numbers."""
-
-    def __init__(self, seed: int, group: int) -> None:
-        self.rng = np.random.default_rng([seed, _GROUPS_STREAM, group])
-
-    def between(self, bounds: tuple[float, float]) -> float:
-        return float(self.rng.uniform(*bounds))
-
-    def angle_rad(self, bounds_deg: tuple[float, float] = (-180.0, 180.0)) -> float:
-        return math.radians(self.between(bounds_deg))
-
-
-def _tilt(sim: SimulationConfig, draws: _Draws) -> tuple[float, float]:
+def _tilt(sim: SimulationConfig, rng: np.random.Generator) -> tuple[float, float]:
     """Return the target's turns about the world's x and y."""
-    tilt_rad = draws.angle_rad(sim.target_tilt_deg)
-    towards_rad = draws.angle_rad()
+    tilt_rad = math.radians(float(rng.uniform(*sim.target_tilt_deg)))
+    towards_rad = math.radians(float(rng.uniform(-180.0, 180.0)))
     if not tilt_rad:
         return (0.0, 0.0)
     # Lifted on the side of +x is a turn about -y, on that of +y one about x.
     return (tilt_rad * math.sin(towards_rad), -tilt_rad * math.cos(towards_rad))
 
 
-def _capture_holes(sim: SimulationConfig, draws: _Draws) -> tuple[tuple[float, float], ...]:
-    """Begin and length of each."""
+def _capture_holes(
+    sim: SimulationConfig, rng: np.random.Generator
+) -> tuple[tuple[float, float], ...]:
+    """Return begin and length of each hole."""
     if not sim.capture_hole_s[1]:
         return ()
     holes, t_s = [], 0.0
-    while (t_s := t_s + float(draws.rng.exponential(sim.capture_hole_every_s))) < _LONGEST_S:
-        length_s = draws.between(sim.capture_hole_s)
+    while (t_s := t_s + float(rng.exponential(sim.capture_hole_every_s))) < _LONGEST_S:
+        length_s = float(rng.uniform(*sim.capture_hole_s))
         holes.append((t_s, length_s))
         t_s += length_s + _LEAST_GAP_S
     return tuple(holes)
 
 
-# --- A radio that loses packets by bursts --------------------------------------------------------
-# A radio that loses packets by bursts: nothing passes for a while, then everything does.
-#
-# Gilbert's model of a channel with two states, in continuous time: both last as long as an
-# exponential distribution says. So a share of the time is lost, in pieces of a given mean length,
-# whatever the packets' rate; both directions suffer together, as from a Wi-Fi nearby or a body in
-# the way.
+# --- A radio that loses packets by bursts: nothing passes for a while, then everything does ------
 
 
 _BURSTS_STREAM = 14
@@ -342,43 +300,30 @@ CONNECTED_S = 4.0
 
 
 class Bursts:
-    """`lost` is asked with times that never go back; same seed, same bursts.
+    """Gilbert's model of a channel with two states, in continuous time: both last as long as an
+    exponential distribution says. So a share of the time is lost, in pieces of a given mean
+    length, whatever the packets' rate; both directions suffer together, as from a Wi-Fi nearby or
+    a body in the way. `lost` is asked with times that never go back; same seed, same bursts.
 
     Args:
-        share: of the time that is lost, 0 to below 1.
+        share: of the time that is lost, above 0 and below 1.
         mean_s: a burst's mean length.
-        from_s: before that nothing is lost.
-
-    `newest`: begin and end of the last burst that has begun; None before the first.
     """
 
-    def __init__(self, seed: int, share: float, mean_s: float, from_s: float = CONNECTED_S) -> None:
+    def __init__(self, seed: int, share: float, mean_s: float) -> None:
         self._rng = np.random.default_rng([seed, _BURSTS_STREAM])
         self._bad_s = mean_s
-        self._good_s = mean_s * (1.0 - share) / share if share > 0.0 else math.inf
+        self._good_s = mean_s * (1.0 - share) / share
         self._bad = False
-        self.newest: tuple[float, float] | None = None
-        self._until_s = math.inf
-        if share > 0.0:
-            self._until_s = from_s + float(self._rng.exponential(self._good_s))
+        self._until_s = CONNECTED_S + float(self._rng.exponential(self._good_s))
 
     def lost(self, t_s: float) -> bool:
         """True if a packet sent at that time is lost."""
         while t_s >= self._until_s:
             self._bad = not self._bad
-            began_s = self._until_s
             mean_s = self._bad_s if self._bad else self._good_s
             self._until_s += float(self._rng.exponential(mean_s))
-            if self._bad:
-                self.newest = (began_s, self._until_s)
         return self._bad
-
-
-def radio_bursts(scenario: Scenario) -> Bursts | None:
-    """Return the bursts of a flight; None where its radio loses nothing."""
-    if not scenario.radio_loss:
-        return None
-    return Bursts(scenario.seed, scenario.radio_loss, scenario.radio_burst_s)
 
 
 # --- What the scenario did, said with the event that it led to -----------------------------------
@@ -387,58 +332,30 @@ def radio_bursts(scenario: Scenario) -> Bursts | None:
 
 LOSSES = ("estimate-lost", "align-lost", "ascend-lost", "camera-gone")
 """Rows of the mission's table that lost pictures lead to."""
-UNHEARD = ("link-lost", "telemetry-stale")
-UNSURE = ("estimate-unsure", "position-astray", "estimator-jump", "fence")
-UNSEEN = (*UNSURE, "position-lost", "heading-lost")
-"""Rows that a motion capture leads to which sees nothing."""
 FELT_FOR_S = 1.2
 """After the last lost frame: a second of no track, and the latency of the next picture."""
 
 
 class EventExplainer:
-    """Explains the events of one flight; call it with each of them, in order."""
+    """Explains the events of one flight that lost frames or a weak first contact led to; call it
+    with each of them, in order."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self._slips = 0
-        self._bursts = Bursts(scenario.seed, scenario.radio_loss, scenario.radio_burst_s)
 
     def __call__(self, event: Event, t_s: float) -> str:
         """Return what the scenario did, in a few words, or the empty string. `t_s` is the event's
         time in the simulation."""
-        scenario = self._scenario
+        scenario, force_n = self._scenario, self._scenario.first_contact_force_n
         held = event.reason if event.kind is EventKind.HOLD else ""
         if event.row in LOSSES or held.startswith(NO_PICTURE_TEXT):
-            return self._lost_frames(t_s)
-        if event.row == "slipped":
+            start_s, frames = scenario.camera_burst or (math.inf, 0)
+            if 0.0 <= t_s - start_s <= frames / scenario.camera_rate_hz + FELT_FOR_S:
+                return f"{frames} frames lost"
+        if event.row == "slipped" and force_n is not None:
             self._slips += 1
-            force_n = scenario.first_contact_force_n
-            if force_n is not None and self._slips == 1:
+            if self._slips == 1:
                 part = force_n / (scenario.mass_kg * GRAVITY_MPS2)
                 return f"the first contact holds {100 * part:.0f} % of the weight"
-        if event.row == "searched-out" and scenario.no_target:
-            return "there is no target"
-        if event.row in UNHEARD or event.reason.startswith("telemetry is"):
-            return self._silence(t_s)
-        if event.row in UNSEEN and (hidden := self._hidden(t_s)):
-            return hidden
-        return ""
-
-    def _lost_frames(self, t_s: float) -> str:
-        burst, rate_hz = self._scenario.camera_burst, self._scenario.camera_rate_hz
-        if burst is None or not 0.0 <= t_s - burst[0] <= burst[1] / rate_hz + FELT_FOR_S:
-            return ""
-        return f"{burst[1]} frames lost"
-
-    def _silence(self, t_s: float) -> str:
-        self._bursts.lost(t_s)
-        newest = self._bursts.newest
-        if newest is None or t_s > newest[1] + FELT_FOR_S:
-            return ""
-        return f"the radio passed nothing for {newest[1] - newest[0]:.1f} s"
-
-    def _hidden(self, t_s: float) -> str:
-        for begin_s, length_s in self._scenario.capture_holes_s:
-            if 0.0 <= t_s - begin_s <= length_s + FELT_FOR_S:
-                return f"the motion capture did not see it for {length_s:.1f} s"
         return ""

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -53,8 +54,7 @@ _BYTE_SIGMA = math.sqrt((256.0**2 - 1.0) / 12.0)
 """Spread of bytes that are all as likely."""
 
 
-@dataclass(frozen=True, eq=False)
-class SheetTexture:
+class SheetTexture(NamedTuple):
     """The sheet at one resolution: `value` is grey times coverage, `alpha` coverage.
 
     A point (x, y) of the target's plane (target axes) is at column
@@ -100,14 +100,6 @@ class Sheet:
         return SheetTexture(grey, alpha, px_per_m, (size - 1) / 2.0)
 
 
-@dataclass(frozen=True, eq=False)
-class CeilingTexture:
-    """A piece of ceiling, `CEILING_TEXTURE_PX` square, that repeats without a seam."""
-
-    image: Picture
-    px_per_m: float
-
-
 class Ceiling:
     """A seeded, seamless grey texture with detail from 2 mm to half a metre."""
 
@@ -123,18 +115,19 @@ class Ceiling:
         while len(self._tiles[-1]) > 128:
             half = cv2.resize(self._tiles[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
             self._tiles.append(np.asarray(half, np.float32))
-        self._levels: dict[int, CeilingTexture] = {}
+        self._levels: dict[int, Picture] = {}
 
-    def texture(self, image_px_per_m: float) -> CeilingTexture:
-        """Return the level with 1 to 2 texels a pixel, or the nearest there is."""
+    def texture(self, image_px_per_m: float) -> tuple[Picture, float]:
+        """Return a piece, `CEILING_TEXTURE_PX` square, that repeats without a seam, and its texels
+        a metre: 1 to 2 a pixel, or the nearest there is."""
         finest = TILE_FINEST_PX / TILE_M
         level = math.floor(math.log2(finest / max(image_px_per_m, 1.0)))
         level = min(max(level, 0), len(self._tiles) - 1)
         if level not in self._levels:
             tile = np.rint(self._tiles[level]).astype(np.uint8)
             times = CEILING_TEXTURE_PX // len(tile)
-            self._levels[level] = CeilingTexture(np.tile(tile, (times, times)), finest / 2**level)
-        return self._levels[level]
+            self._levels[level] = np.tile(tile, (times, times))
+        return self._levels[level], finest / 2**level
 
 
 def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
@@ -155,36 +148,7 @@ Box = tuple[slice, slice]
 """Rows and columns of blocks of `COARSE_PX` pixels."""
 
 
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """A sheet, and how (3, 3) the own target's plane maps to its: None for the own."""
-
-    sheet: Sheet
-    plane: Array | None = None
-
-    def view(self, nodes: NDArray[np.float32], length_px: float) -> View | None:
-        """Return where the sheet is seen at the coarse nodes (rows, columns, 2), in the own
-        target's axes; None where it is out of view. `length_px` is the longest way of the picture
-        within the exposure."""
-        if self.plane is not None:
-            turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
-            nodes = nodes @ turn.astype(np.float32) + shift.astype(np.float32)
-        off_m, reach_m = _off_and_reach(nodes, length_px)
-        half_m = self.sheet.drawing.sheet_side_m / 2.0
-        box = _box_of(off_m - np.minimum(reach_m, 1.0) < half_m)
-        if box is None:
-            return None
-        j, i = ((each.start + each.stop - 1) // 2 + 1 for each in box)
-        texture = self.sheet.texture(local_px_per_m(nodes, j, i, COARSE_PX))
-        scale, centre = texture.px_per_m, texture.center_px
-        to_texels = np.array([[scale, 0.0, centre], [0.0, scale, centre], [0.0, 0.0, 1.0]])
-        if self.plane is not None:
-            to_texels = to_texels @ self.plane
-        return View(texture, box, to_texels)
-
-
-@dataclass(frozen=True, eq=False)
-class View:
+class View(NamedTuple):
     """A sheet in one exposure: in the picture's `box`; `to_texels` (3, 3) maps the own target's
     plane to the texture's columns and rows."""
 
@@ -193,26 +157,39 @@ class View:
     to_texels: Array
 
 
-def _off_and_reach(
-    nodes: NDArray[np.float32], length_px: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return how far each block's centre is from the sheet's, along the axis along which it is
-    farther, and how far from there its pixels look at most, both (rows, columns) in m. `nodes` are
-    the coarse ones in the sheet's axes."""
-    x, y = np.ascontiguousarray(nodes.transpose(2, 0, 1), np.float32)
-    # Half a block to each side, by the distance of the nodes at both sides; the outermost pixels'
-    # centres lie an eighth less far out.
-    reach_m = cv2.max(_span(x), _span(y)) * np.float32(0.25 + 0.5 * length_px / COARSE_PX)
-    off_m = cv2.max(np.abs(x[1:-1, 1:-1]), np.abs(y[1:-1, 1:-1]))
-    return np.asarray(off_m, np.float32), np.asarray(reach_m, np.float32)
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A sheet, and how (3, 3) the own target's plane maps to its."""
 
+    sheet: Sheet
+    plane: Array | None = None  # the own
 
-def _box_of(near: NDArray[np.bool_]) -> Box | None:
-    """Return the box of all blocks that are `near`; None where there are none."""
-    rows, cols = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
-    if not len(rows):
-        return None
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+    def view(self, nodes: NDArray[np.float32], length_px: float) -> View | None:
+        """Return where the sheet is seen at the coarse nodes (rows, columns, 2), in the own
+        target's axes; None where it is out of view. `length_px` is the longest way of the picture
+        within the exposure."""
+        if self.plane is not None:
+            turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
+            nodes = nodes @ turn.astype(np.float32) + shift.astype(np.float32)
+        x, y = np.ascontiguousarray(nodes.transpose(2, 0, 1), np.float32)
+        # How far each block's centre is from the sheet's, along the axis along which it is farther,
+        # and how far from there its pixels look at most: half a block to each side, by the distance
+        # of the nodes at both sides; the outermost pixels' centres lie an eighth less far out.
+        off_m = cv2.max(np.abs(x[1:-1, 1:-1]), np.abs(y[1:-1, 1:-1]))
+        reach_m = cv2.max(_span(x), _span(y)) * np.float32(0.25 + 0.5 * length_px / COARSE_PX)
+        half_m = self.sheet.drawing.sheet_side_m / 2.0
+        near = off_m - np.minimum(reach_m, 1.0) < half_m
+        if not near.any():
+            return None
+        hits = (np.flatnonzero(near.any(axis=axis)).tolist() for axis in (1, 0))
+        rows, cols = (slice(hit[0], hit[-1] + 1) for hit in hits)
+        j, i = ((each.start + each.stop - 1) // 2 + 1 for each in (rows, cols))
+        texture = self.sheet.texture(local_px_per_m(nodes, j, i, COARSE_PX))
+        scale, centre = texture.px_per_m, texture.center_px
+        to_texels = np.array([[scale, 0.0, centre], [0.0, scale, centre], [0.0, 0.0, 1.0]])
+        if self.plane is not None:
+            to_texels = to_texels @ self.plane
+        return View(texture, (rows, cols), to_texels)
 
 
 def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -221,10 +198,8 @@ def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.add(level, cv2.absdiff(x[2:, 1:-1], x[:-2, 1:-1])), np.float32)
 
 
-def box_around(boxes: Sequence[Box]) -> Box | None:
-    """Return the box that holds all of them; None where there are none."""
-    if not boxes:
-        return None
+def box_around(boxes: Sequence[Box]) -> Box:
+    """Return the box that holds all of them."""
     rows, cols = (
         slice(min(each.start for each in spans), max(each.stop for each in spans))
         for spans in zip(*boxes, strict=True)

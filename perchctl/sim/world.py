@@ -24,11 +24,9 @@ Assumptions of the model, each with its source:
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,14 +37,7 @@ os.environ.setdefault("MUJOCO_GL", "disable")
 
 import mujoco
 
-from perchctl.errors import InvalidValue
-from perchctl.geometry import (
-    GRAVITY_MPS2,
-    Array,
-    rotation_from_quaternion,
-    rotation_from_rpy,
-    rpy_from_rotation,
-)
+from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_quaternion, rotation_from_rpy
 from perchctl.sim.powertrain import CellKind, Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
@@ -56,34 +47,22 @@ DRAG_LEVEL_NSPM = 0.009
 DRAG_VERTICAL_NSPM = 0.009
 SUCTION_LENGTH_M = 0.02
 _SQRT_HALF = math.sqrt(0.5)
+_HAND_STEP_S = 1e-4
 _WIND_EVERY = 10  # the wind is evaluated every 20 ms
 
 
-@dataclass(frozen=True)
-class TrueState:
-    """What is true now, SI.
-
-    `position_m`, `velocity_mps` (3,) world; `R_world_body` (3, 3); `rates_radps` (3,)
-    body; `specific_force_mps2` (3,) body, what an ideal accelerometer reads (+g along
-    z at rest); `ceiling_force_n` the push between vehicle and ceiling, >= 0.
-    """
-
-    t_s: float
-    position_m: Array
-    velocity_mps: Array
-    R_world_body: Array
-    rates_radps: Array
-    specific_force_mps2: Array
-    ceiling_force_n: float
-    floor_contact: bool
-    magnet_engaged: bool
+Vector = tuple[float, float, float]
+Way = Callable[[Vector, Array, float], tuple[Array, Array]]
+"""Place (3,) and R_world_body (3, 3) of a vehicle in a hand, given those at which it was taken
+and the time since."""
 
 
 class World:
     """One vehicle in one room. Deterministic for a scenario.
 
-    The plain-float attributes `x_m ... fz_mps2` are the state in the form the firmware
-    model reads 500 times a second; `state()` is the same as arrays.
+    The attributes `x_m ... fz_mps2` are the state: position and velocity in world axes, turning
+    rates in the body's, `quaternion` (w, x, y, z) body to world, and `fx_mps2 ... fz_mps2` what an
+    ideal accelerometer reads in body axes (+g along z at rest).
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -97,11 +76,10 @@ class World:
         self._suction = scenario.ceiling_suction
         self._steps = 0
         self.powertrain = Powertrain(scenario.battery_rest_v, CellKind.of(scenario))
-        self.powertrain.strength = scenario.motor_strength
         self._wind_mps = (0.0, 0.0, 0.0)
         self._wind = Wind(scenario)
         self._held = False
-        self._carried: tuple[float, Way] | None = None
+        self._carried: tuple[float, tuple[Vector, Array], Way] | None = None
         self.magnet = Magnet(scenario)
         self.external_force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
         mujoco.mj_forward(self._model, self._data)
@@ -111,6 +89,11 @@ class World:
     @property
     def t_s(self) -> float:
         return self._steps * CONTROL_PERIOD_S
+
+    @property
+    def height_m(self) -> float:
+        """How far the vehicle is above where it stands on the floor."""
+        return float(self.z_m - REST_HEIGHT_M)
 
     @property
     def magnet_engaged(self) -> bool:
@@ -175,21 +158,6 @@ class World:
             (self.vx_mps - vx) * rate, (self.vy_mps - vy) * rate, (self.vz_mps - vz) * rate
         )
 
-    def state(self) -> TrueState:
-        """Return the true state as arrays."""
-        ceiling_n, floor = self.contacts()
-        return TrueState(
-            self.t_s,
-            np.array((self.x_m, self.y_m, self.z_m)),
-            np.array((self.vx_mps, self.vy_mps, self.vz_mps)),
-            rotation_from_quaternion(self.quaternion),
-            np.array((self.p_radps, self.q_radps, self.r_radps)),
-            np.array((self.fx_mps2, self.fy_mps2, self.fz_mps2)),
-            ceiling_n,
-            floor,
-            self.magnet_engaged,
-        )
-
     def gear_tip_m(self) -> tuple[float, float, float]:
         """Return the gear's tip in world axes."""
         w, x, y, z = self.quaternion
@@ -223,12 +191,11 @@ class World:
         self._held, self._carried = hold, None
         self._place(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
 
-    def move_by_hand(self, stops: Sequence[Stop]) -> None:
-        """Let a hand take the vehicle from where it is through all stops, and hold it at the last
-        until `let_go`. Its sensors feel all of it. Errors: InvalidValue."""
-        roll, pitch, yaw = rpy_from_rotation(rotation_from_quaternion(self.quaternion))
-        start = Stop(0.0, (self.x_m, self.y_m, self.z_m), (roll, pitch, yaw))
-        self._carried = (self.t_s, Way(start, stops))
+    def move_by_hand(self, way: Way) -> None:
+        """Let a hand take the vehicle from where it is along a way, until `let_go`. Its sensors
+        feel all of it."""
+        start = (self.x_m, self.y_m, self.z_m), rotation_from_quaternion(self.quaternion)
+        self._carried = (self.t_s, start, way)
         self._held = True
 
     def let_go(self) -> None:
@@ -239,11 +206,14 @@ class World:
         if self._carried is None:
             self._set_specific_force(0.0, 0.0, 0.0)
             return
-        began_s, way = self._carried
-        now = way.at(self.t_s - began_s)
-        self._place(now.position_m, now.R, now.velocity_mps, now.rates_radps)
-        ax, ay, az = now.acceleration_mps2.tolist()
-        self._set_specific_force(ax, ay, az)
+        began_s, start, way = self._carried
+        t_s, dt_s = self.t_s - began_s, _HAND_STEP_S
+        before, here, after = (way(*start, t_s + k * dt_s) for k in (-1, 0, 1))
+        turn = before[1].T @ after[1]  # so small a turn is its own vector
+        rates = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / (2.0 * dt_s)
+        self._place(here[0], here[1], (after[0] - before[0]) / (2.0 * dt_s), rates)
+        acceleration_mps2 = (after[0] - 2.0 * here[0] + before[0]) / dt_s**2
+        self._set_specific_force(*acceleration_mps2.tolist())
 
     def _place(
         self,
@@ -281,15 +251,11 @@ class World:
 
     def on_floor(self) -> bool:
         """True if the vehicle touches the floor."""
-        if not self._data.ncon:
-            return False
-        return any(self._floor in pair for pair in self._data.contact.geom.tolist())
+        return self.contacts()[1]
 
     def contacts(self) -> tuple[float, bool]:
         """Return the push between vehicle and ceiling, N, and whether the floor is touched."""
         ceiling_n, floor = 0.0, False
-        if not self._data.ncon:
-            return ceiling_n, floor
         wrench = np.zeros(6)
         for i, pair in enumerate(self._data.contact.geom.tolist()):
             floor = floor or self._floor in pair
@@ -414,110 +380,31 @@ _STEADY = 0.7  # the steady part of the draught's speed
 _SHARES = (0.15, 0.15, 0.1)  # standard deviation of the gusts over that speed: x, y, z
 _WIND_STREAM = 1
 
-_Terms = tuple[tuple[float, float, float], ...]
-
 
 class Wind:
-    """`Scenario.draught_mps` is the speed that the gusts reach at two standard deviations."""
+    """`Scenario.draught_mps` is the speed that the gusts reach at two standard deviations. Each
+    axis of a gust is a sum of sines, (amplitude m/s, pulsation rad/s, phase)."""
 
     def __init__(self, scenario: Scenario) -> None:
-        draught = scenario.draught_mps
-        x, y, z = draught
+        x, y, z = scenario.draught_mps
         self._mean = (_STEADY * x, _STEADY * y, _STEADY * z)
-        speed_mps = math.hypot(*draught)
-        rng = np.random.default_rng([scenario.seed, _WIND_STREAM])
+        speed_mps = math.hypot(x, y, z)
         self._still = speed_mps == 0.0
-        self._gusts = tuple(_draw_sines(rng, share * speed_mps) for share in _SHARES)
+        rng = np.random.default_rng([scenario.seed, _WIND_STREAM])
+        self._gusts = []
+        for share in _SHARES:
+            amplitude = share * speed_mps * math.sqrt(2.0 / _TERMS)
+            hz = np.exp(rng.uniform(math.log(_SLOWEST_HZ), math.log(_FASTEST_HZ), _TERMS))
+            phases = rng.uniform(0.0, 2.0 * math.pi, _TERMS).tolist()
+            terms = zip((2.0 * math.pi * hz).tolist(), phases, strict=True)
+            self._gusts.append([(amplitude, w, phase) for w, phase in terms])
 
-    def at(self, t_s: float) -> tuple[float, float, float]:
+    def at(self, t_s: float) -> Vector:
         """Return the wind at t, m/s, world axes; exactly zero in still air."""
         if self._still:
             return (0.0, 0.0, 0.0)
-        x, y, z = self._mean
-        gust_x, gust_y, gust_z = self._gusts
-        return (x + _sum_of(gust_x, t_s), y + _sum_of(gust_y, t_s), z + _sum_of(gust_z, t_s))
-
-
-def _draw_sines(rng: np.random.Generator, sigma_mps: float) -> _Terms:
-    """Return (amplitude m/s, pulsation rad/s, phase) of each sine."""
-    amplitude = sigma_mps * math.sqrt(2.0 / _TERMS)
-    hz = np.exp(rng.uniform(math.log(_SLOWEST_HZ), math.log(_FASTEST_HZ), _TERMS))
-    phases = rng.uniform(0.0, 2.0 * math.pi, _TERMS)
-    return tuple(
-        (amplitude, 2.0 * math.pi * float(f), float(phase))
-        for f, phase in zip(hz, phases, strict=True)
-    )
-
-
-def _sum_of(terms: _Terms, t_s: float) -> float:
-    return sum(a * math.sin(w * t_s + phase) for a, w, phase in terms)
-
-
-# --- A hand that carries the vehicle from stop to stop, smoothly, and turns it on the way -------
-
-
-_HAND_STEP_S = 1e-4
-
-
-@dataclass(frozen=True)
-class Stop:
-    """Reached `after_s` after the one before, at rest."""
-
-    after_s: float
-    position_m: tuple[float, float, float]
-    rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """At one moment, world axes; `rates_radps` (3,) in the body's, as a gyroscope has them."""
-
-    position_m: Array
-    velocity_mps: Array
-    acceleration_mps2: Array
-    R: Array
-    rates_radps: Array
-
-
-class Way:
-    """The way through all stops, from where the vehicle is; at the last it is held still.
-
-    Errors: InvalidValue for a stop that takes no time.
-    """
-
-    def __init__(self, start: Stop, stops: Sequence[Stop]) -> None:
-        for stop in stops:
-            if not stop.after_s > 0.0:
-                raise InvalidValue(f"a hand needs time for its way, not {stop.after_s:g} s")
-        self._stops = (start, *stops)
-        self._ends_s = (0.0, *itertools.accumulate(stop.after_s for stop in stops))
-
-    def at(self, t_s: float) -> Motion:
-        """Return the motion, `t_s` after the vehicle was taken in the hand."""
-        before, here, after = (self._pose(t_s + k * _HAND_STEP_S) for k in (-1, 0, 1))
-        turn = before[1].T @ after[1]  # so small a turn is its own vector
-        rates = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / (2.0 * _HAND_STEP_S)
-        return Motion(
-            here[0],
-            (after[0] - before[0]) / (2.0 * _HAND_STEP_S),
-            (after[0] - 2.0 * here[0] + before[0]) / _HAND_STEP_S**2,
-            here[1],
-            rates,
+        x, y, z = (
+            mean + sum(a * math.sin(w * t_s + phase) for a, w, phase in terms)
+            for mean, terms in zip(self._mean, self._gusts, strict=True)
         )
-
-    def _pose(self, t_s: float) -> tuple[Array, Array]:
-        """Return place (3,) and turn (3, 3)."""
-        t_s = min(max(t_s, 0.0), self._ends_s[-1])
-        leg = next(n for n, end_s in enumerate(self._ends_s) if t_s <= end_s)
-        if leg == 0:
-            stop = self._stops[0]
-            return np.asarray(stop.position_m), rotation_from_rpy(*stop.rpy_rad)
-        one, other = self._stops[leg - 1], self._stops[leg]
-        share = (t_s - self._ends_s[leg - 1]) / other.after_s
-        # At both ends neither speed nor acceleration.
-        share = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-        place, rpy = (
-            np.asarray(a) + share * (np.asarray(b) - np.asarray(a))
-            for a, b in ((one.position_m, other.position_m), (one.rpy_rad, other.rpy_rad))
-        )
-        return place, rotation_from_rpy(*(float(angle) for angle in rpy))
+        return x, y, z

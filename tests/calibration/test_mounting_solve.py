@@ -18,8 +18,8 @@ from perchctl.calibration.mounting.pivot import solve_pivot
 from perchctl.calibration.mounting.recording import MountingPart, missing_motion
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, make_T, rotation_from_rpy
-from perchctl.sim.hand import Hand, T_target_cam_at, draw_hand, pictures, record_hand
 from perchctl.vision import Frame
+from tests.helpers.hand import Hand, T_target_cam_at, draw_hand, pictures, record_hand
 from tests.helpers.mounting import hand, profile, seen
 
 ANGLE = st.floats(-np.pi, np.pi)

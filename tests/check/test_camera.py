@@ -73,8 +73,7 @@ def rehearsed(
     vehicle.world.set_pose((0.0, 0.0, z_m), hold=True)
     link = MockLink(vehicle)
     link.advance_to(0.3)
-    assert vehicle.camera is not None
-    source = FaultyCamera(LockstepSource(vehicle.camera, PROFILE.camera.latency_s), seed=1)
+    source = FaultyCamera(LockstepSource(vehicle, PROFILE.camera.latency_s), seed=1)
     if fault is not None:
         source.begin(fault, 0.4)
     clock = LockstepClock(link)
@@ -265,8 +264,7 @@ def test_a_rehearsal_needs_no_vehicle() -> None:
     """Nor can it send anything: telemetry is all that it gets of one."""
     vehicle = SimulatedVehicle(Scenario(), CAMERA, PROFILE.target)
     clock = LockstepClock(MockLink(vehicle))
-    assert vehicle.camera is not None
-    source = LockstepSource(vehicle.camera, 0.07)
+    source = LockstepSource(vehicle, 0.07)
     done = rehearse(list, source, PIPELINE, PROFILE, clock, 0.3, time.perf_counter)
     assert done.pictures > 3
 

@@ -24,16 +24,16 @@ from perchctl.geometry import (
 )
 from perchctl.positioning import BodyPose, Placed
 from perchctl.profile import PositioningConfig
-from perchctl.sim.world import Stop, Way
 from perchctl.vehicle import Telemetry
 from tests.helpers.capture import TURNS, UPRIGHT, named_up
-from tests.helpers.carried import lifted_and_turned
+from tests.helpers.carried import Stop, Stops, lifted_and_turned
 from tests.helpers.checks import said
 from tests.helpers.mission import telemetry
 
 CONFIG = PositioningConfig(by="mocap", host="lab", body="cf2")
 LASTS_S, DELAY_S = 8.0, 0.015
 I3 = np.eye(3)
+HOME = (0.0, 0.0, 0.012)
 
 
 def bump(t_s: float, from_s: float, to_s: float) -> float:
@@ -218,11 +218,12 @@ def test_a_hand_may_drift_aside() -> None:
     assert recorded(7, way_m=(0.05, -0.12, 0.3)).verdict is Verdict.PASS
 
 
-def truly_moved(way: Way, from_s: float, to_s: float) -> capture.Moved:
+def truly_moved(way: Stops, from_s: float, to_s: float) -> capture.Moved:
     """Vehicle and capture agree on that way."""
-    moments = [way.at(float(t_s)) for t_s in np.arange(from_s, to_s, capture.EVERY_S)]
-    R = Rotation.from_matrix([moment.R for moment in moments])
-    return capture.Moved(R, R, np.array([moment.position_m for moment in moments]), 0.2)
+    times_s = np.arange(from_s, to_s, capture.EVERY_S)
+    places, turns = zip(*(way(HOME, I3, float(t_s)) for t_s in times_s), strict=True)
+    R = Rotation.from_matrix(turns)
+    return capture.Moved(R, R, np.array(places), 0.2)
 
 
 @given(tilt_deg=st.floats(20.0, 40.0), before_s=st.floats(0.2, 5.0), after_s=st.floats(0.2, 20.0))
@@ -231,12 +232,11 @@ def test_what_is_asked_for_is_enough_however_long_it_stands(
     tilt_deg: float, before_s: float, after_s: float
 ) -> None:
     """The very motion, as the simulated hand makes it, tilted more or less."""
-    home = (0.0, 0.0, 0.012)
     share = math.radians(tilt_deg) / math.radians(30.0)
-    way = Way(Stop(1.0, home), [
-        replace(stop, rpy_rad=(share * stop.rpy_rad[0], share * stop.rpy_rad[1], stop.rpy_rad[2]))
-        for stop in lifted_and_turned(home)
-    ])  # fmt: skip
+    way = Stops(tuple(
+        Stop(after_s, place_m, (share * roll, share * pitch, yaw))
+        for after_s, place_m, (roll, pitch, yaw) in lifted_and_turned(HOME).stops
+    ))  # fmt: skip
     moved = truly_moved(way, -before_s, 7.5 + after_s)
     assert capture.is_enough(moved)
     assert capture.hand_finding(moved, CONFIG).verdict is Verdict.PASS
@@ -246,10 +246,10 @@ def test_what_is_asked_for_is_enough_however_long_it_stands(
 @settings(max_examples=20, deadline=None)
 def test_a_hand_that_wobbles_has_tilted_nothing(wobble_deg: float, stands_s: float) -> None:
     up, wobble, turn = (0.0, 0.0, 0.3), math.radians(wobble_deg), math.radians(90.0)
-    way = Way(Stop(1.0, (0.0, 0.0, 0.0)), [
+    way = Stops((
         Stop(1.0, up), Stop(0.8, up, (wobble, -wobble, turn / 2.0)),
-        Stop(0.8, up, (-wobble, wobble, turn)), Stop(1.5, up), Stop(1.0, (0.0, 0.0, 0.0)),
-    ])  # fmt: skip
+        Stop(0.8, up, (-wobble, wobble, turn)), Stop(1.5, up), Stop(1.0, HOME),
+    ))  # fmt: skip
     moved = truly_moved(way, -0.5, 5.1 + stands_s)
     assert not capture.is_enough(moved)
     assert "too few axes" in capture.hand_finding(moved, CONFIG).found

@@ -22,10 +22,9 @@ from perchctl.check.vehicle import LIFTED
 from perchctl.errors import SafetyAbort
 from perchctl.flight import require_comparison
 from perchctl.profile import Profile
-from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, CaptureSettings, SimProcess, draw_scenario
-from perchctl.sim.world import Stop
+from perchctl.sim import CaptureFault, CaptureSettings, SimProcess, draw_scenario
 from tests.helpers.capture import SWAPPED_XY, Y_UP
-from tests.helpers.carried import lifted_and_turned
+from tests.helpers.carried import Stop, Stops, lifted_and_turned
 from tests.helpers.checks import QUICK, options, wait_for
 from tests.helpers.flights import short_profile
 
@@ -85,7 +84,7 @@ class Lab:
 
     def _put_down(self) -> None:
         """By a hand, too: what is put somewhere else no gyroscope follows."""
-        self.sim.move_by_hand([Stop(0.5, HOME)])
+        self.sim.move_by_hand(Stops((Stop(0.5, HOME),)))
         end_s = time.monotonic() + 20.0
         while math.dist(self.sim.truth()["position_m"], HOME) > 1e-3:
             assert time.monotonic() < end_s
@@ -125,7 +124,7 @@ def test_a_capture_that_is_set_up_right_passes_and_may_be_flown_by(sim: SimProce
 @pytest.mark.parametrize(("fault", "body", "within_s", "words"), [
     (CaptureFault(axes=Y_UP), "crazyflie", UNTIL_BACK_S, "swapped axes: up is y"),
     (CaptureFault(axes=SWAPPED_XY), "crazyflie", UNTIL_BACK_S, r"are turned by (8[5-9]|9.) deg"),
-    (CaptureFault(scale=MILLIMETRES_PER_M), "crazyflie", WHOLE_S, "these look like millimetres"),
+    (CaptureFault(scale=1000.0), "crazyflie", WHOLE_S, "these look like millimetres"),
     (None, "wand", WHOLE_S, "the vehicle moves, and the rigid body 'wand' stands still"),
 ])  # fmt: skip
 def test_what_is_set_up_wrong_is_named_and_not_flown_by(

@@ -26,8 +26,7 @@ from perchctl.flight import fly_lockstep
 from perchctl.mission import Event, Outcome, Phase, Tick
 from perchctl.profile import Profile, load_profile, write_profile_values
 from perchctl.profile.positioning import MOST_LATENCY_S
-from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, Scenario, draw_scenario
-from perchctl.sim.capture import OtherBody
+from perchctl.sim import CaptureFault, Scenario, draw_scenario
 from tests.helpers.capture import SWAPPED_XY, Y_UP, Rows
 from tests.helpers.flights import Flown, fly_short
 from tests.helpers.mission import changed
@@ -75,7 +74,7 @@ def test_it_perches(own: dict[str, Any], capture: dict[str, Any], miss_m: float)
         ({"frozen": True}, "is frozen"),
         ({"gone": True}, "no frame has come"),
         ({"swapped": True}, "another body is taken for it"),
-        ({"scale": MILLIMETRES_PER_M}, "jumped by"),
+        ({"scale": 1000.0}, "jumped by"),
     ],
 )
 def test_what_lasts_is_landed_and_named(what: dict[str, Any], words: str) -> None:
@@ -115,12 +114,12 @@ def test_hidden_for_good_it_comes_down_softly_and_near_whatever_the_seed(seed: i
     assert it.farthest_m < 0.4
 
 
-OTHERS = {"others": (OtherBody("wand", (2.5, -0.9, 0.05)),)}
+OTHERS = {"others": (("wand", (2.5, -0.9, 0.05)),)}
 
 
 @pytest.mark.parametrize(("changes", "capture", "error", "words"), [
     ({}, wrong(0.0, axes=Y_UP), SafetyAbort, "swapped axes"),
-    ({}, wrong(0.0, scale=MILLIMETRES_PER_M), SafetyAbort, "millimetres"),
+    ({}, wrong(0.0, scale=1000.0), SafetyAbort, "millimetres"),
     ({}, wrong(0.0, occluded=True), ConnectionFailed, "does not see the rigid body"),
     # It stands level, on the ground, 2.5 m aside of where this vehicle's target hangs.
     ({"target.expected_xy_m": [0.7, -0.5]}, wrong(0.0, swapped=True) | OTHERS, SafetyAbort,

@@ -233,7 +233,7 @@ long = pytest.mark.long
 @pytest.mark.parametrize(("changes", "scenario", "outcome", "code", "words", "way_ends"), [
     pytest.param({}, {"no_target": True}, Outcome.TARGET_NOT_FOUND, 50, "not found",
                  ["APPROACH", "SEARCH", "LANDING", "LANDED"], marks=long, id="no target"),
-    pytest.param({}, {"camera_gone_at_s": FAULT_S}, Outcome.SAFETY, 52, "no picture",
+    pytest.param({}, {"camera_burst": (FAULT_S, 9999)}, Outcome.SAFETY, 52, "no picture",
                  ["ALIGN", ..., "LANDING", "LANDED"], id="camera gone"),
     # The same bytes again and again are no measurement, though they show the target.
     pytest.param({}, {"camera_freeze_at_s": FAULT_S}, Outcome.SAFETY, 52, "stands still",

@@ -23,10 +23,10 @@ from perchctl.link import MockLink
 from perchctl.mission import Phase
 from perchctl.profile import CameraConfig, Profile
 from perchctl.sim import SimulatedVehicle, draw_scenario
-from perchctl.sim.hand import draw_hand, pictures, record_hand
 from perchctl.sim.host import VehicleHost
 from perchctl.sim.process import HostSetup
 from tests.helpers.flights import SEED, fly_short, short_profile
+from tests.helpers.hand import draw_hand, pictures, record_hand
 
 Pictures = list[NDArray[np.uint8]]
 PLAIN = short_profile()

@@ -12,10 +12,11 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.flight.clock import SIM_PATIENCE_S, SLOW, SLOW_S, SimulatedClock
-from perchctl.sim import CLOCK_MARGIN_S, CONTROL_PERIOD_S, SharedTime
+from perchctl.sim import CONTROL_PERIOD_S, SharedTime
 from perchctl.sim.host import Runner
 from perchctl.sim.process import LOOP_PATIENCE_S
 
+CLOCK_MARGIN_S = SharedTime.MARGIN_S
 PERIOD_S = 0.02
 NEAR_S = CONTROL_PERIOD_S + 1e-9
 
@@ -37,7 +38,7 @@ class Rig:
 
     def __init__(self) -> None:
         self.wall_s = 100.0
-        self.host, self.shared, self.runs = Host(), SharedTime(), True
+        self.host, self.shared, self.runs = Host(), SharedTime.free(), True
         self.runner = Runner(
             self.host, None, realtime=True, linger_s=0.0, clock=lambda: self.wall_s,
             shared=self.shared,
@@ -155,8 +156,8 @@ def test_a_vehicle_whose_parent_is_gone_flies_on(rig: Rig) -> None:
 
 
 def test_two_processes_map_the_same_numbers(tmp_path: Any) -> None:
-    mine = SharedTime.create(tmp_path / "time")
-    other = SharedTime(tmp_path / "time")
+    (tmp_path / "time").write_bytes(bytes(SharedTime.free()))
+    mine, other = (SharedTime.mapped(tmp_path / "time") for _ in range(2))
     assert (other.reached_s, other.limit_s) == (0.0, math.inf)
     mine.limit_s, other.reached_s = 1.5, 0.25
     assert (mine.reached_s, other.limit_s) == (0.25, 1.5)

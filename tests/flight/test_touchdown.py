@@ -45,12 +45,12 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, float, Touchdo
     """The vehicle comes down on a share of the thrust that it hovers on. Returns its true speed
     at the floor, its largest true specific force, g, and what was felt."""
     from perchctl.link import MockLink, Radio
-    from perchctl.sim import SimulatedVehicle, draw_scenario, radio_bursts
+    from perchctl.sim import SimulatedVehicle, draw_scenario
 
     profile = load_profile("sim")
     scenario = draw_scenario(profile, seed)
     vehicle = SimulatedVehicle(scenario)
-    link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(radio_bursts(scenario)))
+    link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(scenario.radio_bursts()))
     link.connect()
     motion, carried, last = ImuMotion(), Reckoning(), None
     t_s, dropped_s, hit_s, speed_mps, sink_mps = 1.0, math.inf, math.inf, 0.0, 0.0

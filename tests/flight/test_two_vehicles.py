@@ -115,7 +115,7 @@ def heard(file: Path) -> tuple[set[str], Array]:
         packet = Packet.decode(bytes.fromhex(record["packet"]))
         if packet is None or packet.port not in COMMANDS:
             continue
-        commanders.add(record["from"])
+        commanders.add(tuple(record["from"]))
         generic = (packet.port, packet.channel) == (Port.COMMANDER_GENERIC, 0)
         if generic and packet.data[0] == _POSITION:
             setpoints.append(struct.unpack_from("<fff", packet.data, 1))

@@ -3,20 +3,53 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import NamedTuple
 
-from perchctl.sim.world import Stop
+import numpy as np
+
+from perchctl.geometry import Array, rotation_from_rpy, rpy_from_rotation
+
+Place = tuple[float, float, float]
 
 
-def lifted_and_turned(home: tuple[float, float, float], yaw_rad: float = 0.0) -> tuple[Stop, ...]:
+class Stop(NamedTuple):
+    """Reached `after_s` after the one before, at rest."""
+
+    after_s: float
+    position_m: Place
+    rpy_rad: Place = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Stops:
+    """The way of a hand through all stops (`perchctl.sim.world.Way`); at the last it is held."""
+
+    stops: tuple[Stop, ...]
+
+    def __call__(self, place_m: Place, R: Array, t_s: float) -> tuple[Array, Array]:
+        a, b = np.asarray(place_m), np.asarray(rpy_from_rotation(R))
+        for after_s, *stop in self.stops:
+            c, d = map(np.asarray, stop)
+            share = min(max(t_s / after_s, 0.0), 1.0)
+            # At both ends neither speed nor acceleration.
+            share = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+            if share < 1.0:
+                return a + share * (c - a), rotation_from_rpy(*(b + share * (d - b)).tolist())
+            a, b, t_s = c, d, t_s - after_s
+        return a, rotation_from_rpy(*b.tolist())
+
+
+def lifted_and_turned(home: Place, yaw_rad: float = 0.0) -> Stops:
     """What `perchctl check --lift` asks for: up by 30 cm, turned by 90 deg, tilted forward and
     aside, put back."""
     x, y, z = home
     up, tilt, quarter = (x, y, z + 0.3), math.radians(30.0), 0.5 * math.pi
-    return (
+    return Stops((
         Stop(1.2, up, (0.0, 0.0, yaw_rad)),
         Stop(1.5, up, (0.0, 0.0, yaw_rad + quarter)),
         Stop(0.9, up, (0.0, tilt, yaw_rad + quarter)),
         Stop(1.2, up, (tilt, 0.0, yaw_rad + quarter)),
         Stop(1.5, up, (0.0, 0.0, yaw_rad)),
         Stop(1.2, home, (0.0, 0.0, yaw_rad)),
-    )
+    ))  # fmt: skip

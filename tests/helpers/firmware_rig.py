@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from perchctl.sim import CONTROL_PERIOD_S, Firmware, Scenario
+from perchctl.sim import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.firmware import Firmware
 from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.planner import HlTakeoff
 from perchctl.sim.world import World

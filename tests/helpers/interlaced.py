@@ -9,7 +9,8 @@ import numpy as np
 
 from perchctl.geometry import Array, invert_T, make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
-from perchctl.sim import CONTROL_PERIOD_S, Renderer, Scenario, SimCamera
+from perchctl.sim import CONTROL_PERIOD_S, Renderer, Scenario
+from perchctl.sim.camera import SimCamera
 from perchctl.vision import Frame
 from tests.helpers.target_picture import CAMERA
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from perchctl.calibration import MountingRecording, PoseReader, profile_camera
 from perchctl.calibration.mounting.recording import MountingPart, SeenPose
 from perchctl.profile import Profile, load_profile
-from perchctl.sim.hand import Hand, R_target_cam, attitudes, cam_target_m, draw_hand
+from tests.helpers.hand import Hand, R_target_cam, attitudes, cam_target_m, draw_hand
 
 BARE_STREAM = 431
 TURN_SIGMA_RAD = np.radians((0.15, 0.15, 0.05))

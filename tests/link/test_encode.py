@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,7 +24,8 @@ from perchctl.link import MockLink, Packet, Radio
 from perchctl.link.connection import send_packets
 from perchctl.link.crtp import ARM, LAND_TIMES, MAX_DATA, UNLOCK_THRUST, UNLOCK_TIMES, encode
 from perchctl.link.firmware import EXTERNAL_POSITION_TICK
-from perchctl.sim import CommandService, Scenario, SimulatedVehicle
+from perchctl.sim import Scenario, SimulatedVehicle
+from perchctl.sim.crtp import execute
 from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.planner import HlLand
 from perchctl.vehicle import (
@@ -118,7 +120,7 @@ class Calls:
 def in_lockstep(command: Command) -> list[tuple[str, tuple[Any, ...]]]:
     """What the lockstep link makes the firmware do."""
     firmware = Calls()
-    receive = CommandService(firmware).handle  # type: ignore[arg-type]
+    receive = partial(execute, firmware)  # type: ignore[arg-type]
     MockLink(SimpleNamespace(t_s=0.0, receive=receive)).send(command)  # type: ignore[arg-type]
     return firmware.made
 
@@ -151,6 +153,16 @@ def test_a_number_that_does_not_fit_is_refused(command: Command) -> None:
 
 
 # --- The lockstep link ------------------------------------------------------------------------
+
+
+@given(commands(st.floats(width=32, allow_nan=False)))
+def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None:
+    firmware = Calls()
+    for datagram in by_cflib(command):
+        packet = Packet.decode(datagram)
+        assert packet is not None
+        execute(firmware, packet)  # type: ignore[arg-type]
+    assert in_lockstep(command) == firmware.made
 
 
 @pytest.mark.parametrize(("command", "calls"), [

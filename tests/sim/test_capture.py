@@ -3,11 +3,11 @@ server, read by the library that reads a lab's."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import statistics
-import struct
-import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.errors import InvalidValue
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
-from perchctl.positioning import BodyPose, CaptureFrame, Placed
+from perchctl.positioning import BodyPose, CaptureFrame, Placed, open_capture
 from perchctl.profile import PositioningConfig
 from perchctl.sim import CaptureFault, CaptureSettings, Scenario, SimProcess
-from perchctl.sim import capture as natnet
 from perchctl.sim.capture import SimCapture
 from tests.helpers.capture import Y_UP
+from tests.helpers.waiting import until
 
 STEP_S = 0.002
 EXACT = CaptureSettings(position_noise_m=0.0, attitude_noise_rad=0.0, jitter_s=0.0)
@@ -52,10 +51,14 @@ def watched(
     return frames
 
 
-def wrong(since_s: float, to_s: float, **fault: Any) -> list[CaptureFrame]:
-    """The frames of 1.5 s in which something is wrong for a time."""
+def always(**fault: Any) -> tuple[tuple[float, float, CaptureFault]]:
+    return ((0.0, math.inf, CaptureFault(**fault)),)
+
+
+def wrong(since_s: float, to_s: float, **fault: Any) -> list[float]:
+    """When the frames of 1.5 s come in which something is wrong for a time."""
     faults = ((since_s, to_s, CaptureFault(**fault)),)
-    return watched(SimCapture(replace(EXACT, faults=faults)), 1.5, Room())
+    return [f.t_s for f in watched(SimCapture(replace(EXACT, faults=faults)), 1.5, Room())]
 
 
 def test_frames_come_at_the_cameras_rate_and_late() -> None:
@@ -98,27 +101,21 @@ def test_a_body_s_own_axes_are_undone_by_the_profile_s() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "at_m"),
+    ("settings", "fault", "at_m"),
     [
-        ({}, AT),
-        ({"axes": Y_UP}, (0.3, 0.5, 0.2)),
-        ({"scale": 1000.0}, (300.0, -200.0, 500.0)),
-        ({"mirrored": True}, (0.3, 0.2, 0.5)),
-        ({"swapped": True}, (1.2, -0.9, 0.05)),
+        ({}, {}, AT),
+        ({"heading_rad": math.pi / 2, "origin_m": (1.0, 0.0, 0.0)}, {}, (1.2, 0.3, 0.5)),
+        ({}, {"axes": Y_UP}, (0.3, 0.5, 0.2)),
+        ({}, {"scale": 1000.0}, (300.0, -200.0, 500.0)),
+        ({}, {"mirrored": True}, (0.3, 0.2, 0.5)),
+        ({}, {"swapped": True}, (1.2, -0.9, 0.05)),
     ],
 )
-def test_a_level_body_is_where_the_fault_puts_it(
-    fault: dict[str, Any], at_m: tuple[float, ...]
+def test_a_body_is_where_the_capture_s_world_and_the_fault_put_it(
+    settings: dict[str, Any], fault: dict[str, Any], at_m: tuple[float, ...]
 ) -> None:
-    level = wrong(0.0, 9.0, **fault)[-1].bodies["crazyflie"]
-    assert level.position_m == pytest.approx(at_m)
-    assert level.quaternion == pytest.approx((1.0, 0.0, 0.0, 0.0))
-
-
-def test_the_capture_s_world_is_turned_and_shifted() -> None:
-    turned = replace(EXACT, heading_rad=math.pi / 2, origin_m=(1.0, 0.0, 0.0))
-    seen = watched(SimCapture(turned), 0.5, Room())[-1].bodies["crazyflie"]
-    assert seen.position_m == pytest.approx((1.2, 0.3, 0.5))
+    frames = watched(SimCapture(replace(EXACT, **settings, faults=always(**fault))), 0.5, Room())
+    assert frames[-1].bodies["crazyflie"].position_m == pytest.approx(at_m)
 
 
 def test_an_occluded_body_is_missing_for_its_time_only() -> None:
@@ -146,117 +143,42 @@ def test_frozen_bodies_stay_to_the_last_digit_until_they_are_healed() -> None:
 
 
 def test_frames_that_are_gone_or_late_leave_a_gap_and_never_overtake() -> None:
-    gone = [frame.t_s for frame in wrong(0.5, 1.0, gone=True)]
-    assert not [t_s for t_s in gone if 0.515 < t_s < 1.0]
-    late = [frame.t_s for frame in wrong(0.5, 1.0, late_s=0.1)]
+    assert not [t_s for t_s in wrong(0.5, 1.0, gone=True) if 0.515 < t_s < 1.0]
+    late = wrong(0.5, 1.0, late_s=0.1)
     assert late == sorted(late)
     assert not [t_s for t_s in late if 0.52 < t_s < 0.6]
-
-
-def test_lockstep_hands_on_the_newest_once() -> None:
-    capture, room = SimCapture(EXACT), Room()
-    for _ in range(100):
-        room.t_s += STEP_S
-        capture.advance(room)
-    frame = capture.poll(room.t_s)
-    assert frame is not None
-    assert room.t_s - frame.t_s < 1 / 120
-    assert capture.poll(room.t_s) is None
-    assert capture.problem(room.t_s) is None
-    capture.close()
-
-
-def test_settings_that_cannot_be_are_refused() -> None:
-    with pytest.raises(InvalidValue, match="Hz"):
-        CaptureSettings(rate_hz=0.0)
-    with pytest.raises(InvalidValue, match="one name"):
-        CaptureSettings(body="wand")
 
 
 # --- The server -----------------------------------------------------------------------------------
 
 
-WAIT_S = 10.0
-
-
-class Reader:
-    """The library's client, read in a thread, since it waits without a bound. Its connecting
-    lets no other thread run: what answers has to be another process."""
-
-    def __init__(self, host: str) -> None:
-        library = pytest.importorskip("motioncapture", reason="needs the extra [mocap]")
-        name, port = host.split(":")
-        self._client = library.connect(SimCapture.SYSTEM, {"hostname": name, "port_command": port})
-        self._news = threading.Condition()
-        self._bodies: dict[str, Any] = {}
-        threading.Thread(target=self._run, daemon=True).start()
-
-    def until(self, seen: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """Name -> (position, quaternion) of the first frame that is as wanted."""
-        with self._news:
-            assert self._news.wait_for(lambda: seen(self._bodies), WAIT_S), self._bodies
-            return self._bodies
-
-    def until_at(
-        self, name: str, position_m: tuple[float, float, float], within_m: float
-    ) -> dict[str, Any]:
-        return self.until(lambda b: name in b and math.dist(b[name][0], position_m) < within_m)
-
-    def _run(self) -> None:
-        while True:
-            self._client.waitForNextFrame()
-            bodies = {
-                name: (
-                    tuple(float(v) for v in body.position),
-                    (body.rotation.w, body.rotation.x, body.rotation.y, body.rotation.z),
-                )
-                for name, body in self._client.rigidBodies.items()
-            }
-            with self._news:
-                self._bodies = bodies
-                self._news.notify_all()
-
-
-def test_a_hidden_body_is_marked_as_such_and_not_at_the_origin() -> None:
-    target = BodyPose((0.0, 0.0, 2.2), (1.0, 0.0, 0.0, 0.0))
-    seen = CaptureFrame(1.3, {"target": target})
-    frame = natnet.frame_message(7, ("crazyflie", "target"), seen)
-    kind, length = struct.unpack_from("<HH", frame)
-    assert (kind, length) == (natnet.FRAME, len(frame) - 4)
-    bodies = [struct.unpack_from("<i3f4ffh", frame, 4 + 16 + 38 * i) for i in range(2)]
-    assert [body[-1] for body in bodies] == [0, 1]
-    assert bodies[1][1:8] == pytest.approx((0.0, 0.0, 2.2, 0.0, 0.0, 0.0, 1.0))
+CONFIG = PositioningConfig(by="mocap", body="crazyflie", connect_timeout_s=10.0)
 
 
 def test_the_library_reads_the_room_of_the_vehicle_s_process() -> None:
+    pytest.importorskip("motioncapture", reason="needs the extra [mocap]")
     scenario, here_m = Scenario(extra={"external_position": 1.0}), (0.2, 0.1, 0.6)
-    with SimProcess.start(scenario, "stepped", capture=CaptureSettings()) as sim:
+    with SimProcess.start(scenario, "realtime", capture=CaptureSettings()) as sim:
         assert sim.capture is not None
-        assert sim.capture[0] == SimCapture.SYSTEM
-        first, second = Reader(sim.capture[1]), Reader(sim.capture[1])
-        sim.set_pose(here_m, (0.0, 0.0, 1.0), hold=True)
-        sim.advance(0.1)
-        for reader in (first, second):  # at the same time, on one computer
-            reader.until_at("crazyflie", here_m, 0.006)
-            seen = reader.until_at("wand", (1.2, -0.9, 0.05), 0.006)
-            assert seen["crazyflie"][1] == pytest.approx(
-                (math.cos(0.5), 0.0, 0.0, math.sin(0.5)), abs=0.02
-            )
-        sim.capture_fault(CaptureFault(scale=1000.0), 0.05)
-        sim.advance(0.05)
-        first.until_at("crazyflie", (200.0, 100.0, 600.0), 6.0)
-        sim.advance(0.1)
-        first.until_at("crazyflie", here_m, 0.006)
-        sim.capture_fault(CaptureFault(occluded=True))
-        sim.advance(0.1)
-        first.until(lambda bodies: set(bodies) == {"wand"})
-        sim.capture_fault(None)
-        sim.advance(0.1)
-        first.until(lambda bodies: set(bodies) == {"crazyflie", "wand"})
+        system, host = sim.capture
+        config = CONFIG.model_copy(update={"system": system, "host": host})
+        with contextlib.closing(open_capture(config)) as capture:
 
+            def bodies() -> dict[str, BodyPose]:
+                frame = capture.poll(time.monotonic())
+                return {} if frame is None else frame.bodies
 
-def test_without_a_capture_there_is_none_to_spoil() -> None:
-    with SimProcess.start(pace="stepped") as sim:
-        assert sim.capture is None
-        with pytest.raises(InvalidValue, match="without a motion capture"):
-            sim.capture_fault(CaptureFault(gone=True))
+            def seen_at(name: str, place_m: tuple[float, float, float]) -> BodyPose | None:
+                pose = bodies().get(name)
+                near = pose is not None and math.dist(pose.position_m, place_m) < 0.01
+                return pose if near else None
+
+            sim.set_pose(here_m, (0.0, 0.0, 1.0), hold=True)
+            pose = until(lambda: seen_at("crazyflie", here_m))
+            turned = (math.cos(0.5), 0.0, 0.0, math.sin(0.5))
+            assert pose.quaternion == pytest.approx(turned, abs=0.02)
+            until(lambda: seen_at("wand", (1.2, -0.9, 0.05)))
+            sim.capture_fault(CaptureFault(occluded=True))
+            until(lambda: set(bodies()) == {"wand"})
+            sim.capture_fault(None)
+            until(lambda: set(bodies()) == {"crazyflie", "wand"})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 
@@ -20,6 +21,7 @@ from tests.helpers.crtp_rig import (
     READY,
     TUMBLED_BIT,
     Pilot,
+    height,
     locked,
     notify,
     off,
@@ -33,8 +35,11 @@ UPDATE_S = 0.04  # 25 Hz
 
 
 def test_values_of_the_states(pilot: Pilot) -> None:
-    """Row "supervisor.info": 0x020E, 0x011E, 0x031E, 0x021E, 0x0244, on port 9 and as a log."""
+    """Row "supervisor.info": 0x020E, 0x011E, 0x031E, 0x021E, 0x0244, on port 9 and as a log; the
+    getters of cflib read the same bits."""
     assert pilot.supervisor_info() == pilot.info == READY
+    states = pilot.cf.supervisor.decode_bitfield(pilot.supervisor_info())
+    assert states == ["Is armed", "Is auto armed", "Can fly", "Finished HL trajectory"]
     pilot.unlock()
     pilot.cf.high_level_commander.takeoff(0.6, 2.0)
     pilot.advance(1.9)
@@ -46,13 +51,6 @@ def test_values_of_the_states(pilot: Pilot) -> None:
     pilot.cf.supervisor.send_emergency_stop()
     pilot.advance(3.0)
     assert pilot.supervisor_info() == pilot.info == LOCKED
-
-
-def test_cflib_names_the_bits(pilot: Pilot) -> None:
-    """Row "supervisor.info": cflib's getters read the same bits."""
-    pilot.supervisor_info()
-    states = pilot.cf.supervisor.decode_bitfield(pilot.supervisor_info())
-    assert states == ["Is armed", "Is auto armed", "Can fly", "Finished HL trajectory"]
 
 
 def test_updates_at_25_hz(pilot: Pilot) -> None:
@@ -92,9 +90,12 @@ def test_disarm_in_flight_cuts_without_locking(pilot: Pilot) -> None:
     pilot.cf.supervisor.send_arming_request(False)
     assert pilot.until(off, 0.2) <= UPDATE_S + 0.002
     pilot.advance(6.0)
-    seen = {int(v) for _, v in pilot.log("supervisor.info", since_s)}
-    assert not any(v & LOCKED_BIT for v in seen)
+    assert not any(int(v) & LOCKED_BIT for _, v in pilot.log("supervisor.info", since_s))
     assert pilot.info == READY
+    assert pilot.motors_off()
+    pilot.cf.high_level_commander.takeoff(0.5, 2.0)
+    pilot.advance(2.5)
+    assert height(pilot) > 0.3
 
 
 @pytest.mark.long
@@ -132,7 +133,7 @@ def test_silence_levels_out_then_cuts_and_locks(pilot: Pilot) -> None:
     assert abs(pilot.sim.truth()["rpy_rad"][1]) > math.radians(2.0)  # still under way
     pilot.advance(1.0)
     assert abs(pilot.sim.truth()["rpy_rad"][1]) < math.radians(2.0)
-    assert pilot.sim.truth()["position_m"][2] > 0.6
+    assert height(pilot) > 0.6
     pilot.until(off, 1.0)
     assert pilot.t_s - silent_s == pytest.approx(2.02, abs=0.06)
     pilot.advance(1.0)
@@ -152,22 +153,36 @@ def test_silence_of_1200_ms_recovers(pilot: Pilot) -> None:
     pilot.advance(1.2)
     pilot.stream(5.0, lambda: pilot.hold(0.8))
     assert pilot.info == LOW_LEVEL
-    assert pilot.sim.truth()["position_m"][2] == pytest.approx(0.8, abs=0.1)
+    assert height(pilot) == pytest.approx(0.8, abs=0.1)
+
+
+def send_stop(pilot: Pilot) -> None:
+    pilot.cf.commander.send_stop_setpoint()
+
+
+def send_farewell(pilot: Pilot) -> None:
+    raw(pilot, 0)
 
 
 @pytest.mark.parametrize("perched", [False, True])
-def test_stop_alone_cuts_at_once_and_locks(pilot: Pilot, perched: bool) -> None:
-    """Row "send_stop_setpoint once and then silence": off within 7 ms, locked at +2.0 s."""
+@pytest.mark.parametrize("send", [send_stop, send_farewell])
+def test_a_lone_last_packet_cuts_at_once_and_locks(
+    pilot: Pilot, perched: bool, send: Callable[[Pilot], None]
+) -> None:
+    """Rows "send_stop_setpoint once and then silence: off within 7 ms, locked at +2.0 s",
+    "close_link() sends send_setpoint(0,0,0,0): falls at once and locks", and "a zero packet in
+    flight is itself a cut"."""
     if perched:
         pilot.perch()
     else:
         pilot.fly_to(0.8, 0.5, AIRBORNE_S)
-    pilot.cf.commander.send_stop_setpoint()
+    send(pilot)
     start_s = pilot.t_s
     assert pilot.until(off, 0.1) <= 0.007
     pilot.until(locked, 3.0)
     assert pilot.t_s - start_s == pytest.approx(2.06, abs=0.07)
     assert pilot.sim.truth()["magnet_engaged"] == perched
+    assert pilot.sim.truth()["floor_contact"] != perched
 
 
 def test_stop_and_notify_is_ready_again(pilot: Pilot) -> None:
@@ -184,18 +199,7 @@ def test_stop_and_notify_is_ready_again(pilot: Pilot) -> None:
     pilot.cf.high_level_commander.takeoff(0.5, 2.0)
     pilot.advance(4.0)
     assert pilot.info == HL_DONE
-    assert pilot.sim.truth()["position_m"][2] > 0.4
-
-
-def test_the_farewell_packet_drops_a_flying_vehicle(pilot: Pilot) -> None:
-    """Rows "close_link() sends send_setpoint(0,0,0,0)": falls at once and locks; "a zero packet in
-    flight is itself a cut"."""
-    pilot.fly_to(0.8, 0.5, AIRBORNE_S)
-    raw(pilot, 0)
-    assert pilot.until(off, 0.1) <= 0.007
-    pilot.advance(3.0)
-    assert pilot.sim.truth()["floor_contact"]
-    assert pilot.info & LOCKED_BIT
+    assert height(pilot) > 0.4
 
 
 @pytest.mark.parametrize(("wait_s", "locks"), [(1.0, True), (4.0, False)])
@@ -222,17 +226,15 @@ def test_hl_hover_never_times_out(pilot: Pilot) -> None:
     assert truth["position_m"][2] == pytest.approx(0.8, abs=0.05)
 
 
-def test_emergency_stop(pilot: Pilot) -> None:
-    """Row "Emergency stop: motors off in 25 ms, locked" (within one update)."""
+def test_emergency_stop_and_its_watchdog(pilot: Pilot) -> None:
+    """Rows "Emergency stop: motors off in 25 ms, locked" (within one update) and "Emergency-stop
+    watchdog: starts with its first packet; a gap over 1 s locks"."""
     pilot.take_off(0.6, settle_s=1.0)
     pilot.cf.supervisor.send_emergency_stop()
     assert pilot.until(off, 0.1) <= UPDATE_S + 0.002
     pilot.advance(3.0)
     assert pilot.info == LOCKED
-
-
-def test_emergency_stop_watchdog(pilot: Pilot) -> None:
-    """Row "Emergency-stop watchdog": starts with its first packet; a gap over 1 s locks."""
+    pilot.fresh()
     pilot.take_off(0.6, settle_s=1.0)
     pilot.stream(3.0, pilot.cf.supervisor.send_emergency_stop_watchdog, 0.9)
     assert pilot.info == HL_DONE
@@ -242,29 +244,28 @@ def test_emergency_stop_watchdog(pilot: Pilot) -> None:
     assert pilot.info == LOCKED
 
 
-def test_hl_without_notify_is_not_flown(pilot: Pilot) -> None:
-    """Row "HL command after low-level without notify": HL active, not flown, locks after 2 s."""
+@pytest.mark.parametrize("notified", [False, True])
+def test_hl_after_low_level_flies_only_with_notify(pilot: Pilot, notified: bool) -> None:
+    """Rows "HL command after low-level without notify: HL active, not flown, locks after 2 s" and
+    "With notify first it flies"."""
     pilot.fly_to(0.8, 1.0, AIRBORNE_S)
     last_s = pilot.t_s
-    pilot.cf.high_level_commander.go_to(0, 0, 1.4, 0, 1.5)
+    if notified:
+        notify(pilot)
+    pilot.cf.high_level_commander.go_to(0, 0, 1.2, 0, 1.5)
     pilot.advance(0.3)
     assert pilot.info == HL_RUNNING
     pilot.advance(1.4)
-    assert pilot.sim.truth()["position_m"][2] < 0.9
+    if notified:
+        pilot.advance(4.0)
+        assert pilot.info == HL_DONE
+        assert height(pilot) == pytest.approx(1.2, abs=0.08)
+        return
+    assert height(pilot) < 0.9
     pilot.until(off, 1.0)
     assert pilot.t_s - last_s == pytest.approx(2.0, abs=0.1)
     pilot.advance(0.2)
     assert pilot.info & LOCKED_BIT
-
-
-def test_hl_after_notify_flies(pilot: Pilot) -> None:
-    """Row "With notify first it flies"."""
-    pilot.fly_to(0.8, 1.0, AIRBORNE_S)
-    notify(pilot)
-    pilot.cf.high_level_commander.go_to(0, 0, 1.2, 0, 2.0)
-    pilot.advance(6.0)
-    assert pilot.info == HL_DONE
-    assert pilot.sim.truth()["position_m"][2] == pytest.approx(1.2, abs=0.08)
 
 
 # --- Contact, tumble, crash -------------------------------------------------------
@@ -303,3 +304,5 @@ def test_upside_down_crashes_and_recovers(pilot: Pilot) -> None:
     assert pilot.info & CRASHED_BIT
     pilot.cf.supervisor.send_crash_recovery_request()
     assert pilot.until(lambda t: t["supervisor_info"] == READY, 1.0) <= 0.2
+    pilot.advance(5.0)
+    assert pilot.motors_off()  # the setpoints of the flight that crashed spin nothing

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.sim import CONTROL_PERIOD_S, MOTOR_FORCE_N
+from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.firmware.controller import MOTORS_OFF, THRUST_MIN, MotorDriver
 from perchctl.sim.firmware.firmware import _LEVELS_V
 from perchctl.sim.powertrain import (
-    FULL_COMMAND,
+    MOTOR_FORCE_N,
     STANDSTILL_V,
     Cell,
     CellKind,
@@ -35,53 +35,12 @@ def test_the_inverse_undoes_the_curve(newtons: float) -> None:
     assert thrust_n(motor_v(newtons)) == pytest.approx(newtons, rel=1e-9)
 
 
-@given(st.floats(0.0, 5.0), st.floats(0.0, 5.0))
-def test_more_voltage_is_more_thrust(a: float, b: float) -> None:
-    assert (a - b) * (thrust_n(a) - thrust_n(b)) >= 0.0
-
-
 def test_the_dead_band() -> None:
     assert pytest.approx(0.455, abs=0.001) == STANDSTILL_V
     assert thrust_n(STANDSTILL_V) == thrust_n(0.1) == 0.0
     assert thrust_n(motor_v(MOTOR_FORCE_N)) == pytest.approx(MOTOR_FORCE_N)
     assert settled(4.1).pwm((6999.0,) * 4, 4.1) is MOTORS_OFF
     assert pytest.approx(7000, abs=1) == THRUST_MIN
-
-
-def test_a_sagging_battery_is_met_late() -> None:
-    driver = settled(4.0)
-    at_once = driver.pwm((40000.0,) * 4, 3.6)[0]
-    for _ in range(49):
-        later = driver.pwm((40000.0,) * 4, 3.6)[0]
-    for _ in range(500):
-        settled_pwm = driver.pwm((40000.0,) * 4, 3.6)[0]
-    assert settled_pwm / at_once == pytest.approx(4.0 / 3.6, rel=0.005)
-    assert (settled_pwm - later) / (settled_pwm - at_once) == pytest.approx(0.37, abs=0.03)
-
-
-def test_a_request_over_full_command_is_given_while_the_battery_suffices() -> None:
-    """A yaw step at hover requests 89,000 of two motors, half as much again as full command."""
-    low, high = 56200.0 - 32767.0, 56200.0 + 32767.0
-    pwm = settled(3.7).pwm((low, high, low, high), 3.7)
-    assert pwm[1] < FULL_COMMAND
-    assert pwm[1] * 3.7 / FULL_COMMAND == pytest.approx(
-        motor_v(high / FULL_COMMAND * MOTOR_FORCE_N)
-    )
-
-
-def test_the_cap_takes_the_excess_off_all_four_duty_cycles() -> None:
-    driver = settled(3.2)
-    pwm = driver.pwm((30000.0, 90000.0, 30000.0, 90000.0), 3.2)
-    requested = driver.requested
-    assert requested[1] > FULL_COMMAND
-    assert pwm[1] == FULL_COMMAND
-    assert requested[0] - pwm[0] == pytest.approx(requested[1] - pwm[1])
-    assert driver.pwm((7001.0, 150000.0, 7001.0, 150000.0), 3.2)[0] == 0.0
-
-
-def test_a_battery_that_cannot_be_read_gives_no_thrust() -> None:
-    driver = settled(1.9)
-    assert driver.pwm((40000.0,) * 4, 1.9) is MOTORS_OFF
 
 
 def after(cell: Cell, seconds: float, current_a: float = HOVER_A) -> float:
@@ -96,12 +55,6 @@ def test_each_tenth_of_the_charge_ends_at_the_firmwares_level() -> None:
     for level_v in reversed(_LEVELS_V[1:]):
         assert after(cell, tenth_s) == pytest.approx(level_v, abs=0.002)
     assert after(cell, tenth_s) == pytest.approx(3.0, abs=0.02)
-
-
-def test_it_falls_ever_faster_towards_its_end() -> None:
-    cell = Cell(3.87, CellKind())
-    fallen_v = [cell.rest_v - after(cell, 10.0) for _ in range(7)]
-    assert fallen_v[-1] > 8 * fallen_v[0]
 
 
 def test_an_old_cell_empties_faster_and_sags_more() -> None:

@@ -15,15 +15,14 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.display.panel import event_text
-from perchctl.faults.edges import FaultyRadio
 from perchctl.flight import fly_lockstep
 from perchctl.link import Packet, Radio
 from perchctl.link.mock import TELEMETRY_DELAY_S
 from perchctl.mission import Event, EventKeeper, EventKind, Phase
 from perchctl.mission.state import Severity
-from perchctl.profile import Profile, load_profile
+from perchctl.profile import PositioningConfig, Profile, load_profile
 from perchctl.record import read_log
-from perchctl.sim import EventExplainer, Scenario, draw_capture, draw_scenario, radio_bursts
+from perchctl.sim import EventExplainer, Scenario, draw_capture, draw_scenario
 from perchctl.sim.scenario import CONNECTED_S, LOSSES, Bursts
 from tests.helpers.flights import SEED, short_profile
 
@@ -54,22 +53,6 @@ def test_the_nominal_scenarios_stay_as_they_are() -> None:
     assert digest.hexdigest() == NOMINAL_SHA256
 
 
-@pytest.mark.parametrize("name", ["rough", "extreme"])
-def test_a_harder_world_is_drawn_within_its_ranges(name: str) -> None:
-    profile = load_profile(name)
-    sim = profile.simulation
-    for seed in range(12):
-        drawn = draw_scenario(profile, seed)
-        assert drawn == draw_scenario(profile, seed)
-        assert sim.mass_kg[0] <= drawn.mass_kg <= sim.mass_kg[1]
-        assert math.hypot(*drawn.draught_mps) <= sim.draught_mps[1]
-        tilt_deg = math.degrees(math.hypot(*drawn.target_tilt_rad))
-        assert sim.target_tilt_deg[0] - 1e-9 <= tilt_deg <= sim.target_tilt_deg[1] + 1e-9
-        assert drawn.cell_resistance_ohm is not None
-        assert drawn.cell_charge <= sim.cell_charge[1]
-        assert sim.radio_loss[0] <= drawn.radio_loss <= sim.radio_loss[1]
-
-
 @pytest.mark.parametrize(
     ("world", "key", "value", "field"),
     [
@@ -97,18 +80,14 @@ def test_one_range_moves_no_other_value_of_a_seed(
 
 def test_a_motion_capture_has_the_scenarios_holes() -> None:
     profile = changed("extreme", capture_hole_every_s=5.0)
-    values = profile.model_dump(mode="json")
-    values["positioning"] |= {"by": "mocap", "system": "optitrack", "host": "127.0.0.1"}
-    by_mocap = Profile.model_validate(values)
+    assert draw_capture(profile, 4) is None
+    by_mocap = profile.model_copy(update={"positioning": PositioningConfig(by="mocap", host="lab")})
     settings, holes = draw_capture(by_mocap, 4), draw_scenario(by_mocap, 4).capture_holes_s
     assert settings is not None
-    assert holes
-    assert [(a, b - a) for a, b, _ in settings.faults] == [
-        (begin_s, pytest.approx(length_s)) for begin_s, length_s in holes
-    ]
-    assert all(fault.occluded for *_, fault in settings.faults)
+    assert [fault.occluded for *_, fault in settings.faults] == [True] * len(holes)
+    for (from_s, to_s, _), (begin_s, length_s) in zip(settings.faults, holes, strict=True):
+        assert (from_s, to_s - from_s) == (begin_s, pytest.approx(length_s))
     assert all(b[0] > a[0] + a[1] for a, b in itertools.pairwise(holes))
-    assert draw_capture(profile, 4) is None
 
 
 # --- A radio that fails by bursts -----------------------------------------------------------------
@@ -120,8 +99,10 @@ PACKET = Packet(7, 0, b"\x07")
 
 @pytest.mark.parametrize(("share", "mean_s"), [(0.03, 0.1), (0.2, 0.3)])
 def test_share_and_length_of_bursts_are_what_is_asked_for(share: float, mean_s: float) -> None:
-    until_s, bursts = 2000.0, Bursts(3, share, mean_s, 0.0)
-    lost = [bursts.lost(step * STEP_S) for step in range(round(until_s / STEP_S))]
+    until_s, bursts = 2000.0, Bursts(3, share, mean_s)
+    assert not any(bursts.lost(step * STEP_S) for step in range(round(CONNECTED_S / STEP_S)))
+    times_s = [CONNECTED_S + step * STEP_S for step in range(round(until_s / STEP_S))]
+    lost = [bursts.lost(t_s) for t_s in times_s]
     runs = [sum(run) * STEP_S for is_lost, run in itertools.groupby(lost) if is_lost]
     spread = 4.0 / math.sqrt(len(runs))
     assert sum(runs) / until_s == pytest.approx(share, rel=1.5 * spread)
@@ -129,30 +110,18 @@ def test_share_and_length_of_bursts_are_what_is_asked_for(share: float, mean_s: 
     # Not all alike: as many are longer than twice the mean as an exponential has.
     long = sum(length_s > 2.0 * mean_s for length_s in runs) / len(runs)
     assert long == pytest.approx(math.exp(-2.0), rel=0.35)
-    seldom = Bursts(3, share, mean_s, 0.0)
-    assert lost[::40] == [seldom.lost(step * STEP_S) for step in range(0, len(lost), 40)]
+    seldom = Bursts(3, share, mean_s)
+    assert lost[::40] == [seldom.lost(t_s) for t_s in times_s[::40]]
 
 
-def test_nothing_is_lost_before_the_take_off_nor_without_a_share() -> None:
-    bursts, none = Bursts(1, 0.5, 0.5), Bursts(1, 0.0, 0.1)
-    assert not any(bursts.lost(step * STEP_S) for step in range(int(CONNECTED_S / STEP_S)))
-    assert not none.lost(1e6)
-    assert none.newest is None
-    assert radio_bursts(Scenario()) is None
-
-
-def test_both_directions_are_lost_together_and_faults_are_laid_over_the_same_radio() -> None:
+def test_both_directions_are_lost_together() -> None:
     scenario = Scenario(seed=2, radio_loss=0.3, radio_burst_s=0.3)
-    radio, same = Radio(radio_bursts(scenario)), Bursts(2, 0.3, 0.3)
-    faulty = FaultyRadio(Radio(radio_bursts(scenario)))
+    radio, same = Radio(scenario.radio_bursts()), Bursts(2, 0.3, 0.3)
     for step in range(4000):
         t_s = step * STEP_S
         lost = same.lost(t_s)
-        for each in (radio, faulty):
-            assert each.uplink_arrives(PACKET, t_s) is not lost
-            assert each.downlink_delay_s("fast", t_s) == (None if lost else TELEMETRY_DELAY_S)
-    faulty.cut = True
-    assert not faulty.uplink_arrives(PACKET, 21.0)
+        assert radio.uplink_arrives(PACKET, t_s) is not lost
+        assert radio.downlink_delay_s("fast", t_s) == (None if lost else TELEMETRY_DELAY_S)
 
 
 # --- What explains an event -----------------------------------------------------------------------
@@ -160,14 +129,6 @@ def test_both_directions_are_lost_together_and_faults_are_laid_over_the_same_rad
 
 BURST = Scenario(camera_rate_hz=30.0, camera_burst=(10.0, 15))
 WEAK = Scenario(mass_kg=0.04, first_contact_force_n=0.2 * 0.04 * 9.81)
-HIDDEN = Scenario(capture_holes_s=((8.0, 1.0),))
-SILENT = Scenario(seed=1, radio_loss=0.1, radio_burst_s=0.5)
-
-
-def silent_s() -> float:
-    """The begin of the first burst of `SILENT`."""
-    bursts = Bursts(1, 0.1, 0.5)
-    return next(t / 100.0 for t in range(100000) if bursts.lost(t / 100.0))
 
 
 def phase(row: str) -> Event:
@@ -178,45 +139,27 @@ def hold(reason: str) -> Event:
     return Event(0.0, EventKind.HOLD, reason, Phase.ASCEND, severity=Severity.HOLD)
 
 
-OLD = hold("telemetry is 0.3 s old")
-
-
 @pytest.mark.parametrize(
     ("scenario", "event", "t_s", "words"),
     [
         *((BURST, phase(row), 10.6, "15 frames lost") for row in LOSSES),
         (BURST, hold("no picture for 0.5 s"), 10.6, "15 frames lost"),
+        (BURST, phase("ascend-lost"), 9.9, ""),
+        (BURST, phase("ascend-lost"), 12.0, ""),
+        (BURST, hold("telemetry is 0.3 s old"), 10.6, ""),
+        (BURST, phase("slipped"), 10.6, ""),
         (WEAK, phase("slipped"), 5.0, "20 % of the weight"),
-        (Scenario(no_target=True), phase("searched-out"), 9.0, "no target"),
-        (HIDDEN, phase("position-lost"), 9.5, "for 1.0 s"),
-        (SILENT, OLD, silent_s() + 0.3, "the radio"),
-        (SILENT, phase("link-lost"), silent_s() + 0.3, "the radio"),
     ],
 )
 def test_a_condition_is_named_with_the_event_that_it_led_to(
     scenario: Scenario, event: Event, t_s: float, words: str
 ) -> None:
     explain = EventExplainer(scenario)
-    assert words in explain(event, t_s)
+    text = explain(event, t_s)
+    assert words in text if words else not text
     assert EventExplainer(Scenario())(event, t_s) == ""
     if event.row == "slipped":  # only the first contact is weak
         assert explain(event, t_s) == ""
-
-
-@pytest.mark.parametrize(
-    ("scenario", "event", "t_s"),
-    [
-        (BURST, phase("ascend-lost"), 9.9),
-        (BURST, phase("ascend-lost"), 12.0),
-        (BURST, OLD, 10.6),
-        (BURST, phase("slipped"), 10.6),
-        (HIDDEN, phase("position-lost"), 11.0),
-        (SILENT, OLD, silent_s() - 0.1),
-        (SILENT, phase("slipped"), silent_s() + 0.3),
-    ],
-)
-def test_a_condition_is_not_named_with_others(scenario: Scenario, event: Event, t_s: float) -> None:
-    assert EventExplainer(scenario)(event, t_s) == ""
 
 
 @pytest.mark.long

@@ -17,16 +17,10 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import Array, make_T, rot_z
 from perchctl.profile import TargetConfig
-from perchctl.sim import (
-    CONTROL_PERIOD_S,
-    Renderer,
-    Scenario,
-    SimCamera,
-    SimulatedVehicle,
-)
-from perchctl.sim.camera import DeliveredFrame, Shutter
+from perchctl.sim import CONTROL_PERIOD_S, Renderer, Scenario, SimulatedVehicle
+from perchctl.sim.camera import DeliveredFrame, SimCamera
 from perchctl.sim.optics import Picture
-from perchctl.sim.renderer import Shot, blended
+from perchctl.sim.renderer import Shot
 from perchctl.vision import CameraModel
 
 
@@ -76,18 +70,7 @@ scenarios = st.builds(
     camera_exposure_s=st.floats(0.0, 0.015),
     camera_burst=st.one_of(st.none(), st.tuples(st.floats(0.0, 1.0), st.integers(0, 20))),
     camera_freeze_at_s=st.one_of(st.none(), st.floats(0.0, 1.5)),
-    camera_gone_at_s=st.one_of(st.none(), st.floats(0.0, 1.5)),
 )
-
-
-@settings(max_examples=20, deadline=None, derandomize=True)
-@given(scenarios)
-def test_one_that_mirrors_gives_the_same_pictures_flipped(scene: Scenario) -> None:
-    plain, _ = run(scene, 0.6, 0.005)
-    mirrored, _ = run(replace(scene, camera_mirrored=True), 0.6, 0.005)
-    for one, other in zip(plain, mirrored, strict=True):
-        assert (one.t_arrival_s, one.index) == (other.t_arrival_s, other.index)
-        assert (one.image[:, ::-1] == other.image).all()
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -100,8 +83,6 @@ def test_laws_of_the_schedule(scene: Scenario) -> None:
     assert all(b >= a for a, b in pairwise(arrivals))
     for f in frames:
         assert f.t_arrival_s >= f.t_exposure_s + scene.camera_exposure_s / 2 - 1e-9
-        if scene.camera_gone_at_s is not None:
-            assert f.t_arrival_s < scene.camera_gone_at_s
         if scene.camera_freeze_at_s is None or f.t_exposure_s < scene.camera_freeze_at_s:
             assert f.image[0, 0] == f.index
             assert f.image[0, 1] == round(0.1 * f.t_exposure_s * 1e6)
@@ -132,27 +113,6 @@ def test_faults_change_no_other_frame() -> None:
     assert not lost & set(stub.rendered), "lost frames need no picture"
     by_index = {f.index: f for f in plain}
     assert all(np.array_equal(f.image, by_index[f.index].image) for f in burst)
-
-
-def test_latency_and_jitter_have_the_scenarios_size() -> None:
-    frames, _ = run(Scenario(seed=2, camera_latency_s=0.06, camera_jitter_s=0.004), 20.0, 0.01)
-    delays = np.array([f.t_arrival_s - f.t_exposure_s for f in frames])
-    assert delays.mean() == pytest.approx(0.06, abs=0.001)
-    assert delays.std() == pytest.approx(0.004, rel=0.15)
-
-
-def test_with_the_renderer_the_same_seed_gives_the_same_bytes() -> None:
-    scene = Scenario(seed=11, camera_drop_rate=0.2)
-
-    def flight() -> list[bytes]:
-        camera = SimCamera(scene, Renderer(scene, SMALL, TargetConfig()))
-        for k in range(1, 200):
-            camera.advance(k * CONTROL_PERIOD_S, pose_at)
-        return [f.image.tobytes() for f in camera.take()]
-
-    first = flight()
-    assert len(first) > 5
-    assert first == flight()
 
 
 @pytest.mark.parametrize("receiver_hz", [None, 7.0, 15.0])
@@ -208,32 +168,22 @@ def at_once(t_s: float, turn_radps: float = 0.0) -> Picture:
     return Renderer(STILL, CAMERA, TargetConfig()).render([pose(t_s, turn_radps)])
 
 
-@pytest.mark.parametrize("first", ["top", "bottom"])
-def test_each_field_shows_its_own_moment(first: str) -> None:
-    frame, middle_s = first_frame(replace(STILL, camera_fields=first), TURN_RADPS)
-    early, late = (at_once(middle_s + d, TURN_RADPS) for d in (-0.01, 0.01))
-    top, bottom = (early, late) if first == "top" else (late, early)
-    assert np.array_equal(frame[0::2], top[0::2])
-    assert np.array_equal(frame[1::2], bottom[1::2])
-    assert not np.array_equal(early, late)
-
-
-def test_blended_fields_show_both_moments_in_each_row() -> None:
+def test_blended_fields_are_the_mean_of_each_row_and_its_neighbours() -> None:
     woven, _ = first_frame(replace(STILL, camera_fields="top"), TURN_RADPS)
     frame, _ = first_frame(replace(STILL, camera_fields="top", camera_blended=True), TURN_RADPS)
-    assert np.array_equal(frame, blended(woven))
     mean = (woven[1:-3:2] / 4.0 + woven[2:-2:2] / 2.0 + woven[3:-1:2] / 4.0).astype(np.float32)
     assert np.abs(frame[2:-2:2] - mean).max() <= 0.5
 
 
-@pytest.mark.parametrize("fields", ["progressive", "bottom"])
+@pytest.mark.parametrize("fields", ["progressive", "top", "bottom"])
 def test_each_row_of_a_rolling_shutter_shows_its_own_moment(fields: str) -> None:
     """Of a frame, and of a field."""
     readout_s = 0.02
     rolling = replace(STILL, camera_readout_s=readout_s, camera_fields=fields)
     frame, middle_s = first_frame(rolling, TURN_RADPS)
+    late_s = {"progressive": 0.0, "top": -0.01, "bottom": 0.01}[fields]  # of the first row's field
     for row in (100, 180, 181, 239, 300, 301, 380):  # through the target
-        field_s = 0.0 if fields == "progressive" else 0.01 if row % 2 == 0 else -0.01
+        field_s = late_s if row % 2 == 0 else -late_s
         t_s = middle_s + field_s + readout_s * (row / 479 - 0.5)
         here = at_once(t_s, TURN_RADPS)[row].astype(int)
         wrong = at_once(t_s + readout_s / 4, TURN_RADPS)[row].astype(int)
@@ -252,37 +202,3 @@ def test_lamps_make_bands_of_a_rolling_shutter() -> None:
     depth = 2.0 * abs((measured * swing).mean())
     assert depth == pytest.approx(0.2, abs=0.02)
     assert measured.mean() == pytest.approx(1.0, abs=0.02)
-
-
-def test_a_hunting_exposure_changes_whole_pictures_slowly() -> None:
-    shutter = Shutter(replace(STILL, camera_pumping=0.3))
-    times = np.arange(0.0, 5.0, 0.04)
-    light = [shutter.shots(float(t), lambda t: np.eye(4), 480)[0].light for t in times]
-    assert all(rows is not None and np.ptp(rows) < 1e-9 for rows in light)
-    level = np.array([rows[0] for rows in light if rows is not None])
-    assert 1.25 < level.max() <= 1.3
-    assert 0.7 <= level.min() < 0.75
-    assert np.abs(np.diff(level)).max() < 0.2
-
-
-def test_a_frame_comes_after_its_last_light_and_looks_no_further_back_than_its_first() -> None:
-    slow = replace(
-        STILL, camera_fields="top", camera_readout_s=0.02, camera_exposure_s=0.008,
-        camera_latency_s=0.0,
-    )  # fmt: skip
-    camera = SimCamera(slow, Renderer(slow, CAMERA, TargetConfig()))
-    assert camera.exposed_s == pytest.approx(0.048)
-    now_s = 0.0
-
-    def pose_at(t_s: float) -> Array:
-        assert now_s - camera.exposed_s - CONTROL_PERIOD_S <= t_s <= now_s + 1e-9
-        return pose(t_s)
-
-    arrived = []
-    for step in range(1, 80):
-        now_s = step * CONTROL_PERIOD_S
-        camera.advance(now_s, pose_at)
-        arrived += camera.take()
-    assert len(arrived) >= 2
-    for frame in arrived:
-        assert frame.t_arrival_s >= frame.t_exposure_s + 0.024 - 1e-9

@@ -1,7 +1,7 @@
 """The cascaded PID controller: position and velocity at 100 Hz, attitude and rate at 500 Hz.
 
-Gains and limits are the firmware's defaults for the Crazyflie 2.x; they can be changed
-through the parameters of the same names. Angles in degrees, pitch nose up, as inside
+Gains and limits are the firmware's defaults for the Crazyflie 2.x, whatever is written into the
+parameters of the same names. Angles in degrees, pitch nose up, as inside
 the firmware. Every change of setpoint mode resets all integrators (docs/firmware.md,
 "Setpoint modes"), so the thrust starts again from `thrustBase`. The loops request
 thrust; `MotorDriver` turns these requests into duty cycles.
@@ -75,9 +75,7 @@ class Setpoint:
     @classmethod
     def velocity(cls, vx_mps: float, vy_mps: float, vz_mps: float, yaw_rate_dps: float) -> Setpoint:
         """Return that of `send_velocity_world_setpoint`: yaw rate counter-clockwise positive."""
-        return cls(
-            MODE_VELOCITY, vx_mps=vx_mps, vy_mps=vy_mps, vz_mps=vz_mps, yaw_rate_dps=yaw_rate_dps
-        )
+        return cls(MODE_VELOCITY, 0.0, 0.0, 0.0, vx_mps, vy_mps, vz_mps, yaw_rate_dps=yaw_rate_dps)
 
     @classmethod
     def hover(cls, vx_mps: float, vy_mps: float, yaw_rate_dps: float, z_m: float) -> Setpoint:
@@ -116,6 +114,8 @@ class Setpoint:
 ATTITUDE_DT_S = 0.002
 POSITION_DT_S = 0.01
 POSITION_EVERY = 5
+TILT_MAX_DEG, SPEED_MAX_MPS = 20.0, 1.0  # posCtlPid.rLimit, pLimit, xVelMax, yVelMax, zVelMax
+THRUST_BASE, THRUST_LEAST = 36000.0, 20000.0  # posCtlPid.thrustBase, thrustMin
 INT16_MAX = 32767.0
 UINT16_MAX = 65535.0
 _OVERHEAD = 1.1  # a loop may request a little more than its successor's limit
@@ -123,50 +123,35 @@ _THRUST_SCALE = 1000.0
 
 
 class Pid:
-    """One PID loop; the derivative acts on the measurement. Limits of 0 mean none."""
-
-    __slots__ = ("_i_limit", "_integral", "_limit", "_measured", "_period", "kd", "ki", "kp")
+    """One PID loop; the derivative acts on the measurement. A `limit` of 0 means none."""
 
     def __init__(
         self, kp: float, ki: float, kd: float, period_s: float, i_limit: float, limit: float = 0.0
     ) -> None:
         self.kp, self.ki, self.kd = kp, ki, kd
+        self.limit = limit
         self._period = period_s
         self._i_limit = i_limit
-        self._limit = limit
-        self._integral = 0.0
-        self._measured = 0.0
+        self._integral = self._measured = 0.0
 
     def reset(self, measured: float) -> None:
         self._integral = 0.0
         self._measured = measured
-
-    def set_limit(self, limit: float) -> None:
-        self._limit = limit
 
     def update(self, desired: float, measured: float, turning: bool = False) -> float:
         """Return the output after one period; `turning`: on the circle of 360 degrees."""
         error, change = desired - measured, measured - self._measured
         if turning:
             error, change = cap_deg(error), cap_deg(change)
-        integral = self._integral + error * self._period
         bound = self._i_limit
-        if integral > bound:
-            integral = bound
-        elif integral < -bound:
-            integral = -bound
+        integral = max(-bound, min(bound, self._integral + error * self._period))
         self._integral = integral
         self._measured = measured
         output = self.kp * error + self.ki * integral
         if self.kd != 0.0:
             output -= self.kd * change / self._period
-        limit = self._limit
-        if limit > 0.0:
-            if output > limit:
-                return limit
-            if output < -limit:
-                return -limit
-        return output
+        limit = self.limit
+        return max(-limit, min(limit, output)) if limit > 0.0 else output
 
 
 def cap_deg(angle: float) -> float:
@@ -179,8 +164,6 @@ def cap_deg(angle: float) -> float:
 
 
 def _saturated(value: float) -> float:
-    if -INT16_MAX <= value <= INT16_MAX:
-        return value
     return max(-INT16_MAX, min(INT16_MAX, value))
 
 
@@ -206,41 +189,23 @@ class Controller:
     """Setpoint and estimate in, four thrust requests out, in units of the thrust command."""
 
     def __init__(self) -> None:
-        dt, pt = ATTITUDE_DT_S, POSITION_DT_S
+        dt, pt, tilt = ATTITUDE_DT_S, POSITION_DT_S, TILT_MAX_DEG * _OVERHEAD
         self.roll_rate = Pid(250.0, 500.0, 2.5, dt, 33.3)
         self.pitch_rate = Pid(250.0, 500.0, 2.5, dt, 33.3)
         self.yaw_rate = Pid(120.0, 16.7, 0.0, dt, 166.7)
         self.roll = Pid(6.0, 3.0, 0.0, dt, 20.0)
         self.pitch = Pid(6.0, 3.0, 0.0, dt, 20.0)
         self.yaw = Pid(6.0, 1.0, 0.35, dt, 360.0)
-        self.x = Pid(2.0, 0.0, 0.0, pt, 5000.0)
-        self.y = Pid(2.0, 0.0, 0.0, pt, 5000.0)
-        self.z = Pid(2.0, 0.5, 0.0, pt, 5000.0)
-        self.vx = Pid(25.0, 1.0, 0.0, pt, 5000.0)
-        self.vy = Pid(25.0, 1.0, 0.0, pt, 5000.0)
+        self.x = Pid(2.0, 0.0, 0.0, pt, 5000.0, SPEED_MAX_MPS * _OVERHEAD)
+        self.y = Pid(2.0, 0.0, 0.0, pt, 5000.0, SPEED_MAX_MPS * _OVERHEAD)
+        self.z = Pid(2.0, 0.5, 0.0, pt, 5000.0, SPEED_MAX_MPS * _OVERHEAD)
+        self.vx = Pid(25.0, 1.0, 0.0, pt, 5000.0, tilt)
+        self.vy = Pid(25.0, 1.0, 0.0, pt, 5000.0, tilt)
         self.vz = Pid(25.0, 15.0, 0.0, pt, 5000.0, UINT16_MAX / 2.0 / _THRUST_SCALE)
-        self.thrust_base = 36000.0
-        self.thrust_min = 20000.0
-        self.roll_max_deg = 20.0
-        self.pitch_max_deg = 20.0
-        self.x_speed_max_mps = 1.0
-        self.y_speed_max_mps = 1.0
-        self.z_speed_max_mps = 1.0
-        self.limits_changed()
         self._mode: Mode = MODE_OFF
         self._position_in = 1
         self.thrust = 0.0
-        self.desired_roll_deg = 0.0
-        self.desired_pitch_deg = 0.0
-        self.desired_yaw_deg = 0.0
-
-    def limits_changed(self) -> None:
-        """Hand the limits to the loops that keep them."""
-        self.x.set_limit(self.x_speed_max_mps * _OVERHEAD)
-        self.y.set_limit(self.y_speed_max_mps * _OVERHEAD)
-        self.z.set_limit(max(self.z_speed_max_mps, 0.5) * _OVERHEAD)
-        self.vx.set_limit(self.pitch_max_deg * _OVERHEAD)
-        self.vy.set_limit(self.roll_max_deg * _OVERHEAD)
+        self.desired_roll_deg = self.desired_pitch_deg = self.desired_yaw_deg = 0.0
 
     def update(self, setpoint: Setpoint, now: Estimate) -> Motors:
         mode = setpoint.mode
@@ -248,9 +213,8 @@ class Controller:
             self._mode = mode
             self._reset(now)
         if mode[5] == VELOCITY:
-            self.desired_yaw_deg = cap_deg(
-                self.desired_yaw_deg + setpoint.yaw_rate_dps * ATTITUDE_DT_S
-            )
+            turned_deg = setpoint.yaw_rate_dps * ATTITUDE_DT_S
+            self.desired_yaw_deg = cap_deg(self.desired_yaw_deg + turned_deg)
         elif mode[5] == ABSOLUTE:
             self.desired_yaw_deg = cap_deg(setpoint.yaw_deg)
         self._position_in -= 1
@@ -266,22 +230,15 @@ class Controller:
             self._reset(now)
             self.desired_yaw_deg = now.yaw_deg
             return MOTORS_OFF
-        roll = _saturated(
-            self.roll_rate.update(
-                self.roll.update(self.desired_roll_deg, now.roll_deg), now.gyro_x_dps
-            )
-        )
-        pitch = _saturated(
-            self.pitch_rate.update(
-                self.pitch.update(self.desired_pitch_deg, now.pitch_deg), -now.gyro_y_dps
-            )
-        )
-        yaw = -_saturated(
-            self.yaw_rate.update(
-                self.yaw.update(self.desired_yaw_deg, now.yaw_deg, True), now.gyro_z_dps
-            )
-        )
-        return _distribute(self.thrust, 0.5 * roll, 0.5 * pitch, yaw)
+        roll_dps = self.roll.update(self.desired_roll_deg, now.roll_deg)
+        pitch_dps = self.pitch.update(self.desired_pitch_deg, now.pitch_deg)
+        yaw_dps = self.yaw.update(self.desired_yaw_deg, now.yaw_deg, True)
+        r = 0.5 * _saturated(self.roll_rate.update(roll_dps, now.gyro_x_dps))
+        p = 0.5 * _saturated(self.pitch_rate.update(pitch_dps, -now.gyro_y_dps))
+        y = -_saturated(self.yaw_rate.update(yaw_dps, now.gyro_z_dps))
+        # Neither bounded above nor below (see `MotorDriver`).
+        f = self.thrust
+        return (f - r + p + y, f - r - p - y, f + r - p + y, f + r + p - y)
 
     def _position(self, setpoint: Setpoint, now: Estimate) -> None:
         mode = setpoint.mode
@@ -299,30 +256,22 @@ class Controller:
             want_z = self.z.update(setpoint.z_m, now.z_m)
         pitch = -self.vx.update(want_x, now.vx_mps * c + now.vy_mps * s)
         roll = -self.vy.update(want_y, now.vy_mps * c - now.vx_mps * s)
-        self.desired_pitch_deg = max(-self.pitch_max_deg, min(self.pitch_max_deg, pitch))
-        self.desired_roll_deg = max(-self.roll_max_deg, min(self.roll_max_deg, roll))
-        thrust = self.vz.update(want_z, now.vz_mps) * _THRUST_SCALE + self.thrust_base
-        self.thrust = min(UINT16_MAX, max(self.thrust_min, thrust))
+        self.desired_pitch_deg = max(-TILT_MAX_DEG, min(TILT_MAX_DEG, pitch))
+        self.desired_roll_deg = max(-TILT_MAX_DEG, min(TILT_MAX_DEG, roll))
+        thrust = self.vz.update(want_z, now.vz_mps) * _THRUST_SCALE + THRUST_BASE
+        self.thrust = min(UINT16_MAX, max(THRUST_LEAST, thrust))
 
     def _reset(self, now: Estimate) -> None:
-        for pid, measured in (
-            (self.x, now.x_m),
-            (self.y, now.y_m),
-            (self.z, now.z_m),
-            (self.roll, now.roll_deg),
-            (self.pitch, now.pitch_deg),
-            (self.yaw, now.yaw_deg),
-        ):
-            pid.reset(measured)
+        self.x.reset(now.x_m)
+        self.y.reset(now.y_m)
+        self.z.reset(now.z_m)
+        self.roll.reset(now.roll_deg)
+        self.pitch.reset(now.pitch_deg)
+        self.yaw.reset(now.yaw_deg)
         for pid in (self.vx, self.vy, self.vz, self.roll_rate, self.pitch_rate, self.yaw_rate):
             pid.reset(0.0)
         self.desired_roll_deg = now.roll_deg
         self.desired_pitch_deg = now.pitch_deg
-
-
-def _distribute(thrust: float, r: float, p: float, y: float) -> Motors:
-    """Return thrust requests of M1..M4; neither bounded above nor below (see `MotorDriver`)."""
-    return (thrust - r + p + y, thrust - r - p - y, thrust + r - p + y, thrust + r + p - y)
 
 
 # --- Power distribution: four thrust requests in, four duty cycles (PWM) out -------------------

@@ -40,17 +40,16 @@ _STREAM = 2
 _DEG = 180.0 / math.pi
 _BATCH = 2048
 _NOISE_EVERY = 5  # coloured noise advances at 100 Hz
-_POSITION_MEMORY_S = 0.3
-_VELOCITY_MEMORY_S = 0.1
+_POSITION_KEEP = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / 0.3)  # a memory of 0.3 s
+_VELOCITY_KEEP = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / 0.1)
 _VELOCITY_LATE = 4  # control periods: the group delay of two poles at 30 Hz, 7.5 ms
 _VELOCITY_NOISE_PER_S = 2.5  # m/s of noise a metre of position noise
 _GYRO_NOISE_DPS = 0.08
-_ATTITUDE_MEMORY_S = 2.0
 _ACC_NOISE_G = 0.004
 _ACC_VIBRATION_G = 0.04  # added by turning motors
-_ACC_CUTOFF_HZ = 30.0
+_ACC_LAG = 1.0 - math.exp(-2 * math.pi * 30.0 * CONTROL_PERIOD_S)  # cut off at 30 Hz
 _NO_BIAS = (0.0, 0.0, 0.0)
-_ATTITUDE_GAIN = CONTROL_PERIOD_S / _ATTITUDE_MEMORY_S
+_ATTITUDE_GAIN = CONTROL_PERIOD_S / 2.0  # a memory of 2 s
 _VARIANCE_START, _VARIANCE_FALL_S, _VARIANCE_FLOOR = 100.0, 0.1, 2e-5
 
 
@@ -71,14 +70,10 @@ class Estimator:
         self._velocity_noise = (0.0, 0.0, 0.0)
         self._past: deque[Vector] = deque(maxlen=_VELOCITY_LATE + 1)
         self._velocity_mps: Vector = (0.0, 0.0, 0.0)
-        self._position_keep = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / _POSITION_MEMORY_S)
-        self._velocity_keep = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / _VELOCITY_MEMORY_S)
-        self._acc_lag = 1.0 - math.exp(-2 * math.pi * _ACC_CUTOFF_HZ * CONTROL_PERIOD_S)
         self.outside: OutsideFilter | None = None
         self._imu: Imu | None = None
         if scenario.extra.get("external_position"):
             self.outside, self._imu = OutsideFilter(), Imu(scenario)
-        self._reset_due = True
         self._reset_s = 0.0
         self._rng.uniform()  # keeps the flights of all seeds as they were
         self.hears_outside = True
@@ -88,18 +83,17 @@ class Estimator:
         """Forget drift and outside corrections, as `kalman.resetEstimation` does."""
         self._reset_s = t_s
         self._drift_s = 0.0
-        self._reset_due = True
+        if self.outside is not None:
+            self.outside.reset()
 
     def external_position(self, position_m: Vector) -> None:
         """Take one measurement from outside; only a vehicle without a deck uses it."""
         if self.outside is not None and self.hears_outside:
-            self._reset_if_due(self.outside)
             self.outside.position(position_m)
 
     def external_pose(self, position_m: Vector, quaternion: Quaternion) -> None:
         """Take a measurement with an attitude: w, x, y, z, body to world."""
         if self.outside is not None and self.hears_outside:
-            self._reset_if_due(self.outside)
             self.outside.pose(position_m, quaternion)
 
     def set_outside(self, name: str, value: float) -> None:
@@ -118,14 +112,13 @@ class Estimator:
         """Return the variance of a state, in the order of `Covariance`. All states of a deck's
         estimate have the same one, which falls after a reset."""
         if self.outside is not None:
-            return self.outside.variance(state)
+            return float(self.outside.covariance[state, state])
         age_s = t_s - self._reset_s
         return _VARIANCE_FLOOR + _VARIANCE_START * math.exp(-age_s / _VARIANCE_FALL_S)
 
     def update(
         self,
         world: World,
-        t_s: float,
         *,
         flown: bool,
         spinning: bool,
@@ -134,8 +127,13 @@ class Estimator:
     ) -> None:
         """Estimate one control period later. Motors that are `spinning` shake the accelerometer;
         `flying` is what the supervisor says."""
+        if len(self._white) < 12:
+            self._white = self._rng.standard_normal(_BATCH).tolist()
         if self._steps % _NOISE_EVERY == 0:
-            self._walk()
+            sigma = self._scenario.estimate_noise_m
+            self._position_noise = self._walk(self._position_noise, _POSITION_KEEP, sigma)
+            sigma *= _VELOCITY_NOISE_PER_S
+            self._velocity_noise = self._walk(self._velocity_noise, _VELOCITY_KEEP, sigma)
         self._steps += 1
         gyro_bias, acc_bias, acc_unit = _NO_BIAS, _NO_BIAS, 1.0 / GRAVITY_MPS2
         if self.outside is not None and self._imu is not None:
@@ -154,18 +152,17 @@ class Estimator:
         now.roll_deg = cap_deg(_DEG * (roll + bias[0]))
         now.pitch_deg = -_DEG * (pitch + bias[1])  # the firmware's pitch is nose up
         now.yaw_deg = _DEG * math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
-        white = self._white
-        if len(white) < 12:
-            white = self._white = self._rng.standard_normal(_BATCH).tolist()
-        n6, n5, n4, n3, n2, n1 = white[-6:]
-        del white[-6:]
+        if len(self._white) < 12:
+            self._white = self._rng.standard_normal(_BATCH).tolist()
+        n6, n5, n4, n3, n2, n1 = self._white[-6:]
+        del self._white[-6:]
         now.gyro_x_dps = _DEG * (world.p_radps + gyro_bias[0]) + _GYRO_NOISE_DPS * n1
         now.gyro_y_dps = _DEG * (world.q_radps + gyro_bias[1]) + _GYRO_NOISE_DPS * n2
         now.gyro_z_dps = _DEG * (world.r_radps + gyro_bias[2]) + _GYRO_NOISE_DPS * n3
         if self.spoil is not None:
             self.spoil(now)
         ax, ay, az = self.acc_g
-        lag, unit = self._acc_lag, acc_unit
+        lag, unit = _ACC_LAG, acc_unit
         shake = _ACC_NOISE_G + _ACC_VIBRATION_G if spinning else _ACC_NOISE_G
         self.acc_g = (
             ax + lag * ((world.fx_mps2 + acc_bias[0]) * unit + shake * n4 - ax),
@@ -192,16 +189,8 @@ class Estimator:
         scale = 1.0 / math.sqrt(nw * nw + nx * nx + ny * ny + nz * nz)
         return (scale * nw, scale * nx, scale * ny, scale * nz)
 
-    def _walk(self) -> None:
-        """Position and velocity noise, a step later: each keeps a share of what it was."""
-        sigma = self._scenario.estimate_noise_m
-        if len(self._white) < 12:
-            self._white = self._rng.standard_normal(_BATCH).tolist()
-        self._position_noise = self._walked(self._position_noise, self._position_keep, sigma)
-        sigma *= _VELOCITY_NOISE_PER_S
-        self._velocity_noise = self._walked(self._velocity_noise, self._velocity_keep, sigma)
-
-    def _walked(self, noise: Vector, keep: float, sigma: float) -> Vector:
+    def _walk(self, noise: Vector, keep: float, sigma: float) -> Vector:
+        """Return coloured noise, a step later: it keeps a share of what it was."""
         take, kick = self._white.pop, sigma * math.sqrt(1.0 - keep * keep)
         x, y, z = noise
         return keep * x + kick * take(), keep * y + kick * take(), keep * z + kick * take()
@@ -227,7 +216,6 @@ class Estimator:
     def _move_outside(
         self, outside: OutsideFilter, imu: Imu, world: World, *, flying: bool, pressed: bool
     ) -> None:
-        self._reset_if_due(outside)
         if imu.add(
             (world.fx_mps2, world.fy_mps2, world.fz_mps2),
             (world.p_radps, world.q_radps, world.r_radps),
@@ -236,8 +224,3 @@ class Estimator:
         now = self.now
         now.x_m, now.y_m, now.z_m = outside.position_m
         now.vx_mps, now.vy_mps, now.vz_mps = outside.velocity_mps
-
-    def _reset_if_due(self, outside: OutsideFilter) -> None:
-        if self._reset_due:
-            self._reset_due = False
-            outside.reset()

@@ -15,7 +15,7 @@ from perchctl.sim.firmware.controller import (
     Setpoint,
 )  # fmt: skip
 from perchctl.sim.firmware.estimator import Estimator
-from perchctl.sim.firmware.outside import SETTINGS
+from perchctl.sim.firmware.outside import SETTINGS, Quaternion, Vector
 from perchctl.sim.firmware.planner import HighLevelCommand, Planner
 from perchctl.sim.firmware.supervisor import EVERY as SUPERVISOR_EVERY
 from perchctl.sim.firmware.supervisor import State, Supervisor
@@ -24,7 +24,6 @@ from perchctl.sim.firmware.variables import (
     LOG_VARIABLES,
     PARAMETERS,
     Parameter,
-    apply_parameter,
 )
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
@@ -36,7 +35,6 @@ ESTIMATOR_KALMAN = 2
 RAW_THRUST_MIN, RAW_THRUST_MAX = 1000.0, 60000.0
 
 _NULL = Setpoint()
-_MOTORS_STATES = (State.READY, State.FLYING, State.LANDED)
 
 
 class Firmware:
@@ -78,6 +76,7 @@ class Firmware:
         self._parameters |= self.scenario.parameters
         for name in PARAMETERS:
             self._apply(name)
+        self.estimator.reset(0.0)
 
     @property
     def t_s(self) -> float:
@@ -91,7 +90,6 @@ class Firmware:
         supervisor = self.supervisor
         self.estimator.update(
             self.world,
-            t_s,
             flown=self._flown,
             spinning=self.motors is not MOTORS_OFF,
             flying=supervisor.is_flying,
@@ -114,12 +112,9 @@ class Firmware:
                 self._low_level = False
             self.planner.block(not supervisor.motors_allowed)
             self.power.update(t_s, self.world.battery_v, self._parameters)
-        setpoint = self._setpoint
-        state = supervisor.state
-        if state is State.LEVEL_OUT:
+        setpoint = self._setpoint if supervisor.motors_allowed else _NULL
+        if supervisor.state is State.LEVEL_OUT:
             setpoint = setpoint.levelled()
-        elif state not in _MOTORS_STATES:
-            setpoint = _NULL
         requests = self.controller.update(setpoint, self.estimator.now)
         if not supervisor.motors_allowed:
             requests = MOTORS_OFF
@@ -133,8 +128,19 @@ class Firmware:
     # Commands -----------------------------------------------------------------------
 
     def low_level(self, setpoint: Setpoint) -> None:
-        """Fly this setpoint; it takes over from the high-level commander."""
-        self._accept(self._limited(setpoint) if setpoint.mode == MODE_RAW else setpoint)
+        """Fly this setpoint; it takes over from the high-level commander.
+
+        Raw thrust is limited, and forced to 0 until one packet with thrust 0 has come since boot
+        (docs/firmware.md, "Raw thrust").
+        """
+        if setpoint.mode == MODE_RAW:
+            thrust = min(setpoint.thrust, RAW_THRUST_MAX)
+            if thrust == 0.0:
+                self._thrust_locked = False
+            if self._thrust_locked or thrust < RAW_THRUST_MIN:
+                thrust = 0.0
+            setpoint = replace(setpoint, thrust=thrust)
+        self._setpoint, self._setpoint_s = setpoint, self.t_s
         self._low_level = True
         self.planner.stop()
 
@@ -165,16 +171,12 @@ class Firmware:
         success = self.supervisor.request_recovery()
         return success, not self.supervisor.crashed
 
-    def external_position(self, position_m: tuple[float, float, float]) -> None:
+    def external_position(self, position_m: Vector) -> None:
         """Take a position from outside, m; see `Estimator`."""
         self.external_tick_ms = int(1e3 * self.t_s) % 65536
         self.estimator.external_position(position_m)
 
-    def external_pose(
-        self,
-        position_m: tuple[float, float, float],
-        quaternion_xyzw: tuple[float, float, float, float],
-    ) -> None:
+    def external_pose(self, position_m: Vector, quaternion_xyzw: Quaternion) -> None:
         """Take a pose from outside: m, and body to world."""
         self.external_tick_ms = int(1e3 * self.t_s) % 65536
         x, y, z, w = quaternion_xyzw
@@ -211,9 +213,7 @@ class Firmware:
 
     def log_values(self, names: Iterable[str]) -> dict[str, float]:
         """Return the values of a whole block, by name. Errors as for one."""
-        if self.log_overrides:
-            return {name: self.log_value(name) for name in names}
-        return {name: LIVE[name](self) if name in LIVE else self.log_value(name) for name in names}
+        return {name: self.log_value(name) for name in names}
 
     def get_parameter(self, name: str) -> float:
         """Raises KeyError for an unknown name."""
@@ -230,37 +230,21 @@ class Firmware:
 
     def _apply(self, name: str) -> None:
         value = self._parameters[name]
-        if name == "kalman.resetEstimation":
-            if value == 1.0:
-                self.estimator.reset(self.t_s)
+        if name == "kalman.resetEstimation" and value == 1.0:
+            self.estimator.reset(self.t_s)
         elif name == "stabilizer.estimator":
             self.estimator.hears_outside = value == ESTIMATOR_KALMAN
         elif name in SETTINGS:
             self.estimator.set_outside(name, value)
         elif name == "stabilizer.stop":
             self.supervisor.emergency = self.supervisor.emergency or value != 0.0
-        else:
-            apply_parameter(self.controller, name, value)
-
-    def _accept(self, setpoint: Setpoint) -> None:
-        self._setpoint, self._setpoint_s = setpoint, self.t_s
-
-    def _limited(self, setpoint: Setpoint) -> Setpoint:
-        """Return raw thrust within its limits; it is forced to 0 until one packet with thrust 0 has
-        come since boot (docs/firmware.md, "Raw thrust")."""
-        thrust = min(setpoint.thrust, RAW_THRUST_MAX)
-        if thrust == 0.0:
-            self._thrust_locked = False
-        if self._thrust_locked or thrust < RAW_THRUST_MIN:
-            thrust = 0.0
-        return replace(setpoint, thrust=thrust)
 
     def _consult_planner(self, t_s: float) -> None:
         planner = self.planner
         if planner.active or not self._low_level:
             setpoint = planner.setpoint(t_s)
             if not self._low_level:
-                self._accept(setpoint)
+                self._setpoint, self._setpoint_s = setpoint, t_s
         if not planner.active:
             self._inform_planner()
 

@@ -14,14 +14,16 @@ as `locSrv.extPosStdDev` and `locSrv.extQuatStdDev` say. There is no gate (sourc
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 
-from perchctl.geometry import GRAVITY_MPS2
+from perchctl.geometry import GRAVITY_MPS2, Array
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 Vector = tuple[float, float, float]
+Reading = tuple[float, float, float, float, float, float]
+"""Acceleration, m/s^2, and turning rates, rad/s, body axes."""
 Quaternion = tuple[float, float, float, float]  # w, x, y, z
 
 # --- What the gyroscope and the accelerometer read, as the estimator gets it: means of 100 a second
@@ -48,17 +50,6 @@ _PRESSED_MPS2 = 0.03
 height runs away by 0.1 to 0.2 m/s (docs/firmware.md, "Blind at the ceiling")."""
 
 
-class Reading(NamedTuple):
-    """Body axes."""
-
-    ax_mps2: float
-    ay_mps2: float
-    az_mps2: float
-    p_radps: float
-    q_radps: float
-    r_radps: float
-
-
 class Imu:
     """`add` takes a control period's truth; after `IMU_EVERY` of them `read` gives their mean.
 
@@ -77,51 +68,38 @@ class Imu:
         self.acc_bias_mps2 = x, y, z = scenario.acc_bias_mps2
         self.acc_scale = math.hypot(x, y, GRAVITY_MPS2 + z) / GRAVITY_MPS2
         self._pressed_mps2 = _PRESSED_MPS2 if self._rng.uniform() < 0.5 else -_PRESSED_MPS2
-        self._clear()
+        self._sums = [0.0] * 6
+        self._count = 0
 
-    def add(
-        self, force_mps2: tuple[float, float, float], rates_radps: tuple[float, float, float]
-    ) -> bool:
+    def add(self, force_mps2: Vector, rates_radps: Vector) -> bool:
         """Take the true specific force and rates, body axes; True if a mean is due."""
-        x, y, z = force_mps2
-        p, q, r = rates_radps
-        self._x += x
-        self._y += y
-        self._z += z
-        self._p += p
-        self._q += q
-        self._r += r
+        values = (*force_mps2, *rates_radps)
+        self._sums = [total + value for total, value in zip(self._sums, values, strict=True)]
         self._count += 1
         return self._count == IMU_EVERY
 
     def read(self, *, pressed: bool) -> Reading:
         """Return the mean of what was added since the last reading, with the errors."""
-        white = self._white
-        if len(white) < 6:
-            white = self._white = self._rng.standard_normal(_IMU_BATCH).tolist()
-        take = white.pop
+        if len(self._white) < 6:
+            self._white = self._rng.standard_normal(_IMU_BATCH).tolist()
+        take = self._white.pop
         (bx, by, bz), (bp, bq, br) = self.acc_bias_mps2, self.gyro_bias_radps
         if pressed:
             bz += self._pressed_mps2
         share, unit = 1.0 / self._count, 1.0 / self.acc_scale
-        noise, turn = _ACC_NOISE_MPS2, _GYRO_NOISE_RADPS
-        mean = Reading(
-            unit * (share * self._x + bx + noise * take()),
-            unit * (share * self._y + by + noise * take()),
-            unit * (share * self._z + bz + noise * take()),
-            share * self._p + bp + turn * take(),
-            share * self._q + bq + turn * take(),
-            share * self._r + br + turn * take(),
+        x, y, z, p, q, r = (share * total for total in self._sums)
+        self._sums, self._count = [0.0] * 6, 0
+        return (
+            unit * (x + bx + _ACC_NOISE_MPS2 * take()),
+            unit * (y + by + _ACC_NOISE_MPS2 * take()),
+            unit * (z + bz + _ACC_NOISE_MPS2 * take()),
+            p + bp + _GYRO_NOISE_RADPS * take(),
+            q + bq + _GYRO_NOISE_RADPS * take(),
+            r + br + _GYRO_NOISE_RADPS * take(),
         )
-        self._clear()
-        return mean
-
-    def _clear(self) -> None:
-        self._x = self._y = self._z = self._p = self._q = self._r = 0.0
-        self._count = 0
 
 
-# --- What the estimate knows of its own errors --------------------------------------------------
+# --- The filter ----------------------------------------------------------------------------------
 
 
 POSITION, VELOCITY, ATTITUDE = 0, 3, 6
@@ -133,51 +111,6 @@ _MOST, _LEAST = 100.0, 1e-6
 _NOISE_PER_S = (0.0, 0.0, 0.0, 2.5e-4, 2.5e-4, 1e-3, 1e-5, 1e-5, 1e-5)
 """(m/s)^2 and rad^2 a second: `kalman.pNAcc_xy` 0.5 m/s^2, `pNAcc_z` 1 m/s^2 and `mNGyro_*`
 0.1 rad/s, each added as one of 1000 steps a second (source)."""
-
-
-class Covariance:
-    """What the estimate knows of its own errors: position, velocity and attitude, with all that
-    one says about another. SI, radians, world axes; `rows` (9, 9) is symmetric.
-
-    As in the firmware (source: `kalman_core`), but for the axes: velocity and attitude errors are
-    the world's here and the body's there, which is the same for a vehicle that is nearly level.
-    """
-
-    def __init__(self) -> None:
-        self.forget()
-
-    def forget(self) -> None:
-        """Begin anew, as after `kalman.resetEstimation`."""
-        m2, height_m2 = min(_FIRST_M**2, _MOST), _FIRST_HEIGHT_M**2
-        self.rows = np.diag([m2, m2, height_m2] + [_FIRST_MPS**2] * 3 + [_FIRST_RAD**2] * 3)
-
-    def grow(self, period_s: float, force_mps2: tuple[float, float, float]) -> None:
-        """Grow after a prediction. `force_mps2` is the specific force in world axes, which an
-        attitude that is wrong sends elsewhere."""
-        sx, sy, sz = (period_s * part for part in force_mps2)
-        for rows in (self.rows, self.rows.T):
-            rows[POSITION:VELOCITY] += period_s * rows[VELOCITY:ATTITUDE]
-            a, b, c = rows[ATTITUDE:]
-            u, v, w = rows[VELOCITY:ATTITUDE]
-            rows[VELOCITY:ATTITUDE] = u + sz * b - sy * c, v + sx * c - sz * a, w + sy * a - sx * b
-        self.rows += period_s * np.diag(_NOISE_PER_S)
-        self._bound()
-
-    def measure(self, state: int, variance: float) -> list[float]:
-        """Take a measurement of one state with this variance. Return what to add to each of the
-        nine for every unit that the measurement is more than the estimate."""
-        gains = self.rows[state] / (self.rows[state, state] + variance)
-        self.rows -= np.outer(gains, self.rows[state])
-        self._bound()
-        return [float(gain) for gain in gains]
-
-    def _bound(self) -> None:
-        np.fill_diagonal(self.rows, np.clip(np.diag(self.rows), _LEAST, _MOST))
-
-
-# --- The filter ----------------------------------------------------------------------------------
-
-
 _LEAST_SIGMA = 1e-4
 _REVERSION = 1e-3
 """Share of the way to the initial attitude, each time while not in flight (source:
@@ -197,22 +130,24 @@ SETTINGS = {
 
 
 class OutsideFilter:
-    """`position_m`, `velocity_mps` in world axes, `quaternion` body to world: the estimate."""
+    """`position_m`, `velocity_mps` in world axes, `quaternion` body to world: the estimate.
+
+    `covariance` (9, 9) is what it knows of its own errors: position, velocity and attitude, with
+    all that one says about another; SI, radians, world axes. As in the firmware (source:
+    `kalman_core`), but for the axes: velocity and attitude errors are the world's here and the
+    body's there, which is the same for a vehicle that is nearly level.
+    """
 
     def __init__(self) -> None:
         self.position_sigma_m, self.attitude_sigma_rad = 0.01, 0.0045
         self.initial_x_m = self.initial_y_m = self.initial_z_m = self.initial_yaw_rad = 0.0
         self.most_m, self.most_mps = 100.0, 10.0
-        self._covariance = Covariance()
         self.reset()
-
-    def variance(self, state: int) -> float:
-        """Return the variance of a state; `Covariance` says which it is, and its units."""
-        return float(self._covariance.rows[state, state])
 
     def reset(self) -> None:
         """Begin again at the place and heading of `kalman.initial*`, level and at rest."""
-        self._covariance.forget()
+        m2, height_m2 = min(_FIRST_M**2, _MOST), _FIRST_HEIGHT_M**2
+        self.covariance = np.diag([m2, m2, height_m2] + [_FIRST_MPS**2] * 3 + [_FIRST_RAD**2] * 3)
         self.position_m: Vector = (self.initial_x_m, self.initial_y_m, self.initial_z_m)
         self.velocity_mps: Vector = (0.0, 0.0, 0.0)
         half = 0.5 * self.initial_yaw_rad
@@ -222,7 +157,8 @@ class OutsideFilter:
     def predict(self, reading: Reading, *, flying: bool) -> None:
         """Advance by `IMU_PERIOD_S`. An estimate out of its bounds is reset."""
         t, half_s2 = IMU_PERIOD_S, 0.5 * IMU_PERIOD_S * IMU_PERIOD_S
-        force = fx, fy, fz = self._force(reading, flying=flying)
+        *acceleration, p, q, r = reading
+        force = fx, fy, fz = self._force(acceleration, flying=flying)
         fz -= GRAVITY_MPS2
         x, y, z = self.position_m
         vx, vy, vz = self.velocity_mps
@@ -231,7 +167,7 @@ class OutsideFilter:
         )  # fmt: skip
         self.velocity_mps = (vx + t * fx, vy + t * fy, vz + t * fz)
         half = 0.5 * t
-        turn = (1.0, half * reading.p_radps, half * reading.q_radps, half * reading.r_radps)
+        turn = (1.0, half * p, half * q, half * r)
         w, x, y, z = normalized(multiplied(self.quaternion, turn))
         if not flying:
             keep, (a, _, _, d) = 1.0 - _REVERSION, self._initial
@@ -239,15 +175,16 @@ class OutsideFilter:
             reverted = (keep * w + share * a, keep * x, keep * y, keep * z + share * d)
             w, x, y, z = normalized(reverted)
         self.quaternion = (w, x, y, z)
-        self._covariance.grow(t, force)
+        self._grow(force)
         far_m, fast_mps = max(map(abs, self.position_m)), max(map(abs, self.velocity_mps))
         if 0.0 < self.most_m < far_m or 0.0 < self.most_mps < fast_mps:
             self.reset()
 
     def position(self, measured_m: Vector) -> None:
-        """A position from outside, taken for the one of now."""
+        """Take a position from outside for the one of now."""
         if all(map(math.isfinite, measured_m)):
-            self._correct(POSITION, self._innovation(measured_m), self.position_sigma_m)
+            (mx, my, mz), (x, y, z) = measured_m, self.position_m
+            self._correct(POSITION, (mx - x, my - y, mz - z), self.position_sigma_m)
 
     def pose(self, measured_m: Vector, measured: Quaternion) -> None:
         """Take a pose from outside: a position and an attitude, body to world."""
@@ -263,20 +200,29 @@ class OutsideFilter:
         wrong = (twice * left[1], twice * left[2], twice * left[3])
         self._correct(ATTITUDE, wrong, self.attitude_sigma_rad)
 
-    def _innovation(self, measured_m: Vector) -> Vector:
-        (mx, my, mz), (x, y, z) = measured_m, self.position_m
-        return mx - x, my - y, mz - z
+    def _grow(self, force_mps2: Vector) -> None:
+        """Let the errors grow after a prediction. `force_mps2` is the specific force in world
+        axes, which an attitude that is wrong sends elsewhere."""
+        sx, sy, sz = (IMU_PERIOD_S * part for part in force_mps2)
+        for rows in (self.covariance, self.covariance.T):
+            rows[POSITION:VELOCITY] += IMU_PERIOD_S * rows[VELOCITY:ATTITUDE]
+            a, b, c = rows[ATTITUDE:]
+            u, v, w = rows[VELOCITY:ATTITUDE]
+            rows[VELOCITY:ATTITUDE] = u + sz * b - sy * c, v + sx * c - sz * a, w + sy * a - sx * b
+        self.covariance += IMU_PERIOD_S * np.diag(_NOISE_PER_S)
+        self._bound()
 
     def _correct(self, first: int, wrong: Vector, sigma: float) -> None:
         """Correct three states from `first` on, which are so far off, one after the other."""
         variance = max(sigma, _LEAST_SIGMA) ** 2
-        sums = [0.0] * 9
-        for axis in range(3):
-            state = first + axis
-            left = wrong[axis] - sums[state]
-            gains = self._covariance.measure(state, variance)
-            sums = [s + left * gain for s, gain in zip(sums, gains, strict=True)]
-        dx, dy, dz, ex, ey, ez, a, b, c = sums
+        sums: Array = np.zeros(9)
+        for state in range(first, first + 3):
+            row = self.covariance[state]
+            gains = row / (row[state] + variance)
+            sums = sums + (wrong[state - first] - sums[state]) * gains
+            self.covariance -= np.outer(gains, row)
+            self._bound()
+        dx, dy, dz, ex, ey, ez, a, b, c = sums.tolist()
         x, y, z = self.position_m
         self.position_m = (x + dx, y + dy, z + dz)
         x, y, z = self.velocity_mps
@@ -284,14 +230,17 @@ class OutsideFilter:
         turn = (1.0, 0.5 * a, 0.5 * b, 0.5 * c)
         self.quaternion = normalized(multiplied(turn, self.quaternion))
 
-    def _force(self, reading: Reading, *, flying: bool) -> Vector:
+    def _bound(self) -> None:
+        bounded = np.clip(np.diag(self.covariance), _LEAST, _MOST)
+        np.fill_diagonal(self.covariance, bounded)
+
+    def _force(self, acceleration_mps2: Sequence[float], *, flying: bool) -> Vector:
         """Return what is believed of the specific force, in world axes."""
         w, x, y, z = self.quaternion
-        az = reading.az_mps2
+        ax, ay, az = acceleration_mps2
         ux, uy, uz = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
         if flying:
             return az * ux, az * uy, az * uz
-        ax, ay = reading.ax_mps2, reading.ay_mps2
         return (
             (1 - 2 * (y * y + z * z)) * ax + 2 * (x * y - w * z) * ay + az * ux,
             2 * (x * y + w * z) * ax + (1 - 2 * (x * x + z * z)) * ay + az * uy,

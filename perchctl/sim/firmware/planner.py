@@ -58,15 +58,9 @@ class AxisState(NamedTuple):
 class Polynomial:
     """From a state at t = 0 to rest at `goal` at t = T; no jerk at either end."""
 
-    __slots__ = ("_coefficients", "_duration", "goal")
-
     def __init__(self, start: AxisState, goal: float, duration_s: float) -> None:
         self.goal = goal
-        self._duration = duration_s
-        if duration_s <= 0.0:
-            self._coefficients: tuple[float, ...] = (goal,)
-            return
-        T = duration_s
+        self._duration = T = max(duration_s, 1e-9)
         # In u = t / T with the goal subtracted, eight end conditions fix eight
         # coefficients; the first four are the start itself (its jerk is zero).
         p, v, a = start.value - goal, start.rate * T, start.accel * T * T
@@ -102,8 +96,7 @@ class Planner:
         self._begin_s = 0.0
         self._duration_s = 0.0
         self._axes: tuple[Polynomial, ...] = ()
-        self._now = [AxisState(0.0)] * 4
-        self._start: tuple[Place, Place, float] | None = None  # since, unless a plan was flown
+        self._now = [AxisState(0.0)] * 4  # where a new plan begins
 
     @property
     def active(self) -> bool:
@@ -123,23 +116,10 @@ class Planner:
             self.stop()
         self.blocked = blocked
 
-    def start_from(
-        self,
-        position_m: tuple[float, float, float],
-        velocity_mps: tuple[float, float, float],
-        yaw_rad: float,
-    ) -> None:
-        """Let new plans begin here."""
-        self._start = (position_m, velocity_mps, yaw_rad)
-
-    def _begin(self) -> list[AxisState]:
-        """Return where a new plan begins: the last setpoint, or the estimate while idle."""
-        if self._start is not None:
-            position_m, velocity_mps, yaw_rad = self._start
-            axes = zip(position_m, velocity_mps, strict=True)
-            self._now = [*(AxisState(p, v) for p, v in axes), AxisState(yaw_rad)]
-            self._start = None
-        return self._now
+    def start_from(self, position_m: Place, velocity_mps: Place, yaw_rad: float) -> None:
+        """Let the next plan begin here, unless a setpoint is planned before."""
+        axes = zip(position_m, velocity_mps, strict=True)
+        self._now = [*(AxisState(p, v) for p, v in axes), AxisState(yaw_rad)]
 
     def command(self, command: HighLevelCommand, t_s: float) -> bool:
         """Accept or refuse a command."""
@@ -154,7 +134,9 @@ class Planner:
         landing = isinstance(command, HlLand)
         if (self.state == LANDING) if landing else (self.state != IDLE):
             return False
-        self._vertical(command, t_s)
+        x, y, z, yaw = (AxisState(axis.value) for axis in self._now)
+        place = (x.value, y.value, command.height_m)
+        self._plan((x, y, z, yaw), place, command.yaw_rad, command, t_s)
         self.state = LANDING if landing else FLYING
         return True
 
@@ -165,7 +147,6 @@ class Planner:
         if self.state == IDLE:
             return Setpoint()
         x, y, z, yaw = self._now = [axis.at(t_s - self._begin_s) for axis in self._axes]
-        self._start = None
         return Setpoint(
             MODE_POSITION,
             x.value,
@@ -178,40 +159,33 @@ class Planner:
             yaw_rate_dps=math.degrees(yaw.rate),
         )
 
-    def _vertical(self, command: HlTakeoff, t_s: float) -> None:
-        x, y, z, yaw = self._begin()
-        heading = wrap_rad(yaw.value)
-        turn = 0.0 if command.yaw_rad is None else wrap_rad(command.yaw_rad - heading)
-        self._plan(
-            (AxisState(x.value), AxisState(y.value), AxisState(z.value), AxisState(heading)),
-            (x.value, y.value, command.height_m, heading + turn),
-            command.duration_s,
-            t_s,
-        )
-
     def _go_to(self, command: HlGoTo, t_s: float) -> None:
         if self.active:
-            self._now, self._start = [axis.at(t_s - self._begin_s) for axis in self._axes], None
-        x, y, z, yaw = self._begin()
-        goal = (command.x_m, command.y_m, command.z_m, command.yaw_rad)
+            self._now = [axis.at(t_s - self._begin_s) for axis in self._axes]
+        x, y, z, yaw = self._now
+        place, heading = (command.x_m, command.y_m, command.z_m), command.yaw_rad
         if command.relative:
-            goal = (x.value + goal[0], y.value + goal[1], z.value + goal[2], yaw.value + goal[3])
-        heading = wrap_rad(yaw.value)
-        self._plan(
-            (x, y, z, AxisState(heading, yaw.rate)),
-            (*goal[:3], heading + wrap_rad(goal[3] - heading)),
-            command.duration_s,
-            t_s,
-        )
+            place = (x.value + place[0], y.value + place[1], z.value + place[2])
+            heading += yaw.value
+        self._plan((x, y, z, AxisState(yaw.value, yaw.rate)), place, heading, command, t_s)
         self.state = FLYING
 
     def _plan(
         self,
         start: tuple[AxisState, ...],
-        goal: tuple[float, ...],
-        duration_s: float,
+        place: Place,
+        heading_rad: float | None,
+        command: HlTakeoff | HlGoTo,
         t_s: float,
     ) -> None:
-        self._axes = tuple(Polynomial(s, g, duration_s) for s, g in zip(start, goal, strict=True))
-        self._begin_s = t_s
-        self._duration_s = duration_s
+        """Plan the way to a place; the heading turns the short way round, None keeps it."""
+        *axes, yaw = start
+        now_rad = wrap_rad(yaw.value)
+        turn_rad = 0.0 if heading_rad is None else wrap_rad(heading_rad - now_rad)
+        goal = (*place, now_rad + turn_rad)
+        states = (*axes, AxisState(now_rad, yaw.rate))
+        self._begin_s, self._duration_s = t_s, command.duration_s
+        self._axes = tuple(
+            Polynomial(state, end, command.duration_s)
+            for state, end in zip(states, goal, strict=True)
+        )

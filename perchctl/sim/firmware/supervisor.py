@@ -64,10 +64,8 @@ class Supervisor:
         self.motors_allowed = False
         self._watchdog_s: float | None = None
         self._thrust_s: float | None = None
-        self._ready_s = 0.0
-        self._landed_s = 0.0
+        self._entered_s = 0.0
         self._tumble_s: float | None = None
-        self._info = 0
 
     def request_arming(self, do_arm: bool) -> bool:
         if do_arm == self.armed:
@@ -113,19 +111,19 @@ class Supervisor:
 
     def info(self, *, hl_active: bool, hl_finished: bool) -> int:
         """Return the `supervisor.info` bit field."""
-        state = self.state
-        return (
-            (CAN_ARM if state is State.CHECKS_PASSED else 0)
-            | (ARMED if self.armed else 0)
-            | AUTO_ARM
-            | (CAN_FLY if self.motors_allowed else 0)
-            | (FLYING if self.is_flying else 0)
-            | (TUMBLED if self.tumbled else 0)
-            | (LOCKED if state is State.LOCKED else 0)
-            | (CRASHED if self.crashed else 0)
-            | (HL_ACTIVE if hl_active else 0)
-            | (HL_FINISHED if hl_finished else 0)
-        )
+        bits = {
+            CAN_ARM: self.state is State.CHECKS_PASSED,
+            ARMED: self.armed,
+            AUTO_ARM: True,
+            CAN_FLY: self.motors_allowed,
+            FLYING: self.is_flying,
+            TUMBLED: self.tumbled,
+            LOCKED: self.state is State.LOCKED,
+            CRASHED: self.crashed,
+            HL_ACTIVE: hl_active,
+            HL_FINISHED: hl_finished,
+        }
+        return sum(bit for bit, is_set in bits.items() if is_set)
 
     @property
     def is_flying(self) -> bool:
@@ -143,55 +141,41 @@ class Supervisor:
                 return State.FREE_FALL
             case State.CHECKS_NOT_PASSED if not self.tumbled:
                 return State.CHECKS_PASSED
-            case State.CHECKS_PASSED if self.tumbled:
+            case State.CHECKS_PASSED | State.READY if self.tumbled:
                 return State.CHECKS_NOT_PASSED
             case State.CHECKS_PASSED if self.armed:
                 return State.READY
-            case State.READY:
-                return self._from_ready(t_s, flying)
-            case State.FLYING | State.LEVEL_OUT:
-                return self._from_flight(flying, age_s)
-            case State.LANDED:
-                if not self.armed or t_s - self._landed_s > LANDED_S:
-                    return State.RESET
-                return State.FLYING if flying else State.LANDED
+            case State.READY if flying and self.armed:
+                return State.FLYING
+            case State.READY if not self.armed or t_s - self._entered_s > PREFLIGHT_S:
+                return State.RESET
+            case State.FLYING | State.LEVEL_OUT if age_s > SILENCE_CUT_S + _TICK_S:
+                return State.FREE_FALL
+            case State.FLYING | State.LEVEL_OUT if self.tumbled:
+                return State.CRASHED
+            case State.FLYING | State.LEVEL_OUT if not self.armed:
+                return State.RESET
+            case State.FLYING | State.LEVEL_OUT if age_s > SILENCE_LEVEL_S + _TICK_S:
+                return State.LEVEL_OUT
+            # A level-out that ends goes back through FLYING, so `flying` cannot clear
+            # while setpoints are missing: silence after a lone stop ends in the lock.
+            case State.LEVEL_OUT:
+                return State.FLYING
+            case State.FLYING if not flying:
+                return State.LANDED
+            case State.LANDED if not self.armed or t_s - self._entered_s > LANDED_S:
+                return State.RESET
+            case State.LANDED if flying:
+                return State.FLYING
             case unchanged:
                 return unchanged
 
-    def _from_ready(self, t_s: float, flying: bool) -> State:
-        if self.tumbled:
-            return State.CHECKS_NOT_PASSED
-        if flying and self.armed:
-            return State.FLYING
-        if not self.armed or t_s - self._ready_s > PREFLIGHT_S:
-            return State.RESET
-        return State.READY
-
-    def _from_flight(self, flying: bool, age_s: float) -> State:
-        if age_s > SILENCE_CUT_S + _TICK_S:
-            return State.FREE_FALL
-        if self.tumbled:
-            return State.CRASHED
-        if not self.armed:
-            return State.RESET
-        if age_s > SILENCE_LEVEL_S + _TICK_S:
-            return State.LEVEL_OUT
-        # A level-out that ends goes back through FLYING, so `flying` cannot clear
-        # while setpoints are missing: silence after a lone stop ends in the lock.
-        if self.state is State.LEVEL_OUT or flying:
-            return State.FLYING
-        return State.LANDED
-
     def _entered(self, t_s: float) -> None:
-        state = self.state
-        if state is State.READY:
-            self._ready_s = t_s
-        elif state is State.LANDED:
-            self._landed_s = t_s
-        elif state is State.CRASHED:
+        self._entered_s = t_s
+        if self.state is State.CRASHED:
             self.crashed = True
-        if state not in MOTORS_ALLOWED:
-            self.armed = state is State.CHECKS_PASSED  # the airframe arms itself
+        if self.state not in MOTORS_ALLOWED:
+            self.armed = self.state is State.CHECKS_PASSED  # the airframe arms itself
 
     def _check_tumbled(self, t_s: float, acc_g: tuple[float, float, float]) -> bool:
         if max(abs(a) for a in acc_g) < FREE_FALL_G:

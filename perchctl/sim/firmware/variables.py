@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
-from perchctl.sim.firmware.controller import Controller
 from perchctl.sim.firmware.outside import ATTITUDE, POSITION, VELOCITY
 
 LOG_COUNT = 385
@@ -75,36 +74,26 @@ class Parameter:
     persistent: bool = False
 
 
-def _log_table() -> dict[str, str]:
-    table = {
-        f"{group}.{name}": ctype
-        for group, text in _LOG_GROUPS.items()
-        for ctype, names in _typed(text)
-        for name in names
-    }
-    return table | {f"debugCtr.c{i}": "uint32_t" for i in range(LOG_COUNT - len(table))}
-
-
-def _parameter_table() -> dict[str, Parameter]:
-    table = {}
-    for group, text in _PARAMETER_GROUPS.items():
-        for ctype, items in _typed(text):
-            for item in items:
-                name, value = item.rstrip("*!").split("=")
-                table[f"{group}.{name}"] = Parameter(
-                    ctype, float(value), item.endswith("!"), item.endswith("*")
-                )
-    missing = PARAMETER_COUNT - len(table)
-    return table | {f"debugCtr.p{i}": Parameter("uint32_t", 0.0) for i in range(missing)}
-
-
-def _typed(text: str) -> list[tuple[str, list[str]]]:
+def _typed(text: str) -> list[tuple[str, str]]:
+    """Return each item of a group with its type before it."""
     parts = (part.split(":", 1) for part in text.split(";"))
-    return [(ctype.strip(), names.split()) for ctype, names in parts]
+    return [(ctype.strip(), item) for ctype, items in parts for item in items.split()]
 
 
-LOG_VARIABLES: dict[str, str] = _log_table()
-PARAMETERS: dict[str, Parameter] = _parameter_table()
+LOG_VARIABLES: dict[str, str] = {
+    f"{group}.{name}": ctype for group, text in _LOG_GROUPS.items() for ctype, name in _typed(text)
+}
+LOG_VARIABLES |= {f"debugCtr.c{_i}": "uint32_t" for _i in range(LOG_COUNT - len(LOG_VARIABLES))}
+PARAMETERS: dict[str, Parameter] = {
+    f"{group}.{item.split('=')[0]}": Parameter(
+        ctype, float(item.split("=")[1].rstrip("*!")), item.endswith("!"), item.endswith("*")
+    )
+    for group, text in _PARAMETER_GROUPS.items()
+    for ctype, item in _typed(text)
+}
+PARAMETERS |= {
+    f"debugCtr.p{_i}": Parameter("uint32_t", 0.0) for _i in range(PARAMETER_COUNT - len(PARAMETERS))
+}
 
 
 # --- Where each log variable comes from; the fillers read 0 -------------------------------------
@@ -112,7 +101,6 @@ PARAMETERS: dict[str, Parameter] = _parameter_table()
 
 Getter = Callable[[Any], float]
 """Reads the value off a `Firmware`."""
-_AXES = "xyz"
 
 
 def _field(path: str, scale: float = 1.0) -> Getter:
@@ -127,8 +115,8 @@ def _item(path: str, place: int) -> Getter:
 
 
 def _duty_cycle(path: str, motor: int) -> Getter:
-    read = _item(path, motor)
-    return lambda firmware: float(int(read(firmware)))
+    read = attrgetter(path)
+    return lambda firmware: float(int(read(firmware)[motor]))
 
 
 def _variance(state: int) -> Getter:
@@ -140,78 +128,35 @@ def _range_mm(firmware: Any) -> float:
     return 1000.0 * max(0.0, firmware.world.z_m) if firmware.estimator.outside is None else 0.0
 
 
-def _live() -> dict[str, Getter]:
-    getters: dict[str, Getter] = {
-        "pm.vbat": _field("power.battery_v"),
-        "pm.vbatMV": _field("power.battery_v", 1000.0),
-        "pm.state": _field("power.state"),
-        "pm.batteryLevel": _field("power.level_percent"),
-        "supervisor.info": _field("supervisor_info"),
-        "stabilizer.thrust": _field("controller.thrust"),
-        "radio.rssi": _field("scenario.rssi_dbm", -1.0),
-        "radio.isConnected": lambda firmware: 1.0,
-        "range.zrange": _range_mm,
-        "locSrvZ.tick": _field("external_tick_ms"),
+LIVE: dict[str, Getter] = {
+    "pm.vbat": _field("power.battery_v"),
+    "pm.vbatMV": _field("power.battery_v", 1000.0),
+    "pm.state": _field("power.state"),
+    "pm.batteryLevel": _field("power.level_percent"),
+    "supervisor.info": _field("supervisor_info"),
+    "stabilizer.thrust": _field("controller.thrust"),
+    "radio.rssi": _field("scenario.rssi_dbm", -1.0),
+    "radio.isConnected": lambda firmware: 1.0,
+    "range.zrange": _range_mm,
+    "locSrvZ.tick": _field("external_tick_ms"),
+}
+for _i, _axis in enumerate("xyz"):
+    _place, _speed = f"estimator.now.{_axis}_m", f"estimator.now.v{_axis}_mps"
+    LIVE |= {
+        f"stateEstimate.{_axis}": _field(_place),
+        f"stateEstimate.v{_axis}": _field(_speed),
+        f"stateEstimateZ.{_axis}": _field(_place, 1000.0),
+        f"stateEstimateZ.v{_axis}": _field(_speed, 1000.0),
+        f"kalman.var{_axis.upper()}": _variance(POSITION + _i),
+        f"kalman.varP{_axis.upper()}": _variance(VELOCITY + _i),
+        f"kalman.varD{_i}": _variance(ATTITUDE + _i),
+        f"acc.{_axis}": _item("estimator.acc_g", _i),
+        f"gyro.{_axis}": _field(f"estimator.now.gyro_{_axis}_dps"),
     }
-    for i, axis in enumerate(_AXES):
-        place, speed = f"estimator.now.{axis}_m", f"estimator.now.v{axis}_mps"
-        getters |= {
-            f"stateEstimate.{axis}": _field(place),
-            f"stateEstimate.v{axis}": _field(speed),
-            f"stateEstimateZ.{axis}": _field(place, 1000.0),
-            f"stateEstimateZ.v{axis}": _field(speed, 1000.0),
-            f"kalman.var{axis.upper()}": _variance(POSITION + i),
-            f"kalman.varP{axis.upper()}": _variance(VELOCITY + i),
-            f"kalman.varD{i}": _variance(ATTITUDE + i),
-            f"acc.{axis}": _item("estimator.acc_g", i),
-            f"gyro.{axis}": _field(f"estimator.now.gyro_{axis}_dps"),
-        }
-    for angle in ("roll", "pitch", "yaw"):
-        getters[f"stateEstimate.{angle}"] = _field(f"estimator.now.{angle}_deg")
-        getters[f"stabilizer.{angle}"] = _field(f"estimator.now.{angle}_deg")
-    for i, part in enumerate("wxyz"):
-        getters[f"stateEstimate.q{part}"] = _item("world.quaternion", i)
-        getters[f"kalman.q{i}"] = _item("world.quaternion", i)
-    for i in range(4):
-        getters[f"motor.m{i + 1}"] = _duty_cycle("motors", i)
-        getters[f"motor.m{i + 1}req"] = _duty_cycle("driver.requested", i)
-    return getters
-
-
-LIVE: dict[str, Getter] = _live()
-
-
-# --- Parameters that reach into the controller: the gains and limits of its loops --------------
-
-
-_LOOPS = {
-    "posCtlPid": {axis: axis for axis in ("x", "y", "z")},
-    "velCtlPid": {axis: axis for axis in ("vx", "vy", "vz")},
-    "pid_attitude": {f"{axis}_": axis for axis in ("roll", "pitch", "yaw")},
-    "pid_rate": {f"{axis}_": f"{axis}_rate" for axis in ("roll", "pitch", "yaw")},
-}
-_GAINS = {
-    f"{group}.{prefix}{gain if prefix.endswith('_') else gain.capitalize()}": (loop, gain)
-    for group, loops in _LOOPS.items()
-    for prefix, loop in loops.items()
-    for gain in ("kp", "ki", "kd")
-}
-_LIMITS = {
-    "posCtlPid.rLimit": "roll_max_deg",
-    "posCtlPid.pLimit": "pitch_max_deg",
-    "posCtlPid.xVelMax": "x_speed_max_mps",
-    "posCtlPid.yVelMax": "y_speed_max_mps",
-    "posCtlPid.zVelMax": "z_speed_max_mps",
-    "posCtlPid.thrustBase": "thrust_base",
-    "posCtlPid.thrustMin": "thrust_min",
-}
-
-
-def apply_parameter(controller: Controller, name: str, value: float) -> None:
-    """Put a parameter's value where the controller uses it; others change nothing."""
-    if name in _GAINS:
-        loop, gain = _GAINS[name]
-        setattr(getattr(controller, loop), gain, value)
-    elif name in _LIMITS:
-        setattr(controller, _LIMITS[name], value)
-        controller.limits_changed()
+for _angle in ("roll", "pitch", "yaw"):
+    LIVE[f"stateEstimate.{_angle}"] = _field(f"estimator.now.{_angle}_deg")
+    LIVE[f"stabilizer.{_angle}"] = _field(f"estimator.now.{_angle}_deg")
+for _i, _part in enumerate("wxyz"):
+    LIVE[f"stateEstimate.q{_part}"] = LIVE[f"kalman.q{_i}"] = _item("world.quaternion", _i)
+    LIVE[f"motor.m{_i + 1}"] = _duty_cycle("motors", _i)
+    LIVE[f"motor.m{_i + 1}req"] = _duty_cycle("driver.requested", _i)

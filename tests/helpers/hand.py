@@ -8,7 +8,7 @@ and jitter; the attitude with its errors at the rate of the log blocks. Nothing 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -162,9 +162,9 @@ def _turns(rng: np.random.Generator, part: Part) -> Waves:
     slow_deg, round_deg, quick_deg = (27.0, 200.0, 6.0) if part == "carry" else (25.0, 40.0, 2.0)
     slow = _waves(rng, np.radians([slow_deg, slow_deg, 0.0]), (0.12, 0.3))
     # One of the two sines goes round, so that it is tilted to all sides.
-    for name, ahead in (("amplitude", 0.0), ("rate_hz", 0.0), ("phase", 0.5 * math.pi)):
-        values = getattr(slow, name)
-        values[1, 0] = values[0, 0] + ahead
+    for values in (slow.amplitude, slow.rate_hz, slow.phase):
+        values[1, 0] = values[0, 0]
+    slow.phase[1, 0] += 0.5 * math.pi
     return _together(
         slow,
         _waves(rng, np.radians([0.0, 0.0, round_deg]), (0.03, 0.08)),
@@ -304,14 +304,8 @@ def pictures(hand: Hand, profile: Profile, camera: CameraModel) -> Iterator[Deli
         yield from source.take()
 
 
-def record_hand(
-    hand: Hand,
-    profile: Profile,
-    camera: CameraModel,
-    told: Callable[[], None] = lambda: None,
-) -> MountingRecording:
-    """Record the whole part, through renderer and pipeline; `told` is called for each
-    picture."""
+def record_hand(hand: Hand, profile: Profile, camera: CameraModel) -> MountingRecording:
+    """Record the whole part, through renderer and pipeline."""
     reader = PoseReader(profile, camera, live=False)
     poses = []
     for frame in pictures(hand, profile, camera):
@@ -319,6 +313,5 @@ def record_hand(
         if profile.camera.mirrored:
             picture = unmirror_frame(picture)
         poses += reader.look(picture)
-        told()
     felt, by = attitudes(hand), PoseReader.basis(profile, camera)
     return MountingRecording(hand.part, felt, poses, reader.mirrored, by)
