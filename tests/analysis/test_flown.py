@@ -12,12 +12,10 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 import cv2
 
 from perchctl.analysis.report import ReportedFlight, reported_flight
-from perchctl.faults import FaultResult
 from perchctl.faults.catalogue import BY_NAME, Case
-from perchctl.faults.effects import FOR_EVER, CameraFault, Effect, Killed
+from perchctl.faults.effects import CameraFault, Effect, Killed
 from perchctl.faults.flight import fly_with_fault
 from perchctl.mission import Phase
-from perchctl.record import read_log
 from perchctl.sim import draw_scenario
 from tests.helpers.flights import SEED, short_profile
 
@@ -26,58 +24,35 @@ pytestmark = pytest.mark.long
 SNOW_S = 0.7
 FAULTS: dict[str, tuple[str, Phase, Effect]] = {
     "perched": ("camera-snow", Phase.ASCEND, CameraFault("snow", SNOW_S)),
-    "landed": ("camera-silent", Phase.ALIGN, CameraFault("silent", FOR_EVER)),
-    "killed": ("killed", Phase.ASCEND, Killed()),
+    "unfinished": ("killed", Phase.ASCEND, Killed()),
 }
 
 
-def flown(name: str, folder: Path) -> FaultResult:
-    """`perched`: snow for a while in the ascent; `landed`: the camera falls silent in the
-    alignment, for ever; `killed`: the program is, in the ascent."""
+def flown(outcome: str, folder: Path) -> tuple[ReportedFlight, float | None]:
+    """A flight with that outcome, and when its fault began, s from the first tick: snow for a while
+    in the ascent, or the program is killed in it."""
     cv2.setNumThreads(1)
     profile = short_profile()
-    fault, phase, effect = FAULTS[name]
+    fault, phase, effect = FAULTS[outcome]
     case = Case(BY_NAME[fault], phase, 0.3, (effect,))
-    scenario, log = draw_scenario(profile, SEED), folder / f"{name}.jsonl"
-    return fly_with_fault(profile, case, scenario, log)
+    path = folder / "f.jsonl"
+    result = fly_with_fault(profile, case, draw_scenario(profile, SEED), path)
+    flight = reported_flight(path)
+    assert flight.outcome == outcome
+    begin_s = result.begin_s
+    return flight, None if begin_s is None else flight.flight.log.since(begin_s)
 
 
-@pytest.fixture(scope="module")
-def flights(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, FaultResult]]:
-    folder = tmp_path_factory.mktemp("flights")
-    return folder, {name: flown(name, folder) for name in FAULTS}
-
-
-def told(flights: tuple[Path, dict[str, FaultResult]], name: str) -> ReportedFlight:
-    return reported_flight(flights[0] / f"{name}.jsonl")
-
-
-def test_snow_is_told_with_its_true_times(
-    flights: tuple[Path, dict[str, FaultResult]],
-) -> None:
-    begin_s = flights[1]["perched"].begin_s
-    assert begin_s is not None
-    flight = told(flights, "perched")
-    begin_s = read_log(flights[0] / "perched.jsonl").since(begin_s)
-    lost = [s for s in flight.story if "lost for" in s.text or "No picture" in s.text]
-    assert len(lost) == 1, flight.story
-    assert lost[0].t_s == pytest.approx(begin_s, abs=0.15)
-    found = re.search(r"for (\d\.\d) s", lost[0].text)
+def test_snow_is_told_with_its_true_times(tmp_path: Path) -> None:
+    flight, begin_s = flown("perched", tmp_path)
+    (lost,) = [s for s in flight.story if "lost for" in s.text or "No picture" in s.text]
+    assert lost.t_s == pytest.approx(begin_s, abs=0.15)
+    found = re.search(r"for (\d\.\d) s", lost.text)
     assert found is not None
     assert float(found[1]) == pytest.approx(SNOW_S, abs=0.2)
-    assert flight.outcome == "perched"
     assert flight.story[-1].text.startswith("Perched")
 
 
-def test_a_silent_camera_lands_it_and_a_killed_flight_has_no_end(
-    flights: tuple[Path, dict[str, FaultResult]],
-) -> None:
-    flight = told(flights, "landed")
-    assert flight.outcome == "landed"
-    assert any("No picture" in s.text for s in flight.story)
-    assert any("it landed" in s.text for s in flight.story)
-    assert {a.about for a in flight.advice} >= {"video"}
-
-    flight = told(flights, "killed")
-    assert flight.outcome == "unfinished"
+def test_a_killed_flight_has_no_end(tmp_path: Path) -> None:
+    flight, _ = flown("unfinished", tmp_path)
     assert "The log ends here, in ASCEND" in flight.story[-1].text

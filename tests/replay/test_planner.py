@@ -255,10 +255,8 @@ def test_what_if_names_the_first_tick_that_would_differ() -> None:
     json.dumps(record, allow_nan=False)
 
 
-@pytest.mark.parametrize("setting", ["safety.max_height_m=9", "kalman.n_max=3", "link.loop_hz=20"])
-def test_what_if_nothing_would_differ(setting: str) -> None:
-    """Or nothing that a replay without pictures can tell."""
-    found = what_if(corpus("perched"), setting)
+def test_what_if_nothing_that_a_replay_without_pictures_can_tell_would_differ() -> None:
+    found = what_if(corpus("perched"), "kalman.n_max=3")
     assert found.same
     assert NOTHING_SHOWN in found.notes
 
@@ -267,9 +265,7 @@ def test_what_if_nothing_would_differ(setting: str) -> None:
     ("setting", "error", "why"),
     [
         ("planner.align.xy_m", UsageError, "must be KEY=VALUE"),
-        ("planer.align.xy_m=3", InvalidValue, "planer is unknown; allowed here are name"),
         ("planner.align.xy=3", InvalidValue, "planner.align.xy: this key is unknown"),
-        ("name.x=3", InvalidValue, "name is no section"),
         ("planner.align.xy_m=-1", InvalidValue, "planner.align.xy_m: "),
         ("planner.align.xy_m=[", InvalidValue, "not YAML"),
     ],
