@@ -377,8 +377,6 @@ def executor_of(
         except ImportError as error:
             raise no_cluster(str(error)) from error
         with cluster_pool(cluster, profiles, log_dir) as pool:
-            for note in pool.notes:
-                say(note)
             yield pool
 
     return workers

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import multiprocessing
+import pickle
 import shutil
 import signal
 import socket
@@ -13,8 +14,10 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,19 +25,13 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
 
-from perchctl.campaign import (
-    FlightResult,
-    cluster,
-    cluster_pool,
-    flight_processes,
-    fly_all,
-    run_campaign,
-)
-from perchctl.campaign.cluster import ClusterPool
-from perchctl.campaign.flights import FLOWN_AGAIN
+from perchctl.campaign import FlightResult, cluster, cluster_pool, flight_processes, fly_all
+from perchctl.campaign.cluster import WorkerRequirements, fly_verified, worker_requirements
+from perchctl.campaign.flights import fly_seed
 from perchctl.campaign.results_file import flown_record
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
-from perchctl.profile import load_profile
+from perchctl.places import data_file
+from perchctl.profile import Profile, load_profile
 from tests.helpers.cluster import dies_in_flight, scheduler, worker
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.ended import ended
@@ -62,7 +59,6 @@ def test_what_is_no_address_is_refused(address: str) -> None:
         (("--jobs", "2"), "--jobs 2 does not apply"),
         (("--only", "3"), "--cluster local:2 does not apply; leave it out, or --only"),
         (("--faults", "list"), "--cluster local:2 does not apply"),
-        (("sweep", "planner.attempts=1", "--jobs", "1"), "--jobs 1 does not apply"),
     ],
 )
 def test_what_does_not_go_with_it_is_refused(words: tuple[str, ...], named: str) -> None:
@@ -79,7 +75,6 @@ def test_without_the_library_one_sentence_says_what_to_install(
     monkeypatch.setattr("perchctl.commands.simulate.find_spec", hide)
     said = run("simulate", "-p", SHORT, "-n", "2", "--cluster", "local:2")
     assert said.code == 2
-    assert said.complaint.startswith("--cluster needs the library distributed (it is missing)")
     assert said.complaint.endswith("-m pip install 'perchctl[cluster]'")
 
 
@@ -99,11 +94,94 @@ def test_an_address_that_nobody_answers_is_told_in_time(
     assert list(tmp_path.iterdir()) == []
 
 
+# --- what a worker must have --------------------------------------------------------------------
+
+
+def flown_by(required: WorkerRequirements, patch: pytest.MonkeyPatch, threads: int = 1) -> Ended:
+    """Fly in this process as a worker does that has flown nothing yet."""
+    state = SimpleNamespace(nthreads=threads)
+    there = SimpleNamespace(address="tcp://10.0.0.5:4001", state=state)
+    patch.setattr(cluster, "get_worker", lambda: there)
+    patch.setattr(cluster, "_differences", {})
+    order = pickle.dumps((ends_at_once, (1,), {}))
+    result: Ended = fly_verified(order, required)
+    return result
+
+
+def test_a_worker_like_this_computer_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with worker_requirements([load_profile("sim"), load_profile("rough")], tmp_path) as found:
+        assert len(list(tmp_path.iterdir())) == 1
+        assert len(found.profiles) == 1  # both name the same files
+        assert flown_by(found, monkeypatch).seed == 1
+    assert list(tmp_path.iterdir()) == []
+    with worker_requirements([Profile()], None) as small:  # it goes with each flight
+        assert len(pickle.dumps(small)) < 20_000
+
+
+@pytest.mark.parametrize(
+    "name", ["perchctl", "python", "opencv", "numpy", "mujoco", "filterpy", "distributed"]
+)
+def test_another_program_or_library_is_named_with_both_versions(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with worker_requirements([], None) as own:
+        other = replace(own, state={**own.state, name: "0.1"})
+    with pytest.raises(
+        InvalidValue, match=rf"^worker tcp://10\S+ on .* has {name} \S+.* instead of 0\.1: "
+    ):
+        flown_by(other, monkeypatch)
+
+
+def test_two_flights_in_one_process_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with (
+        worker_requirements([], None) as found,
+        pytest.raises(InvalidValue, match="--nthreads 16 instead of 1"),
+    ):
+        flown_by(found, monkeypatch, threads=16)
+
+
+def test_another_calibration_or_none_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The profile is sent; the files that it names are not."""
+    shipped = data_file("calib", load_profile("sim").camera.calibration)
+    assert shipped is not None
+    file = tmp_path / "camera.yaml"
+    shutil.copyfile(shipped, file)
+    (tmp_path / "mine.yaml").write_text("extends: sim\ncamera: {calibration: camera.yaml}\n")
+    with worker_requirements([load_profile(str(tmp_path / "mine.yaml"))], None) as found:
+        assert flown_by(found, monkeypatch)
+        file.write_text(file.read_text().replace("1", "2"))
+        for _ in range(2):
+            with pytest.raises(InvalidValue, match=f"has {file} .* instead of"):
+                flown_by(found, monkeypatch)
+            file.unlink(missing_ok=True)
+
+
+def test_a_folder_that_is_not_shared_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of the same path on another disk is not the same folder."""
+    with worker_requirements([], tmp_path) as found:
+        assert found.mark is not None
+        found.mark.write_text("of another campaign")
+        with pytest.raises(InvalidValue, match=f"{tmp_path} of another campaign instead of"):
+            flown_by(found, monkeypatch)
+        found.mark.unlink()
+        with pytest.raises(InvalidValue, match=f"{tmp_path} another folder instead of"):
+            flown_by(found, monkeypatch)
+    with (
+        pytest.raises(InvalidValue, match="cannot be written"),
+        worker_requirements([], tmp_path / "none"),
+    ):
+        raise AssertionError
+
+
 # --- workers of this computer -------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def local() -> Iterator[ClusterPool]:
+def local() -> Iterator[Executor]:
     with cluster_pool("local:2", [load_profile(SHORT)]) as pool:
         yield pool
 
@@ -113,58 +191,28 @@ def workers_of_this_computer() -> set[int | None]:
 
 
 @pytest.mark.long
-def test_each_flight_is_flown_once_by_a_worker_and_what_fails_is_told(local: ClusterPool) -> None:
+def test_each_flight_is_flown_once_by_a_worker_and_what_fails_is_told(local: Executor) -> None:
     told: list[int] = []
     flown = fly_all(ends_at_once, [3, 0, 1, 3, 2], local, lambda result: told.append(result.seed))
     assert [flight.seed for flight in flown] == [3, 0, 1, 2]
     assert sorted(told) == [0, 1, 2, 3]
     assert {flight.pid for flight in flown} <= workers_of_this_computer()
     assert all(flight.deaf for flight in flown)
-    assert local.notes == []
     with pytest.raises(PerchError, match="unforeseen ZeroDivisionError in the flight of seed 1"):
         fly_all(fails_later, [0, 1], local)
 
 
 @pytest.mark.long
-def test_a_lost_worker_is_replaced_and_its_flight_flown_again(
-    local: ClusterPool, tmp_path: Path
-) -> None:
-    """What dask gives up, here after the first time, is the campaign's to hand over again."""
-    flown = fly_all(partial(is_lost, folder=tmp_path, times=FLOWN_AGAIN), [0, 1, 2, 3], local)
-    assert [flight.seed for flight in flown] == [0, 1, 2, 3]
-    marks = Counter(path.name[0] for path in tmp_path.iterdir())
-    assert marks["1"] == 1 + FLOWN_AGAIN
-    # A result that a lost worker still held is flown anew.
-    assert sorted(marks) == ["0", "1", "2", "3"]
-    assert max(marks[seed] for seed in "023") <= 1 + FLOWN_AGAIN
-
-
-@pytest.mark.long
 def test_a_real_flight_survives_a_worker_that_is_killed_in_the_middle(
-    local: ClusterPool, tmp_path: Path
+    local: Executor, tmp_path: Path
 ) -> None:
-    """They end as in one process."""
+    """They end as in one process; one that is killed always is told."""
     profile = load_profile(SHORT)
     flown = fly_all(partial(dies_in_flight, profile, tmp_path, (SEED,)), [SEED], local)
     assert [path.name for path in tmp_path.iterdir()] == [str(SEED)]
-    alone = run_campaign(profile, [SEED])
-    assert [flown_record(flight) for flight in flown] == [flown_record(flight) for flight in alone]
-
-
-@pytest.mark.long
-def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No process, and no folder of dask's."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    before = workers_of_this_computer()
-    with cluster_pool("local:1", []) as pool:
-        (pid,) = workers_of_this_computer() - before
-        assert fly_all(ends_at_once, [1], pool)[0].pid == pid
-        assert len(list(tmp_path.iterdir())) == 1
-    end_s = time.monotonic() + AT_ONCE_S
-    while list(tmp_path.iterdir()) or Path(f"/proc/{pid}").exists():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
+    assert [flown_record(flight) for flight in flown] == [flown_record(fly_seed(profile, SEED))]
+    with pytest.raises(PerchError, match="flew seed 1 was ended from outside, 3 times in all"):
+        fly_all(partial(is_lost, folder=tmp_path, times=99), [1], local)
 
 
 @pytest.mark.long
@@ -182,6 +230,21 @@ def test_a_program_that_is_ended_leaves_nothing_behind(
         assert not list(tmp_path.glob("perchctl-cluster-*"))
 
 
+@pytest.mark.long
+def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No process, and no folder of dask's."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    before = workers_of_this_computer()
+    with cluster_pool("local:1", []) as pool:
+        (pid,) = workers_of_this_computer() - before
+        assert fly_all(ends_at_once, [1], pool)[0].pid == pid
+    end_s = time.monotonic() + AT_ONCE_S
+    while list(tmp_path.iterdir()) or Path(f"/proc/{pid}").exists():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
 # --- a scheduler that is there, with workers as users start them --------------------------------
 
 
@@ -197,7 +260,7 @@ def test_two_workers_one_of_which_is_killed(tmp_path: Path) -> None:
         flown = fly_all(partial(is_lost, folder=marks, times=1), [0, 1, 2, 3], pool)
         assert [flight.seed for flight in flown] == [0, 1, 2, 3]
         assert {flight.pid for flight in flown} <= {each.pid for each in workers}
-        assert Counter(path.name[0] for path in marks.iterdir()) == {"0": 1, "1": 2, "2": 1, "3": 1}
+        assert Counter(path.name[0] for path in marks.iterdir())["1"] == 2
         assert len(list(logs.iterdir())) == 1  # the mark of this campaign
 
         told: list[Ended] = []
@@ -223,20 +286,17 @@ def test_workers_that_must_not_fly_and_none_at_all(
     with scheduler(tmp_path) as (address, _process):
         monkeypatch.setattr(cluster, "WORKERS_S", 0.3)
         with (
-            pytest.raises(ConnectionFailed, match=r"has had no worker for .* dask worker tcp://"),
+            pytest.raises(ConnectionFailed, match=r"has no worker: .* dask worker tcp://"),
             cluster_pool(address, []),
         ):
             raise AssertionError
         monkeypatch.setattr(cluster, "WORKERS_S", 60.0)
-        unfit = partial(pytest.raises, InvalidValue, match=r"^worker tcp://127.* has perchctl ")
-        with worker(address, tmp_path), cluster_pool(address, []) as pool:
-            assert fly_all(ends_at_once, [1], pool)
-            pool.submit(ends_first_only, 1)
-            with worker(address, tmp_path, root=other):  # comes later
-                with unfit():
-                    fly_all(ends_at_once, range(2, 4), pool)
-                with unfit(), cluster_pool(address, []):
-                    raise AssertionError
+        with (
+            worker(address, tmp_path, root=other),
+            cluster_pool(address, []) as pool,
+            pytest.raises(InvalidValue, match=r"^worker tcp://127\S+ on .* has perchctl "),
+        ):
+            fly_all(ends_at_once, range(2), pool)
 
 
 # --- who flies a seed changes nothing of it -----------------------------------------------------
@@ -248,7 +308,8 @@ def test_forty_seeds_in_one_process_in_two_and_on_a_cluster(tmp_path: Path) -> N
     profile, seeds, deadly = load_profile("sim"), range(40), (7, 23)
 
     def flown(executor: Executor) -> list[dict[str, Any]]:
-        return [flown_record(result) for result in run_campaign(profile, seeds, executor)]
+        results = fly_all(partial(fly_seed, profile), seeds, executor)
+        return [flown_record(result) for result in results]
 
     with flight_processes(1) as one:
         alone = flown(one)
