@@ -13,13 +13,14 @@ import argparse
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
 
 from perchctl.faults import FaultResult
 from perchctl.faults.catalogue import BY_NAME, Case
-from perchctl.faults.effects import MagnetHolds
+from perchctl.faults.effects import magnet_holds
 from perchctl.faults.flight import fly_with_fault
 from perchctl.faults.oracle import drop_limit_m
 from perchctl.mission import Phase
@@ -46,7 +47,8 @@ def fly(seed: int) -> FaultResult:
         ceiling_z_m=max(LOWEST_CEILING_M, scenario.ceiling_z_m),
         first_contact_force_n=None,
     )
-    case = Case(BY_NAME["weak-magnet"], Phase.PERCH, 0.0, (MagnetHolds(carried(seed)),))
+    held = partial(magnet_holds, of_weight=carried(seed))
+    case = Case(BY_NAME["weak-magnet"], Phase.PERCH, 0.0, (held,))
     return fly_with_fault(profile, case, scenario)
 
 

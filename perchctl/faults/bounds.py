@@ -7,10 +7,10 @@ Neither goes by the program's estimate: that may be what is wrong.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from perchctl.faults import effects as e
 from perchctl.geometry import rot_z
+from perchctl.link import MockLink
 from perchctl.mission import Phase
 from perchctl.profile import Profile
 from perchctl.sim import Scenario
@@ -116,12 +116,18 @@ class UnfeltDrift:
     target as positioning system and out of view, a force while it acts. A step of the estimate
     is not counted, since it can be noticed."""
 
-    def __init__(self, effects: Sequence[e.Effect], scenario: Scenario, *, by_target: bool) -> None:
-        slides = [effect for effect in effects if isinstance(effect, e.EstimateError)]
-        self._slides = [(math.hypot(*slide.drift_mps[:2]), slide.for_s) for slide in slides]
-        pushes = [effect for effect in effects if isinstance(effect, e.Push) and by_target]
+    def __init__(
+        self, effects: tuple[e.Effect, ...], scenario: Scenario, *, by_target: bool
+    ) -> None:
+        self._slides = [
+            (math.hypot(*effect.keywords.get("drift_mps", (0.0, 0.0, 0.0))[:2]), _for_s(effect))
+            for effect in effects
+            if effect.func is e.estimate_error
+        ]
         self._pushes = [
-            (math.hypot(*push.force_n[:2]) / scenario.mass_kg, push.for_s) for push in pushes
+            (math.hypot(*effect.keywords["force_n"][:2]) / scenario.mass_kg, _for_s(effect))
+            for effect in effects
+            if effect.func is e.push and by_target
         ]
         self._slid_m = self._fault_s = 0.0
 
@@ -143,15 +149,17 @@ class DescentBound:
     """The time by which the vehicle should descend: at once if the operator asks for it or an
     exception ends the loop, else as soon as the fault has lasted longer than the profile waits."""
 
-    def __init__(self, effects: Sequence[e.Effect], profile: Profile) -> None:
+    def __init__(self, effects: tuple[e.Effect, ...], profile: Profile) -> None:
         self._effects, self._profile = effects, profile
-        self._due_s = math.inf
+        self._due_s: float | None = None  # None: the fault has not begun
         self._from_m: float | None = None  # its height when the way down was due
 
     def begin(self, t_s: float, phase: Phase | None) -> None:
-        """Note that the fault begins, and the program's phase."""
-        limits_s = [self._limit_s(effect, phase or Phase.APPROACH) for effect in self._effects]
-        self._due_s = t_s + min(limits_s, default=math.inf)
+        """Note when the fault began, and the program's phase then; further calls do nothing."""
+        if self._due_s is None:
+            phase = phase or Phase.APPROACH
+            limits_s = [land_after_s(effect, self._profile, phase) for effect in self._effects]
+            self._due_s = t_s + min(limits_s, default=math.inf)
 
     def is_overdue(
         self,
@@ -167,6 +175,8 @@ class DescentBound:
         the ceiling in time may hang there, and one without `uplink` cannot obey until it hears
         again. `lands`: it flies its own landing, whose trajectory starts from rest with each of
         the three orders; a landing that climbs does not count."""
+        if self._due_s is None:
+            return False
         if touching and t_s < self._due_s + REACTION_S:
             self._due_s = math.inf
         if not uplink:
@@ -180,33 +190,31 @@ class DescentBound:
         begins = lands and height_m <= self._from_m + SUNK_M
         return late and not (comes_down or begins)
 
-    def _limit_s(self, effect: e.Effect, phase: Phase) -> float:
-        """Return the time after which this effect makes the program land; infinite if it need
-        not."""
-        safety, positioning = self._profile.safety, self._profile.positioning
-        lasts_s, limits_s = 0.0, [math.inf]
-        match effect:
-            case e.Operator(presses_s):
-                return min(presses_s) if phase in IN_THE_OPEN else math.inf
-            case e.Raises():
-                return 0.0 if phase in IN_THE_OPEN else math.inf
-            case e.Silence(lasts_s, down=True) | e.BlockDead("state" | "attitude", lasts_s):
-                limits_s.append(safety.telemetry_land_s)
-            case e.Suspended(lasts_s):
-                limits_s.append(safety.loop_late_land_s)
-            case e.TelemetryDelayed(delay_s, lasts_s) if delay_s > safety.telemetry_land_s:
-                limits_s.append(safety.telemetry_land_s)
-            case e.Hung(lasts_s):
-                limits_s.append(safety.loop_late_land_s)
-            case e.CameraFault(kind, lasts_s):
-                if kind in NO_PICTURE and phase in BY_CAMERA:
-                    limits_s.append(safety.camera_land_s)
-                if kind in NO_SIGHT and positioning.by == "target":
-                    limits_s.append(positioning.land_s)
-            case e.DeckSilent(lasts_s):
-                limits_s.append(positioning.land_s)
-            case e.ExternalPositions(how, lasts_s) if how in NO_POSITION:
-                limits_s.append(positioning.land_s)
-        limit_s = min(limits_s)
-        flown = phase in IN_THE_OPEN and lasts_s > limit_s + LASTS_S
-        return limit_s if flown else math.inf
+
+def _for_s(effect: e.Effect) -> float:
+    return float(effect.keywords.get("for_s", e.FOR_EVER))
+
+
+def land_after_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
+    """Return how long after it began in that phase an effect makes the program land; infinite if
+    it need not."""
+    safety, values, limit_s = profile.safety, effect.keywords, math.inf
+    if effect.func is e.operator:
+        limit_s = min(values["presses_s"])
+    elif effect.func is e.raises:
+        limit_s = 0.0
+    elif effect.func in (e.suspended, e.hung):
+        limit_s = safety.loop_late_land_s
+    elif effect.func is e.radio_loss:
+        silent = values.get("down") in ("all", *MockLink.FAST_BLOCKS)
+        if silent and values.get("delay_s", math.inf) > safety.telemetry_land_s:
+            limit_s = safety.telemetry_land_s
+    elif effect.func is e.camera_fault:
+        if values["kind"] in NO_PICTURE and phase in BY_CAMERA:
+            limit_s = safety.camera_land_s
+        if values["kind"] in NO_SIGHT and profile.positioning.by == "target":
+            limit_s = min(limit_s, profile.positioning.land_s)
+    elif effect.func is e.deck_silent or values.get("how") in NO_POSITION:
+        limit_s = profile.positioning.land_s
+    flown = phase in IN_THE_OPEN and _for_s(effect) > limit_s + LASTS_S
+    return limit_s if flown else math.inf

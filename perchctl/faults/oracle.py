@@ -98,37 +98,6 @@ class Sample(NamedTuple):
     heard: bool = True  # its telemetry arrives in time, and tells what is true
 
 
-@dataclass(frozen=True)
-class Limits:
-    """The limits of the profile: two of `safety`, and the radius within which a contact is on
-    the target."""
-
-    max_height_m: float
-    max_tilt_deg: float = 55.0
-    magnet_radius_m: float = 0.025
-
-
-@dataclass
-class Verdict:
-    """What the oracle has found so far.
-
-    Attributes:
-        flags: with when each was first raised, in that order.
-        drop_m: the deepest fall until caught; `slip_ratio`: the magnet's hold over the weight,
-            where that was a slip from the magnet.
-        touchdown_mps, touchdown_aside_mps: the largest speeds, downwards and sideways, with which
-            the floor was met.
-        astray_m: the farthest from where it should have been, in the air.
-    """
-
-    flags: dict[Flag, float] = field(default_factory=dict)
-    drop_m: float = 0.0
-    slip_ratio: float | None = None
-    touchdown_mps: float = 0.0
-    touchdown_aside_mps: float = 0.0
-    astray_m: float = 0.0
-
-
 def drop_limit_m(hold_ratio: float) -> float:
     """Return the height that a slip may cost until it is caught, by the magnet's hold over the
     weight."""
@@ -178,16 +147,25 @@ class _Fall:
 
 
 class Oracle:
-    """The judge of a flight: takes samples at most 20 ms apart and collects its findings in
-    `verdict`."""
+    """The judge of a flight by a profile's limits: takes samples at most 20 ms apart. Within
+    `magnet_radius_m` a contact is on the target.
 
-    def __init__(self, limits: Limits) -> None:
-        self.verdict = Verdict()
+    Attributes:
+        flags: with when each was first raised, in that order.
+        drop_m: the deepest fall until caught.
+        astray_m: the farthest from where it should have been, in the air.
+        newest: the last sample.
+    """
+
+    def __init__(
+        self, max_height_m: float, max_tilt_deg: float = 55.0, magnet_radius_m: float = 0.025
+    ) -> None:
+        self.flags: dict[Flag, float] = {}
+        self.drop_m = self.astray_m = 0.0
         self.newest: Sample | None = None
-        self._max_height_m = limits.max_height_m
-        self._magnet_radius_m = limits.magnet_radius_m
-        self._tilted_up_z = math.cos(math.radians(limits.max_tilt_deg))
-        self._tilt_up_z = math.cos(math.radians(limits.max_tilt_deg - TILT_WITHIN_DEG))
+        self._max_height_m, self._magnet_radius_m = max_height_m, magnet_radius_m
+        self._tilted_up_z = math.cos(math.radians(max_tilt_deg))
+        self._tilt_up_z = math.cos(math.radians(max_tilt_deg - TILT_WITHIN_DEG))
         self._hung: Sample | None = None  # last sample that hung
         self._unpowered, self._weightless = _Lasting(OFF_S), _Lasting(FREE_FALL_S)
         self._press_s = -math.inf  # newest sample that pressed
@@ -253,7 +231,7 @@ class Oracle:
         return s is not None and _airborne(s) and not (s.hanging and not s.motors_on)
 
     def _raise(self, flag: Flag, t_s: float) -> None:
-        self.verdict.flags.setdefault(flag, t_s)
+        self.flags.setdefault(flag, t_s)
 
     def _from_hanging(self, s: Sample) -> bool:
         """Return True if it hung a moment ago, so that it may still be caught."""
@@ -281,8 +259,7 @@ class Oracle:
                 self._fall = _Fall(self._hung.height_m, self._hung.hold_ratio)
         fall = self._fall
         drop_m = fall.top_m - s.height_m
-        if drop_m > self.verdict.drop_m:
-            self.verdict.drop_m, self.verdict.slip_ratio = drop_m, fall.slip_ratio
+        self.drop_m = max(self.drop_m, drop_m)
         unpowered = s.t_s - self._weak_s <= FROM_HANGING_S
         too_deep = fall.slip_ratio is not None and drop_m > drop_limit_m(fall.slip_ratio)
         if unpowered and (too_deep or s.floor):
@@ -298,11 +275,7 @@ class Oracle:
         before = self._before
         if before is None or before.floor or not s.floor:
             return
-        sink_mps = -before.vz_mps
-        found = self.verdict
-        found.touchdown_mps = max(found.touchdown_mps, sink_mps)
-        found.touchdown_aside_mps = max(found.touchdown_aside_mps, before.aside_mps)
-        if sink_mps > TOUCHDOWN_MPS:
+        if -before.vz_mps > TOUCHDOWN_MPS:
             self._raise("fell", s.t_s)
         if before.aside_mps > TOUCHDOWN_ASIDE_MPS:
             self._raise("slid", s.t_s)
@@ -316,7 +289,7 @@ class Oracle:
     def _watch_place(self, s: Sample) -> None:
         if not _airborne(s):
             return
-        self.verdict.astray_m = max(self.verdict.astray_m, s.astray_m)
+        self.astray_m = max(self.astray_m, s.astray_m)
         if s.astray_m > ASTRAY_M or s.height_m > self._max_height_m + TOO_HIGH_M:
             self._raise("strayed", s.t_s)
 

@@ -36,7 +36,7 @@ class Promise:
             return True
         if result.end != "perched" and self.names not in result.reason:
             return False
-        return result.unavoidable is not None or result.end in self.ends
+        return bool(result.expected) or result.end in self.ends
 
 
 PROMISES: dict[str, Promise] = {

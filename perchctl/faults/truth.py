@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from perchctl.faults.effects import Effect, Reboots
+from perchctl.faults.effects import SAMPLE_S, Effect, reboots
 from perchctl.faults.oracle import Sample
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.profile import Profile, TargetConfig
@@ -23,7 +23,6 @@ from perchctl.sim import (
 from perchctl.vehicle import LOCKED
 from perchctl.vision import CameraModel
 
-SAMPLE_S = 0.01
 FULL_THRUST = 60000.0
 """The largest raw thrust order (docs/firmware.md, "Raw thrust"): it lifts every vehicle that can
 fly."""
@@ -141,12 +140,16 @@ class Facts:
     low_s: float | None = None
     low_m: float = 0.0
 
+    def does(self, act: Callable[..., None]) -> bool:
+        """Return True if that is one of the effects."""
+        return any(effect.func is act for effect in self.effects)
+
 
 class FactsRecorder:
     """Follows the true vehicle sample by sample, and notes in `facts` when things happened."""
 
     def __init__(
-        self, vehicle: WatchedVehicle, profile: Profile, effects: tuple[Effect, ...] = ()
+        self, vehicle: SimulatedVehicle, profile: Profile, effects: tuple[Effect, ...] = ()
     ) -> None:
         complete = profile.planner.complete
         self.facts = Facts(effects)
@@ -155,31 +158,32 @@ class FactsRecorder:
         self._vehicle = vehicle
         self._silent_s: float | None = None  # since when nothing has arrived
         self._heard_s = -math.inf  # when the newest silence ended that was long enough for a cut
-        self._landed_alone = self._locked_before = False
+        self._landed_alone = self._locked_before = self._begun = False
         self._hangs_s: float | None = None  # since when the whole weight has hung
         self._before: Sample | None = None
-        self._flew: bool | None = None  # as the fault began
 
-    def see(self, s: Sample, *, begun: bool) -> None:
-        """Note the next sample; `begun`: the fault has begun."""
+    def see(self, s: Sample) -> None:
+        """Note the next sample; `facts.begin_s` is set by then if the fault has begun."""
+        facts, before = self.facts, self._before
         self._note_silence(s)
         self._note_hanging(s)
-        if begun:
-            if self._flew is None:
-                before = self._before
-                self._flew = before is not None and before.motors_on and not before.floor
+        if facts.begin_s is not None:
+            flew = before is not None and before.motors_on and not before.floor
+            if not self._begun and flew and facts.does(reboots):
+                facts.rebooted_s = facts.begin_s
+            self._begun = True
             self._note_power(s)
         self._before = s
 
     def _note_silence(self, s: Sample) -> None:
+        facts = self.facts
         long = self._silent_s is not None and s.t_s - self._silent_s >= CUT_S
-        if long and self._landed_alone:
-            self.facts.own_landing = True
+        facts.own_landing = facts.own_landing or (long and self._landed_alone)
         locks = s.locked and not self._locked_before
         ordered = self._vehicle.firmware.supervisor.emergency  # by a packet, not by silence
         late = s.t_s - self._heard_s <= LOCKS_S and not ordered
-        if locks and (long or late) and self.facts.cut_s is None:
-            self.facts.cut_s = s.t_s
+        if locks and (long or late) and facts.cut_s is None:
+            facts.cut_s = s.t_s
         self._locked_before = s.locked
         if s.uplink:
             self._heard_s = s.t_s if long else self._heard_s
@@ -189,19 +193,16 @@ class FactsRecorder:
             self._landed_alone = self._vehicle.firmware.planner.active
 
     def _note_hanging(self, s: Sample) -> None:
-        still = s.hanging and not s.motors_on
-        if self.facts.let_go_s is None and self._vehicle.world.magnet.let_go:
-            self.facts.let_go_s = s.t_s
-            self.facts.watched = (
-                self._hangs_s is not None and s.t_s - self._hangs_s >= self._watch_s
-            )
-        before = self._before
+        facts, before = self.facts, self._before
+        if facts.let_go_s is None and self._vehicle.world.magnet.let_go:
+            facts.let_go_s = s.t_s
+            facts.watched = self._hangs_s is not None and s.t_s - self._hangs_s >= self._watch_s
         came_off = before is not None and before.hanging and not s.hanging and not s.motors_on
-        if came_off and self.facts.slipped_s is None:
-            self.facts.slipped_s, self.facts.slipped_m = s.t_s, s.height_m
-        if self.facts.slipped_s is not None and s.t_s - self.facts.slipped_s <= TOPPLES_S:
-            self.facts.toppled = self.facts.toppled or s.up_z < TOPPLED_UP_Z
-        if not still:
+        if came_off and facts.slipped_s is None:
+            facts.slipped_s, facts.slipped_m = s.t_s, s.height_m
+        if facts.slipped_s is not None and s.t_s - facts.slipped_s <= TOPPLES_S:
+            facts.toppled = facts.toppled or s.up_z < TOPPLED_UP_Z
+        if s.motors_on or not s.hanging:
             self._hangs_s = None
         elif self._hangs_s is None:
             self._hangs_s = s.t_s
@@ -217,13 +218,3 @@ class FactsRecorder:
             self.facts.weak_s = s.t_s
         if self.facts.low_s is None and world.battery_v < self._min_load_v:
             self.facts.low_s, self.facts.low_m = s.t_s, s.height_m
-
-    def complete(
-        self, *, begin_s: float | None, killed_s: float | None, stop_s: float | None
-    ) -> Facts:
-        """Return the facts after the last sample, completed by times known elsewhere."""
-        facts = self.facts
-        facts.begin_s, facts.killed_s, facts.stop_s = begin_s, killed_s, stop_s
-        if self._flew and any(isinstance(effect, Reboots) for effect in facts.effects):
-            facts.rebooted_s = begin_s
-        return facts
