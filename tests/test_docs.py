@@ -100,10 +100,9 @@ def cheap(line: str) -> list[str]:
         case ["perchctl", "simulate"] if sum("=" in word for word in words) > 1:
             words.append("--help")  # many flights
         case ["perchctl", "simulate"]:
-            if "--cluster" in words:  # the form is looked at; a cluster of one is this computer's
+            if "--cluster" in words:
                 at = words.index("--cluster")
-                local = words[at + 1].startswith("local:")
-                words[at : at + 2] = ["--cluster", "local:1"] if local else []
+                words[at : at + 2] = []
             if words[2] == "compare":
                 words[3:5] = ["quick.yaml", "quick.yaml"]
             else:

@@ -14,23 +14,20 @@ import os
 import pickle
 import platform
 import secrets
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from importlib.metadata import version
-from multiprocessing import active_children, resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
-import dask
-from distributed import Client, KilledWorker, LocalCluster, get_worker
+from distributed import Client, KilledWorker, get_worker
 from distributed.versions import VersionMismatchWarning
 
 import perchctl
-from perchctl.campaign.pool import FLOWN_AGAIN, defer_interrupts
+from perchctl.campaign.pool import defer_interrupts
 from perchctl.campaign.results_file import profile_sha256, source_sha256
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
 from perchctl.files import cannot_be_written
@@ -43,8 +40,6 @@ ANSWER_S = 10.0
 WORKERS_S = 20.0
 """The first worker must register within this time."""
 _CLOSE_S = 1.0
-_NO_PAGES = "127.0.0.1:0"
-"""dask opens a port for its web pages in any case: on loopback, any that is free, and no page."""
 _QUIET = ("distributed", "tornado", "asyncio")
 _LIBRARIES = ("numpy", "mujoco", "filterpy", "distributed")
 """The libraries that compute a flight's figures or carry them between computers; OpenCV has
@@ -162,63 +157,23 @@ class ClusterExecutor(Executor):
 def cluster_pool(
     address: str, profiles: Sequence[Profile], folder: Path | None = None
 ) -> Iterator[Executor]:
-    """Yield an executor of the workers of the scheduler at `address` (``HOST:PORT``,
-    ``tcp://HOST:PORT``, or ``local:N`` for one of this computer with N workers), which have this
-    computer's program, its data for these `profiles`, and its `folder` if one is given.
-    Errors: UsageError, ConnectionFailed, InvalidValue."""
+    """Yield an executor of the workers of the scheduler at `address` (``HOST:PORT`` or
+    ``tcp://HOST:PORT``), which have this computer's program, its data for these `profiles`, and
+    its `folder` if one is given. Errors: UsageError, ConnectionFailed, InvalidValue."""
     if not os.environ.get("PERCHCTL_DEBUG"):
         for name in (*_QUIET, *logging.root.manager.loggerDict):
             if name.startswith(_QUIET):
                 logging.getLogger(name).setLevel(logging.CRITICAL)
     # Each worker compares the versions that matter.
     warnings.filterwarnings("ignore", category=VersionMismatchWarning)
-    with contextlib.ExitStack() as stack:
-        required = stack.enter_context(worker_requirements(profiles, folder))
-        if address.startswith("local:"):
-            address = stack.enter_context(_local_scheduler(address))
+    with worker_requirements(profiles, folder) as required:
         client = _connected(address)
-        stack.callback(_closed, client)
         try:
-            client.wait_for_workers(1, timeout=WORKERS_S)
-        except TimeoutError:
-            raise ConnectionFailed(
-                f"the scheduler at {address} has no worker: start some with dask worker {address} "
-                f"--nthreads 1"
-            ) from None
-        yield ClusterExecutor(client, required)
-
-
-@contextlib.contextmanager
-def _local_scheduler(address: str) -> Iterator[str]:
-    """Start a scheduler and workers on this computer; yields the scheduler's address. They end
-    with this program, killed or not."""
-    workers = address.removeprefix("local:")
-    if not (workers.isascii() and workers.isdigit() and int(workers)):
-        raise UsageError(f"--cluster {address} must be local:N with N workers, as in local:4")
-    with tempfile.TemporaryDirectory(
-        prefix="perchctl-cluster-", ignore_cleanup_errors=True
-    ) as folder:
-        settings = {
-            "distributed.scheduler.allowed-failures": FLOWN_AGAIN,
-            "distributed.scheduler.http.routes": [],
-            "distributed.worker.http.routes": [],
-            "distributed.worker.profile.enabled": False,
-            "temporary-directory": folder,
-        }
-        resource_tracker.ensure_running()  # it lifts the mask of the thread that starts it
-        with dask.config.set(settings):
-            with defer_interrupts():  # threads and processes inherit the mask of who starts them
-                cluster = LocalCluster(
-                    n_workers=int(workers), threads_per_worker=1, memory_limit=0,
-                    dashboard_address=None, scheduler_kwargs={"dashboard_address": _NO_PAGES},
-                    silence_logs=logging.CRITICAL,
-                )  # fmt: skip
-            try:
-                yield cluster.scheduler_address
-            finally:
-                for worker in active_children():  # what they fly would be waited for
-                    worker.kill()
-                _closed(cluster)
+            _wait_for_worker(client, address)
+            yield ClusterExecutor(client, required)
+        finally:
+            with contextlib.suppress(Exception):
+                client.close(timeout=_CLOSE_S)
 
 
 def _connected(address: str) -> Client:
@@ -230,7 +185,7 @@ def _connected(address: str) -> Client:
     except ValueError as error:
         problem = UsageError(
             f"--cluster {address} must be the address of a dask scheduler, as in "
-            f"--cluster tcp://10.0.0.5:8786, or local:N ({error})"
+            f"--cluster tcp://10.0.0.5:8786 ({error})"
         )
     except Exception as error:
         problem = ConnectionFailed(
@@ -241,6 +196,11 @@ def _connected(address: str) -> Client:
     raise problem
 
 
-def _closed(of_dask: Any) -> None:
-    with contextlib.suppress(Exception):
-        of_dask.close(timeout=_CLOSE_S)
+def _wait_for_worker(client: Client, address: str) -> None:
+    try:
+        client.wait_for_workers(1, timeout=WORKERS_S)
+    except TimeoutError:
+        raise ConnectionFailed(
+            f"the scheduler at {address} has no worker: start some with dask worker {address} "
+            f"--nthreads 1"
+        ) from None

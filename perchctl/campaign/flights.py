@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 
 import cv2
 
-from perchctl.campaign.pool import FLOWN_AGAIN
 from perchctl.campaign.results import FlightEnd, FlightResult, peak_memory_mb
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, SafetyAbort, TimedOut
 from perchctl.flight import LockstepFlight, fly_lockstep
@@ -177,8 +176,8 @@ def _result(future: Future[R], seed: object, lost: tuple[type[BaseException], ..
         raise
     except lost as error:
         raise PerchError(
-            f"the process that flew seed {seed} was ended from outside, {1 + FLOWN_AGAIN} times in "
-            f"all (where memory is short, fly fewer at a time: --jobs)"
+            f"the process that flew seed {seed} was ended from outside, and so were those that "
+            f"flew it again (where memory is short, fly fewer at a time: --jobs)"
         ) from error
     except CancelledError as error:
         raise ConnectionFailed(

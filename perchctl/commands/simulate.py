@@ -76,9 +76,8 @@ ClusterOption = Annotated[
     str | None,
     typer.Option(
         "--cluster",
-        metavar="ADDRESS|local:N",
-        help="Fly on the workers of this dask scheduler, as tcp://10.0.0.5:8786, or of one here "
-        "with N workers.",
+        metavar="ADDRESS",
+        help="Fly on the workers of this dask scheduler, as tcp://10.0.0.5:8786.",
     ),
 ]
 app = new_app(Group)

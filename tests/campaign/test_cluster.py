@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
-import multiprocessing
 import pickle
 import shutil
 import signal
 import socket
-import tempfile
-import time
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -36,18 +32,12 @@ from tests.helpers.cluster import dies_in_flight, scheduler, worker
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.ended import ended
 from tests.helpers.flights import ROOT, SEED, SHORT
-from tests.helpers.seeds import Ended, ends_at_once, ends_first_only, fails_later, is_lost
-
-AT_ONCE_S = 20.0
-"""Beside the time for which the flights would go on; on a busy machine, too."""
-
+from tests.helpers.seeds import Ended, ends_at_once, ends_first_only, fails_later
 
 # --- the address, and what it goes together with ------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "address", ["local:", "local:0", "local:-1", "local:\u00b2", "localhost", "http://10.0.0.5:1"]
-)
+@pytest.mark.parametrize("address", ["localhost", "http://10.0.0.5:1"])
 def test_what_is_no_address_is_refused(address: str) -> None:
     with pytest.raises(UsageError, match=r"must be "), cluster_pool(address, []):
         raise AssertionError
@@ -57,12 +47,12 @@ def test_what_is_no_address_is_refused(address: str) -> None:
     ("words", "named"),
     [
         (("--jobs", "2"), "--jobs 2 does not apply"),
-        (("--only", "3"), "--cluster local:2 does not apply; leave it out, or --only"),
-        (("--faults", "list"), "--cluster local:2 does not apply"),
+        (("--only", "3"), "--cluster here:1 does not apply; leave it out, or --only"),
+        (("--faults", "list"), "--cluster here:1 does not apply"),
     ],
 )
 def test_what_does_not_go_with_it_is_refused(words: tuple[str, ...], named: str) -> None:
-    said = run("simulate", *words, "--cluster", "local:2")
+    said = run("simulate", *words, "--cluster", "here:1")
     assert said.code == UsageError.exit_code
     assert named in said.stderr
 
@@ -73,7 +63,7 @@ def test_without_the_library_one_sentence_says_what_to_install(
     there = importlib.util.find_spec
     hide = lambda name, *rest: None if name == "distributed" else there(name, *rest)  # noqa: E731
     monkeypatch.setattr("perchctl.commands.simulate.find_spec", hide)
-    said = run("simulate", "-p", SHORT, "-n", "2", "--cluster", "local:2")
+    said = run("simulate", "-p", SHORT, "-n", "2", "--cluster", "here:1")
     assert said.code == 2
     assert said.complaint.endswith("-m pip install 'perchctl[cluster]'")
 
@@ -177,102 +167,54 @@ def test_a_folder_that_is_not_shared_is_refused(
         raise AssertionError
 
 
-# --- workers of this computer -------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def local() -> Iterator[Executor]:
-    with cluster_pool("local:2", [load_profile(SHORT)]) as pool:
-        yield pool
-
-
-def workers_of_this_computer() -> set[int | None]:
-    return {process.pid for process in multiprocessing.active_children()}
-
-
-@pytest.mark.long
-def test_each_flight_is_flown_once_by_a_worker_and_what_fails_is_told(local: Executor) -> None:
-    told: list[int] = []
-    flown = fly_all(ends_at_once, [3, 0, 1, 3, 2], local, lambda result: told.append(result.seed))
-    assert [flight.seed for flight in flown] == [3, 0, 1, 2]
-    assert sorted(told) == [0, 1, 2, 3]
-    assert {flight.pid for flight in flown} <= workers_of_this_computer()
-    assert all(flight.deaf for flight in flown)
-    with pytest.raises(PerchError, match="unforeseen ZeroDivisionError in the flight of seed 1"):
-        fly_all(fails_later, [0, 1], local)
-
-
-@pytest.mark.long
-def test_a_real_flight_survives_a_worker_that_is_killed_in_the_middle(
-    local: Executor, tmp_path: Path
-) -> None:
-    """They end as in one process; one that is killed always is told."""
-    profile = load_profile(SHORT)
-    flown = fly_all(partial(dies_in_flight, profile, tmp_path, (SEED,)), [SEED], local)
-    assert [path.name for path in tmp_path.iterdir()] == [str(SEED)]
-    assert [flown_record(flight) for flight in flown] == [flown_record(fly_seed(profile, SEED))]
-    with pytest.raises(PerchError, match="flew seed 1 was ended from outside, 3 times in all"):
-        fly_all(partial(is_lost, folder=tmp_path, times=99), [1], local)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_a_program_that_is_ended_leaves_nothing_behind(
-    number: signal.Signals, tmp_path: Path
-) -> None:
-    """A terminal sends its signals to all; what was flown is told."""
-    it = ended(number, AT_ONCE_S, "local:1", env={"TMPDIR": str(tmp_path)})
-    assert it.child
-    if number != signal.SIGKILL:
-        assert it.code == 130
-        assert it.out == "report 1 stopped: 1 of 6 flights were flown\n"
-        assert it.err.endswith("perchctl: stopped: 1 of 6 flights were flown\n")
-        assert not list(tmp_path.glob("perchctl-cluster-*"))
-
-
-@pytest.mark.long
-def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No process, and no folder of dask's."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    before = workers_of_this_computer()
-    with cluster_pool("local:1", []) as pool:
-        (pid,) = workers_of_this_computer() - before
-        assert fly_all(ends_at_once, [1], pool)[0].pid == pid
-    end_s = time.monotonic() + AT_ONCE_S
-    while list(tmp_path.iterdir()) or Path(f"/proc/{pid}").exists():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
-
-
 # --- a scheduler that is there, with workers as users start them --------------------------------
 
 
 @pytest.mark.long
 def test_two_workers_one_of_which_is_killed(tmp_path: Path) -> None:
-    """dask hands its flight to the other; each seed counts once. Then the scheduler is lost."""
+    """dask hands its flight to the other; each seed counts once, and ends as in one process. Then
+    the scheduler is lost."""
     marks, logs = tmp_path / "marks", tmp_path / "logs"
     marks.mkdir()
     logs.mkdir()
+    profile = load_profile(SHORT)
     with scheduler(tmp_path) as (address, process), ExitStack() as stack:
         workers = [stack.enter_context(worker(address, tmp_path)) for _ in range(2)]
-        pool = stack.enter_context(cluster_pool(address, [load_profile("sim")], logs))
-        flown = fly_all(partial(is_lost, folder=marks, times=1), [0, 1, 2, 3], pool)
-        assert [flight.seed for flight in flown] == [0, 1, 2, 3]
+        pool = stack.enter_context(cluster_pool(address, [profile], logs))
+        told: list[Ended] = []
+        flown = fly_all(ends_at_once, [3, 0, 3, 2], pool, told.append)
+        assert [flight.seed for flight in flown] == [3, 0, 2]
+        assert sorted(flight.seed for flight in told) == [0, 2, 3]
         assert {flight.pid for flight in flown} <= {each.pid for each in workers}
-        assert Counter(path.name[0] for path in marks.iterdir())["1"] == 2
+        with pytest.raises(PerchError, match="unforeseen ZeroDivisionError in the flight of seed"):
+            fly_all(fails_later, [0, 1], pool)
         assert len(list(logs.iterdir())) == 1  # the mark of this campaign
 
-        told: list[Ended] = []
+        fly = partial(dies_in_flight, profile, marks, (SEED,))
+        (survivor,) = fly_all(fly, [SEED], pool)
+        assert [path.name for path in marks.iterdir()] == [str(SEED)]
+        assert flown_record(survivor) == flown_record(fly_seed(profile, SEED))
 
         def lose(result: Ended) -> None:
-            told.append(result)
             process.kill()
 
         with pytest.raises(ConnectionFailed, match="does not answer any more: start it again, and"):
             fly_all(ends_first_only, [0, 1, 2], pool, lose)
-        assert [flight.seed for flight in told] == [0]
     assert list(logs.iterdir()) == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_program_that_is_ended_tells_what_was_flown(
+    number: signal.Signals, tmp_path: Path
+) -> None:
+    """A terminal sends its signals to all that it started."""
+    with scheduler(tmp_path) as (address, _process), worker(address, tmp_path):
+        it = ended(number, 1.0, address)
+    if number != signal.SIGKILL:
+        assert it.code == 130
+        assert it.out == "report 1 stopped: 1 of 6 flights were flown\n"
+        assert it.err.endswith("perchctl: stopped: 1 of 6 flights were flown\n")
 
 
 @pytest.mark.long
@@ -307,19 +249,19 @@ def test_forty_seeds_in_one_process_in_two_and_on_a_cluster(tmp_path: Path) -> N
     """Two of them lose the cluster's worker at first, on the way up."""
     profile, seeds, deadly = load_profile("sim"), range(40), (7, 23)
 
-    def flown(executor: Executor) -> list[dict[str, Any]]:
-        results = fly_all(partial(fly_seed, profile), seeds, executor)
-        return [flown_record(result) for result in results]
+    def flown(executor: Executor, fly: Callable[[int], FlightResult]) -> list[dict[str, Any]]:
+        return [flown_record(result) for result in fly_all(fly, seeds, executor)]
 
     with flight_processes(1) as one:
-        alone = flown(one)
+        alone = flown(one, partial(fly_seed, profile))
     assert [record["seed"] for record in alone] == list(seeds)
     with flight_processes(2) as two:
-        assert flown(two) == alone
-    told: list[FlightResult] = []
-    with cluster_pool("local:2", [profile]) as pool:
-        fly = partial(dies_in_flight, profile, tmp_path, deadly)
-        results = fly_all(fly, seeds, pool, told.append)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(map(str, deadly))
-    assert [flown_record(result) for result in results] == alone
-    assert sorted(result.seed for result in told) == list(seeds)
+        assert flown(two, partial(fly_seed, profile)) == alone
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    with scheduler(tmp_path) as (address, _process), ExitStack() as stack:
+        for _ in range(4):
+            stack.enter_context(worker(address, tmp_path))
+        pool = stack.enter_context(cluster_pool(address, [profile]))
+        assert flown(pool, partial(dies_in_flight, profile, marks, deadly)) == alone
+    assert sorted(path.name for path in marks.iterdir()) == sorted(map(str, deadly))
