@@ -18,50 +18,45 @@ Claim = Literal[
 ]  # fmt: skip
 """A claim of hanging or standing includes that the motors are off. `not seen down` claims that
 no telemetry has shown the vehicle at rest with its motors off."""
-
-
-def _claims(*claims: Claim) -> frozenset[Claim]:
-    return frozenset(claims)
-
-
-ROW_CLAIMS: dict[str, frozenset[Claim]] = {
-    "operator-stop": _claims("motors off"),
-    "hung-but-locked": _claims("hangs", "locked"),
-    "locked": _claims("locked", "motors off"),
-    "tumbled": _claims("ended by the supervisor", "motors off"),
-    "crashed": _claims("ended by the supervisor", "motors off"),
-    "tilted": _claims("tilted", "motors off"),
-    "perched": _claims("hangs on the target"),
-    "hung": _claims("hangs"),
-    "landed": _claims("stands"),
-    "held-elsewhere": _claims("held off the target"),
-    "hangs-or-stands": _claims("hangs or stands"),
-    "landing-timeout": _claims("not seen down"),
+Claims = set[Claim]
+ROW_CLAIMS: dict[str, Claims] = {
+    "operator-stop": {"motors off"},
+    "hung-but-locked": {"hangs", "locked"},
+    "locked": {"locked", "motors off"},
+    "tumbled": {"ended by the supervisor", "motors off"},
+    "crashed": {"ended by the supervisor", "motors off"},
+    "tilted": {"tilted", "motors off"},
+    "perched": {"hangs on the target"},
+    "hung": {"hangs"},
+    "landed": {"stands"},
+    "held-elsewhere": {"held off the target"},
+    "hangs-or-stands": {"hangs or stands"},
+    "landing-timeout": {"not seen down"},
 }
 """The claims in the sentence of each transition that ends a flight."""
-PHASE_CLAIMS = {Phase.PERCHED: _claims("hangs"), Phase.LANDED: _claims("stands")}
-OUTCOME_CLAIMS: dict[Outcome, frozenset[Claim]] = {
-    Outcome.PERCHED: _claims("hangs on the target"),
-    Outcome.TARGET_NOT_FOUND: _claims("stands"),
-    Outcome.ATTEMPTS_USED_UP: _claims("hangs or stands"),
-    Outcome.SAFETY: _claims(),
-    Outcome.EMERGENCY: _claims("motors off"),
-    Outcome.OPERATOR: _claims("hangs or stands"),
+PHASE_CLAIMS: dict[Phase, Claims] = {Phase.PERCHED: {"hangs"}, Phase.LANDED: {"stands"}}
+OUTCOME_CLAIMS: dict[Outcome, Claims] = {
+    Outcome.PERCHED: {"hangs on the target"},
+    Outcome.TARGET_NOT_FOUND: {"stands"},
+    Outcome.ATTEMPTS_USED_UP: {"hangs or stands"},
+    Outcome.SAFETY: set(),
+    Outcome.EMERGENCY: {"motors off"},
+    Outcome.OPERATOR: {"hangs or stands"},
 }
 """The claims in the meaning of each outcome's exit code (`perchctl.errors.EXIT_CODES`)."""
 NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
 HELD_ELSEWHERE = "held-elsewhere"
 """The transitions of flights whose end the program does not know: whether the vehicle hangs or
 stands, and whether it came down at all."""
-RESCUE_CLAIMS: dict[Finding | None, frozenset[Claim]] = {
-    Finding.STANDS: _claims("stands"),
-    Finding.HANGS: _claims("hangs"),
-    Finding.HELD: _claims("held off the target"),
-    Finding.UNKNOWN: _claims("hangs or stands"),
-    None: _claims("not seen down"),
+RESCUE_CLAIMS: dict[Finding | None, Claims] = {
+    Finding.STANDS: {"stands"},
+    Finding.HANGS: {"hangs"},
+    Finding.HELD: {"held off the target"},
+    Finding.UNKNOWN: {"hangs or stands"},
+    None: {"not seen down"},
 }
 """The claims in the note of a rescue, by its finding."""
-REFUSAL_CLAIMS = _claims("stands")
+REFUSAL_CLAIMS: Claims = {"stands"}
 """A refusal claims that no motor was started."""
 
 
@@ -70,19 +65,16 @@ def last_row(report: FlightReport) -> str:
     return report.history[-1].row if report.history else ""
 
 
-def claims_of(report: FlightReport) -> frozenset[Claim]:
+def claims_of(report: FlightReport) -> Claims:
     """Return all claims that a report makes about the vehicle."""
-    return frozenset().union(
-        ROW_CLAIMS.get(last_row(report), frozenset()),
-        PHASE_CLAIMS.get(report.phase, frozenset()),
-        OUTCOME_CLAIMS[report.outcome],
-        _claims("locked") if report.locked else _claims(),
-    )
+    claims = ROW_CLAIMS.get(last_row(report), set()) | PHASE_CLAIMS.get(report.phase, set())
+    locked: Claims = {"locked"} if report.locked else set()
+    return claims | OUTCOME_CLAIMS[report.outcome] | locked
 
 
-def claims_of_rescue(event: Event) -> frozenset[Claim]:
+def claims_of_rescue(event: Event) -> Claims:
     """Return the claims of a rescue's note; none for any other event."""
     if event.kind is not EventKind.NOTE or RESCUE not in event.reason:
-        return _claims()
+        return set()
     found = next(found for found, text in RESCUED.items() if event.reason.endswith(text))
     return RESCUE_CLAIMS[found]

@@ -32,7 +32,6 @@ class ExpectedOutcome:
     within_s: float
     flags: tuple[Flag, ...]
     reason: str
-    chosen: bool = False
 
     def covers(self, flag: Flag, t_s: float, facts: Facts) -> bool:
         """Return True if a flag raised at `t_s` is a consequence of the cause."""
@@ -59,14 +58,6 @@ def _killed_in_landing(facts: Facts) -> float | None:
     return facts.killed_s if facts.does(killed) and facts.own_landing else None
 
 
-def _let_go_after_the_watch(facts: Facts) -> float | None:
-    return facts.let_go_s if facts.watched else None
-
-
-def _slipped_low(facts: Facts) -> float | None:
-    return facts.slipped_s if facts.slipped_m < CATCHABLE_M else None
-
-
 def _knocked_off(facts: Facts) -> float | None:
     if (
         not facts.does(push)
@@ -87,28 +78,26 @@ def _sagged_too_fast(facts: Facts) -> float | None:
 
 
 CUT = ExpectedOutcome(
-    "cut by the firmware", lambda facts: facts.cut_s, 4.0,
-    CUT_DOWN,
+    "cut by the firmware", lambda facts: facts.cut_s, 4.0, CUT_DOWN,
     "2 s after the last setpoint the firmware cuts the motors and locks; nothing that the "
-    "program sends arrives any more", chosen=True,
+    "program sends arrives any more",
 )  # fmt: skip
 LEFT_LANDING = ExpectedOutcome(
     "lands alone", _killed_in_landing, 20.0, ("flies_on",),
     "the vehicle flies its own landing to the end without the program: it comes down, softly",
-    chosen=True,
 )  # fmt: skip
 OPERATOR_STOPS = ExpectedOutcome(
-    "the operator's word", lambda facts: facts.stop_s, 4.0,
-    CUT_DOWN,
-    "a second Ctrl-C is an emergency stop: it cuts the motors and locks", chosen=True,
+    "the operator's word", lambda facts: facts.stop_s, 4.0, CUT_DOWN,
+    "a second Ctrl-C is an emergency stop: it cuts the motors and locks",
 )  # fmt: skip
 LETS_GO_LATER = ExpectedOutcome(
-    "let go after the flight", _let_go_after_the_watch, 4.0, FALL,
+    "let go after the flight", lambda facts: facts.let_go_s if facts.watched else None, 4.0, FALL,
     "the whole weight has hung for the time it is watched; the program is no longer there "
     "when the magnet lets go",
 )  # fmt: skip
 TOO_LOW = ExpectedOutcome(
-    "too low to catch", _slipped_low, 4.0, FALL,
+    "too low to catch",
+    lambda facts: facts.slipped_s if facts.slipped_m < CATCHABLE_M else None, 4.0, FALL,
     "a fall from standing motors takes up to 0.8 m to catch; it hung lower than 1 m",
 )  # fmt: skip
 KNOCKED_OFF = ExpectedOutcome(
@@ -125,14 +114,11 @@ SAGS_TOO_FAST = ExpectedOutcome(
     "from the voltage at which it lands to the one that does not lift the weight any more it "
     "has less time than the way down takes",
 )  # fmt: skip
-
 BROWN_OUT = ExpectedOutcome(
-    "started again", lambda facts: facts.rebooted_s, 4.0,
-    (*FALL, "strayed"),
+    "started again", lambda facts: facts.rebooted_s, 4.0, (*FALL, "strayed"),
     "a vehicle that starts again in the air stops its motors; nothing that the program sends can "
-    "be flown", chosen=True,
+    "be flown",
 )  # fmt: skip
-
 EXPECTED_OUTCOMES = (
     BROWN_OUT, CUT, LEFT_LANDING, OPERATOR_STOPS, LETS_GO_LATER, TOO_LOW, KNOCKED_OFF, NO_LIFT,
     SAGS_TOO_FAST,

@@ -2,31 +2,15 @@
 
 The oracle is given samples of the true vehicle (`Sample`) while the flight and the time
 after it pass. It is told when the operator pressed Ctrl-C, when the program ended, and what it
-claimed, and raises flags, the gravest first:
-
-- *crashed*: the program ended by an exception that no fault planted;
-- *fell*: motors off, or free fall, above 0.1 m while the weight does not hang; a
-  touchdown above 0.8 m/s downwards. A vehicle that the magnet lets go of with its motors still is
-  judged by how deep it falls until it is caught (`drop_limit_m`); the floor is too deep;
-- *slid*: a touchdown above 0.5 m/s sideways;
-- *flies_on*: off the ground with turning motors 5 s after the program's end (what falls
-  with still motors has fallen), or not on its way down in time after a loss for which the
-  profile lands (`perchctl.faults.bounds.DescentBound`);
-- *endless*: the flight did not end by itself;
-- *stop_not_obeyed*: the motors turn 0.5 s after the second Ctrl-C or later, though all that time
-  packets passed from the program to the vehicle;
-- *pressed*: the motors press against ceiling or floor for more than 4 s;
-- *strayed*: in the air more than 1 m from where it should be (`perchctl.faults.bounds.PlaceBound`),
-  or truly above the height limit by more than 0.3 m;
-- *lied*: one of the program's claims contradicts what is true of the vehicle, or motors that it
-  said are off turn again;
-- *locked_needlessly*: locked in the end, although it was never crashed, tumbled or tilted.
+claimed, and raises flags, the gravest first (docs/campaigns.md, "Faults"). A vehicle that the
+magnet lets go of with its motors still is judged by how deep it falls until it is caught
+(`drop_limit_m`); the floor is too deep.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal, NamedTuple, get_args
@@ -184,7 +168,7 @@ class Oracle:
         self._muted_s = -math.inf  # when last nothing arrived
         self._end_s = math.inf
 
-    def claims(self, claims: frozenset[Claim], t_s: float) -> None:
+    def claims(self, claims: Iterable[Claim], t_s: float) -> None:
         """Note claims that the program made at `t_s`."""
         self._claims |= dict.fromkeys(claims, t_s)
 

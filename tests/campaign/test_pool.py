@@ -22,7 +22,6 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.campaign import defer_interrupts, flight_processes, fly_all
 from perchctl.campaign.flights import fly_seed
 from perchctl.campaign.pool import FLOWN_AGAIN
-from perchctl.campaign.results import peak_memory_mb
 from perchctl.commands.interrupt import signals_to
 from perchctl.commands.simulate import (
     AGAIN_S,
@@ -45,7 +44,6 @@ from tests.helpers.seeds import (
     is_killed_later,
     is_lost,
     lacks_a_module,
-    no_form,
 )
 
 pytestmark = pytest.mark.long
@@ -212,12 +210,6 @@ def test_a_flight_that_is_lost_always_is_told(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == FLOWN_AGAIN + 1
 
 
-def test_what_has_no_form_is_told_and_ends_no_process() -> None:
-    with flight_processes(1) as pool:
-        assert pool.submit(no_form).exception() is not None
-        assert pool.submit(len, (1, 2)).result() == 2
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_program_that_is_ended_leaves_nothing_behind(number: signal.Signals) -> None:
     """No process that flies on, and, where it could, no warning of semaphores; a terminal
@@ -252,15 +244,6 @@ def held_mb(profile: Profile, seed: int) -> float:
     """By this process, after a flight."""
     fly_seed(profile, seed)
     return int(STATM.read_text().split()[1]) * resource.getpagesize() * 1e-6
-
-
-def test_a_peak_stays() -> None:
-    before_mb = peak_memory_mb()
-    block = bytearray(b"x") * int(1e6 * (before_mb + 60.0))  # more than was ever held
-    while_held_mb = peak_memory_mb()
-    del block
-    assert before_mb + 50.0 < while_held_mb < 2.5 * before_mb + 200.0
-    assert peak_memory_mb() == pytest.approx(while_held_mb, abs=5.0)
 
 
 @pytest.mark.skipif(not STATM.exists(), reason="only Linux tells what is held now")

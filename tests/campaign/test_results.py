@@ -121,19 +121,6 @@ def test_progress_is_one_line_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> 
     assert len(lines[-2]) <= 80
 
 
-def test_progress_elsewhere_is_a_line_now_and_then() -> None:
-    now_s = [0.0]
-    plain = io.StringIO()
-    with progress_bar(100, plain, [LANDED], lambda: now_s[0]) as advance:
-        for _ in range(12):
-            now_s[0] += 2.0
-            advance(PERCHED)
-    assert plain.getvalue().splitlines() == [
-        "perchctl: flown 6 of 100 30.0/min 0:03:08 left 1 landed 5 perched",
-        "perchctl: flown 11 of 100 30.0/min 0:02:58 left 1 landed 10 perched",
-    ]
-
-
 # --- refused before take-off: a result of the campaign, not its end -----------------------------
 
 

@@ -86,13 +86,6 @@ def test_all_that_looks_like_its_target_may_be_flown_to() -> None:
     )
 
 
-def test_a_target_that_moved_is_followed() -> None:
-    made = bound(P.PERCH, at=(2.0, 0.0))
-    made.target_at((2.0, 0.3))
-    assert made.astray_m((2.0, 0.3)) == 0.0
-    assert made.astray_m((2.0, 0.0)) == 0.0
-
-
 def drifted(
     *effects: e.Effect, after_s: float, by_target: bool = True, phase: Phase = P.SEARCH
 ) -> float:
@@ -125,11 +118,6 @@ def test_a_slide_of_before_is_forgotten_once_it_is_under_the_target() -> None:
     drift = UnfeltDrift((SLIDE,), SCENARIO, by_target=False)
     way = [(1.0, P.SEARCH), (2.0, P.ALIGN), (3.0, P.ASCEND), (4.0, P.LANDING)]
     assert [drift.after_m(*each) for each in way] == pytest.approx([0.5, 0.5, 0.0, 0.5])
-
-
-def test_a_push_is_felt_where_something_else_than_the_target_tells_the_position() -> None:
-    push = partial(e.push, force_n=(0.042, 0.0, 1.0), for_s=2.0)
-    assert drifted(push, after_s=1.0, by_target=False) == 0.0
 
 
 # --- the way down -----------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import Any
 
@@ -10,7 +9,6 @@ import pytest
 
 from perchctl.faults import FAULTS
 from perchctl.faults import effects as e
-from perchctl.faults.catalogue import Case, draw_case
 from perchctl.faults.expected_outcomes import (
     BROWN_OUT,
     CUT,
@@ -26,11 +24,7 @@ from perchctl.faults.expected_outcomes import (
     unexpected,
 )
 from perchctl.faults.oracle import FLAGS
-from perchctl.faults.truth import LEAST_LIFT, Facts
-from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission import Phase
-from perchctl.profile import Profile, load_profile
-from perchctl.sim import MOTOR_FORCE_N, Scenario, draw_scenario, most_thrust_n
+from perchctl.faults.truth import Facts
 
 BLOW = partial(e.push, force_n=(0.7, 0.0, 0.0), for_s=0.04)
 
@@ -120,55 +114,3 @@ def test_other_flags_count_whatever_was_expected() -> None:
     flags: dict[Any, float] = {"fell": 10.5, "lied": 10.5}
     assert unexpected(flags, (CUT, OPERATOR_STOPS), Facts(stop_s=10.0)) == ("lied",)
     assert unexpected(flags, (), Facts(stop_s=10.0)) == ("fell", "lied")
-
-
-# --- how many drawn cases may have one ------------------------------------------------
-
-RELEASED_S, TEARS_OFF_N = 1.0, 0.42
-"""The motors stand still no sooner after the contact, and what a hanging vehicle needs at the least
-to be torn off."""
-WATCHED_S, LOOKED_S = 5.2, 6.0
-"""From contact to the end of the watch, with the shipped profiles' times, and for how long the
-oracle looks on from there."""
-
-
-def may_come(outcome: ExpectedOutcome, case: Case, scenario: Scenario) -> bool:
-    """Whether the cause of a rare outcome may come in a drawn case, by what was drawn alone: at
-    most as strict as the flight itself is."""
-    for effect in case.effects:
-        act, values = effect.func, effect.keywords
-        if outcome is LETS_GO_LATER and act is e.magnet_lets_go:
-            return WATCHED_S < float(values["after_s"]) < WATCHED_S + LOOKED_S
-        if outcome is TOO_LOW and act in (e.magnet_holds, e.magnet_lets_go):
-            return scenario.ceiling_z_m < 1.0
-        if outcome is KNOCKED_OFF and act is e.push:
-            hangs = case.phase is Phase.COMPLETE and case.moment_s > RELEASED_S
-            hangs = hangs or case.landed_from in (Phase.PERCH, Phase.COMPLETE)
-            return hangs and math.hypot(*values["force_n"]) > TEARS_OFF_N
-        if outcome is NO_LIFT and act is e.thrust_changed:
-            return is_too_weak(scenario, min(values["to"]), 0.0)
-        if outcome is SAGS_TOO_FAST and act is e.battery_sags:
-            return is_too_weak(scenario, 1.0, values["by_v"])
-    return False
-
-
-def is_too_weak(scenario: Scenario, strength: float, by_v: float) -> bool:
-    lift_n = strength * most_thrust_n(scenario.battery_rest_v - by_v - 0.1)
-    weight_n = scenario.mass_kg * GRAVITY_MPS2
-    return bool(min(4.0 * MOTOR_FORCE_N, lift_n) < LEAST_LIFT * weight_n)
-
-
-@pytest.mark.parametrize("name", ["sim", "target_only"])
-def test_fewer_than_one_drawn_case_in_a_hundred_may_have_a_rare_one(name: str) -> None:
-    """The user's stop, the firmware's own cut, a killed program and the battery's break-down
-    aside."""
-    profile: Profile = load_profile(name)
-    drawn, rare = 5000, 0
-    for seed in range(drawn):
-        fault = draw_case(seed, Scenario()).fault  # whatever the scenario, the same one
-        outcomes = [outcome for outcome in fault.expected if not outcome.chosen]
-        if outcomes:
-            scenario = draw_scenario(profile, seed)
-            case = draw_case(seed, scenario)
-            rare += any(may_come(outcome, case, scenario) for outcome in outcomes)
-    assert 0 < rare < 0.01 * drawn

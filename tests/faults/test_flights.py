@@ -19,7 +19,6 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 import cv2
 from typer.testing import CliRunner
 
-from perchctl.campaign.results_file import flown_record
 from perchctl.commands import app
 from perchctl.commands.fly import POSITIONINGS, with_positioning
 from perchctl.errors import SafetyAbort
@@ -29,7 +28,7 @@ from perchctl.faults.catalogue import BY_NAME, Fault, case_of, draw_case
 from perchctl.faults.claims import NOT_KNOWN, UNCONFIRMED
 from perchctl.faults.edges import PlantedError
 from perchctl.faults.effects import FOR_EVER, deck_silent
-from perchctl.faults.flight import fly_fault_seed, fly_with_fault
+from perchctl.faults.flight import fly_with_fault
 from perchctl.faults.oracle import FLAGS
 from perchctl.faults.promises import PROMISES, Promise
 from perchctl.faults.results import ENDS, worst_first
@@ -270,13 +269,6 @@ def test_a_flight_that_does_not_end_is_counted(monkeypatch: pytest.MonkeyPatch) 
     assert result.flags["endless"] == pytest.approx(5.0, abs=0.1)
 
 
-@pytest.mark.long
-def test_the_same_seed_is_the_same_flight() -> None:
-    short = profile()
-    one, two = (fly_fault_seed(short, SEED, ("operator-once",)) for _ in range(2))
-    assert flown_record(one) == flown_record(two)
-
-
 # --- figures, table, picture ----------------------------------------------------------
 
 
@@ -343,29 +335,6 @@ def simulate(*arguments: str) -> Any:
 
 
 LOW = ("--faults", "low-bare-ceiling,hang-up")
-
-
-@pytest.mark.long
-def test_the_command_prints_one_object(tmp_path: Path) -> None:
-    options = (*LOW, "-n", "1", "--seed", str(SEED), "--json", "--log-dir", str(tmp_path))
-    done = simulate(*options)
-    assert done.exit_code == 0
-    assert set(json.loads(done.stdout)) == set(fault_summary(RESULTS))
-    assert (tmp_path / f"flight_seed{SEED}.jsonl").exists()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("by", ["mocap", "target"])
-def test_the_campaign_asks_each_positioning(by: str, tmp_path: Path) -> None:
-    out = tmp_path / "flown.jsonl"
-    done = simulate(
-        "--positioning", by, "--faults", "hang-up", "-n", "1", "--seed", "8", "--out", str(out)
-    )
-    assert done.exit_code == 0
-    flight = json.loads(out.read_text(encoding="utf-8").splitlines()[1])
-    assert flight["scenario"]["extra"]["external_position"] == 1.0  # and no deck
-    assert flight["end"] in ("landed", "perched", "aborted")
-    assert flight["begin_s"] is not None
 
 
 @pytest.mark.long

@@ -9,7 +9,6 @@ import pytest
 
 from perchctl.faults.claims import Claim
 from perchctl.faults.oracle import (
-    FLAGS,
     SAY_OFF,
     Oracle,
     Sample,
@@ -124,12 +123,6 @@ def test_what_is_a_flag_and_what_is_not_yet_one(
     assert script.show(before, 1.0).flags == flags
 
 
-def test_the_flags_stand_in_the_order_in_which_they_came() -> None:
-    script = Script((HOVER._replace(astray_m=2.0), 0.1), (HOVER._replace(motors_on=False), 0.3))
-    assert list(script.oracle.flags) == ["strayed", "fell"]
-    assert set(script.oracle.flags) <= set(FLAGS)
-
-
 # --- falls and touchdowns -----------------------------------------------------------------------
 
 
@@ -188,12 +181,6 @@ def test_a_slip_to_the_floor_is_a_fall(height_m: float, acc: float, ended: bool)
     assert script.sink(STILL_FALL._replace(height_m=height_m), falling(acc, 2.0)).flags == {"fell"}
 
 
-def test_a_controlled_descent_is_no_fall() -> None:
-    script = Script((HOVER, 0.5)).sink(HOVER, iter([0.35] * 300)).show(FLOOR, 1.0)
-    assert script.flags == set()
-    assert script.oracle.drop_m == 0.0
-
-
 @pytest.mark.parametrize(
     ("times", "press_s", "pause_s", "flags"),
     [(3, 3.0, 0.3, set()), (50, 0.05, 0.05, {"pressed"})],
@@ -243,11 +230,6 @@ def test_lied(claim: Claim) -> None:
     for truths, flags in zip(TRUTHS[claim], (set(), {"lied"}), strict=True):
         for truth in truths:
             assert Script((truth, 1.0)).claim(claim).show(truth, 2.0).flags == flags, truth
-
-
-def test_each_of_several_claims_has_to_be_true() -> None:
-    script = Script((HANGING, 1.0)).claim("hangs", "locked")
-    assert script.show(HANGING, 2.0).flags == {"lied"}
 
 
 def test_what_tilted_and_crashed_before_did_so() -> None:
@@ -303,13 +285,6 @@ def test_what_flies_on_after_the_end(truth: Sample, flags: set[str]) -> None:
     script = Script((truth, 1.0)).end()
     assert script.show(truth, 4.9).flags == set()
     assert script.show(truth, 0.3).flags == flags
-
-
-@pytest.mark.parametrize("how", ["crashed", "endless"])
-def test_how_the_program_ended(how: str) -> None:
-    script = Script((FLOOR, 1.0))
-    script.oracle.ended(script.t_s, **{how: True})
-    assert script.show(FLOOR, 1.0).oracle.flags == {how: pytest.approx(1.0)}
 
 
 def every(period_s: float, for_s: float) -> list[float]:

@@ -139,13 +139,6 @@ def test_silence_that_ends_in_a_cut() -> None:
     assert not it.facts.own_landing
 
 
-@pytest.mark.parametrize(("silent_s", "locked"), [(0.5, False), (3.0, True)])
-def test_a_lock_that_no_silence_brought_is_no_cut(silent_s: float, locked: bool) -> None:
-    it = Recorded().show(HOVER, 1.0, locked=locked)
-    it.show(HOVER, silent_s, uplink=False, locked=locked)
-    assert it.show(HOVER, 1.0, uplink=False, locked=True).facts.cut_s is None
-
-
 @pytest.mark.parametrize(
     ("silent_s", "heard_s", "emergency", "cut"),
     [
