@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
+from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -70,8 +71,8 @@ def main() -> int:
                 f"(limit {drop_limit_m(high):g} m)"
             )
     bad = [(part, r) for part, r in flown if r.flags]
-    ends = {end: sum(r.end == end for _, r in flown) for end in ("perched", "landed", "aborted")}
-    print(f"{ends}; with a flag: {len(bad)}")
+    ends = Counter(r.outcome for _, r in flown)
+    print(f"{dict(ends)}; with a flag: {len(bad)}")
     for part, r in bad:
         print(f"  seed {r.seed}, carries {part:.2f}: {dict(r.flags)}, {r.reason}")
     return 1 if bad else 0

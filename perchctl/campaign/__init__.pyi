@@ -12,6 +12,7 @@ from .flights import fly_measured as fly_measured
 from .flights import seed_log_path as seed_log_path
 from .pool import defer_interrupts as defer_interrupts
 from .pool import flight_processes as flight_processes
+from .results import CampaignFlight as CampaignFlight
 from .results import FlightResult as FlightResult
 from .results import align_columns as align_columns
 from .results import campaign_summary as campaign_summary
@@ -20,5 +21,4 @@ from .results import none_took_off as none_took_off
 from .results import peak_mb as peak_mb
 from .results import rate_record as rate_record
 from .results import rate_text as rate_text
-from .results_file import CampaignFlight as CampaignFlight
 from .results_file import campaign_results as campaign_results

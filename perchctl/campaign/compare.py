@@ -80,6 +80,7 @@ def whole_seeds(results: Iterable[VariantResult], profiles: int) -> list[tuple[F
 # --- What is compared --------------------------------------------------------------------------
 
 
+Pair = tuple[FlightResult, FlightResult]
 Comparison = dict[str, Any]
 """What is known of two flights a seed, A's and B's, ready for JSON, in SI; `better` is "A", "B", or
 None where nothing is proven:
@@ -107,17 +108,16 @@ name, its unit, and the number of units in one of SI."""
 MISS = ("miss_m",)
 
 
-def compare_variants(
-    results: Iterable[VariantResult],
-    profiles: int = 2,
-    numbers: tuple[int, int] = (0, 1),
-    figures: Sequence[str] = tuple(FIGURES),
-    times_asked: int = 1,
+def compare_variants(results: Iterable[VariantResult]) -> Comparison:
+    """Return the comparison of two profiles by the seeds that both have flown."""
+    return compare_pairs([(a, b) for a, b in whole_seeds(results, 2)])
+
+
+def compare_pairs(
+    pairs: Sequence[Pair], figures: Sequence[str] = tuple(FIGURES), times_asked: int = 1
 ) -> Comparison:
-    """Return the comparison of the profiles of two `numbers`, A and B, by the seeds that all have
-    flown. `times_asked`: the number of comparisons that share the 5 %."""
-    a, b = numbers
-    pairs = [(flown[a], flown[b]) for flown in whole_seeds(results, profiles)]
+    """Return the comparison of two flights per seed. `times_asked`: the number of comparisons
+    that share the 5 %."""
     questions = times_asked * (1 + len(figures))
     level = 1.0 - (1.0 - LEVEL) / questions
     return {
@@ -132,7 +132,7 @@ def _ending(r: FlightResult) -> tuple[Any, ...]:
     return r.outcome, r.reason, r.miss_m, r.time_s, r.attempts, r.locked, r.fell
 
 
-def _success(pairs: Sequence[tuple[FlightResult, FlightResult]], questions: int) -> dict[str, Any]:
+def _success(pairs: Sequence[Pair], questions: int) -> dict[str, Any]:
     only_a = sum(b.is_bad and not a.is_bad for a, b in pairs)
     only_b = sum(a.is_bad and not b.is_bad for a, b in pairs)
     p = float(binomtest(only_a, only_a + only_b).pvalue) if only_a + only_b else 1.0
@@ -147,9 +147,7 @@ def _success(pairs: Sequence[tuple[FlightResult, FlightResult]], questions: int)
     return {**rates, "only_a": only_a, "only_b": only_b, "p": round(p, 9), "better": better}
 
 
-def _difference(
-    key: str, pairs: Sequence[tuple[FlightResult, FlightResult]], level: float
-) -> dict[str, Any]:
+def _difference(key: str, pairs: Sequence[Pair], level: float) -> dict[str, Any]:
     flown = [(a, b) for a, b in pairs if "refused" not in (a.outcome, b.outcome)]
     both = [(getattr(a, key), getattr(b, key)) for a, b in flown]
     values = np.array([pair for pair in both if None not in pair], float)
@@ -214,57 +212,43 @@ def _verdict(better: str | None, by: str = "") -> str:
 
 @dataclass(frozen=True)
 class Sweep:
-    """The profiles of a sweep, one for each value of a key. `texts` are the values; number `own`
-    is the profile's own, added at the end if the sweep does not name it."""
+    """The profiles of a sweep, one for each value of a key; the last one is the profile's own."""
 
     key: str
-    texts: tuple[str, ...]
     profiles: tuple[Profile, ...]
-    own: int
 
-    def record(self, results: Iterable[VariantResult]) -> dict[str, Any]:
+    def record(self, results: Sequence[VariantResult]) -> dict[str, Any]:
         """Return the figures of each value (a cell), by the seeds that were flown with every
         value, for JSON. `best`: the value with the most successes, of these the one with the
         smallest median miss; `best_against_own` is the `Comparison` of the own value, A, with it,
         None where they are the same. What is proven there counts that it was picked out of all."""
-        results = tuple(results)
         seeds = whole_seeds(results, len(self.profiles))
-        cells: list[dict[str, Any]] = [
-            {"values": {self.key: profile_value(profile, self.key)}, "own": number == self.own}
+        own = len(self.profiles) - 1
+        cells = [
+            {"value": profile_value(profile, self.key), "own": number == own}
             | _figures([flown[number] for flown in seeds])
             for number, profile in enumerate(self.profiles)
         ]
-
-        def rank(number: int) -> tuple[float, ...]:
-            median_m = cells[number]["miss_m"]["median"]
-            miss_m = math.inf if median_m is None else median_m
-            return -cells[number]["good"], miss_m, number != self.own, number
-
-        best = min(range(len(cells)), key=rank)
+        best = min(range(len(cells)), key=lambda number: _rank(cells[number]))
         against = None
-        if best != self.own:
-            against = compare_variants(
-                results, len(cells), (self.own, best), MISS, times_asked=len(cells) - 1
-            )
-        return {"cells": cells, "best": cells[best]["values"], "best_against_own": against}
+        if best != own:
+            pairs = [(flown[own], flown[best]) for flown in seeds]
+            against = compare_pairs(pairs, MISS, times_asked=own)
+        return {"cells": cells, "best": cells[best]["value"], "best_against_own": against}
 
     def text(self, record: dict[str, Any]) -> str:
         """Return the table of a sweep's `record`, and how the best value compares."""
         rows: list[tuple[str, ...]] = [(self.key, "success", "miss [mm]: median", "p95", "")]
-        for text, cell in zip(self.texts, record["cells"], strict=True):
+        for cell in record["cells"]:
             misses = ("-" if m is None else f"{1e3 * m:.1f}" for m in cell["miss_m"].values())
             rate = rate_text(cell["good"], cell["flights"])
-            is_best = cell["values"] == record["best"]
-            notes = [word for word, on in (("best", is_best), ("own", cell["own"])) if on]
-            rows.append((text, rate, *misses, ", ".join(notes)))
-        lines = [*align_columns(rows), ""]
-        if not record["cells"][0]["flights"]:
-            return "\n".join([*lines, "no seed was flown with every value: nothing can be said"])
-        if record["best_against_own"] is None:
-            return "\n".join([*lines, "the profile's own value is the best"])
-        counted = f"the best was picked out of {len(rows) - 1}, which is counted:"
-        table = comparison_text(("own", "best"), record["best_against_own"])
-        return "\n".join([*lines, counted, table])
+            note = "own" if cell["own"] else ""
+            rows.append((scalar_text(cell["value"]), rate, *misses, note))
+        lines = [*align_columns(rows), "", f"best: {scalar_text(record['best'])}"]
+        if record["best_against_own"] is not None:
+            lines += [f"picked out of {len(rows) - 1}, which is counted:"]
+            lines += [comparison_text(("own", "best"), record["best_against_own"])]
+        return "\n".join(lines)
 
 
 def make_sweep(profile: Profile, sweep: str) -> Sweep:
@@ -281,19 +265,17 @@ def make_sweep(profile: Profile, sweep: str) -> Sweep:
             f"planner.align.xy_m=0.02,0.04"
         )
     profiles = [changed_profile(profile, [f"{key}={text}"], "sweep") for text in texts]
-    if profile not in profiles:
-        profiles.append(profile)
-        texts.append(scalar_text(profile_value(profile, key)))
-    return Sweep(key, tuple(texts), tuple(profiles), profiles.index(profile))
+    return Sweep(key, (*(other for other in profiles if other != profile), profile))
 
 
 def _figures(results: Sequence[FlightResult]) -> dict[str, Any]:
     """Return the figures of one value's flights."""
     good = sum(not r.is_bad for r in results)
     misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
-    return {
-        "flights": len(results),
-        "good": good,
-        **rate_record(good, len(results)),
-        "miss_m": miss_record(misses),
-    }
+    rate = rate_record(good, len(results))
+    return {"flights": len(results), "good": good, **rate, "miss_m": miss_record(misses)}
+
+
+def _rank(cell: dict[str, Any]) -> tuple[float, ...]:
+    median_m = cell["miss_m"]["median"]
+    return -cell["good"], math.inf if median_m is None else median_m, not cell["own"]

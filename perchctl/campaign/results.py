@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import resource
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -22,7 +22,34 @@ WORST = 5
 
 
 @dataclass(frozen=True)
-class FlightResult:
+class CampaignFlight:
+    """What the results of all kinds of campaigns have.
+
+    Attributes:
+        log, log_problem: the flight's log, and what it lacks; None without.
+        cpu_s: what it took of a core.
+        peak_memory_mb: the most that the process that flew it had ever held by its end (1e6
+            bytes).
+        scenario: what the seed drew.
+    """
+
+    seed: int
+    outcome: str
+    _: KW_ONLY
+    log: Path | None = None
+    log_problem: str | None = None
+    cpu_s: float = 0.0
+    peak_memory_mb: float = 0.0
+    scenario: Scenario | None = None
+
+    @property
+    def is_bad(self) -> bool:
+        """True if the flight went wrong."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class FlightResult(CampaignFlight):
     """One simulated flight.
 
     Attributes:
@@ -33,14 +60,8 @@ class FlightResult:
         attempts: perching attempts, the successful one included.
         locked: the supervisor had locked the vehicle at the end.
         fell: it hit the floor other than by landing.
-        cpu_s: what it took of a core.
-        peak_memory_mb: the most that the process that flew it had ever held by its end (1e6
-            bytes).
-        scenario: what the seed drew.
-        log, log_problem: the flight's log, and what it lacks; None without.
     """
 
-    seed: int
     outcome: FlightEnd
     reason: str
     miss_m: float | None
@@ -48,11 +69,6 @@ class FlightResult:
     attempts: int
     locked: bool
     fell: bool
-    log: Path | None = None
-    log_problem: str | None = None
-    cpu_s: float = 0.0
-    peak_memory_mb: float = 0.0
-    scenario: Scenario | None = None
 
     @property
     def is_bad(self) -> bool:
@@ -89,9 +105,9 @@ def miss_record(misses_m: Sequence[float]) -> dict[str, float | None]:
     return {"median": median_m, "p95": p95_m}
 
 
-def peak_mb(results: Iterable[Any]) -> float:
+def peak_mb(results: Iterable[CampaignFlight]) -> float:
     """Return the largest memory, in 1e6 bytes, that this process or one that flew has held."""
-    peaks = (float(r.peak_memory_mb) for r in results)
+    peaks = (r.peak_memory_mb for r in results)
     return round(max([peak_memory_mb(), *peaks]), 1)
 
 

@@ -14,9 +14,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO, Generic, Protocol, TypeVar
+from typing import Any, BinaryIO, Generic, TypeVar
 
 import perchctl
+from perchctl.campaign.results import CampaignFlight
 from perchctl.errors import InvalidValue
 from perchctl.files import cannot_be_written, check_place
 from perchctl.profile import Profile
@@ -29,26 +30,6 @@ from perchctl.record import (
     path_beside,
     to_exact,
 )
-
-
-class CampaignFlight(Protocol):
-    """The result of a flight, of any kind of campaign."""
-
-    @property
-    def seed(self) -> int: ...
-
-    @property
-    def outcome(self) -> str: ...
-
-    @property
-    def is_bad(self) -> bool: ...
-
-    @property
-    def log(self) -> Path | None: ...
-
-    @property
-    def log_problem(self) -> str | None: ...
-
 
 R = TypeVar("R", bound=CampaignFlight)
 

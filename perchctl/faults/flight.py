@@ -11,9 +11,7 @@ from perchctl.calibration import profile_camera
 from perchctl.campaign import fly_measured, seed_log_path
 from perchctl.errors import PerchError
 from perchctl.faults import effects as e
-from perchctl.faults.bounds import DescentBound, PlaceBound, UnfeltDrift
 from perchctl.faults.catalogue import BY_NAME, FROM_THE_START, Case, draw_case
-from perchctl.faults.claims import REFUSAL_CLAIMS, claims_of, claims_of_rescue, last_row
 from perchctl.faults.edges import (
     Edges,
     FaultyCamera,
@@ -23,9 +21,23 @@ from perchctl.faults.edges import (
     ProgramKilled,
 )
 from perchctl.faults.expected_outcomes import unexpected
-from perchctl.faults.oracle import Oracle, Sample
+from perchctl.faults.oracle import (
+    REFUSAL_CLAIMS,
+    Oracle,
+    Sample,
+    claims_of,
+    claims_of_rescue,
+    last_row,
+)
 from perchctl.faults.results import End, FaultResult
-from perchctl.faults.truth import FactsRecorder, WatchedVehicle, sample_of
+from perchctl.faults.truth import (
+    DescentBound,
+    FactsRecorder,
+    PlaceBound,
+    UnfeltDrift,
+    WatchedVehicle,
+    sample_of,
+)
 from perchctl.flight import (
     FlightParts,
     OperatorSwitch,
@@ -211,7 +223,7 @@ class FaultyFlight:
             moment_s=case.moment_s,
             begin_s=facts.begin_s,
             parameters=_parameters(case),
-            end=end,
+            outcome=end,
             reason=reason,
             flags=oracle.flags,
             counted=unexpected(oracle.flags, listed, facts),

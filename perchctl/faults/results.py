@@ -6,14 +6,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, get_args
 
-from perchctl.campaign import align_columns, peak_mb, rate_record, rate_text
+from perchctl.campaign import CampaignFlight, align_columns, peak_mb, rate_record, rate_text
 from perchctl.faults.catalogue import AIR, FAULTS
-from perchctl.faults.claims import NOT_KNOWN, UNCONFIRMED
-from perchctl.faults.oracle import FLAGS, Flag
-from perchctl.sim import Scenario
+from perchctl.faults.oracle import FLAGS, NOT_KNOWN, UNCONFIRMED, Flag
 
 End = Literal["perched", "landed", "aborted", "refused", "failed", "gone"]
 """`refused`: it never took off; `failed`: an exception ended the flight, after the rescue;
@@ -21,7 +18,7 @@ End = Literal["perched", "landed", "aborted", "refused", "failed", "gone"]
 
 
 @dataclass(frozen=True)
-class FaultResult:
+class FaultResult(CampaignFlight):
     """One flight.
 
     Attributes:
@@ -33,17 +30,14 @@ class FaultResult:
         row: of the mission's table, that ended the flight; empty where none did.
         drop_m: the deepest fall until caught, in the simulation's truth.
         astray_m: in the air, the farthest from where it should have been.
-        log, log_problem: the flight's log, and what it lacks; None without.
-        cpu_s, peak_memory_mb, scenario: as `perchctl.campaign.FlightResult` has them.
     """
 
-    seed: int
+    outcome: End
     fault: str
     phase: str
     moment_s: float
     begin_s: float | None
     parameters: dict[str, Any]
-    end: End
     reason: str
     flags: dict[Flag, float]
     counted: tuple[Flag, ...]
@@ -54,15 +48,6 @@ class FaultResult:
     row: str = ""
     expected: tuple[str, ...] = ()
     astray_m: float = 0.0
-    log: Path | None = None
-    log_problem: str | None = None
-    cpu_s: float = 0.0
-    peak_memory_mb: float = 0.0
-    scenario: Scenario | None = None
-
-    @property
-    def outcome(self) -> str:
-        return self.end
 
     @property
     def is_bad(self) -> bool:
@@ -94,7 +79,7 @@ def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
     """
     return {
         "flights": len(results),
-        **{end: sum(r.end == end for r in results) for end in ENDS},
+        **{end: sum(r.outcome == end for r in results) for end in ENDS},
         **{flag: sum(flag in r.counted for r in results) for flag in FLAGS},
         "unavoidable": sum(r.is_excused for r in results),
         "expected_outcomes": dict(Counter(name for r in results for name in r.expected)),
@@ -152,4 +137,4 @@ def _cell(flights: Sequence[FaultResult]) -> str:
 
 def _line(r: FaultResult) -> tuple[str, ...]:
     flags = ", ".join(flag.replace("_", " ") for flag in r.counted)
-    return str(r.seed), r.fault, r.phase, flags, r.end
+    return str(r.seed), r.fault, r.phase, flags, r.outcome

@@ -29,7 +29,7 @@ SIM = load_profile("sim")
 SCENARIO = draw_scenario(SIM, 17)
 FLOWN = FlightResult(
     0, "perched", "hanging still", 0.1 / 3, 20.0, 1, False, False,
-    Path("logs/a.jsonl"), None, 4.0, 200.0, SCENARIO,
+    log=Path("logs/a.jsonl"), cpu_s=4.0, peak_memory_mb=200.0, scenario=SCENARIO,
 )  # fmt: skip
 
 

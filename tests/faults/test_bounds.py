@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 
 from perchctl.faults import effects as e
-from perchctl.faults.bounds import (
+from perchctl.faults.truth import (
     LASTS_S,
     LOW_M,
     REACTION_S,

@@ -8,17 +8,17 @@ import pytest
 
 from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.errors import EXIT_CODES
-from perchctl.faults.claims import (
+from perchctl.faults.oracle import (
     NOT_KNOWN,
     OUTCOME_CLAIMS,
     PHASE_CLAIMS,
     RESCUE_CLAIMS,
     ROW_CLAIMS,
+    SAY_OFF,
     UNCONFIRMED,
     claims_of,
     claims_of_rescue,
 )
-from perchctl.faults.oracle import SAY_OFF
 from perchctl.flight import RESCUED
 from perchctl.mission import RESCUE, Event, EventKind, Finding, FlightReport, Outcome, Phase
 from perchctl.mission.state import TERMINALS, MotorStop

@@ -25,11 +25,10 @@ from perchctl.errors import SafetyAbort
 from perchctl.faults import FAULTS, FaultResult, fault_summary, fault_table
 from perchctl.faults import flight as faulty
 from perchctl.faults.catalogue import BY_NAME, Fault, case_of, draw_case
-from perchctl.faults.claims import NOT_KNOWN, UNCONFIRMED
 from perchctl.faults.edges import PlantedError
 from perchctl.faults.effects import FOR_EVER, deck_silent
 from perchctl.faults.flight import fly_with_fault
-from perchctl.faults.oracle import FLAGS
+from perchctl.faults.oracle import FLAGS, NOT_KNOWN, UNCONFIRMED
 from perchctl.faults.promises import PROMISES, Promise
 from perchctl.faults.results import ENDS, worst_first
 from perchctl.flight import loop
@@ -98,10 +97,10 @@ def test_each_fault_stands_under_one_line_of_the_readme() -> None:
 def test_a_broken_promise_is_seen() -> None:
     once = promise_of("operator-once")
     assert once.is_kept(made(1, "operator-once", Phase.ALIGN))
-    assert not once.is_kept(made(1, "operator-once", Phase.ALIGN, end="aborted"))
+    assert not once.is_kept(made(1, "operator-once", Phase.ALIGN, outcome="aborted"))
     assert not once.is_kept(made(1, "operator-once", Phase.ALIGN, counted=("fell",)))
     silent = promise_of("downlink-silent")
-    unseen = {"end": "aborted", "row": UNCONFIRMED}
+    unseen = {"outcome": "aborted", "row": UNCONFIRMED}
     assert silent.is_kept(made(1, "downlink-silent", Phase.ALIGN, **unseen))
     assert not once.is_kept(made(1, "operator-once", Phase.ALIGN, **unseen))
     turned = promise_of("camera-turned")
@@ -151,7 +150,7 @@ def test_it_does_not_climb_with_an_estimate_that_nothing_corrects(
 ) -> None:
     """Where a deck's positions end it was landed 5.6 s later, from a metre higher up."""
     flight, result = deck_lost(phase, FOR_EVER, acc_z_mps2)
-    assert (result.end, result.counted) == ("landed", ()), result
+    assert (result.outcome, result.counted) == ("landed", ()), result
     assert flight.landed_for_s < 1.0
     assert flight.rise_m < 0.15
 
@@ -159,7 +158,7 @@ def test_it_does_not_climb_with_an_estimate_that_nothing_corrects(
 @pytest.mark.long
 def test_a_deck_that_is_blind_for_a_moment_is_waited_for() -> None:
     flight, result = deck_lost(Phase.ALIGN, 0.3, -0.08)
-    assert (result.end, result.counted) == ("perched", ()), result
+    assert (result.outcome, result.counted) == ("perched", ()), result
     assert math.isinf(flight.landed_for_s)
 
 
@@ -172,7 +171,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[FaultResult, Path]
 
 def test_a_killed_program_is_cut_and_excused(killed: tuple[FaultResult, Path]) -> None:
     result, _ = killed
-    assert (result.end, result.phase, result.miss_m) == ("gone", "ALIGN", None)
+    assert (result.outcome, result.phase, result.miss_m) == ("gone", "ALIGN", None)
     assert set(result.flags) == {"fell", "locked_needlessly"}
     assert result.counted == ()
     assert result.begin_s is not None
@@ -189,7 +188,7 @@ def test_the_log_ends_where_the_program_did(killed: tuple[FaultResult, Path]) ->
 
 def test_the_operator_s_word_is_excused() -> None:
     result = flown("operator-twice", Phase.SEARCH)
-    assert result.end == "aborted"
+    assert result.outcome == "aborted"
     assert result.counted == ()
 
 
@@ -256,7 +255,7 @@ def test_an_exception_that_no_fault_planted_is_counted(
 
     monkeypatch.setattr(loop, "step_mission", raising)
     result = flown("disk-full", Phase.ALIGN)
-    assert (result.end, result.counted) == ("failed", counted)
+    assert (result.outcome, result.counted) == ("failed", counted)
     assert str(error) in result.reason
 
 
@@ -264,7 +263,7 @@ def test_an_exception_that_no_fault_planted_is_counted(
 def test_a_flight_that_does_not_end_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(faulty, "LONGEST_FLIGHT_S", 5.0)
     result = flown("disk-full", Phase.ALIGN)
-    assert result.end == "gone"
+    assert result.outcome == "gone"
     assert "endless" in result.counted
     assert result.flags["endless"] == pytest.approx(5.0, abs=0.1)
 
@@ -275,19 +274,19 @@ def test_a_flight_that_does_not_end_is_counted(monkeypatch: pytest.MonkeyPatch) 
 def made(seed: int, name: str, phase: Phase, **changes: Any) -> FaultResult:
     plain: dict[str, Any] = {
         "seed": seed, "fault": name, "phase": phase.value, "moment_s": 0.5, "begin_s": 4.0,
-        "parameters": {}, "end": "landed", "reason": "", "flags": {}, "counted": (),
+        "parameters": {}, "outcome": "landed", "reason": "", "flags": {}, "counted": (),
         "time_s": 20.0, "miss_m": None, "drop_m": 0.0,
     }  # fmt: skip
     return FaultResult(**(plain | changes))
 
 
 RESULTS = [
-    made(1, "killed", Phase.ALIGN, end="gone", flags={"fell": 6.0},
+    made(1, "killed", Phase.ALIGN, outcome="gone", flags={"fell": 6.0},
          expected=("cut by the firmware",)),
-    made(2, "kick", Phase.ALIGN, end="perched"),
+    made(2, "kick", Phase.ALIGN, outcome="perched"),
     made(3, "kick", Phase.ALIGN, flags={"lied": 9.0, "fell": 8.0}, counted=("lied", "fell")),
     made(4, "weak-magnet", Phase.PERCH, flags={"pressed": 9.0}, counted=("pressed",), row="landed"),
-    made(5, "magnet-lets-go", Phase.PERCH, end="aborted", row=NOT_KNOWN,
+    made(5, "magnet-lets-go", Phase.PERCH, outcome="aborted", row=NOT_KNOWN,
          expected=("let go after the flight",)),
 ]  # fmt: skip
 

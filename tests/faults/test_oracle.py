@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from perchctl.faults.claims import Claim
 from perchctl.faults.oracle import (
     SAY_OFF,
+    Claim,
     Oracle,
     Sample,
     drop_limit_m,
