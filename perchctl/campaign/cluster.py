@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
@@ -30,7 +29,6 @@ import perchctl
 from perchctl.campaign.pool import defer_interrupts
 from perchctl.campaign.results_file import profile_sha256, source_sha256
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
-from perchctl.files import cannot_be_written
 from perchctl.profile import Profile
 
 R = TypeVar("R")
@@ -56,18 +54,17 @@ State = dict[str, str]
 
 @dataclass(frozen=True)
 class WorkerRequirements:
-    """What each worker of a campaign must have; sent with each flight. `campaign`: its name, also
-    the text of the file `mark` in the log folder (None without); `state`: of this computer."""
+    """What each worker of a campaign must have; sent with each flight. `campaign` is a name of its
+    own, `state` that of this computer."""
 
     campaign: str
     profiles: tuple[Profile, ...]
-    mark: Path | None
     state: State
 
 
-def process_state(profiles: Sequence[Profile], mark: Path | None, threads: int) -> State:
-    """Return the program, its libraries, the files of the `profiles`, the folder of the `mark`,
-    and how many flights this process flies at a time."""
+def process_state(profiles: Sequence[Profile], threads: int) -> State:
+    """Return the program, its libraries, the files of the `profiles`, and how many flights this
+    process flies at a time."""
     state = {
         "perchctl": f"{perchctl.__version__} ({source_sha256()[:_SHORT]})",
         "python": ".".join(platform.python_version_tuple()[:2]),
@@ -78,35 +75,15 @@ def process_state(profiles: Sequence[Profile], mark: Path | None, threads: int) 
     for profile in profiles:
         files = filter(None, (profile.camera.calibration, profile.camera.mask))
         state[" and ".join(map(str, files))] = profile_sha256(profile)[:_SHORT]
-    if mark is not None:
-        try:
-            state[str(mark.parent)] = mark.read_text(encoding="ascii")
-        except (OSError, UnicodeDecodeError):
-            state[str(mark.parent)] = "another folder"
     return state
 
 
-@contextlib.contextmanager
-def worker_requirements(
-    profiles: Sequence[Profile], folder: Path | None
-) -> Iterator[WorkerRequirements]:
-    """Yield the requirements of a campaign that begins now; a small file stands in `folder`
-    meanwhile. Errors: InvalidValue if it cannot be written."""
+def worker_requirements(profiles: Sequence[Profile]) -> WorkerRequirements:
+    """Return the requirements of a campaign that begins now."""
     # Their values are sent with each flight; of those that name the same files one is compared.
     different = tuple({(p.camera.calibration, p.camera.mask): p for p in profiles}.values())
-    campaign = f"perchctl-{secrets.token_hex(16)}"
-    mark = None if folder is None else folder.absolute() / f".{campaign}"
-    if mark is not None:
-        try:
-            mark.write_text(campaign, encoding="ascii")
-        except OSError as error:
-            raise cannot_be_written(mark, error) from None
-    try:
-        state = process_state(different, mark, threads=1)
-        yield WorkerRequirements(campaign, different, mark, state)
-    finally:
-        if mark is not None:
-            mark.unlink(missing_ok=True)
+    state = process_state(different, threads=1)
+    return WorkerRequirements(secrets.token_hex(16), different, state)
 
 
 _differences: dict[str, str] = {}
@@ -118,7 +95,7 @@ def fly_verified(order: bytes, required: WorkerRequirements) -> Any:
     Errors: InvalidValue if this worker must not fly; whatever the flight raises."""
     worker = get_worker()
     if required.campaign not in _differences:
-        here = process_state(required.profiles, required.mark, worker.state.nthreads)
+        here = process_state(required.profiles, worker.state.nthreads)
         _differences[required.campaign] = ", ".join(
             f"{name} {here[name]} instead of {wanted}"
             for name, wanted in required.state.items()
@@ -154,26 +131,23 @@ class ClusterExecutor(Executor):
 
 
 @contextlib.contextmanager
-def cluster_pool(
-    address: str, profiles: Sequence[Profile], folder: Path | None = None
-) -> Iterator[Executor]:
+def cluster_pool(address: str, profiles: Sequence[Profile]) -> Iterator[Executor]:
     """Yield an executor of the workers of the scheduler at `address` (``HOST:PORT`` or
-    ``tcp://HOST:PORT``), which have this computer's program, its data for these `profiles`, and
-    its `folder` if one is given. Errors: UsageError, ConnectionFailed, InvalidValue."""
+    ``tcp://HOST:PORT``), which have this computer's program and its data for these `profiles`.
+    Errors: UsageError, ConnectionFailed."""
     if not os.environ.get("PERCHCTL_DEBUG"):
         for name in (*_QUIET, *logging.root.manager.loggerDict):
             if name.startswith(_QUIET):
                 logging.getLogger(name).setLevel(logging.CRITICAL)
     # Each worker compares the versions that matter.
     warnings.filterwarnings("ignore", category=VersionMismatchWarning)
-    with worker_requirements(profiles, folder) as required:
-        client = _connected(address)
-        try:
-            _wait_for_worker(client, address)
-            yield ClusterExecutor(client, required)
-        finally:
-            with contextlib.suppress(Exception):
-                client.close(timeout=_CLOSE_S)
+    client = _connected(address)
+    try:
+        _wait_for_worker(client, address)
+        yield ClusterExecutor(client, worker_requirements(profiles))
+    finally:
+        with contextlib.suppress(Exception):
+            client.close(timeout=_CLOSE_S)
 
 
 def _connected(address: str) -> Client:
