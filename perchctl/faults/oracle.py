@@ -354,9 +354,9 @@ def _airborne(s: Sample) -> bool:
     return not s.floor and s.height_m > LOW_M
 
 
-# --- What the program says at its end, as claims that can be true or false of a vehicle --------
+# --- What the program says at its end, as claims that are true or false of a vehicle -----------
 # A flight ends by a row of the mission's table, in a phase, with an outcome; each of the three
-# becomes a sentence or an exit code that somebody acts on, and each claims something.
+# becomes a sentence or an exit code that somebody acts on.
 
 
 Claims = set[Claim]

@@ -222,8 +222,9 @@ class FactsRecorder:
             self.facts.low_s, self.facts.low_m = s.t_s, s.height_m
 
 
-# --- What a flight is held to: where it should be in each phase, and by when on its way down ---
-# Neither goes by the program's estimate: that may be what is wrong.
+# --- What a flight is held to ------------------------------------------------------------------
+# Where it should be in each phase, and by when it should be on its way down. Neither goes by the
+# program's estimate: that may be what is wrong.
 
 
 Place = tuple[float, float]
