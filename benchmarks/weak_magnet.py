@@ -11,15 +11,17 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
+from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
 
 from perchctl.faults import FaultResult
 from perchctl.faults.catalogue import BY_NAME, Case
-from perchctl.faults.effects import MagnetHolds
+from perchctl.faults.effects import magnet_holds
 from perchctl.faults.flight import fly_with_fault
 from perchctl.faults.oracle import drop_limit_m
 from perchctl.mission import Phase
@@ -46,7 +48,8 @@ def fly(seed: int) -> FaultResult:
         ceiling_z_m=max(LOWEST_CEILING_M, scenario.ceiling_z_m),
         first_contact_force_n=None,
     )
-    case = Case(BY_NAME["weak-magnet"], Phase.PERCH, 0.0, (MagnetHolds(carried(seed)),))
+    held = partial(magnet_holds, of_weight=carried(seed))
+    case = Case(BY_NAME["weak-magnet"], Phase.PERCH, 0.0, (held,))
     return fly_with_fault(profile, case, scenario)
 
 
@@ -68,8 +71,8 @@ def main() -> int:
                 f"(limit {drop_limit_m(high):g} m)"
             )
     bad = [(part, r) for part, r in flown if r.flags]
-    ends = {end: sum(r.end == end for _, r in flown) for end in ("perched", "landed", "aborted")}
-    print(f"{ends}; with a flag: {len(bad)}")
+    ends = Counter(r.outcome for _, r in flown)
+    print(f"{dict(ends)}; with a flag: {len(bad)}")
     for part, r in bad:
         print(f"  seed {r.seed}, carries {part:.2f}: {dict(r.flags)}, {r.reason}")
     return 1 if bad else 0

@@ -23,8 +23,6 @@ if str(ROOT) not in sys.path:
 
 from perchctl.camera import FrameSource  # noqa: E402
 from perchctl.errors import EXIT_CODES  # noqa: E402
-from perchctl.faults import FAULTS  # noqa: E402
-from perchctl.faults.catalogue import AIR, FROM_THE_START, Fault  # noqa: E402
 from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
 from perchctl.faults.promises import PROMISES  # noqa: E402
 from perchctl.link import Link  # noqa: E402
@@ -188,29 +186,6 @@ def exit_codes() -> str:
     return "\n".join(["| code | meaning |", "|---|---|", *rows])
 
 
-def fault_catalogue() -> str:
-    head = [
-        "| name | rows | what happens | begins in | expected outcomes |",
-        "|---|---|---|---|---|",
-    ]
-    return "\n".join([*head, *map(_fault_row, FAULTS)])
-
-
-def _fault_row(fault: Fault) -> str:
-    rows = ", ".join(map(str, fault.rows))
-    expected = ", ".join(outcome.name for outcome in fault.expected_outcomes)
-    return f"| `{fault.name}` | {rows} | {fault.what} | {_phases(fault)} | {expected} |"
-
-
-def _phases(fault: Fault) -> str:
-    if fault.phases is FROM_THE_START:
-        return "from the start"
-    missing = [phase.value for phase in AIR if phase not in fault.phases]
-    if len(missing) > 2:
-        return ", ".join(phase.value for phase in fault.phases)
-    return f"any phase but {', '.join(missing)}" if missing else "any phase"
-
-
 def expected_outcomes() -> str:
     rows = [
         f"| {outcome.name} | {', '.join(sorted(outcome.flags)).replace('_', ' ')} | "
@@ -293,7 +268,6 @@ PARTS: dict[str, Callable[[], str]] = {
     "worlds": worlds,
     "log-fields": log_fields,
     "exit-codes": exit_codes,
-    "fault-catalogue": fault_catalogue,
     "expected-outcomes": expected_outcomes,
     "promises": promises,
 }

@@ -32,7 +32,6 @@ HOMES: dict[str, tuple[str, ...]] = {
     "foxglove_schemas_protobuf": ("perchctl.record.recording_file", "perchctl.record.recorded"),
     "google": ("perchctl.record.recording_file", "perchctl.record.recorded"),
     "distributed": ("perchctl.campaign",),
-    "dask": ("perchctl.campaign",),
     "av": ("perchctl.commands.track_output", "perchctl.camera.network", "perchctl.analysis.film"),
 }
 
@@ -88,11 +87,11 @@ MOST_NAMES = {
     "analysis": 12,
     "calibration": 17,
     "camera": 17,
-    "campaign": 25,
+    "campaign": 24,
     "check": 15,
     "commands": 15,
     "display": 15,
-    "faults": 15,
+    "faults": 6,
     "flight": 22,
     "link": 11,
     "record": 13,

@@ -93,15 +93,15 @@ def test_a_sweep_names_the_best_and_proves_it() -> None:
     assert said.code == 0
     assert said.complaint == "3 cells of 40 seeds are 120 flights"
     lines = said.stdout.splitlines()
-    assert lines[3].endswith("best, own")
-    assert lines[-1] == "the profile's own value is the best"
+    assert lines[3].endswith("own")
+    assert lines[-1] == "best: 0.4"
     base = write("zero.yaml", "planner: {integral_per_s: 0}\n")
     worse = run("simulate", "sweep", f"{KEY}=0.2", "-p", base, "-n", "40").stdout
     assert "B is better by 3.00 mm" in worse
     record = json.loads(run("simulate", "sweep", f"{KEY}=0,0.2", "-n", "9", "--json").stdout)
     assert [cell["own"] for cell in record["cells"]] == [False, False, True]
-    assert record["cells"][0]["values"] == {KEY: 0.0}
-    assert record["best"] == {KEY: 0.4}
+    assert record["cells"][0]["value"] == 0.0
+    assert record["best"] == 0.4
 
 
 @pytest.mark.campaign

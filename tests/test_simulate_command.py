@@ -15,8 +15,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.campaign.results_file import flown_record, result_from
-from perchctl.record import read_log
+from perchctl.campaign import FlightResult
+from perchctl.campaign.results_file import flown_record
+from perchctl.record import from_exact, read_log
 from tests.helpers.commands import Said, elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT, SEED, SHORT
 
@@ -44,7 +45,6 @@ def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
         2, 2, 0, 0, 0, 0,
     ]  # fmt: skip
     assert 0 < said["miss_m"]["median"] <= said["miss_m"]["max"] < 0.020
-    assert said["realtime_factor"] > 0
     assert said["worst_seeds"] == []
     assert said["rates"]["perched"] == {"rate": 1.0, "interval": [0.158114, 1.0]}
     assert 50 < said["peak_memory_mb"] < 1000
@@ -80,7 +80,7 @@ def test_a_campaign_that_is_killed_goes_on_to_the_same_flights(
     figures = json.loads(resumed.stdout)
     assert (figures["flights"], figures["perched"]) == (2, 2)
     flights, others = (
-        sorted((flown_record(result_from(r)) for r in _flights(path)), key=lambda r: r["seed"])
+        sorted((flown_record(from_exact(FlightResult, r)) for r in _flights(path)), key=_seed)
         for path in (out, logs.with_name("out.jsonl"))
     )
     assert flights == others
@@ -90,10 +90,14 @@ def test_a_campaign_that_is_killed_goes_on_to_the_same_flights(
     assert len(_lines(out)) == 3
 
 
+def _seed(record: dict[str, Any]) -> int:
+    return int(record["seed"])
+
+
 def _flights(path: Path) -> list[dict[str, Any]]:
     records = [line for line in _lines(path) if line.pop("kind") == "flight"]
     assert all(record["scenario"]["seed"] == record["seed"] for record in records)
-    assert all(record["timings"]["cpu_s"] > 0 for record in records)
+    assert all(record["cpu_s"] > 0 for record in records)
     return records
 
 

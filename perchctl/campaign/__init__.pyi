@@ -3,15 +3,16 @@ from .compare import VariantResult as VariantResult
 from .compare import compare_variants as compare_variants
 from .compare import comparison_text as comparison_text
 from .compare import fly_variants as fly_variants
+from .compare import make_sweep as make_sweep
 from .flights import LoggedFlight as LoggedFlight
 from .flights import fly_all as fly_all
 from .flights import fly_in_folder as fly_in_folder
 from .flights import fly_logged as fly_logged
 from .flights import fly_measured as fly_measured
-from .flights import run_campaign as run_campaign
 from .flights import seed_log_path as seed_log_path
 from .pool import defer_interrupts as defer_interrupts
 from .pool import flight_processes as flight_processes
+from .results import CampaignFlight as CampaignFlight
 from .results import FlightResult as FlightResult
 from .results import align_columns as align_columns
 from .results import campaign_summary as campaign_summary
@@ -20,6 +21,4 @@ from .results import none_took_off as none_took_off
 from .results import peak_mb as peak_mb
 from .results import rate_record as rate_record
 from .results import rate_text as rate_text
-from .results_file import CampaignFlight as CampaignFlight
 from .results_file import campaign_results as campaign_results
-from .sweep import make_sweep as make_sweep

@@ -1,4 +1,9 @@
-"""The workers of a dask cluster as an executor of flights, by dask's own executor."""
+"""The workers of a dask cluster as an executor of flights, by dask's own executor.
+
+A flight elsewhere is the flight here only by the same program, libraries and data. Each worker
+compares its own state with this computer's before its first flight. The program is known by its
+source, not by a version that two states of a checkout share.
+"""
 
 from __future__ import annotations
 
@@ -7,172 +12,169 @@ import gc
 import logging
 import os
 import pickle
-import tempfile
-import time
+import platform
+import secrets
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Future
-from multiprocessing import active_children, resource_tracker
-from pathlib import Path
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any, TypeVar
 
-import dask
-from distributed import Client, KilledWorker, LocalCluster
-from distributed.utils import LoopRunner
+import cv2
+from distributed import Client, KilledWorker, get_worker
 from distributed.versions import VersionMismatchWarning
 
-from perchctl.campaign.pool import FlightPool, defer_interrupts
-from perchctl.campaign.workers import (
-    WorkerRequirements,
-    fly_verified,
-    verify_cluster,
-    worker_requirements,
-)
-from perchctl.errors import ConnectionFailed, PerchError, UsageError
+import perchctl
+from perchctl.campaign.pool import defer_interrupts
+from perchctl.campaign.results_file import profile_sha256, source_sha256
+from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
 from perchctl.profile import Profile
 
 R = TypeVar("R")
 
 ANSWER_S = 10.0
 """The scheduler must answer within this time."""
-HANGS_S = 60.0
-"""A scheduler that does not answer for this long is lost."""
 WORKERS_S = 20.0
 """The first worker must register within this time."""
-NOBODY_S = 120.0
-"""A campaign waits this long without any worker."""
-_POLL_S = 0.25
 _CLOSE_S = 1.0
-_NO_PAGES = "127.0.0.1:0"
-"""dask opens a port for its web pages in any case: on loopback, any that is free, and no page."""
 _QUIET = ("distributed", "tornado", "asyncio")
+_LIBRARIES = ("numpy", "mujoco", "filterpy", "distributed")
+"""The libraries that compute a flight's figures or carry them between computers; OpenCV has
+several package names and is compared apart."""
+_SHORT = 8
 
 
-class ClusterPool(FlightPool):
-    """A pool of flights on the workers of a dask cluster. `notes`: remarks about the workers, a
-    sentence each."""
+# --- What each worker must have ----------------------------------------------------------------
 
-    lost = (BrokenExecutor, KilledWorker)
 
-    def __init__(self, client: Any, address: str, required: WorkerRequirements) -> None:
-        self._client, self._address, self._required = client, address, required
-        self._executor = client.get_executor(pure=False)
-        self._had_worker_s = time.monotonic()
-        while not self.places(WORKERS_S):
-            time.sleep(_POLL_S)
-        self.notes = verify_cluster(client, address, required)
+State = dict[str, str]
+"""What decides a flight in a process, by name."""
+
+
+@dataclass(frozen=True)
+class WorkerRequirements:
+    """What each worker of a campaign must have; sent with each flight. `campaign` is a name of its
+    own, `state` that of this computer."""
+
+    campaign: str
+    profiles: tuple[Profile, ...]
+    state: State
+
+
+def process_state(profiles: Sequence[Profile], threads: int) -> State:
+    """Return the program, its libraries, the files of the `profiles`, and how many flights this
+    process flies at a time."""
+    state = {
+        "perchctl": f"{perchctl.__version__} ({source_sha256()[:_SHORT]})",
+        "python": ".".join(platform.python_version_tuple()[:2]),
+        "opencv": cv2.__version__,
+        **{name: version(name) for name in _LIBRARIES},
+        "--nthreads": str(threads),
+    }
+    for profile in profiles:
+        files = filter(None, (profile.camera.calibration, profile.camera.mask))
+        state[" and ".join(map(str, files))] = profile_sha256(profile)[:_SHORT]
+    return state
+
+
+def worker_requirements(profiles: Sequence[Profile]) -> WorkerRequirements:
+    """Return the requirements of a campaign that begins now."""
+    # Their values are sent with each flight; of those that name the same files one is compared.
+    different = tuple({(p.camera.calibration, p.camera.mask): p for p in profiles}.values())
+    state = process_state(different, threads=1)
+    return WorkerRequirements(secrets.token_hex(16), different, state)
+
+
+_differences: dict[str, str] = {}
+"""In what this worker differs from what its campaigns require, by campaign; empty: in nothing."""
+
+
+def fly_verified(order: bytes, required: WorkerRequirements) -> Any:
+    """Call the pickled function with its arguments, after verifying a worker that is new.
+    Errors: InvalidValue if this worker must not fly; whatever the flight raises."""
+    worker = get_worker()
+    if required.campaign not in _differences:
+        here = process_state(required.profiles, worker.state.nthreads)
+        _differences[required.campaign] = ", ".join(
+            f"{name} {here[name]} instead of {wanted}"
+            for name, wanted in required.state.items()
+            if here[name] != wanted
+        )
+    if difference := _differences[required.campaign]:
+        raise InvalidValue(
+            f"worker {worker.address} on {platform.node()} has {difference}: make it the same "
+            f"there, and start it again"
+        )
+    fn, args, named = pickle.loads(order)
+    return fn(*args, **named)
+
+
+# --- The executor ------------------------------------------------------------------------------
+
+
+class ClusterExecutor(Executor):
+    """An executor of flights on the workers of a dask cluster. dask flies the flight of a lost
+    worker again. A future fails with an error of `lost` if that happened too often, with
+    InvalidValue if the worker must not fly, and is cancelled if the scheduler is lost."""
+
+    lost = (KilledWorker,)
+
+    def __init__(self, client: Client, required: WorkerRequirements) -> None:
+        self._executor, self._required = client.get_executor(pure=False), required
 
     def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
-        """Hand a flight to a worker. Its future fails with `KilledWorker`, or is cancelled, if
-        the flight was lost, and with InvalidValue if the worker must not fly."""
+        """Return the future of a flight."""
         order = pickle.dumps((fn, args, kwargs))
         future: Future[R] = self._executor.submit(fly_verified, order, self._required)
         return future
 
-    def places(self, nobody_s: float = NOBODY_S) -> int:
-        """Return the number of workers. Errors: ConnectionFailed if the scheduler is gone, or
-        there has been no worker for `nobody_s`."""
-        client = self._client
-        try:
-            if client.status != "running":
-                raise OSError(client.status)
-            workers = len(client.sync(client.scheduler.ncores, callback_timeout=HANGS_S))
-        except (OSError, TimeoutError) as error:
-            raise ConnectionFailed(
-                f"the scheduler of --cluster {self._address} does not answer any more: start it "
-                f"again, and go on with what was written to --out by --resume"
-            ) from error
-        now_s = time.monotonic()
-        if workers:
-            self._had_worker_s = now_s
-        elif now_s - self._had_worker_s >= nobody_s:
-            raise ConnectionFailed(
-                f"the scheduler at {self._address} has had no worker for {nobody_s:.0f} s: start "
-                f"some with dask worker {self._address} --nthreads 1"
-            )
-        return workers
-
 
 @contextlib.contextmanager
-def cluster_pool(
-    address: str, profiles: Sequence[Profile], folder: Path | None = None
-) -> Iterator[ClusterPool]:
-    """Yield an executor of the workers of the scheduler at `address` (``HOST:PORT``,
-    ``tcp://HOST:PORT``, or ``local:N`` for one of this computer with N workers), which have this
-    computer's program, its data for these `profiles`, and its `folder` if one is given.
-    Errors: UsageError, ConnectionFailed, InvalidValue."""
+def cluster_pool(address: str, profiles: Sequence[Profile]) -> Iterator[Executor]:
+    """Yield an executor of the workers of the scheduler at `address` (``HOST:PORT`` or
+    ``tcp://HOST:PORT``), which have this computer's program and its data for these `profiles`.
+    Errors: UsageError, ConnectionFailed."""
     if not os.environ.get("PERCHCTL_DEBUG"):
         for name in (*_QUIET, *logging.root.manager.loggerDict):
             if name.startswith(_QUIET):
                 logging.getLogger(name).setLevel(logging.CRITICAL)
-    # `verify_cluster` compares the versions that matter.
+    # Each worker compares the versions that matter.
     warnings.filterwarnings("ignore", category=VersionMismatchWarning)
-    with contextlib.ExitStack() as stack:
-        required = stack.enter_context(worker_requirements(profiles, folder))
-        resource_tracker.ensure_running()  # it lifts the mask of the thread that starts it
-        with defer_interrupts():  # threads and processes inherit the mask of who starts them
-            runner = LoopRunner(asynchronous=False)
-            runner.start()
-        stack.callback(runner.stop)
-        if address.startswith("local:"):
-            address = stack.enter_context(_local_scheduler(address, runner.loop))
-        client = stack.enter_context(_connected(address, runner.loop))
-        yield ClusterPool(client, address, required)
-
-
-@contextlib.contextmanager
-def _local_scheduler(address: str, loop: Any) -> Iterator[str]:
-    """Start a scheduler and workers on this computer; yields the scheduler's address. They end
-    with this program, killed or not."""
-    workers = address.removeprefix("local:")
-    if not (workers.isascii() and workers.isdigit() and int(workers[:9])):
-        raise UsageError(f"--cluster {address} must be local:N with N workers, as in local:4")
-    with tempfile.TemporaryDirectory(
-        prefix="perchctl-cluster-", ignore_cleanup_errors=True
-    ) as folder:
-        settings = {
-            "distributed.scheduler.allowed-failures": 0,  # `fly_all` flies a lost flight again
-            "distributed.scheduler.http.routes": [],
-            "distributed.worker.http.routes": [],
-            "distributed.worker.profile.enabled": False,
-            "temporary-directory": folder,
-        }
-        with dask.config.set(settings):
-            cluster = LocalCluster(
-                n_workers=int(workers), threads_per_worker=1, memory_limit=0, loop=loop,
-                dashboard_address=None, scheduler_kwargs={"dashboard_address": _NO_PAGES},
-                silence_logs=logging.CRITICAL,
-            )  # fmt: skip
-            try:
-                yield cluster.scheduler_address
-            finally:
-                for worker in active_children():  # what they fly would be waited for
-                    worker.kill()
-                with contextlib.suppress(Exception):
-                    cluster.close(timeout=_CLOSE_S)
-
-
-@contextlib.contextmanager
-def _connected(address: str, loop: Any) -> Iterator[Any]:
-    """Yield a client of the scheduler. Errors: UsageError, ConnectionFailed."""
-    problem: PerchError | None = None
+    client = _connected(address)
     try:
-        client = Client(address, loop=loop, set_as_default=False, timeout=ANSWER_S)
+        _wait_for_worker(client, address)
+        yield ClusterExecutor(client, worker_requirements(profiles))
+    finally:
+        with contextlib.suppress(Exception):
+            client.close(timeout=_CLOSE_S)
+
+
+def _connected(address: str) -> Client:
+    """Return a client of the scheduler. Errors: UsageError, ConnectionFailed."""
+    problem: PerchError
+    try:
+        with defer_interrupts():
+            return Client(address, set_as_default=False, timeout=ANSWER_S)
     except ValueError as error:
         problem = UsageError(
             f"--cluster {address} must be the address of a dask scheduler, as in "
-            f"--cluster tcp://10.0.0.5:8786, or local:N ({error})"
+            f"--cluster tcp://10.0.0.5:8786 ({error})"
         )
     except Exception as error:
         problem = ConnectionFailed(
             f"no dask scheduler answers at {address} within {ANSWER_S:.0f} s "
             f"({type(error).__name__}): start dask scheduler there, or mend the address"
         )
-    if problem is not None:
-        gc.collect()  # a client that did not connect is closed as long as its loop runs
-        raise problem
+    gc.collect()  # a client that did not connect is closed as long as its loop runs
+    raise problem
+
+
+def _wait_for_worker(client: Client, address: str) -> None:
     try:
-        yield client
-    finally:
-        with contextlib.suppress(Exception):
-            client.close(timeout=_CLOSE_S)
+        client.wait_for_workers(1, timeout=WORKERS_S)
+    except TimeoutError:
+        raise ConnectionFailed(
+            f"the scheduler at {address} has no worker: start some with dask worker {address} "
+            f"--nthreads 1"
+        ) from None

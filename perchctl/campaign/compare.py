@@ -1,13 +1,15 @@
-"""The same seeds flown by several profiles: what differs between two, and whether it is proven.
+"""The same seeds flown by several profiles: what differs, and whether it is proven.
 
 Each seed is its own pair, so what differs from seed to seed takes no part. A figure's difference
 is the mean over the pairs, with Student's interval; success is compared by the pairs in which only
-one of both succeeded (McNemar's test, the exact one). All questions that
-are asked together err together in one comparison of twenty at most: each gets its part of the 5 %.
+one of both succeeded (McNemar's test, the exact one). All questions that are asked together err
+together in one comparison of twenty at most: each gets its part of the 5 %.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -18,8 +20,17 @@ import numpy as np
 from scipy.stats import binomtest, ttest_1samp
 
 from perchctl.campaign.flights import fly_all, fly_seed
-from perchctl.campaign.results import LEVEL, FlightResult, align_columns, rate_record, rate_text
-from perchctl.profile import Profile
+from perchctl.campaign.results import (
+    LEVEL,
+    FlightResult,
+    align_columns,
+    miss_record,
+    rate_record,
+    rate_text,
+)
+from perchctl.errors import InvalidValue, UsageError
+from perchctl.plain_yaml import clip_text, split_values
+from perchctl.profile import Profile, changed_profile, profile_value, scalar_text
 
 
 @dataclass(frozen=True)
@@ -38,17 +49,6 @@ class VariantResult:
         return self.result.outcome
 
 
-@dataclass(frozen=True)
-class _Variant:
-    """One flight to be flown: a seed and the number of its profile."""
-
-    seed: int
-    number: int
-
-    def __str__(self) -> str:
-        return f"{self.seed} (profile {self.number + 1})"
-
-
 def fly_variants(
     profiles: Sequence[Profile],
     seeds: Iterable[int],
@@ -56,12 +56,13 @@ def fly_variants(
     on_result: Callable[[VariantResult], None] = lambda result: None,
 ) -> list[VariantResult]:
     """Fly each seed by all profiles before the next seed; arguments and errors as of `fly_all`."""
-    variants = [_Variant(seed, number) for seed in seeds for number in range(len(profiles))]
+    variants = itertools.product(seeds, range(len(profiles)))
     return fly_all(partial(_fly, tuple(profiles)), variants, executor, on_result)
 
 
-def _fly(profiles: tuple[Profile, ...], variant: _Variant) -> VariantResult:
-    return VariantResult(variant.number, fly_seed(profiles[variant.number], variant.seed))
+def _fly(profiles: tuple[Profile, ...], variant: tuple[int, int]) -> VariantResult:
+    seed, number = variant
+    return VariantResult(number, fly_seed(profiles[number], seed))
 
 
 def whole_seeds(results: Iterable[VariantResult], profiles: int) -> list[tuple[FlightResult, ...]]:
@@ -74,11 +75,6 @@ def whole_seeds(results: Iterable[VariantResult], profiles: int) -> list[tuple[F
         for _, flown in sorted(by_seed.items())
         if len(flown) == profiles
     ]
-
-
-def compare_variants(results: Iterable[VariantResult]) -> Comparison:
-    """Return the comparison of two profiles by the seeds that both have flown."""
-    return compare_pairs([(a, b) for a, b in whole_seeds(results, 2)])
 
 
 # --- What is compared --------------------------------------------------------------------------
@@ -102,34 +98,23 @@ many nearly is."""
 _SAME = 1e-9
 """Values whose relative difference is below this differ by rounding only."""
 NOT_PROVEN = "no difference proven"
+FIGURES = {
+    "miss_m": ("miss [mm]", "mm", 1e3),
+    "time_s": ("flight time [s]", "s", 1.0),
+    "attempts": ("attempts", "", 1.0),
+}
+"""The figures of a flight, which are better when smaller: fields of `FlightResult`, each with its
+name, its unit, and the number of units in one of SI."""
+MISS = ("miss_m",)
 
 
-@dataclass(frozen=True)
-class Figure:
-    """A figure of a flight that is better when smaller. `of` returns it in SI units, None if the
-    flight has none; `scale` converts it to `unit`."""
-
-    name: str
-    key: str
-    unit: str
-    scale: float
-    of: Callable[[FlightResult], float | None]
-
-
-MISS = Figure("miss", "miss_m", "mm", 1e3, lambda r: r.miss_m if r.outcome == "perched" else None)
-FIGURES = (
-    MISS,
-    Figure("flight time", "time_s", "s", 1.0, lambda r: _flown(r, r.time_s)),
-    Figure("attempts", "attempts", "", 1.0, lambda r: _flown(r, r.attempts)),
-)
-
-
-def _flown(result: FlightResult, value: float) -> float | None:
-    return None if result.outcome == "refused" else float(value)
+def compare_variants(results: Iterable[VariantResult]) -> Comparison:
+    """Return the comparison of two profiles by the seeds that both have flown."""
+    return compare_pairs([(a, b) for a, b in whole_seeds(results, 2)])
 
 
 def compare_pairs(
-    pairs: Sequence[Pair], figures: Sequence[Figure] = FIGURES, times_asked: int = 1
+    pairs: Sequence[Pair], figures: Sequence[str] = tuple(FIGURES), times_asked: int = 1
 ) -> Comparison:
     """Return the comparison of two flights per seed. `times_asked`: the number of comparisons
     that share the 5 %."""
@@ -139,7 +124,7 @@ def compare_pairs(
         "flights": len(pairs),
         "identical": sum(_ending(a) == _ending(b) for a, b in pairs),
         "success": _success(pairs, questions),
-        **{figure.key: _difference(figure, pairs, level) for figure in figures},
+        **{key: _difference(key, pairs, level) for key in figures},
     }
 
 
@@ -155,20 +140,17 @@ def _success(pairs: Sequence[Pair], questions: int) -> dict[str, Any]:
     better = None
     if p <= 1.0 - LEVEL and only_a != only_b:
         better = "B" if only_b > only_a else "A"
-    good_a, good_b = (sum(not pair[which].is_bad for pair in pairs) for which in (0, 1))
-    return {
-        "A": {"good": good_a, **rate_record(good_a, len(pairs))},
-        "B": {"good": good_b, **rate_record(good_b, len(pairs))},
-        "only_a": only_a,
-        "only_b": only_b,
-        "p": round(p, 9),
-        "better": better,
-    }
+    rates = {}
+    for which, name in enumerate("AB"):
+        good = sum(not pair[which].is_bad for pair in pairs)
+        rates[name] = {"good": good, **rate_record(good, len(pairs))}
+    return {**rates, "only_a": only_a, "only_b": only_b, "p": round(p, 9), "better": better}
 
 
-def _difference(figure: Figure, pairs: Sequence[Pair], level: float) -> dict[str, Any]:
-    both = [(figure.of(a), figure.of(b)) for a, b in pairs]
-    values = np.array([(a, b) for a, b in both if a is not None and b is not None])
+def _difference(key: str, pairs: Sequence[Pair], level: float) -> dict[str, Any]:
+    flown = [(a, b) for a, b in pairs if "refused" not in (a.outcome, b.outcome)]
+    both = [(getattr(a, key), getattr(b, key)) for a, b in flown]
+    values = np.array([pair for pair in both if None not in pair], float)
     found = dict.fromkeys(("a", "b", "difference", "interval", "better"))
     if len(values):
         a, b = map(float, values.mean(axis=0))
@@ -188,53 +170,112 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, floa
     return float(found.low), float(found.high)
 
 
-# --- For people --------------------------------------------------------------------------------
-
-
 def comparison_text(names: tuple[str, str], found: Comparison) -> str:
     """Return the comparison as a table, followed by what is proven."""
-    flights, identical = found["flights"], found["identical"]
-    figures = [figure for figure in FIGURES if figure.key in found]
-    head = ("", f"A: {names[0]}", f"B: {names[1]}", "B less A", "")
-    rows = [head, _success_row(found["success"], flights)]
-    lines = align_columns(rows + [_figure_row(each, found[each.key]) for each in figures])
+    flights, identical, success = found["flights"], found["identical"], found["success"]
+    rows: list[tuple[str, ...]] = [("", f"A: {names[0]}", f"B: {names[1]}", "B less A", "")]
+    rates = (rate_text(success[which]["good"], flights) for which in "AB")
+    only = f"only A {success['only_a']}, only B {success['only_b']}"
+    verdict = _verdict(success["better"])
+    rows.append(("success", *rates, only, f"{verdict} (p = {success['p']:.2g})"))
+    rows += [_figure_row(key, found[key]) for key in FIGURES if key in found]
+    lines = [*align_columns(rows), ""]
     if 0 < identical == flights:
-        return "\n".join([*lines, "", f"identical in all {flights} flights"])
-    if identical:
-        lines += ["", f"identical in {identical} of {flights} flights"]
+        return "\n".join([*lines, f"identical in all {flights} flights"])
     together = (
-        f"the {1 + len(figures)} answers hold together at {100 * LEVEL:.0f} %: intervals of "
+        f"the {len(rows) - 1} answers hold together at {100 * LEVEL:.0f} %: intervals of "
         f"differences and p are widened for it"
     )
-    return "\n".join([*lines, "", together])
+    return "\n".join([*lines, together])
 
 
-def _success_row(success: Mapping[str, Any], flights: int) -> tuple[str, ...]:
-    good_a, good_b = success["A"]["good"], success["B"]["good"]
-    verdict = NOT_PROVEN
-    if success["better"] is not None:
-        share = 100.0 * abs(good_b - good_a) / flights
-        verdict = f"{success['better']} is better by {share:.1f} %"
-    return (
-        "success",
-        rate_text(good_a, flights),
-        rate_text(good_b, flights),
-        f"only A {success['only_a']}, only B {success['only_b']}",
-        f"{verdict} (p = {success['p']:.2g})",
-    )
-
-
-def _figure_row(figure: Figure, found: Mapping[str, Any]) -> tuple[str, ...]:
-    name = f"{figure.name} [{figure.unit}]" if figure.unit else figure.name
+def _figure_row(key: str, found: Mapping[str, Any]) -> tuple[str, ...]:
+    name, unit, scale = FIGURES[key]
     if not found["pairs"]:
         return name, "-", "-", "-", NOT_PROVEN
-    a, b, difference = (figure.scale * found[key] for key in ("a", "b", "difference"))
-    text, verdict = f"{difference:+.2f}", NOT_PROVEN
+    a, b, difference = (scale * found[each] for each in ("a", "b", "difference"))
+    shown = (name, f"{a:.2f}", f"{b:.2f}")
     if found["interval"] is None:
-        verdict += f": {found['pairs']} pairs, {FEWEST_PAIRS} are needed"
-    else:
-        low, high = (figure.scale * bound for bound in found["interval"])
-        text += f" ({low:+.2f} to {high:+.2f})"
-    if found["better"] is not None:
-        verdict = f"{found['better']} is better by {abs(difference):.2f} {figure.unit}".rstrip()
-    return name, f"{a:.2f}", f"{b:.2f}", text, verdict
+        few = f"{NOT_PROVEN}: {found['pairs']} pairs, {FEWEST_PAIRS} are needed"
+        return *shown, f"{difference:+.2f}", few
+    low, high = (scale * bound for bound in found["interval"])
+    verdict = _verdict(found["better"], f" by {abs(difference):.2f} {unit}")
+    return *shown, f"{difference:+.2f} ({low:+.2f} to {high:+.2f})", verdict.rstrip()
+
+
+def _verdict(better: str | None, by: str = "") -> str:
+    return NOT_PROVEN if better is None else f"{better} is better{by}"
+
+
+# --- A key of a profile at several values ------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The profiles of a sweep, one for each value of a key; the last one is the profile's own."""
+
+    key: str
+    profiles: tuple[Profile, ...]
+
+    def record(self, results: Sequence[VariantResult]) -> dict[str, Any]:
+        """Return the figures of each value (a cell), by the seeds that were flown with every
+        value, for JSON. `best`: the value with the most successes, of these the one with the
+        smallest median miss; `best_against_own` is the `Comparison` of the own value, A, with it,
+        None where they are the same. What is proven there counts that it was picked out of all."""
+        seeds = whole_seeds(results, len(self.profiles))
+        own = len(self.profiles) - 1
+        cells = [
+            {"value": profile_value(profile, self.key), "own": number == own}
+            | _figures([flown[number] for flown in seeds])
+            for number, profile in enumerate(self.profiles)
+        ]
+        best = min(range(len(cells)), key=lambda number: _rank(cells[number]))
+        against = None
+        if best != own:
+            pairs = [(flown[own], flown[best]) for flown in seeds]
+            against = compare_pairs(pairs, MISS, times_asked=own)
+        return {"cells": cells, "best": cells[best]["value"], "best_against_own": against}
+
+    def text(self, record: dict[str, Any]) -> str:
+        """Return the table of a sweep's `record`, and how the best value compares."""
+        rows: list[tuple[str, ...]] = [(self.key, "success", "miss [mm]: median", "p95", "")]
+        for cell in record["cells"]:
+            misses = ("-" if m is None else f"{1e3 * m:.1f}" for m in cell["miss_m"].values())
+            rate = rate_text(cell["good"], cell["flights"])
+            note = "own" if cell["own"] else ""
+            rows.append((scalar_text(cell["value"]), rate, *misses, note))
+        lines = [*align_columns(rows), "", f"best: {scalar_text(record['best'])}"]
+        if record["best_against_own"] is not None:
+            lines += [f"picked out of {len(rows) - 1}, which is counted:"]
+            lines += [comparison_text(("own", "best"), record["best_against_own"])]
+        return "\n".join(lines)
+
+
+def make_sweep(profile: Profile, sweep: str) -> Sweep:
+    """Return the sweep of ``key=value,value``; the values as in a profile's file. Errors:
+    UsageError, InvalidValue."""
+    key, equals, text = (part.strip() for part in sweep.partition("="))
+    try:
+        texts = list(split_values(text))
+    except ValueError as error:
+        raise InvalidValue(f"sweep {clip_text(sweep)}: {error}") from None
+    if not equals or not key or not texts:
+        raise UsageError(
+            f"{clip_text(sweep)} must be KEY=VALUE,VALUE with a key of the profile, as in "
+            f"planner.align.xy_m=0.02,0.04"
+        )
+    profiles = [changed_profile(profile, [f"{key}={text}"], "sweep") for text in texts]
+    return Sweep(key, (*(other for other in profiles if other != profile), profile))
+
+
+def _figures(results: Sequence[FlightResult]) -> dict[str, Any]:
+    """Return the figures of one value's flights."""
+    good = sum(not r.is_bad for r in results)
+    misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
+    rate = rate_record(good, len(results))
+    return {"flights": len(results), "good": good, **rate, "miss_m": miss_record(misses)}
+
+
+def _rank(cell: dict[str, Any]) -> tuple[float, ...]:
+    median_m = cell["miss_m"]["median"]
+    return -cell["good"], math.inf if median_m is None else median_m, not cell["own"]

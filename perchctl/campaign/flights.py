@@ -7,20 +7,16 @@ import ctypes
 import gc
 import os
 import time
-from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable
-from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 import cv2
 
-from perchctl.campaign.pool import FlightPool
 from perchctl.campaign.results import FlightEnd, FlightResult, peak_memory_mb
-from perchctl.errors import InvalidValue, PerchError, SafetyAbort, TimedOut
+from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, SafetyAbort, TimedOut
 from perchctl.flight import LockstepFlight, fly_lockstep
 from perchctl.mission import Event, EventKeeper, Phase
 from perchctl.profile import Profile
@@ -36,9 +32,6 @@ OUTCOMES: dict[Phase, FlightEnd] = {
     Phase.LANDED: "landed",
     Phase.ABORTED: "aborted",
 }
-FLOWN_AGAIN = 2
-"""How often a flight that was lost with its process is flown again."""
-_POLL_S = 0.25
 
 
 # --- One flight --------------------------------------------------------------------------------
@@ -91,14 +84,13 @@ def fly_seed(
 
 
 def _fly(profile: Profile, seed: int, log_path: Path | None, record: bool) -> FlightResult:
-    began_s = time.perf_counter()
     log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
     try:
         flight = fly_lockstep(profile, seed, log)
     except (SafetyAbort, TimedOut) as error:
         if log is not None:
             log.abandon(str(error))
-        return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False, 0.0)
+        return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False)
     summary = None if log is None else _closed(log, flight)
     return FlightResult(
         seed=seed,
@@ -109,7 +101,6 @@ def _fly(profile: Profile, seed: int, log_path: Path | None, record: bool) -> Fl
         attempts=flight.report.attempts,
         locked=flight.locked,
         fell=flight.fell,
-        realtime_factor=flight.simulated_s / (time.perf_counter() - began_s),
         log=None if log is None else log.path,
         log_problem=None if summary is None else summary.log_problem,
     )
@@ -143,18 +134,6 @@ def seed_log_path(seed: int, log_dir: Path) -> Path:
 # --- Many flights ------------------------------------------------------------------------------
 
 
-def run_campaign(
-    profile: Profile,
-    seeds: Iterable[int],
-    executor: Executor | None = None,
-    on_result: Callable[[FlightResult], None] = lambda result: None,
-    log_dir: Path | None = None,
-    record: bool = False,
-) -> list[FlightResult]:
-    """Fly all seeds by `fly_all`, and return the results in the order of the seeds."""
-    return fly_all(partial(fly_in_folder, profile, log_dir, record), seeds, executor, on_result)
-
-
 def fly_in_folder(profile: Profile, log_dir: Path | None, record: bool, seed: int) -> FlightResult:
     """Fly a seed as `fly_seed` does, with its log in a folder if one is given."""
     log_path = None if log_dir is None else seed_log_path(seed, log_dir)
@@ -167,13 +146,12 @@ def fly_all(
     executor: Executor | None = None,
     on_result: Callable[[R], None] = lambda result: None,
 ) -> list[R]:
-    """`fly` of each seed, each once, in the order of the seeds; `on_result` as they are done.
+    """Return `fly` of each seed, each once, in the order of the seeds; `on_result` gets them as
+    they are done.
 
-    `executor` is anything with ``submit(fly, seed)`` that returns a future of
-    `concurrent.futures`' kind, or None to fly here; a `FlightPool` gets no more flights at a time
-    than it has places. A flight whose future fails with `BrokenExecutor` (or another error of
-    `FlightPool.lost`), or is cancelled, was lost with the process that flew it, and is flown
-    again, `FLOWN_AGAIN` times at most. Errors: PerchError.
+    `executor` is any of `concurrent.futures`' kind, or None to fly here; its attribute `lost`, if
+    it has one, names the errors of a future whose flight was lost with its process. Errors:
+    PerchError, as soon as one flight fails.
     """
     seeds = list(dict.fromkeys(seeds))
     by_seed: dict[K, R] = {}
@@ -182,56 +160,30 @@ def fly_all(
             by_seed[seed] = fly(seed)
             on_result(by_seed[seed])
         return list(by_seed.values())
-    pool = executor if isinstance(executor, FlightPool) else None
-    lost_errors = FlightPool.lost if pool is None else pool.lost
-    waiting, flying = deque(seeds), 0
-    lost: Counter[K] = Counter()
-    ended: SimpleQueue[tuple[K, Future[R]]] = SimpleQueue()
-    while len(by_seed) < len(seeds):
-        places = len(seeds) if pool is None else pool.places()
-        while waiting and flying < places:
-            seed = waiting.popleft()
-            future = _submitted(executor, fly, seed)
-            future.add_done_callback(partial(_put, ended, seed))
-            flying += 1
-        try:
-            seed, future = ended.get(timeout=_POLL_S)
-        except Empty:
-            continue
-        flying -= 1
-        was_lost = future.cancelled() or isinstance(future.exception(), lost_errors)
-        if was_lost and lost[seed] < FLOWN_AGAIN:
-            lost[seed] += 1
-            waiting.appendleft(seed)
-        elif was_lost:
-            raise PerchError(
-                f"the process that flew seed {seed} was ended from outside, {1 + FLOWN_AGAIN} "
-                f"times in all (where memory is short, fly fewer at a time: --jobs)"
-            )
-        else:
-            by_seed[seed] = result = _result(future, seed)
-            on_result(result)
+    lost = (BrokenExecutor, *getattr(executor, "lost", ()))
+    futures = {executor.submit(fly, seed): seed for seed in seeds}
+    for future in as_completed(futures):
+        seed = futures[future]
+        by_seed[seed] = _result(future, seed, lost)
+        on_result(by_seed[seed])
     return [by_seed[seed] for seed in seeds]
 
 
-def _submitted(executor: Executor, fly: Callable[[K], R], seed: K) -> Future[R]:
-    try:
-        return executor.submit(fly, seed)
-    except BrokenExecutor as error:  # the process was lost while it had no flight
-        future: Future[R] = Future()
-        future.set_exception(error)
-        return future
-
-
-def _put(ended: SimpleQueue[tuple[K, Future[R]]], seed: K, future: Future[R]) -> None:
-    ended.put((seed, future))
-
-
-def _result(future: Future[R], seed: K) -> R:
+def _result(future: Future[R], seed: object, lost: tuple[type[BaseException], ...]) -> R:
     try:
         return future.result()
     except PerchError:
         raise
+    except lost as error:
+        raise PerchError(
+            f"the process that flew seed {seed} was ended from outside, and so were those that "
+            f"flew it again (where memory is short, fly fewer at a time: --jobs)"
+        ) from error
+    except CancelledError as error:
+        raise ConnectionFailed(
+            "the scheduler of --cluster does not answer any more: start it again, and go on with "
+            "what was written to --out by --resume"
+        ) from error
     except ImportError as error:
         raise InvalidValue(
             f"a worker cannot load what flies ({type(error).__name__}: {error}): install this "

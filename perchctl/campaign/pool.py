@@ -1,7 +1,8 @@
 """The processes that fly a campaign on this computer.
 
 Where one process of the standard library's pool is lost, all its flights are. Here each process
-is a pool of its own, so that a lost process costs only the flight that it flew.
+is a pool of its own, with a thread that hands it one flight after the other, so that a lost
+process costs only the flight that it flew, which is flown again.
 """
 
 from __future__ import annotations
@@ -11,8 +12,13 @@ import multiprocessing
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
-from functools import partial
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
 from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
@@ -22,68 +28,71 @@ R = TypeVar("R")
 
 _CONTEXT = multiprocessing.get_context("spawn")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+FLOWN_AGAIN = 2
+"""How often a flight that was lost with its process is flown again."""
 
 
-class FlightPool(Executor):
-    """An executor that gets one flight for each of its places, and the next when one has ended:
-    what waits in a process is lost with it.
-
-    Attributes:
-        lost: the errors of a future whose flight was lost with the process that flew it.
-    """
-
-    lost: tuple[type[BaseException], ...] = (BrokenExecutor,)
-
-    def places(self) -> int:
-        """Return how many flights it takes at a time. Errors: PerchError if no process is left."""
-        raise NotImplementedError
-
-
-class FlightProcesses(FlightPool):
+class FlightProcesses(Executor):
     """A pool of `count` processes, each started with its first flight. They ignore signals, and
-    end when the parent is killed."""
+    end when the parent is killed. A flight's future fails with `BrokenExecutor` if its process was
+    lost `1 + FLOWN_AGAIN` times."""
 
     def __init__(self, count: int) -> None:
-        self._count = count
-        self._all: list[ProcessPoolExecutor] = []
-        self._idle: list[ProcessPoolExecutor] = []
+        self._threads = ThreadPoolExecutor(count)
+        self._own = threading.local()
+        self._processes: list[ProcessPoolExecutor] = []
+        self._starting = threading.Lock()
+        self._killed = False
         resource_tracker.ensure_running()  # it lifts the mask of the thread that starts it
 
-    def places(self) -> int:
-        return self._count
-
     def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
-        """Hand a flight to a free process. Its future fails with `BrokenExecutor` if the process
-        was lost."""
-        if self._idle:
-            process = self._idle.pop()
-        else:
-            process = ProcessPoolExecutor(1, _CONTEXT, end_with_parent)
-            self._all.append(process)
+        """Return the future of a flight, which waits for a free process."""
         with defer_interrupts():  # threads and processes inherit the mask of who starts them
-            future = process.submit(fn, *args, **kwargs)
-        future.add_done_callback(partial(self._landed, process))
-        return future
+            return self._threads.submit(self._fly, fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes after the flights that they were given."""
-        for process in self._all:
-            process.shutdown(wait, cancel_futures=cancel_futures)
+        self._threads.shutdown(wait, cancel_futures=cancel_futures)
+        for process in self._processes:
+            process.shutdown(wait)
 
-    def _landed(self, process: ProcessPoolExecutor, flight: Future[Any]) -> None:
-        if not isinstance(flight.exception(), BrokenExecutor):
-            self._idle.append(process)
+    def kill(self) -> None:
+        """End the processes where they are; what they fly is lost."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        with self._starting:
+            self._killed = True
+            for process in multiprocessing.active_children():
+                process.kill()
+
+    def _fly(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> R:
+        """Fly in the process of this thread, and anew in another one where it is lost."""
+        for _ in range(1 + FLOWN_AGAIN):
+            try:
+                with self._starting:
+                    if self._killed:
+                        break
+                    future = self._own_process().submit(fn, *args, **kwargs)
+                return future.result()
+            except BrokenExecutor:
+                del self._own.process
+        raise BrokenExecutor
+
+    def _own_process(self) -> ProcessPoolExecutor:
+        if not hasattr(self._own, "process"):
+            self._own.process = ProcessPoolExecutor(1, _CONTEXT, end_with_parent)
+            self._processes.append(self._own.process)
+        process: ProcessPoolExecutor = self._own.process
+        return process
 
 
 @contextlib.contextmanager
-def flight_processes(jobs: int) -> Iterator[FlightPool]:
-    """Yield a `FlightPool` of `jobs` processes; an exception ends them where they are."""
+def flight_processes(jobs: int) -> Iterator[Executor]:
+    """Yield an executor of `jobs` processes; an exception ends them where they are."""
     pool = FlightProcesses(jobs)
     try:
         yield pool
     except BaseException:
-        for process in multiprocessing.active_children():
-            process.kill()
+        pool.kill()
         raise
     finally:
         pool.shutdown()
@@ -92,29 +101,19 @@ def flight_processes(jobs: int) -> Iterator[FlightPool]:
 @contextlib.contextmanager
 def defer_interrupts() -> Iterator[None]:
     """Hold back Ctrl-C and SIGTERM until the end of the block; threads and processes started
-    within it never see them."""
+    within it never see them. Python's handlers are replaced meanwhile, too: a signal mask belongs
+    to one thread, so a library's thread may take the signal, and Python would still handle it in
+    the main thread."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    try:
-        with _handlers_deferred():
-            yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextlib.contextmanager
-def _handlers_deferred() -> Iterator[None]:
-    """Replace Python's handlers meanwhile: a signal mask belongs to one thread, so a library's
-    thread may take the signal, and Python would still handle it in the main thread."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     came: list[int] = []
-    handlers = {s: signal.signal(s, lambda number, _frame: came.append(number)) for s in SIGNALS}
+    handlers: dict[signal.Signals, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        handlers = {s: signal.signal(s, lambda number, _: came.append(number)) for s in SIGNALS}
     try:
         yield
     finally:
         for name, handler in handlers.items():
-            if handler is not None:  # None: not Python's own
-                signal.signal(name, handler)
-        for number in came:  # the mask holds these, too, until the block is left
-            signal.pthread_kill(threading.get_ident(), number)
+            signal.signal(name, handler or signal.SIG_DFL)
+        for number in came:
+            signal.raise_signal(number)  # held back by the mask
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

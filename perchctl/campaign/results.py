@@ -2,29 +2,54 @@
 
 from __future__ import annotations
 
-import contextlib
 import resource
-import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from scipy.special import betaincinv
+from scipy.stats import binomtest
 
 from perchctl.errors import SafetyAbort
 from perchctl.sim import Scenario
 
-FlightEnd = Literal["perched", "landed", "aborted", "refused"]
+FlightEnd = Literal["perched", "refused", "landed", "aborted"]
 ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
+"""The better before the worse."""
 WORST = 5
 """The number of bad flights that the table names."""
-_SEVERITY: tuple[FlightEnd, ...] = ("perched", "refused", "landed", "aborted")
 
 
 @dataclass(frozen=True)
-class FlightResult:
+class CampaignFlight:
+    """What the results of all kinds of campaigns have.
+
+    Attributes:
+        log, log_problem: the flight's log, and what it lacks; None without.
+        cpu_s: what it took of a core.
+        peak_memory_mb: the most that the process that flew it had ever held by its end (1e6
+            bytes).
+        scenario: what the seed drew.
+    """
+
+    seed: int
+    outcome: str
+    _: KW_ONLY
+    log: Path | None = None
+    log_problem: str | None = None
+    cpu_s: float = 0.0
+    peak_memory_mb: float = 0.0
+    scenario: Scenario | None = None
+
+    @property
+    def is_bad(self) -> bool:
+        """True if the flight went wrong."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class FlightResult(CampaignFlight):
     """One simulated flight.
 
     Attributes:
@@ -35,15 +60,8 @@ class FlightResult:
         attempts: perching attempts, the successful one included.
         locked: the supervisor had locked the vehicle at the end.
         fell: it hit the floor other than by landing.
-        realtime_factor: loop time over wall time.
-        cpu_s: what it took of a core.
-        peak_memory_mb: the most that the process that flew it had ever held by its end (1e6
-            bytes).
-        scenario: what the seed drew.
-        log, log_problem: the flight's log, and what it lacks; None without.
     """
 
-    seed: int
     outcome: FlightEnd
     reason: str
     miss_m: float | None
@@ -51,12 +69,6 @@ class FlightResult:
     attempts: int
     locked: bool
     fell: bool
-    realtime_factor: float
-    log: Path | None = None
-    log_problem: str | None = None
-    cpu_s: float = 0.0
-    peak_memory_mb: float = 0.0
-    scenario: Scenario | None = None
 
     @property
     def is_bad(self) -> bool:
@@ -65,56 +77,54 @@ class FlightResult:
 
 
 def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
-    """A campaign's figures, ready for JSON.
+    """Return a campaign's figures, ready for JSON.
 
     `rates` has each end's share with its interval. `miss_m` is taken over the perched flights
-    (None without any; p95 by linear interpolation). `realtime_factor` is the flight time over
-    the sum of the flights' own wall times. `worst_seeds` names at most `WORST` flights, all of
-    them bad.
+    (None without any; p95 by linear interpolation). `worst_seeds` names at most `WORST` flights,
+    all of them bad.
     """
+    ends: dict[str, int] = {end: sum(r.outcome == end for r in results) for end in ENDS}
     misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
-    flown_s = sum(r.time_s for r in results)
-    wall_s = sum(r.time_s / r.realtime_factor for r in results if r.realtime_factor > 0)
     return {
         "flights": len(results),
-        **{end: sum(r.outcome == end for r in results) for end in ENDS},
-        "rates": {
-            end: rate_record(sum(r.outcome == end for r in results), len(results)) for end in ENDS
-        },
+        **ends,
+        "rates": {end: rate_record(count, len(results)) for end, count in ends.items()},
         "locked": sum(r.locked for r in results),
         "fell": sum(r.fell for r in results),
-        "miss_m": {
-            "median": _rounded(np.median(misses)) if misses else None,
-            "p95": _rounded(np.percentile(misses, 95)) if misses else None,
-            "max": _rounded(max(misses)) if misses else None,
-        },
-        "realtime_factor": _rounded(flown_s / wall_s) if wall_s > 0 else None,
+        "miss_m": miss_record(misses) | {"max": round(max(misses), 6) if misses else None},
         "peak_memory_mb": peak_mb(results),
         "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
     }
 
 
-def peak_mb(results: Iterable[Any]) -> float:
+def miss_record(misses_m: Sequence[float]) -> dict[str, float | None]:
+    """Return the median and the 95th percentile of misses for JSON; None without any."""
+    if not misses_m:
+        return {"median": None, "p95": None}
+    median_m, p95_m = np.percentile(misses_m, (50, 95)).round(6).tolist()
+    return {"median": median_m, "p95": p95_m}
+
+
+def peak_mb(results: Iterable[CampaignFlight]) -> float:
     """Return the largest memory, in 1e6 bytes, that this process or one that flew has held."""
-    peaks = (float(r.peak_memory_mb) for r in results)
+    peaks = (r.peak_memory_mb for r in results)
     return round(max([peak_memory_mb(), *peaks]), 1)
 
 
 def peak_memory_mb() -> float:
     """Return the largest memory, in 1e6 bytes, that this process has held."""
-    # Linux hands a program the peak of the one that started it; its own stands elsewhere.
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024e-6
-    unit = 1 if sys.platform == "darwin" else 1024  # of getrusage, bytes
-    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit * 1e-6)
+    status = Path("/proc/self/status")
+    if not status.exists():  # no Linux
+        return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1e-6)
+    # Of getrusage Linux gives a program the peak of the one that started it.
+    peak = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
+    return int(peak.split()[1]) * 1024e-6
 
 
 def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
     """Return the bad flights: aborted before landed before refused before perched, then by seed."""
     bad = [r for r in results if r.is_bad]
-    return sorted(bad, key=lambda r: (-_SEVERITY.index(r.outcome), r.seed))
+    return sorted(bad, key=lambda r: (-ENDS.index(r.outcome), r.seed))
 
 
 def none_took_off(results: Sequence[FlightResult]) -> SafetyAbort | None:
@@ -126,30 +136,23 @@ def none_took_off(results: Sequence[FlightResult]) -> SafetyAbort | None:
     return SafetyAbort(f"every flight was refused before take-off: {first.reason}")
 
 
-def _rounded(value: Any) -> float:
-    return round(float(value), 6)
-
-
 def campaign_table(results: Sequence[FlightResult]) -> str:
     """Return the campaign's figures and its worst flights as plain text."""
     figures = campaign_summary(results)
     lines = [f"{name:<18}{text}" for name, text in _rows(figures, results)]
     bad = worst_first(results)
     if bad:
-        shown = "" if len(bad) <= WORST else f", {WORST} of {len(bad)}"
-        lines += ["", f"worst flights{shown}"]
+        lines += ["", f"worst flights of {len(bad)}"]
         lines += align_columns(
             [("seed", "outcome", "miss [mm]", "time [s]", "attempts", "reason")]
             + [_cells(r) for r in bad[:WORST]]
         )
-    elif results:
-        lines += ["", "worst flights: none is bad, all perched, none locked or fell"]
     return "\n".join(lines)
 
 
 def align_columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
     """Return rows of cells as lines with aligned columns; the first row is the head."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in rows
@@ -165,27 +168,22 @@ def _cells(r: FlightResult) -> tuple[str, ...]:
 
 def _rows(figures: Mapping[str, Any], results: Sequence[FlightResult]) -> list[tuple[str, str]]:
     """Return the name and the text of each figure of `campaign_summary`."""
-    flights = figures["flights"]
-    rows = [("flights", str(flights))]
-    for end in ENDS:
-        if end != "refused" or figures[end]:
-            rows.append((end, rate_text(figures[end], flights)))
+    rows = [("flights", str(figures["flights"]))]
+    rows += [
+        (end, rate_text(figures[end], figures["flights"]))
+        for end in ENDS
+        if end != "refused" or figures[end]
+    ]
     rows += [("locked", str(figures["locked"])), ("fell", str(figures["fell"]))]
     miss = figures["miss_m"]
     if miss["max"] is not None:
-        text = ", ".join(f"{k} {miss[k] * 1e3:.1f}" for k in ("median", "p95", "max"))
-        farthest = max(
-            (r for r in results if r.outcome == "perched"), key=lambda r: r.miss_m or 0.0
-        )
-        rows.append(("miss [mm]", f"{text} (seed {farthest.seed})"))
+        rows.append(("miss [mm]", ", ".join(f"{k} {m * 1e3:.1f}" for k, m in miss.items())))
     flown = [r for r in results if r.outcome != "refused"]
     if flown:
         times = [r.time_s for r in flown]
         attempts = [r.attempts for r in flown]
         rows.append(("flight time [s]", f"median {np.median(times):.1f}, max {max(times):.1f}"))
         rows.append(("attempts", f"mean {np.mean(attempts):.2f}, max {max(attempts)}"))
-    if figures["realtime_factor"] is not None:
-        rows.append(("real-time factor", f"{figures['realtime_factor']:.1f}"))
     rows.append(("peak memory [MB]", f"{figures['peak_memory_mb']:.0f}"))
     return rows
 
@@ -199,10 +197,8 @@ LEVEL = 0.95
 def rate_interval(k: int, n: int, level: float = LEVEL) -> tuple[float, float]:
     """Return the exact two-sided confidence interval of a rate after `k` of `n` (Clopper and
     Pearson, 1934): it contains the true rate in at least `level` of all campaigns."""
-    side = 0.5 * (1.0 - level)
-    low = float(betaincinv(k, n - k + 1, side)) if k else 0.0
-    high = float(betaincinv(k + 1, n - k, 1.0 - side)) if k < n else 1.0
-    return low, high
+    found = binomtest(k, n).proportion_ci(level, method="exact")
+    return float(found.low), float(found.high)
 
 
 def rate_text(k: int, n: int) -> str:

@@ -76,9 +76,8 @@ ClusterOption = Annotated[
     str | None,
     typer.Option(
         "--cluster",
-        metavar="ADDRESS|local:N",
-        help="Fly on the workers of this dask scheduler, as tcp://10.0.0.5:8786, or of one here "
-        "with N workers.",
+        metavar="ADDRESS",
+        help="Fly on the workers of this dask scheduler, as tcp://10.0.0.5:8786.",
     ),
 ]
 app = new_app(Group)
@@ -174,7 +173,7 @@ def run(
     names = None
     if faults is not None:
         names = tuple(fault.name for fault in fault_campaigns.select_faults(faults))
-    executor = executor_of(jobs, cluster, [flown], log_dir)
+    executor = executor_of(jobs, cluster, [flown])
 
     def fly_campaign(
         kind: type[C],
@@ -348,11 +347,9 @@ ExecutorOf = Callable[[int], AbstractContextManager[Executor]]
 """Who flies so many flights."""
 
 
-def executor_of(
-    jobs: int | None, cluster: str | None, profiles: Sequence[Profile], log_dir: Path | None = None
-) -> ExecutorOf:
+def executor_of(jobs: int | None, cluster: str | None, profiles: Sequence[Profile]) -> ExecutorOf:
     """Return who flies: processes of this computer, or the workers of a cluster. `profiles`: with
-    the files that flights read; `log_dir`: where they write. Errors: UsageError."""
+    the files that flights read. Errors: UsageError."""
     if cluster is None:
         return lambda flights: campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:
@@ -374,9 +371,7 @@ def executor_of(
                 from perchctl.campaign import cluster_pool
         except ImportError as error:
             raise no_cluster(str(error)) from error
-        with cluster_pool(cluster, profiles, log_dir) as pool:
-            for note in pool.notes:
-                say(note)
+        with cluster_pool(cluster, profiles) as pool:
             yield pool
 
     return workers

@@ -1,17 +1,23 @@
-"""The edges of a flight at which faults come in: its radio, its camera, and the program itself."""
+"""The edges of a flight at which faults come in: its radio, its camera, and the program itself.
+
+What `perchctl.faults.effects` does acts on `Edges`.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
 
 from perchctl.camera import FrameSource
-from perchctl.faults import effects as e
 from perchctl.link import MockLink, Packet, Port, Radio
+from perchctl.sim import SimulatedVehicle
 from perchctl.vision import Frame
 
 # --- The radio: what arrives, what does not, and what comes late -------------------------------
@@ -41,64 +47,50 @@ def order_of(packet: Packet) -> str:
 
 
 class FaultyRadio(Radio):
-    """A radio that loses the packets that `air` loses, and more as effects begin. `cut` ends the
-    uplink for good."""
+    """A radio that loses the packets that `air` loses, and more.
+
+    Attributes:
+        cut: the uplink has ended for good.
+        lost: how many of the next packets of an order are lost; `twice`: orders whose next packet
+            arrives twice.
+        receive: is called with the second copy of a packet.
+    """
 
     def __init__(self, air: Radio | None = None) -> None:
         self._air = air or Radio()
+        self._losses: list[tuple[float, bool, str, float]] = []
         self.cut = False
-        self._begun: list[tuple[e.Silence | e.BlockDead | e.TelemetryDelayed, float]] = []
-        self._left: dict[str, int] = {}  # packets of an order still to be lost
-        self._twice: set[str] = set()
-        self._receive: Callable[[Packet], None] | None = None
+        self.lost: dict[str, int] = {}
+        self.twice: set[str] = set()
+        self.receive: Callable[[Packet], None] | None = None
 
-    def serves(self, receive: Callable[[Packet], None]) -> None:
-        """Name what receives the second copy of a packet."""
-        self._receive = receive
-
-    def begin(self, effect: e.RadioEffect, now_s: float) -> None:
-        """Begin an effect."""
-        match effect:
-            case e.PacketLost(order, count):
-                self._left[order] = count
-            case e.PacketTwice(order):
-                self._twice.add(order)
-            case e.Reboots(boots_s):
-                self._begun.append((e.Silence(boots_s, up=True, down=True), now_s))
-                unasked_s = boots_s + MockLink.BLOCKS_BACK_AFTER_S
-                self._begun.append((e.Silence(unasked_s, up=False, down=True), now_s))
-            case e.Silence() | e.BlockDead() | e.TelemetryDelayed():
-                self._begun.append((effect, now_s))
+    def lose(self, end_s: float, up: bool, down: str, delay_s: float = math.inf) -> None:
+        """Until `end_s` lose all commands (`up`), and the log block of the name `down`, or "all";
+        with `delay_s` it comes late instead."""
+        self._losses.append((end_s, up, down, delay_s))
 
     def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
         if self.cut or not self._air.uplink_arrives(packet, now_s):
             return False
         order = order_of(packet)
-        if self._left.get(order, 0) > 0:
-            self._left[order] -= 1
+        if self.lost.get(order, 0) > 0:
+            self.lost[order] -= 1
             return False
-        for effect, begin_s in self._begun:
-            if isinstance(effect, e.Silence) and effect.up and now_s < begin_s + effect.for_s:
-                return False
-        if order in self._twice and self._receive is not None:
-            self._twice.remove(order)
-            self._receive(packet)
+        if any(up and now_s < end_s for end_s, up, _, _ in self._losses):
+            return False
+        if order in self.twice and self.receive is not None:
+            self.twice.remove(order)
+            self.receive(packet)
         return True
 
     def downlink_delay_s(self, block: str, now_s: float) -> float | None:
         delay_s = self._air.downlink_delay_s(block, now_s)
         if delay_s is None:
             return None
-        for effect, begin_s in self._begun:
-            if now_s >= begin_s + effect.for_s:
-                continue
-            if isinstance(effect, e.Silence) and effect.down:
-                return None
-            if isinstance(effect, e.BlockDead) and effect.block == block:
-                return None
-            if isinstance(effect, e.TelemetryDelayed):
-                delay_s = max(delay_s, effect.delay_s)
-        return delay_s
+        for end_s, _, down, late_s in self._losses:
+            if now_s < end_s and down in ("all", block):
+                delay_s = max(delay_s, late_s)
+        return None if math.isinf(delay_s) else delay_s
 
 
 # --- The camera --------------------------------------------------------------------------------
@@ -112,6 +104,17 @@ SHEET_SIGMA = 6.0
 LOST = 0.2
 
 
+@dataclass(frozen=True)
+class CameraFault:
+    """How the camera's pictures are spoilt. `kind` is silent, frozen, snow, dark, covered, lossy,
+    late, out-of-order, mirrored or sooner (pictures that were late, as the profile expects, no
+    longer are). `late_s` belongs to late and sooner."""
+
+    kind: str
+    for_s: float
+    late_s: float = 0.0
+
+
 class FaultyCamera:
     """A frame source that passes on the simulated camera's frames, spoilt while a fault lasts."""
 
@@ -120,14 +123,14 @@ class FaultyCamera:
     def __init__(self, inner: FrameSource, seed: int) -> None:
         self._inner = inner
         self._rng = np.random.default_rng([seed, SNOW_STREAM])
-        self._fault: e.CameraFault | None = None
+        self._fault: CameraFault | None = None
         self._begin_s = 0.0
         self._last: Frame | None = None
         self._queue: deque[Frame] = deque()
         self._overtaken: Frame | None = None
         self.late_s = 0.0  # until a fault begins, and known to the profile
 
-    def begin(self, fault: e.CameraFault, now_s: float) -> None:
+    def begin(self, fault: CameraFault, now_s: float) -> None:
         self._fault, self._begin_s = fault, now_s
         self.late_s = 0.0
         self._queue.clear()
@@ -159,7 +162,7 @@ class FaultyCamera:
     def close(self) -> None:
         self._inner.close()
 
-    def _spoilt(self, fault: e.CameraFault, frame: Frame | None, now_s: float) -> Frame | None:
+    def _spoilt(self, fault: CameraFault, frame: Frame | None, now_s: float) -> Frame | None:
         if fault.kind == "late":
             return self._late(frame, fault.late_s, now_s)
         if fault.kind == "out-of-order":
@@ -230,58 +233,101 @@ class PlantedError(Exception):
 
 
 class FaultyClock:
-    """The flight's clock in simulated time. Effects on the program happen where the loop waits
-    for its next tick. A killed program sends nothing more through `radio`. A flight that takes
-    longer than `stop_s` is ended."""
+    """The flight's clock in simulated time. What a fault does to the program happens where the loop
+    waits for its next tick. A killed program sends nothing more through `radio`. A flight that
+    takes longer than `stop_s` is ended.
+
+    Attributes:
+        pending: is called where the loop waits next.
+        tick_s, slow_until_s: each tick takes at least `tick_s` until then.
+        killed_s: when the program was killed; `endless`: since its flight took too long.
+    """
 
     def __init__(self, link: MockLink, radio: FaultyRadio, stop_s: float) -> None:
         self._link, self._radio, self._stop_s = link, radio, stop_s
-        self._pending: e.ProgramEffect | None = None
-        self._slow: e.Slow | None = None
-        self._slow_until_s = 0.0
-        self._gone = False
-        self.endless = False
+        self.pending: Callable[[], None] | None = None
+        self.tick_s = self.slow_until_s = 0.0
         self.killed_s: float | None = None
-
-    def begin(self, effect: e.ProgramEffect, now_s: float) -> None:
-        """Begin an effect: where the loop waits next, or with its next ticks."""
-        if isinstance(effect, e.Slow):
-            self._slow, self._slow_until_s = effect, now_s + effect.for_s
-        else:
-            self._pending = effect
+        self.endless = False
 
     def now(self) -> float:
-        if self._gone:
+        if self.killed_s is not None:
             raise ProgramKilled  # it rescues nothing any more, and says nothing
         return self._link.now_s
 
     def wait_until(self, t_s: float) -> None:
         now_s = self._link.now_s
-        if self._slow is not None and now_s < self._slow_until_s:
-            t_s = max(t_s, now_s + self._slow.turn_s)
-        if t_s > now_s and not self._gone:
+        if now_s < self.slow_until_s:
+            t_s = max(t_s, now_s + self.tick_s)
+        if t_s > now_s and self.killed_s is None:
             self._link.advance_to(t_s)
-        effect, self._pending = self._pending, None
-        match effect:
-            case e.Killed():
-                self._kill()
-            case e.Suspended(for_s):
-                # Past the link: none of the program's threads runs.
-                self._link.vehicle.advance_to(self._link.now_s + for_s)
-            case e.Hung(for_s):
-                self._link.advance_to(self._link.now_s + min(for_s, LONGEST_S))
-                if for_s >= e.FOR_EVER:
-                    self._kill()
-            case e.Raises():
-                raise PlantedError("an exception that the fault raised")
+        act, self.pending = self.pending, None
+        if act is not None:
+            act()
         if self._link.now_s > self._stop_s:
             self.endless = True
-            self._kill()
-        if self._gone:
+            self.kill()
+        if self.killed_s is not None:
             raise ProgramKilled
 
-    def _kill(self) -> None:
-        if not self._gone:
-            self._gone = True
+    def kill(self) -> None:
+        """End the program."""
+        if self.killed_s is None:
             self.killed_s = self._link.now_s
             self._radio.cut = True
+
+    def suspend(self, for_s: float) -> None:
+        """Let time pass without the link: none of the program's threads runs."""
+        self._link.vehicle.advance_to(self._link.now_s + for_s)
+
+    def hang(self, for_s: float) -> None:
+        """Let time pass with the link: the loop's thread is stuck, the others live."""
+        self._link.advance_to(self._link.now_s + min(for_s, LONGEST_S))
+        if for_s > LONGEST_S:
+            self.kill()
+
+    def fail(self) -> None:
+        """Raise in the loop's thread."""
+        raise PlantedError("an exception that the fault raised")
+
+
+# --- All of them -------------------------------------------------------------------------------
+
+
+class Edges:
+    """The parts of a flight that faults act on: its vehicle, radio, camera and clock, the
+    operator's Ctrl-C (`press`) and closed terminal (`hang_up`), and `disk`, whose `problem` is
+    that of the log's disk."""
+
+    def __init__(
+        self,
+        vehicle: SimulatedVehicle,
+        radio: FaultyRadio,
+        camera: FaultyCamera,
+        clock: FaultyClock,
+        press: Callable[[], None],
+        hang_up: Callable[[], None],
+        disk: Any,
+    ) -> None:
+        self.vehicle, self.radio, self.camera, self.clock = vehicle, radio, camera, clock
+        self.press, self.hang_up, self.disk = press, hang_up, disk
+        self.deck_silent = False
+        self.each: list[Callable[[float], None]] = []
+        self._later: list[tuple[float, Callable[[], None]]] = []
+
+    def at(self, t_s: float, act: Callable[[], None]) -> None:
+        """Call a function at that time."""
+        self._later.append((t_s, act))
+        self._later.sort(key=lambda entry: entry[0])
+
+    def set_until(self, end_s: float, owner: Any, name: str, value: Any, after: Any) -> None:
+        """Set an attribute now, and set it to `after` at `end_s`."""
+        setattr(owner, name, value)
+        self.at(end_s, partial(setattr, owner, name, after))
+
+    def pass_time(self, t_s: float) -> None:
+        """Call what is due by then, and each function of `each`; called every `SAMPLE_S`."""
+        while self._later and self._later[0][0] <= t_s:
+            self._later.pop(0)[1]()
+        for act in self.each:
+            act(t_s)

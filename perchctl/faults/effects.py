@@ -1,226 +1,331 @@
-"""What a fault does, as values: drawn by the catalogue, laid into a flight by `inject`.
+"""What a fault does, as functions that act on a flight's edges when the fault begins, at `t_s`.
 
-Times are seconds from the fault's beginning; `FOR_EVER` outlasts every flight.
+An effect is such a function with its parameters: a `functools.partial`, which the catalogue draws
+and the injector calls. The planner and the loop know nothing of it. Durations are counted from the
+fault's beginning; `FOR_EVER` outlasts every flight.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import random
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
+from perchctl.faults.edges import CameraFault, Edges
+from perchctl.geometry import GRAVITY_MPS2
+from perchctl.link import MockLink
+from perchctl.mission import Event, Phase, Tick
+from perchctl.profile import Profile
+from perchctl.sim import CaptureFault, Scenario
+
+Effect = partial[Any]
+Axes = tuple[float, float, float]
+"""World axes."""
 FOR_EVER = 1e6
+SAMPLE_S = 0.01
+"""Between two calls of `Injector.each` and `Edges.pass_time`."""
+LIGHTHOUSE = "deck.bcLighthouse4"
+CAPTURE_FAULTS = {
+    "frozen": CaptureFault(frozen=True),
+    "silent": CaptureFault(gone=True),
+    "occluded": CaptureFault(occluded=True),
+    "swapped": CaptureFault(swapped=True),
+    "millimetres": CaptureFault(scale=1000.0),
+    "mirrored": CaptureFault(mirrored=True),
+    "late": CaptureFault(),
+}
 
 
-@dataclass(frozen=True)
-class RadioEffect:
-    """An effect on the radio (`perchctl.faults.edges.FaultyRadio`)."""
+# --- The radio ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class ProgramEffect:
-    """An effect on the program's loop (`perchctl.faults.edges.FaultyClock`)."""
+def radio_loss(
+    edges: Edges,
+    t_s: float,
+    for_s: float,
+    up: bool = False,
+    down: str = "",
+    delay_s: float = math.inf,
+) -> None:
+    """Lose all commands (`up`), and the log block of the name `down`, or "all"; with `delay_s`
+    these come late instead."""
+    edges.radio.lose(t_s + for_s, up, down, delay_s)
 
 
-@dataclass(frozen=True)
-class Silence(RadioEffect):
-    """The radio carries nothing, up, down or both."""
-
-    for_s: float
-    up: bool
-    down: bool
+def packet_lost(edges: Edges, t_s: float, order: str, count: int) -> None:
+    """Lose the next `count` packets of an order (`ORDERS` of `perchctl.faults.edges`)."""
+    edges.radio.lost[order] = count
 
 
-@dataclass(frozen=True)
-class PacketLost(RadioEffect):
-    """The next `count` packets of an order are lost (`ORDERS` of `perchctl.faults.edges`)."""
-
-    order: str
-    count: int
+def packet_twice(edges: Edges, t_s: float, order: str) -> None:
+    """Let the next packet of an order arrive twice."""
+    edges.radio.twice.add(order)
 
 
-@dataclass(frozen=True)
-class PacketTwice(RadioEffect):
-    """The next packet of an order arrives twice."""
-
-    order: str
-
-
-@dataclass(frozen=True)
-class BlockDead(RadioEffect):
-    """One log block stops arriving."""
-
-    block: str
-    for_s: float
+def reboots(edges: Edges, t_s: float, boots_s: float) -> None:
+    """Reboot the vehicle after a voltage drop: its motors stop, it receives nothing for `boots_s`,
+    and its log blocks are gone until the link starts them again."""
+    edges.vehicle.firmware.reboot()
+    edges.radio.lose(t_s + boots_s, up=True, down="all")
+    edges.radio.lose(t_s + (boots_s + MockLink.BLOCKS_BACK_AFTER_S), up=False, down="all")
 
 
-@dataclass(frozen=True)
-class TelemetryDelayed(RadioEffect):
-    delay_s: float
-    for_s: float
+# --- The camera and the positions --------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class CameraFault:
-    """The camera's pictures are spoilt. `kind` is silent, frozen, snow, dark, covered, lossy,
-    late, out-of-order, mirrored or sooner (pictures that were late, as the profile expects, no
-    longer are). `late_s` belongs to late and sooner."""
-
-    kind: str
-    for_s: float
-    late_s: float = 0.0
+def camera_fault(edges: Edges, t_s: float, kind: str, for_s: float, late_s: float = 0.0) -> None:
+    """Spoil the camera's pictures (`CameraFault`)."""
+    edges.camera.begin(CameraFault(kind, for_s, late_s), t_s)
 
 
-@dataclass(frozen=True)
-class EstimateError:
-    """A step and a drift are added to the vehicle's state estimate."""
-
-    step_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    turn_deg: float = 0.0
-    drift_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    for_s: float = FOR_EVER
-
-
-@dataclass(frozen=True)
-class ExternalPositions:
-    """A vehicle without a deck flies by a motion capture that fails. `how` is frozen, silent,
-    occluded, swapped, millimetres, mirrored, or late by `late_s`."""
-
-    how: str
-    for_s: float
-    late_s: float = 0.0
+def external_positions(
+    edges: Edges, t_s: float, how: str, for_s: float, late_s: float = 0.0
+) -> None:
+    """Let the motion capture by which a vehicle without a deck flies fail as `CAPTURE_FAULTS` has
+    it, or be late by `late_s`."""
+    assert edges.vehicle.capture is not None
+    edges.vehicle.capture.lay(replace(CAPTURE_FAULTS[how], late_s=late_s), for_s)
 
 
-@dataclass(frozen=True)
-class DeckSilent:
-    """The absolute positions of the vehicle's deck stop. Until then they corrected an
+def deck_silent(edges: Edges, t_s: float, for_s: float, acc_z_mps2: float) -> None:
+    """Stop the absolute positions of the vehicle's deck. Until then they corrected an
     accelerometer that reads `acc_z_mps2` too much along z, because the motors shake it."""
-
-    for_s: float
-    acc_z_mps2: float
+    edges.set_until(t_s + for_s, edges, "deck_silent", True, False)
 
 
-@dataclass(frozen=True)
-class LogReads:
-    """Log variables report `value` (None: their value of that moment) whatever is true."""
-
-    names: tuple[str, ...]
-    value: float | None
-    for_s: float
+# --- The vehicle -------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class BatterySags:
-    """The battery's resting voltage falls by `by_v` at this rate."""
+def estimate_error(
+    edges: Edges,
+    t_s: float,
+    step_m: Axes = (0.0, 0.0, 0.0),
+    turn_deg: float = 0.0,
+    drift_mps: Axes = (0.0, 0.0, 0.0),
+    for_s: float = FOR_EVER,
+) -> None:
+    """Add a step and a drift to the vehicle's state estimate."""
 
-    rate_vps: float
-    by_v: float
+    def spoil(now: Any) -> None:
+        after_s = edges.vehicle.t_s - t_s
+        x, y, z = step_m
+        vx, vy, vz = drift_mps
+        now.x_m += x + vx * after_s
+        now.y_m += y + vy * after_s
+        now.z_m += z + vz * after_s
+        now.vx_mps += vx
+        now.vy_mps += vy
+        now.vz_mps += vz
+        now.yaw_deg = math.remainder(now.yaw_deg + turn_deg, 360.0)
 
-
-@dataclass(frozen=True)
-class Reboots(RadioEffect):
-    """The vehicle reboots after a voltage drop: its motors stop, it receives nothing for
-    `boots_s`, and its log blocks are gone until the link starts them again."""
-
-    boots_s: float
-
-
-@dataclass(frozen=True)
-class MotorWeak:
-    motor: int  # 1 to 4
-    strength: float
-
-
-@dataclass(frozen=True)
-class ThrustChanged:
-    """All motors give this part of their thrust, as with other propellers."""
-
-    to: float
+    edges.set_until(t_s + for_s, edges.vehicle.firmware.estimator, "spoil", spoil, None)
 
 
-@dataclass(frozen=True)
-class Push:
-    """A force in world axes acts on the vehicle."""
-
-    force_n: tuple[float, float, float]
-    for_s: float
-
-
-@dataclass(frozen=True)
-class MagnetHolds:
-    """The magnet holds this part of the weight from the start."""
-
-    of_weight: float
+def log_reads(
+    edges: Edges, t_s: float, names: tuple[str, ...], value: float | None, for_s: float
+) -> None:
+    """Let log variables report `value` (None: their value of that moment) whatever is true."""
+    firmware = edges.vehicle.firmware
+    for name in names:
+        firmware.log_overrides[name] = firmware.log_value(name) if value is None else value
+    edges.at(t_s + for_s, firmware.log_overrides.clear)
 
 
-@dataclass(frozen=True)
-class MagnetLetsGo:
-    """The magnet lets go for good, so long after the contact."""
+def battery_sags(edges: Edges, t_s: float, rate_vps: float, by_v: float) -> None:
+    """Let the battery's resting voltage fall by `by_v` at this rate."""
+    world, left_v = edges.vehicle.world, by_v
 
-    after_s: float
+    def sag(_now_s: float) -> None:
+        nonlocal left_v
+        step_v = min(rate_vps * SAMPLE_S, left_v)
+        world.battery_rest_v -= step_v
+        left_v -= step_v
 
-
-@dataclass(frozen=True)
-class Room:
-    """The room differs from the scenario from the start; None keeps the drawn value."""
-
-    ceiling_z_m: float | None = None
-    no_target: bool = False
-    target_above_ceiling_m: float = 0.0
-    second_target_m: tuple[float, float] | None = None
-    mount_turned_deg: float = 0.0
+    edges.each.append(sag)
 
 
-@dataclass(frozen=True)
-class TargetMoves:
-    by_m: tuple[float, float]
+def thrust_changed(edges: Edges, t_s: float, to: tuple[float, float, float, float]) -> None:
+    """Leave each motor this part of its thrust, as with other propellers or a weak motor."""
+    powertrain = edges.vehicle.world.powertrain
+    s1, s2, s3, s4 = (s * part for s, part in zip(powertrain.strength, to, strict=True))
+    powertrain.strength = (s1, s2, s3, s4)
 
 
-@dataclass(frozen=True)
-class Operator:
-    """The operator presses Ctrl-C at these times, or closes the terminal (`hang_up`)."""
-
-    presses_s: tuple[float, ...]
-    hang_up: bool = False
+def push(edges: Edges, t_s: float, force_n: Axes, for_s: float) -> None:
+    """Let a force act on the vehicle."""
+    still_n = (0.0, 0.0, 0.0)
+    edges.set_until(t_s + for_s, edges.vehicle.world, "external_force_n", force_n, still_n)
 
 
-@dataclass(frozen=True)
-class Killed(ProgramEffect):
-    """The program is killed and sends nothing more."""
+def magnet_lets_go(edges: Edges, t_s: float, after_s: float) -> None:
+    """Let the magnet go for good, so long after the contact."""
+    world, contact_s = edges.vehicle.world, math.inf
+
+    def watch(now_s: float) -> None:
+        nonlocal contact_s
+        if world.magnet_engaged:
+            contact_s = min(contact_s, now_s)
+        if now_s >= contact_s + after_s:
+            world.magnet.let_go = True
+
+    edges.each.append(watch)
 
 
-@dataclass(frozen=True)
-class Suspended(ProgramEffect):
-    """The whole program is suspended."""
-
-    for_s: float
-
-
-@dataclass(frozen=True)
-class Hung(ProgramEffect):
-    """The loop's thread is stuck; the program's other threads live."""
-
-    for_s: float
+def target_moves(edges: Edges, t_s: float, by_m: tuple[float, float]) -> None:
+    """Move the target with its magnet."""
+    x, y = edges.vehicle.world.magnet.target_xy_m
+    edges.vehicle.move_target((x + by_m[0], y + by_m[1]))
 
 
-@dataclass(frozen=True)
-class Slow(ProgramEffect):
-    """Each tick of the loop takes `turn_s`."""
-
-    turn_s: float
-    for_s: float
+# --- The operator and the program --------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Raises(ProgramEffect):
-    """An exception that the program does not foresee is raised in the loop's thread."""
+def operator(edges: Edges, t_s: float, presses_s: tuple[float, ...], hang_up: bool = False) -> None:
+    """Let the operator press Ctrl-C at these times, or close the terminal (`hang_up`)."""
+    for press_s in presses_s:
+        edges.at(t_s + press_s, edges.hang_up if hang_up else edges.press)
 
 
-@dataclass(frozen=True)
-class DiskFull:
-    for_s: float
+def killed(edges: Edges, t_s: float) -> None:
+    """Kill the program, which sends nothing more."""
+    edges.clock.pending = edges.clock.kill
 
 
-Effect = (
-    RadioEffect | ProgramEffect | CameraFault | EstimateError | ExternalPositions | DeckSilent
-    | LogReads | BatterySags | MotorWeak | ThrustChanged | Push | MagnetHolds | MagnetLetsGo | Room
-    | TargetMoves | Operator | DiskFull
-)  # fmt: skip
+def suspended(edges: Edges, t_s: float, for_s: float) -> None:
+    """Suspend the whole program."""
+    edges.clock.pending = partial(edges.clock.suspend, for_s)
+
+
+def hung(edges: Edges, t_s: float, for_s: float) -> None:
+    """Let the loop's thread be stuck; the program's other threads live."""
+    edges.clock.pending = partial(edges.clock.hang, for_s)
+
+
+def slow(edges: Edges, t_s: float, tick_s: float, for_s: float) -> None:
+    """Let each tick of the loop take `tick_s`."""
+    edges.clock.tick_s, edges.clock.slow_until_s = tick_s, t_s + for_s
+
+
+def raises(edges: Edges, t_s: float) -> None:
+    """Raise an exception that the program does not foresee in the loop's thread."""
+    edges.clock.pending = edges.clock.fail
+
+
+def disk_full(edges: Edges, t_s: float, for_s: float) -> None:
+    """Fill the log's disk."""
+    edges.set_until(t_s + for_s, edges.disk, "problem", "No space left on device", None)
+
+
+# --- What holds from the start -----------------------------------------------------------------
+
+
+def magnet_holds(scenario: Scenario, of_weight: float) -> Scenario:
+    """Return the scenario with a magnet that holds this part of the weight."""
+    hold_n = of_weight * (scenario.mass_kg * GRAVITY_MPS2)
+    return replace(scenario, magnet_force_n=hold_n, first_contact_force_n=None)
+
+
+def room(scenario: Scenario, **fields: Any) -> Scenario:
+    """Return the scenario with other values of these fields."""
+    return replace(scenario, **fields)
+
+
+FROM_THE_START = (magnet_holds, room)
+
+
+def changed_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
+    """Return the scenario with what holds from the start."""
+    for effect in effects:
+        if effect.func in FROM_THE_START:
+            scenario = effect(scenario)
+        elif effect.func in (external_positions, deck_silent):
+            extra = {**scenario.extra, "external_position": 1.0}
+            deck = {LIGHTHOUSE: 1.0} if effect.func is deck_silent else {}
+            scenario = replace(scenario, extra=extra, parameters=scenario.parameters | deck)
+    return scenario
+
+
+def changed_profile(profile: Profile, effects: tuple[Effect, ...]) -> Profile:
+    """Return the profile with the positioning and the camera latency that the effects need."""
+    for effect in effects:
+        if effect.func in (external_positions, deck_silent):
+            by = "deck" if effect.func is deck_silent else "mocap"
+            positioning = profile.positioning.model_copy(update={"by": by})
+            profile = profile.model_copy(update={"positioning": positioning})
+        latency_s = profile.camera.start_latency_s + sooner_s(effect)
+        if latency_s > profile.camera.start_latency_s:
+            camera = profile.camera.model_copy(update={"latency_s": latency_s})
+            profile = profile.model_copy(update={"camera": camera})
+    return profile
+
+
+def sooner_s(effect: Effect) -> float:
+    """Return the time by which the pictures will come sooner than the profile expects."""
+    sooner = effect.func is camera_fault and effect.keywords["kind"] == "sooner"
+    return float(effect.keywords["late_s"]) if sooner else 0.0
+
+
+# --- When they begin ---------------------------------------------------------------------------
+
+
+class Injector:
+    """Begins effects `moment_s` into `phase`, or when the phase ends earlier. It follows the phases
+    as a watcher of the loop; `each` is called every `SAMPLE_S` of simulated time. `begin_s` is
+    None until they begin, `flown` is the phase of the newest tick."""
+
+    problem: str | None = None
+
+    def __init__(
+        self, edges: Edges, effects: tuple[Effect, ...], phase: Phase, moment_s: float
+    ) -> None:
+        self._edges, self._phase, self._moment_s = edges, phase, moment_s
+        self._effects = [effect for effect in effects if effect.func not in FROM_THE_START]
+        self._due_s: float | None = None
+        self.begin_s: float | None = None
+        self.flown: Phase | None = None
+        self._shakes_mps2 = 0.0
+        for effect in effects:
+            edges.camera.late_s += sooner_s(effect)
+            if effect.func is deck_silent:
+                self._shakes_mps2 = effect.keywords["acc_z_mps2"]
+                edges.each.append(
+                    partial(_measure, edges, random.Random(edges.vehicle.scenario.seed))
+                )
+
+    def event(self, event: Event) -> None:
+        return None
+
+    def tick(self, tick: Tick) -> None:
+        if self.flown is None and self._shakes_mps2:
+            self._edges.vehicle.firmware.estimator.shift_accelerometer(self._shakes_mps2)
+        self.flown = tick.state.phase
+        if self.begin_s is not None:
+            return
+        if self.flown is not self._phase:
+            if self._due_s is not None:  # left before its time
+                self.begin(self._edges.vehicle.t_s)
+        elif self._due_s is None:
+            self._due_s = tick.t_s + self._moment_s
+
+    def each(self, t_s: float) -> None:
+        """Begin what is due."""
+        if self.begin_s is None and self._due_s is not None and t_s >= self._due_s:
+            self.begin(t_s)
+
+    def begin(self, t_s: float) -> None:
+        """Begin the effects now."""
+        self.begin_s = t_s
+        for effect in self._effects:
+            effect(self._edges, t_s)
+
+
+def _measure(edges: Edges, noise: random.Random, _now_s: float) -> None:
+    """Give the estimator a position measured by the vehicle's own deck."""
+    if edges.deck_silent:
+        return
+    world, firmware = edges.vehicle.world, edges.vehicle.firmware
+    sigma_m = firmware.scenario.estimate_noise_m
+    x_m, y_m, z_m = (p + noise.gauss(0.0, sigma_m) for p in (world.x_m, world.y_m, world.z_m))
+    firmware.estimator.external_position((x_m, y_m, z_m))

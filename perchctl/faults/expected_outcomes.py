@@ -7,10 +7,10 @@ what was drawn, and not what the program reported.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from perchctl.faults.effects import Killed, Push
+from perchctl.faults.effects import killed, push
 from perchctl.faults.oracle import Flag
 from perchctl.faults.truth import Facts
 from perchctl.mission import CATCHABLE_M
@@ -30,9 +30,8 @@ class ExpectedOutcome:
     name: str
     cause: Callable[[Facts], float | None]
     within_s: float
-    flags: frozenset[Flag]
+    flags: tuple[Flag, ...]
     reason: str
-    chosen: bool = False
 
     def covers(self, flag: Flag, t_s: float, facts: Facts) -> bool:
         """Return True if a flag raised at `t_s` is a consequence of the cause."""
@@ -41,37 +40,31 @@ class ExpectedOutcome:
 
 
 def unexpected(
-    flags: Mapping[Flag, float], outcomes: Iterable[ExpectedOutcome], facts: Facts
+    flags: Mapping[Flag, float], outcomes: Sequence[ExpectedOutcome], facts: Facts
 ) -> tuple[Flag, ...]:
     """Return the flags that no expected outcome covers: those that count."""
-    listed = tuple(outcomes)
     return tuple(
         flag
         for flag, t_s in flags.items()
-        if not any(outcome.covers(flag, t_s, facts) for outcome in listed)
+        if not any(outcome.covers(flag, t_s, facts) for outcome in outcomes)
     )
 
 
-def _flags(*flags: Flag) -> frozenset[Flag]:
-    return frozenset(flags)
+FALL: tuple[Flag, ...] = ("fell", "slid")
+CUT_DOWN: tuple[Flag, ...] = (*FALL, "strayed", "locked_needlessly")
 
 
 def _killed_in_landing(facts: Facts) -> float | None:
-    killed = any(isinstance(effect, Killed) for effect in facts.effects)
-    return facts.killed_s if killed and facts.own_landing else None
-
-
-def _let_go_after_the_watch(facts: Facts) -> float | None:
-    return facts.let_go_s if facts.watched else None
-
-
-def _slipped_low(facts: Facts) -> float | None:
-    return facts.slipped_s if facts.slipped_m < CATCHABLE_M else None
+    return facts.killed_s if facts.does(killed) and facts.own_landing else None
 
 
 def _knocked_off(facts: Facts) -> float | None:
-    pushed = any(isinstance(effect, Push) for effect in facts.effects)
-    if not pushed or facts.begin_s is None or facts.slipped_s is None or not facts.toppled:
+    if (
+        not facts.does(push)
+        or facts.begin_s is None
+        or facts.slipped_s is None
+        or not facts.toppled
+    ):
         return None
     return facts.slipped_s if 0.0 <= facts.slipped_s - facts.begin_s <= PUSHED_OFF_S else None
 
@@ -85,52 +78,47 @@ def _sagged_too_fast(facts: Facts) -> float | None:
 
 
 CUT = ExpectedOutcome(
-    "cut by the firmware", lambda facts: facts.cut_s, 4.0,
-    _flags("fell", "slid", "strayed", "locked_needlessly"),
+    "cut by the firmware", lambda facts: facts.cut_s, 4.0, CUT_DOWN,
     "2 s after the last setpoint the firmware cuts the motors and locks; nothing that the "
-    "program sends arrives any more", chosen=True,
+    "program sends arrives any more",
 )  # fmt: skip
 LEFT_LANDING = ExpectedOutcome(
-    "lands alone", _killed_in_landing, 20.0, _flags("flies_on"),
+    "lands alone", _killed_in_landing, 20.0, ("flies_on",),
     "the vehicle flies its own landing to the end without the program: it comes down, softly",
-    chosen=True,
 )  # fmt: skip
 OPERATOR_STOPS = ExpectedOutcome(
-    "the operator's word", lambda facts: facts.stop_s, 4.0,
-    _flags("fell", "slid", "strayed", "locked_needlessly"),
-    "a second Ctrl-C is an emergency stop: it cuts the motors and locks", chosen=True,
+    "the operator's word", lambda facts: facts.stop_s, 4.0, CUT_DOWN,
+    "a second Ctrl-C is an emergency stop: it cuts the motors and locks",
 )  # fmt: skip
 LETS_GO_LATER = ExpectedOutcome(
-    "let go after the flight", _let_go_after_the_watch, 4.0, _flags("fell", "slid"),
+    "let go after the flight", lambda facts: facts.let_go_s if facts.watched else None, 4.0, FALL,
     "the whole weight has hung for the time it is watched; the program is no longer there "
     "when the magnet lets go",
 )  # fmt: skip
 TOO_LOW = ExpectedOutcome(
-    "too low to catch", _slipped_low, 4.0, _flags("fell", "slid"),
+    "too low to catch",
+    lambda facts: facts.slipped_s if facts.slipped_m < CATCHABLE_M else None, 4.0, FALL,
     "a fall from standing motors takes up to 0.8 m to catch; it hung lower than 1 m",
 )  # fmt: skip
 KNOCKED_OFF = ExpectedOutcome(
-    "knocked off the magnet", _knocked_off, 4.0, _flags("fell", "slid"),
+    "knocked off the magnet", _knocked_off, 4.0, FALL,
     "a blow has torn it off while its motors stood still, and turned it over before they turned",
 )  # fmt: skip
 NO_LIFT = ExpectedOutcome(
-    "too weak to hover", lambda facts: facts.weak_s, 15.0, _flags("fell", "slid"),
+    "too weak to hover", lambda facts: facts.weak_s, 15.0, FALL,
     "what battery and motors can lift is less than the weight: four times what the weak motor "
     "gives, for with more of the others it turns over",
 )  # fmt: skip
 SAGS_TOO_FAST = ExpectedOutcome(
-    "sags too fast", _sagged_too_fast, 15.0, _flags("fell", "slid"),
+    "sags too fast", _sagged_too_fast, 15.0, FALL,
     "from the voltage at which it lands to the one that does not lift the weight any more it "
     "has less time than the way down takes",
 )  # fmt: skip
-
 BROWN_OUT = ExpectedOutcome(
-    "started again", lambda facts: facts.rebooted_s, 4.0,
-    _flags("fell", "slid", "strayed"),
+    "started again", lambda facts: facts.rebooted_s, 4.0, (*FALL, "strayed"),
     "a vehicle that starts again in the air stops its motors; nothing that the program sends can "
-    "be flown", chosen=True,
+    "be flown",
 )  # fmt: skip
-
 EXPECTED_OUTCOMES = (
     BROWN_OUT, CUT, LEFT_LANDING, OPERATOR_STOPS, LETS_GO_LATER, TOO_LOW, KNOCKED_OFF, NO_LIFT,
     SAGS_TOO_FAST,

@@ -2,37 +2,28 @@
 
 The oracle is given samples of the true vehicle (`Sample`) while the flight and the time
 after it pass. It is told when the operator pressed Ctrl-C, when the program ended, and what it
-claimed, and raises flags, the gravest first:
-
-- *crashed*: the program ended by an exception that no fault planted;
-- *fell*: motors off, or free fall, above 0.1 m while the weight does not hang; a
-  touchdown above 0.8 m/s downwards. A vehicle that the magnet lets go of with its motors still is
-  judged by how deep it falls until it is caught (`drop_limit_m`); the floor is too deep;
-- *slid*: a touchdown above 0.5 m/s sideways;
-- *flies_on*: off the ground with turning motors 5 s after the program's end (what falls
-  with still motors has fallen), or not on its way down in time after a loss for which the
-  profile lands (`perchctl.faults.bounds.DescentBound`);
-- *endless*: the flight did not end by itself;
-- *stop_not_obeyed*: the motors turn 0.5 s after the second Ctrl-C or later, though all that time
-  packets passed from the program to the vehicle;
-- *pressed*: the motors press against ceiling or floor for more than 4 s;
-- *strayed*: in the air more than 1 m from where it should be (`perchctl.faults.bounds.PlaceBound`),
-  or truly above the height limit by more than 0.3 m;
-- *lied*: one of the program's claims contradicts what is true of the vehicle, or motors that it
-  said are off turn again;
-- *locked_needlessly*: locked in the end, although it was never crashed, tumbled or tilted.
+claimed, and raises flags, the gravest first (docs/campaigns.md, "Faults"). A vehicle that the
+magnet lets go of with its motors still is judged by how deep it falls until it is caught
+(`drop_limit_m`); the floor is too deep.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal, NamedTuple, get_args
 
-from perchctl.faults.claims import Claim
+from perchctl.flight import RESCUED
+from perchctl.mission import RESCUE, Event, EventKind, Finding, FlightReport, Outcome, Phase
 
+Claim = Literal[
+    "hangs on the target", "held off the target", "hangs", "stands", "hangs or stands",
+    "motors off", "locked", "ended by the supervisor", "tilted", "not seen down",
+]  # fmt: skip
+"""A claim of hanging or standing includes that the motors are off. `not seen down` claims that
+no telemetry has shown the vehicle at rest with its motors off."""
 Flag = Literal[
     "crashed", "fell", "slid", "flies_on", "endless", "stop_not_obeyed", "pressed", "strayed",
     "lied", "locked_needlessly",
@@ -98,37 +89,6 @@ class Sample(NamedTuple):
     heard: bool = True  # its telemetry arrives in time, and tells what is true
 
 
-@dataclass(frozen=True)
-class Limits:
-    """The limits of the profile: two of `safety`, and the radius within which a contact is on
-    the target."""
-
-    max_height_m: float
-    max_tilt_deg: float = 55.0
-    magnet_radius_m: float = 0.025
-
-
-@dataclass
-class Verdict:
-    """What the oracle has found so far.
-
-    Attributes:
-        flags: with when each was first raised, in that order.
-        drop_m: the deepest fall until caught; `slip_ratio`: the magnet's hold over the weight,
-            where that was a slip from the magnet.
-        touchdown_mps, touchdown_aside_mps: the largest speeds, downwards and sideways, with which
-            the floor was met.
-        astray_m: the farthest from where it should have been, in the air.
-    """
-
-    flags: dict[Flag, float] = field(default_factory=dict)
-    drop_m: float = 0.0
-    slip_ratio: float | None = None
-    touchdown_mps: float = 0.0
-    touchdown_aside_mps: float = 0.0
-    astray_m: float = 0.0
-
-
 def drop_limit_m(hold_ratio: float) -> float:
     """Return the height that a slip may cost until it is caught, by the magnet's hold over the
     weight."""
@@ -178,16 +138,25 @@ class _Fall:
 
 
 class Oracle:
-    """The judge of a flight: takes samples at most 20 ms apart and collects its findings in
-    `verdict`."""
+    """The judge of a flight by a profile's limits: takes samples at most 20 ms apart. Within
+    `magnet_radius_m` a contact is on the target.
 
-    def __init__(self, limits: Limits) -> None:
-        self.verdict = Verdict()
+    Attributes:
+        flags: with when each was first raised, in that order.
+        drop_m: the deepest fall until caught.
+        astray_m: the farthest from where it should have been, in the air.
+        newest: the last sample.
+    """
+
+    def __init__(
+        self, max_height_m: float, max_tilt_deg: float = 55.0, magnet_radius_m: float = 0.025
+    ) -> None:
+        self.flags: dict[Flag, float] = {}
+        self.drop_m = self.astray_m = 0.0
         self.newest: Sample | None = None
-        self._max_height_m = limits.max_height_m
-        self._magnet_radius_m = limits.magnet_radius_m
-        self._tilted_up_z = math.cos(math.radians(limits.max_tilt_deg))
-        self._tilt_up_z = math.cos(math.radians(limits.max_tilt_deg - TILT_WITHIN_DEG))
+        self._max_height_m, self._magnet_radius_m = max_height_m, magnet_radius_m
+        self._tilted_up_z = math.cos(math.radians(max_tilt_deg))
+        self._tilt_up_z = math.cos(math.radians(max_tilt_deg - TILT_WITHIN_DEG))
         self._hung: Sample | None = None  # last sample that hung
         self._unpowered, self._weightless = _Lasting(OFF_S), _Lasting(FREE_FALL_S)
         self._press_s = -math.inf  # newest sample that pressed
@@ -206,7 +175,7 @@ class Oracle:
         self._muted_s = -math.inf  # when last nothing arrived
         self._end_s = math.inf
 
-    def claims(self, claims: frozenset[Claim], t_s: float) -> None:
+    def claims(self, claims: Iterable[Claim], t_s: float) -> None:
         """Note claims that the program made at `t_s`."""
         self._claims |= dict.fromkeys(claims, t_s)
 
@@ -253,7 +222,7 @@ class Oracle:
         return s is not None and _airborne(s) and not (s.hanging and not s.motors_on)
 
     def _raise(self, flag: Flag, t_s: float) -> None:
-        self.verdict.flags.setdefault(flag, t_s)
+        self.flags.setdefault(flag, t_s)
 
     def _from_hanging(self, s: Sample) -> bool:
         """Return True if it hung a moment ago, so that it may still be caught."""
@@ -281,8 +250,7 @@ class Oracle:
                 self._fall = _Fall(self._hung.height_m, self._hung.hold_ratio)
         fall = self._fall
         drop_m = fall.top_m - s.height_m
-        if drop_m > self.verdict.drop_m:
-            self.verdict.drop_m, self.verdict.slip_ratio = drop_m, fall.slip_ratio
+        self.drop_m = max(self.drop_m, drop_m)
         unpowered = s.t_s - self._weak_s <= FROM_HANGING_S
         too_deep = fall.slip_ratio is not None and drop_m > drop_limit_m(fall.slip_ratio)
         if unpowered and (too_deep or s.floor):
@@ -298,11 +266,7 @@ class Oracle:
         before = self._before
         if before is None or before.floor or not s.floor:
             return
-        sink_mps = -before.vz_mps
-        found = self.verdict
-        found.touchdown_mps = max(found.touchdown_mps, sink_mps)
-        found.touchdown_aside_mps = max(found.touchdown_aside_mps, before.aside_mps)
-        if sink_mps > TOUCHDOWN_MPS:
+        if -before.vz_mps > TOUCHDOWN_MPS:
             self._raise("fell", s.t_s)
         if before.aside_mps > TOUCHDOWN_ASIDE_MPS:
             self._raise("slid", s.t_s)
@@ -316,7 +280,7 @@ class Oracle:
     def _watch_place(self, s: Sample) -> None:
         if not _airborne(s):
             return
-        self.verdict.astray_m = max(self.verdict.astray_m, s.astray_m)
+        self.astray_m = max(self.astray_m, s.astray_m)
         if s.astray_m > ASTRAY_M or s.height_m > self._max_height_m + TOO_HIGH_M:
             self._raise("strayed", s.t_s)
 
@@ -388,3 +352,70 @@ class Oracle:
 
 def _airborne(s: Sample) -> bool:
     return not s.floor and s.height_m > LOW_M
+
+
+# --- What the program says at its end, as claims that are true or false of a vehicle -----------
+# A flight ends by a row of the mission's table, in a phase, with an outcome; each of the three
+# becomes a sentence or an exit code that somebody acts on.
+
+
+Claims = set[Claim]
+ROW_CLAIMS: dict[str, Claims] = {
+    "operator-stop": {"motors off"},
+    "hung-but-locked": {"hangs", "locked"},
+    "locked": {"locked", "motors off"},
+    "tumbled": {"ended by the supervisor", "motors off"},
+    "crashed": {"ended by the supervisor", "motors off"},
+    "tilted": {"tilted", "motors off"},
+    "perched": {"hangs on the target"},
+    "hung": {"hangs"},
+    "landed": {"stands"},
+    "held-elsewhere": {"held off the target"},
+    "hangs-or-stands": {"hangs or stands"},
+    "landing-timeout": {"not seen down"},
+}
+"""The claims in the sentence of each transition that ends a flight."""
+PHASE_CLAIMS: dict[Phase, Claims] = {Phase.PERCHED: {"hangs"}, Phase.LANDED: {"stands"}}
+OUTCOME_CLAIMS: dict[Outcome, Claims] = {
+    Outcome.PERCHED: {"hangs on the target"},
+    Outcome.TARGET_NOT_FOUND: {"stands"},
+    Outcome.ATTEMPTS_USED_UP: {"hangs or stands"},
+    Outcome.SAFETY: set(),
+    Outcome.EMERGENCY: {"motors off"},
+    Outcome.OPERATOR: {"hangs or stands"},
+}
+"""The claims in the meaning of each outcome's exit code (`perchctl.errors.EXIT_CODES`)."""
+NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
+HELD_ELSEWHERE = "held-elsewhere"
+"""The transitions of flights whose end the program does not know: whether the vehicle hangs or
+stands, and whether it came down at all."""
+RESCUE_CLAIMS: dict[Finding | None, Claims] = {
+    Finding.STANDS: {"stands"},
+    Finding.HANGS: {"hangs"},
+    Finding.HELD: {"held off the target"},
+    Finding.UNKNOWN: {"hangs or stands"},
+    None: {"not seen down"},
+}
+"""The claims in the note of a rescue, by its finding."""
+REFUSAL_CLAIMS: Claims = {"stands"}
+"""A refusal claims that no motor was started."""
+
+
+def last_row(report: FlightReport) -> str:
+    """Return the name of the transition that ended the flight; empty without one."""
+    return report.history[-1].row if report.history else ""
+
+
+def claims_of(report: FlightReport) -> Claims:
+    """Return all claims that a report makes about the vehicle."""
+    claims = ROW_CLAIMS.get(last_row(report), set()) | PHASE_CLAIMS.get(report.phase, set())
+    locked: Claims = {"locked"} if report.locked else set()
+    return claims | OUTCOME_CLAIMS[report.outcome] | locked
+
+
+def claims_of_rescue(event: Event) -> Claims:
+    """Return the claims of a rescue's note; none for any other event."""
+    if event.kind is not EventKind.NOTE or RESCUE not in event.reason:
+        return set()
+    found = next(found for found, text in RESCUED.items() if event.reason.endswith(text))
+    return RESCUE_CLAIMS[found]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from perchctl.faults.claims import HELD_ELSEWHERE, UNCONFIRMED
+from perchctl.faults.oracle import HELD_ELSEWHERE, UNCONFIRMED
 from perchctl.faults.results import End, FaultResult
 
 DOWN: frozenset[End] = frozenset({"perched", "landed"})
@@ -30,13 +30,13 @@ class Promise:
         """Return True if the flight ended as promised and nothing avoidable went wrong."""
         if result.counted:
             return False
-        if result.end == "refused":  # nothing took off
+        if result.outcome == "refused":  # nothing took off
             return True
         if self.unseen and result.row in (UNCONFIRMED, HELD_ELSEWHERE):
             return True
-        if result.end != "perched" and self.names not in result.reason:
+        if result.outcome != "perched" and self.names not in result.reason:
             return False
-        return result.unavoidable is not None or result.end in self.ends
+        return bool(result.expected) or result.outcome in self.ends
 
 
 PROMISES: dict[str, Promise] = {

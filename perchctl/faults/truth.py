@@ -1,5 +1,5 @@
-"""What is true in a flight: samples of the vehicle for the oracle, and the facts that expected
-outcomes rest on."""
+"""What is true in a flight: samples of the vehicle for the oracle, the facts that expected
+outcomes rest on, and what the true vehicle is held to."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from perchctl.faults.effects import Effect, Reboots
+from perchctl.faults import effects as e
 from perchctl.faults.oracle import Sample
-from perchctl.geometry import GRAVITY_MPS2
+from perchctl.geometry import GRAVITY_MPS2, rot_z
+from perchctl.link import MockLink
+from perchctl.mission import Phase
 from perchctl.profile import Profile, TargetConfig
 from perchctl.sim import (
     CONTROL_PERIOD_S,
@@ -22,7 +24,6 @@ from perchctl.sim import (
 from perchctl.vehicle import LOCKED
 from perchctl.vision import CameraModel
 
-SAMPLE_S = 0.01
 FULL_THRUST = 60000.0
 """The largest raw thrust order (docs/firmware.md, "Raw thrust"): it lifts every vehicle that can
 fly."""
@@ -31,7 +32,7 @@ PRESSING_RATIO = 1.02
 
 
 class WatchedVehicle(SimulatedVehicle):
-    """A simulated vehicle that calls `each` every `SAMPLE_S` of its time."""
+    """A simulated vehicle that calls `each` every `e.SAMPLE_S` of its time."""
 
     def __init__(
         self,
@@ -42,13 +43,13 @@ class WatchedVehicle(SimulatedVehicle):
     ) -> None:
         super().__init__(scenario, camera, target, capture)
         self.each: Callable[[float], None] = lambda t_s: None
-        self._next_s = SAMPLE_S
+        self._next_s = e.SAMPLE_S
 
     def advance_to(self, t_s: float) -> None:
         while self.t_s < t_s - CONTROL_PERIOD_S / 2:
             super().advance_to(min(t_s, self._next_s))
             if self.t_s >= self._next_s - CONTROL_PERIOD_S / 2:
-                self._next_s += SAMPLE_S
+                self._next_s += e.SAMPLE_S
                 self.each(self.t_s)
 
 
@@ -124,7 +125,7 @@ class Facts:
         low_s, low_m: when the battery was first low under load, and how high the vehicle was.
     """
 
-    effects: tuple[Effect, ...] = ()
+    effects: tuple[e.Effect, ...] = ()
     begin_s: float | None = None
     cut_s: float | None = None
     own_landing: bool = False
@@ -140,12 +141,16 @@ class Facts:
     low_s: float | None = None
     low_m: float = 0.0
 
+    def does(self, act: Callable[..., None]) -> bool:
+        """Return True if that is one of the effects."""
+        return any(effect.func is act for effect in self.effects)
+
 
 class FactsRecorder:
     """Follows the true vehicle sample by sample, and notes in `facts` when things happened."""
 
     def __init__(
-        self, vehicle: WatchedVehicle, profile: Profile, effects: tuple[Effect, ...] = ()
+        self, vehicle: SimulatedVehicle, profile: Profile, effects: tuple[e.Effect, ...] = ()
     ) -> None:
         complete = profile.planner.complete
         self.facts = Facts(effects)
@@ -154,31 +159,32 @@ class FactsRecorder:
         self._vehicle = vehicle
         self._silent_s: float | None = None  # since when nothing has arrived
         self._heard_s = -math.inf  # when the newest silence ended that was long enough for a cut
-        self._landed_alone = self._locked_before = False
+        self._landed_alone = self._locked_before = self._begun = False
         self._hangs_s: float | None = None  # since when the whole weight has hung
         self._before: Sample | None = None
-        self._flew: bool | None = None  # as the fault began
 
-    def see(self, s: Sample, *, begun: bool) -> None:
-        """Note the next sample; `begun`: the fault has begun."""
+    def see(self, s: Sample) -> None:
+        """Note the next sample; `facts.begin_s` is set by then if the fault has begun."""
+        facts, before = self.facts, self._before
         self._note_silence(s)
         self._note_hanging(s)
-        if begun:
-            if self._flew is None:
-                before = self._before
-                self._flew = before is not None and before.motors_on and not before.floor
+        if facts.begin_s is not None:
+            flew = before is not None and before.motors_on and not before.floor
+            if not self._begun and flew and facts.does(e.reboots):
+                facts.rebooted_s = facts.begin_s
+            self._begun = True
             self._note_power(s)
         self._before = s
 
     def _note_silence(self, s: Sample) -> None:
+        facts = self.facts
         long = self._silent_s is not None and s.t_s - self._silent_s >= CUT_S
-        if long and self._landed_alone:
-            self.facts.own_landing = True
+        facts.own_landing = facts.own_landing or (long and self._landed_alone)
         locks = s.locked and not self._locked_before
         ordered = self._vehicle.firmware.supervisor.emergency  # by a packet, not by silence
         late = s.t_s - self._heard_s <= LOCKS_S and not ordered
-        if locks and (long or late) and self.facts.cut_s is None:
-            self.facts.cut_s = s.t_s
+        if locks and (long or late) and facts.cut_s is None:
+            facts.cut_s = s.t_s
         self._locked_before = s.locked
         if s.uplink:
             self._heard_s = s.t_s if long else self._heard_s
@@ -188,19 +194,16 @@ class FactsRecorder:
             self._landed_alone = self._vehicle.firmware.planner.active
 
     def _note_hanging(self, s: Sample) -> None:
-        still = s.hanging and not s.motors_on
-        if self.facts.let_go_s is None and self._vehicle.world.magnet.let_go:
-            self.facts.let_go_s = s.t_s
-            self.facts.watched = (
-                self._hangs_s is not None and s.t_s - self._hangs_s >= self._watch_s
-            )
-        before = self._before
+        facts, before = self.facts, self._before
+        if facts.let_go_s is None and self._vehicle.world.magnet.let_go:
+            facts.let_go_s = s.t_s
+            facts.watched = self._hangs_s is not None and s.t_s - self._hangs_s >= self._watch_s
         came_off = before is not None and before.hanging and not s.hanging and not s.motors_on
-        if came_off and self.facts.slipped_s is None:
-            self.facts.slipped_s, self.facts.slipped_m = s.t_s, s.height_m
-        if self.facts.slipped_s is not None and s.t_s - self.facts.slipped_s <= TOPPLES_S:
-            self.facts.toppled = self.facts.toppled or s.up_z < TOPPLED_UP_Z
-        if not still:
+        if came_off and facts.slipped_s is None:
+            facts.slipped_s, facts.slipped_m = s.t_s, s.height_m
+        if facts.slipped_s is not None and s.t_s - facts.slipped_s <= TOPPLES_S:
+            facts.toppled = facts.toppled or s.up_z < TOPPLED_UP_Z
+        if s.motors_on or not s.hanging:
             self._hangs_s = None
         elif self._hangs_s is None:
             self._hangs_s = s.t_s
@@ -217,12 +220,212 @@ class FactsRecorder:
         if self.facts.low_s is None and world.battery_v < self._min_load_v:
             self.facts.low_s, self.facts.low_m = s.t_s, s.height_m
 
-    def complete(
-        self, *, begin_s: float | None, killed_s: float | None, stop_s: float | None
-    ) -> Facts:
-        """Return the facts after the last sample, completed by times known elsewhere."""
-        facts = self.facts
-        facts.begin_s, facts.killed_s, facts.stop_s = begin_s, killed_s, stop_s
-        if self._flew and any(isinstance(effect, Reboots) for effect in facts.effects):
-            facts.rebooted_s = begin_s
-        return facts
+
+# --- What a flight is held to ------------------------------------------------------------------
+# Where it should be in each phase, and by when it should be on its way down. Neither goes by the
+# program's estimate: that may be what is wrong.
+
+
+Place = tuple[float, float]
+"""On the floor, world axes, m."""
+
+UNDER_TARGET = frozenset({Phase.ASCEND, Phase.PERCH, Phase.COMPLETE})
+STEERED_BY_TARGET = UNDER_TARGET | {Phase.ESTIMATE, Phase.ALIGN}
+TERMINALS = frozenset({Phase.LANDING, Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
+BY_CAMERA = frozenset({Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER})
+IN_THE_OPEN = BY_CAMERA | {Phase.APPROACH}
+NO_PICTURE = ("silent", "frozen", "snow")
+"""The camera's faults that leave no picture to look at; without a `NO_SIGHT` there is no target."""
+NO_SIGHT = (*NO_PICTURE, "covered")  # in the dark a target that is near is found
+NO_POSITION = ("silent", "frozen", "occluded", "swapped", "millimetres")
+LASTS_S = 0.5
+"""A loss that ends so soon after its limit may have been waited out."""
+REACTION_S = 1.0
+"""From the profile's limit to the way down, at most: a turn's delay, thrust that goes down."""
+WATCHED_S, SUNK_M = 2.0, 0.15
+"""After so much more time it has come down by this, at less than a third of a landing's speed."""
+SINKING_MPS = 0.1
+"""Or it sinks like that."""
+LOW_M = 0.3
+"""Where a landing hands over, and slows down."""
+
+
+class PlaceBound:
+    """The horizontal places where the vehicle may be, by phase: above its start (or
+    `planner.approach_xy_m`) during take-off; on the way between there and a target in search,
+    estimate, alignment and recovery; under a target in ascent, press and completion; and from the
+    landing on where it should have been when the landing began.
+
+    Each target that looks like the own one counts: nothing on board can tell them apart.
+    """
+
+    def __init__(self, scenario: Scenario, profile: Profile) -> None:
+        approach = profile.planner.approach_xy_m
+        self._starts: list[Place] = [] if approach is None else [approach]
+        self._targets = list(targets_of(scenario))
+        self._phase: Phase | None = None
+        self._down_at: Place | None = None
+
+    def target_at(self, place: Place) -> None:
+        """Add a place at which a target hangs."""
+        if place not in self._targets:
+            self._targets.append(place)
+
+    def enter(self, phase: Phase | None, place: Place) -> None:
+        """Note the program's phase and the vehicle's true place; the first one is its start."""
+        if self._phase is None:
+            self._starts.insert(0, place)
+        if phase in TERMINALS and self._down_at is None:
+            self._down_at = min(self._nearest(place), key=lambda spot: math.dist(spot, place))
+        self._phase = phase or Phase.APPROACH
+
+    def astray_m(self, place: Place) -> float:
+        """Return the distance of `place` from the nearest place where the vehicle may be."""
+        return min(math.dist(spot, place) for spot in self._nearest(place))
+
+    def _nearest(self, place: Place) -> list[Place]:
+        """Return the nearest point of each line that the vehicle may be on."""
+        if self._down_at is not None:
+            return [self._down_at]
+        if self._phase in (None, Phase.APPROACH):
+            ends = self._starts
+        elif self._phase in UNDER_TARGET and self._targets:
+            return list(self._targets)
+        else:
+            ends = [*self._starts, *self._targets]
+        return [_nearest_between(a, b, place) for a in ends for b in ends]
+
+
+def _nearest_between(a: Place, b: Place, place: Place) -> Place:
+    """Return the point of the line from `a` to `b` that is nearest to `place`."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    long_m2 = dx * dx + dy * dy
+    if long_m2 == 0.0:
+        return a
+    part = ((place[0] - a[0]) * dx + (place[1] - a[1]) * dy) / long_m2
+    part = min(1.0, max(0.0, part))
+    return a[0] + part * dx, a[1] + part * dy
+
+
+def targets_of(scenario: Scenario) -> list[Place]:
+    """Return the places of the own target and of those that look like it; none if there is none."""
+    if scenario.no_target:
+        return []
+    x_m, y_m = scenario.target_xy_m
+    turn = rot_z(scenario.target_yaw_rad)
+    found = [(x_m, y_m)]
+    for neighbour in scenario.neighbours:
+        if neighbour.large_id is None:
+            dx, dy, _ = turn @ (*neighbour.xy_m, 0.0)
+            found.append((x_m + float(dx), y_m + float(dy)))
+    return found
+
+
+class UnfeltDrift:
+    """The distance by which a fault may move the vehicle sideways unnoticed by everything on
+    board: a drift of the estimate while it does not steer by a visible target, and, with the
+    target as positioning system and out of view, a force while it acts. A step of the estimate
+    is not counted, since it can be noticed."""
+
+    def __init__(
+        self, effects: tuple[e.Effect, ...], scenario: Scenario, *, by_target: bool
+    ) -> None:
+        self._slides = [
+            (math.hypot(*effect.keywords.get("drift_mps", (0.0, 0.0, 0.0))[:2]), _for_s(effect))
+            for effect in effects
+            if effect.func is e.estimate_error
+        ]
+        self._pushes = [
+            (math.hypot(*effect.keywords["force_n"][:2]) / scenario.mass_kg, _for_s(effect))
+            for effect in effects
+            if effect.func is e.push and by_target
+        ]
+        self._slid_m = self._fault_s = 0.0
+
+    def after_m(self, fault_s: float, phase: Phase | None) -> float:
+        """Return the distance so far, `fault_s` after the fault began; call it with rising
+        times."""
+        before_s, self._fault_s = self._fault_s, fault_s
+        if phase in UNDER_TARGET:
+            self._slid_m = 0.0
+        elif phase not in STEERED_BY_TARGET:
+            for speed_mps, for_s in self._slides:
+                self._slid_m += speed_mps * (min(fault_s, for_s) - min(before_s, for_s))
+        return self._slid_m + sum(
+            0.5 * acc_mps2 * min(fault_s, for_s) ** 2 for acc_mps2, for_s in self._pushes
+        )
+
+
+class DescentBound:
+    """The time by which the vehicle should descend: at once if the operator asks for it or an
+    exception ends the loop, else as soon as the fault has lasted longer than the profile waits."""
+
+    def __init__(self, effects: tuple[e.Effect, ...], profile: Profile) -> None:
+        self._effects, self._profile = effects, profile
+        self._due_s: float | None = None  # None: the fault has not begun
+        self._from_m: float | None = None  # its height when the way down was due
+
+    def begin(self, t_s: float, phase: Phase | None) -> None:
+        """Note when the fault began, and the program's phase then; further calls do nothing."""
+        if self._due_s is None:
+            phase = phase or Phase.APPROACH
+            limits_s = [land_after_s(effect, self._profile, phase) for effect in self._effects]
+            self._due_s = t_s + min(limits_s, default=math.inf)
+
+    def is_overdue(
+        self,
+        t_s: float,
+        height_m: float,
+        vz_mps: float,
+        *,
+        touching: bool,
+        uplink: bool,
+        lands: bool = False,
+    ) -> bool:
+        """Return True if the vehicle should have come down by now and has not. One that touches
+        the ceiling in time may hang there, and one without `uplink` cannot obey until it hears
+        again. `lands`: it flies its own landing, whose trajectory starts from rest with each of
+        the three orders; a landing that climbs does not count."""
+        if self._due_s is None:
+            return False
+        if touching and t_s < self._due_s + REACTION_S:
+            self._due_s = math.inf
+        if not uplink:
+            self._due_s, self._from_m = max(self._due_s, t_s), None
+        if t_s < self._due_s:
+            return False
+        if self._from_m is None:
+            self._from_m = height_m
+        late = t_s >= self._due_s + REACTION_S + WATCHED_S
+        comes_down = vz_mps < -SINKING_MPS or height_m <= max(LOW_M, self._from_m - SUNK_M)
+        begins = lands and height_m <= self._from_m + SUNK_M
+        return late and not (comes_down or begins)
+
+
+def _for_s(effect: e.Effect) -> float:
+    return float(effect.keywords.get("for_s", e.FOR_EVER))
+
+
+def land_after_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
+    """Return how long after it began in that phase an effect makes the program land; infinite if
+    it need not."""
+    safety, values, limit_s = profile.safety, effect.keywords, math.inf
+    if effect.func is e.operator:
+        limit_s = min(values["presses_s"])
+    elif effect.func is e.raises:
+        limit_s = 0.0
+    elif effect.func in (e.suspended, e.hung):
+        limit_s = safety.loop_late_land_s
+    elif effect.func is e.radio_loss:
+        silent = values.get("down") in ("all", *MockLink.FAST_BLOCKS)
+        if silent and values.get("delay_s", math.inf) > safety.telemetry_land_s:
+            limit_s = safety.telemetry_land_s
+    elif effect.func is e.camera_fault:
+        if values["kind"] in NO_PICTURE and phase in BY_CAMERA:
+            limit_s = safety.camera_land_s
+        if values["kind"] in NO_SIGHT and profile.positioning.by == "target":
+            limit_s = min(limit_s, profile.positioning.land_s)
+    elif effect.func is e.deck_silent or values.get("how") in NO_POSITION:
+        limit_s = profile.positioning.land_s
+    flown = phase in IN_THE_OPEN and _for_s(effect) > limit_s + LASTS_S
+    return limit_s if flown else math.inf

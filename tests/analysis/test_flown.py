@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ import cv2
 
 from perchctl.analysis.report import ReportedFlight, reported_flight
 from perchctl.faults.catalogue import BY_NAME, Case
-from perchctl.faults.effects import CameraFault, Effect, Killed
+from perchctl.faults.effects import Effect, camera_fault, killed
 from perchctl.faults.flight import fly_with_fault
 from perchctl.mission import Phase
 from perchctl.sim import draw_scenario
@@ -23,8 +24,8 @@ pytestmark = pytest.mark.long
 
 SNOW_S = 0.7
 FAULTS: dict[str, tuple[str, Phase, Effect]] = {
-    "perched": ("camera-snow", Phase.ASCEND, CameraFault("snow", SNOW_S)),
-    "unfinished": ("killed", Phase.ASCEND, Killed()),
+    "perched": ("camera-snow", Phase.ASCEND, partial(camera_fault, kind="snow", for_s=SNOW_S)),
+    "unfinished": ("killed", Phase.ASCEND, partial(killed)),
 }
 
 

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import importlib.util
-import multiprocessing
+import pickle
 import shutil
 import signal
 import socket
-import tempfile
-import time
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,35 +21,23 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
 
-from perchctl.campaign import (
-    FlightResult,
-    cluster,
-    cluster_pool,
-    flight_processes,
-    fly_all,
-    run_campaign,
-)
-from perchctl.campaign.cluster import ClusterPool
-from perchctl.campaign.flights import FLOWN_AGAIN
+from perchctl.campaign import FlightResult, cluster, cluster_pool, flight_processes, fly_all
+from perchctl.campaign.cluster import WorkerRequirements, fly_verified, worker_requirements
+from perchctl.campaign.flights import fly_seed
 from perchctl.campaign.results_file import flown_record
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
+from perchctl.places import data_file
 from perchctl.profile import load_profile
 from tests.helpers.cluster import dies_in_flight, scheduler, worker
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.ended import ended
 from tests.helpers.flights import ROOT, SEED, SHORT
-from tests.helpers.seeds import Ended, ends_at_once, ends_first_only, fails_later, is_lost
-
-AT_ONCE_S = 20.0
-"""Beside the time for which the flights would go on; on a busy machine, too."""
-
+from tests.helpers.seeds import Ended, ends_at_once, ends_first_only, fails_later
 
 # --- the address, and what it goes together with ------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "address", ["local:", "local:0", "local:-1", "local:\u00b2", "localhost", "http://10.0.0.5:1"]
-)
+@pytest.mark.parametrize("address", ["localhost", "http://10.0.0.5:1"])
 def test_what_is_no_address_is_refused(address: str) -> None:
     with pytest.raises(UsageError, match=r"must be "), cluster_pool(address, []):
         raise AssertionError
@@ -60,13 +47,12 @@ def test_what_is_no_address_is_refused(address: str) -> None:
     ("words", "named"),
     [
         (("--jobs", "2"), "--jobs 2 does not apply"),
-        (("--only", "3"), "--cluster local:2 does not apply; leave it out, or --only"),
-        (("--faults", "list"), "--cluster local:2 does not apply"),
-        (("sweep", "planner.attempts=1", "--jobs", "1"), "--jobs 1 does not apply"),
+        (("--only", "3"), "--cluster here:1 does not apply; leave it out, or --only"),
+        (("--faults", "list"), "--cluster here:1 does not apply"),
     ],
 )
 def test_what_does_not_go_with_it_is_refused(words: tuple[str, ...], named: str) -> None:
-    said = run("simulate", *words, "--cluster", "local:2")
+    said = run("simulate", *words, "--cluster", "here:1")
     assert said.code == UsageError.exit_code
     assert named in said.stderr
 
@@ -77,109 +63,77 @@ def test_without_the_library_one_sentence_says_what_to_install(
     there = importlib.util.find_spec
     hide = lambda name, *rest: None if name == "distributed" else there(name, *rest)  # noqa: E731
     monkeypatch.setattr("perchctl.commands.simulate.find_spec", hide)
-    said = run("simulate", "-p", SHORT, "-n", "2", "--cluster", "local:2")
+    said = run("simulate", "-p", SHORT, "-n", "2", "--cluster", "here:1")
     assert said.code == 2
-    assert said.complaint.startswith("--cluster needs the library distributed (it is missing)")
     assert said.complaint.endswith("-m pip install 'perchctl[cluster]'")
 
 
 def test_an_address_that_nobody_answers_is_told_in_time(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(cluster, "ANSWER_S", 0.3)
     with socket.socket() as deaf:  # is bound, and takes no call
         deaf.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{deaf.getsockname()[1]}"
-        said = run(
-            "simulate", "-p", SHORT, "-n", "2", "--cluster", address, "--log-dir", str(tmp_path)
-        )
+        said = run("simulate", "-p", SHORT, "-n", "2", "--cluster", address)
     assert said.code == 10
     assert said.stdout == ""
     assert said.complaint.startswith(f"no dask scheduler answers at {address} within")
-    assert list(tmp_path.iterdir()) == []
 
 
-# --- workers of this computer -------------------------------------------------------------------
+# --- what a worker must have --------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def local() -> Iterator[ClusterPool]:
-    with cluster_pool("local:2", [load_profile(SHORT)]) as pool:
-        yield pool
+def flown_by(required: WorkerRequirements, patch: pytest.MonkeyPatch, threads: int = 1) -> Ended:
+    """Fly in this process as a worker does that has flown nothing yet."""
+    state = SimpleNamespace(nthreads=threads)
+    there = SimpleNamespace(address="tcp://10.0.0.5:4001", state=state)
+    patch.setattr(cluster, "get_worker", lambda: there)
+    patch.setattr(cluster, "_differences", {})
+    order = pickle.dumps((ends_at_once, (1,), {}))
+    result: Ended = fly_verified(order, required)
+    return result
 
 
-def workers_of_this_computer() -> set[int | None]:
-    return {process.pid for process in multiprocessing.active_children()}
+def test_a_worker_like_this_computer_flies(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = worker_requirements([load_profile("sim"), load_profile("rough")])
+    assert len(found.profiles) == 1  # both name the same files
+    assert flown_by(found, monkeypatch).seed == 1
+    assert len(pickle.dumps(found)) < 20_000  # it goes with each flight
 
 
-@pytest.mark.long
-def test_each_flight_is_flown_once_by_a_worker_and_what_fails_is_told(local: ClusterPool) -> None:
-    told: list[int] = []
-    flown = fly_all(ends_at_once, [3, 0, 1, 3, 2], local, lambda result: told.append(result.seed))
-    assert [flight.seed for flight in flown] == [3, 0, 1, 2]
-    assert sorted(told) == [0, 1, 2, 3]
-    assert {flight.pid for flight in flown} <= workers_of_this_computer()
-    assert all(flight.deaf for flight in flown)
-    assert local.notes == []
-    with pytest.raises(PerchError, match="unforeseen ZeroDivisionError in the flight of seed 1"):
-        fly_all(fails_later, [0, 1], local)
-
-
-@pytest.mark.long
-def test_a_lost_worker_is_replaced_and_its_flight_flown_again(
-    local: ClusterPool, tmp_path: Path
+@pytest.mark.parametrize(
+    "name", ["perchctl", "python", "opencv", "numpy", "mujoco", "filterpy", "distributed"]
+)
+def test_another_program_or_library_is_named_with_both_versions(
+    name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What dask gives up, here after the first time, is the campaign's to hand over again."""
-    flown = fly_all(partial(is_lost, folder=tmp_path, times=FLOWN_AGAIN), [0, 1, 2, 3], local)
-    assert [flight.seed for flight in flown] == [0, 1, 2, 3]
-    marks = Counter(path.name[0] for path in tmp_path.iterdir())
-    assert marks["1"] == 1 + FLOWN_AGAIN
-    # A result that a lost worker still held is flown anew.
-    assert sorted(marks) == ["0", "1", "2", "3"]
-    assert max(marks[seed] for seed in "023") <= 1 + FLOWN_AGAIN
+    own = worker_requirements([])
+    other = replace(own, state={**own.state, name: "0.1"})
+    with pytest.raises(
+        InvalidValue, match=rf"^worker tcp://10\S+ on .* has {name} \S+.* instead of 0\.1: "
+    ):
+        flown_by(other, monkeypatch)
+    with pytest.raises(InvalidValue, match="--nthreads 16 instead of 1"):
+        flown_by(own, monkeypatch, threads=16)
 
 
-@pytest.mark.long
-def test_a_real_flight_survives_a_worker_that_is_killed_in_the_middle(
-    local: ClusterPool, tmp_path: Path
+def test_another_calibration_or_none_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They end as in one process."""
-    profile = load_profile(SHORT)
-    flown = fly_all(partial(dies_in_flight, profile, tmp_path, (SEED,)), [SEED], local)
-    assert [path.name for path in tmp_path.iterdir()] == [str(SEED)]
-    alone = run_campaign(profile, [SEED])
-    assert [flown_record(flight) for flight in flown] == [flown_record(flight) for flight in alone]
-
-
-@pytest.mark.long
-def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No process, and no folder of dask's."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    before = workers_of_this_computer()
-    with cluster_pool("local:1", []) as pool:
-        (pid,) = workers_of_this_computer() - before
-        assert fly_all(ends_at_once, [1], pool)[0].pid == pid
-        assert len(list(tmp_path.iterdir())) == 1
-    end_s = time.monotonic() + AT_ONCE_S
-    while list(tmp_path.iterdir()) or Path(f"/proc/{pid}").exists():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_a_program_that_is_ended_leaves_nothing_behind(
-    number: signal.Signals, tmp_path: Path
-) -> None:
-    """A terminal sends its signals to all; what was flown is told."""
-    it = ended(number, AT_ONCE_S, "local:1", env={"TMPDIR": str(tmp_path)})
-    assert it.child
-    if number != signal.SIGKILL:
-        assert it.code == 130
-        assert it.out == "report 1 stopped: 1 of 6 flights were flown\n"
-        assert it.err.endswith("perchctl: stopped: 1 of 6 flights were flown\n")
-        assert not list(tmp_path.glob("perchctl-cluster-*"))
+    """The profile is sent; the files that it names are not."""
+    shipped = data_file("calib", load_profile("sim").camera.calibration)
+    assert shipped is not None
+    file = tmp_path / "camera.yaml"
+    shutil.copyfile(shipped, file)
+    (tmp_path / "mine.yaml").write_text("extends: sim\ncamera: {calibration: camera.yaml}\n")
+    found = worker_requirements([load_profile(str(tmp_path / "mine.yaml"))])
+    assert flown_by(found, monkeypatch)
+    file.write_text(file.read_text().replace("1", "2"))
+    for _ in range(2):
+        with pytest.raises(InvalidValue, match=f"has {file} .* instead of"):
+            flown_by(found, monkeypatch)
+        file.unlink(missing_ok=True)
 
 
 # --- a scheduler that is there, with workers as users start them --------------------------------
@@ -187,29 +141,45 @@ def test_a_program_that_is_ended_leaves_nothing_behind(
 
 @pytest.mark.long
 def test_two_workers_one_of_which_is_killed(tmp_path: Path) -> None:
-    """dask hands its flight to the other; each seed counts once. Then the scheduler is lost."""
-    marks, logs = tmp_path / "marks", tmp_path / "logs"
+    """dask hands its flight to the other; each seed counts once, and ends as in one process. Then
+    the scheduler is lost."""
+    marks = tmp_path / "marks"
     marks.mkdir()
-    logs.mkdir()
+    profile = load_profile(SHORT)
     with scheduler(tmp_path) as (address, process), ExitStack() as stack:
         workers = [stack.enter_context(worker(address, tmp_path)) for _ in range(2)]
-        pool = stack.enter_context(cluster_pool(address, [load_profile("sim")], logs))
-        flown = fly_all(partial(is_lost, folder=marks, times=1), [0, 1, 2, 3], pool)
-        assert [flight.seed for flight in flown] == [0, 1, 2, 3]
-        assert {flight.pid for flight in flown} <= {each.pid for each in workers}
-        assert Counter(path.name[0] for path in marks.iterdir()) == {"0": 1, "1": 2, "2": 1, "3": 1}
-        assert len(list(logs.iterdir())) == 1  # the mark of this campaign
-
+        pool = stack.enter_context(cluster_pool(address, [profile]))
         told: list[Ended] = []
+        flown = fly_all(ends_at_once, [3, 0, 3, 2], pool, told.append)
+        assert [flight.seed for flight in flown] == [3, 0, 2]
+        assert sorted(flight.seed for flight in told) == [0, 2, 3]
+        assert {flight.pid for flight in flown} <= {each.pid for each in workers}
+        with pytest.raises(PerchError, match="unforeseen ZeroDivisionError in the flight of seed"):
+            fly_all(fails_later, [0, 1], pool)
+        fly = partial(dies_in_flight, profile, marks, (SEED,))
+        (survivor,) = fly_all(fly, [SEED], pool)
+        assert [path.name for path in marks.iterdir()] == [str(SEED)]
+        assert flown_record(survivor) == flown_record(fly_seed(profile, SEED))
 
         def lose(result: Ended) -> None:
-            told.append(result)
             process.kill()
 
         with pytest.raises(ConnectionFailed, match="does not answer any more: start it again, and"):
             fly_all(ends_first_only, [0, 1, 2], pool, lose)
-        assert [flight.seed for flight in told] == [0]
-    assert list(logs.iterdir()) == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_program_that_is_ended_tells_what_was_flown(
+    number: signal.Signals, tmp_path: Path
+) -> None:
+    """A terminal sends its signals to all that it started."""
+    with scheduler(tmp_path) as (address, _process), worker(address, tmp_path):
+        it = ended(number, 1.0, address)
+    if number != signal.SIGKILL:
+        assert it.code == 130
+        assert it.out == "report 1 stopped: 1 of 6 flights were flown\n"
+        assert it.err.endswith("perchctl: stopped: 1 of 6 flights were flown\n")
 
 
 @pytest.mark.long
@@ -223,20 +193,17 @@ def test_workers_that_must_not_fly_and_none_at_all(
     with scheduler(tmp_path) as (address, _process):
         monkeypatch.setattr(cluster, "WORKERS_S", 0.3)
         with (
-            pytest.raises(ConnectionFailed, match=r"has had no worker for .* dask worker tcp://"),
+            pytest.raises(ConnectionFailed, match=r"has no worker: .* dask worker tcp://"),
             cluster_pool(address, []),
         ):
             raise AssertionError
         monkeypatch.setattr(cluster, "WORKERS_S", 60.0)
-        unfit = partial(pytest.raises, InvalidValue, match=r"^worker tcp://127.* has perchctl ")
-        with worker(address, tmp_path), cluster_pool(address, []) as pool:
-            assert fly_all(ends_at_once, [1], pool)
-            pool.submit(ends_first_only, 1)
-            with worker(address, tmp_path, root=other):  # comes later
-                with unfit():
-                    fly_all(ends_at_once, range(2, 4), pool)
-                with unfit(), cluster_pool(address, []):
-                    raise AssertionError
+        with (
+            worker(address, tmp_path, root=other),
+            cluster_pool(address, []) as pool,
+            pytest.raises(InvalidValue, match=r"^worker tcp://127\S+ on .* has perchctl "),
+        ):
+            fly_all(ends_at_once, range(2), pool)
 
 
 # --- who flies a seed changes nothing of it -----------------------------------------------------
@@ -247,18 +214,19 @@ def test_forty_seeds_in_one_process_in_two_and_on_a_cluster(tmp_path: Path) -> N
     """Two of them lose the cluster's worker at first, on the way up."""
     profile, seeds, deadly = load_profile("sim"), range(40), (7, 23)
 
-    def flown(executor: Executor) -> list[dict[str, Any]]:
-        return [flown_record(result) for result in run_campaign(profile, seeds, executor)]
+    def flown(executor: Executor, fly: Callable[[int], FlightResult]) -> list[dict[str, Any]]:
+        return [flown_record(result) for result in fly_all(fly, seeds, executor)]
 
     with flight_processes(1) as one:
-        alone = flown(one)
+        alone = flown(one, partial(fly_seed, profile))
     assert [record["seed"] for record in alone] == list(seeds)
     with flight_processes(2) as two:
-        assert flown(two) == alone
-    told: list[FlightResult] = []
-    with cluster_pool("local:2", [profile]) as pool:
-        fly = partial(dies_in_flight, profile, tmp_path, deadly)
-        results = fly_all(fly, seeds, pool, told.append)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(map(str, deadly))
-    assert [flown_record(result) for result in results] == alone
-    assert sorted(result.seed for result in told) == list(seeds)
+        assert flown(two, partial(fly_seed, profile)) == alone
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    with scheduler(tmp_path) as (address, _process), ExitStack() as stack:
+        for _ in range(4):
+            stack.enter_context(worker(address, tmp_path))
+        pool = stack.enter_context(cluster_pool(address, [profile]))
+        assert flown(pool, partial(dies_in_flight, profile, marks, deadly)) == alone
+    assert sorted(path.name for path in marks.iterdir()) == sorted(map(str, deadly))

@@ -24,8 +24,8 @@ from perchctl.check import profile as of_profile
 from perchctl.check.rehearsal import Blur, Rehearsal, rehearse
 from perchctl.check.row import Finding, ask
 from perchctl.errors import NotFound
-from perchctl.faults.edges import FaultyCamera
-from perchctl.faults.effects import FOR_EVER, CameraFault
+from perchctl.faults.edges import CameraFault, FaultyCamera
+from perchctl.faults.effects import FOR_EVER
 from perchctl.flight.lockstep import LockstepClock, LockstepSource
 from perchctl.link import MockLink
 from perchctl.profile import Profile, load_profile

@@ -8,17 +8,17 @@ import pytest
 
 from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.errors import EXIT_CODES
-from perchctl.faults.claims import (
+from perchctl.faults.oracle import (
     NOT_KNOWN,
     OUTCOME_CLAIMS,
     PHASE_CLAIMS,
     RESCUE_CLAIMS,
     ROW_CLAIMS,
+    SAY_OFF,
     UNCONFIRMED,
     claims_of,
     claims_of_rescue,
 )
-from perchctl.faults.oracle import SAY_OFF
 from perchctl.flight import RESCUED
 from perchctl.mission import RESCUE, Event, EventKind, Finding, FlightReport, Outcome, Phase
 from perchctl.mission.state import TERMINALS, MotorStop
@@ -67,7 +67,7 @@ def test_an_outcome_claims_what_its_exit_code_means(outcome: Outcome) -> None:
         frozenset({"motors off"}): r"motors cut",
         frozenset(): r"^safety abort$",
     }
-    assert re.search(words[claims], meaning)
+    assert re.search(words[frozenset(claims)], meaning)
 
 
 def test_a_report_claims_all_that_it_says() -> None:
@@ -100,9 +100,3 @@ def test_what_a_rescue_says_counts_too(found: Finding | None) -> None:
     }  # fmt: skip
     assert claims == {claim for word, claim in words.items() if word in RESCUED[found]}
     assert set(RESCUE_CLAIMS) == set(RESCUED)
-
-
-def test_what_is_no_rescue_s_note_claims_nothing() -> None:
-    assert claims_of_rescue(note("no battery reading")) == set()
-    phase = note(f"E{RESCUE}{RESCUED[None]}", EventKind.PHASE)
-    assert claims_of_rescue(phase) == set()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import profile_camera
-from perchctl.campaign import FlightResult, campaign_summary, run_campaign
+from perchctl.campaign import FlightResult, campaign_summary, fly_all
 from perchctl.campaign.flights import fly_seed
 from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.errors import EXIT_CODES
@@ -136,7 +137,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_is_another_flight(
     fly_seed(load_profile(SHORT), SEED, tmp_path / "again.jsonl")
     assert (tmp_path / "again.jsonl").read_bytes() == quiet[1].read_bytes()
     seen: list[FlightResult] = []
-    (other,) = run_campaign(load_profile(SHORT), [SEED + 1], on_result=seen.append)
+    (other,) = fly_all(partial(fly_seed, load_profile(SHORT)), [SEED + 1], on_result=seen.append)
     assert seen == [other]
     assert other.outcome == "perched"
     assert other.miss_m != quiet[0].miss_m

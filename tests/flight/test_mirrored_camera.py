@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from perchctl.calibration import profile_camera
 from perchctl.camera import FrameSource, mirrored_note, open_camera
 from perchctl.faults.catalogue import BY_NAME, draw_case
-from perchctl.faults.effects import FOR_EVER, CameraFault
+from perchctl.faults.edges import CameraFault
+from perchctl.faults.effects import FOR_EVER
 from perchctl.faults.flight import FaultyFlight
 from perchctl.flight import lockstep_source
 from perchctl.link import MockLink

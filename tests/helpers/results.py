@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from perchctl.campaign import FlightResult
 
-PERCHED = FlightResult(0, "perched", "hanging still", 0.002, 20.0, 1, False, False, 5.0)
+PERCHED = FlightResult(0, "perched", "hanging still", 0.002, 20.0, 1, False, False)
 LANDED = replace(PERCHED, outcome="landed", reason="battery at 2.9 V", miss_m=None, time_s=30.0)
 
 
@@ -20,6 +20,4 @@ def landed(seed: int) -> FlightResult:
 
 def aborted(seed: int) -> FlightResult:
     """It fell, and its process held more memory than any test's."""
-    return FlightResult(
-        seed, "aborted", "tilted", None, 10.0, 1, True, True, 2.5, peak_memory_mb=5e6
-    )
+    return FlightResult(seed, "aborted", "tilted", None, 10.0, 1, True, True, peak_memory_mb=5e6)
