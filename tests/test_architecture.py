@@ -33,7 +33,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "google": ("perchctl.record.recording_file", "perchctl.record.recorded"),
     "distributed": ("perchctl.campaign",),
     "dask": ("perchctl.campaign",),
-    "av": ("perchctl.commands.track_output", "perchctl.camera.network", "perchctl.analysis.film"),
+    "av": ("perchctl.camera.network", "perchctl.analysis.film"),
 }
 
 # Time is an argument here.

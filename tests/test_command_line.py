@@ -235,7 +235,6 @@ WRITING = [
     "make-target -o OUT.pdf",
     "make-target board chessboard:9x6:20mm -o OUT.pdf",
     "track images:. --csv OUT.csv",
-    "track images:. --overlay OUT.mp4",
     "fit-weights session.csv -o OUT.yaml",
 ]
 """Each way to write a file, which is refused before there is anything to work on."""

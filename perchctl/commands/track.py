@@ -10,7 +10,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -46,16 +45,14 @@ from perchctl.commands.track_output import (
     Tracked,
     camera_pose,
     csv_file,
-    overlay_file,
     text_line,
-    text_rows,
     track_record,
     track_sketch,
     track_state,
 )
 from perchctl.display import AXES_OF_SIDE, live_page
-from perchctl.errors import Interrupted, NotFound, UsageError
-from perchctl.files import check_output, same_file
+from perchctl.errors import Interrupted, NotFound
+from perchctl.files import check_output
 from perchctl.perception import BLENDED, INTERLACED, Perception
 from perchctl.places import is_shipped_example
 from perchctl.profile import Profile, find_calibration, load_profile
@@ -68,10 +65,8 @@ from perchctl.vision import (
     make_pipeline,
 )
 
-LIVE_RATE_HZ = 30.0
-"""Of the video that is written of a live source: about how many pictures a second it gives."""
 STILLS_HZ = 1.0
-"""Of files of pictures that do not belong together: so each can be looked at, in the video too."""
+"""Of files of pictures that do not belong together: so each can be looked at on the page."""
 POLL_S = 0.002
 MOST_NOTES = 20
 # A live picture that stands still or is noise is no measurement; the others are searched.
@@ -84,7 +79,7 @@ app = new_app()
 @command(
     app,
     "perchctl track camera:0 --view",
-    "perchctl track video:flight.mp4 --overlay seen.mp4 --csv poses.csv",
+    "perchctl track video:flight.mp4 --csv poses.csv",
     "perchctl track 'images:pictures/*.png' --json",
 )
 def track(
@@ -115,9 +110,6 @@ def track(
     csv: Annotated[
         Path | None, typer.Option("--csv", help="Write the results as CSV, t_s first.")
     ] = None,
-    overlay: Annotated[
-        Path | None, typer.Option("--overlay", help="Write the pictures with results as .mp4.")
-    ] = None,
     force: ForceOption = False,
     view: ViewOption = False,
     view_port: ViewPortOption = 0,
@@ -136,17 +128,13 @@ def track(
     source = parse_source(source, files=True).spec
     if stills is None:  # files of pictures need not belong together
         stills = source.startswith("images:")
-    for path, suffix in ((csv, ".csv"), (overlay, ".mp4")):
-        if path is not None:
-            place = source.partition(":")[2]
-            if place and same_file(path, Path(place).expanduser()):
-                raise UsageError(f"{path} is the source itself; write the result to another file")
-            check_output(path, (suffix,), force)
+    if csv is not None:
+        check_output(csv, (".csv",), force)
     if calibration is None:
         cam = cam or flown.camera.cam
     file = find_calibration(str(calibration or flown.camera.calibration))
     port = page_port(view, view_port)
-    lines = as_json or not (csv or overlay or port is not None)
+    lines = as_json or not (csv or port is not None)
     start_s = time.monotonic()
 
     def now() -> float:
@@ -158,9 +146,9 @@ def track(
         stack.callback(opened.close)
         recording = opened.inner if isinstance(opened, WrappedSource) else opened
         paths: Sequence[Path] = ()
-        rate_hz = count = None
+        count = None
         if isinstance(recording, Recording):
-            paths, rate_hz, count = recording.paths, recording.rate_hz, recording.count
+            paths, count = recording.paths, recording.count
         is_example = is_shipped_example(file)
         ending = (
             ", the shipped example: give your camera's with --calibration" if is_example else ""
@@ -169,10 +157,6 @@ def track(
         prints = PrintCheck(camera, flown.target)
         tracker = Tracker(flown, camera, live=opened.live, stills=stills)
         add_row = stack.enter_context(csv_file(csv)) if csv else None
-        add_picture = None
-        if overlay:
-            film = overlay_file(overlay, camera, rate_hz or LIVE_RATE_HZ)
-            add_picture = stack.enter_context(film)
         stack.enter_context(stop.installed())  # until here Ctrl-C ends at once
         title = f"perchctl track {without_password(source)}"
         page = stack.enter_context(live_page(camera, title, port, say))
@@ -183,8 +167,7 @@ def track(
             place = str(paths[frame.index]) if paths else opened.describe()
             check_size((frame.image.shape[1], frame.image.shape[0]), camera, place)
             name = paths[frame.index].name if paths else frame.index
-            results = tracker.results(frame, name)
-            for tracked in results:
+            for tracked in tracker.results(frame, name):
                 summary.add(tracked)
                 prints.add(tracked.output)
                 if lines:
@@ -194,9 +177,6 @@ def track(
                 if add_row is not None:
                     add_row(track_record(tracked))
                 sketch = track_sketch(tracked, AXES_OF_SIDE * flown.target.large.side_m)
-                if add_picture is not None and tracked is results[-1]:  # of two fields, one
-                    text = tuple(f"{label} {value}" for label, value in text_rows(tracked))
-                    add_picture(tracked.t_s, replace(sketch, text=text))
                 if page is not None:
                     page.show(frame.index, sketch)
                     page.set_state(partial(track_state, tracked))
@@ -210,9 +190,8 @@ def track(
     say(summary.text(ended_s))
     if prints.judged and not is_example:  # another lens would say something of its own
         say(prints.verdict().text)
-    for path in (csv, overlay):
-        if path is not None:
-            say(f"wrote {path}")
+    if csv is not None:
+        say(f"wrote {csv}")
     if stop.requested.is_set():
         raise Interrupted("Ctrl-C: stopped; what was written is complete")
 

@@ -1,4 +1,4 @@
-"""What `perchctl track` gives for each picture, and its forms: JSON, CSV, text, live page, video.
+"""What `perchctl track` gives for each picture, and its forms: JSON, CSV, text, live page.
 
 Poses are in the OpenCV camera frame with cv2.aruco's marker axes
 (``X_cam = R(rvec) X_marker + tvec``). The marker's yaw is ``atan2(R[1, 0], R[0, 0])``: the
@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +19,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.display import PageState, Sketch, draw_sketch
+from perchctl.display import PageState, Sketch
 from perchctl.files import cannot_be_written, whole_file
 from perchctl.geometry import Array, rot_z, yaw_of
 from perchctl.vision import (
     MARKERS,
-    CameraModel,
     Detection,
     MarkerPose,
     PipelineOutput,
@@ -275,69 +273,10 @@ def track_sketch(tracked: Tracked, axis_m: float) -> Sketch:
     )
 
 
-# --- The video ---------------------------------------------------------------------------------
-
-_TICKS_HZ = 90_000  # of the video's times
-_H264 = {"preset": "veryfast", "crf": "20", "bf": "0"}  # no frames out of order: times begin at 0
-
-
-@contextmanager
-def overlay_file(
-    path: Path, camera: CameraModel, rate_hz: float
-) -> Iterator[Callable[[float, Sketch], None]]:
-    """Yield the function that adds a picture, drawn, at its time: H.264 in MP4, which browsers
-    play.
-
-    Each picture is shown from its own time on until the next one's, however irregular they are;
-    the last one is shown for one period of `rate_hz`. The file gets its place as the block ends,
-    and is removed if something fails within it. Errors: InvalidValue if it cannot be written,
-    also from adding.
-    """
-    import av  # late: most runs write no video
-
-    start_s, last = 0.0, -1
-    # Players want even sizes: an odd one gets a line more.
-    more_x, more_y = (n % 2 for n in camera.size_px)
-
-    def add(t_s: float, sketch: Sketch) -> None:
-        nonlocal start_s, last
-        picture = draw_sketch(sketch, camera)
-        picture = np.pad(picture, ((0, more_y), (0, more_x), (0, 0)), mode="edge")
-        frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
-        if last < 0:
-            start_s = t_s
-        # A time that does not rise, as of a clock that was set, counts as the next tick.
-        last = max(round((t_s - start_s) * _TICKS_HZ), last + 1)
-        frame.pts, frame.time_base = last, Fraction(1, _TICKS_HZ)
-        with _refused(path):
-            video.mux(stream.encode(frame))
-
-    with whole_file(path) as part:
-        with _refused(path):
-            # The index in front, so that a browser plays it before it has all of it.
-            video = av.open(str(part), "w", options={"movflags": "faststart"})
-            rate = Fraction(rate_hz).limit_denominator(1001)
-            stream = video.add_stream("libx264", rate, options=_H264)
-            stream.width, stream.height = camera.size_px[0] + more_x, camera.size_px[1] + more_y
-            stream.pix_fmt = "yuv420p"
-            stream.codec_context.time_base = Fraction(1, _TICKS_HZ)
-            video.start_encoding()
-        try:
-            yield add
-            with _refused(path):
-                video.mux(stream.encode(None))
-        finally:
-            with _refused(path):
-                video.close()
-
-
 @contextmanager
 def _refused(path: Path) -> Iterator[None]:
-    """Turn what the system, or FFmpeg, refuses within the block into InvalidValue."""
+    """Turn what the system refuses within the block into InvalidValue."""
     try:
         yield
-    except Exception as error:
-        why = getattr(error, "strerror", None)
-        if why is None:
-            raise
-        raise cannot_be_written(path, OSError(getattr(error, "errno", 0), why)) from None
+    except OSError as error:
+        raise cannot_be_written(path, error) from None
