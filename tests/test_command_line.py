@@ -21,7 +21,6 @@ from perchctl.commands.output import ask_to_confirm
 from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote, UsageError
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT
-from tests.helpers.recording import write_pictures
 
 HEAVY = ("cv2", "numpy", "cflib", "matplotlib", "mujoco", "pydantic", "filterpy", "scipy")
 
@@ -234,7 +233,6 @@ WRITING = [
     "calibrate mask images:. -o OUT.png",
     "make-target -o OUT.pdf",
     "make-target board chessboard:9x6:20mm -o OUT.pdf",
-    "track images:. --csv OUT.csv",
     "fit-weights session.csv -o OUT.yaml",
 ]
 """Each way to write a file, which is refused before there is anything to work on."""
@@ -260,11 +258,9 @@ def test_one_rule_for_what_is_there_already(line: str) -> None:
     [
         f"calibrate convert {CALIBRATION} -o OUT.yaml",
         "make-target board chessboard:9x6:20mm -o OUT.pdf",
-        "track images:pictures --csv OUT.csv",
     ],
 )
 def test_folders_that_are_missing_are_made(line: str) -> None:
-    write_pictures(Path("pictures"))
     *words, out = line.split()
     place = Path(out.replace("OUT", "made/new/out"))
     said = run(*words, str(place))

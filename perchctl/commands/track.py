@@ -29,7 +29,6 @@ from perchctl.camera import (
 )
 from perchctl.commands.command_line import (
     CamOption,
-    ForceOption,
     ProfileOption,
     ViewOption,
     ViewPortOption,
@@ -44,7 +43,6 @@ from perchctl.commands.track_output import (
     CameraPose,
     Tracked,
     camera_pose,
-    csv_file,
     text_line,
     track_record,
     track_sketch,
@@ -52,7 +50,6 @@ from perchctl.commands.track_output import (
 )
 from perchctl.display import AXES_OF_SIDE, live_page
 from perchctl.errors import Interrupted, NotFound
-from perchctl.files import check_output
 from perchctl.perception import BLENDED, INTERLACED, Perception
 from perchctl.places import is_shipped_example
 from perchctl.profile import Profile, find_calibration, load_profile
@@ -79,7 +76,7 @@ app = new_app()
 @command(
     app,
     "perchctl track camera:0 --view",
-    "perchctl track video:flight.mp4 --csv poses.csv",
+    "perchctl track video:flight.mp4 --json > poses.jsonl",
     "perchctl track 'images:pictures/*.png' --json",
 )
 def track(
@@ -107,10 +104,6 @@ def track(
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line a frame.")] = False,
-    csv: Annotated[
-        Path | None, typer.Option("--csv", help="Write the results as CSV, t_s first.")
-    ] = None,
-    force: ForceOption = False,
     view: ViewOption = False,
     view_port: ViewPortOption = 0,
 ) -> None:
@@ -128,13 +121,11 @@ def track(
     source = parse_source(source, files=True).spec
     if stills is None:  # files of pictures need not belong together
         stills = source.startswith("images:")
-    if csv is not None:
-        check_output(csv, (".csv",), force)
     if calibration is None:
         cam = cam or flown.camera.cam
     file = find_calibration(str(calibration or flown.camera.calibration))
     port = page_port(view, view_port)
-    lines = as_json or not (csv or port is not None)
+    lines = as_json or port is None
     start_s = time.monotonic()
 
     def now() -> float:
@@ -156,7 +147,6 @@ def track(
         say(f"calibration: {file.name}{ending}")
         prints = PrintCheck(camera, flown.target)
         tracker = Tracker(flown, camera, live=opened.live, stills=stills)
-        add_row = stack.enter_context(csv_file(csv)) if csv else None
         stack.enter_context(stop.installed())  # until here Ctrl-C ends at once
         title = f"perchctl track {without_password(source)}"
         page = stack.enter_context(live_page(camera, title, port, say))
@@ -174,8 +164,6 @@ def track(
                     line = json.dumps(track_record(tracked)) if as_json else text_line(tracked)
                     # A live result is worth nothing late.
                     print(line, flush=opened.live)
-                if add_row is not None:
-                    add_row(track_record(tracked))
                 sketch = track_sketch(tracked, AXES_OF_SIDE * flown.target.large.side_m)
                 if page is not None:
                     page.show(frame.index, sketch)
@@ -190,10 +178,8 @@ def track(
     say(summary.text(ended_s))
     if prints.judged and not is_example:  # another lens would say something of its own
         say(prints.verdict().text)
-    if csv is not None:
-        say(f"wrote {csv}")
     if stop.requested.is_set():
-        raise Interrupted("Ctrl-C: stopped; what was written is complete")
+        raise Interrupted("Ctrl-C: stopped; what was printed is complete")
 
 
 def _open(

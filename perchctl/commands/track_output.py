@@ -1,4 +1,4 @@
-"""What `perchctl track` gives for each picture, and its forms: JSON, CSV, text, live page.
+"""What `perchctl track` gives for each picture, and its forms: JSON, text, live page.
 
 Poses are in the OpenCV camera frame with cv2.aruco's marker axes
 (``X_cam = R(rvec) X_marker + tvec``). The marker's yaw is ``atan2(R[1, 0], R[0, 0])``: the
@@ -7,12 +7,8 @@ heading of its x axis in the picture's plane, from right towards down.
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -20,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.display import PageState, Sketch
-from perchctl.files import cannot_be_written, whole_file
 from perchctl.geometry import Array, rot_z, yaw_of
 from perchctl.vision import (
     MARKERS,
@@ -114,7 +109,7 @@ def _rotation(rvec: Array) -> Array:
     return np.asarray(cv2.Rodrigues(rvec)[0], dtype=np.float64)
 
 
-# --- JSON and CSV ------------------------------------------------------------------------------
+# --- JSON ------------------------------------------------------------------------------
 
 
 def track_record(tracked: Tracked) -> dict[str, Any]:
@@ -156,65 +151,6 @@ def _finite(value: Any) -> Any:
     if np.ndim(value):
         return [_finite(part) for part in value]
     return float(value) if math.isfinite(value) else None
-
-
-_COLUMNS_OF: dict[str, tuple[str, ...]] = {
-    "tvec_m": ("x_m", "y_m", "z_m"),
-    "rvec_rad": ("rx_rad", "ry_rad", "rz_rad"),
-    "yaw_rad": ("yaw_rad",),
-    "sigma_m": ("sigma_x_m", "sigma_y_m", "sigma_z_m"),
-    "sigma_yaw_rad": ("sigma_yaw_rad",),
-    "reprojection_px": ("reprojection_px",),
-    "corners_px": tuple(f"{c}_{axis}_px" for c in ("tl", "tr", "br", "bl") for axis in "xy"),
-}
-"""The columns of each value of `track_record`'s objects, in the table's order."""
-_OF_TARGET = ("tvec_m", "rvec_rad", "yaw_rad", "sigma_m", "sigma_yaw_rad")
-_OF_MARKER = ("tvec_m", "rvec_rad", "reprojection_px", "corners_px")
-CSV_COLUMNS: tuple[str, ...] = (
-    "t_s",
-    "frame",
-    "stage",
-    *(column for key in _OF_TARGET for column in _COLUMNS_OF[key]),
-    *(f"{name}_{c}" for name in MARKERS for key in _OF_MARKER for c in _COLUMNS_OF[key]),
-)
-
-
-def csv_row(record: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of a `track_record` by `CSV_COLUMNS`, without those of what was not
-    found."""
-    row = {key: record[key] for key in ("t_s", "frame", "stage")}
-    for name in ("target", *MARKERS):
-        prefix = "" if name == "target" else f"{name}_"
-        for key, value in (record[name] or {}).items():
-            if value is not None:
-                values = np.ravel(value).tolist()
-                row |= {f"{prefix}{c}": v for c, v in zip(_COLUMNS_OF[key], values, strict=True)}
-    return row
-
-
-@contextmanager
-def csv_file(path: Path) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Yield the function that adds a row for one `track_record`, `t_s` first.
-
-    The file gets its place as the block ends, and is removed if something fails within it.
-    Errors: InvalidValue if it cannot be written, also from adding.
-    """
-    with whole_file(path) as part:
-        with _refused(path):
-            stream = part.open("w", encoding="utf-8", newline="")
-        table = csv.DictWriter(stream, CSV_COLUMNS, lineterminator="\n")
-
-        def add(record: dict[str, Any]) -> None:
-            with _refused(path):
-                table.writerow(csv_row(record))
-
-        try:
-            with _refused(path):
-                table.writeheader()
-            yield add
-        finally:
-            with _refused(path):
-                stream.close()
 
 
 # --- For people --------------------------------------------------------------------------------
@@ -271,12 +207,3 @@ def track_sketch(tracked: Tracked, axis_m: float) -> Sketch:
         tuple((name, marker.corners_px) for name, marker in tracked.markers.items()),
         None if target is None else (target.rvec_rad, target.tvec_m, axis_m),
     )
-
-
-@contextmanager
-def _refused(path: Path) -> Iterator[None]:
-    """Turn what the system refuses within the block into InvalidValue."""
-    try:
-        yield
-    except OSError as error:
-        raise cannot_be_written(path, error) from None
