@@ -51,11 +51,10 @@ from perchctl.commands.command_line import (
     Group,
     JsonOption,
     ViewOption,
-    ViewPortOption,
     command,
     new_app,
 )
-from perchctl.commands.guide import guide, page_port
+from perchctl.commands.guide import guide
 from perchctl.commands.interrupt import Stopper, draw_unless_interrupted
 from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import search_bar
@@ -132,7 +131,6 @@ def camera(
     name: NameOption = "camera",
     force: ForceOption = False,
     view: ViewOption = False,
-    view_port: ViewPortOption = 0,
     as_json: JsonOption = False,
     measured: MeasuredOption = None,
     size: SizeOption = None,
@@ -164,8 +162,7 @@ def camera(
         _check_output(file, force)
         return _free_folder(file)
 
-    port = page_port(view, view_port)
-    views, missing = _find_views(pictures, layout, kept_in, port)
+    views, missing = _find_views(pictures, layout, kept_in, view)
     file = _file(output, name, views[0].size_px)
     _check_output(file, force)
     say(f"{len(views)} views of the board" + (f", {len(missing)} without" if missing else ""))
@@ -236,7 +233,6 @@ def check(
     board: BoardOption = DEFAULT_BOARD,
     cam: CamOption = None,
     view: ViewOption = False,
-    view_port: ViewPortOption = 0,
     as_json: JsonOption = False,
     measured: MeasuredOption = None,
     size: SizeOption = None,
@@ -247,8 +243,7 @@ def check(
     model: CameraModel | None = None
     with contextlib.suppress(SizeMissing):  # then the pictures' own is taken
         model = load_calibration(calibration, cam=cam)
-    port = page_port(view, view_port)
-    views, missing = _find_views(pictures, layout, lambda _: None, port)
+    views, missing = _find_views(pictures, layout, lambda _: None, view)
     size_px = views[0].size_px
     model = model or load_calibration(calibration, size_px, cam)
     check_size(size_px, model, str(pictures))
@@ -427,20 +422,20 @@ def _find_views(
     source: Source,
     board: Board,
     kept_in: Callable[[tuple[int, int]], Path | None],
-    port: int | None,
+    view: bool,
 ) -> tuple[list[BoardView], list[Rejection]]:
     """Return the views, at least one, and the pictures without a board.
 
     Args:
         kept_in: the folder for a live camera's pictures (None: they are not kept), by their size;
             called before the person begins.
-        port: of a live camera's page; None: no page.
+        view: with the live page of a live camera.
     """
     if source.scheme not in ("images", "video"):
         frames = source.open()
         with contextlib.closing(frames):
             assert frames.size_px is not None  # the first frame is there
-            return capture_live_views(frames, board, kept_in(frames.size_px), port), []
+            return capture_live_views(frames, board, kept_in(frames.size_px), view), []
     with search_bar("searching the board") as progress:
         if source.scheme == "images":
             files = image_files(source.files or source.place)
@@ -458,13 +453,13 @@ def _find_views(
 
 
 def capture_live_views(
-    source: FrameSource, board: Board, folder: Path | None, port: int | None
+    source: FrameSource, board: Board, folder: Path | None, view: bool
 ) -> list[BoardView]:
     """Return views of a live camera, taken until all is covered or Ctrl-C ends it.
 
     Args:
         folder: gets their pictures, each as it is taken; None: they are not kept.
-        port: of the live page; None: no page.
+        view: with the live page.
 
     Raises:
         InvalidValue: no view was taken. Those of `capture_views`.
@@ -493,7 +488,7 @@ def capture_live_views(
         stop = stack.enter_context(Stopper().installed())
         # The page draws the picture and its corners, but no axes: any camera serves.
         any_camera = CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
-        page = stack.enter_context(live_page(any_camera, "perchctl calibrate", port, say))
+        page = stack.enter_context(live_page(any_camera, "perchctl calibrate", view, say))
         show = stack.enter_context(guide(page))
         say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
 

@@ -41,9 +41,8 @@ from perchctl.commands.command_line import (
     ForceOption,
     JsonOption,
     ViewOption,
-    ViewPortOption,
 )
-from perchctl.commands.guide import guide, page_port
+from perchctl.commands.guide import guide
 from perchctl.commands.interrupt import Stopper, ignore_signals
 from perchctl.commands.output import print_lines, print_result, say
 from perchctl.display import live_page
@@ -116,7 +115,6 @@ def mount(
     ] = None,
     force: ForceOption = False,
     view: ViewOption = False,
-    view_port: ViewPortOption = 0,
     as_json: JsonOption = False,
 ) -> int:
     """Measure how the camera is mounted, how late it is, and where the gear's tip is.
@@ -124,9 +122,8 @@ def mount(
     The vehicle is turned in the hand in view of the target (carry), then tilted around the tip of
     its gear (pivot). Its motors are off, and nothing arms.
     """
-    port = page_port(view, view_port)
     if logs:
-        live = {"--uri": uri, "--source": source, "--view": port, "--output": output}
+        live = {"--uri": uri, "--source": source, "--view": view or None, "--output": output}
         for option, value in live.items():
             if value is not None:
                 raise UsageError(f"--from takes no camera, no vehicle, no page: leave {option} out")
@@ -141,7 +138,7 @@ def mount(
         parts: tuple[MountingPart, ...] = ("carry", "pivot") if part is None else (part,)
         frames, link_uri = _live_sources(source, uri, vehicle, parts)
         log = _recording_place(output, find_profile(profile).stem, force)
-        recordings = _record_live(vehicle, camera, frames, link_uri, parts, log, port)
+        recordings = _record_live(vehicle, camera, frames, link_uri, parts, log, view)
         logs = [log] if log.exists() else []
     measured = solve_mounting(vehicle, recordings)
     for line in measured.lines():
@@ -254,12 +251,12 @@ def _record_live(
     uri: str | None,
     parts: Sequence[MountingPart],
     log: Path,
-    port: int | None,
+    view: bool,
 ) -> tuple[MountingRecording, ...]:
     """Record the parts live, also into a file. What was recorded is kept, however it ends.
 
     Args:
-        uri: None: no vehicle is asked. port: None: no page.
+        uri: None: no vehicle is asked. view: with the live page.
 
     Raises:
         Interrupted: Ctrl-C. SafetyAbort: the motors turn.
@@ -279,7 +276,7 @@ def _record_live(
         sensors = VehicleSensors()
         if uri is not None:
             sensors = stack.enter_context(_vehicle(uri, profile, now))
-        page = stack.enter_context(live_page(camera, "perchctl calibrate mount", port, say))
+        page = stack.enter_context(live_page(camera, "perchctl calibrate mount", view, say))
         stack.callback(_keep, tapes, log)
         for part in parts:
             say(HOW[part])

@@ -26,11 +26,9 @@ from perchctl.commands.command_line import (
     SourceOption,
     UriOption,
     ViewOption,
-    ViewPortOption,
     command,
     new_app,
 )
-from perchctl.commands.guide import page_port
 from perchctl.commands.interrupt import draw_unless_interrupted, ignore_signals, signals_to_operator
 from perchctl.commands.output import ask_to_confirm, print_lines, print_result, say
 from perchctl.commands.picture_edges import picture_edges
@@ -119,7 +117,6 @@ def fly(
         bool, typer.Option("--json", help="One JSON object on stdout at the end.")
     ] = False,
     view: ViewOption = False,
-    view_port: ViewPortOption = 0,
 ) -> int:
     """Fly the seven phases: find the target, align, ascend, perch, stop the motors.
 
@@ -136,7 +133,7 @@ def fly(
     asks = not (yes or options.simulated)
     if asks and not sys.stdin.isatty():
         raise UsageError(f"about to arm {options.uri}, and there is nobody to ask: add --yes")
-    return fly_and_report(options, as_json, page_port(view, view_port), asks)
+    return fly_and_report(options, as_json, view, asks)
 
 
 def resolve(
@@ -192,9 +189,9 @@ def ask_before_arming(uri: str) -> None:
         raise UsageError("not confirmed: nothing was started")
 
 
-def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: bool = False) -> int:
-    """Fly, log, plot and report how the flight ended; return the exit code. `port` is the live
-    page's; with `asks` somebody at the terminal has to say yes before it arms."""
+def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = False) -> int:
+    """Fly, log, plot and report how the flight ended; return the exit code. `view`: with
+    the live page; with `asks` somebody at the terminal has to say yes before it arms."""
     simulated_seed = options.seed if options.simulated else None
     log = LogWatcher.real_time(
         options.log_dir, options.profile, options.uri, options.source, simulated_seed,
@@ -210,7 +207,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
     # Once it has landed nothing is left to stop, but much to tell.
     with ignore_signals(), contextlib.ExitStack() as stack:
         try:
-            page = stack.enter_context(flight_page(options, port, switch))
+            page = stack.enter_context(flight_page(options, view, switch))
             report, miss_m = _session(options, log, panel, switch, page, asks)
         except BaseException as error:
             # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
@@ -292,16 +289,14 @@ def _session(
 
 @contextlib.contextmanager
 def flight_page(
-    options: FlyOptions, port: int | None, switch: OperatorSwitch
+    options: FlyOptions, view: bool, switch: OperatorSwitch
 ) -> Iterator[FlightPage | None]:
-    """Yield the page of `--view`, whose STOP lands by the switch; None without it.
-
-    Errors: InvalidValue for a port in use."""
-    if port is None:
+    """Yield the page of `--view`, whose STOP lands by the switch; None without it."""
+    if not view:
         yield None
         return
     profile, title = options.profile, f"perchctl fly {options.uri}"
-    with live_page(profile_camera(profile.camera), title, port, say, switch.land) as page:
+    with live_page(profile_camera(profile.camera), title, view, say, switch.land) as page:
         yield None if page is None else FlightPage(page, profile.target.large.side_m)
 
 

@@ -19,11 +19,6 @@ _BAR_WIDTH = 30
 _REFRESH_HZ = 8
 
 
-def page_port(view: bool, port: int) -> int | None:
-    """Return the port for `--view` and `--view-port` (0: any free one); None for no page."""
-    return port if view or port > 0 else None
-
-
 @contextlib.contextmanager
 def guide(
     page: LivePage | None, stream: TextIO | None = None

@@ -31,11 +31,9 @@ from perchctl.commands.command_line import (
     CamOption,
     ProfileOption,
     ViewOption,
-    ViewPortOption,
     command,
     new_app,
 )
-from perchctl.commands.guide import page_port
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
@@ -105,7 +103,6 @@ def track(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line a frame.")] = False,
     view: ViewOption = False,
-    view_port: ViewPortOption = 0,
 ) -> None:
     """Find the target in a camera, video or pictures, without a vehicle.
 
@@ -124,8 +121,7 @@ def track(
     if calibration is None:
         cam = cam or flown.camera.cam
     file = find_calibration(str(calibration or flown.camera.calibration))
-    port = page_port(view, view_port)
-    lines = as_json or port is None
+    lines = as_json or not view
     start_s = time.monotonic()
 
     def now() -> float:
@@ -149,7 +145,7 @@ def track(
         tracker = Tracker(flown, camera, live=opened.live, stills=stills)
         stack.enter_context(stop.installed())  # until here Ctrl-C ends at once
         title = f"perchctl track {without_password(source)}"
-        page = stack.enter_context(live_page(camera, title, port, say))
+        page = stack.enter_context(live_page(camera, title, view, say))
         has_bar = not opened.live and not (lines and sys.stdout.isatty())
         advance = stack.enter_context(count_bar("frames", count, has_bar))
         first: tuple[float, float] | None = None  # times of the first frame and of now

@@ -23,7 +23,6 @@ from urllib.parse import urlsplit
 import cv2
 
 from perchctl.display.sketch import Sketch, draw_sketch
-from perchctl.errors import InvalidValue
 from perchctl.vision import CameraModel
 
 JPEG_QUALITY = 80
@@ -42,17 +41,15 @@ class LivePage:
     Args:
         camera: for drawing the axes.
         title: heading of the page.
-        port: 0 lets the operating system choose.
         on_stop: called by the STOP button, from a thread of the page; None: no button.
 
-    `url` holds the token that STOP needs. Errors: InvalidValue for a port in use.
+    `url` holds the token that STOP needs.
     """
 
     def __init__(
         self,
         camera: CameraModel,
         title: str,
-        port: int = 0,
         on_stop: Callable[[], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -76,14 +73,7 @@ class LivePage:
         self._read_s: float | None = None
         self._card: PageState | None = None
         self._card_read = False
-        try:
-            self._server = PageServer(self, port)
-        except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or str(error)
-            raise InvalidValue(
-                f"port {port} on 127.0.0.1 cannot be used ({reason}); choose another with "
-                f"--view-port, or leave that out"
-            ) from None
+        self._server = PageServer(self)
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}/?token={self.token}"
         self._thread = threading.Thread(
             target=self._server.serve_forever,
@@ -210,16 +200,16 @@ class LivePage:
 def live_page(
     camera: CameraModel,
     title: str,
-    port: int | None,
+    wanted: bool,
     report: Callable[[str], None],
     on_stop: Callable[[], None] | None = None,
 ) -> Iterator[LivePage | None]:
-    """Yield a page for the block, or None without a port (0: any free one); `report` prints its
-    address, and at the end its problem. `on_stop`: as in `LivePage`. Errors: InvalidValue."""
-    if port is None:
+    """Yield a page for the block, or None if none is wanted; `report` prints its address, and at
+    the end its problem. `on_stop`: as in `LivePage`."""
+    if not wanted:
         yield None
         return
-    page = LivePage(camera, title, port, on_stop)
+    page = LivePage(camera, title, on_stop)
     report(f"live page{' with a STOP button' if on_stop else ''}: {page.url}")
     try:
         yield page
@@ -259,10 +249,10 @@ class PageServer(ThreadingHTTPServer):
     block_on_close = False
     allow_reuse_address = True
 
-    def __init__(self, page: LivePage, port: int) -> None:
+    def __init__(self, page: LivePage) -> None:
         self.page = page
         self.html = _HTML.read_text(encoding="utf-8")
-        super().__init__(("127.0.0.1", port), _Handler)
+        super().__init__(("127.0.0.1", 0), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Keep an error in the page's `problem`, but for a reader that goes away."""

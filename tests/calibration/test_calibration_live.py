@@ -173,13 +173,13 @@ def test_live_pictures_are_kept_as_they_come_also_of_a_camera_that_goes(
         images += [renderer.render(pose, rng, noise=1.0)] * 2
     folder = tmp_path / "calib" / "pictures"
     with pytest.raises(TimedOut, match="only 2 views"):
-        capture_live_views(_Frames(images, ends=True), CHESSBOARD, folder, None)
+        capture_live_views(_Frames(images, ends=True), CHESSBOARD, folder, False)
     assert f"kept 2 pictures: images:{folder} takes them again" in capsys.readouterr().err
     for k, name in enumerate(("view_001.png", "view_002.png")):
         assert (cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) == images[2 * k]).all()
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(TimedOut, match="only 2 views"):  # a full disk is no reason to end
-        capture_live_views(_Frames(images, True), CHESSBOARD, tmp_path / "file" / "p", None)
+        capture_live_views(_Frames(images, True), CHESSBOARD, tmp_path / "file" / "p", False)
     assert capsys.readouterr().err.count("no longer kept") == 1
 
 

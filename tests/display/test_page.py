@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -16,7 +15,6 @@ import pytest
 
 from perchctl.display import LivePage, Sketch
 from perchctl.display.live import TOKEN_HEADER, is_loopback
-from perchctl.errors import InvalidValue
 from tests.helpers.live_page import CORNERS, ask, stop
 from tests.helpers.recording import camera
 
@@ -107,15 +105,6 @@ def test_what_fails_is_remembered_and_not_raised(page: LivePage) -> None:
     assert b"image/jpeg" not in ask(page.url, "/stream")[1]
     assert page.problem is not None
     assert ask(page.url)[0] == 200
-
-
-def test_a_port_in_use_is_refused_in_one_sentence() -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(InvalidValue, match=f"port {port} .*--view-port"):
-            LivePage(camera(), "t", port)
 
 
 # --- who may do what --------------------------------------------------------------------

@@ -158,7 +158,7 @@ OPTIONS = FlyOptions(load_profile("sim"), Path("sim.yaml"), "sim://", "sim:")
 def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) -> None:
     now_s = [100.0]
     switch = OperatorSwitch(listening=True, clock=lambda: now_s[0])
-    with flight_page(OPTIONS, 0, switch) as flight:
+    with flight_page(OPTIONS, True, switch) as flight:
         assert flight is not None
         assert flight.page.url in capsys.readouterr().err
         assert switch.read() is Operator.NONE
@@ -264,7 +264,7 @@ def test_the_page_of_a_flight_ends_with_its_card(
         return report, None
 
     monkeypatch.setattr(fly, "_session", session)
-    assert fly.fly_and_report(options, as_json=False, port=0) == 50
+    assert fly.fly_and_report(options, as_json=False, view=True) == 50
     card = last_state["card"]
     assert card["outcome"] == "LANDED"
     assert card["reason"].startswith("target not found")
@@ -285,7 +285,7 @@ def test_the_page_of_a_flight_that_failed_says_so(
     monkeypatch.setattr(LogWatcher, "abandon", lambda *a: (ended.append("log"), abandon(*a)))
     monkeypatch.setattr(fly, "_session", session)
     with pytest.raises(Interrupted):
-        fly.fly_and_report(options, as_json=False, port=0)
+        fly.fly_and_report(options, as_json=False, view=True)
     assert last_state["card"]["outcome"] == "FAILED"
     assert "nothing was started" in last_state["card"]["reason"]
     assert last_state["card"]["rows"] == []  # no tick, no log

@@ -71,7 +71,6 @@ def test_ctrl_c_leaves_whole_lines(video: Path, monkeypatch: pytest.MonkeyPatch)
         (["BROKEN"], 30, "a.png cannot be read"),
         (["PICTURES", "--calibration", "no.yaml"], 20, "no.yaml"),
         (["PICTURES", "-p", "nobody"], 20, "'nobody'"),
-        (["PICTURES", "--view-port", "99999"], 2, "65535"),
     ],
 )
 def test_bad_input_is_one_sentence(
