@@ -80,7 +80,7 @@ def read_part(stream: http.client.HTTPResponse) -> np.ndarray[Any, Any]:
 def test_the_stream_gives_the_drawn_picture(page: LivePage) -> None:
     grey = np.full((480, 640), 90, np.uint8)
     pose = (np.array([np.pi, 0.0, 0.0]), np.array([0.0, 0.0, 0.5]), 0.075)
-    page.show(0, Sketch(grey, (("large", CORNERS),), pose, ("stage both",)))
+    page.show(0, Sketch(grey, (("large", CORNERS),), pose))
     with streaming(page) as answer:
         assert answer.getheader("Content-Type", "").startswith("multipart/x-mixed-replace")
         drawn = read_part(answer).astype(int)
