@@ -22,7 +22,6 @@ from perchctl.calibration import (
     Calibration,
     GuidedFrame,
     Rejection,
-    SizeMissing,
     calibrate_camera,
     calibration_text,
     camera_record,
@@ -240,13 +239,9 @@ def check(
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
     pictures = _source(source, size, view)
     layout = _measured_board(board, measured)
-    model: CameraModel | None = None
-    with contextlib.suppress(SizeMissing):  # then the pictures' own is taken
-        model = load_calibration(calibration, cam=cam)
+    model = load_calibration(calibration, cam=cam)
     views, missing = _find_views(pictures, layout, lambda _: None, view)
-    size_px = views[0].size_px
-    model = model or load_calibration(calibration, size_px, cam)
-    check_size(size_px, model, str(pictures))
+    check_size(views[0].size_px, model, str(pictures))
     result = check_calibration(model, views)
     for item in missing:
         say(f"{item.view}: {item.reason}")

@@ -16,7 +16,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.calibration import SizeMissing, load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.camera import (
     FrameSource,
     Recording,
@@ -129,7 +129,14 @@ def track(
 
     stop, summary = Stopper(), TrackSummary()
     with contextlib.ExitStack() as stack:
-        opened, camera = _open(source, flown, file, cam, stills, now)
+        camera = load_calibration(file, cam=cam)
+        opened = open_camera(
+            source,
+            now,
+            flown.camera,
+            size_px=camera.size_px,
+            pictures_hz=STILLS_HZ if stills else None,
+        )
         stack.callback(opened.close)
         recording = opened.inner if isinstance(opened, WrappedSource) else opened
         paths: Sequence[Path] = ()
@@ -176,26 +183,6 @@ def track(
         say(prints.verdict().text)
     if stop.requested.is_set():
         raise Interrupted("Ctrl-C: stopped; what was printed is complete")
-
-
-def _open(
-    source: str,
-    profile: Profile,
-    calibration: Path,
-    cam: str | None,
-    stills: bool,
-    now: Callable[[], float],
-) -> tuple[FrameSource, CameraModel]:
-    """Return the open source, and its camera. Errors: NotFound, InvalidValue."""
-    camera = None
-    with contextlib.suppress(SizeMissing):  # then the first picture's is taken
-        camera = load_calibration(calibration, cam=cam)
-    size_px = None if camera is None else camera.size_px
-    pictures_hz = STILLS_HZ if stills else None
-    opened = open_camera(source, now, profile.camera, size_px=size_px, pictures_hz=pictures_hz)
-    if camera is None:
-        camera = load_calibration(calibration, opened.size_px, cam)
-    return opened, camera
 
 
 def frames(
