@@ -91,7 +91,7 @@ MOST_NAMES = {
     "campaign": 25,
     "check": 15,
     "commands": 15,
-    "display": 15,
+    "display": 8,
     "faults": 15,
     "flight": 22,
     "link": 15,

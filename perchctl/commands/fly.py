@@ -34,10 +34,8 @@ from perchctl.commands.output import ask_to_confirm, print_lines, print_result, 
 from perchctl.commands.picture_edges import picture_edges
 from perchctl.display import (
     FlightPage,
-    failed_card,
     live_page,
     open_panel,
-    summary_card,
 )
 from perchctl.errors import (
     EXIT_CODES,
@@ -212,7 +210,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
         except BaseException as error:
             # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
             if page is not None:
-                page.end(failed_card(error, log.path if log.begun else None))
+                page.fail(error, log.path if log.begun else None)
             log.abandon(str(error) or type(error).__name__)
             raise
         finally:
@@ -221,7 +219,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
         assert summary is not None
         print_lines(summary_text(summary, log.path), stdout=not as_json)
         if page is not None:
-            page.end(summary_card(summary, log.path))
+            page.end(summary, log.path)
     code = exit_code(report.outcome, summary)
     plot = draw_unless_interrupted(lambda: plot_of(log.path, options.profile))
     if plot is not None:

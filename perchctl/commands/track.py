@@ -1,4 +1,9 @@
-"""`perchctl track`: the pipeline on any source, without a vehicle."""
+"""`perchctl track`: the pipeline on any source, without a vehicle.
+
+Poses are in the OpenCV camera frame with cv2.aruco's marker axes
+(``X_cam = R(rvec) X_marker + tvec``). The marker's yaw is ``atan2(R[1, 0], R[0, 0])``: the
+heading of its x axis in the picture's plane, from right towards down.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +15,13 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
+import cv2
+import numpy as np
 import typer
 
 from perchctl.calibration import load_calibration
@@ -37,25 +45,21 @@ from perchctl.commands.command_line import (
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
-from perchctl.commands.track_output import (
-    CameraPose,
-    Tracked,
-    camera_pose,
-    text_line,
-    track_record,
-    track_sketch,
-    track_state,
-)
-from perchctl.display import AXES_OF_SIDE, live_page
+from perchctl.display import live_page, sketch_of
 from perchctl.errors import Interrupted, NotFound
+from perchctl.geometry import Array, rot_z, yaw_of
 from perchctl.perception import BLENDED, INTERLACED, Perception
 from perchctl.places import is_shipped_example
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.target import PrintCheck
 from perchctl.vision import (
+    MARKERS,
     CameraModel,
     Frame,
+    MarkerPose,
     PipelineOutput,
+    Stage,
+    better_conditioned,
     camera_profile,
     make_pipeline,
 )
@@ -63,7 +67,6 @@ from perchctl.vision import (
 STILLS_HZ = 1.0
 """Of files of pictures that do not belong together: so each can be looked at on the page."""
 POLL_S = 0.002
-MOST_NOTES = 20
 # A live picture that stands still or is noise is no measurement; the others are searched.
 _NO_PICTURE = ("frozen", "snow")
 _DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
@@ -130,12 +133,9 @@ def track(
     stop, summary = Stopper(), TrackSummary()
     with contextlib.ExitStack() as stack:
         camera = load_calibration(file, cam=cam)
+        pictures_hz = STILLS_HZ if stills else None
         opened = open_camera(
-            source,
-            now,
-            flown.camera,
-            size_px=camera.size_px,
-            pictures_hz=STILLS_HZ if stills else None,
+            source, now, flown.camera, size_px=camera.size_px, pictures_hz=pictures_hz
         )
         stack.callback(opened.close)
         recording = opened.inner if isinstance(opened, WrappedSource) else opened
@@ -156,7 +156,7 @@ def track(
         has_bar = not opened.live and not (lines and sys.stdout.isatty())
         advance = stack.enter_context(count_bar("frames", count, has_bar))
         first: tuple[float, float] | None = None  # times of the first frame and of now
-        for frame in frames(opened, now, stop, summary):
+        for frame in frames(opened, now, stop):
             place = str(paths[frame.index]) if paths else opened.describe()
             check_size((frame.image.shape[1], frame.image.shape[0]), camera, place)
             name = paths[frame.index].name if paths else frame.index
@@ -167,8 +167,8 @@ def track(
                     line = json.dumps(track_record(tracked)) if as_json else text_line(tracked)
                     # A live result is worth nothing late.
                     print(line, flush=opened.live)
-                sketch = track_sketch(tracked, AXES_OF_SIDE * flown.target.large.side_m)
                 if page is not None:
+                    sketch = sketch_of(tracked.picture, tracked.output, flown.target.large.side_m)
                     page.show(frame.index, sketch)
                     page.set_state(partial(track_state, tracked))
             advance()
@@ -185,15 +185,15 @@ def track(
         raise Interrupted("Ctrl-C: stopped; what was printed is complete")
 
 
-def frames(
-    source: FrameSource, now: Callable[[], float], stop: Stopper, summary: TrackSummary
-) -> Iterator[Frame]:
+def frames(source: FrameSource, now: Callable[[], float], stop: Stopper) -> Iterator[Frame]:
     """Yield every frame of a recording, the newest ones of a live source, until the end or
-    Ctrl-C."""
+    Ctrl-C. A source that is silent is reported once, until it gives a frame again."""
+    is_silent = False
     while not stop.requested.is_set():
         now_s = now()
         frame = source.poll(now_s)
         if frame is not None:
+            is_silent = False
             yield frame
             continue
         if source.finished:
@@ -202,8 +202,48 @@ def frames(
         if (gone := source.problem(-math.inf)) is not None:
             say(gone)
             return
-        summary.add_silence(source.problem(now_s))
+        problem = source.problem(now_s)
+        if problem is not None and not is_silent:
+            say(f"{problem}; waiting for it (Ctrl-C ends)")
+            is_silent = True
         stop.requested.wait(POLL_S)
+
+
+# --- Results -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPose:
+    """The target's pose in the camera frame; `sigma_m` (3,) is along the camera's axes."""
+
+    rvec_rad: Array
+    tvec_m: Array
+    yaw_rad: float
+    sigma_m: Array
+    sigma_yaw_rad: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """The result of one picture.
+
+    Attributes:
+        name: the picture's file name, or its frame's index if it has none.
+        output: what the pipeline found; None if the picture was not searched.
+        target: at stage ``none`` this is the filter's prediction.
+        notes: the sentences that the picture deserves.
+    """
+
+    name: str | int
+    picture: Frame
+    output: PipelineOutput | None = None
+    target: CameraPose | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def stage(self) -> str:
+        """The markers that this picture shows."""
+        return (Stage.NONE if self.output is None else self.output.stage).value
 
 
 class Tracker:
@@ -219,7 +259,6 @@ class Tracker:
         self._config, self._live, self._stills = profile.camera, live, stills
         self._disagreement_frames = 1 if stills else profile.merge.disagreement_frames
         self._target: CameraPose | None = None
-        self._interlaced = False
 
     def results(self, frame: Frame, name: str | int) -> list[Tracked]:
         """Return the frame's result, or those of its two fields; none for a live source's
@@ -229,19 +268,16 @@ class Tracker:
             return []
         about = () if judged.kind in ("ok", "repeated") else (judged.text,)
         if self._live and judged.kind in _NO_PICTURE:
-            return [Tracked(name, frame.t_s, frame.image, notes=about)]
+            return [Tracked(name, frame, notes=about)]
         results = []
         for picture, output in self._perception.look(frame):
             self._target = camera_pose(output, not self._stills, self._target)
             notes = (*about, *self._notes(output))
-            results.append(Tracked(name, picture.t_s, picture.image, output, self._target, notes))
+            results.append(Tracked(name, picture, output, self._target, notes))
         return results
 
     def _notes(self, output: PipelineOutput) -> Iterator[str]:
-        interlaced = output.fields != "whole"
-        if not self._stills:  # at rest nothing is combed, and that is no news
-            self._interlaced = interlaced = interlaced or self._interlaced
-        if interlaced:
+        if output.fields != "whole":
             yield INTERLACED
         if output.detections.ghost_px > 0.0:
             yield BLENDED
@@ -253,39 +289,128 @@ class Tracker:
             yield _DISAGREE
 
 
+def camera_pose(
+    output: PipelineOutput, filtered: bool, before: CameraPose | None
+) -> CameraPose | None:
+    """Return the target's pose in the camera frame, from a pipeline whose body, gear and camera
+    are one; None without a target.
+
+    `filtered` False takes the pose as measured. `before` is the last target: its tilt is kept
+    while the filter predicts.
+    """
+    target = output.target
+    if target is None:
+        return None
+    pose, is_whole = _measured_pose(output, target.stage)
+    if pose is not None and is_whole and not filtered:
+        R = _rotation(pose.rvec_rad)
+        return CameraPose(pose.rvec_rad, pose.tvec_m, yaw_of(R), pose.sigma_m, pose.sigma_yaw_rad)
+    known = pose or before
+    if known is None:
+        return None
+    # The filter holds position and yaw; the tilt is the picture's own.
+    R = _rotation(known.rvec_rad)
+    R = rot_z(target.e_yaw_rad - yaw_of(R)) @ R
+    rvec = np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64).ravel()
+    return CameraPose(rvec, target.e_m, target.e_yaw_rad, target.sigma_m, target.sigma_yaw_rad)
+
+
+def _measured_pose(output: PipelineOutput, stage: Stage) -> tuple[MarkerPose | None, bool]:
+    """Return the pose that the target rests on, and whether it alone makes the target."""
+    poses = output.poses
+    if stage is not Stage.BOTH:
+        return poses.get(stage.value), True
+    if "joint" in poses:
+        return poses["joint"], True
+    return better_conditioned(poses["large"], poses["small"]), False
+
+
+def _rotation(rvec: Array) -> Array:
+    return np.asarray(cv2.Rodrigues(rvec)[0], dtype=np.float64)
+
+
+# --- What is printed ---------------------------------------------------------------------------
+
+
+def track_record(tracked: Tracked) -> dict[str, Any]:
+    """Return the line of `track --json`; what is not finite becomes None."""
+    target, output = tracked.target, tracked.output
+    return {
+        "frame": tracked.name,
+        "t_s": _finite(tracked.picture.t_s),
+        "stage": tracked.stage,
+        **{name: None if output is None else _marker_record(output, name) for name in MARKERS},
+        "target": None
+        if target is None
+        else {key: _finite(value) for key, value in vars(target).items()},
+    }
+
+
+def _marker_record(
+    output: PipelineOutput, name: Literal["large", "small"]
+) -> dict[str, Any] | None:
+    marker = output.detections.get(name)
+    if marker is None:
+        return None
+    pose = output.poses.get(name)
+    return {"corners_px": _finite(marker.corners_px)} | {
+        key: None if pose is None else _finite(getattr(pose, key))
+        for key in ("rvec_rad", "tvec_m", "reprojection_px")
+    }
+
+
+def _finite(value: Any) -> Any:
+    """Return the number, or the nested lists of the array's numbers, as Python's; None for each
+    that is not finite."""
+    if np.ndim(value):
+        return [_finite(part) for part in value]
+    return float(value) if math.isfinite(value) else None
+
+
+def text_line(tracked: Tracked) -> str:
+    """Return one line for a terminal, at most 100 columns but for long file names."""
+    head = f"{tracked.name!s:>6}  {tracked.picture.t_s:9.3f} s  {tracked.stage:<5}"
+    return f"{head}  {_target_text(tracked.target)}"
+
+
+def _target_text(target: CameraPose | None) -> str:
+    """Return the target's place and heading for people, in centimetres and degrees."""
+    if target is None:
+        return "target not seen"
+    x, y, z = (f"{100.0 * v:+7.2f}" for v in target.tvec_m)
+    return f"x {x}  y {y}  z {z} cm  yaw {math.degrees(target.yaw_rad):+7.2f} deg"
+
+
+def track_state(tracked: Tracked) -> dict[str, Any]:
+    """Return what the live page shows of a frame, ready for JSON."""
+    rows = [
+        ["frame", f"{tracked.name}   {tracked.picture.t_s:.3f} s"],
+        ["markers", tracked.stage],
+        ["target", _target_text(tracked.target)],
+    ]
+    return {"rows": rows, "note": "; ".join(tracked.notes)}
+
+
 class TrackSummary:
-    """Counts results, and prints a sentence as a condition begins, `MOST_NOTES` at the most."""
+    """Counts results and the conditions that they note; each is printed once, as it begins."""
 
     def __init__(self) -> None:
         self.frames = 0
         self._found: Counter[str] = Counter()
         self._noted: Counter[str] = Counter()
-        self._before: frozenset[str] = frozenset()
-        self._left = MOST_NOTES
-        self._silent = False
 
     def add(self, tracked: Tracked) -> None:
         """Count this result, and print what is new in it."""
         self.frames += 1
-        self._found.update(list(tracked.markers))
-        name = tracked.frame if isinstance(tracked.frame, str) else f"frame {tracked.frame}"
+        if tracked.output is not None:
+            seen = tracked.output.detections
+            self._found.update(name for name in MARKERS if seen.get(name) is not None)
         for note in tracked.notes:
-            if _kind(note) in self._before:
-                continue
-            self._left -= 1
-            if self._left >= 0:
-                say(f"{name}: {note}")
-            if self._left == 0:
-                say("more of this kind is only counted from here on")
-        self._before = frozenset(map(_kind, tracked.notes))
-        self._noted.update(self._before)
-        self._silent = False
-
-    def add_silence(self, problem: str | None) -> None:
-        """Print once why the source gives no frame at present; None if it only has none yet."""
-        if problem is not None and not self._silent:
-            say(f"{problem}; waiting for it (Ctrl-C ends)")
-        self._silent = self._silent or problem is not None
+            kind = re.split("[:,]", note, maxsplit=1)[0]  # without what differs between frames
+            if not self._noted[kind]:
+                place = tracked.name if isinstance(tracked.name, str) else f"frame {tracked.name}"
+                say(f"{place}: {note}")
+            self._noted[kind] += 1
 
     def text(self, took_s: float) -> str:
         """Return the sentence at the end."""
@@ -296,8 +421,3 @@ class TrackSummary:
             f"{frames} {'frame' if frames == 1 else 'frames'} in {took_s:.1f} s "
             f"({frames / took_s:.0f} a second): large {large:.0f} %, small {small:.0f} %{counted}"
         )
-
-
-def _kind(note: str) -> str:
-    """Return the note without what differs from frame to frame."""
-    return re.split("[:,]", note, maxsplit=1)[0]

@@ -32,8 +32,6 @@ READS_S, LAST_READ_S = 2.5, 2.0
 _RATE_FRAMES = 30  # over which the frame rate is taken
 _RATE_STALE_S = 1.0
 
-PageState = dict[str, Any]
-
 
 class LivePage:
     """Serves one page until closed.
@@ -68,10 +66,10 @@ class LivePage:
         self._frame: int | None = None
         self._times: deque[float] = deque(maxlen=_RATE_FRAMES)
         self._jpeg: tuple[int, bytes] | None = None
-        self._describe: Callable[[], PageState] = dict
+        self._describe: Callable[[], dict[str, Any]] = dict
         self._state_s: float | None = None  # None: nothing is due
         self._read_s: float | None = None
-        self._card: PageState | None = None
+        self._card: dict[str, Any] | None = None
         self._card_read = False
         self._server = PageServer(self)
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}/?token={self.token}"
@@ -94,13 +92,13 @@ class LivePage:
             self._number += 1
             self._changed.notify_all()
 
-    def set_state(self, describe: Callable[[], PageState], *, live: bool = True) -> None:
+    def set_state(self, describe: Callable[[], dict[str, Any]], *, live: bool = True) -> None:
         """Show these numbers from now on; they are formatted only when a reader polls. While they
         are `live`, others are due at once, and the page says when they stay away."""
         self._describe = describe
         self._state_s = self._clock() if live else None
 
-    def end(self, card: PageState) -> None:
+    def end(self, card: dict[str, Any]) -> None:
         """Show how it ended: the last picture and numbers stay, with this card. Waits, bounded,
         until a reader that is there has it."""
         with self._changed:
@@ -111,7 +109,7 @@ class LivePage:
 
     # --- for the server's threads --------------------------------------------
 
-    def state(self) -> PageState:
+    def state(self) -> dict[str, Any]:
         """What the page polls: `describe`'s keys (rows of a name, a text and, for a bar, a share
         0..1; note, phase, battery, over), and title, rate_hz, stop (``none``, ``ready``,
         ``requested``, ``over``), age_s of these numbers (None where no others are due), card
@@ -134,7 +132,7 @@ class LivePage:
         self._read_s = self._clock()
         return described | fixed | {"page_problem": self.problem}
 
-    def was_read(self, state: PageState) -> None:
+    def was_read(self, state: dict[str, Any]) -> None:
         """Note that this state has reached a reader."""
         if state.get("card") is not None:
             with self._changed:

@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision import CameraModel, project
+from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput, project
 
 # Blue, green, red.
 _OUTLINE = {"large": (0, 200, 255), "small": (255, 200, 0)}
 _AXES = ((60, 60, 255), (60, 220, 60), (255, 120, 60))
 _OTHER = (255, 255, 255)
 _SUBPIXEL_BITS = 4
+AXES_OF_SIDE = 0.5
+"""Length of the drawn axes, in sides of the large marker."""
 _FAR_PX = 8000.0  # beyond this a line's end shows nothing, and would overflow
 
 
@@ -32,6 +34,21 @@ class Sketch:
     image: NDArray[np.uint8]
     outlines: tuple[tuple[str, Array], ...] = ()
     pose: tuple[Array, Array, float] | None = None
+
+
+def sketch_of(frame: Frame, output: PipelineOutput | None, large_side_m: float) -> Sketch:
+    """Return the frame with the outlines of its markers and the axes of its pose; bare if it was
+    not searched. `large_side_m` is the side of the large marker."""
+    if output is None or output.detections.frame_index != frame.index:
+        return Sketch(frame.image)
+    found = ((name, output.detections.get(name)) for name in MARKERS)
+    poses = output.poses
+    pose = next((poses[name] for name in ("joint", "large", "small") if name in poses), None)
+    return Sketch(
+        frame.image,
+        tuple((name, seen.corners_px) for name, seen in found if seen is not None),
+        None if pose is None else (pose.rvec_rad, pose.tvec_m, AXES_OF_SIDE * large_side_m),
+    )
 
 
 def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:

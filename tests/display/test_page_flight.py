@@ -15,7 +15,7 @@ import pytest
 
 from perchctl.commands import fly
 from perchctl.commands.fly import flight_page
-from perchctl.display import FlightPage, LivePage, failed_card, summary_card
+from perchctl.display import FlightPage, LivePage
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch
 from perchctl.flight.operator import AGAIN_S, HELD_S
@@ -139,17 +139,6 @@ def test_after_the_flight_nothing_is_due_and_nothing_to_stop(
     assert (state["age_s"], state["stop"]) == (None, "over")
 
 
-def test_the_page_looks_at_the_age_by_itself(page: LivePage) -> None:
-    """Whatever hangs, its script is the browser's: a timer, answers that are not waited for
-    without end (`AbortSignal.timeout` is of 2022, and asked for before each use), and a STOP that
-    is ready again at a program that was gone and now hangs."""
-    script = page._server.html.partition("<script")[2]
-    for part in ("setInterval(watch", "AbortSignal.timeout ?", "known = stop;"):
-        assert part in script
-    assert script.count("...within(") == 2
-    assert 'showStop(silent ? known : "gone")' in script
-
-
 # --- STOP ------------------------------------------------------------------------------------
 
 OPTIONS = FlyOptions(load_profile("sim"), Path("sim.yaml"), "sim://", "sim:")
@@ -188,9 +177,12 @@ SUMMARY = FlightSummary(
 )
 
 
-def test_the_card_tells_outcome_reason_miss_and_where_to_look(tmp_path: Path) -> None:
+def test_the_card_tells_outcome_reason_miss_and_where_to_look(
+    page: LivePage, tmp_path: Path
+) -> None:
     log = tmp_path / "my flights" / "flight.jsonl"
-    card = summary_card(SUMMARY, log)
+    FlightPage(page, 0.15).end(SUMMARY, log)
+    card = state_of(page)["card"]
     assert (card["outcome"], card["good"]) == ("PERCHED", True)
     assert card["reason"] == SUMMARY.reason
     rows = dict(card["rows"])
@@ -202,14 +194,16 @@ def test_the_card_tells_outcome_reason_miss_and_where_to_look(tmp_path: Path) ->
 def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     page: LivePage, tmp_path: Path
 ) -> None:
-    card = failed_card(Interrupted("interrupted before take-off"), None)
-    assert (card["outcome"], card["good"], card["rows"]) == ("FAILED", False, [])
-    assert "report" in dict(failed_card(RuntimeError(), tmp_path)["rows"])
     flight = FlightPage(page, 0.15)
+    flight.fail(Interrupted("interrupted before take-off"), None)
+    card = state_of(page)["card"]
+    assert (card["outcome"], card["good"], card["rows"]) == ("FAILED", False, [])
     flight.event(note(START_S, "RuntimeError in flight: it is down, or hangs: the motors are off"))
     flight.event(note(START_S, "the recording has ended (no space): the flight and its log go on"))
-    flight.end(failed_card(RuntimeError("boom"), None))
-    assert state_of(page)["card"]["rows"][0][1].endswith("the motors are off")
+    flight.fail(RuntimeError("boom"), tmp_path)
+    rows = state_of(page)["card"]["rows"]
+    assert rows[0][1].endswith("the motors are off")
+    assert "report" in dict(rows)
 
 
 def test_nobody_is_waited_for_where_nobody_looks(page: LivePage) -> None:
@@ -280,8 +274,8 @@ def test_the_page_of_a_flight_that_failed_says_so(
         raise Interrupted("interrupted before take-off: nothing was started")
 
     ended: list[str] = []
-    page_end, abandon = FlightPage.end, LogWatcher.abandon
-    monkeypatch.setattr(FlightPage, "end", lambda *a: (ended.append("page"), page_end(*a)))
+    page_fail, abandon = FlightPage.fail, LogWatcher.abandon
+    monkeypatch.setattr(FlightPage, "fail", lambda *a: (ended.append("page"), page_fail(*a)))
     monkeypatch.setattr(LogWatcher, "abandon", lambda *a: (ended.append("log"), abandon(*a)))
     monkeypatch.setattr(fly, "_session", session)
     with pytest.raises(Interrupted):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from perchctl.display import Sketch, draw_sketch
+from perchctl.display import Sketch
+from perchctl.display.sketch import draw_sketch
 from tests.helpers.recording import camera
 
 

@@ -1,9 +1,12 @@
-"""`perchctl track`: its results against the truth, and the sentences that pictures deserve."""
+"""`perchctl track`: its results against the truth, the sentences that pictures deserve, its end."""
 
 from __future__ import annotations
 
 import json
 import math
+import signal
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,35 +17,93 @@ import pytest
 from perchctl.calibration import load_calibration
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.track import Tracker, TrackSummary, frames
+from perchctl.display import LivePage
 from perchctl.errors import InvalidValue
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.vision import Frame, project, square_corners
+from tests.helpers.commands import run
 from tests.helpers.interlaced import Pass
+from tests.helpers.live_page import ask
 from tests.helpers.recording import (
+    CALIBRATION,
     STAGE_OF,
     VIEWS,
     camera,
     moving,
     picture,
     true_pose,
+    write_pictures,
     write_video,
 )
 from tests.helpers.target_picture import CAMERA
-from tests.helpers.track import (
-    CALIBRATION,
-    DISTORTION,
-    MOVING,
-    PINHOLE,
-    lines,
-    track,
-    write_opencv,
-    write_ros,
-)
 
 SCENES = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "scenes"
 PAL_S = 0.04
 FIELDS = 10
+MOVING = 24
+"""Frames of the video of a moving camera."""
+PINHOLE = [380.0, 0.0, 321.5, 0.0, 380.6, 238.2, 0.0, 0.0, 1.0]
+DISTORTION = [-0.17, 0.04, 0.0004, -0.0007, 0.0]
+parse = partial(json.loads, parse_constant=pytest.fail)
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """One run: its exit code, the objects on stdout, and the sentences on stderr."""
+
+    code: int
+    lines: list[dict[str, Any]]
+    stderr: str
+
+
+def track(source: str | Path, *words: str | Path, calibration: Path = CALIBRATION) -> Tracked:
+    """`perchctl track SOURCE --json` with these words."""
+    given = ("track", source, "--json", "--calibration", calibration, *words)
+    said = run(*map(str, given))
+    return Tracked(said.code, [parse(line) for line in said.stdout.splitlines()], said.stderr)
+
+
+def lines(source: str | Path, *words: str | Path, **options: Path) -> list[dict[str, Any]]:
+    """Those of a run that ends well."""
+    tracked = track(source, *words, **options)
+    assert tracked.code == 0, tracked.stderr
+    return tracked.lines
+
+
+def write_ros(folder: Path, K: list[float], dist: list[float]) -> Path:
+    path = folder / "ros.yaml"
+    path.write_text(
+        f"image_width: 640\nimage_height: 480\ndistortion_model: plumb_bob\n"
+        f"camera_matrix: {{rows: 3, cols: 3, data: {K}}}\n"
+        f"distortion_coefficients: {{rows: 1, cols: {len(dist)}, data: {dist}}}\n"
+    )
+    return path
+
+
+def write_opencv(
+    path: Path, size_px: tuple[int, int] | None, K: Any = PINHOLE, dist: Any = DISTORTION
+) -> Path:
+    """A calibration as OpenCV's FileStorage writes it."""
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    if size_px is not None:
+        storage.write("image_width", size_px[0])
+        storage.write("image_height", size_px[1])
+    storage.write("camera_matrix", np.array(K).reshape(3, 3))
+    storage.write("distortion_coefficients", np.array(dist).reshape(-1, 1))
+    storage.release()
+    return path
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_pictures(tmp_path_factory.mktemp("track") / "pictures")
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    images = [picture(moving(i), i) for i in range(MOVING)]
+    return write_video(tmp_path_factory.mktemp("track") / "moving.mp4", images)
 
 
 SHAPES = {
@@ -356,7 +417,7 @@ class Script:
 def test_a_live_source_is_waited_for_and_its_end_is_told(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    seen = [f.index for f in frames(Script(3), lambda: 5.0, Stopper(), TrackSummary())]
+    seen = [f.index for f in frames(Script(3), lambda: 5.0, Stopper())]
     assert seen == [2, 1, 0]
     said = capsys.readouterr().err
     assert said.startswith("perchctl: silent for 2 s; waiting")
@@ -422,3 +483,88 @@ def test_a_picture_of_another_size_is_named(number: int, tmp_path: Path) -> None
     assert tracked.code == InvalidValue.exit_code
     for words in (f"{number}.png", "320x240", "640x480"):
         assert words in tracked.stderr
+
+
+# --- the page, the end, bad input -----------------------------------------------------------
+
+
+def test_the_live_page_has_the_newest_numbers(
+    pictures: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states = []
+    tell = LivePage.set_state
+
+    def asked(self: LivePage, *describe: Any) -> None:
+        tell(self, *describe)
+        states.append(json.loads(ask(self.url, "/state")[1]))
+
+    monkeypatch.setattr(LivePage, "set_state", asked)
+    tracked = track(pictures, "--view")
+    shown = [dict(state["rows"]) for state in states]
+    assert [rows["markers"] for rows in shown] == [line["stage"] for line in tracked.lines]
+    for rows, line in zip(shown, tracked.lines, strict=True):
+        if line["target"] is None:
+            assert rows["target"] == "target not seen"
+        else:
+            assert f"{100.0 * line['target']['tvec_m'][0]:+.2f}" in rows["target"]
+    assert {state["stop"] for state in states} == {"none"}
+    assert "live page: http://127.0.0.1" in tracked.stderr
+    assert "failed" not in tracked.stderr
+
+
+def test_what_was_not_found_is_said(pictures: Path) -> None:
+    said = run("track", str(pictures / "away.png"))
+    assert "target not seen" in said.stdout
+    assert said.complaint.startswith("1 frame in")
+
+
+def test_ctrl_c_leaves_whole_lines(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    count = TrackSummary.add
+
+    def pressing(self: TrackSummary, *results: Any) -> None:
+        count(self, *results)
+        if self.frames == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(TrackSummary, "add", pressing)
+    tracked = track(video)
+    assert tracked.code == 130
+    *lines, failure = tracked.lines
+    assert (len(lines), failure["exit_code"]) == (3, 130)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "expected"),
+    [
+        (["nowhere.mp4"], 20, "nowhere.mp4 does not exist"),
+        (["video:nowhere.mp4"], 20, "nowhere.mp4 was not found"),
+        (["images:*.nothing"], 20, "names pictures"),
+        (["nonsense"], 20, "nonsense does not exist"),
+        (["nonsense:1"], 30, "camera:N"),
+        (["sim:"], 30, "camera:N"),
+        (["."], 20, "holds no pictures"),
+        (["BROKEN"], 30, "a.png cannot be read"),
+        (["PICTURES", "--calibration", "no.yaml"], 20, "no.yaml"),
+        (["PICTURES", "-p", "nobody"], 20, "'nobody'"),
+    ],
+)
+def test_bad_input_is_one_sentence(
+    words: list[str],
+    code: int,
+    expected: str,
+    pictures: Path,
+    video: Path,
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    broken = tmp_path_factory.mktemp("broken") / "a.png"
+    broken.write_bytes(b"no picture")
+    places = {"PICTURES": str(pictures), "VIDEO": str(video), "BROKEN": str(broken)}
+    said = run("track", *(places.get(word, word) for word in words))
+    assert (said.code, said.stdout) == (code, "")
+    assert expected in said.stderr
+    if said.stderr.startswith("perchctl: "):
+        assert len(said.stderr.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
