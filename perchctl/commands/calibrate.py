@@ -69,9 +69,6 @@ DEFAULT_BOARD = "charuco:10x7:25mm:18mm:DICT_5X5_100"
 MASK_S = 20.0
 """How long a live camera is watched to learn a mask."""
 
-DETAILS = "Details"
-"""Heading of the options that are not of every day."""
-
 SourceArgument = Annotated[
     list[str],
     typer.Argument(
@@ -93,7 +90,6 @@ MeasuredOption = Annotated[
     typer.Option(
         "--measured",
         help="Width and height of the board's black area as printed, mm: 249.3x174.9.",
-        rich_help_panel=DETAILS,
     ),
 ]
 SizeOption = Annotated[
@@ -101,7 +97,6 @@ SizeOption = Annotated[
     typer.Option(
         "--size",
         help="Asked of camera:N, as in 720x576; else its driver's own.",
-        rich_help_panel=DETAILS,
     ),
 ]
 NameOption = Annotated[str, typer.Option("--name", help="The camera's name.")]
@@ -138,7 +133,6 @@ def camera(
         typer.Option(
             "--model",
             help="Lens model; auto takes the simplest one that follows the lens.",
-            rich_help_panel=DETAILS,
         ),
     ] = "auto",
 ) -> None:

@@ -48,7 +48,6 @@ from perchctl.target import (
 from perchctl.vision import CameraModel
 
 SIDE_LIMITS_M = (0.004, 2.0)
-ANOTHER = "Another target than the profile's"
 
 PageOption = Annotated[str, typer.Option("--page", help="a4, letter, a3, or 220x240mm.")]
 MagnetOption = Annotated[
@@ -57,7 +56,7 @@ MagnetOption = Annotated[
 
 
 def _of_target(name: str, text: str, **limits: Any) -> Any:
-    return typer.Option(name, help=text, rich_help_panel=ANOTHER, **limits)
+    return typer.Option(name, help=text, **limits)
 
 
 LargeOption = Annotated[

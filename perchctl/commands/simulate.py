@@ -112,16 +112,13 @@ def run(
     cluster: ClusterOption = None,
     log_dir: Annotated[
         Path | None,
-        typer.Option(
-            "--log-dir", help="Log the flights, into this folder.", rich_help_panel="Files"
-        ),
+        typer.Option("--log-dir", help="Log the flights, into this folder."),
     ] = None,
     record: Annotated[
         bool,
         typer.Option(
             "--record",
             help="Keep the pictures, in an MCAP file beside each log.",
-            rich_help_panel="Files",
         ),
     ] = False,
     keep: Annotated[
@@ -129,21 +126,17 @@ def run(
         typer.Option(
             "--keep",
             help="Of the logs in --log-dir; all by default.",
-            rich_help_panel="Files",
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", help="JSONL file; each flight's result, as it ends.", rich_help_panel="Files"
-        ),
+        typer.Option("--out", help="JSONL file; each flight's result, as it ends."),
     ] = None,
     resume: Annotated[
         bool,
         typer.Option(
             "--resume",
             help="Go on with --out: fly the seeds that it lacks.",
-            rich_help_panel="Files",
         ),
     ] = False,
     force: ForceOption = False,
