@@ -13,7 +13,7 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Literal, Protocol, TypeVar
+from typing import Annotated, Any, Protocol, TypeVar
 
 import typer
 
@@ -121,13 +121,6 @@ def run(
             help="Keep the pictures, in an MCAP file beside each log.",
         ),
     ] = False,
-    keep: Annotated[
-        Literal["all", "failed"] | None,
-        typer.Option(
-            "--keep",
-            help="Of the logs in --log-dir; all by default.",
-        ),
-    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="JSONL file; each flight's result, as it ends."),
@@ -150,11 +143,10 @@ def run(
         return _list_faults(as_json)
     if only is not None:
         one = f"--only {only} repeats the one flight of seed {only}"
-        _refuse_options(one, {**many, "--keep": keep}, ", or --only")
-    if log_dir is None and (record or keep is not None) and only is None:
+        _refuse_options(one, many, ", or --only")
+    if record and log_dir is None and only is None:
         raise UsageError(
-            f"{'--record' if record else '--keep'} concerns the logs of the flights: name their "
-            f"folder with --log-dir"
+            "--record concerns the logs of the flights: name their folder with --log-dir"
         )
     if resume and out is None:
         raise UsageError("--resume goes on with a file of results: name it with --out")
@@ -179,12 +171,11 @@ def run(
         objection: Callable[[list[C]], PerchError | None] = lambda results: None,
     ) -> int:
         with campaigns.campaign_results(
-            flown, seeds, kind, faults=names, out=out, resume=resume, force=force, log_dir=log_dir,
-            failed_logs_only=keep == "failed",
-        ) as kept:  # fmt: skip
+            flown, seeds, kind, faults=names, out=out, resume=resume, force=force, log_dir=log_dir
+        ) as kept:
             return fly_each(
                 lambda executor, note: campaigns.fly_all(fly, kept.left, executor, note),
-                partial(_report, summary, table, as_json, log_dir, keep),
+                partial(_report, summary, table, as_json, log_dir),
                 len(seeds), executor, kept.earlier, kept.note, objection,
             )  # fmt: skip
 
@@ -463,22 +454,18 @@ def _report(
     table: Callable[[list[C]], str],
     as_json: bool,
     log_dir: Path | None,
-    keep: str | None,
     results: list[C],
     problem: PerchError | None,
 ) -> None:
     print_result(with_problem(summary(results), problem) if as_json else table(results))
-    say_where_logs_are(results, log_dir, keep)
+    say_where_logs_are(results, log_dir)
 
 
-def say_where_logs_are(
-    results: Sequence[campaigns.CampaignFlight], log_dir: Path | None, keep: str | None = None
-) -> None:
+def say_where_logs_are(results: Sequence[campaigns.CampaignFlight], log_dir: Path | None) -> None:
     """Print on stderr where the logs are, and what they lack."""
     if log_dir is None or not results:
         return
-    kept = "the logs that are kept" if keep else "the flights' logs"
-    say(f"{kept} are in {log_dir}")
+    say(f"the flights' logs are in {log_dir}")
     problems = [result.log_problem for result in results if result.log_problem is not None]
     if problems:
         say(f"{len(problems)} of {len(results)} logs are incomplete: {problems[0]}")
