@@ -3,10 +3,8 @@ from .compare import VariantResult as VariantResult
 from .compare import compare_variants as compare_variants
 from .compare import comparison_text as comparison_text
 from .compare import fly_variants as fly_variants
-from .flights import LoggedFlight as LoggedFlight
 from .flights import fly_all as fly_all
 from .flights import fly_in_folder as fly_in_folder
-from .flights import fly_logged as fly_logged
 from .flights import fly_measured as fly_measured
 from .flights import run_campaign as run_campaign
 from .flights import seed_log_path as seed_log_path
