@@ -189,7 +189,7 @@ LONG = (
     "perchctl log export",
     "perchctl simulate",
     "perchctl calibrate aideck:",
-    "perchctl calibrate images:board --measured",
+    "perchctl calibrate images:board -b",
     "perchctl fit-weights collect",
     "perchctl make-target design",
     "python docs/pictures/make.py",

@@ -60,7 +60,7 @@ from perchctl.commands.progress import search_bar
 from perchctl.display import live_page
 from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files
-from perchctl.target import NOTABLE_SCALE_ERROR, Board, mm_text, parse_board
+from perchctl.target import Board, parse_board
 from perchctl.vision import CameraModel
 
 FOLDER = Path("calib")
@@ -82,14 +82,8 @@ BoardOption = Annotated[
         "--board",
         "-b",
         help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 "
-        "(squares; :legacy behind it for OpenCV's old layout).",
-    ),
-]
-MeasuredOption = Annotated[
-    str | None,
-    typer.Option(
-        "--measured",
-        help="Width and height of the board's black area as printed, mm: 249.3x174.9.",
+        "(squares; :legacy behind it for OpenCV's old layout, :measured=249.3x174.9mm for the "
+        "black area as printed).",
     ),
 ]
 SizeOption = Annotated[
@@ -126,7 +120,6 @@ def camera(
     force: ForceOption = False,
     view: ViewOption = False,
     as_json: JsonOption = False,
-    measured: MeasuredOption = None,
     size: SizeOption = None,
     model: Annotated[
         Literal["auto", "plumb_bob", "rational_polynomial", "fisheye"],
@@ -146,7 +139,7 @@ def camera(
     _check_name(name)
     if output is not None:
         _check_output(output, force)
-    layout = _measured_board(board, measured)
+    layout = parse_board(board)
 
     def kept_in(size_px: tuple[int, int]) -> Path:
         """Return the folder for a live camera's pictures; raises before a person has worked for
@@ -227,12 +220,11 @@ def check(
     cam: CamOption = None,
     view: ViewOption = False,
     as_json: JsonOption = False,
-    measured: MeasuredOption = None,
     size: SizeOption = None,
 ) -> int:
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
     pictures = _source(source, size, view)
-    layout = _measured_board(board, measured)
+    layout = parse_board(board)
     model = load_calibration(calibration, cam=cam)
     views, missing = _find_views(pictures, layout, lambda _: None, view)
     check_size(views[0].size_px, model, str(pictures))
@@ -387,24 +379,6 @@ def _mask_pictures(source: FrameSource, stopped: Callable[[], bool]) -> Iterator
 
 
 # -- the board and its views ----------------------------------------------------
-
-
-def _measured_board(notation: str, measured: str | None) -> Board:
-    """Return the board with the measured sides of its black area, after a comparison with those
-    that it was meant to have. Raises NotFound, InvalidValue."""
-    board = parse_board(notation)
-    if measured is None:
-        return board
-    sides = measured.removesuffix("mm")
-    if not re.fullmatch(r"[\d.]+x[\d.]+", sides):
-        raise InvalidValue(f"--measured {measured}: not WIDTHxHEIGHT in mm, as in 249.3x174.9")
-    board = parse_board(f"{board.notation().partition(':measured=')[0]}:measured={sides}mm")
-    for name, meant_m, scale in zip(("width", "height"), board.size_m, board.scale, strict=True):
-        off = f"{100 * (scale - 1):+.2f} % against {mm_text(meant_m)} mm"
-        say(f"{name}: {mm_text(scale * meant_m)} mm, {off}")
-        if abs(scale - 1) > NOTABLE_SCALE_ERROR:
-            say(f"{name}: more than 1 % off: was the page scaled when it was printed?")
-    return board
 
 
 def _find_views(
