@@ -8,8 +8,7 @@ import datetime
 import itertools
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -34,11 +33,9 @@ from perchctl.calibration import (
     views_of_video,
 )
 from perchctl.camera import (
-    IMAGE_SUFFIXES,
     FrameSource,
     Grey,
     check_size,
-    image_files,
     open_camera,
     parse_source,
     without_password,
@@ -58,7 +55,7 @@ from perchctl.commands.interrupt import Stopper, draw_unless_interrupted
 from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import search_bar
 from perchctl.display import live_page
-from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
+from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files
 from perchctl.target import Board, parse_board
 from perchctl.vision import CameraModel
@@ -70,10 +67,10 @@ MASK_S = 20.0
 """How long a live camera is watched to learn a mask."""
 
 SourceArgument = Annotated[
-    list[str],
+    str,
     typer.Argument(
         help="images:DIR (or a pattern), video:FILE, camera:N or its name, rtsp://..., "
-        "http://..., aideck://HOST, or a path; or many picture files.",
+        "http://..., aideck://HOST, or a path.",
     ),
 ]
 BoardOption = Annotated[
@@ -110,7 +107,7 @@ app = new_app(Group)
     app,
     "perchctl calibrate images:board",
     "perchctl calibrate camera:0 --view",
-    "perchctl calibrate left*.jpg --board chessboard:9x6:25mm",
+    "perchctl calibrate 'left*.jpg' --board chessboard:9x6:25mm",
 )
 def camera(
     source: SourceArgument,
@@ -135,7 +132,7 @@ def camera(
     by more than 5 times its view's spread; both are named, as are pictures without a board. The
     pictures of a live camera are kept in a folder beside the output.
     """
-    pictures = _source(source, size, view)
+    pictures = _source(source, view)
     _check_name(name)
     if output is not None:
         _check_output(output, force)
@@ -148,7 +145,7 @@ def camera(
         _check_output(file, force)
         return _free_folder(file)
 
-    views, missing = _find_views(pictures, layout, kept_in, view)
+    views, missing = _find_views(pictures, _size(size, pictures), layout, kept_in, view)
     file = _file(output, name, views[0].size_px)
     _check_output(file, force)
     say(f"{len(views)} views of the board" + (f", {len(missing)} without" if missing else ""))
@@ -185,10 +182,10 @@ def mask(
     as_json: JsonOption = False,
 ) -> None:
     """Learn what the vehicle itself covers of the picture, while it is turned about."""
-    pictures = _source(source, size)
+    pictures = _source(source)
     check_output(output, (".png",), force, "a mask's format")
     with contextlib.ExitStack() as stack:
-        frames = pictures.open()
+        frames = open_camera(pictures, time.monotonic, size_px=_size(size, pictures))
         stack.callback(frames.close)
         stop = stack.enter_context(Stopper().installed())
         if frames.live:
@@ -220,14 +217,13 @@ def check(
     cam: CamOption = None,
     view: ViewOption = False,
     as_json: JsonOption = False,
-    size: SizeOption = None,
 ) -> int:
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
-    pictures = _source(source, size, view)
+    pictures = _source(source, view)
     layout = parse_board(board)
     model = load_calibration(calibration, cam=cam)
-    views, missing = _find_views(pictures, layout, lambda _: None, view)
-    check_size(views[0].size_px, model, str(pictures))
+    views, missing = _find_views(pictures, model.size_px, layout, lambda _: None, view)
+    check_size(views[0].size_px, model, without_password(pictures))
     result = check_calibration(model, views)
     for item in missing:
         say(f"{item.view}: {item.reason}")
@@ -302,70 +298,28 @@ def _draw(result: Calibration, picture: Path) -> Path:
 # -- the source ---------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Source:
-    """A source as `open_camera` takes it, or the picture files that were named one by one."""
-
-    spec: str
-    files: tuple[Path, ...] = ()
-    size_px: tuple[int, int] | None = None  # asked of a camera of this computer
-
-    def __str__(self) -> str:
-        """Return the name of the source in messages."""
-        if self.files:
-            return f"{self.files[0]} and {len(self.files) - 1} more"
-        return without_password(self.spec)
-
-    @property
-    def scheme(self) -> str:
-        """The part before the colon: ``images``, ``video``, or a live source's."""
-        return self.spec.partition(":")[0]
-
-    @property
-    def place(self) -> str:
-        """The part behind the colon: a path, for ``images`` and ``video``."""
-        return str(Path(self.spec.partition(":")[2]).expanduser())
-
-    def open(self) -> FrameSource:
-        """Open the source. Errors: those of `open_camera`."""
-        return open_camera(self.files or self.spec, time.monotonic, size_px=self.size_px)
-
-
-def _source(words: Sequence[str], size: str | None, view: bool = False) -> Source:
-    """Return the source that the command line names; several words are picture files, which is what
-    a shell makes of ``left*.jpg``. Raises NotFound, InvalidValue, UsageError."""
-    if len(words) == 1:
-        source = Source(parse_source(words[0], files=True).spec)
-    else:
-        files = tuple(Path(word) for word in words)
-        for file in files:
-            _check_picture(file)
-        source = Source("images:", files)
-    if view and not parse_source(source.spec).live:
+def _source(text: str, view: bool = False) -> str:
+    """Return the source that the command line names, as `open_camera` takes it. Raises NotFound,
+    InvalidValue, UsageError."""
+    source = parse_source(text, files=True)
+    if view and not source.live:
         raise UsageError(f"{source} is no live camera: --view does not apply; leave it out")
-    return with_size(source, size)
+    return source.spec
 
 
-def _check_picture(file: Path) -> None:
-    if not file.exists():
-        raise NotFound(f"{file} does not exist; several sources are picture files, one by one")
-    if not file.is_file() or file.suffix.lower() not in IMAGE_SUFFIXES:
-        raise UsageError(
-            f"{file} is no picture file: several sources must all be pictures, as in "
-            f"left*.jpg; a folder, a video or a camera stands alone"
-        )
-
-
-def with_size(source: Source, text: str | None) -> Source:
-    """Return the source with `--size`. Raises InvalidValue, UsageError."""
+def _size(text: str | None, source: str) -> tuple[int, int] | None:
+    """Return the `--size` that a camera of this computer is asked for. Raises InvalidValue,
+    UsageError."""
     if text is None:
-        return source
+        return None
     found = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text)
     if found is None:
         raise InvalidValue(f"--size: found {text!r}; needed is WIDTHxHEIGHT, as in 720x576")
-    if source.scheme != "camera":
-        raise UsageError(f"--size is asked of camera:N, and {source} has its own: leave it out")
-    return replace(source, size_px=(int(found[1]), int(found[2])))
+    if not source.startswith("camera:"):
+        raise UsageError(
+            f"--size is asked of camera:N, and {without_password(source)} has its own: leave it out"
+        )
+    return int(found[1]), int(found[2])
 
 
 def _mask_pictures(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]:
@@ -382,7 +336,8 @@ def _mask_pictures(source: FrameSource, stopped: Callable[[], bool]) -> Iterator
 
 
 def _find_views(
-    source: Source,
+    spec: str,
+    size_px: tuple[int, int] | None,
     board: Board,
     kept_in: Callable[[tuple[int, int]], Path | None],
     view: bool,
@@ -394,17 +349,18 @@ def _find_views(
             called before the person begins.
         view: with the live page of a live camera.
     """
-    if source.scheme not in ("images", "video"):
-        frames = source.open()
+    source = parse_source(spec)
+    place = Path(source.place).expanduser()
+    if source.live:
+        frames = open_camera(spec, time.monotonic, size_px=size_px)
         with contextlib.closing(frames):
             assert frames.size_px is not None  # the first frame is there
             return capture_live_views(frames, board, kept_in(frames.size_px), view), []
     with search_bar("searching the board") as progress:
         if source.scheme == "images":
-            files = image_files(source.files or source.place)
-            views, missing = views_of_images(files, board, progress)
+            views, missing = views_of_images(str(place), board, progress)
         else:
-            views, missing = views_of_video(Path(source.place), board, progress)
+            views, missing = views_of_video(place, board, progress)
     if not views:
         count = f"{len(missing)} pictures" if source.scheme == "images" else missing[0].view
         raise InvalidValue(
