@@ -5,21 +5,18 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import itertools
 import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
 import typer
 
 from perchctl.calibration import (
     BoardView,
     Calibration,
-    GuidedFrame,
     Rejection,
     calibrate_camera,
     calibration_text,
@@ -129,8 +126,7 @@ def camera(
     """Calibrate the camera, and report what its error means in mm at the target.
 
     A view is rejected when its RMS is above 2.5 times the median view's, a corner when it is off
-    by more than 5 times its view's spread; both are named, as are pictures without a board. The
-    pictures of a live camera are kept in a folder beside the output.
+    by more than 5 times its view's spread; both are named, as are pictures without a board.
     """
     pictures = _source(source, view)
     _check_name(name)
@@ -138,14 +134,11 @@ def camera(
         _check_output(output, force)
     layout = parse_board(board)
 
-    def kept_in(size_px: tuple[int, int]) -> Path:
-        """Return the folder for a live camera's pictures; raises before a person has worked for
-        them."""
-        file = _file(output, name, size_px)
-        _check_output(file, force)
-        return _free_folder(file)
+    def check_place_of(size_px: tuple[int, int]) -> None:
+        """Raise before a person has worked for a file that cannot be written."""
+        _check_output(_file(output, name, size_px), force)
 
-    views, missing = _find_views(pictures, _size(size, pictures), layout, kept_in, view)
+    views, missing = _find_views(pictures, _size(size, pictures), layout, view, check_place_of)
     file = _file(output, name, views[0].size_px)
     _check_output(file, force)
     say(f"{len(views)} views of the board" + (f", {len(missing)} without" if missing else ""))
@@ -222,7 +215,7 @@ def check(
     pictures = _source(source, view)
     layout = parse_board(board)
     model = load_calibration(calibration, cam=cam)
-    views, missing = _find_views(pictures, model.size_px, layout, lambda _: None, view)
+    views, missing = _find_views(pictures, model.size_px, layout, view)
     check_size(views[0].size_px, model, without_password(pictures))
     result = check_calibration(model, views)
     for item in missing:
@@ -276,12 +269,6 @@ def _file(output: Path | None, name: str, size_px: tuple[int, int]) -> Path:
 def _check_output(file: Path, force: bool) -> None:
     check_output(file, SUFFIXES, force, f"{CONTENT}; the report goes beside it as .png")
     check_place(file.with_suffix(".png"), force)
-
-
-def _free_folder(file: Path) -> Path:
-    """Return the first folder for pictures beside the file that does not exist yet."""
-    names = (f"{file.stem}_pictures{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
-    return next(folder for name in names if not (folder := file.with_name(name)).exists())
 
 
 def _now() -> str:
@@ -339,15 +326,14 @@ def _find_views(
     spec: str,
     size_px: tuple[int, int] | None,
     board: Board,
-    kept_in: Callable[[tuple[int, int]], Path | None],
     view: bool,
+    check: Callable[[tuple[int, int]], None] = lambda size_px: None,
 ) -> tuple[list[BoardView], list[Rejection]]:
     """Return the views, at least one, and the pictures without a board.
 
     Args:
-        kept_in: the folder for a live camera's pictures (None: they are not kept), by their size;
-            called before the person begins.
         view: with the live page of a live camera.
+        check: called with a live camera's picture size before the person begins.
     """
     source = parse_source(spec)
     place = Path(source.place).expanduser()
@@ -355,7 +341,8 @@ def _find_views(
         frames = open_camera(spec, time.monotonic, size_px=size_px)
         with contextlib.closing(frames):
             assert frames.size_px is not None  # the first frame is there
-            return capture_live_views(frames, board, kept_in(frames.size_px), view), []
+            check(frames.size_px)
+            return capture_live_views(frames, board, view), []
     with search_bar("searching the board") as progress:
         if source.scheme == "images":
             views, missing = views_of_images(str(place), board, progress)
@@ -371,52 +358,20 @@ def _find_views(
     return views, missing
 
 
-def capture_live_views(
-    source: FrameSource, board: Board, folder: Path | None, view: bool
-) -> list[BoardView]:
+def capture_live_views(source: FrameSource, board: Board, view: bool) -> list[BoardView]:
     """Return views of a live camera, taken until all is covered or Ctrl-C ends it.
-
-    Args:
-        folder: gets their pictures, each as it is taken; None: they are not kept.
-        view: with the live page.
 
     Raises:
         InvalidValue: no view was taken. Those of `capture_views`.
     """
-    kept: list[Path] = []
-
-    def keep(picture: Grey) -> None:
-        """Write the picture; those that cannot be kept are still calibrated from."""
-        nonlocal folder
-        if folder is None:
-            return
-        path = folder / f"view_{len(kept) + 1:03d}.png"
-        try:
-            write_files({path: cv2.imencode(".png", picture)[1].tobytes()})
-            kept.append(path)
-        except InvalidValue as error:
-            folder = None
-            say(f"pictures are no longer kept: {error}")
-
-    def report_kept() -> None:
-        if kept:
-            say(f"kept {len(kept)} pictures: images:{kept[0].parent} takes them again")
-
     with contextlib.ExitStack() as stack:
-        stack.callback(report_kept)
         stop = stack.enter_context(Stopper().installed())
         # The page draws the picture and its corners, but no axes: any camera serves.
         any_camera = CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
         page = stack.enter_context(live_page(any_camera, "perchctl calibrate", view, say))
         show = stack.enter_context(guide(page))
         say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
-
-        def seen(moment: GuidedFrame) -> None:
-            if moment.taken:
-                keep(moment.image)
-            show(moment)
-
-        views = capture_views(source, board, seen, stopped=stop.requested.is_set)
+        views = capture_views(source, board, show, stopped=stop.requested.is_set)
     if not views:
         raise InvalidValue(
             f"no view of the board {board.notation()} was taken from {source.describe()}"

@@ -23,7 +23,6 @@ from perchctl.calibration.board.capture import (
     update_capture,
 )
 from perchctl.camera import Grey
-from perchctl.commands.calibrate import capture_live_views
 from perchctl.commands.guide import guide, page_state
 from perchctl.display import LivePage, Sketch
 from perchctl.errors import TimedOut
@@ -160,27 +159,6 @@ def test_a_board_s_farther_side_is_known() -> None:
             assert (corners[:, 2] @ corners[:, 1 - about] > 0) == (sign > 0)
             view = corner_view(rng, camera, CHARUCO, pose, 0.0, "v")
             assert sign * getattr(signature(view, CHARUCO), name) > 0.1
-
-
-def test_live_pictures_are_kept_as_they_come_also_of_a_camera_that_goes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    camera = draw_camera(np.random.default_rng(3), (320, 240))
-    rng = np.random.default_rng(2)
-    renderer = BoardRenderer(camera, CHESSBOARD)
-    images = []
-    for pose in draw_poses(rng, camera, CHESSBOARD, 2):
-        images += [renderer.render(pose, rng, noise=1.0)] * 2
-    folder = tmp_path / "calib" / "pictures"
-    with pytest.raises(TimedOut, match="only 2 views"):
-        capture_live_views(_Frames(images, ends=True), CHESSBOARD, folder, False)
-    assert f"kept 2 pictures: images:{folder} takes them again" in capsys.readouterr().err
-    for k, name in enumerate(("view_001.png", "view_002.png")):
-        assert (cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) == images[2 * k]).all()
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(TimedOut, match="only 2 views"):  # a full disk is no reason to end
-        capture_live_views(_Frames(images, True), CHESSBOARD, tmp_path / "file" / "p", False)
-    assert capsys.readouterr().err.count("no longer kept") == 1
 
 
 def test_a_live_camera_is_refused_before_anybody_has_worked_for_it(
