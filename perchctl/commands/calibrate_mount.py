@@ -146,7 +146,6 @@ def mount(
     written, before, problem = None, None, None
     if into is not None:
         try:
-            _check_unchanged(profile, vehicle)
             before = write_profile_values(into, measured.profile_values())
             written = into
             say(f"wrote these into {written}; as it was before it is {before}")
@@ -208,25 +207,17 @@ def _recording_place(output: Path | None, name: str, force: bool) -> Path:
 
 
 def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecording]:
-    """Return each part once, or the one that is asked for. Errors: NotFound, InvalidValue."""
-    named = [(path, recording) for path in logs for recording in read_recordings(path)]
-    places: dict[MountingPart, Path] = {}
-    for path, recording in named:
-        if part not in (None, recording.part):
-            continue
-        if recording.part in places:
-            raise InvalidValue(
-                f"{path}: the {recording.part} is in {places[recording.part]} already: name one "
-                f"recording of each part"
-            )
-        places[recording.part] = path
-    if not places:
-        held = " and ".join(dict.fromkeys(recording.part for _, recording in named))
+    """Return the recordings of the part that is asked for, or of all; the last one of a part
+    counts. Errors: NotFound, InvalidValue."""
+    held = [recording for path in logs for recording in read_recordings(path)]
+    found = {each.part: each for each in held if part in (None, each.part)}
+    if not found:
+        parts = " and ".join(dict.fromkeys(recording.part for recording in held))
         raise InvalidValue(
-            f"{', '.join(map(str, logs))} holds no {part}, but a {held}: leave --part out, or "
+            f"{', '.join(map(str, logs))} holds no {part}, but a {parts}: leave --part out, or "
             f"name the other recording too"
         )
-    return [recording for _, recording in named if recording.part in places]
+    return list(found.values())
 
 
 def _check_seen_by(recordings: Sequence[MountingRecording], now: str) -> None:
@@ -348,15 +339,3 @@ def solve_mounting(profile: Profile, recordings: Sequence[MountingRecording]) ->
         other = "pivot" if carried is None else "carry"
         raise InvalidValue(f"{error} (--part {other} takes the {other} alone)") from None
     return MountingReport(profile, carried, pivoted)
-
-
-def _check_unchanged(name: str, then: Profile) -> None:
-    """Raise InvalidValue if the profile no longer says what the numbers rest on: a gear by one
-    turn of the camera is wrong beside another, and a recording takes minutes; NotFound."""
-    now = load_profile(name, with_weights=False)
-    rests_on = [(p.camera.mount, p.camera.latency_s, p.vehicle) for p in (now, then)]
-    if rests_on[0] != rests_on[1]:
-        raise InvalidValue(
-            f"{find_profile(name)} was changed meanwhile, and nothing is written: these numbers "
-            f"rest on what it said before; measure again, with --from"
-        )
