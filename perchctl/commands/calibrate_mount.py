@@ -38,7 +38,6 @@ from perchctl.camera import (
     parse_source,
 )
 from perchctl.commands.command_line import (
-    ForceOption,
     JsonOption,
     ViewOption,
 )
@@ -53,7 +52,7 @@ from perchctl.errors import (
     SafetyAbort,
     UsageError,
 )
-from perchctl.files import check_output
+from perchctl.files import check_place
 from perchctl.link import MotionLink, check_uri
 from perchctl.profile import (
     Profile,
@@ -109,11 +108,6 @@ def mount(
             "--write", help="Put the numbers into the profile; the old file is kept beside it."
         ),
     ] = False,
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="The recording of a live run, .jsonl."),
-    ] = None,
-    force: ForceOption = False,
     view: ViewOption = False,
     as_json: JsonOption = False,
 ) -> int:
@@ -123,7 +117,7 @@ def mount(
     its gear (pivot). Its motors are off, and nothing arms.
     """
     if logs:
-        live = {"--uri": uri, "--source": source, "--view": view or None, "--output": output}
+        live = {"--uri": uri, "--source": source, "--view": view or None}
         for option, value in live.items():
             if value is not None:
                 raise UsageError(f"--from takes no camera, no vehicle, no page: leave {option} out")
@@ -137,7 +131,7 @@ def mount(
     else:
         parts: tuple[MountingPart, ...] = ("carry", "pivot") if part is None else (part,)
         frames, link_uri = _live_sources(source, uri, vehicle, parts)
-        log = _recording_place(output, find_profile(profile).stem, force)
+        log = _free_place(find_profile(profile).stem)
         recordings = _record_live(vehicle, camera, frames, link_uri, parts, log, view)
         logs = [log] if log.exists() else []
     measured = solve_mounting(vehicle, recordings)
@@ -193,14 +187,13 @@ def _live_sources(
     return name.spec, link_uri
 
 
-def _recording_place(output: Path | None, name: str, force: bool) -> Path:
-    """Return where a live recording goes: `output`, or the next name that is free, so that nothing
-    is measured in vain."""
-    if output is None:
-        stems = (f"mounting_{name}{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
-        output = next(p for stem in stems if not (p := FOLDER / f"{stem}.jsonl").exists())
-    check_output(output, (".jsonl",), force, "the recording's format")
-    return output
+def _free_place(name: str) -> Path:
+    """Return where a live recording goes: the next name that is free, so that nothing is measured
+    in vain."""
+    stems = (f"mounting_{name}{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
+    place = next(p for stem in stems if not (p := FOLDER / f"{stem}.jsonl").exists())
+    check_place(place, force=False)
+    return place
 
 
 # -- recordings of files ----------------------------------------------------------

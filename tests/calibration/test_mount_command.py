@@ -71,9 +71,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 # --- what it refuses -----------------------------------------------------------------------
 
 
-PIVOT_OF_A_CAMERA = ("--part", "pivot", "--source", "camera:99")
-
-
 @pytest.mark.parametrize(
     ("words", "code", "expected"),
     [
@@ -94,9 +91,6 @@ PIVOT_OF_A_CAMERA = ("--part", "pivot", "--source", "camera:99")
         (["-p", "mine.yaml", "--from", "x.jsonl", "-u", "usb://0"], 2, ["--uri"]),
         (["-p", "mine.yaml", "--from", "x.jsonl", "--view"], 2, ["--view"]),
         (["-p", "crazyflie", "--write"], 30, ["shipped", "cp ", "-p my_"]),
-        (["-p", "mine.yaml", "-o", "x.jsonl", "--from", "y.jsonl"], 2, ["--output"]),
-        (["-p", "mine.yaml", "-o", "x.png", *PIVOT_OF_A_CAMERA], 30, [".jsonl"]),
-        (["-p", "mine.yaml", "-o", "mine.yaml/x.jsonl", *PIVOT_OF_A_CAMERA], 30, ["mine.yaml"]),
         (["-p", "mine.yaml", "--board", "chessboard:9x6:25mm"], 2, ["--board"]),
     ],
 )  # fmt: skip
