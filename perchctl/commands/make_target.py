@@ -185,7 +185,7 @@ def board(
     app,
     "perchctl make-target design",
     "perchctl make-target design example_640x480.yaml --ceiling 2.4 --blur 2.0",
-    "perchctl make-target design -p my_vehicle.yaml --large 120mm --small 20mm",
+    "perchctl make-target design -p my_vehicle.yaml",
 )
 def design(
     camera: CameraArgument = None,
@@ -194,19 +194,12 @@ def design(
     blur: BlurOption = 1.0,
     cam: CamOption = None,
     as_json: JsonOption = False,
-    large: LargeOption = None,
-    large_id: LargeIdOption = None,
-    large_dict: LargeDictOption = None,
-    small: SmallOption = None,
-    small_id: SmallIdOption = None,
-    small_dict: SmallDictOption = None,
 ) -> None:
     """Compute from where to where a camera sees each marker, and where a gap is."""
     config = load_profile(profile)
     name, model = _camera(config, camera, cam)
-    target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
-    found = make_design(target, model, Optics(blur), config, ceiling)
-    record = found.record() | {"target": target.model_dump(mode="json")}
+    found = make_design(config.target, model, Optics(blur), config, ceiling)
+    record = found.record() | {"target": config.target.model_dump(mode="json")}
     _write({}, [found.text(name)], record, False, as_json)
 
 
@@ -261,12 +254,6 @@ def measured(
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
-    large: LargeOption = None,
-    large_id: LargeIdOption = None,
-    large_dict: LargeDictOption = None,
-    small: SmallOption = None,
-    small_id: SmallIdOption = None,
-    small_dict: SmallDictOption = None,
 ) -> None:
     """Write the sizes that were measured on the print into the profile that flies."""
     if measured_large is None and measured_small is None:
@@ -280,13 +267,12 @@ def measured(
     config = load_profile(profile)
     if not force:
         raise InvalidValue(f"{path} exists already; add --force to write the sizes into it")
-    nominal = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
     sides_m = {
         name: parse_length(text, f"--measured-{name}", bare_unit="mm")
         for name, text in (("large", measured_large), ("small", measured_small))
         if text is not None
     }
-    found = measured_target(nominal, sides_m)
+    found = measured_target(config.target, sides_m)
     values = _changed_values(found.target, config.target)
     before = write_profile_values(path, values) if values else None
     lines = [*found.notes, f"changed {path}: fly -p {path}"]
