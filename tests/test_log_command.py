@@ -37,17 +37,6 @@ def test_the_newest_is_shown_and_named(words: list[str], logs: Path) -> None:
 def test_a_folder_stands_for_its_newest_log(logs: Path) -> None:
     synthetic.write(Path("other/flight_x.jsonl"), summary=synthetic.SUMMARY, most=3)
     assert run("log", "other").stdout.startswith("PERCHED")
-    assert [line.split()[0] for line in run("log", "list", "other").stdout.splitlines()] == [
-        "log",
-        "flight_x.jsonl",
-    ]
-
-
-def test_a_folder_is_listed(logs: Path) -> None:
-    lines = run("log", "list").stdout.splitlines()
-    assert [line.split()[0] for line in lines] == ["log", "flight_new.jsonl", "flight_old.jsonl"]
-    told = json.loads(run("log", "list", str(logs), "-n", "1", "--json").stdout)
-    assert [each["outcome"] for each in told["logs"]] == ["unknown"]
 
 
 def test_a_table_goes_beside_the_log_or_to_a_file(logs: Path) -> None:
@@ -103,7 +92,6 @@ BAD: dict[str, dict[str, object]] = {"exposure": {"frame_t_s": "x"}, "age": {"te
     ("words", "code", "said"),
     [
         (["show", "none.jsonl"], 20, "does not exist"),
-        (["list", "nowhere"], 20, "there is no folder nowhere"),
         (["show", "empty"], 20, "holds no flight log"),
         (["replay", "flight_1.jsonl", "-p", "smi"], 20, "'smi'"),
         (["show", "a.csv"], 30, "not a flight log"),

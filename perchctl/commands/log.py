@@ -13,7 +13,6 @@ from perchctl.analysis import (
     Comparison,
     FlightAnalysis,
     check_readable,
-    list_text,
     newest_logs,
     replay_lines,
     replay_record,
@@ -21,7 +20,6 @@ from perchctl.analysis import (
     show_text,
     write_report,
 )
-from perchctl.analysis import list_logs as listed_logs
 from perchctl.analysis import replay as replay_flight
 from perchctl.commands.command_line import (
     ForceOption,
@@ -59,21 +57,17 @@ app = new_app(Group)
 
 
 def _log_file(place: Path | None) -> Path:
-    """Return the log that is named; else the newest of the folder, which is then printed.
+    """Return the log that is named; else the newest of the folder, which is then printed; by
+    default of where `fly` puts the logs unless a profile says otherwise.
 
     Errors: NotFound.
     """
     if place is not None and not place.is_dir():
         return place
-    (newest,) = newest_logs(_folder(place), 1)
+    folder = Path(Profile().log.directory) if place is None else place
+    (newest,) = newest_logs(folder, 1)
     say(f"the newest log: {newest}")
     return newest
-
-
-def _folder(place: Path | None) -> Path:
-    """Return the folder that is named; else where `fly` puts the logs unless a profile says
-    otherwise."""
-    return Path(Profile().log.directory) if place is None else place
 
 
 @contextlib.contextmanager
@@ -93,7 +87,7 @@ def _opened(path: Path) -> Iterator[FlightLog]:
     app,
     "perchctl log show",
     "perchctl log show perchctl-logs/flight.jsonl --json",
-    "perchctl log list -n 20",
+    "perchctl log show perchctl-logs",
     short_help="Show a flight: how it ended and why, its phases, holds, battery, frames, findings.",
 )
 def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
@@ -105,26 +99,6 @@ def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
     with _opened(_log_file(file)) as log:
         analysis = FlightAnalysis(log)
         print_result(show_record(analysis) if as_json else show_text(analysis))
-
-
-@command(
-    app,
-    "perchctl log list",
-    "perchctl log list logs -n 30",
-    "perchctl log list --json",
-    name="list",
-)
-def list_logs(
-    folder: Annotated[
-        Path | None, typer.Argument(help="The folder of the logs. Default: perchctl-logs.")
-    ] = None,
-    count: Annotated[int, typer.Option("--count", "-n", min=1, help="How many logs.")] = 10,
-    as_json: JsonOption = False,
-) -> None:
-    """List the newest logs of a folder, a line each."""
-    place = _folder(folder)
-    logs = listed_logs(place, count)
-    print_result({"folder": str(place), "logs": logs} if as_json else list_text(logs))
 
 
 @command(
