@@ -107,24 +107,21 @@ class Question:
     """One question of the dialogue; each function gets the answers to those before it.
 
     `default` gives the text that Enter stands for, `parse` the answer, or raises InvalidValue or
-    NotFound. `hint` stands behind the text.
+    NotFound.
     """
 
     name: str
-    option: str
     text: str
     default: Callable[[Answers], str]
     parse: Callable[[str, Answers], Any]
-    hint: Callable[[Answers], str] = lambda _: ""
 
 
 def collect_answers(
     given: Mapping[str, str], open_question: Callable[[Question, Answers], Any]
 ) -> dict[str, Any]:
-    """Return the answers to all questions: by the options that are `given`, or else by
-    `open_question`.
+    """Return the answers to all questions: those that are `given`, or else by `open_question`.
 
-    Raises InvalidValue and NotFound, each with the option's name.
+    Raises InvalidValue and NotFound, each with the question's name.
     """
     answers: dict[str, Any] = {}
     for question in QUESTIONS:
@@ -134,7 +131,7 @@ def collect_answers(
         try:
             answers[question.name] = question.parse(given[question.name].strip(), answers)
         except PerchError as error:
-            raise type(error)(f"{question.option}: {error}") from None
+            raise type(error)(f"--set {question.name}: {error}") from None
     return answers
 
 
@@ -148,14 +145,14 @@ def _ask_person(question: Question, answers: Answers) -> Any:
     default = question.default(answers)
     while True:
         # On stderr: stdout is for the result.
-        text = f"{question.text}{question.hint(answers)}\n  [{default}] "
+        text = f"{question.text}\n  [{default}] "
         print(text, end="", file=sys.stderr, flush=True)
         try:
             return question.parse(input().strip() or default, answers)
         except EOFError:
             raise UsageError(
-                "there is nobody to ask, and nothing was written: answer by options, or add "
-                "--defaults for what is not answered"
+                "there is nobody to ask, and nothing was written: answer by --set, or "
+                "add --defaults for what is not answered"
             ) from None
         except (PerchError, UnicodeDecodeError) as error:
             print_lines(f"  {error}")
@@ -197,32 +194,29 @@ def _one_of(text: str, choices: tuple[str, ...]) -> str:
     return text
 
 
-def _numbers(text: str, unit: str, count: int = 1) -> tuple[float, ...]:
-    """Return that many numbers, with spaces or commas between, and the unit or none behind each."""
+def _numbers(text: str, unit: str, low: float, high: float, count: int = 1) -> tuple[float, ...]:
+    """Return that many numbers within the limits, with spaces or commas between, and the unit or
+    none behind each."""
     words = re.sub(rf"(?<=[\d.])\s*{unit}(?![a-zA-Z])", " ", text).replace(",", " ").split()
     if len(words) != count or not all(map(_NUMBER.fullmatch, words)):
         wanted = "a number" if count == 1 else f"{count} numbers"
         raise InvalidValue(f"found {text!r}; needed is {wanted}, in {unit}")
-    return tuple(float(word) for word in words)
+    values = tuple(float(word) for word in words)
+    for value in values:
+        if not low <= value <= high:
+            raise InvalidValue(f"found {value:g} {unit}; allowed are {low:g} to {high:g} {unit}")
+    return values
 
 
 def _within(text: str, unit: str, low: float, high: float) -> float:
-    (value,) = _numbers(text, unit)
-    if not low <= value <= high:
-        raise InvalidValue(f"found {value:g} {unit}; allowed are {low:g} to {high:g} {unit}")
-    return value
+    return _numbers(text, unit, low, high)[0]
 
 
 def _place(text: str, _answers: Answers) -> tuple[float, ...]:
     """Return metres from three numbers in millimetres."""
-    values = _numbers(text, "mm", 3)
+    values = _numbers(text, "mm", -MOST_MM, MOST_MM, 3)
     if any(values) and all(abs(value) < 1 for value in values):
         raise InvalidValue(f"found {text!r}: these look like metres; the question is in mm")
-    for value in values:
-        if abs(value) > MOST_MM:
-            raise InvalidValue(
-                f"found {value:g} mm; allowed are {-MOST_MM:g} to {MOST_MM:g} mm on an axis"
-            )
     return tuple(_thousandth(value) for value in values)
 
 
@@ -240,95 +234,76 @@ def _thousandth(value: float) -> float:
 
 QUESTIONS: tuple[Question, ...] = (
     Question(
-        "uri", "--uri", "The vehicle's URI: radio://0/80/2M/E7E7E7E7E7, usb://0, sim://, ...",
+        "uri", "The vehicle's URI: radio://0/80/2M/E7E7E7E7E7, usb://0, sim://, ...",
         lambda _: RADIO, _uri,
     ),
     Question(
-        "source", "--source", "The camera: camera:N (a receiver at /dev/videoN), http://..., aideck://HOST",
+        "source", "The camera: camera:N (a receiver at /dev/videoN), http://..., aideck://HOST",
         lambda answers: "sim:" if answers["uri"].startswith(SIMULATED) else "camera:0", _source,
     ),
     Question(
-        "calibration", "--calibration",
-        "Its calibration file, of `perchctl calibrate` (none: not yet)",
+        "calibration", "Its calibration file, of `perchctl calibrate` (none: not yet)",
         lambda answers: EXAMPLE if answers["source"] == "sim:" else NONE_YET, _calibration,
     ),
     Question(
-        "latency", "--latency",
-        "How late the picture is, from exposure to arrival, ms (60 to 100 are usual)",
+        "latency", "How late the picture is, from exposure to arrival, ms (60 to 100 are usual)",
         lambda _: "80", lambda text, _: _within(text, "ms", 1, 390),
     ),
     Question(
-        "front", "--front-at",
-        "Hold a hand over the front of the vehicle. At which edge of the picture\n"
+        "front", "Hold a hand over the front of the vehicle. At which edge of the picture\n"
         "does it come in: top, right, bottom or left?",
         lambda _: "top", lambda text, _: _one_of(text, tuple(PICTURE_EDGES)),
     ),
     Question(
-        "left", "--left-at", "And a hand over its left side?",
+        "left", "And a hand over its left side (a camera that mirrors has it at the other edge)?",
         lambda answers: edges_beside(answers["front"])[0],
         lambda text, answers: _one_of(text, edges_beside(answers["front"])),
-        lambda answers: " ({}, or {} if the camera mirrors its picture)".format(
-            *edges_beside(answers["front"])
-        ),
     ),
     Question(
-        "camera", "--camera-at",
-        "Where is the lens, from the vehicle's centre: forward, left, up, mm?",
+        "camera", "Where is the lens, from the vehicle's centre: forward, left, up, mm?",
         lambda _: "30 0 10", _place,
     ),
     Question(
-        "gear", "--gear-at", "Where is the tip of the magnet gear, likewise, mm?",
+        "gear", "Where is the tip of the magnet gear, likewise, mm?",
         lambda _: "0 0 30", _place,
     ),
     Question(
-        "large", "--large", "Side of the target's large black square as printed, mm",
+        "large", "Side of the target's large black square as printed, mm",
         lambda _: "150", lambda text, _: _within(text, "mm", 20, 2000),
     ),
     Question(
-        "small", "--small", "Side of the small one, mm",
+        "small", "Side of the small one, mm",
         lambda answers: f"{max(4.0, answers['large'] / 6.0):.4g}", _small,
     ),
     Question(
-        "ceiling", "--ceiling", "Height of the ceiling over the floor, m",
+        "ceiling", "Height of the ceiling over the floor, m",
         lambda _: "2.4", lambda text, _: _within(text, "m", 1, 10),
     ),
     Question(
-        "fence", "--fence", "Free space around the place of take-off, its radius, m",
+        "fence", "Free space around the place of take-off, its radius, m",
         lambda _: "1.5", lambda text, _: _within(text, "m", 0.3, 20),
     ),
 )  # fmt: skip
 
 
-def _option(name: str) -> Any:
-    """Return the option that answers a question beforehand."""
-    (question,) = (question for question in QUESTIONS if question.name == name)
-    names = [question.option, "-u"] if name == "uri" else [question.option]
-    return typer.Option(*names, help=question.text)
-
-
 @command(
     app,
     "perchctl profile new -o my_vehicle.yaml",
-    "perchctl profile new -u radio://0/80/2M/E7E7E7E7E7 --source camera:0",
-    "perchctl profile new --ceiling 3.1 --defaults",
+    "perchctl profile new --set uri=usb://0 --set source=camera:0",
+    "perchctl profile new --set ceiling=3.1 --defaults",
 )
 def new(
-    context: typer.Context,
     output: Annotated[Path, typer.Option("--output", "-o", help="Profile to write.")] = Path(
         "my_vehicle.yaml"
     ),
-    uri: Annotated[str | None, _option("uri")] = None,
-    source: Annotated[str | None, _option("source")] = None,
-    calibration: Annotated[str | None, _option("calibration")] = None,
-    latency: Annotated[str | None, _option("latency")] = None,
-    front: Annotated[str | None, _option("front")] = None,
-    left: Annotated[str | None, _option("left")] = None,
-    camera: Annotated[str | None, _option("camera")] = None,
-    gear: Annotated[str | None, _option("gear")] = None,
-    large: Annotated[str | None, _option("large")] = None,
-    small: Annotated[str | None, _option("small")] = None,
-    ceiling: Annotated[str | None, _option("ceiling")] = None,
-    fence: Annotated[str | None, _option("fence")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=ANSWER",
+            help=f"Answer a question beforehand: {', '.join(q.name for q in QUESTIONS)}.",
+        ),
+    ] = None,
     defaults: Annotated[
         bool, typer.Option("--defaults", help="Ask nothing: defaults for what is not given.")
     ] = False,
@@ -336,13 +311,15 @@ def new(
 ) -> None:
     """Write a profile of your vehicle, every key commented, in a short dialogue.
 
-    Options answer questions beforehand; with all of them, or --defaults, nothing is asked. The
-    mounting is described in words: at which edge of the camera's picture a hand over the
-    vehicle's front comes in, and one over its left side.
+    With --set for every question, or --defaults, nothing is asked. The mounting is described in
+    words: at which edge of the camera's picture a hand over the vehicle's front comes in, and one
+    over its left side.
     """
     check_output(output, (".yaml", ".yml"), force, "what a profile is")
-    given = {question.name: context.params[question.name] for question in QUESTIONS}
-    given = {name: text for name, text in given.items() if text is not None}
+    given = dict(setting.partition("=")[::2] for setting in settings or ())
+    unknown = given.keys() - {question.name for question in QUESTIONS}
+    if unknown:
+        raise UsageError(f"--set {unknown.pop()}: there is no such question; --help lists them")
     if given.get("source") == "sim:":  # no other vehicle flies by those pictures
         given.setdefault("uri", SIMULATED)
     answers = collect_answers(

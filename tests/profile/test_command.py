@@ -21,12 +21,11 @@ from tests.profile.test_written import uncommented
 
 mm = st.decimals(-299, 299, places=1).map(str)
 places = st.tuples(mm, mm, mm).filter(lambda place: any(abs(float(x)) >= 1 for x in place))
-OPTIONS = {question.name: question.option for question in QUESTIONS}
 
 
 def new(output: Path, *words: str, typed: str = "", **given: str) -> Result:
     """`perchctl profile new` with these answers."""
-    options = [word for name, text in given.items() for word in (OPTIONS[name], text)]
+    options = [word for name, text in given.items() for word in ("--set", f"{name}={text}")]
     return CliRunner().invoke(
         app, ["profile", "new", "-o", str(output), *options, *words], input=typed
     )
@@ -103,10 +102,9 @@ def test_enter_takes_every_default(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("front", sorted(PICTURE_EDGES))
-def test_a_mirrored_picture_is_asked_about_and_named(front: str, tmp_path: Path) -> None:
+def test_a_mirrored_picture_is_named(front: str, tmp_path: Path) -> None:
     plain, mirrored = edges_beside(front)
-    said = new(tmp_path / "asked.yaml", typed="\n" * len(QUESTIONS), front=front).stderr
-    assert f"({plain}, or {mirrored} if the camera mirrors its picture)" in said
+    said = new(tmp_path / "plain.yaml", "--defaults", front=front, left=plain).stderr
     assert "camera.mirrored" not in said
     said = new(tmp_path / "m.yaml", "--defaults", front=front, left=mirrored).stderr
     assert "camera.mirrored: true" in said
@@ -156,7 +154,7 @@ def test_a_wrong_option_is_refused_by_its_name_before_anything_is_asked(
     refused = new(tmp_path / "m.yaml", **({"uri": "usb://0"} | {name: text}))
     assert refused.exit_code == (20 if name == "calibration" else 30)
     (line,) = refused.stderr.splitlines()
-    assert line.startswith(f"perchctl: {OPTIONS[name]}: ")
+    assert line.startswith(f"perchctl: --set {name}: ")
     assert allowed in line
     assert list(tmp_path.iterdir()) == []
 
