@@ -47,10 +47,9 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.guide import guide
 from perchctl.commands.interrupt import Stopper, draw_unless_interrupted
 from perchctl.commands.output import print_result, say
-from perchctl.commands.progress import search_bar
+from perchctl.commands.progress import guide, search_bar
 from perchctl.display import live_page
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files

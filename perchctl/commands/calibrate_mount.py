@@ -41,9 +41,9 @@ from perchctl.commands.command_line import (
     JsonOption,
     ViewOption,
 )
-from perchctl.commands.guide import guide
 from perchctl.commands.interrupt import Stopper, ignore_signals
 from perchctl.commands.output import print_lines, print_result, say
+from perchctl.commands.progress import guide
 from perchctl.display import live_page
 from perchctl.errors import (
     Interrupted,

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import sys
+import termios
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
@@ -37,9 +38,7 @@ def drop_stream(stream: TextIO) -> None:
 def ask_to_confirm(question: str) -> bool:
     """Return True if somebody at the terminal says yes now: what was typed before the question
     appeared is no answer to it."""
-    with contextlib.suppress(ImportError, OSError, ValueError, AttributeError):
-        import termios  # which Windows lacks
-
+    with contextlib.suppress(OSError, ValueError, AttributeError, termios.error):
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
     # On stderr: stdout is for the result.
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)

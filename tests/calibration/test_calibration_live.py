@@ -23,7 +23,7 @@ from perchctl.calibration.board.capture import (
     update_capture,
 )
 from perchctl.camera import Grey
-from perchctl.commands.guide import guide, page_state
+from perchctl.commands.progress import guide, page_state
 from perchctl.display import LivePage, Sketch
 from perchctl.errors import TimedOut
 from perchctl.vision import Frame
