@@ -112,7 +112,7 @@ def test_completion_offers_subcommands_and_options() -> None:
         ("calibrate", 2),
         ("calibrate images:none", 20),
         ("calibrate images:. -o camera.txt", 30),
-        ("make-target --large 3-miles", 30),
+        ("make-target design none.yaml", 20),
         ("fit-weights", 2),
         ("fit-weights none.csv", 20),
     ],

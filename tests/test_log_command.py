@@ -46,8 +46,7 @@ def test_a_table_goes_beside_the_log_or_to_a_file(logs: Path) -> None:
     assert (rows[0][0], rows[1][0], len(rows)) == ("t_s", "0.0", 61)
     assert run("log", "export", OLD).code == 30
     assert run("log", "export", OLD, "--force").code == 0
-    told = json.loads(run("log", "export", "-o", "new/x.csv", "--json").stdout)
-    assert (told["output"], told["format"], told["rows"]) == ("new/x.csv", "csv", 30)
+    assert "new/x.csv (30 rows" in run("log", "export", "-o", "new/x.csv").stdout
 
 
 def test_a_report_is_of_the_newest_and_of_each_log_once(logs: Path) -> None:
@@ -64,7 +63,7 @@ def test_a_plot_s_name_is_its_form(logs: Path, monkeypatch: pytest.MonkeyPatch) 
     drawn: list[Path] = []
     monkeypatch.setattr("perchctl.analysis.plot_flight", lambda _log, path: drawn.append(path))
     assert run("log", "plot", OLD).stdout == "plot:      perchctl-logs/flight_old.png\n"
-    assert json.loads(run("log", "plot", OLD, "-o", "x.PDF", "--json").stdout)["plot"] == "x.PDF"
+    assert run("log", "plot", OLD, "-o", "x.PDF").stdout == "plot:      x.PDF\n"
     assert drawn == [Path("perchctl-logs/flight_old.png"), Path("x.PDF")]
 
 
@@ -121,7 +120,6 @@ def test_what_goes_wrong_is_one_sentence(words: list[str], code: int, said: str)
     for name, bad in BAD.items():
         changed = json.dumps(json.loads(tick) | bad).encode() + b"\n"
         Path(f"bad_{name}.jsonl").write_bytes(b"".join([*before, tick, changed, end]))
-    result = run("log", *words, "--json")
-    assert result.code == code
+    result = run("log", *words)
+    assert (result.code, result.stdout) == (code, "")
     assert said in result.complaint
-    assert json.loads(result.stdout)["exit_code"] == code

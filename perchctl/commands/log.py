@@ -116,19 +116,16 @@ def plot(
         ),
     ] = None,
     force: ForceOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Draw a flight: errors, detections, lost frames, height, battery, the last seconds."""
     path = _log_file(file)
     picture = output or path_beside(path, ".png")
     with _opened(path) as log:
         check_output(picture, FORMATS, force, DRAWN_IN)
-        outcome = FlightAnalysis(log).summary.outcome
     from perchctl.analysis import plot_flight
 
     plot_flight(log, picture)
-    record = {"log": str(path), "plot": str(picture), "outcome": outcome}
-    print_result(record if as_json else f"plot:      {picture}")
+    print(f"plot:      {picture}")
 
 
 @command(
@@ -153,7 +150,7 @@ def compare(
     app,
     "perchctl log export",
     "perchctl log export perchctl-logs/flight.jsonl -o flight.csv",
-    "perchctl log export --force --json",
+    "perchctl log export perchctl-logs --force",
 )
 def export(
     file: LogArgument = None,
@@ -162,7 +159,6 @@ def export(
         typer.Option("--output", "-o", help="The file: .csv. Default: beside the log."),
     ] = None,
     force: ForceOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Write a log as a table that other programs open."""
     path = _log_file(file)
@@ -171,12 +167,7 @@ def export(
     with _opened(path) as log:
         table = log_table(log)
     write_files({place: table.csv().encode("utf-8", errors="backslashreplace")})
-    rows, columns = len(table.rows), len(table.columns)
-    if as_json:
-        found = {"log": str(path), "output": str(place), "format": "csv"}
-        print_result(found | {"rows": rows, "columns": columns})
-    else:
-        print(f"export:    {place} ({rows} rows, {columns} columns)")
+    print(f"export:    {place} ({len(table.rows)} rows, {len(table.columns)} columns)")
 
 
 @command(
@@ -294,7 +285,6 @@ def film(
         int, typer.Option("--width", min=320, max=1920, help="Width of the film, in pixels.")
     ] = 960,
     force: ForceOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Make a film of a flight: the camera's picture, a side view to scale, error and thrust.
 
@@ -311,8 +301,5 @@ def film(
     from perchctl.analysis import write_film
 
     pictures = recorded_pictures(path, exact=False) if is_recorded else None
-    count = write_film(flight, pictures, place, rate_hz, width_px)
-    if as_json:
-        print_result({"log": str(path), "film": str(place), "pictures": count})
-    else:
-        print(f"film:      {place}")
+    write_film(flight, pictures, place, rate_hz, width_px)
+    print(f"film:      {place}")

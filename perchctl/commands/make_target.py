@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -119,7 +118,6 @@ def sheet(
     page: PageOption = "a4",
     magnet: MagnetOption = "50mm",
     force: ForceOption = False,
-    as_json: JsonOption = False,
     large: LargeOption = None,
     large_id: LargeIdOption = None,
     large_dict: LargeDictOption = None,
@@ -136,15 +134,12 @@ def sheet(
     magnet_m = parse_length(magnet, "--magnet")
     check_target(target, magnet_m)
     _check_pdf(output)
-    pdf = target_pdf(target, page, magnet_m, *_origin(config, target))
-    lines = [
-        f"wrote {output}",
-        "both markers are read from the drawing",
-        "print at 100 % and measure both rulers: 100 mm each",
-        *_mounting(config, target),
-    ]
-    record = {"target": target.model_dump(mode="json")}
-    _write({output: pdf}, lines, record, force, as_json)
+    check_place(output, force)
+    write_files({output: target_pdf(target, page, magnet_m, *_origin(config, target))})
+    print(f"wrote {output}")
+    print("both markers are read from the drawing")
+    print("print at 100 % and measure both rulers: 100 mm each")
+    print("\n".join(_mounting(config, target)))
 
 
 @command(
@@ -166,19 +161,16 @@ def board(
     ),
     page: PageOption = "a4",
     force: ForceOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Print a calibration board, in the notation that calibrate reads."""
     printed = parse_board(notation)
     if printed.scale != (1.0, 1.0):
         raise UsageError(f"{notation}: a board is printed as meant; leave out :measured=")
     _check_pdf(output)
-    lines = [
-        f"wrote {output}",
-        "print at 100 %, glue it on something flat, and measure both rulers: 100 mm each",
-    ]
-    record = {"board": printed.notation()}
-    _write({output: board_pdf(printed, page)}, lines, record, force, as_json)
+    check_place(output, force)
+    write_files({output: board_pdf(printed, page)})
+    print(f"wrote {output}")
+    print("print at 100 %, glue it on something flat, and measure both rulers: 100 mm each")
 
 
 @command(
@@ -200,7 +192,7 @@ def design(
     name, model = _camera(config, camera, cam)
     found = make_design(config.target, model, Optics(blur), config, ceiling)
     record = found.record() | {"target": config.target.model_dump(mode="json")}
-    _write({}, [found.text(name)], record, False, as_json)
+    print_result(record if as_json else found.text(name))
 
 
 @command(
@@ -231,7 +223,8 @@ def suggest(
         f"--small-dict {small.dictionary} --page {held_by}"
     )
     record = {"command": command, "target": found.target.model_dump(mode="json")}
-    _write({}, [command, "", found.text(name)], record | found.record(), False, as_json)
+    text = f"{command}\n\n{found.text(name)}"
+    print_result(record | found.record() if as_json else text)
 
 
 @command(
@@ -365,17 +358,3 @@ def _mounting(profile: Profile, target: TargetConfig) -> list[str]:
 def _check_pdf(path: Path) -> None:
     if path.suffix.lower() != ".pdf":
         raise UsageError(f"-o {path}: the file must end in .pdf")
-
-
-def _write(
-    files: Mapping[Path, bytes],
-    lines: list[str],
-    record: dict[str, Any],
-    force: bool,
-    as_json: bool,
-) -> None:
-    """Write all files, then print what was done."""
-    for path in files:
-        check_place(path, force)
-    write_files(files)
-    print_result({"files": [str(path) for path in files]} | record if as_json else "\n".join(lines))
