@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.camera import ConnectedCamera, find_cameras
+from perchctl.camera import find_cameras
 from perchctl.check import CheckScope, Row, Verdict, scan_rows
 from perchctl.check import check as check_rows
 from perchctl.commands.command_line import (
@@ -90,18 +90,13 @@ def check(
     if cameras and (given or scan or uri is not None):
         raise UsageError("--cameras only lists this computer's cameras: give it --json at most")
     if cameras:
-        return list_cameras(as_json)
+        return report(camera_rows(), as_json)
     if scan:
         say("scanning all channels and rates")
-        return report(_scanned(uri), as_json)
+        return report(scan_rows(uri), as_json)
     options = resolve(profile, uri, source, seed=seed, log_dir=log_dir)
     scope = CheckScope(lift=lift, tell=say)
     return report(check_rows(options, scope), as_json)
-
-
-def _scanned(uri: str | None) -> Iterator[Row]:
-    """Yield the rows of the scan, so that Ctrl-C may end it."""
-    yield from scan_rows(uri)
 
 
 def report(rows: Iterable[Row], as_json: bool) -> int:
@@ -180,27 +175,18 @@ def _wrapped(text: str, first: str, others: str) -> list[str]:
 # --- `perchctl check --cameras`: what this computer's cameras are called -------------------
 
 
-NONE = "this computer has no camera: plug in the receiver or camera (Linux lists /dev/videoN)"
-
-
-def list_cameras(as_json: bool, known: Sequence[ConnectedCamera] | None = None) -> int:
-    """Print them; returns the exit code. Nothing is set, and no picture taken. `known` takes the
-    place of this computer's. Errors: NotFound where there are none."""
-    known = find_cameras() if known is None else known
-    if not known:
-        raise NotFound(NONE)
-    if as_json:
-        print(json.dumps([{"source": camera.source, **asdict(camera)} for camera in known]))
-    else:
-        print("\n".join(line for camera in known for line in camera_lines(camera)))
-    return 0
-
-
-def camera_lines(camera: ConnectedCamera) -> list[str]:
-    """Return the lines that describe a camera to people."""
-    lines = [f"{camera.source}  {camera.name or '(no name)'}"]
-    if camera.stable_path:
-        lines.append(f"  {camera.stable_path}")
-    if camera.problem:
-        lines.append(f"  {camera.problem}; get the right to it, as by the group video")
-    return lines
+def camera_rows() -> Iterator[Row]:
+    """Yield a row for each camera of this computer. Nothing is set, and no picture taken. Errors:
+    NotFound where there are none."""
+    cameras = find_cameras()
+    if not cameras:
+        raise NotFound(
+            "this computer has no camera: plug in the receiver or camera (Linux lists /dev/videoN)"
+        )
+    for camera in cameras:
+        found = ", ".join(part for part in (camera.name, camera.stable_path) if part)
+        if camera.problem:
+            advice = "get the right to it, as by the group video"
+            yield Row(camera.source, Verdict.WARN, f"{found}: {camera.problem}", advice)
+        else:
+            yield Row(camera.source, Verdict.PASS, found)
