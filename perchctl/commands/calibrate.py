@@ -86,13 +86,12 @@ SizeOption = Annotated[
         help="Asked of camera:N, as in 720x576; else its driver's own.",
     ),
 ]
-NameOption = Annotated[str, typer.Option("--name", help="The camera's name.")]
 OutputOption = Annotated[
     Path | None,
     typer.Option(
         "--output",
         "-o",
-        help="Calibration file. Default: calib/NAME_WIDTHxHEIGHT.yaml.",
+        help="Calibration file. Default: calib/camera_WIDTHxHEIGHT.yaml.",
     ),
 ]
 
@@ -109,7 +108,6 @@ def camera(
     source: SourceArgument,
     board: BoardOption = DEFAULT_BOARD,
     output: OutputOption = None,
-    name: NameOption = "camera",
     force: ForceOption = False,
     view: ViewOption = False,
     as_json: JsonOption = False,
@@ -128,21 +126,20 @@ def camera(
     by more than 5 times its view's spread; both are named, as are pictures without a board.
     """
     pictures = _source(source, view)
-    _check_name(name)
     if output is not None:
         _check_output(output, force)
     layout = parse_board(board)
 
     def check_place_of(size_px: tuple[int, int]) -> None:
         """Raise before a person has worked for a file that cannot be written."""
-        _check_output(_file(output, name, size_px), force)
+        _check_output(_file(output, size_px), force)
 
     views, missing = _find_views(pictures, _size(size, pictures), layout, view, check_place_of)
-    file = _file(output, name, views[0].size_px)
+    file = _file(output, views[0].size_px)
     _check_output(file, force)
     say(f"{len(views)} views of the board" + (f", {len(missing)} without" if missing else ""))
     result = calibrate_camera(views, layout.notation(), model, missing)
-    write_files({file: result.text(name, _now()).encode()})
+    write_files({file: result.text(file.stem, _now()).encode()})
     for line in result.lines():
         say(line)
     report = draw_unless_interrupted(lambda: _draw(result, file.with_suffix(".png")))
@@ -230,25 +227,23 @@ def check(
     app,
     "perchctl calibrate convert opencv.yaml",
     "perchctl calibrate convert camchain.yaml --cam cam0 -o mine.yaml",
-    "perchctl calibrate convert ost.yaml --name fpv",
+    "perchctl calibrate convert ost.yaml -o calib/fpv.yaml",
 )
 def convert(
     calibration: Annotated[Path, typer.Argument(help="A file of OpenCV, Kalibr or ROS.")],
     output: OutputOption = None,
-    name: NameOption = "camera",
     cam: CamOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write another program's calibration as perchctl's file."""
-    _check_name(name)
     model = load_calibration(calibration, cam=cam)
-    file = _file(output, name, model.size_px)
+    file = _file(output, model.size_px)
     if same_file(file, calibration):
         raise UsageError(f"{file} is the file to convert; name another with --output")
     check_output(file, SUFFIXES, force, CONTENT)
     notes = {"date": _now(), "converted_from": calibration.name}
-    write_files({file: calibration_text(model, name, notes).encode()})
+    write_files({file: calibration_text(model, file.stem, notes).encode()})
     say(f"wrote {file} ({model.model}, {model.size_px[0]}x{model.size_px[1]} px)")
     print_result(camera_record(model) | {"file": str(file)} if as_json else file)
 
@@ -256,13 +251,8 @@ def convert(
 # -- files --------------------------------------------------------------------
 
 
-def _check_name(name: str) -> None:
-    if not name.strip() or "/" in name:
-        raise UsageError(f"--name {name!r} cannot name a file; use a word such as camera")
-
-
-def _file(output: Path | None, name: str, size_px: tuple[int, int]) -> Path:
-    return output or FOLDER / f"{name}_{size_px[0]}x{size_px[1]}.yaml"
+def _file(output: Path | None, size_px: tuple[int, int]) -> Path:
+    return output or FOLDER / f"camera_{size_px[0]}x{size_px[1]}.yaml"
 
 
 def _check_output(file: Path, force: bool) -> None:

@@ -156,7 +156,6 @@ def test_pictures_that_will_not_do_are_refused(
         (["images:/nowhere"], 20),
         (["images:.", "-b", "chess:9x6"], 30),
         (["images:.", "--model", "cubic"], 2),
-        (["images:.", "--name", "a/b"], 2),
         (["images:.", "--view"], 2),
         (["images:.", "--size", "640x480"], 2),
         (["images:.", "--check", "camera.yaml"], 2),
