@@ -9,7 +9,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from datetime import timedelta
 from functools import partial
 from typing import Any, Protocol, TextIO
 
@@ -53,22 +52,19 @@ def progress_bar(
     on a terminal, elsewhere a new one each `LINE_S` at most. `earlier`: flown before."""
     stream = stream or sys.stderr
     ends = Counter(result.outcome for result in earlier)
-    before, began_s = ends.total(), clock()
-    printed_s = began_s
-    with _bar("flights", TextColumn("{task.description}"), total=total, stream=stream, width=8) as (
-        update
-    ):
-        update(completed=before, description=_counted(ends))
+    printed_s = clock()
+    columns = (TimeRemainingColumn(), TextColumn("{task.description}"))
+    with _bar("flights", *columns, total=total, stream=stream, width=8) as update:
+        update(completed=ends.total(), description=_counted(ends))
 
         def advance(result: Ended) -> None:
             nonlocal printed_s
             ends[result.outcome] += 1
-            flown, now_s = ends.total(), clock()
-            text = f"{_pace(flown - before, now_s - began_s, total - flown)} {_counted(ends)}"
+            flown, text = ends.total(), _counted(ends)
             update(completed=flown, description=text)
-            if stream.isatty() or flown >= total or now_s - printed_s < LINE_S:
+            if stream.isatty() or flown >= total or clock() - printed_s < LINE_S:
                 return
-            printed_s = now_s
+            printed_s = clock()
             with contextlib.suppress(OSError, ValueError):  # nobody reads any more
                 print(f"perchctl: flown {flown} of {total} {text}", file=stream, flush=True)
 
@@ -77,14 +73,6 @@ def progress_bar(
 
 def _counted(ends: Counter[str]) -> str:
     return " ".join(f"{n} {end}" for end, n in ends.items())
-
-
-def _pace(flown: int, elapsed_s: float, left: int) -> str:
-    """Return flights a minute, and the time that is left at this pace."""
-    if elapsed_s <= 0.0:
-        return ""
-    left_s = timedelta(seconds=round(elapsed_s / flown * max(0, left)))
-    return f"{60.0 * flown / elapsed_s:.1f}/min {left_s} left"
 
 
 @contextlib.contextmanager
