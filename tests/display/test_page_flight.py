@@ -164,12 +164,6 @@ def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) ->
         assert switch.read() is Operator.STOP
 
 
-def test_without_view_no_page_is_opened(capsys: pytest.CaptureFixture[str]) -> None:
-    with flight_page(OPTIONS, None, OperatorSwitch()) as flight:
-        assert flight is None
-    assert capsys.readouterr().err == ""
-
-
 # --- how it ended ----------------------------------------------------------------------------
 
 SUMMARY = FlightSummary(
@@ -204,12 +198,6 @@ def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     rows = state_of(page)["card"]["rows"]
     assert rows[0][1].endswith("the motors are off")
     assert "report" in dict(rows)
-
-
-def test_nobody_is_waited_for_where_nobody_looks(page: LivePage) -> None:
-    page.end({"outcome": "LANDED"})  # returns at once: no reader would ever wake it
-    state = state_of(page)
-    assert (state["card"], state["stop"], state["age_s"]) == ({"outcome": "LANDED"}, "over", None)
 
 
 def test_who_looks_gets_the_card_before_the_page_goes(page: LivePage) -> None:
