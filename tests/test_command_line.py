@@ -69,32 +69,10 @@ def test_fly_help_lists_every_exit_code_in_a_line() -> None:
     assert "CFLIB_URI" in text
 
 
-def test_the_help_of_simulate_needs_no_simulator() -> None:
-    done = run_apart("simulate", "--help", before="import sys; sys.modules['mujoco'] = None")
-    assert done.code == 0, done.stderr
-    assert "Usage: perchctl simulate" in done.stdout
-
-
 def test_wrong_usage_is_2() -> None:
     for words in ("fly --bogus", "perch", "simulate -n 0", "simulate --seed -1"):
         assert run(*words.split()).code == 2
     assert run("--version").stdout.strip() == f"perchctl {__version__}"
-
-
-def test_completion_offers_subcommands_and_options() -> None:
-    def offered(*words: str) -> list[str]:
-        done = run_apart(
-            _PERCHCTL_COMPLETE="complete_bash",
-            COMP_WORDS="\n".join(["perchctl", *words]),
-            COMP_CWORD=str(len(words)),
-        )
-        assert done.stderr == ""
-        return done.stdout.split()
-
-    assert offered("sim") == ["simulate"]
-    assert offered("simulate", "com") == ["compare"]
-    assert offered("fly", "--pro") == ["--profile"]
-    assert "--install-completion" in run("--help").stdout
 
 
 # --- Failures ------------------------------------------------------------------------------
@@ -251,21 +229,6 @@ def test_one_rule_for_what_is_there_already(line: str) -> None:
     assert [path.name for path in Path().iterdir()] == [name]
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        f"calibrate convert {CALIBRATION} -o OUT.yaml",
-        "make-target board chessboard:9x6:20mm -o OUT.pdf",
-    ],
-)
-def test_folders_that_are_missing_are_made(line: str) -> None:
-    *words, out = line.split()
-    place = Path(out.replace("OUT", "made/new/out"))
-    said = run(*words, str(place))
-    assert said.code == 0, said.stderr
-    assert [path.name for path in place.parent.iterdir()] == [place.name]
-
-
 # --- A full disk, and Ctrl-C while it loads -------------------------------------------------
 
 
@@ -303,13 +266,6 @@ def test_ctrl_c_while_loading_is_one_sentence(module: str) -> None:
 def test_ctrl_c_while_loading_is_an_object_where_one_is_wanted() -> None:
     done = run_apart("fly", "--dry-run", "--json", before=pressed_at("numpy"))
     assert json.loads(done.stdout) == {"error": "Ctrl-C", "exit_code": 130}
-
-
-def test_ctrl_c_in_a_command_is_130(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(typer.Exit) as left, report_failures():
-        raise KeyboardInterrupt
-    assert left.value.exit_code == 130
-    assert "Ctrl-C" in capsys.readouterr().err
 
 
 def test_an_ignored_ctrl_c_stays_ignored() -> None:
