@@ -184,9 +184,10 @@ def camera_rows() -> Iterator[Row]:
             "this computer has no camera: plug in the receiver or camera (Linux lists /dev/videoN)"
         )
     for camera in cameras:
+        source = f"camera:{camera.number}"
         found = ", ".join(part for part in (camera.name, camera.stable_path) if part)
         if camera.problem:
             advice = "get the right to it, as by the group video"
-            yield Row(camera.source, Verdict.WARN, f"{found}: {camera.problem}", advice)
+            yield Row(source, Verdict.WARN, f"{found}: {camera.problem}", advice)
         else:
-            yield Row(camera.source, Verdict.PASS, found)
+            yield Row(source, Verdict.PASS, found)

@@ -18,7 +18,6 @@ from perchctl.camera import (
     parse_source,
     profile_record,
     without_password,
-    without_passwords,
 )
 from perchctl.check import Verdict, profile_rows
 from perchctl.commands.command_line import (
@@ -73,7 +72,7 @@ def show(profile: ProfileOption = "sim", as_json: JsonOption = False) -> int:
         }
         print_result(record)
         return 0
-    print(profile_text(without_passwords(loaded)), end="")
+    print(profile_text(Profile.model_validate(profile_record(loaded))), end="")
     _say_doubts(loaded)
     return 0
 

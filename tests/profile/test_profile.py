@@ -162,9 +162,9 @@ def bomb(levels: int) -> str:
 def test_aliases_that_unfold_to_millions_are_refused_shortly(tmp_path: Path) -> None:
     assert len(bomb(8)) < 500
     message = _refusal(tmp_path, bomb(8))
-    assert "alias" in message
+    assert "more than 20000 values" in message
     assert len(message) < 300 + len(str(tmp_path))
-    with pytest.raises(InvalidValue, match="alias"):
+    with pytest.raises(InvalidValue, match="more than 20000 values"):
         load_calibration(tmp_path / "mine.yaml")
 
 
