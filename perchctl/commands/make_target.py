@@ -21,7 +21,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.output import print_result
 from perchctl.errors import InvalidValue, PerchError, UsageError
-from perchctl.files import check_place, write_files
+from perchctl.files import check_output, write_files
 from perchctl.profile import (
     MarkerConfig,
     Profile,
@@ -133,8 +133,7 @@ def sheet(
     target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
     magnet_m = parse_length(magnet, "--magnet")
     check_target(target, magnet_m)
-    _check_pdf(output)
-    check_place(output, force)
+    check_output(output, (".pdf",), force, "what is printed")
     write_files({output: target_pdf(target, page, magnet_m, *_origin(config, target))})
     print(f"wrote {output}")
     print("both markers are read from the drawing")
@@ -166,8 +165,7 @@ def board(
     printed = parse_board(notation)
     if printed.scale != (1.0, 1.0):
         raise UsageError(f"{notation}: a board is printed as meant; leave out :measured=")
-    _check_pdf(output)
-    check_place(output, force)
+    check_output(output, (".pdf",), force, "what is printed")
     write_files({output: board_pdf(printed, page)})
     print(f"wrote {output}")
     print("print at 100 %, glue it on something flat, and measure both rulers: 100 mm each")
@@ -353,8 +351,3 @@ def _mounting(profile: Profile, target: TargetConfig) -> list[str]:
         return []
     name = profile.camera.calibration
     return [f"{name}: {text}" for text in assess_mounting(target, camera, profile).lines()]
-
-
-def _check_pdf(path: Path) -> None:
-    if path.suffix.lower() != ".pdf":
-        raise UsageError(f"-o {path}: the file must end in .pdf")
