@@ -6,7 +6,6 @@ import json
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -52,12 +51,6 @@ def check(
     profile: ProfileOption = "sim",
     uri: UriOption = None,
     source: SourceOption = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", help="Seed of the simulated scenario; 11 by default.")
-    ] = None,
-    log_dir: Annotated[
-        Path | None, typer.Option("--log-dir", help="Folder that the flight log will go to.")
-    ] = None,
     scan: Annotated[
         bool,
         typer.Option("--scan", help="Only show which vehicles answer, on any channel and rate."),
@@ -84,7 +77,7 @@ def check(
     no motor turns. Exits with 0 when nothing fails, with 10 when the vehicle does not answer, 20
     when the camera gives no picture, 52 for any other failing row.
     """
-    given = any(value not in (None, False) for value in (source, seed, log_dir, lift))
+    given = any(value not in (None, False) for value in (source, lift))
     if scan and given:
         raise UsageError("--scan only shows which vehicles answer: give it -u and --json at most")
     if cameras and (given or scan or uri is not None):
@@ -94,7 +87,7 @@ def check(
     if scan:
         say("scanning all channels and rates")
         return report(scan_rows(uri), as_json)
-    options = resolve(profile, uri, source, seed=seed, log_dir=log_dir)
+    options = resolve(profile, uri, source)
     scope = CheckScope(lift=lift, tell=say)
     return report(check_rows(options, scope), as_json)
 
