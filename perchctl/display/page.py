@@ -26,6 +26,8 @@ class FlightPage:
     the error.
     """
 
+    problem: str | None = None
+
     def __init__(self, page: LivePage, large_side_m: float) -> None:
         self.page = page
         self._side_m = large_side_m
@@ -34,10 +36,6 @@ class FlightPage:
         self._rescue = ""
         waiting = {"phase": "WAITING", "rows": [["reason", "vehicle and camera"]]}
         page.set_state(lambda: waiting, live=False)
-
-    @property
-    def problem(self) -> str | None:
-        return None
 
     def watched(self, source: FrameSource) -> FrameSource:
         """Return the same source; each frame it gives is remembered for the page."""
@@ -93,7 +91,6 @@ def flight_state(tick: Tick) -> dict[str, Any]:
     return {
         "phase": state.phase.value,
         "battery": f"{volts:.2f} V" if math.isfinite(volts) else "battery unknown",
-        "battery_v": volts if math.isfinite(volts) else None,
         "rows": [list(row) for row in status_rows(tick)],
         "note": f"held: {state.hold}" if state.hold else seen,
         "over": state.phase.is_over,
