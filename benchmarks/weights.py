@@ -41,7 +41,7 @@ def experiment(profile: str, positions: int, folder: Path) -> None:
     words = ("-p", profile, "--truth", "sim", "--positions", str(positions))
     command("collect", str(other), *words, "--seed", "1")
     command("collect", str(fitted), *words, "--seed", "0")
-    print(command(str(fitted), "-p", profile, "--test", str(other)))
+    print(command(str(fitted), "--test", str(other)))
 
 
 def write_rows(path: Path, rows: int) -> None:

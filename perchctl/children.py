@@ -109,11 +109,6 @@ def spawn(code: str, output: int | IO[bytes]) -> subprocess.Popen[bytes]:
     terminal's Ctrl-C. `output` takes what it prints: a file, or subprocess.PIPE."""
     root = str(Path(__file__).resolve().parents[1])
     command = [sys.executable, "-P", "-c", _PREFACE + code, root]
-    if sys.platform == "win32":
-        return subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT,
-            creationflags=subprocess.CREATE_NEW_PROCESS_GROUP,
-        )  # fmt: skip
     return subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT,
         start_new_session=True,

@@ -126,22 +126,7 @@ class ProfileNote(Note):
     """Says that a profile was read, but one of its keys has another name by now, or is not used."""
 
 
-ERROR_CLASSES: tuple[type[PerchError], ...] = (
-    PerchError,
-    UsageError,
-    ConnectionFailed,
-    NotFound,
-    InvalidValue,
-    TimedOut,
-    TargetNotFound,
-    AttemptsUsedUp,
-    SafetyAbort,
-    EmergencyStopped,
-    LogIncomplete,
-    ReplayDiffers,
-    Interrupted,
-)
-
+_ALL: list[type[PerchError]] = [PerchError, *PerchError.__subclasses__()]
 EXIT_CODES: dict[int, str] = {0: "perched (or the command did what was asked)"} | {
-    cls.exit_code: cls.meaning for cls in ERROR_CLASSES
+    cls.exit_code: cls.meaning for cls in _ALL
 }

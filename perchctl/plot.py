@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
 
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -40,18 +39,12 @@ def save_figure(figure: Figure, path: Path) -> None:
     """Write the figure in the format that the name ends in (`FORMATS`), the same bytes for the
     same figure; the file is there whole or not at all. Raises InvalidValue."""
     check_output(path, FORMATS, force=True, content="what plots are drawn in")
+    write_files({path: figure_bytes(figure, path.suffix.lower())})
+
+
+def figure_bytes(figure: Figure, suffix: str = ".png") -> bytes:
+    """Return the figure in one of `FORMATS`, the same bytes for the same figure."""
     content = BytesIO()
-    kind = path.suffix.lower().removeprefix(".")
     with rc_context({"svg.hashsalt": "perchctl"}):
-        figure.savefig(content, format=kind, metadata=_METADATA[f".{kind}"])
-    write_files({path: content.getvalue()})
-
-
-def save_png(figure: Figure, file: Path | BinaryIO) -> None:
-    """Write the figure; a file is there whole or not at all. Raises InvalidValue."""
-    content = BytesIO()
-    figure.savefig(content, format="png", metadata={"Software": None})
-    if isinstance(file, Path):
-        write_files({file: content.getvalue()})
-    else:
-        file.write(content.getvalue())
+        figure.savefig(content, format=suffix.removeprefix("."), metadata=_METADATA[suffix])
+    return content.getvalue()

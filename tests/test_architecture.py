@@ -32,7 +32,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "foxglove_schemas_protobuf": ("perchctl.record.recording_file", "perchctl.record.recorded"),
     "google": ("perchctl.record.recording_file", "perchctl.record.recorded"),
     "distributed": ("perchctl.campaign",),
-    "av": ("perchctl.commands.track_output", "perchctl.camera.network", "perchctl.analysis.film"),
+    "av": ("perchctl.camera.network", "perchctl.analysis.film"),
 }
 
 # Time is an argument here.
@@ -90,7 +90,7 @@ MOST_NAMES = {
     "campaign": 24,
     "check": 15,
     "commands": 15,
-    "display": 15,
+    "display": 8,
     "faults": 6,
     "flight": 22,
     "link": 11,

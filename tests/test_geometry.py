@@ -42,11 +42,6 @@ def test_wrap_keeps_the_direction_and_the_range(angle: float) -> None:
     assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
 
 
-@pytest.mark.parametrize("angle", [math.pi, -math.pi, 3 * math.pi])
-def test_half_a_turn_is_plus_pi(angle: float) -> None:
-    assert wrap_rad(angle) == pytest.approx(math.pi)
-
-
 @given(transforms())
 def test_inverse(T_a_b: np.ndarray) -> None:
     assert np.allclose(T_a_b @ invert_T(T_a_b), np.eye(4), atol=1e-9)

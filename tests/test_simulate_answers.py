@@ -68,13 +68,6 @@ def test_a_difference_is_told_with_the_keys_that_differ() -> None:
     assert record["profile"] == {KEY: {"a": 0.4, "b": 0.0}}
 
 
-def test_a_copy_is_the_same_in_all_flights() -> None:
-    copy = write("copy.yaml", "description: a copy\n")
-    said = run("simulate", "compare", "sim", copy, "-n", "60")
-    assert "identical in all 60 flights\nthe profiles do not differ\n" in said.stdout
-    assert "better" not in said.stdout
-
-
 def test_ctrl_c_leaves_the_seeds_that_both_have_flown(monkeypatch: pytest.MonkeyPatch) -> None:
     def variants(_profiles: object, _seeds: object, _executor: object, note: Note) -> None:
         for seed, number in ((0, 0), (0, 1), (1, 0)):

@@ -125,14 +125,10 @@ def test_one_seed_is_told_with_its_phases_log_and_plot(repeated: tuple[Said, Pat
     assert said.code == 0
     assert said.stderr == ""
     lines = said.stdout.splitlines()
-    assert lines[0] == "[   0.00 s] APPROACH: start"
-    assert re.fullmatch(r"\[ +\d+\.\d\d s\] COMPLETE: contact proven by .*", lines[6])
-    assert lines[8] == "PERCHED: hanging still with the motors off"
-    words = dict(line.split(":", 1) for line in lines[9:])
-    assert {"miss", "flight", "phases", "battery", "log", "plot"} <= set(words)
-    assert "ALIGN 0.4 s > ASCEND" in words["phases"]
-    assert Path(words["log"].strip()) == folder / f"flight_seed{SEED}.jsonl"
-    assert Path(words["plot"].strip()) == folder / f"flight_seed{SEED}.png"
+    assert lines[0] == "PERCHED: hanging still with the motors off"
+    assert re.search(r"COMPLETE .*contact proven by", said.stdout)
+    log = folder / f"flight_seed{SEED}.jsonl"
+    assert lines[-2:] == [f"log:       {log}", f"plot:      {log.with_suffix('.png')}"]
     assert {path.suffix for path in folder.iterdir()} == {".jsonl", ".png"}
 
 

@@ -42,6 +42,7 @@ from perchctl.calibration import profile_camera  # noqa: E402
 from perchctl.display import (  # noqa: E402
     LivePage,
     Sketch,
+    sketch_of,
 )
 from perchctl.display.page import flight_state  # noqa: E402
 from perchctl.display.panel import panel  # noqa: E402
@@ -125,15 +126,7 @@ class Flight:
     def sketch(self, frame: Frame) -> Sketch:
         """The frame with what the pipeline finds in it."""
         _, output = step(PipelineState(), frame, None, self.pipeline)
-        found = {name: output.detections.get(name) for name in ("large", "small")}
-        poses = output.poses
-        pose = next((poses[name] for name in ("joint", "large", "small") if name in poses), None)
-        axis_m = 0.5 * self.profile.target.large.side_m
-        return Sketch(
-            frame.image,
-            tuple((name, seen.corners_px) for name, seen in found.items() if seen is not None),
-            None if pose is None else (pose.rvec_rad, pose.tvec_m, axis_m),
-        )
+        return sketch_of(frame, output, self.profile.target.large.side_m)
 
     def tick(self, index: int) -> Tick:
         """What the displays showed at that tick."""
@@ -424,7 +417,7 @@ def _shown(flown: Flight) -> int:
 def _photograph(
     file: Path, url: str, size_px: tuple[int, int], until: str = "true", scale: float = 1.0
 ) -> None:
-    from tests.helpers.browser import browsing, why_no_browser
+    from browser import browsing, why_no_browser
 
     if why := why_no_browser():
         print(f"{file.name}: skipped, {why}")

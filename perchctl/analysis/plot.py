@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
 from textwrap import fill
 
@@ -27,9 +26,9 @@ from perchctl.plot import (
     PURPLE,
     SKY,
     VERMILLION,
+    figure_bytes,
     new_figure,
     save_figure,
-    save_png,
 )
 from perchctl.record import FlightLog
 
@@ -66,9 +65,7 @@ def plot_flight(log: FlightLog, path: Path | str) -> None:
 
 def flight_png(flight: FlightAnalysis) -> bytes:
     """Return the picture of a flight as a PNG; the log has at least one tick."""
-    content = BytesIO()
-    save_png(flight_figure(flight), content)
-    return content.getvalue()
+    return figure_bytes(flight_figure(flight))
 
 
 def flight_figure(flight: FlightAnalysis) -> Figure:

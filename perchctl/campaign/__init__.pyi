@@ -4,10 +4,8 @@ from .compare import compare_variants as compare_variants
 from .compare import comparison_text as comparison_text
 from .compare import fly_variants as fly_variants
 from .compare import make_sweep as make_sweep
-from .flights import LoggedFlight as LoggedFlight
 from .flights import fly_all as fly_all
 from .flights import fly_in_folder as fly_in_folder
-from .flights import fly_logged as fly_logged
 from .flights import fly_measured as fly_measured
 from .flights import seed_log_path as seed_log_path
 from .pool import defer_interrupts as defer_interrupts

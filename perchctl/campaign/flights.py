@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,7 +18,7 @@ import cv2
 from perchctl.campaign.results import FlightEnd, FlightResult, peak_memory_mb
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, SafetyAbort, TimedOut
 from perchctl.flight import LockstepFlight, fly_lockstep
-from perchctl.mission import Event, EventKeeper, Phase
+from perchctl.mission import Phase
 from perchctl.profile import Profile
 from perchctl.record import FlightSummary, LogWatcher
 from perchctl.sim import Scenario, draw_scenario
@@ -35,17 +35,6 @@ OUTCOMES: dict[Phase, FlightEnd] = {
 
 
 # --- One flight --------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class LoggedFlight:
-    """One flight with its summary, its log file and its events in order."""
-
-    seed: int
-    outcome: FlightEnd
-    summary: FlightSummary
-    log: Path
-    events: tuple[Event, ...]
 
 
 def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R:
@@ -104,18 +93,6 @@ def _fly(profile: Profile, seed: int, log_path: Path | None, record: bool) -> Fl
         log=None if log is None else log.path,
         log_problem=None if summary is None else summary.log_problem,
     )
-
-
-def fly_logged(profile: Profile, folder: Path, seed: int, record: bool = False) -> LoggedFlight:
-    """Fly one seed and return it with log, summary and events. Errors: NotFound, InvalidValue
-    (calibration, log)."""
-    cv2.setNumThreads(1)
-    log = LogWatcher.lockstep(seed_log_path(seed, folder), profile, seed, record)
-    events = EventKeeper()
-    flight = fly_lockstep(profile, seed, log, watchers=(events,))
-    summary = _closed(log, flight)
-    assert summary is not None
-    return LoggedFlight(seed, _outcome(flight), summary, log.path, tuple(events.seen))
 
 
 def _closed(log: LogWatcher, flight: LockstepFlight) -> FlightSummary | None:

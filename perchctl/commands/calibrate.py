@@ -5,11 +5,9 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import itertools
 import re
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,7 +17,6 @@ import typer
 
 from perchctl.calibration import (
     FoundViews,
-    GuidedFrame,
     calibrate_camera,
     calibration_text,
     capture_views,
@@ -30,7 +27,6 @@ from perchctl.calibration import (
 )
 from perchctl.camera import (
     FrameSource,
-    Grey,
     check_size,
     image_files,
     open_camera,
@@ -44,16 +40,14 @@ from perchctl.commands.command_line import (
     Group,
     JsonOption,
     ViewOption,
-    ViewPortOption,
     command,
     new_app,
 )
-from perchctl.commands.guide import guide, page_port
 from perchctl.commands.interrupt import Stopper, draw_unless_interrupted
 from perchctl.commands.output import print_result, say
-from perchctl.commands.progress import search_bar
+from perchctl.commands.progress import guide, search_bar
 from perchctl.display import live_page
-from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
+from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files
 from perchctl.target import Board
 from perchctl.vision import CameraModel
@@ -61,14 +55,12 @@ from perchctl.vision import CameraModel
 FOLDER = Path("calib")
 SUFFIXES, CONTENT = (".yaml", ".yml"), "the format of a calibration"
 DEFAULT_BOARD = "charuco:10x7:25mm:18mm:DICT_5X5_100"
-DETAILS = "Details"
-"""Heading of the options that are not of every day."""
 
 SourceArgument = Annotated[
-    list[str],
+    str,
     typer.Argument(
         help="images:DIR (or a pattern), video:FILE, camera:N or its name, rtsp://..., "
-        "http://..., aideck://HOST, or a path; or many picture files.",
+        "http://..., aideck://HOST, or a path.",
     ),
 ]
 BoardOption = Annotated[
@@ -76,15 +68,8 @@ BoardOption = Annotated[
     typer.Option(
         "--board",
         "-b",
-        help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 (squares).",
-    ),
-]
-MeasuredOption = Annotated[
-    str | None,
-    typer.Option(
-        "--measured",
-        help="Width and height of the board's black area as printed, mm: 249.3x174.9.",
-        rich_help_panel=DETAILS,
+        help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 "
+        "(squares); :measured=249.3x174.9mm behind it for the black area as printed.",
     ),
 ]
 SizeOption = Annotated[
@@ -92,16 +77,14 @@ SizeOption = Annotated[
     typer.Option(
         "--size",
         help="Asked of camera:N, as in 720x576; else its driver's own.",
-        rich_help_panel=DETAILS,
     ),
 ]
-NameOption = Annotated[str, typer.Option("--name", help="The camera's name.")]
 OutputOption = Annotated[
     Path | None,
     typer.Option(
         "--output",
         "-o",
-        help="Calibration file. Default: calib/NAME_WIDTHxHEIGHT.yaml.",
+        help="Calibration file. Default: calib/camera_WIDTHxHEIGHT.yaml.",
     ),
 ]
 
@@ -112,55 +95,45 @@ app = new_app(Group)
     app,
     "perchctl calibrate images:board",
     "perchctl calibrate camera:0 --view",
-    "perchctl calibrate left*.jpg --board chessboard:9x6:25mm",
+    "perchctl calibrate 'left*.jpg' --board chessboard:9x6:25mm",
 )
 def camera(
     source: SourceArgument,
     board: BoardOption = DEFAULT_BOARD,
     output: OutputOption = None,
-    name: NameOption = "camera",
     force: ForceOption = False,
     view: ViewOption = False,
-    view_port: ViewPortOption = 0,
     as_json: JsonOption = False,
-    measured: MeasuredOption = None,
     size: SizeOption = None,
     model: Annotated[
         Literal["auto", "plumb_bob", "fisheye"],
         typer.Option(
             "--model",
             help="Lens model; auto takes the simplest one that follows the lens.",
-            rich_help_panel=DETAILS,
         ),
     ] = "auto",
 ) -> None:
     """Calibrate the camera, and report what its error means in mm at the target.
 
     A view is rejected when its RMS is above 2.5 times the median view's, a corner when it is off
-    by more than 5 times its view's spread; both are named, as are pictures without a board. The
-    pictures of a live camera are kept in a folder beside the output.
+    by more than 5 times its view's spread; both are named, as are pictures without a board.
     """
-    pictures = _source(source, size, view)
-    _check_name(name)
+    pictures = _source(source, view)
     if output is not None:
         _check_output(output, force)
-    layout = _measured_board(board, measured)
+    layout = Board.parse(board)
 
-    def kept_in(size_px: tuple[int, int]) -> Path:
-        """Return the folder for a live camera's pictures; raises before a person has worked for
-        them."""
-        file = _file(output, name, size_px)
-        _check_output(file, force)
-        return _free_folder(file)
+    def check_place_of(size_px: tuple[int, int]) -> None:
+        """Raise before a person has worked for a file that cannot be written."""
+        _check_output(_file(output, size_px), force)
 
-    port = page_port(view, view_port)
-    found = _find_views(pictures, layout, kept_in, port)
-    file = _file(output, name, found.views[0].size_px)
+    found = _find_views(pictures, _size(size, pictures), layout, view, check_place_of)
+    file = _file(output, found.views[0].size_px)
     _check_output(file, force)
     without = f", {len(found.missing)} without" if found.missing else ""
     say(f"{len(found.views)} views of the board{without}")
     result = calibrate_camera(found, layout.notation(), model)
-    write_files({file: result.text(name, _now()).encode()})
+    write_files({file: result.text(file.stem, _now()).encode()})
     for line in result.lines():
         say(line)
 
@@ -201,10 +174,10 @@ def mask(
     as_json: JsonOption = False,
 ) -> None:
     """Learn what the vehicle itself covers of the picture, while it is turned about."""
-    pictures = _source(source, size)
+    pictures = _source(source)
     check_output(output, (".png",), force, "a mask's format")
     with contextlib.ExitStack() as stack:
-        frames = pictures.open()
+        frames = open_camera(pictures, time.monotonic, size_px=_size(size, pictures))
         stack.callback(frames.close)
         stop = stack.enter_context(Stopper().installed())
         if frames.live:
@@ -229,18 +202,14 @@ def check(
     board: BoardOption = DEFAULT_BOARD,
     cam: CamOption = None,
     view: ViewOption = False,
-    view_port: ViewPortOption = 0,
     as_json: JsonOption = False,
-    measured: MeasuredOption = None,
-    size: SizeOption = None,
 ) -> int:
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
-    pictures = _source(source, size, view)
-    layout = _measured_board(board, measured)
+    pictures = _source(source, view)
+    layout = Board.parse(board)
     model = load_calibration(calibration, cam=cam)
-    port = page_port(view, view_port)
-    found = _find_views(pictures, layout, lambda _: None, port)
-    check_size(found.views[0].size_px, model, str(pictures))
+    found = _find_views(pictures, model.size_px, layout, view)
+    check_size(found.views[0].size_px, model, without_password(pictures))
     result = check_calibration(model, found)
     for item in found.missing:
         say(f"{item.view}: {item.reason}")
@@ -255,25 +224,23 @@ def check(
     app,
     "perchctl calibrate convert opencv.yaml",
     "perchctl calibrate convert camchain.yaml --cam cam0 -o mine.yaml",
-    "perchctl calibrate convert ost.yaml --name fpv",
+    "perchctl calibrate convert ost.yaml -o calib/fpv.yaml",
 )
 def convert(
     calibration: Annotated[Path, typer.Argument(help="A file of OpenCV, Kalibr or ROS.")],
     output: OutputOption = None,
-    name: NameOption = "camera",
     cam: CamOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write another program's calibration as perchctl's file."""
-    _check_name(name)
     model = load_calibration(calibration, cam=cam)
-    file = _file(output, name, model.size_px)
+    file = _file(output, model.size_px)
     if same_file(file, calibration):
         raise UsageError(f"{file} is the file to convert; name another with --output")
     check_output(file, SUFFIXES, force, CONTENT)
     notes = {"date": _now(), "converted_from": calibration.name}
-    write_files({file: calibration_text(model, name, notes).encode()})
+    write_files({file: calibration_text(model, file.stem, notes).encode()})
     say(f"wrote {file} ({model.model}, {model.size_px[0]}x{model.size_px[1]} px)")
     print_result({"file": str(file)} if as_json else file)
 
@@ -281,24 +248,13 @@ def convert(
 # -- files --------------------------------------------------------------------
 
 
-def _check_name(name: str) -> None:
-    if not name.strip() or "/" in name:
-        raise UsageError(f"--name {name!r} cannot name a file; use a word such as camera")
-
-
-def _file(output: Path | None, name: str, size_px: tuple[int, int]) -> Path:
-    return output or FOLDER / f"{name}_{size_px[0]}x{size_px[1]}.yaml"
+def _file(output: Path | None, size_px: tuple[int, int]) -> Path:
+    return output or FOLDER / f"camera_{size_px[0]}x{size_px[1]}.yaml"
 
 
 def _check_output(file: Path, force: bool) -> None:
     check_output(file, SUFFIXES, force, f"{CONTENT}; the report goes beside it as .png")
     check_place(file.with_suffix(".png"), force)
-
-
-def _free_folder(file: Path) -> Path:
-    """Return the first folder for pictures beside the file that does not exist yet."""
-    names = (f"{file.stem}_pictures{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
-    return next(folder for name in names if not (folder := file.with_name(name)).exists())
 
 
 def _now() -> str:
@@ -308,110 +264,57 @@ def _now() -> str:
 # -- the source ---------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Source:
-    """A source as `open_camera` takes it, or the picture files that were named one by one."""
-
-    spec: str
-    files: tuple[Path, ...] = ()
-    size_px: tuple[int, int] | None = None  # asked of a camera of this computer
-
-    def __str__(self) -> str:
-        """Return the name of the source in messages."""
-        if self.files:
-            return f"{self.files[0]} and {len(self.files) - 1} more"
-        return without_password(self.spec)
-
-    @property
-    def scheme(self) -> str:
-        """The part before the colon: ``images``, ``video``, or a live source's."""
-        return self.spec.partition(":")[0]
-
-    @property
-    def place(self) -> str:
-        """The part behind the colon: a path, for ``images`` and ``video``."""
-        return str(Path(self.spec.partition(":")[2]).expanduser())
-
-    def open(self) -> FrameSource:
-        """Open the source. Errors: those of `open_camera`."""
-        return open_camera(self.files or self.spec, time.monotonic, size_px=self.size_px)
-
-
-def _source(words: Sequence[str], size: str | None, view: bool = False) -> Source:
-    """Return the source that the command line names; several words are picture files, which is what
-    a shell makes of ``left*.jpg``. Raises NotFound, InvalidValue, UsageError."""
-    if len(words) == 1:
-        source = Source(parse_source(words[0], files=True).spec)
-    else:
-        files = tuple(Path(word) for word in words)
-        for file in files:
-            _check_picture(file)
-        source = Source("images:", files)
-    if view and not parse_source(source.spec).live:
+def _source(text: str, view: bool = False) -> str:
+    """Return the source that the command line names, as `open_camera` takes it. Raises NotFound,
+    InvalidValue, UsageError."""
+    source = parse_source(text, files=True)
+    if view and not source.live:
         raise UsageError(f"{source} is no live camera: --view does not apply; leave it out")
-    return with_size(source, size)
+    return source.spec
 
 
-def _check_picture(file: Path) -> None:
-    if not file.exists():
-        raise NotFound(f"{file} does not exist; several sources are picture files, one by one")
-    if not file.is_file() or parse_source(str(file), files=True).scheme != "images":
-        raise UsageError(
-            f"{file} is no picture file: several sources must all be pictures, as in "
-            f"left*.jpg; a folder, a video or a camera stands alone"
-        )
-
-
-def with_size(source: Source, text: str | None) -> Source:
-    """Return the source with `--size`. Raises InvalidValue, UsageError."""
+def _size(text: str | None, source: str) -> tuple[int, int] | None:
+    """Return the `--size` that a camera of this computer is asked for. Raises InvalidValue,
+    UsageError."""
     if text is None:
-        return source
+        return None
     found = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text)
     if found is None:
         raise InvalidValue(f"--size: found {text!r}; needed is WIDTHxHEIGHT, as in 720x576")
-    if source.scheme != "camera":
-        raise UsageError(f"--size is asked of camera:N, and {source} has its own: leave it out")
-    return replace(source, size_px=(int(found[1]), int(found[2])))
+    if not source.startswith("camera:"):
+        raise UsageError(
+            f"--size is asked of camera:N, and {without_password(source)} has its own: leave it out"
+        )
+    return int(found[1]), int(found[2])
 
 
 # -- the board and its views ----------------------------------------------------
 
 
-def _measured_board(notation: str, measured: str | None) -> Board:
-    """Return the board with the measured sides of its black area, after a comparison with those
-    that it was meant to have. Raises NotFound, InvalidValue."""
-    board = Board.parse(notation)
-    if measured is None:
-        return board
-    board, notes = board.with_sides(measured)
-    for note in notes:
-        say(note)
-    return board
-
-
 def _find_views(
-    source: Source,
+    spec: str,
+    size_px: tuple[int, int] | None,
     board: Board,
-    kept_in: Callable[[tuple[int, int]], Path | None],
-    port: int | None,
+    view: bool,
+    check: Callable[[tuple[int, int]], None] = lambda size_px: None,
 ) -> FoundViews:
     """Return the views, at least one, and the pictures without a board.
 
     Args:
-        kept_in: the folder for a live camera's pictures (None: they are not kept), by their size;
-            called before the person begins.
-        port: of a live camera's page; None: no page.
+        view: with the live page of a live camera.
+        check: called with a live camera's picture size before the person begins.
     """
-    if source.scheme not in ("images", "video"):
-        frames = source.open()
+    source = parse_source(spec)
+    place = Path(source.place).expanduser()
+    if source.live:
+        frames = open_camera(spec, time.monotonic, size_px=size_px)
         with contextlib.closing(frames):
             assert frames.size_px is not None  # the first frame is there
-            return capture_live_views(frames, board, kept_in(frames.size_px), port)
+            check(frames.size_px)
+            return capture_live_views(frames, board, view)
     with search_bar("searching the board") as progress:
-        if source.scheme == "images":
-            found = find_views(image_files(source.files or source.place), board, progress)
-        else:
-            found = find_views(Path(source.place), board, progress)
+        pictures = image_files(str(place)) if source.scheme == "images" else place
+        found = find_views(pictures, board, progress)
     if not found.views:
         first, count = found.missing[0], f"{len(found.missing)} pictures"
         raise InvalidValue(
@@ -422,52 +325,20 @@ def _find_views(
     return found
 
 
-def capture_live_views(
-    source: FrameSource, board: Board, folder: Path | None, port: int | None
-) -> FoundViews:
+def capture_live_views(source: FrameSource, board: Board, view: bool) -> FoundViews:
     """Return views of a live camera, taken until all is covered or Ctrl-C ends it.
-
-    Args:
-        folder: gets their pictures, each as it is taken; None: they are not kept.
-        port: of the live page; None: no page.
 
     Raises:
         InvalidValue: no view was taken. Those of `capture_views`.
     """
-    kept: list[Path] = []
-
-    def keep(picture: Grey) -> None:
-        """Write the picture; those that cannot be kept are still calibrated from."""
-        nonlocal folder
-        if folder is None:
-            return
-        path = folder / f"view_{len(kept) + 1:03d}.png"
-        try:
-            write_files({path: cv2.imencode(".png", picture)[1].tobytes()})
-            kept.append(path)
-        except InvalidValue as error:
-            folder = None
-            say(f"pictures are no longer kept: {error}")
-
-    def report_kept() -> None:
-        if kept:
-            say(f"kept {len(kept)} pictures: images:{kept[0].parent} takes them again")
-
     with contextlib.ExitStack() as stack:
-        stack.callback(report_kept)
         stop = stack.enter_context(Stopper().installed())
         # The page draws the picture and its corners, but no axes: any camera serves.
         any_camera = CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
-        page = stack.enter_context(live_page(any_camera, "perchctl calibrate", port, say))
+        page = stack.enter_context(live_page(any_camera, "perchctl calibrate", view, say))
         show = stack.enter_context(guide(page))
         say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
-
-        def seen(moment: GuidedFrame) -> None:
-            if moment.taken:
-                keep(moment.image)
-            show(moment)
-
-        found = capture_views(source, board, seen, stopped=stop.requested.is_set)
+        found = capture_views(source, board, show, stopped=stop.requested.is_set)
     if not found.views:
         raise InvalidValue(
             f"no view of the board {board.notation()} was taken from {source.describe()}"

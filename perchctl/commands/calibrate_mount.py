@@ -31,14 +31,12 @@ from perchctl.camera import (
     parse_source,
 )
 from perchctl.commands.command_line import (
-    ForceOption,
     JsonOption,
     ViewOption,
-    ViewPortOption,
 )
-from perchctl.commands.guide import guide, page_port
 from perchctl.commands.interrupt import Stopper, ignore_signals
 from perchctl.commands.output import print_lines, print_result, say
+from perchctl.commands.progress import guide
 from perchctl.display import live_page
 from perchctl.errors import (
     Interrupted,
@@ -47,7 +45,7 @@ from perchctl.errors import (
     SafetyAbort,
     UsageError,
 )
-from perchctl.files import check_output
+from perchctl.files import check_place
 from perchctl.link import MotionLink, check_uri
 from perchctl.profile import (
     Profile,
@@ -62,7 +60,7 @@ FOLDER = Path("calib")
 Part = Literal["carry", "pivot"]
 Sensors = tuple[Callable[[], list[AttitudeSample]], Callable[[float], str | None]]
 """What a recording reads of the vehicle: its new samples, and what is wrong with it by a time."""
-HOW: dict[str, str] = {
+HOW: dict[Part, str] = {
     "carry": "carry: hold the vehicle under the target (or the target before its camera); turn it "
     "about all its axes and move it, the target in view",
     "pivot": "pivot: stand the tip of the gear on one point that does not move, the target in "
@@ -106,13 +104,7 @@ def mount(
             "--write", help="Put the numbers into the profile; the old file is kept beside it."
         ),
     ] = False,
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="The recording of a live run, .jsonl."),
-    ] = None,
-    force: ForceOption = False,
     view: ViewOption = False,
-    view_port: ViewPortOption = 0,
     as_json: JsonOption = False,
 ) -> int:
     """Measure how the camera is mounted, how late it is, and where the gear's tip is.
@@ -120,9 +112,8 @@ def mount(
     The vehicle is turned in the hand in view of the target (carry), then tilted around the tip of
     its gear (pivot). Its motors are off, and nothing arms.
     """
-    port = page_port(view, view_port)
     if logs:
-        live = {"--uri": uri, "--source": source, "--view": port, "--output": output}
+        live = {"--uri": uri, "--source": source, "--view": view or None}
         for option, value in live.items():
             if value is not None:
                 raise UsageError(f"--from takes no camera, no vehicle, no page: leave {option} out")
@@ -136,8 +127,8 @@ def mount(
     else:
         parts: tuple[Part, ...] = ("carry", "pivot") if part is None else (part,)
         frames, link_uri = _live_sources(source, uri, vehicle, parts)
-        log = _recording_place(output, find_profile(profile).stem, force)
-        recordings = _record_live(vehicle, camera, frames, link_uri, parts, log, port)
+        log = _free_place(find_profile(profile).stem)
+        recordings = _record_live(vehicle, camera, frames, link_uri, parts, log, view)
         logs = [log] if log.exists() else []
     measured = solve_mounting(vehicle, recordings)
     for line in measured.lines():
@@ -145,7 +136,6 @@ def mount(
     written, before, problem = None, None, None
     if into is not None:
         try:
-            _check_unchanged(profile, vehicle)
             before = write_profile_values(into, measured.profile_values())
             written = into
             say(f"wrote these into {written}; as it was before it is {before}")
@@ -193,39 +183,30 @@ def _live_sources(
     return name.spec, link_uri
 
 
-def _recording_place(output: Path | None, name: str, force: bool) -> Path:
-    """Return where a live recording goes: `output`, or the next name that is free, so that nothing
-    is measured in vain."""
-    if output is None:
-        stems = (f"mounting_{name}{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
-        output = next(p for stem in stems if not (p := FOLDER / f"{stem}.jsonl").exists())
-    check_output(output, (".jsonl",), force, "the recording's format")
-    return output
+def _free_place(name: str) -> Path:
+    """Return where a live recording goes: the next name that is free, so that nothing is measured
+    in vain."""
+    stems = (f"mounting_{name}{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
+    place = next(p for stem in stems if not (p := FOLDER / f"{stem}.jsonl").exists())
+    check_place(place, force=False)
+    return place
 
 
 # -- recordings of files ----------------------------------------------------------
 
 
 def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecording]:
-    """Return each part once, or the one that is asked for. Errors: NotFound, InvalidValue."""
-    named = [(path, recording) for path in logs for recording in MountingRecording.read(path)]
-    places: dict[str, Path] = {}
-    for path, recording in named:
-        if part not in (None, recording.part):
-            continue
-        if recording.part in places:
-            raise InvalidValue(
-                f"{path}: the {recording.part} is in {places[recording.part]} already: name one "
-                f"recording of each part"
-            )
-        places[recording.part] = path
-    if not places:
-        held = " and ".join(dict.fromkeys(recording.part for _, recording in named))
+    """Return the recordings of the part that is asked for, or of all; the last one of a part
+    counts. Errors: NotFound, InvalidValue."""
+    held = [recording for path in logs for recording in MountingRecording.read(path)]
+    found = {each.part: each for each in held if part in (None, each.part)}
+    if not found:
+        parts = " and ".join(dict.fromkeys(recording.part for recording in held))
         raise InvalidValue(
-            f"{', '.join(map(str, logs))} holds no {part}, but a {held}: leave --part out, or "
+            f"{', '.join(map(str, logs))} holds no {part}, but a {parts}: leave --part out, or "
             f"name the other recording too"
         )
-    return [recording for _, recording in named if recording.part in places]
+    return list(found.values())
 
 
 def _check_seen_by(recordings: Sequence[MountingRecording], now: str) -> None:
@@ -250,12 +231,12 @@ def _record_live(
     uri: str | None,
     parts: Sequence[Part],
     log: Path,
-    port: int | None,
+    view: bool,
 ) -> list[MountingRecording]:
     """Record the parts live, also into a file. What was recorded is kept, however it ends.
 
     Args:
-        uri: None: no vehicle is asked. port: None: no page.
+        uri: None: no vehicle is asked. view: with the live page.
 
     Raises:
         Interrupted: Ctrl-C. SafetyAbort: the motors turn.
@@ -275,7 +256,7 @@ def _record_live(
         sensors: Sensors = (list, lambda now_s: None)
         if uri is not None:
             sensors = stack.enter_context(_vehicle(uri, profile, now))
-        page = stack.enter_context(live_page(camera, "perchctl calibrate mount", port, say))
+        page = stack.enter_context(live_page(camera, "perchctl calibrate mount", view, say))
         stack.callback(_keep, recordings, log)
         for part in parts:
             say(HOW[part])
@@ -330,18 +311,3 @@ def _keep(recordings: Sequence[MountingRecording], log: Path) -> None:
         say(f"the recording is not kept: {error}")
         return
     say(f"kept the recording: {log}; --from {log} measures from it again")
-
-
-# -- the result -------------------------------------------------------------------
-
-
-def _check_unchanged(name: str, then: Profile) -> None:
-    """Raise InvalidValue if the profile no longer says what the numbers rest on: a gear by one
-    turn of the camera is wrong beside another, and a recording takes minutes; NotFound."""
-    now = load_profile(name, with_weights=False)
-    rests_on = [(p.camera.mount, p.camera.latency_s, p.vehicle) for p in (now, then)]
-    if rests_on[0] != rests_on[1]:
-        raise InvalidValue(
-            f"{find_profile(name)} was changed meanwhile, and nothing is written: these numbers "
-            f"rest on what it said before; measure again, with --from"
-        )

@@ -6,7 +6,6 @@ import json
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -52,12 +51,6 @@ def check(
     profile: ProfileOption = "sim",
     uri: UriOption = None,
     source: SourceOption = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", help="Seed of the simulated scenario; 11 by default.")
-    ] = None,
-    log_dir: Annotated[
-        Path | None, typer.Option("--log-dir", help="Folder that the flight log will go to.")
-    ] = None,
     scan: Annotated[
         bool,
         typer.Option("--scan", help="Only show which vehicles answer, on any channel and rate."),
@@ -84,24 +77,19 @@ def check(
     no motor turns. Exits with 0 when nothing fails, with 10 when the vehicle does not answer, 20
     when the camera gives no picture, 52 for any other failing row.
     """
-    given = any(value not in (None, False) for value in (source, seed, log_dir, lift))
+    given = any(value not in (None, False) for value in (source, lift))
     if scan and given:
         raise UsageError("--scan only shows which vehicles answer: give it -u and --json at most")
     if cameras and (given or scan or uri is not None):
         raise UsageError("--cameras only lists this computer's cameras: give it --json at most")
     if cameras:
-        return list_cameras(as_json)
+        return report(camera_rows(), as_json)
     if scan:
         say("scanning all channels and rates")
-        return report(_scanned(uri), as_json)
-    options = resolve(profile, uri, source, seed=seed, log_dir=log_dir)
+        return report(scan_rows(uri), as_json)
+    options = resolve(profile, uri, source)
     scope = CheckScope(lift=lift, tell=say)
     return report(check_rows(options, scope), as_json)
-
-
-def _scanned(uri: str | None) -> Iterator[Row]:
-    """Yield the rows of the scan, so that Ctrl-C may end it."""
-    yield from scan_rows(uri)
 
 
 def report(rows: Iterable[Row], as_json: bool) -> int:
@@ -180,22 +168,19 @@ def _wrapped(text: str, first: str, others: str) -> list[str]:
 # --- `perchctl check --cameras`: what this computer's cameras are called -------------------
 
 
-NONE = "this computer has no camera: plug in the receiver or camera (Linux lists /dev/videoN)"
-
-
-def list_cameras(as_json: bool) -> int:
-    """Print them; returns the exit code. Nothing is set, and no picture taken. Errors: NotFound
-    where there are none."""
-    known = find_cameras()
-    if not known:
-        raise NotFound(NONE)
-    if as_json:
-        print(json.dumps([{"source": f"camera:{c.number}", **asdict(c)} for c in known]))
-        return 0
-    for camera in known:
-        print(f"camera:{camera.number}  {camera.name or '(no name)'}")
-        if camera.stable_path:
-            print(f"  {camera.stable_path}")
+def camera_rows() -> Iterator[Row]:
+    """Yield a row for each camera of this computer. Nothing is set, and no picture taken. Errors:
+    NotFound where there are none."""
+    cameras = find_cameras()
+    if not cameras:
+        raise NotFound(
+            "this computer has no camera: plug in the receiver or camera (Linux lists /dev/videoN)"
+        )
+    for camera in cameras:
+        source = f"camera:{camera.number}"
+        found = ", ".join(part for part in (camera.name, camera.stable_path) if part)
         if camera.problem:
-            print(f"  {camera.problem}; get the right to it, as by the group video")
-    return 0
+            advice = "get the right to it, as by the group video"
+            yield Row(source, Verdict.WARN, f"{found}: {camera.problem}", advice)
+        else:
+            yield Row(source, Verdict.PASS, found)

@@ -7,7 +7,6 @@ only as it is used, so that the help is quick, and may import whatever it needs 
 from __future__ import annotations
 
 import contextlib
-import difflib
 import errno
 import functools
 import importlib
@@ -22,6 +21,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from perchctl import __version__
+from perchctl.commands.output import drop_stream, say
 from perchctl.errors import (
     EXIT_CODES,
     Interrupted,
@@ -36,9 +36,18 @@ from perchctl.startup import failure_record, restore_ctrl_c
 EXIT_TABLE = "\b\nExit codes:\n" + "\n".join(
     f"{code:>5}  {meaning}" for code, meaning in sorted(EXIT_CODES.items())
 )
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_BAD_PLACE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ENOTDIR)
-
+_REFUSED = {
+    errno.ENOSPC: "free some space",
+    errno.EDQUOT: "free some space",
+    errno.EFBIG: "free some space",
+    errno.EROFS: "choose another place",
+    errno.EACCES: "choose another place",
+    errno.EPERM: "choose another place",
+    errno.ENAMETOOLONG: "choose another place",
+    errno.ENOTDIR: "choose another place",
+}
+"""Why the operating system refuses a place, and what to do."""
+_LONGEST_PLACE = 200
 
 COMMANDS: dict[str, str] = {
     "make-target": "Print the target true to size, or a board; design it; write measured sizes.",
@@ -60,36 +69,16 @@ COMMANDS: dict[str, str] = {
 }
 """In the order in which one uses them, with the first sentence of their help."""
 
-_CLOSE = 0.6
-"""The least likeness of a misspelt command to the one that was meant."""
 _SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
-
-
-class Command(TyperCommand):
-    """Lists its options by their `rich_help_panel`, those without one first."""
-
-    def format_options(self, ctx: Any, formatter: Any) -> None:
-        sections: dict[str, list[tuple[str, str]]] = {}
-        for param in self.get_params(ctx):
-            record = param.get_help_record(ctx)
-            if record is not None:
-                plain = "Arguments" if param.param_type_name == "argument" else "Options"
-                panel = getattr(param, "rich_help_panel", None) or plain
-                sections.setdefault(panel, []).append(record)
-        for name, records in sections.items():
-            with formatter.section(name):
-                formatter.write_dl(records)
 
 
 class Group(TyperGroup):
     """A group of subcommands, of which the first is the main one: it runs if none is named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if ctx.resilient_parsing:  # a shell asks for what may come
-            return super().parse_args(ctx, args)
-        if not args or args[0] not in (*self.commands, *_SETTINGS["help_option_names"]):
-            if args and not os.path.exists(args[0]):
-                _refuse_misspelt(args[0], list(self.commands), f"perchctl {ctx.info_name} ")
+        named = (*self.commands, *_SETTINGS["help_option_names"])
+        # A shell that completes words asks for what may come, and wants no main one.
+        if not ctx.resilient_parsing and (not args or args[0] not in named):
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
 
@@ -97,14 +86,11 @@ class Group(TyperGroup):
         """Write the help of the main subcommand, with the others listed below it."""
         name, main_command = next(iter(self.commands.items()))
         inner = typer.Context(main_command, info_name=ctx.info_name, parent=ctx.parent, **_SETTINGS)
-        main_command.format_usage(inner, formatter)
-        main_command.format_help_text(inner, formatter)
-        main_command.format_options(inner, formatter)
+        main_command.format_help(inner, formatter)
         with formatter.section(f"Subcommands; without one it is {name}"):
             formatter.write_dl(
                 [(each.name, each.get_short_help_str(200)) for each in self.commands.values()]
             )
-        main_command.format_epilog(inner, formatter)
 
 
 class _Unloaded(TyperCommand):
@@ -120,32 +106,14 @@ class _Unloaded(TyperCommand):
 class _Commands(TyperGroup):
     """The subcommands of `COMMANDS`; what fails in one of them becomes a sentence."""
 
-    def list_commands(self, ctx: Any) -> list[str]:
-        return list(COMMANDS)
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        if cmd_name not in COMMANDS:
-            return None
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
         # The whole sentence: of its own accord the list of the commands cuts it.
-        return _Unloaded(cmd_name, short_help=COMMANDS[cmd_name])
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if args and args[0] not in COMMANDS:
-            _refuse_misspelt(args[0], list(COMMANDS), "perchctl ")
-        return super().resolve_command(ctx, args)
+        self.commands = {name: _Unloaded(name, short_help=COMMANDS[name]) for name in COMMANDS}
 
     def invoke(self, ctx: Any) -> Any:
         with report_failures("--json" in ctx.args):
             return super().invoke(ctx)
-
-
-def _refuse_misspelt(word: str, names: list[str], path: str) -> None:
-    """Raises UsageError if a word looks like one of the commands below `path`, misspelt."""
-    is_word = word.replace("-", "").isalpha()  # a file or a source has more in its name
-    if is_word and (close := difflib.get_close_matches(word, names, 1, _CLOSE)):
-        raise UsageError(
-            f"{path}{word} is no command; did you mean {path}{close[0]}? ({path}--help lists all)"
-        )
 
 
 def new_app(cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
@@ -184,7 +152,7 @@ def command(
             sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
             raise typer.Exit(code or 0)
 
-        return group.command(cls=Command, epilog=epilog, **settings)(do)
+        return group.command(epilog=epilog, **settings)(do)
 
     return add
 
@@ -221,10 +189,6 @@ JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on std
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 ViewOption = Annotated[
     bool, typer.Option("--view", help="Serve a live page on 127.0.0.1 and print its address.")
-]
-ViewPortOption = Annotated[
-    int,
-    typer.Option("--view-port", min=0, max=65535, help="Port of the live page; 0: any free one."),
 ]
 CamOption = Annotated[
     str | None,
@@ -263,7 +227,7 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
     except KeyboardInterrupt:
         _leave("Ctrl-C", Interrupted.exit_code, as_json)
     except BrokenPipeError:
-        _drop_stdout()
+        drop_stream(sys.stdout)
         raise typer.Exit(PerchError.exit_code) from None
     except Exception as error:
         if hasattr(error, "format_message"):  # wrong usage, which typer prints
@@ -272,10 +236,12 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
             raise
         if os.environ.get("PERCHCTL_DEBUG"):
             raise
-        sentence = _place_refused(error)
-        if sentence is not None:
-            if not getattr(error, "filename", None):
-                _drop_stdout()
+        if isinstance(error, OSError) and error.errno in _REFUSED:
+            if error.filename is None:
+                drop_stream(sys.stdout)
+            place = str(error.filename or "the result")[:_LONGEST_PLACE]
+            advice = _REFUSED[error.errno]
+            sentence = f"{place} cannot be written: {error.strerror}: {advice}"
             _leave(sentence, InvalidValue.exit_code, as_json)
         _leave(
             f"unforeseen {type(error).__name__}: {error} "
@@ -286,7 +252,7 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
 
 
 def _leave(sentence: str, code: int, as_json: bool) -> NoReturn:
-    _complain(sentence)
+    say(sentence)
     if as_json:
         _print_failure(sentence, code)
     raise typer.Exit(code) from None
@@ -296,28 +262,7 @@ def _print_failure(sentence: str, code: int) -> None:
     try:
         print(failure_record(sentence, code), flush=True)
     except OSError:
-        _drop_stdout()
-
-
-def _drop_stdout() -> None:
-    """Discard what stdout still holds, so that it does not fail again at the program's end."""
-    with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _place_refused(error: Exception) -> str | None:
-    """Return the sentence for a place that the operating system refused, if no caller has written
-    one; a full disk has the same exit code everywhere."""
-    if not isinstance(error, OSError):
-        return None
-    if error.errno in _NO_ROOM:
-        place = error.filename or "the result"
-        return f"{place} cannot be written: {error.strerror}: free some space"
-    if error.errno in _BAD_PLACE and error.filename:
-        name = str(error.filename)
-        shown = name if len(name) <= 200 else f"{name[:197]}..."
-        return f"{shown} cannot be used: {error.strerror}: choose another place"
-    return None
+        drop_stream(sys.stdout)
 
 
 @contextlib.contextmanager
@@ -334,15 +279,10 @@ def _notes() -> Iterator[None]:
                 show_others(message, category, *place, **more)
             elif str(message) not in printed:
                 printed.add(str(message))
-                _complain(str(message))
+                say(str(message))
 
         warnings.showwarning = show
         yield
-
-
-def _complain(sentence: str) -> None:
-    with contextlib.suppress(OSError):  # a terminal that is closed keeps the exit code
-        print(f"perchctl: {sentence}", file=sys.stderr, flush=True)
 
 
 def _print_version(wanted: bool) -> None:

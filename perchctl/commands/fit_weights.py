@@ -24,11 +24,10 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import count_bar
-from perchctl.errors import NotFound, PerchError, UsageError, no_simulator
+from perchctl.errors import PerchError, UsageError, no_simulator
 from perchctl.files import check_output, same_file
-from perchctl.places import data_folder, user_config_folder
 from perchctl.positioning import open_capture
-from perchctl.profile import Profile, find_weights, load_profile
+from perchctl.profile import Profile, load_profile
 from perchctl.vision import CameraModel
 from perchctl.weights import (
     Experiment,
@@ -46,7 +45,7 @@ app = new_app(Group)
 
 @command(
     app,
-    "perchctl fit-weights session.csv -p sim",
+    "perchctl fit-weights session.csv",
     "perchctl fit-weights session.csv --test other.csv",
     "perchctl fit-weights session.csv -o weights.yaml --method lms",
 )
@@ -54,9 +53,8 @@ def fit(
     data: Annotated[
         list[Path] | None, typer.Argument(help="CSV files, as fit-weights collect writes them.")
     ] = None,
-    profile: ProfileOption = "sim",
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Weights file; else the profile's.")
+        Path | None, typer.Option("--output", "-o", help="Weights file to write.")
     ] = None,
     test: Annotated[
         Path | None, typer.Option("--test", help="Judge the weights on this other data too.")
@@ -83,75 +81,28 @@ def fit(
         if any(same_file(output, file) for file in files):
             raise UsageError(f"{output} is the data itself; write the result to another file")
         check_output(output, (".yaml", ".yml"), force)
-    # The weights file may not be there yet: this command makes it.
-    config = load_profile(profile, with_weights=False)
     result = fit_weights(files, method, test)
     if not as_json:
         print(report_text(result), flush=True)
-    file: Path | None = None
     problem: PerchError | None = None
-    try:
-        file = _place_for_weights(config, output, any(result.proven), anyway, force)
-        if file is not None:
-            date = datetime.now(UTC).isoformat(timespec="seconds")
-            write_weights(file, result, date, anyway=anyway)
-            say(f"weights: {file}")
-            if config.merge.method != "weights":
-                say(
-                    f"profile {config.name} merges by {config.merge.method}: these weights fly "
-                    f"with merge.method: weights and merge.weights_file: {file.name}"
-                )
-    except PerchError as error:  # the weights are known, and are printed all the same
-        problem = error
+    if output is None:
+        say("no file written: name one with -o")
+    elif any(result.proven) or anyway:
+        date = datetime.now(UTC).isoformat(timespec="seconds")
+        write_weights(output, result, date, anyway=anyway)
+        say(f"weights: {output}; they fly with merge.method: weights and merge.weights_file")
+    else:
+        problem = PerchError(
+            f"{output} not written: on no axis do the weights beat the better single marker beyond "
+            f"the interval; take more positions, or write them all the same with --anyway"
+        )
         say(str(problem))
     code = 0 if problem is None else problem.exit_code
     if as_json:
         failure = {} if problem is None else {"error": str(problem), "exit_code": code}
-        print_result(weights_record(result) | {"weights_file": file and str(file)} | failure)
+        written = None if problem or output is None else str(output)
+        print_result(weights_record(result) | {"weights_file": written} | failure)
     return code
-
-
-def _place_for_weights(
-    profile: Profile, output: Path | None, recommended: bool, anyway: bool, force: bool
-) -> Path | None:
-    """Return where the weights are to be written: `-o`, else the profile's file; None, after a
-    sentence, if they are not written. Raises PerchError if `-o` names a file and the weights are
-    not recommended."""
-    place = output or _profile_file(profile)
-    if place is None:
-        say(
-            "no file written: name one with -o, or in the profile (merge.weights_file)"
-            if recommended
-            else "no file written: the weights are not recommended"
-        )
-        return None
-    if place.exists() and not force:
-        say(f"{place} exists already and stays as it is; add --force to replace it")
-        return None
-    if recommended or anyway:
-        return place
-    sentence = (
-        f"{place} not written: on no axis do the weights beat the better single marker beyond "
-        f"the interval; take more positions, or write them all the same with --anyway"
-    )
-    if output is not None:
-        raise PerchError(sentence)
-    say(sentence)
-    return None
-
-
-def _profile_file(profile: Profile) -> Path | None:
-    """Return the path of the profile's weights file, which may not exist yet."""
-    name = profile.merge.weights_file
-    if name is None:
-        return None
-    try:
-        return find_weights(name)
-    except NotFound:
-        missing = Path(name)
-        if missing.parent == data_folder("profiles").resolve():
-            return user_config_folder() / "weights" / missing.name
-        return missing
 
 
 # --- collect -----------------------------------------------------------------------------------
@@ -195,7 +146,7 @@ def collect(
         poses = TypedTruth() if truth == "typed" else _open_capture(config, target_body)
         with closing(poses):
             _collect_with_person(session, config, camera, positions, frames, poses, source)
-    say(f"{session} is complete: perchctl fit-weights {session} -p {profile} fits the weights")
+    say(f"{session} is complete: perchctl fit-weights {session} -o weights.yaml fits the weights")
 
 
 def _open_session(path: Path, frames: int) -> SessionFile:

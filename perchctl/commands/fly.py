@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import sys
 import textwrap
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime
@@ -26,20 +25,16 @@ from perchctl.commands.command_line import (
     SourceOption,
     UriOption,
     ViewOption,
-    ViewPortOption,
     command,
     new_app,
 )
-from perchctl.commands.guide import page_port
 from perchctl.commands.interrupt import draw_unless_interrupted, ignore_signals, signals_to_operator
 from perchctl.commands.output import ask_to_confirm, print_lines, print_result, say
 from perchctl.commands.picture_edges import picture_edges
 from perchctl.display import (
     FlightPage,
-    failed_card,
     live_page,
     open_panel,
-    summary_card,
 )
 from perchctl.errors import (
     EXIT_CODES,
@@ -59,16 +54,14 @@ from perchctl.flight import (
     fly_session,
     require_comparison,
 )
-from perchctl.mission import Event, EventKind, FlightReport, Outcome, Phase, Watcher
+from perchctl.mission import FlightReport, Outcome, Phase, Watcher
 from perchctl.profile import (
     PositioningConfig,
     Profile,
     find_calibration,
     find_mask,
     find_profile,
-    find_weights,
     load_profile,
-    read_weights,
 )
 from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log
 from perchctl.target import mm_text, overhead_text
@@ -119,7 +112,6 @@ def fly(
         bool, typer.Option("--json", help="One JSON object on stdout at the end.")
     ] = False,
     view: ViewOption = False,
-    view_port: ViewPortOption = 0,
 ) -> int:
     """Fly the seven phases: find the target, align, ascend, perch, stop the motors.
 
@@ -136,7 +128,7 @@ def fly(
     asks = not (yes or options.simulated)
     if asks and not sys.stdin.isatty():
         raise UsageError(f"about to arm {options.uri}, and there is nobody to ask: add --yes")
-    return fly_and_report(options, as_json, page_port(view, view_port), asks)
+    return fly_and_report(options, as_json, view, asks)
 
 
 def resolve(
@@ -192,30 +184,26 @@ def ask_before_arming(uri: str) -> None:
         raise UsageError("not confirmed: nothing was started")
 
 
-def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: bool = False) -> int:
-    """Fly, log, plot and report how the flight ended; return the exit code. `port` is the live
-    page's; with `asks` somebody at the terminal has to say yes before it arms."""
+def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = False) -> int:
+    """Fly, log, plot and report how the flight ended; return the exit code. `view`: with
+    the live page; with `asks` somebody at the terminal has to say yes before it arms."""
     simulated_seed = options.seed if options.simulated else None
     log = LogWatcher.real_time(
         options.log_dir, options.profile, options.uri, options.source, simulated_seed,
         options.record,
     )  # fmt: skip
     panel = open_panel(stream=sys.stderr)
-    merges = ""
-    if options.profile.merge.method == "weights":
-        merges = f"; merges with {weights_text(options)}"
-        log.event(Event(time.monotonic(), EventKind.NOTE, merges.removeprefix("; ")))
-    say(f"connecting to {options.uri}{merges}")
+    say(f"connecting to {options.uri}")
     switch, page = OperatorSwitch(), None
     # Once it has landed nothing is left to stop, but much to tell.
     with ignore_signals(), contextlib.ExitStack() as stack:
         try:
-            page = stack.enter_context(flight_page(options, port, switch))
+            page = stack.enter_context(flight_page(options, view, switch))
             report, miss_m = _session(options, log, panel, switch, page, asks)
         except BaseException as error:
             # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
             if page is not None:
-                page.end(failed_card(error, log.path if log.begun else None))
+                page.fail(error, log.path if log.begun else None)
             log.abandon(str(error) or type(error).__name__)
             raise
         finally:
@@ -224,7 +212,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: b
         assert summary is not None
         print_lines(summary.text(log.path), stdout=not as_json)
         if page is not None:
-            page.end(summary_card(summary, log.path))
+            page.end(summary, log.path)
     code = exit_code(report.outcome, summary)
     plot = draw_unless_interrupted(lambda: plot_of(log.path, options.profile))
     if plot is not None:
@@ -292,16 +280,14 @@ def _session(
 
 @contextlib.contextmanager
 def flight_page(
-    options: FlyOptions, port: int | None, switch: OperatorSwitch
+    options: FlyOptions, view: bool, switch: OperatorSwitch
 ) -> Iterator[FlightPage | None]:
-    """Yield the page of `--view`, whose STOP lands by the switch; None without it.
-
-    Errors: InvalidValue for a port in use."""
-    if port is None:
+    """Yield the page of `--view`, whose STOP lands by the switch; None without it."""
+    if not view:
         yield None
         return
     profile, title = options.profile, f"perchctl fly {options.uri}"
-    with live_page(profile_camera(profile.camera), title, port, say, switch.land) as page:
+    with live_page(profile_camera(profile.camera), title, view, say, switch.land) as page:
         yield None if page is None else FlightPage(page, profile.target.large.side_m)
 
 
@@ -350,80 +336,70 @@ def plan_text(options: FlyOptions) -> str:
     resolved, profile, planner = plan(options), options.profile, options.profile.planner
     camera, large, small = profile.camera, profile.target.large, profile.target.small
     search, align, ascend, perch = planner.search, planner.align, planner.ascend, planner.perch
-    seed = f", seed {options.seed}" if options.simulated else ""
-    cam = f" {camera.cam}" if camera.cam else ""
     mask = f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""
     turn = " ".join(f"{angle:g}" for angle in camera.mount.rpy_deg)
-    mirrored = ", mirrored" if camera.mirrored else ""
+    edges = picture_edges(camera.mount, camera.mirrored)
     late = camera.latency_s
-    latency = late if isinstance(late, str) else f"{late * 1e3:g} ms"
-    merge = weights_text(options) if profile.merge.method == "weights" else "joint solve"
-    press = (
-        f"press {perch.press_m} m above" if perch.mode != "raw" else f"raw thrust {perch.thrust}"
-    )
-    pictures = f", with pictures up to {profile.log.max_mb:g} MB" if options.record else ""
-    text = f"""\
-vehicle      {options.uri}{seed}
-camera       {resolved["source"]}, calibration {resolved["calibration_file"]}{cam}{mask}
-positioning  {_positioning(options)}
-profile      {resolved["profile_file"]}: {profile.description}
-target       {large.side_m * 1e3:g} mm {large.dictionary}/{large.id} around \
-{small.side_m * 1e3:g} mm {small.dictionary}/{small.id}{_expected_place(profile)}
-gear         tip at {_mm(profile.vehicle.gear_body_m)} (forward, left, up)
-mounting     camera at {_mm(camera.mount.position_m)}, rpy {turn} deg{mirrored}\
-{_edges_of_the_picture(profile)}
-latency      {latency} from exposure to arrival
-merge        {merge}
-1 APPROACH   take off to {planner.takeoff_height_m:g} m
-2 SEARCH     {search.attempts} attempts of {search.wait_s:g} s, {search.step_m:g} m higher each, \
-at most {search.max_height_m:g} m
-3 ESTIMATE   {planner.estimate.dwell_s:g} s of steady pose
-4 ALIGN      within {align.xy_m * 1e3:g} mm and {align.yaw_deg:g} deg for {align.dwell_s:g} s
-5 ASCEND     at {ascend.speed_mps:g} m/s to {ascend.standoff_m * 1e3:g} mm under the target, \
-settle within {ascend.settle_xy_m * 1e3:g} mm
-6 PERCH      {press}, at most {perch.timeout_s:g} s
-7 COMPLETE   release in {planner.complete.steps} steps, watch for {planner.complete.watch_s:g} s
-attempts     {planner.attempts}, perching time {planner.perching_time_s:g} s
-fence        {profile.safety.fence_radius_m:g} m around the place of take-off
-height       at most {profile.safety.max_height_m:g} m above the ground
-battery      at least {profile.safety.min_rest_v:g} V at rest, \
-{profile.safety.min_load_v:g} V in flight; {_energy_gate(profile)}
-log          {resolved["log_directory"]}{pictures}
-"""
-    for row in resolved["check"]:
-        if row["verdict"] in (Verdict.WARN, Verdict.FAIL):
-            text += f"{row['verdict']:{_COLUMN}}{row['name']}: {row['found']}; {row['advice']}\n"
+    rows = [
+        ("vehicle", f"{options.uri}{f', seed {options.seed}' if options.simulated else ''}"),
+        ("camera", f"{resolved['source']}, calibration {resolved['calibration_file']}{mask}"),
+        ("positioning", _positioning(options)),
+        ("profile", f"{resolved['profile_file']}: {profile.description}"),
+        (
+            "target",
+            f"{large.side_m * 1e3:g} mm {large.dictionary}/{large.id} around "
+            f"{small.side_m * 1e3:g} mm {small.dictionary}/{small.id}",
+        ),
+        ("gear", f"tip at {_mm(profile.vehicle.gear_body_m)} (forward, left, up)"),
+        (
+            "mounting",
+            f"camera at {_mm(camera.mount.position_m)}, rpy {turn} deg"
+            f"{', mirrored' if camera.mirrored else ''}"
+            + (f": picture's {edges[0]} is the front, {edges[1]} the left side" if edges else ""),
+        ),
+        ("latency", late if isinstance(late, str) else f"{late * 1e3:g} ms"),
+        ("merge", _merge_text(profile)),
+        ("1 APPROACH", f"take off to {planner.takeoff_height_m:g} m"),
+        (
+            "2 SEARCH",
+            f"{search.attempts} attempts of {search.wait_s:g} s, {search.step_m:g} m higher each, "
+            f"at most {search.max_height_m:g} m",
+        ),
+        ("3 ESTIMATE", f"{planner.estimate.dwell_s:g} s of steady pose"),
+        (
+            "4 ALIGN",
+            f"within {align.xy_m * 1e3:g} mm and {align.yaw_deg:g} deg for {align.dwell_s:g} s",
+        ),
+        (
+            "5 ASCEND",
+            f"at {ascend.speed_mps:g} m/s to {ascend.standoff_m * 1e3:g} mm under the target, "
+            f"settle within {ascend.settle_xy_m * 1e3:g} mm",
+        ),
+        ("6 PERCH", f"at most {perch.timeout_s:g} s"),
+        ("7 COMPLETE", f"watch for {planner.complete.watch_s:g} s"),
+        ("attempts", f"{planner.attempts}, perching time {planner.perching_time_s:g} s"),
+        (
+            "limits",
+            f"{profile.safety.fence_radius_m:g} m around the place of take-off, "
+            f"{profile.safety.max_height_m:g} m above the ground; battery "
+            f"{profile.safety.min_rest_v:g} V at rest, {profile.safety.min_load_v:g} V in flight",
+        ),
+        ("log", f"{resolved['log_directory']}{', with pictures' if options.record else ''}"),
+    ]
+    rows += [
+        (row["verdict"], f"{row['name']}: {row['found']}; {row['advice']}")
+        for row in resolved["check"]
+        if row["verdict"] in (Verdict.WARN, Verdict.FAIL)
+    ]
     return "\n".join(
         textwrap.fill(
-            line,
+            f"{name:{_COLUMN}}{text}",
             _WIDTH,
             subsequent_indent=" " * _COLUMN,
             break_long_words=False,
             break_on_hyphens=False,
         )
-        for line in text.splitlines()
-    )
-
-
-def _expected_place(profile: Profile) -> str:
-    target = profile.target
-    if target.expected_xy_m is None:
-        return ""
-    x_m, y_m = target.expected_xy_m
-    return f", within {target.expected_within_m:g} m of x {x_m:g} m, y {y_m:g} m"
-
-
-def _edges_of_the_picture(profile: Profile) -> str:
-    edges = picture_edges(profile.camera.mount, profile.camera.mirrored)
-    return "" if edges is None else f": picture's {edges[0]} is the front, {edges[1]} the left side"
-
-
-def _energy_gate(profile: Profile) -> str:
-    if not profile.safety.energy_gate:
-        return "attempts begin whatever it has left"
-    return (
-        f"{profile.vehicle.battery_mah:g} mAh; no attempt without enough for its landing and "
-        f"{profile.safety.energy_reserve_s:g} s"
+        for name, text in rows
     )
 
 
@@ -444,15 +420,10 @@ def _mm(place_m: tuple[float, float, float]) -> str:
     return f"{' '.join(mm_text(part) for part in place_m)} mm"
 
 
-def weights_text(options: FlyOptions) -> str:
-    """Return which merge weights fly, and the file that they are from, with its date and data."""
-    merge = options.profile.merge
+def _merge_text(profile: Profile) -> str:
+    """Return how the markers are merged; of weights also where they are from."""
+    merge = profile.merge
+    if merge.method != "weights":
+        return "joint solve"
     numbers = ", ".join(f"{axis} {w:g}" for axis, w in merge.weights.model_dump().items())
-    if merge.weights_file is None:
-        return f"weights {numbers} (of the profile)"
-    path = find_weights(merge.weights_file)
-    fitted = read_weights(path)
-    return (
-        f"weights {numbers} (from {path}: {fitted.date}, {fitted.method}, data "
-        f"{fitted.data.sha256[:12]})"
-    )
+    return f"weights {numbers} ({merge.weights_file or 'of the profile'})"

@@ -17,16 +17,9 @@ from perchctl.flight import OperatorSwitch
 Handler = Callable[[int, FrameType | None], None]
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-
-def _known(*names: str) -> tuple[signal.Signals, ...]:
-    """Return those signals that the operating system has."""
-    return tuple(signal.Signals[name] for name in names if name in signal.Signals.__members__)
-
-
-LANDING_SIGNALS = _known("SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
+LANDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """End or suspend a program elsewhere; a flight they land."""
-_MUTED = _known("SIGTTOU", "SIGTTIN")  # would suspend a flight in a shell's background
-_SUSPENDING = _known("SIGTSTP")
+_MUTED = (signal.SIGTTOU, signal.SIGTTIN)  # would suspend a flight in a shell's background
 _NO_SUSPENDING = "Ctrl-Z does not suspend a flight: landing"
 
 
@@ -90,7 +83,7 @@ def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str
                 switch.press()
             elif number in LANDING_SIGNALS:
                 switch.land()
-        if switch.listening and any(number in _SUSPENDING for number in numbers):
+        if switch.listening and signal.SIGTSTP in numbers:
             # Not from this thread: a terminal that stands still would hold up the signals.
             threading.Thread(target=report, args=(_NO_SUSPENDING,), daemon=True).start()
 

@@ -12,13 +12,11 @@ import typer
 from perchctl.analysis import (
     Comparison,
     FlightAnalysis,
-    list_text,
     newest_logs,
     show_record,
     show_text,
     write_report,
 )
-from perchctl.analysis import list_logs as listed_logs
 from perchctl.analysis import replay as replay_flight
 from perchctl.commands.command_line import (
     ForceOption,
@@ -55,21 +53,17 @@ app = new_app(Group)
 
 
 def _log_file(place: Path | None) -> Path:
-    """Return the log that is named; else the newest of the folder, which is then printed.
+    """Return the log that is named; else the newest of the folder, which is then printed; by
+    default of where `fly` puts the logs unless a profile says otherwise.
 
     Errors: NotFound.
     """
     if place is not None and not place.is_dir():
         return place
-    (newest,) = newest_logs(_folder(place), 1)
+    folder = Path(Profile().log.directory) if place is None else place
+    (newest,) = newest_logs(folder, 1)
     say(f"the newest log: {newest}")
     return newest
-
-
-def _folder(place: Path | None) -> Path:
-    """Return the folder that is named; else where `fly` puts the logs unless a profile says
-    otherwise."""
-    return Path(Profile().log.directory) if place is None else place
 
 
 @contextlib.contextmanager
@@ -89,7 +83,7 @@ def _opened(path: Path) -> Iterator[FlightLog]:
     app,
     "perchctl log show",
     "perchctl log show perchctl-logs/flight.jsonl --json",
-    "perchctl log list -n 20",
+    "perchctl log show perchctl-logs",
     short_help="Show a flight: how it ended and why, its phases, holds, battery, frames, findings.",
 )
 def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
@@ -101,26 +95,6 @@ def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
     with _opened(_log_file(file)) as log:
         analysis = FlightAnalysis(log)
         print_result(show_record(analysis) if as_json else show_text(analysis))
-
-
-@command(
-    app,
-    "perchctl log list",
-    "perchctl log list logs -n 30",
-    "perchctl log list --json",
-    name="list",
-)
-def list_logs(
-    folder: Annotated[
-        Path | None, typer.Argument(help="The folder of the logs. Default: perchctl-logs.")
-    ] = None,
-    count: Annotated[int, typer.Option("--count", "-n", min=1, help="How many logs.")] = 10,
-    as_json: JsonOption = False,
-) -> None:
-    """List the newest logs of a folder, a line each."""
-    place = _folder(folder)
-    logs = listed_logs(place, count)
-    print_result({"folder": str(place), "logs": logs} if as_json else list_text(logs))
 
 
 @command(
@@ -138,19 +112,16 @@ def plot(
         ),
     ] = None,
     force: ForceOption = False,
-    as_json: JsonOption = False,
 ) -> None:
-    """Draw a flight: detections, lost frames, height, battery, the last seconds."""
+    """Draw a flight: errors, detections, lost frames, height, battery, the last seconds."""
     path = _log_file(file)
     picture = output or path_beside(path, ".png")
     with _opened(path) as log:
         check_output(picture, FORMATS, force, DRAWN_IN)
-        outcome = FlightAnalysis(log).summary.outcome
     from perchctl.analysis import plot_flight
 
     plot_flight(log, picture)
-    record = {"log": str(path), "plot": str(picture), "outcome": outcome}
-    print_result(record if as_json else f"plot:      {picture}")
+    print(f"plot:      {picture}")
 
 
 @command(
@@ -175,7 +146,7 @@ def compare(
     app,
     "perchctl log export",
     "perchctl log export perchctl-logs/flight.jsonl -o flight.csv",
-    "perchctl log export --force --json",
+    "perchctl log export perchctl-logs --force",
 )
 def export(
     file: LogArgument = None,
@@ -184,7 +155,6 @@ def export(
         typer.Option("--output", "-o", help="The file: .csv. Default: beside the log."),
     ] = None,
     force: ForceOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Write a log as a table that other programs open."""
     path = _log_file(file)
@@ -193,12 +163,8 @@ def export(
     with _opened(path) as log:
         table = log.csv()
     write_files({place: table.encode("utf-8", errors="backslashreplace")})
-    rows, columns = len(log.records), table.partition("\n")[0].count(",") + 1
-    if as_json:
-        found = {"log": str(path), "output": str(place), "format": "csv"}
-        print_result(found | {"rows": rows, "columns": columns})
-    else:
-        print(f"export:    {place} ({rows} rows, {columns} columns)")
+    columns = table.partition("\n")[0].count(",") + 1
+    print(f"export:    {place} ({len(log.records)} rows, {columns} columns)")
 
 
 @command(
@@ -315,7 +281,6 @@ def film(
         int, typer.Option("--width", min=320, max=1920, help="Width of the film, in pixels.")
     ] = 960,
     force: ForceOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Make a film of a flight: the camera's picture, a side view to scale, error and thrust.
 
@@ -332,8 +297,5 @@ def film(
     from perchctl.analysis import write_film
 
     pictures = recorded_pictures(path, exact=False) if is_recorded else None
-    count = write_film(flight, pictures, place, rate_hz, width_px)
-    if as_json:
-        print_result({"log": str(path), "film": str(place), "pictures": count})
-    else:
-        print(f"film:      {place}")
+    write_film(flight, pictures, place, rate_hz, width_px)
+    print(f"film:      {place}")

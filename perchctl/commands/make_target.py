@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,7 +21,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.output import print_result
 from perchctl.errors import InvalidValue, UsageError
-from perchctl.files import check_place, write_files
+from perchctl.files import check_output, write_files
 from perchctl.profile import (
     MarkerConfig,
     Profile,
@@ -45,7 +44,6 @@ from perchctl.target import (
 from perchctl.vision import CameraModel
 
 SIDE_LIMITS_M = (0.004, 2.0)
-ANOTHER = "Another target than the profile's"
 
 PageOption = Annotated[str, typer.Option("--page", help="a4, letter, a3, or 220x240mm.")]
 MagnetOption = Annotated[
@@ -54,7 +52,7 @@ MagnetOption = Annotated[
 
 
 def _of_target(name: str, text: str, **limits: Any) -> Any:
-    return typer.Option(name, help=text, rich_help_panel=ANOTHER, **limits)
+    return typer.Option(name, help=text, **limits)
 
 
 LargeOption = Annotated[
@@ -117,7 +115,6 @@ def sheet(
     page: PageOption = "a4",
     magnet: MagnetOption = "50mm",
     force: ForceOption = False,
-    as_json: JsonOption = False,
     large: LargeOption = None,
     large_id: LargeIdOption = None,
     large_dict: LargeDictOption = None,
@@ -132,15 +129,11 @@ def sheet(
     config = load_profile(profile)
     target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
     magnet_m = parse_length(magnet, "--magnet")
-    _check_pdf(output)
-    pdf = target_pdf(target, page, magnet_m, *_origin(config, target))
-    lines = [
-        f"wrote {output}",
-        "both markers are read from the drawing",
-        "print at 100 % and measure both rulers: 100 mm each",
-    ]
-    record = {"target": target.model_dump(mode="json")}
-    _write({output: pdf}, lines, record, force, as_json)
+    check_output(output, (".pdf",), force, "what is printed")
+    write_files({output: target_pdf(target, page, magnet_m, *_origin(config, target))})
+    print(f"wrote {output}")
+    print("both markers are read from the drawing")
+    print("print at 100 % and measure both rulers: 100 mm each")
 
 
 @command(
@@ -162,26 +155,22 @@ def board(
     ),
     page: PageOption = "a4",
     force: ForceOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Print a calibration board, in the notation that calibrate reads."""
     printed = Board.parse(notation)
     if printed.scale != (1.0, 1.0):
         raise UsageError(f"{notation}: a board is printed as meant; leave out :measured=")
-    _check_pdf(output)
-    lines = [
-        f"wrote {output}",
-        "print at 100 %, glue it on something flat, and measure both rulers: 100 mm each",
-    ]
-    record = {"board": printed.notation()}
-    _write({output: board_pdf(printed, page)}, lines, record, force, as_json)
+    check_output(output, (".pdf",), force, "what is printed")
+    write_files({output: board_pdf(printed, page)})
+    print(f"wrote {output}")
+    print("print at 100 %, glue it on something flat, and measure both rulers: 100 mm each")
 
 
 @command(
     app,
     "perchctl make-target design",
     "perchctl make-target design example_640x480.yaml --ceiling 2.4 --blur 2.0",
-    "perchctl make-target design -p my_vehicle.yaml --large 120mm --small 20mm",
+    "perchctl make-target design -p my_vehicle.yaml",
 )
 def design(
     camera: CameraArgument = None,
@@ -190,20 +179,13 @@ def design(
     blur: BlurOption = 1.0,
     cam: CamOption = None,
     as_json: JsonOption = False,
-    large: LargeOption = None,
-    large_id: LargeIdOption = None,
-    large_dict: LargeDictOption = None,
-    small: SmallOption = None,
-    small_id: SmallIdOption = None,
-    small_dict: SmallDictOption = None,
 ) -> None:
     """Compute from where to where a camera sees each marker, and where a gap is."""
     config = load_profile(profile)
     name, model = _camera(config, camera, cam)
-    target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
-    found = make_design(target, model, blur, config, ceiling)
-    record = found.record() | {"target": target.model_dump(mode="json")}
-    _write({}, [found.text(name)], record, False, as_json)
+    found = make_design(config.target, model, blur, config, ceiling)
+    record = found.record() | {"target": config.target.model_dump(mode="json")}
+    print_result(record if as_json else found.text(name))
 
 
 @command(
@@ -234,7 +216,8 @@ def suggest(
         f"--small-dict {small.dictionary} --page {held_by}"
     )
     record = {"command": command, "target": found.target.model_dump(mode="json")}
-    _write({}, [command, "", found.text(name)], record | found.record(), False, as_json)
+    text = f"{command}\n\n{found.text(name)}"
+    print_result(record | found.record() if as_json else text)
 
 
 @command(
@@ -257,12 +240,6 @@ def measured(
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
-    large: LargeOption = None,
-    large_id: LargeIdOption = None,
-    large_dict: LargeDictOption = None,
-    small: SmallOption = None,
-    small_id: SmallIdOption = None,
-    small_dict: SmallDictOption = None,
 ) -> None:
     """Write the sizes that were measured on the print into the profile that flies."""
     if measured_large is None and measured_small is None:
@@ -276,13 +253,12 @@ def measured(
     config = load_profile(profile)
     if not force:
         raise InvalidValue(f"{path} exists already; add --force to write the sizes into it")
-    nominal = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
     sides_m = {
         name: parse_length(text, f"--measured-{name}", bare_unit="mm")
         for name, text in (("large", measured_large), ("small", measured_small))
         if text is not None
     }
-    found, notes = measured_target(nominal, sides_m)
+    found, notes = measured_target(config.target, sides_m)
     values = _changed_values(found, config.target)
     before = write_profile_values(path, values) if values else None
     lines = [*notes, f"changed {path}: fly -p {path}"]
@@ -359,22 +335,3 @@ def _origin(profile: Profile, target: TargetConfig) -> tuple[str, datetime.date 
     if target == profile.target:
         return f"profile {profile.name}", profile.date
     return "sizes from the command line", None
-
-
-def _check_pdf(path: Path) -> None:
-    if path.suffix.lower() != ".pdf":
-        raise UsageError(f"-o {path}: the file must end in .pdf")
-
-
-def _write(
-    files: Mapping[Path, bytes],
-    lines: list[str],
-    record: dict[str, Any],
-    force: bool,
-    as_json: bool,
-) -> None:
-    """Write all files, then print what was done."""
-    for path in files:
-        check_place(path, force)
-    write_files(files)
-    print_result({"files": [str(path) for path in files]} | record if as_json else "\n".join(lines))

@@ -6,9 +6,10 @@ import contextlib
 import json
 import os
 import sys
+import termios
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 
 def say(sentence: str) -> None:
@@ -25,17 +26,19 @@ def print_lines(text: str, stdout: bool = False) -> None:
     except (OSError, ValueError) as error:
         if stdout and isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
             say(f"the result cannot be written: {error.strerror}; free some space")
-        with contextlib.suppress(OSError, ValueError):
-            # What is left in the buffer must not fail at the program's end.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        drop_stream(stream)
+
+
+def drop_stream(stream: TextIO) -> None:
+    """Discard what the stream still holds, so that it does not fail again at the program's end."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def ask_to_confirm(question: str) -> bool:
     """Return True if somebody at the terminal says yes now: what was typed before the question
     appeared is no answer to it."""
-    with contextlib.suppress(ImportError, OSError, ValueError, AttributeError):
-        import termios  # which Windows lacks
-
+    with contextlib.suppress(OSError, ValueError, AttributeError, termios.error):
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
     # On stderr: stdout is for the result.
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)

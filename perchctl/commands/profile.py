@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
-import os
-import re
 import shlex
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -87,274 +84,56 @@ def _say_doubts(profile: Profile) -> None:
             say(f"{row.name}: {row.found}; {row.advice}")
 
 
-# --- A new profile: the questions ---------------------------------------------------------------
+# --- A new profile ------------------------------------------------------------------------------
 
 EXAMPLE = "example_640x480.yaml"
-AIDECKS_EXAMPLE = "example_aideck_324x244.yaml"
-NONE_YET = "none"
-SIMULATED, RADIO = "sim://", "radio://0/80/2M/E7E7E7E7E7"
-MOST_MM = 300.0
-"""How far from the vehicle's centre the profile allows a camera or a gear on each axis."""
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)")
-
-Answers = Mapping[str, Any]
-"""Parsed answers by their question's name."""
-
-
-@dataclass(frozen=True)
-class Question:
-    """One question of the dialogue; each function gets the answers to those before it.
-
-    `default` gives the text that Enter stands for, `parse` the answer, or raises InvalidValue or
-    NotFound. `hint` stands behind the text.
-    """
-
-    name: str
-    option: str
-    text: str
-    default: Callable[[Answers], str]
-    parse: Callable[[str, Answers], Any]
-    hint: Callable[[Answers], str] = lambda _: ""
-
-
-def collect_answers(
-    given: Mapping[str, str], open_question: Callable[[Question, Answers], Any]
-) -> dict[str, Any]:
-    """Return the answers to all questions: by the options that are `given`, or else by
-    `open_question`.
-
-    Raises InvalidValue and NotFound, each with the option's name.
-    """
-    answers: dict[str, Any] = {}
-    for question in QUESTIONS:
-        if question.name not in given:
-            answers[question.name] = open_question(question, answers)
-            continue
-        try:
-            answers[question.name] = question.parse(given[question.name].strip(), answers)
-        except PerchError as error:
-            raise type(error)(f"{question.option}: {error}") from None
-    return answers
-
-
-def _by_default(question: Question, answers: Answers) -> Any:
-    return question.parse(question.default(answers), answers)
-
-
-def _ask_person(question: Question, answers: Answers) -> Any:
-    """Return what somebody types, asked for again until it is valid. Raises UsageError if the
-    input has ended."""
-    default = question.default(answers)
-    while True:
-        # On stderr: stdout is for the result.
-        text = f"{question.text}{question.hint(answers)}\n  [{default}] "
-        print(text, end="", file=sys.stderr, flush=True)
-        try:
-            return question.parse(input().strip() or default, answers)
-        except EOFError:
-            raise UsageError(
-                "there is nobody to ask, and nothing was written: answer by options, or add "
-                "--defaults for what is not answered"
-            ) from None
-        except (PerchError, UnicodeDecodeError) as error:
-            print_lines(f"  {error}")
-
-
-def _uri(text: str, _answers: Answers) -> str:
-    check_uri(text)
-    return text
-
-
-def _source(text: str, answers: Answers) -> str:
-    source = parse_source(text)
-    if source.scheme == "camera" and re.fullmatch(r"\W*(-\d*)?", source.place):
-        raise InvalidValue(f"{text!r} names no camera; write camera:N or camera:NAME")
-    if answers["uri"].startswith(SIMULATED) or (source.scheme != "sim" and source.live):
-        return text
-    raise InvalidValue(
-        f"{source} is no camera that flies with {answers['uri']}; allowed are camera:N, "
-        f"camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH, aideck://HOST"
-    )
-
-
-def _is_aideck(source: str) -> bool:
-    return source.lower().startswith("aideck:")
-
-
-def _calibration(text: str, _answers: Answers) -> Path | None:
-    """Return the file; None for none yet."""
-    if text == NONE_YET:
-        return None
-    path = find_calibration(text)
-    load_calibration(path)
-    return path.resolve()
-
-
-def _one_of(text: str, choices: tuple[str, ...]) -> str:
-    if text not in choices:
-        raise InvalidValue(f"found {text!r}; allowed are {', '.join(choices)}")
-    return text
-
-
-def _numbers(text: str, unit: str, count: int = 1) -> tuple[float, ...]:
-    """Return that many numbers, with spaces or commas between, and the unit or none behind each."""
-    words = re.sub(rf"(?<=[\d.])\s*{unit}(?![a-zA-Z])", " ", text).replace(",", " ").split()
-    if len(words) != count or not all(map(_NUMBER.fullmatch, words)):
-        wanted = "a number" if count == 1 else f"{count} numbers"
-        raise InvalidValue(f"found {text!r}; needed is {wanted}, in {unit}")
-    return tuple(float(word) for word in words)
-
-
-def _within(text: str, unit: str, low: float, high: float) -> float:
-    (value,) = _numbers(text, unit)
-    if not low <= value <= high:
-        raise InvalidValue(f"found {value:g} {unit}; allowed are {low:g} to {high:g} {unit}")
-    return value
-
-
-def _place(text: str, _answers: Answers) -> tuple[float, ...]:
-    """Return metres from three numbers in millimetres."""
-    values = _numbers(text, "mm", 3)
-    if any(values) and all(abs(value) < 1 for value in values):
-        raise InvalidValue(f"found {text!r}: these look like metres; the question is in mm")
-    for value in values:
-        if abs(value) > MOST_MM:
-            raise InvalidValue(
-                f"found {value:g} mm; allowed are {-MOST_MM:g} to {MOST_MM:g} mm on an axis"
-            )
-    return tuple(_thousandth(value) for value in values)
-
-
-def _small(text: str, answers: Answers) -> float:
-    side_mm = _within(text, "mm", 4, 1000)
-    if side_mm >= answers["large"] / 2:
-        raise InvalidValue(f"found {side_mm:g} mm; allowed is less than half of the large square")
-    return side_mm
-
-
-def _thousandth(value: float) -> float:
-    """Return 0.0249 for 24.9, not 0.024899999999999999."""
-    return float(f"{value / 1e3:.12g}")
-
-
-QUESTIONS: tuple[Question, ...] = (
-    Question(
-        "uri", "--uri", "The vehicle's URI: radio://0/80/2M/E7E7E7E7E7, usb://0, sim://, ...",
-        lambda _: RADIO, _uri,
-    ),
-    Question(
-        "source", "--source", "The camera: camera:N (a receiver at /dev/videoN), http://..., aideck://HOST",
-        lambda answers: "sim:" if answers["uri"].startswith(SIMULATED) else "camera:0", _source,
-    ),
-    Question(
-        "calibration", "--calibration",
-        "Its calibration file, of `perchctl calibrate` (none: not yet)",
-        lambda answers: EXAMPLE if answers["source"] == "sim:" else NONE_YET, _calibration,
-    ),
-    Question(
-        "latency", "--latency",
-        "How late the picture is, from exposure to arrival, ms (60 to 100 are usual)",
-        lambda _: "80", lambda text, _: _within(text, "ms", 1, 390),
-    ),
-    Question(
-        "front", "--front-at",
-        "Hold a hand over the front of the vehicle. At which edge of the picture\n"
-        "does it come in: top, right, bottom or left?",
-        lambda _: "top", lambda text, _: _one_of(text, tuple(PICTURE_EDGES)),
-    ),
-    Question(
-        "left", "--left-at", "And a hand over its left side?",
-        lambda answers: edges_beside(answers["front"])[0],
-        lambda text, answers: _one_of(text, edges_beside(answers["front"])),
-        lambda answers: " ({}, or {} if the camera mirrors its picture)".format(
-            *edges_beside(answers["front"])
-        ),
-    ),
-    Question(
-        "camera", "--camera-at",
-        "Where is the lens, from the vehicle's centre: forward, left, up, mm?",
-        lambda _: "30 0 10", _place,
-    ),
-    Question(
-        "gear", "--gear-at", "Where is the tip of the magnet gear, likewise, mm?",
-        lambda _: "0 0 30", _place,
-    ),
-    Question(
-        "large", "--large", "Side of the target's large black square as printed, mm",
-        lambda _: "150", lambda text, _: _within(text, "mm", 20, 2000),
-    ),
-    Question(
-        "small", "--small", "Side of the small one, mm",
-        lambda answers: f"{max(4.0, answers['large'] / 6.0):.4g}", _small,
-    ),
-    Question(
-        "ceiling", "--ceiling", "Height of the ceiling over the floor, m",
-        lambda _: "2.4", lambda text, _: _within(text, "m", 1, 10),
-    ),
-    Question(
-        "fence", "--fence", "Free space around the place of take-off, its radius, m",
-        lambda _: "1.5", lambda text, _: _within(text, "m", 0.3, 20),
-    ),
-)  # fmt: skip
-
-
-def _option(name: str) -> Any:
-    """Return the option that answers a question beforehand."""
-    (question,) = (question for question in QUESTIONS if question.name == name)
-    names = [question.option, "-u"] if name == "uri" else [question.option]
-    return typer.Option(*names, help=question.text)
-
-
-@command(
-    app,
-    "perchctl profile new -o my_vehicle.yaml",
-    "perchctl profile new -u radio://0/80/2M/E7E7E7E7E7 --source camera:0",
-    "perchctl profile new --ceiling 3.1 --defaults",
+SIMULATED = "sim://"
+QUESTIONS: dict[str, str] = {
+    "link.uri": "radio://0/80/2M/E7E7E7E7E7",
+    "camera.source": "camera:0",
+    "camera.calibration": EXAMPLE,
+    "camera.latency_s": "0.08",
+    "front": "top",
+    "left": "left",
+    "camera.mount.position_m": "[0.03, 0, 0.01]",
+    "vehicle.gear_body_m": "[0, 0, 0.03]",
+    "target.large.side_m": "0.15",
+    "target.small.side_m": "0.025",
+    "ceiling": "2.4",
+    "safety.fence_radius_m": "1.5",
+}
+"""What is asked, in this order, with what Enter stands for: keys of the profile, which explains
+them, and the words of `WORDS`. Some defaults depend on earlier answers (`default_answer`)."""
+WORDS: dict[str, str] = {
+    "front": "Hold a hand over the front of the vehicle. At which edge of the picture does it\n"
+    "come in: top, right, bottom or left?",
+    "left": "And a hand over its left side (a camera that mirrors has it at the other edge)?",
+    "ceiling": "Height of the ceiling over the floor, m",
+}
+CEILING_M = (1.0, 10.0)
+OVER_THE_CEILING_M = 0.4
+"""The height limit is so far above the ceiling: an estimate that drifts must not end a flight."""
+FAR_SIGHT_M, NEAR_SIGHT_M, LOW_SEARCH_M = 1.1, 0.5, 1.3
+"""The search goes up to where the ceiling is that near, or to `LOW_SEARCH_M` where that is
+higher and there is room."""
+AIDECK_KEYS = (
+    "kalman.drift_mps2",
+    "kalman.n_max",
+    "planner.ascend.settle_xy_m",
+    "planner.ascend.fresh_s",
+    "safety.max_frame_age_s",
 )
-def new(
-    context: typer.Context,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Profile to write.")] = Path(
-        "my_vehicle.yaml"
-    ),
-    uri: Annotated[str | None, _option("uri")] = None,
-    source: Annotated[str | None, _option("source")] = None,
-    calibration: Annotated[str | None, _option("calibration")] = None,
-    latency: Annotated[str | None, _option("latency")] = None,
-    front: Annotated[str | None, _option("front")] = None,
-    left: Annotated[str | None, _option("left")] = None,
-    camera: Annotated[str | None, _option("camera")] = None,
-    gear: Annotated[str | None, _option("gear")] = None,
-    large: Annotated[str | None, _option("large")] = None,
-    small: Annotated[str | None, _option("small")] = None,
-    ceiling: Annotated[str | None, _option("ceiling")] = None,
-    fence: Annotated[str | None, _option("fence")] = None,
-    defaults: Annotated[
-        bool, typer.Option("--defaults", help="Ask nothing: defaults for what is not given.")
-    ] = False,
-    force: ForceOption = False,
-) -> None:
-    """Write a profile of your vehicle, every key commented, in a short dialogue.
-
-    Options answer questions beforehand; with all of them, or --defaults, nothing is asked. The
-    mounting is described in words: at which edge of the camera's picture a hand over the
-    vehicle's front comes in, and one over its left side.
-    """
-    check_output(output, (".yaml", ".yml"), force, "what a profile is")
-    given = {question.name: context.params[question.name] for question in QUESTIONS}
-    given = {name: text for name, text in given.items() if text is not None}
-    if given.get("source") == "sim:":  # no other vehicle flies by those pictures
-        given.setdefault("uri", SIMULATED)
-    answers = collect_answers(
-        given, _by_default
-    )  # all options are checked before anything is asked
-    if not defaults and len(given) < len(QUESTIONS):
-        print_lines(f"A new profile: {output}. Enter takes what stands in brackets.")
-        answers = collect_answers(given, _ask_person)
-    write_new_profile(output, answers)
-
-
-# --- A new profile: its keys --------------------------------------------------------------------
-
+"""What an AI-deck's few and late pictures need besides: as the shipped profile has it."""
+SHOWN_KEYS = (
+    "target.large.dictionary",
+    "target.large.id",
+    "target.small.dictionary",
+    "target.small.id",
+    "planner.attempts",
+    "safety.min_rest_v",
+    "safety.min_load_v",
+)
+"""Keys that are written with their defaults, since they are changed most often."""
 HEAD = """\
 # A profile of perchctl, made by perchctl profile new. Above each key stands what
 # it means (unit, what is allowed). Body axes: x forward, y left, z up, from the
@@ -366,32 +145,54 @@ HEAD = """\
 #   yaml-language-server: $schema=perchctl.schema.json
 
 """
-AIDECK_KEYS = (
-    "kalman.drift_mps2",
-    "kalman.n_max",
-    "planner.ascend.settle_xy_m",
-    "planner.ascend.fresh_s",
-    "safety.max_frame_age_s",
+
+Answers = dict[str, str]
+"""Texts by question, or by another key of the profile."""
+
+
+@command(
+    app,
+    "perchctl profile new -o my_vehicle.yaml",
+    "perchctl profile new --set link.uri=usb://0 --set camera.source=camera:0",
+    "perchctl profile new --set ceiling=3.1 --defaults",
 )
-"""What an AI-deck's few and late pictures need besides: as the shipped profile has it."""
-OVER_THE_CEILING_M = 0.4
-"""The height limit is so far above the ceiling: an estimate that drifts must not end a flight."""
-FAR_SIGHT_M, NEAR_SIGHT_M, LOW_SEARCH_M = 1.1, 0.5, 1.3
-"""The search goes up to where the ceiling is that near, or to `LOW_SEARCH_M` where that is
-higher and there is room."""
+def new(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Profile to write.")] = Path(
+        "my_vehicle.yaml"
+    ),
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Answer beforehand: any key of the profile, front, left (of the picture's edges) "
+            "or ceiling (m).",
+        ),
+    ] = None,
+    defaults: Annotated[
+        bool, typer.Option("--defaults", help="Ask nothing: defaults for what is not given.")
+    ] = False,
+    force: ForceOption = False,
+) -> None:
+    """Write a profile of your vehicle, every key commented, in a short dialogue.
 
-
-def write_new_profile(output: Path, answers: Answers) -> None:
-    """Write the profile into `output`, and report what is doubtful. Raises InvalidValue."""
-    keys = profile_keys(answers, output)
+    With --set for every question, or --defaults, nothing is asked. The mounting is described in
+    words: at which edge of the camera's picture a hand over the vehicle's front comes in, and one
+    over its left side.
+    """
+    check_output(output, (".yaml", ".yml"), force, "what a profile is")
+    given = dict(setting.partition("=")[::2] for setting in settings or ())
+    new_profile(given, output.stem)  # before anything is asked
+    if not defaults and not QUESTIONS.keys() <= given.keys():
+        print_lines(f"A new profile: {output}. Enter takes what stands in brackets.")
+    answers = dict(given)
+    for name in QUESTIONS:
+        if name not in given:
+            answers = ask_person(name, answers) if not defaults else by_default(name, answers)
+    profile, keys = new_profile(answers, output.stem)
     shown = shlex.quote(str(output))
-    settings = [
-        f"{key}={json.dumps(value)}" for key, value in {"name": output.stem, **keys}.items()
-    ]
-    profile = changed_profile(Profile(), settings, str(output))
-    text = HEAD.format(name=shown) + profile_text(profile, keys)
-    write_files({output: text.encode()})
-    if keys["camera.mirrored"]:
+    write_files({output: (HEAD.format(name=shown) + profile_text(profile, keys)).encode()})
+    if profile.camera.mirrored:
         say(
             f"camera: with the front at its {answers['front']} and the left side at its "
             f"{answers['left']} edge the picture is mirrored: wrote camera.mirrored: true, which "
@@ -401,59 +202,130 @@ def write_new_profile(output: Path, answers: Answers) -> None:
     print(f"wrote {output}\nlook at the plan: perchctl fly -p {shown} --dry-run")
 
 
-def profile_keys(answer: Answers, output: Path) -> dict[str, Any]:
-    """Return the keys of the new profile by their dotted paths."""
-    uri, source, default = answer["uri"], answer["source"], Profile()
-    turn_deg, mirrored = mount_from_edges(answer["front"], answer["left"])
-    ceiling_m = answer["ceiling"]
-    low_m = min(LOW_SEARCH_M, ceiling_m - NEAR_SIGHT_M)
-    search_m = round(max(low_m, ceiling_m - FAR_SIGHT_M), 2)
+def default_answer(name: str, answers: Answers) -> str:
+    """Return what Enter stands for, after the answers to the questions before."""
+    uri, source = answers.get("link.uri", ""), answers.get("camera.source", "")
+    if name == "link.uri" and source == "sim:":  # no other vehicle flies by those pictures
+        return SIMULATED
+    if name == "camera.source" and uri.startswith(SIMULATED):
+        return "sim:"
+    if name == "camera.calibration" and _is_aideck(source):
+        return load_profile("aideck").camera.calibration
+    if name == "left":
+        return edges_beside(answers["front"])[0]
+    if name == "target.small.side_m":
+        with contextlib.suppress(ValueError):  # what is no number is refused as the large side
+            return f"{max(0.004, float(answers['target.large.side_m']) / 6.0):.4g}"
+    return QUESTIONS[name]
+
+
+def by_default(name: str, answers: Answers) -> Answers:
+    """Return the answers with the default of that question."""
+    return {**answers, name: default_answer(name, answers)}
+
+
+def ask_person(name: str, answers: Answers) -> Answers:
+    """Return the answers with what somebody types, asked for again until it is valid. Raises
+    UsageError if the input has ended."""
+    default = default_answer(name, answers)
+    question = WORDS.get(name) or _explanation(name)
+    while True:
+        # On stderr: stdout is for the result.
+        print(f"{question}\n  {name} [{default}] ", end="", file=sys.stderr, flush=True)
+        try:
+            answered = {**answers, name: input().strip() or default}
+            new_profile(answered, "new")
+        except EOFError:
+            raise UsageError(
+                "there is nobody to ask, and nothing was written: answer by --set, or add "
+                "--defaults for what is not answered"
+            ) from None
+        except (PerchError, UnicodeDecodeError) as error:
+            print_lines(f"  {error}")
+        else:
+            return answered
+
+
+def _explanation(key: str) -> str:
+    """Return the comment of a key: what it means, its unit, what is allowed."""
+    lines = (line.strip() for line in profile_text(Profile(), {key}).splitlines())
+    return "\n".join(line.removeprefix("# ") for line in lines if line.startswith("#"))
+
+
+def new_profile(answers: Answers, name: str) -> tuple[Profile, set[str]]:
+    """Return the profile that these answers make, few or all, and the keys that it is written with.
+    Raises NotFound, InvalidValue, UsageError, each with the key."""
+    texts = {key: text for key, text in answers.items() if key not in WORDS}
+    if "target.large.side_m" in texts and "target.small.side_m" not in texts:
+        texts["target.small.side_m"] = default_answer("target.small.side_m", answers)
+    if (calibration := texts.get("camera.calibration")) is not None:
+        path = Path(calibration).expanduser()
+        texts["camera.calibration"] = str(path.resolve()) if path.is_file() else calibration
+        load_calibration(find_calibration(texts["camera.calibration"]))
+    for key, check in (("link.uri", check_uri), ("camera.source", parse_source)):
+        if key in texts:
+            check(texts[key])
+    source = texts.get("camera.source", "")
+    derived = {"name": name, **_mount_keys(answers), **_height_keys(answers)}
+    if source:
+        uri = texts.get("link.uri", SIMULATED)
+        derived["description"] = f"a vehicle at {uri}, its camera at {without_password(source)}"
+        derived["camera.readout_s"] = 0.0 if source.startswith("sim:") else None
+        derived["link.parameters"] = {"stabilizer.estimator": 2}
+    if _is_aideck(source):
+        shipped = load_profile("aideck")
+        derived |= {path: profile_value(shipped, path) for path in AIDECK_KEYS}
+    settings = {key: json.dumps(value) for key, value in derived.items()}
+    for key, text in texts.items():
+        is_text = isinstance(profile_value(Profile(), key), str)
+        settings[key] = json.dumps(text) if is_text else text
+    profile = changed_profile(Profile(), [f"{key}={text}" for key, text in settings.items()])
+    return profile, {*settings, *SHOWN_KEYS} - {"name"}
+
+
+def _mount_keys(answers: Answers) -> dict[str, Any]:
+    """Return the camera's rotation by the edges that the hands came in at. Raises InvalidValue."""
+    front, left = answers.get("front"), answers.get("left")
+    if front is None:
+        return {}
+    if front not in PICTURE_EDGES:
+        raise InvalidValue(f"front: found {front!r}; allowed are {', '.join(PICTURE_EDGES)}")
+    left = left or edges_beside(front)[0]
+    if left not in edges_beside(front):
+        raise InvalidValue(f"left: found {left!r}; allowed are {', '.join(edges_beside(front))}")
+    turn_deg, mirrored = mount_from_edges(front, left)
+    return {"camera.mount.rpy_deg": (0.0, 0.0, turn_deg), "camera.mirrored": mirrored}
+
+
+def _height_keys(answers: Answers) -> dict[str, Any]:
+    """Return the heights and times that depend on the ceiling. Raises InvalidValue."""
+    if "ceiling" not in answers:
+        return {}
+    try:
+        ceiling_m = float(answers["ceiling"].removesuffix("m"))
+    except ValueError:
+        ceiling_m = math.nan
+    low_m, high_m = CEILING_M
+    if not low_m <= ceiling_m <= high_m:
+        raise InvalidValue(
+            f"ceiling: found {answers['ceiling']!r}; allowed are {low_m:g} to {high_m:g} m"
+        )
+    default = Profile().planner
+    low_search_m = min(LOW_SEARCH_M, ceiling_m - NEAR_SIGHT_M)
+    search_m = round(max(low_search_m, ceiling_m - FAR_SIGHT_M), 2)
     most_m = round(ceiling_m + OVER_THE_CEILING_M, 2)
-    landing = default.planner.landing
+    landing = default.landing
     down_s = most_m / landing.speed_mps * landing.timeout_s / landing.overdue_s
-    keys = {
-        "description": f"a vehicle at {uri}, with its camera at {without_password(source)}",
-        "camera.source": source,
-        "camera.calibration": _calibration_name(answer["calibration"], output, source),
-        "camera.latency_s": _thousandth(answer["latency"]),
-        "camera.mount.position_m": answer["camera"],
-        "camera.mount.rpy_deg": (0.0, 0.0, turn_deg),
-        "camera.mirrored": mirrored,
-        "camera.readout_s": 0.0 if source.startswith("sim:") else None,
-        "vehicle.gear_body_m": answer["gear"],
-        "target.large.dictionary": default.target.large.dictionary,
-        "target.large.id": default.target.large.id,
-        "target.large.side_m": _thousandth(answer["large"]),
-        "target.small.dictionary": default.target.small.dictionary,
-        "target.small.id": default.target.small.id,
-        "target.small.side_m": _thousandth(answer["small"]),
+    return {
         "planner.takeoff_height_m": min(0.5, search_m),
         "planner.search.max_height_m": search_m,
         "planner.landing.timeout_s": max(landing.timeout_s, 5.0 * (math.floor(down_s / 5.0) + 1)),
-        "planner.attempts": default.planner.attempts,
-        "safety.min_rest_v": default.safety.min_rest_v,
-        "safety.min_load_v": default.safety.min_load_v,
         "safety.max_height_m": most_m,
-        "safety.fence_radius_m": answer["fence"],
-        "link.uri": uri,
-        "link.parameters": {"stabilizer.estimator": 2},
     }
-    if _is_aideck(source):
-        shipped = load_profile("aideck")
-        keys |= {path: profile_value(shipped, path) for path in AIDECK_KEYS}
-    return keys
 
 
-def _calibration_name(calibration: Path | None, output: Path, source: str) -> str:
-    """Return the calibration as the profile at `output` names it: beside it, or by the whole
-    path."""
-    if calibration is None:
-        return AIDECKS_EXAMPLE if _is_aideck(source) else EXAMPLE
-    if calibration == find_calibration(EXAMPLE).resolve():
-        return EXAMPLE
-    folder = output.absolute().parent.resolve()
-    within = calibration.is_relative_to(folder)
-    return os.path.relpath(calibration, folder) if within else str(calibration)
+def _is_aideck(source: str) -> bool:
+    return source.lower().startswith("aideck:")
 
 
 @command(

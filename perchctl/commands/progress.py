@@ -1,5 +1,6 @@
-"""Bars of progress on stderr: on a terminal only; in a pipe or a file nothing, or of campaigns a
-line now and then."""
+"""What a person sees while a command works: bars of progress on stderr, on a terminal only (in a
+pipe or a file nothing, or of campaigns a line now and then), and the guide of a measurement by
+hand, as rows with bars on terminal and page."""
 
 from __future__ import annotations
 
@@ -8,11 +9,11 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from datetime import timedelta
 from functools import partial
 from typing import Any, Protocol, TextIO
 
 from rich.console import Console
+from rich.live import Live
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -21,6 +22,11 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
+from rich.text import Text
+
+from perchctl.calibration import GuidedFrame
+from perchctl.display import LivePage, Sketch
 
 _REFRESH_HZ = 4
 _WHOLE_RUN_S = 1e6
@@ -46,22 +52,19 @@ def progress_bar(
     on a terminal, elsewhere a new one each `LINE_S` at most. `earlier`: flown before."""
     stream = stream or sys.stderr
     ends = Counter(result.outcome for result in earlier)
-    before, began_s = ends.total(), clock()
-    printed_s = began_s
-    with _bar("flights", TextColumn("{task.description}"), total=total, stream=stream, width=8) as (
-        update
-    ):
-        update(completed=before, description=_counted(ends))
+    printed_s = clock()
+    columns = (TimeRemainingColumn(), TextColumn("{task.description}"))
+    with _bar("flights", *columns, total=total, stream=stream, width=8) as update:
+        update(completed=ends.total(), description=_counted(ends))
 
         def advance(result: Ended) -> None:
             nonlocal printed_s
             ends[result.outcome] += 1
-            flown, now_s = ends.total(), clock()
-            text = f"{_pace(flown - before, now_s - began_s, total - flown)} {_counted(ends)}"
+            flown, text = ends.total(), _counted(ends)
             update(completed=flown, description=text)
-            if stream.isatty() or flown >= total or now_s - printed_s < LINE_S:
+            if stream.isatty() or flown >= total or clock() - printed_s < LINE_S:
                 return
-            printed_s = now_s
+            printed_s = clock()
             with contextlib.suppress(OSError, ValueError):  # nobody reads any more
                 print(f"perchctl: flown {flown} of {total} {text}", file=stream, flush=True)
 
@@ -70,14 +73,6 @@ def progress_bar(
 
 def _counted(ends: Counter[str]) -> str:
     return " ".join(f"{n} {end}" for end, n in ends.items())
-
-
-def _pace(flown: int, elapsed_s: float, left: int) -> str:
-    """Return flights a minute, and the time that is left at this pace."""
-    if elapsed_s <= 0.0:
-        return ""
-    left_s = timedelta(seconds=round(elapsed_s / flown * max(0, left)))
-    return f"{60.0 * flown / elapsed_s:.1f}/min {left_s} left"
 
 
 @contextlib.contextmanager
@@ -119,3 +114,60 @@ def _bar(
         speed_estimate_period=_WHOLE_RUN_S,
     ) as progress:
         yield partial(progress.update, progress.add_task("", total=total))
+
+
+# --- A person is guided ------------------------------------------------------------------------
+
+_BAR_WIDTH = 30
+_GUIDE_HZ = 8
+
+
+@contextlib.contextmanager
+def guide(
+    page: LivePage | None, stream: TextIO | None = None
+) -> Iterator[Callable[[GuidedFrame], None]]:
+    """Yield the function that shows a guided frame: as a table on a terminal, in a pipe as a line
+    whenever that changes, and on the page if there is one."""
+    console = Console(file=stream or sys.stderr)
+    with contextlib.ExitStack() as stack:
+        table: Live | None = None
+        if console.is_terminal:
+            table = stack.enter_context(
+                Live(console=console, refresh_per_second=_GUIDE_HZ, redirect_stdout=False)
+            )
+        last_line = ""
+
+        def show(guided: GuidedFrame) -> None:
+            nonlocal last_line
+            if table is not None:
+                table.update(_table(guided))
+            elif guided.line != last_line:
+                last_line = guided.line
+                line = f"perchctl: {guided.line}"
+                console.print(line, markup=False, highlight=False, soft_wrap=True)
+            if page is not None:
+                sketch = Sketch(guided.image, guided.outlines)
+                page.show(guided.index, sketch)
+                page.set_state(lambda: page_state(guided))
+
+        yield show
+
+
+def _table(guided: GuidedFrame) -> Table:
+    table = Table.grid(padding=(0, 1))
+    for name, text, share in guided.rows:
+        if share is None:
+            table.add_row(name, Text(text), "")
+            continue
+        full = round(_BAR_WIDTH * min(max(share, 0.0), 1.0))
+        colour = "green" if share >= 1.0 else "yellow"
+        bar = Text("#" * full, style=colour) + Text("." * (_BAR_WIDTH - full), style="dim")
+        table.add_row(name, bar, text)
+    table.add_row("", Text(guided.advice, style="bold"), "")
+    return table
+
+
+def page_state(guided: GuidedFrame) -> dict[str, Any]:
+    """Return the page's rows (the shares as numbers, for bars) and its headline."""
+    rows = [[value for value in row if value is not None] for row in guided.rows]
+    return {"rows": rows, "phase": guided.advice}

@@ -8,19 +8,19 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Literal, Protocol, TypeVar
+from typing import Annotated, Any
 
 import typer
 
 # By their packages, whose names load as they are used: the help needs no simulator.
 from perchctl import campaign as campaigns
 from perchctl import faults as fault_campaigns
-from perchctl.analysis import profile_differences
+from perchctl.analysis import FlightAnalysis, profile_differences, show_text
 from perchctl.commands.command_line import (
     ForceOption,
     Group,
@@ -34,7 +34,6 @@ from perchctl.commands.fly import plot_of, with_positioning
 from perchctl.commands.interrupt import signals_to
 from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import progress_bar
-from perchctl.display import timed_event_text
 from perchctl.errors import (
     Interrupted,
     InvalidValue,
@@ -44,23 +43,11 @@ from perchctl.errors import (
     no_simulator,
 )
 from perchctl.profile import Profile, load_profile
-from perchctl.record import to_exact
+from perchctl.record import read_log, to_exact
 
-R = TypeVar("R", bound="_Flown")
-C = TypeVar("C", bound="campaigns.CampaignFlight")
 AGAIN_S = 0.5
 """A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
 _NO_DIFFERENCE = ("name", "description", "date")
-
-
-class _Flown(Protocol):
-    """A flight's result, of whatever kind."""
-
-    @property
-    def seed(self) -> int: ...
-
-    @property
-    def outcome(self) -> str: ...
 
 
 FlightsOption = Annotated[
@@ -111,121 +98,101 @@ def run(
     cluster: ClusterOption = None,
     log_dir: Annotated[
         Path | None,
-        typer.Option(
-            "--log-dir", help="Log the flights, into this folder.", rich_help_panel="Files"
-        ),
+        typer.Option("--log-dir", help="Log the flights, into this folder."),
     ] = None,
     record: Annotated[
         bool,
         typer.Option(
             "--record",
             help="Keep the pictures, in an MCAP file beside each log.",
-            rich_help_panel="Files",
         ),
     ] = False,
-    keep: Annotated[
-        Literal["all", "failed"] | None,
-        typer.Option(
-            "--keep",
-            help="Of the logs in --log-dir; all by default.",
-            rich_help_panel="Files",
-        ),
-    ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", help="JSONL file; each flight's result, as it ends.", rich_help_panel="Files"
-        ),
+        typer.Option("--out", help="JSONL file; each flight's result, as it ends."),
     ] = None,
     resume: Annotated[
         bool,
         typer.Option(
             "--resume",
             help="Go on with --out: fly the seeds that it lacks.",
-            rich_help_panel="Files",
         ),
     ] = False,
     force: ForceOption = False,
 ) -> int:
     """Fly many seeded scenarios in lockstep, faster than real time, and count."""
     _require_simulator()
-    many = {"-n": flights, "--seed": seed, "--jobs": jobs, "--cluster": cluster, "--out": out}
     if faults == "list":
-        others = {**many, "--only": only, "--log-dir": log_dir}
-        _refuse_options("--faults list flies nothing", others, "")
         return _list_faults(as_json)
-    if only is not None:
-        one = f"--only {only} repeats the one flight of seed {only}"
-        _refuse_options(one, {**many, "--keep": keep}, ", or --only")
-    if log_dir is None and (record or keep is not None) and only is None:
+    if only is not None and (flights is not None or seed is not None):
         raise UsageError(
-            f"{'--record' if record else '--keep'} concerns the logs of the flights: name their "
-            f"folder with --log-dir"
+            f"--only {only} repeats the one flight of seed {only}: leave out -n and --seed"
+        )
+    if record and log_dir is None and only is None:
+        raise UsageError(
+            "--record concerns the logs of the flights: name their folder with --log-dir"
         )
     if resume and out is None:
         raise UsageError("--resume goes on with a file of results: name it with --out")
     if out is not None and out.suffix != ".jsonl":
         raise InvalidValue(f"{out} must end in .jsonl: a result is one line of JSON")
     flown = with_positioning(load_profile(profile), positioning)
+    if only is not None:
+        flights, seed = 1, only
+        log_dir = log_dir or Path(flown.log.directory)
     if cluster is not None and log_dir is not None:
         log_dir = log_dir.absolute()  # workers are started in other folders
     seeds = _seeds(flights, seed)
-    names = None
-    if faults is not None:
-        names = tuple(fault.name for fault in fault_campaigns.select_faults(faults))
     executor = executor_of(jobs, cluster, [flown])
-
-    def fly_campaign(
-        kind: type[C],
-        fly: Callable[[int], C],
-        summary: Callable[[list[C]], Mapping[str, Any]],
-        table: Callable[[list[C]], str],
-        objection: Callable[[list[C]], PerchError | None] = lambda results: None,
-    ) -> int:
-        with campaigns.campaign_results(
-            flown, seeds, kind, faults=names, out=out, resume=resume, force=force, log_dir=log_dir,
-            failed_logs_only=keep == "failed",
-        ) as kept:  # fmt: skip
-            return fly_each(
-                lambda executor, note: campaigns.fly_all(fly, kept.left, executor, note),
-                partial(_report, summary, table, as_json, log_dir, keep),
-                len(seeds), executor, kept.earlier, kept.note, objection,
-            )  # fmt: skip
-
-    folder = log_dir or Path(flown.log.directory)
-
-    def fly_only(seed: int, fly: Callable[[int], R], report: Callable[..., None]) -> int:
-        return fly_each(
-            lambda executor, note: campaigns.fly_all(fly, [seed], executor, note),
-            partial(report, flown, as_json),
-            1,
-            executor,
-        )
-
-    with signals_to(stop_once()):
-        if only is not None and names is not None:
-            return fly_only(
-                only,
-                partial(fault_campaigns.fly_fault_in_folder, flown, names, folder, record),
-                _report_fault,
-            )
-        if only is not None:
-            fly = partial(campaigns.fly_logged, flown, folder, record=record)
-            return fly_only(only, fly, _report_flight)
-        if names is not None:
-            return fly_campaign(
-                fault_campaigns.FaultResult,
-                partial(fault_campaigns.fly_fault_in_folder, flown, names, log_dir, record),
-                fault_campaigns.fault_summary,
-                fault_campaigns.fault_table,
-            )
-        return fly_campaign(
+    if faults is None:
+        names = None
+        campaign = _Campaign(
             campaigns.FlightResult,
             partial(campaigns.fly_in_folder, flown, log_dir, record),
             campaigns.campaign_summary,
             campaigns.campaign_table,
             campaigns.none_took_off,
         )
+    else:
+        names = tuple(fault.name for fault in fault_campaigns.select_faults(faults))
+        campaign = _Campaign(
+            fault_campaigns.FaultResult,
+            partial(fault_campaigns.fly_fault_in_folder, flown, names, log_dir, record),
+            fault_campaigns.fault_summary,
+            fault_campaigns.fault_table,
+        )
+
+    def report(results: list[Any], problem: PerchError | None) -> None:
+        if only is not None:
+            _report_one(results[0], flown, as_json)
+            return
+        figures = with_problem(campaign.summary(results), problem) if as_json else None
+        print_result(figures or campaign.table(results))
+        say_where_logs_are(results, log_dir)
+
+    with (
+        signals_to(stop_once()),
+        campaigns.campaign_results(
+            flown, seeds, campaign.kind,
+            faults=names, out=out, resume=resume, force=force, log_dir=log_dir,
+        ) as kept,
+    ):  # fmt: skip
+        return fly_each(
+            lambda executor, note: campaigns.fly_all(campaign.fly, kept.left, executor, note),
+            report, len(seeds), executor, kept.earlier, kept.note, campaign.objection,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Campaign:
+    """What differs between campaigns with and without faults: the type of a flight's result, how a
+    seed is flown, figures and text of all results, and what they amount to as a failure."""
+
+    kind: type[Any]
+    fly: Callable[[int], Any]
+    summary: Callable[[list[Any]], Mapping[str, Any]]
+    table: Callable[[list[Any]], str]
+    objection: Callable[[list[Any]], PerchError | None] = lambda results: None
 
 
 @command(
@@ -331,15 +298,6 @@ def _seeds(flights: int | None, first: int | None) -> list[int]:
     return list(range(first or 0, (first or 0) + (flights or 10)))
 
 
-def _refuse_options(reason: str, options: Mapping[str, object], instead: str) -> None:
-    given = [f"{name} {value}" for name, value in options.items() if value is not None]
-    if given:
-        does, it = ("does", "it") if len(given) == 1 else ("do", "them")
-        raise UsageError(
-            f"{reason}: {' and '.join(given)} {does} not apply; leave {it} out{instead}"
-        )
-
-
 # --- Who flies, and how it may end -------------------------------------------------------------
 
 
@@ -361,11 +319,7 @@ def executor_of(jobs: int | None, cluster: str | None, profiles: Sequence[Profil
         raise no_cluster()
 
     @contextlib.contextmanager
-    def workers(flights: int) -> Iterator[Executor]:
-        if not flights:
-            with campaigns.flight_processes(1) as processes:
-                yield processes
-            return
+    def workers(_flights: int) -> Iterator[Executor]:
         try:
             with campaigns.defer_interrupts():
                 from perchctl.campaign import cluster_pool
@@ -378,13 +332,13 @@ def executor_of(jobs: int | None, cluster: str | None, profiles: Sequence[Profil
 
 
 def fly_each(
-    campaign: Callable[[Executor, Callable[[R], None]], object],
-    report: Callable[[list[R], PerchError | None], None],
+    campaign: Callable[[Executor, Callable[[Any], None]], object],
+    report: Callable[[list[Any], PerchError | None], None],
     total: int,
     executor_of: ExecutorOf,
-    earlier: Sequence[R] = (),
-    keep: Callable[[R], None] = lambda result: None,
-    objection: Callable[[list[R]], PerchError | None] = lambda results: None,
+    earlier: Sequence[Any] = (),
+    keep: Callable[[Any], None] = lambda result: None,
+    objection: Callable[[list[Any]], PerchError | None] = lambda results: None,
 ) -> int:
     """Fly a campaign of `total` flights, and report those that were flown, however it ends: also
     by Ctrl-C, or when a flight fails. Returns the exit code.
@@ -405,7 +359,7 @@ def fly_each(
         ):
             begun = True
 
-            def note(result: R) -> None:
+            def note(result: Any) -> None:
                 with campaigns.defer_interrupts():
                     results.append(result)
                     keep(result)
@@ -458,75 +412,39 @@ def with_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[
     return {**record, "error": str(problem), "exit_code": problem.exit_code}
 
 
-def _report(
-    summary: Callable[[list[C]], Mapping[str, Any]],
-    table: Callable[[list[C]], str],
-    as_json: bool,
-    log_dir: Path | None,
-    keep: str | None,
-    results: list[C],
-    problem: PerchError | None,
-) -> None:
-    print_result(with_problem(summary(results), problem) if as_json else table(results))
-    say_where_logs_are(results, log_dir, keep)
-
-
-def say_where_logs_are(
-    results: Sequence[campaigns.CampaignFlight], log_dir: Path | None, keep: str | None = None
-) -> None:
+def say_where_logs_are(results: Sequence[campaigns.CampaignFlight], log_dir: Path | None) -> None:
     """Print on stderr where the logs are, and what they lack."""
     if log_dir is None or not results:
         return
-    kept = "the logs that are kept" if keep else "the flights' logs"
-    say(f"{kept} are in {log_dir}")
+    say(f"the flights' logs are in {log_dir}")
     problems = [result.log_problem for result in results if result.log_problem is not None]
     if problems:
         say(f"{len(problems)} of {len(results)} logs are incomplete: {problems[0]}")
 
 
-def _report_flight(
-    profile: Profile, as_json: bool, flights: list[campaigns.LoggedFlight], _: PerchError | None
+def _report_one(
+    result: campaigns.FlightResult | fault_campaigns.FaultResult, profile: Profile, as_json: bool
 ) -> None:
-    """Print the one flight as `perchctl fly` prints one."""
-    (flight,) = flights
-    summary = flight.summary
-    if not as_json:
-        start_s = flight.events[0].t_s
-        for event in flight.events:
-            print(timed_event_text(event, start_s))
-        print(summary.text(flight.log), flush=True)
-    plot = _plot(flight.log, profile)
-    if as_json:
-        lacks = {"lost_records": summary.lost_records, "log_problem": summary.log_problem}
-        files = {"log": str(flight.log), "plot": None if plot is None else str(plot)}
-        print_result({"seed": flight.seed} | summary.as_record() | lacks | files)
-    elif plot is not None:
-        print(f"plot:      {plot}")
-
-
-def _report_fault(
-    profile: Profile,
-    as_json: bool,
-    results: list[fault_campaigns.FaultResult],
-    _: PerchError | None,
-) -> None:
-    """Print all that is known of the one flight with its fault."""
-    (result,) = results
+    """Print the one flight of `--only`, with its fault if there is one, and draw its plot."""
     known = asdict(result)
-    if not as_json:
+    has_log = result.log is not None and result.log.exists()
+    if not as_json and isinstance(result, fault_campaigns.FaultResult):
         print("\n".join(f"{name:<18} {value}" for name, value in known.items()), flush=True)
-    assert result.log is not None
-    plot = _plot(result.log, profile)
+    elif not as_json and result.log is not None and has_log:
+        print(
+            f"{show_text(FlightAnalysis(read_log(result.log)))}\nlog:       {result.log}",
+            flush=True,
+        )
+    elif not as_json:
+        print(f"{result.outcome.upper()}: {result.reason}", flush=True)
+    plot = None
+    if result.log is not None and has_log:
+        with contextlib.suppress(KeyboardInterrupt):  # the flight is reported all the same
+            plot = plot_of(result.log, profile)
     if as_json:
         print_result(to_exact({**known, "plot": plot}))
     elif plot is not None:
-        print(f"{'plot':<18} {plot}")
-
-
-def _plot(log: Path, profile: Profile) -> Path | None:
-    with contextlib.suppress(KeyboardInterrupt):  # the flight is flown, and is told all the same
-        return plot_of(log, profile)
-    return None
+        print(f"plot:      {plot}")
 
 
 def _list_faults(as_json: bool) -> int:

@@ -1,4 +1,9 @@
-"""`perchctl track`: the pipeline on any source, without a vehicle."""
+"""`perchctl track`: the pipeline on any source, without a vehicle.
+
+Poses are in the OpenCV camera frame with cv2.aruco's marker axes
+(``X_cam = R(rvec) X_marker + tvec``). The marker's yaw is ``atan2(R[1, 0], R[0, 0])``: the
+heading of its x axis in the picture's plane, from right towards down.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +15,13 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
+import cv2
+import numpy as np
 import typer
 
 from perchctl.calibration import load_calibration
@@ -30,50 +37,36 @@ from perchctl.camera import (
 )
 from perchctl.commands.command_line import (
     CamOption,
-    ForceOption,
     ProfileOption,
     ViewOption,
-    ViewPortOption,
     command,
     new_app,
 )
-from perchctl.commands.guide import page_port
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
-from perchctl.commands.track_output import (
-    CameraPose,
-    Tracked,
-    camera_pose,
-    csv_file,
-    overlay_file,
-    text_line,
-    text_rows,
-    track_record,
-    track_sketch,
-    track_state,
-)
-from perchctl.display import AXES_OF_SIDE, live_page
-from perchctl.errors import Interrupted, NotFound, UsageError
-from perchctl.files import check_output, same_file
+from perchctl.display import live_page, sketch_of
+from perchctl.errors import Interrupted, NotFound
+from perchctl.geometry import Array, rot_z, yaw_of
 from perchctl.perception import BLENDED, INTERLACED, Perception
 from perchctl.places import is_shipped_example
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.target import PrintCheck
 from perchctl.vision import (
+    MARKERS,
     CameraModel,
     Frame,
+    MarkerPose,
     PipelineOutput,
+    Stage,
+    better_conditioned,
     camera_profile,
     make_pipeline,
 )
 
-LIVE_RATE_HZ = 30.0
-"""Of the video that is written of a live source: about how many pictures a second it gives."""
 STILLS_HZ = 1.0
-"""Of files of pictures that do not belong together: so each can be looked at, in the video too."""
+"""Of files of pictures that do not belong together: so each can be looked at on the page."""
 POLL_S = 0.002
-MOST_NOTES = 20
 # A live picture that stands still or is noise is no measurement; the others are searched.
 _NO_PICTURE = ("frozen", "snow")
 _DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
@@ -84,7 +77,7 @@ app = new_app()
 @command(
     app,
     "perchctl track camera:0 --view",
-    "perchctl track video:flight.mp4 --overlay seen.mp4 --csv poses.csv",
+    "perchctl track video:flight.mp4 --json > poses.jsonl",
     "perchctl track 'images:pictures/*.png' --json",
 )
 def track(
@@ -112,15 +105,7 @@ def track(
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line a frame.")] = False,
-    csv: Annotated[
-        Path | None, typer.Option("--csv", help="Write the results as CSV, t_s first.")
-    ] = None,
-    overlay: Annotated[
-        Path | None, typer.Option("--overlay", help="Write the pictures with results as .mp4.")
-    ] = None,
-    force: ForceOption = False,
     view: ViewOption = False,
-    view_port: ViewPortOption = 0,
 ) -> None:
     """Find the target in a camera, video or pictures, without a vehicle.
 
@@ -136,17 +121,10 @@ def track(
     source = parse_source(source, files=True).spec
     if stills is None:  # files of pictures need not belong together
         stills = source.startswith("images:")
-    for path, suffix in ((csv, ".csv"), (overlay, ".mp4")):
-        if path is not None:
-            place = source.partition(":")[2]
-            if place and same_file(path, Path(place).expanduser()):
-                raise UsageError(f"{path} is the source itself; write the result to another file")
-            check_output(path, (suffix,), force)
     if calibration is None:
         cam = cam or flown.camera.cam
     file = find_calibration(str(calibration or flown.camera.calibration))
-    port = page_port(view, view_port)
-    lines = as_json or not (csv or overlay or port is not None)
+    lines = as_json or not view
     start_s = time.monotonic()
 
     def now() -> float:
@@ -154,13 +132,17 @@ def track(
 
     stop, summary = Stopper(), TrackSummary()
     with contextlib.ExitStack() as stack:
-        opened, camera = _open(source, flown, file, cam, stills, now)
+        camera = load_calibration(file, cam=cam)
+        pictures_hz = STILLS_HZ if stills else None
+        opened = open_camera(
+            source, now, flown.camera, size_px=camera.size_px, pictures_hz=pictures_hz
+        )
         stack.callback(opened.close)
         recording = opened.inner if isinstance(opened, WrappedSource) else opened
         paths: Sequence[Path] = ()
-        rate_hz = count = None
+        count = None
         if isinstance(recording, Recording):
-            paths, rate_hz, count = recording.paths, recording.rate_hz, recording.count
+            paths, count = recording.paths, recording.count
         is_example = is_shipped_example(file)
         ending = (
             ", the shipped example: give your camera's with --calibration" if is_example else ""
@@ -168,36 +150,25 @@ def track(
         say(f"calibration: {file.name}{ending}")
         prints = PrintCheck(camera, flown.target)
         tracker = Tracker(flown, camera, live=opened.live, stills=stills)
-        add_row = stack.enter_context(csv_file(csv)) if csv else None
-        add_picture = None
-        if overlay:
-            film = overlay_file(overlay, camera, rate_hz or LIVE_RATE_HZ)
-            add_picture = stack.enter_context(film)
         stack.enter_context(stop.installed())  # until here Ctrl-C ends at once
         title = f"perchctl track {without_password(source)}"
-        page = stack.enter_context(live_page(camera, title, port, say))
+        page = stack.enter_context(live_page(camera, title, view, say))
         has_bar = not opened.live and not (lines and sys.stdout.isatty())
         advance = stack.enter_context(count_bar("frames", count, has_bar))
         first: tuple[float, float] | None = None  # times of the first frame and of now
-        for frame in frames(opened, now, stop, summary):
+        for frame in frames(opened, now, stop):
             place = str(paths[frame.index]) if paths else opened.describe()
             check_size((frame.image.shape[1], frame.image.shape[0]), camera, place)
             name = paths[frame.index].name if paths else frame.index
-            results = tracker.results(frame, name)
-            for tracked in results:
+            for tracked in tracker.results(frame, name):
                 summary.add(tracked)
                 prints.add(tracked.output)
                 if lines:
                     line = json.dumps(track_record(tracked)) if as_json else text_line(tracked)
                     # A live result is worth nothing late.
                     print(line, flush=opened.live)
-                if add_row is not None:
-                    add_row(track_record(tracked))
-                sketch = track_sketch(tracked, AXES_OF_SIDE * flown.target.large.side_m)
-                if add_picture is not None and tracked is results[-1]:  # of two fields, one
-                    text = tuple(f"{label} {value}" for label, value in text_rows(tracked))
-                    add_picture(tracked.t_s, replace(sketch, text=text))
                 if page is not None:
+                    sketch = sketch_of(tracked.picture, tracked.output, flown.target.large.side_m)
                     page.show(frame.index, sketch)
                     page.set_state(partial(track_state, tracked))
             advance()
@@ -210,37 +181,19 @@ def track(
     say(summary.text(ended_s))
     if prints.judged and not is_example:  # another lens would say something of its own
         say(prints.verdict()[1])
-    for path in (csv, overlay):
-        if path is not None:
-            say(f"wrote {path}")
     if stop.requested.is_set():
-        raise Interrupted("Ctrl-C: stopped; what was written is complete")
+        raise Interrupted("Ctrl-C: stopped; what was printed is complete")
 
 
-def _open(
-    source: str,
-    profile: Profile,
-    calibration: Path,
-    cam: str | None,
-    stills: bool,
-    now: Callable[[], float],
-) -> tuple[FrameSource, CameraModel]:
-    """Return the open source, and its camera. Errors: NotFound, InvalidValue."""
-    camera = load_calibration(calibration, cam=cam)
-    hz = STILLS_HZ if stills else None
-    opened = open_camera(source, now, profile.camera, size_px=camera.size_px, pictures_hz=hz)
-    return opened, camera
-
-
-def frames(
-    source: FrameSource, now: Callable[[], float], stop: Stopper, summary: TrackSummary
-) -> Iterator[Frame]:
+def frames(source: FrameSource, now: Callable[[], float], stop: Stopper) -> Iterator[Frame]:
     """Yield every frame of a recording, the newest ones of a live source, until the end or
-    Ctrl-C."""
+    Ctrl-C. A source that is silent is reported once, until it gives a frame again."""
+    is_silent = False
     while not stop.requested.is_set():
         now_s = now()
         frame = source.poll(now_s)
         if frame is not None:
+            is_silent = False
             yield frame
             continue
         if source.finished:
@@ -249,8 +202,48 @@ def frames(
         if (gone := source.problem(-math.inf)) is not None:
             say(gone)
             return
-        summary.add_silence(source.problem(now_s))
+        problem = source.problem(now_s)
+        if problem is not None and not is_silent:
+            say(f"{problem}; waiting for it (Ctrl-C ends)")
+            is_silent = True
         stop.requested.wait(POLL_S)
+
+
+# --- Results -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPose:
+    """The target's pose in the camera frame; `sigma_m` (3,) is along the camera's axes."""
+
+    rvec_rad: Array
+    tvec_m: Array
+    yaw_rad: float
+    sigma_m: Array
+    sigma_yaw_rad: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """The result of one picture.
+
+    Attributes:
+        name: the picture's file name, or its frame's index if it has none.
+        output: what the pipeline found; None if the picture was not searched.
+        target: at stage ``none`` this is the filter's prediction.
+        notes: the sentences that the picture deserves.
+    """
+
+    name: str | int
+    picture: Frame
+    output: PipelineOutput | None = None
+    target: CameraPose | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def stage(self) -> str:
+        """The markers that this picture shows."""
+        return (Stage.NONE if self.output is None else self.output.stage).value
 
 
 class Tracker:
@@ -266,7 +259,6 @@ class Tracker:
         self._config, self._live, self._stills = profile.camera, live, stills
         self._disagreement_frames = 1 if stills else profile.merge.disagreement_frames
         self._target: CameraPose | None = None
-        self._interlaced = False
 
     def results(self, frame: Frame, name: str | int) -> list[Tracked]:
         """Return the frame's result, or those of its two fields; none for a live source's
@@ -276,19 +268,16 @@ class Tracker:
             return []
         about = () if judged.kind in ("ok", "repeated") else (judged.text,)
         if self._live and judged.kind in _NO_PICTURE:
-            return [Tracked(name, frame.t_s, frame.image, notes=about)]
+            return [Tracked(name, frame, notes=about)]
         results = []
         for picture, output in self._perception.look(frame):
             self._target = camera_pose(output, not self._stills, self._target)
             notes = (*about, *self._notes(output))
-            results.append(Tracked(name, picture.t_s, picture.image, output, self._target, notes))
+            results.append(Tracked(name, picture, output, self._target, notes))
         return results
 
     def _notes(self, output: PipelineOutput) -> Iterator[str]:
-        interlaced = output.fields != "whole"
-        if not self._stills:  # at rest nothing is combed, and that is no news
-            self._interlaced = interlaced = interlaced or self._interlaced
-        if interlaced:
+        if output.fields != "whole":
             yield INTERLACED
         if output.detections.ghost_px > 0.0:
             yield BLENDED
@@ -300,39 +289,128 @@ class Tracker:
             yield _DISAGREE
 
 
+def camera_pose(
+    output: PipelineOutput, filtered: bool, before: CameraPose | None
+) -> CameraPose | None:
+    """Return the target's pose in the camera frame, from a pipeline whose body, gear and camera
+    are one; None without a target.
+
+    `filtered` False takes the pose as measured. `before` is the last target: its tilt is kept
+    while the filter predicts.
+    """
+    target = output.target
+    if target is None:
+        return None
+    pose, is_whole = _measured_pose(output, target.stage)
+    if pose is not None and is_whole and not filtered:
+        R = _rotation(pose.rvec_rad)
+        return CameraPose(pose.rvec_rad, pose.tvec_m, yaw_of(R), pose.sigma_m, pose.sigma_yaw_rad)
+    known = pose or before
+    if known is None:
+        return None
+    # The filter holds position and yaw; the tilt is the picture's own.
+    R = _rotation(known.rvec_rad)
+    R = rot_z(target.e_yaw_rad - yaw_of(R)) @ R
+    rvec = np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64).ravel()
+    return CameraPose(rvec, target.e_m, target.e_yaw_rad, target.sigma_m, target.sigma_yaw_rad)
+
+
+def _measured_pose(output: PipelineOutput, stage: Stage) -> tuple[MarkerPose | None, bool]:
+    """Return the pose that the target rests on, and whether it alone makes the target."""
+    poses = output.poses
+    if stage is not Stage.BOTH:
+        return poses.get(stage.value), True
+    if "joint" in poses:
+        return poses["joint"], True
+    return better_conditioned(poses["large"], poses["small"]), False
+
+
+def _rotation(rvec: Array) -> Array:
+    return np.asarray(cv2.Rodrigues(rvec)[0], dtype=np.float64)
+
+
+# --- What is printed ---------------------------------------------------------------------------
+
+
+def track_record(tracked: Tracked) -> dict[str, Any]:
+    """Return the line of `track --json`; what is not finite becomes None."""
+    target, output = tracked.target, tracked.output
+    return {
+        "frame": tracked.name,
+        "t_s": _finite(tracked.picture.t_s),
+        "stage": tracked.stage,
+        **{name: None if output is None else _marker_record(output, name) for name in MARKERS},
+        "target": None
+        if target is None
+        else {key: _finite(value) for key, value in vars(target).items()},
+    }
+
+
+def _marker_record(
+    output: PipelineOutput, name: Literal["large", "small"]
+) -> dict[str, Any] | None:
+    marker = output.detections.get(name)
+    if marker is None:
+        return None
+    pose = output.poses.get(name)
+    return {"corners_px": _finite(marker.corners_px)} | {
+        key: None if pose is None else _finite(getattr(pose, key))
+        for key in ("rvec_rad", "tvec_m", "reprojection_px")
+    }
+
+
+def _finite(value: Any) -> Any:
+    """Return the number, or the nested lists of the array's numbers, as Python's; None for each
+    that is not finite."""
+    if np.ndim(value):
+        return [_finite(part) for part in value]
+    return float(value) if math.isfinite(value) else None
+
+
+def text_line(tracked: Tracked) -> str:
+    """Return one line for a terminal, at most 100 columns but for long file names."""
+    head = f"{tracked.name!s:>6}  {tracked.picture.t_s:9.3f} s  {tracked.stage:<5}"
+    return f"{head}  {_target_text(tracked.target)}"
+
+
+def _target_text(target: CameraPose | None) -> str:
+    """Return the target's place and heading for people, in centimetres and degrees."""
+    if target is None:
+        return "target not seen"
+    x, y, z = (f"{100.0 * v:+7.2f}" for v in target.tvec_m)
+    return f"x {x}  y {y}  z {z} cm  yaw {math.degrees(target.yaw_rad):+7.2f} deg"
+
+
+def track_state(tracked: Tracked) -> dict[str, Any]:
+    """Return what the live page shows of a frame, ready for JSON."""
+    rows = [
+        ["frame", f"{tracked.name}   {tracked.picture.t_s:.3f} s"],
+        ["markers", tracked.stage],
+        ["target", _target_text(tracked.target)],
+    ]
+    return {"rows": rows, "note": "; ".join(tracked.notes)}
+
+
 class TrackSummary:
-    """Counts results, and prints a sentence as a condition begins, `MOST_NOTES` at the most."""
+    """Counts results and the conditions that they note; each is printed once, as it begins."""
 
     def __init__(self) -> None:
         self.frames = 0
         self._found: Counter[str] = Counter()
         self._noted: Counter[str] = Counter()
-        self._before: frozenset[str] = frozenset()
-        self._left = MOST_NOTES
-        self._silent = False
 
     def add(self, tracked: Tracked) -> None:
         """Count this result, and print what is new in it."""
         self.frames += 1
-        self._found.update(list(tracked.markers))
-        name = tracked.frame if isinstance(tracked.frame, str) else f"frame {tracked.frame}"
+        if tracked.output is not None:
+            seen = tracked.output.detections
+            self._found.update(name for name in MARKERS if seen.get(name) is not None)
         for note in tracked.notes:
-            if _kind(note) in self._before:
-                continue
-            self._left -= 1
-            if self._left >= 0:
-                say(f"{name}: {note}")
-            if self._left == 0:
-                say("more of this kind is only counted from here on")
-        self._before = frozenset(map(_kind, tracked.notes))
-        self._noted.update(self._before)
-        self._silent = False
-
-    def add_silence(self, problem: str | None) -> None:
-        """Print once why the source gives no frame at present; None if it only has none yet."""
-        if problem is not None and not self._silent:
-            say(f"{problem}; waiting for it (Ctrl-C ends)")
-        self._silent = self._silent or problem is not None
+            kind = re.split("[:,]", note, maxsplit=1)[0]  # without what differs between frames
+            if not self._noted[kind]:
+                place = tracked.name if isinstance(tracked.name, str) else f"frame {tracked.name}"
+                say(f"{place}: {note}")
+            self._noted[kind] += 1
 
     def text(self, took_s: float) -> str:
         """Return the sentence at the end."""
@@ -343,8 +421,3 @@ class TrackSummary:
             f"{frames} {'frame' if frames == 1 else 'frames'} in {took_s:.1f} s "
             f"({frames / took_s:.0f} a second): large {large:.0f} %, small {small:.0f} %{counted}"
         )
-
-
-def _kind(note: str) -> str:
-    """Return the note without what differs from frame to frame."""
-    return re.split("[:,]", note, maxsplit=1)[0]

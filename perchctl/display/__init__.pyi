@@ -1,11 +1,7 @@
 from .live import LivePage as LivePage
-from .live import PageState as PageState
 from .live import live_page as live_page
-from .page import AXES_OF_SIDE as AXES_OF_SIDE
 from .page import FlightPage as FlightPage
-from .page import failed_card as failed_card
-from .page import summary_card as summary_card
 from .panel import open_panel as open_panel
 from .panel import timed_event_text as timed_event_text
 from .sketch import Sketch as Sketch
-from .sketch import draw_sketch as draw_sketch
+from .sketch import sketch_of as sketch_of

@@ -23,7 +23,6 @@ from urllib.parse import urlsplit
 import cv2
 
 from perchctl.display.sketch import Sketch, draw_sketch
-from perchctl.errors import InvalidValue
 from perchctl.vision import CameraModel
 
 JPEG_QUALITY = 80
@@ -33,8 +32,6 @@ READS_S, LAST_READ_S = 2.5, 2.0
 _RATE_FRAMES = 30  # over which the frame rate is taken
 _RATE_STALE_S = 1.0
 
-PageState = dict[str, Any]
-
 
 class LivePage:
     """Serves one page until closed.
@@ -42,17 +39,15 @@ class LivePage:
     Args:
         camera: for drawing the axes.
         title: heading of the page.
-        port: 0 lets the operating system choose.
         on_stop: called by the STOP button, from a thread of the page; None: no button.
 
-    `url` holds the token that STOP needs. Errors: InvalidValue for a port in use.
+    `url` holds the token that STOP needs.
     """
 
     def __init__(
         self,
         camera: CameraModel,
         title: str,
-        port: int = 0,
         on_stop: Callable[[], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -71,19 +66,12 @@ class LivePage:
         self._frame: int | None = None
         self._times: deque[float] = deque(maxlen=_RATE_FRAMES)
         self._jpeg: tuple[int, bytes] | None = None
-        self._describe: Callable[[], PageState] = dict
+        self._describe: Callable[[], dict[str, Any]] = dict
         self._state_s: float | None = None  # None: nothing is due
         self._read_s: float | None = None
-        self._card: PageState | None = None
+        self._card: dict[str, Any] | None = None
         self._card_read = False
-        try:
-            self._server = PageServer(self, port)
-        except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or str(error)
-            raise InvalidValue(
-                f"port {port} on 127.0.0.1 cannot be used ({reason}); choose another with "
-                f"--view-port, or leave that out"
-            ) from None
+        self._server = PageServer(self)
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}/?token={self.token}"
         self._thread = threading.Thread(
             target=self._server.serve_forever,
@@ -104,13 +92,13 @@ class LivePage:
             self._number += 1
             self._changed.notify_all()
 
-    def set_state(self, describe: Callable[[], PageState], *, live: bool = True) -> None:
+    def set_state(self, describe: Callable[[], dict[str, Any]], *, live: bool = True) -> None:
         """Show these numbers from now on; they are formatted only when a reader polls. While they
         are `live`, others are due at once, and the page says when they stay away."""
         self._describe = describe
         self._state_s = self._clock() if live else None
 
-    def end(self, card: PageState) -> None:
+    def end(self, card: dict[str, Any]) -> None:
         """Show how it ended: the last picture and numbers stay, with this card. Waits, bounded,
         until a reader that is there has it."""
         with self._changed:
@@ -121,7 +109,7 @@ class LivePage:
 
     # --- for the server's threads --------------------------------------------
 
-    def state(self) -> PageState:
+    def state(self) -> dict[str, Any]:
         """What the page polls: `describe`'s keys (rows of a name, a text and, for a bar, a share
         0..1; note, phase, battery, over), and title, rate_hz, stop (``none``, ``ready``,
         ``requested``, ``over``), age_s of these numbers (None where no others are due), card
@@ -144,7 +132,7 @@ class LivePage:
         self._read_s = self._clock()
         return described | fixed | {"page_problem": self.problem}
 
-    def was_read(self, state: PageState) -> None:
+    def was_read(self, state: dict[str, Any]) -> None:
         """Note that this state has reached a reader."""
         if state.get("card") is not None:
             with self._changed:
@@ -210,16 +198,16 @@ class LivePage:
 def live_page(
     camera: CameraModel,
     title: str,
-    port: int | None,
+    wanted: bool,
     report: Callable[[str], None],
     on_stop: Callable[[], None] | None = None,
 ) -> Iterator[LivePage | None]:
-    """Yield a page for the block, or None without a port (0: any free one); `report` prints its
-    address, and at the end its problem. `on_stop`: as in `LivePage`. Errors: InvalidValue."""
-    if port is None:
+    """Yield a page for the block, or None if none is wanted; `report` prints its address, and at
+    the end its problem. `on_stop`: as in `LivePage`."""
+    if not wanted:
         yield None
         return
-    page = LivePage(camera, title, port, on_stop)
+    page = LivePage(camera, title, on_stop)
     report(f"live page{' with a STOP button' if on_stop else ''}: {page.url}")
     try:
         yield page
@@ -259,10 +247,10 @@ class PageServer(ThreadingHTTPServer):
     block_on_close = False
     allow_reuse_address = True
 
-    def __init__(self, page: LivePage, port: int) -> None:
+    def __init__(self, page: LivePage) -> None:
         self.page = page
         self.html = _HTML.read_text(encoding="utf-8")
-        super().__init__(("127.0.0.1", port), _Handler)
+        super().__init__(("127.0.0.1", 0), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Keep an error in the page's `problem`, but for a reader that goes away."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 import threading
 from collections import deque
 from typing import TextIO
@@ -234,15 +233,10 @@ class FlightPanel:
             self._surface.show(tick)
 
 
-def open_panel(interactive: bool | None = None, stream: TextIO | None = None) -> FlightPanel:
-    """Start the display: a panel if `interactive`, plain lines if not; None: as the stream is.
-
-    `stream` defaults to stderr. NO_COLOR takes the colours away.
-    """
-    stream = sys.stderr if stream is None else stream
-    if interactive is None:
-        interactive = stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
-    if not interactive:
+def open_panel(stream: TextIO) -> FlightPanel:
+    """Start the display: a panel if the stream is a terminal, plain lines if not. NO_COLOR takes
+    the colours away."""
+    if not stream.isatty() or os.environ.get("TERM") in ("dumb", "unknown"):
         return FlightPanel(PlainSurface(stream))
     console = Console(
         file=stream,

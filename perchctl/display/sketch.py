@@ -1,4 +1,4 @@
-"""The picture with what was found in it: outlines, the target's axes, numbers."""
+"""The picture with what was found in it: outlines and the target's axes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision import CameraModel, project
+from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput, project
 
 # Blue, green, red.
 _OUTLINE = {"large": (0, 200, 255), "small": (255, 200, 0)}
 _AXES = ((60, 60, 255), (60, 220, 60), (255, 120, 60))
-_TEXT, _SHADOW = (255, 255, 255), (0, 0, 0)
+_OTHER = (255, 255, 255)
 _SUBPIXEL_BITS = 4
-_LEAST_TEXT_SCALE = 0.75  # of what a picture of 480 lines has
+AXES_OF_SIDE = 0.5
+"""Length of the drawn axes, in sides of the large marker."""
 _FAR_PX = 8000.0  # beyond this a line's end shows nothing, and would overflow
 
 
@@ -28,13 +29,26 @@ class Sketch:
         image: grey (h, w) uint8; not changed by drawing.
         outlines: marker's name and its corners (4, 2) px.
         pose: rvec (3,) and tvec (3,) of the axes to draw, and their length in m.
-        text: lines for the lower left corner.
     """
 
     image: NDArray[np.uint8]
     outlines: tuple[tuple[str, Array], ...] = ()
     pose: tuple[Array, Array, float] | None = None
-    text: tuple[str, ...] = ()
+
+
+def sketch_of(frame: Frame, output: PipelineOutput | None, large_side_m: float) -> Sketch:
+    """Return the frame with the outlines of its markers and the axes of its pose; bare if it was
+    not searched. `large_side_m` is the side of the large marker."""
+    if output is None or output.detections.frame_index != frame.index:
+        return Sketch(frame.image)
+    found = ((name, output.detections.get(name)) for name in MARKERS)
+    poses = output.poses
+    pose = next((poses[name] for name in ("joint", "large", "small") if name in poses), None)
+    return Sketch(
+        frame.image,
+        tuple((name, seen.corners_px) for name, seen in found if seen is not None),
+        None if pose is None else (pose.rvec_rad, pose.tvec_m, AXES_OF_SIDE * large_side_m),
+    )
 
 
 def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
@@ -43,7 +57,7 @@ def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
     for name, corners in sketch.outlines:
         if not np.isfinite(corners).all() or np.abs(corners).max() > _FAR_PX:
             continue
-        colour = _OUTLINE.get(name, _TEXT)
+        colour = _OUTLINE.get(name, _OTHER)
         cv2.polylines(
             picture, [_fixed(corners)], True, colour, 1, cv2.LINE_AA, shift=_SUBPIXEL_BITS
         )
@@ -52,7 +66,6 @@ def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
         cv2.circle(picture, (x, y), 3 << _SUBPIXEL_BITS, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
     if sketch.pose is not None:
         _draw_axes(picture, *sketch.pose, camera)
-    _draw_text(picture, sketch.text)
     return picture
 
 
@@ -71,31 +84,6 @@ def _draw_axes(
     for end, colour in zip(fixed[1:], _AXES, strict=True):
         tip = (int(end[0]), int(end[1]))
         cv2.line(picture, start, tip, colour, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def _draw_text(picture: NDArray[np.uint8], lines: tuple[str, ...]) -> None:
-    """Draw white letters with a dark rim into the lower left corner.
-
-    The rim is grown from the letters: the font's glyphs are wider where they are thicker, and
-    the same text drawn thick would not lie under the thin one.
-    """
-    if not lines:
-        return
-    height, width = picture.shape[:2]
-    scale = max(height / 480.0, _LEAST_TEXT_SCALE)
-    margin, row = round(6 * scale), round(17 * scale)
-    band = picture[max(0, height - row * len(lines) - margin) :]
-    letters = np.zeros(band.shape[:2], np.uint8)
-    face, y = cv2.FONT_HERSHEY_SIMPLEX, band.shape[0] - row * (len(lines) - 1) - round(8 * scale)
-    for line in lines:
-        wide_px = cv2.getTextSize(line, face, 0.45 * scale, 1)[0][0]
-        fitting = 0.45 * scale * min(1.0, (width - 2 * margin) / max(wide_px, 1))
-        cv2.putText(letters, line, (margin, y), face, fitting, (255,), 1, cv2.LINE_AA)
-        y += row
-    rim = cv2.dilate(letters, np.ones((3, 3), np.uint8), iterations=max(1, round(scale)))
-    for mask, colour in ((rim, _SHADOW), (letters, _TEXT)):
-        share = mask[:, :, None] / 255.0
-        band[:] = np.rint(band * (1.0 - share) + np.array(colour) * share)
 
 
 def _fixed(points_px: Array) -> NDArray[np.int32]:

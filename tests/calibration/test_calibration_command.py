@@ -112,12 +112,7 @@ def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Pa
         (["images:{board}", "-o", "mine.yaml"], 30, ["--force"]),
         (["{board}/board_0[01].png"], 30, ["only 2 pictures", "add 3"]),
         (["images:sizes"], 30, ["480x300", "480x360"]),
-        (["images:{board}", "--measured", "249.5"], 30, ["WIDTHxHEIGHT in mm"]),
-        (["images:{board}", "--measured", "24.9x17.4"], 30, ["measure what is black"]),
-        (["{one}", "no.png"], 20, ["no.png does not exist"]),
-        (["{one}", "{one}", "{board}"], 2, ["{board}"]),
-        (["{one}", "{one}", "camera:0"], 20, ["camera:0"]),
-        (["{one}", "{two}", "-b", "chessboard:9x6:25mm"], 30, ["none of 2 pictures", "and 1 more"]),
+        (["{one}", "-b", "chessboard:9x6:25mm"], 30, ["none of 1 pictures"]),
     ],
 )
 def test_pictures_that_will_not_do_are_refused(
@@ -135,7 +130,7 @@ def test_pictures_that_will_not_do_are_refused(
     for i, path in enumerate(files[:4] if "images:sizes" in words else []):
         picture = cv2.imread(str(path))
         cv2.imwrite(f"sizes/{path.name}", picture[: 300 if i == 2 else 360])
-    places = {"board": rendered[0], "one": files[0], "two": files[1]}
+    places = {"board": rendered[0], "one": files[0]}
     given = ["-b", BOARD, "-o", "o.yaml", *(word.format(**places) for word in words)]
     refused(calibrate(*given), code, *(part.format(**places) for part in expected))
     assert Path("mine.yaml").read_text() == "mine"
@@ -149,7 +144,6 @@ def test_pictures_that_will_not_do_are_refused(
         (["images:/nowhere"], 20),
         (["images:.", "-b", "chess:9x6"], 30),
         (["images:.", "--model", "cubic"], 2),
-        (["images:.", "--name", "a/b"], 2),
         (["images:.", "--view"], 2),
         (["images:.", "--size", "640x480"], 2),
         (["check", "no.yaml", "images:."], 20),

@@ -130,3 +130,30 @@ def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
         load_calibration(chain, cam="cam2")
     with pytest.raises(InvalidValue, match="is no Kalibr file"):
         load_calibration("example_640x480.yaml", cam="cam0")
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), [
+    ("radtan", "fov", "'fov' is not supported"),
+    ("pinhole", "omni", "'omni' is not supported"),
+    ("[300.0, 300.0, 320.0, 240.0]", "[380.0, 1.0]", "fu, fv, pu, pv"),
+    ("  resolution: [640, 480]\n", "", "key resolution is missing"),
+    ("resolution: [640, 480]", "resolution: 640", "not a number"),
+    ("intrinsics: [300.0,", "intrinsics: [wide,", "not a number"),
+    ("-0.002]", "-0.002, 0.0, 0.0]", "found 6"),
+])  # fmt: skip
+def test_other_camchains_are_refused(tmp_path: Path, old: str, new: str, expected: str) -> None:
+    chain = _camchain(tmp_path / "camchain.yaml")
+    text = chain.read_text()
+    assert old in text
+    chain.write_text(text.replace(old, new, 1))
+    with pytest.raises(InvalidValue, match=expected):
+        load_calibration(chain, cam="cam0")
+
+
+def test_a_missing_size_is_refused(tmp_path: Path) -> None:
+    text = calibration_text(_camera("plumb_bob"), "camera", {})
+    path = tmp_path / "camera.yaml"
+    lines = [line for line in text.splitlines(keepends=True) if not line.startswith("image_")]
+    path.write_text("".join(lines))
+    with pytest.raises(InvalidValue, match="size"):
+        load_calibration(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -19,8 +20,8 @@ from perchctl.calibration.board.capture import (
     signature,
 )
 from perchctl.camera import Grey
-from perchctl.commands.calibrate import capture_live_views
-from perchctl.commands.guide import guide, page_state
+from perchctl.commands.progress import guide, page_state
+from perchctl.display import LivePage, Sketch
 from perchctl.errors import TimedOut
 from tests.helpers.boards import (
     CHARUCO,
@@ -30,7 +31,7 @@ from tests.helpers.boards import (
     draw_camera,
     draw_poses,
 )
-from tests.helpers.calibrating import calibrate
+from tests.helpers.calibrating import calibrate, refused
 from tests.helpers.gear import Pictures
 
 pytestmark = pytest.mark.long
@@ -132,19 +133,19 @@ def test_a_board_s_farther_side_is_known() -> None:
             assert sign * signature(view, CHARUCO)[part] > 0.1
 
 
-def test_live_pictures_are_kept_as_they_come_also_of_a_camera_that_goes(
-    shown: list[Grey], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_live_camera_is_refused_before_anybody_has_worked_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = tmp_path / "calib" / "pictures"
-    with pytest.raises(TimedOut, match="only 2 views"):
-        capture_live_views(_frames(shown[:6]), CHESSBOARD, folder, None)
-    assert f"kept 2 pictures: images:{folder} takes them again" in capsys.readouterr().err
-    for k, name in enumerate(("view_001.png", "view_002.png")):
-        assert (cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) == shown[3 * k]).all()
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(TimedOut, match="only 2 views"):  # a full disk is no reason to end
-        capture_live_views(_frames(shown[:6]), CHESSBOARD, tmp_path / "file" / "p", None)
-    assert capsys.readouterr().err.count("no longer kept") == 1
+    monkeypatch.chdir(tmp_path)
+    output = tmp_path / "calib" / "camera_64x48.yaml"
+    output.parent.mkdir()
+    output.write_text("mine")
+    with contextlib.closing(LivePage(draw_camera(np.random.default_rng(0)), "camera")) as page:
+        page.show(0, Sketch(np.zeros((48, 64), np.uint8)))
+        url = page.url.replace("/?", "/stream?")
+        sentence = refused(calibrate(url), 30)
+        assert "camera_64x48.yaml exists already; add --force" in sentence
+    assert output.read_text() == "mine"
 
 
 def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> None:

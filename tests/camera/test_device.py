@@ -75,23 +75,15 @@ def test_a_camera_is_named_by_number_name_part_of_it_or_path(plugged: Callable[.
             number(text)
 
 
-def test_the_list_for_people_and_for_programs(
-    plugged: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_list_for_people(plugged: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
     devices = plugged({0: "USB Video"}, usb_grabber=0)
     monkeypatch.setattr(check, "find_cameras", lambda: find_cameras(devices, devices))
-
-    def listed(*words: str) -> str:
-        done = CliRunner().invoke(app, ["check", "--cameras", *words])
-        assert done.exit_code == 0
-        return done.stdout
-
-    assert listed().startswith("camera:0  USB Video\n")
-    assert "usb_grabber" in listed()
-    (record,) = json.loads(listed("--json"))
-    assert (record["source"], record["problem"]) == ("camera:0", "")
+    said = CliRunner().invoke(app, ["check", "--cameras"]).stdout
+    assert "camera:0" in said
+    assert "USB Video" in said
+    assert "usb_grabber" in said
     monkeypatch.setattr(os, "access", lambda *_: False)
-    assert "Permission denied" in listed()
+    assert "Permission denied" in CliRunner().invoke(app, ["check", "--cameras"]).stdout
 
 
 def test_no_camera_at_all(plugged: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,8 +18,7 @@ from perchctl.camera import (
     without_password,
 )
 from perchctl.camera.source import to_grey
-from perchctl.commands.calibrate import Source, with_size
-from perchctl.errors import InvalidValue, NotFound, UsageError
+from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig, Profile
 from perchctl.vision import CameraModel, Frame
 
@@ -234,13 +233,3 @@ def test_what_is_no_picture_is_named(tmp_path: Path, data: bytes) -> None:
     path.write_bytes(data)
     with pytest.raises(InvalidValue, match=r"a\.jpg .*(cannot be read|is cut off)"):
         open_camera(f"images:{path}", clock)
-
-
-def test_the_size_of_a_calibration_is_asked_of_a_camera_of_this_computer_only() -> None:
-    assert with_size(Source("camera:0"), "720x576").size_px == (720, 576)
-    assert with_size(Source("http://host/a"), None).size_px is None
-    for text in ("720", "720x", "0x0", "720 x 576"):
-        with pytest.raises(InvalidValue, match="WIDTHxHEIGHT, as in 720x576"):
-            with_size(Source("camera:0"), text)
-    with pytest.raises(UsageError, match="http://host/a has its own: leave it out"):
-        with_size(Source("http://me:secret@host/a"), "720x576")

@@ -117,7 +117,8 @@ def test_progress_is_one_line_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> 
         for _ in range(10):
             advance(PERCHED)
     lines = re.split(r"[\r\n]+", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue()))
-    assert lines[-2].endswith("925/1000 10.0/min 0:07:30 left 12 landed 3 aborted 910 perched")
+    assert "925/1000" in lines[-2]
+    assert lines[-2].endswith("12 landed 3 aborted 910 perched")
     assert len(lines[-2]) <= 80
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -16,9 +15,7 @@ import pytest
 
 from perchctl.display import LivePage, Sketch
 from perchctl.display.live import TOKEN_HEADER, is_loopback
-from perchctl.errors import InvalidValue
 from tests.helpers.live_page import CORNERS, ask, stop
-from tests.helpers.recording import camera
 
 
 def test_the_page_needs_nothing_from_elsewhere(page: LivePage) -> None:
@@ -39,24 +36,6 @@ def test_the_state_is_the_newest(page: LivePage) -> None:
     assert state["title"] == "perchctl test"
     assert state["stop"] == "ready"
     assert state["rate_hz"] == 0.0
-
-
-def test_the_frame_rate_counts_frames_and_falls_to_zero() -> None:
-    times = iter([10.0, 10.1, 10.2, 10.3])
-    now = [10.3]
-    page = LivePage(camera(), "t", clock=lambda: next(times, now[0]))
-    try:
-        for index in range(4):
-            page.show(index, Sketch(np.zeros((4, 4), np.uint8)))
-            if index == 2:
-                before = page._number
-        page.show(3, Sketch(np.zeros((4, 4), np.uint8)))  # the same frame, drawn into
-        assert page._number == before + 2
-        assert page.rate_hz() == pytest.approx(10.0)
-        now[0] = 12.0
-        assert page.rate_hz() == 0.0
-    finally:
-        page.close()
 
 
 @contextmanager
@@ -82,7 +61,7 @@ def read_part(stream: http.client.HTTPResponse) -> np.ndarray[Any, Any]:
 def test_the_stream_gives_the_drawn_picture(page: LivePage) -> None:
     grey = np.full((480, 640), 90, np.uint8)
     pose = (np.array([np.pi, 0.0, 0.0]), np.array([0.0, 0.0, 0.5]), 0.075)
-    page.show(0, Sketch(grey, (("large", CORNERS),), pose, ("stage both",)))
+    page.show(0, Sketch(grey, (("large", CORNERS),), pose))
     with streaming(page) as answer:
         assert answer.getheader("Content-Type", "").startswith("multipart/x-mixed-replace")
         drawn = read_part(answer).astype(int)
@@ -107,15 +86,6 @@ def test_what_fails_is_remembered_and_not_raised(page: LivePage) -> None:
     assert b"image/jpeg" not in ask(page.url, "/stream")[1]
     assert page.problem is not None
     assert ask(page.url)[0] == 200
-
-
-def test_a_port_in_use_is_refused_in_one_sentence() -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(InvalidValue, match=f"port {port} .*--view-port"):
-            LivePage(camera(), "t", port)
 
 
 # --- who may do what --------------------------------------------------------------------
@@ -155,12 +125,3 @@ def test_the_names_of_this_machine() -> None:
         assert is_loopback(host)
     for host in ("127.0.0.1@evil.example", "127.0.0.2", "[", None):
         assert not is_loopback(host)
-
-
-def test_without_stop_there_is_none() -> None:
-    page = LivePage(camera(), "t")
-    try:
-        assert json.loads(ask(page.url, "/state")[1])["stop"] == "none"
-        assert stop(page.url, page.token) == 403
-    finally:
-        page.close()

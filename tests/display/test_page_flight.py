@@ -15,7 +15,7 @@ import pytest
 
 from perchctl.commands import fly
 from perchctl.commands.fly import flight_page
-from perchctl.display import FlightPage, LivePage, failed_card, summary_card
+from perchctl.display import FlightPage, LivePage
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch
 from perchctl.flight.operator import AGAIN_S, HELD_S
@@ -139,17 +139,6 @@ def test_after_the_flight_nothing_is_due_and_nothing_to_stop(
     assert (state["age_s"], state["stop"]) == (None, "over")
 
 
-def test_the_page_looks_at_the_age_by_itself(page: LivePage) -> None:
-    """Whatever hangs, its script is the browser's: a timer, answers that are not waited for
-    without end (`AbortSignal.timeout` is of 2022, and asked for before each use), and a STOP that
-    is ready again at a program that was gone and now hangs."""
-    script = page._server.html.partition("<script")[2]
-    for part in ("setInterval(watch", "AbortSignal.timeout ?", "known = stop;"):
-        assert part in script
-    assert script.count("...within(") == 2
-    assert 'showStop(silent ? known : "gone")' in script
-
-
 # --- STOP ------------------------------------------------------------------------------------
 
 OPTIONS = FlyOptions(load_profile("sim"), Path("sim.yaml"), "sim://", "sim:")
@@ -158,7 +147,7 @@ OPTIONS = FlyOptions(load_profile("sim"), Path("sim.yaml"), "sim://", "sim:")
 def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) -> None:
     now_s = [100.0]
     switch = OperatorSwitch(listening=True, clock=lambda: now_s[0])
-    with flight_page(OPTIONS, 0, switch) as flight:
+    with flight_page(OPTIONS, True, switch) as flight:
         assert flight is not None
         assert flight.page.url in capsys.readouterr().err
         assert switch.read() is Operator.NONE
@@ -175,12 +164,6 @@ def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) ->
         assert switch.read() is Operator.STOP
 
 
-def test_without_view_no_page_is_opened(capsys: pytest.CaptureFixture[str]) -> None:
-    with flight_page(OPTIONS, None, OperatorSwitch()) as flight:
-        assert flight is None
-    assert capsys.readouterr().err == ""
-
-
 # --- how it ended ----------------------------------------------------------------------------
 
 SUMMARY = FlightSummary(
@@ -188,9 +171,12 @@ SUMMARY = FlightSummary(
 )
 
 
-def test_the_card_tells_outcome_reason_miss_and_where_to_look(tmp_path: Path) -> None:
+def test_the_card_tells_outcome_reason_miss_and_where_to_look(
+    page: LivePage, tmp_path: Path
+) -> None:
     log = tmp_path / "my flights" / "flight.jsonl"
-    card = summary_card(SUMMARY, log)
+    FlightPage(page, 0.15).end(SUMMARY, log)
+    card = state_of(page)["card"]
     assert (card["outcome"], card["good"]) == ("PERCHED", True)
     assert card["reason"] == SUMMARY.reason
     rows = dict(card["rows"])
@@ -202,20 +188,16 @@ def test_the_card_tells_outcome_reason_miss_and_where_to_look(tmp_path: Path) ->
 def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     page: LivePage, tmp_path: Path
 ) -> None:
-    card = failed_card(Interrupted("interrupted before take-off"), None)
-    assert (card["outcome"], card["good"], card["rows"]) == ("FAILED", False, [])
-    assert "report" in dict(failed_card(RuntimeError(), tmp_path)["rows"])
     flight = FlightPage(page, 0.15)
+    flight.fail(Interrupted("interrupted before take-off"), None)
+    card = state_of(page)["card"]
+    assert (card["outcome"], card["good"], card["rows"]) == ("FAILED", False, [])
     flight.event(note(START_S, "RuntimeError in flight: it is down, or hangs: the motors are off"))
     flight.event(note(START_S, "the recording has ended (no space): the flight and its log go on"))
-    flight.end(failed_card(RuntimeError("boom"), None))
-    assert state_of(page)["card"]["rows"][0][1].endswith("the motors are off")
-
-
-def test_nobody_is_waited_for_where_nobody_looks(page: LivePage) -> None:
-    page.end({"outcome": "LANDED"})  # returns at once: no reader would ever wake it
-    state = state_of(page)
-    assert (state["card"], state["stop"], state["age_s"]) == ({"outcome": "LANDED"}, "over", None)
+    flight.fail(RuntimeError("boom"), tmp_path)
+    rows = state_of(page)["card"]["rows"]
+    assert rows[0][1].endswith("the motors are off")
+    assert "report" in dict(rows)
 
 
 def test_who_looks_gets_the_card_before_the_page_goes(page: LivePage) -> None:
@@ -264,7 +246,7 @@ def test_the_page_of_a_flight_ends_with_its_card(
         return report, None
 
     monkeypatch.setattr(fly, "_session", session)
-    assert fly.fly_and_report(options, as_json=False, port=0) == 50
+    assert fly.fly_and_report(options, as_json=False, view=True) == 50
     card = last_state["card"]
     assert card["outcome"] == "LANDED"
     assert card["reason"].startswith("target not found")
@@ -280,12 +262,12 @@ def test_the_page_of_a_flight_that_failed_says_so(
         raise Interrupted("interrupted before take-off: nothing was started")
 
     ended: list[str] = []
-    page_end, abandon = FlightPage.end, LogWatcher.abandon
-    monkeypatch.setattr(FlightPage, "end", lambda *a: (ended.append("page"), page_end(*a)))
+    page_fail, abandon = FlightPage.fail, LogWatcher.abandon
+    monkeypatch.setattr(FlightPage, "fail", lambda *a: (ended.append("page"), page_fail(*a)))
     monkeypatch.setattr(LogWatcher, "abandon", lambda *a: (ended.append("log"), abandon(*a)))
     monkeypatch.setattr(fly, "_session", session)
     with pytest.raises(Interrupted):
-        fly.fly_and_report(options, as_json=False, port=0)
+        fly.fly_and_report(options, as_json=False, view=True)
     assert last_state["card"]["outcome"] == "FAILED"
     assert "nothing was started" in last_state["card"]["reason"]
     assert last_state["card"]["rows"] == []  # no tick, no log

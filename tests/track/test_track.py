@@ -1,9 +1,12 @@
-"""`perchctl track`: its results against the truth, and the sentences that pictures deserve."""
+"""`perchctl track`: its results against the truth, the sentences that pictures deserve, its end."""
 
 from __future__ import annotations
 
 import json
 import math
+import signal
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,38 +14,80 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration import load_calibration
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.track import Tracker, TrackSummary, frames
+from perchctl.display import LivePage
 from perchctl.errors import InvalidValue
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.vision import Frame, project, square_corners
+from tests.helpers.commands import run
 from tests.helpers.interlaced import Pass
+from tests.helpers.live_page import ask
 from tests.helpers.recording import (
+    CALIBRATION,
     STAGE_OF,
     VIEWS,
     camera,
     moving,
     picture,
     true_pose,
+    write_pictures,
     write_video,
 )
 from tests.helpers.target_picture import CAMERA
-from tests.helpers.track import (
-    CALIBRATION,
-    DISTORTION,
-    MOVING,
-    PINHOLE,
-    lines,
-    track,
-    write_opencv,
-    write_ros,
-)
 
 SCENES = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "scenes"
 PAL_S = 0.04
 FIELDS = 10
+MOVING = 24
+"""Frames of the video of a moving camera."""
+parse = partial(json.loads, parse_constant=pytest.fail)
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """One run: its exit code, the objects on stdout, and the sentences on stderr."""
+
+    code: int
+    lines: list[dict[str, Any]]
+    stderr: str
+
+
+def track(source: str | Path, *words: str | Path, calibration: Path = CALIBRATION) -> Tracked:
+    """`perchctl track SOURCE --json` with these words."""
+    given = ("track", source, "--json", "--calibration", calibration, *words)
+    said = run(*map(str, given))
+    return Tracked(said.code, [parse(line) for line in said.stdout.splitlines()], said.stderr)
+
+
+def lines(source: str | Path, *words: str | Path, **options: Path) -> list[dict[str, Any]]:
+    """Those of a run that ends well."""
+    tracked = track(source, *words, **options)
+    assert tracked.code == 0, tracked.stderr
+    return tracked.lines
+
+
+def write_opencv(path: Path, size_px: tuple[int, int], K: Any, dist: Any) -> Path:
+    """A calibration as OpenCV's FileStorage writes it."""
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", size_px[0])
+    storage.write("image_height", size_px[1])
+    storage.write("camera_matrix", np.array(K).reshape(3, 3))
+    storage.write("distortion_coefficients", np.array(dist).reshape(-1, 1))
+    storage.release()
+    return path
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_pictures(tmp_path_factory.mktemp("track") / "pictures")
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    images = [picture(moving(i), i) for i in range(MOVING)]
+    return write_video(tmp_path_factory.mktemp("track") / "moving.mp4", images)
 
 
 SHAPES = {
@@ -146,32 +191,6 @@ def test_files_of_pictures_are_stills_unless_the_user_says_otherwise(pictures: P
     )
 
 
-def test_rendered_scenes_with_exact_truth(tmp_path: Path) -> None:
-    if not (SCENES / "truth.json").is_file():
-        pytest.skip(f"the rendered scenes are absent ({SCENES})")
-    truth = json.loads((SCENES / "truth.json").read_text())
-    values = [v for row in truth["camera_matrix"] for v in row]
-    file = write_ros(tmp_path, values, truth["dist_coeffs"])
-    found_lines = {line["frame"]: line for line in lines(SCENES / "frames", calibration=file)}
-    assert sorted(found_lines) == sorted(Path(f["file"]).name for f in truth["frames"])
-    found = {"large": [0, 0], "small": [0, 0]}
-    for entry in truth["frames"]:
-        line = found_lines[Path(entry["file"]).name]
-        check_schema(line)
-        if not entry["target_present"]:
-            assert line["stage"] == "none", entry["file"]
-            continue
-        for name in found:
-            if entry[f"{name}_in_view"] and entry["category"] != "occluded":
-                found[name][0] += line[name] is not None
-                found[name][1] += 1
-        if entry["category"] in ("clean", "table1", "table2"):
-            error_m = np.array(line["target"]["tvec_m"]) - entry["tvec"]
-            assert np.abs(error_m).max() < (0.0005 if entry["tvec"][2] < 0.25 else 0.006)
-    assert found["large"][0] >= 0.9 * found["large"][1]
-    assert found["small"][0] >= 0.85 * found["small"][1]
-
-
 # --- interlaced and blended pictures ----------------------------------------------------
 
 
@@ -188,10 +207,7 @@ def recording(folder: Path, *scenes: tuple[Pass, int]) -> Path:
 
 def test_the_fields_of_a_video_are_tracked_one_by_one(tmp_path: Path, calibration: Path) -> None:
     scene = Pass(0.3, (0.2, 0.05, 0.0), camera_fields="bottom")
-    overlay = tmp_path / "seen.mp4"
-    tracked = track(
-        recording(tmp_path, (scene, FIELDS)), "--overlay", overlay, calibration=calibration
-    )
+    tracked = track(recording(tmp_path, (scene, FIELDS)), calibration=calibration)
     assert [line["frame"] for line in tracked.lines[-4:]] == [8, 8, 9, 9]
     times = [line["t_s"] for line in tracked.lines[-6:]]
     assert np.diff(times) == pytest.approx(PAL_S / 2, abs=1e-3)
@@ -200,16 +216,6 @@ def test_the_fields_of_a_video_are_tracked_one_by_one(tmp_path: Path, calibratio
     x = [np.mean(line["small"]["corners_px"], axis=0)[0] for line in tracked.lines[-8:]]
     assert (np.diff(x) < 0).all() or (np.diff(x) > 0).all()
     assert tracked.stderr.count("interlaced") == 2  # as it begins, in the summary
-    video = cv2.VideoCapture(str(overlay))
-    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == FIELDS
-
-
-def test_a_camera_that_rests_and_moves_is_named_once(tmp_path: Path, calibration: Path) -> None:
-    """At rest nothing is combed, and when it moves again that is no news."""
-    moves = Pass(0.3, (0.2, 0.05, 0.0), camera_fields="top")
-    rests = Pass(0.3, (0.0, 0.0, 0.0), 0.0, camera_fields="top")
-    file = recording(tmp_path, (moves, 4), (rests, 3), (moves, 4))
-    assert track(file, calibration=calibration).stderr.count("interlaced") == 2
 
 
 def test_interlaced_stills_have_one_result_each(tmp_path: Path, calibration: Path) -> None:
@@ -223,13 +229,6 @@ def test_interlaced_stills_have_one_result_each(tmp_path: Path, calibration: Pat
     for line in tracked.lines:
         assert np.abs(np.array(line["target"]["tvec_m"]) - truth[line["frame"]]).max() < 2e-4
     assert "interlaced" in tracked.stderr
-
-
-def test_blended_fields_are_named(tmp_path: Path, calibration: Path) -> None:
-    scene = Pass(0.3, (0.25, 0.05, 0.0), camera_fields="top", camera_blended=True)
-    said = track(recording(tmp_path, (scene, FIELDS)), calibration=calibration).stderr
-    assert "blended" in said
-    assert "interlaced" not in said
 
 
 # --- pictures that cannot be right ------------------------------------------------------
@@ -286,17 +285,6 @@ def test_a_live_picture_that_repeats_is_no_frame_and_then_frozen() -> None:
     assert "snow" in snow.notes[0]
 
 
-@pytest.mark.parametrize("stills", [False, True])
-def test_a_video_is_filtered_and_a_still_is_as_measured(stills: bool) -> None:
-    following = tracker(live=False, stills=stills)
-    for i in range(3):
-        [seen] = following.results(Frame(i, i / 30.0, picture(moving(i), i)), i)
-    assert seen.output is not None
-    assert seen.target is not None
-    measured_m = seen.output.poses["joint"].tvec_m
-    assert np.array_equal(seen.target.tvec_m, measured_m) is stills
-
-
 def test_markers_that_contradict_are_named() -> None:
     sim = load_profile("sim")
     small = sim.target.small.model_copy(update={"side_m": 0.032})
@@ -317,13 +305,9 @@ def test_a_print_error_is_named(video: Path, tmp_path: Path) -> None:
     said = track(video, "-p", profile, calibration=own).stderr
     assert "print error: the small marker is" in said
     assert "print good within its noise" in track(video, calibration=own).stderr
-
-
-def test_the_calibration_is_named_and_the_example_judges_no_print(video: Path) -> None:
-    """Another camera's lens would call a good print wrong."""
-    said = track(video).stderr
-    assert "calibration: example_640x480.yaml, the shipped example" in said
-    assert "print" not in said
+    example = track(video).stderr  # whose lens would call a good print wrong
+    assert "the shipped example" in example
+    assert "print" not in example
 
 
 class Script:
@@ -361,71 +345,104 @@ class Script:
 def test_a_live_source_is_waited_for_and_its_end_is_told(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    seen = [f.index for f in frames(Script(3), lambda: 5.0, Stopper(), TrackSummary())]
+    seen = [f.index for f in frames(Script(3), lambda: 5.0, Stopper())]
     assert seen == [2, 1, 0]
     said = capsys.readouterr().err
     assert said.startswith("perchctl: silent for 2 s; waiting")
     assert said.endswith("perchctl: the stream has ended\n")
 
 
-# --- whose calibration ------------------------------------------------------------------
-
-KALIBR = """cam0:
-  cam_overlaps: []
-  camera_model: pinhole
-  distortion_coeffs: [-0.17, 0.04, 0.0004, -0.0007]
-  distortion_model: radtan
-  intrinsics: [380.0, 380.6, 321.5, 238.2]
-  resolution: [640, 480]
-  rostopic: /camera/image_raw
-"""
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        ("radtan", "fov", "'fov' is not supported"),
-        ("pinhole", "omni", "'omni' is not supported"),
-        ("intrinsics: [380.0, 380.6, 321.5, 238.2]", "intrinsics: [380.0, 1.0]", "fu, fv, pu, pv"),
-        ("  resolution: [640, 480]\n", "", "key resolution is missing"),
-        ("resolution: [640, 480]", "resolution: 640", "not a number"),
-        ("intrinsics: [380.0,", "intrinsics: [wide,", "not a number"),
-        ("rostopic: /camera/image_raw\n", "x: 1\ncam1: {}\n", "holds 2 cameras"),
-        (KALIBR, "cam0: 3\n", "cam0 must hold keys"),
-        ("-0.0007]", "-0.0007, 0.0, 0.0]", "found 6"),
-    ],
-)
-def test_other_camchains_are_refused(tmp_path: Path, old: str, new: str, expected: str) -> None:
-    assert old in KALIBR
-    path = tmp_path / "camchain.yaml"
-    path.write_text(KALIBR.replace(old, new))
-    with pytest.raises(InvalidValue, match=expected):
-        load_calibration(path)
-
-
-def test_the_opencv_fisheye_flag_is_heeded(tmp_path: Path) -> None:
-    path = write_opencv(tmp_path / "fisheye.yml", (640, 480), dist=np.zeros(4))
-    path.write_text(path.read_text() + "fisheye_model: 1\n")
-    assert load_calibration(path).model == "fisheye"
-
-
-def test_a_missing_size_is_refused(tmp_path: Path) -> None:
-    whole, ros = write_ros(tmp_path, PINHOLE, DISTORTION), tmp_path / "without.yaml"
-    ros.write_text(whole.read_text().replace("image_width: 640\nimage_height: 480\n", ""))
-    for file in (ros, write_opencv(tmp_path / "opencv.yml", None)):
-        with pytest.raises(InvalidValue, match="image size is missing"):
-            load_calibration(file)
-
-
 @pytest.mark.parametrize("number", [0, 1])
-def test_a_picture_of_another_size_is_named_and_no_file_is_left(
-    number: int, tmp_path: Path
-) -> None:
+def test_a_picture_of_another_size_is_named(number: int, tmp_path: Path) -> None:
     for k in range(2):
         size = (320, 240) if k == number else (640, 480)
         cv2.imwrite(str(tmp_path / f"{k}.png"), cv2.resize(picture(VIEWS["both"]), size))
-    tracked = track(tmp_path, "--csv", tmp_path / "x.csv", "--overlay", tmp_path / "x.mp4")
+    tracked = track(tmp_path)
     assert tracked.code == InvalidValue.exit_code
     for words in (f"{number}.png", "320x240", "640x480"):
         assert words in tracked.stderr
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["0.png", "1.png"]
+
+
+# --- the page, the end, bad input -----------------------------------------------------------
+
+
+def test_the_live_page_has_the_newest_numbers(
+    pictures: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states = []
+    tell = LivePage.set_state
+
+    def asked(self: LivePage, *describe: Any) -> None:
+        tell(self, *describe)
+        states.append(json.loads(ask(self.url, "/state")[1]))
+
+    monkeypatch.setattr(LivePage, "set_state", asked)
+    tracked = track(pictures, "--view")
+    shown = [dict(state["rows"]) for state in states]
+    assert [rows["markers"] for rows in shown] == [line["stage"] for line in tracked.lines]
+    for rows, line in zip(shown, tracked.lines, strict=True):
+        if line["target"] is None:
+            assert rows["target"] == "target not seen"
+        else:
+            assert f"{100.0 * line['target']['tvec_m'][0]:+.2f}" in rows["target"]
+    assert {state["stop"] for state in states} == {"none"}
+    assert "live page: http://127.0.0.1" in tracked.stderr
+    assert "failed" not in tracked.stderr
+
+
+def test_what_was_not_found_is_said(pictures: Path) -> None:
+    said = run("track", str(pictures / "away.png"))
+    assert "target not seen" in said.stdout
+    assert said.complaint.startswith("1 frame in")
+
+
+def test_ctrl_c_leaves_whole_lines(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    count = TrackSummary.add
+
+    def pressing(self: TrackSummary, *results: Any) -> None:
+        count(self, *results)
+        if self.frames == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(TrackSummary, "add", pressing)
+    tracked = track(video)
+    assert tracked.code == 130
+    *lines, failure = tracked.lines
+    assert (len(lines), failure["exit_code"]) == (3, 130)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "expected"),
+    [
+        (["nowhere.mp4"], 20, "nowhere.mp4 does not exist"),
+        (["video:nowhere.mp4"], 20, "nowhere.mp4 was not found"),
+        (["images:*.nothing"], 20, "names pictures"),
+        (["nonsense"], 20, "nonsense does not exist"),
+        (["nonsense:1"], 30, "camera:N"),
+        (["sim:"], 30, "camera:N"),
+        (["."], 20, "holds no pictures"),
+        (["BROKEN"], 30, "a.png cannot be read"),
+        (["PICTURES", "--calibration", "no.yaml"], 20, "no.yaml"),
+        (["PICTURES", "-p", "nobody"], 20, "'nobody'"),
+    ],
+)
+def test_bad_input_is_one_sentence(
+    words: list[str],
+    code: int,
+    expected: str,
+    pictures: Path,
+    video: Path,
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    broken = tmp_path_factory.mktemp("broken") / "a.png"
+    broken.write_bytes(b"no picture")
+    places = {"PICTURES": str(pictures), "VIDEO": str(video), "BROKEN": str(broken)}
+    said = run("track", *(places.get(word, word) for word in words))
+    assert (said.code, said.stdout) == (code, "")
+    assert expected in said.stderr
+    if said.stderr.startswith("perchctl: "):
+        assert len(said.stderr.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from textwrap import wrap
 
 import numpy as np
@@ -11,7 +10,7 @@ from matplotlib.figure import Figure
 
 from perchctl.calibration.board.predict import limit_mm
 from perchctl.calibration.board.solve import Calibration, Level
-from perchctl.plot import BLACK, BLUE, GREEN, GREY, GRID, VERMILLION, new_figure, save_png
+from perchctl.plot import BLACK, BLUE, GREEN, GREY, GRID, VERMILLION, figure_bytes, new_figure
 
 BANNER: dict[Level, str] = {"fly": GREEN, "care": "#B36B00", "stop": "#B00020"}
 WIDTH_IN, PANELS_IN, LINE_IN = 13.0, 8.6, 0.26
@@ -24,9 +23,7 @@ LIMIT_LOW = 0.5  # mm: the axis reaches down to it
 
 def draw_calibration(calibration: Calibration) -> bytes:
     """Return the report as a PNG."""
-    content = io.BytesIO()
-    save_png(report_figure(calibration), content)
-    return content.getvalue()
+    return figure_bytes(report_figure(calibration))
 
 
 def report_figure(calibration: Calibration) -> Figure:
