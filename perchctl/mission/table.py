@@ -85,7 +85,6 @@ ONLY_UP = frozenset({P.APPROACH, P.SEARCH, P.ESTIMATE})
 WALKED = frozenset({P.ESTIMATE, P.ALIGN, P.ASCEND})
 _CAMERA_PHASES = BY_CAMERA - {P.RECOVER}
 
-CATCHABLE_M = 1.0  # lower, a slip reaches the floor (docs/firmware.md, "Catching a slip")
 KNOCKED_S = 0.04  # more than one sample of telemetry
 LIFTED_M, SIDEWAYS_M = 0.05, 0.12
 LOW_M, ASTRAY_LOW_M, ASTRAY_LANDING_M, ASTRAY_M = 0.3, 0.22, 0.4, 0.8
@@ -370,10 +369,7 @@ def why_contact(c: Context) -> str:
     by = "position, acceleration and thrust"
     if not c.placed:
         by = f"acceleration and thrust, {unplaced_text(c)}"
-    text = f"contact proven by {by}; {1e3 * aside_m:.1f} +- {1e3 * sigma_m:.1f} mm off centre"
-    if c.height_m >= CATCHABLE_M:
-        return text
-    return f"{text}; at {c.height_m:.1f} m, too low for a slip to be caught"
+    return f"contact proven by {by}; {1e3 * aside_m:.1f} +- {1e3 * sigma_m:.1f} mm off centre"
 
 
 def stopped_for_s(c: Context) -> float:
