@@ -23,7 +23,7 @@ from perchctl.analysis.sight import (
     within,
 )
 from perchctl.geometry import Array
-from perchctl.mission import Findings, SentBy
+from perchctl.mission import Findings
 from perchctl.record import FlightLog, FlightSummary, PhaseSpan
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -318,7 +318,7 @@ class Takeover:
     """What one sender sent in one go. Times are on the loop's clock; `sent` counts the commands by
     their name in a tick's `cmd`, in the order of their first."""
 
-    by: SentBy
+    by: str
     start_s: float
     end_s: float
     sent: tuple[tuple[str, int], ...]

@@ -10,7 +10,6 @@ from typing import Any
 
 from perchctl.analysis.decide import Decided, Difference, decide
 from perchctl.analysis.replayer import Replay, Seen
-from perchctl.mission import Condition
 
 CAUTION = (
     "after the first difference the world would have answered differently: from there on this is "
@@ -164,7 +163,7 @@ def changed_gates(replay: Replay) -> list[Gate]:
 
 def _falls(decided: Iterable[Decided], t0_s: float) -> dict[str, list[float]]:
     times: dict[str, list[float]] = {}
-    before: frozenset[Condition] = frozenset()
+    before: frozenset[Any] = frozenset()
     row = ""
     for each in decided:
         if each.turn.role != "flown" or each.state is None:

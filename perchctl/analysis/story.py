@@ -11,7 +11,7 @@ import numpy as np
 from perchctl.analysis.flight import FlightAnalysis, runs_of
 from perchctl.analysis.sight import Loss
 from perchctl.analysis.words import count, length
-from perchctl.mission import SEVEN_PHASES, Phase
+from perchctl.mission import Phase
 from perchctl.record import PhaseSpan
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -31,7 +31,7 @@ ACTS = {
     "stop": "it stopped the motors",
     "emergency": "it cut the motors",
 }
-SEVEN = tuple(phase.value for phase in SEVEN_PHASES)
+SEVEN = tuple(phase.value for phase in Phase)[:7]
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from perchctl.campaign.pool import FlightPool
 from perchctl.campaign.results import FlightEnd, FlightResult, peak_memory_mb
 from perchctl.errors import InvalidValue, PerchError, SafetyAbort, TimedOut
 from perchctl.flight import LockstepFlight, fly_lockstep
-from perchctl.mission import Event, EventKeeper, Phase
+from perchctl.mission import Event, Phase, Tick
 from perchctl.profile import Profile
 from perchctl.record import FlightSummary, LogWatcher
 from perchctl.sim import Scenario, draw_scenario
@@ -120,11 +120,26 @@ def fly_logged(profile: Profile, folder: Path, seed: int, record: bool = False) 
     (calibration, log)."""
     cv2.setNumThreads(1)
     log = LogWatcher.lockstep(seed_log_path(seed, folder), profile, seed, record)
-    events = EventKeeper()
+    events = _EventKeeper()
     flight = fly_lockstep(profile, seed, log, watchers=(events,))
     summary = _closed(log, flight)
     assert summary is not None
     return LoggedFlight(seed, _outcome(flight), summary, log.path, tuple(events.seen))
+
+
+class _EventKeeper:
+    """A watcher that keeps the events."""
+
+    problem: str | None = None
+
+    def __init__(self) -> None:
+        self.seen: list[Event] = []
+
+    def tick(self, tick: Tick) -> None:
+        return None
+
+    def event(self, event: Event) -> None:
+        self.seen.append(event)
 
 
 def _closed(log: LogWatcher, flight: LockstepFlight) -> FlightSummary | None:

@@ -12,7 +12,7 @@ from perchctl.camera import FrameSource, WatchedSource
 from perchctl.display.live import LivePage, PageState
 from perchctl.display.panel import status_rows
 from perchctl.display.sketch import Sketch
-from perchctl.mission import RESCUE, Event, EventKind, Tick
+from perchctl.mission import Event, Tick
 from perchctl.record import FlightSummary, summary_text
 from perchctl.vision import MARKERS, Frame, PipelineOutput
 
@@ -59,7 +59,7 @@ class FlightPage:
             self.page.remember(error)
 
     def event(self, event: Event) -> None:
-        if event.kind is EventKind.NOTE and RESCUE in event.reason:
+        if event.is_rescue:
             self._rescue = event.reason
 
     def end(self, card: Card) -> None:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from perchctl.flight import RESCUED
-from perchctl.mission import RESCUE, Event, EventKind, Finding, FlightReport, Outcome, Phase
+from perchctl.mission import Event, Finding, FlightReport, Outcome, Phase
 
 Claim = Literal[
     "hangs on the target", "held off the target", "hangs", "stands", "hangs or stands",
@@ -53,12 +52,12 @@ NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
 HELD_ELSEWHERE = "held-elsewhere"
 """The transitions of flights whose end the program does not know: whether the vehicle hangs or
 stands, and whether it came down at all."""
-RESCUE_CLAIMS: dict[Finding | None, frozenset[Claim]] = {
+RESCUE_CLAIMS: dict[Finding, frozenset[Claim]] = {
     Finding.STANDS: _claims("stands"),
     Finding.HANGS: _claims("hangs"),
     Finding.HELD: _claims("held off the target"),
     Finding.UNKNOWN: _claims("hangs or stands"),
-    None: _claims("not seen down"),
+    Finding.UNSEEN: _claims("not seen down"),
 }
 """The claims in the note of a rescue, by its finding."""
 REFUSAL_CLAIMS = _claims("stands")
@@ -82,7 +81,7 @@ def claims_of(report: FlightReport) -> frozenset[Claim]:
 
 def claims_of_rescue(event: Event) -> frozenset[Claim]:
     """Return the claims of a rescue's note; none for any other event."""
-    if event.kind is not EventKind.NOTE or RESCUE not in event.reason:
+    if not event.is_rescue:
         return _claims()
-    found = next(found for found, text in RESCUED.items() if event.reason.endswith(text))
+    found = next(found for found in Finding if found.value in event.reason)
     return RESCUE_CLAIMS[found]

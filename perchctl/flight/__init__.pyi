@@ -10,7 +10,6 @@ from .lockstep import LockstepFlight as LockstepFlight
 from .lockstep import feed_lockstep as feed_lockstep
 from .lockstep import fly_lockstep as fly_lockstep
 from .lockstep import lockstep_source as lockstep_source
-from .loop import RESCUED as RESCUED
 from .loop import FlightParts as FlightParts
 from .loop import fly as fly
 from .operator import OperatorSwitch as OperatorSwitch

@@ -19,11 +19,11 @@ from dataclasses import dataclass
 from perchctl.flight.clock import Clock
 from perchctl.link import Link
 from perchctl.mission import (
+    Finding,
     Observation,
     Operator,
     Phase,
     PlannerState,
-    Rest,
     SentCommand,
     VisualInertialMotion,
     rest_of,
@@ -233,9 +233,9 @@ def rescue(
     position_age_s: Callable[[float], float] = lambda now_s: 0.0,
     told: Callable[[SentCommand], None] = lambda sent: None,
     felt: VisualInertialMotion | None = None,
-) -> Rest:
+) -> str:
     """Land whatever still flies, without planner, camera and log, bounded by the landing's time.
-    Returns where the vehicle came to rest, once its motors have been seen off.
+    Returns where the vehicle came to rest, as a sentence without its end.
 
     Args:
         state: the planner's last; None before its first tick.
@@ -256,7 +256,7 @@ def rescue(
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
         if operator() is Operator.STOP:
             send(EmergencyStop())  # the link's guard repeats it
-            return Rest()
+            return Finding.UNSEEN.value
         with suppress(Exception):
             history = add_samples(history, link.telemetry(), profile.safety)
         newest = history.newest
@@ -278,7 +278,7 @@ def rescue(
             if rest is not None:
                 return rest
         clock.wait_until(now_s + period_s)
-    return Rest()
+    return Finding.UNSEEN.value
 
 
 def _before_take_off(obs: Observation) -> PlannerState:

@@ -120,12 +120,13 @@ MANOEUVRES: dict[tuple[Evidence, Reach, Stage], Manoeuvre] = {
 
 
 class Finding(Enum):
-    """Where a vehicle with its motors off is."""
+    """Where a vehicle with its motors off is, as a sentence without its end."""
 
-    HANGS = "hangs"
-    HELD = "is held away from the target"
-    STANDS = "stands"
-    UNKNOWN = "not known"
+    HANGS = "the vehicle hangs on the magnet, its motors are off"
+    HELD = "something holds the vehicle away from the target; the motors are off"
+    STANDS = "the vehicle stands on the floor, its motors are off"
+    UNKNOWN = "the motors are off; it is not known whether the vehicle hangs or stands"
+    UNSEEN = "how it ended could not be confirmed: keep away from the vehicle"  # they may turn
 
 
 LOOKED_S = 2.0  # a target that is seen far above has so long to show where the vehicle is

@@ -91,10 +91,14 @@ def start_mission(obs: Observation) -> PlannerState:
 
 
 def step_mission(
-    state: PlannerState, obs: Observation, profile: Profile, table: tuple[Transition, ...] = TABLE
+    state: PlannerState | None,
+    obs: Observation,
+    profile: Profile,
+    table: tuple[Transition, ...] = TABLE,
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the mission; returns the new state, and the command to send."""
-    state = _remember(state, obs, profile)
+    """Fly one tick of the mission; `state` is None in the first, on the ground. Returns the new
+    state, and the command to send."""
+    state = _remember(state or start_mission(obs), obs, profile)
     row = first_match(Context(state, obs, profile), table)
     if row is not None:
         state = _enter(state, row, Context(state, obs, profile))

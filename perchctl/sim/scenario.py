@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2, Array, make_T, rotation_from_rpy
-from perchctl.mission import NO_PICTURE_TEXT, Event, EventKind
+from perchctl.mission import Event, EventKind
 from perchctl.profile import Profile, SimulationConfig
 
 CONTROL_PERIOD_S = 0.002
@@ -408,7 +408,7 @@ class EventExplainer:
         time in the simulation."""
         scenario = self._scenario
         held = event.reason if event.kind is EventKind.HOLD else ""
-        if event.row in LOSSES or held.startswith(NO_PICTURE_TEXT):
+        if event.row in LOSSES or held.startswith("no picture"):
             return self._lost_frames(t_s)
         if event.row == "slipped":
             self._slips += 1

@@ -21,7 +21,7 @@ from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.errors import EXIT_CODES
 from perchctl.flight import FlyOptions, LockstepFlight, fly_lockstep, lockstep
 from perchctl.geometry import rot_z
-from perchctl.mission import Event, EventKeeper, EventKind, Operator, Outcome, Phase, Tick
+from perchctl.mission import Event, EventKind, Operator, Outcome, Phase, Tick
 from perchctl.mission.state import SEVEN_PHASES
 from perchctl.perception.online_calibration import SLEW
 from perchctl.profile import load_profile
@@ -29,6 +29,7 @@ from perchctl.record import FlightLog, read_log
 from perchctl.sim import draw_scenario
 from perchctl.vision import TargetEstimate
 from tests.helpers.flights import SEED, SHORT, Flown, fly_short, short_profile
+from tests.helpers.loop_rig import Watcher
 
 SEVEN_NAMES = [phase.value for phase in SEVEN_PHASES]
 MISS_LIMIT_M = 0.020
@@ -166,10 +167,10 @@ def test_the_full_scenario_perches() -> None:
     assert scenario.camera_drop_rate == 0.1
     assert scenario.draught_mps != (0.0, 0.0, 0.0)
     assert scenario.drift_mps != (0.0, 0.0, 0.0)
-    events = EventKeeper()
+    events = Watcher()
     flight = fly_lockstep(load_profile("sim"), FlyOptions.seed, watchers=(events,))
     assert_perched(Flown(flight, 0.0))
-    assert [e.phase.value for e in events.seen if e.phase] == [*SEVEN_NAMES, "PERCHED"]
+    assert [e.phase.value for e in events.events if e.phase] == [*SEVEN_NAMES, "PERCHED"]
     found = flight.report.findings
     assert found is not None
     assert found.advice == ()

@@ -21,7 +21,6 @@ from perchctl.mission import (
     Operator,
     Phase,
     Touchdown,
-    integrate_imu,
     planner,
 )
 from perchctl.mission.context import Context
@@ -70,7 +69,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, float, Touchdo
         for sample in link.telemetry():
             if last is None:
                 place = sample.position_m
-            motion = integrate_imu(motion, last, sample)
+            motion = motion.with_sample(last, sample)
             believed = not blind or t_s < dropped_s
             carried, last = advance_reckoning(carried, motion, sample, believed=believed), sample
     assert last is not None
@@ -107,7 +106,7 @@ def blown(*hits: tuple[float, float, float]) -> ImuMotion:
             if hit_s <= t_s < hit_s + 0.015:
                 acc_g = force_g
         sample = telemetry(t_s, 0.0, velocity_mps=(0.0, 0.0, vz_mps), acc_z_g=acc_g)
-        motion = integrate_imu(motion, last, sample)
+        motion = motion.with_sample(last, sample)
         last = sample
     return motion
 
@@ -125,7 +124,7 @@ def test_an_estimate_that_has_the_blow_before_the_samples_do(steady_s: float) ->
     steady = [(-0.4, 1.001)] * round(100 * steady_s)
     for i, (vz_mps, acc_g) in enumerate([*steady, (0.02, 2.9), (0.02, 3.8), *[(0.02, 1.0)] * 8]):
         sample = telemetry(0.01 * i, 0.0, velocity_mps=(0.0, 0.0, vz_mps), acc_z_g=acc_g)
-        motion, last = integrate_imu(motion, last, sample), sample
+        motion, last = motion.with_sample(last, sample), sample
     assert (motion.blow.estimated_mps, motion.blow.peak_g) == (-0.4, 3.8)
 
 

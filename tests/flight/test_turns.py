@@ -101,8 +101,7 @@ def test_a_planner_that_fails_on_the_first_turn_fails_again(
     def fails(obs: Observation) -> PlannerState:
         raise ValueError("by the test")
 
-    for module in ("perchctl.flight.loop", "perchctl.analysis.decide"):
-        monkeypatch.setattr(f"{module}.start_mission", fails)
+    monkeypatch.setattr("perchctl.mission.planner.start_mission", fails)
     rig = Rig()
     (again,) = decide(broken(rig, ValueError).turns, rig.profile)
     assert (again.turn.role, again.error, again.differs) == ("failed", "ValueError", False)

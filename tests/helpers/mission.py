@@ -15,7 +15,6 @@ from perchctl.mission import (
     Observation,
     Phase,
     PlannerState,
-    integrate_imu,
     planner,
 )
 from perchctl.mission.state import EnergyState, Severity
@@ -129,7 +128,7 @@ class Felt:
     def __call__(self, obs: Observation) -> Observation:
         sample = obs.telemetry
         if self._last is None or sample.t_s > self._last.t_s:
-            self._motion = integrate_imu(self._motion, self._last, sample)
+            self._motion = self._motion.with_sample(self._last, sample)
             self._last = sample
         return replace(obs, imu=self._motion)
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import ImuMotion, integrate_imu
+from perchctl.mission import ImuMotion
 from perchctl.mission.imu import (
     FROZEN_S,
     GAP_S,
@@ -29,7 +29,7 @@ from tests.helpers.mission import HOVER_THRUST, telemetry
 def flown(samples: list[Telemetry], motion: ImuMotion | None = None) -> ImuMotion:
     motion = motion or ImuMotion()
     for last, new in zip([None, *samples], samples, strict=False):
-        motion = integrate_imu(motion, last, new)
+        motion = motion.with_sample(last, new)
     return motion
 
 
@@ -49,7 +49,7 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
 def since_heard(after: Telemetry, before: Telemetry | None = None) -> ImuMotion:
     """What a silence leaves, of a vehicle that hung at 1.9 m before it."""
     hung = [telemetry(0.01 * i, 1.9) for i in range(100)]
-    return integrate_imu(flown(hung), before or hung[-1], after)
+    return flown(hung).with_sample(before or hung[-1], after)
 
 
 @given(silent_s=st.floats(GAP_S + 0.01, 4.0), drift_mps=st.floats(-0.1, 0.1))
@@ -156,7 +156,7 @@ def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     after = telemetry(1.7, velocity_mps=(0.1, 0.2, -0.5))
     imu = flown([before])
     old = Reckoning(imu, velocity_mps=(0.0, 0.0, 0.05), estimated_mps=before.velocity_mps)
-    heard = integrate_imu(imu, before, after)
+    heard = imu.with_sample(before, after)
     new = advance_reckoning(old, heard, after, believed=False)
     assert new.velocity_mps == pytest.approx((0.0, 0.2, -0.6))
     assert advance_reckoning(old, heard, after, believed=True).velocity_mps == after.velocity_mps
@@ -172,7 +172,7 @@ def test_in_a_silence_it_may_climb_into_the_magnet_s_reach(below_m: float, silen
     after = telemetry(1.0 + silent_s, velocity_mps=(0.0, 0.0, -0.3))
     imu = flown([before])
     old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
-    new = advance_reckoning(old, integrate_imu(imu, before, after), after, believed=False)
+    new = advance_reckoning(old, imu.with_sample(before, after), after, believed=False)
     assert (new.unsure_s == after.t_s) == (below_m - MOST_CLIMB_MPS * silent_s < REACH_M)
     assert new.below_m == below_m
     seen = add_sight(new, after.t_s + 0.1, (0.0, 0.0), below_m, 0.001)
@@ -187,11 +187,11 @@ def test_what_had_no_thrust_in_a_silence_did_not_climb(below_m: float, silent_s:
         after = telemetry(1.0 + silent_s, thrust=0.0, start=start)
         imu = flown([before])
         old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
-        new = advance_reckoning(old, integrate_imu(imu, before, after), after, believed=False)
+        new = advance_reckoning(old, imu.with_sample(before, after), after, believed=False)
         assert new.unsure_s == -math.inf
         assert new.below_m == math.inf
         near = replace(old, below_m=0.02, nearest_m=0.02)
-        new = advance_reckoning(near, integrate_imu(imu, before, after), after, believed=False)
+        new = advance_reckoning(near, imu.with_sample(before, after), after, believed=False)
         assert (new.unsure_s, new.below_m) == (after.t_s, 0.02)
 
 
@@ -201,13 +201,13 @@ def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring
     reckoning = add_sight(Reckoning(flown(falls[:1])), 0.9, (0.0, 0.0), 0.0, 0.001)
     motion = flown(falls[:1])
     for last, new in pairwise(falls):
-        motion = integrate_imu(motion, last, new)
+        motion = motion.with_sample(last, new)
         reckoning = advance_reckoning(reckoning, motion, new, believed=False)
     assert motion.fell_s > 1.0
     assert 0.02 < reckoning.nearest_m < 0.1
     late = telemetry(falls[-1].t_s + 1.5)
     reckoning = advance_reckoning(
-        reckoning, integrate_imu(motion, falls[-1], late), late, believed=False
+        reckoning, motion.with_sample(falls[-1], late), late, believed=False
     )
     assert reckoning.unsure_s == late.t_s
 
@@ -224,7 +224,7 @@ def beside_mps(turn: int, pushed_g: float = 0.0, samples: int = 4, offset_g: flo
             t_s, velocity_mps=(turn * 0.01 * i, 0.0, 0.0), pitch_rad=lean_rad + 1e-6 * (i % 7),
             acc_x_g=offset_g + (pushed_g if 3 <= i < 3 + samples else 1e-6 * (i % 7)),
         )  # fmt: skip
-        motion = integrate_imu(motion, last, new)
+        motion = motion.with_sample(last, new)
         reckoning = advance_reckoning(reckoning, motion, new, believed=True)
         last = new
     return abs(reckoning.beside_mps[0])
@@ -258,7 +258,7 @@ def uncorrected_s(*growths: tuple[float, float]) -> float:
             if round(100 * t_s) % 10 == 0:
                 variance += 0.1 * per_s
             new = telemetry(t_s, climb_variance_m2ps2=variance)
-            motion, last = integrate_imu(motion, last, new), new
+            motion, last = motion.with_sample(last, new), new
     return motion.corrections.age_s(t_s)
 
 
@@ -295,6 +295,6 @@ def test_an_offset_that_turning_motors_make_is_learned_while_the_estimate_is_bel
     reckoning, motion, last = Reckoning(), ImuMotion(), None
     for i in range(1500):
         new = telemetry(0.01 * i, acc_z_g=1.0 + too_much_g + 1e-6 * (i % 7))
-        motion = integrate_imu(motion, last, new)
+        motion = motion.with_sample(last, new)
         reckoning, last = advance_reckoning(reckoning, motion, new, believed=i < 1000), new
     assert abs(reckoning.velocity_mps[2]) < 0.1

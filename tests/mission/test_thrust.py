@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import (
-    Condition,
     Observation,
     Operator,
     Outcome,
@@ -22,7 +21,7 @@ from perchctl.mission import (
 from perchctl.mission.conditions import CONDITIONS, contact_thrust
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import FLOOR_M, limited
-from perchctl.mission.state import FLYING_PHASES
+from perchctl.mission.state import FLYING_PHASES, Condition
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, Command, PositionSetpoint
 from tests.helpers.mission import (
