@@ -13,11 +13,11 @@ from .records import Turn as Turn
 from .records import TurnInputs as TurnInputs
 from .records import TurnTiming as TurnTiming
 from .records import Watcher as Watcher
-from .report import ContactError as ContactError
 from .report import Findings as Findings
 from .report import FlightReport as FlightReport
 from .report import Touchdown as Touchdown
 from .report import rest_of as rest_of
+from .state import ContactError as ContactError
 from .state import Mismatch as Mismatch
 from .state import Observation as Observation
 from .state import Operator as Operator

@@ -10,7 +10,14 @@ from dataclasses import dataclass
 from perchctl.mission.context import Context
 from perchctl.mission.lander import Finding, rest_finding
 from perchctl.mission.records import Event
-from perchctl.mission.state import Condition, Observation, Outcome, Phase, PlannerState
+from perchctl.mission.state import (
+    Condition,
+    ContactError,
+    Observation,
+    Outcome,
+    Phase,
+    PlannerState,
+)
 from perchctl.profile import CameraConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import FRESH_S, LOCKED
@@ -22,20 +29,6 @@ SAME_HEIGHT_M = 0.3  # a blow higher above the present place was none by the flo
 SURE = 1.96  # standard deviations on both sides of a 95 % interval
 LATENCY_GATE_S = 0.02  # 30 ms make an alignment swing by centimetres
 TURN_GATE_DEG = 2.0  # 35 mm at 1 m, more than the cone of an ascent forgives
-
-
-@dataclass(frozen=True)
-class ContactError:
-    """Horizontal distance of the gear from the target's axis as contact was proven, and its
-    standard deviation."""
-
-    aside_m: float
-    sigma_m: float
-
-    @property
-    def text(self) -> str:
-        """The error in words, as in ``1.8 +- 0.6 mm off centre``."""
-        return f"{1e3 * self.aside_m:.1f} +- {1e3 * self.sigma_m:.1f} mm off centre"
 
 
 @dataclass(frozen=True)
@@ -133,8 +126,8 @@ class FlightReport:
         consistency: Consistency | None,
     ) -> FlightReport:
         """The report of a mission that is over, by its last tick."""
-        hangs, aside_m = state.phase is Phase.PERCHED, state.contact_aside_m
-        placed = hangs and aside_m is not None and math.isfinite(state.contact_sigma_m)
+        hangs, contact = state.phase is Phase.PERCHED, state.contact
+        placed = hangs and contact is not None and math.isfinite(contact.sigma_m)
         return cls(
             phase=state.phase,
             outcome=state.outcome or Outcome.SAFETY,
@@ -146,7 +139,7 @@ class FlightReport:
             locked=obs.telemetry.has(LOCKED) or state.outcome is Outcome.EMERGENCY,
             history=history,
             findings=None if consistency is None else Findings.of(consistency, profile.camera),
-            contact=ContactError(aside_m or 0.0, state.contact_sigma_m) if placed else None,
+            contact=contact if placed else None,
             touchdown=touchdown_of(Context(state, obs, profile)),
         )
 
@@ -168,7 +161,7 @@ def touchdown_of(c: Context) -> Touchdown | None:
     """The newest blow from below, where it may have been the floor's; None if there was none.
 
     Its speed is the estimate's where that is believed, else as reckoned by the accelerometer."""
-    tel, imu, reckoning = c.obs.telemetry, c.obs.imu, c.state.reckoning
+    tel, imu, reckoning = c.telemetry, c.obs.imu, c.state.reckoning
     blow = imu.blow
     if c.state.phase is Phase.PERCHED or min(tel.t_s, imu.off_s) - blow.t_s > LATEST_S:
         return None

@@ -70,6 +70,10 @@ class Severity(IntEnum):
     LAND = 3
     STOP = 4
 
+    def then(self, row: Severity) -> Severity:
+        """The flight's severity after a transition: from `LAND` on it only rises."""
+        return max(self, row) if self >= Severity.LAND else row
+
 
 class Outcome(Enum):
     """Why the flight ended, each with one exit code."""
@@ -118,6 +122,26 @@ class MotorStop(Enum):
     NONE = "none"  # they are left alone
     PLAIN = "plain"  # stopped, where the supervisor has ended the flight already
     EMERGENCY = "emergency"  # cut and locked
+
+
+@dataclass(frozen=True)
+class ContactError:
+    """Horizontal distance of the gear from the target's axis as contact was proven, and its
+    standard deviation, infinite where that is not known."""
+
+    aside_m: float
+    sigma_m: float
+
+    def is_within(self, radius_m: float) -> bool:
+        """True if it is known to be so near to the axis."""
+        return self.aside_m + self.sigma_m <= radius_m
+
+    @property
+    def text(self) -> str:
+        """The error in words, as in ``1.8 +- 0.6 mm off centre``."""
+        if not math.isfinite(self.sigma_m):
+            return "at an unknown distance from the centre"
+        return f"{1e3 * self.aside_m:.1f} +- {1e3 * self.sigma_m:.1f} mm off centre"
 
 
 class Operator(IntEnum):
@@ -244,8 +268,7 @@ class PlannerState:
     battery: BatteryOutlook = field(default_factory=BatteryOutlook)  # what that is enough for
     reckoning: Reckoning = field(default_factory=Reckoning)  # speed and place by the accelerometer
     reach_s: float | None = None  # within the magnet's reach since
-    contact_aside_m: float | None = None  # gear to the target's axis, as it made contact
-    contact_sigma_m: float = 0.0  # standard deviation of that
+    contact: ContactError | None = None  # as it made contact
     heading_lost: bool = False  # position control would lead away from its setpoint
     blind_s: float | None = None  # accelerometer and attitude are all there is, since
     blind_height_m: float = 0.0  # above the ground, as reckoned since then

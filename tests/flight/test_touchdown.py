@@ -196,16 +196,14 @@ def test_the_rescue_says_so() -> None:
 
 
 def test_an_attempt_that_failed_leaves_no_contact() -> None:
-    state = replace(
-        state_in(Phase.COMPLETE, z_m=HANG_Z_M), contact_aside_m=0.002, contact_sigma_m=0.001
-    )
+    state = replace(state_in(Phase.COMPLETE, z_m=HANG_Z_M), contact=ContactError(0.002, 0.001))
     falls = telemetry(10.02, HANG_Z_M - 0.1, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)
     for t_s in (10.02, 10.04, 10.06, 10.08):
         state, _ = planner.step_mission(
             state, observation(t_s, telemetry=replace(falls, t_s=t_s)), PROFILE
         )
     assert state.phase is Phase.RECOVER
-    assert state.contact_aside_m is None
+    assert state.contact is None
 
 
 def test_blind_it_is_the_reckoned_speed_that_counts() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from perchctl.mission import ImuMotion, Observation, Outcome, Phase, PlannerState
-from perchctl.mission.conditions import OTHERWISE_MPS, contact_aside_m
+from perchctl.mission.conditions import OTHERWISE_MPS, contact_error
 from perchctl.mission.context import Context
 from perchctl.mission.imu import Reckoning, add_step
 from perchctl.mission.lander import LEAST_ORDERS
@@ -260,7 +260,7 @@ def test_what_nobody_saw_hang_has_not_perched(
     assert not any(isinstance(command, Land | PositionSetpoint) for command in flight.commands)
     assert flight.state.phase is ends
     if ends is Phase.ABORTED:
-        assert any("still hangs is not known" in tick.state.reason for tick in flight.ticks)
+        assert "fell-unseen" in flight.rows
         assert "not known" in flight.state.reason
 
 
@@ -352,7 +352,7 @@ def test_the_spread_of_a_contact_grows_with_what_the_estimate_may_slide(
         return observation(t_s, HANG_Z_M, target=remembered)
 
     flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 0.1, PROFILES[by])
-    _, sigma_m = contact_aside_m(Context(flight.state, flight.obs, PROFILES[by]))
+    sigma_m = contact_error(Context(flight.state, flight.obs, PROFILES[by])).sigma_m
     assert least_m <= sigma_m <= most_m
 
 
@@ -429,7 +429,7 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
 
     flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.3, profile, feels=True)
     assert math.hypot(*flight.state.reckoning.stepped_m) == pytest.approx(sigma_m, abs=1e-3)
-    assert contact_aside_m(Context(flight.state, flight.obs, profile))[1] >= sigma_m - 1e-3
+    assert contact_error(Context(flight.state, flight.obs, profile)).sigma_m >= sigma_m - 1e-3
 
 
 def test_a_position_that_moves_as_fast_as_it_says_is_no_step() -> None:

@@ -554,8 +554,7 @@ def test_what_is_felt_to_be_held_is_within_reach_whatever_late_pictures_say(
     assert (flight.state.reach_s is not None) is within
     if within:
         landing = lander.begin_landing(flight.state, flight.obs, PROFILE)
-        reach = lander.reach_of(Context(landing, flight.obs, PROFILE))
-        assert reach is lander.Reach.MAGNET
+        assert lander.is_in_reach(Context(landing, flight.obs, PROFILE))
 
 
 # --- Without a heading: level, on the vertical speed alone ----------------------------------------
