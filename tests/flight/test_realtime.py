@@ -30,7 +30,6 @@ from tests.helpers.waiting import until
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration
-from perchctl.flight.clock import SLOW
 from perchctl.mission.state import SEVEN_PHASES
 from perchctl.profile import find_calibration, load_profile
 from perchctl.record import FlightLog, read_log
@@ -299,7 +298,4 @@ def test_a_flight_waits_for_a_simulator_that_is_starved(tmp_path: Path) -> None:
         os.kill(simulator, signal.SIGCONT)
         rest = process.stderr.read()
         assert process.wait(FLIGHT_LIMIT_S) == 0, rest
-    assert rest.count(SLOW) == 1
-    log = read_log(the_log(tmp_path))
-    assert [event["reason"] for event in log.events].count(SLOW) == 1
-    assert log.column("tel_age_s").max() < LATE_S
+    assert read_log(the_log(tmp_path)).column("tel_age_s").max() < LATE_S

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.flight.clock import SIM_PATIENCE_S, SLOW, SLOW_S, SimulatedClock
+from perchctl.flight.clock import SIM_PATIENCE_S, SimulatedClock
 from perchctl.sim import CLOCK_MARGIN_S, CONTROL_PERIOD_S, SharedTime
 from perchctl.sim.host import Runner
 from perchctl.sim.process import LOOP_PATIENCE_S
@@ -81,21 +81,13 @@ def rig(free: Rig) -> Iterator[Rig]:
 
 def test_on_an_idle_computer_it_is_real_time(rig: Rig) -> None:
     assert rig.turns(90) <= NEAR_S
-    assert rig.clock.remarks() == []
     assert rig.host.elapsed_s == pytest.approx(100 * PERIOD_S, abs=NEAR_S)
     assert rig.wall_s - 100.0 == pytest.approx(100 * PERIOD_S, abs=2 * NEAR_S)
     assert rig.clock.now() == pytest.approx(rig.wall_s, abs=NEAR_S)
 
 
-def test_it_waits_for_a_busy_loop_and_says_so_once(rig: Rig) -> None:
-    said = []
-    rig.turns(1, work_s=0.9 * SLOW_S)  # as a computer does now and then
-    rig.turns(10)
-    assert rig.clock.remarks() == []
-    for _ in range(100):
-        rig.turns(1, work_s=0.1)
-        said += rig.clock.remarks()
-    assert said == [SLOW]
+def test_it_waits_for_a_busy_loop(rig: Rig) -> None:
+    rig.turns(100, work_s=0.1)
     assert rig.turns(100, work_s=0.1) <= CLOCK_MARGIN_S + NEAR_S
     assert rig.host.elapsed_s < 0.5 * (rig.wall_s - 100.0)
 
