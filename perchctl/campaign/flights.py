@@ -21,7 +21,7 @@ import cv2
 from perchctl.campaign.pool import FlightPool
 from perchctl.campaign.results import FlightEnd, FlightResult, peak_memory_mb
 from perchctl.errors import InvalidValue, PerchError, SafetyAbort, TimedOut
-from perchctl.flight import LockstepFlight, fly_lockstep
+from perchctl.flight import fly_lockstep
 from perchctl.mission import Event, Phase, Tick
 from perchctl.profile import Profile
 from perchctl.record import FlightSummary, LogWatcher
@@ -99,10 +99,10 @@ def _fly(profile: Profile, seed: int, log_path: Path | None, record: bool) -> Fl
         if log is not None:
             log.abandon(str(error))
         return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False, 0.0)
-    summary = None if log is None else _closed(log, flight)
+    summary = None if log is None else flight.conclude(log)
     return FlightResult(
         seed=seed,
-        outcome=_outcome(flight),
+        outcome=OUTCOMES[flight.end],
         reason=flight.report.reason,
         miss_m=flight.perched_miss_m,
         time_s=flight.report.duration_s,
@@ -122,9 +122,9 @@ def fly_logged(profile: Profile, folder: Path, seed: int, record: bool = False) 
     log = LogWatcher.lockstep(seed_log_path(seed, folder), profile, seed, record)
     events = _EventKeeper()
     flight = fly_lockstep(profile, seed, log, watchers=(events,))
-    summary = _closed(log, flight)
+    summary = flight.conclude(log)
     assert summary is not None
-    return LoggedFlight(seed, _outcome(flight), summary, log.path, tuple(events.seen))
+    return LoggedFlight(seed, OUTCOMES[flight.end], summary, log.path, tuple(events.seen))
 
 
 class _EventKeeper:
@@ -140,14 +140,6 @@ class _EventKeeper:
 
     def event(self, event: Event) -> None:
         self.seen.append(event)
-
-
-def _closed(log: LogWatcher, flight: LockstepFlight) -> FlightSummary | None:
-    return log.close(flight.report, flight.perched_miss_m, flight.fell)
-
-
-def _outcome(flight: LockstepFlight) -> FlightEnd:
-    return OUTCOMES[flight.report.phase] if not flight.fell else "aborted"
 
 
 def seed_log_path(seed: int, log_dir: Path) -> Path:

@@ -16,7 +16,7 @@ from perchctl.link import MockLink, Radio
 from perchctl.mission import Event, FlightReport, Operator, Phase, Tick, Watcher
 from perchctl.positioning import FeedThread, Placed, PositionFeed
 from perchctl.profile import Profile
-from perchctl.record import LogWatcher
+from perchctl.record import FlightSummary, LogWatcher
 from perchctl.sim import (
     CaptureSettings,
     DeliveredFrame,
@@ -151,6 +151,15 @@ class LockstepFlight:
         """The gear's distance from the target's centre, where it hangs there."""
         return self.miss_m if self.report.phase is Phase.PERCHED and self.hanging else None
 
+    @property
+    def end(self) -> Phase:
+        """The phase in which it ended, ABORTED for one that fell."""
+        return Phase.ABORTED if self.fell else self.report.phase
+
+    def conclude(self, log: LogWatcher) -> FlightSummary | None:
+        """Write the flight's summary and close its log. Returns the summary."""
+        return log.close(self.report, self.perched_miss_m, self.fell)
+
 
 def fly_lockstep(
     profile: Profile,
@@ -179,7 +188,7 @@ def fly_lockstep(
             profile, log=watcher, scenario=scenario, capture=capture, operator_at=operator_at,
             watchers=watchers,
         )  # fmt: skip
-        watcher.close(flight.report, flight.perched_miss_m, flight.fell)
+        flight.conclude(watcher)
         return flight
     camera = profile_camera(profile.camera)
     capture = capture or draw_capture(profile, scenario.seed)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from perchctl.errors import SafetyAbort, TimedOut, distinct_figures
+from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight.criteria import (
     AtRest,
     GroundCriteria,
@@ -14,9 +14,6 @@ from perchctl.flight.criteria import (
     apart,
     measurer,
     missing,
-    too_near_problem,
-    unmeasured_problem,
-    world_problem,
 )
 from perchctl.geometry import Place, rot_z
 from perchctl.link import Link
@@ -25,7 +22,6 @@ from perchctl.profile import Profile
 from perchctl.target import (
     TargetView,
     offset_text,
-    overhead_reach,
     overhead_view,
     view_from,
 )
@@ -46,7 +42,7 @@ def refuse_unmeasured(link: Link, profile: Profile, *, positions: bool) -> None:
     """Raises SafetyAbort without any position source. `positions`: those of the profile's motion
     capture are being sent."""
     if profile.positioning.by == "deck":
-        _refuse(unmeasured_problem(link.measured_by(), profile))
+        _refuse(GroundCriteria.unmeasured(link.measured_by(), profile))
     elif profile.positioning.by == "mocap" and not positions:
         raise SafetyAbort("the profile says positioning: mocap, and nothing sends positions")
 
@@ -72,7 +68,7 @@ def refuse_strange(
         return
     place = status.measured if stands else None
     if place is not None:
-        _refuse(world_problem(place, telemetry, profile))
+        _refuse(criteria.world_problem(place))
     if at_rest is not None:
         _refuse(at_rest.strange(place, profile))
 
@@ -130,7 +126,7 @@ def still_waiting_for(
             problem = not_in_view(target, camera_problem, telemetry, profile, camera)
         what = f"a sight of the target, which measures the position ({problem.sentence})"
         return _bounded(what, waited_s, limit_s)
-    _refuse(too_near_problem(target))
+    _refuse(criteria.too_near(target))
     return ""
 
 
@@ -161,30 +157,25 @@ def out_of_view(
     picture of a vehicle that leans a little, at take-off height over the start or over
     `planner.approach_xy_m`. `yaw_rad`: its heading at the start."""
     planner, (x, y, z) = profile.planner, start_m
-    top_m = z + planner.takeoff_height_m
-    over = _seen_leaning((x, y, top_m), yaw_rad, target, profile, camera)
-    if not over.whole:
-        return Problem(
-            f"the target is the positioning system, and would leave the picture as the vehicle "
-            f"takes off: {_too_far(over, profile, camera)} at {planner.takeoff_height_m:g} m of "
-            f"height",
-            f"put the vehicle {offset_text(over.aside_m)} from where it stands, or lower "
-            f"planner.takeoff_height_m",
-        )
-    if planner.approach_xy_m is None:
-        return None
-    there = _seen_leaning((*planner.approach_xy_m, top_m), yaw_rad, target, profile, camera)
-    if there.whole:
-        return None
-    to_x, to_y = planner.approach_xy_m
-    u, v = (float(part) for part in target.position_m[:2])
-    return Problem(
-        f"the target is the positioning system, and from planner.approach_xy_m (x {to_x:g}, "
-        f"y {to_y:g} m) the vehicle would not see it: {_too_far(there, profile, camera)}, and "
-        f"without it nothing brings the vehicle back",
-        f"leave planner.approach_xy_m out, since the target is in view from where it stands, or "
-        f"set it near the target's x {u:.2f}, y {v:.2f} m",
-    )
+    advice = f"lower planner.takeoff_height_m, now {planner.takeoff_height_m:g} m"
+    for over in ((x, y), planner.approach_xy_m):
+        if over is None:
+            continue
+        body_m = (*over, z + planner.takeoff_height_m)
+        sight = _seen_leaning(body_m, yaw_rad, target, profile, camera)
+        if over == (x, y):
+            advice = (
+                f"put the vehicle {offset_text(sight.aside_m)} from where it stands, or {advice}"
+            )
+        else:
+            advice = "leave planner.approach_xy_m out, or set it near the target"
+        if not sight.whole:
+            return Problem(
+                f"the target is the positioning system, and from x {over[0]:.2f}, y {over[1]:.2f} "
+                f"m at take-off height the vehicle would not see it: {_too_far(sight)}",
+                advice,
+            )
+    return None
 
 
 def target_from(
@@ -216,19 +207,13 @@ def _leant_m(sight: TargetView) -> float:
     return sight.height_m * math.tan(math.radians(LEAN_DEG))
 
 
-def _too_far(sight: TargetView, profile: Profile, camera: CameraModel) -> str:
-    """Return in words how far aside the target would be, and how far it may be."""
+def _too_far(sight: TargetView) -> str:
     if not sight.height_m > 0.0:
         return "it would be no higher than the camera"
-    aside_m, most = math.hypot(*sight.aside_m), ""
-    aside = f"{aside_m:.2f}"
-    side_m, mount = profile.target.large.side_m, profile.camera.mount
-    reach = overhead_reach(side_m, camera, mount, sight.height_m)
-    if reach is not None:
-        room_m = math.floor(100.0 * max(0.0, reach.radius_m - _leant_m(sight))) / 100.0
-        aside, room = distinct_figures(aside_m, room_m, 2)
-        most = f", {room} m at most,"
-    return f"{aside} m aside of the camera's axis{most} {sight.height_m:.2f} m over the camera"
+    return (
+        f"{math.hypot(*sight.aside_m):.2f} m aside of the camera's axis, {sight.height_m:.2f} m "
+        f"over the camera"
+    )
 
 
 def not_in_view(

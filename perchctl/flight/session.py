@@ -63,6 +63,10 @@ class FlyOptions:
         """True if the URI is that of the simulated vehicle."""
         return self.uri.startswith("sim://")
 
+    def require_comparison(self) -> None:
+        """Raises SafetyAbort for a capture that no hand has compared with this vehicle."""
+        require_comparison(self.profile.positioning, self.uri, simulated=self.simulated)
+
 
 def check_options(options: FlyOptions) -> None:
     """Refuse what can be refused before anything is opened. Errors: InvalidValue, UsageError."""
@@ -100,7 +104,7 @@ def fly_session(
     at its frames. `remarks`: as in `FlightParts`. `before_arming` is called once vehicle and camera
     have answered; what it raises ends the session on the ground.
     """
-    require_comparison(options.profile.positioning, options.uri, simulated=options.simulated)
+    options.require_comparison()
     profile, switch = options.profile, switch or OperatorSwitch()
     camera = profile_camera(profile.camera)
     pipeline = make_pipeline(profile, camera)

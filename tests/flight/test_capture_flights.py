@@ -122,7 +122,7 @@ OTHERS = {"others": (OtherBody("wand", (2.5, -0.9, 0.05)),)}
     ({}, wrong(0.0, occluded=True), ConnectionFailed, "does not see the rigid body"),
     # It stands level, on the ground, 2.5 m aside of where this vehicle's target hangs.
     ({"target.expected_xy_m": [0.7, -0.5]}, wrong(0.0, swapped=True) | OTHERS, SafetyAbort,
-     "is the rigid body 'crazyflie' another vehicle's"),
+     "names another vehicle's body"),
 ])  # fmt: skip
 def test_what_is_no_position_of_this_vehicle_does_not_take_off(
     changes: dict[str, Any], capture: dict[str, Any], error: type[PerchError], words: str

@@ -19,7 +19,8 @@ from perchctl.campaign import FlightResult, campaign_summary, run_campaign
 from perchctl.campaign.flights import fly_seed
 from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.errors import EXIT_CODES
-from perchctl.flight import FlyOptions, LockstepFlight, fly_lockstep, lockstep
+from perchctl.flight import FlyOptions, fly_lockstep, lockstep
+from perchctl.flight.lockstep import LockstepFlight
 from perchctl.geometry import rot_z
 from perchctl.mission import Event, EventKind, Operator, Outcome, Phase, Tick
 from perchctl.mission.state import SEVEN_PHASES
