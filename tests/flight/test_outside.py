@@ -91,15 +91,6 @@ def test_another_axis_up_is_named_by_the_attitude(
     assert problem is None or f"up is {up} in the motion capture" in problem.found
 
 
-@given(st.sampled_from(TURNS), st.floats(0.6, 2.5))
-def test_a_body_defined_in_another_world_shows_once_it_is_turned(turn: Any, yaw: float) -> None:
-    """Level where it was defined, it says nothing; that is what `check --lift` is for."""
-    for heading, told in ((0.0, False), (yaw, named_up(turn) not in ("z", "-z"))):
-        own = turn @ rotation_from_rpy(0.0, 0.0, heading) @ turn.T
-        problem = with_another_up(at(0.0, 0.0, 0.0, own), replace(REST, yaw_rad=heading))
-        assert (problem is not None) is told
-
-
 @pytest.mark.parametrize(("place", "agrees"), [
     (at(0.05, 0.0, 0.05), True), (at(0.2, 0.0, 0.02), False), (at(0.0, 0.0, math.nan), False),
     (turned(0.2), True), (turned(0.4), False),
@@ -170,13 +161,6 @@ def test_positions_that_lead_astray_are_sent_no_more() -> None:
     assert len(outside.stopped_s) == 1
 
 
-def test_positions_that_come_late_are_waited_for() -> None:
-    it, _ = rig(hidden=lambda t_s: t_s < 2.0)
-    it.operator = lambda: Operator.LAND if it.link.said(PositionSetpoint) else Operator.NONE
-    assert it.fly().outcome is Outcome.OPERATOR
-    assert it.link.said(PositionSetpoint)[0] >= 2.0
-
-
 @pytest.mark.parametrize(("how", "error", "words"), [
     ({"hidden": lambda t_s: True}, TimedOut, f"positions of the motion capture .{HIDDEN}"),
     ({"place": lambda p: at(250.0, -100.0, 12.0)}, SafetyAbort, "millimetres"),
@@ -213,15 +197,6 @@ def test_an_occlusion_is_held_and_a_lasting_one_landed(for_s: float, lands: bool
     ages_s = [tick.outside.age_s for tick in it.watcher.ticks if tick.outside]
     assert len(ages_s) == len(it.watcher.ticks)
     assert max(ages_s) > 0.25
-
-
-def test_an_occlusion_that_holds_nothing_is_told() -> None:
-    """On the way down it is not held for it; the pilot reads it all the same, once."""
-    it, _ = rig(hidden=lambda t_s: t_s > 3.2)
-    it.operator = lambda: Operator.LAND if it.link.now_s > 3.0 else Operator.NONE
-    it.fly()
-    notes = [e for e in it.watcher.events if e.kind.value == "note" and HIDDEN in e.reason]
-    assert len(notes) == 1
 
 
 # --- only what is fresh is judged -------------------------------------------------------------

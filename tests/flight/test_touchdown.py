@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from html import unescape
@@ -17,21 +16,18 @@ from perchctl.mission import (
     ContactError,
     EventKind,
     ImuMotion,
-    Observation,
     Operator,
     Phase,
     Touchdown,
-    planner,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.imu import BLOW_MPS, Blow, Reckoning, advance_reckoning
-from perchctl.mission.report import HARD_MPS, touchdown_of
-from perchctl.profile import load_profile
+from perchctl.mission.imu import Blow, Reckoning, advance_reckoning
+from perchctl.mission.report import touchdown_of
 from perchctl.record import FlightSummary, read_log, summary_text
-from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
+from perchctl.vehicle import Telemetry
 from tests.helpers import log
 from tests.helpers.loop_rig import PROFILE, Broken, Guarded, Rig, Vehicle, hanging_camera
-from tests.helpers.mission import HANG_Z_M, observation, state_in, telemetry
+from tests.helpers.mission import observation, state_in, telemetry
 
 HARD = Touchdown(0.9, 3.1)
 SENTENCE = "touched down hard: 0.9 m/s, 3.1 g"
@@ -40,82 +36,7 @@ SENTENCE = "touched down hard: 0.9 m/s, 3.1 g"
 # --- True of the vehicle ---------------------------------------------------------------------
 
 
-def dropped(seed: int, share: float, blind: bool) -> tuple[float, float, Touchdown | None]:
-    """The vehicle comes down on a share of the thrust that it hovers on. Returns its true speed
-    at the floor, its largest true specific force, g, and what was felt."""
-    from perchctl.link import MockLink, Radio
-    from perchctl.sim import SimulatedVehicle, draw_scenario, radio_bursts
-
-    profile = load_profile("sim")
-    scenario = draw_scenario(profile, seed)
-    vehicle = SimulatedVehicle(scenario)
-    link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(radio_bursts(scenario)))
-    link.connect()
-    motion, carried, last = ImuMotion(), Reckoning(), None
-    t_s, dropped_s, hit_s, speed_mps, sink_mps = 1.0, math.inf, math.inf, 0.0, 0.0
-    place = (0.0, 0.0, 0.0)
-    while t_s < min(9.0, hit_s + 0.6):
-        if t_s < 5.0:
-            link.send(PositionSetpoint(place[0], place[1], place[2] + min(0.5, 0.3 * t_s), 0.0))
-        else:
-            dropped_s = min(dropped_s, t_s)
-            link.send(RawThrust(int(share * motion.hover_thrust)))
-        for _ in range(10):
-            t_s += 0.002
-            link.advance_to(t_s)
-            if dropped_s < t_s < hit_s and vehicle.world.on_floor():
-                hit_s, speed_mps = t_s, sink_mps
-            sink_mps = -vehicle.world.vz_mps
-        for sample in link.telemetry():
-            if last is None:
-                place = sample.position_m
-            motion = motion.with_sample(last, sample)
-            believed = not blind or t_s < dropped_s
-            carried, last = advance_reckoning(carried, motion, sample, believed=believed), sample
-    assert last is not None
-    obs = Observation(last.t_s, last, imu=motion)
-    blind_s = dropped_s if blind else None
-    state = replace(state_in(Phase.LANDED, z_m=0.0), reckoning=carried, blind_s=blind_s)
-    return speed_mps, motion.blow.peak_g, touchdown_of(Context(state, obs, profile))
-
-
-@pytest.mark.parametrize("blind", [False, True])
-@pytest.mark.parametrize("share", [0.96, 0.85, 0.5])
-def test_the_felt_speed_is_the_true_one(share: float, blind: bool) -> None:
-    pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
-    truth_mps, _, felt = dropped(3, share, blind)
-    assert truth_mps > 0.4
-    assert felt is not None
-    assert felt.speed_mps == pytest.approx(truth_mps, abs=0.15 if blind else 0.08)
-    assert felt.is_hard is (truth_mps > HARD_MPS)
-    assert felt.peak_g > 2.0
-
-
 # --- A blow, sample by sample ------------------------------------------------------------------
-
-
-def blown(*hits: tuple[float, float, float]) -> ImuMotion:
-    """Each hit: when, with what speed down, and the specific force of two samples."""
-    motion, last = ImuMotion(), None
-    for i in range(300):
-        t_s = 0.01 * i
-        vz_mps, acc_g = 0.0, 1.0
-        for hit_s, down_mps, force_g in hits:
-            if hit_s - 0.2 <= t_s < hit_s:
-                vz_mps = -down_mps
-            if hit_s <= t_s < hit_s + 0.015:
-                acc_g = force_g
-        sample = telemetry(t_s, 0.0, velocity_mps=(0.0, 0.0, vz_mps), acc_z_g=acc_g)
-        motion = motion.with_sample(last, sample)
-        last = sample
-    return motion
-
-
-def test_of_bounces_the_hardest_counts_and_a_blow_of_long_ago_none() -> None:
-    blow = blown((1.0, 1.2, 3.0), (2.0, 0.9, 4.1), (2.3, 0.4, 2.9)).blow
-    assert (blow.estimated_mps, blow.peak_g) == (-0.9, 4.1)
-    assert blow.t_s == pytest.approx(2.0, abs=0.03)
-    assert blown((1.0, 0.2, 1.0 + BLOW_MPS)).blow.t_s == -math.inf  # a soft one
 
 
 @pytest.mark.parametrize("steady_s", [0.2, 0.21, 0.22, 0.23, 0.24, 0.25])
@@ -193,17 +114,6 @@ def test_the_rescue_says_so() -> None:
         rig.fly()
     note = next(e for e in rig.watcher.events if e.kind is EventKind.NOTE and "Broken" in e.reason)
     assert note.reason.endswith(f"; it {SENTENCE}")
-
-
-def test_an_attempt_that_failed_leaves_no_contact() -> None:
-    state = replace(state_in(Phase.COMPLETE, z_m=HANG_Z_M), contact=ContactError(0.002, 0.001))
-    falls = telemetry(10.02, HANG_Z_M - 0.1, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)
-    for t_s in (10.02, 10.04, 10.06, 10.08):
-        state, _ = planner.step_mission(
-            state, observation(t_s, telemetry=replace(falls, t_s=t_s)), PROFILE
-        )
-    assert state.phase is Phase.RECOVER
-    assert state.contact is None
 
 
 def test_blind_it_is_the_reckoned_speed_that_counts() -> None:

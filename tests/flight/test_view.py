@@ -30,7 +30,7 @@ from perchctl.positioning import FeedStatus
 from perchctl.positioning.feed import UNSEEN
 from perchctl.vehicle import ExternalPosition
 from perchctl.vision import CameraModel
-from tests.helpers.flights import fly_short, short_profile
+from tests.helpers.flights import short_profile
 from tests.helpers.mission import READY, changed, target_at, telemetry
 
 CAMERA = CameraModel(
@@ -150,15 +150,3 @@ def test_what_is_refused_speaks_of_the_target() -> None:
     status = FeedStatus(0.05, None, 20, None, 30.0, ExternalPosition(FEET))
     with pytest.raises(SafetyAbort, match=r"expected 4\.0 m from where the vehicle stands"):
         refuse_strange(status, REST, far, REST.t_s)
-
-
-@pytest.mark.parametrize(("changes", "scenario", "words"), [
-    ({"planner.approach_xy_m": [1.9, 0.0]}, {}, "the vehicle would not see it"),
-    ({"safety.estimator_wait_s": 0.6}, {"no_target": True}, "not in view.*at most 3.2 m above"),
-])  # fmt: skip
-def test_a_simulated_vehicle_stays_on_the_ground(
-    changes: dict[str, Any], scenario: dict[str, Any], words: str
-) -> None:
-    """The senses' own place of the target, and the pipeline's own camera."""
-    with pytest.raises((SafetyAbort, TimedOut), match=words):
-        fly_short({"positioning": "target"} | changes, **scenario)

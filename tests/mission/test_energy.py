@@ -24,7 +24,7 @@ from perchctl.mission.battery import (
 )
 from perchctl.mission.context import Context
 from perchctl.mission.state import EnergyState
-from perchctl.profile import Profile, load_profile
+from perchctl.profile import Profile
 from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.powertrain import Cell, CellKind
 from perchctl.vehicle import FULL_THRUST
@@ -97,27 +97,6 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
             assert told_s > ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
 
 
-@pytest.mark.long
-def test_a_battery_larger_than_assumed_is_not_thought_fuller_near_its_end() -> None:
-    """The count of the thrust has come to the end of the charge long before it has."""
-    moments = []
-    for moment in hovering(3.95, CellKind(charge=1.6), 300.0, hover=0.7):
-        moments.append(moment)
-        if moment.t_s > 1.0 and moment.under_load_v < LOW_V:
-            break
-    assert moments[-1].energy.used > charge_at(3.95)
-    for ahead_s in (60.0, 40.0, 20.0):
-        told_s = left_s(moments[-round(ahead_s / PERIOD_S)].energy, PROFILE, 0.7)
-        assert told_s is not None
-        assert 0.7 * ahead_s < told_s < 1.5 * ahead_s
-
-
-def test_a_voltage_above_the_curve_is_nothing_spent() -> None:
-    begun = EnergyState(ground_v=4.35, load=HOVER)
-    energy = update_energy(begun, PERIOD_S, 4.35 - 0.63 * HOVER, HOVER_THRUST, MAH)
-    assert energy.fit[2] == pytest.approx(0.0, abs=1e-3)
-
-
 def test_a_light_vehicle_s_battery_is_not_asked_for_a_long_press() -> None:
     """It sags deep under full thrust, for a second; hovering takes half of that."""
     cell = CellKind(resistance_ohm=0.9 / 4.4)
@@ -167,12 +146,6 @@ def test_a_moment_without_readings_is_counted_on() -> None:
     known_s, counted_s = (left_s(each, PROFILE, HOVER) for each in (last.energy, blind))
     assert known_s is not None
     assert counted_s == pytest.approx(known_s - 4.0, abs=0.5)
-
-
-def test_readings_that_begin_under_load_are_taken_as_usual_ones() -> None:
-    """As after a reading that came late: the sag is not known, and what is usual counts."""
-    energy = used_up(EnergyState(), 3.5, HOVER_THRUST, 4.0)
-    assert energy.rest_v == pytest.approx(3.5 + 0.63 * HOVER, abs=0.05)
 
 
 @given(st.floats(3.0, 4.2))
@@ -235,13 +208,6 @@ def test_fewer_and_fewer_attempts_are_left() -> None:
     assert told[-1] == PROFILE.planner.attempts
 
 
-@pytest.mark.parametrize(("reserve_s", "share"), [(math.nan, 0), (math.inf, 0), (-math.inf, 1)])
-def test_figures_that_are_no_numbers_end_no_flight(reserve_s: float, share: int) -> None:
-    profile = changed({"safety.energy_reserve_s": reserve_s})
-    c = Context(state_in(Phase.ALIGN), observation(20.0), profile)
-    assert outlook(c).attempts == share * PROFILE.planner.attempts
-
-
 def flown(
     phase: Phase, energy: EnergyState, seconds: float, profile: Profile = PROFILE, **tel: Any
 ) -> PlannerState:
@@ -293,10 +259,6 @@ def test_the_gate_holds_back_only_what_has_too_little_and_has_not_begun(
         assert state.battery.left_s is None
 
 
-def test_the_paper_s_profile_has_no_gate() -> None:
-    assert not load_profile("paper").safety.energy_gate
-
-
 def test_a_reading_that_stands_still_is_none() -> None:
     state = state_in(Phase.ALIGN)
     for age_s, known in ((0.5, True), (4.0, True), (9.0, False)):
@@ -323,10 +285,3 @@ def test_a_flight_ends_sooner_where_battery_low_fires_sooner(changes: dict[str, 
     assert usual_s is not None
     assert sooner_s is not None
     assert 0.0 < sooner_s < usual_s
-
-
-def test_who_has_no_target_goes_on_searching() -> None:
-    """Pressed against a lamp in its search, say: no attempt is at hand that could be refused."""
-    begin = replace(state_in(Phase.RECOVER), energy=FINE_BATTERY, target_m=None)
-    flight = fly(begin, at(obs={"target": None}), 2.0, one_phase=True)
-    assert flight.state.row == "recovered"

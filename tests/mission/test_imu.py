@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -23,7 +22,7 @@ from perchctl.mission.imu import (
     advance_reckoning,
 )
 from perchctl.vehicle import Telemetry
-from tests.helpers.mission import HOVER_THRUST, telemetry
+from tests.helpers.mission import telemetry
 
 
 def flown(samples: list[Telemetry], motion: ImuMotion | None = None) -> ImuMotion:
@@ -71,51 +70,6 @@ def test_a_silence_over_which_the_estimate_shows_no_fall_hides_none(
         assert since_heard(after).gap_s == t_s
     still = telemetry(0.99, 1.9)
     assert since_heard(replace(still, t_s=t_s), still).gap_s == t_s
-
-
-@pytest.mark.parametrize(
-    ("way_m", "climb_mps", "hidden"),
-    [(0.0, -0.1, False), (-0.2, -0.1, False), (-0.4, -0.2, True), (0.0, -0.4, True)],
-)
-def test_where_only_the_accelerometer_stands_still_the_estimate_tells_of_a_fall(
-    way_m: float, climb_mps: float, hidden: bool
-) -> None:
-    samples = [telemetry(0.01 * i, 1.9, acc_x_g=0.01) for i in range(50)]
-    samples += [
-        telemetry(
-            0.5 + 0.01 * i, 1.9 + way_m * i / 50, acc_x_g=0.01,
-            velocity_mps=(1e-9 * i, 0.0, climb_mps if i == 25 else 0.0),
-        )
-        for i in range(50)
-    ]  # fmt: skip
-    motion = flown(samples)
-    assert motion.silent_s > 0.9
-    assert (motion.gap_s > 0.5) is hidden
-
-
-def test_with_an_attitude_that_stands_still_the_estimate_s_change_counts() -> None:
-    """What it leans by is not known, and whether it falls still is."""
-    samples = [telemetry(0.01 * i, roll_rad=0.2 if i else 0.0, acc_z_g=1.0) for i in range(100)]
-    motion = flown(samples)
-    assert motion.gap_s < 0.0
-    before = Reckoning(flown(samples[:99]), (0.1, 0.2, 0.3), estimated_mps=(0.0, 0.0, 0.0))
-    after = replace(samples[-1], velocity_mps=(0.0, 0.1, 0.0))
-    assert advance_reckoning(before, motion, after, believed=False).velocity_mps == (
-        pytest.approx((0.1, 0.3, 0.3))
-    )
-
-
-def test_astray_with_an_attitude_that_stands_still_it_still_feels_a_fall() -> None:
-    """Sideways what was reckoned stays; downwards the accelerometer goes on telling."""
-    samples = [
-        telemetry(0.01 * i, roll_rad=0.01 if i else 0.0, acc_x_g=0.001 * i, acc_z_g=0.8)
-        for i in range(100)
-    ]
-    before, motion = flown(samples[:50]), flown(samples)
-    old = Reckoning(before, (0.1, 0.2, -0.3))
-    new = advance_reckoning(old, motion, samples[-1], believed=False, astray=True)
-    fell_mps = -0.2 * 9.81 * 0.5
-    assert new.velocity_mps == pytest.approx((0.1, 0.2, -0.3 + fell_mps), abs=0.01)
 
 
 @given(
@@ -179,39 +133,6 @@ def test_in_a_silence_it_may_climb_into_the_magnet_s_reach(below_m: float, silen
     assert seen.nearest_m == below_m
 
 
-@given(below_m=st.floats(0.05, 2.0), silent_s=st.floats(GAP_S + 0.01, 3.0))
-def test_what_had_no_thrust_in_a_silence_did_not_climb(below_m: float, silent_s: float) -> None:
-    """With motors that were off, or started anew: it lies, or hangs where it hung."""
-    for thrust, start in ((0.0, 0), (HOVER_THRUST, 1)):
-        before = telemetry(1.0, thrust=thrust)
-        after = telemetry(1.0 + silent_s, thrust=0.0, start=start)
-        imu = flown([before])
-        old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
-        new = advance_reckoning(old, imu.with_sample(before, after), after, believed=False)
-        assert new.unsure_s == -math.inf
-        assert new.below_m == math.inf
-        near = replace(old, below_m=0.02, nearest_m=0.02)
-        new = advance_reckoning(near, imu.with_sample(before, after), after, believed=False)
-        assert (new.unsure_s, new.below_m) == (after.t_s, 0.02)
-
-
-def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring() -> None:
-    """It fell by 5 cm, and the setpoint that catches it is a metre above."""
-    falls = [telemetry(1.0 + 0.01 * i, acc_z_g=0.3) for i in range(13)]
-    reckoning = add_sight(Reckoning(flown(falls[:1])), 0.9, (0.0, 0.0), 0.0, 0.001)
-    motion = flown(falls[:1])
-    for last, new in pairwise(falls):
-        motion = motion.with_sample(last, new)
-        reckoning = advance_reckoning(reckoning, motion, new, believed=False)
-    assert motion.fell_s > 1.0
-    assert 0.02 < reckoning.nearest_m < 0.1
-    late = telemetry(falls[-1].t_s + 1.5)
-    reckoning = advance_reckoning(
-        reckoning, motion.with_sample(falls[-1], late), late, believed=False
-    )
-    assert reckoning.unsure_s == late.t_s
-
-
 def beside_mps(turn: int, pushed_g: float = 0.0, samples: int = 4, offset_g: float = 0.0) -> float:
     """After 0.4 s of a tilt that speeds it up by 1 m/s2, with an estimate that follows as it is, or
     mirrored (`turn` -1), or corrected by positions after a push that it did not feel and that so
@@ -236,12 +157,6 @@ def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_wa
     assert beside_mps(-1, pushed_g=2.0 * PUSHED_G) == 0.0
     assert beside_mps(-1, pushed_g=0.09, samples=20) == 0.0  # a gust of 1 m/s in a second
     assert beside_mps(-1, offset_g=1.2 * PUSHED_G) > 0.3
-
-
-@pytest.mark.parametrize("pushed_g", [2.0 * PUSHED_G, -2.0 * PUSHED_G])
-def test_a_sample_that_the_motors_shook_is_no_push(pushed_g: float) -> None:
-    """It would end the comparison for as long as mirrored positions take to tumble the vehicle."""
-    assert beside_mps(-1, pushed_g=pushed_g, samples=1) > 0.25
 
 
 # --- Whether the estimate is corrected -----------------------------------------------------------
@@ -285,16 +200,3 @@ def test_what_is_corrected_or_not_known_is_not_called_uncorrected(
 def test_no_silence_and_no_frozen_accelerometer_hides_that_nothing_corrects_it() -> None:
     silent = [telemetry(0.3 * i, climb_variance_m2ps2=1e-4 + 3e-4 * i) for i in range(10)]
     assert flown(silent).corrections.age_s(2.7) == pytest.approx(2.7)
-
-
-@pytest.mark.parametrize("too_much_g", [-0.008, 0.008])
-def test_an_offset_that_turning_motors_make_is_learned_while_the_estimate_is_believed(
-    too_much_g: float,
-) -> None:
-    """Blind, it would be 0.4 m/s within 5 s: a way down ends in a hover, or above it."""
-    reckoning, motion, last = Reckoning(), ImuMotion(), None
-    for i in range(1500):
-        new = telemetry(0.01 * i, acc_z_g=1.0 + too_much_g + 1e-6 * (i % 7))
-        motion = motion.with_sample(last, new)
-        reckoning, last = advance_reckoning(reckoning, motion, new, believed=i < 1000), new
-    assert abs(reckoning.velocity_mps[2]) < 0.1

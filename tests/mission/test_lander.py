@@ -258,17 +258,6 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     assert isinstance(command, RawThrust if astray else PositionSetpoint)
 
 
-@pytest.mark.parametrize(("positioning", "within"), [("target", True), ("deck", False)])
-def test_what_presses_by_the_target_may_be_in_the_magnet_s_reach(
-    positioning: str, within: bool
-) -> None:
-    """Under a sheet that hangs above a ceiling which the camera does not see."""
-    obs = at(1.2, thrust=65535.0)(NOW_S)
-    state = lander.begin_landing(state_in(Phase.ASCEND), obs, PROFILES[positioning])
-    assert state.pressed
-    assert (state.contact_z_m == 1.2) is within
-
-
 @pytest.mark.parametrize(
     ("evidence", "held", "changes", "spent"),
     [
@@ -304,31 +293,6 @@ def test_below_5_cm_it_stops_only_at_rest(vz_mps: float, stops: bool) -> None:
     assert isinstance(lander.act(c)[1], StopMotors if stops else RawThrust)
 
 
-@pytest.mark.parametrize(
-    ("since_s", "within", "kind"),
-    [
-        (0.5, lander.UNLEARNED_WITHIN, PositionSetpoint),
-        (0.5, lander.HOVER_WITHIN, RawThrust),
-        (2.0, lander.UNLEARNED_WITHIN, RawThrust),
-    ],
-)
-def test_unheard_with_a_hover_thrust_never_felt_its_own_estimate_is_nearer(
-    since_s: float, within: float, kind: type
-) -> None:
-    unheard = {"t_s": NOW_S - 1.5}
-    c = context(Evidence.NOTHING, since_s=since_s, tel=unheard, level_within=within)
-    assert isinstance(lander.act(c)[1], kind)
-
-
-def test_a_press_that_was_ordered_is_unwound_whatever_thrust_is_read() -> None:
-    """By a reading that stands still nothing presses."""
-    begin = state_in(Phase.PERCH, NOW_S - 60.0, HANG_Z_M)
-    quiet = at(HANG_Z_M, thrust=HOVER_THRUST, acc_z_g=1.3)(NOW_S + TICK_S)
-    state, command = planner.step_mission(begin, quiet, DECKS)
-    assert (state.phase, state.row, state.pressed) == (Phase.RECOVER, "no-contact", True)
-    assert is_setpoint(command, below_m=HANG_Z_M - 0.1)
-
-
 # --- What pictures and accelerometer agree on ---------------------------------------------------
 
 
@@ -345,59 +309,6 @@ def test_level_is_what_pictures_show_to_be_level() -> None:
         tilts.append(command.pitch_rad)
     assert tilts[0] == pytest.approx(-0.2 / 9.81, rel=0.05)  # nose up, against it
     assert tilts[0] < tilts[1] < tilts[2] == 0.0
-
-
-def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
-    c = context(Evidence.IMU, reckoning=Reckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
-    motion = VisualInertialMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0), 0.0)
-    obs = replace(c.obs, felt=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
-    state = lander.observe(c.state, obs, c.profile)
-    assert state.reckoning.velocity_mps[:2] == (0.3, 0.0)
-    later = replace(obs, imu=replace(obs.imu, t_s=NOW_S + 0.01))  # the same motion again
-    moved = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.1, 0.0, 0.0)))
-    assert lander.observe(moved, later, c.profile).reckoning.velocity_mps[0] < 0.2
-
-
-@pytest.mark.parametrize("starts", [0, 1])
-def test_a_silence_on_the_way_down_has_the_height_that_the_estimate_felt(starts: int) -> None:
-    """The way down began while the program had heard nothing for long. A vehicle that started anew
-    has another world."""
-    last = telemetry(NOW_S - 1.7, 0.5)
-    reckoning = Reckoning(imu=ImuMotion(t_s=last.t_s))
-    c = context(Evidence.IMU, z_m=0.5, last=last, reckoning=reckoning)
-    tel = telemetry(NOW_S, 0.2, start=starts)
-    imu = ImuMotion(t_s=NOW_S, silent_s=NOW_S)
-    state = lander.observe(c.state, replace(c.obs, telemetry=tel, imu=imu), c.profile)
-    assert state.blind_height_m == pytest.approx(0.5 if starts else 0.2)
-
-
-@pytest.mark.parametrize("later_s", [0.0, 0.5])
-def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
-    """Its vertical speed is what they tell with the right delay, and the floor may be near."""
-    reckoning = Reckoning(imu=ImuMotion(t_s=NOW_S - 0.03), velocity_mps=(0.0, 0.0, -0.7))
-    c = context(Evidence.IMU, blind_height_m=2.0, reckoning=reckoning)
-    motion = VisualInertialMotion(NOW_S - 0.01, (0.0, 0.0), (0.0, 0.0), -0.4)
-    obs = replace(c.obs, felt=motion, mismatch=Mismatch(later_s) if later_s else None)
-    state = lander.observe(c.state, replace(obs, imu=replace(obs.imu, t_s=NOW_S)), c.profile)
-    assert state.reckoning.velocity_mps[2] == pytest.approx(-0.4 if later_s else -0.7, abs=0.05)
-    state = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.0, 0.0, -0.4)))
-    _, command = lander.act(Context(state, obs, c.profile))
-    assert isinstance(command, RawThrust)
-    assert (command.thrust > 0.97 * HOVER_THRUST) is (later_s > 0.0)
-
-
-def test_a_hover_thrust_that_was_not_learned_is_felt() -> None:
-    """In a climb that speeds up by 0.07 g the thrust is 7 % above it; one sample is noise."""
-    felt = Felt()
-    for i in range(60):
-        acc_z_g = 1.0 if i == 59 else 1.07
-        obs = felt(at(thrust=1.07 * HOVER_THRUST, acc_z_g=acc_z_g)(NOW_S + 0.01 * i))
-    unlearned = replace(state_in(Phase.APPROACH), hover_thrust=0.0)
-    state = lander.begin_landing(unlearned, obs, BY_TARGET)
-    assert state.level_hover == pytest.approx(HOVER_THRUST, rel=0.01)
-    hovering = replace(unlearned, phase=Phase.ALIGN, t_s=obs.t_s - TICK_S, last=None)
-    state, _ = planner.step_mission(hovering, obs, DECKS)
-    assert state.hover_thrust == pytest.approx(HOVER_THRUST, rel=0.01)
 
 
 @pytest.mark.parametrize("hung", [0.9, 1.1])
@@ -473,12 +384,6 @@ def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
     seen = replace(silence, sight_s=NOW_S - 2.5)
     told = Finding.STANDS if reach_s is None else Finding.HANGS
     assert ended(reach_s, reckoning=seen) is told
-
-
-def test_a_floor_that_was_felt_on_the_way_down_is_where_it_stands() -> None:
-    """It came down too gently for a fall, though it pressed before."""
-    assert ended(NOW_S - 4.0) is Finding.HANGS
-    assert ended(NOW_S - 4.0, touch_s=NOW_S - 2.0) is Finding.STANDS
 
 
 @pytest.mark.parametrize(("phase", "below_m"), [(Phase.PERCH, math.inf), (Phase.ASCEND, 0.02)])

@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
-from perchctl.mission.mounting import MountWatch, Sight, describe_turn, sight_of, update_watch
+from perchctl.mission.mounting import MountWatch, Sight, describe_turn, update_watch
 from perchctl.vehicle import Command, PositionSetpoint
-from tests.helpers.mission import CEILING_M, state_in, target_at, telemetry
+from tests.helpers.mission import CEILING_M, state_in, target_at
 from tests.mission.rig import BEGIN_S, Motors, at, fly
 
 FRAME_S = 1.0 / 30.0
@@ -84,22 +84,6 @@ def test_a_turned_mounting_shows_in_the_vehicles_own_tilts(deg: int) -> None:
     watch = _tilting(deg)
     assert watch.wrong
     assert abs(math.remainder(math.degrees(watch.turn_rad) - deg, 360.0)) < 5.0
-
-
-@pytest.mark.parametrize("late_s", [-0.06, 0.0, 0.06])
-def test_tilts_that_are_seen_late_are_no_turned_mounting(late_s: float) -> None:
-    assert _tilting(0.0, late_s).against == 0
-
-
-def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
-    """Nose down by 10 deg, heading left: the axis leans to the left."""
-    tel = telemetry(
-        1.0, position_m=(0.3, 0.1, 1.0), pitch_rad=math.radians(10.0), yaw_rad=math.pi / 2
-    )
-    sight = sight_of(1.0, tel, np.array([0.5, 0.2, 2.2]))
-    assert sight.vehicle == pytest.approx(0.3 + 0.1j)
-    assert sight.target == pytest.approx(0.5 + 0.2j)
-    assert sight.lean == pytest.approx(1.2j * math.sin(math.radians(10.0)), rel=0.02)
 
 
 def test_a_landing_for_the_mounting_stops_at_once() -> None:

@@ -12,13 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import ContactError, Observation, Operator, Outcome, Phase, PlannerState
-from perchctl.mission.conditions import touched_error
-from perchctl.mission.context import Context
 from perchctl.mission.guidance import UNREAD_S
 from perchctl.mission.lander import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, own_landing
 from perchctl.mission.planner import step_mission
-from perchctl.mission.state import Condition
-from perchctl.mission.table import TABLE
 from perchctl.vehicle import (
     CRASHED,
     FULL_THRUST,
@@ -358,112 +354,9 @@ def test_what_hangs_where_it_touched_the_target_is_told_by_its_place_there(
         assert flight.state.contact.aside_m == pytest.approx(aside_m)
 
 
-def test_what_hangs_where_it_was_pressed_below_the_target_has_not_touched_it() -> None:
-    flight = backed_off(aside_m=0.0, sigma_m=1e-3, below_m=0.2)
-    assert {"blocked", "held"} <= flight.rows
-    assert flight.state.phase is Phase.ABORTED
-
-
-@pytest.mark.parametrize("positioning", ["deck", "target"])
-def test_what_fell_from_where_it_touched_the_target_is_not_caught_there(positioning: str) -> None:
-    rows = backed_off(positioning, aside_m=0.012, sigma_m=0.022, comes_off=True).rows
-    assert "beside-the-magnet" in rows
-    assert not rows & {"caught", "hangs-at-contact", "contact", "perched", "hung"}
-
-
-@pytest.mark.parametrize(
-    ("touched", "by", "moved_m", "row"),
-    [
-        (False, "deck", 0.0, "hangs-at-contact"),
-        (False, "deck", 0.12, "held"),
-        (True, "mocap", 0.12, "held"),
-    ],
-)
-def test_what_a_hand_holds_where_nothing_was_touched_is_not_caught(
-    touched: bool, by: str, moved_m: float, row: str
-) -> None:
-    """A press that ended in the air, so near the target that it may be its magnet that holds it;
-    or farther aside; or one that touched it, and then went aside by a motion capture, which does
-    not slide."""
-    felt, profile = Felt(), PROFILES[by]
-    state = landing(HANG_Z_M - 0.04, Phase.PERCH)
-    state = replace(state, entered_s=10.0 - PROFILE.planner.perch.timeout_s + 0.3, reach_s=None)
-    for i in range(1, 400):
-        t_s = 10.0 + TICK_S * i
-        held = state.phase is not Phase.PERCH
-        went_m = min(moved_m, 0.08 * (t_s - state.entered_s)) if held else 0.0
-        tel = telemetry(
-            t_s, thrust=(0.34 if held else 1.2 if touched else 1.0) * HOVER_THRUST,
-            position_m=(0.03 + went_m, 0.0, HANG_Z_M - 0.04),
-        )  # fmt: skip
-        if 0.0 < went_m < moved_m:
-            tel = replace(tel, velocity_mps=(0.08 + tel.velocity_mps[0], 0.0, 0.0))
-        target = target_at(
-            t_s, body_m=tel.position_m, sigma_m=np.full(3, 0.01), measured=False, tracked=False,
-            measured_s=10.0,
-        )  # fmt: skip
-        state, _ = step_mission(
-            state, felt(observation(t_s, telemetry=tel, target=target)), profile
-        )
-        if state.phase not in (Phase.PERCH, Phase.RECOVER):
-            break
-    assert (state.phase, state.row) == (Phase.LANDING, row)
-
-
 # --- Where it touched, as it is remembered -------------------------------------------------------
 
 TOUCHED: dict[str, Any] = {"contact": ContactError(0.01, 0.02)}
-
-
-def recovering(row: str, old: PlannerState, **obs: object) -> PlannerState:
-    """One tick on, into RECOVER by that row."""
-    table = tuple(
-        replace(r, when=lambda c: True) for r in TABLE if r.name == row and old.phase in r.phases
-    )
-    state, _ = step_mission(old, observation(10.02, HANG_Z_M, **obs), PROFILE, table)
-    assert (state.phase, state.row) == (Phase.RECOVER, row)
-    return state
-
-
-@pytest.mark.parametrize(
-    ("phase", "row", "kept"),
-    [
-        (Phase.COMPLETE, "not-released", True), (Phase.COMPLETE, "slipped", False),
-        (Phase.RECOVER, "blocked", True), (Phase.PERCH, "no-contact", False),
-    ],
-)  # fmt: skip
-def test_what_has_not_come_off_keeps_the_place_where_it_touched(
-    phase: Phase, row: str, kept: bool
-) -> None:
-    after = recovering(row, hanging(phase, **TOUCHED))
-    assert after.contact == (ContactError(0.01, 0.02) if kept else None)
-
-
-@pytest.mark.parametrize(("since_s", "touched"), [(10.0, False), (9.0, True)])
-def test_one_sample_that_looks_like_a_contact_is_no_touch(since_s: float, touched: bool) -> None:
-    tel = telemetry(10.02, HANG_Z_M, thrust=1.2 * HOVER_THRUST)
-    pressing = landing(phase=Phase.PERCH, since={Condition.CONTACT: since_s})
-    after = recovering("no-contact", pressing, telemetry=tel)
-    assert (after.contact is not None) is touched
-
-
-def test_a_sight_of_now_tells_the_place_better_than_a_touch_of_before() -> None:
-    state, seen = hanging(Phase.RECOVER, **TOUCHED), observation(10.02, HANG_Z_M)
-    assert seen.target is not None
-    lost = replace(seen, target=replace(seen.target, tracked=False))
-    assert touched_error(Context(state, lost, PROFILE)) == ContactError(0.01, 0.02)
-    assert touched_error(Context(state, seen, PROFILE)) is None
-
-
-def test_a_landing_for_another_reason_proves_no_touch() -> None:
-    used = hanging(Phase.RECOVER, **TOUCHED, attempts=PROFILE.planner.attempts, entered_s=9.0)
-    state = fly(used, at(HANG_Z_M)).state
-    assert (state.row, state.contact) == ("attempts-used", None)
-
-
-def test_what_has_left_its_contact_forgets_where_that_was() -> None:
-    state = fly(hanging(Phase.RECOVER, **TOUCHED), at(HANG_Z_M - 0.1)).state
-    assert (state.contact_z_m, state.contact) == (None, None)
 
 
 def test_a_vehicle_still_at_the_ceiling_has_not_recovered() -> None:
@@ -501,23 +394,6 @@ def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
         assert isinstance(command, PositionSetpoint), i
 
 
-def test_a_raw_release_waits_for_telemetry_too() -> None:
-    profile = changed({"planner.perch.mode": "raw"})
-    state = mid_release(released_s=None, setpoint=None, entered_s=9.6)
-    look = at(HANG_Z_M, age_s=0.2, thrust=1000.0)
-    assert isinstance(fly(state, look, profile=profile).command, PositionSetpoint)
-
-
-@pytest.mark.parametrize(("age_s", "released"), [(0.02, True), (0.2, True), (0.5, False)])
-def test_a_release_in_a_landing_begins_on_telemetry_that_is_a_little_late(
-    age_s: float, released: bool
-) -> None:
-    """It stops nothing; what is older than `safety.telemetry_hold_s` begins nothing."""
-    flight = fly(hanging(), at(HANG_Z_M, age_s=age_s, thrust=20000.0), 1.6)
-    assert not flight.stops_s
-    assert (flight.state.released_s is not None) is released
-
-
 @pytest.mark.parametrize(
     "still", [{"released_s": 5.0}, {"orders": 3, "ordered_s": 5.0}], ids=["still", "ordered"]
 )
@@ -550,26 +426,6 @@ def test_a_completion_whose_telemetry_stands_still_ends(
     assert flight.state.phase is ends
 
 
-@pytest.mark.parametrize(
-    ("z_m", "silence_s", "ends"),
-    [
-        (0.02, 0.7, Phase.LANDED),  # it lies on the floor
-        (HANG_Z_M - 0.1, 0.7, Phase.PERCHED),
-        (HANG_Z_M - 0.6, 0.0, Phase.PERCHED),  # an estimate drifts while it is watched
-    ],
-)
-def test_after_the_stop_it_hangs_unless_a_silence_hid_a_fall(
-    z_m: float, silence_s: float, ends: Phase
-) -> None:
-    felt, state = Felt(), mid_release(stopped_s=4.0, orders=5, reach_s=3.0)
-    felt(at(1.0, **OFF)(10.0))
-    for i in range(1, 50):
-        obs = felt(at(z_m, **OFF)(10.0 + silence_s + TICK_S * i))
-        state, _ = step_mission(state, obs, PROFILE)
-    assert state.phase is ends
-    assert ends is Phase.PERCHED or state.outcome is Outcome.SAFETY
-
-
 # --- A slip ---------------------------------------------------------------------------
 
 
@@ -587,14 +443,6 @@ def test_a_falling_vehicle_does_not_hang_at_its_contact() -> None:
     assert flight.state.phase is not Phase.PERCHED
 
 
-def test_without_a_heading_a_slip_is_not_caught_by_position() -> None:
-    """Position control would lead away from its setpoint: raw thrust brakes the fall."""
-    state = landing(1.8, caught=False, catch_above_m=0.2, heading_lost=True)
-    flight = fly(state, at(1.8, velocity_mps=SINKS))
-    assert isinstance(flight.command, RawThrust)
-    assert flight.state.caught
-
-
 def slipped(**changes: Any) -> PlannerState:
     """A slip that is being caught."""
     below = PositionSetpoint(0.0, 0.0, HANG_Z_M - 0.25, 0.0)
@@ -603,19 +451,6 @@ def slipped(**changes: Any) -> PlannerState:
 
 
 FALLS: dict[str, Any] = {"velocity_mps": SINKS, "thrust": 1000.0, "acc_z_g": 0.2}
-
-
-def test_no_hold_keeps_a_slip_from_being_caught() -> None:
-    look = at(HANG_Z_M - 0.1, obs={"loop_late_s": 0.4}, **FALLS)
-    state, command = step_mission(slipped(), look(10.2), PROFILE)
-    assert is_setpoint(command, above_m=HANG_Z_M)
-    assert not state.caught
-
-
-def test_nothing_is_caught_on_an_old_speed() -> None:
-    """Two seconds of full thrust on a speed of long ago would end far above."""
-    _, command = step_mission(slipped(), at(HANG_Z_M - 0.1, age_s=0.2, **FALLS)(10.3), PROFILE)
-    assert is_setpoint(command, below_m=HANG_Z_M + 0.1)
 
 
 @pytest.mark.parametrize("caught", [False, True])
@@ -639,18 +474,6 @@ def test_a_step_of_the_estimates_height_moves_what_is_remembered(step_m: float) 
     assert before.ground_m is not None
     assert state.ground_m is not None
     assert state.ground_m[2] == pytest.approx(before.ground_m[2] + step_m, abs=0.02)
-
-
-@pytest.mark.parametrize(
-    ("gap_s", "moves"), [(0.02, True), (0.1, True), (0.3, False), (5.0, False)]
-)
-def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves: bool) -> None:
-    """It was at rest before the silence and is at rest after it: on the floor."""
-    state = landing(1.0, last=telemetry(10.0, 1.0))
-    new, _ = step_mission(state, at(0.02, obs={"jumped": True})(10.0 + gap_s), PROFILE)
-    assert state.ground_m is not None
-    assert new.ground_m is not None
-    assert new.ground_m[2] - state.ground_m[2] == pytest.approx(-0.98 if moves else 0.0)
 
 
 def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None:
@@ -736,23 +559,6 @@ def test_its_own_landing_is_slow_and_aims_lower_the_longer_the_estimate_has_drif
 
 
 # --- What stays up, or stands still ----------------------------------------------------
-
-
-def test_a_landing_that_stays_up_hangs_wherever_its_target_was_thought_to_be() -> None:
-    """Neither a contact was noticed nor is a target in sight: it is held, and put to the proof."""
-    look = at(1.8, obs={"target": None}, thrust=0.5 * HOVER_THRUST)
-    assert isinstance(fly(landing(1.8), look, 1.6).command, RawThrust)
-
-
-def test_a_height_that_has_frozen_far_below_the_target_is_no_hanging() -> None:
-    """On the floor, where a positioning system's height stood still half a metre above it."""
-    target = {"target": observation(10.0, 0.5).target}
-    flight = fly(landing(0.5), at(0.5, obs=target, thrust=0.4 * HOVER_THRUST), 1.6)
-    assert not any(isinstance(command, RawThrust) for command in flight.commands)
-    state = flight.state
-    for i in range(1, 11):
-        state, _ = step_mission(state, at(0.5, obs=target, **OFF)(11.6 + TICK_S * i), PROFILE)
-    assert state.phase is Phase.LANDED
 
 
 @pytest.mark.parametrize(
