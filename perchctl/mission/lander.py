@@ -151,54 +151,50 @@ def step_landing(
 ) -> tuple[PlannerState, Command]:
     """Fly one tick of the way down without the mission's table, for watchdog and rescue; the way
     down begins with the first. Returns the new state, and the command to send."""
-    state = observe(begin_landing(state, obs, profile), obs, profile)
-    state = replace(state, since=conditions_since(Context(state, obs, profile)))
-    state, command = act(Context(state, obs, profile))
+    c = observe(begin_landing(Context(state, obs, profile)))
+    state, command = act(c.evolve(since=conditions_since(c)))
     return replace(note_order(state, command), t_s=obs.t_s, last=obs.telemetry), command
 
 
-def begin_landing(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """The state with its way down begun; the same state if it had begun before."""
-    if state.phase is Phase.LANDING:
-        return state
-    c = Context(state, obs, profile)
-    new = replace(
-        state, phase=Phase.LANDING, entered_s=obs.t_s, severity=max(state.severity, Severity.LAND),
-        since=lasting_conditions(state.since),
-        entry_m=obs.telemetry.position_m, entry_yaw_rad=obs.telemetry.yaw_rad,
-        pressed=state.caught and presses(c), ordered_s=None, orders=0,
+def begin_landing(c: Context) -> Context:
+    """The tick with its way down begun; the same tick if it had begun before."""
+    if c.state.phase is Phase.LANDING:
+        return c
+    new = c.evolve(
+        phase=Phase.LANDING, entered_s=c.t_s, severity=max(c.state.severity, Severity.LAND),
+        since=lasting_conditions(c.state.since),
+        entry_m=c.telemetry.position_m, entry_yaw_rad=c.telemetry.yaw_rad,
+        pressed=c.state.caught and presses(c), ordered_s=None, orders=0,
     )  # fmt: skip
-    return enter_landing(new, state, obs, profile)
+    return enter_landing(new, c.state)
 
 
-def enter_landing(
-    new: PlannerState, old: PlannerState, obs: Observation, profile: Profile
-) -> PlannerState:
-    """The state that a way down from `old` starts with; `new` has its entry already."""
-    tel, stopped_s = obs.telemetry, old.stopped_s
-    heard = obs.t_s - tel.t_s <= profile.safety.proof_age_s
-    ordered = heard and tel.has(HL_ACTIVE) and profile.positioning.by != "target"
-    if ordered and not new.astray:  # else it would follow the wrong positions to its end
-        new = replace(new, orders=LEAST_ORDERS, ordered_s=obs.t_s)
+def enter_landing(c: Context, old: PlannerState) -> Context:
+    """The tick with what a way down from `old` starts with; it has its entry already."""
+    tel, stopped_s = c.telemetry, old.stopped_s
+    heard = c.t_s - tel.t_s <= c.safety.proof_age_s
+    ordered = heard and tel.has(HL_ACTIVE) and not c.by_sight
+    if ordered and not c.state.astray:  # else it would follow the wrong positions to its end
+        c = c.evolve(orders=LEAST_ORDERS, ordered_s=c.t_s)
     elif heard and tel.thrust < 1 and stopped_s is None:
         # The motors were stopped, or never turned: nothing spins them up again.
-        new = replace(new, stopped_s=obs.t_s)
+        c = c.evolve(stopped_s=c.t_s)
     contact_z_m = old.contact_z_m
-    c = Context(new, obs, profile)
-    if contact_z_m is None and (old.phase is Phase.PERCH or (new.pressed and c.by_sight)):
+    if contact_z_m is None and (old.phase is Phase.PERCH or (c.state.pressed and c.by_sight)):
         # It may be in the magnet's reach, also below a sheet that hangs above an unseen ceiling:
         # it has to be seen below before it counts as free.
         contact_z_m = tel.position_m[2]
-    hover = _hover_thrust(old, obs)
+    hover = _hover_thrust(old, c.obs)
     # While the loop was silent the watchdog may have brought it down or to the magnet: what was
     # measured meanwhile counts from the tick before.
-    within = contact_z_m is not None or new.reckoning.below_m < REACH_M
-    new = replace(
-        new, reach_s=old.t_s if within and old.reach_s is None else old.reach_s,
+    within = contact_z_m is not None or c.state.reckoning.below_m < REACH_M
+    blind = _has_lost_its_position(c)
+    c = c.evolve(
+        reach_s=old.t_s if within and old.reach_s is None else old.reach_s,
         contact_z_m=contact_z_m, level_hover=hover, hover_thrust=hover,
         level_within=HOVER_WITHIN if old.hover_thrust else UNLEARNED_WITHIN,
     )  # fmt: skip
-    return lose_position(new, obs) if _has_lost_its_position(c) else new
+    return lose_position(c) if blind else c
 
 
 # --- What is known ------------------------------------------------------------------------------
@@ -321,10 +317,11 @@ def hangs_stopped(c: Context) -> bool:
 # --- What is remembered -------------------------------------------------------------------------
 
 
-def observe(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """The state with one more observation. Hangs of the loop, jumps of the estimate and lost
-    positions are noticed here, for all who fly a way down."""
-    if state.last is not None and obs.t_s - state.t_s > profile.positioning.hold_s:
+def observe(c: Context) -> Context:
+    """The tick with what is remembered of its observation. Hangs of the loop, jumps of the estimate
+    and lost positions are noticed here, for all who fly a way down."""
+    state, obs = c.state, c.obs
+    if state.last is not None and obs.t_s - state.t_s > c.profile.positioning.hold_s:
         # After a hang of the loop everything from before is stale; dwell times begin anew.
         kept = lasting_conditions(state.since)
         off_s = max(obs.imu.off_s, obs.imu.silent_s)
@@ -332,22 +329,21 @@ def observe(state: PlannerState, obs: Observation, profile: Profile) -> PlannerS
             # All samples of the hang have come, and in none do the motors turn: else a loop that
             # hangs in every turn would never see a landing end.
             kept[Condition.DOWN] = max(off_s, state.since[Condition.DOWN])
-        stale_s = obs.t_s if profile.positioning.by == "target" else state.stale_s
         # A catch is over, and its setpoint far above with it: held, it would press.
         setpoint = state.setpoint if state.caught else None
-        state = replace(state, since=kept, stale_s=stale_s, caught=True, setpoint=setpoint)
-    if Context(state, obs, profile).position_is_stale:
-        state = replace(state, stale_s=obs.t_s)
+        stale_s = obs.t_s if c.by_sight else state.stale_s
+        c = c.evolve(since=kept, stale_s=stale_s, caught=True, setpoint=setpoint)
+    if c.position_is_stale:
+        c = c.evolve(stale_s=obs.t_s)
     if obs.jumped:
-        state = _jumped(state, obs)
-    if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
-        state = replace(state, heading_lost=True, hover_thrust=_hover_thrust(state, obs))
-    state = _reckon(Context(_answered(state, obs, profile), obs, profile))
-    c = Context(state, obs, profile)
-    comes_down = state.phase is Phase.LANDING and is_driven(c)
-    if comes_down and state.blind_s is None and _has_lost_its_position(c):
-        return lose_position(state, obs)
-    return state
+        c = c.with_state(_jumped(c.state, obs))
+    if obs.turned_rad > math.radians(c.safety.heading_lost_deg):
+        c = c.evolve(heading_lost=True, hover_thrust=_hover_thrust(c.state, obs))
+    c = c.with_state(_reckon(_answered(c)))
+    comes_down = c.state.phase is Phase.LANDING and is_driven(c)
+    if comes_down and c.state.blind_s is None and _has_lost_its_position(c):
+        return lose_position(c)
+    return c
 
 
 def note_order(state: PlannerState, command: Command) -> PlannerState:
@@ -361,25 +357,24 @@ def note_order(state: PlannerState, command: Command) -> PlannerState:
             return replace(state, raw_order=None, unanswered_s=None)
 
 
-def _answered(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """The state with the time since which the thrust that is read differs from the order: a reading
+def _answered(c: Context) -> Context:
+    """The tick with the time since which the thrust that is read differs from the order: a reading
     that stands still under a changed order leaves the thrust unknown."""
-    if state.raw_order is None:
-        return state
-    wanted = 0.0 if state.raw_order < STILL_THRUST else min(MOST_RAW, state.raw_order)
-    apart = abs(obs.telemetry.thrust - wanted) > UNANSWERED_PART * FULL_THRUST
-    since_s = obs.t_s if state.unanswered_s is None else state.unanswered_s
-    new = replace(state, unanswered_s=since_s if apart else None)
-    known = Context(new, obs, profile).thrust_is_known
-    return new if known else replace(new, unread_s=obs.t_s)
+    order = c.state.raw_order
+    if order is None:
+        return c
+    wanted = 0.0 if order < STILL_THRUST else min(MOST_RAW, order)
+    apart = abs(c.telemetry.thrust - wanted) > UNANSWERED_PART * FULL_THRUST
+    since_s = c.t_s if c.state.unanswered_s is None else c.state.unanswered_s
+    c = c.evolve(unanswered_s=since_s if apart else None)
+    return c if c.thrust_is_known else c.evolve(unread_s=c.t_s)
 
 
-def lose_position(state: PlannerState, obs: Observation) -> PlannerState:
-    """The state once accelerometer and attitude are all that is left, for good: each change of the
+def lose_position(c: Context) -> Context:
+    """The tick once accelerometer and attitude are all that is left, for good: each change of the
     mode costs height, so no sight is believed again on this way down."""
-    hover = _hover_thrust(state, obs)
-    height_m = obs.telemetry.position_m[2] - state.ground_z_m
-    return replace(state, blind_s=obs.t_s, blind_height_m=height_m, hover_thrust=hover)
+    hover = _hover_thrust(c.state, c.obs)
+    return c.evolve(blind_s=c.t_s, blind_height_m=c.height_m, hover_thrust=hover)
 
 
 def _reckon(c: Context) -> PlannerState:

@@ -98,29 +98,27 @@ def step_mission(
 ) -> tuple[PlannerState, Command]:
     """Fly one tick of the mission; `state` is None in the first, on the ground. Returns the new
     state, and the command to send."""
-    state = _remember(state or start_mission(obs), obs, profile)
-    row = first_match(Context(state, obs, profile), table)
+    c = _remember(Context(state or start_mission(obs), obs, profile))
+    row = first_match(c, table)
     if row is not None:
-        state = _enter(state, row, Context(state, obs, profile))
-        state = replace(state, hold=hold_reason(Context(state, obs, profile)))
-    new, command = act(Context(state, obs, profile))
+        c = _enter(c, row)
+        c = c.evolve(hold=hold_reason(c))
+    new, command = act(c)
     return replace(lander.note_order(new, command), t_s=obs.t_s), command
 
 
-def _remember(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    state = lander.observe(_with_target(state, obs), obs, profile)
-    context = Context(state, obs, profile)
-    state = replace(state, hold=hold_reason(context))
-    since = conditions_since(context)
-    if state.hold:
+def _remember(c: Context) -> Context:
+    c = lander.observe(c.with_state(_with_target(c.state, c.obs)))
+    hold, since, hover = hold_reason(c), conditions_since(c), c.state.hover_thrust
+    if hold:
         since = lasting_conditions(since)  # a held vehicle proves nothing: dwell times begin anew
     # Near the target an ascent may press against a ceiling that is lower than thought.
-    away = state.phase is not Phase.ASCEND or context.error_z_m > profile.planner.ascend.near_m
-    if away and state.phase in _LEARNING and hovers(context):
-        state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
-    state = replace(state, last=obs.telemetry, energy=battery.read_battery(context))
-    state = replace(state, battery=battery.outlook(Context(state, obs, profile)))
-    return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
+    away = c.state.phase is not Phase.ASCEND or c.error_z_m > c.planner.ascend.near_m
+    if away and c.state.phase in _LEARNING and hovers(c):
+        hover = _learned_hover_thrust(c.state, c.obs)
+    energy = battery.read_battery(c)
+    c = c.evolve(hold=hold, hover_thrust=hover, last=c.telemetry, energy=energy)
+    return c.evolve(battery=battery.outlook(c), since=since, mount=_mount_watched(c))
 
 
 def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
@@ -164,32 +162,21 @@ def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
     return state.hover_thrust + part * (thrust - state.hover_thrust)
 
 
-def _enter(state: PlannerState, row: Transition, context: Context) -> PlannerState:
-    obs = context.obs
-    new = replace(
-        state,
-        phase=row.to,
-        entered_s=obs.t_s,
-        reason=row.explain(context),
-        row=row.name,
-        severity=state.severity.then(row.severity),
-        motor_stop=row.motor_stop,
-        outcome=_outcome(state, row),
-        since=lasting_conditions(state.since),
-        attempts=state.attempts + int(row.counts_attempt),
-        entry_m=obs.telemetry.position_m,
-        entry_yaw_rad=obs.telemetry.yaw_rad,
-        search_step_s=obs.t_s,
-        confirmed=0,
-        # An ordered press has wound the integrators up, whatever thrust is read; a fall that is
-        # just being caught turns at full thrust in the air.
-        pressed=row.to in (Phase.RECOVER, Phase.LANDING)
-        and state.caught
-        and (state.phase is Phase.PERCH or presses(context)),
-        ordered_s=None,
-        orders=0,
-    )
-    return _started_phase(new, state, context)
+def _enter(c: Context, row: Transition) -> Context:
+    state = c.state
+    # An ordered press has wound the integrators up, whatever thrust is read; a fall that is just
+    # being caught turns at full thrust in the air.
+    ends = row.to in (Phase.RECOVER, Phase.LANDING)
+    pressed = ends and state.caught and (state.phase is Phase.PERCH or presses(c))
+    new = c.evolve(
+        phase=row.to, entered_s=c.t_s, reason=row.explain(c), row=row.name,
+        severity=state.severity.then(row.severity), motor_stop=row.motor_stop,
+        outcome=_outcome(state, row), since=lasting_conditions(state.since),
+        attempts=state.attempts + int(row.counts_attempt), entry_m=c.telemetry.position_m,
+        entry_yaw_rad=c.telemetry.yaw_rad, search_step_s=c.t_s, confirmed=0, pressed=pressed,
+        ordered_s=None, orders=0,
+    )  # fmt: skip
+    return _started_phase(new, c)
 
 
 def _outcome(state: PlannerState, row: Transition) -> Outcome | None:
@@ -202,46 +189,42 @@ def _outcome(state: PlannerState, row: Transition) -> Outcome | None:
     return row.outcome or state.outcome
 
 
-def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerState:
-    """The state that a phase starts with."""
-    obs = c.obs
-    match new.phase:
+def _started_phase(new: Context, c: Context) -> Context:
+    """The tick with what its phase starts with; `c` is the tick before the transition."""
+    old, row, z_m = c.state, new.state.row, c.telemetry.position_m[2]
+    match new.state.phase:
         case Phase.COMPLETE:
-            z_m, contact = obs.telemetry.position_m[2], touched_error(c) or contact_error(c)
-            return replace(new, contact_z_m=z_m, contact=contact, released_s=None)
+            contact = touched_error(c) or contact_error(c)
+            return new.evolve(contact_z_m=z_m, contact=contact, released_s=None)
         case Phase.RECOVER:
-            z_m = obs.telemetry.position_m[2]
-            blocked_z_m = z_m if new.row == "blocked" else old.blocked_z_m
-            touched = old.phase is Phase.PERCH or new.row == "blocked"
-            return replace(
-                new,
+            touched = old.phase is Phase.PERCH or row == "blocked"
+            return new.evolve(
                 stopped_s=None,
-                contact=_touched(old, new.row, c),
+                contact=_touched(old, row, c),
                 # In the magnet's reach until it is seen below.
                 contact_z_m=z_m if touched else old.contact_z_m,
                 released_s=None,
-                caught=new.row != "slipped" or is_carried(old.hover_thrust, obs.telemetry.thrust),
-                catch_above_m=catch_above_m(old.hover_thrust, obs.telemetry.thrust),
-                blocked_z_m=blocked_z_m,
+                caught=row != "slipped" or is_carried(old.hover_thrust, c.telemetry.thrust),
+                catch_above_m=catch_above_m(old.hover_thrust, c.telemetry.thrust),
+                blocked_z_m=z_m if row == "blocked" else old.blocked_z_m,
             )
         case Phase.LANDING:
             # The mounting may be right and the motion capture's axes wrong, by which the landing
             # would speed up until it tilts over.
             capture = c.profile.positioning.by == "mocap" and old.mount.wrong
-            if new.row == "position-astray" or (new.row == "mounting" and capture):
+            if row == "position-astray" or (row == "mounting" and capture):
                 reckoning = old.reckoning if old.astray else discount_wrong_positions(old.reckoning)
-                new = replace(new, astray=True, reckoning=reckoning)
-            if new.row == "mounting":
-                # The setpoint is ahead, in a wrong direction.
-                new = replace(new, setpoint=None)
-            if old.phase is Phase.RECOVER and new.row != "hangs-at-contact":
-                new = replace(new, contact=None)  # nothing was felt to hold it there
-            return lander.enter_landing(new, old, obs, c.profile)
+                new = new.evolve(astray=True, reckoning=reckoning)
+            if row == "mounting":
+                new = new.evolve(setpoint=None)  # it is ahead, in a wrong direction
+            if old.phase is Phase.RECOVER and row != "hangs-at-contact":
+                new = new.evolve(contact=None)  # nothing was felt to hold it there
+            return lander.enter_landing(new, old)
         case Phase.ASCEND:
-            return replace(new, searches=0)
+            return new.evolve(searches=0)
         case Phase.SEARCH if old.setpoint is not None:
             sp = old.setpoint
-            return replace(new, entry_m=(sp.x_m, sp.y_m, sp.z_m), entry_yaw_rad=sp.yaw_rad)
+            return new.evolve(entry_m=(sp.x_m, sp.y_m, sp.z_m), entry_yaw_rad=sp.yaw_rad)
         case _:
             return new
 

@@ -47,15 +47,7 @@ class Phase(Enum):
         return self in TERMINALS
 
 
-SEVEN_PHASES = (
-    Phase.APPROACH,
-    Phase.SEARCH,
-    Phase.ESTIMATE,
-    Phase.ALIGN,
-    Phase.ASCEND,
-    Phase.PERCH,
-    Phase.COMPLETE,
-)
+SEVEN_PHASES = tuple(Phase)[:7]
 FLYING_PHASES = frozenset({*SEVEN_PHASES, Phase.RECOVER})
 BEFORE_CONTACT = FLYING_PHASES - {Phase.COMPLETE}
 TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})

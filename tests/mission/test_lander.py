@@ -173,7 +173,7 @@ def judged(profile: Profile, state: dict[str, Any], **observed: Any) -> Evidence
     began = replace(state_in(Phase.LANDING, NOW_S - 1.0, HIGH_M), t_s=NOW_S - TICK_S, **state)
     age_s, behind_s = observed.pop("age_s", 0.01), observed.pop("behind_s", 0.0)
     obs = at(HIGH_M, age_s=age_s, obs=observed, behind_s=behind_s)(NOW_S)
-    return evidence_of(Context(lander.observe(began, obs, profile), obs, profile))
+    return evidence_of(lander.observe(Context(began, obs, profile)))
 
 
 @pytest.mark.parametrize(
@@ -322,14 +322,14 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
         since={planner.Condition.DOWN: 0.0, planner.Condition.BATTERY_LOW: 1.0},
     )  # fmt: skip
     obs = observation(NOW_S + hung * profile.positioning.hold_s, HIGH_M)
-    after = lander.observe(state, obs, profile)
+    after = lander.observe(Context(state, obs, profile)).state
     assert (planner.Condition.DOWN in after.since) is not stale
     assert planner.Condition.BATTERY_LOW in after.since
     assert after.caught is stale
     # The setpoint of a catch is far above, and would press; any other is held.
     assert (after.setpoint is None) is stale
     held = replace(state, caught=True)
-    assert lander.observe(held, obs, profile).setpoint == held.setpoint
+    assert lander.observe(Context(held, obs, profile)).state.setpoint == held.setpoint
     if positioning == "target":
         assert (after.blind_s is not None) is stale
 
@@ -396,7 +396,7 @@ def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
     before = state_in(phase, NOW_S - 11.0, HANG_Z_M)
     before = replace(before, reckoning=Reckoning(UNMOVED, below_m=below_m))
     entered = replace(before, phase=Phase.LANDING, entered_s=NOW_S, t_s=NOW_S)
-    new = lander.enter_landing(entered, before, obs, BY_TARGET)
+    new = lander.enter_landing(Context(entered, obs, BY_TARGET), before).state
     assert new.stopped_s == NOW_S
     assert lander.rest_finding(Context(new, obs, BY_TARGET)) is Finding.HANGS
 
@@ -455,7 +455,7 @@ def began(phase: Phase, remembered: dict[str, Any], profile: Profile) -> Planner
     flies = state_in(Phase.ALIGN if phase is Phase.LANDING else phase, z_m=1.0)
     state = replace(flies, hover_thrust=remembered.get("hover_thrust", HOVER_THRUST))
     if phase is Phase.LANDING:
-        state = lander.begin_landing(state, observation(NOW_S, 1.0), profile)
+        state = lander.begin_landing(Context(state, observation(NOW_S, 1.0), profile)).state
     return replace(state, **{k: v for k, v in remembered.items() if k != "hover_thrust"})
 
 
