@@ -22,7 +22,7 @@ from perchctl.campaign.pool import FlightPool
 from perchctl.campaign.results import FlightEnd, FlightResult, peak_memory_mb
 from perchctl.errors import InvalidValue, PerchError, SafetyAbort, TimedOut
 from perchctl.flight import fly_lockstep
-from perchctl.mission import Event, Phase, Tick
+from perchctl.mission import Event, Phase, Watcher
 from perchctl.profile import Profile
 from perchctl.record import FlightSummary, LogWatcher
 from perchctl.sim import Scenario, draw_scenario
@@ -127,16 +127,11 @@ def fly_logged(profile: Profile, folder: Path, seed: int, record: bool = False) 
     return LoggedFlight(seed, OUTCOMES[flight.end], summary, log.path, tuple(events.seen))
 
 
-class _EventKeeper:
+class _EventKeeper(Watcher):
     """A watcher that keeps the events."""
-
-    problem: str | None = None
 
     def __init__(self) -> None:
         self.seen: list[Event] = []
-
-    def tick(self, tick: Tick) -> None:
-        return None
 
     def event(self, event: Event) -> None:
         self.seen.append(event)

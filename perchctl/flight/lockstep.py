@@ -13,7 +13,7 @@ from perchctl.camera import FrameSource, NewestSlot, mirrored_as_profiled
 from perchctl.errors import ConnectionFailed
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.link import MockLink, Radio
-from perchctl.mission import Event, FlightReport, Operator, Phase, Tick, Watcher
+from perchctl.mission import FlightReport, Operator, Phase, Tick, Watcher
 from perchctl.positioning import FeedThread, Placed, PositionFeed
 from perchctl.profile import Profile
 from perchctl.record import FlightSummary, LogWatcher
@@ -101,10 +101,8 @@ def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
     return mirrored_as_profiled(source, profile.camera)
 
 
-class Truth:
+class Truth(Watcher):
     """A watcher of the true vehicle, which the flight cannot see."""
-
-    problem: str | None = None
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
@@ -112,9 +110,6 @@ class Truth:
         self._was_down = True
         self.fell = False
         self.touchdown_mps = 0.0
-
-    def event(self, event: Event) -> None:
-        return None
 
     def tick(self, tick: Tick) -> None:
         world = self._vehicle.world
@@ -250,10 +245,8 @@ def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> Loc
     )
 
 
-class _OperatorAt:
+class _OperatorAt(Watcher):
     """Gives the operator's command once a phase has been reached."""
-
-    problem: str | None = None
 
     def __init__(self, at: dict[Phase, Operator]) -> None:
         self._at = at
@@ -264,9 +257,6 @@ class _OperatorAt:
 
     def tick(self, tick: Tick) -> None:
         self._command = max(self._command, self._at.get(tick.state.phase, Operator.NONE))
-
-    def event(self, event: Event) -> None:
-        return None
 
 
 # --- External positions in lockstep: the simulated motion capture, by the same feed --------------

@@ -236,7 +236,11 @@ def started_feed(
 
     Errors: those of `CflibLink.settle`, and SafetyAbort for positions of another world."""
     if config.by == "target":
-        _settle_standing(link, clock, profile)
+        standing = StandingFeed(link.external, profile.safety.ground_z_m)
+        thread = FeedThread(standing, clock.now, 1.0 / profile.positioning.rate_hz)
+        thread.start()
+        with contextlib.closing(thread):
+            link.settle(standing)
         return None  # what follows is seen, and sent, by the loop
     if capture is None:
         return None
@@ -247,17 +251,6 @@ def started_feed(
     _refuse_strange(feed, link, clock, profile)
     link.settle(feed)
     return feed
-
-
-def _settle_standing(link: CflibLink, clock: Clock, profile: Profile) -> None:
-    """Settle the estimate on the ground, at the world's origin."""
-    feed = StandingFeed(link.external, profile.safety.ground_z_m)
-    thread = FeedThread(feed, clock.now, 1.0 / profile.positioning.rate_hz)
-    thread.start()
-    try:
-        link.settle(feed)
-    finally:
-        thread.close()
 
 
 def _refuse_strange(feed: PositionFeed, link: CflibLink, clock: Clock, profile: Profile) -> None:

@@ -271,7 +271,7 @@ def rescue(
                 imu=history.imu,
                 felt=felt,
             )
-            state, command = step_landing(state or _before_take_off(obs), obs, profile)
+            state, command = step_landing(state, obs, profile)
             if not isinstance(command, Idle):
                 send(command)
             rest = rest_of(state, obs, profile, LOOK_S)
@@ -279,9 +279,3 @@ def rescue(
                 return rest
         clock.wait_until(now_s + period_s)
     return Finding.UNSEEN.value
-
-
-def _before_take_off(obs: Observation) -> PlannerState:
-    """Return the planner's state if its first tick was the one that failed."""
-    position_m = obs.telemetry.position_m
-    return PlannerState(t_s=obs.t_s, started_s=obs.t_s, ground_m=position_m, entry_m=position_m)

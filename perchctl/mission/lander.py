@@ -147,11 +147,13 @@ AT_REST_S = 0.3
 
 
 def step_landing(
-    state: PlannerState, obs: Observation, profile: Profile
+    state: PlannerState | None, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
     """Fly one tick of the way down without the mission's table, for watchdog and rescue; the way
-    down begins with the first. Returns the new state, and the command to send."""
-    c = observe(begin_landing(Context(state, obs, profile)))
+    down begins with the first. `state` is None if the planner has none yet. Returns the new state,
+    and the command to send."""
+    c = Context(state or PlannerState.on_ground(obs), obs, profile)
+    c = observe(begin_landing(c))
     state, command = act(c.evolve(since=conditions_since(c)))
     return replace(note_order(state, command), t_s=obs.t_s, last=obs.telemetry), command
 

@@ -76,20 +76,6 @@ WARY_MPS, WARY_M = 0.25, 0.2  # sideways, while nothing confirms the camera's mo
 _LEARNING = (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
 
 
-def start_mission(obs: Observation) -> PlannerState:
-    """The state of a planner on the ground, before take-off."""
-    tel = obs.telemetry
-    return PlannerState(
-        entered_s=obs.t_s,
-        started_s=obs.t_s,
-        t_s=obs.t_s,
-        search_step_s=obs.t_s,
-        ground_m=tel.position_m,
-        entry_m=tel.position_m,
-        entry_yaw_rad=tel.yaw_rad,
-    )
-
-
 def step_mission(
     state: PlannerState | None,
     obs: Observation,
@@ -98,7 +84,7 @@ def step_mission(
 ) -> tuple[PlannerState, Command]:
     """Fly one tick of the mission; `state` is None in the first, on the ground. Returns the new
     state, and the command to send."""
-    c = _remember(Context(state or start_mission(obs), obs, profile))
+    c = _remember(Context(state or PlannerState.on_ground(obs), obs, profile))
     row = first_match(c, table)
     if row is not None:
         c = _enter(c, row)

@@ -11,7 +11,6 @@ from typing import Literal, Protocol
 
 from perchctl.geometry import Array
 from perchctl.mission.context import Context
-from perchctl.mission.planner import start_mission
 from perchctl.mission.state import Observation, Outcome, Phase, PlannerState, Severity
 from perchctl.mission.table import unplaced_text
 from perchctl.profile import Profile
@@ -59,7 +58,7 @@ class Event:
         """The events of one tick; `before` is None in the first."""
         events: list[Event] = []
         if before is None:
-            before = start_mission(obs)
+            before = PlannerState.on_ground(obs)
             events.append(cls(obs.t_s, EventKind.PHASE, before.reason, before.phase))
             if not is_battery_reading(obs.telemetry.battery_v):
                 grace_s = profile.safety.battery_stale_s
@@ -200,10 +199,13 @@ class Watcher(Protocol):
 
     def tick(self, tick: Tick) -> None:
         """Take a flown turn."""
+        return
 
     def event(self, event: Event) -> None:
         """Take something that happened."""
+        return
 
     @property
     def problem(self) -> str | None:
         """Why the watcher lost something; None while it lost nothing."""
+        return None

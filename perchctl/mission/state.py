@@ -279,3 +279,12 @@ class PlannerState:
     def ground_z_m(self) -> float:
         """Height of the ground that the flight started from; 0 if it is unknown."""
         return self.ground_m[2] if self.ground_m else 0.0
+
+    @classmethod
+    def on_ground(cls, obs: Observation) -> PlannerState:
+        """The state before take-off."""
+        tel, t_s = obs.telemetry, obs.t_s
+        return cls(
+            entered_s=t_s, started_s=t_s, t_s=t_s, search_step_s=t_s,
+            ground_m=tel.position_m, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
+        )  # fmt: skip

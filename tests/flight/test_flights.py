@@ -17,7 +17,6 @@ from perchctl.calibration import profile_camera
 from perchctl.campaign import FlightResult, campaign_summary, run_campaign
 from perchctl.campaign.flights import fly_seed
 from perchctl.commands.fly import EXIT_CODE_OF
-from perchctl.errors import EXIT_CODES
 from perchctl.flight import FlyOptions, fly_lockstep, lockstep
 from perchctl.flight.lockstep import LockstepFlight
 from perchctl.mission import Event, EventKind, Operator, Outcome, Phase, Tick
@@ -97,16 +96,6 @@ def test_a_quiet_flight_perches_by_the_seven_phases_in_order(
     assert {"large", "both"} <= stages or {"both", "small"} <= stages
 
 
-def test_its_log_is_whole(quiet_log: FlightLog) -> None:
-    assert not quiet_log.truncated
-    assert quiet_log.summary is not None
-    assert quiet_log.summary["outcome"] == "perched"
-    assert quiet_log.header["seed"] == SEED
-    assert quiet_log.header["lockstep"]
-    steps = np.diff(quiet_log.column("t_s"))
-    assert steps == pytest.approx(0.02, abs=1e-5)  # one record a loop
-
-
 @pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes_and_another_is_another_flight(
     quiet: tuple[FlightResult, Path], tmp_path: Path
@@ -162,18 +151,6 @@ def test_a_first_contact_that_does_not_hold_is_tried_again(mode: str) -> None:
     assert_perched(flown, attempts=2)
     assert flown.way[:8] == [*SEVEN_NAMES, "RECOVER"]
     assert flown.way[8:] == ["ESTIMATE", "ALIGN", "ASCEND", "PERCH", "COMPLETE", "PERCHED"]
-
-
-@pytest.mark.long
-def test_what_hangs_when_the_attempts_are_used_up_is_not_said_to_have_landed() -> None:
-    """The magnet holds, but the one attempt was given up before that was seen."""
-    flown = fly_short({"planner.attempts": 1, "planner.complete.release_timeout_s": 1.85})
-    assert flown.flight.hanging
-    assert flown.way[-3:] == ["RECOVER", "LANDING", "PERCHED"]
-    assert flown.report.outcome is Outcome.ATTEMPTS_USED_UP
-    assert "used up; hanging with the motors off" in flown.report.reason
-    assert flown.report.attempts == 1
-    assert "left hanging" in EXIT_CODES[EXIT_CODE_OF[flown.report.outcome]]
 
 
 # --- Faults ------------------------------------------------------------------------------

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -123,17 +121,3 @@ def test_a_simulator_that_is_gone_does_not_stop_time_nor_turn_it_back(rig: Rig) 
     assert alone_s <= rig.clock.now() <= alone_s + 0.1 + NEAR_S
     rig.turns(50)
     assert rig.clock.now() - alone_s == pytest.approx(50 * PERIOD_S, abs=0.1 + NEAR_S)
-
-
-def test_before_and_after_the_loop_time_runs_freely(free: Rig) -> None:
-    free.turns(1, work_s=0.5)
-    assert math.isinf(free.shared.limit_s)
-    assert free.host.elapsed_s == pytest.approx(0.5, abs=NEAR_S)
-    with contextlib.suppress(ValueError), free.clock.waiting_for_loop():
-        free.turns(1)
-        assert math.isfinite(free.shared.limit_s)
-        raise ValueError("the loop fails")
-    assert math.isinf(free.shared.limit_s)
-    began_s = free.clock.now()
-    free.let_pass(1.0)
-    assert free.clock.now() - began_s == pytest.approx(1.0, abs=0.05)

@@ -21,13 +21,13 @@ from perchctl.mission import (
     Touchdown,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.imu import Blow, Reckoning, advance_reckoning
+from perchctl.mission.imu import Blow
 from perchctl.mission.report import touchdown_of
 from perchctl.record import FlightSummary, read_log, summary_text
 from perchctl.vehicle import Telemetry
 from tests.helpers import log
 from tests.helpers.loop_rig import PROFILE, Broken, Guarded, Rig, Vehicle, hanging_camera
-from tests.helpers.mission import observation, state_in, telemetry
+from tests.helpers.mission import observation, state_in
 
 HARD = Touchdown(0.9, 3.1)
 SENTENCE = "touched down hard: 0.9 m/s, 3.1 g"
@@ -37,16 +37,6 @@ SENTENCE = "touched down hard: 0.9 m/s, 3.1 g"
 
 
 # --- A blow, sample by sample ------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("steady_s", [0.2, 0.21, 0.22, 0.23, 0.24, 0.25])
-def test_an_estimate_that_has_the_blow_before_the_samples_do(steady_s: float) -> None:
-    motion, last = ImuMotion(), None
-    steady = [(-0.4, 1.001)] * round(100 * steady_s)
-    for i, (vz_mps, acc_g) in enumerate([*steady, (0.02, 2.9), (0.02, 3.8), *[(0.02, 1.0)] * 8]):
-        sample = telemetry(0.01 * i, 0.0, velocity_mps=(0.0, 0.0, vz_mps), acc_z_g=acc_g)
-        motion, last = motion.with_sample(last, sample), sample
-    assert (motion.blow.estimated_mps, motion.blow.peak_g) == (-0.4, 3.8)
 
 
 @pytest.mark.parametrize(
@@ -114,25 +104,6 @@ def test_the_rescue_says_so() -> None:
         rig.fly()
     note = next(e for e in rig.watcher.events if e.kind is EventKind.NOTE and "Broken" in e.reason)
     assert note.reason.endswith(f"; it {SENTENCE}")
-
-
-def test_blind_it_is_the_reckoned_speed_that_counts() -> None:
-    """The estimate has drifted; by what has been felt since, it came down at 0.9 m/s. Neither the
-    blow's own samples nor what stands still on the floor changes that."""
-    before = ImuMotion(t_s=8.9, velocity_mps=(0.0, 0.0, -1.3))
-    after = ImuMotion(t_s=9.1, velocity_mps=(0.0, 0.0, 0.4), blow=Blow(9.0, -0.2, -1.5, 3.1))
-    carried = advance_reckoning(
-        Reckoning(before, velocity_mps=(0.0, 0.0, -0.7)), after, telemetry(9.1, 0.4), believed=False
-    )
-    still = replace(after, t_s=10.0, silent_s=10.0)
-    carried = advance_reckoning(carried, still, telemetry(10.0, 0.4), believed=False)
-    state = replace(state_in(Phase.LANDED, z_m=0.0), blind_s=5.0, reckoning=carried)
-    told = touchdown_of(Context(state, observation(10.0, 0.4, imu=still), PROFILE))
-    assert told is not None
-    assert (told.speed_mps, told.peak_g) == (pytest.approx(0.9), 3.1)
-    silent = replace(after, silent_s=8.95)  # what was reckoned ended there
-    carried = advance_reckoning(Reckoning(before), silent, telemetry(9.1, 0.4), believed=False)
-    assert carried.struck_mps == -0.2
 
 
 # --- What is told ---------------------------------------------------------------------------------

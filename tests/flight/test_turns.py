@@ -97,10 +97,10 @@ def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_planner_that_fails_on_the_first_turn_fails_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def fails(obs: Observation) -> PlannerState:
+    def fails(c: object) -> None:
         raise ValueError("by the test")
 
-    monkeypatch.setattr("perchctl.mission.planner.start_mission", fails)
+    monkeypatch.setattr("perchctl.mission.planner._remember", fails)
     rig = Rig()
     (again,) = decide(broken(rig, ValueError).turns, rig.profile)
     assert (again.turn.role, again.error, again.differs) == ("failed", "ValueError", False)

@@ -16,12 +16,10 @@ from hypothesis import strategies as st
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import SafetyAbort, TimedOut
-from perchctl.flight import GroundCriteria, out_of_view
-from perchctl.flight.criteria import AtRest
+from perchctl.flight import out_of_view
 from perchctl.flight.preflight import (
     LEAN_DEG,
     refuse_out_of_view,
-    refuse_strange,
     still_waiting_for,
     target_from,
 )
@@ -136,17 +134,3 @@ def test_a_target_in_view_is_waited_for_no_longer() -> None:
     assert waits(outside=FeedStatus(0.05, None, 20, placed, 30.0, placed)) == ""
     told = waits(outside=FeedStatus(0.05, None, 20, off, 30.0, off))
     assert "the state estimate to agree with the sight of the target" in told
-
-
-def test_what_is_refused_speaks_of_the_target() -> None:
-    at_rest = AtRest()
-    assert at_rest.strange(ExternalPosition(FEET), TARGET) is None
-    moved = at_rest.strange(ExternalPosition((0.2, 0.0, 0.0)), TARGET)
-    assert moved is not None
-    assert "the sight of the target the vehicle has moved by 0.20 m" in moved.sentence
-    # A height or a far place cannot be another world's: there is only the vehicle's own.
-    assert GroundCriteria(REST, TARGET).world_problem(ExternalPosition((0.0, 0.0, 0.4))) is None
-    far = changed({"target.expected_xy_m": (4.0, 0.0)}, TARGET)
-    status = FeedStatus(0.05, None, 20, None, 30.0, ExternalPosition(FEET))
-    with pytest.raises(SafetyAbort, match=r"expected 4\.0 m from where the vehicle stands"):
-        refuse_strange(status, REST, far, REST.t_s)

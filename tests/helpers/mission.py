@@ -15,7 +15,6 @@ from perchctl.mission import (
     Observation,
     Phase,
     PlannerState,
-    planner,
 )
 from perchctl.mission.state import EnergyState, Severity
 from perchctl.profile import Profile
@@ -155,7 +154,7 @@ def note(t_s: float, text: str) -> Event:
 
 def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
     """A planner that has just come into `phase` in an undisturbed flight."""
-    state = planner.start_mission(observation(0.0, 0.0))
+    state = PlannerState.on_ground(observation(0.0, 0.0))
     return replace(
         state,
         phase=phase,

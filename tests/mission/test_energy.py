@@ -16,7 +16,6 @@ from perchctl.mission.battery import (
     charge_at,
     fit_battery,
     left_s,
-    needs_of,
     outlook,
     read_battery,
     resting_v,
@@ -97,16 +96,6 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
             assert told_s > ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
 
 
-def test_a_light_vehicle_s_battery_is_not_asked_for_a_long_press() -> None:
-    """It sags deep under full thrust, for a second; hovering takes half of that."""
-    cell = CellKind(resistance_ohm=0.9 / 4.4)
-    moments = list(hovering(3.95, cell, 70.0, hover=0.5))
-    assert min(m.under_load_v for m in moments) > LOW_V
-    told_s = left_s(moments[round(8.0 / PERIOD_S)].energy, PROFILE, 0.5)
-    assert told_s is not None
-    assert told_s > 60.0
-
-
 @pytest.mark.parametrize("ohm", [0.12, 0.143, 0.2])
 def test_the_sag_is_found_within_seconds(ohm: float) -> None:
     *_, last = hovering(4.1, CellKind(resistance_ohm=ohm), 5.0)
@@ -126,11 +115,6 @@ def used_up(energy: EnergyState, volts: float, thrust: float, lasts_s: float) ->
     for _ in range(round(lasts_s / PERIOD_S)):
         energy = update_energy(energy, PERIOD_S, volts, thrust, MAH)
     return energy
-
-
-def test_the_count_of_the_thrust() -> None:
-    energy = used_up(EnergyState(), 3.7, FULL_THRUST, 10.0)
-    assert energy.used * MAH == pytest.approx(4.4 / 3.6 * 10.0)
 
 
 @pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan])
@@ -190,14 +174,6 @@ def at_gate(phase: Phase, rest_v: float, **changes: object) -> Context:
     state = replace(state_in(phase), energy=energy, **changes)  # type: ignore[arg-type]
     c = Context(state, observation(20.0), PROFILE)
     return Context(replace(state, battery=outlook(c)), c.obs, PROFILE)
-
-
-def test_needs_follow_the_way() -> None:
-    align, recover = needs_of(at_gate(Phase.ALIGN, 4.0)), needs_of(at_gate(Phase.RECOVER, 4.0))
-    assert recover.attempt_s > align.attempt_s
-    high = Context(state_in(Phase.ALIGN), observation(20.0, 0.2), PROFILE)
-    assert needs_of(high).attempt_s > align.attempt_s
-    assert needs_of(high).landing_s == pytest.approx(align.landing_s)
 
 
 def test_fewer_and_fewer_attempts_are_left() -> None:

@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from perchctl.mission import ImuMotion, Observation, Outcome, Phase, PlannerState
-from perchctl.mission.conditions import OTHERWISE_MPS, contact_error
-from perchctl.mission.context import Context
+from perchctl.mission import Observation, Outcome, Phase, PlannerState
+from perchctl.mission.conditions import OTHERWISE_MPS
 from perchctl.mission.imu import Reckoning
 from perchctl.mission.lander import LEAST_ORDERS
 from perchctl.mission.planner import step_mission
@@ -25,7 +24,6 @@ from perchctl.vehicle import (
 )
 from tests.helpers.mission import (
     AIRBORNE,
-    BY_TARGET,
     HANG_Z_M,
     HOVER_THRUST,
     MOCAP,
@@ -105,22 +103,6 @@ def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, los
     assert "variance only grows" in state.reason
     assert LAND_S <= len(sent) * TICK_S <= 1.0
     assert isinstance(sent[-1], RawThrust)
-
-
-@pytest.mark.parametrize(("phase", "to"), [
-    (Phase.APPROACH, Phase.SEARCH), (Phase.ALIGN, Phase.ASCEND), (Phase.RECOVER, Phase.ESTIMATE),
-])  # fmt: skip
-def test_no_dwell_time_counts_without_a_position(phase: Phase, to: Phase) -> None:
-    """Hidden again and again for 0.3 s, never long enough to be landed for."""
-    z_m = 0.5 if phase is Phase.APPROACH else 1.0
-
-    def flickers(t_s: float) -> Observation:
-        since_s = (t_s - BEGIN_S) % 0.35
-        return observation(t_s, z_m, **hidden(since_s if since_s < 0.3 else 0.0))
-
-    begin = state_in(phase, z_m=z_m)
-    assert fly(begin, at(z_m), 1.2, MOCAP, one_phase=True).state.phase is to
-    assert fly(begin, flickers, 1.2, MOCAP).state.phase is phase
 
 
 # --- At the ceiling ----------------------------------------------------------------------
@@ -270,40 +252,6 @@ def test_what_something_carries_is_put_down_gently_whatever_that_is(
 SMEARED_M = (0.0196, 0.0158, 0.0123, 0.0098)
 
 
-@pytest.mark.parametrize(
-    ("steps_m", "seen_s", "profile", "sigma_m"),
-    [
-        ((0.06,), 0.5, MOCAP, 0.06),
-        ((0.06,), 0.5, PROFILE, 0.06),
-        (SMEARED_M, 0.5, MOCAP, sum(SMEARED_M)),
-        ((0.05, 0.0, -0.05), 0.5, MOCAP, 0.0),
-        ((0.06,), 0.97, MOCAP, 0.06),  # by pictures of before it that arrive after it
-        ((0.06,), 1.1, MOCAP, 0.0),  # by one that is exposed after it
-        ((0.006,), 0.5, MOCAP, 0.0),  # the noise of an estimate
-        ((0.06,), 0.5, BY_TARGET, 0.0),
-    ],
-)
-def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
-    steps_m: tuple[float, ...], seen_s: float, profile: Profile, sigma_m: float
-) -> None:
-    """By as much as it steps beyond its speed, tick by tick from 0.98 s on: it was wrong before, or
-    it is now. A picture arrives 0.06 s after its exposure."""
-
-    def look(t_s: float) -> Observation:
-        done = max(0, round((t_s - BEGIN_S) / TICK_S) - 48)
-        body_m = (sum(steps_m[:done]), 0.0, HANG_Z_M)
-        exposed_s = min(t_s - 10.06, seen_s)
-        target = target_at(
-            t_s, body_m=body_m, measured=exposed_s < seen_s, measured_s=10.0 + exposed_s
-        )
-        obs = {"target": target, "new_frame": target.measured}
-        return at(obs=obs, position_m=body_m)(t_s)
-
-    flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.3, profile, feels=True)
-    assert math.hypot(*flight.state.reckoning.stepped_m) == pytest.approx(sigma_m, abs=1e-3)
-    assert contact_error(Context(flight.state, flight.obs, profile)).sigma_m >= sigma_m - 1e-3
-
-
 # --- Another world: what goes astray by it comes down level, by thrust alone ---------------------
 
 
@@ -412,19 +360,6 @@ def test_what_is_carried_off_farther_than_a_draught_leads_is_in_another_world(
     assert (state.row == "position-astray") is lands
 
 
-@pytest.mark.parametrize(("z_m", "pushed_s", "lands"), [
-    (0.5, 9.5, False), (0.5, 8.0, True), (0.2, 9.5, True),
-])  # fmt: skip
-def test_what_a_gust_carries_off_is_not_in_another_world(
-    z_m: float, pushed_s: float, lands: bool
-) -> None:
-    """Moving air is felt as a force from the side. Near the floor nothing asks for it."""
-    gust = {"imu": ImuMotion(t_s=10.02, pushed_s=pushed_s)}
-    look = at(obs=gust, position_m=(0.3, 0.0, z_m))
-    state = fly(state_in(Phase.ESTIMATE, z_m=0.5), look, profile=MOCAP).state
-    assert (state.row == "position-astray") is lands
-
-
 @pytest.mark.parametrize("profile", [MOCAP, PROFILE])
 @pytest.mark.parametrize(
     ("phase", "climb_mps", "lands"),
@@ -440,14 +375,6 @@ def test_positions_that_are_late_swing_it_up_and_down(
     state = fly(state_in(phase), at(velocity_mps=(0.0, 0.0, climb_mps)), profile=profile).state
     assert (state.row == "position-astray") is (lands and profile is MOCAP)
     assert state.row != "position-astray" or "late" in state.reason
-
-
-def test_a_landing_that_goes_astray_is_named_anew_and_flown_level() -> None:
-    begin = replace(state_in(Phase.LANDING, z_m=0.5), reason="camera.mount", row="mounting")
-    flight = fly(begin, at(position_m=(0.5, 0.0, 0.5)), profile=MOCAP)
-    assert isinstance(flight.command, RawThrust)
-    assert flight.state.astray
-    assert "swapped axes" in flight.state.reason
 
 
 def gains_beside(

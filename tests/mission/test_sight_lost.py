@@ -24,20 +24,15 @@ from perchctl.mission.lander import (
 )
 from perchctl.mission.planner import step_mission
 from perchctl.mission.state import Severity
-from perchctl.mission.table import BLIND_VARIANCE_M2
-from perchctl.vehicle import Command, Land, PositionSetpoint, RawThrust, StopMotors
+from perchctl.vehicle import PositionSetpoint, RawThrust, StopMotors
+from tests.helpers.mission import BY_TARGET as PROFILE
 from tests.helpers.mission import (
-    AIRBORNE,
     CEILING_M,
     HANG_Z_M,
     HOVER_THRUST,
-    READY,
-    Felt,
     state_in,
     target_at,
-    telemetry,
 )
-from tests.helpers.mission import BY_TARGET as PROFILE
 from tests.helpers.mission import PROFILE as DECKS
 from tests.mission.rig import BEGIN_S, TICK_S, Flight, Look, Motors, at, fly, is_setpoint
 
@@ -112,15 +107,6 @@ def test_sinking_ends_above_the_floor() -> None:
     state = lost(state_in(Phase.ALIGN, z_m=LOWEST_M + 0.05), LAND_S - 0.1, LOWEST_M + 0.05).state
     assert state.setpoint is not None
     assert state.setpoint.z_m == pytest.approx(LOWEST_M)
-
-
-def test_the_estimates_own_doubt_ends_the_waiting_sooner() -> None:
-    doubts = {"position_variance_m2": 1.1 * BLIND_VARIANCE_M2}
-    flight = lost(state_in(Phase.ALIGN), 0.8, **doubts)
-    first = next(tick for tick in flight.ticks if tick.state.phase is Phase.LANDING)
-    assert first.t_s - BEGIN_S == pytest.approx(HOLD_S, abs=0.05)
-    soon = fly(state_in(Phase.ALIGN), unseen(1.0, for_s=0.1, **doubts), profile=PROFILE)
-    assert soon.state.phase is Phase.ALIGN
 
 
 @given(
@@ -229,51 +215,6 @@ def test_level_it_brakes_what_sinks_fast_and_lets_sink_what_does_not(
     assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -SINK_MPS)
     assert command.thrust <= 60000  # more is clipped
     assert blind or (command.roll_rad, command.pitch_rad) == (0.0, 0.0)
-
-
-class Drifts(Motors):
-    """By its estimate, and its reckoning, it sinks for ever; something has carried it for long.
-    It may be silent for a while, in which it has gone down by more."""
-
-    def __init__(self, silence_s: float) -> None:
-        super().__init__(HOVER_THRUST)
-        self.silence_s, self.stopped = silence_s, False
-
-    def look(self, t_s: float, state: PlannerState) -> Observation:
-        passed_s = t_s - BEGIN_S
-        silent = 1.0 + 1e-6 < passed_s <= 1.0 + self.silence_s + 1e-6
-        fallen_m = 0.4 if self.silence_s and passed_s > 1.0 + self.silence_s + 1e-6 else 0.0
-        tel = telemetry(
-            BEGIN_S + 1.0 if silent else t_s, 1.0 - 0.5 * passed_s - fallen_m, thrust=self.thrust,
-            velocity_mps=(0.0, 0.0, -SINK_MPS), supervisor=READY if self.stopped else AIRBORNE,
-        )  # fmt: skip
-        return replace(unseen(1.0, for_s=2.0)(t_s), telemetry=tel, target=None)
-
-    def obey(self, state: PlannerState, command: Command) -> None:
-        self.stopped |= isinstance(command, StopMotors)
-        self.thrust = float(command.thrust) if isinstance(command, RawThrust) else self.thrust
-        self.thrust = 0.0 if self.stopped else self.thrust
-
-
-@pytest.mark.parametrize(
-    ("in_reach", "silence_s", "ends"),
-    [(False, 0.0, Phase.LANDED), (True, 0.0, Phase.PERCHED), (True, 0.3, Phase.ABORTED)],
-)
-def test_a_blind_way_down_whose_speed_has_drifted_ends_all_the_same(
-    in_reach: bool, silence_s: float, ends: Phase
-) -> None:
-    """That may be the magnet only where it began in its reach, and is, as long as no fall is felt
-    and no silence could hide one."""
-    felt = Felt()
-    began = felt(unseen(1.0, for_s=2.0)(BEGIN_S))
-    state = blinded(
-        1.0, contact_z_m=1.0 if in_reach else None, reach_s=BEGIN_S if in_reach else None,
-        reckoning=Reckoning(imu=began.imu, velocity_mps=(0.0, 0.0, -SINK_MPS)),
-    )  # fmt: skip
-    flight = fly(state, Drifts(silence_s), 20.0, PROFILE, feels=felt)
-    assert not any(isinstance(command, Land) for command in flight.commands)
-    assert flight.stops_s
-    assert flight.state.phase is ends, flight.state.reason
 
 
 # --- the last centimetres ------------------------------------------------------------------

@@ -221,7 +221,7 @@ def test_a_target_that_seems_to_lie_below_is_not_dived_to(phase: Phase) -> None:
 
 
 def test_a_take_off_begins_on_the_ground() -> None:
-    begin = planner.start_mission(observation(BEGIN_S, 0.0))
+    begin = PlannerState.on_ground(observation(BEGIN_S, 0.0))
     flight = fly(begin, at(0.0, thrust=0.0, supervisor=READY))
     assert is_setpoint(flight.command, below_m=FLOOR_M)
 

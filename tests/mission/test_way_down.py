@@ -11,13 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.mission import ContactError, Observation, Operator, Outcome, Phase, PlannerState
+from perchctl.mission import ContactError, Observation, Outcome, Phase, PlannerState
 from perchctl.mission.guidance import UNREAD_S
 from perchctl.mission.lander import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, own_landing
 from perchctl.mission.planner import step_mission
 from perchctl.vehicle import (
     CRASHED,
-    FULL_THRUST,
     HL_ACTIVE,
     LOCKED,
     TUMBLED,
@@ -37,7 +36,6 @@ from tests.helpers.mission import (
     PROFILES,
     READY,
     Felt,
-    changed,
     observation,
     state_in,
     target_at,
@@ -78,13 +76,6 @@ def test_a_way_down_that_begins_pressed_goes_far_below_until_it_is_away(phase: P
     state, command = step_mission(pressing.state, away(10.5), PROFILE)
     assert not state.pressed
     assert is_setpoint(command, above_m=0.4)
-
-
-@pytest.mark.parametrize(("thrust", "pressed"), [(65535.0, True), (42000.0, False)])
-def test_what_presses_when_its_way_down_begins_is_remembered(thrust: float, pressed: bool) -> None:
-    look = at(1.0, obs={"operator": Operator.LAND}, thrust=thrust)
-    state = fly(landing(1.0, Phase.SEARCH), look).state
-    assert (state.phase, state.pressed) == (Phase.LANDING, pressed)
 
 
 # --- A landing stops no motor but on the floor's or the ceiling's proof ------------------------
@@ -364,13 +355,6 @@ def test_a_vehicle_still_at_the_ceiling_has_not_recovered() -> None:
     assert fly(hanging(Phase.RECOVER), at(HANG_Z_M), 1.2).state.phase is Phase.RECOVER
 
 
-@pytest.mark.parametrize("descend_m", [0.02, 0.1])
-def test_a_short_descent_is_enough_to_have_left(descend_m: float) -> None:
-    profile = changed({"planner.recover.descend_m": descend_m})
-    flight = fly(hanging(Phase.RECOVER), at(HANG_Z_M - descend_m), 1.2, profile)
-    assert flight.state.phase is not Phase.RECOVER
-
-
 # --- The release -----------------------------------------------------------------------
 
 
@@ -392,17 +376,6 @@ def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
         seen_again = at(HANG_Z_M, thrust=20000.0)(10.22 + TICK_S * i)
         state, command = step_mission(state, seen_again, PROFILE)
         assert isinstance(command, PositionSetpoint), i
-
-
-@pytest.mark.parametrize(
-    "still", [{"released_s": 5.0}, {"orders": 3, "ordered_s": 5.0}], ids=["still", "ordered"]
-)
-def test_a_flight_that_ends_hanging_unseen_is_kept_from_locking(still: dict[str, Any]) -> None:
-    """Its motors stand still by raw thrust; the stream's end alone would lock it."""
-    state = hanging(entered_s=10.0 - PROFILE.planner.landing.timeout_s, **still)
-    flight = fly(state, at(HANG_Z_M, age_s=0.22, thrust=1000.0))
-    assert flight.state.phase is Phase.ABORTED
-    assert isinstance(flight.command, StopMotors) is ("released_s" in still)
 
 
 @pytest.mark.parametrize("positioning", ["deck", "target"])
@@ -451,14 +424,6 @@ def slipped(**changes: Any) -> PlannerState:
 
 
 FALLS: dict[str, Any] = {"velocity_mps": SINKS, "thrust": 1000.0, "acc_z_g": 0.2}
-
-
-@pytest.mark.parametrize("caught", [False, True])
-def test_a_fall_that_turns_at_full_thrust_presses_nothing(caught: bool) -> None:
-    turns = at(HANG_Z_M - 0.1, velocity_mps=(0.0, 0.0, 0.01), thrust=FULL_THRUST, acc_z_g=1.1)
-    state = slipped(caught=caught, attempts=PROFILE.planner.attempts)
-    state, _ = step_mission(state, turns(10.6), PROFILE)
-    assert (state.phase, state.pressed) == (Phase.LANDING, caught)
 
 
 # --- A step of the estimate -------------------------------------------------------------
