@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +11,10 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration import profile_camera
 from perchctl.campaign import FlightResult, campaign_summary, run_campaign
 from perchctl.campaign.flights import fly_seed
 from perchctl.commands.fly import EXIT_CODE_OF
-from perchctl.flight import FlyOptions, fly_lockstep, lockstep
+from perchctl.flight import FlyOptions, fly_lockstep
 from perchctl.flight.lockstep import LockstepFlight
 from perchctl.mission import Event, EventKind, Operator, Outcome, Phase, Tick
 from perchctl.mission.state import SEVEN_PHASES
@@ -276,19 +273,3 @@ def test_the_planner_is_shown_the_same(tmp_path: Path) -> None:
 
 
 # --- Flights of one profile share their pipeline; no other one does -------------------------------
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"kalman.n_max": 7}, {"camera.mount.rpy_deg": (0.0, 1.0, 0.0)}, {"target.large.side_m": 0.12}],
-    ids=lambda change: next(iter(change)),
-)
-def test_a_profile_or_a_camera_that_differs_has_its_own(change: dict[str, object]) -> None:
-    pipeline_of: Callable[..., Any] = lockstep._pipeline_of
-    profile = short_profile()
-    camera, again = profile_camera(profile.camera), profile_camera(profile.camera)
-    shared = pipeline_of(profile, camera)
-    assert pipeline_of(short_profile(), again) is shared
-    assert pipeline_of(short_profile(change), camera) is not shared
-    other = replace(camera, dist=camera.dist + 1e-9)
-    assert pipeline_of(profile, other).camera is other

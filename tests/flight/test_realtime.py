@@ -113,23 +113,6 @@ LEAST_MISS_M = 0.002
 """By decks: a lucky one would ask for more than any picture tells."""
 
 
-@pytest.mark.campaign
-def best_miss_m(folder: Path, *words: str) -> float:
-    """The miss of the first of two flights that perches."""
-    for attempt in ("first", "second"):
-        _, out, err = flown(folder / attempt, *words, "--yes", "--json")
-        said = json.loads(out)
-        if said["outcome"] == "perched":
-            return float(said["miss_m"])
-    pytest.fail(err)
-
-
-def test_by_a_motion_capture_it_perches(tmp_path: Path) -> None:
-    pytest.importorskip("motioncapture", reason="motion capture needs the extra [mocap]")
-    words = ("-p", SHORT, "--positioning", "mocap", "--seed", str(SEED))
-    assert best_miss_m(tmp_path, *words) < 0.02
-
-
 # --- Interrupted flights -------------------------------------------------------------------
 
 

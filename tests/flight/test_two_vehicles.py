@@ -83,19 +83,6 @@ def test_where_only_the_other_s_is_in_view_it_lands_and_says_why() -> None:
     assert flown.farthest_m < 0.15
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("seed", range(10))
-@pytest.mark.parametrize("knows", [False, True])
-def test_ten_pairs_with_the_same_markers(seed: int, knows: bool) -> None:
-    """Those that know where their targets hang are half a metre apart, and may start nearer to the
-    other's."""
-    profile = short_profile({} if knows else {"simulation.start_offset_m": 0.25}, "sim")
-    for scenario in pair(profile, seed, 0.5 if knows else APART_M):
-        target = profile.target.model_copy(update={"expected_xy_m": scenario.target_xy_m})
-        own = profile.model_copy(update={"target": target}) if knows else profile
-        perches_on_its_own(own, scenario)
-
-
 # --- in real time ------------------------------------------------------------------------
 
 

@@ -102,14 +102,6 @@ def test_the_sag_is_found_within_seconds(ohm: float) -> None:
     assert fit_battery(last.energy)[0] == pytest.approx(4.4 * ohm, rel=0.05)
 
 
-@pytest.mark.parametrize(("charge", "least", "most"), [(1.0, 1.0, 1.15), (0.5, 1.3, 2.3)])
-def test_a_hungry_battery_is_found_out_while_it_flies(
-    charge: float, least: float, most: float
-) -> None:
-    *_, last = hovering(4.1, CellKind(charge=charge), 30.0)
-    assert least <= fit_battery(last.energy)[1] < most
-
-
 def used_up(energy: EnergyState, volts: float, thrust: float, lasts_s: float) -> EnergyState:
     """The state after a time under the same reading and thrust."""
     for _ in range(round(lasts_s / PERIOD_S)):
@@ -122,14 +114,6 @@ def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
     energy = used_up(used_up(EnergyState(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
     assert left_s(energy, PROFILE, HOVER) is None
     assert energy.unknown_s == pytest.approx(10.0)
-
-
-def test_a_moment_without_readings_is_counted_on() -> None:
-    *_, last = hovering(4.0, CellKind(), 12.0)
-    blind = used_up(last.energy, math.nan, HOVER_THRUST, 4.0)
-    known_s, counted_s = (left_s(each, PROFILE, HOVER) for each in (last.energy, blind))
-    assert known_s is not None
-    assert counted_s == pytest.approx(known_s - 4.0, abs=0.5)
 
 
 @given(st.floats(3.0, 4.2))

@@ -9,13 +9,9 @@ from typing import Any
 import pytest
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
-from perchctl.mission.conditions import OTHERWISE_MPS
-from perchctl.mission.imu import Reckoning
-from perchctl.mission.lander import LEAST_ORDERS
 from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile
 from perchctl.vehicle import (
-    HL_ACTIVE,
     Command,
     Land,
     PositionSetpoint,
@@ -35,7 +31,7 @@ from tests.helpers.mission import (
     target_at,
     telemetry,
 )
-from tests.mission.rig import BEGIN_S, TICK_S, Flight, Motors, at, fly, is_setpoint, times
+from tests.mission.rig import BEGIN_S, TICK_S, Flight, Motors, at, fly, is_setpoint
 
 HOLD_S, LAND_S = MOCAP.positioning.hold_s, MOCAP.positioning.land_s
 HIDDEN = "motion capture at vicon:lab does not see the rigid body 'cf2'"
@@ -375,31 +371,3 @@ def test_positions_that_are_late_swing_it_up_and_down(
     state = fly(state_in(phase), at(velocity_mps=(0.0, 0.0, climb_mps)), profile=profile).state
     assert (state.row == "position-astray") is (lands and profile is MOCAP)
     assert state.row != "position-astray" or "late" in state.reason
-
-
-def gains_beside(
-    state: PlannerState, beside_mps: float, lasts_s: float, **tel: Any
-) -> tuple[PlannerState, Command]:
-    """Flown by positions that gain so much speed aside which the accelerometer does not feel."""
-    felt = Felt()
-    begun = felt(at()(BEGIN_S))
-    state = replace(state, last=begun.telemetry, reckoning=Reckoning(imu=begun.imu))
-    for t_s in times(lasts_s):
-        if not state.astray:
-            beside = replace(state.reckoning, beside_mps=(0.0, beside_mps))
-            state = replace(state, reckoning=beside)
-        alive = {name: value + 1e-6 * (round(100 * t_s) % 7) for name, value in tel.items()}
-        obs = at(supervisor=AIRBORNE | HL_ACTIVE, **alive)(t_s)
-        state, command = step_mission(state, felt(obs), MOCAP)
-    return state, command
-
-
-@pytest.mark.parametrize("beside_mps", [0.9 * OTHERWISE_MPS, 1.1 * OTHERWISE_MPS])
-def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
-    beside_mps: float,
-) -> None:
-    """It would follow them to its end: 15 m aside within six seconds, where they are mirrored."""
-    begin = replace(state_in(Phase.LANDING), orders=LEAST_ORDERS, ordered_s=BEGIN_S)
-    state, command = gains_beside(begin, -beside_mps, 0.2)
-    assert state.astray is (beside_mps > OTHERWISE_MPS)
-    assert isinstance(command, RawThrust) is state.astray

@@ -17,10 +17,8 @@ from perchctl.mission.lander import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, own_l
 from perchctl.mission.planner import step_mission
 from perchctl.vehicle import (
     CRASHED,
-    HL_ACTIVE,
     LOCKED,
     TUMBLED,
-    Command,
     EmergencyStop,
     Idle,
     Land,
@@ -41,7 +39,7 @@ from tests.helpers.mission import (
     target_at,
     telemetry,
 )
-from tests.mission.rig import BEGIN_S, TICK_S, Flight, Motors, at, fly, is_setpoint
+from tests.mission.rig import BEGIN_S, TICK_S, Motors, at, fly, is_setpoint
 
 SINKS = (0.0, 0.0, -0.5)
 OFF: dict[str, Any] = {"thrust": 0.0, "supervisor": READY}
@@ -284,67 +282,6 @@ def test_only_what_hangs_at_the_target_is_caught(
     assert fly(begin, InAHand(below_m, aside_m, sigma_m), 2.18, feels=True).state.phase is to
 
 
-class BacksOff(Motors):
-    """Pressed out of sight of the target, and backed off from; what it touched holds it, or lets
-    it fall to the floor 0.4 s later. The estimate goes on sliding, by 2 cm/s."""
-
-    def __init__(
-        self, aside_m: float, sigma_m: float, *, below_m: float = 0.0, comes_off: bool = False,
-        by_sight: bool = False,
-    ) -> None:  # fmt: skip
-        super().__init__(1.2 * HOVER_THRUST)
-        self.aside_m, self.sigma_m, self.up_m = aside_m, sigma_m, HANG_Z_M - below_m
-        self.comes_off, self.by_sight, self.off_s = comes_off, by_sight, math.inf
-
-    def look(self, t_s: float, state: PlannerState) -> Observation:
-        if self.comes_off and state.phase is Phase.RECOVER:
-            self.off_s = min(self.off_s, state.entered_s + 0.4)
-        fell_s = max(0.0, t_s - self.off_s)
-        z_m = max(0.0, self.up_m - 4.9 * fell_s**2)
-        at_m = (self.aside_m + 0.02 * max(0.0, t_s - 10.5), 0.0, z_m)
-        tel = telemetry(
-            t_s, thrust=self.thrust, position_m=at_m, acc_z_g=0.0 if fell_s > 0.0 < z_m else 1.0
-        )
-        target = target_at(
-            t_s, body_m=at_m, sigma_m=np.full(3, self.sigma_m), measured=False, tracked=False,
-            measured_s=10.0,
-        )  # fmt: skip
-        age_s = t_s - 10.0 if self.by_sight else 0.0
-        return observation(t_s, telemetry=tel, target=target, position_age_s=age_s)
-
-    def obey(self, state: PlannerState, command: Command) -> None:
-        if not (isinstance(command, PositionSetpoint) and state.phase is Phase.PERCH):
-            super().obey(state, command)
-
-
-def backed_off(positioning: str = "deck", **how: Any) -> Flight:
-    vehicle = BacksOff(**how, by_sight=positioning == "target")
-    begin = landing(vehicle.up_m, Phase.PERCH)
-    return fly(begin, vehicle, 16.0, PROFILES[positioning], feels=True)
-
-
-@pytest.mark.parametrize(
-    ("aside_m", "sigma_m", "row", "ends", "outcome"),
-    [
-        (0.012, 0.022, "caught", Phase.PERCHED, Outcome.PERCHED),
-        (0.012, 0.075, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
-        (0.04, 0.01, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
-        (0.012, math.inf, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
-        (0.06, 0.01, "held", Phase.ABORTED, Outcome.SAFETY),
-    ],
-)
-def test_what_hangs_where_it_touched_the_target_is_told_by_its_place_there(
-    aside_m: float, sigma_m: float, row: str, ends: Phase, outcome: Outcome
-) -> None:
-    """Not by where the estimate slides to meanwhile, 4 cm farther aside."""
-    flight = backed_off(aside_m=aside_m, sigma_m=sigma_m)
-    assert {"beside-the-magnet", row} <= flight.rows
-    assert (flight.state.phase, flight.state.outcome) == (ends, outcome)
-    if ends is Phase.PERCHED:
-        assert flight.state.contact is not None
-        assert flight.state.contact.aside_m == pytest.approx(aside_m)
-
-
 # --- Where it touched, as it is remembered -------------------------------------------------------
 
 TOUCHED: dict[str, Any] = {"contact": ContactError(0.01, 0.02)}
@@ -439,20 +376,6 @@ def test_a_step_of_the_estimates_height_moves_what_is_remembered(step_m: float) 
     assert before.ground_m is not None
     assert state.ground_m is not None
     assert state.ground_m[2] == pytest.approx(before.ground_m[2] + step_m, abs=0.02)
-
-
-def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None:
-    """By the line in the world that was it would dive by the step."""
-    lands = AIRBORNE | HL_ACTIVE
-    state = landing(0.4, orders=3, ordered_s=9.0, last=telemetry(9.98, 0.4, supervisor=lands))
-    up = at(0.9, obs={"jumped": True}, velocity_mps=(0.0, 0.0, -0.3), supervisor=lands)
-    state, command = step_mission(state, up(10.0), PROFILE)
-    assert is_setpoint(command, above_m=1.2)
-    slow = at(0.87, velocity_mps=(0.0, 0.0, -0.05), supervisor=lands)
-    state, command = step_mission(state, slow(10.14), PROFILE)
-    assert isinstance(command, Land)
-    assert state.ground_m is not None
-    assert command.height_m < state.ground_m[2]
 
 
 # --- Its own landing -----------------------------------------------------------------
