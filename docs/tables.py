@@ -27,7 +27,7 @@ from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
 from perchctl.faults.promises import PROMISES  # noqa: E402
 from perchctl.link import Link  # noqa: E402
 from perchctl.mission import Phase, step_mission, table  # noqa: E402
-from perchctl.mission.lander import MANOEUVRES, Evidence, Reach, Stage  # noqa: E402
+from perchctl.mission.lander import DESCENTS  # noqa: E402
 from perchctl.mission.state import BEFORE_CONTACT, FLYING_PHASES  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
 from perchctl.profile import Profile, load_profile  # noqa: E402
@@ -202,16 +202,10 @@ def promises() -> str:
 
 
 def manoeuvres() -> str:
-    """A row for each evidence, a column for each stage; the magnet's reach where it matters."""
-    rows = []
-    for evidence in Evidence:
-        cells = []
-        for stage in Stage:
-            free, near = (MANOEUVRES[evidence, reach, stage].value for reach in Reach)
-            cells.append(free if free == near else f"{free}; near the magnet {near}")
-        rows.append(f"| {evidence.value} | {' | '.join(cells)} |")
-    head = " | ".join(stage.value for stage in Stage)
-    return "\n".join([f"| evidence | {head} |", "|---" * (len(Stage) + 1) + "|", *rows])
+    """A row for each evidence."""
+    rows = [f"| {e.value} | {free.value} | {held.value} |" for e, (free, held) in DESCENTS.items()]
+    head = "| evidence | free | within the magnet's reach |"
+    return "\n".join([head, "|---|---|---|", *rows])
 
 
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (

@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import Any
 
 from perchctl.errors import InvalidValue
-from perchctl.mission import Observation, PlannerState, Turn, start_mission, step_mission
+from perchctl.mission import Observation, PlannerState, Turn, step_mission
 from perchctl.profile import Profile
 from perchctl.record import FlightLog, to_exact
 from perchctl.vehicle import Command
@@ -90,7 +90,7 @@ def decide(
         if obs is None or turn.role == "waiting":
             continue
         try:
-            new, command = step_mission(state or start_mission(obs), obs, profile)
+            new, command = step_mission(state, obs, profile)
         except Exception as error:
             yield Decided(tick, turn, obs, state, None, type(error).__name__)
             return  # what came after it cannot be decided

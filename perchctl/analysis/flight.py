@@ -15,7 +15,6 @@ import numpy as np
 
 from perchctl.analysis.sight import Frames, Loss, frames_of, losses_of, percentile
 from perchctl.geometry import Array
-from perchctl.mission import SentBy
 from perchctl.record import FlightLog, FlightSummary, PhaseSpan
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -250,7 +249,7 @@ class Takeover:
     """What one sender sent in one go. Times are since the flight's first turn; `commands` counts
     the commands by their name in a tick's `cmd`, in the order of their first."""
 
-    by: SentBy
+    by: str
     start_s: float
     end_s: float
     commands: dict[str, int]

@@ -27,7 +27,7 @@ from perchctl.analysis.story import Sentence, story_of
 from perchctl.analysis.words import count, length
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import write_files
-from perchctl.mission import SEVEN_PHASES
+from perchctl.mission import Phase
 from perchctl.record import log_values, path_beside, read_log, recorded_pictures
 
 UNFINISHED = "unfinished"
@@ -179,7 +179,7 @@ def _templates() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     templates.globals.update(
-        seven_phases=[phase.value for phase in SEVEN_PHASES],
+        seven_phases=[phase.value for phase in tuple(Phase)[:7]],
         plot_of=lambda flight: _address("image/png", flight_png(flight)),
         film_of=film_address,
     )

@@ -17,10 +17,10 @@ import cv2
 
 from perchctl.campaign.results import FlightEnd, FlightResult, peak_memory_mb
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, SafetyAbort, TimedOut
-from perchctl.flight import LockstepFlight, fly_lockstep
+from perchctl.flight import fly_lockstep
 from perchctl.mission import Phase
 from perchctl.profile import Profile
-from perchctl.record import FlightSummary, LogWatcher
+from perchctl.record import LogWatcher
 from perchctl.sim import Scenario, draw_scenario
 
 R = TypeVar("R")
@@ -80,10 +80,10 @@ def _fly(profile: Profile, seed: int, log_path: Path | None, record: bool) -> Fl
         if log is not None:
             log.abandon(str(error))
         return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False)
-    summary = None if log is None else _closed(log, flight)
+    summary = None if log is None else flight.conclude(log)
     return FlightResult(
         seed=seed,
-        outcome=_outcome(flight),
+        outcome=OUTCOMES[flight.end],
         reason=flight.report.reason,
         miss_m=flight.perched_miss_m,
         time_s=flight.report.duration_s,
@@ -93,14 +93,6 @@ def _fly(profile: Profile, seed: int, log_path: Path | None, record: bool) -> Fl
         log=None if log is None else log.path,
         log_problem=None if summary is None else summary.log_problem,
     )
-
-
-def _closed(log: LogWatcher, flight: LockstepFlight) -> FlightSummary | None:
-    return log.close(flight.report, flight.perched_miss_m, flight.fell)
-
-
-def _outcome(flight: LockstepFlight) -> FlightEnd:
-    return OUTCOMES[flight.report.phase] if not flight.fell else "aborted"
 
 
 def seed_log_path(seed: int, log_dir: Path) -> Path:

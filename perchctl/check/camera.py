@@ -29,7 +29,7 @@ from perchctl.check.row import (
     worst,
 )
 from perchctl.errors import PerchError
-from perchctl.flight import out_of_view, too_near_problem
+from perchctl.flight import GroundCriteria, out_of_view
 from perchctl.geometry import Place
 from perchctl.perception import BLENDED, MIRRORED_FRAMES
 from perchctl.profile import Profile
@@ -211,7 +211,7 @@ def _target(rehearsal: Rehearsal, profile: Profile) -> Finding:
         away_m = math.hypot(*(float(e) for e in target.e_m))
         spread_mm = 1e3 * float(max(target.sigma_m))
         found += f", {away_m:.2f} m from the gear (+- {spread_mm:.0f} mm)"
-        if problem := too_near_problem(target):
+        if problem := GroundCriteria.too_near(target):
             return failed(problem.found, problem.advice)
     if rehearsal.found < SEEN_WARN * rehearsal.pictures:
         return warned(found, "nearer, sharper, or more light: see focus")

@@ -40,7 +40,7 @@ from perchctl.check.row import (
     warned,
     worst,
 )
-from perchctl.flight import GroundCriteria, world_problem
+from perchctl.flight import GroundCriteria
 from perchctl.geometry import Array, nearest_axis, rotation_from_rpy, rpy_from_rotation
 from perchctl.link import vehicle_uri
 from perchctl.perception import History, attitude_at
@@ -175,18 +175,16 @@ def _place(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
     """Judge the body's place by the criteria of `fly`."""
     newest = heard.telemetry[-1] if heard.telemetry else None
     place = places[-1].external(pose=True)
-    if newest is not None:
-        criteria = GroundCriteria(newest, profile)
-        if criteria.tilt or criteria.motion:
-            return skipped("the vehicle does not stand level and still")
-    problem = world_problem(place, newest, profile)
+    if newest is None:
+        return skipped("it cannot be compared: no telemetry")
+    criteria = GroundCriteria(newest, profile)
+    if criteria.tilt or criteria.motion:
+        return skipped("the vehicle does not stand level and still")
+    problem = criteria.world_problem(place)
     if problem is not None:
         return failed(problem.found, problem.advice)
     x, y, z = place.position_m
-    found = f"x {x:.2f}, y {y:.2f}, z {z:.2f} m"
-    if newest is None:
-        return skipped(f"{found}; its attitude is not compared: no telemetry")
-    return passed(found)
+    return passed(f"x {x:.2f}, y {y:.2f}, z {z:.2f} m")
 
 
 CAPTURE: dict[str, Callable[[Listened, list[Placed], Profile], Finding]] = {

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from perchctl.camera import FrameSource, WrappedSource
-from perchctl.flight import Clock, FlightInputs
+from perchctl.flight import FlightInputs, WallClock
 from perchctl.profile import Profile
 from perchctl.target import PrintCheck
 from perchctl.vehicle import Telemetry
@@ -123,7 +123,7 @@ def rehearse(
     source: FrameSource,
     pipeline: Pipeline,
     profile: Profile,
-    clock: Clock,
+    clock: WallClock,
     duration_s: float = REHEARSED_S,
     stopwatch: Callable[[], float] = time.perf_counter,
 ) -> Rehearsal:

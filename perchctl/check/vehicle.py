@@ -23,7 +23,7 @@ from perchctl.check.row import (
     warned,
     worst,
 )
-from perchctl.flight import GroundCriteria, unmeasured_problem
+from perchctl.flight import GroundCriteria
 from perchctl.link import ProbeLink
 from perchctl.profile import Profile
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, MeasuredBy, Telemetry
@@ -196,7 +196,7 @@ def _positioning(vehicle: Vehicle, profile: Profile) -> Finding:
         "target": "by the target, see in view",
         "deck": f"by {decks}" if decks else "by positions from outside",
     }
-    problem = unmeasured_problem(vehicle.measured_by, profile)
+    problem = GroundCriteria.unmeasured(vehicle.measured_by, profile)
     return by_problem(problem, found[profile.positioning.by])
 
 

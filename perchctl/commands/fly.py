@@ -52,7 +52,6 @@ from perchctl.flight import (
     OperatorSwitch,
     check_options,
     fly_session,
-    require_comparison,
 )
 from perchctl.mission import FlightReport, Outcome, Phase, Watcher
 from perchctl.profile import (
@@ -124,7 +123,7 @@ def fly(
         return 0
     for warning in warnings_before_flight(options):
         say(f"check: {warning}")
-    require_comparison(options.profile.positioning, options.uri, simulated=options.simulated)
+    options.require_comparison()
     asks = not (yes or options.simulated)
     if asks and not sys.stdin.isatty():
         raise UsageError(f"about to arm {options.uri}, and there is nobody to ask: add --yes")

@@ -12,7 +12,7 @@ from perchctl.camera import FrameSource, WrappedSource
 from perchctl.display.live import LivePage
 from perchctl.display.panel import status_rows
 from perchctl.display.sketch import Sketch, sketch_of
-from perchctl.mission import RESCUE, Event, EventKind, Tick
+from perchctl.mission import Event, Tick
 from perchctl.record import FlightSummary
 from perchctl.vision import Frame
 
@@ -53,7 +53,7 @@ class FlightPage:
             self.page.remember(error)
 
     def event(self, event: Event) -> None:
-        if event.kind is EventKind.NOTE and RESCUE in event.reason:
+        if event.is_rescue:
             self._rescue = event.reason
 
     def end(self, summary: FlightSummary, log: Path) -> None:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from perchctl.faults.effects import killed, push
 from perchctl.faults.oracle import Flag
 from perchctl.faults.truth import Facts
-from perchctl.mission import CATCHABLE_M
 
+CATCHABLE_M = 1.0  # lower, a slip reaches the floor (docs/firmware.md, "Catching a slip")
 NOTICED_S, DOWN_MPS = 1.5, 0.4
 """How long a low battery takes to be believed, and how fast a landing goes at best."""
 PUSHED_OFF_S = 0.2

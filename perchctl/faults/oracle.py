@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal, NamedTuple, get_args
 
-from perchctl.flight import RESCUED
-from perchctl.mission import RESCUE, Event, EventKind, Finding, FlightReport, Outcome, Phase
+from perchctl.mission import Event, Finding, FlightReport, Outcome, Phase
 
 Claim = Literal[
     "hangs on the target", "held off the target", "hangs", "stands", "hangs or stands",
@@ -389,12 +388,12 @@ NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
 HELD_ELSEWHERE = "held-elsewhere"
 """The transitions of flights whose end the program does not know: whether the vehicle hangs or
 stands, and whether it came down at all."""
-RESCUE_CLAIMS: dict[Finding | None, Claims] = {
+RESCUE_CLAIMS: dict[Finding, Claims] = {
     Finding.STANDS: {"stands"},
     Finding.HANGS: {"hangs"},
     Finding.HELD: {"held off the target"},
     Finding.UNKNOWN: {"hangs or stands"},
-    None: {"not seen down"},
+    Finding.UNSEEN: {"not seen down"},
 }
 """The claims in the note of a rescue, by its finding."""
 REFUSAL_CLAIMS: Claims = {"stands"}
@@ -415,7 +414,7 @@ def claims_of(report: FlightReport) -> Claims:
 
 def claims_of_rescue(event: Event) -> Claims:
     """Return the claims of a rescue's note; none for any other event."""
-    if event.kind is not EventKind.NOTE or RESCUE not in event.reason:
+    if not event.is_rescue:
         return set()
-    found = next(found for found, text in RESCUED.items() if event.reason.endswith(text))
+    found = next(found for found in Finding if found.value in event.reason)
     return RESCUE_CLAIMS[found]

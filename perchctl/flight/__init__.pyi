@@ -1,16 +1,10 @@
-from .clock import Clock as Clock
 from .clock import WallClock as WallClock
 from .criteria import GroundCriteria as GroundCriteria
 from .criteria import Problem as Problem
-from .criteria import too_near_problem as too_near_problem
-from .criteria import unmeasured_problem as unmeasured_problem
-from .criteria import world_problem as world_problem
 from .inputs import FlightInputs as FlightInputs
-from .lockstep import LockstepFlight as LockstepFlight
 from .lockstep import feed_lockstep as feed_lockstep
 from .lockstep import fly_lockstep as fly_lockstep
 from .lockstep import lockstep_source as lockstep_source
-from .loop import RESCUED as RESCUED
 from .loop import FlightParts as FlightParts
 from .loop import fly as fly
 from .operator import OperatorSwitch as OperatorSwitch
@@ -18,5 +12,4 @@ from .preflight import out_of_view as out_of_view
 from .session import FlyOptions as FlyOptions
 from .session import check_options as check_options
 from .session import fly_session as fly_session
-from .session import require_comparison as require_comparison
 from .session import simulated_vehicle as simulated_vehicle

@@ -15,11 +15,6 @@ if TYPE_CHECKING:
 SIM_PATIENCE_S = 5.0
 """Wait for a stopped simulator, on the wall's clock: longer than the simulator waits for the loop,
 so that they never wait for each other."""
-SLOW_S = 1.0  # behind the wall's clock, from which on the flight is called slow
-SLOW = (
-    "this computer is busy: the simulated flight runs slower than real time; its times are "
-    "simulated ones"
-)
 _POLL_S = 0.001
 
 
@@ -67,8 +62,7 @@ class SimulatedClock:
         self._reached_s, self._moved_s = shared.reached_s, wall()
         self._now_s = self._moved_s
         self.zero_s = self._now_s - self._reached_s
-        self._began_s: tuple[float, float] | None = None  # the wall's and this clock's
-        self._slow_told = False
+        self._waits = False
 
     def now(self) -> float:
         with self._lock:
@@ -82,7 +76,7 @@ class SimulatedClock:
             return self._now_s
 
     def wait_until(self, t_s: float) -> None:
-        if self._began_s is not None:
+        if self._waits:
             self._shared.limit_s = t_s - self.zero_s + self._margin_s
         while (left_s := t_s - self.now()) > 0:
             self._sleep(max(left_s, _POLL_S))
@@ -90,17 +84,9 @@ class SimulatedClock:
     @contextlib.contextmanager
     def waiting_for_loop(self) -> Iterator[None]:
         """A context in which simulated time goes on for `margin_s` after each `wait_until` only."""
-        self._began_s = self._wall(), self.now()
+        self._waits = True
         try:
             yield
         finally:
-            self._began_s = None
+            self._waits = False
             self._shared.limit_s = math.inf
-
-    def remarks(self) -> list[str]:
-        """Return the remark that the flight is slow, once."""
-        if self._began_s is None or self._slow_told:
-            return []
-        wall_s, own_s = self._began_s
-        self._slow_told = self._wall() - wall_s - (self.now() - own_s) > SLOW_S
-        return [SLOW] if self._slow_told else []

@@ -1,6 +1,6 @@
 """Criteria for a vehicle on the ground, used by `fly` before it takes off and by `check`. Pure.
 
-Each returns what is wrong, or None. Of a vehicle at rest two things are known without a motion
+Each gives what is wrong, or None. Of a vehicle at rest two things are known without a motion
 capture: where the ground is, and which way is up. A world with another axis up, or a body whose
 axes are turned, shows against the second once the vehicle stands in another heading than the one in
 which its body was defined; a height in millimetres against the first. The rest shows when a hand
@@ -31,7 +31,6 @@ from perchctl.vehicle import (
     FLYING,
     LOCKED,
     NO_BATTERY_READING_V,
-    POSITION_DECKS,
     TUMBLED,
     ExternalPosition,
     MeasuredBy,
@@ -160,105 +159,90 @@ class GroundCriteria:
             return None
         return Problem(f"its accelerometer reads {acc_z_g:.2f} g", "let it stand still")
 
-
-def unmeasured_problem(by: MeasuredBy, profile: Profile) -> Problem | None:
-    """Return the problem of a vehicle without any position source, which would fly by a sum of
-    accelerations."""
-    config = profile.positioning
-    if config.by != "deck" or by.placed_by(config.decks) or by.external:
-        return None
-    if by.external is None:
-        found = "no positioning deck; whether positions come from outside is not told"
-    else:
-        found = "no positioning deck, and no position comes from outside"
-    advice = (
-        "mount a positioning deck (flow, lighthouse, loco), or set positioning: mocap or "
-        "positioning: target"
-    )
-    others = [deck for deck in by.decks if deck not in POSITION_DECKS]
-    if others:
-        advice += f"; if {' or '.join(others)} measures it, name that one in positioning.decks"
-    return Problem(found, advice)
-
-
-def too_near_problem(target: TargetEstimate | None) -> Problem | None:
-    """Return the problem of a target that is too near for a vehicle on the ground."""
-    if target is None or not target.tracked:
-        return None
-    away_m = math.hypot(*(float(e) for e in target.e_m))
-    if away_m >= WITHIN_REACH_M:
-        return None
-    away, needed = distinct_figures(away_m, WITHIN_REACH_M, 2)
-    return Problem(
-        f"the target is only {away} m away, at least {needed} m are needed",
-        "the vehicle hangs, or stands too close under it; take it down first",
-    )
-
-
-# --- External positions --------------------------------------------------------------------------
-
-
-def measurer(profile: Profile) -> str:
-    """Return the source of the external positions, in words."""
-    by_target = profile.positioning.by == "target"
-    return "the sight of the target" if by_target else "the motion capture"
-
-
-def world_problem(
-    place: ExternalPosition, telemetry: Telemetry | None, profile: Profile
-) -> Problem | None:
-    """Return the problem of an external position in another unit, with another axis up, or
-    elsewhere, which waiting will not mend.
-
-    Without telemetry the axes are not compared. By the target the world is the vehicle's own, so
-    only the fence counts.
-    """
-    if profile.positioning.by == "target":
-        return unreachable(place, profile)
-    return (
-        _in_millimetres(place, profile)
-        or (None if telemetry is None else with_another_up(place, telemetry))
-        or _off_the_ground(place, profile)
-        or unreachable(place, profile)
-    )
-
-
-def unreachable(place: ExternalPosition, profile: Profile) -> Problem | None:
-    """Return the problem of a place from which no flight reaches the expected target: perhaps
-    another vehicle's body."""
-    target, (x, y, _) = profile.target, place.position_m
-    if target.expected_xy_m is None:
-        return None
-    away_m = math.dist((x, y), target.expected_xy_m)
-    if not away_m > profile.safety.fence_radius_m + target.expected_within_m:
-        return None
-    if profile.positioning.by == "target":
-        return Problem(
-            f"the target is expected {away_m:.1f} m from where the vehicle stands, and the fence "
-            f"is {profile.safety.fence_radius_m:g} m",
-            "with positioning: target the world's zero is where it stands: correct "
-            "target.expected_xy_m",
+    @staticmethod
+    def unmeasured(by: MeasuredBy, profile: Profile) -> Problem | None:
+        """A vehicle without any position source, which would fly by a sum of accelerations."""
+        config = profile.positioning
+        if config.by != "deck" or by.placed_by(config.decks) or by.external:
+            return None
+        outside = "whether positions come from outside is not told"
+        if by.external is not None:
+            outside = "no position comes from outside"
+        advice = (
+            "mount a positioning deck (flow, lighthouse, loco), or set positioning: mocap or "
+            "positioning: target"
         )
-    return Problem(
-        f"the motion capture has the vehicle at x {x:.2f}, y {y:.2f} m, {away_m:.1f} m from where "
-        f"its target is expected, and the fence is {profile.safety.fence_radius_m:g} m",
-        f"is the rigid body {profile.positioning.body!r} another vehicle's? correct "
-        f"positioning.body, or target.expected_xy_m",
-    )
+        if by.decks:
+            advice += (
+                f"; if {' or '.join(by.decks)} measures it, name that one in positioning.decks"
+            )
+        return Problem(f"no positioning deck, and {outside}", advice)
 
+    @staticmethod
+    def too_near(target: TargetEstimate | None) -> Problem | None:
+        """A target that is too near for a vehicle on the ground."""
+        if target is None or not target.tracked:
+            return None
+        away_m = math.hypot(*(float(e) for e in target.e_m))
+        if away_m >= WITHIN_REACH_M:
+            return None
+        away, needed = distinct_figures(away_m, WITHIN_REACH_M, 2)
+        return Problem(
+            f"the target is only {away} m away, at least {needed} m are needed",
+            "the vehicle hangs, or stands too close under it; take it down first",
+        )
 
-def _in_millimetres(place: ExternalPosition, profile: Profile) -> Problem | None:
-    """Return the problem of an external position that seems to be in millimetres."""
-    safety, (x, y, z) = profile.safety, place.position_m
-    far_m = max(abs(v) for v in place.position_m)
-    on_ground = abs(z / 1000.0 - safety.ground_z_m) <= safety.ground_tolerance_m
-    if not far_m >= ROOM_M and not (z >= HIGH_M and on_ground):
-        return None
-    return Problem(
-        f"the motion capture has the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m: these look "
-        f"like millimetres",
-        "set the unit of its stream to metres",
-    )
+    def world_problem(self, place: ExternalPosition) -> Problem | None:
+        """An external position in another unit, with another axis up, or elsewhere, which waiting
+        will not mend. By the target the world is the vehicle's own, so only the fence counts."""
+        if self.profile.positioning.by == "target":
+            return self._unreachable(place)
+        return (
+            self._in_millimetres(place)
+            or with_another_up(place, self.telemetry)
+            or self._off_the_ground(place)
+            or self._unreachable(place)
+        )
+
+    def _unreachable(self, place: ExternalPosition) -> Problem | None:
+        """A place from which no flight reaches the expected target: perhaps another vehicle's."""
+        target, (x, y, _) = self.profile.target, place.position_m
+        if target.expected_xy_m is None:
+            return None
+        away_m, fence_m = (
+            math.dist((x, y), target.expected_xy_m),
+            self.profile.safety.fence_radius_m,
+        )
+        if not away_m > fence_m + target.expected_within_m:
+            return None
+        return Problem(
+            f"the target is expected {away_m:.1f} m from where the vehicle stands (x {x:.2f}, y "
+            f"{y:.2f} m), and the fence is {fence_m:g} m",
+            "correct target.expected_xy_m, or positioning.body if it names another vehicle's body",
+        )
+
+    def _in_millimetres(self, place: ExternalPosition) -> Problem | None:
+        safety, (x, y, z) = self.profile.safety, place.position_m
+        far_m = max(abs(v) for v in place.position_m)
+        on_ground = abs(z / 1000.0 - safety.ground_z_m) <= safety.ground_tolerance_m
+        if not far_m >= ROOM_M and not (z >= HIGH_M and on_ground):
+            return None
+        return Problem(
+            f"the motion capture has the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m: these look "
+            f"like millimetres",
+            "set the unit of its stream to metres",
+        )
+
+    def _off_the_ground(self, place: ExternalPosition) -> Problem | None:
+        safety, z_m = self.profile.safety, place.position_m[2]
+        if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
+            return None
+        return Problem(
+            f"the motion capture has the vehicle at {z_m:.2f} m, and the ground is at "
+            f"{safety.ground_z_m:.2f} m",
+            "swapped axes, another rigid body or zero: perchctl check --lift tells; "
+            "safety.ground_z_m is the height that it has where it stands",
+        )
 
 
 def with_another_up(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
@@ -272,40 +256,20 @@ def with_another_up(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
     if not off_deg > UPRIGHT_DEG:
         return None
     axis = nearest_axis(up)
-    if axis is None:
-        return Problem(
-            f"the motion capture has the vehicle tilted by {off_deg:.0f} deg against its own "
-            f"attitude",
-            "is it the right rigid body? set its axes level in the capture, or "
-            "positioning.body_rpy_deg; perchctl check --lift tells by how much",
-        )
-    return Problem(
-        f"swapped axes: up is {axis} in the motion capture",
-        "set its world to z up; if only the rigid body's own axes lie so, define them anew "
-        "with the vehicle level, or set positioning.body_rpy_deg",
-    )
-
-
-def _off_the_ground(place: ExternalPosition, profile: Profile) -> Problem | None:
-    """Return the problem of an external height that is not the ground's."""
-    safety, z_m = profile.safety, place.position_m[2]
-    if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
-        return None
-    found = (
-        f"the motion capture has the vehicle at {z_m:.2f} m, and the ground is at "
-        f"{safety.ground_z_m:.2f} m"
-    )
-    level = [
-        axis
-        for axis, v in zip("xy", place.position_m[:2], strict=True)
-        if abs(v - safety.ground_z_m) <= safety.ground_tolerance_m
-    ]
-    perhaps = f"swapped axes (is its {' or its '.join(level)} up?)" if level else "swapped axes"
+    found = f"the motion capture has the vehicle tilted by {off_deg:.0f} deg against its attitude"
+    if axis is not None:
+        found = f"swapped axes: up is {axis} in the motion capture"
     return Problem(
         found,
-        f"{perhaps}, another rigid body or zero: perchctl check --lift tells; "
-        f"safety.ground_z_m is the height that it has where it stands",
+        "set its world to z up, define the rigid body's axes level, or set "
+        "positioning.body_rpy_deg; perchctl check --lift tells by how much",
     )
+
+
+def measurer(profile: Profile) -> str:
+    """Return the source of the external positions, in words."""
+    by_target = profile.positioning.by == "target"
+    return "the sight of the target" if by_target else "the motion capture"
 
 
 class AtRest:
@@ -325,16 +289,9 @@ class AtRest:
         way_m = math.dist(self._from.position_m, place.position_m)
         if not way_m > WANDERED_M:
             return None
-        if profile.positioning.by == "target":
-            return Problem(
-                f"by the target the vehicle has moved by {way_m:.2f} m, and it stands still",
-                "the target has moved: let it hang still, then start anew",
-            )
-        body = profile.positioning.body
         return Problem(
-            f"the rigid body {body!r} has moved by {way_m:.2f} m in the motion capture, and the "
-            f"vehicle stands still",
-            "it is another body's: correct positioning.body; if somebody carried it, put it down",
+            f"by {measurer(profile)} the vehicle has moved by {way_m:.2f} m, and it stands still",
+            "let the target hang still, put down what is carried, or correct positioning.body",
         )
 
 

@@ -13,10 +13,10 @@ from perchctl.camera import FrameSource, NewestSlot, WrappedSource, unmirror_fra
 from perchctl.errors import ConnectionFailed
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.link import MockLink, Radio
-from perchctl.mission import Event, FlightReport, Operator, Phase, Tick, Watcher
+from perchctl.mission import FlightReport, Operator, Phase, Tick, Watcher
 from perchctl.positioning import Placed, PositionFeed
 from perchctl.profile import Profile
-from perchctl.record import LogWatcher
+from perchctl.record import FlightSummary, LogWatcher
 from perchctl.sim import (
     CaptureSettings,
     EventExplainer,
@@ -91,10 +91,8 @@ def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
     return WrappedSource(source, unmirror_frame) if profile.camera.mirrored else source
 
 
-class Truth:
+class Truth(Watcher):
     """A watcher of the true vehicle, which the flight cannot see."""
-
-    problem: str | None = None
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
@@ -102,9 +100,6 @@ class Truth:
         self._was_down = True
         self.fell = False
         self.touchdown_mps = 0.0
-
-    def event(self, event: Event) -> None:
-        return None
 
     def tick(self, tick: Tick) -> None:
         world = self._vehicle.world
@@ -141,6 +136,15 @@ class LockstepFlight:
         """The gear's distance from the target's centre, where it hangs there."""
         return self.miss_m if self.report.phase is Phase.PERCHED and self.hanging else None
 
+    @property
+    def end(self) -> Phase:
+        """The phase in which it ended, ABORTED for one that fell."""
+        return Phase.ABORTED if self.fell else self.report.phase
+
+    def conclude(self, log: LogWatcher) -> FlightSummary | None:
+        """Write the flight's summary and close its log. Returns the summary."""
+        return log.close(self.report, self.perched_miss_m, self.fell)
+
 
 def fly_lockstep(
     profile: Profile,
@@ -169,7 +173,7 @@ def fly_lockstep(
             profile, log=watcher, scenario=scenario, capture=capture, operator_at=operator_at,
             watchers=watchers,
         )  # fmt: skip
-        watcher.close(flight.report, flight.perched_miss_m, flight.fell)
+        flight.conclude(watcher)
         return flight
     camera = profile_camera(profile.camera)
     capture = capture or draw_capture(profile, scenario.seed)
@@ -231,10 +235,8 @@ def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> Loc
     )
 
 
-class _OperatorAt:
+class _OperatorAt(Watcher):
     """Gives the operator's command once a phase has been reached."""
-
-    problem: str | None = None
 
     def __init__(self, at: dict[Phase, Operator]) -> None:
         self._at = at
@@ -245,9 +247,6 @@ class _OperatorAt:
 
     def tick(self, tick: Tick) -> None:
         self._command = max(self._command, self._at.get(tick.state.phase, Operator.NONE))
-
-    def event(self, event: Event) -> None:
-        return None
 
 
 # --- External positions in lockstep: the simulated motion capture, by the same feed --------------

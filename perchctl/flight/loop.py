@@ -27,22 +27,16 @@ from perchctl.flight.turns import Turns
 from perchctl.flight.watchdog import Watchdog, rescue
 from perchctl.link import Link
 from perchctl.mission import (
-    RESCUE,
     Event,
     EventKind,
-    Finding,
     FlightReport,
     Observation,
     Operator,
     Phase,
     PlannerState,
-    Rest,
     SentCommand,
     Tick,
     Watcher,
-    events_of,
-    flight_report,
-    start_mission,
     step_mission,
 )
 from perchctl.positioning import FeedStatus
@@ -107,7 +101,7 @@ def fly(parts: FlightParts) -> FlightReport:
         return _mission(parts, inputs, watchdog, turns)
     except BaseException as error:
         watchdog.rescuing()
-        found = rescue(
+        rest = rescue(
             parts.link,
             parts.clock,
             parts.profile,
@@ -120,7 +114,7 @@ def fly(parts: FlightParts) -> FlightReport:
         )
         with contextlib.suppress(Exception):  # the log may be what failed
             turns.failed(inputs, error)
-        _tell_rescue(parts, error, found)
+        _tell_rescue(parts, error, rest)
         raise
 
 
@@ -144,22 +138,10 @@ def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
     return tell
 
 
-RESCUED = {
-    Finding.STANDS: "the vehicle stands on the floor, its motors are off",
-    Finding.HANGS: "the vehicle hangs on the magnet, its motors are off",
-    Finding.HELD: "something holds the vehicle away from the target; the motors are off",
-    Finding.UNKNOWN: "the motors are off; it is not known whether the vehicle hangs or stands",
-    None: "how it ended could not be confirmed: keep away from the vehicle",
-}
-
-
-def _tell_rescue(parts: FlightParts, error: BaseException, found: Rest) -> None:
-    text = f"{type(error).__name__}{RESCUE}{RESCUED[found.finding]}"
-    if found.touchdown is not None and found.touchdown.is_hard:
-        text += f"; it {found.touchdown.text}"
+def _tell_rescue(parts: FlightParts, error: BaseException, rest: str) -> None:
     for watcher in parts.watchers:
         with contextlib.suppress(Exception):  # it may be the one that failed
-            watcher.event(Event(parts.clock.now(), EventKind.NOTE, text))
+            watcher.event(Event.of_rescue(parts.clock.now(), error, rest))
 
 
 def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) -> None:
@@ -215,7 +197,7 @@ def _mission(
         turns.lap()
         turns.observed(obs)
         before = state
-        new, command = step_mission(before or start_mission(obs), obs, parts.profile)
+        new, command = step_mission(before, obs, parts.profile)
         turns.decided(obs, new, command, outside)
         turns.lap()
         overruled = new.phase.is_flying and watchdog.overruled_s > late_s
@@ -232,7 +214,7 @@ def _mission(
         if state.astray and parts.positions is not None and not (before and before.astray):
             parts.positions.stop()
             inputs.perception.drop_sights()
-        events = events_of(before, state, obs, parts.profile)
+        events = Event.of_tick(before, state, obs, parts.profile)
         if obs.log_problem is not None and not log_noted:
             log_noted = True
             text = f"the log of this flight is incomplete: {obs.log_problem}"
@@ -257,7 +239,7 @@ def _mission(
             watcher.tick(tick)
         if state.phase.is_over:
             watchdog.end(motors_off=state.phase is not Phase.ABORTED)
-            return flight_report(
+            return FlightReport.of(
                 state, obs, parts.profile, tuple(passed), inputs.perception.consistency()
             )
         due_s += period_s

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from perchctl.errors import SafetyAbort, TimedOut, distinct_figures
+from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight.criteria import (
     AtRest,
     GroundCriteria,
@@ -14,9 +14,6 @@ from perchctl.flight.criteria import (
     apart,
     measurer,
     missing,
-    too_near_problem,
-    unmeasured_problem,
-    world_problem,
 )
 from perchctl.geometry import Place, rot_z
 from perchctl.link import Link
@@ -44,7 +41,7 @@ def refuse_unmeasured(link: Link, profile: Profile, *, positions: bool) -> None:
     """Raises SafetyAbort without any position source. `positions`: those of the profile's motion
     capture are being sent."""
     if profile.positioning.by == "deck":
-        _refuse(unmeasured_problem(link.measured_by(), profile))
+        _refuse(GroundCriteria.unmeasured(link.measured_by(), profile))
     elif profile.positioning.by == "mocap" and not positions:
         raise SafetyAbort("the profile says positioning: mocap, and nothing sends positions")
 
@@ -70,7 +67,7 @@ def refuse_strange(
         return
     place = status.measured if stands else None
     if place is not None:
-        _refuse(world_problem(place, telemetry, profile))
+        _refuse(criteria.world_problem(place))
     if at_rest is not None:
         _refuse(at_rest.strange(place, profile))
 
@@ -128,7 +125,7 @@ def still_waiting_for(
             problem = not_in_view(target, camera_problem, telemetry, profile, camera)
         what = f"a sight of the target, which measures the position ({problem.sentence})"
         return _bounded(what, waited_s, limit_s)
-    _refuse(too_near_problem(target))
+    _refuse(criteria.too_near(target))
     return ""
 
 
@@ -159,30 +156,23 @@ def out_of_view(
     picture of a vehicle that leans a little, at take-off height over the start or over
     `planner.approach_xy_m`. `yaw_rad`: its heading at the start."""
     planner, (x, y, z) = profile.planner, start_m
-    top_m = z + planner.takeoff_height_m
-    over = _seen_leaning((x, y, top_m), yaw_rad, target, profile, camera)
-    if not over.whole:
-        return Problem(
-            f"the target is the positioning system, and would leave the picture as the vehicle "
-            f"takes off: {_too_far(over)} at {planner.takeoff_height_m:g} m of "
-            f"height",
-            f"put the vehicle {over.aside_text} from where it stands, or lower "
-            f"planner.takeoff_height_m",
-        )
-    if planner.approach_xy_m is None:
-        return None
-    there = _seen_leaning((*planner.approach_xy_m, top_m), yaw_rad, target, profile, camera)
-    if there.whole:
-        return None
-    to_x, to_y = planner.approach_xy_m
-    u, v = (float(part) for part in target.position_m[:2])
-    return Problem(
-        f"the target is the positioning system, and from planner.approach_xy_m (x {to_x:g}, "
-        f"y {to_y:g} m) the vehicle would not see it: {_too_far(there)}, and "
-        f"without it nothing brings the vehicle back",
-        f"leave planner.approach_xy_m out, since the target is in view from where it stands, or "
-        f"set it near the target's x {u:.2f}, y {v:.2f} m",
-    )
+    advice = f"lower planner.takeoff_height_m, now {planner.takeoff_height_m:g} m"
+    for over in ((x, y), planner.approach_xy_m):
+        if over is None:
+            continue
+        body_m = (*over, z + planner.takeoff_height_m)
+        sight = _seen_leaning(body_m, yaw_rad, target, profile, camera)
+        if over == (x, y):
+            advice = f"put the vehicle {sight.aside_text} from where it stands, or {advice}"
+        else:
+            advice = "leave planner.approach_xy_m out, or set it near the target"
+        if not sight.whole:
+            return Problem(
+                f"the target is the positioning system, and from x {over[0]:.2f}, y {over[1]:.2f} "
+                f"m at take-off height the vehicle would not see it: {_too_far(sight)}",
+                advice,
+            )
+    return None
 
 
 def target_from(
@@ -215,16 +205,12 @@ def _leant_m(sight: TargetView) -> float:
 
 
 def _too_far(sight: TargetView) -> str:
-    """Return in words how far aside the target would be, and how far it may be."""
     if not sight.height_m > 0.0:
         return "it would be no higher than the camera"
-    aside_m, most = math.hypot(*sight.aside_m), ""
-    aside = f"{aside_m:.2f}"
-    if sight.reach_m is not None:
-        room_m = math.floor(100.0 * max(0.0, sight.reach_m - _leant_m(sight))) / 100.0
-        aside, room = distinct_figures(aside_m, room_m, 2)
-        most = f", {room} m at most,"
-    return f"{aside} m aside of the camera's axis{most} {sight.height_m:.2f} m over the camera"
+    return (
+        f"{math.hypot(*sight.aside_m):.2f} m aside of the camera's axis, {sight.height_m:.2f} m "
+        f"over the camera"
+    )
 
 
 def not_in_view(

@@ -35,7 +35,6 @@ from perchctl.positioning import (
     open_capture,
 )
 from perchctl.profile import PositioningConfig, Profile
-from perchctl.values import replace
 from perchctl.vision import CameraModel, make_pipeline
 
 if TYPE_CHECKING:
@@ -60,6 +59,10 @@ class FlyOptions:
     def simulated(self) -> bool:
         """True if the URI is that of the simulated vehicle."""
         return self.uri.startswith("sim://")
+
+    def require_comparison(self) -> None:
+        """Raises SafetyAbort for a capture that no hand has compared with this vehicle."""
+        require_comparison(self.profile.positioning, self.uri, simulated=self.simulated)
 
 
 def check_options(options: FlyOptions) -> None:
@@ -98,8 +101,7 @@ def fly_session(
     at its frames. `remarks`: as in `FlightParts`. `before_arming` is called once vehicle and camera
     have answered; what it raises ends the session on the ground.
     """
-    check_options(options)
-    require_comparison(options.profile.positioning, options.uri, simulated=options.simulated)
+    options.require_comparison()
     profile, switch = options.profile, switch or OperatorSwitch()
     camera = profile_camera(profile.camera)
     pipeline = make_pipeline(profile, camera)
@@ -131,12 +133,10 @@ def fly_session(
                 link, source, clock, profile, pipeline, watchers, switch.read,
                 explain, positions, remarks,
             )  # fmt: skip
-            if isinstance(clock, WallClock):
+            with contextlib.ExitStack() as waiting:
+                if isinstance(clock, SimulatedClock):
+                    waiting.enter_context(clock.waiting_for_loop())
                 report = fly(parts)
-            else:
-                slow = clock.remarks
-                with clock.waiting_for_loop():
-                    report = fly(replace(parts, remarks=lambda: (*remarks(), *slow())))
         finally:
             switch.listening = True  # while closing, Ctrl-C must not cut the wait short
             link.close()

@@ -19,11 +19,11 @@ from dataclasses import dataclass
 from perchctl.flight.clock import Clock
 from perchctl.link import Link
 from perchctl.mission import (
+    Finding,
     Observation,
     Operator,
     Phase,
     PlannerState,
-    Rest,
     SentCommand,
     VisualInertialMotion,
     rest_of,
@@ -233,9 +233,9 @@ def rescue(
     position_age_s: Callable[[float], float] = lambda now_s: 0.0,
     told: Callable[[SentCommand], None] = lambda sent: None,
     felt: VisualInertialMotion | None = None,
-) -> Rest:
+) -> str:
     """Land whatever still flies, without planner, camera and log, bounded by the landing's time.
-    Returns where the vehicle came to rest, once its motors have been seen off.
+    Returns where the vehicle came to rest, as a sentence without its end.
 
     Args:
         state: the planner's last; None before its first tick.
@@ -256,7 +256,7 @@ def rescue(
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
         if operator() is Operator.STOP:
             send(EmergencyStop())  # the link's guard repeats it
-            return Rest()
+            return Finding.UNSEEN.value
         with suppress(Exception):
             history = add_samples(history, link.telemetry(), profile.safety)
         newest = history.newest
@@ -271,17 +271,11 @@ def rescue(
                 imu=history.imu,
                 felt=felt,
             )
-            state, command = step_landing(state or _before_take_off(obs), obs, profile)
+            state, command = step_landing(state, obs, profile)
             if not isinstance(command, Idle):
                 send(command)
             rest = rest_of(state, obs, profile, LOOK_S)
             if rest is not None:
                 return rest
         clock.wait_until(now_s + period_s)
-    return Rest()
-
-
-def _before_take_off(obs: Observation) -> PlannerState:
-    """Return the planner's state if its first tick was the one that failed."""
-    position_m = obs.telemetry.position_m
-    return PlannerState(t_s=obs.t_s, started_s=obs.t_s, ground_m=position_m, entry_m=position_m)
+    return Finding.UNSEEN.value

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from perchctl.link.protocol import SentCallback, ignore_sent
-from perchctl.mission import SentBy, SentCommand
+from perchctl.mission import SentCommand
 from perchctl.vehicle import Command, EmergencyStop, PositionSetpoint, RawThrust
 
 _STREAMED = (PositionSetpoint, RawThrust)
@@ -42,7 +42,7 @@ class _Waiting:
 
     put_s: float
     command: Command
-    by: SentBy | None
+    by: str | None
     rest: deque[Any] | None = None
     begun: bool = False
 
@@ -97,7 +97,7 @@ class Sender:
         self._keeper = threading.Thread(target=self._keep, name="perchctl-guard", daemon=True)
         self._keeper.start()
 
-    def put(self, command: Command, by: SentBy | None = None) -> None:
+    def put(self, command: Command, by: str | None = None) -> None:
         """Queue a command. `by`: who sends it in the loop's place."""
         with self._ready:
             if isinstance(command, EmergencyStop):

@@ -51,20 +51,11 @@ _SHARES, _VOLTS = zip(*CURVE, strict=True)
 # --- The battery's state, fitted reading by reading ----------------------------------------------
 
 
-@dataclass(frozen=True)
-class BatteryFit:
-    """The battery as fitted: its `sag_v` under full thrust, and its `hunger`, by how much faster it
-    empties than assumed."""
-
-    sag_v: float
-    hunger: float
-
-
 def read_battery(c: Context) -> EnergyState:
     """The battery's state with this tick's reading; one that is not fresh counts as none."""
-    tel = c.obs.telemetry
+    tel = c.telemetry
     reading_v = tel.battery_v if c.obs.battery_age_s <= FRESH_S else math.nan
-    dt_s = max(0.0, c.obs.t_s - c.state.t_s)
+    dt_s = max(0.0, c.t_s - c.state.t_s)
     return update_energy(c.state.energy, dt_s, reading_v, tel.thrust, c.profile.vehicle.battery_mah)
 
 
@@ -83,8 +74,12 @@ def update_energy(
     if load >= LEAST_LOAD:
         known = dt_s / 3.0 if state.mean_load else 1.0
         state = replace(state, mean_load=_towards(state.mean_load, load, known))
-    if not is_battery_reading(battery_v):
-        return _counted(state, dt_s, battery_mah)
+    if not is_battery_reading(battery_v):  # the last estimate, less what the thrust takes
+        state = replace(state, unknown_s=state.unknown_s + dt_s)
+        if state.rest_v is None:
+            return state
+        spent = fit_battery(state)[1] * state.load * _per_s(battery_mah) * dt_s
+        return replace(state, rest_v=resting_v(charge_at(state.rest_v) - spent))
     state = replace(state, unknown_s=0.0)
     if load == 0.0 and not state.loaded_s:
         return replace(state, ground_v=battery_v, rest_v=battery_v)
@@ -95,25 +90,21 @@ def update_energy(
     if state.load >= LEAST_LOAD:
         fit = _summed(state, dt_s, battery_v)
         state = replace(state, fit=fit, loaded_s=state.loaded_s + dt_s)
-    now_v = battery_v + fit_battery(state).sag_v * state.load
+    now_v = battery_v + fit_battery(state)[0] * state.load
     rest_v = now_v if state.rest_v is None else _towards(state.rest_v, now_v, dt_s / SMOOTH_S)
     return replace(state, rest_v=rest_v)
 
 
-def fit_battery(state: EnergyState) -> BatteryFit:
-    """The least-squares fit to the readings, around the usual values and within bounds."""
+def fit_battery(state: EnergyState) -> tuple[float, float]:
+    """The sag under full thrust, in V, and the hunger: the least-squares fit to the readings,
+    around the usual values and within bounds."""
     a, b, c, p, q = state.fit
     a += SAG_WITHIN_V**-2
     c += HUNGER_WITHIN**-2
     det = a * c - b * b
     sag_v = USUAL_SAG_V + (c * p - b * q) / det
     hunger = USUAL_HUNGER + (a * q - b * p) / det
-    return BatteryFit(max(LEAST_SAG_V, sag_v), min(MOST_HUNGER, max(LEAST_HUNGER, hunger)))
-
-
-def loaded_v(state: EnergyState, load: float) -> float | None:
-    """The present voltage under a share of the full thrust; None if it is unknown."""
-    return None if state.rest_v is None else state.rest_v - fit_battery(state).sag_v * load
+    return max(LEAST_SAG_V, sag_v), min(MOST_HUNGER, max(LEAST_HUNGER, hunger))
 
 
 def charge_at(rest_v: float) -> float:
@@ -129,15 +120,6 @@ def resting_v(share: float) -> float:
 def _along(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> float:
     i = min(max(bisect_right(xs, x), 1), len(xs) - 1)
     return ys[i - 1] + (x - xs[i - 1]) * (ys[i] - ys[i - 1]) / (xs[i] - xs[i - 1])
-
-
-def _counted(state: EnergyState, dt_s: float, battery_mah: float) -> EnergyState:
-    """The state after a time without a reading: the last estimate, less what the thrust takes."""
-    state = replace(state, unknown_s=state.unknown_s + dt_s)
-    if state.rest_v is None:
-        return state
-    spent = fit_battery(state).hunger * state.load * _per_s(battery_mah) * dt_s
-    return replace(state, rest_v=resting_v(charge_at(state.rest_v) - spent))
 
 
 def _summed(
@@ -175,16 +157,6 @@ def _towards(value: float, goal: float, part: float) -> float:
 
 
 @dataclass(frozen=True)
-class Floor:
-    """The voltages that end a flight: under a long load, and under that of a press, which takes
-    `press_load` of the full thrust."""
-
-    hover_v: float
-    press_v: float
-    press_load: float = 1.0
-
-
-@dataclass(frozen=True)
 class Needs:
     """The seconds of flight that the attempt at hand, each further one and the landing take."""
 
@@ -198,56 +170,49 @@ def outlook(c: Context) -> BatteryOutlook:
 
     An unknown charge counts as what the last reading left, less what was used since, and at most
     as the grace of a vehicle without a reading (fault 7)."""
-    energy, battery_mah = c.state.energy, c.profile.vehicle.battery_mah
-    used_mah = energy.used * battery_mah
-    counted_s = left_s(energy, floor_of(c.profile), battery_mah, _hover_load(c))
+    energy = c.state.energy
+    used_mah = energy.used * c.profile.vehicle.battery_mah
+    load = (c.state.hover_thrust or FULL_THRUST * energy.mean_load) / FULL_THRUST
+    counted_s = left_s(energy, c.profile, load)
     seconds = None if energy.unknown_s > UNKNOWN_S else counted_s
     if c.target_m is None:
         return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
-    needs = needs_of(c)
-    if seconds is None:
+    enough_s, needs = seconds, needs_of(c)
+    if enough_s is None:
         enough_s = _grace_s(c) if counted_s is None else min(counted_s, _grace_s(c))
-    else:
-        enough_s = seconds
-    spare_s = enough_s - c.profile.safety.energy_reserve_s - needs.landing_s - needs.attempt_s
-    left = c.profile.planner.attempts - c.state.attempts
+    spare_s = enough_s - c.safety.energy_reserve_s - needs.landing_s - needs.attempt_s
+    left = c.planner.attempts - c.state.attempts
     attempts = 0  # also where the figures are no numbers
     if spare_s >= 0.0:
         attempts = 1 + math.floor(min(spare_s / needs.again_s, max(0, left)))
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
 
 
-def left_s(
-    state: EnergyState, floor: Floor, battery_mah: float, hover_load: float | None = None
-) -> float | None:
-    """Seconds for which hovering keeps the voltage above the floor; None if that is unknown.
+def left_s(state: EnergyState, profile: Profile, load: float) -> float | None:
+    """Seconds for which hovering on a share of the full thrust keeps the voltage above that at
+    which `battery-low` fires; None if that is unknown.
 
-    `hover_load` is a share of the full thrust, by default that of the last seconds."""
-    load = hover_load or state.mean_load
+    It fires by the firmware's limit under a long load, by the profile's under one that outlasts
+    `safety.battery_debounce_s`, which a press seldom does."""
     if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
         return None
-    fit = fit_battery(state)
-    press_load = max(load, floor.press_load)
-    end_v = max(floor.hover_v + fit.sag_v * load, floor.press_v + fit.sag_v * press_load)
+    safety, perch = profile.safety, profile.planner.perch
+    hover_v = max(
+        float(profile.link.parameters.get("pm.lowVoltage", LOW_POWER_V)), safety.min_load_v
+    )
+    lasts = TOUCHING_S + perch.contact_dwell_s > safety.battery_debounce_s
+    press_v = safety.min_load_v - (0.0 if lasts else PRESS_DIP_V)
+    press_load = max(load, press_thrust(profile) / FULL_THRUST)
+    sag_v, hunger = fit_battery(state)
+    end_v = max(hover_v + sag_v * load, press_v + sag_v * press_load)
     share = charge_at(state.rest_v) - charge_at(end_v)
-    return max(0.0, share) / (fit.hunger * load * _per_s(battery_mah))
-
-
-def floor_of(profile: Profile) -> Floor:
-    """The voltages at which `battery-low` fires: by the firmware's limit under a long load, by the
-    profile's under one that outlasts `safety.battery_debounce_s`, which a press seldom does."""
-    safety = profile.safety
-    low_v = float(profile.link.parameters.get("pm.lowVoltage", LOW_POWER_V))
-    press_s = TOUCHING_S + profile.planner.perch.contact_dwell_s
-    dip_v = 0.0 if press_s > safety.battery_debounce_s else PRESS_DIP_V
-    press_load = press_thrust(profile) / FULL_THRUST
-    return Floor(max(low_v, safety.min_load_v), safety.min_load_v - dip_v, press_load)
+    return max(0.0, share) / (hunger * load * _per_s(profile.vehicle.battery_mah))
 
 
 def needs_of(c: Context) -> Needs:
     """The seconds that attempts and landing take, by the height of a target that was seen."""
-    planner = c.profile.planner
-    up_m = max(0.0, c.contact_goal_z_m - c.obs.telemetry.position_m[2])
+    planner = c.planner
+    up_m = max(0.0, c.contact_goal_z_m - c.telemetry.position_m[2])
     touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
     touch_s += planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
     aligned_s = 0.0
@@ -264,35 +229,27 @@ def needs_of(c: Context) -> Needs:
 def is_short_of_charge(c: Context) -> bool:
     """True if the attempt that would begin now has not enough. Without a remembered target none
     begins: a search comes first, and the question after it."""
-    gated = c.profile.safety.energy_gate and c.target_m is not None
+    gated = c.safety.energy_gate and c.target_m is not None
     return gated and not c.state.battery.attempts
 
 
 def why_short(c: Context) -> str:
     """The shortfall with its figures, as a sentence."""
-    seconds, volts = c.state.battery.left_s, loaded_v(c.state.energy, _hover_load(c))
-    needs = needs_of(c)
-    if seconds is None or volts is None:
-        has = (
-            f"what the battery has left is not known, and of the time that it may fly without a "
-            f"reading (safety.battery_stale_s) {max(0.0, _grace_s(c)):.0f} s are left"
-        )
-    else:
-        has = f"the battery has {max(0.0, seconds):.0f} s left at {volts:.2f} V under load"
+    seconds, needs = c.state.battery.left_s, needs_of(c)
+    has = (
+        "what the battery has left is not known"
+        if seconds is None
+        else (f"the battery has {seconds:.0f} s left")
+    )
     return (
         f"{has}; an attempt takes {needs.attempt_s:.0f} s, the landing {needs.landing_s:.0f} s, "
-        f"the reserve is {c.profile.safety.energy_reserve_s:g} s"
+        f"the reserve is {c.safety.energy_reserve_s:g} s"
     )
 
 
 def _grace_s(c: Context) -> float:
     """Seconds that `battery-unknown` leaves to a vehicle whose reading is unknown."""
-    return c.profile.safety.battery_stale_s - max(c.state.energy.unknown_s, c.obs.battery_age_s)
-
-
-def _hover_load(c: Context) -> float:
-    """The share of the full thrust that hovering takes."""
-    return (c.state.hover_thrust or FULL_THRUST * c.state.energy.mean_load) / FULL_THRUST
+    return c.safety.battery_stale_s - max(c.state.energy.unknown_s, c.obs.battery_age_s)
 
 
 def _climb_s(profile: Profile, up_m: float) -> float:

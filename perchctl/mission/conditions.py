@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 
 from perchctl.mission.context import Context
-from perchctl.mission.state import Condition, Phase
+from perchctl.mission.state import Condition, ContactError, Phase
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, FULL_THRUST, LOW_POWER, NO_BATTERY_READING_V
 
@@ -32,31 +32,17 @@ STILL_MOTORS_THRUST = 5000  # and less stops them (docs/firmware.md, "Release in
 FALLING_MPS = -0.05
 
 
-def _aligned(c: Context) -> bool:
-    align = c.profile.planner.align
-    return (
-        c.fresh
-        and c.error_xy_m <= align.xy_m
-        and abs(c.error_yaw_rad) <= math.radians(align.yaw_deg)
-    )
-
-
 def _settled(c: Context) -> bool:
     """True if it is slow under the target at the stand-off, by the small marker (fault 33)."""
-    ascend = c.profile.planner.ascend
+    ascend = c.planner.ascend
     return (
         c.fresh
         and c.small_is_fresh
-        and c.error_z_m <= ascend.standoff_m + ascend.settle_z_m
+        and c.is_near_standoff
         and c.error_xy_m <= ascend.settle_xy_m
         and abs(c.error_yaw_rad) <= math.radians(ascend.settle_yaw_deg)
         and c.speed_mps <= ascend.settle_speed_mps
     )
-
-
-def _near_standoff(c: Context) -> bool:
-    ascend = c.profile.planner.ascend
-    return c.tracked and c.error_z_m <= ascend.standoff_m + ascend.settle_z_m
 
 
 def _moves_otherwise(c: Context) -> bool:
@@ -74,9 +60,9 @@ def _contact(c: Context) -> bool:
     height is the last sight's, carried on, and the accelerometer shows that nothing climbs: an
     impact spoils the estimated speed (docs/firmware.md, "After the impact").
     """
-    perch, tel = c.profile.planner.perch, c.obs.telemetry
+    perch, tel = c.planner.perch, c.telemetry
     steady = abs(tel.velocity_mps[2]) <= perch.contact_speed_mps and c.placed
-    felt_s = c.obs.t_s - c.obs.imu.steady_s
+    felt_s = c.t_s - c.obs.imu.steady_s
     return (
         abs(c.error_z_m) <= perch.contact_z_m + (CARRIED_ON_MPS * unseen_s(c) if c.by_sight else 0)
         and (steady or felt_s >= perch.contact_dwell_s)
@@ -89,11 +75,11 @@ def _contact(c: Context) -> bool:
 
 def unseen_s(c: Context) -> float:
     """Seconds since the exposure of the last sight."""
-    return max(0.0, c.obs.t_s - c.state.reckoning.sight_s)
+    return max(0.0, c.t_s - c.state.reckoning.sight_s)
 
 
-def contact_aside_m(c: Context) -> tuple[float, float]:
-    """Distance of the gear from the target's axis, and its standard deviation.
+def contact_error(c: Context) -> ContactError:
+    """How far the gear is from the target's axis.
 
     By decks, the last sight is carried on by an estimate that slides and that the blow on the
     ceiling shakes; without positions `reckoned` has counted that already. A step of the estimate
@@ -102,28 +88,28 @@ def contact_aside_m(c: Context) -> tuple[float, float]:
     sigma_m = math.hypot(reckoning.aside_sigma_m, TOUCHES_M, *reckoning.stepped_m)
     if c.profile.positioning.by == "deck" and c.placed:
         sigma_m = math.hypot(sigma_m, SHAKEN_M, SLIDES_MPS * unseen_s(c))
-    return math.hypot(*reckoning.aside_m), sigma_m
+    return ContactError(math.hypot(*reckoning.aside_m), sigma_m)
 
 
-def touched_aside_m(c: Context) -> tuple[float, float] | None:
-    """The `contact_aside_m` of the moment in which the gear touched something at the target's
+def touched_error(c: Context) -> ContactError | None:
+    """The `contact_error` of the moment in which the gear touched something at the target's
     height: what has not left since is still there. None after it left, and where a sight of now or
     a motion capture gives the place."""
     state = c.state
-    if state.phase is not Phase.RECOVER or state.contact_aside_m is None or c.fresh:
+    if state.phase is not Phase.RECOVER or state.contact is None or c.fresh:
         return None
-    x_m, y_m, _ = c.obs.telemetry.position_m
+    x_m, y_m, _ = c.telemetry.position_m
     away_m = math.hypot(x_m - state.entry_m[0], y_m - state.entry_m[1])
     by_capture = c.profile.positioning.by == "mocap" and c.placed
-    if by_capture and away_m > c.profile.planner.perch.contact_xy_m:
+    if by_capture and away_m > c.planner.perch.contact_xy_m:
         return None
-    return state.contact_aside_m, state.contact_sigma_m
+    return state.contact
 
 
 def contact_within_m(c: Context) -> float:
     """Tolerance of the target's height for a gear in contact, with the estimate's bounded drift
     since the last sight."""
-    planner = c.profile.planner
+    planner = c.planner
     drift_mps = CARRIED_ON_MPS if c.by_sight else planner.landing.drift_mps
     return planner.perch.contact_z_m + min(planner.perch.contact_z_m, drift_mps * unseen_s(c))
 
@@ -131,8 +117,7 @@ def contact_within_m(c: Context) -> float:
 def is_at_target(c: Context) -> bool:
     """True if the gear is at the target's height and within the magnet's radius of its axis, all
     known well enough."""
-    aside_m, sigma_m = contact_aside_m(c)
-    near = aside_m + sigma_m <= c.profile.planner.perch.contact_xy_m
+    near = contact_error(c).is_within(c.planner.perch.contact_xy_m)
     return near and abs(c.error_z_m) <= contact_within_m(c)
 
 
@@ -144,14 +129,14 @@ def press_thrust(profile: Profile) -> float:
 
 def contact_thrust(c: Context) -> float:
     """The thrust that proves a contact: more than hovering takes, as far as there is more."""
-    wanted = c.profile.planner.perch.contact_thrust_ratio * c.state.hover_thrust
+    wanted = c.planner.perch.contact_thrust_ratio * c.state.hover_thrust
     return min(wanted, PROVABLE * press_thrust(c.profile))
 
 
 def hovers(c: Context) -> bool:
     """True if the thrust is what hovering takes: the vehicle is neither carried nor pressed, not
     at its thrust's limit, and hardly accelerated."""
-    tel, setpoint = c.obs.telemetry, c.state.setpoint
+    tel, setpoint = c.telemetry, c.state.setpoint
     vz = tel.velocity_mps[2]
     stuck = setpoint is not None and setpoint.z_m - tel.position_m[2] > PRESSED_M and vz < 0.05
     return (
@@ -172,13 +157,13 @@ def _magnet_holds(c: Context) -> bool:
 
 def _is_carried(c: Context) -> bool:
     """True if the thrust could not carry the vehicle."""
-    most = c.profile.planner.complete.hold_ratio * c.state.hover_thrust
-    return c.thrust_is_known and c.state.hover_thrust > 0 and c.obs.telemetry.thrust <= most
+    most = c.planner.complete.hold_ratio * c.state.hover_thrust
+    return c.thrust_is_known and c.state.hover_thrust > 0 and c.telemetry.thrust <= most
 
 
 def _slipping(c: Context) -> bool:
     """True if it falls away from the proven contact, by position or by acceleration."""
-    complete, tel = c.profile.planner.complete, c.obs.telemetry
+    complete, tel = c.planner.complete, c.telemetry
     if c.state.contact_z_m is None or not c.sinks(complete.slip_mps):
         return False
     above_m = tel.position_m[2] - c.state.contact_z_m
@@ -188,14 +173,14 @@ def _slipping(c: Context) -> bool:
 def _still(c: Context) -> bool:
     """True if it does not move, and something carries it: the accelerometer reads one g. While no
     position corrects the speed, the accelerometer alone counts."""
-    return c.reads_one_g and (abs(c.obs.telemetry.velocity_mps[2]) < 0.05 or not c.placed)
+    return c.reads_one_g and (abs(c.telemetry.velocity_mps[2]) < 0.05 or not c.placed)
 
 
 def _weight_hangs(c: Context) -> bool:
     """True if the motors stand still, and the vehicle hangs where it made contact."""
     return (
         c.state.released_s is not None
-        and (c.obs.telemetry.thrust <= STILL_MOTORS_THRUST or not c.thrust_is_known)
+        and (c.telemetry.thrust <= STILL_MOTORS_THRUST or not c.thrust_is_known)
         and _still(c)
         and not _slipping(c)
     )
@@ -206,7 +191,7 @@ def _hanging(c: Context) -> bool:
     it. `is_at_target` tells if that is the target's magnet.
 
     Without a position a magnet looks like the floor; the slow release that follows suits both."""
-    tel, complete = c.obs.telemetry, c.profile.planner.complete
+    tel, complete = c.telemetry, c.planner.complete
     if not c.placed:
         return _is_carried(c) and _still(c)
     held = _is_carried(c) and c.height_m > 0.3 and _still(c)
@@ -222,44 +207,21 @@ def _hanging(c: Context) -> bool:
     return held and (at_contact or at_target or stayed)
 
 
-def _steady(c: Context) -> bool:
-    return c.speed_mps <= c.profile.planner.recover.steady_mps
-
-
-def _at_takeoff_height(c: Context) -> bool:
-    return (
-        c.height_m >= 0.8 * c.profile.planner.takeoff_height_m
-        and c.speed_mps <= 0.25
-        and c.state.setpoint is not None
-    )
-
-
-def _estimated(c: Context) -> bool:
-    return c.fresh and c.state.target_spread_m <= c.profile.planner.estimate.spread_m
-
-
-def _tilted(c: Context) -> bool:
-    """True if a fresh attitude is beyond the tilt limit, however old the position is."""
-    return c.imu_proves and c.tilt_rad > math.radians(c.profile.safety.max_tilt_deg)
-
-
 def _down(c: Context) -> bool:
     """True if the motors are off by the telemetry, and the supervisor agrees that nothing flies, or
     has not changed its word for long."""
     stopped_s = c.state.stopped_s
-    long_off = stopped_s is not None and c.obs.t_s - stopped_s > SUPERVISOR_S
-    return c.obs.telemetry.thrust < 1 and (not c.obs.telemetry.has(FLYING) or long_off)
+    long_off = stopped_s is not None and c.t_s - stopped_s > SUPERVISOR_S
+    return c.telemetry.thrust < 1 and (not c.telemetry.has(FLYING) or long_off)
 
 
 def _on_floor(c: Context) -> bool:
     """True if it does not move on a thrust that could not carry it, low or below where the landing
     began: a drifting estimate may place the floor anywhere."""
     near_target = c.obs.target is not None and abs(c.error_z_m) <= 0.3
-    came_down_m = c.state.entry_m[2] - c.obs.telemetry.position_m[2]
+    came_down_m = c.state.entry_m[2] - c.telemetry.position_m[2]
     came_down = c.state.phase is Phase.LANDING and came_down_m > DESCENDED_M
-    low = c.height_m < c.profile.planner.landing.handover_m or (
-        came_down and c.state.contact_z_m is None
-    )
+    low = c.height_m < c.planner.landing.handover_m or (came_down and c.state.contact_z_m is None)
     return _is_carried(c) and low and not near_target and _still(c)
 
 
@@ -267,7 +229,7 @@ def _blocked(c: Context) -> bool:
     """True if it is pressed against something: the setpoint is above, the thrust at its limit or
     above what hovering takes, and nothing moves. If hovering takes nearly all thrust, that is no
     proof."""
-    setpoint, tel, safety = c.state.setpoint, c.obs.telemetry, c.profile.safety
+    setpoint, tel, safety = c.state.setpoint, c.telemetry, c.safety
     if setpoint is None or setpoint.z_m - tel.position_m[2] < PRESSED_M:
         return False
     hover = c.state.hover_thrust
@@ -282,58 +244,67 @@ def _carried(c: Context) -> bool:
     """True if accelerometer and thrust alone show that something carries or presses it: much more
     or much less thrust than hovering takes, at one g and a steady speed, by which it would rise or
     sink in the air."""
-    tel, perch, hover = c.obs.telemetry, c.profile.planner.perch, c.state.hover_thrust
-    apart = (c.profile.safety.blocked_thrust_ratio - 1.0) * hover
+    tel, perch, hover = c.telemetry, c.planner.perch, c.state.hover_thrust
+    apart = (c.safety.blocked_thrust_ratio - 1.0) * hover
     pressed = tel.thrust >= min(hover + apart, SATURATED * FULL_THRUST)
     return (
         0 < hover < LITTLE_LEFT * FULL_THRUST
         and c.thrust_is_known
         and (pressed or tel.thrust <= hover - apart)
         and c.reads_one_g
-        and c.obs.t_s - c.obs.imu.steady_s >= perch.contact_dwell_s
+        and c.t_s - c.obs.imu.steady_s >= perch.contact_dwell_s
     )
-
-
-def _knocked(c: Context) -> bool:
-    vx, vy, _ = c.obs.telemetry.velocity_mps
-    return c.proves and c.placed and math.hypot(vx, vy) > KNOCKED_MPS
 
 
 def _saturated(c: Context) -> bool:
     """True at full thrust on which the vehicle does not rise (nor is it just being caught)."""
-    full = c.obs.telemetry.thrust >= SATURATED * FULL_THRUST
+    full = c.telemetry.thrust >= SATURATED * FULL_THRUST
     return full and -0.15 < c.climb_mps < 0.05
 
 
 def _battery_is_low(c: Context) -> bool:
     """True if the firmware reports low power, or the voltage is low and was measured at all."""
-    tel = c.obs.telemetry
+    tel = c.telemetry
     known = tel.battery_v >= NO_BATTERY_READING_V
-    low = known and tel.battery_v < c.profile.safety.min_load_v
+    low = known and tel.battery_v < c.safety.min_load_v
     return tel.battery_state == LOW_POWER or low
 
 
 CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
-    Condition.AT_TAKEOFF_HEIGHT: _at_takeoff_height,
-    Condition.ESTIMATED: _estimated,
-    Condition.ALIGNED: _aligned,
+    Condition.AT_TAKEOFF_HEIGHT: lambda c: (
+        c.height_m >= 0.8 * c.planner.takeoff_height_m
+        and c.speed_mps <= 0.25
+        and c.state.setpoint is not None
+    ),
+    Condition.ESTIMATED: lambda c: (
+        c.fresh and c.state.target_spread_m <= c.planner.estimate.spread_m
+    ),
+    Condition.ALIGNED: lambda c: (
+        c.fresh
+        and c.error_xy_m <= c.planner.align.xy_m
+        and abs(c.error_yaw_rad) <= math.radians(c.planner.align.yaw_deg)
+    ),
     Condition.UNTRACKED: lambda c: not c.tracked,
-    Condition.NEAR_STANDOFF: _near_standoff,
+    Condition.NEAR_STANDOFF: lambda c: c.tracked and c.is_near_standoff,
     Condition.SETTLED: _settled,
     Condition.CONTACT: _contact,
     Condition.MAGNET_HOLDS: _magnet_holds,
     Condition.SLIPPING: _slipping,
     Condition.HANGING: _hanging,
-    Condition.STEADY: _steady,
-    Condition.TILTED: _tilted,
+    Condition.STEADY: lambda c: c.speed_mps <= c.planner.recover.steady_mps,
+    Condition.TILTED: lambda c: (  # by a fresh attitude, however old the position is
+        c.imu_proves and c.tilt_rad > math.radians(c.safety.max_tilt_deg)
+    ),
     Condition.DOWN: _down,
     Condition.ON_FLOOR: _on_floor,
     Condition.WEIGHT_HANGS: _weight_hangs,
     Condition.BLOCKED: _blocked,
     Condition.CARRIED: _carried,
-    Condition.KNOCKED: _knocked,
+    Condition.KNOCKED: lambda c: (
+        c.placed and math.hypot(*c.telemetry.velocity_mps[:2]) > KNOCKED_MPS
+    ),
     Condition.SATURATED: _saturated,
-    Condition.UNSURE: lambda c: c.variance_m2 > c.profile.safety.flight_variance_m2,
+    Condition.UNSURE: lambda c: c.variance_m2 > c.safety.flight_variance_m2,
     Condition.TARGET_BELOW: lambda c: c.fresh and c.error_z_m < -BELOW_M,
     Condition.BATTERY_LOW: _battery_is_low,
     Condition.OTHERWISE: _moves_otherwise,
@@ -354,7 +325,7 @@ BY_PLACE = frozenset({C.HANGING, C.CONTACT, C.ON_FLOOR})
 
 def conditions_since(c: Context) -> dict[Condition, float]:
     """`PlannerState.since` of this tick, without the conditions that are void in it."""
-    old, now_s, void = c.state.since, c.obs.t_s, _void(c)
+    old, now_s, void = c.state.since, c.t_s, _void(c)
     return {
         name: old.get(name, now_s)
         for name, holds in CONDITIONS.items()
@@ -380,7 +351,7 @@ def _void(c: Context) -> frozenset[Condition]:
         return void
     # In a landing it begins a release, which goes on over fresh telemetry only. Late telemetry may
     # begin it, and so may a missing position: else the vehicle would hang there until it is cut.
-    late = c.attitude_age_s > c.profile.safety.telemetry_hold_s
+    late = c.attitude_age_s > c.safety.telemetry_hold_s
     return void | {C.HANGING} if late else void - {C.HANGING}
 
 
@@ -390,13 +361,8 @@ def _void(c: Context) -> frozenset[Condition]:
 def has_slipped(c: Context) -> bool:
     """True if it has slipped off its contact: debounced, but in free fall at once, since each 10 ms
     costs what full thrust takes 80 ms to give back."""
-    tel, complete = c.obs.telemetry, c.profile.planner.complete
+    tel, complete = c.telemetry, c.planner.complete
     falls = c.state.released_s is not None and tel.acc_z_g < complete.slip_acc_g
     if falls and c.imu_proves and c.climb_mps < FALLING_MPS:
         return True
     return c.held(C.SLIPPING) >= complete.slip_dwell_s
-
-
-def latency_changed(c: Context) -> bool:
-    """True if the pictures show the vehicle's motion later or earlier than assumed."""
-    return c.obs.mismatch is not None and c.obs.mismatch.later_s != 0.0

@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from perchctl.geometry import Array
-from perchctl.mission.state import Condition, Observation, PlannerState
-from perchctl.profile import Profile
+from perchctl.mission.state import Condition, Mismatch, Observation, PlannerState
+from perchctl.profile import PlannerConfig, Profile, SafetyConfig
+from perchctl.values import replace
+from perchctl.vehicle import Telemetry
 
 FAR_BELOW_M = 0.5
 PUT_RIGHT_S = 0.5  # when external positions come again, the estimate is drawn back for so long
@@ -29,39 +32,68 @@ class Context:
         """The same tick with another state."""
         return Context(state, self.obs, self.profile)
 
+    def evolve(self, **changes: Any) -> Context:
+        """The same tick with changes of its state."""
+        return self.with_state(replace(self.state, **changes))
+
+    @property
+    def t_s(self) -> float:
+        """Time of the tick on the loop's clock."""
+        return self.obs.t_s
+
+    @property
+    def telemetry(self) -> Telemetry:
+        """The newest sample."""
+        return self.obs.telemetry
+
+    @property
+    def planner(self) -> PlannerConfig:
+        """The profile's section of that name."""
+        return self.profile.planner
+
+    @property
+    def safety(self) -> SafetyConfig:
+        """The profile's section of that name."""
+        return self.profile.safety
+
+    @property
+    def mismatch(self) -> Mismatch:
+        """What would bring the target to rest; zero while it rests."""
+        return self.obs.mismatch or Mismatch()
+
     @property
     def in_phase_s(self) -> float:
         """Seconds since the phase was entered."""
-        return self.obs.t_s - self.state.entered_s
+        return self.t_s - self.state.entered_s
 
     def held(self, condition: Condition) -> float:
         """Seconds for which the condition has been true; -1 when it is not."""
         since = self.state.since.get(condition)
-        return -1.0 if since is None else self.obs.t_s - since
+        return -1.0 if since is None else self.t_s - since
 
     # --- the vehicle -----------------------------------------------------
 
     @cached_property
     def speed_mps(self) -> float:
         """Length of the estimated velocity."""
-        return math.sqrt(sum(v * v for v in self.obs.telemetry.velocity_mps))
+        return math.sqrt(sum(v * v for v in self.telemetry.velocity_mps))
 
     @property
     def height_m(self) -> float:
         """Height above the ground that the flight started from, in the estimate's world."""
-        return self.obs.telemetry.position_m[2] - self.state.ground_z_m
+        return self.telemetry.position_m[2] - self.state.ground_z_m
 
     @property
     def telemetry_age_s(self) -> float:
         """Age of the telemetry's oldest part: position and velocity come in a packet of their own,
         and a frozen reading is as old as its first one."""
-        tel, imu = self.obs.telemetry, self.obs.imu
-        return self.obs.t_s - tel.t_s + max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
+        tel, imu = self.telemetry, self.obs.imu
+        return self.t_s - tel.t_s + max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
 
     @property
     def attitude_age_s(self) -> float:
         """Age of attitude, acceleration, thrust and supervisor bits, which come together."""
-        return self.obs.t_s - self.obs.telemetry.t_s
+        return self.t_s - self.telemetry.t_s
 
     @property
     def position_age_s(self) -> float:
@@ -69,7 +101,7 @@ class Context:
         newest correction of its estimate."""
         age_s = self.obs.position_age_s
         if self.profile.positioning.by == "deck":
-            age_s = max(age_s, self.obs.imu.corrections.age_s(self.obs.t_s))
+            age_s = max(age_s, self.obs.imu.corrections.age_s(self.t_s))
         return age_s
 
     @property
@@ -80,19 +112,19 @@ class Context:
     @property
     def proves(self) -> bool:
         """True if all of the telemetry is new enough to prove anything."""
-        return self.telemetry_age_s <= self.profile.safety.proof_age_s
+        return self.telemetry_age_s <= self.safety.proof_age_s
 
     @property
     def imu_proves(self) -> bool:
         """True if attitude, acceleration, thrust and supervisor bits are new enough to prove
         anything, whatever the age of the position."""
-        return self.attitude_age_s <= self.profile.safety.proof_age_s
+        return self.attitude_age_s <= self.safety.proof_age_s
 
     @property
     def thrust_is_known(self) -> bool:
         """True if the thrust that is read follows what is ordered."""
         unanswered_s = self.state.unanswered_s
-        return unanswered_s is None or self.obs.t_s - unanswered_s <= ANSWER_S
+        return unanswered_s is None or self.t_s - unanswered_s <= ANSWER_S
 
     @property
     def located(self) -> bool:
@@ -103,7 +135,7 @@ class Context:
         if self.state.astray or self.position_is_stale:
             return False
         stale_s = self.state.stale_s
-        return stale_s is None or self.obs.t_s - stale_s > PUT_RIGHT_S
+        return stale_s is None or self.t_s - stale_s > PUT_RIGHT_S
 
     @property
     def placed(self) -> bool:
@@ -117,7 +149,7 @@ class Context:
         reckoning = self.state.reckoning
         if not self.by_sight or reckoning.imu is None or self.position_age_s <= CORRECTED_S:
             return False
-        (x, y, _), (ex, ey, _) = reckoning.velocity_mps, self.obs.telemetry.velocity_mps
+        (x, y, _), (ex, ey, _) = reckoning.velocity_mps, self.telemetry.velocity_mps
         return math.hypot(x - ex, y - ey) > BLOWN_MPS
 
     @property
@@ -128,7 +160,7 @@ class Context:
         reckoning = self.state.reckoning
         if blind and reckoning.imu is not None:
             return reckoning.velocity_mps[2]
-        return self.obs.telemetry.velocity_mps[2]
+        return self.telemetry.velocity_mps[2]
 
     @property
     def by_sight(self) -> bool:
@@ -138,27 +170,27 @@ class Context:
     def sinks(self, mps: float) -> bool:
         """True if the vehicle sinks faster than `mps`. A speed that no position corrects counts
         only while the accelerometer reads less than the weight, too."""
-        tel = self.obs.telemetry
+        tel = self.telemetry
         if self.climb_mps >= -mps:
             return False
-        return self.placed or tel.acc_z_g < 1.0 - self.profile.planner.perch.contact_acc_g
+        return self.placed or tel.acc_z_g < 1.0 - self.planner.perch.contact_acc_g
 
     @property
     def variance_m2(self) -> float:
         """Variance of the position; 0 if the firmware reports none, infinite if it is no number."""
-        variance = self.obs.telemetry.position_variance_m2 or 0.0
+        variance = self.telemetry.position_variance_m2 or 0.0
         return math.inf if math.isnan(variance) else variance
 
     @property
     def reads_one_g(self) -> bool:
         """True if the accelerometer reads one g, as of what something carries."""
-        acc_g = self.profile.planner.perch.contact_acc_g
-        return abs(self.obs.telemetry.acc_z_g - 1.0) <= acc_g
+        acc_g = self.planner.perch.contact_acc_g
+        return abs(self.telemetry.acc_z_g - 1.0) <= acc_g
 
     @property
     def tilt_rad(self) -> float:
         """Angle between the vehicle's upward axis and the vertical."""
-        tel = self.obs.telemetry
+        tel = self.telemetry
         return math.acos(max(-1.0, min(1.0, math.cos(tel.roll_rad) * math.cos(tel.pitch_rad))))
 
     # --- the target ------------------------------------------------------
@@ -195,7 +227,7 @@ class Context:
     def target_age_s(self) -> float:
         """Seconds since the exposure of the last frame in which the target was measured."""
         target = self.obs.target
-        return math.inf if target is None else self.obs.t_s - target.measured_s
+        return math.inf if target is None else self.t_s - target.measured_s
 
     @property
     def tracked(self) -> bool:
@@ -213,13 +245,13 @@ class Context:
         target = self.obs.target
         if target is None:
             return False
-        return self.obs.t_s - target.small_measured_s <= self._fresh_limit_s
+        return self.t_s - target.small_measured_s <= self._fresh_limit_s
 
     @property
     def _fresh_limit_s(self) -> float:
         # On its arrival a frame is as old as the camera's latency.
         latency_s = self.profile.camera.start_latency_s + self.obs.delay_s
-        return self.profile.planner.ascend.fresh_s + latency_s
+        return self.planner.ascend.fresh_s + latency_s
 
     @property
     def contact_goal_z_m(self) -> float:
@@ -235,7 +267,13 @@ class Context:
         return self.target_m is not None and self.error_z_m > FAR_BELOW_M
 
     @property
+    def is_near_standoff(self) -> bool:
+        """True once the gear is at the height at which an ascent settles."""
+        ascend = self.planner.ascend
+        return self.error_z_m <= ascend.standoff_m + ascend.settle_z_m
+
+    @property
     def cone_m(self) -> float:
         """How far aside of the target an ascent may be at the present height."""
-        ascend = self.profile.planner.ascend
+        ascend = self.planner.ascend
         return ascend.cone_base_m + ascend.cone_slope * max(0.0, self.error_z_m)

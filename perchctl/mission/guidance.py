@@ -54,8 +54,8 @@ CAUGHT_MPS = -0.1  # by then the thrust is above the weight, and rises on
 
 def hold_here(c: Context) -> PositionSetpoint:
     """The present position and heading of the estimate."""
-    x, y, z = c.obs.telemetry.position_m
-    return PositionSetpoint(x, y, z, c.obs.telemetry.yaw_rad)
+    x, y, z = c.telemetry.position_m
+    return PositionSetpoint(x, y, z, c.telemetry.yaw_rad)
 
 
 def under_target_xy(c: Context, yaw_rad: float) -> tuple[float, float]:
@@ -94,9 +94,9 @@ def integrated(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[f
     It takes away the offset that a steady draught leaves to the onboard position loop, and rests
     while the error is large.
     """
-    planner = c.profile.planner
-    ex = goal_xy[0] - c.obs.telemetry.position_m[0]
-    ey = goal_xy[1] - c.obs.telemetry.position_m[1]
+    planner = c.planner
+    ex = goal_xy[0] - c.telemetry.position_m[0]
+    ey = goal_xy[1] - c.telemetry.position_m[1]
     tx, ty = c.state.integral_m
     if math.hypot(ex, ey) < 0.06:
         tx += planner.integral_per_s * ex * dt_s
@@ -114,7 +114,7 @@ def corrected(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> 
     height a multiple of the error is added: the onboard integrator, wound up in a climb, carries
     the vehicle several centimetres past a setpoint that stops.
     """
-    tel = c.obs.telemetry
+    tel = c.telemetry
     rise = HEIGHT_GAIN * (reference.z_m - tel.position_m[2]) - HEIGHT_RATE_S * tel.velocity_mps[2]
     lifted = max(-HEIGHT_LIMIT_M, min(HEIGHT_LIMIT_M, rise)) if lift else 0.0
     dx, dy = _stiffened(c, reference)
@@ -133,7 +133,7 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
     gain = max(0.0, min(1.0, near))
     if gain == 0.0:
         return 0.0, 0.0
-    (x, y, _), (vx, vy, _) = c.obs.telemetry.position_m, c.obs.telemetry.velocity_mps
+    (x, y, _), (vx, vy, _) = c.telemetry.position_m, c.telemetry.velocity_mps
     dx = gain * (POSITION_GAIN * (reference.x_m - x) - VELOCITY_GAIN_S * vx)
     dy = gain * (POSITION_GAIN * (reference.y_m - y) - VELOCITY_GAIN_S * vy)
     size = math.hypot(dx, dy)
@@ -147,14 +147,14 @@ def sinking(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     if not (c.by_sight and c.position_is_stale) or c.state.ground_m is None:
         return setpoint
     lowest_m = min(setpoint.z_m, c.state.ground_m[2] + LOWEST_M)
-    z_m = setpoint.z_m - SINK_MPS * max(0.0, c.obs.t_s - c.state.t_s)
+    z_m = setpoint.z_m - SINK_MPS * max(0.0, c.t_s - c.state.t_s)
     return replace(setpoint, z_m=max(lowest_m, z_m))
 
 
 def limited(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     """The setpoint inside the fence, under the height limit and above the ground (fault 36), lower
     only in a take-off."""
-    ground, safety = c.state.ground_m, c.profile.safety
+    ground, safety = c.state.ground_m, c.safety
     if ground is None:
         return setpoint
     dx, dy = setpoint.x_m - ground[0], setpoint.y_m - ground[1]
@@ -177,13 +177,13 @@ def presses(c: Context) -> bool:
     """True if it is at its thrust's limit, or above what hovering takes, and does not move."""
     return (
         _is_strong(c)
-        and abs(c.obs.telemetry.velocity_mps[2]) <= UNPRESSED_MPS
+        and abs(c.telemetry.velocity_mps[2]) <= UNPRESSED_MPS
         and c.height_m >= LIFTED_M
     )
 
 
 def _is_strong(c: Context) -> bool:
-    thrust, hover = c.obs.telemetry.thrust, c.state.hover_thrust
+    thrust, hover = c.telemetry.thrust, c.state.hover_thrust
     return thrust >= PRESSING_PART * FULL_THRUST or (hover > 0 and thrust >= PRESSING_RATIO * hover)
 
 
@@ -194,7 +194,7 @@ def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     After a second at full thrust they need many seconds of a setpoint just below, and a change to
     the vehicle's own landing does not reset them.
     """
-    state, tel = c.state, c.obs.telemetry
+    state, tel = c.state, c.telemetry
     x, y, z = state.entry_m
     if not state.pressed:
         return state, None
@@ -211,7 +211,7 @@ def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
 
 def lower_thrust(c: Context) -> Acted:
     """The release's first stage: the setpoint goes down in steps, or the raw thrust of a press."""
-    complete, perch, state = c.profile.planner.complete, c.profile.planner.perch, c.state
+    complete, perch, state = c.planner.complete, c.planner.perch, c.state
     step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
     part = step / complete.steps
     if perch.mode == "raw":
@@ -223,7 +223,7 @@ def lower_thrust(c: Context) -> Acted:
     setpoint = state.setpoint or hold_here(c)
     assert state.contact_z_m is not None
     # Without a position the estimate slides, and the vehicle does not: the setpoint goes with it.
-    slid_m = 0.0 if c.placed else c.obs.telemetry.position_m[2] - state.contact_z_m
+    slid_m = 0.0 if c.placed else c.telemetry.position_m[2] - state.contact_z_m
     top = state.entry_m[2] + perch.press_m + slid_m
     low = state.contact_z_m - complete.release_drop_m + slid_m
     setpoint = replace(setpoint, z_m=top + part * (low - top))
@@ -235,20 +235,20 @@ def release_by_thrust(c: Context) -> Acted:
     """The release's second stage: raw thrust down to still motors, and the stop when the whole
     weight has hung long enough. Without fresh telemetry it begins anew; in a landing late telemetry
     is enough, or what hangs would end by its own landing."""
-    late_s = c.profile.safety.telemetry_hold_s if c.state.phase is Phase.LANDING else 0.0
+    late_s = c.safety.telemetry_hold_s if c.state.phase is Phase.LANDING else 0.0
     if not c.imu_proves and c.attitude_age_s > late_s:
         return hold_by_position(c)
-    complete, state = c.profile.planner.complete, c.state
+    complete, state = c.planner.complete, c.state
     if state.released_s is None:
-        z_m = c.obs.telemetry.position_m[2]
-        state = replace(state, released_s=c.obs.t_s, contact_z_m=state.contact_z_m or z_m)
+        z_m = c.telemetry.position_m[2]
+        state = replace(state, released_s=c.t_s, contact_z_m=state.contact_z_m or z_m)
     assert state.released_s is not None
     hung_s = c.held(Condition.WEIGHT_HANGS)
-    unread_s = UNREAD_S if state.unread_s >= c.obs.t_s - hung_s else 0.0
+    unread_s = UNREAD_S if state.unread_s >= c.t_s - hung_s else 0.0
     if hung_s >= complete.hang_s + unread_s:
         return stop_motors(c)
-    part = min(1.0, (c.obs.t_s - state.released_s) / complete.ramp_s)
-    start = c.profile.planner.perch.thrust if state.setpoint is None else THRUST_MIN
+    part = min(1.0, (c.t_s - state.released_s) / complete.ramp_s)
+    start = c.planner.perch.thrust if state.setpoint is None else THRUST_MIN
     start = min(start, THRUST_MIN)
     return state, RawThrust(int(start + part * (STILL_THRUST - start)))
 
@@ -256,7 +256,7 @@ def release_by_thrust(c: Context) -> Acted:
 def hold_by_position(c: Context) -> Acted:
     """Hold by position while telemetry is old: what hangs stays, what falls unseen is caught.
     Still motors would be a stop without a proof."""
-    state, tel = c.state, c.obs.telemetry
+    state, tel = c.state, c.telemetry
     x, y, z_m = tel.position_m
     if state.contact_z_m is not None and c.placed:  # else the estimate has slid away from it
         z_m = state.contact_z_m
@@ -268,18 +268,18 @@ def is_still(c: Context) -> bool:
     """True if the motors stand still by raw thrust: a stop then only ends the stream without a
     lock."""
     released_s = c.state.released_s
-    return released_s is not None and c.obs.t_s - released_s > c.profile.planner.complete.ramp_s
+    return released_s is not None and c.t_s - released_s > c.planner.complete.ramp_s
 
 
 def stop_motors(c: Context) -> Acted:
     """Stop and notify, `STOPS` times whatever the telemetry shows: one lost notify locks a vehicle
     that hangs. Again while there is thrust."""
-    state, now_s = c.state, c.obs.t_s
+    state, now_s = c.state, c.t_s
     if state.stopped_s is None:
         return replace(state, stopped_s=now_s, ordered_s=now_s, orders=1), StopMotors()
     waited_s = now_s - (state.ordered_s if state.ordered_s is not None else state.stopped_s)
     still_to_send = state.orders < STOPS and waited_s >= STOP_PERIOD_S
-    if still_to_send or (c.obs.telemetry.thrust >= 1 and waited_s >= STOP_AGAIN_S):
+    if still_to_send or (c.telemetry.thrust >= 1 and waited_s >= STOP_AGAIN_S):
         return replace(state, ordered_s=now_s, orders=state.orders + 1), StopMotors()
     return state, Idle()
 
@@ -298,7 +298,7 @@ def is_carried(hover_thrust: float, thrust: float) -> bool:
 def catch(c: Context) -> Acted | None:
     """After a slip a setpoint far above, until the vehicle hardly sinks; None when it is caught, or
     its telemetry is old."""
-    state, tel = c.state, c.obs.telemetry
+    state, tel = c.state, c.telemetry
     if state.caught or not c.imu_proves:
         return None
     begun = c.in_phase_s < CATCH_LEAST_S
@@ -314,7 +314,7 @@ def catch(c: Context) -> Acted | None:
 def _braked_place_m(c: Context) -> tuple[float, float]:
     """The setpoint that takes out a sideways speed which the estimate misses: the position mode
     asks for `POSITION_GAIN_PER_S` times the way to it."""
-    tel, reckoned_mps = c.obs.telemetry, c.state.reckoning.velocity_mps
+    tel, reckoned_mps = c.telemetry, c.state.reckoning.velocity_mps
     missed_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
     x_mps, y_mps = (max(-MOST_BRAKED_MPS, min(MOST_BRAKED_MPS, mps)) for mps in missed_mps)
     x_m, y_m, _ = tel.position_m
@@ -324,6 +324,6 @@ def _braked_place_m(c: Context) -> tuple[float, float]:
 def left_contact(c: Context, below_m: float) -> Context:
     """The context without its contact once the vehicle is so far below it."""
     contact_z_m = c.state.contact_z_m
-    if contact_z_m is None or c.obs.telemetry.position_m[2] >= contact_z_m - below_m:
+    if contact_z_m is None or c.telemetry.position_m[2] >= contact_z_m - below_m:
         return c
-    return c.with_state(replace(c.state, contact_z_m=None, contact_aside_m=None))
+    return c.evolve(contact_z_m=None, contact=None)

@@ -152,82 +152,104 @@ class ImuMotion:
         changed."""
         return max(0.0, self.place_frozen_s - self.frozen_s)
 
+    def with_sample(self, last: Telemetry | None, new: Telemetry) -> ImuMotion:
+        """The motion with one more sample; `last` is the one before, None at the first."""
+        dt_s = math.inf if last is None else new.t_s - last.t_s
+        started_anew = last is not None and new.start != last.start
+        motion = replace(
+            self,
+            t_s=new.t_s,
+            started_s=new.t_s if started_anew else self.started_s,
+            frozen_s=_frozen_s(self.frozen_s, last, new, _ACCELERATION),
+            attitude_frozen_s=_frozen_s(self.attitude_frozen_s, last, new, _ATTITUDE),
+            place_frozen_s=_frozen_s(self.place_frozen_s, last, new, _PLACE),
+            corrections=self.corrections.updated(new),
+            off_s=min(self.off_s, new.t_s) if new.thrust < 1 else math.inf,
+        )
+        if last is None or not 0.0 < dt_s <= GAP_S or motion.frozen_s > FROZEN_S:
+            return _after_silence(motion, last, new)
+        offset_g = motion.offset_g
+        if new.thrust < 1 and not new.has(FLYING):
+            offset_g = _offset_at_rest(offset_g, new, min(1.0, dt_s / REST_MEMORY_S))
+        misled_rad, turning_radps = _misled(motion, last, new, dt_s)
+        before = ImuMotion.acceleration_mps2(last, offset_g, motion.misled_rad)
+        after = ImuMotion.acceleration_mps2(new, offset_g, misled_rad)
+        dv = tuple(0.5 * (a + b) * dt_s for a, b in zip(before, after, strict=True))
+        x, y, z = (v + d for v, d in zip(motion.velocity_mps, dv, strict=True))
+        up_mps2 = dv[2] / dt_s
+        offset = motion.offset_mps2 + (
+            max(IMPACT_G * GRAVITY_MPS2, min(-IMPACT_G * GRAVITY_MPS2, up_mps2))
+            - motion.offset_mps2
+        ) * min(1.0, dt_s / OFFSET_MEMORY_S)
+        felt_mps2 = max(up_mps2, IMPACT_G * GRAVITY_MPS2) - offset
+        sink = motion.sink_mps + felt_mps2 * dt_s
+        sink = min(0.0, sink - sink * dt_s / SINK_MEMORY_S)
+        blow = max(0.0, motion.blow_mps * math.exp(-dt_s / BLOW_S) + up_mps2 * dt_s)
+        light = min(motion.light_since_s, new.t_s) if new.acc_z_g < FALL_G else math.inf
+        fell = sink < SINK_MPS or new.t_s - light >= FALL_S
+        steady_s, steady_mps = motion.steady_s, motion.steady_mps
+        if abs(z - steady_mps) > STEADY_MPS:
+            steady_s, steady_mps = new.t_s, z
+        steady_aside_s, (mean_x, mean_y) = motion.steady_aside_s, motion.steady_aside_mps
+        keeps = math.exp(-dt_s / ASIDE_MEMORY_S)
+        steady_aside_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
+        if math.dist((x, y), steady_aside_mps) > STEADY_ASIDE_MPS:
+            steady_aside_s = new.t_s
+        now = Blow(new.t_s, new.velocity_mps[2], z, new.acc_z_g)
+        # The mean sideways force with one more sample.
+        keeps = math.exp(-dt_s / PUSH_MEMORY_S)
+        x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
+        mean_x_g, mean_y_g = motion.aside_g
+        aside_g = (
+            x_g + keeps * (mean_x_g - new.acc_x_g + offset_g[0]),
+            y_g + keeps * (mean_y_g - new.acc_y_g + offset_g[1]),
+        )
+        last_moment = (*(m for m in motion.last_moment if new.t_s - m.t_s <= BEFORE_BLOW_S), now)
+        return replace(
+            motion,
+            velocity_mps=(x, y, z),
+            offset_g=offset_g,
+            fell_s=new.t_s if fell else motion.fell_s,
+            sunk_m=0.0,
+            steady_s=steady_s,
+            steady_mps=steady_mps,
+            steady_aside_s=steady_aside_s,
+            steady_aside_mps=steady_aside_mps,
+            light_since_s=light,
+            sink_mps=sink,
+            offset_mps2=offset,
+            blow_mps=blow,
+            blow_s=new.t_s if blow > BLOW_MPS else motion.blow_s,
+            hover_thrust=_hover_thrust(motion.hover_thrust, new, dt_s),
+            aside_g=aside_g,
+            pushed_s=new.t_s if math.hypot(*aside_g) > PUSHED_G else motion.pushed_s,
+            misled_rad=misled_rad,
+            turning_radps=turning_radps,
+            last_moment=last_moment,
+            blow=_struck(motion, new, last_moment, blow),
+        )
 
-def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
-    """The motion with one more sample; `last` is the one before, None at the first."""
-    dt_s = math.inf if last is None else new.t_s - last.t_s
-    started_anew = last is not None and new.start != last.start
-    motion = replace(
-        motion,
-        t_s=new.t_s,
-        started_s=new.t_s if started_anew else motion.started_s,
-        frozen_s=_frozen_s(motion.frozen_s, last, new, _ACCELERATION),
-        attitude_frozen_s=_frozen_s(motion.attitude_frozen_s, last, new, _ATTITUDE),
-        place_frozen_s=_frozen_s(motion.place_frozen_s, last, new, _PLACE),
-        corrections=motion.corrections.updated(new),
-        off_s=min(motion.off_s, new.t_s) if new.thrust < 1 else math.inf,
-    )
-    if last is None or not 0.0 < dt_s <= GAP_S or motion.frozen_s > FROZEN_S:
-        return _after_silence(motion, last, new)
-    offset_g = motion.offset_g
-    if new.thrust < 1 and not new.has(FLYING):
-        offset_g = _offset_at_rest(offset_g, new, min(1.0, dt_s / REST_MEMORY_S))
-    misled_rad, turning_radps = _misled(motion, last, new, dt_s)
-    before = acceleration_mps2(last, offset_g, motion.misled_rad)
-    after = acceleration_mps2(new, offset_g, misled_rad)
-    dv = tuple(0.5 * (a + b) * dt_s for a, b in zip(before, after, strict=True))
-    x, y, z = (v + d for v, d in zip(motion.velocity_mps, dv, strict=True))
-    up_mps2 = dv[2] / dt_s
-    offset = motion.offset_mps2 + (
-        max(IMPACT_G * GRAVITY_MPS2, min(-IMPACT_G * GRAVITY_MPS2, up_mps2)) - motion.offset_mps2
-    ) * min(1.0, dt_s / OFFSET_MEMORY_S)
-    felt_mps2 = max(up_mps2, IMPACT_G * GRAVITY_MPS2) - offset
-    sink = motion.sink_mps + felt_mps2 * dt_s
-    sink = min(0.0, sink - sink * dt_s / SINK_MEMORY_S)
-    blow = max(0.0, motion.blow_mps * math.exp(-dt_s / BLOW_S) + up_mps2 * dt_s)
-    light = min(motion.light_since_s, new.t_s) if new.acc_z_g < FALL_G else math.inf
-    fell = sink < SINK_MPS or new.t_s - light >= FALL_S
-    steady_s, steady_mps = motion.steady_s, motion.steady_mps
-    if abs(z - steady_mps) > STEADY_MPS:
-        steady_s, steady_mps = new.t_s, z
-    steady_aside_s, (mean_x, mean_y) = motion.steady_aside_s, motion.steady_aside_mps
-    keeps = math.exp(-dt_s / ASIDE_MEMORY_S)
-    steady_aside_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
-    if math.dist((x, y), steady_aside_mps) > STEADY_ASIDE_MPS:
-        steady_aside_s = new.t_s
-    now = Blow(new.t_s, new.velocity_mps[2], z, new.acc_z_g)
-    # The mean sideways force with one more sample.
-    keeps = math.exp(-dt_s / PUSH_MEMORY_S)
-    x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
-    mean_x_g, mean_y_g = motion.aside_g
-    aside_g = (
-        x_g + keeps * (mean_x_g - new.acc_x_g + offset_g[0]),
-        y_g + keeps * (mean_y_g - new.acc_y_g + offset_g[1]),
-    )
-    last_moment = (*(m for m in motion.last_moment if new.t_s - m.t_s <= BEFORE_BLOW_S), now)
-    return replace(
-        motion,
-        velocity_mps=(x, y, z),
-        offset_g=offset_g,
-        fell_s=new.t_s if fell else motion.fell_s,
-        sunk_m=0.0,
-        steady_s=steady_s,
-        steady_mps=steady_mps,
-        steady_aside_s=steady_aside_s,
-        steady_aside_mps=steady_aside_mps,
-        light_since_s=light,
-        sink_mps=sink,
-        offset_mps2=offset,
-        blow_mps=blow,
-        blow_s=new.t_s if blow > BLOW_MPS else motion.blow_s,
-        hover_thrust=_hover_thrust(motion.hover_thrust, new, dt_s),
-        aside_g=aside_g,
-        pushed_s=new.t_s if math.hypot(*aside_g) > PUSHED_G else motion.pushed_s,
-        misled_rad=misled_rad,
-        turning_radps=turning_radps,
-        last_moment=last_moment,
-        blow=_struck(motion, new, last_moment, blow),
-    )
+    @staticmethod
+    def acceleration_mps2(
+        sample: Telemetry, offset_g: Vector, misled_rad: tuple[float, float] = (0.0, 0.0)
+    ) -> Vector:
+        """Acceleration in world axes by the specific force and the attitude of one sample, without
+        the accelerometer's offset and what corrections have turned roll and pitch by wrongly."""
+        roll_rad, pitch_rad = sample.roll_rad - misled_rad[0], sample.pitch_rad - misled_rad[1]
+        cr, sr = math.cos(roll_rad), math.sin(roll_rad)
+        cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
+        cy, sy = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
+        fx, fy = sample.acc_x_g - offset_g[0], sample.acc_y_g - offset_g[1]
+        fz = sample.acc_z_g - offset_g[2]
+        level_x = cp * fx + sp * (sr * fy + cr * fz)
+        level_y = cr * fy - sr * fz
+        up = -sp * fx + cp * (sr * fy + cr * fz)
+        g = GRAVITY_MPS2
+        return (
+            g * (cy * level_x - sy * level_y),
+            g * (sy * level_x + cy * level_y),
+            g * (up - 1.0),
+        )
 
 
 def _after_silence(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
@@ -328,24 +350,6 @@ def _offset_at_rest(old: Vector, sample: Telemetry, share: float) -> Vector:
     x, y, z = sample.acc_x_g + sp, sample.acc_y_g - cp * sr, sample.acc_z_g - cp * cr
     ox, oy, oz = old
     return (ox + share * (x - ox), oy + share * (y - oy), oz + share * (z - oz))
-
-
-def acceleration_mps2(
-    sample: Telemetry, offset_g: Vector, misled_rad: tuple[float, float] = (0.0, 0.0)
-) -> Vector:
-    """Acceleration in world axes by the specific force and the attitude of one sample, without the
-    accelerometer's offset and the part of roll and pitch that corrections have turned wrongly."""
-    roll_rad, pitch_rad = sample.roll_rad - misled_rad[0], sample.pitch_rad - misled_rad[1]
-    cr, sr = math.cos(roll_rad), math.sin(roll_rad)
-    cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
-    cy, sy = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
-    fx, fy = sample.acc_x_g - offset_g[0], sample.acc_y_g - offset_g[1]
-    fz = sample.acc_z_g - offset_g[2]
-    level_x = cp * fx + sp * (sr * fy + cr * fz)
-    level_y = cr * fy - sr * fz
-    up = -sp * fx + cp * (sr * fy + cr * fz)
-    g = GRAVITY_MPS2
-    return (g * (cy * level_x - sy * level_y), g * (sy * level_x + cy * level_y), g * (up - 1.0))
 
 
 @dataclass(frozen=True)

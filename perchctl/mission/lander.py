@@ -2,12 +2,9 @@
 
 Pure: `step_landing(state, observation, profile) -> (state, command)`.
 
-`MANOEUVRES` (the table of docs/mission.md) decides by three things:
-
-- the `Evidence` that is fresh: an external position, a position by the target, height alone,
-  accelerometer and attitude alone, or nothing;
-- the `Reach`: whether the vehicle may be where the magnet holds it;
-- the `Stage`: coming down, landing by itself, the weight put on the magnet, or stopped.
+What lands by itself, has its weight on the magnet or is stopped goes on with that, whatever is
+known. What still comes down follows `DESCENTS` (the table of docs/mission.md), by the `Evidence`
+that is fresh and by whether the vehicle may be where the magnet holds it.
 
 Two proofs go before the table: what falls off the magnet is caught, and what stands on the floor is
 stopped. The vehicle's own landing follows a trajectory by its clock and then stops the motors,
@@ -30,7 +27,6 @@ from perchctl.mission.conditions import (
     contact_within_m,
     has_slipped,
     lasting_conditions,
-    latency_changed,
 )
 from perchctl.mission.context import FAR_BELOW_M, HANGING_S, PUT_RIGHT_S, Context
 from perchctl.mission.guidance import (
@@ -51,7 +47,7 @@ from perchctl.mission.guidance import (
 )
 from perchctl.mission.imu import REACH_M, UNSEEN_S, Vector, add_sight, add_step, advance_reckoning
 from perchctl.mission.state import Condition, Observation, Phase, PlannerState, Severity
-from perchctl.profile import LandingConfig, Profile
+from perchctl.profile import PlannerConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import (
     FLYING,
@@ -76,56 +72,35 @@ class Evidence(Enum):
     NOTHING = "nothing"
 
 
-class Reach(Enum):
-    """Whether the magnet may hold the vehicle."""
-
-    FREE = "free"
-    MAGNET = "within the magnet's reach"
-
-
-class Stage(Enum):
-    """How far the way down has come."""
-
-    DOWN = "coming down"
-    ORDERED = "landing by itself"
-    RELEASED = "weight on the magnet"
-    STOPPED = "motors stopped"
-
-
 class Manoeuvre(Enum):
-    """What the lander commands."""
+    """How the lander brings a vehicle down."""
 
     SETPOINTS = "position setpoints, then its own landing"
     SETPOINTS_LEVEL = "position setpoints, then level"
     PEEL = "a setpoint below, then the weight on the magnet"
     LEVEL = "level, by thrust"
     OWN_LANDING = "its own landing"
-    WEIGHT_ON_MAGNET = "the weight on the magnet"
-    STOP = "stop the motors"
 
 
-_E, _R, _S, _M = Evidence, Reach, Stage, Manoeuvre
-MANOEUVRES: dict[tuple[Evidence, Reach, Stage], Manoeuvre] = {
-    (_E.POSITION, _R.FREE, _S.DOWN): _M.SETPOINTS,
-    (_E.SIGHT, _R.FREE, _S.DOWN): _M.SETPOINTS_LEVEL,
-    (_E.ONBOARD, _R.FREE, _S.DOWN): _M.OWN_LANDING,
-    **{(e, _R.MAGNET, _S.DOWN): _M.PEEL for e in (_E.POSITION, _E.SIGHT, _E.ONBOARD)},
-    **{(e, r, _S.DOWN): _M.LEVEL for e in (_E.HEIGHT, _E.IMU, _E.NOTHING) for r in _R},
-    # A landing of its own goes on, whatever is known: to change it costs height.
-    **{(e, r, _S.ORDERED): _M.OWN_LANDING for e in _E for r in _R},
-    **{(e, r, _S.RELEASED): _M.WEIGHT_ON_MAGNET for e in _E for r in _R},
-    **{(e, r, _S.STOPPED): _M.STOP for e in _E for r in _R},
+DESCENTS: dict[Evidence, tuple[Manoeuvre, Manoeuvre]] = {
+    Evidence.POSITION: (Manoeuvre.SETPOINTS, Manoeuvre.PEEL),
+    Evidence.SIGHT: (Manoeuvre.SETPOINTS_LEVEL, Manoeuvre.PEEL),
+    Evidence.ONBOARD: (Manoeuvre.OWN_LANDING, Manoeuvre.PEEL),
+    Evidence.HEIGHT: (Manoeuvre.LEVEL, Manoeuvre.LEVEL),
+    Evidence.IMU: (Manoeuvre.LEVEL, Manoeuvre.LEVEL),
+    Evidence.NOTHING: (Manoeuvre.LEVEL, Manoeuvre.LEVEL),
 }
-"""Evidence x reach x stage -> manoeuvre."""
+"""Evidence -> manoeuvre of what comes down free, and within the magnet's reach."""
 
 
 class Finding(Enum):
-    """Where a vehicle with its motors off is."""
+    """Where a vehicle with its motors off is, as a sentence without its end."""
 
-    HANGS = "hangs"
-    HELD = "is held away from the target"
-    STANDS = "stands"
-    UNKNOWN = "not known"
+    HANGS = "the vehicle hangs on the magnet, its motors are off"
+    HELD = "something holds the vehicle away from the target; the motors are off"
+    STANDS = "the vehicle stands on the floor, its motors are off"
+    UNKNOWN = "the motors are off; it is not known whether the vehicle hangs or stands"
+    UNSEEN = "how it ended could not be confirmed: keep away from the vehicle"  # they may turn
 
 
 LOOKED_S = 2.0  # a target that is seen far above has so long to show where the vehicle is
@@ -138,7 +113,6 @@ while nothing shows."""
 PLANNED_MPS, SETTLING_S = 0.35, 1.8  # of the own landing's quintic: largest speed; time to begin
 PEAK_OF_MEAN = 1.875  # of a quintic from rest to rest: its largest speed over its mean
 MOST_DRIFT_M = 1.0
-UNKNOWN_M = 1.0  # to come down from an unknown height
 PEELED_M = 0.1  # below the contact by so much, the magnet has let go
 PEEL_BELOW_M, PEEL_S = 0.35, 4.0
 DROPPING_MPS = -0.35
@@ -173,58 +147,56 @@ AT_REST_S = 0.3
 
 
 def step_landing(
-    state: PlannerState, obs: Observation, profile: Profile
+    state: PlannerState | None, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
     """Fly one tick of the way down without the mission's table, for watchdog and rescue; the way
-    down begins with the first. Returns the new state, and the command to send."""
-    state = observe(begin_landing(state, obs, profile), obs, profile)
-    state = replace(state, since=conditions_since(Context(state, obs, profile)))
-    state, command = act(Context(state, obs, profile))
+    down begins with the first. `state` is None if the planner has none yet. Returns the new state,
+    and the command to send."""
+    c = Context(state or PlannerState.on_ground(obs), obs, profile)
+    c = observe(begin_landing(c))
+    state, command = act(c.evolve(since=conditions_since(c)))
     return replace(note_order(state, command), t_s=obs.t_s, last=obs.telemetry), command
 
 
-def begin_landing(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """The state with its way down begun; the same state if it had begun before."""
-    if state.phase is Phase.LANDING:
-        return state
-    c = Context(state, obs, profile)
-    new = replace(
-        state, phase=Phase.LANDING, entered_s=obs.t_s, severity=max(state.severity, Severity.LAND),
-        since=lasting_conditions(state.since),
-        entry_m=obs.telemetry.position_m, entry_yaw_rad=obs.telemetry.yaw_rad,
-        pressed=state.caught and presses(c), ordered_s=None, orders=0,
+def begin_landing(c: Context) -> Context:
+    """The tick with its way down begun; the same tick if it had begun before."""
+    if c.state.phase is Phase.LANDING:
+        return c
+    new = c.evolve(
+        phase=Phase.LANDING, entered_s=c.t_s, severity=max(c.state.severity, Severity.LAND),
+        since=lasting_conditions(c.state.since),
+        entry_m=c.telemetry.position_m, entry_yaw_rad=c.telemetry.yaw_rad,
+        pressed=c.state.caught and presses(c), ordered_s=None, orders=0,
     )  # fmt: skip
-    return enter_landing(new, state, obs, profile)
+    return enter_landing(new, c.state)
 
 
-def enter_landing(
-    new: PlannerState, old: PlannerState, obs: Observation, profile: Profile
-) -> PlannerState:
-    """The state that a way down from `old` starts with; `new` has its entry already."""
-    tel, stopped_s = obs.telemetry, old.stopped_s
-    heard = obs.t_s - tel.t_s <= profile.safety.proof_age_s
-    ordered = heard and tel.has(HL_ACTIVE) and profile.positioning.by != "target"
-    if ordered and not new.astray:  # else it would follow the wrong positions to its end
-        new = replace(new, orders=LEAST_ORDERS, ordered_s=obs.t_s)
+def enter_landing(c: Context, old: PlannerState) -> Context:
+    """The tick with what a way down from `old` starts with; it has its entry already."""
+    tel, stopped_s = c.telemetry, old.stopped_s
+    heard = c.t_s - tel.t_s <= c.safety.proof_age_s
+    ordered = heard and tel.has(HL_ACTIVE) and not c.by_sight
+    if ordered and not c.state.astray:  # else it would follow the wrong positions to its end
+        c = c.evolve(orders=LEAST_ORDERS, ordered_s=c.t_s)
     elif heard and tel.thrust < 1 and stopped_s is None:
         # The motors were stopped, or never turned: nothing spins them up again.
-        new = replace(new, stopped_s=obs.t_s)
+        c = c.evolve(stopped_s=c.t_s)
     contact_z_m = old.contact_z_m
-    c = Context(new, obs, profile)
-    if contact_z_m is None and (old.phase is Phase.PERCH or (new.pressed and c.by_sight)):
+    if contact_z_m is None and (old.phase is Phase.PERCH or (c.state.pressed and c.by_sight)):
         # It may be in the magnet's reach, also below a sheet that hangs above an unseen ceiling:
         # it has to be seen below before it counts as free.
         contact_z_m = tel.position_m[2]
-    hover = _hover_thrust(old, obs)
+    hover = _hover_thrust(old, c.obs)
     # While the loop was silent the watchdog may have brought it down or to the magnet: what was
     # measured meanwhile counts from the tick before.
-    within = contact_z_m is not None or new.reckoning.below_m < REACH_M
-    new = replace(
-        new, reach_s=old.t_s if within and old.reach_s is None else old.reach_s,
+    within = contact_z_m is not None or c.state.reckoning.below_m < REACH_M
+    blind = _has_lost_its_position(c)
+    c = c.evolve(
+        reach_s=old.t_s if within and old.reach_s is None else old.reach_s,
         contact_z_m=contact_z_m, level_hover=hover, hover_thrust=hover,
         level_within=HOVER_WITHIN if old.hover_thrust else UNLEARNED_WITHIN,
     )  # fmt: skip
-    return lose_position(new, obs) if _has_lost_its_position(c) else new
+    return lose_position(c) if blind else c
 
 
 # --- What is known ------------------------------------------------------------------------------
@@ -232,7 +204,7 @@ def enter_landing(
 
 def evidence_of(c: Context) -> Evidence:
     """The best that is fresh in this tick."""
-    heard = c.attitude_age_s <= c.profile.safety.telemetry_hold_s
+    heard = c.attitude_age_s <= c.safety.telemetry_hold_s
     unplaced = c.state.astray or c.state.blind_s is not None
     if not heard and (c.by_sight or unplaced):
         return Evidence.NOTHING
@@ -241,14 +213,14 @@ def evidence_of(c: Context) -> Evidence:
     if c.by_sight:
         return Evidence.HEIGHT if c.state.heading_lost else Evidence.SIGHT
     if heard and c.state.heading_lost:
-        fresh = c.telemetry_age_s <= c.profile.safety.telemetry_hold_s
+        fresh = c.telemetry_age_s <= c.safety.telemetry_hold_s
         return Evidence.HEIGHT if fresh and c.placed else Evidence.IMU
     return Evidence.ONBOARD if _is_doubtful(c) else Evidence.POSITION
 
 
 def _is_doubtful(c: Context) -> bool:
     """True if the height, the stream or this loop cannot be relied on."""
-    safety = c.profile.safety
+    safety = c.safety
     return (
         c.obs.link_problem is not None
         or c.telemetry_age_s > safety.telemetry_hold_s
@@ -267,19 +239,14 @@ def _has_lost_its_position(c: Context) -> bool:
     return not (_is_sighted(c) if c.by_sight else c.located or c.state.astray)
 
 
-def reach_of(c: Context) -> Reach:
-    """Whether the magnet may hold the vehicle: since a contact, or since it was reckoned near."""
-    within = c.state.contact_z_m is not None or c.state.reach_s is not None
-    return Reach.MAGNET if within else Reach.FREE
+def is_in_reach(c: Context) -> bool:
+    """True if the magnet may hold the vehicle: since a contact, or since it was reckoned near."""
+    return c.state.contact_z_m is not None or c.state.reach_s is not None
 
 
-def stage_of(c: Context) -> Stage:
-    """How far the way down has come, by the orders that were given."""
-    if c.state.stopped_s is not None:
-        return Stage.STOPPED
-    if c.state.released_s is not None:
-        return Stage.RELEASED
-    return Stage.ORDERED if c.state.orders else Stage.DOWN
+def is_driven(c: Context) -> bool:
+    """True if neither the weight was put on the magnet nor the motors stopped."""
+    return c.state.released_s is None and c.state.stopped_s is None
 
 
 def rest_finding(c: Context) -> Finding:
@@ -288,7 +255,7 @@ def rest_finding(c: Context) -> Finding:
     What was within the magnet's reach and has not fallen since hangs, unless a silence of the
     telemetry could hide a fall. Else a position decides, or the picture of a target far above.
     """
-    tel, state = c.obs.telemetry, c.state
+    tel, state = c.telemetry, c.state
     if _is_held_elsewhere(c):
         return Finding.HELD
     if c.by_sight or not c.placed:
@@ -308,11 +275,11 @@ def _is_held_elsewhere(c: Context) -> bool:
     state = c.state
     if state.phase is not Phase.LANDING:
         return False
-    if c.placed and state.entry_m[2] - c.obs.telemetry.position_m[2] >= STAYED_M:
+    if c.placed and state.entry_m[2] - c.telemetry.position_m[2] >= STAYED_M:
         return False
     if state.row == HELD:
         return c.obs.imu.fell_s <= state.entered_s
-    below = contact_within_m(c) < c.error_z_m <= FAR_BELOW_M and state.contact_aside_m is None
+    below = contact_within_m(c) < c.error_z_m <= FAR_BELOW_M and state.contact is None
     by_position = c.placed and not c.by_sight and state.jump_s is None and c.height_m > HIGH_M
     return below and (c.fresh or by_position)
 
@@ -332,10 +299,10 @@ def _by_fall(c: Context, since_s: float | None) -> Finding:
 def hangs_where_it_did(c: Context) -> bool:
     """True if it is at its contact by a position, or has hung all the time by the accelerometer.
     A silence as long as a fall leaves it unknown."""
-    contact_z_m, tel = c.state.contact_z_m, c.obs.telemetry
+    contact_z_m, tel = c.state.contact_z_m, c.telemetry
     if not c.by_sight and c.placed and contact_z_m is not None:
         # A slip ends the contact at once, and the estimate of what hangs drifts less.
-        falls = tel.velocity_mps[2] < -c.profile.planner.complete.slip_mps
+        falls = tel.velocity_mps[2] < -c.planner.complete.slip_mps
         if not falls and contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M:
             return True
     return _by_fall(c, c.state.reach_s) is Finding.HANGS
@@ -352,10 +319,11 @@ def hangs_stopped(c: Context) -> bool:
 # --- What is remembered -------------------------------------------------------------------------
 
 
-def observe(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """The state with one more observation. Hangs of the loop, jumps of the estimate and lost
-    positions are noticed here, for all who fly a way down."""
-    if state.last is not None and obs.t_s - state.t_s > profile.positioning.hold_s:
+def observe(c: Context) -> Context:
+    """The tick with what is remembered of its observation. Hangs of the loop, jumps of the estimate
+    and lost positions are noticed here, for all who fly a way down."""
+    state, obs = c.state, c.obs
+    if state.last is not None and obs.t_s - state.t_s > c.profile.positioning.hold_s:
         # After a hang of the loop everything from before is stale; dwell times begin anew.
         kept = lasting_conditions(state.since)
         off_s = max(obs.imu.off_s, obs.imu.silent_s)
@@ -363,22 +331,21 @@ def observe(state: PlannerState, obs: Observation, profile: Profile) -> PlannerS
             # All samples of the hang have come, and in none do the motors turn: else a loop that
             # hangs in every turn would never see a landing end.
             kept[Condition.DOWN] = max(off_s, state.since[Condition.DOWN])
-        stale_s = obs.t_s if profile.positioning.by == "target" else state.stale_s
         # A catch is over, and its setpoint far above with it: held, it would press.
         setpoint = state.setpoint if state.caught else None
-        state = replace(state, since=kept, stale_s=stale_s, caught=True, setpoint=setpoint)
-    if Context(state, obs, profile).position_is_stale:
-        state = replace(state, stale_s=obs.t_s)
+        stale_s = obs.t_s if c.by_sight else state.stale_s
+        c = c.evolve(since=kept, stale_s=stale_s, caught=True, setpoint=setpoint)
+    if c.position_is_stale:
+        c = c.evolve(stale_s=obs.t_s)
     if obs.jumped:
-        state = _jumped(state, obs)
-    if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
-        state = replace(state, heading_lost=True, hover_thrust=_hover_thrust(state, obs))
-    state = _reckon(Context(_answered(state, obs, profile), obs, profile))
-    c = Context(state, obs, profile)
-    comes_down = state.phase is Phase.LANDING and stage_of(c) in (Stage.DOWN, Stage.ORDERED)
-    if comes_down and state.blind_s is None and _has_lost_its_position(c):
-        return lose_position(state, obs)
-    return state
+        c = c.with_state(_jumped(c.state, obs))
+    if obs.turned_rad > math.radians(c.safety.heading_lost_deg):
+        c = c.evolve(heading_lost=True, hover_thrust=_hover_thrust(c.state, obs))
+    c = c.with_state(_reckon(_answered(c)))
+    comes_down = c.state.phase is Phase.LANDING and is_driven(c)
+    if comes_down and c.state.blind_s is None and _has_lost_its_position(c):
+        return lose_position(c)
+    return c
 
 
 def note_order(state: PlannerState, command: Command) -> PlannerState:
@@ -392,25 +359,24 @@ def note_order(state: PlannerState, command: Command) -> PlannerState:
             return replace(state, raw_order=None, unanswered_s=None)
 
 
-def _answered(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """The state with the time since which the thrust that is read differs from the order: a reading
+def _answered(c: Context) -> Context:
+    """The tick with the time since which the thrust that is read differs from the order: a reading
     that stands still under a changed order leaves the thrust unknown."""
-    if state.raw_order is None:
-        return state
-    wanted = 0.0 if state.raw_order < STILL_THRUST else min(MOST_RAW, state.raw_order)
-    apart = abs(obs.telemetry.thrust - wanted) > UNANSWERED_PART * FULL_THRUST
-    since_s = obs.t_s if state.unanswered_s is None else state.unanswered_s
-    new = replace(state, unanswered_s=since_s if apart else None)
-    known = Context(new, obs, profile).thrust_is_known
-    return new if known else replace(new, unread_s=obs.t_s)
+    order = c.state.raw_order
+    if order is None:
+        return c
+    wanted = 0.0 if order < STILL_THRUST else min(MOST_RAW, order)
+    apart = abs(c.telemetry.thrust - wanted) > UNANSWERED_PART * FULL_THRUST
+    since_s = c.t_s if c.state.unanswered_s is None else c.state.unanswered_s
+    c = c.evolve(unanswered_s=since_s if apart else None)
+    return c if c.thrust_is_known else c.evolve(unread_s=c.t_s)
 
 
-def lose_position(state: PlannerState, obs: Observation) -> PlannerState:
-    """The state once accelerometer and attitude are all that is left, for good: each change of the
+def lose_position(c: Context) -> Context:
+    """The tick once accelerometer and attitude are all that is left, for good: each change of the
     mode costs height, so no sight is believed again on this way down."""
-    hover = _hover_thrust(state, obs)
-    height_m = obs.telemetry.position_m[2] - state.ground_z_m
-    return replace(state, blind_s=obs.t_s, blind_height_m=height_m, hover_thrust=hover)
+    hover = _hover_thrust(c.state, c.obs)
+    return c.evolve(blind_s=c.t_s, blind_height_m=c.height_m, hover_thrust=hover)
 
 
 def _reckon(c: Context) -> PlannerState:
@@ -431,7 +397,7 @@ def _reckon(c: Context) -> PlannerState:
         blown = obs.t_s - obs.imu.steady_aside_s < AT_REST_S
         x_mps, y_mps, _ = new.velocity_mps
         new = replace(new, velocity_mps=(x_mps, y_mps, 0.0) if blown else (0.0, 0.0, 0.0))
-    felt, late = obs.felt, latency_changed(c)
+    felt, late = obs.felt, c.mismatch.later_s != 0.0
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
         # Late pictures have led the estimate's height astray, too.
         climb_mps = felt.climb_mps if late else None
@@ -458,14 +424,14 @@ def _reckon(c: Context) -> PlannerState:
     held_s = c.held(Condition.CARRIED)
     flies = state.phase is not Phase.LANDING  # there the hover thrust is no more than learned
     near = c.by_sight and flies and new.below_m < CARRIED_WITHIN_M
-    if near and held_s >= c.profile.planner.perch.contact_dwell_s:
+    if near and held_s >= c.planner.perch.contact_dwell_s:
         # It is at the target; late pictures show it lower.
         new = replace(
             new, below_m=min(0.0, new.below_m), nearest_m=min(0.0, new.nearest_m),
             velocity_mps=(*new.velocity_mps[:2], 0.0),
         )  # fmt: skip
     reach_s = state.reach_s
-    if stage_of(c) in (Stage.DOWN, Stage.ORDERED):  # what is released or stopped moves no more
+    if is_driven(c):  # what is released or stopped moves no more
         # After the floor was touched nothing climbs, whatever was reckoned since.
         near = new.below_m < REACH_M and state.touch_s is None
         within = state.contact_z_m is not None or near
@@ -547,11 +513,17 @@ def act(c: Context) -> Acted:
         if (caught := _catch(c)) is not None:
             return caught
         c = c.with_state(replace(state, caught=True))
-    if c.state.stopped_s is None and _stands(c):
+    if c.state.stopped_s is not None or _stands(c):
         return stop_motors(c)
-    if c.held(Condition.HANGING) >= HANGING_S and stage_of(c) is Stage.DOWN:
-        return release_by_thrust(c)
-    manoeuvre = MANOEUVRES[evidence_of(c), reach_of(c), stage_of(c)]
+    if c.state.released_s is not None:
+        return _weight_on_magnet(c)
+    if c.state.orders:  # to change a landing of its own costs height
+        return _own_landing(c)
+    return release_by_thrust(c) if c.held(Condition.HANGING) >= HANGING_S else _descend(c)
+
+
+def _descend(c: Context) -> Acted:
+    manoeuvre = DESCENTS[evidence_of(c)][is_in_reach(c)]
     if manoeuvre in BY_SETPOINTS and (c.by_sight or manoeuvre is not Manoeuvre.PEEL):
         state, away = leave_press(c)
         if away is not None:
@@ -563,10 +535,12 @@ def act(c: Context) -> Acted:
 def _falls_free(c: Context) -> bool:
     """True if it has come off the magnet: released or stopped up there, or peeled with too little
     thrust left to go down slowly."""
-    if not c.imu_proves or stage_of(c) is Stage.ORDERED:
+    if not c.imu_proves:
         return False
-    if c.state.released_s is not None or c.state.stopped_s is not None:
-        return reach_of(c) is Reach.MAGNET and has_slipped(c)
+    if not is_driven(c):
+        return is_in_reach(c) and has_slipped(c)
+    if c.state.orders:
+        return False
     return c.state.contact_z_m is not None and c.state.caught and c.sinks(-DROPPING_MPS)
 
 
@@ -576,22 +550,22 @@ def _stands(c: Context) -> bool:
         return True
     # Where height is measured, it stops as soon as it sinks no more, instead of sliding.
     level = c.by_sight and c.placed and c.state.blind_s is None and c.state.level_thrust > 0.0
-    low = c.height_m < STOP_BELOW_M and reach_of(c) is Reach.FREE
+    low = c.height_m < STOP_BELOW_M and not is_in_reach(c)
     return level and low and c.climb_mps > -RESTS_MPS
 
 
 def _caught_again(c: Context) -> Acted:
     """The landing, begun anew below: the vehicle is free of the magnet, and falls."""
-    tel = c.obs.telemetry
+    tel = c.telemetry
     state = replace(
         c.state, released_s=None, stopped_s=None, contact_z_m=None, reach_s=None, caught=False,
         pressed=False, catch_above_m=catch_above_m(c.state.hover_thrust, tel.thrust),
         setpoint=None, ordered_s=None, orders=0, level_thrust=0.0,
-        entered_s=c.obs.t_s, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
+        entered_s=c.t_s, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
         reckoning=replace(c.state.reckoning, below_m=math.inf),
     )  # fmt: skip
     c = c.with_state(state)
-    return _catch(c) or ACTIONS[MANOEUVRES[evidence_of(c), Reach.FREE, Stage.DOWN]](c)
+    return _catch(c) or _descend(c)
 
 
 def _catch(c: Context) -> Acted | None:
@@ -603,8 +577,8 @@ def _catch(c: Context) -> Acted | None:
 def _setpoints(c: Context) -> Acted:
     """Sink by setpoints to the hand-over, and by the vehicle's own landing from there."""
     # When the landing's time is over nothing is sent: by then it must be landing by itself.
-    overdue = c.in_phase_s > c.profile.planner.landing.overdue_s
-    if overdue or c.height_m <= c.profile.planner.landing.handover_m:
+    overdue = c.in_phase_s > c.planner.landing.overdue_s
+    if overdue or c.height_m <= c.planner.landing.handover_m:
         return _own_landing(c)
     return _by_setpoints(c)
 
@@ -612,7 +586,7 @@ def _setpoints(c: Context) -> Acted:
 def _setpoints_level(c: Context) -> Acted:
     """Sink by setpoints to the hand-over, and level from there: the vehicle's own landing would
     follow an estimate that rests on pictures, to an unmeasured floor."""
-    if c.state.level_thrust or c.height_m <= c.profile.planner.landing.handover_m:
+    if c.state.level_thrust or c.height_m <= c.planner.landing.handover_m:
         return _level(c)
     return _by_setpoints(c)
 
@@ -628,7 +602,7 @@ def _peel(c: Context) -> Acted:
 
 def _by_setpoints(c: Context) -> Acted:
     """Sink straight down at the landing's speed, from where the landing began."""
-    landing, state = c.profile.planner.landing, c.state
+    landing, state = c.planner.landing, c.state
     here = hold_here(c)
     start = state.setpoint if state.caught and state.setpoint is not None else here
     # A setpoint far above (the press, a search step) is not walked down slowly.
@@ -638,39 +612,35 @@ def _by_setpoints(c: Context) -> Acted:
     setpoint = walk(
         start,
         goal,
-        c.obs.t_s - state.t_s,
-        xy_mps=c.profile.planner.align.speed_mps,
+        c.t_s - state.t_s,
+        xy_mps=c.planner.align.speed_mps,
         up_mps=0.0,
         down_mps=landing.speed_mps,
         yaw_rate_radps=0.0,
     )
     # The setpoint does not run away from a vehicle that does not follow, beyond what takes the
     # thrust down to its least.
-    if c.telemetry_age_s <= c.profile.safety.telemetry_hold_s:
+    if c.telemetry_age_s <= c.safety.telemetry_hold_s:
         setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - PEEL_BELOW_M))
     state = replace(left_contact(c, PEELED_M).state, setpoint=setpoint, caught=True)
     return state, limited(c, setpoint)
 
 
-def own_landing(landing: LandingConfig, ground_z_m: float, flown_s: float, z_m: float) -> Land:
+def own_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z_m: float) -> Land:
     """The order for the vehicle's own landing from `z_m`, a quintic from rest to rest.
 
     It aims below the ground, and the lower the longer the estimate has had to drift: at the
     trajectory's end the motors stop, and over a lower floor they would drop it. It never aims above
-    the vehicle, whose estimate may be far below the ground by now. A `z_m` that is no number counts
-    as `UNKNOWN_M`.
+    the vehicle, whose estimate may be far below the ground by now.
     """
-    below_m = landing.undershoot_m + min(MOST_DRIFT_M, landing.drift_mps * max(0.0, flown_s))
-    known = math.isfinite(z_m)
-    aim_m = (min(ground_z_m, z_m) if known else ground_z_m) - below_m
-    way_m = z_m - aim_m if known else UNKNOWN_M
-    lasts_s = SETTLING_S + PEAK_OF_MEAN * way_m / PLANNED_MPS
-    return Land(aim_m, lasts_s)
+    drifted_m = min(MOST_DRIFT_M, planner.landing.drift_mps * max(0.0, flown_s))
+    aim_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
+    return Land(aim_m, SETTLING_S + PEAK_OF_MEAN * (z_m - aim_m) / PLANNED_MPS)
 
 
 def _own_landing(c: Context) -> Acted:
     """The vehicle's own landing, ordered again while it shows no effect."""
-    landing, state, tel = c.profile.planner.landing, c.state, c.obs.telemetry
+    tel = c.telemetry
     state, away = leave_press(c)
     if away is not None and not _is_doubtful(c) and not state.orders:
         return state, away
@@ -679,12 +649,12 @@ def _own_landing(c: Context) -> Acted:
     carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
     if c.imu_proves and tel.thrust < 1 and carried and (state.orders or not tel.has(FLYING)):
         return state, Idle()  # on the floor: another order would spin the motors up again
-    waited = math.inf if state.ordered_s is None else c.obs.t_s - state.ordered_s
+    waited = math.inf if state.ordered_s is None else c.t_s - state.ordered_s
     seen = state.orders >= LEAST_ORDERS and c.imu_proves and tel.has(HL_ACTIVE)
     if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
-        flown_s = c.obs.t_s - state.started_s
-        order = own_landing(landing, state.ground_z_m, flown_s, tel.position_m[2])
-        return replace(state, ordered_s=c.obs.t_s, orders=state.orders + 1, setpoint=None), order
+        flown_s = c.t_s - state.started_s
+        order = own_landing(c.planner, state.ground_z_m, flown_s, tel.position_m[2])
+        return replace(state, ordered_s=c.t_s, orders=state.orders + 1, setpoint=None), order
     return state, Idle()
 
 
@@ -693,8 +663,8 @@ def _level(c: Context) -> Acted:
     believed, the estimate; tilted against the sideways speed. What does not sink gets less and less
     thrust: it begins to sink, the ceiling lets go or proves that it holds, and the floor proves
     itself."""
-    state, tel = c.state, c.obs.telemetry
-    dt_s = max(0.0, min(0.1, c.obs.t_s - state.t_s))
+    state, tel = c.state, c.telemetry
+    dt_s = max(0.0, min(0.1, c.t_s - state.t_s))
     age_s = max(1e-3, dt_s, c.attitude_age_s)
     unheard = age_s > LATEST_S
     unlearned = state.level_thrust == 0.0 and state.level_within == UNLEARNED_WITHIN
@@ -707,17 +677,17 @@ def _level(c: Context) -> Acted:
     height_m = c.height_m if state.blind_s is None else state.blind_height_m
     height_m += min(0.0, climb_mps) * age_s
     # Late pictures may show the floor half a metre too far.
-    low = height_m <= SLOW_BELOW_M or latency_changed(c)
+    low = height_m <= SLOW_BELOW_M or c.mismatch.later_s != 0.0
     sink_mps = LOW_SINK_MPS if low else SINK_MPS
     gain = GAIN_AGE_S2_PER_M / max(1e-3, c.attitude_age_s)
     gain = max(LEAST_GAIN_S_PER_M, min(MOST_GAIN_S_PER_M, gain))
     thrust = hover * (1.0 - gain * (climb_mps + sink_mps)) / max(0.8, math.cos(c.tilt_rad))
     touch_s = state.touch_s
-    if touch_s is None and c.obs.t_s - c.obs.imu.blow_s < TOUCH_S and height_m < TOUCH_BELOW_M:
-        touch_s = c.obs.t_s
+    if touch_s is None and c.t_s - c.obs.imu.blow_s < TOUCH_S and height_m < TOUCH_BELOW_M:
+        touch_s = c.t_s
     if unheard:
         thrust *= UNHEARD_PART
-    touched_s = math.inf if touch_s is None else c.obs.t_s - touch_s
+    touched_s = math.inf if touch_s is None else c.t_s - touch_s
     # In the air the accelerometer reads what the thrust gives, on the floor one g.
     if touched_s >= TOUCH_S and c.imu_proves and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover):
         touch_s = None  # it falls with its thrust: that was no floor
@@ -749,7 +719,7 @@ def is_spent(c: Context) -> bool:
     for long, or the setpoint to the floor. Without a stop the firmware would lock it 2 s later."""
     setpoint, ground_m = c.state.setpoint, c.state.ground_m
     if setpoint is not None and ground_m is not None:
-        landing = c.profile.planner.landing
+        landing = c.planner.landing
         if c.state.row == "landing-timeout" and setpoint.z_m <= ground_m[2] + landing.handover_m:
             return True
     return 0.0 < c.state.level_thrust <= LEAST_PART * c.state.hover_thrust + 1.0
@@ -762,7 +732,7 @@ def left_level(c: Context) -> Context:
     reach_s = c.state.reach_s
     if reach_s is not None and c.obs.imu.fell_s > max(reach_s, c.state.entered_s):
         reckoning = replace(c.state.reckoning, below_m=math.inf)
-        blind_s = None if c.state.blind_s is None else c.obs.t_s
+        blind_s = None if c.state.blind_s is None else c.t_s
         state = replace(
             c.state, contact_z_m=None, reach_s=None, reckoning=reckoning, blind_s=blind_s
         )
@@ -773,12 +743,12 @@ def left_level(c: Context) -> Context:
 def _learned_hover(c: Context, dt_s: float) -> float:
     """The hover thrust, drawn to the thrust for each g in free flight: what was learned in a climb,
     or not at all, is several per cent off."""
-    state, tel = c.state, c.obs.telemetry
+    state, tel = c.state, c.telemetry
     first = state.level_hover or state.hover_thrust
     within = state.level_within
     if c.attitude_age_s > LATEST_S or not 0.7 <= tel.acc_z_g <= 1.3 or tel.thrust < 0.5 * first:
         return state.hover_thrust
-    if reach_of(c) is Reach.MAGNET or state.touch_s is not None:
+    if is_in_reach(c) or state.touch_s is not None:
         return state.hover_thrust
     felt = tel.thrust / tel.acc_z_g
     memory_s = HOVER_MEMORY_S if within == HOVER_WITHIN else 0.5 * HOVER_MEMORY_S
@@ -798,20 +768,20 @@ def _is_overdue(c: Context) -> bool:
     spare_s = LEVEL_SPARE_S if heard else UNHEARD_SPARE_S
     if not heard and c.state.level_within == UNLEARNED_WITHIN:
         spare_s += OWN_ESTIMATE_S  # in which its own estimate has flown it on the spot
-    return c.obs.t_s - began_s > spare_s + way_m / LEVEL_MEAN_MPS
+    return c.t_s - began_s > spare_s + way_m / LEVEL_MEAN_MPS
 
 
 def _braking(c: Context) -> tuple[float, float]:
     """Roll and pitch against the sideways speed, and against the attitude's error as pictures
     measured it; level without a heading."""
-    if c.state.heading_lost or reach_of(c) is Reach.MAGNET:
+    if c.state.heading_lost or is_in_reach(c):
         return 0.0, 0.0
-    yaw_rad = c.obs.telemetry.yaw_rad
+    yaw_rad = c.telemetry.yaw_rad
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     x_mps, y_mps, _ = c.state.reckoning.velocity_mps
     speed_mps = max(1e-6, math.hypot(x_mps, y_mps))
-    blind_s = 0.0 if c.state.blind_s is None else c.obs.t_s - c.state.blind_s
-    felt_s = math.inf if c.obs.felt is None else c.obs.t_s - c.obs.felt.t_s
+    blind_s = 0.0 if c.state.blind_s is None else c.t_s - c.state.blind_s
+    felt_s = math.inf if c.obs.felt is None else c.t_s - c.obs.felt.t_s
     unsure_mps = min(MOST_UNSURE_MPS, UNSURE_MPS + UNSURE_MPS2 * min(blind_s, felt_s))
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
     part *= min(1.0, BRAKED_AGE_S / max(1e-3, c.attitude_age_s))
@@ -831,10 +801,10 @@ def _against(mps: float) -> float:
 def _weight_on_magnet(c: Context) -> Acted:
     """Put the whole weight on whatever carries it, and monitor that; without telemetry order what
     carries most of it: what hangs stays, what has fallen does not rise."""
-    if c.attitude_age_s <= c.profile.safety.telemetry_hold_s:
+    if c.attitude_age_s <= c.safety.telemetry_hold_s:
         return release_by_thrust(c)
     thrust = int(max(STILL_THRUST, min(THRUST_MIN, LEAST_PART * c.state.hover_thrust)))
-    return replace(c.state, released_s=c.obs.t_s), RawThrust(thrust)
+    return replace(c.state, released_s=c.t_s), RawThrust(thrust)
 
 
 ACTIONS = {
@@ -843,7 +813,5 @@ ACTIONS = {
     Manoeuvre.PEEL: _peel,
     Manoeuvre.LEVEL: _level,
     Manoeuvre.OWN_LANDING: _own_landing,
-    Manoeuvre.WEIGHT_ON_MAGNET: _weight_on_magnet,
-    Manoeuvre.STOP: stop_motors,
 }
 BY_SETPOINTS = (Manoeuvre.SETPOINTS, Manoeuvre.SETPOINTS_LEVEL, Manoeuvre.PEEL)

@@ -18,11 +18,11 @@ import numpy as np
 from perchctl.mission import battery, lander
 from perchctl.mission.conditions import (
     conditions_since,
-    contact_aside_m,
+    contact_error,
     contact_within_m,
     hovers,
     lasting_conditions,
-    touched_aside_m,
+    touched_error,
 )
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import (
@@ -51,6 +51,7 @@ from perchctl.mission.imu import discount_wrong_positions
 from perchctl.mission.mounting import MountWatch, sight_of, update_watch
 from perchctl.mission.state import (
     Condition,
+    ContactError,
     MotorStop,
     Observation,
     Outcome,
@@ -63,7 +64,6 @@ from perchctl.mission.table import (
     Transition,
     first_match,
     hold_reason,
-    raise_severity,
 )
 from perchctl.profile import Profile
 from perchctl.values import replace
@@ -76,47 +76,35 @@ WARY_MPS, WARY_M = 0.25, 0.2  # sideways, while nothing confirms the camera's mo
 _LEARNING = (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
 
 
-def start_mission(obs: Observation) -> PlannerState:
-    """The state of a planner on the ground, before take-off."""
-    tel = obs.telemetry
-    return PlannerState(
-        entered_s=obs.t_s,
-        started_s=obs.t_s,
-        t_s=obs.t_s,
-        search_step_s=obs.t_s,
-        ground_m=tel.position_m,
-        entry_m=tel.position_m,
-        entry_yaw_rad=tel.yaw_rad,
-    )
-
-
 def step_mission(
-    state: PlannerState, obs: Observation, profile: Profile, table: tuple[Transition, ...] = TABLE
+    state: PlannerState | None,
+    obs: Observation,
+    profile: Profile,
+    table: tuple[Transition, ...] = TABLE,
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the mission; returns the new state, and the command to send."""
-    state = _remember(state, obs, profile)
-    row = first_match(Context(state, obs, profile), table)
+    """Fly one tick of the mission; `state` is None in the first, on the ground. Returns the new
+    state, and the command to send."""
+    c = _remember(Context(state or PlannerState.on_ground(obs), obs, profile))
+    row = first_match(c, table)
     if row is not None:
-        state = _enter(state, row, Context(state, obs, profile))
-        state = replace(state, hold=hold_reason(Context(state, obs, profile)))
-    new, command = act(Context(state, obs, profile))
+        c = _enter(c, row)
+        c = c.evolve(hold=hold_reason(c))
+    new, command = act(c)
     return replace(lander.note_order(new, command), t_s=obs.t_s), command
 
 
-def _remember(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    state = lander.observe(_with_target(state, obs), obs, profile)
-    context = Context(state, obs, profile)
-    state = replace(state, hold=hold_reason(context))
-    since = conditions_since(context)
-    if state.hold:
+def _remember(c: Context) -> Context:
+    c = lander.observe(c.with_state(_with_target(c.state, c.obs)))
+    hold, since, hover = hold_reason(c), conditions_since(c), c.state.hover_thrust
+    if hold:
         since = lasting_conditions(since)  # a held vehicle proves nothing: dwell times begin anew
     # Near the target an ascent may press against a ceiling that is lower than thought.
-    away = state.phase is not Phase.ASCEND or context.error_z_m > profile.planner.ascend.near_m
-    if away and state.phase in _LEARNING and hovers(context):
-        state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
-    state = replace(state, last=obs.telemetry, energy=battery.read_battery(context))
-    state = replace(state, battery=battery.outlook(Context(state, obs, profile)))
-    return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
+    away = c.state.phase is not Phase.ASCEND or c.error_z_m > c.planner.ascend.near_m
+    if away and c.state.phase in _LEARNING and hovers(c):
+        hover = _learned_hover_thrust(c.state, c.obs)
+    energy = battery.read_battery(c)
+    c = c.evolve(hold=hold, hover_thrust=hover, last=c.telemetry, energy=energy)
+    return c.evolve(battery=battery.outlook(c), since=since, mount=_mount_watched(c))
 
 
 def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
@@ -146,7 +134,7 @@ def _mount_watched(c: Context) -> MountWatch:
         return mount
     if target is None or not target.measured or target.world_m is None:
         return mount
-    return update_watch(mount, sight_of(c.obs.t_s, c.obs.telemetry, target.world_m))
+    return update_watch(mount, sight_of(c.t_s, c.telemetry, target.world_m))
 
 
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
@@ -160,32 +148,21 @@ def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
     return state.hover_thrust + part * (thrust - state.hover_thrust)
 
 
-def _enter(state: PlannerState, row: Transition, context: Context) -> PlannerState:
-    obs = context.obs
-    new = replace(
-        state,
-        phase=row.to,
-        entered_s=obs.t_s,
-        reason=row.explain(context),
-        row=row.name,
-        severity=raise_severity(state.severity, row.severity),
-        motor_stop=row.motor_stop,
-        outcome=_outcome(state, row),
-        since=lasting_conditions(state.since),
-        attempts=state.attempts + int(row.counts_attempt),
-        entry_m=obs.telemetry.position_m,
-        entry_yaw_rad=obs.telemetry.yaw_rad,
-        search_step_s=obs.t_s,
-        confirmed=0,
-        # An ordered press has wound the integrators up, whatever thrust is read; a fall that is
-        # just being caught turns at full thrust in the air.
-        pressed=row.to in (Phase.RECOVER, Phase.LANDING)
-        and state.caught
-        and (state.phase is Phase.PERCH or presses(context)),
-        ordered_s=None,
-        orders=0,
-    )
-    return _started_phase(new, state, context)
+def _enter(c: Context, row: Transition) -> Context:
+    state = c.state
+    # An ordered press has wound the integrators up, whatever thrust is read; a fall that is just
+    # being caught turns at full thrust in the air.
+    ends = row.to in (Phase.RECOVER, Phase.LANDING)
+    pressed = ends and state.caught and (state.phase is Phase.PERCH or presses(c))
+    new = c.evolve(
+        phase=row.to, entered_s=c.t_s, reason=row.explain(c), row=row.name,
+        severity=state.severity.then(row.severity), motor_stop=row.motor_stop,
+        outcome=_outcome(state, row), since=lasting_conditions(state.since),
+        attempts=state.attempts + int(row.counts_attempt), entry_m=c.telemetry.position_m,
+        entry_yaw_rad=c.telemetry.yaw_rad, search_step_s=c.t_s, confirmed=0, pressed=pressed,
+        ordered_s=None, orders=0,
+    )  # fmt: skip
+    return _started_phase(new, c)
 
 
 def _outcome(state: PlannerState, row: Transition) -> Outcome | None:
@@ -198,71 +175,58 @@ def _outcome(state: PlannerState, row: Transition) -> Outcome | None:
     return row.outcome or state.outcome
 
 
-def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerState:
-    """The state that a phase starts with."""
-    obs = c.obs
-    match new.phase:
+def _started_phase(new: Context, c: Context) -> Context:
+    """The tick with what its phase starts with; `c` is the tick before the transition."""
+    old, row, z_m = c.state, new.state.row, c.telemetry.position_m[2]
+    match new.state.phase:
         case Phase.COMPLETE:
-            aside_m, sigma_m = touched_aside_m(c) or contact_aside_m(c)
-            return replace(
-                new,
-                contact_z_m=obs.telemetry.position_m[2],
-                contact_aside_m=aside_m,
-                contact_sigma_m=sigma_m,
-                released_s=None,
-            )
+            contact = touched_error(c) or contact_error(c)
+            return new.evolve(contact_z_m=z_m, contact=contact, released_s=None)
         case Phase.RECOVER:
-            z_m = obs.telemetry.position_m[2]
-            blocked_z_m = z_m if new.row == "blocked" else old.blocked_z_m
-            touched = old.phase is Phase.PERCH or new.row == "blocked"
-            kept_aside_m, kept_sigma_m = _touched_aside(old, new.row, c)
-            return replace(
-                new,
+            touched = old.phase is Phase.PERCH or row == "blocked"
+            return new.evolve(
                 stopped_s=None,
-                contact_aside_m=kept_aside_m,
-                contact_sigma_m=kept_sigma_m,
+                contact=_touched(old, row, c),
                 # In the magnet's reach until it is seen below.
                 contact_z_m=z_m if touched else old.contact_z_m,
                 released_s=None,
-                caught=new.row != "slipped" or is_carried(old.hover_thrust, obs.telemetry.thrust),
-                catch_above_m=catch_above_m(old.hover_thrust, obs.telemetry.thrust),
-                blocked_z_m=blocked_z_m,
+                caught=row != "slipped" or is_carried(old.hover_thrust, c.telemetry.thrust),
+                catch_above_m=catch_above_m(old.hover_thrust, c.telemetry.thrust),
+                blocked_z_m=z_m if row == "blocked" else old.blocked_z_m,
             )
         case Phase.LANDING:
             # The mounting may be right and the motion capture's axes wrong, by which the landing
             # would speed up until it tilts over.
             capture = c.profile.positioning.by == "mocap" and old.mount.wrong
-            if new.row == "position-astray" or (new.row == "mounting" and capture):
+            if row == "position-astray" or (row == "mounting" and capture):
                 reckoning = old.reckoning if old.astray else discount_wrong_positions(old.reckoning)
-                new = replace(new, astray=True, reckoning=reckoning)
-            if new.row == "mounting":
-                # The setpoint is ahead, in a wrong direction.
-                new = replace(new, setpoint=None)
-            if old.phase is Phase.RECOVER and new.row != "hangs-at-contact":
-                new = replace(new, contact_aside_m=None)  # nothing was felt to hold it there
-            return lander.enter_landing(new, old, obs, c.profile)
+                new = new.evolve(astray=True, reckoning=reckoning)
+            if row == "mounting":
+                new = new.evolve(setpoint=None)  # it is ahead, in a wrong direction
+            if old.phase is Phase.RECOVER and row != "hangs-at-contact":
+                new = new.evolve(contact=None)  # nothing was felt to hold it there
+            return lander.enter_landing(new, old)
         case Phase.ASCEND:
-            return replace(new, searches=0)
+            return new.evolve(searches=0)
         case Phase.SEARCH if old.setpoint is not None:
             sp = old.setpoint
-            return replace(new, entry_m=(sp.x_m, sp.y_m, sp.z_m), entry_yaw_rad=sp.yaw_rad)
+            return new.evolve(entry_m=(sp.x_m, sp.y_m, sp.z_m), entry_yaw_rad=sp.yaw_rad)
         case _:
             return new
 
 
-def _touched_aside(old: PlannerState, row: str, c: Context) -> tuple[float | None, float]:
-    """How far aside of the target the gear touched something at the target's height, with the
-    standard deviation, for what backs off from there; None if nothing was touched."""
-    kept = old.contact_aside_m, old.contact_sigma_m
+def _touched(old: PlannerState, row: str, c: Context) -> ContactError | None:
+    """How far aside of the target the gear touched something at the target's height, for what
+    backs off from there; None if nothing was touched."""
     if row == "not-released":  # the contact was proven, and nothing has come off
-        return kept
+        return old.contact
     if old.phase is Phase.RECOVER:  # pressed again before it had left
-        return kept if old.contact_z_m is not None else (None, 0.0)
-    proven = c.held(Condition.CONTACT) >= c.profile.planner.perch.contact_dwell_s
+        return old.contact if old.contact_z_m is not None else None
+    proven = c.held(Condition.CONTACT) >= c.planner.perch.contact_dwell_s
     carried = proven or c.held(Condition.CARRIED) >= 0.0  # which has that dwell in itself
     if old.phase is Phase.PERCH and carried and abs(c.error_z_m) <= contact_within_m(c):
-        return contact_aside_m(c)
-    return None, 0.0
+        return contact_error(c)
+    return None
 
 
 # --- What each phase sends -----------------------------------------------------------------------
@@ -292,14 +256,14 @@ def _walk_to(
 
 
 def _walked(c: Context, goal: PositionSetpoint, up_mps: float, down_mps: float) -> PositionSetpoint:
-    align = c.profile.planner.align
+    align = c.planner.align
     xy_mps = align.speed_mps
     if c.state.phase in (Phase.ALIGN, Phase.ASCEND) and c.state.mount.open:
         xy_mps = min(xy_mps, WARY_MPS) if c.fresh else 0.0
     return walk(
         c.state.setpoint or hold_here(c),
         goal,
-        c.obs.t_s - c.state.t_s,
+        c.t_s - c.state.t_s,
         xy_mps=xy_mps,
         up_mps=up_mps,
         down_mps=down_mps,
@@ -310,8 +274,8 @@ def _walked(c: Context, goal: PositionSetpoint, up_mps: float, down_mps: float) 
 def _under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Acted:
     """Walk under the target at height `z_m`, and learn the trim that keeps the gear there."""
     goal = _target_goal(c, z_m)
-    trim = integrated(c, (goal.x_m, goal.y_m), c.obs.t_s - c.state.t_s)
-    c = c.with_state(replace(c.state, integral_m=trim))
+    trim = integrated(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
+    c = c.evolve(integral_m=trim)
     return _walk_to(c, goal, up_mps=up_mps)
 
 
@@ -325,7 +289,7 @@ def _target_goal(c: Context, z_m: float) -> PositionSetpoint:
 def _approach(c: Context) -> Acted:
     """Rise from the ground on position setpoints: if they stop at any moment, the firmware levels
     out and cuts, and the vehicle never hovers on its own."""
-    planner, state = c.profile.planner, c.state
+    planner, state = c.planner, c.state
     assert state.ground_m is not None
     x, y, z = state.ground_m
     start = state.setpoint or PositionSetpoint(x, y, z, state.entry_yaw_rad)
@@ -341,23 +305,23 @@ def _search(c: Context) -> Acted:
     """Wait, climb a step, turn a step, wait again; never above the limit. A target that was seen
     before is looked for from under it; while nothing confirms the camera's mounting, only a little
     nearer than where it was seen last."""
-    search, state, ground_m = c.profile.planner.search, c.state, c.state.ground_m
+    search, state, ground_m = c.planner.search, c.state, c.state.ground_m
     assert ground_m is not None
-    if c.obs.t_s - state.search_step_s > search.wait_s:
-        state = replace(state, searches=state.searches + 1, search_step_s=c.obs.t_s)
+    if c.t_s - state.search_step_s > search.wait_s:
+        state = replace(state, searches=state.searches + 1, search_step_s=c.t_s)
         c = c.with_state(state)
     x, y, z = state.entry_m
     if c.target_m is not None:
         there = under_target_xy(c, state.entry_yaw_rad)
         x, y = _not_far(state.mount.last_from or (x, y), there) if state.mount.open else there
-        height = min(z, c.contact_goal_z_m - c.profile.planner.ascend.near_m)
+        height = min(z, c.contact_goal_z_m - c.planner.ascend.near_m)
     else:
         top = max(z, ground_m[2] + search.max_height_m)
         if state.blocked_z_m is not None:
             top = min(top, state.blocked_z_m - BLOCKED_ROOM_M)
         height = min(z + search.step_m * state.searches, top)
     yaw = state.entry_yaw_rad + math.radians(search.yaw_step_deg) * state.searches
-    up_mps = c.profile.planner.ascend.speed_mps
+    up_mps = c.planner.ascend.speed_mps
     return _walk_to(c, PositionSetpoint(x, y, height, yaw), up_mps=up_mps)
 
 
@@ -379,11 +343,11 @@ def _align(c: Context) -> Acted:
 
 def _ascend(c: Context) -> Acted:
     """Climb only with a fresh target and well inside the cone; slower near the target."""
-    ascend = c.profile.planner.ascend
+    ascend = c.planner.ascend
     setpoint = c.state.setpoint or hold_here(c)
     goal_z = c.contact_goal_z_m - ascend.standoff_m
     may_climb = c.fresh and c.error_xy_m < 0.7 * c.cone_m
-    lag = setpoint.z_m - c.obs.telemetry.position_m[2]
+    lag = setpoint.z_m - c.telemetry.position_m[2]
     speed = ascend.near_speed_mps if c.error_z_m < ascend.near_m else ascend.speed_mps
     # Slower towards the stand-off; the setpoint does not run away from a vehicle short of thrust.
     speed = min(speed, max(0.02, goal_z - setpoint.z_m))
@@ -392,7 +356,7 @@ def _ascend(c: Context) -> Acted:
 
 def _perch(c: Context) -> Acted:
     """Press. Position and trim stay as they are: against the ceiling they would wind up."""
-    perch = c.profile.planner.perch
+    perch = c.planner.perch
     if perch.mode == "raw":
         return c.state, RawThrust(perch.thrust)
     if c.target_m is None:
@@ -405,7 +369,7 @@ def _complete(c: Context) -> Acted:
     """Release in two stages; stop the motors once the whole weight hangs; watch."""
     if c.state.stopped_s is not None:
         return stop_motors(c)
-    holds = c.held(Condition.MAGNET_HOLDS) >= c.profile.planner.complete.hold_dwell_s
+    holds = c.held(Condition.MAGNET_HOLDS) >= c.planner.complete.hold_dwell_s
     return release_by_thrust(c) if holds or c.state.released_s is not None else lower_thrust(c)
 
 
@@ -414,13 +378,13 @@ def _recover(c: Context) -> Acted:
     that no controller is reset."""
     if (caught := catch(c)) is not None:
         return caught
-    recover = c.profile.planner.recover
+    recover = c.planner.recover
     c = left_contact(c, min(AWAY_M, 0.5 * recover.descend_m))
     state, away = leave_press(c)
     if away is not None:
         return state, away
     if not state.caught:
-        x, y, z = c.obs.telemetry.position_m  # from where it sinks no more
+        x, y, z = c.telemetry.position_m  # from where it sinks no more
         state = replace(state, caught=True, setpoint=None, entry_m=(x, y, z + recover.descend_m))
     z = state.entry_m[2] - recover.descend_m
     setpoint = state.setpoint or hold_here(c)
@@ -444,7 +408,7 @@ def _aborted(c: Context) -> Acted:
     locked 2 s after the stream's end: it gets the pair that prevents that."""
     if c.state.orders:
         return c.state, Idle()
-    state = replace(c.state, orders=1, ordered_s=c.obs.t_s)
+    state = replace(c.state, orders=1, ordered_s=c.t_s)
     match state.motor_stop:
         case MotorStop.EMERGENCY:
             return state, EmergencyStop()

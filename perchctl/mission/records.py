@@ -11,17 +11,14 @@ from typing import Literal, Protocol
 
 from perchctl.geometry import Array
 from perchctl.mission.context import Context
-from perchctl.mission.planner import start_mission
 from perchctl.mission.state import Observation, Outcome, Phase, PlannerState, Severity
 from perchctl.mission.table import unplaced_text
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, ExternalPosition, Telemetry, is_battery_reading
 from perchctl.vision import Consistency, PictureKind, PipelineOutput, TargetEstimate
 
-SentBy = Literal["watchdog", "rescue", "reconnect", "farewell"]
 TurnRole = Literal["waiting", "redone", "flown", "failed"]
 RESCUE = " in flight: "
-"""The words between the error's name and what was done, in the note of a rescue in flight."""
 
 
 class EventKind(Enum):
@@ -44,30 +41,40 @@ class Event:
     severity: Severity = Severity.CONTINUE
     simulated: str = ""  # what the simulated scenario did that led to it
 
+    @classmethod
+    def of_rescue(cls, t_s: float, error: BaseException, rest: str) -> Event:
+        """The note on what became of a vehicle after an error in flight; `rest` as in `rest_of`."""
+        return cls(t_s, EventKind.NOTE, f"{type(error).__name__}{RESCUE}{rest}")
 
-def events_of(
-    before: PlannerState | None, state: PlannerState, obs: Observation, profile: Profile
-) -> list[Event]:
-    """The events of one tick; `before` is None in the first."""
-    events: list[Event] = []
-    if before is None:
-        before = start_mission(obs)
-        events.append(Event(obs.t_s, EventKind.PHASE, before.reason, before.phase))
-        if not is_battery_reading(obs.telemetry.battery_v):
-            grace_s = profile.safety.battery_stale_s
-            text = f"no battery reading: landing after {grace_s:.0f} s at most"
-            events.append(Event(obs.t_s, EventKind.NOTE, text, before.phase))
-    if state.phase is not before.phase:
-        entered = EventKind.PHASE, state.reason, state.phase, state.row, state.severity
-        events.append(Event(obs.t_s, *entered))
-    elif state.hold and not before.hold:
-        held = Event(obs.t_s, EventKind.HOLD, state.hold, state.phase, severity=Severity.HOLD)
-        events.append(held)
-    elif state.stale_s == obs.t_s and before.stale_s != before.t_s and not state.hold:
-        # The pilot reads it also where the vehicle is not held for it.
-        text = unplaced_text(Context(state, obs, profile))
-        events.append(Event(obs.t_s, EventKind.NOTE, text, state.phase))
-    return events
+    @property
+    def is_rescue(self) -> bool:
+        """True for an event `of_rescue`."""
+        return self.kind is EventKind.NOTE and RESCUE in self.reason
+
+    @classmethod
+    def of_tick(
+        cls, before: PlannerState | None, state: PlannerState, obs: Observation, profile: Profile
+    ) -> list[Event]:
+        """The events of one tick; `before` is None in the first."""
+        events: list[Event] = []
+        if before is None:
+            before = PlannerState.on_ground(obs)
+            events.append(cls(obs.t_s, EventKind.PHASE, before.reason, before.phase))
+            if not is_battery_reading(obs.telemetry.battery_v):
+                grace_s = profile.safety.battery_stale_s
+                text = f"no battery reading: landing after {grace_s:.0f} s at most"
+                events.append(cls(obs.t_s, EventKind.NOTE, text, before.phase))
+        if state.phase is not before.phase:
+            entered = EventKind.PHASE, state.reason, state.phase, state.row, state.severity
+            events.append(cls(obs.t_s, *entered))
+        elif state.hold and not before.hold:
+            held = EventKind.HOLD, state.hold, state.phase
+            events.append(cls(obs.t_s, *held, severity=Severity.HOLD))
+        elif state.stale_s == obs.t_s and before.stale_s != before.t_s and not state.hold:
+            # The pilot reads it also where the vehicle is not held for it.
+            text = unplaced_text(Context(state, obs, profile))
+            events.append(cls(obs.t_s, EventKind.NOTE, text, state.phase))
+        return events
 
 
 @dataclass(frozen=True)
@@ -81,7 +88,7 @@ class SentCommand:
     """
 
     t_s: float
-    by: SentBy
+    by: str
     command: Command
 
 
@@ -192,25 +199,13 @@ class Watcher(Protocol):
 
     def tick(self, tick: Tick) -> None:
         """Take a flown turn."""
+        return
 
     def event(self, event: Event) -> None:
         """Take something that happened."""
+        return
 
     @property
     def problem(self) -> str | None:
         """Why the watcher lost something; None while it lost nothing."""
-
-
-class EventKeeper:
-    """A watcher that keeps the events."""
-
-    problem: str | None = None
-
-    def __init__(self) -> None:
-        self.seen: list[Event] = []
-
-    def tick(self, tick: Tick) -> None:
         return None
-
-    def event(self, event: Event) -> None:
-        self.seen.append(event)

@@ -6,13 +6,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from perchctl.mission.context import Context
 from perchctl.mission.lander import Finding, rest_finding
 from perchctl.mission.records import Event
-from perchctl.mission.state import Condition, Observation, Outcome, Phase, PlannerState
-from perchctl.profile import USED_LATENCY_S, CameraConfig, Profile
+from perchctl.mission.state import (
+    Condition,
+    ContactError,
+    Observation,
+    Outcome,
+    Phase,
+    PlannerState,
+)
+from perchctl.profile import CameraConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import FRESH_S, LOCKED
 from perchctl.vision import Consistency
@@ -23,20 +29,6 @@ SAME_HEIGHT_M = 0.3  # a blow higher above the present place was none by the flo
 SURE = 1.96  # standard deviations on both sides of a 95 % interval
 LATENCY_GATE_S = 0.02  # 30 ms make an alignment swing by centimetres
 TURN_GATE_DEG = 2.0  # 35 mm at 1 m, more than the cone of an ascent forgives
-
-
-@dataclass(frozen=True)
-class ContactError:
-    """Horizontal distance of the gear from the target's axis as contact was proven, and its
-    standard deviation."""
-
-    aside_m: float
-    sigma_m: float
-
-    @property
-    def text(self) -> str:
-        """The error in words, as in ``1.8 +- 0.6 mm off centre``."""
-        return f"{1e3 * self.aside_m:.1f} +- {1e3 * self.sigma_m:.1f} mm off centre"
 
 
 @dataclass(frozen=True)
@@ -59,11 +51,54 @@ class Touchdown:
         return f"{how}: {self.speed_mps:.1f} m/s, {self.peak_g:.1f} g"
 
 
-class Rest(NamedTuple):
-    """Where a vehicle came to rest, and how it met the floor; None for what is unknown."""
+@dataclass(frozen=True)
+class Findings:
+    """Latency, and the camera's turn from what the profile says about body x, y and z, each with
+    one standard deviation; `advice` in sentences, empty if the profile fits."""
 
-    finding: Finding | None = None
-    touchdown: Touchdown | None = None
+    latency_s: float
+    latency_sigma_s: float
+    turn_deg: tuple[float, float, float]
+    turn_sigma_deg: tuple[float, float, float]
+    advice: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, seen: Consistency, camera: CameraConfig) -> Findings:
+        """The flight's findings. Advised is what is beyond its gate, and surely so."""
+        latency_s = camera.start_latency_s + seen.delay_s
+        x, y, z = (math.degrees(turn) for turn in seen.turn_rad)
+        sx, sy, sz = (math.degrees(sigma) for sigma in seen.turn_sigma_rad)
+        found, advice = cls(latency_s, seen.delay_sigma_s, (x, y, z), (sx, sy, sz)), []
+        set_here = not isinstance(camera.latency_s, str)  # else the measured one is used
+        if set_here and _is_off(seen.delay_s, LATENCY_GATE_S, seen.delay_sigma_s):
+            advice.append(
+                f"latency {found.latency_text}, profile says {camera.start_latency_s * 1e3:.0f}: "
+                f"set camera.latency_s to {max(0.0, latency_s):.3f}"
+            )
+        turns = zip(found.turn_deg, found.turn_sigma_deg, strict=True)
+        if any(_is_off(turn, TURN_GATE_DEG, sigma) for turn, sigma in turns):
+            advice.append(
+                f"the camera is turned by {found.turn_text} from what the profile says: measure it "
+                f"with `perchctl calibrate mount`"
+            )
+        return replace(found, advice=tuple(advice))
+
+    @property
+    def latency_text(self) -> str:
+        """The latency with its 95 % interval, as in ``92 +- 6 ms``."""
+        return f"{self.latency_s * 1e3:.0f} +- {SURE * self.latency_sigma_s * 1e3:.0f} ms"
+
+    @property
+    def turn_text(self) -> str:
+        """The turn about x, y and z with 95 % intervals, as in
+        ``0.2 +- 0.6, -0.1 +- 0.6, 0.4 +- 1.8 deg``."""
+        each = zip(self.turn_deg, self.turn_sigma_deg, strict=True)
+        return ", ".join(f"{turn:.1f} +- {SURE * sigma:.1f}" for turn, sigma in each) + " deg"
+
+
+def _is_off(off: float, gate: float, sigma: float) -> bool:
+    """True if it is beyond the gate, and its 95 % interval is narrower than it is itself."""
+    return abs(off) > max(gate, 2.0 * SURE * sigma)
 
 
 @dataclass(frozen=True)
@@ -81,48 +116,52 @@ class FlightReport:
     contact: ContactError | None = None  # of what hangs
     touchdown: Touchdown | None = None  # of what met the floor
 
+    @classmethod
+    def of(
+        cls,
+        state: PlannerState,
+        obs: Observation,
+        profile: Profile,
+        history: tuple[Event, ...],
+        consistency: Consistency | None,
+    ) -> FlightReport:
+        """The report of a mission that is over, by its last tick."""
+        hangs, contact = state.phase is Phase.PERCHED, state.contact
+        placed = hangs and contact is not None and math.isfinite(contact.sigma_m)
+        return cls(
+            phase=state.phase,
+            outcome=state.outcome or Outcome.SAFETY,
+            reason=_reason(state, obs, history),
+            # A hold that is noticed once the attempts are used up has been counted as failed.
+            attempts=state.attempts + int(hangs and state.outcome is not Outcome.ATTEMPTS_USED_UP),
+            duration_s=obs.t_s - state.started_s,
+            # The telemetry at hand is older than an emergency stop, which always locks.
+            locked=obs.telemetry.has(LOCKED) or state.outcome is Outcome.EMERGENCY,
+            history=history,
+            findings=None if consistency is None else Findings.of(consistency, profile.camera),
+            contact=contact if placed else None,
+            touchdown=touchdown_of(Context(state, obs, profile)),
+        )
 
-def flight_report(
-    state: PlannerState,
-    obs: Observation,
-    profile: Profile,
-    history: tuple[Event, ...],
-    consistency: Consistency | None,
-) -> FlightReport:
-    """The report of a mission that is over, by its last tick."""
-    c = Context(state, obs, profile)
-    # A hold that is noticed once the attempts are used up has been counted as failed.
-    hangs = state.phase is Phase.PERCHED and state.outcome is not Outcome.ATTEMPTS_USED_UP
-    return FlightReport(
-        phase=state.phase,
-        outcome=state.outcome or Outcome.SAFETY,
-        reason=_reason(state, obs, history),
-        attempts=state.attempts + int(hangs),
-        duration_s=obs.t_s - state.started_s,
-        # The telemetry at hand is older than an emergency stop, which always locks.
-        locked=obs.telemetry.has(LOCKED) or state.outcome is Outcome.EMERGENCY,
-        history=history,
-        findings=None if consistency is None else flight_findings(consistency, profile.camera),
-        contact=_contact_error(state),
-        touchdown=touchdown_of(c),
-    )
 
-
-def rest_of(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> Rest | None:
-    """Where the vehicle is, once its motors have been seen off for `off_s`; None before that."""
+def rest_of(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> str | None:
+    """Where the vehicle is, as a sentence without its end, once its motors have been seen off for
+    `off_s`; None before that. A hard touchdown is told with it."""
     c = Context(state, obs, profile)
     if c.held(Condition.DOWN) < off_s:
         return None
-    finding = rest_finding(c)
+    finding, touchdown = rest_finding(c), touchdown_of(c)
     hangs = finding in (Finding.HANGS, Finding.HELD)
-    return Rest(finding, None if hangs else touchdown_of(c))
+    if hangs or touchdown is None or not touchdown.is_hard:
+        return finding.value
+    return f"{finding.value}; it {touchdown.text}"
 
 
 def touchdown_of(c: Context) -> Touchdown | None:
     """The newest blow from below, where it may have been the floor's; None if there was none.
 
     Its speed is the estimate's where that is believed, else as reckoned by the accelerometer."""
-    tel, imu, reckoning = c.obs.telemetry, c.obs.imu, c.state.reckoning
+    tel, imu, reckoning = c.telemetry, c.obs.imu, c.state.reckoning
     blow = imu.blow
     if c.state.phase is Phase.PERCHED or min(tel.t_s, imu.off_s) - blow.t_s > LATEST_S:
         return None
@@ -131,14 +170,6 @@ def touchdown_of(c: Context) -> Touchdown | None:
     reckoned = c.state.blind_s is not None or c.state.astray
     speed_mps = -(reckoning.struck_mps if reckoned else blow.estimated_mps)
     return Touchdown(max(0.0, speed_mps), blow.peak_g)
-
-
-def _contact_error(state: PlannerState) -> ContactError | None:
-    """The contact error of a vehicle that hangs; None if its contact was never placed."""
-    aside_m, sigma_m = state.contact_aside_m, state.contact_sigma_m
-    if state.phase is not Phase.PERCHED or aside_m is None or not math.isfinite(sigma_m):
-        return None
-    return ContactError(aside_m, sigma_m)
 
 
 def _reason(state: PlannerState, obs: Observation, history: tuple[Event, ...]) -> str:
@@ -154,80 +185,3 @@ def _reason(state: PlannerState, obs: Observation, history: tuple[Event, ...]) -
         cause = f"nothing was heard from the vehicle for {age_s:.1f} s"
     text = f"the landing was ordered but could not be confirmed: {cause}"
     return f"{why}; {text}" if why else text
-
-
-# --- What the flight showed of latency and mounting ----------------------------------------------
-
-
-@dataclass(frozen=True)
-class Findings:
-    """Latency, and the camera's turn from what the profile says about body x, y and z, each with
-    one standard deviation; `advice` in sentences, empty if the profile fits."""
-
-    latency_s: float
-    latency_sigma_s: float
-    turn_deg: tuple[float, float, float]
-    turn_sigma_deg: tuple[float, float, float]
-    advice: tuple[str, ...] = ()
-
-    @property
-    def latency_text(self) -> str:
-        """The latency with its 95 % interval, as in ``92 +- 6 ms``."""
-        return f"{self.latency_s * 1e3:.0f} +- {SURE * self.latency_sigma_s * 1e3:.0f} ms"
-
-    @property
-    def turn_text(self) -> str:
-        """The turn about x, y and z with 95 % intervals, as in
-        ``0.2 +- 0.6, -0.1 +- 0.6, 0.4 +- 1.8 deg``."""
-        each = zip(self.turn_deg, self.turn_sigma_deg, strict=True)
-        return ", ".join(f"{turn:.1f} +- {SURE * sigma:.1f}" for turn, sigma in each) + " deg"
-
-
-def flight_findings(seen: Consistency, camera: CameraConfig) -> Findings:
-    """The flight's findings, with advice where the flown profile differs."""
-    x, y, z = (math.degrees(turn) for turn in seen.turn_rad)
-    sx, sy, sz = (math.degrees(sigma) for sigma in seen.turn_sigma_rad)
-    found = Findings(
-        latency_s=camera.start_latency_s + seen.delay_s,
-        latency_sigma_s=seen.delay_sigma_s,
-        turn_deg=(x, y, z),
-        turn_sigma_deg=(sx, sy, sz),
-    )
-    advice = [*_about_latency(found, camera), *_about_turn(found)]
-    return replace(found, advice=tuple(advice))
-
-
-def _about_latency(found: Findings, camera: CameraConfig) -> list[str]:
-    least_s, most_s = USED_LATENCY_S
-    measured = isinstance(camera.latency_s, str)
-    used_s = min(max(found.latency_s, least_s), most_s) if measured else camera.start_latency_s
-    off_s = found.latency_s - used_s
-    if not _is_worth_saying(off_s, LATENCY_GATE_S, found.latency_sigma_s):
-        return []
-    found_text = f"latency {found.latency_text}"
-    if measured:
-        return [
-            f"{found_text}, and {least_s * 1e3:.0f} to {most_s * 1e3:.0f} are used with "
-            f"camera.latency_s: measured: find what delays the pictures"
-        ]
-    to_set = f"set camera.latency_s to {max(0.0, found.latency_s):.3f}"
-    return [f"{found_text}, profile says {used_s * 1e3:.0f}: {to_set}"]
-
-
-def _about_turn(found: Findings) -> list[str]:
-    off = [
-        f"{turn:.1f} +- {SURE * sigma:.1f} deg about {axis}"
-        for axis, turn, sigma in zip("xyz", found.turn_deg, found.turn_sigma_deg, strict=True)
-        if _is_worth_saying(turn, TURN_GATE_DEG, sigma)
-    ]
-    if not off:
-        return []
-    return [
-        f"the camera is turned by {', '.join(off)} from what the profile says: measure it with "
-        f"`perchctl calibrate mount`"
-    ]
-
-
-def _is_worth_saying(off: float, gate: float, sigma: float) -> bool:
-    """True if it is beyond the gate, and its 95 % interval is narrower than it is itself."""
-    return abs(off) > max(gate, 2.0 * SURE * sigma)

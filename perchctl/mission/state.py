@@ -47,15 +47,7 @@ class Phase(Enum):
         return self in TERMINALS
 
 
-SEVEN_PHASES = (
-    Phase.APPROACH,
-    Phase.SEARCH,
-    Phase.ESTIMATE,
-    Phase.ALIGN,
-    Phase.ASCEND,
-    Phase.PERCH,
-    Phase.COMPLETE,
-)
+SEVEN_PHASES = tuple(Phase)[:7]
 FLYING_PHASES = frozenset({*SEVEN_PHASES, Phase.RECOVER})
 BEFORE_CONTACT = FLYING_PHASES - {Phase.COMPLETE}
 TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
@@ -69,6 +61,10 @@ class Severity(IntEnum):
     BACK_OFF = 2
     LAND = 3
     STOP = 4
+
+    def then(self, row: Severity) -> Severity:
+        """The flight's severity after a transition: from `LAND` on it only rises."""
+        return max(self, row) if self >= Severity.LAND else row
 
 
 class Outcome(Enum):
@@ -118,6 +114,26 @@ class MotorStop(Enum):
     NONE = "none"  # they are left alone
     PLAIN = "plain"  # stopped, where the supervisor has ended the flight already
     EMERGENCY = "emergency"  # cut and locked
+
+
+@dataclass(frozen=True)
+class ContactError:
+    """Horizontal distance of the gear from the target's axis as contact was proven, and its
+    standard deviation, infinite where that is not known."""
+
+    aside_m: float
+    sigma_m: float
+
+    def is_within(self, radius_m: float) -> bool:
+        """True if it is known to be so near to the axis."""
+        return self.aside_m + self.sigma_m <= radius_m
+
+    @property
+    def text(self) -> str:
+        """The error in words, as in ``1.8 +- 0.6 mm off centre``."""
+        if not math.isfinite(self.sigma_m):
+            return "at an unknown distance from the centre"
+        return f"{1e3 * self.aside_m:.1f} +- {1e3 * self.sigma_m:.1f} mm off centre"
 
 
 class Operator(IntEnum):
@@ -244,8 +260,7 @@ class PlannerState:
     battery: BatteryOutlook = field(default_factory=BatteryOutlook)  # what that is enough for
     reckoning: Reckoning = field(default_factory=Reckoning)  # speed and place by the accelerometer
     reach_s: float | None = None  # within the magnet's reach since
-    contact_aside_m: float | None = None  # gear to the target's axis, as it made contact
-    contact_sigma_m: float = 0.0  # standard deviation of that
+    contact: ContactError | None = None  # as it made contact
     heading_lost: bool = False  # position control would lead away from its setpoint
     blind_s: float | None = None  # accelerometer and attitude are all there is, since
     blind_height_m: float = 0.0  # above the ground, as reckoned since then
@@ -264,3 +279,12 @@ class PlannerState:
     def ground_z_m(self) -> float:
         """Height of the ground that the flight started from; 0 if it is unknown."""
         return self.ground_m[2] if self.ground_m else 0.0
+
+    @classmethod
+    def on_ground(cls, obs: Observation) -> PlannerState:
+        """The state before take-off."""
+        tel, t_s = obs.telemetry, obs.t_s
+        return cls(
+            entered_s=t_s, started_s=t_s, t_s=t_s, search_step_s=t_s,
+            ground_m=tel.position_m, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
+        )  # fmt: skip

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, field
 
 from perchctl.geometry import wrap_rad
-from perchctl.mission import ImuMotion, integrate_imu
+from perchctl.mission import ImuMotion
 from perchctl.profile import SafetyConfig
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry, is_battery_reading
@@ -66,7 +66,7 @@ def add_samples(history: History, new: list[Telemetry], safety: SafetyConfig) ->
             changed_s = sample.t_s
         if is_battery_reading(sample.battery_v) and sample.battery_v != battery_v:
             changed_s, battery_v = sample.t_s, sample.battery_v
-        imu = integrate_imu(imu, samples[-1] if samples else None, sample)
+        imu = imu.with_sample(samples[-1] if samples else None, sample)
         samples.append(sample)
     if samples:
         oldest = samples[-1].t_s - KEEP_S

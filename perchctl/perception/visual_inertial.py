@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.mission import Mismatch, VisualInertialMotion, acceleration_mps2
+from perchctl.mission import ImuMotion, Mismatch, VisualInertialMotion
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
@@ -125,7 +125,7 @@ def motion_by_hypothesis(
     stamps_s = np.array([s.t_s for s in samples])
     attitudes = np.array([(s.roll_rad, s.pitch_rad, s.yaw_rad) for s in samples])
     attitudes[:, 2] = np.unwrap(attitudes[:, 2])
-    forces = np.array([acceleration_mps2(s, offset_g) for s in samples])
+    forces = np.array([ImuMotion.acceleration_mps2(s, offset_g) for s in samples])
     speeds = _integral(stamps_s, forces)
     moved = _integral(stamps_s, speeds)
 

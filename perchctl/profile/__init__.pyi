@@ -17,7 +17,7 @@ from .load import first_invalid_key as first_invalid_key
 from .load import load_profile as load_profile
 from .load import read_mask as read_mask
 from .load import read_weights as read_weights
-from .mission import LandingConfig as LandingConfig
+from .mission import PlannerConfig as PlannerConfig
 from .mission import SafetyConfig as SafetyConfig
 from .positioning import PositioningConfig as PositioningConfig
 from .schema import LinkConfig as LinkConfig

@@ -170,6 +170,8 @@ class LandingConfig(Section):
 
 
 class PlannerConfig(Section):
+    """How the mission flies, phase by phase."""
+
     takeoff_height_m: float = key(0.5, "of the take-off, above the ground", ge=0.2, le=5)
     takeoff_speed_mps: float = key(0.3, "of the setpoint, from the ground up", gt=0, le=1)
     approach_xy_m: tuple[float, float] | None = key(

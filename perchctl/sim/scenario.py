@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2, Array, make_T, rotation_from_rpy
-from perchctl.mission import NO_PICTURE_TEXT, Event, EventKind
+from perchctl.mission import Event, EventKind
 from perchctl.profile import Profile, SimulationConfig
 
 CONTROL_PERIOD_S = 0.002
@@ -349,7 +349,7 @@ class EventExplainer:
         time in the simulation."""
         scenario, force_n = self._scenario, self._scenario.first_contact_force_n
         held = event.reason if event.kind is EventKind.HOLD else ""
-        if event.row in LOSSES or held.startswith(NO_PICTURE_TEXT):
+        if event.row in LOSSES or held.startswith("no picture"):
             start_s, frames = scenario.camera_burst or (math.inf, 0)
             if 0.0 <= t_s - start_s <= frames / scenario.camera_rate_hz + FELT_FOR_S:
                 return f"{frames} frames lost"

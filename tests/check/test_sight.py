@@ -58,7 +58,7 @@ def test_under_the_target_both_rows_pass_and_say_from_how_far() -> None:
 @pytest.mark.parametrize(("verdict", "words", "advice", "done"), [
     ("fail", "no, and fly refuses", "at most 3.2 m above the camera",
      rehearsed(found=0, target=None)),
-    ("fail", "as the vehicle takes off", "forward", rehearsed(1.3)),
+    ("fail", "the vehicle would not see it", "forward", rehearsed(1.3)),
     ("warn", "in 33 % of the pictures", "nearer", rehearsed(found=20)),
     ("warn", "not at the end", "lost frames", rehearsed(target=None)),
     ("warn", "only 1 % of the picture's width", "put the vehicle", rehearsed(looked=[shown(5.0)])),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -19,8 +20,7 @@ from perchctl.faults.oracle import (
     claims_of,
     claims_of_rescue,
 )
-from perchctl.flight import RESCUED
-from perchctl.mission import RESCUE, Event, EventKind, Finding, FlightReport, Outcome, Phase
+from perchctl.mission import Event, EventKind, Finding, FlightReport, Outcome, Phase
 from perchctl.mission.state import TERMINALS, MotorStop
 from perchctl.mission.table import TABLE
 
@@ -88,15 +88,22 @@ def note(text: str, kind: EventKind = EventKind.NOTE) -> Event:
     return Event(9.0, kind, text)
 
 
-@pytest.mark.parametrize("found", RESCUED)
-def test_what_a_rescue_says_counts_too(found: Finding | None) -> None:
+@pytest.mark.parametrize("found", Finding)
+def test_what_a_rescue_says_counts_too(found: Finding) -> None:
     """By what it found: that it hangs is another claim than that it stands."""
-    claims = claims_of_rescue(note(f"ValueError{RESCUE}{RESCUED[found]}"))
+    claims = claims_of_rescue(Event.of_rescue(9.0, ValueError(), f"{found.value}; it fell hard"))
     words = {
         "stands on the floor": "stands", "hangs on the magnet": "hangs",
         "something holds the vehicle": "held off the target",
         "whether the vehicle hangs or stands": "hangs or stands",
         "could not be confirmed": "not seen down",
     }  # fmt: skip
-    assert claims == {claim for word, claim in words.items() if word in RESCUED[found]}
-    assert set(RESCUE_CLAIMS) == set(RESCUED)
+    assert claims == {claim for word, claim in words.items() if word in found.value}
+    assert set(RESCUE_CLAIMS) == set(Finding)
+
+
+def test_what_is_no_rescue_s_note_claims_nothing() -> None:
+    assert claims_of_rescue(note("no battery reading")) == set()
+    rescue = Event.of_rescue(9.0, ValueError(), Finding.UNSEEN.value)
+    phase = replace(rescue, kind=EventKind.PHASE)
+    assert claims_of_rescue(phase) == set()

@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration import profile_camera
 from perchctl.campaign import FlightResult, campaign_summary, fly_all
 from perchctl.campaign.flights import fly_seed
 from perchctl.commands.fly import EXIT_CODE_OF
-from perchctl.errors import EXIT_CODES
-from perchctl.flight import FlyOptions, LockstepFlight, fly_lockstep, lockstep
-from perchctl.geometry import rot_z
-from perchctl.mission import Event, EventKeeper, EventKind, Operator, Outcome, Phase, Tick
+from perchctl.flight import FlyOptions, fly_lockstep
+from perchctl.flight.lockstep import LockstepFlight
+from perchctl.mission import Event, EventKind, Operator, Outcome, Phase, Tick
 from perchctl.mission.state import SEVEN_PHASES
-from perchctl.perception.online_calibration import SLEW
 from perchctl.profile import load_profile
 from perchctl.record import FlightLog, read_log
 from perchctl.sim import draw_scenario
 from perchctl.vision import TargetEstimate
 from tests.helpers.flights import SEED, SHORT, Flown, fly_short, short_profile
+from tests.helpers.loop_rig import Watcher
 
 SEVEN_NAMES = [phase.value for phase in SEVEN_PHASES]
 MISS_LIMIT_M = 0.020
@@ -99,37 +94,6 @@ def test_a_quiet_flight_perches_by_the_seven_phases_in_order(
     assert {"large", "both"} <= stages or {"both", "small"} <= stages
 
 
-def test_its_log_is_whole(quiet_log: FlightLog) -> None:
-    assert not quiet_log.truncated
-    assert quiet_log.summary is not None
-    assert quiet_log.summary["outcome"] == "perched"
-    assert quiet_log.header["seed"] == SEED
-    assert quiet_log.header["lockstep"]
-    steps = np.diff(quiet_log.column("t_s"))
-    assert steps == pytest.approx(0.02, abs=1e-5)  # one record a loop
-
-
-def test_its_log_tells_latency_and_mounting_once_a_second(quiet_log: FlightLog) -> None:
-    """The pictures are 60 ms late, the profile says 75; the camera is mounted as it says."""
-    told = quiet_log.column("t_s")[np.isfinite(quiet_log.column("delay_s"))]
-    assert len(told) >= 4
-    assert np.diff(told).min() > 0.9
-    last = quiet_log.column("t_s") == told[-1]
-    for key, truth in (("delay_s", -0.015), ("turn_x_rad", 0.0), ("turn_z_rad", 0.0)):
-        sigma = quiet_log.column(key.replace("_s", "_sigma_s").replace("_rad", "_sigma_rad"))[last]
-        assert abs(quiet_log.column(key)[last] - truth) < 3.0 * sigma
-    assert quiet_log.summary is not None
-    assert quiet_log.summary["latency_s"] == pytest.approx(0.06, abs=0.01)
-    assert len(quiet_log.summary["mount_turn_sigma_deg"]) == 3
-
-
-def test_it_sends_one_kind_of_setpoint_once_it_flies(quiet_log: FlightLog) -> None:
-    """Firmware facts, "Setpoint modes": a change of mode costs 0.3 m at 42 g."""
-    kinds = [r["cmd"] for r in quiet_log.records if r["cmd"] != "idle"]
-    once = [kind for i, kind in enumerate(kinds) if i == 0 or kinds[i - 1] != kind]
-    assert len(once) == 3, once  # take-off, position setpoints, motors stopped
-
-
 @pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes_and_another_is_another_flight(
     quiet: tuple[FlightResult, Path], tmp_path: Path
@@ -147,17 +111,6 @@ def test_the_same_seed_gives_the_same_bytes_and_another_is_another_flight(
 # --- The scenario of the shipped profile -------------------------------------------------
 
 
-def test_the_first_flight_stays_plain_on_a_computer_that_is_not_quick() -> None:
-    """Whenever in the flight they come, so few lost frames, and one more beside them, are no
-    hold, and nothing else was drawn that leads to an event."""
-    profile = load_profile("sim")
-    scenario = draw_scenario(profile, FlyOptions.seed)
-    assert scenario.camera_burst is not None
-    gap_s = (scenario.camera_burst[1] + 2) / scenario.camera_rate_hz + scenario.camera_jitter_s
-    assert gap_s < profile.safety.camera_hold_s - 0.1
-    assert scenario.first_contact_force_n is None
-
-
 @pytest.mark.long
 def test_the_full_scenario_perches() -> None:
     """Drift, draught, lost frames, mounting error, noise: all of them in one flight, which is a
@@ -167,10 +120,10 @@ def test_the_full_scenario_perches() -> None:
     assert scenario.camera_drop_rate == 0.1
     assert scenario.draught_mps != (0.0, 0.0, 0.0)
     assert scenario.drift_mps != (0.0, 0.0, 0.0)
-    events = EventKeeper()
+    events = Watcher()
     flight = fly_lockstep(load_profile("sim"), FlyOptions.seed, watchers=(events,))
     assert_perched(Flown(flight, 0.0))
-    assert [e.phase.value for e in events.seen if e.phase] == [*SEVEN_NAMES, "PERCHED"]
+    assert [e.phase.value for e in events.events if e.phase] == [*SEVEN_NAMES, "PERCHED"]
     found = flight.report.findings
     assert found is not None
     assert found.advice == ()
@@ -196,31 +149,6 @@ def test_a_first_contact_that_does_not_hold_is_tried_again(mode: str) -> None:
     assert_perched(flown, attempts=2)
     assert flown.way[:8] == [*SEVEN_NAMES, "RECOVER"]
     assert flown.way[8:] == ["ESTIMATE", "ALIGN", "ASCEND", "PERCH", "COMPLETE", "PERCHED"]
-
-
-@pytest.mark.long
-def test_what_hangs_when_the_attempts_are_used_up_is_not_said_to_have_landed() -> None:
-    """The magnet holds, but the one attempt was given up before that was seen."""
-    flown = fly_short({"planner.attempts": 1, "planner.complete.release_timeout_s": 1.85})
-    assert flown.flight.hanging
-    assert flown.way[-3:] == ["RECOVER", "LANDING", "PERCHED"]
-    assert flown.report.outcome is Outcome.ATTEMPTS_USED_UP
-    assert "used up; hanging with the motors off" in flown.report.reason
-    assert flown.report.attempts == 1
-    assert "left hanging" in EXIT_CODES[EXIT_CODE_OF[flown.report.outcome]]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("magnet_n", "lost_m"), [(0.10, 0.11), (0.30, 0.46), (0.38, 0.78)])
-def test_a_caught_slip_costs_the_measured_height(magnet_n: float, lost_m: float) -> None:
-    """docs/firmware.md, "Catching a slip": what the program's own catch costs at 42 g.
-
-    A slip falls into a period of the loop anywhere, which is worth 0.1 m: the mean of four."""
-    room = {"mass_kg": 0.042, "ceiling_z_m": 2.0, "battery_rest_v": 4.15}
-    flown = fly_short({"planner.attempts": 4}, magnet_force_n=magnet_n, **room)
-    assert_landed(flown, Outcome.ATTEMPTS_USED_UP, 51)
-    assert flown.way.count("PERCH") == len(flown.slips_m) == 4
-    assert sum(flown.slips_m) / 4 == pytest.approx(lost_m, rel=0.15)
 
 
 # --- Faults ------------------------------------------------------------------------------
@@ -256,49 +184,6 @@ def test_what_goes_wrong_is_landed_and_named(
         way_ends = way_ends[2:]
     assert flown.way[-len(way_ends) :] == way_ends
     assert "PERCH" not in flown.way
-
-
-@pytest.mark.long
-def test_without_the_gate_the_battery_just_does() -> None:
-    flown = fly_short(LOW | {"safety.energy_gate": False}, battery_rest_v=3.775)
-    assert flown.way[-1] == "PERCHED"
-
-
-def _turned(deg: float) -> dict[str, Any]:
-    """A scenario whose camera is turned so far from what the profile says."""
-    drawn = draw_scenario(load_profile(SHORT), SEED)
-    turned = np.array(drawn.T_body_cam_true)
-    turned[:3, :3] = rot_z(np.radians(deg)) @ turned[:3, :3]
-    return {"T_body_cam_true": tuple(map(tuple, turned.tolist())), "target_xy_m": (0.25, 0.1)}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("deg", [90, 180, -90])
-def test_a_turned_mounting_is_named_within_three_decimetres(deg: int) -> None:
-    """Unnoticed, such a flight goes the wrong way until it meets the fence."""
-    flown = fly_short(**_turned(deg))
-    assert_landed(flown, Outcome.SAFETY, 52, f"camera seems turned by about {deg} deg")
-    assert "`perchctl calibrate mount`" in flown.report.reason
-    found = flown.report.findings
-    assert found is not None
-    assert any("turned by" in advice and "about z" in advice for advice in found.advice)
-    off_deg = (found.turn_deg[2] - deg + 180.0) % 360.0 - 180.0
-    assert abs(off_deg) < 3.0 * found.turn_sigma_deg[2]
-    assert flown.farthest_m < 0.25
-
-
-@pytest.mark.long
-def test_a_latency_that_is_measured_is_used() -> None:
-    """110 ms, of which the profile says nothing."""
-    looker = Looker()
-    profile = short_profile({"camera.latency_s": "measured"})
-    scenario = replace(draw_scenario(profile, SEED), camera_latency_s=0.11)
-    flight = fly_lockstep(profile, scenario=scenario, watchers=(looker,))
-    assert flight.report.phase is Phase.PERCHED
-    assert flight.miss_m < MISS_LIMIT_M
-    used_s = [tick.delay_used_s for tick in looker.ticks]
-    assert profile.camera.start_latency_s + used_s[-1] == pytest.approx(0.11, abs=0.012)
-    assert max(np.abs(np.diff(used_s))) <= SLEW * 0.1 + 1e-9
 
 
 # --- The operator ---------------------------------------------------------------------
@@ -360,15 +245,6 @@ def test_it_perches_and_is_never_held(scenario: dict[str, Any]) -> None:
     assert not any(event.kind is EventKind.HOLD for event in flown.report.history)
 
 
-@pytest.mark.long
-def test_a_receiver_that_is_stuck_in_flight_ends_in_a_landing() -> None:
-    flown = fly_short(**PAL, camera_receiver_hz=60.0, camera_freeze_at_s=6.0)
-    assert flown.report.phase is Phase.LANDED
-    reasons = {event.row: event.reason for event in flown.report.history}
-    assert reasons["camera-gone"] == "the picture stands still"
-    assert not flown.flight.fell
-
-
 # --- A flight that nobody records is the same, but for the spread of the present ------------------
 
 
@@ -398,33 +274,3 @@ def test_the_planner_is_shown_the_same(tmp_path: Path) -> None:
 
 
 # --- Flights of one profile share their pipeline; no other one does -------------------------------
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"kalman.n_max": 7}, {"camera.mount.rpy_deg": (0.0, 1.0, 0.0)}, {"target.large.side_m": 0.12}],
-    ids=lambda change: next(iter(change)),
-)
-def test_a_profile_or_a_camera_that_differs_has_its_own(change: dict[str, object]) -> None:
-    pipeline_of: Callable[..., Any] = lockstep._pipeline_of
-    profile = short_profile()
-    camera, again = profile_camera(profile.camera), profile_camera(profile.camera)
-    shared = pipeline_of(profile, camera)
-    assert pipeline_of(short_profile(), again) is shared
-    assert pipeline_of(short_profile(change), camera) is not shared
-    other = replace(camera, dist=camera.dist + 1e-9)
-    assert pipeline_of(profile, other).camera is other
-
-
-def test_and_a_mask_is_read_each_time(tmp_path: Path) -> None:
-    file = tmp_path / "mask.png"
-    camera = profile_camera(short_profile().camera)
-    width, height = camera.size_px
-    masked = short_profile({"camera.mask": str(file)})
-    for rows in (20, 40):
-        covered = np.zeros((height, width), np.uint8)
-        covered[:rows, :60] = 255
-        cv2.imwrite(str(file), covered)
-        mask = lockstep._pipeline_of(masked, camera).detector.mask
-        assert mask is not None
-        assert np.count_nonzero(mask.whole) == rows * 60

@@ -157,7 +157,7 @@ def test_while_hanging_with_the_motors_off_it_starts_nothing() -> None:
 def test_at_the_ceiling_it_peels_off_first() -> None:
     """The vehicle's own landing would run by its clock and end up there, motors off."""
     rig = rescuing(2.0)
-    assert rig.rescue(telemetry(0.0, 2.0), **AT_CEILING).finding is Finding.STANDS
+    assert rig.rescue(telemetry(0.0, 2.0), **AT_CEILING) == Finding.STANDS.value
     first = rig.link.sent[0][1]
     assert isinstance(first, PositionSetpoint)
     assert first.z_m <= 2.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -198,66 +197,6 @@ def test_signals_that_end_or_suspend_a_program_land(name: str) -> None:
 def test_a_hanging_loop_is_landed_without_the_operator() -> None:
     with Hanging(0.02) as flight:
         flight.sends("Land", "NONE")
-
-
-def printed(code: str) -> str:
-    """What a program prints that knows the signals and the switch."""
-    known = (
-        "import os, signal, time\n"
-        "from perchctl.commands.interrupt import signals_to_operator\n"
-        "from perchctl.errors import Interrupted\n"
-        "from perchctl.flight import OperatorSwitch\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", known + code], cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_a_hang_up_that_is_ignored_stays_ignored() -> None:
-    """As under nohup."""
-    said = printed(
-        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
-        "switch = OperatorSwitch(listening=True)\n"
-        "with signals_to_operator(switch, print):\n"
-        "    os.kill(os.getpid(), signal.SIGHUP)\n"
-        "    print(switch.read().name)\n"
-        "print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)\n"
-    )
-    assert said.split() == ["NONE", "True"]
-
-
-def test_before_the_flight_each_signal_leaves_by_one_sentence() -> None:
-    said = printed(
-        "for name in ('SIGINT', 'SIGTERM', 'SIGHUP', 'SIGTSTP'):\n"
-        "    try:\n"
-        "        with signals_to_operator(OperatorSwitch(), print):\n"
-        "            os.kill(os.getpid(), signal.Signals[name])\n"
-        "            time.sleep(5)\n"
-        "    except Interrupted as error:\n"
-        "        print(error)\n"
-    )
-    assert said.count("nothing was started") == 4
-
-
-def test_a_terminal_that_is_gone_is_no_failure() -> None:
-    """Writes to stderr fail with EIO or EPIPE: nothing is raised, and the exit code stays."""
-    code = (
-        "import sys\n"
-        "from perchctl.commands.output import print_lines, say\n"
-        "from perchctl.display import open_panel\n"
-        "from perchctl.mission import Event, EventKind\n"
-        "say('one'); panel = open_panel(stream=sys.stderr)\n"
-        "panel.event(Event(0.0, EventKind.NOTE, 'two'))\n"
-        "panel.close(); print_lines('three')\n"
-        "sys.exit(7)\n"
-    )
-    read, write = os.pipe()
-    os.close(read)
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, stderr=write)
-    os.close(write)
-    assert done.returncode == 7
 
 
 def test_it_is_asked_once_the_vehicle_has_answered(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,19 +6,16 @@ What the machine's load can spoil is tried once more; nothing passes without fly
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
-import pty
 import re
 import signal
 import subprocess
 import sys
-import termios
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +27,6 @@ from tests.helpers.waiting import until
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration
-from perchctl.flight.clock import SLOW
 from perchctl.mission.state import SEVEN_PHASES
 from perchctl.profile import find_calibration, load_profile
 from perchctl.record import FlightLog, read_log
@@ -115,30 +111,6 @@ def test_fly_perches_in_real_time_through_cflib(tmp_path: Path) -> None:
 
 LEAST_MISS_M = 0.002
 """By decks: a lucky one would ask for more than any picture tells."""
-
-
-def best_miss_m(folder: Path, *words: str) -> float:
-    """The miss of the first of two flights that perches."""
-    for attempt in ("first", "second"):
-        _, out, err = flown(folder / attempt, *words, "--yes", "--json")
-        said = json.loads(out)
-        if said["outcome"] == "perched":
-            return float(said["miss_m"])
-    pytest.fail(err)
-
-
-@pytest.mark.campaign
-def test_by_the_target_alone_it_perches_not_much_worse_than_by_a_deck(tmp_path: Path) -> None:
-    by_target_m = best_miss_m(tmp_path / "target", "-p", "target_only")
-    by_deck_m = best_miss_m(tmp_path / "deck", "-p", "target_only", "--positioning", "deck")
-    assert by_target_m <= 2.0 * max(by_deck_m, LEAST_MISS_M)
-
-
-@pytest.mark.campaign
-def test_by_a_motion_capture_it_perches(tmp_path: Path) -> None:
-    pytest.importorskip("motioncapture", reason="motion capture needs the extra [mocap]")
-    words = ("-p", SHORT, "--positioning", "mocap", "--seed", str(SEED))
-    assert best_miss_m(tmp_path, *words) < 0.02
 
 
 # --- Interrupted flights -------------------------------------------------------------------
@@ -259,47 +231,3 @@ def test_kill_9_in_flight_leaves_a_log_and_a_vehicle_that_ends_by_itself(tmp_pat
     assert locked_s == pytest.approx(cut_s, abs=0.1)
     held = [t["position_m"][2] for t in past if after_s < t["t_s"] < before_s + 1.7]
     assert min(held) > 0.2  # until then it hovers
-
-
-@pytest.mark.long
-def test_a_terminal_that_is_closed_in_flight_lands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A hang-up, and from then on each write to the terminal fails."""
-    monkeypatch.setenv("TERM", "xterm")
-    with vehicle(tmp_path) as own, ExitStack() as stack:
-        terminal, its_end = pty.openpty()
-        process = own.fly(
-            tmp_path, stdin=its_end, stdout=its_end, stderr=its_end,
-            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
-        )  # fmt: skip
-        stack.enter_context(bounded(process))
-        os.close(its_end)
-        seen = b""
-        while b"SEARCH:" not in seen:
-            seen += os.read(terminal, 4096)
-        until(lambda: own.sim.truth()["position_m"][2] > 0.3, 5.0)
-        os.close(terminal)
-        assert process.wait(FLIGHT_LIMIT_S) == 130
-        assert_landed_by_the_operator(own.sim.truth(), read_log(the_log(tmp_path)))
-
-
-@pytest.mark.long
-def test_a_flight_waits_for_a_simulator_that_is_starved(tmp_path: Path) -> None:
-    """As on a busy computer: its process gets no time for a while."""
-    process = started(tmp_path, "-p", SHORT, "--seed", str(SEED), stdout=None)
-    with bounded(process, SLOW_FLIGHT_LIMIT_S), process:
-        assert process.stderr is not None
-        while "] SEARCH:" not in process.stderr.readline():
-            assert process.poll() is None
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text()
-        (simulator,) = (int(pid) for pid in children.split())
-        os.kill(simulator, signal.SIGSTOP)
-        threading.Event().wait(2.5)
-        os.kill(simulator, signal.SIGCONT)
-        rest = process.stderr.read()
-        assert process.wait(FLIGHT_LIMIT_S) == 0, rest
-    assert rest.count(SLOW) == 1
-    log = read_log(the_log(tmp_path))
-    assert [event["reason"] for event in log.events].count(SLOW) == 1
-    assert log.column("tel_age_s").max() < LATE_S

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,7 +9,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.flight.clock import SIM_PATIENCE_S, SLOW, SLOW_S, SimulatedClock
+from perchctl.flight.clock import SIM_PATIENCE_S, SimulatedClock
 from perchctl.sim import CONTROL_PERIOD_S, SharedTime
 from perchctl.sim.host import Runner
 from perchctl.sim.process import LOOP_PATIENCE_S
@@ -82,21 +80,13 @@ def rig(free: Rig) -> Iterator[Rig]:
 
 def test_on_an_idle_computer_it_is_real_time(rig: Rig) -> None:
     assert rig.turns(90) <= NEAR_S
-    assert rig.clock.remarks() == []
     assert rig.host.elapsed_s == pytest.approx(100 * PERIOD_S, abs=NEAR_S)
     assert rig.wall_s - 100.0 == pytest.approx(100 * PERIOD_S, abs=2 * NEAR_S)
     assert rig.clock.now() == pytest.approx(rig.wall_s, abs=NEAR_S)
 
 
-def test_it_waits_for_a_busy_loop_and_says_so_once(rig: Rig) -> None:
-    said = []
-    rig.turns(1, work_s=0.9 * SLOW_S)  # as a computer does now and then
-    rig.turns(10)
-    assert rig.clock.remarks() == []
-    for _ in range(100):
-        rig.turns(1, work_s=0.1)
-        said += rig.clock.remarks()
-    assert said == [SLOW]
+def test_it_waits_for_a_busy_loop(rig: Rig) -> None:
+    rig.turns(100, work_s=0.1)
     assert rig.turns(100, work_s=0.1) <= CLOCK_MARGIN_S + NEAR_S
     assert rig.host.elapsed_s < 0.5 * (rig.wall_s - 100.0)
 
@@ -132,32 +122,3 @@ def test_a_simulator_that_is_gone_does_not_stop_time_nor_turn_it_back(rig: Rig) 
     assert alone_s <= rig.clock.now() <= alone_s + 0.1 + NEAR_S
     rig.turns(50)
     assert rig.clock.now() - alone_s == pytest.approx(50 * PERIOD_S, abs=0.1 + NEAR_S)
-
-
-def test_before_and_after_the_loop_time_runs_freely(free: Rig) -> None:
-    free.turns(1, work_s=0.5)
-    assert math.isinf(free.shared.limit_s)
-    assert free.host.elapsed_s == pytest.approx(0.5, abs=NEAR_S)
-    with contextlib.suppress(ValueError), free.clock.waiting_for_loop():
-        free.turns(1)
-        assert math.isfinite(free.shared.limit_s)
-        raise ValueError("the loop fails")
-    assert math.isinf(free.shared.limit_s)
-    began_s = free.clock.now()
-    free.let_pass(1.0)
-    assert free.clock.now() - began_s == pytest.approx(1.0, abs=0.05)
-
-
-def test_a_vehicle_whose_parent_is_gone_flies_on(rig: Rig) -> None:
-    stands_s = rig.host.elapsed_s
-    rig.runner._lose_parent()
-    rig.let_pass(1.0)
-    assert rig.host.elapsed_s == pytest.approx(stands_s + 1.0, abs=0.05)
-
-
-def test_two_processes_map_the_same_numbers(tmp_path: Any) -> None:
-    (tmp_path / "time").write_bytes(bytes(SharedTime.free()))
-    mine, other = (SharedTime.mapped(tmp_path / "time") for _ in range(2))
-    assert (other.reached_s, other.limit_s) == (0.0, math.inf)
-    mine.limit_s, other.reached_s = 1.5, 0.25
-    assert (mine.reached_s, other.limit_s) == (0.25, 1.5)

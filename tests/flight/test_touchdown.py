@@ -20,18 +20,16 @@ from perchctl.mission import (
     Operator,
     Phase,
     Touchdown,
-    integrate_imu,
-    planner,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.imu import BLOW_MPS, Blow, Reckoning, advance_reckoning
+from perchctl.mission.imu import Blow, Reckoning, advance_reckoning, integrate_imu
 from perchctl.mission.report import HARD_MPS, touchdown_of
 from perchctl.profile import load_profile
 from perchctl.record import FlightSummary, read_log
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
 from tests.helpers import log
 from tests.helpers.loop_rig import PROFILE, Broken, Guarded, Rig, Vehicle, hanging_camera
-from tests.helpers.mission import HANG_Z_M, observation, state_in, telemetry
+from tests.helpers.mission import observation, state_in
 
 HARD = Touchdown(0.9, 3.1)
 SENTENCE = "touched down hard: 0.9 m/s, 3.1 g"
@@ -92,40 +90,6 @@ def test_the_felt_speed_is_the_true_one(share: float, blind: bool) -> None:
 
 
 # --- A blow, sample by sample ------------------------------------------------------------------
-
-
-def blown(*hits: tuple[float, float, float]) -> ImuMotion:
-    """Each hit: when, with what speed down, and the specific force of two samples."""
-    motion, last = ImuMotion(), None
-    for i in range(300):
-        t_s = 0.01 * i
-        vz_mps, acc_g = 0.0, 1.0
-        for hit_s, down_mps, force_g in hits:
-            if hit_s - 0.2 <= t_s < hit_s:
-                vz_mps = -down_mps
-            if hit_s <= t_s < hit_s + 0.015:
-                acc_g = force_g
-        sample = telemetry(t_s, 0.0, velocity_mps=(0.0, 0.0, vz_mps), acc_z_g=acc_g)
-        motion = integrate_imu(motion, last, sample)
-        last = sample
-    return motion
-
-
-def test_of_bounces_the_hardest_counts_and_a_blow_of_long_ago_none() -> None:
-    blow = blown((1.0, 1.2, 3.0), (2.0, 0.9, 4.1), (2.3, 0.4, 2.9)).blow
-    assert (blow.estimated_mps, blow.peak_g) == (-0.9, 4.1)
-    assert blow.t_s == pytest.approx(2.0, abs=0.03)
-    assert blown((1.0, 0.2, 1.0 + BLOW_MPS)).blow.t_s == -math.inf  # a soft one
-
-
-@pytest.mark.parametrize("steady_s", [0.2, 0.21, 0.22, 0.23, 0.24, 0.25])
-def test_an_estimate_that_has_the_blow_before_the_samples_do(steady_s: float) -> None:
-    motion, last = ImuMotion(), None
-    steady = [(-0.4, 1.001)] * round(100 * steady_s)
-    for i, (vz_mps, acc_g) in enumerate([*steady, (0.02, 2.9), (0.02, 3.8), *[(0.02, 1.0)] * 8]):
-        sample = telemetry(0.01 * i, 0.0, velocity_mps=(0.0, 0.0, vz_mps), acc_z_g=acc_g)
-        motion, last = integrate_imu(motion, last, sample), sample
-    assert (motion.blow.estimated_mps, motion.blow.peak_g) == (-0.4, 3.8)
 
 
 @pytest.mark.parametrize(
@@ -193,38 +157,6 @@ def test_the_rescue_says_so() -> None:
         rig.fly()
     note = next(e for e in rig.watcher.events if e.kind is EventKind.NOTE and "Broken" in e.reason)
     assert note.reason.endswith(f"; it {SENTENCE}")
-
-
-def test_an_attempt_that_failed_leaves_no_contact() -> None:
-    state = replace(
-        state_in(Phase.COMPLETE, z_m=HANG_Z_M), contact_aside_m=0.002, contact_sigma_m=0.001
-    )
-    falls = telemetry(10.02, HANG_Z_M - 0.1, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)
-    for t_s in (10.02, 10.04, 10.06, 10.08):
-        state, _ = planner.step_mission(
-            state, observation(t_s, telemetry=replace(falls, t_s=t_s)), PROFILE
-        )
-    assert state.phase is Phase.RECOVER
-    assert state.contact_aside_m is None
-
-
-def test_blind_it_is_the_reckoned_speed_that_counts() -> None:
-    """The estimate has drifted; by what has been felt since, it came down at 0.9 m/s. Neither the
-    blow's own samples nor what stands still on the floor changes that."""
-    before = ImuMotion(t_s=8.9, velocity_mps=(0.0, 0.0, -1.3))
-    after = ImuMotion(t_s=9.1, velocity_mps=(0.0, 0.0, 0.4), blow=Blow(9.0, -0.2, -1.5, 3.1))
-    carried = advance_reckoning(
-        Reckoning(before, velocity_mps=(0.0, 0.0, -0.7)), after, telemetry(9.1, 0.4), believed=False
-    )
-    still = replace(after, t_s=10.0, silent_s=10.0)
-    carried = advance_reckoning(carried, still, telemetry(10.0, 0.4), believed=False)
-    state = replace(state_in(Phase.LANDED, z_m=0.0), blind_s=5.0, reckoning=carried)
-    told = touchdown_of(Context(state, observation(10.0, 0.4, imu=still), PROFILE))
-    assert told is not None
-    assert (told.speed_mps, told.peak_g) == (pytest.approx(0.9), 3.1)
-    silent = replace(after, silent_s=8.95)  # what was reckoned ended there
-    carried = advance_reckoning(Reckoning(before), silent, telemetry(9.1, 0.4), believed=False)
-    assert carried.struck_mps == -0.2
 
 
 # --- What is told ---------------------------------------------------------------------------------

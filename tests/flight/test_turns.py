@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import pytest
 
 from perchctl.analysis.decide import decide
-from perchctl.flight import FlightInputs, WallClock, fly
-from perchctl.flight.turns import Turns, TurnWatcher
-from perchctl.mission import Observation, Operator, Outcome, PlannerState, Tick, Turn, step_mission
+from perchctl.flight import FlightInputs, fly
+from perchctl.flight.turns import TurnWatcher
+from perchctl.mission import Observation, Operator, PlannerState, Tick, Turn, step_mission
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, Land
 from tests.helpers.hangs import hang_in_the_planner, plan_by
@@ -98,11 +97,10 @@ def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_planner_that_fails_on_the_first_turn_fails_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def fails(obs: Observation) -> PlannerState:
+    def fails(c: object) -> None:
         raise ValueError("by the test")
 
-    for module in ("perchctl.flight.loop", "perchctl.analysis.decide"):
-        monkeypatch.setattr(f"{module}.start_mission", fails)
+    monkeypatch.setattr("perchctl.mission.planner._remember", fails)
     rig = Rig()
     (again,) = decide(broken(rig, ValueError).turns, rig.profile)
     assert (again.turn.role, again.error, again.difference) == ("failed", "ValueError", None)
@@ -143,24 +141,6 @@ def test_an_interrupted_planner_did_not_fail_and_no_turn_is_told_twice(
     assert {turn.role for turn in broken(Rig(), KeyboardInterrupt).turns} == {"waiting"}
 
 
-@pytest.mark.parametrize(
-    ("changes", "field"),
-    [({"reason": "another word"}, "reason"), ({"outcome": Outcome.SAFETY}, "outcome")],
-)
-def test_a_planner_that_changes_only_what_it_says_is_found_out(
-    changes: dict[str, Any], field: str
-) -> None:
-    rig = Rig()
-    turns = flown(rig).of_ticks
-    turns[7] = replace(turns[7], **changes)
-    found = next((each for each in decide(turns, rig.profile) if each.difference), None)
-    assert found is not None
-    assert found.difference is not None
-    assert (found.tick, found.difference[0]) == (7, field)
-    turns[7] = replace(turns[7], reason=None)  # of before version 4
-    assert not any(each.difference for each in decide(turns, rig.profile))
-
-
 def test_all_that_is_taken_in_is_in_the_turns_and_a_watcher_of_ticks_gets_no_others() -> None:
     assert isinstance(Told(), TurnWatcher)
     assert not isinstance(LooksOn(), TurnWatcher)
@@ -177,19 +157,3 @@ def test_all_that_is_taken_in_is_in_the_turns_and_a_watcher_of_ticks_gets_no_oth
     taken = [s for turn in turns for s in (*turn.taken.samples, *turn.taken.late)]
     assert taken == given
     assert all(turn.taken.frame is not None for turn in turns)
-
-
-@pytest.mark.parametrize(("times", "parts"), [
-    ([1.0, 1.01, 1.012, 1.0125, 1.02], (0.01, 0.002, 0.0005, 0.02)),
-    ([2.0, 2.01, 2.312, 2.313], (0.01, 0.302, 0.0, 0.313)),  # decided anew: it was not sent
-])  # fmt: skip
-def test_in_real_time_its_parts_are_timed(times: list[float], parts: tuple[float, ...]) -> None:
-    clock: Callable[[], float] = iter(times).__next__
-    turns = Turns(WallClock(), (), clock)
-    turns.begin(times[0])
-    for _ in times[2:]:
-        turns.lap()
-    timing = turns._timing()
-    assert timing is not None
-    told = (timing.pipeline_s, timing.planner_s, timing.send_s, timing.turn_s)
-    assert told == pytest.approx(parts)

@@ -5,31 +5,23 @@ Both targets hang under one ceiling and show in both cameras' pictures.
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import struct
-import subprocess
-import sys
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration import profile_camera
 from perchctl.flight import fly_lockstep
-from perchctl.geometry import Array, invert_T, make_T, rot_z, yaw_of
-from perchctl.link import Packet, Port
+from perchctl.geometry import invert_T, make_T, rot_z, yaw_of
+from perchctl.link import Port
 from perchctl.mission import Phase
-from perchctl.profile import Profile, load_profile
-from perchctl.record import FlightLog, read_log
-from perchctl.sim import Neighbour, Scenario, SimProcess, draw_scenario
-from tests.helpers.flights import ROOT, SEED, SHORT, fly_short, short_profile
+from perchctl.profile import Profile
+from perchctl.record import read_log
+from perchctl.sim import Neighbour, Scenario, draw_scenario
+from tests.helpers.flights import SEED, fly_short, short_profile
 
 APART_M = 0.8
 MISS_M = 0.02
@@ -91,46 +83,7 @@ def test_where_only_the_other_s_is_in_view_it_lands_and_says_why() -> None:
     assert flown.farthest_m < 0.15
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("seed", range(10))
-@pytest.mark.parametrize("knows", [False, True])
-def test_ten_pairs_with_the_same_markers(seed: int, knows: bool) -> None:
-    """Those that know where their targets hang are half a metre apart, and may start nearer to the
-    other's."""
-    profile = short_profile({} if knows else {"simulation.start_offset_m": 0.25}, "sim")
-    for scenario in pair(profile, seed, 0.5 if knows else APART_M):
-        target = profile.target.model_copy(update={"expected_xy_m": scenario.target_xy_m})
-        own = profile.model_copy(update={"target": target}) if knows else profile
-        perches_on_its_own(own, scenario)
-
-
 # --- in real time ------------------------------------------------------------------------
-
-
-def heard(file: Path) -> tuple[set[str], Array]:
-    """Who sent commands to a vehicle, and the position setpoints that reached it, (n, 3)."""
-    commanders, setpoints = set(), []
-    for line in file.read_text().splitlines():
-        record = json.loads(line)
-        packet = Packet.decode(bytes.fromhex(record["packet"]))
-        if packet is None or packet.port not in COMMANDS:
-            continue
-        commanders.add(tuple(record["from"]))
-        generic = (packet.port, packet.channel) == (Port.COMMANDER_GENERIC, 0)
-        if generic and packet.data[0] == _POSITION:
-            setpoints.append(struct.unpack_from("<fff", packet.data, 1))
-    return commanders, np.array(setpoints).reshape(-1, 3)
-
-
-def sent(log: FlightLog) -> Array:
-    """The position setpoints that a flight's log has, (n, 3)."""
-    places = np.stack([log.column(f"cmd_{axis}_m") for axis in "xyz"], axis=1)
-    return places[np.isfinite(places).all(axis=1)]
-
-
-def farthest_m(points: Array, others: Array) -> Array:
-    """From each point (n, 3) to the nearest of the others (m, 3)."""
-    return np.array([np.abs(others - point).max(axis=1).min() for point in points])
 
 
 CALIBRATION = """%YAML 1.0
@@ -141,74 +94,3 @@ distortion_model: plumb_bob
 camera_matrix: {rows: 3, cols: 3, data: [190, 0, 160.5, 0, 190.3, 118.9, 0, 0, 1]}
 distortion_coefficients: {rows: 1, cols: 5, data: [-0.17, 0.04, 0.0004, -0.0007, -0.003]}
 """
-
-
-def small_pictures(folder: Path) -> str:
-    """The short profile with a quarter of the pixels: two vehicles, two programs."""
-    (folder / "small.yaml").write_text(CALIBRATION)
-    path = folder / "short_small.yaml"
-    path.write_text(f"extends: {SHORT}\ncamera: {{calibration: small.yaml}}\n")
-    return str(path)
-
-
-@pytest.mark.campaign
-@pytest.mark.parametrize("seed", range(3))
-def test_two_programs_fly_two_vehicles_at_the_same_time(seed: int, tmp_path: Path) -> None:
-    """What reaches a vehicle comes from its own program, however slow the machine is; one that was
-    fast enough perches."""
-    path = small_pictures(tmp_path)
-    profile = load_profile(path)
-    ended: list[tuple[dict[str, Any], dict[str, Any], set[str], Array]] = []
-    too_slow = False
-    with ExitStack() as stack:
-        flying = []
-        for name, scenario in zip("ab", pair(profile, seed, APART_M), strict=True):
-            sim = stack.enter_context(
-                SimProcess.start(
-                    scenario, camera=profile_camera(profile.camera), target=profile.target,
-                    heard_file=tmp_path / name,
-                )
-            )  # fmt: skip
-            words = ["fly", "-p", path, "--uri", sim.uri, "--source", sim.stream_url]
-            program = subprocess.Popen(
-                [sys.executable, "-m", "perchctl", *words, "--yes", "--json", "--view",
-                 "--log-dir", str(tmp_path)],
-                env=os.environ | {"PYTHONPATH": str(ROOT)},
-                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            )  # fmt: skip
-            stack.callback(program.kill)
-            flying.append((name, sim, program))
-        for name, sim, program in flying:
-            out, err = program.communicate(timeout=FLIGHT_LIMIT_S)
-            assert out, err
-            ended.append(
-                (
-                    json.loads(out) | {"code": program.returncode},
-                    sim.truth(),
-                    *heard(tmp_path / name),
-                )
-            )
-    assert len({said["log"] for said, *_ in ended}) == 2
-    assert len(set.union(*(commanders for *_, commanders, _ in ended))) == 2
-    logs = [read_log(Path(said["log"])) for said, *_ in ended]
-    for (said, truth, commanders, setpoints_m), own, other in zip(
-        ended, logs, reversed(logs), strict=True
-    ):
-        assert len(commanders) == 1
-        assert len(setpoints_m) > 100
-        unlogged_m = setpoints_m[farthest_m(setpoints_m, sent(own)) >= SAME_M]
-        # The watchdog's own: it holds where the vehicle was while the loop was silent.
-        assert len(unlogged_m) < 0.05 * len(setpoints_m)
-        assert (farthest_m(unlogged_m, sent(other)) >= SAME_M).all()
-        assert (farthest_m(unlogged_m, sent(own)) < WATCHDOG_M).all()
-        # The same comparison would notice: hardly one of them is in the other's log.
-        assert np.mean(farthest_m(setpoints_m, sent(other)) < SAME_M) < 0.05
-        fence_m = own.header["profile"]["safety"]["fence_radius_m"]
-        assert np.hypot(setpoints_m[:, 0], setpoints_m[:, 1]).max() < fence_m
-        if max(own.column("late_s").max(), own.column("tel_age_s").max()) > LATEST_S:
-            too_slow = True
-            continue
-        assert (said["code"], truth["magnet_engaged"]) == (0, True), said
-        assert truth["gear_miss_m"] < MISS_M
-    if too_slow:
-        pytest.skip("two flights in real time were too much for this machine; nothing was mixed")

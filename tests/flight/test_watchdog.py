@@ -120,13 +120,6 @@ def test_a_catch_that_the_watchdog_held_ends_with_the_sinking() -> None:
     assert rig.after(0.5) == replace(HOVER, z_m=0.8)
 
 
-def test_what_is_held_is_not_asked_anew_each_time() -> None:
-    rig = Rig(HIGH, z_m=1.0)
-    assert rig.after(0.31) == HELD
-    rig.z_m = 0.7
-    assert rig.after(0.5) == HELD
-
-
 @pytest.mark.parametrize("newest", [None, telemetry(T_S, 5.0)])
 def test_without_telemetry_it_is_the_height_of_the_last_turn(newest: Telemetry | None) -> None:
     assert Rig(HIGH, z_m=1.0).poll(0.35, newest) == HELD

@@ -19,10 +19,9 @@ from perchctl.mission import (
     Observation,
     Operator,
     Phase,
-    Rest,
+    PlannerState,
     SentCommand,
     Tick,
-    planner,
 )
 from perchctl.perception import History
 from perchctl.profile import Profile
@@ -271,11 +270,11 @@ class Rig:
     def fly(self) -> FlightReport:
         return fly(self.parts())
 
-    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> Rest:
+    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> str:
         """A rescue of what was flying as `known` and `state` say, its positions `age_s` old."""
         ground = replace(known, position_m=(0.0, 0.0, 0.0))
         told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last": known} | state
-        before = replace(planner.start_mission(Observation(known.t_s, ground)), **told)
+        before = replace(PlannerState.on_ground(Observation(known.t_s, ground)), **told)
         began_s = self.link.now_s
         return rescue(
             self.link,

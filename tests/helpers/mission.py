@@ -15,8 +15,6 @@ from perchctl.mission import (
     Observation,
     Phase,
     PlannerState,
-    integrate_imu,
-    planner,
 )
 from perchctl.mission.state import EnergyState, Severity
 from perchctl.profile import Profile
@@ -129,7 +127,7 @@ class Felt:
     def __call__(self, obs: Observation) -> Observation:
         sample = obs.telemetry
         if self._last is None or sample.t_s > self._last.t_s:
-            self._motion = integrate_imu(self._motion, self._last, sample)
+            self._motion = self._motion.with_sample(self._last, sample)
             self._last = sample
         return replace(obs, imu=self._motion)
 
@@ -156,7 +154,7 @@ def note(t_s: float, text: str) -> Event:
 
 def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
     """A planner that has just come into `phase` in an undisturbed flight."""
-    state = planner.start_mission(observation(0.0, 0.0))
+    state = PlannerState.on_ground(observation(0.0, 0.0))
     return replace(
         state,
         phase=phase,

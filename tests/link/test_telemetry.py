@@ -29,9 +29,10 @@ from perchctl.link.telemetry import (
     Timebase,
     telemetry_from,
 )
-from perchctl.mission import Condition, Observation, Phase, PlannerState
+from perchctl.mission import Observation, Phase, PlannerState
 from perchctl.mission.conditions import BY_PLACE, PROOFS, conditions_since
 from perchctl.mission.context import Context
+from perchctl.mission.state import Condition
 from perchctl.profile import LinkConfig, Profile
 from perchctl.vehicle import FLYING
 from tests.helpers.mission import READY, telemetry

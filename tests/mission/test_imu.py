@@ -4,32 +4,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import ImuMotion, integrate_imu
+from perchctl.mission import ImuMotion
 from perchctl.mission.imu import (
     FROZEN_S,
     GAP_S,
-    MOST_CLIMB_MPS,
-    PUSHED_G,
-    REACH_M,
     UNCORRECTED_S,
     Reckoning,
-    add_sight,
     advance_reckoning,
 )
 from perchctl.vehicle import Telemetry
-from tests.helpers.mission import HOVER_THRUST, telemetry
+from tests.helpers.mission import telemetry
 
 
 def flown(samples: list[Telemetry], motion: ImuMotion | None = None) -> ImuMotion:
     motion = motion or ImuMotion()
     for last, new in zip([None, *samples], samples, strict=False):
-        motion = integrate_imu(motion, last, new)
+        motion = motion.with_sample(last, new)
     return motion
 
 
@@ -49,7 +44,7 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
 def since_heard(after: Telemetry, before: Telemetry | None = None) -> ImuMotion:
     """What a silence leaves, of a vehicle that hung at 1.9 m before it."""
     hung = [telemetry(0.01 * i, 1.9) for i in range(100)]
-    return integrate_imu(flown(hung), before or hung[-1], after)
+    return flown(hung).with_sample(before or hung[-1], after)
 
 
 @given(silent_s=st.floats(GAP_S + 0.01, 4.0), drift_mps=st.floats(-0.1, 0.1))
@@ -73,82 +68,6 @@ def test_a_silence_over_which_the_estimate_shows_no_fall_hides_none(
     assert since_heard(replace(still, t_s=t_s), still).gap_s == t_s
 
 
-@pytest.mark.parametrize(
-    ("way_m", "climb_mps", "hidden"),
-    [(0.0, -0.1, False), (-0.2, -0.1, False), (-0.4, -0.2, True), (0.0, -0.4, True)],
-)
-def test_where_only_the_accelerometer_stands_still_the_estimate_tells_of_a_fall(
-    way_m: float, climb_mps: float, hidden: bool
-) -> None:
-    samples = [telemetry(0.01 * i, 1.9, acc_x_g=0.01) for i in range(50)]
-    samples += [
-        telemetry(
-            0.5 + 0.01 * i, 1.9 + way_m * i / 50, acc_x_g=0.01,
-            velocity_mps=(1e-9 * i, 0.0, climb_mps if i == 25 else 0.0),
-        )
-        for i in range(50)
-    ]  # fmt: skip
-    motion = flown(samples)
-    assert motion.silent_s > 0.9
-    assert (motion.gap_s > 0.5) is hidden
-
-
-def test_with_an_attitude_that_stands_still_the_estimate_s_change_counts() -> None:
-    """What it leans by is not known, and whether it falls still is."""
-    samples = [telemetry(0.01 * i, roll_rad=0.2 if i else 0.0, acc_z_g=1.0) for i in range(100)]
-    motion = flown(samples)
-    assert motion.gap_s < 0.0
-    before = Reckoning(flown(samples[:99]), (0.1, 0.2, 0.3), estimated_mps=(0.0, 0.0, 0.0))
-    after = replace(samples[-1], velocity_mps=(0.0, 0.1, 0.0))
-    assert advance_reckoning(before, motion, after, believed=False).velocity_mps == (
-        pytest.approx((0.1, 0.3, 0.3))
-    )
-
-
-def test_astray_with_an_attitude_that_stands_still_it_still_feels_a_fall() -> None:
-    """Sideways what was reckoned stays; downwards the accelerometer goes on telling."""
-    samples = [
-        telemetry(0.01 * i, roll_rad=0.01 if i else 0.0, acc_x_g=0.001 * i, acc_z_g=0.8)
-        for i in range(100)
-    ]
-    before, motion = flown(samples[:50]), flown(samples)
-    old = Reckoning(before, (0.1, 0.2, -0.3))
-    new = advance_reckoning(old, motion, samples[-1], believed=False, astray=True)
-    fell_mps = -0.2 * 9.81 * 0.5
-    assert new.velocity_mps == pytest.approx((0.1, 0.2, -0.3 + fell_mps), abs=0.01)
-
-
-@given(
-    step_rad=st.tuples(st.floats(-0.15, 0.15), st.floats(-0.15, 0.15)),
-    step_mps=st.floats(0.2, 2.0),
-    rate_radps=st.floats(-3.0, 3.0),
-)
-def test_a_correction_by_a_wrong_position_does_not_turn_what_is_felt(
-    step_rad: tuple[float, float], step_mps: float, rate_radps: float
-) -> None:
-    """The estimate's speed steps, and the attitude with it, while the vehicle itself turns on."""
-
-    def flight(jumps: bool) -> list[Telemetry]:
-        samples = []
-        for i in range(60):
-            after = jumps and i >= 30
-            roll, pitch = step_rad if after else (0.0, 0.0)
-            turned_rad = 0.1 * rate_radps * max(0.0, min(0.1, 0.01 * i - 0.25))
-            samples.append(
-                telemetry(
-                    0.01 * i, roll_rad=turned_rad + roll, pitch_rad=pitch,
-                    velocity_mps=(step_mps if after else 0.0, 0.0, 0.0),
-                    acc_x_g=0.0001 * i, acc_z_g=1.0,
-                )
-            )  # fmt: skip
-        return samples
-
-    misled, true = flown(flight(True)), flown(flight(False))
-    assert true.misled_rad == (0.0, 0.0)
-    assert misled.misled_rad == pytest.approx(step_rad, rel=0.06, abs=0.001)
-    assert misled.velocity_mps[:2] == pytest.approx(true.velocity_mps[:2], abs=0.04)
-
-
 def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     """On board the accelerometer was felt all the time, and no position corrected anything. What
     the estimate was wrong by before it is still wrong by."""
@@ -156,92 +75,13 @@ def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     after = telemetry(1.7, velocity_mps=(0.1, 0.2, -0.5))
     imu = flown([before])
     old = Reckoning(imu, velocity_mps=(0.0, 0.0, 0.05), estimated_mps=before.velocity_mps)
-    heard = integrate_imu(imu, before, after)
+    heard = imu.with_sample(before, after)
     new = advance_reckoning(old, heard, after, believed=False)
     assert new.velocity_mps == pytest.approx((0.0, 0.2, -0.6))
     assert advance_reckoning(old, heard, after, believed=True).velocity_mps == after.velocity_mps
     assert advance_reckoning(old, heard, after, believed=False, astray=True).velocity_mps == (
         old.velocity_mps
     )
-
-
-@given(below_m=st.floats(0.05, 2.0), silent_s=st.floats(GAP_S + 0.01, 2.0))
-def test_in_a_silence_it_may_climb_into_the_magnet_s_reach(below_m: float, silent_s: float) -> None:
-    """However it was last heard to sink. A sight from after it tells again where it is."""
-    before = telemetry(1.0, velocity_mps=(0.0, 0.0, -0.3))
-    after = telemetry(1.0 + silent_s, velocity_mps=(0.0, 0.0, -0.3))
-    imu = flown([before])
-    old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
-    new = advance_reckoning(old, integrate_imu(imu, before, after), after, believed=False)
-    assert (new.unsure_s == after.t_s) == (below_m - MOST_CLIMB_MPS * silent_s < REACH_M)
-    assert new.below_m == below_m
-    seen = add_sight(new, after.t_s + 0.1, (0.0, 0.0), below_m, 0.001)
-    assert seen.nearest_m == below_m
-
-
-@given(below_m=st.floats(0.05, 2.0), silent_s=st.floats(GAP_S + 0.01, 3.0))
-def test_what_had_no_thrust_in_a_silence_did_not_climb(below_m: float, silent_s: float) -> None:
-    """With motors that were off, or started anew: it lies, or hangs where it hung."""
-    for thrust, start in ((0.0, 0), (HOVER_THRUST, 1)):
-        before = telemetry(1.0, thrust=thrust)
-        after = telemetry(1.0 + silent_s, thrust=0.0, start=start)
-        imu = flown([before])
-        old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
-        new = advance_reckoning(old, integrate_imu(imu, before, after), after, believed=False)
-        assert new.unsure_s == -math.inf
-        assert new.below_m == math.inf
-        near = replace(old, below_m=0.02, nearest_m=0.02)
-        new = advance_reckoning(near, integrate_imu(imu, before, after), after, believed=False)
-        assert (new.unsure_s, new.below_m) == (after.t_s, 0.02)
-
-
-def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring() -> None:
-    """It fell by 5 cm, and the setpoint that catches it is a metre above."""
-    falls = [telemetry(1.0 + 0.01 * i, acc_z_g=0.3) for i in range(13)]
-    reckoning = add_sight(Reckoning(flown(falls[:1])), 0.9, (0.0, 0.0), 0.0, 0.001)
-    motion = flown(falls[:1])
-    for last, new in pairwise(falls):
-        motion = integrate_imu(motion, last, new)
-        reckoning = advance_reckoning(reckoning, motion, new, believed=False)
-    assert motion.fell_s > 1.0
-    assert 0.02 < reckoning.nearest_m < 0.1
-    late = telemetry(falls[-1].t_s + 1.5)
-    reckoning = advance_reckoning(
-        reckoning, integrate_imu(motion, falls[-1], late), late, believed=False
-    )
-    assert reckoning.unsure_s == late.t_s
-
-
-def beside_mps(turn: int, pushed_g: float = 0.0, samples: int = 4, offset_g: float = 0.0) -> float:
-    """After 0.4 s of a tilt that speeds it up by 1 m/s2, with an estimate that follows as it is, or
-    mirrored (`turn` -1), or corrected by positions after a push that it did not feel and that so
-    many samples show. `offset_g`: what the accelerometer reads too much."""
-    lean_rad = 1.0 / 9.81
-    reckoning, motion, last = Reckoning(), ImuMotion(offset_g=(offset_g, 0.0, 0.0)), None
-    for i in range(41):
-        t_s = 1.0 + 0.01 * i
-        new = telemetry(
-            t_s, velocity_mps=(turn * 0.01 * i, 0.0, 0.0), pitch_rad=lean_rad + 1e-6 * (i % 7),
-            acc_x_g=offset_g + (pushed_g if 3 <= i < 3 + samples else 1e-6 * (i % 7)),
-        )  # fmt: skip
-        motion = integrate_imu(motion, last, new)
-        reckoning = advance_reckoning(reckoning, motion, new, believed=True)
-        last = new
-    return abs(reckoning.beside_mps[0])
-
-
-def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_was_pushed() -> None:
-    assert beside_mps(1) < 0.05
-    assert beside_mps(-1) > 0.3
-    assert beside_mps(-1, pushed_g=2.0 * PUSHED_G) == 0.0
-    assert beside_mps(-1, pushed_g=0.09, samples=20) == 0.0  # a gust of 1 m/s in a second
-    assert beside_mps(-1, offset_g=1.2 * PUSHED_G) > 0.3
-
-
-@pytest.mark.parametrize("pushed_g", [2.0 * PUSHED_G, -2.0 * PUSHED_G])
-def test_a_sample_that_the_motors_shook_is_no_push(pushed_g: float) -> None:
-    """It would end the comparison for as long as mirrored positions take to tumble the vehicle."""
-    assert beside_mps(-1, pushed_g=pushed_g, samples=1) > 0.25
 
 
 # --- Whether the estimate is corrected -----------------------------------------------------------
@@ -258,7 +98,7 @@ def uncorrected_s(*growths: tuple[float, float]) -> float:
             if round(100 * t_s) % 10 == 0:
                 variance += 0.1 * per_s
             new = telemetry(t_s, climb_variance_m2ps2=variance)
-            motion, last = integrate_imu(motion, last, new), new
+            motion, last = motion.with_sample(last, new), new
     return motion.corrections.age_s(t_s)
 
 
@@ -285,16 +125,3 @@ def test_what_is_corrected_or_not_known_is_not_called_uncorrected(
 def test_no_silence_and_no_frozen_accelerometer_hides_that_nothing_corrects_it() -> None:
     silent = [telemetry(0.3 * i, climb_variance_m2ps2=1e-4 + 3e-4 * i) for i in range(10)]
     assert flown(silent).corrections.age_s(2.7) == pytest.approx(2.7)
-
-
-@pytest.mark.parametrize("too_much_g", [-0.008, 0.008])
-def test_an_offset_that_turning_motors_make_is_learned_while_the_estimate_is_believed(
-    too_much_g: float,
-) -> None:
-    """Blind, it would be 0.4 m/s within 5 s: a way down ends in a hover, or above it."""
-    reckoning, motion, last = Reckoning(), ImuMotion(), None
-    for i in range(1500):
-        new = telemetry(0.01 * i, acc_z_g=1.0 + too_much_g + 1e-6 * (i % 7))
-        motion = integrate_imu(motion, last, new)
-        reckoning, last = advance_reckoning(reckoning, motion, new, believed=i < 1000), new
-    assert abs(reckoning.velocity_mps[2]) < 0.1

@@ -6,19 +6,12 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 
-from perchctl.mission import ImuMotion, Observation, Outcome, Phase, PlannerState
-from perchctl.mission.conditions import OTHERWISE_MPS, contact_aside_m
-from perchctl.mission.context import Context
-from perchctl.mission.imu import Reckoning, add_step
-from perchctl.mission.lander import LEAST_ORDERS
+from perchctl.mission import Observation, Outcome, Phase, PlannerState
 from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile
 from perchctl.vehicle import (
-    HL_ACTIVE,
-    LOCKED,
     Command,
     Land,
     PositionSetpoint,
@@ -27,12 +20,10 @@ from perchctl.vehicle import (
 )
 from tests.helpers.mission import (
     AIRBORNE,
-    BY_TARGET,
     HANG_Z_M,
     HOVER_THRUST,
     MOCAP,
     PROFILE,
-    PROFILES,
     READY,
     Felt,
     observation,
@@ -40,7 +31,7 @@ from tests.helpers.mission import (
     target_at,
     telemetry,
 )
-from tests.mission.rig import BEGIN_S, TICK_S, Flight, Motors, at, fly, is_setpoint, times
+from tests.mission.rig import BEGIN_S, TICK_S, Flight, Motors, at, fly, is_setpoint
 
 HOLD_S, LAND_S = MOCAP.positioning.hold_s, MOCAP.positioning.land_s
 HIDDEN = "motion capture at vicon:lab does not see the rigid body 'cf2'"
@@ -108,28 +99,6 @@ def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, los
     assert "variance only grows" in state.reason
     assert LAND_S <= len(sent) * TICK_S <= 1.0
     assert isinstance(sent[-1], RawThrust)
-
-
-def test_what_was_never_measured_lands_at_once() -> None:
-    state = fly(state_in(Phase.ALIGN), at(obs=hidden(math.inf)), profile=MOCAP).state
-    assert state.phase is Phase.LANDING
-    assert "no position has come" in state.reason
-
-
-@pytest.mark.parametrize(("phase", "to"), [
-    (Phase.APPROACH, Phase.SEARCH), (Phase.ALIGN, Phase.ASCEND), (Phase.RECOVER, Phase.ESTIMATE),
-])  # fmt: skip
-def test_no_dwell_time_counts_without_a_position(phase: Phase, to: Phase) -> None:
-    """Hidden again and again for 0.3 s, never long enough to be landed for."""
-    z_m = 0.5 if phase is Phase.APPROACH else 1.0
-
-    def flickers(t_s: float) -> Observation:
-        since_s = (t_s - BEGIN_S) % 0.35
-        return observation(t_s, z_m, **hidden(since_s if since_s < 0.3 else 0.0))
-
-    begin = state_in(phase, z_m=z_m)
-    assert fly(begin, at(z_m), 1.2, MOCAP, one_phase=True).state.phase is to
-    assert fly(begin, flickers, 1.2, MOCAP).state.phase is phase
 
 
 # --- At the ceiling ----------------------------------------------------------------------
@@ -205,17 +174,6 @@ def test_a_release_goes_on_by_the_accelerometer_when_the_body_is_hidden_for_good
     assert flight.stops_s[0] - flight.still_s[0] >= PROFILE.planner.complete.hang_s - 0.05
 
 
-def test_the_same_slide_with_decks_is_a_slip() -> None:
-    """Their position is measured all the time: what sinks by it falls."""
-
-    class Measured(Hangs):
-        def look(self, t_s: float, state: PlannerState) -> Observation:
-            return replace(super().look(t_s, state), position_age_s=0.0)
-
-    flight = fly(at_the_magnet(released_s=BEGIN_S), Measured(0.2), 0.3, feels=True)
-    assert flight.state.row == "slipped"
-
-
 @pytest.mark.parametrize("carries", [0.05, 0.3])
 @pytest.mark.parametrize("drift_mps", [0.0, 0.2])
 def test_a_magnet_that_gives_way_is_noticed_without_a_position(
@@ -260,41 +218,8 @@ def test_what_nobody_saw_hang_has_not_perched(
     assert not any(isinstance(command, Land | PositionSetpoint) for command in flight.commands)
     assert flight.state.phase is ends
     if ends is Phase.ABORTED:
-        assert any("still hangs is not known" in tick.state.reason for tick in flight.ticks)
+        assert "fell-unseen" in flight.rows
         assert "not known" in flight.state.reason
-
-
-@pytest.mark.parametrize(("silence_s", "gained_mps"), [(0.02, 0.0), (0.5, 0.0), (0.5, -2.5)])
-def test_a_locked_vehicle_hangs_where_it_has_not_fallen_from(
-    silence_s: float, gained_mps: float
-) -> None:
-    felt = Felt()
-    felt(off(BEGIN_S - 0.02))
-    locked = felt(off(BEGIN_S + silence_s, READY | LOCKED, gained_mps))
-    state, _ = step_mission(at_the_magnet(**STOPPED), locked, MOCAP)
-    assert state.phase is (Phase.ABORTED if gained_mps else Phase.PERCHED)
-
-
-def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> None:
-    """On the floor a magnet's hold and the ground's look alike; a lock makes no perch of it."""
-    state = replace(
-        state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, contact_z_m=0.6, released_s=9.0,
-        stopped_s=9.9, stale_s=BEGIN_S, reach_s=8.0,
-    )  # fmt: skip
-    felt = Felt()
-    felt(off(BEGIN_S - TICK_S))
-    locked = felt(off(BEGIN_S, READY | LOCKED))
-    assert step_mission(state, locked, MOCAP)[0].phase is Phase.ABORTED
-    hung = replace(state, phase=Phase.COMPLETE)
-    assert step_mission(hung, locked, MOCAP)[0].phase is Phase.PERCHED
-
-
-def test_a_release_that_is_held_goes_by_where_the_estimate_is_now() -> None:
-    """It has slid 0.4 m up from the contact: a setpoint at the contact would take the thrust
-    away."""
-    late = at(HANG_Z_M + 0.4, age_s=0.22, obs=hidden(4.0), thrust=1000.0)
-    flight = fly(at_the_magnet(released_s=9.0, reach_s=None), late, profile=MOCAP)
-    assert is_setpoint(flight.command, above_m=HANG_Z_M + 0.4)
 
 
 # --- On the way down ---------------------------------------------------------------------
@@ -317,153 +242,10 @@ def test_what_something_carries_is_put_down_gently_whatever_that_is(
     assert flight.state.phase is ends
 
 
-def test_a_drifting_descent_is_no_floor() -> None:
-    """It seems to have come down by half a metre, and is held by the magnet."""
-    look = at(0.9, obs={"target": None, **hidden(1.0)}, thrust=20000.0)
-    assert not fly(state_in(Phase.LANDING, z_m=1.5), look, 0.9, MOCAP).stops_s
-
-
-def test_the_ground_stays_where_it_was_when_the_drift_ends() -> None:
-    """The estimate steps back to the truth: what was remembered before the drift is true."""
-    state = fly(state_in(Phase.ALIGN), at(1.3, obs=hidden(0.5)), profile=MOCAP).state
-    for stale_s, stays in ((state.stale_s, True), (None, False)):
-        jumps = at(obs={"jumped": True})(10.04)
-        after, _ = step_mission(replace(state, stale_s=stale_s), jumps, MOCAP)
-        assert (after.ground_m == state.ground_m) is stays
-
-
 # --- Where it touched ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("by", "unseen_s", "least_m", "most_m"),
-    [("deck", 0.1, 0.002, 0.003), ("deck", 1.0, 0.01, 0.012), ("mocap", 1.0, 0.001, 0.002)],
-)
-def test_the_spread_of_a_contact_grows_with_what_the_estimate_may_slide(
-    by: str, unseen_s: float, least_m: float, most_m: float
-) -> None:
-    """A target that is only remembered keeps the spread of its last sight."""
-
-    def look(t_s: float) -> Observation:
-        remembered = target_at(
-            t_s, body_m=(0.0, 0.0, HANG_Z_M), measured_s=t_s - unseen_s, measured=False,
-            tracked=False, sigma_m=np.full(3, 1e-4),
-        )  # fmt: skip
-        return observation(t_s, HANG_Z_M, target=remembered)
-
-    flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 0.1, PROFILES[by])
-    _, sigma_m = contact_aside_m(Context(flight.state, flight.obs, PROFILES[by]))
-    assert least_m <= sigma_m <= most_m
-
-
-@pytest.mark.parametrize(("silent", "aside_m"), [(True, 0.0), (False, 0.06)])
-def test_positions_that_come_back_do_not_move_a_gear_that_has_not_moved(
-    silent: bool, aside_m: float
-) -> None:
-    """Felt to stand still at the target, out of sight: 6 cm, by which the estimate is set right
-    after half a second without a position, were its own."""
-
-    def look(t_s: float) -> Observation:
-        since_s = t_s - BEGIN_S
-        body_m = (0.06 if since_s > 0.9 else 0.0, 0.0, HANG_Z_M)
-        target = target_at(t_s, body_m=body_m, measured=since_s < 0.2, measured_s=min(t_s, 10.2))
-        gone_s = since_s - 0.3 if silent and since_s < 0.9 else 0.0
-        gone = {"target": target, "position_age_s": max(0.0, gone_s)}
-        return at(obs=gone, position_m=body_m)(t_s)
-
-    state = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.5, MOCAP, feels=True).state
-    assert math.hypot(*state.reckoning.aside_m) == pytest.approx(aside_m, abs=0.01)
-    assert math.hypot(*state.reckoning.stepped_m) == pytest.approx(aside_m, abs=0.01)
-
-
-def test_a_gap_in_the_positions_brings_nothing_nearer_to_the_magnet() -> None:
-    """Hovering below a target that is out of sight since: how far below it is, the position tells
-    as soon as it is back."""
-    z_m = HANG_Z_M - 0.35
-
-    def look(t_s: float) -> Observation:
-        since_s = t_s - BEGIN_S
-        target = target_at(
-            t_s, body_m=(0.0, 0.0, z_m), measured=since_s < 0.2, measured_s=min(t_s, 10.2),
-            tracked=since_s < 0.7,
-        )  # fmt: skip
-        gone_s = since_s - 0.2 if 0.2 < since_s < 0.5 else 0.0
-        return observation(t_s, z_m, target=target, position_age_s=gone_s)
-
-    state = fly(state_in(Phase.ALIGN, z_m=z_m), look, 8.0, MOCAP, feels=True).state
-    assert state.reckoning.below_m == pytest.approx(0.35, abs=0.01)
-    assert state.reach_s is None
-
-
 SMEARED_M = (0.0196, 0.0158, 0.0123, 0.0098)
-
-
-@pytest.mark.parametrize(
-    ("steps_m", "seen_s", "profile", "sigma_m"),
-    [
-        ((0.06,), 0.5, MOCAP, 0.06),
-        ((0.06,), 0.5, PROFILE, 0.06),
-        (SMEARED_M, 0.5, MOCAP, sum(SMEARED_M)),
-        ((0.05, 0.0, -0.05), 0.5, MOCAP, 0.0),
-        ((0.06,), 0.97, MOCAP, 0.06),  # by pictures of before it that arrive after it
-        ((0.06,), 1.1, MOCAP, 0.0),  # by one that is exposed after it
-        ((0.006,), 0.5, MOCAP, 0.0),  # the noise of an estimate
-        ((0.06,), 0.5, BY_TARGET, 0.0),
-    ],
-)
-def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
-    steps_m: tuple[float, ...], seen_s: float, profile: Profile, sigma_m: float
-) -> None:
-    """By as much as it steps beyond its speed, tick by tick from 0.98 s on: it was wrong before, or
-    it is now. A picture arrives 0.06 s after its exposure."""
-
-    def look(t_s: float) -> Observation:
-        done = max(0, round((t_s - BEGIN_S) / TICK_S) - 48)
-        body_m = (sum(steps_m[:done]), 0.0, HANG_Z_M)
-        exposed_s = min(t_s - 10.06, seen_s)
-        target = target_at(
-            t_s, body_m=body_m, measured=exposed_s < seen_s, measured_s=10.0 + exposed_s
-        )
-        obs = {"target": target, "new_frame": target.measured}
-        return at(obs=obs, position_m=body_m)(t_s)
-
-    flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.3, profile, feels=True)
-    assert math.hypot(*flight.state.reckoning.stepped_m) == pytest.approx(sigma_m, abs=1e-3)
-    assert contact_aside_m(Context(flight.state, flight.obs, profile))[1] >= sigma_m - 1e-3
-
-
-def test_a_position_that_moves_as_fast_as_it_says_is_no_step() -> None:
-    """However late its packet is: one that is 80 ms old is carried on by 50."""
-    old, last = Reckoning(), telemetry(9.98)
-    for k in range(40):
-        t_s, behind_s = 10.0 + 0.02 * k, 0.08 if k % 3 else 0.0
-        at_m = 0.6 * (t_s - max(0.0, behind_s - 0.05))
-        tel = telemetry(
-            t_s, position_m=(at_m, 0.0, 1.0), velocity_mps=(0.6, 0.0, 0.0), behind_s=behind_s
-        )
-        old = add_step(old, last, tel) if k else old
-        last = tel
-    assert old.stepped_m == (0.0, 0.0)
-
-
-@pytest.mark.parametrize(("x_m", "row"), [(0.0, "hangs-at-contact"), (0.2, "held")])
-def test_what_hangs_where_the_place_is_unsure_is_not_said_to_be_held_elsewhere(
-    x_m: float, row: str
-) -> None:
-    """On the magnet while the estimate steps by 6 cm, out of sight of the target; or 20 cm aside,
-    which no such step explains."""
-
-    def look(t_s: float) -> Observation:
-        body_m = (x_m + (0.06 if t_s > 10.48 else 0.0), 0.0, HANG_Z_M)
-        target = target_at(
-            t_s, body_m=body_m, measured=t_s < 10.3, measured_s=min(t_s, 10.3), tracked=t_s < 10.4
-        )
-        obs = {"target": target, "new_frame": target.measured}
-        return at(obs=obs, position_m=body_m, thrust=0.34 * HOVER_THRUST)(t_s)
-
-    flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 2.9, MOCAP, feels=True)
-    landed = [tick.state.row for tick in flight.ticks if tick.state.phase is Phase.LANDING]
-    assert landed[0] == row
 
 
 # --- Another world: what goes astray by it comes down level, by thrust alone ---------------------
@@ -530,29 +312,6 @@ def test_from_high_up_it_comes_down_as_softly(height_m: float, felt_too_much_g: 
     assert -0.9 < it.met_mps < 0.0
 
 
-def test_a_felt_speed_that_has_drifted_keeps_nothing_up() -> None:
-    """By an accelerometer whose offset nobody knows it seems to sink faster and faster, and is
-    braked more and more: for so long as the way takes, and no longer."""
-    it = Falls(1.0, HOVER_THRUST, too_much_g=-0.02)
-    fly(state_in(Phase.ALIGN, z_m=1.0), it, 12.0, MOCAP, feels=True)
-    assert it.met_mps < 0.0
-
-
-def test_what_is_astray_and_unfelt_for_a_moment_keeps_the_speed_that_it_had() -> None:
-    """A gap in telemetry tells nothing: neither that it stands still nor the estimate's speed."""
-    felt = Felt()
-    began = felt(at()(10.0))
-    state = replace(
-        state_in(Phase.LANDING), astray=True, row="position-astray", last=began.telemetry,
-        reckoning=Reckoning(imu=began.imu, velocity_mps=(0.0, 0.0, -0.4)),
-    )  # fmt: skip
-    wrong = (0.0, 0.0, 0.8)
-    after, _ = step_mission(state, felt(at(velocity_mps=wrong)(10.3)), MOCAP)
-    assert after.reckoning.velocity_mps[2] == pytest.approx(-0.4)
-    again, _ = step_mission(after, felt(at(velocity_mps=wrong, acc_z_g=1.1)(10.32)), MOCAP)
-    assert -0.4 < again.reckoning.velocity_mps[2] < -0.38
-
-
 def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:
     """On the floor, by a height that says 0.6 m: the motors are stopped all the same, in time."""
 
@@ -597,19 +356,6 @@ def test_what_is_carried_off_farther_than_a_draught_leads_is_in_another_world(
     assert (state.row == "position-astray") is lands
 
 
-@pytest.mark.parametrize(("z_m", "pushed_s", "lands"), [
-    (0.5, 9.5, False), (0.5, 8.0, True), (0.2, 9.5, True),
-])  # fmt: skip
-def test_what_a_gust_carries_off_is_not_in_another_world(
-    z_m: float, pushed_s: float, lands: bool
-) -> None:
-    """Moving air is felt as a force from the side. Near the floor nothing asks for it."""
-    gust = {"imu": ImuMotion(t_s=10.02, pushed_s=pushed_s)}
-    look = at(obs=gust, position_m=(0.3, 0.0, z_m))
-    state = fly(state_in(Phase.ESTIMATE, z_m=0.5), look, profile=MOCAP).state
-    assert (state.row == "position-astray") is lands
-
-
 @pytest.mark.parametrize("profile", [MOCAP, PROFILE])
 @pytest.mark.parametrize(
     ("phase", "climb_mps", "lands"),
@@ -625,47 +371,3 @@ def test_positions_that_are_late_swing_it_up_and_down(
     state = fly(state_in(phase), at(velocity_mps=(0.0, 0.0, climb_mps)), profile=profile).state
     assert (state.row == "position-astray") is (lands and profile is MOCAP)
     assert state.row != "position-astray" or "late" in state.reason
-
-
-def test_a_landing_that_goes_astray_is_named_anew_and_flown_level() -> None:
-    begin = replace(state_in(Phase.LANDING, z_m=0.5), reason="camera.mount", row="mounting")
-    flight = fly(begin, at(position_m=(0.5, 0.0, 0.5)), profile=MOCAP)
-    assert isinstance(flight.command, RawThrust)
-    assert flight.state.astray
-    assert "swapped axes" in flight.state.reason
-
-
-def gains_beside(
-    state: PlannerState, beside_mps: float, lasts_s: float, **tel: Any
-) -> tuple[PlannerState, Command]:
-    """Flown by positions that gain so much speed aside which the accelerometer does not feel."""
-    felt = Felt()
-    begun = felt(at()(BEGIN_S))
-    state = replace(state, last=begun.telemetry, reckoning=Reckoning(imu=begun.imu))
-    for t_s in times(lasts_s):
-        if not state.astray:
-            beside = replace(state.reckoning, beside_mps=(0.0, beside_mps))
-            state = replace(state, reckoning=beside)
-        alive = {name: value + 1e-6 * (round(100 * t_s) % 7) for name, value in tel.items()}
-        obs = at(supervisor=AIRBORNE | HL_ACTIVE, **alive)(t_s)
-        state, command = step_mission(state, felt(obs), MOCAP)
-    return state, command
-
-
-@pytest.mark.parametrize("beside_mps", [0.9 * OTHERWISE_MPS, 1.1 * OTHERWISE_MPS])
-def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
-    beside_mps: float,
-) -> None:
-    """It would follow them to its end: 15 m aside within six seconds, where they are mirrored."""
-    begin = replace(state_in(Phase.LANDING), orders=LEAST_ORDERS, ordered_s=BEGIN_S)
-    state, command = gains_beside(begin, -beside_mps, 0.2)
-    assert state.astray is (beside_mps > OTHERWISE_MPS)
-    assert isinstance(command, RawThrust) is state.astray
-
-
-def test_a_tilt_that_wrong_positions_have_turned_is_taken_off_the_reckoned_motion() -> None:
-    """They have added 0.3 m/s to the left: so the attitude leans by 0.05 rad that the vehicle does
-    not, and what is reckoned by it would brake a speed that is none."""
-    state, _ = gains_beside(state_in(Phase.ALIGN), 0.3, 1.5, roll_rad=-0.05)
-    assert state.row == "position-astray"
-    assert abs(state.reckoning.velocity_mps[1]) < 0.15

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import (
+    ContactError,
     ImuMotion,
     Mismatch,
     Observation,
@@ -21,7 +22,7 @@ from perchctl.mission import (
 )
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
 from perchctl.mission.state import FLYING_PHASES, Severity
-from perchctl.mission.table import TABLE, Transition, first_match, raise_severity
+from perchctl.mission.table import TABLE, Transition, first_match
 from perchctl.vehicle import (
     CRASHED,
     LOCKED,
@@ -195,8 +196,7 @@ CASES: dict[str, Case] = {
     "hangs-at-contact": Case(
         P.RECOVER, P.LANDING, unseen(CONTACT_Z_M, 0.05, thrust=QUIET), 2.2, O.SAFETY,
         state={
-            "entered_s": BEGIN_S, "contact_z_m": CONTACT_Z_M, "contact_aside_m": 0.01,
-            "contact_sigma_m": 0.05,
+            "entered_s": BEGIN_S, "contact_z_m": CONTACT_Z_M, "contact": ContactError(0.01, 0.05),
         },
         z_m=CONTACT_Z_M,
     ),
@@ -351,7 +351,7 @@ def test_no_row_undoes_a_landing() -> None:
 def test_from_landing_on_the_severity_only_rises(rows: list[Severity]) -> None:
     severity, grave = Severity.CONTINUE, False
     for row in rows:
-        before, severity = severity, raise_severity(severity, row)
+        before, severity = severity, severity.then(row)
         assert not grave or severity >= before
         grave = grave or severity >= Severity.LAND
         assert grave == (severity >= Severity.LAND)

@@ -11,21 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.mission import CATCHABLE_M, Observation, Operator, Outcome, Phase, PlannerState
-from perchctl.mission.conditions import touched_aside_m
-from perchctl.mission.context import Context
+from perchctl.mission import ContactError, Observation, Outcome, Phase, PlannerState
 from perchctl.mission.guidance import UNREAD_S
 from perchctl.mission.lander import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, own_landing
 from perchctl.mission.planner import step_mission
-from perchctl.mission.state import Condition
-from perchctl.mission.table import TABLE
 from perchctl.vehicle import (
     CRASHED,
-    FULL_THRUST,
-    HL_ACTIVE,
     LOCKED,
     TUMBLED,
-    Command,
     EmergencyStop,
     Idle,
     Land,
@@ -41,13 +34,12 @@ from tests.helpers.mission import (
     PROFILES,
     READY,
     Felt,
-    changed,
     observation,
     state_in,
     target_at,
     telemetry,
 )
-from tests.mission.rig import BEGIN_S, TICK_S, Flight, Motors, at, fly, is_setpoint
+from tests.mission.rig import BEGIN_S, TICK_S, Motors, at, fly, is_setpoint
 
 SINKS = (0.0, 0.0, -0.5)
 OFF: dict[str, Any] = {"thrust": 0.0, "supervisor": READY}
@@ -82,13 +74,6 @@ def test_a_way_down_that_begins_pressed_goes_far_below_until_it_is_away(phase: P
     state, command = step_mission(pressing.state, away(10.5), PROFILE)
     assert not state.pressed
     assert is_setpoint(command, above_m=0.4)
-
-
-@pytest.mark.parametrize(("thrust", "pressed"), [(65535.0, True), (42000.0, False)])
-def test_what_presses_when_its_way_down_begins_is_remembered(thrust: float, pressed: bool) -> None:
-    look = at(1.0, obs={"operator": Operator.LAND}, thrust=thrust)
-    state = fly(landing(1.0, Phase.SEARCH), look).state
-    assert (state.phase, state.pressed) == (Phase.LANDING, pressed)
 
 
 # --- A landing stops no motor but on the floor's or the ceiling's proof ------------------------
@@ -297,184 +282,14 @@ def test_only_what_hangs_at_the_target_is_caught(
     assert fly(begin, InAHand(below_m, aside_m, sigma_m), 2.18, feels=True).state.phase is to
 
 
-class BacksOff(Motors):
-    """Pressed out of sight of the target, and backed off from; what it touched holds it, or lets
-    it fall to the floor 0.4 s later. The estimate goes on sliding, by 2 cm/s."""
-
-    def __init__(
-        self, aside_m: float, sigma_m: float, *, below_m: float = 0.0, comes_off: bool = False,
-        by_sight: bool = False,
-    ) -> None:  # fmt: skip
-        super().__init__(1.2 * HOVER_THRUST)
-        self.aside_m, self.sigma_m, self.up_m = aside_m, sigma_m, HANG_Z_M - below_m
-        self.comes_off, self.by_sight, self.off_s = comes_off, by_sight, math.inf
-
-    def look(self, t_s: float, state: PlannerState) -> Observation:
-        if self.comes_off and state.phase is Phase.RECOVER:
-            self.off_s = min(self.off_s, state.entered_s + 0.4)
-        fell_s = max(0.0, t_s - self.off_s)
-        z_m = max(0.0, self.up_m - 4.9 * fell_s**2)
-        at_m = (self.aside_m + 0.02 * max(0.0, t_s - 10.5), 0.0, z_m)
-        tel = telemetry(
-            t_s, thrust=self.thrust, position_m=at_m, acc_z_g=0.0 if fell_s > 0.0 < z_m else 1.0
-        )
-        target = target_at(
-            t_s, body_m=at_m, sigma_m=np.full(3, self.sigma_m), measured=False, tracked=False,
-            measured_s=10.0,
-        )  # fmt: skip
-        age_s = t_s - 10.0 if self.by_sight else 0.0
-        return observation(t_s, telemetry=tel, target=target, position_age_s=age_s)
-
-    def obey(self, state: PlannerState, command: Command) -> None:
-        if not (isinstance(command, PositionSetpoint) and state.phase is Phase.PERCH):
-            super().obey(state, command)
-
-
-def backed_off(positioning: str = "deck", **how: Any) -> Flight:
-    vehicle = BacksOff(**how, by_sight=positioning == "target")
-    begin = landing(vehicle.up_m, Phase.PERCH)
-    return fly(begin, vehicle, 16.0, PROFILES[positioning], feels=True)
-
-
-@pytest.mark.parametrize(
-    ("aside_m", "sigma_m", "row", "ends", "outcome"),
-    [
-        (0.012, 0.022, "caught", Phase.PERCHED, Outcome.PERCHED),
-        (0.012, 0.075, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
-        (0.04, 0.01, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
-        (0.012, math.inf, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
-        (0.06, 0.01, "held", Phase.ABORTED, Outcome.SAFETY),
-    ],
-)
-def test_what_hangs_where_it_touched_the_target_is_told_by_its_place_there(
-    aside_m: float, sigma_m: float, row: str, ends: Phase, outcome: Outcome
-) -> None:
-    """Not by where the estimate slides to meanwhile, 4 cm farther aside."""
-    flight = backed_off(aside_m=aside_m, sigma_m=sigma_m)
-    assert {"beside-the-magnet", row} <= flight.rows
-    assert (flight.state.phase, flight.state.outcome) == (ends, outcome)
-    if ends is Phase.PERCHED:
-        assert flight.state.contact_aside_m == pytest.approx(aside_m)
-
-
-def test_what_hangs_where_it_was_pressed_below_the_target_has_not_touched_it() -> None:
-    flight = backed_off(aside_m=0.0, sigma_m=1e-3, below_m=0.2)
-    assert {"blocked", "held"} <= flight.rows
-    assert flight.state.phase is Phase.ABORTED
-
-
-@pytest.mark.parametrize("positioning", ["deck", "target"])
-def test_what_fell_from_where_it_touched_the_target_is_not_caught_there(positioning: str) -> None:
-    rows = backed_off(positioning, aside_m=0.012, sigma_m=0.022, comes_off=True).rows
-    assert "beside-the-magnet" in rows
-    assert not rows & {"caught", "hangs-at-contact", "contact", "perched", "hung"}
-
-
-@pytest.mark.parametrize(
-    ("touched", "by", "moved_m", "row"),
-    [
-        (False, "deck", 0.0, "hangs-at-contact"),
-        (False, "deck", 0.12, "held"),
-        (True, "mocap", 0.12, "held"),
-    ],
-)
-def test_what_a_hand_holds_where_nothing_was_touched_is_not_caught(
-    touched: bool, by: str, moved_m: float, row: str
-) -> None:
-    """A press that ended in the air, so near the target that it may be its magnet that holds it;
-    or farther aside; or one that touched it, and then went aside by a motion capture, which does
-    not slide."""
-    felt, profile = Felt(), PROFILES[by]
-    state = landing(HANG_Z_M - 0.04, Phase.PERCH)
-    state = replace(state, entered_s=10.0 - PROFILE.planner.perch.timeout_s + 0.3, reach_s=None)
-    for i in range(1, 400):
-        t_s = 10.0 + TICK_S * i
-        held = state.phase is not Phase.PERCH
-        went_m = min(moved_m, 0.08 * (t_s - state.entered_s)) if held else 0.0
-        tel = telemetry(
-            t_s, thrust=(0.34 if held else 1.2 if touched else 1.0) * HOVER_THRUST,
-            position_m=(0.03 + went_m, 0.0, HANG_Z_M - 0.04),
-        )  # fmt: skip
-        if 0.0 < went_m < moved_m:
-            tel = replace(tel, velocity_mps=(0.08 + tel.velocity_mps[0], 0.0, 0.0))
-        target = target_at(
-            t_s, body_m=tel.position_m, sigma_m=np.full(3, 0.01), measured=False, tracked=False,
-            measured_s=10.0,
-        )  # fmt: skip
-        state, _ = step_mission(
-            state, felt(observation(t_s, telemetry=tel, target=target)), profile
-        )
-        if state.phase not in (Phase.PERCH, Phase.RECOVER):
-            break
-    assert (state.phase, state.row) == (Phase.LANDING, row)
-
-
 # --- Where it touched, as it is remembered -------------------------------------------------------
 
-TOUCHED: dict[str, Any] = {"contact_aside_m": 0.01, "contact_sigma_m": 0.02}
-
-
-def recovering(row: str, old: PlannerState, **obs: object) -> PlannerState:
-    """One tick on, into RECOVER by that row."""
-    table = tuple(
-        replace(r, when=lambda c: True) for r in TABLE if r.name == row and old.phase in r.phases
-    )
-    state, _ = step_mission(old, observation(10.02, HANG_Z_M, **obs), PROFILE, table)
-    assert (state.phase, state.row) == (Phase.RECOVER, row)
-    return state
-
-
-@pytest.mark.parametrize(
-    ("phase", "row", "kept"),
-    [
-        (Phase.COMPLETE, "not-released", True), (Phase.COMPLETE, "slipped", False),
-        (Phase.RECOVER, "blocked", True), (Phase.PERCH, "no-contact", False),
-    ],
-)  # fmt: skip
-def test_what_has_not_come_off_keeps_the_place_where_it_touched(
-    phase: Phase, row: str, kept: bool
-) -> None:
-    after = recovering(row, hanging(phase, **TOUCHED))
-    assert after.contact_aside_m == (0.01 if kept else None)
-
-
-@pytest.mark.parametrize(("since_s", "touched"), [(10.0, False), (9.0, True)])
-def test_one_sample_that_looks_like_a_contact_is_no_touch(since_s: float, touched: bool) -> None:
-    tel = telemetry(10.02, HANG_Z_M, thrust=1.2 * HOVER_THRUST)
-    pressing = landing(phase=Phase.PERCH, since={Condition.CONTACT: since_s})
-    after = recovering("no-contact", pressing, telemetry=tel)
-    assert (after.contact_aside_m is not None) is touched
-
-
-def test_a_sight_of_now_tells_the_place_better_than_a_touch_of_before() -> None:
-    state, seen = hanging(Phase.RECOVER, **TOUCHED), observation(10.02, HANG_Z_M)
-    assert seen.target is not None
-    lost = replace(seen, target=replace(seen.target, tracked=False))
-    assert touched_aside_m(Context(state, lost, PROFILE)) == (0.01, 0.02)
-    assert touched_aside_m(Context(state, seen, PROFILE)) is None
-
-
-def test_a_landing_for_another_reason_proves_no_touch() -> None:
-    used = hanging(Phase.RECOVER, **TOUCHED, attempts=PROFILE.planner.attempts, entered_s=9.0)
-    state = fly(used, at(HANG_Z_M)).state
-    assert (state.row, state.contact_aside_m) == ("attempts-used", None)
-
-
-def test_what_has_left_its_contact_forgets_where_that_was() -> None:
-    state = fly(hanging(Phase.RECOVER, **TOUCHED), at(HANG_Z_M - 0.1)).state
-    assert (state.contact_z_m, state.contact_aside_m) == (None, None)
+TOUCHED: dict[str, Any] = {"contact": ContactError(0.01, 0.02)}
 
 
 def test_a_vehicle_still_at_the_ceiling_has_not_recovered() -> None:
     """Steady because it sticks there: the next attempt would begin pressed."""
     assert fly(hanging(Phase.RECOVER), at(HANG_Z_M), 1.2).state.phase is Phase.RECOVER
-
-
-@pytest.mark.parametrize("descend_m", [0.02, 0.1])
-def test_a_short_descent_is_enough_to_have_left(descend_m: float) -> None:
-    profile = changed({"planner.recover.descend_m": descend_m})
-    flight = fly(hanging(Phase.RECOVER), at(HANG_Z_M - descend_m), 1.2, profile)
-    assert flight.state.phase is not Phase.RECOVER
 
 
 # --- The release -----------------------------------------------------------------------
@@ -500,34 +315,6 @@ def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
         assert isinstance(command, PositionSetpoint), i
 
 
-def test_a_raw_release_waits_for_telemetry_too() -> None:
-    profile = changed({"planner.perch.mode": "raw"})
-    state = mid_release(released_s=None, setpoint=None, entered_s=9.6)
-    look = at(HANG_Z_M, age_s=0.2, thrust=1000.0)
-    assert isinstance(fly(state, look, profile=profile).command, PositionSetpoint)
-
-
-@pytest.mark.parametrize(("age_s", "released"), [(0.02, True), (0.2, True), (0.5, False)])
-def test_a_release_in_a_landing_begins_on_telemetry_that_is_a_little_late(
-    age_s: float, released: bool
-) -> None:
-    """It stops nothing; what is older than `safety.telemetry_hold_s` begins nothing."""
-    flight = fly(hanging(), at(HANG_Z_M, age_s=age_s, thrust=20000.0), 1.6)
-    assert not flight.stops_s
-    assert (flight.state.released_s is not None) is released
-
-
-@pytest.mark.parametrize(
-    "still", [{"released_s": 5.0}, {"orders": 3, "ordered_s": 5.0}], ids=["still", "ordered"]
-)
-def test_a_flight_that_ends_hanging_unseen_is_kept_from_locking(still: dict[str, Any]) -> None:
-    """Its motors stand still by raw thrust; the stream's end alone would lock it."""
-    state = hanging(entered_s=10.0 - PROFILE.planner.landing.timeout_s, **still)
-    flight = fly(state, at(HANG_Z_M, age_s=0.22, thrust=1000.0))
-    assert flight.state.phase is Phase.ABORTED
-    assert isinstance(flight.command, StopMotors) is ("released_s" in still)
-
-
 @pytest.mark.parametrize("positioning", ["deck", "target"])
 @pytest.mark.parametrize(
     ("frozen", "ends"),
@@ -549,26 +336,6 @@ def test_a_completion_whose_telemetry_stands_still_ends(
     assert flight.state.phase is ends
 
 
-@pytest.mark.parametrize(
-    ("z_m", "silence_s", "ends"),
-    [
-        (0.02, 0.7, Phase.LANDED),  # it lies on the floor
-        (HANG_Z_M - 0.1, 0.7, Phase.PERCHED),
-        (HANG_Z_M - 0.6, 0.0, Phase.PERCHED),  # an estimate drifts while it is watched
-    ],
-)
-def test_after_the_stop_it_hangs_unless_a_silence_hid_a_fall(
-    z_m: float, silence_s: float, ends: Phase
-) -> None:
-    felt, state = Felt(), mid_release(stopped_s=4.0, orders=5, reach_s=3.0)
-    felt(at(1.0, **OFF)(10.0))
-    for i in range(1, 50):
-        obs = felt(at(z_m, **OFF)(10.0 + silence_s + TICK_S * i))
-        state, _ = step_mission(state, obs, PROFILE)
-    assert state.phase is ends
-    assert ends is Phase.PERCHED or state.outcome is Outcome.SAFETY
-
-
 # --- A slip ---------------------------------------------------------------------------
 
 
@@ -586,14 +353,6 @@ def test_a_falling_vehicle_does_not_hang_at_its_contact() -> None:
     assert flight.state.phase is not Phase.PERCHED
 
 
-def test_without_a_heading_a_slip_is_not_caught_by_position() -> None:
-    """Position control would lead away from its setpoint: raw thrust brakes the fall."""
-    state = landing(1.8, caught=False, catch_above_m=0.2, heading_lost=True)
-    flight = fly(state, at(1.8, velocity_mps=SINKS))
-    assert isinstance(flight.command, RawThrust)
-    assert flight.state.caught
-
-
 def slipped(**changes: Any) -> PlannerState:
     """A slip that is being caught."""
     below = PositionSetpoint(0.0, 0.0, HANG_Z_M - 0.25, 0.0)
@@ -602,40 +361,6 @@ def slipped(**changes: Any) -> PlannerState:
 
 
 FALLS: dict[str, Any] = {"velocity_mps": SINKS, "thrust": 1000.0, "acc_z_g": 0.2}
-
-
-def test_no_hold_keeps_a_slip_from_being_caught() -> None:
-    look = at(HANG_Z_M - 0.1, obs={"loop_late_s": 0.4}, **FALLS)
-    state, command = step_mission(slipped(), look(10.2), PROFILE)
-    assert is_setpoint(command, above_m=HANG_Z_M)
-    assert not state.caught
-
-
-def test_nothing_is_caught_on_an_old_speed() -> None:
-    """Two seconds of full thrust on a speed of long ago would end far above."""
-    _, command = step_mission(slipped(), at(HANG_Z_M - 0.1, age_s=0.2, **FALLS)(10.3), PROFILE)
-    assert is_setpoint(command, below_m=HANG_Z_M + 0.1)
-
-
-@pytest.mark.parametrize("caught", [False, True])
-def test_a_fall_that_turns_at_full_thrust_presses_nothing(caught: bool) -> None:
-    turns = at(HANG_Z_M - 0.1, velocity_mps=(0.0, 0.0, 0.01), thrust=FULL_THRUST, acc_z_g=1.1)
-    state = slipped(caught=caught, attempts=PROFILE.planner.attempts)
-    state, _ = step_mission(state, turns(10.6), PROFILE)
-    assert (state.phase, state.pressed) == (Phase.LANDING, caught)
-
-
-def test_a_contact_too_low_for_a_catch_says_so() -> None:
-    z_m = CATCHABLE_M - 0.1
-    target = target_at(BEGIN_S, (0.0, 0.0, z_m + 0.03), (0.0, 0.0, z_m), e_m=np.zeros(3))
-
-    def touches(t_s: float) -> Observation:
-        now = replace(target, t_s=t_s, measured_s=t_s, small_measured_s=t_s)
-        return at(z_m, obs={"target": now}, thrust=1.14 * HOVER_THRUST)(t_s)
-
-    state = fly(landing(z_m, Phase.PERCH), touches, 1.2).state
-    assert state.phase is Phase.COMPLETE
-    assert "too low for a slip to be caught" in state.reason
 
 
 # --- A step of the estimate -------------------------------------------------------------
@@ -651,32 +376,6 @@ def test_a_step_of_the_estimates_height_moves_what_is_remembered(step_m: float) 
     assert before.ground_m is not None
     assert state.ground_m is not None
     assert state.ground_m[2] == pytest.approx(before.ground_m[2] + step_m, abs=0.02)
-
-
-@pytest.mark.parametrize(
-    ("gap_s", "moves"), [(0.02, True), (0.1, True), (0.3, False), (5.0, False)]
-)
-def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves: bool) -> None:
-    """It was at rest before the silence and is at rest after it: on the floor."""
-    state = landing(1.0, last=telemetry(10.0, 1.0))
-    new, _ = step_mission(state, at(0.02, obs={"jumped": True})(10.0 + gap_s), PROFILE)
-    assert state.ground_m is not None
-    assert new.ground_m is not None
-    assert new.ground_m[2] - state.ground_m[2] == pytest.approx(-0.98 if moves else 0.0)
-
-
-def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None:
-    """By the line in the world that was it would dive by the step."""
-    lands = AIRBORNE | HL_ACTIVE
-    state = landing(0.4, orders=3, ordered_s=9.0, last=telemetry(9.98, 0.4, supervisor=lands))
-    up = at(0.9, obs={"jumped": True}, velocity_mps=(0.0, 0.0, -0.3), supervisor=lands)
-    state, command = step_mission(state, up(10.0), PROFILE)
-    assert is_setpoint(command, above_m=1.2)
-    slow = at(0.87, velocity_mps=(0.0, 0.0, -0.05), supervisor=lands)
-    state, command = step_mission(state, slow(10.14), PROFILE)
-    assert isinstance(command, Land)
-    assert state.ground_m is not None
-    assert command.height_m < state.ground_m[2]
 
 
 # --- Its own landing -----------------------------------------------------------------
@@ -740,38 +439,14 @@ def test_its_own_landing_is_slow_and_aims_lower_the_longer_the_estimate_has_drif
     """Also from below the ground, from where it would climb to it. Of a quintic the largest speed
     is 15/8 of the mean; it begins while the vehicle sinks, which costs time that is not way."""
     config = PROFILE.planner.landing
-    order = own_landing(config, 0.0, flown_s, z_m)
+    order = own_landing(PROFILE.planner, 0.0, flown_s, z_m)
     drift_m = min(MOST_DRIFT_M, config.drift_mps * flown_s)
     assert order.height_m == pytest.approx(min(0.0, z_m) - config.undershoot_m - drift_m)
     way_m = z_m - order.height_m
     assert 15 / 8 * way_m / (order.duration_s - SETTLING_S) == pytest.approx(PLANNED_MPS)
 
 
-@pytest.mark.parametrize("z_m", [math.nan, math.inf])
-def test_an_unknown_height_is_landed_slowly(z_m: float) -> None:
-    order = own_landing(PROFILE.planner.landing, 0.0, 1e6, z_m)
-    assert order.duration_s > 5.0
-    assert order.height_m >= -PROFILE.planner.landing.undershoot_m - MOST_DRIFT_M
-
-
 # --- What stays up, or stands still ----------------------------------------------------
-
-
-def test_a_landing_that_stays_up_hangs_wherever_its_target_was_thought_to_be() -> None:
-    """Neither a contact was noticed nor is a target in sight: it is held, and put to the proof."""
-    look = at(1.8, obs={"target": None}, thrust=0.5 * HOVER_THRUST)
-    assert isinstance(fly(landing(1.8), look, 1.6).command, RawThrust)
-
-
-def test_a_height_that_has_frozen_far_below_the_target_is_no_hanging() -> None:
-    """On the floor, where a positioning system's height stood still half a metre above it."""
-    target = {"target": observation(10.0, 0.5).target}
-    flight = fly(landing(0.5), at(0.5, obs=target, thrust=0.4 * HOVER_THRUST), 1.6)
-    assert not any(isinstance(command, RawThrust) for command in flight.commands)
-    state = flight.state
-    for i in range(1, 11):
-        state, _ = step_mission(state, at(0.5, obs=target, **OFF)(11.6 + TICK_S * i), PROFILE)
-    assert state.phase is Phase.LANDED
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.flight.loop import events_of
-from perchctl.mission import Outcome, planner
+from perchctl.mission import Event, Outcome, PlannerState
 from perchctl.perception import History, add_samples
 from perchctl.vehicle import Telemetry
 from tests.helpers.loop_rig import PROFILE, Rig, Vehicle
@@ -85,7 +84,7 @@ def test_a_battery_that_tells_nothing_new_ages(readings_v: tuple[float, ...], ag
 @pytest.mark.parametrize(("battery_v", "told"), [(math.nan, True), (0.0, True), (3.8, False)])
 def test_a_flight_without_a_battery_reading_says_so(battery_v: float, told: bool) -> None:
     obs = observation(1.0, telemetry=telemetry(1.0, battery_v=battery_v))
-    events = events_of(None, planner.start_mission(obs), obs, PROFILE)
+    events = Event.of_tick(None, PlannerState.on_ground(obs), obs, PROFILE)
     assert any("no battery reading" in event.reason for event in events) is told
 
 

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
 from perchctl.mission import (
-    Condition,
     ExternalPositions,
     FrameSeen,
     Observation,
@@ -28,6 +27,7 @@ from perchctl.mission import (
     TurnInputs,
     TurnTiming,
 )
+from perchctl.mission.state import Condition
 from perchctl.record import from_exact, to_exact
 from perchctl.record.exact import decode_line, encode, to_plain
 from perchctl.record.read import sent_of, turn_of

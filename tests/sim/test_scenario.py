@@ -18,13 +18,14 @@ from perchctl.display.panel import event_text
 from perchctl.flight import fly_lockstep
 from perchctl.link import Packet, Radio
 from perchctl.link.mock import TELEMETRY_DELAY_S
-from perchctl.mission import Event, EventKeeper, EventKind, Phase
+from perchctl.mission import Event, EventKind, Phase
 from perchctl.mission.state import Severity
 from perchctl.profile import PositioningConfig, Profile, load_profile
 from perchctl.record import read_log
 from perchctl.sim import EventExplainer, Scenario, draw_capture, draw_scenario
 from perchctl.sim.scenario import CONNECTED_S, LOSSES, Bursts
 from tests.helpers.flights import SEED, short_profile
+from tests.helpers.loop_rig import Watcher
 
 NOMINAL_SHA256 = "b8d613ad776dbc378846d5e8d02d5fcdc3e0384a4bfb241e780905d9d4b55071"
 """Of the nominal scenarios of seeds 0 to 20: figures of earlier campaigns are of these."""
@@ -167,9 +168,9 @@ def test_a_flight_names_it_in_its_events_and_in_its_log(tmp_path: Path) -> None:
     """The ascent lasts from 4.4 to 10 s."""
     profile = short_profile({"planner.attempts": 1})
     scenario = replace(draw_scenario(profile, SEED), camera_burst=(6.0, 14))
-    keeper, log = EventKeeper(), tmp_path / "f.jsonl"
+    keeper, log = Watcher(), tmp_path / "f.jsonl"
     flight = fly_lockstep(profile, SEED, log, scenario=scenario, watchers=(keeper,))
-    named = [event for event in keeper.seen if event.simulated]
+    named = [event for event in keeper.events if event.simulated]
     assert ["14 frames lost" in event_text(event) for event in named] == [True]
     recorded = [e.get("simulated") for e in read_log(log).events if e.get("simulated")]
     assert recorded == ["14 frames lost"]
