@@ -22,7 +22,7 @@ from perchctl.mission import (
     Touchdown,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.imu import Blow, Reckoning, advance_reckoning, integrate_imu
+from perchctl.mission.imu import Blow, ImuMotion, Reckoning, advance_reckoning
 from perchctl.mission.report import HARD_MPS, touchdown_of
 from perchctl.profile import load_profile
 from perchctl.record import FlightSummary, read_log
@@ -67,7 +67,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, float, Touchdo
         for sample in link.telemetry():
             if last is None:
                 place = sample.position_m
-            motion = integrate_imu(motion, last, sample)
+            motion = motion.with_sample(last, sample)
             believed = not blind or t_s < dropped_s
             carried, last = advance_reckoning(carried, motion, sample, believed=believed), sample
     assert last is not None
