@@ -30,7 +30,7 @@ from perchctl.check.row import (
 from perchctl.errors import PerchError
 from perchctl.flight import out_of_view, too_near_problem
 from perchctl.geometry import Place
-from perchctl.perception import BLENDED, MIRRORED_FRAMES
+from perchctl.perception import MIRRORED_FRAMES
 from perchctl.profile import Profile
 from perchctl.target import (
     edge_margin,
@@ -171,8 +171,6 @@ def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
         found = f"{late} of {rehearsal.pictures} came after newer ones"
         return failed(found, "use another stream or receiver: these hold pictures back")
     if not rehearsal.problems:
-        if BLENDED in rehearsal.remarks:
-            return warned(BLENDED, "switch the converter's deinterlacing off")
         again = rehearsal.repeats
         repeated = f"; {again} repetitions by the receiver are not counted" if again else ""
         return passed(f"{rehearsal.pictures} good ones{repeated}")

@@ -75,7 +75,6 @@ class Rehearsal:
     late_s: list[float] = field(default_factory=list)
     ages_s: list[float] = field(default_factory=list)
     problems: Counter[str] = field(default_factory=Counter)
-    remarks: list[str] = field(default_factory=list)
     looked: list[Looked] = field(default_factory=list)
     pictures: int = 0
     repeats: int = 0
@@ -162,7 +161,6 @@ def rehearse(
     end_s = clock.now()
     done.problem = source.problem(end_s) or ""
     done.silent_s = end_s - (done.arrivals[-1][1] if done.arrivals else start_s)
-    done.remarks = senses.perception.take_remarks()
     target = senses.target(end_s)
     done.target = target if target is not None and target.tracked else None
     newest = senses.history.newest

@@ -56,7 +56,7 @@ from perchctl.commands.track_output import (
 from perchctl.display import AXES_OF_SIDE, live_page
 from perchctl.errors import Interrupted, NotFound, UsageError
 from perchctl.files import check_output, same_file
-from perchctl.perception import BLENDED, INTERLACED, Perception
+from perchctl.perception import INTERLACED, Perception
 from perchctl.places import is_shipped_example
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.target import PrintCheck
@@ -295,8 +295,6 @@ class Tracker:
             self._interlaced = interlaced = interlaced or self._interlaced
         if interlaced:
             yield INTERLACED
-        if output.detections.ghost_px > 0.0:
-            yield BLENDED
         if output.lock_note:
             yield output.lock_note
         if output.detections.mirrored:

@@ -39,10 +39,6 @@ from perchctl.vision import (
 )
 
 INTERLACED = "interlaced: the two fields of a frame are measured each for itself"
-BLENDED = (
-    "blended: moving edges are double, as if the camera's fields had been averaged: switch that "
-    "off in the receiver or converter"
-)
 _OTHER_TARGET = (
     "a target is in view that is too far from target.expected_xy_m to be the own one: it is not "
     "followed"
@@ -153,7 +149,6 @@ class Perception:
             self.refused = output.lock_note
         for text, shown in (
             (INTERLACED, output.fields != "whole"),
-            (BLENDED, output.detections.ghost_px > 0.0),
             (_OTHER_TARGET, output.refused),
         ):
             before = self._shown.get(text, 0)

@@ -117,8 +117,6 @@ class Detections:
     velocity_px_s: Array | None = None  # of the markers in the picture, (2,)
     flow_px_s: dict[MarkerName, Array] = field(default_factory=dict)  # of each corner, (4, 2)
     edge_shift: EdgeShift | None = None
-    ghost_px: float = 0.0  # between the double edges of two blended fields; 0: single edges
-    ghost_age: int = 0  # pictures since these were looked for
 
     def get(self, marker: MarkerName) -> Detection | None:
         """Return that marker's detection, None without one."""

@@ -11,7 +11,6 @@ from perchctl.flight import FlightInputs
 from perchctl.geometry import rpy_from_rotation
 from perchctl.link import Link
 from perchctl.perception import perception
-from perchctl.perception.perception import REMARK_PICTURES
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
 from perchctl.vision import Frame, make_pipeline
@@ -107,12 +106,6 @@ def test_both_fields_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     flown_by(scene, 10)
     assert len(seen) >= 16
     assert np.diff(seen)[-6:] == pytest.approx(0.02, abs=1e-3)
-
-
-def test_blended_fields_are_remarked_once() -> None:
-    scene = Pass(0.3, (0.25, 0.05, 0.0), camera_fields="top", camera_blended=True)
-    _, remarks = flown_by(scene, REMARK_PICTURES + 6)
-    assert [text.partition(":")[0] for text in remarks] == ["blended"]
 
 
 def test_of_whole_pictures_there_is_nothing_to_remark() -> None:

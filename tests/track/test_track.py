@@ -115,8 +115,7 @@ def test_a_video_is_tracked_frame_by_frame(video: Path) -> None:
         R = np.asarray(cv2.Rodrigues(np.array(line["target"]["rvec_rad"]))[0], dtype=np.float64)
         assert line["target"]["yaw_rad"] == pytest.approx(yaw_of(R), abs=1e-9)
     assert lines(video) == tracked.lines
-    for word in ("interlaced", "blended"):
-        assert word not in tracked.stderr
+    assert "interlaced" not in tracked.stderr
 
 
 def test_the_filter_bridges_a_lost_frame(tmp_path: Path) -> None:
@@ -172,7 +171,7 @@ def test_rendered_scenes_with_exact_truth(tmp_path: Path) -> None:
     assert found["small"][0] >= 0.85 * found["small"][1]
 
 
-# --- interlaced and blended pictures ----------------------------------------------------
+# --- interlaced pictures ----------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -223,13 +222,6 @@ def test_interlaced_stills_have_one_result_each(tmp_path: Path, calibration: Pat
     for line in tracked.lines:
         assert np.abs(np.array(line["target"]["tvec_m"]) - truth[line["frame"]]).max() < 2e-4
     assert "interlaced" in tracked.stderr
-
-
-def test_blended_fields_are_named(tmp_path: Path, calibration: Path) -> None:
-    scene = Pass(0.3, (0.25, 0.05, 0.0), camera_fields="top", camera_blended=True)
-    said = track(recording(tmp_path, (scene, FIELDS)), calibration=calibration).stderr
-    assert "blended" in said
-    assert "interlaced" not in said
 
 
 # --- pictures that cannot be right ------------------------------------------------------

@@ -41,7 +41,7 @@ from perchctl.vision.markers.cut import (
     may_be_whole,
     outline_of,
 )
-from perchctl.vision.markers.detect import between, detect_markers, with_ghosts
+from perchctl.vision.markers.detect import between, detect_markers
 from perchctl.vision.markers.partial import seen_edges
 from perchctl.vision.markers.search import Found, search
 from tests.helpers.markers import SETUP, both, corners, frame
@@ -317,25 +317,6 @@ def test_two_fields_of_it_are_surer_than_one() -> None:
     assert middle.small.cov_px2 is not None
     assert np.allclose(middle.small.corners_px, a.small.corners_px + 0.5)
     assert np.allclose(middle.small.cov_px2, a.small.cov_px2 / 2.0)
-
-
-def double_edges() -> tuple[Detections, NDArray[np.uint8]]:
-    """A marker's square twice, 6 px apart."""
-    image = np.full(SHAPE, 200.0)
-    image[100:300, 200:400] -= 80.0
-    image[106:306, 206:406] -= 80.0
-    at = np.array([[203.0, 103.0], [403.0, 103.0], [403.0, 303.0], [203.0, 303.0]])
-    double = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.uint8)
-    return Detections(0, 0.0, small=Detection("small", at, 0.1, True)), double
-
-
-def test_no_double_edges_are_looked_for_where_sides_are_outside() -> None:
-    """What is read there is the picture's rim. A whole marker's are found."""
-    whole, double = double_edges()
-    assert with_ghosts(whole, None, double).ghost_px > 0.0
-    assert whole.small is not None
-    cut = replace(whole, small=replace(whole.small, cov_px2=np.eye(8)))
-    assert with_ghosts(cut, None, double) is cut
 
 
 @pytest.mark.parametrize("side_px", [1e6, 1e8, 1e12])
