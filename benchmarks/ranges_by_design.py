@@ -22,7 +22,8 @@ from perchctl.sim import Renderer, Scenario
 from perchctl.target import Optics
 from perchctl.target.design import design_ranges
 from perchctl.target.reading import FOUND_RATE, TRIALS, PlainReader
-from perchctl.vision import CameraModel, MarkerName
+from perchctl.vision import CameraModel
+from perchctl.vision.types import MarkerName
 
 FOCAL_PX = (250.0, 380.0, 600.0)
 BLUR_PX = (0.6, 1.5, 2.5)

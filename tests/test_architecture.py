@@ -102,7 +102,7 @@ MOST_NAMES = {
     "profile": 35,
     "sim": 23,
     "target": 24,
-    "vision": 38,
+    "vision": 26,
     "weights": 9,
 }
 

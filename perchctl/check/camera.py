@@ -284,7 +284,9 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
         f", {math.hypot(*sight.aside_m):.2f} m aside of the camera's axis "
         f"{sight.height_m:.2f} m above it"
     )
-    shown = [each.detections.large for each in rehearsal.looked if each.detections.large]
+    shown = [
+        each.output.detections.large for each in rehearsal.looked if each.output.detections.large
+    ]
     room = edge_margin(shown[-1].corners_px, camera.size_px) if shown else 1.0
     if room < ROOM_WARN:
         found += f", only {100.0 * max(0.0, room):.0f} % of the picture's width from its edge"

@@ -17,7 +17,7 @@ from perchctl.flight import Clock, FlightInputs
 from perchctl.profile import Profile
 from perchctl.target import PrintCheck, PrintVerdict
 from perchctl.vehicle import Telemetry
-from perchctl.vision import MARKERS, Detections, Frame, Pipeline, TargetEstimate, refine_lines
+from perchctl.vision import MARKERS, Frame, Pipeline, PipelineOutput, TargetEstimate, refine_lines
 
 REHEARSED_S = 3.0
 WARM_FRAMES = 3
@@ -33,7 +33,7 @@ class Looked:
     """One picture with what was found in it."""
 
     frame: Frame
-    detections: Detections
+    output: PipelineOutput
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def _note(
     done.found += seen.large is not None or seen.small is not None
     done.mirrored += seen.mirrored
     prints.add(output)
-    done.looked = [*done.looked[1 - KEPT_FRAMES :], Looked(frame, seen)]
+    done.looked = [*done.looked[1 - KEPT_FRAMES :], Looked(frame, output)]
 
 
 # --- What the pictures are like -----------------------------------------------------------------
@@ -214,7 +214,7 @@ def _blur(looked: Sequence[Looked], pipeline: Pipeline) -> Blur | None:
     least, most = [], []
     for each in looked:
         for name in MARKERS:
-            seen = each.detections.get(name)
+            seen = each.output.detections.get(name)
             if seen is None:
                 continue
             rim = pipeline.detector.patterns[name].rim

@@ -26,11 +26,8 @@ from perchctl.geometry import Array, rot_z, yaw_of
 from perchctl.vision import (
     MARKERS,
     CameraModel,
-    Detection,
     MarkerPose,
     PipelineOutput,
-    Stage,
-    better_conditioned,
 )
 
 
@@ -67,13 +64,13 @@ class Tracked:
     @property
     def stage(self) -> str:
         """The markers that this picture shows."""
-        return (Stage.NONE if self.output is None else self.output.stage).value
+        return "none" if self.output is None else self.output.stage.value
 
     @property
-    def markers(self) -> dict[str, Detection]:
-        """The markers that were found, by name."""
+    def markers(self) -> dict[str, Array]:
+        """The corners (4, 2) px of the markers that were found, by name."""
         found = {} if self.output is None else {m: self.output.detections.get(m) for m in MARKERS}
-        return {name: marker for name, marker in found.items() if marker is not None}
+        return {name: marker.corners_px for name, marker in found.items() if marker is not None}
 
 
 def camera_pose(
@@ -88,7 +85,7 @@ def camera_pose(
     target = output.target
     if target is None:
         return None
-    pose, is_whole = _measured_pose(output, target.stage)
+    pose, is_whole = _measured_pose(output, target.stage.value)
     if pose is not None and is_whole and not filtered:
         R = _rotation(pose.rvec_rad)
         return CameraPose(pose.rvec_rad, pose.tvec_m, yaw_of(R), pose.sigma_m, pose.sigma_yaw_rad)
@@ -102,14 +99,15 @@ def camera_pose(
     return CameraPose(rvec, target.e_m, target.e_yaw_rad, target.sigma_m, target.sigma_yaw_rad)
 
 
-def _measured_pose(output: PipelineOutput, stage: Stage) -> tuple[MarkerPose | None, bool]:
+def _measured_pose(output: PipelineOutput, stage: str) -> tuple[MarkerPose | None, bool]:
     """Return the pose that the target rests on, and whether it alone makes the target."""
     poses = output.poses
-    if stage is not Stage.BOTH:
-        return poses.get(stage.value), True
+    if stage != "both":
+        return poses.get(stage), True
     if "joint" in poses:
         return poses["joint"], True
-    return better_conditioned(poses["large"], poses["small"]), False
+    surest = min(poses.values(), key=lambda pose: float(np.linalg.norm(pose.sigma_m)))
+    return surest, False
 
 
 def _rotation(rvec: Array) -> Array:
@@ -140,12 +138,12 @@ def track_record(tracked: Tracked) -> dict[str, Any]:
 
 
 def _marker_record(tracked: Tracked, name: str) -> dict[str, Any] | None:
-    marker = tracked.markers.get(name)
-    if marker is None or tracked.output is None:
+    corners_px = tracked.markers.get(name)
+    if corners_px is None or tracked.output is None:
         return None
     pose = tracked.output.poses.get(name)
     return {
-        "corners_px": _finite(marker.corners_px),
+        "corners_px": _finite(corners_px),
         "rvec_rad": None if pose is None else _finite(pose.rvec_rad),
         "tvec_m": None if pose is None else _finite(pose.tvec_m),
         "reprojection_px": None if pose is None else _finite(pose.reprojection_px),
@@ -237,8 +235,7 @@ def text_rows(tracked: Tracked) -> list[tuple[str, str]]:
             ("sigma", f"{spread} mm   {math.degrees(target.sigma_yaw_rad):.2f} deg"),
         ]
     poses = {} if tracked.output is None else tracked.output.poses
-    for name, marker in tracked.markers.items():
-        corners = marker.corners_px
+    for name, corners in tracked.markers.items():
         side_px = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean()
         fit = f"fits to {poses[name].reprojection_px:.2f} px" if name in poses else "no pose"
         rows.append((name, f"side {side_px:.0f} px   {fit}"))
@@ -270,7 +267,7 @@ def track_sketch(tracked: Tracked, axis_m: float) -> Sketch:
     target = tracked.target
     return Sketch(
         tracked.image,
-        tuple((name, marker.corners_px) for name, marker in tracked.markers.items()),
+        tuple(tracked.markers.items()),
         None if target is None else (target.rvec_rad, target.tvec_m, axis_m),
     )
 

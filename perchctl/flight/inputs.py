@@ -24,7 +24,7 @@ from perchctl.values import replace
 from perchctl.vehicle import SendPosition, Telemetry
 from perchctl.vision import (
     Frame,
-    MeasuredMarkers,
+    MarkerPose,
     Pipeline,
     PipelineOutput,
     TargetEstimate,
@@ -118,7 +118,7 @@ class FlightInputs:
         if look:
             for _, self.output in perception.look(frame, used_s):
                 if positioning is not None and self._is_heard(now_s):
-                    positioning.see(perception.state.measured, self.history, now_s)
+                    positioning.see(perception.state.measured.surest, self.history, now_s)
         mirrored = perception.is_mirrored
         self.camera_problem = mirrored_note(self.profile.camera) if mirrored else self._note
 
@@ -245,9 +245,8 @@ class TargetPositioning:
         elif touches:
             self.feed.known(touching_m, now_s)
 
-    def see(self, measured: MeasuredMarkers, history: History, now_s: float) -> None:
+    def see(self, pose: MarkerPose | None, history: History, now_s: float) -> None:
         """Send the position by a picture, unless the vehicle is pressed or hangs."""
-        pose = measured.surest
         if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_S:
             return
         then, now = attitude_at(history, pose.t_s), attitude_at(history, now_s)

@@ -26,8 +26,6 @@ from perchctl.perception.visual_inertial import (
 from perchctl.profile import Profile
 from perchctl.vision import (
     Consistency,
-    Detections,
-    FieldState,
     Frame,
     Pipeline,
     PipelineOutput,
@@ -69,7 +67,6 @@ class Perception:
     motion: VisualInertialWindow = field(default_factory=VisualInertialWindow)
     refused: str | None = None
     _health: HealthState = field(default_factory=HealthState)
-    _fields: FieldState = field(default_factory=FieldState)
     _mirrored: int = 0
     _shown: dict[str, int] = field(default_factory=dict)
     _remarks: list[str] = field(default_factory=list)
@@ -88,11 +85,11 @@ class Perception:
             found: tuple[Frame, ...] = (frame,)
             self.state = PipelineState()
         else:
-            self._fields, found = pictures(self._fields, frame, self.pipeline)
+            self.state, found = pictures(self.state, frame, self.pipeline)
         for picture in found:
             attitude = attitude_at(self.history, picture.t_s)
             self.state, output = step(self.state, picture, attitude, self.pipeline)
-            self._mirrored = _mirrored_frames(self._mirrored, output.detections)
+            self._mirrored = _mirrored_frames(self._mirrored, output)
             self._remark(output)
             self._calibrate(output, later_s)
             yield picture, output
@@ -158,8 +155,8 @@ class Perception:
                     self._remarks.append(text)
 
 
-def _mirrored_frames(before: int, found: Detections) -> int:
+def _mirrored_frames(before: int, output: PipelineOutput) -> int:
     """Count the frames that have shown the target's mirror image since one showed the target."""
-    if found.mirrored:
+    if output.detections.mirrored:
         return before + 1
-    return 0 if found.large is not None or found.small is not None else before
+    return 0 if output.detections.markers else before

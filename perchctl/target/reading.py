@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from perchctl.errors import InvalidValue
 from perchctl.profile import MarkerConfig, TargetConfig, aruco_dictionary
 from perchctl.target.drawing import TargetDrawing, draw_target, marker_cells, mm_text
-from perchctl.vision import MARKERS, MarkerName
+from perchctl.vision import MARKERS
 
 
 class PlainReader:
@@ -34,7 +34,7 @@ class PlainReader:
         ]
         self._detector: Any = cv2.aruco.ArucoDetector(dictionaries, cv2.aruco.DetectorParameters())
 
-    def read(self, image: NDArray[np.uint8]) -> dict[MarkerName, NDArray[np.float32]]:
+    def read(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
         """Return the corners (4, 2) px of the markers in a grey picture (TL TR BR BL)."""
         corners, ids, _, which = self._detector.detectMarkersMultiDict(image)
         if ids is None or len(corners) == 0:
@@ -78,7 +78,7 @@ class Optics:
 @cache
 def smallest_side_px(
     target: TargetConfig,
-    marker: MarkerName,
+    marker: str,
     optics: Optics,
     picture_px: int,
 ) -> float | None:
@@ -114,7 +114,7 @@ def smallest_side_px(
 def _found_share(
     drawing: TargetDrawing,
     reader: PlainReader,
-    marker: MarkerName,
+    marker: str,
     side_px: float,
     optics: Optics,
     picture_px: int,

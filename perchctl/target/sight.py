@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.geometry import R_MARKER_TARGET, Array, rot_z, rpy_from_rotation
-from perchctl.profile import DetectorConfig, Mounting, Profile, TargetConfig
+from perchctl.profile import Mounting, Profile, TargetConfig
 from perchctl.vision import (
     CameraModel,
-    RigidPose,
-    make_aruco_detector,
     shows_enough_of_target,
     square_corners,
     undistort,
@@ -258,7 +256,6 @@ FROM_M = 0.10
 """The last stretch that is judged, from gear to target."""
 _STEP_M, _FINE_M = 0.005, 0.0005
 _WORTH_M = 0.002  # less is no reason to turn a camera
-_OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its axes
 
 
 @dataclass(frozen=True)
@@ -351,7 +348,7 @@ def _blind_range(
 ) -> BlindRange:
     """Return the blind range of a camera turned so; `gear_m` is the gear from it, body axes."""
     R, offset = R_body_cam.T, R_body_cam.T @ gear_m
-    view, patterns = FieldOfView(camera), make_aruco_detector(DetectorConfig(), target).patterns
+    view = FieldOfView(camera)
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
 
     def whole(range_m: float) -> bool:
@@ -359,9 +356,7 @@ def _blind_range(
 
     def left(range_m: float) -> bool:
         centre = R @ np.array([0.0, 0.0, range_m]) + offset
-        half_m = target.large.side_m / 2.0
-        pose = RigidPose(R @ R_MARKER_TARGET @ _OWN_AXES, centre / half_m)
-        return whole(range_m) or shows_enough_of_target(pose, patterns, camera)
+        return whole(range_m) or shows_enough_of_target(R @ R_MARKER_TARGET, centre, target, camera)
 
     return BlindRange(_lost_at_m(whole), _lost_at_m(left))
 

@@ -326,6 +326,22 @@ class MeasuredMarkers:
 
 
 @dataclass(frozen=True, eq=False)
+class FieldState:
+    """What is known of a stream's fields. `kind`: of the last frame that was looked at, `skipped`
+    frames ago. `votes`: for the top field being the earlier one. `top_first`: None until it is
+    known. `periods_s`: of the last frames, the newest of which came at `last_s`. `previous`: the
+    last picture, where it was combed."""
+
+    kind: PictureKind | None = None
+    skipped: int = 0
+    votes: float = 0.0
+    top_first: bool | None = None
+    periods_s: tuple[float, ...] = ()
+    last_s: float | None = None
+    previous: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class PipelineState:
     """All the memory of the pipeline; `PipelineState()` is a fresh start."""
 
@@ -340,6 +356,7 @@ class PipelineState:
     empty_frames: int = 0  # in a row, without either marker
     lock: Lock | None = None
     stranger: Stranger | None = None
+    fields: FieldState = FieldState()
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from perchctl.calibration.board.detect import find_board, fit_saddles
 from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.target import Board
-from perchctl.vision import is_combed, project
+from perchctl.vision import project, split_fields
 from tests.helpers.boards import (
     CHARUCO,
     CHESSBOARD,
@@ -132,7 +132,7 @@ def test_corners_of_an_interlaced_picture_are_half_way_between_its_fields() -> N
         poses = pose - step, pose + step
         picture, bottom = (renderer.render(each, rng, noise=2.0) for each in poses)
         picture[1::2] = bottom[1::2]
-        combed += is_combed(picture)
+        combed += len(split_fields(picture)) == 2
         view = _view(CHARUCO, picture)
         there = [project(CHARUCO.corners_m(), p[:3], p[3:], CAMERA)[view.ids] for p in poses]
         moments = [(there[0] + there[1]) / 2.0, *there]
@@ -147,5 +147,5 @@ def test_a_comb_is_no_sharpness() -> None:
     still = BoardRenderer(CAMERA, CHARUCO).render(pose, rng, noise=2.0)
     combed = still.copy()
     combed[1::2] = np.roll(still, 3, axis=1)[1::2]
-    assert is_combed(combed)
+    assert len(split_fields(combed)) == 2
     assert sharpness(combed) < 1.2 * sharpness(still)

@@ -41,7 +41,8 @@ from perchctl.vehicle import (
     StopMotors,
     Telemetry,
 )
-from perchctl.vision import CameraModel, Stage, TargetEstimate
+from perchctl.vision import CameraModel, TargetEstimate
+from perchctl.vision.types import Stage
 
 floats = st.floats(width=64)
 vectors = st.tuples(floats, floats, floats)

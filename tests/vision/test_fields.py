@@ -15,19 +15,17 @@ import pytest
 from perchctl.geometry import Array
 from perchctl.vision import (
     CameraModel,
-    FieldState,
     Frame,
     PictureKind,
     Pipeline,
     PipelineState,
     estimate_pose,
-    field_picture,
-    is_combed,
     pictures,
     step,
 )
-from perchctl.vision.fields import FieldsMode, combing, separate_fields
+from perchctl.vision.fields import FieldsMode, combing, field_picture, is_combed, separate_fields
 from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.types import FieldState
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -184,9 +182,9 @@ def test_the_profile_may_know_better() -> None:
 
 def measured(scene: Pass, frames: list[Frame], setup: Pipeline) -> tuple[list[Array], int]:
     """Errors, mm, of the poses at their pictures' own times, and the number of pictures."""
-    state, fields, errors, count = PipelineState(), FieldState(), [], 0
+    state, errors, count = PipelineState(), [], 0
     for frame in frames:
-        fields, parts = pictures(fields, frame, setup)
+        state, parts = pictures(state, frame, setup)
         for part in parts:
             count += 1
             state, output = step(state, part, None, setup)

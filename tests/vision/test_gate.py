@@ -16,7 +16,6 @@ from perchctl.geometry import make_T, rot_z, rotation_from_rpy
 from perchctl.profile import KalmanConfig, MergeConfig
 from perchctl.vision import (
     Attitude,
-    Detections,
     MarkerPose,
     Pipeline,
     PipelineOutput,
@@ -25,7 +24,7 @@ from perchctl.vision import (
 from perchctl.vision.filter import Measurement, make_filter
 from perchctl.vision.pipeline import follow
 from perchctl.vision.tracks import ESTABLISHED_FRAMES, FORGET_S, REACQUIRE_S, Sight, judged
-from perchctl.vision.types import Lock, MarkerTrack, Stranger
+from perchctl.vision.types import Detections, Lock, MarkerTrack, Stranger
 from tests.helpers.seen import seen_from
 
 Build = Callable[..., Pipeline]

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.vision import CameraModel, distort, project, undistort, undistort_px
-from perchctl.vision.lens import pinhole_px
+from perchctl.vision import CameraModel, project, undistort
+from perchctl.vision.lens import distort, pinhole_px, undistort_px
 from tests.helpers.target_picture import CAMERA
 
 FISHEYE = CameraModel((640, 480), CAMERA.K, np.array([-0.02, 0.004, 0.001, -0.0005]), "fisheye")

@@ -13,20 +13,16 @@ from hypothesis import strategies as st
 from perchctl.geometry import Array, wrap_rad, yaw_of
 from perchctl.profile import MergeConfig, Profile, WeightsConfig
 from perchctl.vision import (
-    Detection,
-    Detections,
-    FieldState,
     MarkerPose,
     PipelineState,
     PoseSetup,
-    Stage,
-    better_conditioned,
     make_pipeline,
     pictures,
     step,
 )
 from perchctl.vision.merge import (
     UNKNOWN_READOUT_S,
+    better_conditioned,
     choose_stage,
     disagree,
     merge_pair,
@@ -35,6 +31,7 @@ from perchctl.vision.merge import (
     stage_of,
     weight_matrix,
 )
+from perchctl.vision.types import Detection, Detections, Stage
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 
@@ -202,9 +199,9 @@ def measured(scene: Pass, readout_s: float | None) -> tuple[Array, float]:
         "target": {"size_sigma": 0.0, "curl_per_m": 0.0},
     }
     setup = make_pipeline(Profile.model_validate(values), CAMERA)
-    state, fields, errors, nees = PipelineState(), FieldState(), [], []
+    state, errors, nees = PipelineState(), [], []
     for k, frame in enumerate(scene.frames(12)):
-        fields, parts = pictures(fields, frame, setup)
+        state, parts = pictures(state, frame, setup)
         for part in parts:
             state, output = step(state, part, None, setup)
             if k < 4:

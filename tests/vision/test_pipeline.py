@@ -39,12 +39,11 @@ from perchctl.vision import (
     PipelineOutput,
     PipelineState,
     PoseSetup,
-    Stage,
     estimate,
     step,
 )
 from perchctl.vision.tracks import expected_corners, update_sight
-from perchctl.vision.types import Sighting
+from perchctl.vision.types import Sighting, Stage
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 Build = Callable[..., Pipeline]

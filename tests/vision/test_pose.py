@@ -25,7 +25,6 @@ from perchctl.profile import KalmanConfig, PoseConfig, TargetConfig
 from perchctl.sim.renderer import spoil
 from perchctl.vision import (
     Attitude,
-    Detection,
     Frame,
     MarkerPose,
     Pipeline,
@@ -40,6 +39,7 @@ from perchctl.vision.filter import PRINT, make_filter
 from perchctl.vision.merge import disagree
 from perchctl.vision.pose import PoseCandidate, mirror_solution, normal_cam
 from perchctl.vision.target_selection import measurement
+from perchctl.vision.types import Detection
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 SIDES = {"large": 0.150, "small": 0.025}

@@ -19,7 +19,7 @@ from perchctl.camera import BrokenPicture, FrameSource, Grey, VideoSource, image
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import Array
 from perchctl.target import Board
-from perchctl.vision import Frame, field_picture, is_combed
+from perchctl.vision import Frame, split_fields
 
 MIN_VIEWS = 5
 VIDEO_WINDOW = 8
@@ -124,8 +124,7 @@ def _sharpest_frames(source: VideoSource) -> Iterator[Frame]:
 def sharpness(image: Grey) -> float:
     """Return the variance of a picture's second derivative; of one field where there are two: the
     comb of a moving picture is no sharpness."""
-    if is_combed(image):
-        image = field_picture(image, 0)
+    image = split_fields(image)[0]
     step = max(1, image.shape[1] // _SHARPNESS_WIDTH)
     small = np.ascontiguousarray(image[::step, ::step])
     return float(cv2.Laplacian(small, cv2.CV_32F).var())

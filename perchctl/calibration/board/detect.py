@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.target import Board
-from perchctl.vision import field_picture, is_combed
+from perchctl.vision import split_fields
 
 MIN_CORNERS = 6
 """Fewer give a pose, but nothing about the lens."""
@@ -72,10 +72,8 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     Of an interlaced picture, whose fields show a moving board in two places, the view is the
     mean of both fields' corners: where the board was half way between them.
     """
-    if is_combed(image):
-        fields = (_find_in_field(field_picture(image, row), board, name) for row in (0, 1))
-        return _mean_of_fields(*fields)
-    return _find_in_field(image, board, name)
+    fields = [_find_in_field(field, board, name) for field in split_fields(image)]
+    return _mean_of_fields(*fields) if len(fields) == 2 else fields[0]
 
 
 def _mean_of_fields(a: BoardView | str, b: BoardView | str) -> BoardView | str:

@@ -24,7 +24,7 @@ from perchctl.calibration.board.predict import coverage, predict_errors
 from perchctl.calibration.board.result import Calibration, Lack
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.vision import distort, undistort
+from perchctl.vision import project, undistort
 
 FOLDS_BACK = "folds back inside of the picture"
 _EASIER = 0.95  # a richer model must leave at most this part of the simpler one's spread
@@ -102,7 +102,9 @@ def _is_usable(fit: Fit) -> bool:
     rays = undistort(grid, camera)
     if not (0 < camera.K[0, 2] < w and 0 < camera.K[1, 2] < h and np.isfinite(rays).all()):
         return False
-    return bool(np.abs(distort(rays, camera) - grid).max() < 0.05)
+    ahead = np.column_stack([rays, np.ones(len(rays))])
+    again = project(ahead, np.zeros(3), np.zeros(3), camera)
+    return bool(np.abs(again - grid).max() < 0.05)
 
 
 # --- Whether there is enough to calibrate from; if not, what to add ----------------------------

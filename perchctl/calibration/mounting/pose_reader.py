@@ -14,7 +14,6 @@ from perchctl.profile import Profile
 from perchctl.vision import (
     MARKERS,
     CameraModel,
-    FieldState,
     Frame,
     MarkerPose,
     PipelineOutput,
@@ -40,7 +39,6 @@ class PoseReader:
         self._pipeline = make_pipeline(bare, camera)
         self._live = live
         self._state = PipelineState()
-        self._fields = FieldState()
         self._health = HealthState()
         self.mirrored = 0
         self.outlines: tuple[tuple[str, Array], ...] = ()
@@ -56,7 +54,7 @@ class PoseReader:
             self.trouble = judged.text
             if judged.kind in ("frozen", "snow"):
                 return []
-        self._fields, found = pictures(self._fields, frame, self._pipeline)
+        self._state, found = pictures(self._state, frame, self._pipeline)
         seen = []
         for picture in found:
             self._state, output = step(self._state, picture, None, self._pipeline)

@@ -15,25 +15,21 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, Profile
 from perchctl.vision import (
     Attitude,
-    Detection,
-    Detections,
     Frame,
-    MarkerName,
     PipelineOutput,
     PipelineState,
     PoseSetup,
-    RigidPose,
-    distort,
     estimate_pose,
     project,
     square_corners,
     step,
     undistort,
-    undistort_px,
 )
+from perchctl.vision.lens import distort, undistort_px
 from perchctl.vision.markers.corners import within
 from perchctl.vision.markers.cut import (
     MOST_AGE_S,
+    RigidPose,
     cut_markers,
     fitted,
     is_cut,
@@ -44,6 +40,7 @@ from perchctl.vision.markers.cut import (
 from perchctl.vision.markers.detect import between, detect_markers
 from perchctl.vision.markers.partial import seen_edges
 from perchctl.vision.markers.search import Found, search
+from perchctl.vision.types import Detection, Detections, MarkerName
 from tests.helpers.markers import SETUP, both, corners, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 

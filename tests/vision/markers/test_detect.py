@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
-from perchctl.vision import (
-    Detection,
-    Detections,
-    Frame,
-    make_aruco_detector,
-    project,
-    square_corners,
-)
+from perchctl.vision import Frame, project, square_corners
 from perchctl.vision.markers.detect import (
     Picture,
     around,
@@ -27,8 +20,9 @@ from perchctl.vision.markers.detect import (
     predicted_corners,
     with_motion,
 )
-from perchctl.vision.markers.detector import MIRROR_INDEX
+from perchctl.vision.markers.detector import MIRROR_INDEX, make_aruco_detector
 from perchctl.vision.markers.search import misfit
+from perchctl.vision.types import Detection, Detections
 from tests.helpers.markers import POSE, SETUP, blurry, both, box, corners, followed, frame, paste
 from tests.helpers.target_picture import CAMERA, pose_of, render
 

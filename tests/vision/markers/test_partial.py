@@ -15,25 +15,24 @@ from numpy.typing import NDArray
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, Profile, TargetConfig, load_profile
-from perchctl.vision import (
-    Detections,
-    Frame,
-    MarkerName,
-    PipelineState,
-    field_picture,
-    make_aruco_detector,
-    make_pipeline,
-    step,
-)
+from perchctl.vision import Frame, PipelineState, make_pipeline, step
+from perchctl.vision.fields import field_picture
 from perchctl.vision.markers.corners import from_unit, mapped
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import filled, hidden_in, hides, make_mask
+from perchctl.vision.markers.detector import (
+    filled,
+    hidden_in,
+    hides,
+    make_aruco_detector,
+    make_mask,
+)
 from perchctl.vision.markers.partial import (
     KnownBy,
     fit_partly,
     seen_partly,
 )
 from perchctl.vision.markers.search import search
+from perchctl.vision.types import Detections, MarkerName
 from tests.helpers.markers import POSE, SETUP, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 

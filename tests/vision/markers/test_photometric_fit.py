@@ -13,15 +13,8 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig
-from perchctl.vision import (
-    CameraModel,
-    Detection,
-    Detections,
-    make_aruco_detector,
-    project,
-    square_corners,
-    undistort_px,
-)
+from perchctl.vision import CameraModel, project, square_corners
+from perchctl.vision.lens import undistort_px
 from perchctl.vision.markers.blurred import (
     aligned,
     expected_in_blur,
@@ -31,6 +24,7 @@ from perchctl.vision.markers.blurred import (
 )
 from perchctl.vision.markers.corners import UNIT, corner_jacobian, from_unit, mapped
 from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.markers.detector import make_aruco_detector
 from perchctl.vision.markers.pattern import Drawing, drawing_of
 from perchctl.vision.markers.photometric_fit import (
     Alignment,
@@ -40,6 +34,7 @@ from perchctl.vision.markers.photometric_fit import (
     projected,
     through_lens,
 )
+from perchctl.vision.types import Detection, Detections
 from tests.helpers.markers import SETUP, blurry, box, corners, frame
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
