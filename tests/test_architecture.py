@@ -97,7 +97,7 @@ MOST_NAMES = {
     "link": 15,
     "record": 18,
     "mission": 42,
-    "perception": 15,
+    "perception": 7,
     "positioning": 15,
     "profile": 35,
     "sim": 23,

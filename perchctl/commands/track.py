@@ -56,7 +56,7 @@ from perchctl.commands.track_output import (
 from perchctl.display import AXES_OF_SIDE, live_page
 from perchctl.errors import Interrupted, NotFound, UsageError
 from perchctl.files import check_output, same_file
-from perchctl.perception import INTERLACED, Perception
+from perchctl.perception import Perception
 from perchctl.places import is_shipped_example
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.target import PrintCheck
@@ -76,6 +76,7 @@ POLL_S = 0.002
 MOST_NOTES = 20
 # A live picture that stands still or is noise is no measurement; the others are searched.
 _NO_PICTURE = ("frozen", "snow")
+INTERLACED = "interlaced: the two fields of a frame are measured each for itself"
 _DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
 
 app = new_app()

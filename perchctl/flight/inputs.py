@@ -15,7 +15,6 @@ from perchctl.perception import (
     add_late_samples,
     add_samples,
     attitude_at,
-    attitude_of,
     battery_age_s,
 )
 from perchctl.positioning import FeedStatus, SightFeed
@@ -256,9 +255,8 @@ class TargetPositioning:
     def steered(self, target: TargetEstimate | None, history: History) -> TargetEstimate | None:
         """Return the estimate with the target where it stands; as seen until its place is known."""
         newest = history.newest
-        if target is None or newest is None:
-            return target
-        return self.feed.steered(target, attitude_of(newest))
+        now = None if newest is None else attitude_at(history, newest.t_s)
+        return target if target is None or now is None else self.feed.steered(target, now)
 
 
 def is_supported(history: History, now_s: float) -> bool:

@@ -130,11 +130,6 @@ def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
     return samples[min(i, len(samples) - 1)].velocity_mps
 
 
-def attitude_of(sample: Telemetry) -> Attitude:
-    """Attitude, position and velocity of a sample."""
-    return _attitude(sample, 0.0)
-
-
 def _time_s(sample: Telemetry) -> float:
     return sample.t_s
 

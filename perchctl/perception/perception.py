@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from perchctl.camera import HealthState, HealthVerdict, assess_frame
-from perchctl.perception.history import History, attitude_at, attitude_of
+from perchctl.perception.history import History, attitude_at
 from perchctl.perception.online_calibration import (
     OnlineCalibration,
     solve_consistency,
@@ -36,13 +36,7 @@ from perchctl.vision import (
     step,
 )
 
-INTERLACED = "interlaced: the two fields of a frame are measured each for itself"
-_OTHER_TARGET = (
-    "a target is in view that is too far from target.expected_xy_m to be the own one: it is not "
-    "followed"
-)
 MIRRORED_FRAMES = 5
-REMARK_PICTURES = 3
 
 
 @dataclass(eq=False)
@@ -68,8 +62,6 @@ class Perception:
     refused: str | None = None
     _health: HealthState = field(default_factory=HealthState)
     _mirrored: int = 0
-    _shown: dict[str, int] = field(default_factory=dict)
-    _remarks: list[str] = field(default_factory=list)
 
     def assess(self, frame: Frame, live: bool) -> HealthVerdict:
         """Judge whether a frame can be a measurement at all; called once for each frame, in order.
@@ -90,7 +82,8 @@ class Perception:
             attitude = attitude_at(self.history, picture.t_s)
             self.state, output = step(self.state, picture, attitude, self.pipeline)
             self._mirrored = _mirrored_frames(self._mirrored, output)
-            self._remark(output)
+            if output.refused:
+                self.refused = output.lock_note
             self._calibrate(output, later_s)
             yield picture, output
 
@@ -103,7 +96,7 @@ class Perception:
         """The target at the present, for the vehicle's newest attitude; None while none was seen.
         Without `spread` its standard deviations are those of the newest frame."""
         newest = self.history.newest
-        attitude = None if newest is None else attitude_of(newest)
+        attitude = None if newest is None else attitude_at(self.history, newest.t_s)
         return estimate(self.state, t_s, attitude, self.pipeline, spread=spread)
 
     def consistency(self) -> Consistency | None:
@@ -114,11 +107,6 @@ class Perception:
         """Forget the sights by which the vehicle's motion is judged, since wrong positions have
         turned its attitude."""
         self.motion = drop_sights(self.motion)
-
-    def take_remarks(self) -> list[str]:
-        """Return the remarks about the pictures that are new since the last call."""
-        new, self._remarks = self._remarks, []
-        return new
 
     def _calibrate(self, output: PipelineOutput, later_s: float) -> None:
         """Update the estimates of motion, latency and mounting with a picture of the target."""
@@ -139,20 +127,6 @@ class Perception:
     @property
     def _attitude_sigma_rad(self) -> float:
         return math.radians(self.profile.kalman.attitude_sigma_deg)
-
-    def _remark(self, output: PipelineOutput) -> None:
-        """Make each remark once a stream, when three pictures in a row have shown its reason."""
-        if output.refused:
-            self.refused = output.lock_note
-        for text, shown in (
-            (INTERLACED, output.fields != "whole"),
-            (_OTHER_TARGET, output.refused),
-        ):
-            before = self._shown.get(text, 0)
-            if before < REMARK_PICTURES:
-                self._shown[text] = before + 1 if shown else 0
-                if self._shown[text] == REMARK_PICTURES:
-                    self._remarks.append(text)
 
 
 def _mirrored_frames(before: int, output: PipelineOutput) -> int:

@@ -64,32 +64,30 @@ class Camera:
         return "a camera"
 
 
-def flown_by(scene: Pass, count: int = 14) -> tuple[list[Any], list[str]]:
-    """The outputs of all turns with a frame, and what was remarked."""
+def flown_by(scene: Pass, count: int = 14) -> list[Any]:
+    """The outputs of all turns with a frame."""
     vehicle = Vehicle(scene)
     pipeline = make_pipeline(PROFILE, CAMERA)
     inputs = FlightInputs(cast(Link, vehicle), cast(Any, Camera(scene, count)), pipeline, PROFILE)
-    outputs, remarks = [], []
+    outputs = []
     for k in range(1, 80):
         vehicle.now_s = k * PERIOD_S
         inputs.take_in(vehicle.now_s)
-        remarks += inputs.perception.take_remarks()
         if inputs.output is not None:
             outputs.append(inputs.output)
-    return outputs, remarks
+    return outputs
 
 
 @pytest.mark.parametrize("first", ["top", "bottom"])
 def test_a_target_stands_still_under_fields_in_flight(first: str) -> None:
     scene = Pass(0.25, (0.25, 0.1, 0.0), camera_fields=first, camera_latency_s=0.06)
-    outputs, remarks = flown_by(scene)
+    outputs = flown_by(scene)
     assert len(outputs) == 14
     assert {output.fields for output in outputs[5:]} == {"bottom" if first == "top" else "top"}
     places = [output.target.world_m for output in outputs[5:]]
     # Fields 10 ms from their time would be 2.7 mm aside.
     there = np.array([0.0, 0.0, scene.scenario.ceiling_z_m])
     assert np.abs(np.array(places) - there).max() < 7e-4
-    assert [text.partition(":")[0] for text in remarks] == ["interlaced"]
 
 
 def test_both_fields_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,9 +104,3 @@ def test_both_fields_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     flown_by(scene, 10)
     assert len(seen) >= 16
     assert np.diff(seen)[-6:] == pytest.approx(0.02, abs=1e-3)
-
-
-def test_of_whole_pictures_there_is_nothing_to_remark() -> None:
-    outputs, remarks = flown_by(Pass(0.25, (0.25, 0.1, 0.0)), 6)
-    assert {output.fields for output in outputs} == {"whole"}
-    assert remarks == []

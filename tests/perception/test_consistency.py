@@ -14,7 +14,6 @@ from perchctl.perception.online_calibration import (
     ATTITUDE_STEP_S,
     STAMPS_S,
     ConsistencySums,
-    Moment,
     add_moment,
     consistency_moment,
     solve_consistency,
@@ -124,7 +123,8 @@ def _fly(
         )
         sums = add_moment(
             sums,
-            consistency_moment(t_s, pose, before, after, velocity(t_s - told_s), told_s, setup),
+            t_s,
+            *consistency_moment(pose, before, after, velocity(t_s - told_s), told_s, setup),
         )
     return sums
 
@@ -203,13 +203,13 @@ def test_the_sums_do_not_grow_and_the_old_ones_stay(setup: PoseSetup) -> None:
     assert old.level is not None
     kept = old.level.copy(), old.information.copy()
     rows = np.ones((3, 8))
-    moment = Moment(old.t_s + FRAME_S, rows, np.full(3, 1e-6), 1.0)
-    new = add_moment(old, moment)
+    moment = rows, np.full(3, 1e-6), 1.0
+    new = add_moment(old, old.t_s + FRAME_S, *moment)
     assert new is not old
     assert np.array_equal(old.level, kept[0])
     assert np.array_equal(old.information, kept[1])
     assert np.array_equal(rows, np.ones((3, 8)))
-    assert add_moment(new, replace(moment, t_s=old.t_s)) is new  # an older frame is none
+    assert add_moment(new, old.t_s, *moment) is new  # an older frame is none
 
 
 def test_scatter_beyond_the_claimed_widens_the_intervals(setup: PoseSetup) -> None:
