@@ -97,7 +97,7 @@ MOST_NAMES = {
     "link": 15,
     "record": 18,
     "mission": 42,
-    "perception": 7,
+    "perception": 6,
     "positioning": 15,
     "profile": 35,
     "sim": 23,

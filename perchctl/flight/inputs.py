@@ -12,7 +12,6 @@ from perchctl.mission import FrameSeen, Observation, PoseSeen, TurnInputs
 from perchctl.perception import (
     History,
     Perception,
-    add_late_samples,
     add_samples,
     attitude_at,
     battery_age_s,
@@ -133,7 +132,7 @@ class FlightInputs:
     def present(self, began_s: float, now_s: float) -> None:
         """Take in what has arrived while camera or vision hung, since the tick of `began_s`."""
         late = self.link.telemetry()
-        self.perception.history = add_late_samples(self.history, late, self.profile.safety)
+        self.perception.history = add_samples(self.history, late, self.profile.safety, late=True)
         self.taken = replace(self.taken, late=tuple(late))
         if self.last_good_frame_s == began_s:
             self.last_good_frame_s = now_s  # the picture came: the camera is not gone

@@ -1,5 +1,4 @@
 from .history import History as History
-from .history import add_late_samples as add_late_samples
 from .history import add_samples as add_samples
 from .history import attitude_at as attitude_at
 from .history import battery_age_s as battery_age_s
