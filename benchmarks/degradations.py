@@ -62,7 +62,6 @@ ROWS = (
     Degradation("clean"),
     Degradation("in motion", True),
     Degradation("fields woven", True, {"camera_fields": "top"}),
-    Degradation("fields blended", True, {"camera_fields": "top", "camera_blended": True}),
     Degradation("rolling 20 ms, known", True, ROLLING, camera={"readout_s": 0.02}),
     Degradation("rolling 20 ms, unknown", True, ROLLING, camera={"readout_s": None}),
     Degradation("flicker", False, ROLLING | {"camera_flicker": 0.35}),

@@ -29,8 +29,6 @@ from perchctl.profile import KalmanConfig
 from perchctl.vision import (
     MARKERS,
     Attitude,
-    Detection,
-    Detections,
     Pipeline,
     PipelineOutput,
     PipelineState,
@@ -38,6 +36,7 @@ from perchctl.vision import (
     square_corners,
 )
 from perchctl.vision.pipeline import follow
+from perchctl.vision.types import Detection, Detections
 
 RATE_HZ = 30.0
 BINS_M = (0.0, 0.12, 0.25, 0.5, 1.0, 2.0)

@@ -23,9 +23,10 @@ from common import (
 )
 
 from perchctl.geometry import Array
-from perchctl.vision import MARKERS, Detection, Detections, Frame
+from perchctl.vision import MARKERS, Frame
 from perchctl.vision.markers.corners import side_lengths_px
 from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.types import Detection, Detections
 
 SIDES_PX = (
     64,

@@ -21,7 +21,8 @@ from perchctl.profile import Profile, TargetConfig
 from perchctl.sim import Renderer, Scenario
 from perchctl.target import make_design
 from perchctl.target.reading import FOUND_RATE, NOISE, TRIALS, PlainReader
-from perchctl.vision import CameraModel, MarkerName
+from perchctl.vision import CameraModel
+from perchctl.vision.types import MarkerName
 
 FOCAL_PX = (250.0, 380.0, 600.0)
 BLUR_PX = (0.6, 1.5, 2.5)

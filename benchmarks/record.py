@@ -45,7 +45,7 @@ from perchctl.profile import Profile
 from perchctl.record import LogWatcher
 from perchctl.record.summary import RecordingEnd
 from perchctl.vehicle import PositionSetpoint, Telemetry
-from perchctl.vision import FieldState, Frame, PipelineOutput, PipelineState, pictures, step
+from perchctl.vision import Frame, PipelineOutput, PipelineState, pictures, step
 
 GOAL_MS = 0.3
 BLOCK_S = 1.0
@@ -86,7 +86,7 @@ def flown(frames: list[Frame], for_s: float, folder: Path) -> tuple[Times, Recor
     began_s = time.monotonic()
     camera: FrameSource = Camera(frames, began_s)
     sources = {record: log.watched(camera) for record, log in logs.items()}
-    setup, state, stream = setup_with(), PipelineState(), FieldState()
+    setup, state = setup_with(), PipelineState()
     took: Times = {(part, record): [] for part in PARTS for record in logs}
     due_s, number = began_s, 0
     while due_s < began_s + for_s:
@@ -98,7 +98,7 @@ def flown(frames: list[Frame], for_s: float, folder: Path) -> tuple[Times, Recor
         given, mid = time.perf_counter(), preempted()
         output: PipelineOutput | None = None
         if frame is not None:
-            stream, found = pictures(stream, frame, setup)
+            state, found = pictures(state, frame, setup)
             for picture in found:
                 state, output = step(state, picture, None, setup)
         tick = tick_of(number, now_s, frame, output)

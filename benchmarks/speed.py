@@ -25,8 +25,6 @@ from common import (
 from perchctl.geometry import Array
 from perchctl.vision import (
     Attitude,
-    Detections,
-    FieldState,
     Frame,
     PipelineOutput,
     PipelineState,
@@ -34,6 +32,7 @@ from perchctl.vision import (
     step,
 )
 from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.types import Detections
 
 RATE_HZ, PASSES = 30.0, 15
 BASE, WHOLE = "two full-frame detectors", "frame to target pose"
@@ -83,7 +82,7 @@ def main() -> None:
     frames = list(sequence(120 if quick else 420))
     visible = {n: [in_view(true_corners(T, n)) for _, _, T in frames] for n in ("large", "small")}
     last: Detections | None = None
-    state, stream = PipelineState(), FieldState()
+    state = PipelineState()
     setup = setup_with()
     errors = []
 
@@ -97,14 +96,14 @@ def main() -> None:
         return {"large": seen.large, "small": seen.small}
 
     def whole(k: int, attitude: Attitude | None) -> Found:
-        nonlocal state, stream
-        stream, (frame,) = pictures(stream, frames[k][0], setup)
+        nonlocal state
+        state, (frame,) = pictures(state, frames[k][0], setup)
         state, output = step(state, frame, attitude, setup)
         return {"large": output.detections.large, "small": output.detections.small, "all": output}
 
     def afresh() -> None:
-        nonlocal last, state, stream
-        last, state, stream = None, PipelineState(), FieldState()
+        nonlocal last, state
+        last, state = None, PipelineState()
 
     rows = []
     total = {name: sum(seen) for name, seen in visible.items()}

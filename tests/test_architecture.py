@@ -96,12 +96,12 @@ MOST_NAMES = {
     "link": 11,
     "record": 13,
     "mission": 27,
-    "perception": 15,
+    "perception": 6,
     "positioning": 10,
     "profile": 35,
     "sim": 14,
     "target": 15,
-    "vision": 38,
+    "vision": 26,
     "weights": 9,
 }
 

@@ -69,14 +69,8 @@ from perchctl.sim import (  # noqa: E402
     draw_scenario,
 )
 from perchctl.vehicle import Idle, Telemetry  # noqa: E402
-from perchctl.vision import (  # noqa: E402
-    Frame,
-    PipelineState,
-    Stage,
-    TargetEstimate,
-    make_pipeline,
-    step,
-)
+from perchctl.vision import Frame, PipelineState, TargetEstimate, make_pipeline, step  # noqa: E402
+from perchctl.vision.types import Stage  # noqa: E402
 
 PAGE_PX, REPORT_PX = (1100, 560), (1200, 1250)
 FILM = ("--rate", "6", "--width", "640")

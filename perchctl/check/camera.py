@@ -31,7 +31,7 @@ from perchctl.check.row import (
 from perchctl.errors import PerchError
 from perchctl.flight import GroundCriteria, out_of_view
 from perchctl.geometry import Place
-from perchctl.perception import BLENDED, MIRRORED_FRAMES
+from perchctl.perception import MIRRORED_FRAMES
 from perchctl.profile import Profile
 from perchctl.target import (
     overhead_text,
@@ -168,8 +168,6 @@ def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
         found = f"{late} of {rehearsal.pictures} came after newer ones"
         return failed(found, "use another stream or receiver: these hold pictures back")
     if not rehearsal.problems:
-        if BLENDED in rehearsal.remarks:
-            return warned(BLENDED, "switch the converter's deinterlacing off")
         again = rehearsal.repeats
         repeated = f"; {again} repetitions by the receiver are not counted" if again else ""
         return passed(f"{rehearsal.pictures} good ones{repeated}")
@@ -271,7 +269,8 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
         f", {math.hypot(*sight.aside_m):.2f} m aside of the camera's axis "
         f"{sight.height_m:.2f} m above it"
     )
-    shown = [each.detections.large for each in rehearsal.looked if each.detections.large]
+    found_large = (each.output.detections.large for each in rehearsal.looked)
+    shown = [marker for marker in found_large if marker is not None]
     room = 1.0
     if shown:
         far_edge = np.array(camera.size_px) - 0.5

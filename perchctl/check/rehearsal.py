@@ -17,7 +17,7 @@ from perchctl.flight import FlightInputs, WallClock
 from perchctl.profile import Profile
 from perchctl.target import PrintCheck
 from perchctl.vehicle import Telemetry
-from perchctl.vision import MARKERS, Detections, Frame, Pipeline, TargetEstimate, refine_lines
+from perchctl.vision import MARKERS, Frame, Pipeline, PipelineOutput, TargetEstimate, refine_lines
 
 REHEARSED_S = 3.0
 WARM_FRAMES = 3
@@ -33,7 +33,7 @@ class Looked:
     """One picture with what was found in it."""
 
     frame: Frame
-    detections: Detections
+    output: PipelineOutput
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,6 @@ class Rehearsal:
     late_s: list[float] = field(default_factory=list)
     ages_s: list[float] = field(default_factory=list)
     problems: Counter[str] = field(default_factory=Counter)
-    remarks: list[str] = field(default_factory=list)
     looked: list[Looked] = field(default_factory=list)
     pictures: int = 0
     repeats: int = 0
@@ -152,7 +151,6 @@ def rehearse(
     end_s = clock.now()
     done.problem = source.problem(end_s) or ""
     done.silent_s = end_s - (done.arrivals[-1][1] if done.arrivals else start_s)
-    done.remarks = senses.perception.take_remarks()
     target = senses.target(end_s)
     done.target = target if target is not None and target.tracked else None
     done.print_verdict = prints.verdict() if prints.judged else None
@@ -185,7 +183,7 @@ def _note(
     done.found += seen.large is not None or seen.small is not None
     done.mirrored += seen.mirrored
     prints.add(output)
-    done.looked = [*done.looked[1 - KEPT_FRAMES :], Looked(frame, seen)]
+    done.looked = [*done.looked[1 - KEPT_FRAMES :], Looked(frame, output)]
 
 
 def _blur(looked: Sequence[Looked], pipeline: Pipeline) -> Blur | None:
@@ -193,7 +191,7 @@ def _blur(looked: Sequence[Looked], pipeline: Pipeline) -> Blur | None:
     least, most = [], []
     for each in looked:
         for name in MARKERS:
-            seen = each.detections.get(name)
+            seen = each.output.detections.get(name)
             if seen is None:
                 continue
             rim = pipeline.detector.patterns[name].rim

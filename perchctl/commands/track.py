@@ -48,7 +48,7 @@ from perchctl.commands.progress import count_bar
 from perchctl.display import live_page, sketch_of
 from perchctl.errors import Interrupted, NotFound
 from perchctl.geometry import Array, rot_z, yaw_of
-from perchctl.perception import BLENDED, INTERLACED, Perception
+from perchctl.perception import Perception
 from perchctl.places import is_shipped_example
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.target import PrintCheck
@@ -58,8 +58,6 @@ from perchctl.vision import (
     Frame,
     MarkerPose,
     PipelineOutput,
-    Stage,
-    better_conditioned,
     camera_profile,
     make_pipeline,
 )
@@ -69,6 +67,7 @@ STILLS_HZ = 1.0
 POLL_S = 0.002
 # A live picture that stands still or is noise is no measurement; the others are searched.
 _NO_PICTURE = ("frozen", "snow")
+INTERLACED = "interlaced: the two fields of a frame are measured each for itself"
 _DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
 
 app = new_app()
@@ -243,7 +242,7 @@ class Tracked:
     @property
     def stage(self) -> str:
         """The markers that this picture shows."""
-        return (Stage.NONE if self.output is None else self.output.stage).value
+        return "none" if self.output is None else self.output.stage.value
 
 
 class Tracker:
@@ -279,8 +278,6 @@ class Tracker:
     def _notes(self, output: PipelineOutput) -> Iterator[str]:
         if output.fields != "whole":
             yield INTERLACED
-        if output.detections.ghost_px > 0.0:
-            yield BLENDED
         if output.lock_note:
             yield output.lock_note
         if output.detections.mirrored:
@@ -301,7 +298,7 @@ def camera_pose(
     target = output.target
     if target is None:
         return None
-    pose, is_whole = _measured_pose(output, target.stage)
+    pose, is_whole = _measured_pose(output, target.stage.value)
     if pose is not None and is_whole and not filtered:
         R = _rotation(pose.rvec_rad)
         return CameraPose(pose.rvec_rad, pose.tvec_m, yaw_of(R), pose.sigma_m, pose.sigma_yaw_rad)
@@ -315,14 +312,15 @@ def camera_pose(
     return CameraPose(rvec, target.e_m, target.e_yaw_rad, target.sigma_m, target.sigma_yaw_rad)
 
 
-def _measured_pose(output: PipelineOutput, stage: Stage) -> tuple[MarkerPose | None, bool]:
+def _measured_pose(output: PipelineOutput, stage: str) -> tuple[MarkerPose | None, bool]:
     """Return the pose that the target rests on, and whether it alone makes the target."""
     poses = output.poses
-    if stage is not Stage.BOTH:
-        return poses.get(stage.value), True
+    if stage != "both":
+        return poses.get(stage), True
     if "joint" in poses:
         return poses["joint"], True
-    return better_conditioned(poses["large"], poses["small"]), False
+    surest = min(poses.values(), key=lambda pose: float(np.linalg.norm(pose.sigma_m)))
+    return surest, False
 
 
 def _rotation(rvec: Array) -> Array:

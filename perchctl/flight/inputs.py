@@ -12,10 +12,8 @@ from perchctl.mission import FrameSeen, Observation, PoseSeen, TurnInputs
 from perchctl.perception import (
     History,
     Perception,
-    add_late_samples,
     add_samples,
     attitude_at,
-    attitude_of,
     battery_age_s,
 )
 from perchctl.positioning import FeedStatus, SightFeed
@@ -24,7 +22,7 @@ from perchctl.values import replace
 from perchctl.vehicle import SendPosition, Telemetry
 from perchctl.vision import (
     Frame,
-    MeasuredMarkers,
+    MarkerPose,
     Pipeline,
     PipelineOutput,
     TargetEstimate,
@@ -118,7 +116,7 @@ class FlightInputs:
         if look:
             for _, self.output in perception.look(frame, used_s):
                 if positioning is not None and self._is_heard(now_s):
-                    positioning.see(perception.state.measured, self.history, now_s)
+                    positioning.see(perception.state.measured.surest, self.history, now_s)
         mirrored = perception.is_mirrored
         self.camera_problem = mirrored_note(self.profile.camera) if mirrored else self._note
 
@@ -134,7 +132,7 @@ class FlightInputs:
     def present(self, began_s: float, now_s: float) -> None:
         """Take in what has arrived while camera or vision hung, since the tick of `began_s`."""
         late = self.link.telemetry()
-        self.perception.history = add_late_samples(self.history, late, self.profile.safety)
+        self.perception.history = add_samples(self.history, late, self.profile.safety, late=True)
         self.taken = replace(self.taken, late=tuple(late))
         if self.last_good_frame_s == began_s:
             self.last_good_frame_s = now_s  # the picture came: the camera is not gone
@@ -245,9 +243,8 @@ class TargetPositioning:
         elif touches:
             self.feed.known(touching_m, now_s)
 
-    def see(self, measured: MeasuredMarkers, history: History, now_s: float) -> None:
+    def see(self, pose: MarkerPose | None, history: History, now_s: float) -> None:
         """Send the position by a picture, unless the vehicle is pressed or hangs."""
-        pose = measured.surest
         if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_S:
             return
         then, now = attitude_at(history, pose.t_s), attitude_at(history, now_s)
@@ -257,9 +254,8 @@ class TargetPositioning:
     def steered(self, target: TargetEstimate | None, history: History) -> TargetEstimate | None:
         """Return the estimate with the target where it stands; as seen until its place is known."""
         newest = history.newest
-        if target is None or newest is None:
-            return target
-        return self.feed.steered(target, attitude_of(newest))
+        now = None if newest is None else attitude_at(history, newest.t_s)
+        return target if target is None or now is None else self.feed.steered(target, now)
 
 
 def is_supported(history: History, now_s: float) -> bool:

@@ -219,7 +219,7 @@ def _mission(
             log_noted = True
             text = f"the log of this flight is incomplete: {obs.log_problem}"
             events.append(Event(now_s, EventKind.NOTE, text, state.phase))
-        for text in (*inputs.perception.take_remarks(), *parts.remarks()):
+        for text in parts.remarks():
             events.append(Event(now_s, EventKind.NOTE, text, state.phase))
         for event in events:
             event = replace(event, simulated=parts.simulated(event))

@@ -1,10 +1,6 @@
 from .history import History as History
-from .history import add_late_samples as add_late_samples
 from .history import add_samples as add_samples
 from .history import attitude_at as attitude_at
-from .history import attitude_of as attitude_of
 from .history import battery_age_s as battery_age_s
-from .perception import BLENDED as BLENDED
-from .perception import INTERLACED as INTERLACED
 from .perception import MIRRORED_FRAMES as MIRRORED_FRAMES
 from .perception import Perception as Perception

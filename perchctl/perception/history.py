@@ -42,14 +42,17 @@ class History:
         return self.samples[-1] if self.samples else None
 
 
-def add_samples(history: History, new: list[Telemetry], safety: SafetyConfig) -> History:
+def add_samples(
+    history: History, new: list[Telemetry], safety: SafetyConfig, late: bool = False
+) -> History:
     """The history with new samples; `jumped` and `turned_rad`, the largest step of the
-    heading, are about these samples only.
+    heading, are about these samples only, or about those before, too, where they came `late` in
+    the same turn.
 
     Samples with NaN or out of order are left out (fault 35). Where position and velocity alone
     are no numbers, they are those of the sample before, and older by that.
     """
-    jumped, turned_rad = False, 0.0
+    jumped, turned_rad = (history.jumped, history.turned_rad) if late else (False, 0.0)
     if not new:
         return replace(history, jumped=jumped, turned_rad=turned_rad)
     samples, imu = list(history.samples), history.imu
@@ -73,14 +76,6 @@ def add_samples(history: History, new: list[Telemetry], safety: SafetyConfig) ->
         first = bisect.bisect_left(samples, oldest, key=_time_s)
         samples = samples[first:]
     return History(tuple(samples), jumped, turned_rad, changed_s, battery_v, imu)
-
-
-def add_late_samples(history: History, late: list[Telemetry], safety: SafetyConfig) -> History:
-    """The history with samples that came later in the same turn; `jumped` and `turned_rad` go on to
-    count the earlier ones, too."""
-    after = add_samples(history, late, safety)
-    turned_rad = max(history.turned_rad, after.turned_rad)
-    return replace(after, jumped=history.jumped or after.jumped, turned_rad=turned_rad)
 
 
 def battery_age_s(history: History, now_s: float) -> float:
@@ -128,11 +123,6 @@ def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
         return 0.0, 0.0, 0.0
     i = bisect.bisect_left(samples, t_s, key=_time_s)
     return samples[min(i, len(samples) - 1)].velocity_mps
-
-
-def attitude_of(sample: Telemetry) -> Attitude:
-    """Attitude, position and velocity of a sample."""
-    return _attitude(sample, 0.0)
 
 
 def _time_s(sample: Telemetry) -> float:

@@ -84,8 +84,8 @@ def _learned(
     if before is None or after is None:
         return old
     velocity_mps = velocity_at(history, t_s - delay_s)
-    moment = consistency_moment(t_s, pose, before, after, velocity_mps, delay_s, setup)
-    new = replace(old, sums=add_moment(old.sums, moment))
+    moment = consistency_moment(pose, before, after, velocity_mps, delay_s, setup)
+    new = replace(old, sums=add_moment(old.sums, t_s, *moment))
     if t_s - old.solved_s >= SOLVE_EVERY_S:
         newest = solve_consistency(new.sums, attitude_sigma_rad)
         new = replace(new, newest=newest, solved_s=t_s)
@@ -163,29 +163,21 @@ class ConsistencySums:
     rows: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """One frame's target. `rows` (3, 8) as the columns have them, `variance` (3,) of the place,
-    and `range_m` along the upward axis."""
-
-    t_s: float
-    rows: Array
-    variance: Array
-    range_m: float
-
-
 def consistency_moment(
-    t_s: float,
     pose: MarkerPose,
     before: Attitude,
     after: Attitude,
     velocity_mps: tuple[float, float, float],
     delay_s: float,
     setup: PoseSetup,
-) -> Moment:
-    """Return the frame's target, for the vehicle's attitude `ATTITUDE_STEP_S` before and after the
-    frame's time less `delay_s`, and its velocity then. `delay_s` is the delay that is thought
-    likely: about it, the factors are those of small changes."""
+) -> tuple[Array, Array, float]:
+    """Return what a frame tells: rows (3, 8) as the columns have them, the variance (3,) of the
+    target's place, and its range along the upward axis, m.
+
+    `before` and `after` are the vehicle's attitude `ATTITUDE_STEP_S` before and after the frame's
+    time less `delay_s`, `velocity_mps` its velocity then. `delay_s` is the delay that is thought
+    likely: about it, the factors are those of small changes.
+    """
     assert pose.cov is not None
     T_body_cam = setup.T_body_cam
     R_body_cam = T_body_cam[:3, :3]
@@ -214,7 +206,7 @@ def consistency_moment(
     rate *= _above(abs(rate), NOISE_RADPS)
     rows.append([heading0 + 0.5 * turned + delay_s * rate, rate] + 6 * [0.0])
     noise.append(float(pose.cov[3, 3]) + LEAST_SIGMA_RAD**2 + (JITTER_S * rate) ** 2)
-    return Moment(t_s, np.array(rows), np.array(noise), z)
+    return np.array(rows), np.array(noise), z
 
 
 def _above(size: float, noise: float) -> float:
@@ -240,29 +232,31 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def add_moment(old: ConsistencySums, new: Moment) -> ConsistencySums:
-    """Return the sums with one more frame. After a gap, or where the target or the estimate's world
-    has jumped, the level begins anew, and what was learned is kept."""
+def add_moment(
+    old: ConsistencySums, t_s: float, rows: Array, variance: Array, range_m: float
+) -> ConsistencySums:
+    """Return the sums with the frame of `t_s`, which tells what `consistency_moment` returns. After
+    a gap, or where the target or the estimate's world has jumped, the level begins anew, and what
+    was learned is kept."""
     if old.level is None:
-        first = new.rows, new.variance
-        return replace(old, t_s=new.t_s, began_s=new.t_s, level=first[0], variance=first[1])
-    gap_s = new.t_s - old.t_s
+        return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)
+    gap_s = t_s - old.t_s
     if gap_s <= 0.0:
         return old
-    rows = new.rows.copy()
-    rows[X, DRIFT_X] = rows[Y, DRIFT_Y] = new.t_s - old.began_s
+    rows = rows.copy()
+    rows[X, DRIFT_X] = rows[Y, DRIFT_Y] = t_s - old.began_s
     change = rows - old.level
     change[HEADING, PLACE] = wrap_rad(float(change[HEADING, PLACE]))
-    walk_m2 = WALK_M**2 + (WALK_RAD * new.range_m) ** 2
+    walk_m2 = WALK_M**2 + (WALK_RAD * range_m) ** 2
     predicted = old.variance + np.array([walk_m2, walk_m2, WALK_RAD**2]) * gap_s
-    spread = predicted + new.variance
+    spread = predicted + variance
     size = np.abs(change)
     beyond = size[:, PLACE] - GATE_SIGMAS * np.sqrt(spread) > size @ _POSSIBLE
     if gap_s > MOST_GAP_S or beyond.any():
-        return replace(old, t_s=new.t_s, level=rows, variance=new.variance)
+        return replace(old, t_s=t_s, level=rows, variance=variance)
     gain = predicted / spread
     return ConsistencySums(
-        new.t_s,
+        t_s,
         old.began_s,
         old.level + gain[:, None] * change,
         (1.0 - gain) * predicted,

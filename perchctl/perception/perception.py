@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from perchctl.camera import FrameHealth
-from perchctl.perception.history import History, attitude_at, attitude_of
+from perchctl.perception.history import History, attitude_at
 from perchctl.perception.online_calibration import (
     OnlineCalibration,
     solve_consistency,
@@ -26,8 +26,6 @@ from perchctl.perception.visual_inertial import (
 from perchctl.profile import Profile
 from perchctl.vision import (
     Consistency,
-    Detections,
-    FieldState,
     Frame,
     Pipeline,
     PipelineOutput,
@@ -38,17 +36,7 @@ from perchctl.vision import (
     step,
 )
 
-INTERLACED = "interlaced: the two fields of a frame are measured each for itself"
-BLENDED = (
-    "blended: moving edges are double, as if the camera's fields had been averaged: switch that "
-    "off in the receiver or converter"
-)
-_OTHER_TARGET = (
-    "a target is in view that is too far from target.expected_xy_m to be the own one: it is not "
-    "followed"
-)
 MIRRORED_FRAMES = 5
-REMARK_PICTURES = 3
 
 
 @dataclass(eq=False)
@@ -74,10 +62,7 @@ class Perception:
     motion: VisualInertialWindow = field(default_factory=VisualInertialWindow)
     refused: str | None = None
     health: FrameHealth = field(default_factory=FrameHealth)
-    _fields: FieldState = field(default_factory=FieldState)
     _mirrored: int = 0
-    _shown: dict[str, int] = field(default_factory=dict)
-    _remarks: list[str] = field(default_factory=list)
 
     def look(self, frame: Frame, later_s: float = 0.0) -> Iterator[tuple[Frame, PipelineOutput]]:
         """Yield each picture of the frame with what the pipeline finds in it: one picture, or the
@@ -87,12 +72,13 @@ class Perception:
             found: tuple[Frame, ...] = (frame,)
             self.state = PipelineState()
         else:
-            self._fields, found = pictures(self._fields, frame, self.pipeline)
+            self.state, found = pictures(self.state, frame, self.pipeline)
         for picture in found:
             attitude = attitude_at(self.history, picture.t_s)
             self.state, output = step(self.state, picture, attitude, self.pipeline)
-            self._mirrored = _mirrored_frames(self._mirrored, output.detections)
-            self._remark(output)
+            self._mirrored = _mirrored_frames(self._mirrored, output)
+            if output.refused:
+                self.refused = output.lock_note
             self._calibrate(output, later_s)
             yield picture, output
 
@@ -105,7 +91,7 @@ class Perception:
         """The target at the present, for the vehicle's newest attitude; None while none was seen.
         Without `spread` its standard deviations are those of the newest frame."""
         newest = self.history.newest
-        attitude = None if newest is None else attitude_of(newest)
+        attitude = None if newest is None else attitude_at(self.history, newest.t_s)
         return estimate(self.state, t_s, attitude, self.pipeline, spread=spread)
 
     def consistency(self) -> Consistency | None:
@@ -116,11 +102,6 @@ class Perception:
         """Forget the sights by which the vehicle's motion is judged, since wrong positions have
         turned its attitude."""
         self.motion = drop_sights(self.motion)
-
-    def take_remarks(self) -> list[str]:
-        """Return the remarks about the pictures that are new since the last call."""
-        new, self._remarks = self._remarks, []
-        return new
 
     def _calibrate(self, output: PipelineOutput, later_s: float) -> None:
         """Update the estimates of motion, latency and mounting with a picture of the target."""
@@ -142,24 +123,9 @@ class Perception:
     def _attitude_sigma_rad(self) -> float:
         return math.radians(self.profile.kalman.attitude_sigma_deg)
 
-    def _remark(self, output: PipelineOutput) -> None:
-        """Make each remark once a stream, when three pictures in a row have shown its reason."""
-        if output.refused:
-            self.refused = output.lock_note
-        for text, shown in (
-            (INTERLACED, output.fields != "whole"),
-            (BLENDED, output.detections.ghost_px > 0.0),
-            (_OTHER_TARGET, output.refused),
-        ):
-            before = self._shown.get(text, 0)
-            if before < REMARK_PICTURES:
-                self._shown[text] = before + 1 if shown else 0
-                if self._shown[text] == REMARK_PICTURES:
-                    self._remarks.append(text)
 
-
-def _mirrored_frames(before: int, found: Detections) -> int:
+def _mirrored_frames(before: int, output: PipelineOutput) -> int:
     """Count the frames that have shown the target's mirror image since one showed the target."""
-    if found.mirrored:
+    if output.detections.mirrored:
         return before + 1
-    return 0 if found.large is not None or found.small is not None else before
+    return 0 if output.detections.markers else before

@@ -16,7 +16,7 @@ import numpy as np
 from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig, TargetConfig
 from perchctl.target.drawing import marker_corners_m, measured_scale
-from perchctl.vision import CameraModel, PipelineOutput, undistort_px
+from perchctl.vision import CameraModel, PipelineOutput, undistort
 
 MEASURED_SIGMA = 0.001
 """What measured sizes may be off by, relative: 0.15 mm of a large marker."""
@@ -70,7 +70,8 @@ def size_ratio(
     """Return the small marker's size relative to the large one's, over the ratio in the profile
     (1.01 is printed 1 % too large), from one frame's corners, (4, 2) px each; and the share by
     which corners may err systematically. None where the corners span no plane."""
-    seen = undistort_px(np.concatenate([large_px, small_px]), camera).astype(np.float32)
+    rays = undistort(np.concatenate([large_px, small_px]), camera)
+    seen = (rays @ camera.K[:2, :2].T + camera.K[:2, 2]).astype(np.float32)
     sides = [
         float(np.linalg.norm(q - np.roll(q, 1, axis=0), axis=1).mean()) for q in np.split(seen, 2)
     ]

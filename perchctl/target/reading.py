@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from perchctl.errors import InvalidValue
 from perchctl.profile import MarkerConfig, TargetConfig, aruco_dictionary
 from perchctl.target.drawing import TargetDrawing, draw_target, marker_cells, mm_text
-from perchctl.vision import MARKERS, MarkerName
+from perchctl.vision import MARKERS
 
 
 class PlainReader:
@@ -31,7 +31,7 @@ class PlainReader:
         dictionaries = [_single_marker_dictionary(m) for m in (target.large, target.small)]
         self._detector: Any = cv2.aruco.ArucoDetector(dictionaries, cv2.aruco.DetectorParameters())
 
-    def read(self, image: NDArray[np.uint8]) -> dict[MarkerName, NDArray[np.float32]]:
+    def read(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
         """Return the corners (4, 2) px of the markers in a grey picture (TL TR BR BL)."""
         corners, ids, _, which = self._detector.detectMarkersMultiDict(image)
         if ids is None or len(corners) == 0:
@@ -67,7 +67,7 @@ _PERIMETER_RATE = 0.03  # cv2.aruco's least perimeter, per side of the picture
 
 @cache
 def smallest_side_px(
-    target: TargetConfig, marker: MarkerName, blur_px: float, picture_px: int
+    target: TargetConfig, marker: str, blur_px: float, picture_px: int
 ) -> float | None:
     """Return the side in px from which on the marker, seen straight on at any turn, is found in
     `FOUND_RATE` of the pictures; None where even `SIDE_RANGE_PX[1]` is not.

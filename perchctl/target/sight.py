@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.geometry import R_MARKER_TARGET, Array, rot_z
-from perchctl.profile import DetectorConfig, Mounting, Profile, TargetConfig
+from perchctl.profile import Mounting, Profile, TargetConfig
 from perchctl.vision import (
     CameraModel,
-    RigidPose,
-    make_aruco_detector,
     shows_enough_of_target,
     square_corners,
     undistort,
@@ -258,7 +256,6 @@ def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> 
     little."""
     R, offset = gear_from_camera(profile)
     view = FieldOfView(camera)
-    patterns = make_aruco_detector(DetectorConfig(), target).patterns
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
 
     def whole(range_m: float) -> bool:
@@ -266,9 +263,7 @@ def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> 
 
     def left(range_m: float) -> bool:
         centre = R @ np.array([0.0, 0.0, range_m]) + offset
-        half_m = target.large.side_m / 2.0
-        pose = RigidPose(R @ R_MARKER_TARGET @ _OWN_AXES, centre / half_m)
-        return whole(range_m) or shows_enough_of_target(pose, patterns, camera)
+        return whole(range_m) or shows_enough_of_target(R @ R_MARKER_TARGET, centre, target, camera)
 
     return BlindRange(_lost_at_m(whole), _lost_at_m(left))
 

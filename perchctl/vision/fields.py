@@ -19,7 +19,6 @@ the mean is taken, which belongs to the middle moment in either order.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from statistics import mean, median
 from typing import Literal
 
@@ -28,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.values import replace
-from perchctl.vision.types import Frame, PictureKind
+from perchctl.vision.types import FieldState, Frame
 
 FieldsMode = Literal["auto", "top", "bottom", "progressive"]
 Grey = NDArray[np.uint8]
@@ -54,35 +53,6 @@ _MAX_GAP_S = 0.25  # older pictures say nothing of the order
 _EVIDENCE = 1.0  # a sum of votes, of at most 1 each, that decides: two frames at least
 _MOST_EVIDENCE = 3.0  # so that a changed order is found in time
 _TURNED_EVIDENCE = 1.0  # against an order that was taken for known
-
-
-@dataclass(frozen=True, eq=False)
-class FieldState:
-    """What is known of a stream. `kind`: of the last frame that was looked at, `skipped` frames
-    ago. `votes`: for the
-    top field being the earlier one. `top_first`: None until it is known. `previous`: the last
-    picture, where it was combed."""
-
-    kind: PictureKind | None = None
-    skipped: int = 0
-    votes: float = 0.0
-    top_first: bool | None = None
-    periods_s: tuple[float, ...] = ()
-    last_s: float | None = None
-    previous: Grey | None = None
-
-    @property
-    def period_s(self) -> float:
-        """The frames' period, which is television's where it is near to that."""
-        if not self.periods_s:
-            return _PERIODS_S[1]
-        middle_s = median(self.periods_s)
-        # A receiver with a rate of its own moves them to and fro: 25 a second in 60 come 33 and
-        # 50 ms apart. Lost frames are farther apart than that.
-        period_s = mean(p for p in self.periods_s if p < _LOST * middle_s)
-        if _VIDEO_PERIODS_S[0] < period_s < _VIDEO_PERIODS_S[1]:
-            return min(_PERIODS_S, key=lambda p: abs(p - period_s))
-        return period_s
 
 
 def combing(image: Grey) -> float:
@@ -115,10 +85,18 @@ def is_combed(image: Grey) -> bool:
     return combing(image) > _COMBED
 
 
+def split_fields(image: Grey) -> tuple[Grey, ...]:
+    """Return the pictures that are in a picture (h, w): the top and the bottom field at full height
+    where it holds two of different times, else itself. What is at row y in the picture is there in
+    either field."""
+    if not is_combed(image):
+        return (image,)
+    return field_picture(image, 0), field_picture(image, 1)
+
+
 def field_picture(image: Grey, first_row: int) -> Grey:
     """Return one field at full height: its own rows (`first_row`, and every second after it) stay
-    where they are, those between are interpolated. What is at row y in the frame is there in this
-    picture."""
+    where they are, those between are interpolated."""
     own = image[first_row::2]
     # Row k of the result lies between rows k and k + 1 of the field.
     between = cv2.filter2D(own, -1, _TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)
@@ -184,11 +162,24 @@ def separate_fields(
         return state, (frame,)
     top, bottom = halves(frame)
     early, late = (top, bottom) if state.top_first else (bottom, top)
-    apart_s = state.period_s / 2.0
+    apart_s = _period_s(state.periods_s) / 2.0
     return state, (
         replace(early, t_s=frame.t_s - apart_s / 2.0),
         replace(late, t_s=frame.t_s + apart_s / 2.0),
     )
+
+
+def _period_s(periods_s: tuple[float, ...]) -> float:
+    """Return the frames' period, which is television's where it is near to that."""
+    if not periods_s:
+        return _PERIODS_S[1]
+    middle_s = median(periods_s)
+    # A receiver with a rate of its own moves them to and fro: 25 a second in 60 come 33 and
+    # 50 ms apart. Lost frames are farther apart than that.
+    period_s = mean(p for p in periods_s if p < _LOST * middle_s)
+    if _VIDEO_PERIODS_S[0] < period_s < _VIDEO_PERIODS_S[1]:
+        return min(_PERIODS_S, key=lambda p: abs(p - period_s))
+    return period_s
 
 
 def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:

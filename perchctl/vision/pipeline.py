@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.profile import KalmanConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
-from perchctl.vision.fields import FieldsMode, FieldState, classify_fields, separate_fields
+from perchctl.vision.fields import FieldsMode, classify_fields, separate_fields
 from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
@@ -136,11 +136,13 @@ def camera_profile(profile: Profile) -> Profile:
 
 
 def pictures(
-    state: FieldState, frame: Frame, pipeline: Pipeline
-) -> tuple[FieldState, tuple[Frame, ...]]:
-    """Return what a stream's frame holds, each for a `step` of its own: one picture, or the two
-    fields of an interlaced camera in their order of time, each with its own time."""
-    return separate_fields(state, frame, pipeline.fields)
+    state: PipelineState, frame: Frame, pipeline: Pipeline
+) -> tuple[PipelineState, tuple[Frame, ...]]:
+    """Return the new memory and what a stream's frame holds, each for a `step` of its own: one
+    picture, or the two fields of an interlaced camera in their order of time, each with its own
+    time."""
+    fields, found = separate_fields(state.fields, frame, pipeline.fields)
+    return replace(state, fields=fields), found
 
 
 def step(
@@ -220,6 +222,7 @@ def _followed(
         empty_frames=0 if anything else state.empty_frames + 1,
         lock=followed.lock,
         stranger=followed.stranger,
+        fields=state.fields,
     )
     output = PipelineOutput(
         detections=detections,

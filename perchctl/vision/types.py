@@ -117,8 +117,6 @@ class Detections:
     velocity_px_s: Array | None = None  # of the markers in the picture, (2,)
     flow_px_s: dict[MarkerName, Array] = field(default_factory=dict)  # of each corner, (4, 2)
     edge_shift: EdgeShift | None = None
-    ghost_px: float = 0.0  # between the double edges of two blended fields; 0: single edges
-    ghost_age: int = 0  # pictures since these were looked for
 
     def get(self, marker: MarkerName) -> Detection | None:
         """Return that marker's detection, None without one."""
@@ -328,6 +326,22 @@ class MeasuredMarkers:
 
 
 @dataclass(frozen=True, eq=False)
+class FieldState:
+    """What is known of a stream's fields. `kind`: of the last frame that was looked at, `skipped`
+    frames ago. `votes`: for the top field being the earlier one. `top_first`: None until it is
+    known. `periods_s`: of the last frames, the newest of which came at `last_s`. `previous`: the
+    last picture, where it was combed."""
+
+    kind: PictureKind | None = None
+    skipped: int = 0
+    votes: float = 0.0
+    top_first: bool | None = None
+    periods_s: tuple[float, ...] = ()
+    last_s: float | None = None
+    previous: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class PipelineState:
     """All the memory of the pipeline; `PipelineState()` is a fresh start."""
 
@@ -342,6 +356,7 @@ class PipelineState:
     empty_frames: int = 0  # in a row, without either marker
     lock: Lock | None = None
     stranger: Stranger | None = None
+    fields: FieldState = FieldState()
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,8 @@ from perchctl.check.row import ask_all
 from perchctl.check.vehicle import BY_FLY, VEHICLE, Vehicle
 from perchctl.profile import Profile, load_profile
 from perchctl.vehicle import MeasuredBy, Telemetry
-from perchctl.vision import CameraModel, Detection, Detections, Frame
+from perchctl.vision import CameraModel, Frame, PipelineOutput
+from perchctl.vision.types import Detection, Detections, Stage
 from tests.helpers.checks import AT_REST, PROFILE
 from tests.helpers.flights import short_profile
 from tests.helpers.mission import target_at
@@ -32,7 +33,8 @@ def shown(left_px: float) -> Looked:
     """A picture with the large marker so far from its left edge."""
     unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     corners = 30.0 * unit + np.array([left_px, 200.0])
-    return Looked(PICTURE, replace(NOTHING, large=Detection("large", corners, 0.1, True)))
+    seen = replace(NOTHING, large=Detection("large", corners, 0.1, True))
+    return Looked(PICTURE, PipelineOutput(seen, {}, None, Stage.LARGE))
 
 
 def rehearsed(x: float = 0.1, y: float = 0.0, z: float = 2.0, **changes: Any) -> Rehearsal:

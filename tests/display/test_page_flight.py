@@ -28,7 +28,8 @@ from perchctl.mission import (
 )
 from perchctl.profile import load_profile
 from perchctl.record import FlightSummary, LogWatcher
-from perchctl.vision import Detection, Detections, Frame, MarkerPose, PipelineOutput, Stage
+from perchctl.vision import Frame, MarkerPose, PipelineOutput
+from perchctl.vision.types import Detection, Detections, Stage
 from tests.helpers.live_page import CORNERS, ask, stop, tick
 from tests.helpers.mission import entered, note
 from tests.helpers.recording import camera

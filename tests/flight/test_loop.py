@@ -17,7 +17,7 @@ from perchctl.flight.preflight import still_waiting_for
 from perchctl.mission import FlightReport, Operator, Outcome, Tick
 from perchctl.perception import perception
 from perchctl.vehicle import CRASHED, DECK_FAULT, FLYING, LOCKED, TUMBLED, Land, PositionSetpoint
-from perchctl.vision import Detections
+from perchctl.vision.types import Detections
 from tests.helpers.loop_rig import PROFILE, Camera, Rig, SleepyClock, Vehicle, noise
 from tests.helpers.mission import READY, changed, target_at, telemetry
 

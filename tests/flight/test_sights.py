@@ -17,7 +17,7 @@ from perchctl.geometry import Place
 from perchctl.perception import History, add_samples
 from perchctl.profile import SafetyConfig
 from perchctl.vehicle import ExternalPosition, Telemetry
-from perchctl.vision import MarkerPose, MeasuredMarkers, make_pipeline
+from perchctl.vision import MarkerPose, make_pipeline
 from tests.helpers.mission import target_at, telemetry
 from tests.helpers.sights import TARGET_ONLY
 
@@ -85,7 +85,7 @@ def test_an_attitude_that_stands_still_places_nobody(frozen: bool) -> None:
         telemetry(1.0 + SAMPLE_S * i, 1.0, **({"roll_rad": 0.1} if frozen and i else {}))
         for i in range(50)
     ]
-    sights.see(MeasuredMarkers(poses={"large": pose}), history(samples), 1.5)
+    sights.see(pose, history(samples), 1.5)
     assert bool(sent) is not frozen
 
 

@@ -22,7 +22,7 @@ from perchctl.mission import (
     Touchdown,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.imu import Blow, ImuMotion, Reckoning, advance_reckoning
+from perchctl.mission.imu import Blow, Reckoning, advance_reckoning
 from perchctl.mission.report import HARD_MPS, touchdown_of
 from perchctl.profile import load_profile
 from perchctl.record import FlightSummary, read_log

@@ -26,7 +26,8 @@ from perchctl.vehicle import (
     StopMotors,
     Telemetry,
 )
-from perchctl.vision import Detection, Detections, MarkerPose, PipelineOutput, Stage, TargetEstimate
+from perchctl.vision import MarkerPose, PipelineOutput, TargetEstimate
+from perchctl.vision.types import Detection, Detections, Stage
 from tests.helpers.mission import note
 
 PERIOD_S = 0.02

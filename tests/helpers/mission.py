@@ -26,7 +26,8 @@ from perchctl.vehicle import (
     PositionSetpoint,
     Telemetry,
 )
-from perchctl.vision import Stage, TargetEstimate
+from perchctl.vision import TargetEstimate
+from perchctl.vision.types import Stage
 
 READY = AUTO_ARM | CAN_FLY | ARMED
 AIRBORNE = READY | FLYING

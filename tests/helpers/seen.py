@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z
-from perchctl.vision import MARKERS, Detection, Detections, project, square_corners
+from perchctl.vision import MARKERS, project, square_corners
+from perchctl.vision.types import Detection, Detections
 from tests.helpers.target_picture import CAMERA
 
 SIDES_M = {"large": 0.150, "small": 0.025}

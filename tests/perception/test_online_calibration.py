@@ -88,19 +88,6 @@ def test_what_is_no_number_teaches_nothing() -> None:
     assert _frames(unknown, MEASURED, 30).used_s == 0.01
 
 
-def test_after_a_gap_nothing_jumps() -> None:
-    start = replace(OnlineCalibration(newest=_seen(0.1, 0.004)), solved_s=1e9, seen_s=2.0)
-    history = History((telemetry(9.9), telemetry(10.1)))
-    used_s = update_calibration(start, 10.0, POSE, history, SETUP, MEASURED, 0.005).used_s
-    assert used_s <= SLEW * 0.1
-
-
-def test_nothing_is_learned_right_under_the_target() -> None:
-    near = replace(POSE, tvec_m=np.array([0.0, 0.0, 0.1]))
-    assert _frames(OnlineCalibration(), MEASURED, 20, near).sums.level is None
-    assert _frames(OnlineCalibration(), MEASURED, 20).sums.level is not None
-
-
 def test_a_later_picture_is_as_fresh_as_it_can_be() -> None:
     """ASCEND climbs by fresh pictures, and one cannot be newer than the latency that is used."""
     state = state_in(Phase.ASCEND)

@@ -14,7 +14,6 @@ from perchctl.geometry import GRAVITY_MPS2, Array, rot_z, rotation_from_rpy
 from perchctl.perception.visual_inertial import (
     LEAST_LATER_S,
     STEP_S,
-    WINDOW_S,
     VisualInertialWindow,
     drop_sights,
     estimate_motion,
@@ -117,18 +116,6 @@ def test_a_delay_is_found_and_the_speed_with_it(
     assert motion.climb_mps == pytest.approx(true_climb_mps, abs=0.05)
 
 
-def test_the_vertical_speed_is_told_only_while_the_delay_has_just_been_found() -> None:
-    """A mismatch stays, and its delay may end: where nothing swings no wandering shows that."""
-    swing = Swing(0.05, heave_m=0.05)
-    found = watched(swing, later_s=0.2)
-    assert found.motion is not None
-    assert found.motion.climb_mps is not None
-    long_ago = watched(swing, later_s=0.2, for_s=1.5 + WINDOW_S)
-    assert long_ago.mismatch is not None
-    assert long_ago.motion is not None
-    assert long_ago.motion.climb_mps is None
-
-
 @pytest.mark.parametrize("quarters", [1, 2, -1])
 def test_a_turned_camera_is_found(quarters: int) -> None:
     turned_rad = 0.5 * math.pi * quarters
@@ -159,24 +146,3 @@ def test_a_camera_as_the_profile_has_it_fits(
 def test_at_rest_nothing_is_known() -> None:
     assert watched(Swing(0.0), later_s=0.3).mismatch is None
     assert watched(Swing(0.0), turned_rad=math.pi).mismatch is None
-
-
-def test_a_sum_that_wanders_a_little_counts_once_positions_have_turned_the_attitude() -> None:
-    """What they have turned it by goes back slowly, and the speed has to be braked by then."""
-    sure, rough = watched(Swing(), sway_m=0.015), watched(Swing(), sway_m=0.015, anew=True)
-    assert sure.motion is None
-    assert rough.motion is not None
-    true_mps = Swing().velocity_mps(rough.motion.t_s)[:2]
-    assert rough.motion.velocity_mps == pytest.approx(true_mps, abs=0.1)
-
-
-@given(later_s=st.floats(-0.05, 0.05), heading_rad=st.floats(-3.0, 3.0))
-def test_a_delay_too_small_to_be_named_does_not_make_a_speed(
-    later_s: float, heading_rad: float
-) -> None:
-    swing = Swing(0.06, heading_rad=heading_rad)
-    watch = watched(swing, later_s=later_s)
-    assert watch.mismatch is None
-    assert watch.motion is not None
-    true_mps = swing.velocity_mps(watch.motion.t_s)[:2]
-    assert watch.motion.velocity_mps == pytest.approx(true_mps, abs=0.05)

@@ -21,7 +21,7 @@ from perchctl.profile import changed_profile
 from perchctl.record import FlightLog, LogWatcher, read_log
 from perchctl.record.header import make_header
 from perchctl.record.write import FlightLogWriter
-from perchctl.vision import FieldState, Frame, Pipeline
+from perchctl.vision import Frame, Pipeline, PipelineState
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner
 from tests.helpers.loop_rig import PROFILE, Camera, Rig, SleepyClock, Vehicle
 
@@ -121,7 +121,7 @@ def test_with_another_latency_the_pictures_are_of_another_time(
     log, given_s = begun(flight[0]), []
     inside = perception.pictures
 
-    def looked_at(state: FieldState, frame: Frame, pipeline: Pipeline) -> Any:
+    def looked_at(state: PipelineState, frame: Frame, pipeline: Pipeline) -> Any:
         given_s.append(frame.t_s)
         return inside(state, frame, pipeline)
 

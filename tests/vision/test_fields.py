@@ -15,19 +15,17 @@ import pytest
 from perchctl.geometry import Array
 from perchctl.vision import (
     CameraModel,
-    FieldState,
     Frame,
     PictureKind,
     Pipeline,
     PipelineState,
     estimate_pose,
-    field_picture,
-    is_combed,
     pictures,
     step,
 )
-from perchctl.vision.fields import FieldsMode, combing, separate_fields
-from perchctl.vision.markers.detect import detect_markers, with_ghosts
+from perchctl.vision.fields import FieldsMode, combing, field_picture, is_combed, separate_fields
+from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.types import FieldState
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -184,9 +182,9 @@ def test_the_profile_may_know_better() -> None:
 
 def measured(scene: Pass, frames: list[Frame], setup: Pipeline) -> tuple[list[Array], int]:
     """Errors, mm, of the poses at their pictures' own times, and the number of pictures."""
-    state, fields, errors, count = PipelineState(), FieldState(), [], 0
+    state, errors, count = PipelineState(), [], 0
     for frame in frames:
-        fields, parts = pictures(fields, frame, setup)
+        state, parts = pictures(state, frame, setup)
         for part in parts:
             count += 1
             state, output = step(state, part, None, setup)
@@ -239,49 +237,6 @@ def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
             squares[name].append(float(e @ np.linalg.solve(pose.cov[:3, :3], e)) / 3.0)
     assert 0.2 < np.mean(squares["claimed"]) < 2.0
     assert np.mean(squares["as elsewhere"]) > 3.0
-
-
-# --- Blended -----------------------------------------------------------------------------------
-
-
-def ghosts(setup: Pipeline, scene: Pass) -> list[tuple[float, float]]:
-    """The double edges' distance and the corners' spread, by picture."""
-    state, found = PipelineState(), []
-    for frame in scene.frames(6):
-        state, output = step(state, frame, None, setup)
-        if (seen := output.detections.large or output.detections.small) is not None:
-            found.append((output.detections.ghost_px, seen.sigma_px))
-    return found
-
-
-@pytest.mark.parametrize(
-    "below_m", [0.3, *(pytest.param(z_m, marks=pytest.mark.long) for z_m in (0.15, 0.5))]
-)
-def test_blended_fields_are_named_and_not_trusted(build: Build, below_m: float) -> None:
-    speed = 0.75 * below_m  # 6 px between the fields
-    scene = Pass(below_m, (speed, 0.2 * speed, 0.0), camera_fields="top", camera_blended=True)
-    found = ghosts(build(), scene)
-    assert len(found) >= 4
-    assert all(4.0 < px < 8.0 for px, _ in found)
-    assert all(sigma > 0.2 * px for px, sigma in found)
-
-
-@pytest.mark.parametrize("exposure_s", [0.0, 0.008, 0.02])
-@pytest.mark.parametrize(
-    "below_m", [0.3, *(pytest.param(z_m, marks=pytest.mark.long) for z_m in (0.1, 0.5, 1.2))]
-)
-def test_motion_and_its_blur_are_not_blended_fields(
-    build: Build, below_m: float, exposure_s: float
-) -> None:
-    scene = Pass(
-        below_m, (0.8 * below_m, 0.3 * below_m, 0.0),
-        camera_exposure_s=exposure_s, camera_noise_sigma=12.0,
-    )  # fmt: skip
-    state, setup = PipelineState(), build()
-    for frame in scene.frames(5):
-        state, output = step(state, frame, None, setup)
-        seen = replace(output.detections, velocity_px_s=None)
-        assert with_ghosts(seen, None, frame.image).ghost_px == 0.0
 
 
 # --- Shared pictures ---------------------------------------------------------------------------

@@ -16,7 +16,6 @@ from perchctl.geometry import make_T, rot_z, rotation_from_rpy
 from perchctl.profile import KalmanConfig, MergeConfig
 from perchctl.vision import (
     Attitude,
-    Detections,
     MarkerPose,
     Pipeline,
     PipelineOutput,
@@ -25,7 +24,7 @@ from perchctl.vision import (
 from perchctl.vision.filter import Measurement, make_filter
 from perchctl.vision.pipeline import follow
 from perchctl.vision.tracks import ESTABLISHED_FRAMES, FORGET_S, REACQUIRE_S, Sight, judged
-from perchctl.vision.types import Lock, MarkerTrack, Stranger
+from perchctl.vision.types import Detections, Lock, MarkerTrack, Stranger
 from tests.helpers.seen import seen_from
 
 Build = Callable[..., Pipeline]
@@ -263,21 +262,6 @@ def test_the_target_goes_on_when_the_attitude_comes_and_goes(build: Build, metho
     assert all(measured(watch.show(3)))
     watch.in_world = True
     assert all(measured(watch.show(3)))
-
-
-def test_what_is_expected_next_follows_from_the_pose_that_was_judged(build: Build) -> None:
-    """Of two markers that contradict each other one is fed: not always the large one."""
-    setup = build(merge=MergeConfig(method="weights"))
-    T = make_T(rot_z(0.0), TARGET_M - [0.0, 0.0, 0.15])
-    rng = np.random.default_rng(1)
-    seen, other = (seen_from(T, TARGET_M + np.array([x, 0.0, 0.0]), 0.0, rng) for x in (0.0, 0.06))
-    assert other.large is not None
-    mixed = replace(seen, large=replace(other.large, sigma_px=0.5))
-    state, _ = follow(PipelineState(), mixed, None, setup)
-    assert state.measured.contradicting
-    (fed,) = state.measured.fed.values()
-    assert fed.source == "small"
-    assert state.sighting.pose is fed
 
 
 def test_of_two_targets_in_view_one_is_told(build: Build) -> None:

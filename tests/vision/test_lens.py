@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.vision import CameraModel, distort, project, undistort, undistort_px
-from perchctl.vision.lens import pinhole_px
+from perchctl.vision import CameraModel, project, undistort
+from perchctl.vision.lens import distort
 from tests.helpers.target_picture import CAMERA
 
 FISHEYE = CameraModel((640, 480), CAMERA.K, np.array([-0.02, 0.004, 0.001, -0.0005]), "fisheye")
@@ -32,21 +32,9 @@ def test_undistort_converges_at_the_corners_of_the_picture() -> None:
     assert np.abs(distort(undistort(corners, CAMERA), CAMERA) - corners).max() < 1e-5
 
 
-def test_without_distortion_both_pixels_are_the_same() -> None:
-    plain = CameraModel((640, 480), CAMERA.K, np.zeros(5))
-    px = np.array([[10.0, 20.0], [600.0, 400.0]])
-    assert np.allclose(undistort_px(px, plain), px, atol=1e-9)
-    assert np.allclose(pinhole_px(undistort(px, plain), plain), px, atol=1e-9)
-
-
 @pytest.mark.parametrize("camera", [CAMERA, FISHEYE], ids=lambda c: c.model)
 def test_project_is_the_lens_applied_to_the_ray(camera: CameraModel) -> None:
     points = np.array([[0.05, -0.02, 0.0], [-0.03, 0.04, 0.01]])
     rvec, tvec = np.zeros(3), np.array([0.02, 0.01, 0.5])
     rays = (points + tvec)[:, :2] / (points + tvec)[:, 2:]
     assert np.allclose(project(points, rvec, tvec, camera), distort(rays, camera), atol=1e-9)
-
-
-def test_no_points_give_no_points() -> None:
-    assert undistort(np.empty((0, 2)), CAMERA).shape == (0, 2)
-    assert project(np.empty((0, 3)), np.zeros(3), np.zeros(3), CAMERA).shape == (0, 2)

@@ -13,28 +13,20 @@ from hypothesis import strategies as st
 from perchctl.geometry import Array, wrap_rad, yaw_of
 from perchctl.profile import MergeConfig, Profile, WeightsConfig
 from perchctl.vision import (
-    Detection,
-    Detections,
-    FieldState,
     MarkerPose,
     PipelineState,
-    PoseSetup,
-    Stage,
-    better_conditioned,
     make_pipeline,
     pictures,
     step,
 )
 from perchctl.vision.merge import (
-    UNKNOWN_READOUT_S,
     choose_stage,
     disagree,
     merge_pair,
-    merge_variance,
-    seen_at_once,
     stage_of,
     weight_matrix,
 )
+from perchctl.vision.types import Stage
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 
@@ -91,17 +83,6 @@ def test_yaw_is_merged_on_the_circle(w: WeightsConfig, a: float, gap: float) -> 
     assert abs(wrap_rad(merged - (a + (1.0 - w.yaw) * gap))) < 1e-9
 
 
-@given(w=weights)
-def test_variances_propagate(w: WeightsConfig) -> None:
-    rng = np.random.default_rng(0)
-    large = rng.normal(0.0, [1, 2, 3, 0.01], (4000, 4))
-    small = rng.normal(0.0, [3, 1, 2, 0.02], (4000, 4))
-    merged = large @ np.diag([w.x, w.y, w.z, w.yaw])
-    merged += small @ np.diag([1 - w.x, 1 - w.y, 1 - w.z, 1 - w.yaw])
-    expected = merge_variance(np.array([1, 4, 9, 1e-4]), np.array([9, 1, 4, 4e-4]), w)
-    assert np.allclose(merged.var(axis=0), expected, rtol=0.15)
-
-
 SEEN = {
     (False, False): Stage.NONE,
     (True, False): Stage.LARGE,
@@ -132,65 +113,10 @@ def test_markers_disagree_beyond_the_limit_unless_they_are_vague() -> None:
     assert not disagree(sure, pose((0.0, 0.0, 0.54), 0.02, "small"), 0.03)
 
 
-def test_the_better_conditioned_marker_wins() -> None:
-    large, small = pose((0, 0, 0.5), 0.001), pose((0, 0, 0.5), 0.004, "small")
-    assert better_conditioned(large, small) is large
-    assert better_conditioned(pose((0, 0, 0.5), 0.01), small) is small
-
-
 # --- A rolling shutter's corners, brought to one moment ----------------------------------------
 
 
 READOUT_S = 0.02
-CORNERS = np.array([[100.0, 50.0], [200.0, 50.0], [200.0, 400.0], [100.0, 400.0]])
-
-
-def shutter(readout_s: float | None) -> PoseSetup:
-    values = Profile()
-    mount, gear_m = values.camera.mount, values.vehicle.gear_body_m
-    return PoseSetup(values.pose, values.target, mount.T_body_cam, gear_m, CAMERA, readout_s)
-
-
-def moving(corners: Array, velocity_px_s: tuple[float, float]) -> Detections:
-    flow = np.tile(velocity_px_s, (4, 1))
-    return Detections(
-        1, 0.0, large=Detection("large", corners, 0.05, True),
-        velocity_px_s=flow[0], flow_px_s={"large": flow},
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("velocity_px_s", [(300.0, 0.0), (0.0, 300.0), (-200.0, -400.0)])
-def test_corners_go_back_to_the_middle_rows_moment(velocity_px_s: tuple[float, float]) -> None:
-    """Corners that move evenly, each seen when the shutter's row meets it."""
-    v = np.array(velocity_px_s)
-
-    def seen(frame_s: float) -> Array:
-        # Row y is exposed at frame_s + (y / 479 - 1/2) R, and the corner is at its y then.
-        slope = READOUT_S / 479.0
-        t_s = (frame_s + (CORNERS[:, 1] / 479.0 - 0.5) * READOUT_S) / (1.0 - v[1] * slope)
-        return np.asarray(CORNERS + v * t_s[:, None])
-
-    now, before = seen(0.0), seen(-0.04)
-    flow = (now - before) / 0.04
-    found = Detections(1, 0.0, large=Detection("large", now, 0.05, True), flow_px_s={"large": flow})
-    (back,) = seen_at_once(found, shutter(READOUT_S))
-    assert np.abs(now - CORNERS).max() > 1.0
-    assert back.corners_px == pytest.approx(CORNERS, abs=1e-6)
-
-
-def test_without_motion_or_a_rolling_shutter_nothing_moves() -> None:
-    still = Detections(0, 0.0, small=Detection("small", CORNERS, 0.05, True))
-    for readout_s in (0.0, READOUT_S, None):
-        assert seen_at_once(still, shutter(readout_s)) == [still.small]
-    fast = moving(CORNERS, (300.0, 0.0))
-    assert seen_at_once(fast, shutter(0.0)) == [fast.large]
-
-
-def test_an_unknown_shutter_is_an_error_of_all_corners_together() -> None:
-    (seen,) = seen_at_once(moving(CORNERS, (300.0, 0.0)), shutter(None))
-    assert np.array_equal(seen.corners_px, CORNERS)
-    assert seen.common_px[0] == pytest.approx((-300.0 * UNKNOWN_READOUT_S * (0.5 - 50 / 479), 0.0))
-    assert (seen.common_px[2] > 0.0)[0]
 
 
 def measured(scene: Pass, readout_s: float | None) -> tuple[Array, float]:
@@ -202,9 +128,9 @@ def measured(scene: Pass, readout_s: float | None) -> tuple[Array, float]:
         "target": {"size_sigma": 0.0, "curl_per_m": 0.0},
     }
     setup = make_pipeline(Profile.model_validate(values), CAMERA)
-    state, fields, errors, nees = PipelineState(), FieldState(), [], []
+    state, errors, nees = PipelineState(), [], []
     for k, frame in enumerate(scene.frames(12)):
-        fields, parts = pictures(fields, frame, setup)
+        state, parts = pictures(state, frame, setup)
         for part in parts:
             state, output = step(state, part, None, setup)
             if k < 4:
@@ -239,9 +165,3 @@ def test_an_unknown_shutter_makes_modest(motion: dict[str, Any]) -> None:
     scene = Pass(0.3, **motion, camera_readout_s=READOUT_S)
     assert measured(scene, None)[1] < 1.5
     assert measured(scene, 0.0)[1] > 2.0
-
-
-def test_fields_have_a_shutter_each() -> None:
-    scene = Pass(0.3, **ACROSS, camera_readout_s=READOUT_S, camera_fields="top")
-    known, _ = measured(scene, READOUT_S)
-    assert (known < [0.06, 0.06, 0.12, 0.04]).all()

@@ -39,12 +39,11 @@ from perchctl.vision import (
     PipelineOutput,
     PipelineState,
     PoseSetup,
-    Stage,
     estimate,
     step,
 )
 from perchctl.vision.tracks import expected_corners, update_sight
-from perchctl.vision.types import Sighting
+from perchctl.vision.types import Sighting, Stage
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 Build = Callable[..., Pipeline]
@@ -181,27 +180,6 @@ def test_any_one_marker_feeds_the_target(
     assert np.abs(output.target.e_m - [0.01, 0.02, 0.22]).max() < 0.001
 
 
-def test_the_joint_track_goes_on_from_marker_to_marker(build: Build) -> None:
-    setup, state = build(), PipelineState()
-    for k, seen in enumerate([("large",), ("large", "small"), ("small",), ("small",)]):
-        image = render(*pose_of(0.0, 0.0, 0.22), markers=seen)
-        state, output = step(state, Frame(k, k / 30, image), None, setup)
-        assert set(state.tracks) == {"joint"}
-        assert output.target.unseen == 0
-        assert np.abs(output.target.e_m - [0.0, 0.0, 0.22]).max() < 0.001
-
-
-def test_a_marker_that_is_unseen_coasts_while_the_other_is_used(build: Build) -> None:
-    setup, state = build(merge=MergeConfig(method="weights")), PipelineState()
-    for k, seen in enumerate([("large", "small"), ("large",), ("large",)]):
-        image = render(*pose_of(0.0, 0.0, 0.22), markers=seen)
-        state, output = step(state, Frame(k, k / 30, image), None, setup)
-    assert state.tracks["small"].unseen == 2
-    assert state.tracks["large"].unseen == 0
-    assert output.target.measured
-    assert output.target.stage is Stage.LARGE
-
-
 @pytest.mark.parametrize(
     ("z_m", "stage"), [(0.30, Stage.LARGE), (0.22, Stage.BOTH), (0.17, Stage.SMALL)]
 )
@@ -229,33 +207,6 @@ def test_markers_that_contradict_are_counted_and_the_better_is_used(
         assert output.disagreeing_frames == k + 1
         assert output.target.e_m[2] == pytest.approx(0.24, abs=0.001)
         assert output.target.stage is Stage.LARGE
-
-
-def test_velocity_is_in_level_axes(build: Build) -> None:
-    """A target carried through the world along x, seen by a vehicle that faces y."""
-    setup, state = build(kalman=KalmanConfig(k1=0.001, k2=1.0)), PipelineState()
-    for k in range(12):
-        attitude = Attitude(k / 30, 0.0, 0.0, math.pi / 2, (0.0, 0.0, 1.0))
-        e = rot_z(-math.pi / 2) @ np.array([0.3 * k / 30, 0.0, 0.5])
-        image = render(*pose_of(*e))
-        state, output = step(state, Frame(k, k / 30, image), attitude, setup)
-    assert output.target.world_velocity_mps[0] > 0.08
-    assert np.abs(output.target.world_velocity_mps[1:]).max() < 0.01
-    assert output.target.velocity_mps[1] == pytest.approx(-output.target.world_velocity_mps[0])
-    assert np.abs(output.target.velocity_mps[[0, 2]]).max() < 0.01
-
-
-@pytest.mark.parametrize("frame", ["world", "level"])
-def test_the_estimate_at_the_frame_is_the_frames(build: Build, frame: str) -> None:
-    setup = build(kalman=KalmanConfig(frame=frame), mount=MOUNT, gear_body_m=GEAR)
-    state = PipelineState()
-    for k in range(4):
-        attitude = fly(k)
-        state, output = step(state, Frame(k, attitude.t_s, view(attitude)), attitude, setup)
-        target = estimate(state, attitude.t_s, attitude, setup)
-        assert np.allclose(target.e_m, output.target.e_m, atol=1e-12)
-        assert target.e_yaw_rad == pytest.approx(output.target.e_yaw_rad)
-        assert (target.measured, target.tracked, target.unseen) == (True, True, 0)
 
 
 @given(

@@ -21,11 +21,10 @@ from perchctl.geometry import (
     rotation_from_rpy,
     wrap_rad,
 )
-from perchctl.profile import KalmanConfig, PoseConfig, TargetConfig
+from perchctl.profile import PoseConfig, TargetConfig
 from perchctl.sim.renderer import spoil
 from perchctl.vision import (
     Attitude,
-    Detection,
     Frame,
     MarkerPose,
     Pipeline,
@@ -36,10 +35,8 @@ from perchctl.vision import (
     square_corners,
     step,
 )
-from perchctl.vision.filter import PRINT, make_filter
-from perchctl.vision.merge import disagree
-from perchctl.vision.pose import PoseCandidate, mirror_solution, normal_cam
-from perchctl.vision.target_selection import measurement
+from perchctl.vision.pose import normal_cam
+from perchctl.vision.types import Detection
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 SIDES = {"large": 0.150, "small": 0.025}
@@ -164,24 +161,6 @@ def test_e_is_the_target_relative_to_the_gear_in_the_level_frame(
     assert abs(wrap_rad(pose.e_yaw_rad - wrap_rad(target_yaw - yaw))) < 2e-3
 
 
-def test_the_other_tilt_looks_the_same_and_its_other_tilt_is_the_first() -> None:
-    rvec, tvec = pose_of(0.05, 0.02, 1.2, 0.4, 0.15, -0.1)
-    other = mirror_solution(rvec, tvec)
-    assert other is not None
-    back = mirror_solution(other, tvec)
-    assert back is not None
-    assert np.allclose(cv2.Rodrigues(back)[0], cv2.Rodrigues(rvec)[0], atol=1e-9)
-    shift = project(square_corners(0.025), other, tvec, CAMERA) - project(
-        square_corners(0.025), rvec, tvec, CAMERA
-    )
-    assert np.abs(shift).max() < 0.05
-    sight = tvec / np.linalg.norm(tvec)
-    n, m = (cv2.Rodrigues(r)[0][:, 2] for r in (rvec, other))
-    assert n @ sight == pytest.approx(m @ sight)
-    frontal, ahead = pose_of(0.0, 0.0, 1.0)
-    assert mirror_solution(frontal, ahead) is None
-
-
 def tilts_deg(attitude: bool, previous: bool, draws: int = 60) -> Array:
     """Angle between the true and the found normal of a small, far, tilted marker."""
     rng = np.random.default_rng(3)
@@ -219,25 +198,6 @@ def test_the_position_is_usable_even_with_the_wrong_tilt() -> None:
         assert abs(pose.e_m[2] - expected[2]) < 0.02
 
 
-@pytest.mark.parametrize("by_lines", [False, True])
-@pytest.mark.parametrize("seen", [["large"], ["small"], ["large", "small"]])
-def test_sigma_is_the_spread_that_noise_makes(seen: list[str], by_lines: bool) -> None:
-    rng = np.random.default_rng(5)
-    rvec, tvec = pose_of(0.01, 0.02, 0.3, 0.4, 0.12, -0.16)
-    attitude = Attitude(0.0, 0.12, -0.16, 0.0)
-    poses = [
-        posed([marker(n, rvec, tvec, 0.1, rng, 0.1, by_lines) for n in seen], attitude)
-        for _ in range(150)
-    ]
-    spread = np.std([p.e_m for p in poses], axis=0)
-    claimed = np.sqrt(np.mean([p.sigma_m**2 for p in poses], axis=0))
-    assert (claimed > 0.75 * spread).all()
-    assert (claimed < 2.0 * spread).all()
-    spread_yaw = np.std([p.e_yaw_rad for p in poses])
-    claimed_yaw = math.sqrt(np.mean([p.sigma_yaw_rad**2 for p in poses]))
-    assert 0.75 * spread_yaw < claimed_yaw < 2.0 * spread_yaw
-
-
 @pytest.mark.parametrize("seen", [["large"], ["large", "small"]])
 def test_the_covariance_is_that_of_the_errors(seen: list[str]) -> None:
     """Mean squared error in units of the covariance: its degrees of freedom, within 20 %."""
@@ -256,39 +216,12 @@ def test_the_covariance_is_that_of_the_errors(seen: list[str]) -> None:
     assert 0.8 < np.mean(squares) / 4.0 < 1.2
 
 
-def test_a_shift_of_all_edges_counts_for_the_distance_alone() -> None:
-    rvec, tvec = pose_of(0.0, 0.0, 0.4, 0.3)
-    plain = marker("large", rvec, tvec)
-    shifted = Detection("large", plain.corners_px, plain.sigma_px, True, 0.1)
-    sure, unsure = (posed([d]) for d in (plain, shifted))
-    side_px = 0.150 / 0.4 * 400.0
-    assert unsure.sigma_m[2] == pytest.approx(0.4 * 0.2 / side_px, rel=0.1)
-    assert unsure.sigma_m[2] > 3.0 * sure.sigma_m[2]
-    assert np.allclose(unsure.sigma_m[:2], sure.sigma_m[:2], rtol=0.3)
-    assert unsure.sigma_yaw_rad < 1.5 * sure.sigma_yaw_rad
-
-
 def test_both_markers_together_are_surer_than_either() -> None:
     rvec, tvec = pose_of(0.0, 0.0, 0.24, 0.3)
     both = [marker(name, rvec, tvec) for name in ("large", "small")]
     joint = posed(both)
     for one in both:
         assert (joint.sigma_m < posed([one]).sigma_m).all()
-
-
-def test_a_vague_marker_does_not_spoil_a_sharp_one() -> None:
-    rvec, tvec = pose_of(0.01, 0.0, 0.5, 0.3, 0.05, 0.05)
-    sharp = marker("large", rvec, tvec)
-    off = marker("small", rvec, tvec)
-    attitude = Attitude(0.0, 0.05, 0.05, 0.0)
-
-    def error_m(sigma_px: float) -> float:
-        vague = Detection("small", off.corners_px + 1.0, sigma_px, False)
-        pose = posed([sharp, vague], attitude)
-        return float(np.abs(pose.tvec_m - tvec)[:2].max())
-
-    assert error_m(1.0) < 5e-5
-    assert error_m(0.02) > 4e-4  # taken for as sharp as the other
 
 
 def test_corners_that_are_no_square_are_refused() -> None:
@@ -323,23 +256,7 @@ def test_useless_corners_give_no_pose_or_a_finite_one(solver: str, corners: Arra
         assert math.isfinite(pose.e_yaw_rad)
 
 
-def test_a_start_from_the_joint_pose_gives_the_markers_own_pose() -> None:
-    rvec, tvec = pose_of(0.02, -0.01, 0.3, 0.6, 0.1, 0.05)
-    attitude = Attitude(0.0, 0.1, 0.05, 0.0)
-    rng = np.random.default_rng(2)
-    both = [marker(name, rvec, tvec, 0.05, rng) for name in ("large", "small")]
-    joint = posed(both, attitude)
-    for one in both:
-        alone = posed([one], attitude)
-        start = PoseCandidate(joint.rvec_rad, joint.tvec_m)
-        started = estimate_pose([one], 0.0, attitude, PLAIN, start=start)
-        assert np.allclose(alone.e_m, started.e_m, atol=2e-5)
-
-
 # --- A print that is not as the profile has it -------------------------------------------------
-
-
-SEEN = [["large"], ["small"], ["large", "small"]]
 
 
 def setup_of(**target: float) -> PoseSetup:
@@ -369,26 +286,6 @@ def solved(
     return pose
 
 
-@pytest.mark.parametrize("seen", SEEN)
-def test_the_claim_is_what_a_size_off_by_one_standard_deviation_does(seen: list[str]) -> None:
-    setup = setup_of(size_sigma=0.005, curl_per_m=0.0)
-    true, smaller = solved(seen, setup), solved(seen, setup, scale=1.0 / 1.005)
-    assert np.allclose(smaller.e_m - true.e_m, true.print_m[:, 0], rtol=0.02, atol=1e-6)
-    assert np.linalg.norm(true.print_m[:, 0]) == pytest.approx(0.005 * 0.302, rel=0.02)
-    known = solved(seen, setup_of(size_sigma=0.0, curl_per_m=0.0))
-    assert np.allclose(true.sigma_m**2 - known.sigma_m**2, true.print_m[:, 0] ** 2)
-
-
-@pytest.mark.parametrize("seen", SEEN)
-def test_the_claim_is_what_a_curl_of_one_standard_deviation_does(seen: list[str]) -> None:
-    setup = setup_of(size_sigma=0.0, curl_per_m=0.03)
-    true, curled = solved(seen, setup), solved(seen, setup, curl_per_m=0.03)
-    moved = curled.e_m - true.e_m
-    assert np.allclose(moved, true.print_m[:, 1], rtol=0.1, atol=5e-6)
-    if seen == ["large"]:
-        assert np.linalg.norm(moved) == pytest.approx(0.03 * 2 * 0.075**2, rel=0.05)
-
-
 def test_a_sheet_that_shows_its_curl_moves_the_pose_less() -> None:
     """The small marker in its middle is moved least; on a sheet that counts as flat the large
     one, far surer, outweighs it."""
@@ -405,23 +302,6 @@ def test_a_sheet_that_shows_its_curl_moves_the_pose_less() -> None:
     assert off_m[0] > 1e-3
     assert off_m[1] < 0.5 * off_m[0]
     assert off_m[1] < 3.0 * claims_m[1]
-
-
-def test_corners_that_err_are_no_curl() -> None:
-    """A small marker that is no square tells nothing of the sheet."""
-    rvec, tvec = pose_of(0.0, 0.0, 0.2, 0.4, 0.0, 0.0)
-    detections = []
-    for name, side_m in SIDES.items():
-        px = project(square_corners(side_m), rvec, tvec, CAMERA)
-        if name == "small":
-            px = px + np.array([[0.5, 0.4], [-0.4, 0.3], [0.4, -0.3], [-0.3, -0.4]])
-        detections.append(Detection(name, px, 0.02, True))
-    flat, curling = (
-        estimate_pose(detections, 0.0, None, setup_of(size_sigma=0.0, curl_per_m=c))
-        for c in (0.0, 0.03)
-    )
-    assert flat.chi2 > 10.0
-    assert np.allclose(flat.e_m, curling.e_m, atol=1e-9)
 
 
 @pytest.mark.parametrize(("scale", "most"), [(1.02, 16.0), (1.005, 4.0)])
@@ -443,31 +323,6 @@ def test_a_wrong_size_is_within_its_claim(scale: float, most: float) -> None:
         off = np.append(pose.e_m - true.e_m, wrap_rad(pose.e_yaw_rad - true.e_yaw_rad))
         squares.append(float(off @ np.linalg.solve(pose.cov, off)))
     assert np.mean(squares) < most + 4.0
-
-
-def test_a_wrong_print_excuses_no_gap_between_the_markers() -> None:
-    """Both are as wrong, and in the same direction."""
-    place = (0.0, 0.0, 0.8, 0.0, 0.05, -0.04)
-    setup = setup_of(size_sigma=0.1, curl_per_m=0.0)
-    large = solved(["large"], setup, place)
-    smaller = solved(["small"], setup, (0.0, 0.0, 1.0, 0.0, 0.05, -0.04))
-    assert np.abs(large.e_m - smaller.e_m).max() < 4.0 * large.sigma_m.max()
-    assert disagree(large, smaller, 0.03)
-
-
-def test_the_print_s_errors_are_no_noise_of_a_measurement() -> None:
-    """They do not change from frame to frame: no filter trusts a pose less for them, and no
-    number of frames takes them away."""
-    true, doubtful = setup_of(size_sigma=0.0, curl_per_m=0.0), setup_of(size_sigma=0.02)
-    constants = make_filter(KalmanConfig())
-    known, told = (
-        measurement(solved(["large", "small"], setup), None, False, constants, setup)
-        for setup in (true, doubtful)
-    )
-    assert known.R is not None
-    assert told.R is not None
-    assert np.allclose(known.R, told.R, rtol=1e-6, atol=1e-15)
-    assert np.linalg.norm(told.bias[1:, PRINT]) > 0.02 * 0.3
 
 
 # --- The spread that a picture's pose claims is what it errs by --------------------------------

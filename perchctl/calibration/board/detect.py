@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.target import Board
-from perchctl.vision import field_picture, is_combed
+from perchctl.vision import split_fields
 
 MIN_CORNERS = 6
 """Fewer give a pose, but nothing about the lens."""
@@ -74,8 +74,7 @@ class FoundViews:
 def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     """Return the view of a board in a grey picture (h, w), or why there is none; of an interlaced
     picture, whose fields show a moving board in two places, that of its first field."""
-    if is_combed(image):
-        image = field_picture(image, 0)
+    image = split_fields(image)[0]
     h, w = image.shape
     scale = min(1.0, SEARCH_PX / max(h, w))
     small = image

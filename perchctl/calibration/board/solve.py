@@ -25,7 +25,7 @@ from perchctl.calibration.board.predict import RangeError, coverage, limit_mm, p
 from perchctl.calibration.files import calibration_text
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.vision import CameraModel, distort, undistort
+from perchctl.vision import CameraModel, project, undistort
 
 Level = Literal["fly", "care", "stop"]
 TITLES: dict[Level, str] = {
@@ -229,7 +229,9 @@ def _is_usable(camera: CameraModel) -> bool:
     rays = undistort(pixels, camera)
     if not (0 < camera.K[0, 2] < w and 0 < camera.K[1, 2] < h and np.isfinite(rays).all()):
         return False
-    return bool(np.abs(distort(rays, camera) - pixels).max() < 0.05)
+    ahead = np.column_stack([rays, np.ones(len(rays))])
+    again = project(ahead, np.zeros(3), np.zeros(3), camera)
+    return bool(np.abs(again - pixels).max() < 0.05)
 
 
 # --- Whether there is enough to calibrate from; if not, what to add ----------------------------

@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
+from perchctl.profile import DetectorConfig, TargetConfig
 from perchctl.vision.lens import distort, undistort
 from perchctl.vision.markers.corners import UNIT, RefinedCorners, mapped, within
-from perchctl.vision.markers.detector import Covered, hides
+from perchctl.vision.markers.detector import Covered, hides, make_aruco_detector
 from perchctl.vision.markers.edge_fit import MIDDLES, sample
 from perchctl.vision.markers.pattern import Drawing, Pattern, drawn
 from perchctl.vision.markers.photometric_fit import likeness, make_grid
@@ -41,6 +42,7 @@ _MOST_SPREAD = 0.04  # of the centre, in half sides
 _FLOOR_PX = 0.02
 _SMALL_PLACES = 12  # that make it the small marker that was seen
 _INVERTED = 1e-3  # normalised; the lens model holds where its inverse is one
+_OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its axes
 
 
 def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
@@ -113,16 +115,24 @@ def cut_markers(
 
 
 def shows_enough_of_target(
-    pose: RigidPose, patterns: Mapping[MarkerName, Pattern], camera: CameraModel
+    R_cam_marker: Array, position_m: Array, target: TargetConfig, camera: CameraModel
 ) -> bool:
-    """Return True if what a picture taken in that pose shows of the target is enough to measure
-    it."""
+    """Return True if what a picture shows of the target is enough to measure it, with the large
+    marker's axes (3, 3) and centre (3,) so in the camera."""
+    patterns = _patterns_of(target)
+    pose = RigidPose(R_cam_marker @ _OWN_AXES, position_m / (target.large.side_m / 2.0))
     drawing = patterns["large"].drawing
     found = foreseen(pose, outline_of(drawing), _print_sigma(patterns), camera)
     if found is None or not _trusted(found):
         return False
     half = drawing.ratio if _stands_for(found) == "small" else 1.0
     return _corners(found, half, camera) is not None
+
+
+@lru_cache(maxsize=4)
+def _patterns_of(target: TargetConfig) -> dict[MarkerName, Pattern]:
+    """Return how the target's markers look."""
+    return make_aruco_detector(DetectorConfig(), target).patterns
 
 
 def _print_sigma(patterns: Mapping[MarkerName, Pattern]) -> Array:

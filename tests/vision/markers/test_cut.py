@@ -12,38 +12,29 @@ import pytest
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.profile import DetectorConfig, Profile
+from perchctl.profile import DetectorConfig
 from perchctl.vision import (
     Attitude,
-    Detection,
-    Detections,
     Frame,
-    MarkerName,
     PipelineOutput,
     PipelineState,
-    PoseSetup,
-    RigidPose,
-    distort,
-    estimate_pose,
     project,
     square_corners,
     step,
-    undistort,
-    undistort_px,
 )
+from perchctl.vision.lens import undistort_px
 from perchctl.vision.markers.corners import within
 from perchctl.vision.markers.cut import (
     MOST_AGE_S,
+    RigidPose,
     cut_markers,
     fitted,
     is_cut,
-    lattice_of,
-    may_be_whole,
     outline_of,
 )
-from perchctl.vision.markers.detect import between, detect_markers, with_ghosts
+from perchctl.vision.markers.detect import between, detect_markers
 from perchctl.vision.markers.partial import seen_edges
-from perchctl.vision.markers.search import Found, search
+from perchctl.vision.types import Detection, Detections, MarkerName
 from tests.helpers.markers import SETUP, both, corners, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -121,45 +112,6 @@ def test_it_needs_a_target_that_was_measured_lately() -> None:
     assert nothing(look("height", age_s=MOST_AGE_S + 0.01))
 
 
-@pytest.fixture
-def searches(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """The searches that were made."""
-    made = []
-
-    def noting(*args: Any, **keys: Any) -> Found:
-        made.append(args)
-        return search(*args, **keys)
-
-    monkeypatch.setattr("perchctl.vision.markers.detect.search", noting)
-    return made
-
-
-EMPTY = np.full(SHAPE, 120, np.uint8)
-
-
-@pytest.mark.parametrize(("age_s", "searched"), [(MOST_AGE_S, False), (MOST_AGE_S + 0.01, True)])
-def test_nothing_is_searched_for_where_nothing_can_be_whole(
-    age_s: float, searched: bool, searches: list[Any]
-) -> None:
-    """So long as that is known: later the target may be anywhere."""
-    assert nothing(look("under", EMPTY, age_s=age_s))
-    assert bool(searches) is searched
-
-
-@pytest.mark.parametrize(("out_px", "searched"), [(30.0, True), (50.0, False)])
-def test_what_was_cut_is_searched_for_where_it_may_be_whole_again(
-    out_px: float, searched: bool, searches: list[Any]
-) -> None:
-    square_px = np.array([[0.0, 0.0], [60.0, 0.0], [60.0, 60.0], [0.0, 60.0]])
-    aside = square_px + np.array([SHAPE[1] - 60.0 + out_px, 100.0])
-    expected: dict[MarkerName, Array] = {
-        "small": aside,
-        "large": 12.0 * square_px + [500.0, -200.0],
-    }
-    assert nothing(detect_markers(frame(EMPTY), seen_before("under"), SETUP, CAMERA, expected))
-    assert bool(searches) is searched
-
-
 def test_a_target_that_was_whole_is_searched_for_wherever_it_is_expected() -> None:
     """A prediction by an estimate that has jumped may be anywhere."""
     whole = pose_of(0.0, 0.0, 0.4, 0.3)
@@ -169,14 +121,6 @@ def test_a_target_that_was_whole_is_searched_for_wherever_it_is_expected() -> No
     found = detect_markers(frame(image), before, SETUP, CAMERA, both(POSES["under"]))
     for name, one in (("large", found.large), ("small", found.small)):
         assert np.abs(one.corners_px - at[name]).max() < 0.2
-
-
-def test_what_may_be_whole_if_the_prediction_is_a_little_off_is_searched_for() -> None:
-    square_px = np.array([[0.0, 0.0], [60.0, 0.0], [60.0, 60.0], [0.0, 60.0]])
-    for out_px, may in ((-1.0, True), (30.0, True), (50.0, False)):
-        aside = square_px + np.array([SHAPE[1] - 60.0 + out_px, 100.0])
-        assert may_be_whole({"small": aside, "large": 6.0 * square_px - 900.0}, SHAPE) is may
-    assert not may_be_whole({"small": np.full((4, 2), np.nan)}, SHAPE)
 
 
 def _bare(kind: str) -> NDArray[np.uint8]:
@@ -283,27 +227,6 @@ def _pose(name: str) -> RigidPose:
     return RigidPose(R @ np.diag([1.0, -1.0, -1.0]), tvec / 0.075)
 
 
-@pytest.mark.parametrize("name", ["height", "width", "aside"])
-def test_the_lens_is_not_used_beyond_its_rim(name: str) -> None:
-    """Far outside a lens's polynomial folds back into the picture, where there is no edge."""
-    drawing = SETUP.patterns["large"].drawing
-    outline = outline_of(drawing)
-    found = fitted(picture(name), _pose(name), outline, 0.0 * outline.cell, CAMERA)
-    assert found.shown == found.in_view
-    assert lattice_of(CAMERA).reach < 1.5
-
-
-def test_corners_that_the_lens_cannot_image_are_not_given() -> None:
-    """Of the large marker alone in view, and its far corners where the lens model has no
-    inverse."""
-    image, outline = picture("corner"), outline_of(SETUP.patterns["large"].drawing)
-    x = undistort(distort(np.array([[2.3, 0.6]]), CAMERA), CAMERA)
-    assert np.abs(x - (2.3, 0.6)).max() > 1e-2
-    found = fitted(image, _pose("corner"), outline, 0.0 * outline.cell, CAMERA)
-    assert found.small == 0
-    assert cut_markers(image, both(POSES["corner"]), SETUP.patterns, CAMERA) == {}
-
-
 def test_a_prediction_may_be_off_in_range() -> None:
     rvec, tvec = BESIDE_HEIGHT
     for growth in (0.93, 1.07):
@@ -317,25 +240,6 @@ def test_two_fields_of_it_are_surer_than_one() -> None:
     assert middle.small.cov_px2 is not None
     assert np.allclose(middle.small.corners_px, a.small.corners_px + 0.5)
     assert np.allclose(middle.small.cov_px2, a.small.cov_px2 / 2.0)
-
-
-def double_edges() -> tuple[Detections, NDArray[np.uint8]]:
-    """A marker's square twice, 6 px apart."""
-    image = np.full(SHAPE, 200.0)
-    image[100:300, 200:400] -= 80.0
-    image[106:306, 206:406] -= 80.0
-    at = np.array([[203.0, 103.0], [403.0, 103.0], [403.0, 303.0], [203.0, 303.0]])
-    double = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.uint8)
-    return Detections(0, 0.0, small=Detection("small", at, 0.1, True)), double
-
-
-def test_no_double_edges_are_looked_for_where_sides_are_outside() -> None:
-    """What is read there is the picture's rim. A whole marker's are found."""
-    whole, double = double_edges()
-    assert with_ghosts(whole, None, double).ghost_px > 0.0
-    assert whole.small is not None
-    cut = replace(whole, small=replace(whole.small, cov_px2=np.eye(8)))
-    assert with_ghosts(cut, None, double) is cut
 
 
 @pytest.mark.parametrize("side_px", [1e6, 1e8, 1e12])
@@ -391,30 +295,3 @@ def test_an_ascent_is_measured_to_the_end(build: Any, along: str) -> None:
     claimed = np.array([next(iter(o.poses.values())).sigma_m for _, o in cut])
     assert ((errors_m(cut, along) / claimed) ** 2).mean() < 2.0
     assert claimed.max() < 5e-4
-
-
-@pytest.mark.long
-def test_without_it_the_last_centimetres_are_blind(build: Any) -> None:
-    rows = ascent(build, "height", with_attitude=True, cut=False)
-    assert not any(o.poses for z, o in rows if z < 0.05)
-
-
-def test_a_pose_heeds_the_covariance_of_its_corners() -> None:
-    """What is off in the direction in which the corners are vague moves the pose little, and
-    the pose claims as much as they do."""
-    setup = PoseSetup(Profile().pose, Profile().target, np.eye(4), (0.0, 0.0, 0.0), CAMERA)
-    true = pose_of(0.0, -0.01, 0.05, 0.1)
-    at = project(square_corners(0.025), *true, CAMERA)
-    vague = np.tile([0.0, 1.0], 4)  # all of them together, along the picture's height
-    cov = 0.02**2 * np.eye(8) + 4.0 * np.outer(vague, vague)
-    off = at + 2.0 * vague.reshape(4, 2)
-
-    def pose(cov_px2: Array | None) -> Any:
-        seen = Detection("small", off, 0.02, True, cov_px2=cov_px2)
-        return estimate_pose([seen], 0.0, None, setup)
-
-    heedless, heeding = pose(None), pose(cov)
-    assert heeding.sigma_m[1] > 5.0 * heedless.sigma_m[1]
-    assert heeding.sigma_m[1] > 3.0 * heeding.sigma_m[0]
-    assert abs(heeding.e_m[1] + 0.01) < 3.0 * heeding.sigma_m[1]
-    assert abs(heedless.e_m[1] + 0.01) > 4.0 * heedless.sigma_m[1]

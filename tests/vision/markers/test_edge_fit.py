@@ -2,122 +2,30 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from perchctl.geometry import Array
-from perchctl.vision import MARKERS, project, square_corners
+from perchctl.vision import project, square_corners
 from perchctl.vision.markers.corners import (
     RAW_SIGMA_PX,
     SUBPIX_SIGMA_PX,
-    UNIT,
-    completed,
-    from_unit,
-    mapped,
-    nested,
-    to_unit,
 )
 from perchctl.vision.markers.edge_fit import (
-    ALONG,
-    PROFILES,
-    STEPS,
-    Edges,
-    Surroundings,
-    locate,
     refine,
 )
 from perchctl.vision.markers.pattern import (
     cells_agree,
     cells_mostly_agree,
-    resemblance,
     rim_of_bits,
 )
-from tests.helpers.markers import POSE, SETUP, box, corners
+from tests.helpers.markers import POSE, SETUP, corners
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 HALF_PX, NEAR_PX, DEPTH_PX = 7.0, 7.0, 12.0
-OFFSETS: Array = HALF_PX * np.linspace(-1.0, 1.0, STEPS + 1)
-
-
-def soft_step(x: Array, blur_px: float) -> Array:
-    return 0.5 * (1.0 + np.vectorize(math.erf)(x / (math.sqrt(2.0) * blur_px)))
-
-
-def located(
-    place_px: Array,
-    blur_px: float,
-    *,
-    far_side: bool = False,
-    noise: float = 0.0,
-    shown: slice = slice(None),
-) -> Edges:
-    """One row of profiles (n,) with the edge at `place_px`; with `far_side`, white ends
-    a cell further out. Others than those `shown` count for nothing."""
-    x = OFFSETS - place_px[:, None]
-    white = soft_step(x, blur_px)
-    if far_side:
-        white -= soft_step(x - DEPTH_PX, blur_px)
-    grey = 30.0 + 170.0 * white
-    grey += np.random.default_rng(0).normal(0.0, 1.0, grey.shape) * noise
-    none = np.zeros((1, PROFILES))
-    possible = np.zeros((1, PROFILES), dtype=np.bool_)
-    possible[0, shown] = True
-    around = Surroundings(
-        depth_px=np.array([DEPTH_PX]),
-        inside=none,
-        outside=none + 1.0 if far_side else none,
-        possible=possible,
-    )
-    return locate(grey[None].astype(np.float32), np.array([HALF_PX]), np.array([NEAR_PX]), around)
-
-
-@pytest.mark.parametrize("blur_px", [0.8, 1.2, 2.0])
-@pytest.mark.parametrize("place_px", [-1.3, 0.0, 0.4])
-def test_a_lone_edge_is_found_with_its_blur(place_px: float, blur_px: float) -> None:
-    edges = located(place_px + 0.5 * ALONG, blur_px)
-    assert np.abs(edges.offset_px[0] - place_px - 0.5 * ALONG).max() < 0.02
-    assert (edges.weight > 0.5).all()
-    assert edges.blur_px[0] == pytest.approx(blur_px, rel=0.2)
-
-
-def test_a_neighbouring_edge_does_not_push_it_away() -> None:
-    edges = located(np.zeros(PROFILES), 2.0, far_side=True)
-    assert np.abs(edges.offset_px).max() < 0.03
-
-
-def test_profiles_with_an_edge_elsewhere_are_outliers() -> None:
-    place = np.zeros(PROFILES)
-    place[5:9] = 3.0
-    edges = located(place, 1.0)
-    assert (edges.weight[0, 5:9] == 0.0).all()
-    assert (np.delete(edges.weight[0], range(5, 9)) > 0.5).all()
-
-
-@given(
-    shown=st.integers(3, PROFILES).flatmap(
-        lambda n: st.integers(0, PROFILES - n).map(lambda first: slice(first, first + n))
-    ),
-    place_px=st.floats(-4.0, 4.0),
-    slope_px=st.floats(-0.5, 0.5),
-    blur_px=st.floats(0.7, 1.5),
-)
-def test_a_side_of_which_little_is_shown_is_found_all_the_same(
-    shown: slice, place_px: float, slope_px: float, blur_px: float
-) -> None:
-    """Of a marker that the picture cuts off: wherever the rest of the side would be."""
-    place = place_px + slope_px * ALONG
-    edges = located(place, blur_px, noise=4.0, shown=shown)
-    weight = edges.weight[0]
-    assert weight.sum() > 1.0
-    assert abs(float((weight * (edges.offset_px[0] - place)).sum() / weight.sum())) < 0.2
-
-
 # --- Corners by lines --------------------------------------------------------------------------
 
 
@@ -192,13 +100,6 @@ def test_sides_near_the_ends_of_their_profiles_are_where_they_are(off_px: float)
     assert fitted >= 6
 
 
-def test_lines_beat_subpix_tenfold_in_bias() -> None:
-    subpix = abs(errors(0.0, 0.7, "subpix", 6, 0.150)[:, 0].mean())
-    line = abs(errors(0.0, 0.7, "line", 6, 0.150)[:, 0].mean())
-    assert subpix > 0.05
-    assert line < subpix / 10.0
-
-
 @pytest.mark.parametrize("curl", [-0.02, 0.02])
 def test_a_sheet_that_curls_shifts_no_edges(curl: float) -> None:
     """It narrows or widens the large marker's border as glare would. The small marker is hardly
@@ -265,19 +166,6 @@ def test_what_is_no_square_or_flat_falls_back_to_the_raw_corners() -> None:
         assert result.sigma_px in (RAW_SIGMA_PX, SUBPIX_SIGMA_PX)
 
 
-@pytest.mark.parametrize("blur_px", [3.0, 6.0, 12.0])
-def test_in_strong_blur_the_result_is_never_worse_than_subpix(blur_px: float) -> None:
-    rvec, tvec = pose_of(0.0, 0.0, 0.6, 0.3)
-    image = render(rvec, tvec, blur_px=blur_px)
-    true = true_corners(rvec, tvec, 0.150)
-
-    def worst(method: str) -> float:
-        result = refine(image, inwards(true, 1.0)[None], [RIMS[6]], CAMERA, method)[0]
-        return float(np.abs(result.corners_px - true).max())
-
-    assert worst("line") <= worst("subpix") + 1e-9
-
-
 def test_none_leaves_the_corners_alone() -> None:
     rvec, tvec = pose_of(*POSES[0])
     raw = true_corners(rvec, tvec, 0.150)[None] + 0.3
@@ -288,37 +176,6 @@ def test_none_leaves_the_corners_alone() -> None:
 
 
 # --- A marker's square -------------------------------------------------------------------------
-
-
-def test_one_marker_gives_the_place_of_the_other() -> None:
-    assert np.abs(nested(corners("large"), 1 / 6, CAMERA) - corners("small")).max() < 0.01
-    whole = completed({"small": corners("small")}, SETUP.ratio, CAMERA)
-    assert np.abs(whole["large"] - corners("large")).max() < 0.01
-    assert set(completed({"large": corners("large")}, SETUP.ratio, CAMERA)) == {"large", "small"}
-
-
-quads = st.tuples(
-    st.floats(100.0, 500.0), st.floats(100.0, 400.0), st.floats(20.0, 150.0), st.integers(0, 99)
-).map(lambda v: box(*v[:3]) + np.random.default_rng(v[3]).uniform(-0.1, 0.1, (4, 2)) * v[2])
-
-
-@given(quad=quads)
-@settings(max_examples=40, deadline=None)
-def test_both_homographies_of_the_unit_square_are_each_others_inverse(quad: Array) -> None:
-    assert np.allclose(mapped(from_unit(quad), UNIT), quad, atol=1e-3)
-    assert np.allclose(mapped(to_unit(quad), quad), UNIT, atol=1e-4)
-    inside = np.random.default_rng(0).uniform(-1.0, 1.0, (5, 3, 2))
-    there_and_back = mapped(to_unit(quad), mapped(from_unit(quad), inside))
-    assert there_and_back.shape == inside.shape
-    assert np.allclose(there_and_back, inside, atol=1e-4)
-
-
-@given(quad=quads, ratio=st.floats(0.1, 1.0))
-@settings(max_examples=40, deadline=None)
-def test_a_square_in_a_square_has_the_inverse_ratio_around_it(quad: Array, ratio: float) -> None:
-    for camera in (None, CAMERA):
-        inner = nested(quad, ratio, camera)
-        assert np.allclose(nested(inner, 1.0 / ratio, camera), quad, atol=0.05)
 
 
 # --- Cells -------------------------------------------------------------------------------------
@@ -346,16 +203,6 @@ def test_every_single_cell_counts() -> None:
             assert not cells_agree(spoilt, corners("large"), pattern), (row, column)
 
 
-def test_resemblance_gives_the_turn_of_a_marker() -> None:
-    image = cv2.GaussianBlur(render(*POSE), (0, 0), 2.0)
-    for name in MARKERS:
-        for k in range(4):
-            rolled = np.roll(corners(name), -k, axis=0)
-            likeness = resemblance(np.asarray(image), rolled, SETUP.patterns[name])
-            assert int(np.argmax(likeness)) == k
-            assert likeness[k] > 0.8
-
-
 def test_some_covered_cells_are_allowed_for_where_the_place_is_known() -> None:
     pattern, quad = SETUP.patterns["large"], corners("large")
     image = render(*POSE)
@@ -364,12 +211,3 @@ def test_some_covered_cells_are_allowed_for_where_the_place_is_known() -> None:
     assert not cells_agree(image, quad, pattern)
     assert cells_mostly_agree(image, quad, pattern)
     assert not cells_mostly_agree(image, quad + 30.0, pattern)
-
-
-def test_cells_outside_of_the_picture_or_without_contrast_agree_with_nothing() -> None:
-    pattern, image = SETUP.patterns["large"], render(*POSE)
-    flat = np.full_like(image, 120)
-    for picture, quad in ((image, corners("large") + 500.0), (flat, corners("large"))):
-        assert not cells_agree(picture, quad, pattern)
-        assert not cells_mostly_agree(picture, quad, pattern)
-        assert np.array_equal(resemblance(picture, quad, pattern), np.zeros(4))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,25 +14,20 @@ from numpy.typing import NDArray
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, Profile, TargetConfig, load_profile
-from perchctl.vision import (
-    Detections,
-    Frame,
-    MarkerName,
-    PipelineState,
-    field_picture,
-    make_aruco_detector,
-    make_pipeline,
-    step,
-)
+from perchctl.vision import make_pipeline
 from perchctl.vision.markers.corners import from_unit, mapped
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import filled, hidden_in, hides, make_mask
+from perchctl.vision.markers.detector import (
+    hides,
+    make_aruco_detector,
+    make_mask,
+)
 from perchctl.vision.markers.partial import (
     KnownBy,
-    fit_partly,
     seen_partly,
 )
 from perchctl.vision.markers.search import search
+from perchctl.vision.types import Detections, MarkerName
 from tests.helpers.markers import POSE, SETUP, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -140,18 +134,6 @@ def test_what_the_edge_cut_off_is_not_taken_unless_its_cells_are_seen() -> None:
     assert found.small is not None
 
 
-def test_a_pose_from_a_cut_marker_is_as_good_as_it_claims(build: Callable[..., object]) -> None:
-    setup = build()
-    for seed in range(4):
-        pose = cut(0.04, seed)
-        image = render(*pose, noise=2.0, seed=seed)
-        output = step(PipelineState(), Frame(0, 0.0, image), None, setup)[1]
-        joint = output.poses["joint"]
-        error = joint.e_m - pose[1]
-        assert np.abs(error).max() < 6e-4
-        assert error @ np.linalg.solve(joint.cov[:3, :3], error) < 16.0
-
-
 @pytest.mark.parametrize("share", [0.005, 0.08])
 def test_a_cut_marker_is_verified_where_it_is_expected(share: float) -> None:
     pose = cut(share, 2)
@@ -188,37 +170,6 @@ def test_a_highlight_on_a_corner_leaves_three_sides(radius: float, corner: int) 
     assert np.abs(again.large.corners_px - true).max() < 0.3
 
 
-def test_the_way_of_the_last_round_is_not_taken_for_spread() -> None:
-    """From wherever the fit starts, it claims the same."""
-    image, true = render(*POSE, noise=2.0), corners("large")
-    spreads = []
-    for off_px in (0.0, 0.5, 1.5, 3.0):
-        found = fit_partly(image, true + off_px, LARGE, CAMERA)
-        spreads.append(found.sigma_px)
-    assert max(spreads) < 1.03 * min(spreads)
-
-
-def test_what_is_hidden_is_no_edge() -> None:
-    """A bar along a whole side: without that side, the inner edge of its border is left."""
-    image, true = render(*POSE, noise=2.0), corners("large")
-    ends = [tuple(int(v) for v in np.rint(p)) for p in true[:2] + 2.0]
-    cv2.line(image, ends[0], ends[1], 90, 9)
-    covered = np.zeros_like(image)
-    cv2.line(covered, ends[0], ends[1], 1, 13)
-    for off_px in (0.0, 3.0):
-        found = seen_partly(image, true + off_px, LARGE, CAMERA, "bits", covered > 0)
-        assert np.abs(found.corners_px - true).max() < 0.2
-
-
-@pytest.mark.parametrize("light_grey", [200.0, 800.0])
-def test_light_over_most_of_two_sides_moves_no_corner(light_grey: float) -> None:
-    image, true = render(*POSE, noise=2.0), corners("large")
-    side = float(np.linalg.norm(true[0] - true[1]))
-    bright = glaring(image, true[2] + 0.05 * (true[0] - true[2]), 0.55 * side, light_grey)
-    found = fit_partly(bright, true + 1.0, LARGE, CAMERA)
-    assert np.abs(found.corners_px - true).max() < 0.3
-
-
 def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     image, true = render(*POSE, noise=2.0), corners("large")
     black = np.flatnonzero(LARGE.inner & ~LARGE.white)[0]
@@ -253,27 +204,6 @@ def test_a_code_that_may_be_another_one_is_not_told_by_its_bits_alone() -> None:
     covered[round(y) : round(y + 0.9 * cell), round(x) : round(x + 1.9 * cell)] = True
     assert seen_partly(image, true, LARGE, CAMERA, "bits", covered) is None
     assert seen_partly(image, true, LARGE, CAMERA, "track", covered) is not None
-
-
-@pytest.mark.parametrize("grey", [0, 128, 255])
-def test_nothing_is_fitted_to_no_contrast(grey: int) -> None:
-    flat = np.full((H, W), grey, np.uint8)
-    assert fit_partly(flat, corners("large"), LARGE, CAMERA) is None
-    assert fit_partly(flat, np.full((4, 2), np.nan), LARGE, CAMERA) is None
-    assert fit_partly(flat, corners("large") + 5000.0, LARGE, CAMERA) is None
-
-
-@pytest.mark.parametrize("z_m", [0.11, 0.12, 0.13])
-def test_a_marker_that_fills_the_picture_is_known_by_its_cells_as_the_lens_bends_them(
-    z_m: float,
-) -> None:
-    # The vehicle's last centimetres: the large marker's corners are beyond the picture, and its
-    # middle is 20 px from where a square with these corners would have it.
-    for x_m, y_m in ((-0.022, 0.0), (-0.02, 0.012), (0.025, -0.01)):
-        pose = pose_of(x_m, y_m, z_m, 0.05)
-        true = corners("large", pose)
-        found = seen_partly(render(*pose, noise=2.0), true + 3.0, LARGE, CAMERA, "track")
-        assert np.abs(found.corners_px - true).max() < 0.5
 
 
 # --- The vehicle's own gear in the picture: `camera.mask`, from the file to the corners --------
@@ -321,19 +251,6 @@ def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
         assert np.abs(before.large.corners_px - TRUE).max() < 0.2
 
 
-def test_where_it_is_expected_a_hidden_cell_is_unknown_and_not_wrong() -> None:
-    pattern = SETUP.patterns["large"]
-    black = np.flatnonzero(pattern.inner & ~pattern.white)[0]
-    spots = mapped(from_unit(TRUE), pattern.spots[pattern.owner == black])
-    x, y = spots.mean(axis=0)
-    covered = over((x, y), (x, y), width=40)
-    image = filled(behind(render(*POSE, noise=2.0), covered), covered)
-    expected: dict[MarkerName, Array] = {"large": TRUE + 1.0}
-    seen = followed(image, expected, hidden=covered)
-    assert np.abs(seen["large"].corners_px - TRUE).max() < 0.2
-    assert "large" not in followed(image, expected)
-
-
 @pytest.mark.parametrize("name", sorted(LEGS))
 def test_what_a_leg_covers_counts_for_nothing(name: str) -> None:
     """Whatever grey the gear has, the same is found."""
@@ -346,51 +263,6 @@ def test_what_a_leg_covers_counts_for_nothing(name: str) -> None:
         found.append(large.corners_px)
     assert np.array_equal(found[0], found[1])
     assert np.array_equal(found[0], found[2])
-
-
-def test_a_field_shows_the_gear_in_the_rows_beside_it_too() -> None:
-    covered = LEGS["corner"]
-    mask = make_mask(covered)
-    image = np.where(covered, 0, 200).astype(np.uint8)
-    for first_row, name in ((0, "top"), (1, "bottom")):
-        field = field_picture(image, first_row)
-        hidden = hidden_in(Frame(0, 0.0, field, fields=name), mask)
-        assert hidden is not None
-        assert (field[~hidden] == 200).all()
-    whole = hidden_in(Frame(0, 0.0, image, fields="whole"), mask)
-    assert whole is not None
-    assert np.array_equal(whole, covered)
-
-
-def test_the_fields_of_a_woven_frame_are_measured_behind_a_leg() -> None:
-    covered = LEGS["across a corner"]
-    top, bottom = (render(*pose_of(0.03 + x, -0.02, 0.35, 0.7, 0.05, -0.08)) for x in (-2e-3, 2e-3))
-    woven = top.copy()
-    woven[1::2] = bottom[1::2]
-    setup = replace(SETUP, mask=make_mask(covered))
-    seen = Frame(0, 0.0, behind(woven, covered), fields="woven")
-    found = detect_markers(seen, None, setup, CAMERA)
-    assert np.abs(found.large.corners_px - TRUE).max() < 0.2
-
-
-def test_what_is_filled_in_makes_no_edge() -> None:
-    image = np.full((H, W), 180, np.uint8)
-    covered = LEGS["corner"]
-    assert np.abs(filled(behind(image, covered), covered).astype(int) - 180).max() <= 1
-    everything = np.ones((H, W), np.bool_)
-    everything[:, :4] = False
-    assert np.abs(filled(image, everything).astype(int) - 180).max() <= 1
-
-
-def test_hides_is_about_the_marker_and_the_white_around_it() -> None:
-    assert not hides(None, TRUE)
-    assert not hides(over((0, 0), (60, 10)), TRUE)
-    assert not hides(LEGS["corner"], TRUE + 5000.0)
-    assert not hides(LEGS["corner"], np.full((4, 2), np.nan))
-    # Beside the marker, within its bounding box.
-    turned = corners("large", pose_of(0.0, 0.0, 0.5, np.pi / 4))
-    corner = tuple(turned.min(axis=0) + 4.0)
-    assert not hides(over(corner, corner, width=5), turned)
 
 
 # --- the file ----------------------------------------------------------------------------------

@@ -2,36 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from perchctl.profile import DetectorConfig
 from perchctl.vision import Frame, PipelineState, step
 from perchctl.vision.markers import detect as detect_room
 from perchctl.vision.markers import search as search_room
-from perchctl.vision.markers.search import choose, search_halved, search_window
-from tests.helpers.markers import SETUP, both, box
-from tests.helpers.markers import corners as corners_of
+from perchctl.vision.markers.search import choose
+from tests.helpers.markers import SETUP, box
 from tests.helpers.target_picture import pose_of, render
 
 RATIO = SETUP.ratio
-
-
-def test_the_window_leaves_room_for_the_large_marker_around_the_small_one() -> None:
-    window = search_window({"small": box(300, 240, 20)}, RATIO, (480, 640))
-    assert window is not None
-    rows, columns = window
-    assert columns.start <= 240 < 360 <= columns.stop
-    assert rows.start <= 180 < 300 <= rows.stop
-    close = search_window({"small": box(300, 240, 90)}, RATIO, (480, 640))
-    assert close is not None
-    assert np.empty((480, 640))[close].size < 0.4 * 640 * 480
-    assert search_window({"large": box(320, 240, 430)}, RATIO, (480, 640)) is None
 
 
 @pytest.mark.parametrize(
@@ -78,22 +62,6 @@ def test_choice_among_candidates(large, small, expected, result) -> None:
     assert set(chosen) == set(result)
     for name, index in result.items():
         assert chosen[name] is pools[name][index]
-
-
-@pytest.mark.parametrize(("z_m", "found"), [(0.1, {"small"}), (0.16, {"large", "small"})])
-def test_large_markers_are_found_at_half_the_size_at_their_place(
-    z_m: float, found: set[str]
-) -> None:
-    """In the last centimetres the prediction may be off by more than lines are looked for."""
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        x_m, y_m = rng.uniform(-0.02, 0.02, 2) * z_m
-        pose = pose_of(x_m, y_m, z_m, 0.5 * math.pi * seed + rng.uniform(-0.1, 0.1))
-        off = {name: corners + rng.uniform(-25.0, 25.0, 2) for name, corners in both(pose).items()}
-        seen = search_halved(render(*pose, noise=4.0, seed=seed), off, SETUP).corners_px
-        assert seen.keys() == found
-        for name, quad in seen.items():  # lines are looked for within 7 px
-            assert np.abs(quad - corners_of(name, pose)).max() < 4.0
 
 
 def test_a_whole_target_elsewhere_does_not_stand_in_for_the_own_one() -> None:
@@ -199,12 +167,6 @@ def test_no_frame_of_a_stream_has_two_dear_searches(stream: Stream) -> None:
     assert lost[0].window > 0
 
 
-def test_a_first_picture_is_searched_by_all(stream: Stream) -> None:
-    stream.see(EMPTY)
-    assert stream.done[0].whole == 1
-    assert stream.done[0].all_in_blur == 1
-
-
 @pytest.mark.parametrize("lost", [0, 1, 2, 3, 7, 40])
 @pytest.mark.parametrize("place", [NEAR, ASIDE])
 def test_what_comes_back_is_found_by_the_second_frame(
@@ -217,35 +179,3 @@ def test_what_comes_back_is_found_by_the_second_frame(
         assert not stream.see(EMPTY)
     back = render(*place)
     assert any(stream.see(back) for _ in range(2))
-
-
-@pytest.mark.parametrize("lost", [2, 6])
-def test_without_fits_to_blurred_targets_no_frame_is_left_unsearched(
-    build: object, lost: int
-) -> None:
-    stream = Stream(build(detector=DetectorConfig(blurred=False)))
-    for k in range(3 + lost):
-        assert stream.see(render(*NEAR) if k < 3 else EMPTY) == (k < 3)
-    assert stream.see(render(*NEAR))
-
-
-def test_blur_after_a_loss_is_seen_through_near_the_old_place(stream: Stream) -> None:
-    for _ in range(3):
-        assert stream.see(render(*NEAR))
-    soft = cv2.GaussianBlur(render(*pose_of(0.1, -0.03, 1.2, 0.4)).astype(np.float32), (0, 0), 5.0)
-    picture = np.clip(np.rint(soft), 0, 255).astype(np.uint8)
-    for _ in range(2):
-        stream.see(EMPTY)
-    assert any(stream.see(picture) for _ in range(2))
-    assert stream.done[-1].near_in_blur == 1
-
-
-def test_what_is_seen_and_not_the_target_does_not_end_the_sharp_search(stream: Stream) -> None:
-    """A stranger in every frame: once nothing is expected any more, all is searched."""
-    for _ in range(8):
-        assert stream.see(render(*NEAR))
-    farther = render(*pose_of(-0.3, 0.2, 2.2, 0.4))
-    for _ in range(45):
-        stream.see(farther)
-    assert stream.state.lock.pose.tvec_m[2] < 1.3
-    assert [(done.whole, done.all_in_blur) for done in stream.done[-10:]] == [(1, 0)] * 10
