@@ -28,6 +28,7 @@ from perchctl.check.row import (
     warned,
 )
 from perchctl.errors import PerchError, SafetyAbort
+from perchctl.files import check_place
 from perchctl.flight import FlyOptions
 from perchctl.places import is_shipped_example
 from perchctl.profile import DOUBTFUL, Profile, find_calibration
@@ -66,8 +67,9 @@ def quick_rows(options: FlyOptions) -> list[Row]:
 
 def warnings_before_flight(options: FlyOptions) -> list[str]:
     """Return a sentence for each row that warns. Errors: SafetyAbort for the first that fails; of
-    the calibration's file InvalidValue, NotFound."""
+    the calibration's file InvalidValue, NotFound; of the log's folder InvalidValue."""
     profile_camera(options.profile.camera)
+    check_place(options.log_dir / "flight.jsonl", force=True)
     rows = quick_rows(options)
     for row in rows:
         if row.verdict is Verdict.FAIL:

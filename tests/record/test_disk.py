@@ -219,7 +219,7 @@ def test_a_full_disk_is_in_the_exit_code_of_a_good_flight(
     monkeypatch.setattr(fly, "_session", session)
     if full:
         monkeypatch.setattr(os, "write", no_room)
-    assert fly.fly_and_report(options, as_json=True, port=None) == code
+    assert fly.fly_and_report(options, as_json=True, view=False) == code
     said = capsys.readouterr()
     told = json.loads(said.out)
     assert told["exit_code"] == code

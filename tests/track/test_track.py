@@ -446,7 +446,7 @@ def test_ctrl_c_leaves_whole_lines(video: Path, monkeypatch: pytest.MonkeyPatch)
         (["nonsense:1"], 30, "camera:N"),
         (["sim:"], 30, "camera:N"),
         (["."], 20, "holds no pictures"),
-        (["BROKEN"], 30, "a.png cannot be read"),
+        (["BROKEN"], 30, "cannot be read as a picture"),
         (["PICTURES", "--calibration", "no.yaml"], 20, "no.yaml"),
         (["PICTURES", "-p", "nobody"], 20, "'nobody'"),
     ],
