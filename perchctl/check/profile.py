@@ -25,6 +25,7 @@ from perchctl.check.row import (
     by_limits,
     failed,
     passed,
+    skipped,
     warned,
 )
 from perchctl.errors import PerchError, SafetyAbort
@@ -208,7 +209,10 @@ def log_finding(folder: Path) -> Finding:
         return failed(f"{there} is a file", advice)
     if not os.access(there, os.W_OK | os.X_OK):
         return failed(f"no right to write in {there}", advice)
-    free = shutil.disk_usage(there).free
+    usage = shutil.disk_usage(there)
+    if not usage.total:
+        return skipped(f"{there} is on no disk")
+    free = usage.free
     shown = f"{free / 1e9:.1f} GB free" if free >= 1e9 else f"{free / 1e6:.0f} MB free"
     found = f"{folder}{'' if there == folder else ' (new)'}, {shown}"
     advice = "free some space: a flight's log has some 5 MB a minute"

@@ -284,5 +284,7 @@ def test_the_log_s_folder_is_not_made_and_a_file_in_its_place_fails(tmp_path: Pa
 def test_a_full_disk_makes_its_row(
     free: int, verdict: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(of_profile.shutil, "disk_usage", lambda path: SimpleNamespace(free=free))
+    monkeypatch.setattr(
+        of_profile.shutil, "disk_usage", lambda path: SimpleNamespace(free=free, total=10**12)
+    )
     assert of_profile.log_finding(tmp_path).verdict == verdict
