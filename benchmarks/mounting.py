@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from perchctl.calibration import MountingRecording, profile_camera
-from perchctl.calibration.jackknife import SIGMAS_95
+from perchctl.calibration.board.adjust import SIGMAS_95
 from perchctl.calibration.mounting.carry import solve_carry
 from perchctl.calibration.mounting.pivot import solve_pivot
 from perchctl.errors import InvalidValue

@@ -18,13 +18,11 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 import perchctl
-from perchctl.analysis.advice import Advice, advice_of
 from perchctl.analysis.film import write_film
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
-from perchctl.analysis.story import Sentence, story_of
-from perchctl.analysis.words import count, length
+from perchctl.analysis.story import Advice, Sentence, advice_of, count, length, story_of
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import write_files
 from perchctl.mission import Phase

@@ -30,7 +30,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.interrupt import draw_unless_interrupted, ignore_signals, signals_to_operator
 from perchctl.commands.output import ask_to_confirm, print_lines, print_result, say
-from perchctl.commands.picture_edges import picture_edges
+from perchctl.commands.profile import picture_edges
 from perchctl.display import (
     FlightPage,
     live_page,

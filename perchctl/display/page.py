@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.camera import FrameSource, WrappedSource
-from perchctl.display.live import LivePage
+from perchctl.display.live import LivePage, Sketch, sketch_of
 from perchctl.display.panel import status_rows
-from perchctl.display.sketch import Sketch, sketch_of
 from perchctl.mission import Event, Tick
 from perchctl.record import FlightSummary
 from perchctl.vision import Frame

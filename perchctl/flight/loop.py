@@ -15,7 +15,7 @@ from perchctl.camera import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
 from perchctl.flight.criteria import AtRest
-from perchctl.flight.inputs import FlightInputs
+from perchctl.flight.inputs import FlightInputs, Turns
 from perchctl.flight.preflight import (
     refuse,
     refuse_out_of_view,
@@ -23,7 +23,6 @@ from perchctl.flight.preflight import (
     refuse_unmeasured,
     still_waiting_for,
 )
-from perchctl.flight.turns import Turns
 from perchctl.flight.watchdog import Watchdog, rescue
 from perchctl.link import Link
 from perchctl.mission import (

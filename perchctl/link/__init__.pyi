@@ -7,5 +7,5 @@ from .listening import find_vehicles as find_vehicles
 from .mock import MockLink as MockLink
 from .mock import Radio as Radio
 from .protocol import Link as Link
-from .uri import check_uri as check_uri
-from .uri import vehicle_uri as vehicle_uri
+from .protocol import check_uri as check_uri
+from .protocol import vehicle_uri as vehicle_uri

@@ -31,10 +31,9 @@ from perchctl.link.external_position import (
     estimator_parameters,
 )
 from perchctl.link.firmware import check_firmware, measured_by, set_parameters
-from perchctl.link.protocol import Guard, SentCallback, ignore_sent
+from perchctl.link.protocol import Guard, SentCallback, check_uri, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
 from perchctl.link.telemetry import LogBlocks
-from perchctl.link.uri import check_uri
 from perchctl.mission import SentCommand
 from perchctl.positioning import PositionFeed
 from perchctl.profile import LinkConfig, PositioningConfig

@@ -17,7 +17,7 @@ from typing import Any
 from perchctl.errors import ConnectionFailed
 from perchctl.files import cannot_be_written
 from perchctl.link.crtp import Packet
-from perchctl.link.uri import UDEV_HELP, vehicle_uri
+from perchctl.link.protocol import UDEV_HELP, vehicle_uri
 from perchctl.places import user_cache_folder, user_runtime_folder
 
 CONNECT_TRIES = 2

@@ -36,8 +36,8 @@ from perchctl.link.firmware import (
     read_parameters,
     read_variable,
 )
+from perchctl.link.protocol import FORMS, USUAL_ADDRESS
 from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S, Timebase, start_block
-from perchctl.link.uri import FORMS, USUAL_ADDRESS
 from perchctl.profile import LinkConfig
 from perchctl.vehicle import FLYING
 

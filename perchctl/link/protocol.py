@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from perchctl.errors import InvalidValue
 from perchctl.mission import SentCommand
 from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
 
@@ -66,3 +68,60 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Leave the vehicle safe: closes only when it is not flying (bounded wait)."""
+
+
+# --- The forms of a vehicle's URI, and what to do without rights to the radio ------------------
+
+
+USUAL_ADDRESS = "E7E7E7E7E7"
+_USUAL = ("2", "2M", USUAL_ADDRESS)  # channel, rate and address of a radio's URI that names none
+_CHANNEL, _RATE, _ADDRESS = "(12[0-5]|1[01][0-9]|0?[0-9]{1,2})", "(250K|1M|2M)", "[0-9A-Fa-f]{1,10}"
+_HOST_AND_PORT = r"[^/:\s]+:0*[1-9]\d{0,4}"
+FORMS = {
+    "sim": "",
+    "radio": rf"([0-9]+|[0-9A-Fa-f]{{10}})(/{_CHANNEL}(/{_RATE}(/{_ADDRESS})?)?)?(\?.+)?",
+    "usb": r"\d+",
+    "udp": _HOST_AND_PORT,
+    "tcp": _HOST_AND_PORT,
+    "serial": ".+",
+}
+EXAMPLES = (
+    "sim://, radio://0/80/2M/E7E7E7E7E7 (channel 0 to 125; 250K, 1M or 2M; an address of at "
+    "most ten hex digits), usb://0, udp://127.0.0.1:19850 (port 1 to 65535)"
+)
+
+UDEV_HELP = """\
+Write these lines to /etc/udev/rules.d/99-bitcraze.rules:
+  # Crazyradio (PA and 2.0)
+  SUBSYSTEM=="usb", ATTRS{idVendor}=="1915", ATTRS{idProduct}=="7777", MODE="0664", GROUP="plugdev"
+  # Crazyradio bootloader
+  SUBSYSTEM=="usb", ATTRS{idVendor}=="1915", ATTRS{idProduct}=="0101", MODE="0664", GROUP="plugdev"
+  # Crazyflie over USB
+  SUBSYSTEM=="usb", ATTRS{idVendor}=="0483", ATTRS{idProduct}=="5740", MODE="0664", GROUP="plugdev"
+then run:
+  sudo groupadd -f plugdev
+  sudo usermod -a -G plugdev $USER
+  sudo udevadm control --reload-rules && sudo udevadm trigger
+log in again, and plug the radio or the vehicle in again."""
+
+
+def check_uri(uri: str) -> str:
+    """Return the URI's scheme. Raises InvalidValue, which names what is allowed."""
+    scheme, _, rest = uri.partition("://")
+    fits = "://" in uri and scheme in FORMS and re.fullmatch(FORMS[scheme], rest)
+    if not fits or (scheme in ("udp", "tcp") and int(rest.rpartition(":")[2]) > 65535):
+        raise InvalidValue(f"URI {uri!r} is not one of a vehicle; examples: {EXAMPLES}")
+    return scheme
+
+
+def vehicle_uri(uri: str) -> str:
+    """Return the URI without what does not tell vehicles apart: a radio's dongle, case, options."""
+    scheme, _, rest = uri.partition("?")[0].partition("://")
+    scheme = scheme.lower()
+    if scheme == "radio":
+        given = [part for part in rest.split("/")[1:4] if part]
+        channel, rate, address = (*given, *_USUAL[len(given) :])
+        return f"radio/{int(channel)}/{rate.upper()}/{address.upper().zfill(len(USUAL_ADDRESS))}"
+    if scheme != "serial":  # whose place is a file, and its case tells
+        rest = rest.lower().replace("localhost:", "127.0.0.1:")
+    return f"{scheme}/{rest}"

@@ -1,6 +1,3 @@
-from .dictionaries import aruco_dictionary as aruco_dictionary
-from .dictionaries import check_marker_id as check_marker_id
-from .dictionaries import dictionary_size as dictionary_size
 from .edit import changed_profile as changed_profile
 from .edit import profile_value as profile_value
 from .edit import writable_profile as writable_profile
@@ -33,3 +30,6 @@ from .vision import Mounting as Mounting
 from .vision import PoseConfig as PoseConfig
 from .vision import TargetConfig as TargetConfig
 from .vision import WeightsConfig as WeightsConfig
+from .vision import aruco_dictionary as aruco_dictionary
+from .vision import check_marker_id as check_marker_id
+from .vision import dictionary_size as dictionary_size

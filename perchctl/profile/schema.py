@@ -13,7 +13,6 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from perchctl.profile.base import Section, key, without_constants
-from perchctl.profile.dictionaries import check_marker_id
 from perchctl.profile.limits import IMPOSSIBLE
 from perchctl.profile.mission import PlannerConfig, SafetyConfig
 from perchctl.profile.positioning import PositioningConfig
@@ -26,6 +25,7 @@ from perchctl.profile.vision import (
     PoseConfig,
     TargetConfig,
     VehicleConfig,
+    check_marker_id,
 )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from perchctl.analysis import FlightAnalysis
-from perchctl.analysis.advice import advice_of
+from perchctl.analysis.story import advice_of
 from tests.helpers.log import GONE_S, SUMMARY
 from tests.helpers.told import flown_s, made
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from perchctl.display import Sketch
-from perchctl.display.sketch import draw_sketch
+from perchctl.display.live import draw_sketch
 from tests.helpers.recording import camera
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from perchctl.analysis.decide import decide
 from perchctl.flight import FlightInputs, fly
-from perchctl.flight.turns import TurnWatcher
+from perchctl.flight.inputs import TurnWatcher
 from perchctl.mission import Observation, Operator, PlannerState, Tick, Turn, step_mission
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, Land

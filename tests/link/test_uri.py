@@ -6,7 +6,7 @@ import pytest
 
 from perchctl.errors import InvalidValue
 from perchctl.link import check_uri, listening, vehicle_uri
-from perchctl.link.uri import UDEV_HELP
+from perchctl.link.protocol import UDEV_HELP
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
 

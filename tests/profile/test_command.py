@@ -14,8 +14,14 @@ from typer.testing import CliRunner, Result
 
 from perchctl.check import Verdict, profile_rows
 from perchctl.commands import app
-from perchctl.commands.picture_edges import PICTURE_EDGES, edges_beside, picture_edges
-from perchctl.commands.profile import QUESTIONS, WORDS, new_profile
+from perchctl.commands.profile import (
+    PICTURE_EDGES,
+    QUESTIONS,
+    WORDS,
+    edges_beside,
+    new_profile,
+    picture_edges,
+)
 from perchctl.profile import Profile, find_calibration, load_profile, profile_value
 from perchctl.profile.keys import keys
 from tests.profile.test_written import uncommented

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from perchctl.commands.picture_edges import (
+from perchctl.commands.profile import (
     PICTURE_EDGES,
     edges_beside,
     mount_from_edges,

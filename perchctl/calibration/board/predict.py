@@ -16,9 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.calibration.board.adjust import derivatives, fit_poses
+from perchctl.calibration.board.adjust import SIGMAS_95, derivatives, fit_poses
 from perchctl.calibration.board.detect import BoardView
-from perchctl.calibration.jackknife import SIGMAS_95
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel, project, undistort
 

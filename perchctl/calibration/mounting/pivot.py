@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from perchctl.calibration.mounting.carry import MOST_LEFT_OUT, Rows, weighed_rows
 from perchctl.calibration.mounting.recording import (
     HOW_TO_RECORD,
     MountingRecording,
@@ -18,7 +19,6 @@ from perchctl.calibration.mounting.recording import (
     check_recording,
     pose_arrays,
 )
-from perchctl.calibration.mounting.robust import MOST_LEFT_OUT, Rows, weighed_rows
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 

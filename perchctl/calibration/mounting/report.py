@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perchctl.calibration.jackknife import SIGMAS_95
+from perchctl.calibration.board.adjust import SIGMAS_95
 from perchctl.calibration.mounting.carry import CarrySolution, solve_carry
 from perchctl.calibration.mounting.pivot import PivotSolution, solve_pivot
 from perchctl.calibration.mounting.recording import MountingRecording
