@@ -110,9 +110,12 @@ def spawn(code: str, output: int | IO[bytes]) -> subprocess.Popen[bytes]:
     root = str(Path(__file__).resolve().parents[1])
     command = [sys.executable, "-P", "-c", _PREFACE + code, root]
     return subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT,
+        command,
+        stdin=subprocess.PIPE,
+        stdout=output,
+        stderr=subprocess.STDOUT,
         start_new_session=True,
-    )  # fmt: skip
+    )
 
 
 def send_address(child: subprocess.Popen[bytes], listener: socket.socket, token: str) -> None:

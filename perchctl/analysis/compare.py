@@ -30,14 +30,16 @@ class Comparison:
                 [stay.duration_s for stay in flight.log.phases if stay.phase == name]
                 for flight in self.flights
             )
-            found.append({
-                "phase": name,
-                "a_s": round(sum(a), 6),
-                "b_s": round(sum(b), 6),
-                "difference_s": round(sum(b) - sum(a), 6),
-                "a_visits": len(a),
-                "b_visits": len(b),
-            })  # fmt: skip
+            found.append(
+                {
+                    "phase": name,
+                    "a_s": round(sum(a), 6),
+                    "b_s": round(sum(b), 6),
+                    "difference_s": round(sum(b) - sum(a), 6),
+                    "a_visits": len(a),
+                    "b_visits": len(b),
+                }
+            )
         return found
 
     @cached_property

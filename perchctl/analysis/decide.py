@@ -99,7 +99,7 @@ def decide(
             state, tick = new, tick + 1
 
 
-# --- In which field two values first differ, to the bit: 0.0 is not -0.0, and NaN is NaN ---------
+# --- In which field two values first differ, to the bit: 0.0 is not -0.0, and NaN is NaN ---
 
 
 def first_differing(name: str, one: Any, other: Any) -> FieldDifference | None:

@@ -175,8 +175,13 @@ class _Stage:
         if ways.target_z_m is not None:
             ax.axhline(ways.target_z_m, color=GREY, linewidth=1.0)
             half_m = 0.5 * ways.large_side_m
-            ax.plot([-half_m, half_m], [ways.target_z_m] * 2, color=BLACK, linewidth=4.0,
-                    solid_capstyle="butt")  # fmt: skip
+            ax.plot(
+                [-half_m, half_m],
+                [ways.target_z_m] * 2,
+                color=BLACK,
+                linewidth=4.0,
+                solid_capstyle="butt",
+            )
         self._trail = self._line(ax, color=SKY, linewidth=1.0)
         self._setpoint = self._line(ax, "+", color=VERMILLION, markersize=7)
         self._arms = self._line(ax, color=BLUE, linewidth=3.0)
@@ -293,7 +298,7 @@ def _filled(points_m: Array) -> Array:
     return filled
 
 
-# --- The file ----------------------------------------------------------------------------------
+# --- The file ---------------------------------------------------------
 
 
 def _write_video(pictures: Iterator[Rgb], path: Path, rate: Fraction) -> None:

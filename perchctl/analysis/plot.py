@@ -42,8 +42,11 @@ NAME_GAP = 0.02
 LOST_SHARE = 0.05
 """Of a panel's height, in which lost frames are marked."""
 FULL_THRUST_PERCENT = 1 / 655.35
-RAW = (("j", "s", GREEN, "both, raw"), ("l", "o", SKY, "large, raw"), ("s", "^", ORANGE,
-       "small, raw"))  # fmt: skip
+RAW = (
+    ("j", "s", GREEN, "both, raw"),
+    ("l", "o", SKY, "large, raw"),
+    ("s", "^", ORANGE, "small, raw"),
+)
 """Of a raw pose: its letter in the log's keys, its marker, colour and label."""
 TRACKS = (
     ("x_m", 100.0, "x [cm]"),
@@ -111,7 +114,7 @@ def title_of(flight: FlightAnalysis) -> str:
     return "   |   ".join(parts).replace("$", r"\$")
 
 
-# --- panels -------------------------------------------------------------------------------
+# --- panels -----------------------------------------------------------
 
 
 def _draw_raw_and_filtered(
@@ -190,8 +193,15 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
     for axis, colour in (("x", BLUE), ("y", ORANGE)):
         for source, marker, _, _ in RAW:
             raw_mm = 1e3 * log.column(f"{source}{axis}_m")[near]
-            ax.plot(frame_s[near], raw_mm, marker, markersize=2.4, color=colour, fillstyle="none",
-                    markeredgewidth=0.6)  # fmt: skip
+            ax.plot(
+                frame_s[near],
+                raw_mm,
+                marker,
+                markersize=2.4,
+                color=colour,
+                fillstyle="none",
+                markeredgewidth=0.6,
+            )
         e_mm = 1e3 * flight.tracked(f"e{axis}_m")[inside]
         ax.plot(t_s, e_mm, color=colour, linewidth=1.4, label=f"e{axis}")
         span_mm.append(_most(np.abs(e_mm)))
@@ -214,8 +224,14 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
 def _mark_lost(ax: Axes, frames: Frames) -> None:
     """Mark frames without the target, and times without any frame, at the panel's bottom."""
     if frames.unseen_s.size:
-        ax.vlines(frames.unseen_s, 0.0, LOST_SHARE, transform=ax.get_xaxis_transform(),
-                  color=BLACK, linewidth=0.7)  # fmt: skip
+        ax.vlines(
+            frames.unseen_s,
+            0.0,
+            LOST_SHARE,
+            transform=ax.get_xaxis_transform(),
+            color=BLACK,
+            linewidth=0.7,
+        )
     for start_s, end_s in frames.gaps_s:
         ax.axvspan(start_s, end_s, 0.0, LOST_SHARE, color=VERMILLION, linewidth=0.0)
 
@@ -234,7 +250,7 @@ def _most(values: Array) -> float:
     return float(known.max()) if known.size else 0.0
 
 
-# --- phases -------------------------------------------------------------------------------
+# --- phases -----------------------------------------------------------
 
 
 def _shade_spans(ax: Axes, spans: Sequence[Span]) -> None:
@@ -260,6 +276,12 @@ def _name_spans(ax: Axes, spans: Sequence[Span], shown_s: tuple[float, float]) -
         at_s = max((start_s + end_s) / 2, named_s + gap_s)
         if at_s > end_s + 2 * gap_s and i < len(spans) - 1:
             continue
-        ax.annotate(name, xy=(at_s, 1.03), xycoords=("data", "axes fraction"), rotation=45,
-                    fontsize=8, annotation_clip=False)  # fmt: skip
+        ax.annotate(
+            name,
+            xy=(at_s, 1.03),
+            xycoords=("data", "axes fraction"),
+            rotation=45,
+            fontsize=8,
+            annotation_clip=False,
+        )
         named_s = at_s

@@ -273,7 +273,7 @@ def pipeline_of(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -
         raise InvalidValue(f"{log.path}: its mask does not fit its calibration: {error}") from None
 
 
-# --- What the pictures show ------------------------------------------------------------------
+# --- What the pictures show -------------------------------------------
 
 
 def _seen(

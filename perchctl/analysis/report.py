@@ -138,7 +138,7 @@ class ReportedFlight:
         return found
 
 
-# --- the page ---------------------------------------------------------------------------
+# --- the page ---------------------------------------------------------
 
 POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
 """No script, nothing from elsewhere: the browser holds the page to it."""
@@ -150,8 +150,16 @@ def page_of(flights: Sequence[ReportedFlight], with_film: bool = False) -> str:
     articles = []
     for number, told in enumerate(flights, start=1):
         with log_values(told.flight.log.path):
-            articles.append(_render("flight.html", told=told, flight=told.flight, number=number,
-                                    is_session=len(flights) > 1, with_film=with_film))  # fmt: skip
+            articles.append(
+                _render(
+                    "flight.html",
+                    told=told,
+                    flight=told.flight,
+                    number=number,
+                    is_session=len(flights) > 1,
+                    with_film=with_film,
+                )
+            )
     return _render(
         "page.html",
         flights=flights,
@@ -213,7 +221,7 @@ def _address(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-# --- What the camera saw when the mission decided: out of the recording beside the log ---------
+# --- What the camera saw when the mission decided: out of the recording beside the log ---
 
 DECIDED = {"ESTIMATE": "found", "ASCEND": "aligned", "PERCH": "settled", "COMPLETE": "contact"}
 WIDEST_PX, JPEG_QUALITY = 480, 80

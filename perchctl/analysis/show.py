@@ -152,7 +152,7 @@ def hung(begin: str, text: str) -> list[str]:
     return lines or [begin.rstrip()]
 
 
-# --- Which logs a folder holds, the newest first, and how each ended ---------------------------
+# --- Which logs a folder holds, the newest first, and how each ended ---
 
 
 def newest_logs(folder: Path, most: int | None = None) -> list[Path]:

@@ -153,7 +153,7 @@ def _upper(sentence: str) -> str:
     return sentence[:1].upper() + sentence[1:]
 
 
-# --- Figures as people read them ---------------------------------------------------------------
+# --- Figures as people read them --------------------------------------
 
 
 def length(metres: float) -> str:

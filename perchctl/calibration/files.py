@@ -180,7 +180,7 @@ def _checked(size: Any, K: NDArray[Any], dist: NDArray[Any], model: str) -> Came
     return CameraModel((width, height), K, dist, "fisheye" if model == "equidistant" else model)
 
 
-# --- Writing ---------------------------------------------------------------------------------
+# --- Writing ----------------------------------------------------------
 # ROS wants camera_info keys; FileStorage wants ``dt: d`` in each matrix and a first line
 # ``%YAML 1.0``; PyYAML refuses ``%YAML:1.0`` and OpenCV's tags, and reads ``1e-05`` as a string.
 

@@ -176,7 +176,7 @@ def _header_of(data: bytes, came_s: float) -> _Picture | None:
     return None
 
 
-# --- A colour camera's mosaic in what is delivered as a grey picture ------------------------------
+# --- A colour camera's mosaic in what is delivered as a grey picture ---
 # The sensor's pixels look through colour filters, two by two, and a raw picture, or a JPEG that
 # was made of one as if it were grey, has their pattern all over it. Corners measured on it are
 # off by up to 6 times as much, and a fifth of the far markers is not found (`benchmarks/aideck.py

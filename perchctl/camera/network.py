@@ -83,7 +83,7 @@ def _reason(error: Exception) -> str:
     return one_line(error)
 
 
-# --- Motion-JPEG over HTTP ----------------------------------------------------------------------
+# --- Motion-JPEG over HTTP --------------------------------------------
 
 
 READ_BYTES = 65536

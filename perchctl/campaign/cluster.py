@@ -45,7 +45,7 @@ several package names and is compared apart."""
 _SHORT = 8
 
 
-# --- What each worker must have ----------------------------------------------------------------
+# --- What each worker must have ---------------------------------------
 
 
 State = dict[str, str]
@@ -110,7 +110,7 @@ def fly_verified(order: bytes, required: WorkerRequirements) -> Any:
     return fn(*args, **named)
 
 
-# --- The executor ------------------------------------------------------------------------------
+# --- The executor -----------------------------------------------------
 
 
 class ClusterExecutor(Executor):

@@ -77,7 +77,7 @@ def whole_seeds(results: Iterable[VariantResult], profiles: int) -> list[tuple[F
     ]
 
 
-# --- What is compared --------------------------------------------------------------------------
+# --- What is compared -------------------------------------------------
 
 
 Pair = tuple[FlightResult, FlightResult]
@@ -207,7 +207,7 @@ def _verdict(better: str | None, by: str = "") -> str:
     return NOT_PROVEN if better is None else f"{better} is better{by}"
 
 
-# --- A key of a profile at several values ------------------------------------------------------
+# --- A key of a profile at several values -----------------------------
 
 
 @dataclass(frozen=True)

@@ -188,7 +188,7 @@ def _rows(figures: Mapping[str, Any], results: Sequence[FlightResult]) -> list[t
     return rows
 
 
-# --- Rates as what is known of them: k of n, and the interval that the true rate is in ---------
+# --- Rates as what is known of them: k of n, and the interval that the true rate is in ---
 
 
 LEVEL = 0.95

@@ -116,7 +116,7 @@ OF_THE_COMPUTER = ("cpu_s", "peak_memory_mb", "log", "log_problem")
 """The fields that differ between computers, or from hour to hour."""
 
 
-# --- The header --------------------------------------------------------------------------------
+# --- The header -------------------------------------------------------
 
 
 SOURCE = Path(perchctl.__file__).resolve().parent
@@ -160,7 +160,7 @@ def source_sha256(root: Path = SOURCE) -> str:
     return whole.hexdigest()
 
 
-# --- Lines -------------------------------------------------------------------------------------
+# --- Lines ------------------------------------------------------------
 
 
 def _write(file: BinaryIO, record: dict[str, Any]) -> None:

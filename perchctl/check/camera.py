@@ -104,7 +104,7 @@ def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) ->
     return rows
 
 
-# --- The pictures -------------------------------------------------------------------------------
+# --- The pictures -----------------------------------------------------
 
 
 def _rate(rehearsal: Rehearsal, profile: Profile) -> Finding:
@@ -241,7 +241,7 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
 }
 
 
-# --- Where the target is the positioning system -------------------------------------------------
+# --- Where the target is the positioning system -----------------------
 
 
 def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
@@ -262,9 +262,14 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
     if problem is not None:
         return failed(problem.found, problem.advice)
     sight = view_from(
-        np.array(feet), 0.0, place.position_m, place.yaw_rad,
-        profile.target, camera, profile.camera.mount,
-    )  # fmt: skip
+        np.array(feet),
+        0.0,
+        place.position_m,
+        place.yaw_rad,
+        profile.target,
+        camera,
+        profile.camera.mount,
+    )
     found += (
         f", {math.hypot(*sight.aside_m):.2f} m aside of the camera's axis "
         f"{sight.height_m:.2f} m above it"
@@ -290,7 +295,7 @@ def names_of(profile: Profile) -> tuple[str, ...]:
     return (*PICTURES, *([IN_VIEW] if profile.positioning.by == "target" else ()))
 
 
-# --- The computer that looks at the pictures ----------------------------------------------------
+# --- The computer that looks at the pictures --------------------------
 
 
 def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:

@@ -107,7 +107,7 @@ def listen(
     return Listened(tuple(telemetry), tuple(frames), source.problem(clock()))
 
 
-# --- At rest ------------------------------------------------------------------------------------
+# --- At rest ----------------------------------------------------------
 
 
 def refused_rows(why: str, config: PositioningConfig) -> list[Row]:
@@ -193,7 +193,7 @@ CAPTURE: dict[str, Callable[[Listened, list[Placed], Profile], Finding]] = {
 """The rows of a body that is seen, in their order."""
 
 
-# --- In a hand ----------------------------------------------------------------------------------
+# --- In a hand --------------------------------------------------------
 
 HOW_TO_TURN = (
     "lift it straight up by 30 cm, turn it by 90 deg, tilt it forward and aside, put it back"
@@ -406,7 +406,7 @@ def _body_finding(turns: Turns, moved: Moved, config: PositioningConfig) -> Find
     return passed(f"{found}; rose by {risen_m:.2f} m")
 
 
-# --- What the hand found, written down for `fly` ------------------------------------------------
+# --- What the hand found, written down for `fly` ----------------------
 
 COMPARED = "compared"
 

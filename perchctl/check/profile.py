@@ -182,7 +182,7 @@ def _way(plan: _Plan) -> Finding:
     return passed(found)
 
 
-# --- Where the target is the positioning system -------------------------------------------------
+# --- Where the target is the positioning system -----------------------
 
 
 def _latency(plan: _Plan) -> Finding:
@@ -198,7 +198,7 @@ def _latency(plan: _Plan) -> Finding:
     )
 
 
-# --- The computer's disk ------------------------------------------------------------------------
+# --- The computer's disk ----------------------------------------------
 
 
 def log_finding(folder: Path) -> Finding:

@@ -205,9 +205,13 @@ class VehicleSession:
             return capture.paired(so_far.telemetry, so_far.places(config))
 
         seen = capture.listen(
-            self.probe.telemetry, room, time.monotonic, time.sleep, within_s,
+            self.probe.telemetry,
+            room,
+            time.monotonic,
+            time.sleep,
+            within_s,
             lambda so_far: capture.is_enough(moved(so_far)),
-        )  # fmt: skip
+        )
         return capture.hand_finding(moved(seen), config)
 
 

@@ -126,7 +126,7 @@ def moved_m(samples: Sequence[Telemetry]) -> float:
     return math.dist(*ends)
 
 
-# --- Its rows -----------------------------------------------------------------------------------
+# --- Its rows ---------------------------------------------------------
 
 
 def _packets(vehicle: Vehicle, profile: Profile) -> Finding:
@@ -288,7 +288,7 @@ VEHICLE: dict[str, Callable[[Vehicle, Profile], Finding]] = {
 """The rows of a vehicle that answers, in their order."""
 
 
-# --- Lifted by hand and put back, motors off -----------------------------------------------------
+# --- Lifted by hand and put back, motors off --------------------------
 
 LIFTED = "lifted"
 LIFT_S = 20.0
@@ -335,7 +335,7 @@ def lift_finding(seen: Sequence[Telemetry]) -> Finding:
     return passed(found)
 
 
-# --- Which vehicles answer ----------------------------------------------------------------------
+# --- Which vehicles answer --------------------------------------------
 
 
 def answering_rows(uris: Sequence[str], radio_problem: str) -> list[Row]:

@@ -245,7 +245,7 @@ def convert(
     print_result({"file": str(file)} if as_json else file)
 
 
-# -- files --------------------------------------------------------------------
+# -- files -------------------------------------------------------------
 
 
 def _file(output: Path | None, size_px: tuple[int, int]) -> Path:
@@ -261,7 +261,7 @@ def _now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
-# -- the source ---------------------------------------------------------------
+# -- the source --------------------------------------------------------
 
 
 def _source(text: str, view: bool = False) -> str:
@@ -288,7 +288,7 @@ def _size(text: str | None, source: str) -> tuple[int, int] | None:
     return int(found[1]), int(found[2])
 
 
-# -- the board and its views ----------------------------------------------------
+# -- the board and its views -------------------------------------------
 
 
 def _find_views(

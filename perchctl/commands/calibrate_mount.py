@@ -157,7 +157,7 @@ def mount(
     return code
 
 
-# -- what is refused at once ----------------------------------------------------
+# -- what is refused at once -------------------------------------------
 
 
 def _live_sources(
@@ -192,7 +192,7 @@ def _free_place(name: str) -> Path:
     return place
 
 
-# -- recordings of files ----------------------------------------------------------
+# -- recordings of files -----------------------------------------------
 
 
 def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecording]:
@@ -221,7 +221,7 @@ def _check_seen_by(recordings: Sequence[MountingRecording], now: str) -> None:
             )
 
 
-# -- a live recording -------------------------------------------------------------
+# -- a live recording --------------------------------------------------
 
 
 def _record_live(

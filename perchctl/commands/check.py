@@ -165,7 +165,7 @@ def _wrapped(text: str, first: str, others: str) -> list[str]:
     )
 
 
-# --- `perchctl check --cameras`: what this computer's cameras are called -------------------
+# --- `perchctl check --cameras`: what this computer's cameras are called ---
 
 
 def camera_rows() -> Iterator[Row]:

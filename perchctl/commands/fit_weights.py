@@ -105,7 +105,7 @@ def fit(
     return code
 
 
-# --- collect -----------------------------------------------------------------------------------
+# --- collect ----------------------------------------------------------
 
 
 @command(
@@ -193,9 +193,17 @@ def _collect_with_person(
         )
     with closing(open_camera(spec, now, profile.camera, size_px=camera.size_px)) as frame_source:
         experiment = Experiment(
-            _open_session(path, frames), frame_source, profile, camera, poses,
-            ask=_ask, say=say, bar=count_bar, now=now, wait=time.sleep,
-        )  # fmt: skip
+            _open_session(path, frames),
+            frame_source,
+            profile,
+            camera,
+            poses,
+            ask=_ask,
+            say=say,
+            bar=count_bar,
+            now=now,
+            wait=time.sleep,
+        )
         experiment.run(positions, frames)
 
 

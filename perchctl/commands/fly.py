@@ -188,9 +188,13 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
     the live page; with `asks` somebody at the terminal has to say yes before it arms."""
     simulated_seed = options.seed if options.simulated else None
     log = LogWatcher.real_time(
-        options.log_dir, options.profile, options.uri, options.source, simulated_seed,
+        options.log_dir,
+        options.profile,
+        options.uri,
+        options.source,
+        simulated_seed,
         options.record,
-    )  # fmt: skip
+    )
     panel = open_panel(stream=sys.stderr)
     say(f"connecting to {options.uri}")
     switch, page = OperatorSwitch(), None

@@ -288,7 +288,7 @@ def _changed_values(new: TargetConfig, old: TargetConfig) -> dict[str, float | i
     return values
 
 
-# --- What several of them do -------------------------------------------------------------------
+# --- What several of them do ------------------------------------------
 
 
 Marker = tuple[str | None, int | None, str | None]

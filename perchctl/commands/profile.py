@@ -81,7 +81,7 @@ def _say_doubts(profile: Profile) -> None:
             say(f"{row.name}: {row.found}; {row.advice}")
 
 
-# --- A new profile ------------------------------------------------------------------------------
+# --- A new profile ----------------------------------------------------
 
 EXAMPLE = "example_640x480.yaml"
 SIMULATED = "sim://"
@@ -336,7 +336,7 @@ def schema() -> None:
     print(json.dumps(editor_schema(), indent=2))
 
 
-# --- How a camera is turned, in words: which edge of its picture is the vehicle's front --------
+# --- How a camera is turned, in words: which edge of its picture is the vehicle's front ---
 # People see the picture and the vehicle, and no axes: a hand over the vehicle's front comes into
 # the picture at one edge, over its left side at another. The two tell the camera's turn about
 # its view, and whether the picture is mirrored (docs/conventions.md, "Camera mount").

@@ -173,14 +173,25 @@ def run(
     with (
         signals_to(stop_once()),
         campaigns.campaign_results(
-            flown, seeds, campaign.kind,
-            faults=names, out=out, resume=resume, force=force, log_dir=log_dir,
+            flown,
+            seeds,
+            campaign.kind,
+            faults=names,
+            out=out,
+            resume=resume,
+            force=force,
+            log_dir=log_dir,
         ) as kept,
-    ):  # fmt: skip
+    ):
         return fly_each(
             lambda executor, note: campaigns.fly_all(campaign.fly, kept.left, executor, note),
-            report, len(seeds), executor, kept.earlier, kept.note, campaign.objection,
-        )  # fmt: skip
+            report,
+            len(seeds),
+            executor,
+            kept.earlier,
+            kept.note,
+            campaign.objection,
+        )
 
 
 @dataclass(frozen=True)
@@ -298,7 +309,7 @@ def _seeds(flights: int | None, first: int | None) -> list[int]:
     return list(range(first or 0, (first or 0) + (flights or 10)))
 
 
-# --- Who flies, and how it may end -------------------------------------------------------------
+# --- Who flies, and how it may end ------------------------------------
 
 
 ExecutorOf = Callable[[int], AbstractContextManager[Executor]]
@@ -402,7 +413,7 @@ def stop_once(
     return press
 
 
-# --- What is printed ---------------------------------------------------------------------------
+# --- What is printed --------------------------------------------------
 
 
 def with_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[str, Any]:

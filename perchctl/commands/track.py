@@ -208,7 +208,7 @@ def frames(source: FrameSource, now: Callable[[], float], stop: Stopper) -> Iter
         stop.requested.wait(POLL_S)
 
 
-# --- Results -----------------------------------------------------------------------------------
+# --- Results ----------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,7 +327,7 @@ def _rotation(rvec: Array) -> Array:
     return np.asarray(cv2.Rodrigues(rvec)[0], dtype=np.float64)
 
 
-# --- What is printed ---------------------------------------------------------------------------
+# --- What is printed --------------------------------------------------
 
 
 def track_record(tracked: Tracked) -> dict[str, Any]:

@@ -220,7 +220,7 @@ def live_page(
             report(f"the live page failed: {page.problem}")
 
 
-# --- HTTP of the live page: on loopback only, and only under loopback's names ------------------
+# --- HTTP of the live page: on loopback only, and only under loopback's names ---
 # A site in the same browser can send requests to 127.0.0.1 too. So the Host header must
 # name this machine (a rebound DNS name does not), STOP needs the token of the printed
 # address, in a header that a foreign site may not send, and nothing allows its reading.
@@ -352,7 +352,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Referrer-Policy", "no-referrer")
 
 
-# --- The picture with what was found in it: outlines and the target's axes ---------------------
+# --- The picture with what was found in it: outlines and the target's axes ---
 
 
 # Blue, green, red.

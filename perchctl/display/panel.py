@@ -93,7 +93,7 @@ def timed_event_text(event: Event, start_s: float) -> str:
     return f"[{event.t_s - start_s:7.2f} s] {event_text(event)}"
 
 
-# --- The live display: a panel on a terminal, one plain line an event elsewhere ----------------
+# --- The live display: a panel on a terminal, one plain line an event elsewhere ---
 # The flight loop only leaves its newest tick and its events here; a thread of
 # the display's own draws them. So neither an exception nor a terminal that stands
 # still (Ctrl-S, a stalled ssh) reaches the loop.

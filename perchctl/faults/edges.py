@@ -20,7 +20,7 @@ from perchctl.link import MockLink, Packet, Port, Radio
 from perchctl.sim import SimulatedVehicle
 from perchctl.vision import Frame
 
-# --- The radio: what arrives, what does not, and what comes late -------------------------------
+# --- The radio: what arrives, what does not, and what comes late ------
 
 
 ORDERS = ("setpoint", "raw", "land", "notify", "stop", "emergency-stop")
@@ -93,7 +93,7 @@ class FaultyRadio(Radio):
         return None if math.isinf(delay_s) else delay_s
 
 
-# --- The camera --------------------------------------------------------------------------------
+# --- The camera -------------------------------------------------------
 
 
 SNOW_STREAM = 512
@@ -216,7 +216,7 @@ class FaultyCamera:
         return frame
 
 
-# --- The program: simulated time passes while its loop does not run ----------------------------
+# --- The program: simulated time passes while its loop does not run ---
 
 
 LONGEST_S = 60.0
@@ -291,7 +291,7 @@ class FaultyClock:
         raise PlantedError("an exception that the fault raised")
 
 
-# --- All of them -------------------------------------------------------------------------------
+# --- All of them ------------------------------------------------------
 
 
 class Edges:

@@ -38,7 +38,7 @@ CAPTURE_FAULTS = {
 }
 
 
-# --- The radio ---------------------------------------------------------------------------------
+# --- The radio --------------------------------------------------------
 
 
 def radio_loss(
@@ -72,7 +72,7 @@ def reboots(edges: Edges, t_s: float, boots_s: float) -> None:
     edges.radio.lose(t_s + (boots_s + MockLink.BLOCKS_BACK_AFTER_S), up=False, down="all")
 
 
-# --- The camera and the positions --------------------------------------------------------------
+# --- The camera and the positions -------------------------------------
 
 
 def camera_fault(edges: Edges, t_s: float, kind: str, for_s: float, late_s: float = 0.0) -> None:
@@ -95,7 +95,7 @@ def deck_silent(edges: Edges, t_s: float, for_s: float, acc_z_mps2: float) -> No
     edges.set_until(t_s + for_s, edges, "deck_silent", True, False)
 
 
-# --- The vehicle -------------------------------------------------------------------------------
+# --- The vehicle ------------------------------------------------------
 
 
 def estimate_error(
@@ -179,7 +179,7 @@ def target_moves(edges: Edges, t_s: float, by_m: tuple[float, float]) -> None:
     edges.vehicle.move_target((x + by_m[0], y + by_m[1]))
 
 
-# --- The operator and the program --------------------------------------------------------------
+# --- The operator and the program -------------------------------------
 
 
 def operator(edges: Edges, t_s: float, presses_s: tuple[float, ...], hang_up: bool = False) -> None:
@@ -218,7 +218,7 @@ def disk_full(edges: Edges, t_s: float, for_s: float) -> None:
     edges.set_until(t_s + for_s, edges.disk, "problem", "No space left on device", None)
 
 
-# --- What holds from the start -----------------------------------------------------------------
+# --- What holds from the start ----------------------------------------
 
 
 def magnet_holds(scenario: Scenario, of_weight: float) -> Scenario:
@@ -267,7 +267,7 @@ def sooner_s(effect: Effect) -> float:
     return float(effect.keywords["late_s"]) if sooner else 0.0
 
 
-# --- When they begin ---------------------------------------------------------------------------
+# --- When they begin --------------------------------------------------
 
 
 class Injector:

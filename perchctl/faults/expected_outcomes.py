@@ -78,48 +78,81 @@ def _sagged_too_fast(facts: Facts) -> float | None:
 
 
 CUT = ExpectedOutcome(
-    "cut by the firmware", lambda facts: facts.cut_s, 4.0, CUT_DOWN,
+    "cut by the firmware",
+    lambda facts: facts.cut_s,
+    4.0,
+    CUT_DOWN,
     "2 s after the last setpoint the firmware cuts the motors and locks; nothing that the "
     "program sends arrives any more",
-)  # fmt: skip
+)
 LEFT_LANDING = ExpectedOutcome(
-    "lands alone", _killed_in_landing, 20.0, ("flies_on",),
+    "lands alone",
+    _killed_in_landing,
+    20.0,
+    ("flies_on",),
     "the vehicle flies its own landing to the end without the program: it comes down, softly",
-)  # fmt: skip
+)
 OPERATOR_STOPS = ExpectedOutcome(
-    "the operator's word", lambda facts: facts.stop_s, 4.0, CUT_DOWN,
+    "the operator's word",
+    lambda facts: facts.stop_s,
+    4.0,
+    CUT_DOWN,
     "a second Ctrl-C is an emergency stop: it cuts the motors and locks",
-)  # fmt: skip
+)
 LETS_GO_LATER = ExpectedOutcome(
-    "let go after the flight", lambda facts: facts.let_go_s if facts.watched else None, 4.0, FALL,
+    "let go after the flight",
+    lambda facts: facts.let_go_s if facts.watched else None,
+    4.0,
+    FALL,
     "the whole weight has hung for the time it is watched; the program is no longer there "
     "when the magnet lets go",
-)  # fmt: skip
+)
 TOO_LOW = ExpectedOutcome(
     "too low to catch",
-    lambda facts: facts.slipped_s if facts.slipped_m < CATCHABLE_M else None, 4.0, FALL,
+    lambda facts: facts.slipped_s if facts.slipped_m < CATCHABLE_M else None,
+    4.0,
+    FALL,
     "a fall from standing motors takes up to 0.8 m to catch; it hung lower than 1 m",
-)  # fmt: skip
+)
 KNOCKED_OFF = ExpectedOutcome(
-    "knocked off the magnet", _knocked_off, 4.0, FALL,
+    "knocked off the magnet",
+    _knocked_off,
+    4.0,
+    FALL,
     "a blow has torn it off while its motors stood still, and turned it over before they turned",
-)  # fmt: skip
+)
 NO_LIFT = ExpectedOutcome(
-    "too weak to hover", lambda facts: facts.weak_s, 15.0, FALL,
+    "too weak to hover",
+    lambda facts: facts.weak_s,
+    15.0,
+    FALL,
     "what battery and motors can lift is less than the weight: four times what the weak motor "
     "gives, for with more of the others it turns over",
-)  # fmt: skip
+)
 SAGS_TOO_FAST = ExpectedOutcome(
-    "sags too fast", _sagged_too_fast, 15.0, FALL,
+    "sags too fast",
+    _sagged_too_fast,
+    15.0,
+    FALL,
     "from the voltage at which it lands to the one that does not lift the weight any more it "
     "has less time than the way down takes",
-)  # fmt: skip
+)
 BROWN_OUT = ExpectedOutcome(
-    "started again", lambda facts: facts.rebooted_s, 4.0, (*FALL, "strayed"),
+    "started again",
+    lambda facts: facts.rebooted_s,
+    4.0,
+    (*FALL, "strayed"),
     "a vehicle that starts again in the air stops its motors; nothing that the program sends can "
     "be flown",
-)  # fmt: skip
+)
 EXPECTED_OUTCOMES = (
-    BROWN_OUT, CUT, LEFT_LANDING, OPERATOR_STOPS, LETS_GO_LATER, TOO_LOW, KNOCKED_OFF, NO_LIFT,
+    BROWN_OUT,
+    CUT,
+    LEFT_LANDING,
+    OPERATOR_STOPS,
+    LETS_GO_LATER,
+    TOO_LOW,
+    KNOCKED_OFF,
+    NO_LIFT,
     SAGS_TOO_FAST,
-)  # fmt: skip
+)

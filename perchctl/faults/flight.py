@@ -99,10 +99,16 @@ class FaultyFlight:
         pipeline = make_pipeline(profile, camera)
         seen = source if log is None else log.watched(source)
         self._parts = FlightParts(
-            self._link, seen, clock, profile, pipeline, watchers, self._switch.read,
+            self._link,
+            seen,
+            clock,
+            profile,
+            pipeline,
+            watchers,
+            self._switch.read,
             positions=feed_lockstep(self._link, profile),
             remarks=tuple if log is None else log.remarks,
-        )  # fmt: skip
+        )
         safety, radius_m = profile.safety, profile.planner.perch.contact_xy_m
         self._oracle = Oracle(safety.max_height_m, safety.max_tilt_deg, radius_m)
         self._place_bound = PlaceBound(scenario, profile)

@@ -18,15 +18,31 @@ from typing import Literal, NamedTuple, get_args
 from perchctl.mission import Event, Finding, FlightReport, Outcome, Phase
 
 Claim = Literal[
-    "hangs on the target", "held off the target", "hangs", "stands", "hangs or stands",
-    "motors off", "locked", "ended by the supervisor", "tilted", "not seen down",
-]  # fmt: skip
+    "hangs on the target",
+    "held off the target",
+    "hangs",
+    "stands",
+    "hangs or stands",
+    "motors off",
+    "locked",
+    "ended by the supervisor",
+    "tilted",
+    "not seen down",
+]
 """A claim of hanging or standing includes that the motors are off. `not seen down` claims that
 no telemetry has shown the vehicle at rest with its motors off."""
 Flag = Literal[
-    "crashed", "fell", "slid", "flies_on", "endless", "stop_not_obeyed", "pressed", "strayed",
-    "lied", "locked_needlessly",
-]  # fmt: skip
+    "crashed",
+    "fell",
+    "slid",
+    "flies_on",
+    "endless",
+    "stop_not_obeyed",
+    "pressed",
+    "strayed",
+    "lied",
+    "locked_needlessly",
+]
 FLAGS: tuple[Flag, ...] = get_args(Flag)
 
 LOW_M = 0.1
@@ -353,7 +369,7 @@ def _airborne(s: Sample) -> bool:
     return not s.floor and s.height_m > LOW_M
 
 
-# --- What the program says at its end, as claims that are true or false of a vehicle -----------
+# --- What the program says at its end, as claims that are true or false of a vehicle ---
 # A flight ends by a row of the mission's table, in a phase, with an outcome; each of the three
 # becomes a sentence or an exit code that somebody acts on.
 

@@ -60,7 +60,7 @@ class FaultResult(CampaignFlight):
         return len(self.counted) < len(self.flags)
 
 
-# --- A campaign's figures ----------------------------------------------------------------------
+# --- A campaign's figures ---------------------------------------------
 
 
 ENDS: tuple[End, ...] = get_args(End)

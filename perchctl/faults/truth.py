@@ -90,7 +90,7 @@ def sample_of(vehicle: SimulatedVehicle) -> Sample:
     )
 
 
-# --- The facts ---------------------------------------------------------------------------------
+# --- The facts --------------------------------------------------------
 
 
 LEAST_LIFT = 1.02
@@ -221,7 +221,7 @@ class FactsRecorder:
             self.facts.low_s, self.facts.low_m = s.t_s, s.height_m
 
 
-# --- What a flight is held to ------------------------------------------------------------------
+# --- What a flight is held to -----------------------------------------
 # Where it should be in each phase, and by when it should be on its way down. Neither goes by the
 # program's estimate: that may be what is wrong.
 

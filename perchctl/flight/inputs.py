@@ -55,10 +55,21 @@ class FlightInputs:
     """Takes in telemetry and at most one frame a tick, and observes what follows from them."""
 
     SENSED: ClassVar = (
-        "telemetry", "target", "new_frame", "camera_age_s", "camera_problem", "battery_age_s",
-        "jumped", "turned_rad", "disagreeing_frames", "delay_s", "target_refused", "imu",
-        "felt", "mismatch",
-    )  # fmt: skip
+        "telemetry",
+        "target",
+        "new_frame",
+        "camera_age_s",
+        "camera_problem",
+        "battery_age_s",
+        "jumped",
+        "turned_rad",
+        "disagreeing_frames",
+        "delay_s",
+        "target_refused",
+        "imu",
+        "felt",
+        "mismatch",
+    )
     """The fields of an `Observation` that come from here; the others are the loop's."""
     ENDED_TEXT: ClassVar = " has ended"
     """Follows the source's description in the camera's problem of a recording that is over."""
@@ -104,9 +115,13 @@ class FlightInputs:
         frame = self.source.poll(now_s)
         problem = self.source.problem(now_s)
         self.taken = TurnInputs(
-            tuple(samples), frame=_seen(frame), problem=problem, ended=self.source.finished,
-            live=self.source.live, look=look,
-        )  # fmt: skip
+            tuple(samples),
+            frame=_seen(frame),
+            problem=problem,
+            ended=self.source.finished,
+            live=self.source.live,
+            look=look,
+        )
         used_s = perception.calibration.used_s
         if frame is not None and used_s:
             frame = replace(frame, t_s=frame.t_s - used_s)
@@ -219,7 +234,7 @@ def _seen(frame: Frame | None) -> FrameSeen | None:
     return FrameSeen(frame.index, frame.t_s, frame.t_arrival_s, frame.fields, frame.repeated)
 
 
-# --- The target as positioning system, tick by tick ----------------------------------------------
+# --- The target as positioning system, tick by tick -------------------
 # Standing, pressed or hanging, the place is known better than by any picture, and is sent instead;
 # only while the accelerometer shows that something carries the vehicle, up to the first sample that
 # does not: what falls while it gets the position of a hanging vehicle would look as if it hung.
@@ -283,7 +298,7 @@ def is_supported(history: History, now_s: float) -> bool:
     )
 
 
-# --- Each turn of the loop as a value, for the log; and how long its parts took ----------------
+# --- Each turn of the loop as a value, for the log; and how long its parts took ---
 
 
 @runtime_checkable
@@ -331,9 +346,14 @@ class Turns:
     def waiting(self, inputs: FlightInputs, now_s: float, outside: FeedStatus | None) -> None:
         """Report a turn before take-off."""
         turn = Turn(
-            self._counted(), "waiting", now_s, now_s, inputs.taken, inputs.poses,
+            self._counted(),
+            "waiting",
+            now_s,
+            now_s,
+            inputs.taken,
+            inputs.poses,
             outside=external_positions(outside),
-        )  # fmt: skip
+        )
         self._report(turn)
 
     def observed(self, obs: Observation) -> None:
@@ -364,9 +384,15 @@ class Turns:
         elif isinstance(error, Exception):  # else the planner was only interrupted
             self._open = None
             turn = Turn(
-                self._counted(), "failed", self._began_s, obs.t_s, inputs.taken, inputs.poses,
-                observation=obs, error=type(error).__name__,
-            )  # fmt: skip
+                self._counted(),
+                "failed",
+                self._began_s,
+                obs.t_s,
+                inputs.taken,
+                inputs.poses,
+                observation=obs,
+                error=type(error).__name__,
+            )
             self._report(turn)
 
     def flown(

@@ -170,9 +170,13 @@ def fly_lockstep(
     if isinstance(log, (Path, str)):
         watcher = LogWatcher.lockstep(Path(log), profile, scenario.seed)
         flight = fly_lockstep(
-            profile, log=watcher, scenario=scenario, capture=capture, operator_at=operator_at,
+            profile,
+            log=watcher,
+            scenario=scenario,
+            capture=capture,
+            operator_at=operator_at,
             watchers=watchers,
-        )  # fmt: skip
+        )
         flight.conclude(watcher)
         return flight
     camera = profile_camera(profile.camera)
@@ -191,10 +195,17 @@ def fly_lockstep(
     explain = EventExplainer(scenario)
     pipeline = _pipeline_of(profile, camera)
     parts = FlightParts(
-        link, source, LockstepClock(link), profile, pipeline, (*watchers, operator), operator.read,
+        link,
+        source,
+        LockstepClock(link),
+        profile,
+        pipeline,
+        (*watchers, operator),
+        operator.read,
         lambda event: explain(event, event.t_s),  # the clock is the simulation's
-        positions, tuple if log is None else log.remarks,
-    )  # fmt: skip
+        positions,
+        tuple if log is None else log.remarks,
+    )
     link.connect()
     report = fly(parts)
     vehicle.watched = False
@@ -249,7 +260,7 @@ class _OperatorAt(Watcher):
         self._command = max(self._command, self._at.get(tick.state.phase, Operator.NONE))
 
 
-# --- External positions in lockstep: the simulated motion capture, by the same feed --------------
+# --- External positions in lockstep: the simulated motion capture, by the same feed ---
 
 
 def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:

@@ -88,9 +88,13 @@ def fly(parts: FlightParts) -> FlightReport:
     """
     turns = Turns(parts.clock, parts.watchers)
     inputs = FlightInputs(
-        parts.link, parts.source, parts.pipeline, parts.profile, send=parts.link.external,
+        parts.link,
+        parts.source,
+        parts.pipeline,
+        parts.profile,
+        send=parts.link.external,
         recorded=turns.are_watched,
-    )  # fmt: skip
+    )
     _wait_until_ready(parts, inputs, turns)  # nothing is started before it returns
     if inputs.history.newest is not None:
         inputs.ground_z_m = inputs.history.newest.position_m[2]
@@ -157,11 +161,16 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) ->
         refuse_strange(outside, newest, parts.profile, now_s, at_rest)
         turns.waiting(inputs, now_s, outside)
         waiting = still_waiting_for(
-            newest, inputs.frames > 0, inputs.camera_problem or inputs.perception.refused,
-            now_s - started_s, parts.profile,
-            inputs.target(now_s), 0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
-            outside, parts.pipeline.camera,
-        )  # fmt: skip
+            newest,
+            inputs.frames > 0,
+            inputs.camera_problem or inputs.perception.refused,
+            now_s - started_s,
+            parts.profile,
+            inputs.target(now_s),
+            0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
+            outside,
+            parts.pipeline.camera,
+        )
         if parts.source.finished:
             raise NotFound(
                 f"{parts.source.describe()} ended before take-off: a flight needs pictures that "
@@ -229,10 +238,20 @@ def _mission(
         turn = turns.flown(inputs, obs, state, command, outside)
         newest = inputs.perception.calibration.newest
         tick = Tick(
-            obs.t_s, obs.telemetry, inputs.output, obs.target, state, command, obs.loop_late_s,
-            obs.camera_age_s, obs.t_s - obs.telemetry.t_s + obs.telemetry.behind_s,
-            None if newest is logged else newest, obs.delay_s, turn.outside, turn,
-        )  # fmt: skip
+            obs.t_s,
+            obs.telemetry,
+            inputs.output,
+            obs.target,
+            state,
+            command,
+            obs.loop_late_s,
+            obs.camera_age_s,
+            obs.t_s - obs.telemetry.t_s + obs.telemetry.behind_s,
+            None if newest is logged else newest,
+            obs.delay_s,
+            turn.outside,
+            turn,
+        )
         logged = newest
         for watcher in parts.watchers:
             watcher.tick(tick)

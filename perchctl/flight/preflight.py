@@ -140,7 +140,7 @@ def _bounded(what: str, waited_s: float, limit_s: float) -> str:
     return what
 
 
-# --- Whether a target that is the positioning system stays in view on the way up. Pure -----------
+# --- Whether a target that is the positioning system stays in view on the way up. Pure ---
 # The way up is known: straight, then to `planner.approach_xy_m`. The higher the vehicle, the less
 # of the ceiling is in its picture; without the target it has no position.
 
@@ -180,9 +180,14 @@ def target_from(
 ) -> TargetView:
     """Return the target as seen from a level vehicle at a place in its world."""
     return view_from(
-        np.array(body_m), yaw_rad, target.position_m, target.yaw_rad,
-        profile.target, camera, profile.camera.mount,
-    )  # fmt: skip
+        np.array(body_m),
+        yaw_rad,
+        target.position_m,
+        target.yaw_rad,
+        profile.target,
+        camera,
+        profile.camera.mount,
+    )
 
 
 def _seen_leaning(

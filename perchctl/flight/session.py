@@ -130,9 +130,17 @@ def fly_session(
             positions = started_feed(stack, capture, link, positioning, clock, profile)
             switch.listening = True
             parts = FlightParts(
-                link, source, clock, profile, pipeline, watchers, switch.read,
-                explain, positions, remarks,
-            )  # fmt: skip
+                link,
+                source,
+                clock,
+                profile,
+                pipeline,
+                watchers,
+                switch.read,
+                explain,
+                positions,
+                remarks,
+            )
             with contextlib.ExitStack() as waiting:
                 if isinstance(clock, SimulatedClock):
                     waiting.enter_context(clock.waiting_for_loop())
@@ -183,7 +191,7 @@ def _simulated_clock(
     return clock, lambda event: explain(event, event.t_s - clock.zero_s)
 
 
-# --- External positions for one flight in real time: capture, feed, and the thread between -------
+# --- External positions for one flight in real time: capture, feed, and the thread between ---
 
 
 def _check_positioning(profile: Profile, *, simulated: bool) -> None:

@@ -220,7 +220,7 @@ def _held_place(last: LastTick, known: Telemetry | None) -> PositionSetpoint:
             return PositionSetpoint(x, y, z, sample.yaw_rad)
 
 
-# --- After an error: the last resort of every error path ---------------------------------------
+# --- After an error: the last resort of every error path --------------
 
 
 def rescue(

@@ -120,10 +120,13 @@ class CflibLink:
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
         Settling(
-            self.connection.cf, self._uri, self._positioning,
+            self.connection.cf,
+            self._uri,
+            self._positioning,
             feed or Standing(self.external, ground_z_m, self._clock),
-            lambda: self._blocks.newest, self._clock,
-        ).run()  # fmt: skip
+            lambda: self._blocks.newest,
+            self._clock,
+        ).run()
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
         self._guard, self._on_sent = guard, on_sent

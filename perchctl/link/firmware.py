@@ -96,7 +96,7 @@ def _read_back(parameters: Any, name: str) -> str | None:
         parameters.remove_update_callback(group, short, on_value)
 
 
-# --- What tells the vehicle where it is, and the value of a single variable ---------------------
+# --- What tells the vehicle where it is, and the value of a single variable ---
 
 
 ANSWER_S = 1.5

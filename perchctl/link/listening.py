@@ -58,17 +58,21 @@ class ListeningLink(CflibLink):
         self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
 
 
-# --- How a vehicle is moved by hand: attitude and turn rates of one moment, in one packet --------
+# --- How a vehicle is moved by hand: attitude and turn rates of one moment, in one packet ---
 
 
 PERIOD_S = 0.01
 MOTION_BLOCK = dict.fromkeys(
     (
-        "stateEstimate.roll", "stateEstimate.pitch", "stateEstimate.yaw",
-        "gyro.x", "gyro.y", "gyro.z",
+        "stateEstimate.roll",
+        "stateEstimate.pitch",
+        "stateEstimate.yaw",
+        "gyro.x",
+        "gyro.y",
+        "gyro.z",
     ),
     "float",
-) | {"supervisor.info": "uint16_t"}  # fmt: skip
+) | {"supervisor.info": "uint16_t"}
 """All 26 bytes that a log block holds."""
 MOST_SAMPLES = 20_000
 
@@ -132,7 +136,7 @@ class MotionLink(ListeningLink):
             )
 
 
-# --- What a vehicle holds, and how good the radio is ---------------------------------------------
+# --- What a vehicle holds, and how good the radio is ------------------
 
 
 ANSWER_S = 0.5
@@ -223,7 +227,7 @@ class ProbeLink(ListeningLink):
         self.quality = float(percent)
 
 
-# --- Which vehicles answer: channels, rates and addresses of the radio, USB, and UDP -----------
+# --- Which vehicles answer: channels, rates and addresses of the radio, USB, and UDP ---
 
 
 SCAN_TIMEOUT_S = 20.0

@@ -70,7 +70,7 @@ class Link(Protocol):
         """Leave the vehicle safe: closes only when it is not flying (bounded wait)."""
 
 
-# --- The forms of a vehicle's URI, and what to do without rights to the radio ------------------
+# --- The forms of a vehicle's URI, and what to do without rights to the radio ---
 
 
 USUAL_ADDRESS = "E7E7E7E7E7"

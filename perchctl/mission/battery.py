@@ -26,9 +26,20 @@ from perchctl.values import replace
 from perchctl.vehicle import FULL_THRUST, is_battery_reading
 
 CURVE: tuple[tuple[float, float], ...] = (
-    (0.0, 3.0), (0.02, 3.4), (0.05, 3.64), (0.1, 3.76), (0.2, 3.82), (0.3, 3.86), (0.4, 3.885),
-    (0.5, 3.915), (0.6, 3.955), (0.7, 3.995), (0.8, 4.04), (0.9, 4.1), (1.0, 4.2),
-)  # fmt: skip
+    (0.0, 3.0),
+    (0.02, 3.4),
+    (0.05, 3.64),
+    (0.1, 3.76),
+    (0.2, 3.82),
+    (0.3, 3.86),
+    (0.4, 3.885),
+    (0.5, 3.915),
+    (0.6, 3.955),
+    (0.7, 3.995),
+    (0.8, 4.04),
+    (0.9, 4.1),
+    (1.0, 4.2),
+)
 """Share of the charge, and the resting voltage: a little below the firmware's own table."""
 FULL_A = 4.4  # four motors at full thrust; proportional to the thrust below
 LOW_POWER_V = 3.2  # the firmware reports low power after 5 s, unless `pm.lowVoltage` differs
@@ -48,7 +59,7 @@ BACK_OFF_S = 3.0  # from a failed attempt until it is steady and sees the target
 _SHARES, _VOLTS = zip(*CURVE, strict=True)
 
 
-# --- The battery's state, fitted reading by reading ----------------------------------------------
+# --- The battery's state, fitted reading by reading -------------------
 
 
 def read_battery(c: Context) -> EnergyState:
@@ -153,7 +164,7 @@ def _towards(value: float, goal: float, part: float) -> float:
     return value + min(1.0, part) * (goal - value)
 
 
-# --- What that is enough for ---------------------------------------------------------------------
+# --- What that is enough for ------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -314,10 +314,16 @@ LASTING = frozenset({C.BATTERY_LOW, C.TILTED, C.UNSURE, C.SATURATED, C.CARRIED, 
 """The vehicle's own, whatever the phase, and however it is held."""
 PROOFS = frozenset(
     {
-        C.HANGING, C.CONTACT, C.MAGNET_HOLDS, C.WEIGHT_HANGS, C.DOWN, C.ON_FLOOR, C.CARRIED,
+        C.HANGING,
+        C.CONTACT,
+        C.MAGNET_HOLDS,
+        C.WEIGHT_HANGS,
+        C.DOWN,
+        C.ON_FLOOR,
+        C.CARRIED,
         C.SATURATED,
     }
-)  # fmt: skip
+)
 """What may stop the motors or end a flight: these count over fresh telemetry only."""
 BY_PLACE = frozenset({C.HANGING, C.CONTACT, C.ON_FLOOR})
 """Proofs that rest on the position: these count only while it is measured."""
@@ -355,7 +361,7 @@ def _void(c: Context) -> frozenset[Condition]:
     return void | {C.HANGING} if late else void - {C.HANGING}
 
 
-# --- What both the table and the way down ask ----------------------------------------------------
+# --- What both the table and the way down ask -------------------------
 
 
 def has_slipped(c: Context) -> bool:

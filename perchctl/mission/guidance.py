@@ -49,7 +49,7 @@ POSITION_GAIN_PER_S = 2.0  # the firmware's `posCtlPid.xKp` and `yKp`
 CAUGHT_MPS = -0.1  # by then the thrust is above the weight, and rises on
 
 
-# --- Setpoints -----------------------------------------------------------------------------------
+# --- Setpoints --------------------------------------------------------
 
 
 def hold_here(c: Context) -> PositionSetpoint:
@@ -170,7 +170,7 @@ def limited(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     )
 
 
-# --- The press, its release, and the catch of a slip ---------------------------------------------
+# --- The press, its release, and the catch of a slip ------------------
 
 
 def presses(c: Context) -> bool:

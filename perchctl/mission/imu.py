@@ -255,10 +255,15 @@ class ImuMotion:
 def _after_silence(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
     """The motion with the first sample, or with one that continues none."""
     motion = replace(
-        motion, steady_s=new.t_s, steady_mps=motion.velocity_mps[2], steady_aside_s=new.t_s,
-        steady_aside_mps=motion.velocity_mps[:2], sink_mps=0.0, blow_mps=0.0,
+        motion,
+        steady_s=new.t_s,
+        steady_mps=motion.velocity_mps[2],
+        steady_aside_s=new.t_s,
+        steady_aside_mps=motion.velocity_mps[:2],
+        sink_mps=0.0,
+        blow_mps=0.0,
         light_since_s=math.inf,
-    )  # fmt: skip
+    )
     if last is None:
         return replace(motion, sunk_m=0.0)
     sunk_m = min(0.0, motion.sunk_m + new.position_m[2] - last.position_m[2])
@@ -297,10 +302,11 @@ def _struck(motion: ImuMotion, new: Telemetry, last_moment: tuple[Blow, ...], mp
         if not follows:
             return begun
         return replace(
-            old, peak_g=max(old.peak_g, begun.peak_g),
+            old,
+            peak_g=max(old.peak_g, begun.peak_g),
             estimated_mps=min(old.estimated_mps, begun.estimated_mps),
             felt_mps=min(old.felt_mps, begun.felt_mps),
-        )  # fmt: skip
+        )
     return replace(old, peak_g=max(old.peak_g, new.acc_z_g)) if follows else old
 
 
@@ -406,9 +412,11 @@ def advance_reckoning(
             nearest_m = old.nearest_m - _most_climb_m(old, imu.t_s, flew=flew)
             near = nearest_m < REACH_M
             unknown = replace(
-                unknown, nearest_m=nearest_m, unsure_s=imu.t_s if near else old.unsure_s,
+                unknown,
+                nearest_m=nearest_m,
+                unsure_s=imu.t_s if near else old.unsure_s,
                 below_m=old.below_m if near or flew else math.inf,
-            )  # fmt: skip
+            )
         return unknown if old.imu is None else replace(unknown, aside_sigma_m=math.inf)
     dt_s = imu.t_s - old.imu.t_s
     if not dt_s > 0.0:

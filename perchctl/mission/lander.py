@@ -163,11 +163,16 @@ def begin_landing(c: Context) -> Context:
     if c.state.phase is Phase.LANDING:
         return c
     new = c.evolve(
-        phase=Phase.LANDING, entered_s=c.t_s, severity=max(c.state.severity, Severity.LAND),
+        phase=Phase.LANDING,
+        entered_s=c.t_s,
+        severity=max(c.state.severity, Severity.LAND),
         since=lasting_conditions(c.state.since),
-        entry_m=c.telemetry.position_m, entry_yaw_rad=c.telemetry.yaw_rad,
-        pressed=c.state.caught and presses(c), ordered_s=None, orders=0,
-    )  # fmt: skip
+        entry_m=c.telemetry.position_m,
+        entry_yaw_rad=c.telemetry.yaw_rad,
+        pressed=c.state.caught and presses(c),
+        ordered_s=None,
+        orders=0,
+    )
     return enter_landing(new, c.state)
 
 
@@ -193,13 +198,15 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
     blind = _has_lost_its_position(c)
     c = c.evolve(
         reach_s=old.t_s if within and old.reach_s is None else old.reach_s,
-        contact_z_m=contact_z_m, level_hover=hover, hover_thrust=hover,
+        contact_z_m=contact_z_m,
+        level_hover=hover,
+        hover_thrust=hover,
         level_within=HOVER_WITHIN if old.hover_thrust else UNLEARNED_WITHIN,
-    )  # fmt: skip
+    )
     return lose_position(c) if blind else c
 
 
-# --- What is known ------------------------------------------------------------------------------
+# --- What is known ----------------------------------------------------
 
 
 def evidence_of(c: Context) -> Evidence:
@@ -316,7 +323,7 @@ def hangs_stopped(c: Context) -> bool:
     return hangs_where_it_did(c)
 
 
-# --- What is remembered -------------------------------------------------------------------------
+# --- What is remembered -----------------------------------------------
 
 
 def observe(c: Context) -> Context:
@@ -427,9 +434,11 @@ def _reckon(c: Context) -> PlannerState:
     if near and held_s >= c.planner.perch.contact_dwell_s:
         # It is at the target; late pictures show it lower.
         new = replace(
-            new, below_m=min(0.0, new.below_m), nearest_m=min(0.0, new.nearest_m),
+            new,
+            below_m=min(0.0, new.below_m),
+            nearest_m=min(0.0, new.nearest_m),
             velocity_mps=(*new.velocity_mps[:2], 0.0),
-        )  # fmt: skip
+        )
     reach_s = state.reach_s
     if is_driven(c):  # what is released or stopped moves no more
         # After the floor was touched nothing climbs, whatever was reckoned since.
@@ -471,9 +480,13 @@ def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
     if state.phase is Phase.LANDING and state.orders and tel.thrust >= 1:
         # Its own landing goes on along a line in the old world: it dives, or climbs.
         state = replace(
-            state, entered_s=obs.t_s, orders=0, ordered_s=None, caught=False,
+            state,
+            entered_s=obs.t_s,
+            orders=0,
+            ordered_s=None,
+            caught=False,
             catch_above_m=CATCH_STILL_ABOVE_M,
-        )  # fmt: skip
+        )
     if setpoint is not None:
         z_m = z if contact_z_m is None else setpoint.z_m + moved_m[2]
         setpoint = PositionSetpoint(x, y, z_m, tel.yaw_rad)
@@ -501,7 +514,7 @@ def _hover_thrust(state: PlannerState, obs: Observation) -> float:
     return state.hover_thrust or obs.imu.hover_thrust or measured
 
 
-# --- What is commanded --------------------------------------------------------------------------
+# --- What is commanded ------------------------------------------------
 
 
 def act(c: Context) -> Acted:
@@ -558,12 +571,23 @@ def _caught_again(c: Context) -> Acted:
     """The landing, begun anew below: the vehicle is free of the magnet, and falls."""
     tel = c.telemetry
     state = replace(
-        c.state, released_s=None, stopped_s=None, contact_z_m=None, reach_s=None, caught=False,
-        pressed=False, catch_above_m=catch_above_m(c.state.hover_thrust, tel.thrust),
-        setpoint=None, ordered_s=None, orders=0, level_thrust=0.0,
-        entered_s=c.t_s, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
+        c.state,
+        released_s=None,
+        stopped_s=None,
+        contact_z_m=None,
+        reach_s=None,
+        caught=False,
+        pressed=False,
+        catch_above_m=catch_above_m(c.state.hover_thrust, tel.thrust),
+        setpoint=None,
+        ordered_s=None,
+        orders=0,
+        level_thrust=0.0,
+        entered_s=c.t_s,
+        entry_m=tel.position_m,
+        entry_yaw_rad=tel.yaw_rad,
         reckoning=replace(c.state.reckoning, below_m=math.inf),
-    )  # fmt: skip
+    )
     c = c.with_state(state)
     return _catch(c) or _descend(c)
 
@@ -706,10 +730,17 @@ def _level(c: Context) -> Acted:
     gained_mps = GRAVITY_MPS2 * (thrust / hover - 1.0) * dt_s
     under_way_mps = state.under_way_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
     state = replace(
-        left_level(c).state, hover_thrust=hover, level_thrust=thrust, touch_s=touch_s,
+        left_level(c).state,
+        hover_thrust=hover,
+        level_thrust=thrust,
+        touch_s=touch_s,
         level_hover=state.level_hover or state.hover_thrust,
-        under_way_mps=under_way_mps, level_sample_s=tel.t_s, setpoint=None, orders=0, caught=True,
-    )  # fmt: skip
+        under_way_mps=under_way_mps,
+        level_sample_s=tel.t_s,
+        setpoint=None,
+        orders=0,
+        caught=True,
+    )
     roll_rad, pitch_rad = (0.0, 0.0) if touch_s is not None else _braking(c)
     return state, RawThrust(int(thrust), roll_rad, pitch_rad)
 

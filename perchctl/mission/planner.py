@@ -155,13 +155,23 @@ def _enter(c: Context, row: Transition) -> Context:
     ends = row.to in (Phase.RECOVER, Phase.LANDING)
     pressed = ends and state.caught and (state.phase is Phase.PERCH or presses(c))
     new = c.evolve(
-        phase=row.to, entered_s=c.t_s, reason=row.explain(c), row=row.name,
-        severity=state.severity.then(row.severity), motor_stop=row.motor_stop,
-        outcome=_outcome(state, row), since=lasting_conditions(state.since),
-        attempts=state.attempts + int(row.counts_attempt), entry_m=c.telemetry.position_m,
-        entry_yaw_rad=c.telemetry.yaw_rad, search_step_s=c.t_s, confirmed=0, pressed=pressed,
-        ordered_s=None, orders=0,
-    )  # fmt: skip
+        phase=row.to,
+        entered_s=c.t_s,
+        reason=row.explain(c),
+        row=row.name,
+        severity=state.severity.then(row.severity),
+        motor_stop=row.motor_stop,
+        outcome=_outcome(state, row),
+        since=lasting_conditions(state.since),
+        attempts=state.attempts + int(row.counts_attempt),
+        entry_m=c.telemetry.position_m,
+        entry_yaw_rad=c.telemetry.yaw_rad,
+        search_step_s=c.t_s,
+        confirmed=0,
+        pressed=pressed,
+        ordered_s=None,
+        orders=0,
+    )
     return _started_phase(new, c)
 
 
@@ -229,7 +239,7 @@ def _touched(old: PlannerState, row: str, c: Context) -> ContactError | None:
     return None
 
 
-# --- What each phase sends -----------------------------------------------------------------------
+# --- What each phase sends --------------------------------------------
 
 
 def act(c: Context) -> Acted:

@@ -285,6 +285,11 @@ class PlannerState:
         """The state before take-off."""
         tel, t_s = obs.telemetry, obs.t_s
         return cls(
-            entered_s=t_s, started_s=t_s, t_s=t_s, search_step_s=t_s,
-            ground_m=tel.position_m, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
-        )  # fmt: skip
+            entered_s=t_s,
+            started_s=t_s,
+            t_s=t_s,
+            search_step_s=t_s,
+            ground_m=tel.position_m,
+            entry_m=tel.position_m,
+            entry_yaw_rad=tel.yaw_rad,
+        )

@@ -92,7 +92,7 @@ BLIND_VARIANCE_M2 = 0.02  # about 3 s after the last sight (docs/firmware.md, "T
 UNCORRECTED = "the estimate's variance only grows; is the positioning system gone?"
 
 
-# --- Whether the position, the pictures and their mounting can be relied on ----------------------
+# --- Whether the position, the pictures and their mounting can be relied on ---
 
 
 def is_astray(c: Context) -> bool:
@@ -202,7 +202,7 @@ def why_not_found(c: Context) -> str:
     return f"{text}: {why}" if why else text
 
 
-# --- Whether something holds or blocks the vehicle, or its thrust is too weak --------------------
+# --- Whether something holds or blocks the vehicle, or its thrust is too weak ---
 
 
 def is_caught(c: Context) -> bool:
@@ -253,7 +253,7 @@ def too_weak(c: Context) -> bool:
     return near and c.state.hover_thrust > SATURATED * press_thrust(c.profile)
 
 
-# --- Attempts, the press and the release ---------------------------------------------------------
+# --- Attempts, the press and the release ------------------------------
 
 
 def attempts_used(c: Context) -> bool:
@@ -303,7 +303,7 @@ def is_off_as(finding: Finding) -> Predicate:
     return lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is finding
 
 
-# --- Why the vehicle is held in place ------------------------------------------------------------
+# --- Why the vehicle is held in place ---------------------------------
 
 
 def hold_reason(c: Context) -> str:
@@ -331,16 +331,14 @@ def why_no_picture(c: Context) -> str:
     return c.obs.camera_problem or f"no picture for {c.obs.camera_age_s:.1f} s"
 
 
-# --- The three ways out of the mission ------------------------------------------------------------
+# --- The three ways out of the mission --------------------------------
 
 
 def stops(
     name: str, when: Predicate, reason: str, motor_stop: MotorStop, outcome: Outcome = O.SAFETY
 ) -> Transition:
     """The motors are stopped, wherever in the air it is."""
-    return Transition(
-        name, AIR, when, P.ABORTED, reason, S.STOP, outcome, motor_stop=motor_stop
-    )  # fmt: skip
+    return Transition(name, AIR, when, P.ABORTED, reason, S.STOP, outcome, motor_stop=motor_stop)
 
 
 def lands(
@@ -355,110 +353,151 @@ def backs_off(name: str, phases: Set[Phase], when: Predicate, reason: Reason) ->
     return Transition(name, phases, when, P.RECOVER, reason, S.BACK_OFF, counts_attempt=True)
 
 
-# --- The safety rows, gravest first --------------------------------------------------------------
+# --- The safety rows, gravest first -----------------------------------
 
 SAFETY: tuple[Transition, ...] = (
     stops(
-        "operator-stop", lambda c: c.obs.operator >= Operator.STOP, "second Ctrl-C: emergency stop",
-        MotorStop.EMERGENCY, O.EMERGENCY,
+        "operator-stop",
+        lambda c: c.obs.operator >= Operator.STOP,
+        "second Ctrl-C: emergency stop",
+        MotorStop.EMERGENCY,
+        O.EMERGENCY,
     ),
     Transition(
-        "hung-but-locked", {P.COMPLETE, P.LANDING},
-        lambda c: c.telemetry.has(LOCKED) and hangs_stopped(c), P.PERCHED,
+        "hung-but-locked",
+        {P.COMPLETE, P.LANDING},
+        lambda c: c.telemetry.has(LOCKED) and hangs_stopped(c),
+        P.PERCHED,
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
         outcome=O.PERCHED,
     ),
     stops(
-        "locked", lambda c: c.telemetry.has(LOCKED),
-        "the supervisor has locked the vehicle: inspect and restart it", MotorStop.PLAIN,
+        "locked",
+        lambda c: c.telemetry.has(LOCKED),
+        "the supervisor has locked the vehicle: inspect and restart it",
+        MotorStop.PLAIN,
     ),
     stops(
-        "tumbled", lambda c: c.telemetry.has(TUMBLED),
-        "the vehicle has tumbled: inspect and restart it", MotorStop.PLAIN,
+        "tumbled",
+        lambda c: c.telemetry.has(TUMBLED),
+        "the vehicle has tumbled: inspect and restart it",
+        MotorStop.PLAIN,
     ),
     stops(
-        "crashed", lambda c: c.telemetry.has(CRASHED),
-        "the supervisor reports a crash: inspect and restart the vehicle", MotorStop.PLAIN,
+        "crashed",
+        lambda c: c.telemetry.has(CRASHED),
+        "the supervisor reports a crash: inspect and restart the vehicle",
+        MotorStop.PLAIN,
     ),
     stops(
         "tilted",
         lambda c: c.held(C.TILTED) >= c.safety.tilt_debounce_s and c.state.stopped_s is None,
-        "tilted beyond the limit: motors cut", MotorStop.EMERGENCY,
+        "tilted beyond the limit: motors cut",
+        MotorStop.EMERGENCY,
     ),
     lands(
-        "operator-land", FLYING_PHASES, lambda c: c.obs.operator >= Operator.LAND,
-        "the operator asked to land", O.OPERATOR,
+        "operator-land",
+        FLYING_PHASES,
+        lambda c: c.obs.operator >= Operator.LAND,
+        "the operator asked to land",
+        O.OPERATOR,
     ),
     lands(
-        "link-lost", FLYING_PHASES, lambda c: c.obs.link_problem is not None,
+        "link-lost",
+        FLYING_PHASES,
+        lambda c: c.obs.link_problem is not None,
         lambda c: f"link lost: {c.obs.link_problem}",
     ),
     lands(
-        "telemetry-stale", FLYING_PHASES, lambda c: c.telemetry_age_s > c.safety.telemetry_land_s,
+        "telemetry-stale",
+        FLYING_PHASES,
+        lambda c: c.telemetry_age_s > c.safety.telemetry_land_s,
         lambda c: f"no telemetry for {c.telemetry_age_s:.1f} s",
     ),
     lands(
-        "heading-lost", BEFORE_CONTACT, lambda c: c.state.heading_lost,
+        "heading-lost",
+        BEFORE_CONTACT,
+        lambda c: c.state.heading_lost,
         "the estimated heading jumped: down level, by thrust alone",
     ),
     lands("position-astray", IN_THE_OPEN | {P.LANDING}, is_astray, why_astray),
     lands(
-        "position-lost", IN_THE_OPEN | {P.PERCH}, is_lost,
+        "position-lost",
+        IN_THE_OPEN | {P.PERCH},
+        is_lost,
         lambda c: f"{unplaced_text(c)}; down level, by thrust alone",
     ),
     lands(
-        "estimator-jump", BEFORE_CONTACT,
+        "estimator-jump",
+        BEFORE_CONTACT,
         lambda c: c.state.jump_s is not None and c.t_s - c.state.jump_s >= c.safety.jump_hold_s,
         "the state estimate jumped: landing where it is",
     ),
     lands(
-        "estimate-unsure", IN_THE_OPEN, lambda c: c.held(C.UNSURE) >= c.safety.variance_land_s,
-        lambda c: f"the position's variance is {c.variance_m2:.2g} m^2, at most "
-        f"{c.safety.flight_variance_m2:g} allowed: is the positioning system gone?",
+        "estimate-unsure",
+        IN_THE_OPEN,
+        lambda c: c.held(C.UNSURE) >= c.safety.variance_land_s,
+        lambda c: (
+            f"the position's variance is {c.variance_m2:.2g} m^2, at most "
+            f"{c.safety.flight_variance_m2:g} allowed: is the positioning system gone?"
+        ),
     ),
     lands(
-        "battery-low", BEFORE_CONTACT,
+        "battery-low",
+        BEFORE_CONTACT,
         lambda c: c.held(C.BATTERY_LOW) >= c.safety.battery_debounce_s,
         lambda c: f"battery at {c.telemetry.battery_v:.2f} V under load",
     ),
     lands(
-        "battery-unknown", BEFORE_CONTACT, lambda c: c.obs.battery_age_s > c.safety.battery_stale_s,
+        "battery-unknown",
+        BEFORE_CONTACT,
+        lambda c: c.obs.battery_age_s > c.safety.battery_stale_s,
         "the battery's reading stands still",
     ),
     lands("latency", IN_THE_OPEN, lambda c: c.mismatch.later_s != 0.0, why_latency),
     lands("mounting", IN_THE_OPEN, mounted_wrong, why_mounted_wrong),
     lands(
-        "height-limit", BEFORE_CONTACT, lambda c: c.height_m > c.safety.max_height_m,
+        "height-limit",
+        BEFORE_CONTACT,
+        lambda c: c.height_m > c.safety.max_height_m,
         lambda c: f"height {c.height_m:.2f} m is above the limit",
     ),
     lands("fence", BEFORE_CONTACT, fence_broken, "outside the fence"),
     lands(
-        "camera-gone", BY_CAMERA, lambda c: c.obs.camera_age_s > c.safety.camera_land_s,
+        "camera-gone",
+        BY_CAMERA,
+        lambda c: c.obs.camera_age_s > c.safety.camera_land_s,
         why_no_picture,
     ),
     lands(
-        "loop-late", FLYING_PHASES, lambda c: c.obs.loop_late_s > c.safety.loop_late_land_s,
+        "loop-late",
+        FLYING_PHASES,
+        lambda c: c.obs.loop_late_s > c.safety.loop_late_land_s,
         lambda c: f"the control loop was {c.obs.loop_late_s:.1f} s late",
     ),
     lands(
-        "markers-disagree", BY_CAMERA,
+        "markers-disagree",
+        BY_CAMERA,
         lambda c: c.obs.disagreeing_frames >= c.profile.merge.disagreement_frames,
         "large and small marker contradict each other: check the printed sizes in the "
         "profile and the camera's calibration",
     ),
     lands(
-        "log-lost", BEFORE_CONTACT,
+        "log-lost",
+        BEFORE_CONTACT,
         lambda c: c.safety.land_on_log_error and c.obs.log_problem is not None,
         lambda c: f"flight log: {c.obs.log_problem}",
     ),
     lands(
-        "time-over", BEFORE_CONTACT,
+        "time-over",
+        BEFORE_CONTACT,
         lambda c: c.t_s - c.state.started_s > c.planner.perching_time_s,
-        "the perching time is over", O.ATTEMPTS_USED_UP,
+        "the perching time is over",
+        O.ATTEMPTS_USED_UP,
     ),
-)  # fmt: skip
+)
 
-# --- The whole table -----------------------------------------------------------------------------
+# --- The whole table --------------------------------------------------
 
 TABLE: tuple[Transition, ...] = (
     *SAFETY,
@@ -466,59 +505,92 @@ TABLE: tuple[Transition, ...] = (
     Transition("caught", BEFORE_COMPLETION, is_caught, P.COMPLETE, "hanging on the magnet already"),
     lands(HELD, BEFORE_COMPLETION, is_held_elsewhere, "something holds it where the target is not"),
     lands(
-        "hangs-at-contact", BEFORE_COMPLETION, lambda c: c.held(C.HANGING) >= HELD_S,
+        "hangs-at-contact",
+        BEFORE_COMPLETION,
+        lambda c: c.held(C.HANGING) >= HELD_S,
         why_hangs_at_contact,
     ),
     # --- something is in the way -----------------------------------------------
     lands(
-        "cannot-rise", {P.APPROACH}, lambda c: is_blocked(c) or too_weak(c),
+        "cannot-rise",
+        {P.APPROACH},
+        lambda c: is_blocked(c) or too_weak(c),
         lambda c: f"pressed at {c.height_m:.2f} m: something is above, or the thrust is weak",
     ),
     backs_off(
-        "blocked", BEFORE_COMPLETION, is_blocked_off_target,
-        lambda c: f"pressed against something at {c.height_m:.2f} m"
-        + ("" if c.state.hover_thrust else ", or the thrust is weak"),
+        "blocked",
+        BEFORE_COMPLETION,
+        is_blocked_off_target,
+        lambda c: (
+            f"pressed against something at {c.height_m:.2f} m"
+            + ("" if c.state.hover_thrust else ", or the thrust is weak")
+        ),
     ),
     lands(
-        "too-weak", BY_CAMERA, too_weak,
+        "too-weak",
+        BY_CAMERA,
+        too_weak,
         "hovering takes all the thrust: the vehicle is too heavy, the battery too low, or "
         "something is above",
     ),
     # --- phase 1: approach ---------------------------------------------------
     Transition(
-        "approached", {P.APPROACH}, lambda c: c.held(C.AT_TAKEOFF_HEIGHT) >= 0.3, P.SEARCH,
+        "approached",
+        {P.APPROACH},
+        lambda c: c.held(C.AT_TAKEOFF_HEIGHT) >= 0.3,
+        P.SEARCH,
         "hovering in the perching area",
     ),
     lands(
-        "approach-timeout", {P.APPROACH}, lambda c: c.in_phase_s > c.planner.approach_timeout_s,
+        "approach-timeout",
+        {P.APPROACH},
+        lambda c: c.in_phase_s > c.planner.approach_timeout_s,
         lambda c: f"take-off reached only {c.height_m:.2f} m",
     ),
     # --- phase 2: search -----------------------------------------------------
     Transition(
-        "found", {P.SEARCH}, lambda c: c.state.confirmed >= c.planner.search.confirm_frames,
-        P.ESTIMATE, "target seen",
+        "found",
+        {P.SEARCH},
+        lambda c: c.state.confirmed >= c.planner.search.confirm_frames,
+        P.ESTIMATE,
+        "target seen",
     ),
     lands(
-        "searched-out", {P.SEARCH}, lambda c: c.state.searches >= c.planner.search.attempts,
-        why_not_found, O.TARGET_NOT_FOUND,
+        "searched-out",
+        {P.SEARCH},
+        lambda c: c.state.searches >= c.planner.search.attempts,
+        why_not_found,
+        O.TARGET_NOT_FOUND,
     ),
     # --- phase 3: estimate ---------------------------------------------------
     Transition(
-        "estimate-lost", {P.ESTIMATE},
+        "estimate-lost",
+        {P.ESTIMATE},
         lambda c: c.held(C.UNTRACKED) > 1.0 or c.in_phase_s > c.planner.estimate.timeout_s,
-        P.SEARCH, "the target's pose does not settle", S.HOLD,
+        P.SEARCH,
+        "the target's pose does not settle",
+        S.HOLD,
     ),
     Transition(
-        "estimated", {P.ESTIMATE}, lambda c: c.held(C.ESTIMATED) >= c.planner.estimate.dwell_s,
-        P.ALIGN, "pose is steady",
+        "estimated",
+        {P.ESTIMATE},
+        lambda c: c.held(C.ESTIMATED) >= c.planner.estimate.dwell_s,
+        P.ALIGN,
+        "pose is steady",
     ),
     # --- phase 4: align ------------------------------------------------------
     Transition(
-        "align-lost", {P.ALIGN}, lambda c: not c.tracked, P.SEARCH, "target lost in alignment",
+        "align-lost",
+        {P.ALIGN},
+        lambda c: not c.tracked,
+        P.SEARCH,
+        "target lost in alignment",
         S.HOLD,
     ),
     backs_off(
-        "align-timeout", {P.ALIGN}, lambda c: c.in_phase_s > c.planner.align.timeout_s,
+        "align-timeout",
+        {P.ALIGN},
+        lambda c: c.in_phase_s > c.planner.align.timeout_s,
         "alignment took too long",
     ),
     lands("too-little-left", {P.ALIGN, P.RECOVER}, too_little_left, why_short),
@@ -526,97 +598,153 @@ TABLE: tuple[Transition, ...] = (
     # --- phase 5: ascend -----------------------------------------------------
     backs_off("ascend-lost", {P.ASCEND}, lambda c: not c.tracked, "target lost in ascent"),
     Transition(
-        "outside-cone", {P.ASCEND}, lambda c: c.error_xy_m > c.cone_m, P.ALIGN,
-        "drifted out of the cone", S.HOLD,
+        "outside-cone",
+        {P.ASCEND},
+        lambda c: c.error_xy_m > c.cone_m,
+        P.ALIGN,
+        "drifted out of the cone",
+        S.HOLD,
     ),
     backs_off(
-        "ascend-timeout", {P.ASCEND},
-        lambda c: c.in_phase_s > c.planner.ascend.timeout_s
-        or c.held(C.NEAR_STANDOFF) > c.planner.ascend.settle_timeout_s,
+        "ascend-timeout",
+        {P.ASCEND},
+        lambda c: (
+            c.in_phase_s > c.planner.ascend.timeout_s
+            or c.held(C.NEAR_STANDOFF) > c.planner.ascend.settle_timeout_s
+        ),
         "does not settle under the target",
     ),
     Transition(
-        "settled", {P.ASCEND}, lambda c: c.held(C.SETTLED) >= c.planner.ascend.settle_dwell_s,
-        P.PERCH, "settled at the stand-off",
+        "settled",
+        {P.ASCEND},
+        lambda c: c.held(C.SETTLED) >= c.planner.ascend.settle_dwell_s,
+        P.PERCH,
+        "settled at the stand-off",
     ),
     # --- phase 6: perch ------------------------------------------------------
     backs_off(
-        "beside-the-magnet", {P.PERCH},
+        "beside-the-magnet",
+        {P.PERCH},
         lambda c: is_in_contact(c) and not contact_error(c).is_within(c.planner.perch.contact_xy_m),
         lambda c: f"contact {contact_error(c).text}",
     ),
     Transition("contact", {P.PERCH}, is_in_contact, P.COMPLETE, why_contact),
     backs_off(
         # The last centimetres are flown unseen: by the target alone, by dead reckoning.
-        "pressed-blindly", {P.PERCH}, lambda c: c.by_sight and c.position_age_s > BLIND_PRESS_S,
+        "pressed-blindly",
+        {P.PERCH},
+        lambda c: c.by_sight and c.position_age_s > BLIND_PRESS_S,
         lambda c: f"no contact {c.position_age_s:.1f} s after the last sight of the target",
     ),
     backs_off(
-        "knocked-aside", {P.PERCH}, lambda c: c.held(C.KNOCKED) >= KNOCKED_S,
+        "knocked-aside",
+        {P.PERCH},
+        lambda c: c.held(C.KNOCKED) >= KNOCKED_S,
         "pushed aside under the target",
     ),
     backs_off(
         # Not in time, or not before the next turn of a loop as late as this one.
-        "no-contact", {P.PERCH},
+        "no-contact",
+        {P.PERCH},
         lambda c: c.in_phase_s + c.obs.loop_late_s > c.planner.perch.timeout_s,
         "no proof of contact",
     ),
     # --- phase 7: completion -------------------------------------------------
     backs_off(
-        "slipped", {P.COMPLETE}, has_slipped,
+        "slipped",
+        {P.COMPLETE},
+        has_slipped,
         lambda c: "slipped while hanging" if c.state.stopped_s else "the magnet does not hold",
     ),
     backs_off(
-        "not-released", {P.COMPLETE},
+        "not-released",
+        {P.COMPLETE},
         lambda c: c.state.stopped_s is None and c.in_phase_s > c.planner.complete.release_timeout_s,
         "the thrust could not be released",
     ),
     Transition(
-        "perched", {P.COMPLETE}, lambda c: release_monitored(c) and hangs_where_it_did(c),
-        P.PERCHED, "hanging still with the motors off", outcome=O.PERCHED,
+        "perched",
+        {P.COMPLETE},
+        lambda c: release_monitored(c) and hangs_where_it_did(c),
+        P.PERCHED,
+        "hanging still with the motors off",
+        outcome=O.PERCHED,
     ),
     lands("fell-unseen", {P.COMPLETE}, release_monitored, "it is not known to hang where it did"),
     lands(
-        "not-stopped", {P.COMPLETE},
+        "not-stopped",
+        {P.COMPLETE},
         lambda c: stopped_for_s(c) > c.planner.complete.watch_s + UNSTOPPED_S,
         lambda c: f"motors stopped, but their thrust still reads {c.telemetry.thrust:.0f}",
     ),
     # --- the failed attempt --------------------------------------------------
     lands(
-        "attempts-used", {P.RECOVER}, lambda c: attempts_used(c) and c.in_phase_s > 0.5,
-        "all perching attempts are used up", O.ATTEMPTS_USED_UP,
+        "attempts-used",
+        {P.RECOVER},
+        lambda c: attempts_used(c) and c.in_phase_s > 0.5,
+        "all perching attempts are used up",
+        O.ATTEMPTS_USED_UP,
     ),
     Transition(
-        "recovered", {P.RECOVER}, has_recovered, P.ESTIMATE, "steady again, trying once more",
+        "recovered",
+        {P.RECOVER},
+        has_recovered,
+        P.ESTIMATE,
+        "steady again, trying once more",
     ),
     lands(
-        "recover-timeout", {P.RECOVER}, lambda c: c.in_phase_s > c.planner.recover.timeout_s,
+        "recover-timeout",
+        {P.RECOVER},
+        lambda c: c.in_phase_s > c.planner.recover.timeout_s,
         "the vehicle does not become steady",
     ),
     # --- landing ---------------------------------------------------------------
     Transition(
-        "hung", {P.LANDING}, is_off_as(Finding.HANGS), P.PERCHED, "hanging with the motors off",
+        "hung",
+        {P.LANDING},
+        is_off_as(Finding.HANGS),
+        P.PERCHED,
+        "hanging with the motors off",
     ),
     Transition(
-        "landed", {P.LANDING}, is_off_as(Finding.STANDS), P.LANDED,
-        lambda c: "motors off"
-        + ("" if c.state.blind_s is None else "; it was felt to come down to the floor"),
+        "landed",
+        {P.LANDING},
+        is_off_as(Finding.STANDS),
+        P.LANDED,
+        lambda c: (
+            "motors off"
+            + ("" if c.state.blind_s is None else "; it was felt to come down to the floor")
+        ),
     ),
     Transition(
-        "held-elsewhere", {P.LANDING}, is_off_as(Finding.HELD), P.ABORTED,
+        "held-elsewhere",
+        {P.LANDING},
+        is_off_as(Finding.HELD),
+        P.ABORTED,
         "motors off; something holds it where its estimate has no target: look before you touch it",
-        S.LAND, O.SAFETY,
+        S.LAND,
+        O.SAFETY,
     ),
     Transition(
-        "hangs-or-stands", {P.LANDING}, lambda c: c.held(C.DOWN) >= LOOKED_S, P.ABORTED,
+        "hangs-or-stands",
+        {P.LANDING},
+        lambda c: c.held(C.DOWN) >= LOOKED_S,
+        P.ABORTED,
         "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
-        "whether it hangs or stands: look before you touch it", S.LAND, O.SAFETY,
+        "whether it hangs or stands: look before you touch it",
+        S.LAND,
+        O.SAFETY,
     ),
     Transition(
-        "landing-timeout", {P.LANDING}, lambda c: c.in_phase_s > c.planner.landing.timeout_s,
-        P.ABORTED, "the landing was not confirmed in time", S.LAND, O.SAFETY,
+        "landing-timeout",
+        {P.LANDING},
+        lambda c: c.in_phase_s > c.planner.landing.timeout_s,
+        P.ABORTED,
+        "the landing was not confirmed in time",
+        S.LAND,
+        O.SAFETY,
     ),
-)  # fmt: skip
+)
 _ROWS_OF = {phase: tuple(row for row in TABLE if phase in row.phases) for phase in Phase}
 
 

@@ -103,7 +103,7 @@ def _slewed(new: OnlineCalibration, camera: CameraConfig, dt_s: float) -> float:
     return new.used_s + max(-step_s, min(step_s, goal_s - new.used_s))
 
 
-# --- What a flight tells about the latency and the mounting --------------------------------------
+# --- What a flight tells about the latency and the mounting -----------
 # The target stands still in the world. Where the pictures are later than the profile says by d,
 # it is placed as the vehicle was d earlier: beside its place by d times the speed at which the
 # vehicle's motion and turning sweep the line of sight. Where the camera is turned from what the

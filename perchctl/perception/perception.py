@@ -115,9 +115,14 @@ class Perception:
         if pose is None or output.target is None or not output.target.measured:
             return
         self.calibration = update_calibration(
-            self.calibration, output.detections.t_s + later_s, pose, self.history,
-            self.pipeline.pose, self.profile.camera, self._attitude_sigma_rad,
-        )  # fmt: skip
+            self.calibration,
+            output.detections.t_s + later_s,
+            pose,
+            self.history,
+            self.pipeline.pose,
+            self.profile.camera,
+            self._attitude_sigma_rad,
+        )
 
     @property
     def _attitude_sigma_rad(self) -> float:

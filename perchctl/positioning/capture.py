@@ -213,7 +213,7 @@ class MotionCapture:
         return f": {self._last_line}" if self._last_line else ""
 
 
-# --- The child process in which the library of motion capture runs, away from the flight -------
+# --- The child process in which the library of motion capture runs, away from the flight ---
 # Some of its systems wait in `connect` for ever, without letting any other thread of their process
 # run, and some end the process without a word (docs/positioning.md). Here that stops nobody.
 

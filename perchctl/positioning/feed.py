@@ -246,7 +246,7 @@ class PositionFeed:
         return f"no frame has come from {who} for {now_s - self._framed_s:.1f} s"
 
 
-# --- Which of a capture's frames may be believed, and where the vehicle's body is in them ------
+# --- Which of a capture's frames may be believed, and where the vehicle's body is in them ---
 # Motion capture fails in ways that look like data: a body that is hidden keeps its last pose,
 # two bodies swap their names, a symmetric one flips, a pose arrives late (faults 10 and 11).
 # Each is refused here, with one sentence that names it.

@@ -70,7 +70,7 @@ def _holds_truth(value: Any) -> bool:
     return isinstance(value, bool)
 
 
-# --- Units ---------------------------------------------------------------------------------------
+# --- Units ------------------------------------------------------------
 
 UNITS = {
     "acc_g": "g",
@@ -111,7 +111,7 @@ def key_unit(path: str) -> str:
     return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")
 
 
-# --- Keys that have become constants of their section, or are gone -----------------------------
+# --- Keys that have become constants of their section, or are gone ----
 
 GONE = frozenset(
     (

@@ -26,7 +26,7 @@ from perchctl.profile.base import without_constants
 from perchctl.profile.load import check_profile, find_profile, first_invalid_key
 from perchctl.profile.schema import Profile
 
-# --- Keys of a loaded profile -------------------------------------------------------------------
+# --- Keys of a loaded profile -----------------------------------------
 
 
 def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
@@ -86,7 +86,7 @@ def _put(values: dict[str, Any], dotted: str, value: Any) -> None:
     values[key] = value
 
 
-# --- Numbers in a profile's file ----------------------------------------------------------------
+# --- Numbers in a profile's file --------------------------------------
 
 Value = float | int | str | tuple[float, ...]
 

@@ -101,7 +101,7 @@ def _span(number: dict[str, Any]) -> str:
     return low if least is None else f"at least {low}"
 
 
-# --- A profile as a commented file --------------------------------------------------------------
+# --- A profile as a commented file ------------------------------------
 
 _WIDTH = 80
 
@@ -129,9 +129,13 @@ def profile_text(profile: Profile, paths: Collection[str] | None = None) -> str:
         before = sections
         margin = "  " * len(sections)
         lines += textwrap.wrap(
-            _comment(key), _WIDTH, initial_indent=f"{margin}# ", subsequent_indent=f"{margin}# ",
-            break_long_words=False, break_on_hyphens=False,
-        )  # fmt: skip
+            _comment(key),
+            _WIDTH,
+            initial_indent=f"{margin}# ",
+            subsequent_indent=f"{margin}# ",
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
         lines.append(f"{margin}{name}: {scalar_text(key.default)}")
     return "\n".join(lines) + "\n"
 

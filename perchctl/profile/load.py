@@ -95,7 +95,7 @@ def _checked(path: Path, own: dict[str, Any]) -> Profile:
         raise InvalidValue(_one_sentence(path, error)) from None
 
 
-# --- The weights file ---------------------------------------------------------------------------
+# --- The weights file -------------------------------------------------
 
 
 class FittedData(BaseModel):
@@ -150,7 +150,7 @@ def read_weights(path: Path) -> FittedWeights:
         raise InvalidValue(_one_sentence(path, error)) from None
 
 
-# --- The camera's calibration and mask -----------------------------------------------------------
+# --- The camera's calibration and mask --------------------------------
 
 
 def find_calibration(name: str) -> Path:
@@ -213,7 +213,7 @@ def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     return covered
 
 
-# --- Reading ------------------------------------------------------------------------------------
+# --- Reading ----------------------------------------------------------
 
 
 def _choices() -> str:

@@ -18,7 +18,7 @@ from perchctl.profile.base import BodyVector3, Section, Vector3, key
 _FORMAT = "^[A-Z0-9]{3,4}$"
 
 
-# --- ArUco dictionaries by name, and the ids they hold -----------------------------------------
+# --- ArUco dictionaries by name, and the ids they hold ----------------
 
 
 @cache
@@ -68,7 +68,7 @@ def check_marker_id(name: str, marker_id: int) -> None:
     raise ValueError(f"id {marker_id} is outside {name}, which holds 0..{count - 1}{hint}")
 
 
-# --- The keys ---------------------------------------------------------------------------------
+# --- The keys ---------------------------------------------------------
 
 
 class Mounting(Section):

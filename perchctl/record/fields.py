@@ -237,9 +237,15 @@ def _xyz(prefix: str, vector: Any, unit: str = "m") -> dict[str, Any]:
 
 def _telemetry_values(tel: Telemetry) -> dict[str, Any]:
     same = (
-        "roll_rad", "pitch_rad", "yaw_rad", "acc_z_g", "thrust", "battery_v", "battery_state",
+        "roll_rad",
+        "pitch_rad",
+        "yaw_rad",
+        "acc_z_g",
+        "thrust",
+        "battery_v",
+        "battery_state",
         "supervisor",
-    )  # fmt: skip
+    )
     return {
         **_xyz("", tel.position_m),
         **_xyz("v", tel.velocity_mps, "mps"),

@@ -301,7 +301,7 @@ def _cells(key: str, record: Mapping[str, Any]) -> list[Any]:
     return [value]
 
 
-# --- the file -----------------------------------------------------------------------------
+# --- the file ---------------------------------------------------------
 
 
 def read_log(path: Path | str) -> FlightLog:
@@ -418,7 +418,7 @@ def _without_kind(record: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in record.items() if k != "kind"}
 
 
-# --- turns, and what was sent in the loop's place --------------------------------------------
+# --- turns, and what was sent in the loop's place ---------------------
 
 
 def turn_of(record: dict[str, Any]) -> Turn:

@@ -60,7 +60,7 @@ TARGET_KEYS = ("tx_m", "ty_m", "tz_m", "tyaw_rad")
 SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
 
 
-# --- the file -------------------------------------------------------------------------------
+# --- the file ---------------------------------------------------------
 
 
 class RecordingFile:
@@ -216,7 +216,7 @@ TICK_SCHEMA = {
 """JSON schema of the ticks, for which Foxglove has none."""
 
 
-# --- Foxglove's messages ----------------------------------------------------------------------
+# --- Foxglove's messages ----------------------------------------------
 
 _LEVELS = {"hold": Log.WARNING, "back off": Log.WARNING, "land": Log.ERROR, "stop": Log.FATAL}
 _OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)

@@ -182,7 +182,7 @@ def _explain(error: OSError) -> str:
     return f"the flight log cannot be written: {error.strerror or error}"
 
 
-# --- where a flight's files lie: the log, and what is beside it by its name ---------------------
+# --- where a flight's files lie: the log, and what is beside it by its name ---
 
 
 def path_beside(log: Path | str, suffix: str) -> Path:

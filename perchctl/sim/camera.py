@@ -158,7 +158,7 @@ class SimCamera:
         return np.asarray(np.rint(BLUE_GREY + BLUE_NOISE * noise), np.uint8)
 
 
-# --- When each row of a frame is exposed and in what light ---------------------------------------
+# --- When each row of a frame is exposed and in what light ------------
 # A rolling shutter exposes its rows one after the other within the read-out time; an interlaced
 # camera takes two pictures a frame, half the frame's period apart, each with its own rows.
 

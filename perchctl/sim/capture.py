@@ -217,7 +217,7 @@ class SimCapture:
         return BodyPose((x, y, z), quaternion_from_rotation(turn @ R @ turn.T))
 
 
-# --- The server on loopback --------------------------------------------------------------------
+# --- The server on loopback -------------------------------------------
 # It speaks NatNet 3.1, as OptiTrack's server does, so `motioncapture` reads it. Of the systems
 # which that package reads without a vendor's machine this one hands a frame on the soonest: VRPN's
 # client looks only every 10 ms, Qualisys's binds one fixed port.

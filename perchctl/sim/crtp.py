@@ -39,7 +39,7 @@ class Status(IntEnum):
     EEXIST = 17
 
 
-# --- Packets that command the vehicle, turned into the firmware model's calls ------------------
+# --- Packets that command the vehicle, turned into the firmware model's calls ---
 
 
 _SETPOINTS: dict[int, Callable[..., Setpoint]] = {
@@ -127,7 +127,7 @@ def _plan(firmware: Firmware, data: bytes) -> Status:
     return Status.OK
 
 
-# --- C numbers --------------------------------------------------------------------------------
+# --- C numbers --------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ BY_CTYPE = {
 BY_LOG_CODE = {number.log_code: number for number in BY_CTYPE.values()}
 
 
-# --- Tables of contents: which log variables and parameters there are, by number ---------------
+# --- Tables of contents: which log variables and parameters there are, by number ---
 # cflib keeps a table in a file named after its CRC, so the CRC follows from the contents and
 # nothing else: the same table has the same CRC in every process.
 
@@ -206,7 +206,7 @@ class Toc:
         return data[:3] + self._items[number] if number < len(self._items) else data[:1]
 
 
-# --- The server --------------------------------------------------------------------------------
+# --- The server -------------------------------------------------------
 # Limits of log blocks as measured: 26 bytes a block, period 10 ms x 1..254, 16 blocks,
 # 128 variables (docs/firmware.md, "Link").
 

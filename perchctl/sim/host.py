@@ -200,7 +200,7 @@ def _write(file: TextIO, record: dict[str, Any]) -> None:
     file.flush()
 
 
-# --- The child process: runs the vehicle that the parent describes ------------------------------
+# --- The child process: runs the vehicle that the parent describes ----
 
 
 def serve_parent() -> None:
@@ -222,7 +222,7 @@ def serve_parent() -> None:
         Runner(host, channel, realtime=realtime, linger_s=setup.linger_s, shared=shared).run()
 
 
-# --- How time passes in the simulated vehicle's process, and when it ends ----------------------
+# --- How time passes in the simulated vehicle's process, and when it ends ---
 # - real time: paced by the wall clock; catches up after a hiccup, never runs ahead. While a flight
 #   sets `SharedTime.limit_s`, it waits for the flight's loop instead;
 # - stepped: only the parent's `advance` moves time; between two of them the link is
@@ -336,7 +336,7 @@ class Runner:
         self._origin_s = self._clock() - self._host.elapsed_s
 
 
-# --- The simulated camera's picture over HTTP, as a network camera would send it ---------------
+# --- The simulated camera's picture over HTTP, as a network camera would send it ---
 # One part of a multipart answer is one JPEG; a slow client skips frames, the newest wins.
 
 

@@ -116,7 +116,7 @@ def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) 
     return 2.0 * stride / math.sqrt(max(area, 1e-12))
 
 
-# --- What a lens makes of its pixels, for all pictures and all flights alike --------------------
+# --- What a lens makes of its pixels, for all pictures and all flights alike ---
 
 
 VIGNETTING_EXPONENT = 0.6

@@ -76,7 +76,7 @@ def thrust_n(volts: float) -> float:
     return C0 + volts * (C1 + volts * (C2 + volts * C3))
 
 
-# --- The cell that feeds the motors: charge, resting voltage, resistance, age -------------------
+# --- The cell that feeds the motors: charge, resting voltage, resistance, age ---
 # - Resting voltage by charge: the levels in tenths by which the firmware tells a battery's
 #   state (`perchctl.sim.firmware.firmware`) are a discharge curve of the Crazyflie's own cell.
 #   It is flat in the middle and falls ever faster below a tenth, where 24 s of hovering take
@@ -93,10 +93,23 @@ RESISTANCE_OHM = 0.143
 SLOW_S = 15.0
 KNEE = 0.1
 _CELL_CURVE: tuple[tuple[float, float], ...] = (
-    (-0.02, 2.5), (0.0, 3.0), (0.01, 3.3), (0.025, 3.52), (0.05, 3.67), (0.1, 3.78),
-    (0.2, 3.83), (0.3, 3.87), (0.4, 3.89), (0.5, 3.92), (0.6, 3.96), (0.7, 4.0),
-    (0.8, 4.04), (0.9, 4.1), (1.0, 4.2), (1.05, 4.3),
-)  # fmt: skip
+    (-0.02, 2.5),
+    (0.0, 3.0),
+    (0.01, 3.3),
+    (0.025, 3.52),
+    (0.05, 3.67),
+    (0.1, 3.78),
+    (0.2, 3.83),
+    (0.3, 3.87),
+    (0.4, 3.89),
+    (0.5, 3.92),
+    (0.6, 3.96),
+    (0.7, 4.0),
+    (0.8, 4.04),
+    (0.9, 4.1),
+    (1.0, 4.2),
+    (1.05, 4.3),
+)
 _CELL_ENDS = tuple(x for x, _ in _CELL_CURVE[1:])  # of its straight parts
 _EMPTY_V, _FULL_V = _CELL_CURVE[0][1], _CELL_CURVE[-1][1]
 

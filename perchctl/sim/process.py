@@ -103,9 +103,16 @@ SLOWEST_PACE = 20.0
 _STOP_TIMEOUT_S = 5.0
 _CHILD = "from perchctl.sim.host import serve_parent; serve_parent()"
 REQUESTS = (
-    "truth", "set_pose", "move_by_hand", "let_go", "set_battery", "silence", "capture_fault",
-    "reboot", "replace_vehicle",
-)  # fmt: skip
+    "truth",
+    "set_pose",
+    "move_by_hand",
+    "let_go",
+    "set_battery",
+    "silence",
+    "capture_fault",
+    "reboot",
+    "replace_vehicle",
+)
 """Methods of the child's `VehicleHost` and its `World` that a `SimProcess` has, too."""
 
 

@@ -240,8 +240,11 @@ class Renderer:
         wider = cv2.resize(texels, None, fx=crop, fy=crop)
         picture = sample(texture, wider[crop:-crop, crop:-crop], cv2.BORDER_WRAP)
         if misses.any():
-            mask = cv2.resize(misses[1:-1, 1:-1].astype(np.uint8), picture.shape[::-1],
-                              interpolation=cv2.INTER_NEAREST)  # fmt: skip
+            mask = cv2.resize(
+                misses[1:-1, 1:-1].astype(np.uint8),
+                picture.shape[::-1],
+                interpolation=cv2.INTER_NEAREST,
+            )
             picture[mask > 0] = FLOOR_GREY
         kernel = line_kernel(motion_px / step)
         if length_px >= SHARP_MOTION_PX and kernel is not None:
@@ -283,7 +286,7 @@ class Renderer:
         return np.clip(bank, -255.0, 255.0).astype(np.int16), places
 
 
-# --- Sums, look-ups and shading of whole pictures ------------------------------------------------
+# --- Sums, look-ups and shading of whole pictures ---------------------
 
 
 def mean_of(pictures: Sequence[Picture]) -> Picture:
@@ -317,7 +320,7 @@ def blended(frame: Picture) -> Picture:
     return np.asarray((rows[:-2] + 2 * rows[1:-1] + rows[2:] + 2) // 4, np.uint8)
 
 
-# --- A camera that does not move ----------------------------------------------------------------
+# --- A camera that does not move --------------------------------------
 # On the floor and under the magnet the vehicle stirs by less than any picture shows. Where the
 # picture moves by less than `STILL_PX` within the exposure, its pose is rounded, so that a vehicle
 # at rest sees the same picture again and again but for the noise.
@@ -338,7 +341,7 @@ def rounded(T_target_cam: Array) -> Array:
     return T
 
 
-# --- Motion within one exposure: how many poses it needs, and its blur as a kernel --------------
+# --- Motion within one exposure: how many poses it needs, and its blur as a kernel ---
 
 
 SHARP_MOTION_PX = 0.25
@@ -400,7 +403,7 @@ def line_kernel(motion_px: Array) -> NDArray[np.float32] | None:
     return np.asarray(kernel / kernel.sum(), np.float32)
 
 
-# --- Faults of an analogue video link: lines that tremble, hum bars, torn and lost lines -------
+# --- Faults of an analogue video link: lines that tremble, hum bars, torn and lost lines ---
 
 
 LINE_JITTER_PX = 1.2
@@ -423,8 +426,9 @@ def spoil(image: NDArray[np.uint8], strength: float, rng: np.random.Generator) -
         shift[band] += rng.normal(0.0, TEAR_PX * strength) * fade
     cols, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
     cols = cols + shift[:, None].astype(np.float32)
-    out = cv2.remap(image, cols, rows.astype(np.float32), cv2.INTER_LINEAR,
-                    borderMode=cv2.BORDER_REPLICATE).astype(np.float32)  # fmt: skip
+    out = cv2.remap(
+        image, cols, rows.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    ).astype(np.float32)
     phase, bars = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.7, 2.5)
     hum = np.sin(2.0 * np.pi * bars * np.arange(height) / height + phase)
     out += (HUM_GREY * strength * hum)[:, None].astype(np.float32)

@@ -145,7 +145,7 @@ class Scenario:
         return Bursts(self.seed, self.radio_loss, self.radio_burst_s) if self.radio_loss else None
 
 
-# --- From a profile's ranges and a seed to a scenario --------------------------------------------
+# --- From a profile's ranges and a seed to a scenario -----------------
 # What harder worlds draw beyond that of `sim` comes in groups, each from a random stream of its
 # own, so that no other value of a seed moves.
 
@@ -153,11 +153,22 @@ class Scenario:
 _STREAM, _GROUPS_STREAM, _IMU_STREAM = 1, 21, 22  # the scenario's own random streams
 _AIR, _CELL, _TILT, _RADIO, _CAPTURE = 0, 1, 2, 6, 7
 _AS_GIVEN = (
-    "camera_rate_hz", "camera_jitter_s", "camera_drop_rate", "camera_exposure_s",
-    "camera_defocus_px", "camera_fields", "camera_blended", "camera_readout_s", "camera_flicker",
-    "camera_pumping", "camera_receiver_hz", "camera_blank_rate", "estimate_noise_m",
-    "magnet_force_n", "no_target",
-)  # fmt: skip
+    "camera_rate_hz",
+    "camera_jitter_s",
+    "camera_drop_rate",
+    "camera_exposure_s",
+    "camera_defocus_px",
+    "camera_fields",
+    "camera_blended",
+    "camera_readout_s",
+    "camera_flicker",
+    "camera_pumping",
+    "camera_receiver_hz",
+    "camera_blank_rate",
+    "estimate_noise_m",
+    "magnet_force_n",
+    "no_target",
+)
 """Keys of the profile that are the same for every seed."""
 _LONGEST_S = 240.0
 """No simulated flight lasts longer."""
@@ -291,7 +302,7 @@ def _capture_holes(
     return tuple(holes)
 
 
-# --- A radio that loses packets by bursts: nothing passes for a while, then everything does ------
+# --- A radio that loses packets by bursts: nothing passes for a while, then everything does ---
 
 
 _BURSTS_STREAM = 14
@@ -326,7 +337,7 @@ class Bursts:
         return self._bad
 
 
-# --- What the scenario did, said with the event that it led to -----------------------------------
+# --- What the scenario did, said with the event that it led to --------
 # A newcomer who sees the target lost should not look for the fault in the program.
 
 

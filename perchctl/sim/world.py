@@ -265,7 +265,7 @@ class World:
         return ceiling_n, floor
 
 
-# --- The rigid bodies as a MuJoCo model: floor, ceiling, and the vehicle with its gear ---------
+# --- The rigid bodies as a MuJoCo model: floor, ceiling, and the vehicle with its gear ---
 
 
 FRAME_HALF_M = (0.035, 0.035, 0.012)
@@ -317,7 +317,7 @@ def build_model(scenario: Scenario) -> Any:
     )
 
 
-# --- The magnet: what pulls the gear's tip towards the ceiling, and whether it holds -----------
+# --- The magnet: what pulls the gear's tip towards the ceiling, and whether it holds ---
 # It acts within `MAGNET_RADIUS_M` of the target's centre on an upright vehicle, fully at
 # contact, and falls to zero over `MAGNET_RANGE_M` of gap. The first contact may be weaker
 # than the later ones (`Scenario.first_contact_force_n`); it is over when the tip has
@@ -371,7 +371,7 @@ class Magnet:
             self._came_off = True
 
 
-# --- The air in the room: a draught with smooth gusts ------------------------------------------
+# --- The air in the room: a draught with smooth gusts -----------------
 
 
 _TERMS = 5

@@ -110,8 +110,11 @@ class Board:
         whole, _, measured = text.strip().partition(_MEASURED)
         found = _CHESSBOARD.fullmatch(whole) or _CHARUCO.fullmatch(whole)
         if found is None:
-            raise _wrong(text, "it is neither chessboard:COLUMNSxROWS:SQUARE nor "
-                         "charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY")  # fmt: skip
+            raise _wrong(
+                text,
+                "it is neither chessboard:COLUMNSxROWS:SQUARE nor "
+                "charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY",
+            )
         columns = int(found["columns"])
         rows = int(found["rows"])
         if not (3 <= columns <= MAX_COUNT and 3 <= rows <= MAX_COUNT):
@@ -166,7 +169,7 @@ def _wrong(text: str, why: str) -> InvalidValue:
     return InvalidValue(f"board {text!r}: {why} (for example {EXAMPLES})")
 
 
-# --- What of a board is black ------------------------------------------------------------------
+# --- What of a board is black -----------------------------------------
 
 
 def board_rectangles(board: Board) -> list[Rectangle]:

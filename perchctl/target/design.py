@@ -189,7 +189,7 @@ def make_design(
     )
 
 
-# --- Sizes and ids that cover the way from the search height to the contact ----------------------
+# --- Sizes and ids that cover the way from the search height to the contact ---
 
 
 DEFAULT_SEARCH_M = 1.15

@@ -214,7 +214,7 @@ def merged_rectangles(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> lis
     return found
 
 
-# --- Lengths as people write them: with their unit ---------------------------------------------
+# --- Lengths as people write them: with their unit --------------------
 
 
 MAX_SCALE_ERROR = 0.1

@@ -120,7 +120,7 @@ def fits(target: TargetConfig, page: str) -> bool:
     return _layout_on(target, parse_page(page), _caption(target)) is not None
 
 
-# --- Pages and their texts ----------------------------------------------------------------------
+# --- Pages and their texts --------------------------------------------
 
 
 def parse_page(text: str) -> tuple[float, float]:
@@ -223,7 +223,7 @@ def fitting_page(target: TargetConfig, texts: Sequence[str] = ()) -> str:
     return _page_text(width, 2.0 * (half + _caption_room(texts, width)[1]))
 
 
-# --- Drawing ------------------------------------------------------------------------------------
+# --- Drawing ----------------------------------------------------------
 
 
 class _Paper(FPDF):
@@ -272,9 +272,14 @@ class _Paper(FPDF):
         self.line(x0, y0, x1, y1)
 
     def write_line(
-        self, x: float, y: float, text: str, size: float = _TEXT, back: float = 0.0,
+        self,
+        x: float,
+        y: float,
+        text: str,
+        size: float = _TEXT,
+        back: float = 0.0,
         turn_deg: float = 0.0,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Write a line of text on the base line y, turned about its place. `back` of its width
         (0..1) lies before x."""
         self.set_font("helvetica", size=size * _PT_PER_MM)

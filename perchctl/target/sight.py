@@ -86,7 +86,7 @@ def raised(outline_m: Array, height_m: float) -> Array:
     return np.column_stack([outline_m, np.full(len(outline_m), height_m)])
 
 
-# --- From the ground: where the target is the vehicle's positioning system, it has to be seen ----
+# --- From the ground: where the target is the vehicle's positioning system, it has to be seen ---
 
 
 SURE_PX = 18.0
@@ -216,7 +216,7 @@ def _directions(values: tuple[float, float], least: float, figures: str, unit: s
     )
 
 
-# --- Near the target: from where on a mounting is blind ------------------------------------------
+# --- Near the target: from where on a mounting is blind ---------------
 # With the gear under the target's centre, the vehicle level and its heading the target's, as in
 # an ascent: so the outline of the markers is upright in body axes. A camera beside the gear sees
 # the target aside of its axis, and its picture is wider than high: with the offset along the

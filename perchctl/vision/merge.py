@@ -216,7 +216,7 @@ def _alone(track: MarkerTrack, pose: MarkerPose | None) -> Merged:
     )
 
 
-# --- Corners of a rolling shutter at one moment ------------------------------------------------
+# --- Corners of a rolling shutter at one moment -----------------------
 # The rows of such a picture are exposed one after the other within the read-out time, and what
 # moves is sheared, stretched or squeezed: at 20 ms and 0.3 m/s by as much as the target moves in
 # a few milliseconds. A frame's time is its middle row's. Each corner is moved back along
@@ -270,7 +270,7 @@ def seen_at_once(detections: Detections, setup: PoseSetup) -> list[Detection]:
     return out
 
 
-# --- Merging the two markers into the one pose of the target (paper, section II-A.2) -----------
+# --- Merging the two markers into the one pose of the target (paper, section II-A.2) ---
 
 
 def stage_of(large: bool, small: bool) -> Stage:

@@ -257,9 +257,13 @@ def estimate(
     if not state.tracks:
         nothing = np.zeros(3)
         target = replace(
-            target, stage=Stage.NONE, measured=False, tracked=False,
-            velocity_mps=nothing, world_velocity_mps=nothing,
-        )  # fmt: skip
+            target,
+            stage=Stage.NONE,
+            measured=False,
+            tracked=False,
+            velocity_mps=nothing,
+            world_velocity_mps=nothing,
+        )
         return _carried(target, t_s, attitude, pipeline)
     if not state.in_world:
         return _carried(target, t_s, attitude, pipeline)
@@ -270,7 +274,7 @@ def estimate(
     return replace(target, t_s=t_s, **_seen_in_world(merged, attitude, pipeline, spread))
 
 
-# --- from the tracks to the target -------------------------------------------------
+# --- from the tracks to the target ------------------------------------
 
 
 def _at_frame(
@@ -316,7 +320,7 @@ def _carried(
     return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
 
 
-# --- What merged tracks say of the target, as a `TargetEstimate` has it ------------------------
+# --- What merged tracks say of the target, as a `TargetEstimate` has it ---
 
 
 def _seen_in_level(merged: Merged, attitude: Attitude | None, pipeline: Pipeline) -> dict[str, Any]:

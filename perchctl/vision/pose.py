@@ -227,7 +227,7 @@ def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
     return np.asarray((hx * dx[:, 1] - hy * dx[:, 0]) / max(hx * hx + hy * hy, 1e-12))
 
 
-# --- Rotation and translation from corners: closed forms, then least squares in which each -----
+# --- Rotation and translation from corners: closed forms, then least squares in which each ---
 # corner counts as it was measured.
 
 
@@ -481,7 +481,7 @@ def _likeliest(scored: list[Scored], points: Points, prior: TiltPrior) -> Scored
     return min(scored, key=cost)
 
 
-# --- A sheet that is not flat: what its curl does to corners, and what they are worth then -----
+# --- A sheet that is not flat: what its curl does to corners, and what they are worth then ---
 # Corners that curl has moved err together, and those far from the centre err most: a joint pose of
 # both markers rests on the small one as far as the large one may be off.
 
@@ -503,7 +503,7 @@ def weight_with(curl: Array) -> Array:
     return weight
 
 
-# --- Corners as a pose is solved from them: where they are, and what each is worth -------------
+# --- Corners as a pose is solved from them: where they are, and what each is worth ---
 # Corners that are intersections of fitted lines do not err on their own: a line is off
 # by an offset and a tilt, and moves the corners at both of its ends. Its two ends have
 # errors across it of variance s^2 with a correlation of -1/2, so half the line's offset

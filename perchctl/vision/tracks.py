@@ -123,7 +123,7 @@ def _verdict(
     return verdict
 
 
-# --- Whether a pose is the target's that was locked on -----------------------------------------
+# --- Whether a pose is the target's that was locked on ----------------
 # Something else can look like the target: one more of it, a smaller one, or one of its markers,
 # lone and of another size. In a picture it cannot be told from the target, but the target does not
 # jump. A pose that contradicts the lock by more than noise, motion and drift explain is a
@@ -250,7 +250,7 @@ def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, verdict: Verdict
     )
 
 
-# --- how well a pose fits ----------------------------------------------------------
+# --- how well a pose fits ---------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,7 +341,7 @@ def _goes_on(lock: Lock, sight: Sight, fit: _Fit) -> bool:
     return calm and seen < _EXPLAINED * jumped
 
 
-# --- strangers ---------------------------------------------------------------------
+# --- strangers --------------------------------------------------------
 
 
 def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: FilterSetup) -> Stranger:
@@ -386,7 +386,7 @@ def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
     )
 
 
-# --- Where the target should be in the next picture --------------------------------------------
+# --- Where the target should be in the next picture -------------------
 # The target stands still, so the vehicle's own motion predicts its place in the picture. The state
 # estimate gives that motion twice: as the difference of two positions, and as speed times time.
 # Positions step by millimetres with each fix from outside, which are many pixels near the target;

@@ -192,7 +192,7 @@ class SessionFile:
         self.done = list(counts)
 
 
-# --- The actual pose -----------------------------------------------------------------------------
+# --- The actual pose --------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +322,7 @@ def _median(
     return np.median([each.position_m for each in placed], axis=0), (roll, pitch, wrap_rad(yaw))
 
 
-# --- The dialogue --------------------------------------------------------------------------------
+# --- The dialogue -----------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

@@ -128,7 +128,7 @@ def _joined(parts: list[Measurements]) -> Measurements:
     )
 
 
-# --- Reading the CSV ---------------------------------------------------------------------------
+# --- Reading the CSV --------------------------------------------------
 
 
 def read_csv(path: Path) -> Measurements:
@@ -211,7 +211,7 @@ def _check_cells(
     refuse(np.isnan(poses["actual"][:, 0]), "the actual pose is empty")
 
 
-# --- Data that would fit to nonsense -------------------------------------------------------------
+# --- Data that would fit to nonsense ----------------------------------
 
 
 def _check_positions(data: Measurements) -> None:

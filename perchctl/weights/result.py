@@ -110,7 +110,7 @@ def fit_weights(paths: Sequence[Path], chosen: str, test: Path | None = None) ->
     )
 
 
-# --- The JSON record and the weights file ------------------------------------------------------
+# --- The JSON record and the weights file -----------------------------
 
 
 def _by_axis(values: Iterable[float]) -> dict[str, float | None]:
@@ -170,7 +170,7 @@ def write_weights(path: Path, result: Result, date: str, *, anyway: bool) -> Non
     write_files({path: (_HEAD + yaml.safe_dump(content, sort_keys=False)).encode("utf-8")})
 
 
-# --- The report, for a terminal of 80 columns: the verdict first, notes last -------------------
+# --- The report, for a terminal of 80 columns: the verdict first, notes last ---
 # Lengths are in micrometres and angles in thousandths of a degree, as that is the size of the
 # errors of good corners.
 

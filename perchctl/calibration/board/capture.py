@@ -28,7 +28,7 @@ Progress = Callable[[int, int | None], None]
 """Called with the number of pictures done, and of all where it is known."""
 
 
-# --- Pictures and videos -------------------------------------------------------------------
+# --- Pictures and videos ----------------------------------------------
 
 
 def find_views(
@@ -120,7 +120,7 @@ def sharpness(image: Grey) -> float:
     return float(cv2.Laplacian(np.ascontiguousarray(image[::2, ::2]), cv2.CV_32F).var())
 
 
-# --- How alike two views are ---------------------------------------------------------------
+# --- How alike two views are ------------------------------------------
 
 
 AXES = ("x", "y", "size", "tilt")
@@ -179,7 +179,7 @@ def select_views(views: Sequence[BoardView], board: Board) -> list[BoardView]:
     return [views[k] for k in taken]
 
 
-# --- Guided capture ------------------------------------------------------------------------
+# --- Guided capture ---------------------------------------------------
 
 
 _STILL_SHARE = 1.5 / 640.0  # of the width, between two frames

@@ -149,7 +149,7 @@ def _local_axes(cells: Array, corners: Array) -> Array:
     return np.asarray((H[:2, :2] - at * H[2, :2]) / w)
 
 
-# --- The corner where four squares meet, by fitting the picture around it ----------------------
+# --- The corner where four squares meet, by fitting the picture around it ---
 # `cv2.cornerSubPix` with a fixed window takes in the neighbouring corners of small squares, and a
 # ChArUco board's markers: it errs by 0.03 to 0.5 px where this errs by 0.02. Here the window
 # follows the square's own size and slant, and the grey levels in it are fitted by what a lens

@@ -37,9 +37,15 @@ def report_figure(calibration: Calibration) -> Figure:
     panels = figure.add_subfigure(halves[1])
     banner.set_facecolor(BANNER[calibration.level])
     banner.text(
-        0.012, 0.5, _plain("\n".join(lines)), fontsize=13, color="white", weight="bold",
-        va="center", linespacing=1.3,
-    )  # fmt: skip
+        0.012,
+        0.5,
+        _plain("\n".join(lines)),
+        fontsize=13,
+        color="white",
+        weight="bold",
+        va="center",
+        linespacing=1.3,
+    )
     axes = panels.subplot_mosaic("ab;cc")
     _draw_coverage(axes["a"], calibration)
     _draw_residuals(axes["b"], calibration)
@@ -67,9 +73,14 @@ def _draw_residuals(ax: Axes, calibration: Calibration) -> None:
     largest = max(float(np.quantile(length, 0.99)), 1e-6)
     scale = _ARROW_SHARE * w / largest
     ax.quiver(
-        *points.T, *residuals.T, color=np.where(length > 3 * np.median(length), VERMILLION, BLUE),
-        angles="xy", scale_units="xy", scale=1.0 / scale, width=0.0018,
-    )  # fmt: skip
+        *points.T,
+        *residuals.T,
+        color=np.where(length > 3 * np.median(length), VERMILLION, BLUE),
+        angles="xy",
+        scale_units="xy",
+        scale=1.0 / scale,
+        width=0.0018,
+    )
     key = float(f"{largest / 2:.1g}")
     ax.plot([12, 12 + key * scale], [h - 14, h - 14], color=BLACK, linewidth=2)
     ax.text(16 + key * scale, h - 14, f"{key:g} px", fontsize=8, va="center")

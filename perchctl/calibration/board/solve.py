@@ -234,7 +234,7 @@ def _is_usable(camera: CameraModel) -> bool:
     return bool(np.abs(again - pixels).max() < 0.05)
 
 
-# --- Whether there is enough to calibrate from; if not, what to add ----------------------------
+# --- Whether there is enough to calibrate from; if not, what to add ---
 
 
 MIN_VIEWS, GOOD_VIEWS = 5, 10

@@ -173,7 +173,7 @@ def _check(rows: Rows, latency_s: float, cov: Array) -> None:
         )
 
 
-# --- The vehicle's rotation, from its gyroscope ------------------------------------------------
+# --- The vehicle's rotation, from its gyroscope -----------------------
 # Rates integrated over the whole recording drift by the sensor's constant error and by its noise's
 # random walk only, some hundredths of a degree in half a minute.
 
@@ -251,7 +251,7 @@ def _vectors(R: Array) -> Array:
     return np.asarray(Rotation.from_matrix(R).as_rotvec())
 
 
-# --- Turn of the camera and latency from nothing -------------------------------------------------
+# --- Turn of the camera and latency from nothing ----------------------
 # No start is needed, whatever the camera's turn.
 # Between two pictures the camera turns by the same rotation as the body, seen in its own axes:
 # ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency of a grid the R_body_cam
@@ -308,7 +308,7 @@ def _fit_turn(body: Array, seen: Array) -> tuple[Array, float]:
     return R, float((miss * weight).mean())
 
 
-# --- Robust least squares of misfits (n, 3), and what it leaves uncertain ---------------------
+# --- Robust least squares of misfits (n, 3), and what it leaves uncertain ---
 # A pose's own covariance is taken as true up to a factor, and a pose whose timestamp is off errs
 # along the vehicle's rotation, by the rate times the jitter. Both are found from the misfits, which
 # are counted as Student's t with few degrees of freedom, so that wrong poses do not bend them.

@@ -185,7 +185,7 @@ def pose_arrays(recording: MountingRecording) -> PoseArrays:
     )
 
 
-# --- The motion that a recording needs, named while it is recorded and before it is solved -------
+# --- The motion that a recording needs, named while it is recorded and before it is solved ---
 
 
 HOW_TO_RECORD: dict[MountingPart, str] = {

@@ -18,7 +18,7 @@ from perchctl.sim.scenario import CONTROL_PERIOD_S
 Motors = tuple[float, float, float, float]
 MOTORS_OFF: Motors = (0.0, 0.0, 0.0, 0.0)
 
-# --- Setpoints: which axes are controlled how --------------------------------------------------
+# --- Setpoints: which axes are controlled how -------------------------
 
 DISABLED, ABSOLUTE, VELOCITY = 0, 1, 2
 
@@ -109,7 +109,7 @@ class Setpoint:
         return replace(self, mode=mode, roll_deg=0.0, pitch_deg=0.0, yaw_rate_dps=0.0)
 
 
-# --- The loops -------------------------------------------------------------------------------
+# --- The loops --------------------------------------------------------
 
 ATTITUDE_DT_S = 0.002
 POSITION_DT_S = 0.01
@@ -274,7 +274,7 @@ class Controller:
         self.desired_pitch_deg = now.pitch_deg
 
 
-# --- Power distribution: four thrust requests in, four duty cycles (PWM) out -------------------
+# --- Power distribution: four thrust requests in, four duty cycles (PWM) out ---
 # In the firmware's order (source: power distribution, motor driver and stabiliser of release
 # 2026.08): the battery's voltage is compensated by the inverted thrust curve first, then what
 # exceeds the full duty cycle is taken off all four. More than 0.12 N may so be requested of one

@@ -13,7 +13,7 @@ from perchctl.sim.firmware.controller import (
     Controller,
     MotorDriver,
     Setpoint,
-)  # fmt: skip
+)
 from perchctl.sim.firmware.estimator import Estimator
 from perchctl.sim.firmware.outside import SETTINGS, Quaternion, Vector
 from perchctl.sim.firmware.planner import HighLevelCommand, Planner
@@ -257,7 +257,7 @@ class Firmware:
         )
 
 
-# --- The battery as the power management reports it: voltage, level, low-power state -----------
+# --- The battery as the power management reports it: voltage, level, low-power state ---
 
 
 ON_BATTERY, LOW_POWER = 0, 3

@@ -63,8 +63,10 @@ class Imu:
         angle = float(self._rng.uniform(-math.pi, math.pi))
         p, q, r = scenario.gyro_bias_radps
         self.gyro_bias_radps = (
-            p + _GYRO_LEFT_RADPS * math.cos(angle), q + _GYRO_LEFT_RADPS * math.sin(angle), r,
-        )  # fmt: skip
+            p + _GYRO_LEFT_RADPS * math.cos(angle),
+            q + _GYRO_LEFT_RADPS * math.sin(angle),
+            r,
+        )
         self.acc_bias_mps2 = x, y, z = scenario.acc_bias_mps2
         self.acc_scale = math.hypot(x, y, GRAVITY_MPS2 + z) / GRAVITY_MPS2
         self._pressed_mps2 = _PRESSED_MPS2 if self._rng.uniform() < 0.5 else -_PRESSED_MPS2
@@ -99,7 +101,7 @@ class Imu:
         )
 
 
-# --- The filter ----------------------------------------------------------------------------------
+# --- The filter -------------------------------------------------------
 
 
 POSITION, VELOCITY, ATTITUDE = 0, 3, 6
@@ -163,8 +165,10 @@ class OutsideFilter:
         x, y, z = self.position_m
         vx, vy, vz = self.velocity_mps
         self.position_m = (
-            x + t * vx + half_s2 * fx, y + t * vy + half_s2 * fy, z + t * vz + half_s2 * fz,
-        )  # fmt: skip
+            x + t * vx + half_s2 * fx,
+            y + t * vy + half_s2 * fy,
+            z + t * vz + half_s2 * fz,
+        )
         self.velocity_mps = (vx + t * fx, vy + t * fy, vz + t * fz)
         half = 0.5 * t
         turn = (1.0, half * p, half * q, half * r)

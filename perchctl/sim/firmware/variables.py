@@ -96,7 +96,7 @@ PARAMETERS |= {
 }
 
 
-# --- Where each log variable comes from; the fillers read 0 -------------------------------------
+# --- Where each log variable comes from; the fillers read 0 -----------
 
 
 Getter = Callable[[Any], float]

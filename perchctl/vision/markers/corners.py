@@ -120,7 +120,7 @@ def completed(
     return both
 
 
-# --- A marker's corners as they were refined, and each by its own neighbourhood ----------------
+# --- A marker's corners as they were refined, and each by its own neighbourhood ---
 # That is the way where no lines can be fitted (`perchctl.vision.markers.edge_fit`): such a
 # corner is pulled inwards (0.15 to 0.55 px), which makes the target look far.
 

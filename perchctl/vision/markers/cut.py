@@ -264,8 +264,9 @@ def lattice_of(camera: CameraModel) -> Lattice:
     reach = _REACHED * float(np.hypot(*rays.T).max())
     step = w / (_NODES * float(camera.K[0, 0]))
     nodes = np.maximum(np.ceil(np.ptp(rays, axis=0) / step).astype(int), 1)
-    fine = [rays.min(axis=0)[k] + step * ((np.arange(_FINE * nodes[k]) + 0.5) / _FINE)
-            for k in (0, 1)]  # fmt: skip
+    fine = [
+        rays.min(axis=0)[k] + step * ((np.arange(_FINE * nodes[k]) + 0.5) / _FINE) for k in (0, 1)
+    ]
     x, y = np.meshgrid(*fine)
     at = distort(np.stack([x.ravel(), y.ravel()], axis=1), camera)
     inside = np.isfinite(at).all(axis=1) & (np.hypot(x, y).ravel() < reach)
@@ -317,8 +318,9 @@ def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) ->
     (3, 3) maps own coordinates to normalised ones."""
     step = lattice.step / _FINE
     start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
-    G = np.array([[1.0 / step, 0.0, -start[0] / step], [0.0, 1.0 / step, -start[1] / step],
-                  [0.0, 0.0, 1.0]])  # fmt: skip
+    G = np.array(
+        [[1.0 / step, 0.0, -start[0] / step], [0.0, 1.0 / step, -start[1] / step], [0.0, 0.0, 1.0]]
+    )
     white, T = texture
     M = G @ H @ np.linalg.inv(T)
     rows, columns = lattice.inside.shape
@@ -367,7 +369,7 @@ def looks_like(H: Array, texture: Texture, view: Overview) -> tuple[float, float
     return likeness(grey, grey - A @ light), gain
 
 
-# --- The drawing of the whole target: its edges between black and white, and its picture -------
+# --- The drawing of the whole target: its edges between black and white, and its picture ---
 # Both markers share a centre and a plane, so their cells make one drawing, in the large marker's
 # own coordinates (see `perchctl.vision.markers.corners`).
 
@@ -598,10 +600,12 @@ def _in_view(
     # The lens's own change, (n, 2, 2), by small steps.
     small = 1e-4
     D = np.stack(
-        [(distort(x + step, camera) - at) / small for step in (np.array([small, 0.0]),
-                                                               np.array([0.0, small]))],
+        [
+            (distort(x + step, camera) - at) / small
+            for step in (np.array([small, 0.0]), np.array([0.0, small]))
+        ],
         axis=2,
-    )  # fmt: skip
+    )
     # A point's change with turn (about the drawing's centre) and move: dx / d(X), (n, 2, 3).
     P = np.zeros((len(x), 2, 3))
     P[:, 0, 0] = P[:, 1, 1] = 1.0 / X[:, 2]

@@ -263,13 +263,18 @@ def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Det
         return None
     interpolated = fields in ("top", "bottom")
     return Detection(
-        name, r.corners_px, r.sigma_px, r.refined, r.shift_sigma_px,
-        cov_px2=r.cov_px2, row_sigma_px=r.row_sigma_px,
+        name,
+        r.corners_px,
+        r.sigma_px,
+        r.refined,
+        r.shift_sigma_px,
+        cov_px2=r.cov_px2,
+        row_sigma_px=r.row_sigma_px,
         lying_sigma_px=interpolated_sigma_px(r.least_blur_px) if interpolated else 0.0,
-    )  # fmt: skip
+    )
 
 
-# --- How the markers move from picture to picture, and where that leads them -------------------
+# --- How the markers move from picture to picture, and where that leads them ---
 
 
 _QUARTERS: Array = np.full(4, 0.25)
@@ -348,9 +353,15 @@ def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
         alone = _OTHER[name] not in better
         max_sigma = _MAX_SIGMA_ALONE if alone else _MAX_SIGMA
         exact = aligned(
-            image, start, patterns[name], picture.camera, _REACH, _blur_px(better.get(name)),
-            max_sigma=max_sigma, alone=alone,
-        )  # fmt: skip
+            image,
+            start,
+            patterns[name],
+            picture.camera,
+            _REACH,
+            _blur_px(better.get(name)),
+            max_sigma=max_sigma,
+            alone=alone,
+        )
         if exact is not None:
             better[name] = exact
         elif alone and searched:
@@ -384,7 +395,7 @@ def _start(picture: Picture, name: MarkerName, seen: _Seen) -> Array | None:
     return None
 
 
-# --- Markers where they are expected: no search, only verification -----------------------------
+# --- Markers where they are expected: no search, only verification ----
 # Sides are fitted at the predicted corners, and every cell is read through the result's
 # homography: a strict check (all cells right, none nearly wrong) at a tenth of the price of
 # a search.
@@ -481,7 +492,7 @@ def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
     return partly if partly and is_centred(partly) else None
 
 
-# --- The markers of two fields, at the moment half way between them ----------------------------
+# --- The markers of two fields, at the moment half way between them ---
 
 
 _MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s

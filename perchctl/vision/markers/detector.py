@@ -142,7 +142,7 @@ def _distance(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> int:
     return min(int((np.rot90(a, turn) != b).sum()) for turn in range(4))
 
 
-# --- The vehicle's own gear in the picture: where it is, nothing is to be seen of a target -----
+# --- The vehicle's own gear in the picture: where it is, nothing is to be seen of a target ---
 # Legs and guards do not move in the picture, so what they cover is known (`camera.mask`). There the
 # picture is filled with what is around it, so that no threshold joins the gear to a marker's rim,
 # and no side or cell is measured.

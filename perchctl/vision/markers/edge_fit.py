@@ -42,7 +42,7 @@ from perchctl.vision.markers.corners import (
 from perchctl.vision.markers.pattern import Rim
 from perchctl.vision.types import CameraModel, EdgeShift
 
-# --- Grey profiles across the sides of markers -------------------------------------------------
+# --- Grey profiles across the sides of markers ------------------------
 # They are sampled along each side's image through the lens, so that distortion does not
 # bend the side away from the samples. All rows (a row is one side of one marker) run
 # through the same arrays.
@@ -386,10 +386,13 @@ def _accepted(
         and grey > _MIN_CONTRAST * PROFILES
         and is_sharp
         for residual, count, grey, is_sharp in zip(
-            residual_px.tolist(), inliers.tolist(), contrast.tolist(), sharp.tolist(),
+            residual_px.tolist(),
+            inliers.tolist(),
+            contrast.tolist(),
+            sharp.tolist(),
             strict=True,
         )
-    ]  # fmt: skip
+    ]
     return [
         cell_px > _MIN_CELL_PX
         and all(good[4 * i : 4 * i + 4])
@@ -441,7 +444,7 @@ def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
     return math.sqrt(slope) if slope > (_LEAST_ROWS - 1.0) * max(still, 0.0) else 0.0
 
 
-# --- The sides of markers, measured: the edge's place on profiles across each of them ----------
+# --- The sides of markers, measured: the edge's place on profiles across each of them ---
 # A row is one side of one marker: rows 4 i to 4 i + 3 belong to marker i. After all of
 # them the inner edges of one marker's border may follow.
 
@@ -580,7 +583,7 @@ def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> 
     return Surroundings(depth_px, inside, outside, possible)
 
 
-# --- Edges between black and white to a hundredth of a pixel, on grey profiles across them -----
+# --- Edges between black and white to a hundredth of a pixel, on grey profiles across them ---
 # The edge in each profile is the gradient's windowed centroid; this is repeated with the
 # window centred on the side's own line (narrow, hence calm in noise). A blur that is equal
 # on both flanks of an edge does not move its centroid.

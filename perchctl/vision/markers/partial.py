@@ -216,7 +216,7 @@ def _spread(seen: SeenEdges, left: Array) -> tuple[float, float] | None:
     return scatter, max(chi2 / freedom, 1.0)
 
 
-# --- Which marker it is, by the cells that are seen of it --------------------------------------
+# --- Which marker it is, by the cells that are seen of it -------------
 
 
 KnownBy = Literal["bits", "track", "other"]

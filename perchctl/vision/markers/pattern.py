@@ -215,7 +215,7 @@ def _softened(drawing: Drawing, spots: Array) -> Array:
     return np.asarray(white[at[:, 1], at[:, 0]])
 
 
-# --- A marker's drawing on a grid: how white each node is, sharp and blurred -------------------
+# --- A marker's drawing on a grid: how white each node is, sharp and blurred ---
 
 
 _REACH_CELLS = 0.6  # of white around the border
@@ -240,8 +240,9 @@ class Drawing:
         return 1.0 + _REACH_CELLS * 2.0 / len(self.cells)
 
 
-def drawing_of(bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None,
-               ratio: float = 0.0) -> Drawing:  # fmt: skip
+def drawing_of(
+    bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None, ratio: float = 0.0
+) -> Drawing:
     """Return the drawing of inner bits, 1 = white; with a centre, that of the target's large
     marker: its sheet has a cell of white around it."""
     cells = np.pad(bits.astype(np.float64), 1)

@@ -216,7 +216,7 @@ def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
     return _Equations(gain, error, J, noise, N, g)
 
 
-# --- How much the picture looks like a drawing that was fitted to it ---------------------------
+# --- How much the picture looks like a drawing that was fitted to it ---
 
 
 def likeness(grey: Array, error: Array) -> float:
@@ -295,7 +295,7 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
     return index, np.maximum(count, 1.0)
 
 
-# --- The light on a marker: what turns its drawing into grey values ----------------------------
+# --- The light on a marker: what turns its drawing into grey values ---
 # Offset and gain, their slopes over the marker, the bend of the tone curve (clipped white,
 # gamma) and the grey beyond the sheet. All of them shift edges if left out.
 
@@ -314,7 +314,7 @@ def _lit_jacobian(drawing: Rendered, light: Array) -> Array:
     return change
 
 
-# --- A grid over a marker in its own coordinates, and the picture read at its nodes ------------
+# --- A grid over a marker in its own coordinates, and the picture read at its nodes ---
 
 
 _FEW = 9  # a side
@@ -416,7 +416,7 @@ def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) ->
     return np.asarray(grey, dtype=np.float64).ravel()
 
 
-# --- Products of long rows, a value for each node of a square grid -----------------------------
+# --- Products of long rows, a value for each node of a square grid ----
 # They are taken block by block: large products wake threads, which cost more than they
 # save, and far more on a busy machine.
 
@@ -521,8 +521,13 @@ def _blurred(sharp: NDArray[np.float32], sigma: float, axis: Array) -> tuple[Arr
     along = u * du + v * dv
     changes = np.empty((9, n, n))
     for part, one, other in (
-        (0, u, du), (1, v, du), (3, u, dv), (4, v, dv), (6, -u, along), (7, -v, along),
-    ):  # fmt: skip
+        (0, u, du),
+        (1, v, du),
+        (3, u, dv),
+        (4, v, dv),
+        (6, -u, along),
+        (7, -v, along),
+    ):
         np.multiply(-one, other, out=changes[part])
     changes[2], changes[5], changes[8] = -du, -dv, 0.5 * laplace
     return value.ravel().astype(np.float64), changes.reshape(9, n * n)
