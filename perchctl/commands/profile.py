@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import re
 import shlex
 import sys
 from pathlib import Path
@@ -99,14 +100,37 @@ QUESTIONS: dict[str, str] = {
     "ceiling": "2.4",
     "safety.fence_radius_m": "1.5",
 }
-"""What is asked, in this order, with what Enter stands for: keys of the profile, which explains
-them, and the words of `WORDS`. Some defaults depend on earlier answers (`default_answer`)."""
+"""What is asked, in this order, with the default: keys of the profile, the two edges of the
+picture, and the ceiling. Some defaults depend on earlier answers (`default_answer`)."""
 WORDS: dict[str, str] = {
+    "link.uri": "The vehicle's URI: radio://0/80/2M/E7E7E7E7E7, usb://0, sim://",
+    "camera.source": "The camera: camera:N (a receiver at /dev/videoN), http://..., rtsp://..., "
+    "aideck://HOST",
+    "camera.calibration": "Its calibration file, of perchctl calibrate",
+    "camera.latency_s": "How late the picture is, from exposure to arrival (often 60 to 100 ms)",
     "front": "Hold a hand over the front of the vehicle. At which edge of the picture does it\n"
     "come in: top, right, bottom or left?",
     "left": "And a hand over its left side (a camera that mirrors has it at the other edge)?",
-    "ceiling": "Height of the ceiling over the floor, m",
+    "camera.mount.position_m": "Where is the lens from the vehicle's centre: forward, left, up?",
+    "vehicle.gear_body_m": "Where is the tip of the magnet gear: forward, left, up?",
+    "target.large.side_m": "Side of the target's large black square as printed",
+    "target.small.side_m": "Side of the small black square",
+    "ceiling": "Height of the ceiling over the floor",
+    "safety.fence_radius_m": "Radius of the free space around the place of take-off",
 }
+MEASURES: dict[str, tuple[str, float]] = {
+    "camera.latency_s": ("ms", 1e-3),
+    "camera.mount.position_m": ("mm", 1e-3),
+    "vehicle.gear_body_m": ("mm", 1e-3),
+    "target.large.side_m": ("mm", 1e-3),
+    "target.small.side_m": ("mm", 1e-3),
+    "ceiling": ("m", 1.0),
+    "safety.fence_radius_m": ("m", 1.0),
+}
+"""The unit that people answer in, and its size in the key's."""
+EDGES_AND_CEILING = ("front", "left", "ceiling")
+"""Questions that are no keys of the profile."""
+BACK = "back"
 CEILING_M = (1.0, 10.0)
 OVER_THE_CEILING_M = 0.4
 """The height limit is so far above the ceiling: an estimate that drifts must not end a flight."""
@@ -180,12 +204,14 @@ def new(
     check_output(output, (".yaml", ".yml"), force, "what a profile is")
     given = dict(setting.partition("=")[::2] for setting in settings or ())
     new_profile(given, output.stem)  # before anything is asked
-    if not defaults and not QUESTIONS.keys() <= given.keys():
-        print_lines(f"A new profile: {output}. Enter takes what stands in brackets.")
     answers = dict(given)
-    for name in QUESTIONS:
-        if name not in given:
-            answers = ask_person(name, answers) if not defaults else by_default(name, answers)
+    for name in [name for name in QUESTIONS if name not in given] if defaults else []:
+        answers[name] = default_answer(name, answers)
+    if not QUESTIONS.keys() <= answers.keys():
+        print_lines(
+            f"A new profile: {output}. Enter takes what stands in brackets, {BACK} goes back."
+        )
+        answers = ask_person(given)
     profile, keys = new_profile(answers, output.stem)
     shown = shlex.quote(str(output))
     write_files({output: (HEAD.format(name=shown) + profile_text(profile, keys)).encode()})
@@ -208,6 +234,9 @@ def default_answer(name: str, answers: Answers) -> str:
         return "sim:"
     if name == "camera.calibration" and _is_aideck(source):
         return load_profile("aideck").camera.calibration
+    made = sorted(Path("calib").glob("camera_*.yaml"), key=lambda path: path.stat().st_mtime)
+    if name == "camera.calibration" and made and not source.startswith("sim:"):
+        return str(made[-1])
     if name == "left":
         return edges_beside(answers["front"])[0]
     if name == "target.small.side_m":
@@ -216,43 +245,88 @@ def default_answer(name: str, answers: Answers) -> str:
     return QUESTIONS[name]
 
 
-def by_default(name: str, answers: Answers) -> Answers:
-    """Return the answers with the default of that question."""
-    return {**answers, name: default_answer(name, answers)}
-
-
-def ask_person(name: str, answers: Answers) -> Answers:
-    """Return the answers with what somebody types, asked for again until it is valid. Raises
-    UsageError if the input has ended."""
-    default = default_answer(name, answers)
-    question = WORDS.get(name) or _explanation(name)
+def ask_person(given: Answers) -> Answers:
+    """Return `given` with what somebody types: each question until its answer is valid, and what
+    was answered once more before it is taken. Raises UsageError if the input has ended."""
+    names = [name for name in QUESTIONS if name not in given]
+    before: list[Answers] = [given]
     while True:
-        # On stderr: stdout is for the result.
-        print(f"{question}\n  {name} [{default}] ", end="", file=sys.stderr, flush=True)
-        try:
-            answered = {**answers, name: input().strip() or default}
-            new_profile(answered, "new")
-        except EOFError:
-            raise UsageError(
-                "there is nobody to ask, and nothing was written: answer by --set, or add "
-                "--defaults for what is not answered"
-            ) from None
-        except (PerchError, UnicodeDecodeError) as error:
-            print_lines(f"  {error}")
+        answers, number = before[-1], len(before)
+        if number > len(names):
+            print_lines(summary(answers))
+            question, default = "Enter writes it", ""
         else:
-            return answered
+            name = names[number - 1]
+            default = default_answer(name, answers)
+            question = f"{number} of {len(names)}: {WORDS[name]}\n  [{_shown(name, default)}]"
+        try:
+            typed = _typed(question)
+            if typed.lower() == BACK:
+                before = before[: max(1, number - 1)]
+            elif number > len(names):
+                return answers
+            else:
+                answered = {**answers, name: _read(name, typed) if typed else default}
+                new_profile(answered, "new")
+                before.append(answered)
+        except (PerchError, UnicodeDecodeError) as error:
+            if isinstance(error, UsageError):
+                raise
+            print_lines(f"  {error}")
 
 
-def _explanation(key: str) -> str:
-    """Return the comment of a key: what it means, its unit, what is allowed."""
-    lines = (line.strip() for line in profile_text(Profile(), {key}).splitlines())
-    return "\n".join(line.removeprefix("# ") for line in lines if line.startswith("#"))
+def _typed(question: str) -> str:
+    # On stderr: stdout is for the result.
+    print(f"{question} ", end="", file=sys.stderr, flush=True)
+    try:
+        return input().strip()
+    except EOFError:
+        raise UsageError(
+            "there is nobody to ask, and nothing was written: answer by --set, or add "
+            "--defaults for what is not answered"
+        ) from None
+
+
+def _read(name: str, typed: str) -> str:
+    """Return the text of a key's value for what a person types: numbers, with the question's unit
+    or without. Raises InvalidValue."""
+    if name not in MEASURES:
+        return typed
+    unit, size = MEASURES[name]
+    words = re.sub(rf"(?<=[\d.])\s*{unit}(?![a-zA-Z])", " ", typed).replace(",", " ").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        raise InvalidValue(f"found {typed!r}; numbers in {unit} are needed") from None
+    if unit == "mm" and any(numbers) and all(abs(number) < 1.0 for number in numbers):
+        raise InvalidValue(f"found {typed!r}: these look like metres; the question is in mm")
+    values = [f"{number * size:.12g}" for number in numbers]
+    return values[0] if len(values) == 1 else f"[{', '.join(values)}]"
+
+
+def _shown(name: str, value: str) -> str:
+    """Return the text of a key's value as a person would type it."""
+    if name not in MEASURES:
+        return value
+    unit, size = MEASURES[name]
+    numbers = (float(part) / size for part in value.strip("[]").split(","))
+    return f"{' '.join(f'{number:.4g}' for number in numbers)} {unit}"
+
+
+def summary(answers: Answers) -> str:
+    """Return what the profile would say, for a last look."""
+    profile, _ = new_profile(answers, "new")
+    mirrored = "mirrored" if profile.camera.mirrored else "not mirrored"
+    turn = profile.camera.mount.rpy_deg[2]
+    rows = [(name, _shown(name, answers[name])) for name in QUESTIONS if name in answers]
+    rows.append(("picture", f"{mirrored}, turned by {turn:g} deg about the vertical"))
+    return "\n".join(f"  {name:<24} {text}" for name, text in rows)
 
 
 def new_profile(answers: Answers, name: str) -> tuple[Profile, set[str]]:
     """Return the profile that these answers make, few or all, and the keys that it is written with.
     Raises NotFound, InvalidValue, UsageError, each with the key."""
-    texts = {key: text for key, text in answers.items() if key not in WORDS}
+    texts = {key: text for key, text in answers.items() if key not in EDGES_AND_CEILING}
     if "target.large.side_m" in texts and "target.small.side_m" not in texts:
         texts["target.small.side_m"] = default_answer("target.small.side_m", answers)
     if (calibration := texts.get("camera.calibration")) is not None:

@@ -93,7 +93,7 @@ def test_the_file_loads_and_equals_what_was_answered(said: dict[str, str]) -> No
 
 def test_enter_takes_every_default(tmp_path: Path) -> None:
     asked, silent = tmp_path / "asked.yaml", tmp_path / "silent.yaml"
-    assert new(asked, typed="\n" * len(QUESTIONS)).exit_code == 0
+    assert new(asked, typed="\n" * (len(QUESTIONS) + 1)).exit_code == 0
     one, other = load_profile(str(asked)), made(silent)
     assert one.model_copy(update={"name": ""}) == other.model_copy(update={"name": ""})
     assert one.link.uri.startswith("radio://")
@@ -137,13 +137,46 @@ WRONG: dict[str, tuple[str, str]] = {
 }
 
 
+MISTYPED = WRONG | {
+    "camera.latency_s": ("2000", "allowed are 0 to 1"),
+    "camera.mount.position_m": ("0.03 0 0.01", "look like metres"),
+    "vehicle.gear_body_m": ("0 0 400", "0.4"),
+    "target.large.side_m": ("15 cm", "numbers in mm"),
+    "target.small.side_m": ("80", "less than half"),
+    "safety.fence_radius_m": ("far", "numbers in m"),
+}
+
+
 def test_a_wrong_answer_is_asked_again_with_what_is_allowed(tmp_path: Path) -> None:
     output = tmp_path / "mine.yaml"
-    done = new(output, typed="".join(f"{WRONG[name][0]}\n\n" for name in QUESTIONS))
+    done = new(output, typed="".join(f"{MISTYPED[name][0]}\n\n" for name in QUESTIONS) + "\n")
     assert done.exit_code == 0
-    for _, allowed in WRONG.values():
+    for _, allowed in MISTYPED.values():
         assert allowed in done.stderr
     assert load_profile(str(output)).link.uri.startswith("radio://")
+
+
+def test_a_ruler_s_millimetres_are_written_as_metres_and_one_may_go_back(tmp_path: Path) -> None:
+    output = tmp_path / "mine.yaml"
+    typed = ["usb://0", "", "", "80", "back", "95 ms", "top", "left", "31.5, 0 -4 mm", "", "180"]
+    done = new(output, typed="\n".join([*typed, "", "", "", "back", "1.2", ""]) + "\n")
+    assert done.exit_code == 0, done.stderr
+    mine = load_profile(str(output))
+    assert mine.camera.latency_s == 0.095
+    assert mine.camera.mount.position_m == (0.0315, 0.0, -0.004)
+    assert (mine.target.large.side_m, mine.target.small.side_m) == (0.18, 0.03)
+    assert mine.safety.fence_radius_m == 1.2
+    assert "picture                  mirrored, turned by" in done.stderr
+
+
+def test_a_calibration_that_lies_there_is_offered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    own = tmp_path / "calib" / "camera_640x480.yaml"
+    own.parent.mkdir()
+    own.write_bytes(find_calibration("example_640x480").read_bytes())
+    assert Path(made(tmp_path / "m.yaml").camera.calibration).samefile(own)
 
 
 @pytest.mark.parametrize(("name", "text", "allowed"), [
