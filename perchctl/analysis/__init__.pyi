@@ -5,8 +5,6 @@ from .flight import FlightAnalysis as FlightAnalysis
 from .plot import plot_flight as plot_flight
 from .replayer import replay as replay
 from .report import write_report as write_report
-from .show import list_logs as list_logs
-from .show import list_text as list_text
 from .show import newest_logs as newest_logs
 from .show import show_record as show_record
 from .show import show_text as show_text

@@ -133,8 +133,11 @@ class ReportedFlight:
             )
         if log.ignored_bytes:
             found.append(f"Its last {log.ignored_bytes} bytes could not be read and are left out.")
-        if end.log_problem:
-            found.append(f"The log lacks {count(end.lost_records, 'record')}: {end.log_problem}.")
+        if end.lost_records:
+            why = end.log_problem or "no reason is known"
+            found.append(f"The log lacks {count(end.lost_records, 'record')}: {why}.")
+        elif end.log_problem:
+            found.append(f"The log may lack its last records: {end.log_problem}.")
         return found
 
 
@@ -283,7 +286,7 @@ def _jpeg(record: dict[str, Any], image: NDArray[np.uint8]) -> bytes:
     scale = min(1.0, WIDEST_PX / drawn.shape[1])
     drawn = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     for key, colour in (("large_px", LARGE_BGR), ("small_px", SMALL_BGR)):
-        if record.get(key) is not None:
+        if np.size(record.get(key) or ()) == 8:
             # A pixel's centre is a whole number; shrunk, too.
             points = (np.array(record[key], dtype=np.float64).reshape(4, 2) + 0.5) * scale - 0.5
             fixed = np.round(points * 16).astype(np.int32)

@@ -3,15 +3,15 @@ the logs of a folder, a line each."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
 from perchctl.analysis.flight import FlightAnalysis
-from perchctl.errors import NotFound, PerchError
-from perchctl.record import FlightLog, FlightSummary, PhaseSpan, log_values, read_log
+from perchctl.errors import NotFound
+from perchctl.record import FlightLog, PhaseSpan
 
 COLUMNS = 79
 _HANG = 11
@@ -171,42 +171,3 @@ def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
 
 def _age_key(path: Path) -> tuple[int, str]:
     return (path.stat().st_mtime_ns if path.exists() else 0), path.name
-
-
-def list_logs(folder: Path, most: int | None = None) -> list[dict[str, Any]]:
-    """Return the newest logs of a folder, each with how it ended, as JSON's own types. For a file
-    that cannot be read `problem` says why, and the rest is None. Errors: NotFound."""
-    return [_listed(path) for path in newest_logs(folder, most)]
-
-
-def _listed(path: Path) -> dict[str, Any]:
-    keys = ("started_utc", "profile", "seed", "outcome", "reason", "duration_s", "miss_m")
-    found: dict[str, Any] = {"log": str(path), **dict.fromkeys(keys), "problem": None}
-    try:
-        with log_values(path):
-            log = read_log(path)
-            end = FlightSummary.of(log)
-    except PerchError as error:
-        return found | {"problem": str(error).removeprefix(f"{path}: ")}
-    header = {key: log.header.get(key) for key in ("started_utc", "seed")}
-    ended = {key: getattr(end, key) for key in ("outcome", "reason", "duration_s", "miss_m")}
-    return found | header | ended | {"profile": log.profile_name}
-
-
-def list_text(logs: Sequence[Mapping[str, Any]]) -> str:
-    """Return the records of `list_logs`, a line each, as wide as a terminal of 80 columns."""
-    names = [plain(Path(each["log"]).name) for each in logs]
-    width = min(44, max([3, *map(len, names)]))
-    lines = [f"{'log':<{width}}  {'s':>6}  how it ended"]
-    for name, each in zip(names, logs, strict=True):
-        seconds = "-" if each["duration_s"] is None else f"{each['duration_s']:.1f}"
-        how = each["problem"] or f"{each['outcome']}: {each['reason']}".rstrip(": ")
-        if each["miss_m"] is not None:
-            how = f"{each['outcome']}, {each['miss_m'] * 1e3:.1f} mm"
-        how = _cut(plain(how), COLUMNS - width - 10)
-        lines.append(f"{_cut(name, width):<{width}}  {seconds:>6}  {how}".rstrip())
-    return "\n".join(lines)
-
-
-def _cut(text: str, room: int) -> str:
-    return text if len(text) <= room else f"{text[: room - 3]}..."

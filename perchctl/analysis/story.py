@@ -131,22 +131,21 @@ def _motors(flight: FlightAnalysis) -> Iterator[Sentence]:
 
 def _end(flight: FlightAnalysis) -> Iterator[Sentence]:
     """Tell what the vehicle needs after the flight, or where a log stops without its end."""
-    end, phases = flight.summary, flight.log.phases
-    text = ""
+    end, phases, end_s = flight.summary, flight.log.phases, flight.log.end_s
     if flight.log.summary is None:
         text = f"The log ends here, in {phases[-1].phase if phases else '?'}"
-        height_m = flight.at(flight.log.end_s, "z_m") - flight.at(0.0, "z_m")
+        height_m = flight.at(end_s, "z_m") - flight.at(0.0, "z_m")
         if phases and phases[-1].phase in FLYING | {"LANDING"} and math.isfinite(height_m):
             text += f" at {length(height_m)}"
         text += ": how the flight ended is not known, its program was ended"
-    elif end.locked:
+        yield Sentence(end_s, text, "bad")
+    if end.locked:
         text = "The supervisor locked the vehicle: inspect and restart it"
-    elif end.touchdown is not None and end.touchdown.is_hard:
-        text = f"It {end.touchdown.text}"
-    elif end.fell:
-        text = "The vehicle fell"
-    if text:
-        yield Sentence(flight.log.end_s, text, "bad")
+        yield Sentence(end_s, text, "bad")
+    if end.touchdown is not None and end.touchdown.is_hard:
+        yield Sentence(end_s, f"It {end.touchdown.text}", "bad")
+    if end.fell:
+        yield Sentence(end_s, "The vehicle fell", "bad")
 
 
 def _upper(sentence: str) -> str:

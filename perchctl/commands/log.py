@@ -113,7 +113,7 @@ def plot(
     ] = None,
     force: ForceOption = False,
 ) -> None:
-    """Draw a flight: errors, detections, lost frames, height, battery, the last seconds."""
+    """Draw a flight: detections, lost frames, height, battery, the last seconds."""
     path = _log_file(file)
     picture = output or path_beside(path, ".png")
     with _opened(path) as log:

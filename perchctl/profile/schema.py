@@ -46,7 +46,7 @@ class LogConfig(Section):
     plot: bool = key(True, "draw the flight after it")
     max_mb: float = key(
         2000.0,
-        "no more pictures are recorded into a larger recording, before it is packed",
+        "a larger recording is ended, before it is packed",
         gt=0,
         le=1e6,
     )

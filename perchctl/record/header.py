@@ -89,25 +89,70 @@ def _packed(mask: NDArray[np.bool_]) -> str:
     return base64.b64encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode("ascii")
 
 
+# --- A fingerprint of how this computer calculates ---------------------------------------------
+# Libraries choose their kernels by the processor: numpy's BLAS and vector functions, OpenCV's
+# filters, the sine of the C library. They sum in another order, or round once where others round
+# twice, so that the last bits of a pose are a processor's own.
+
+
+_SIDES = (2, 3, 4, 6, 8, 12)
+
+
 @cache
 def arithmetic_fingerprint() -> str:
-    """Return eight hexadecimal digits for how this computer calculates. Where they are the same,
-    with the same libraries, single-threaded results are the same to the bit.
+    """Return eight hexadecimal digits. Where they are the same, with the same libraries,
+    single-threaded results are the same to the bit: they stand for the kernels that may be chosen,
+    and for the results of some small calculations."""
+    bits = zlib.crc32(repr((_kernels(), cv2.getCPUFeaturesLine())).encode())
+    for part in (_of_libm(), *_of_numpy(), *_of_opencv()):
+        bits = zlib.crc32(np.ascontiguousarray(part).tobytes(), bits)
+    return f"{bits:08x}"
 
-    Libraries choose their kernels by the processor, and these round differently in the last bits.
-    numpy and OpenCV name what they choose by; the C library and numpy's BLAS are known by the
-    results of some small calculations.
-    """
+
+def _kernels() -> Any:
     config: Any = np.show_config(mode="dicts")
-    kernels = repr((config.get("SIMD Extensions"), cv2.getCPUFeaturesLine()))
-    x = np.arange(1, 257) * (math.pi / 97.0)
+    return config.get("SIMD Extensions", {}) if isinstance(config, dict) else {}
+
+
+def _grid() -> Any:
+    return np.arange(1, 257) * (math.pi / 97.0)
+
+
+def _of_libm() -> Any:
     functions = (math.sin, math.cos, math.atan, math.exp, math.log, math.sqrt)
-    results = [np.array([f(v) for v in x.tolist() for f in functions]), np.exp(-x), x.sum()]
-    for n in (2, 3, 4, 6, 8, 12):
+    values = [f(x) for x in _grid().tolist() for f in functions]
+    return np.array(values + [math.hypot(x, 1.0 / x, 0.3) for x in _grid().tolist()])
+
+
+def _of_numpy() -> list[Any]:
+    x = _grid()
+    found = [np.sin(x), np.cos(x), np.exp(-x), np.arctan2(x, 2.0), x.sum(), np.dot(x, x)]
+    for n in _SIDES:
         A = np.sin(x[: n * n]).reshape(n, n)
         S = A.dot(A.T) + n * np.eye(n)
-        results += [S, np.linalg.solve(S, A), *np.linalg.eigh(S), np.linalg.svd(A)[1]]
-    bits = zlib.crc32(kernels.encode())
-    for result in results:
-        bits = zlib.crc32(np.ascontiguousarray(result).tobytes(), bits)
-    return f"{bits:08x}"
+        found += [S, np.linalg.solve(S, A), np.linalg.inv(S), *np.linalg.eigh(S)]
+        found += [np.linalg.svd(A)[1], A.dot(A[0]), np.einsum("ij,jk->ik", A, S)]
+    return found
+
+
+def _of_opencv() -> list[Any]:
+    y, x = np.mgrid[0:64, 0:96]
+    image = np.asarray(128 + 90 * np.sign((x - 40) * (y - 30)) + (7 * x + 13 * y) % 29, np.uint8)
+    corners = np.array([[[40.3, 30.4]]], np.float32)
+    way = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 1e-4)
+    K = np.array([[300.0, 0.0, 48.0], [0.0, 300.0, 32.0], [0.0, 0.0, 1.0]])
+    points = np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    turned, moved = np.array([0.1, -0.2, 0.3]), np.array([0.1, 0.2, 9.0])
+    seen, by_place = cv2.projectPoints(points, turned, moved, K, np.array([0.1, -0.05, 0.0, 0.0]))
+    _, r, t = cv2.solvePnP(points, seen, K, None, flags=cv2.SOLVEPNP_IPPE)
+    return [
+        cv2.GaussianBlur(image.astype(np.float32), (5, 5), 1.1),
+        cv2.Sobel(image, cv2.CV_32F, 1, 0),
+        cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), way),
+        cv2.warpPerspective(image, K / 300.0 + 0.001, (48, 48)),
+        cv2.Rodrigues(turned)[0],
+        seen,
+        by_place,
+        r,
+        t,
+    ]

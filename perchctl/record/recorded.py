@@ -16,6 +16,7 @@ from mcap.exceptions import InvalidMagic, McapError
 from mcap.records import Channel, McapRecord, Message
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
+from zstandard import ZstdError
 
 from perchctl.camera import decode_picture
 from perchctl.errors import InvalidValue, NotFound
@@ -24,7 +25,7 @@ from perchctl.record.write import recording_path
 
 MOST_RECORD_BYTES = 64_000_000
 """A flight's chunk has 4 MB and one picture; a longer record is a damaged length."""
-_TORN = (McapError, ValueError, RuntimeError, struct.error)
+_TORN = (McapError, ValueError, RuntimeError, struct.error, ZstdError)
 """What the libraries raise for a record that is cut or damaged; lz4's errors among them."""
 
 

@@ -108,7 +108,7 @@ class FlightSummary:
         )
 
     def as_record(self) -> dict[str, Any]:
-        """Return the record for `FlightLogWriter.conclude`. The phases are in the ticks already,
+        """Return the record for `FlightLogWriter.close`. The phases are in the ticks already,
         and the writer adds what the log lacks."""
         return {
             "outcome": self.outcome,
