@@ -11,7 +11,7 @@ from perchctl.analysis.story import ACTIONS, ENDS, Sentence, story_of
 from perchctl.mission import Phase
 from tests.helpers.log import GONE_S, PLAN
 from tests.helpers.mission import note
-from tests.helpers.told import START_S, Change, entered, flown_s, made
+from tests.helpers.told import START_S, SUMMARY, Change, entered, flown_s, made
 
 
 def story(change: Change = lambda record: None, **more: Any) -> list[Sentence]:
@@ -114,6 +114,14 @@ def test_a_killed_flight_has_no_end() -> None:
     last = story(change, summary=None)[-1]
     assert last.grade == "bad"
     assert "The log ends here, in PERCH at 1.87 m" in last.text
+
+
+def test_each_harm_of_the_end_is_told() -> None:
+    harm = {"locked": True, "fell": True, "touchdown_mps": 1.4, "touchdown_g": 6.0}
+    told = story(summary=SUMMARY | harm)
+    for words in ("locked the vehicle", "touched down hard: 1.4 m/s, 6.0 g", "The vehicle fell"):
+        assert only(told, words).grade == "bad"
+    assert "touched down" not in str(story(summary=SUMMARY | harm | {"touchdown_mps": 0.3}))
 
 
 def test_a_log_of_the_first_version_and_one_without_a_tick() -> None:

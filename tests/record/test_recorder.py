@@ -22,13 +22,15 @@ from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers import recorded
 from tests.helpers.disk import full_disk
+from tests.helpers.mission import changed
 from tests.helpers.recorded import MemoryDisk
 
 WAIT_S = 20.0
 
 
-def onto(disk: Any, live: bool = False) -> Recorder:
-    return Recorder(Path("f.mcap"), disk, synthetic.header(), recorded.PROFILE, live)
+def onto(disk: Any, live: bool = False, max_mb: float = 1000.0) -> Recorder:
+    profile = changed({"log.max_mb": max_mb}, recorded.PROFILE)
+    return Recorder(Path("f.mcap"), disk, synthetic.header(), profile, live)
 
 
 def pictures_on(disk: MemoryDisk, tmp_path: Path) -> list[int]:
@@ -62,10 +64,9 @@ def test_what_ends_the_recording_is_one_sentence_and_the_flight_goes_on(
     """A full disk, a disk with the log's last room, a recording as large as it may be, and what
     cannot be encoded."""
     disk, flight = MemoryDisk(), recorded.flown(120)
-    recorder = onto(disk)
+    recorder = onto(disk, max_mb=change.get("max_mb", 1000.0))
     recorded.fly(recorder, recorded.Flown(flight.frames[:60], flight.ticks[:120]))
     disk.room, disk.free = change.get("room"), change.get("free", 10**12)
-    recorder._most_bytes = change.get("max_mb", 1000) * 1e6
     if "tick" in change:
         recorder.tick(change["tick"])
     recorded.fly(recorder, recorded.Flown(flight.frames[60:], flight.ticks[120:]))

@@ -154,6 +154,21 @@ def test_the_transforms_lead_from_the_world_to_camera_gear_and_target(
     np.testing.assert_allclose(T["world setpoint"], make_T(rot_z(tick["cmd_yaw_rad"]), place))
 
 
+def test_the_body_is_where_it_was_when_that_was_measured(found: dict[str, list[Any]]) -> None:
+    (body,) = [each for each in found["/tf"][50].transforms if each.child_frame_id == "body"]
+    told_s = FLIGHT.ticks[50]["t_s"] - FLIGHT.ticks[50]["tel_age_s"] - 1.0
+    since_s = body.timestamp.seconds - STARTED.timestamp() + body.timestamp.nanos * 1e-9
+    assert since_s == pytest.approx(told_s, abs=1e-8)
+
+
+def test_values_that_are_no_numbers_make_no_transform(tmp_path: Path) -> None:
+    recorder = recorded.recorder(tmp_path / "f.mcap")
+    recorder.tick({**FLIGHT.ticks[0], "x_m": float("nan"), "cmd_z_m": float("inf")})
+    recorder.close()
+    (said,) = recorded.messages(tmp_path / "f.mcap")["/tf"]
+    assert set(recorded.transforms(said)) == {"body camera", "body gear"}
+
+
 def test_events_and_corners_are_shown(found: dict[str, list[Any]]) -> None:
     (said,) = found["/log"]
     assert (said.message, said.level) == ("LANDING: target not found", Log_pb2.Log.ERROR)
