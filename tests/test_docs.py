@@ -356,6 +356,14 @@ def broken_links(path: Path, page: str) -> list[str]:
     return broken
 
 
+def test_a_broken_link_is_seen() -> None:
+    page = (
+        "[a](nowhere.md) [b](faults.md#not-there) [`no_such_name`](../perchctl/geometry.py) "
+        "[`wrap_rad`](../perchctl/geometry.py) [c](faults.md#the-table)"
+    )
+    assert len(broken_links(DOCS / "x.md", page)) == 3
+
+
 @EACH_PAGE
 def test_links_lead_somewhere(path: Path) -> None:
     assert broken_links(path, TEXT[path]) == []

@@ -92,7 +92,7 @@ QUESTIONS: dict[str, str] = {
     "camera.calibration": EXAMPLE,
     "camera.latency_s": "0.08",
     "front": "top",
-    "left": "left",
+    "left": "",
     "camera.mount.position_m": "[0.03, 0, 0.01]",
     "vehicle.gear_body_m": "[0, 0, 0.03]",
     "target.large.side_m": "0.15",
@@ -272,7 +272,7 @@ def ask_person(given: Answers) -> Answers:
         except (PerchError, UnicodeDecodeError) as error:
             if isinstance(error, UsageError):
                 raise
-            print_lines(f"  {error}")
+            print_lines(f"  {str(error).removeprefix('--set: ')}")
 
 
 def _typed(question: str) -> str:
@@ -336,6 +336,8 @@ def new_profile(answers: Answers, name: str) -> tuple[Profile, set[str]]:
     for key, check in (("link.uri", check_uri), ("camera.source", parse_source)):
         if key in texts:
             check(texts[key])
+    if texts.get("camera.source") == "camera:":
+        raise InvalidValue("camera.source: found camera:; write camera:N or camera:NAME")
     source = texts.get("camera.source", "")
     derived = {"name": name, **_mount_keys(answers), **_height_keys(answers)}
     if source:

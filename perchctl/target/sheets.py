@@ -103,8 +103,8 @@ def board_pdf(board: Board, page: str) -> bytes:
     texts = (
         f"perchctl {board.notation()}   print at 100 %, not scaled: both rulers must measure "
         f"100 mm",
-        f"Then measure the black area ({width:g} x {height:g} mm) and give its sides to perchctl "
-        f"calibrate --measured WIDTHxHEIGHT.",
+        f"Then measure the black area ({width:g} x {height:g} mm) and tell them to perchctl "
+        f"calibrate, behind the board: {board.notation()}:measured=WIDTHxHEIGHTmm.",
     )
     left = max(UNPRINTABLE, pdf.cx - width / 2)
     lines = wrapped(texts, _LABEL, held[0] - UNPRINTABLE - left)

@@ -139,5 +139,5 @@ def test_what_is_set_up_wrong_is_named_and_not_flown_by(
         sim.capture_fault(None)
     assert rows[LIFTED].verdict is Verdict.FAIL, rows[LIFTED]
     assert re.search(words, rows[LIFTED].found)
-    with pytest.raises(SafetyAbort, match="found by check --lift on"):
+    with pytest.raises(SafetyAbort, match="compared by hand on"):
         it.may_fly()

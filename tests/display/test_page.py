@@ -16,6 +16,7 @@ import pytest
 from perchctl.display import LivePage, Sketch
 from perchctl.display.live import TOKEN_HEADER, is_loopback
 from tests.helpers.live_page import CORNERS, ask, stop
+from tests.helpers.recording import camera
 
 
 def test_the_page_needs_nothing_from_elsewhere(page: LivePage) -> None:
@@ -74,6 +75,25 @@ def test_the_stream_gives_the_drawn_picture(page: LivePage) -> None:
         page.close()  # ends a stream that waits
         while answer.read1(4096):
             pass
+
+
+def test_without_stop_there_is_none() -> None:
+    page = LivePage(camera(), "t")
+    try:
+        assert json.loads(ask(page.url, "/state")[1])["stop"] == "none"
+        assert stop(page.url, page.token) == 403
+    finally:
+        page.close()
+
+
+def test_the_page_looks_by_itself_at_the_age_of_what_it_shows(page: LivePage) -> None:
+    """Whatever hangs, its script is the browser's: a timer, answers that are not waited for
+    without end, and a STOP that is ready again at a program that was gone."""
+    script = page._server.html.partition("<script")[2]
+    for part in ("setInterval(watch", "AbortSignal.timeout ?", "known = stop;"):
+        assert part in script
+    assert script.count("...within(") == 2
+    assert 'showStop(silent ? known : "gone")' in script
 
 
 def test_what_fails_is_remembered_and_not_raised(page: LivePage) -> None:

@@ -201,6 +201,12 @@ def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     assert "report" in dict(rows)
 
 
+def test_nobody_is_waited_for_where_nobody_looks(page: LivePage) -> None:
+    page.end({"outcome": "LANDED"})  # returns at once: no reader would ever wake it
+    state = state_of(page)
+    assert (state["card"], state["stop"], state["age_s"]) == ({"outcome": "LANDED"}, "over", None)
+
+
 def test_who_looks_gets_the_card_before_the_page_goes(page: LivePage) -> None:
     state_of(page)
     thread = threading.Thread(target=page.end, args=({"outcome": "LANDED"},))

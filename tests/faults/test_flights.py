@@ -249,7 +249,7 @@ def test_an_exception_that_no_fault_planted_is_counted(
     step = step_mission
 
     def raising(state: Any, *rest: Any) -> Any:
-        if state.phase is Phase.SEARCH:
+        if state is not None and state.phase is Phase.SEARCH:
             raise error
         return step(state, *rest)
 

@@ -170,7 +170,7 @@ long = pytest.mark.long
     pytest.param(LOW, {"battery_rest_v": 3.3}, Outcome.SAFETY, 52, "battery",
                  ["LANDING", "LANDED"], marks=long, id="battery nearly empty"),
     # It would just do here: the gate does not bet on it, and lands with the figures.
-    pytest.param(LOW, {"battery_rest_v": 3.775}, Outcome.SAFETY, 52, " s left at 3.",
+    pytest.param(LOW, {"battery_rest_v": 3.775}, Outcome.SAFETY, 52, " s left; an attempt takes",
                  ["ALIGN", "LANDING", "LANDED"], marks=long, id="battery for no attempt"),
 ])  # fmt: skip
 def test_what_goes_wrong_is_landed_and_named(
