@@ -38,7 +38,8 @@ MAX_PACKET_BYTES = 1022
 """Largest length of a packet: the deck's buffers hold no more (its MTU)."""
 MOST_SIDE_PX = 1024
 
-# What waits unread would be taken for new: the kernel holds back the deck instead.
+# What waits unread while the reader stalls is then given out one by one, dated when it is read.
+# Linux holds at most twice this, three raw pictures or some forty JPEGs; then the deck has to wait.
 _RECEIVE_BYTES = 131072
 _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|[0-9A-Fa-f:]+")
 _PACKET = struct.Struct("<HBB")

@@ -1,7 +1,7 @@
 """A JPEG's structure: where it ends, what size it says, and its pixels; pure.
 
-What a radio or a file delivers may be damaged anywhere. Two bytes that say a size of 32000x32000
-cost a decoder gigabytes and minutes, so the size is read before anything is decoded.
+What a radio delivers may be damaged anywhere. Two bytes that say a size of 32000x32000 cost a
+decoder gigabytes and minutes, so the size is read before anything of a stream is decoded.
 """
 
 from __future__ import annotations
@@ -56,6 +56,9 @@ def jpeg_extent(data: bytes | bytearray) -> Extent | None:
         if at + 2 > len(data):
             return None
         code = data[at + 1]
+        if data[at] == code == 0xFF:
+            at += 1  # a fill byte
+            continue
         if data[at] != 0xFF or code < 0xC0 or code == _SOI:
             raise Damaged(at)
         if code == _EOI:

@@ -153,7 +153,7 @@ class MjpegSource(StreamSource):
             # If the network delivered several at once only the newest is worth decoding.
             for picture, extent in reversed(splitter.feed(data)):
                 width, height = extent.size_px
-                image = grey_pixels(picture) if width * height <= MOST_STREAM_PX else None
+                image = grey_pixels(picture) if 0 < width * height <= MOST_STREAM_PX else None
                 if image is not None:
                     self._put(image, encoded=picture)
                     break

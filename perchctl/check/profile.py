@@ -209,7 +209,10 @@ def log_finding(folder: Path) -> Finding:
         return failed(f"{there} is a file", advice)
     if not os.access(there, os.W_OK | os.X_OK):
         return failed(f"no right to write in {there}", advice)
-    usage = shutil.disk_usage(there)
+    try:
+        usage = shutil.disk_usage(there)
+    except OSError as error:
+        return skipped(f"free space not known ({error.strerror or error})")
     if not usage.total:
         return skipped(f"{there} is on no disk")
     free = usage.free

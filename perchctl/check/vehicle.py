@@ -190,7 +190,7 @@ def _supervisor(vehicle: Vehicle, profile: Profile) -> Finding:
 
 
 def _positioning(vehicle: Vehicle, profile: Profile) -> Finding:
-    decks = ", ".join(vehicle.measured_by.decks)
+    decks = ", ".join(vehicle.position_decks(profile))
     found = {
         "mocap": f"by {profile.positioning.label}, see its rows",
         "target": "by the target, see in view",

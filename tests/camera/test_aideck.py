@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from perchctl.calibration import load_calibration
+from perchctl.camera import aideck as aideck_module
 from perchctl.camera import open_camera
 from perchctl.camera.aideck import (
     STALLED_S,
     AiDeckSource,
     MosaicFilter,
+    _Picture,
     aideck_address,
     has_mosaic,
     without_mosaic,
@@ -40,7 +43,7 @@ from tests.helpers.aideck import (
     raw_packets,
 )
 from tests.helpers.commands import run
-from tests.helpers.live import Clock, begun, level, next_frame
+from tests.helpers.live import Clock, begun, level, next_frame, resized
 from tests.helpers.waiting import until
 
 CAMERA = load_calibration("example_aideck_324x244.yaml")
@@ -153,15 +156,30 @@ def test_a_fault_costs_its_own_picture_and_no_connection(
     assert source.connections == 1
 
 
+@pytest.mark.parametrize("said", [(65_000, 65_000), (325, 244), (0, 244)])
+def test_a_jpeg_whose_size_bytes_are_damaged_is_not_decoded(
+    said: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = b"".join(p[4:] for p in jpeg_packets(picture(80))[1:])
+
+    def pixels(data: bytes) -> np.ndarray[Any, Any] | None:
+        return _Picture(0.0, 324, 244, True, len(data), bytearray(data)).pixels()
+
+    assert pixels(whole) is not None
+    monkeypatch.setattr(aideck_module, "grey_pixels", lambda data: pytest.fail("decoded"))
+    assert pixels(resized(whole, *said)) is None
+
+
 @pytest.mark.parametrize("end", [
-    [raw(picture(80))[:40_000]], [raw(picture(80))[:40_000], NEVER], [b"\x40\x9c\x63\x05", NEVER],
+    [b"".join(WHOLE[:20])], [raw(picture(80))[:40_000], NEVER], [b"\x40\x9c\x63\x05", NEVER],
 ], ids=["broken off", "stalls", "no packet"])  # fmt: skip
 def test_it_connects_anew(end: list[bytes | threading.Event], deck: AiDeck, read: Read) -> None:
     deck.scripts.put([raw(picture(60)), *end])
-    deck.scripts.put([raw(picture(160)), NEVER])
+    deck.scripts.put([b"".join(WHOLE[20:]), raw(picture(160)), NEVER])
     source = read(read_timeout_s=0.2)
-    until(lambda: source._count == 2)
-    assert level(next_frame(source)) == 160
+    until(lambda: source._count >= 2)
+    after = next_frame(source)
+    assert (level(after), after.index) == (160, 1), "the rest of the broken one is no picture"
     assert source.connections >= 2
 
 

@@ -96,7 +96,7 @@ def test_the_size_is_the_decoder_s_also_behind_a_thumbnail(picture: bytes) -> No
     image, small = grey_pixels(picture), jpeg(10, (16, 24))
     assert image is not None
     inside = b"\xff\xe1" + struct.pack(">H", 2 + len(small)) + small
-    for each in (picture, SOI + inside + picture[2:]):
+    for each in (picture, SOI + inside + picture[2:], SOI + b"\xff\xff" + picture[3:]):
         assert jpeg_extent(each) == (len(each), (image.shape[1], image.shape[0]))
 
 

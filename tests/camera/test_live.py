@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.camera import open_camera
+from perchctl.camera import network, open_camera
 from perchctl.camera.credentials import authorization
+from perchctl.camera.jpeg import grey_pixels
 from perchctl.camera.network import MAX_FAILED_CONNECTIONS, MjpegSource, StreamSource
 from perchctl.camera.source import SILENT_AFTER_S, LiveSource
 from perchctl.errors import NotFound, TimedOut
@@ -68,18 +69,37 @@ def test_the_newest_frame_is_stamped_at_arrival_less_the_latency_and_given_once(
     assert source.problem(clock.t_s) is None
 
 
-SIZES = [(40_000, 40_000), (4097, 4096), (0, 64)]
-
-
-@pytest.mark.parametrize("damaged", [jpeg(60)[:300], *(resized(jpeg(60), *px) for px in SIZES)])
 def test_a_damaged_picture_costs_no_connection(
-    damaged: bytes, server: MjpegServer, opened: list[LiveSource]
+    server: MjpegServer, opened: list[LiveSource]
 ) -> None:
-    server.scripts.put([part(damaged), part(jpeg(160)), threading.Event()])
+    server.scripts.put([part(jpeg(60)[:300]), part(jpeg(160)), threading.Event()])
     source = stream(server, Clock(), opened)
     assert level(next_frame(source)) == 160
     assert source.connections == 1
     assert source.problem(100.0) is None
+
+
+@pytest.mark.parametrize("size_px", [(40_000, 40_000), (4097, 4096), (0, 64)])
+def test_a_picture_of_no_size_or_above_the_largest_is_not_decoded(
+    size_px: tuple[int, int],
+    server: MjpegServer,
+    opened: list[LiveSource],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nor does it cost the connection."""
+    go, whole, tried = threading.Event(), jpeg(160), list[bytes]()
+
+    def decode(data: bytes) -> Any:
+        tried.append(data)
+        return grey_pixels(data)
+
+    monkeypatch.setattr(network, "grey_pixels", decode)
+    server.scripts.put([part(resized(jpeg(60), *size_px)), go, part(whole), threading.Event()])
+    source = stream(server, Clock(), opened)
+    until(lambda: source.damaged == 1)
+    go.set()
+    assert level(next_frame(source)) == 160
+    assert (tried, source.connections) == ([whole], 1)
 
 
 class Broken(StreamSource):
@@ -145,6 +165,17 @@ def test_it_reconnects_when_the_stream_ends_and_gives_up_after_five_in_vain(
     until(lambda: "gave no picture" in (source.problem(100.0) or ""))
     assert source.connections == 2 + MAX_FAILED_CONNECTIONS
     assert "5 attempts: the stream ended" in str(source.problem(100.0))
+
+
+def test_a_server_of_one_picture_a_connection_is_kept_though_they_are_equal(
+    server: MjpegServer, opened: list[LiveSource]
+) -> None:
+    for _ in range(MAX_FAILED_CONNECTIONS + 1):
+        server.scripts.put([part(jpeg(60))])
+    server.scripts.put([part(jpeg(60)), threading.Event()])
+    source = stream(server, Clock(), opened)
+    until(lambda: source._arrived == MAX_FAILED_CONNECTIONS + 2)
+    assert source.problem(100.0) is None
 
 
 def test_closing_waits_no_longer_than_a_read(server: MjpegServer) -> None:

@@ -206,6 +206,11 @@ def test_a_fault_alone_makes_its_row_and_no_other(
     assert others == set()
 
 
+def test_a_deck_that_places_nothing_is_not_named_for_what_places_it() -> None:
+    vehicle = replace(GOOD, measured_by=MeasuredBy(("bcAI",), True))
+    assert rows_of(vehicle)["positioning"].found == "by positions from outside"
+
+
 def test_a_deck_of_one_s_own_is_believed_where_it_is_named() -> None:
     vehicle = replace(GOOD, measured_by=MeasuredBy(("labUwb",), None))
     known = Profile.model_validate({"positioning": {"decks": ["labUwb"]}})

@@ -129,6 +129,17 @@ def test_what_ends_on_the_way_is_named_and_closing_ends_the_process(
     assert not any(thread.is_alive() for thread in capture._threads)
 
 
+def test_a_flood_of_frames_fills_nothing(faulty: Callable[..., MotionCapture]) -> None:
+    capture = faulty("floods")
+    first = capture._frames[0]
+    until(lambda: capture._frames[0] is not first)
+    assert len(capture.frames()) <= capture_module.KEPT
+    seen, end_s = 0, time.monotonic() + 0.3
+    while time.monotonic() < end_s:
+        seen += len(capture.frames())
+    assert seen < 0.3 * 600
+
+
 def test_a_library_that_prints_without_end_is_read_away(
     faulty: Callable[..., MotionCapture], capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 from perchctl.check import Verdict
 from perchctl.check.capture import comparison_rows, save_row
-from perchctl.check.row import failed, passed, warned
+from perchctl.check.row import failed, passed, skipped, warned
 from perchctl.commands import app
 from perchctl.errors import SafetyAbort
 from perchctl.flight import session
@@ -140,6 +140,13 @@ def test_what_did_not_pass_ends_an_older_pass(lifted: Any) -> None:
     again = save_row(passed("fine"), CONFIG, URI, datetime.now().astimezone())
     assert again.verdict is Verdict.PASS
     require()
+
+
+def test_a_lift_that_told_nothing_leaves_the_record_as_it_is() -> None:
+    for verdict in (Verdict.WARN, Verdict.PASS):
+        row = save_row(skipped("not moved"), CONFIG, URI, datetime.now().astimezone())
+        assert row.verdict is verdict
+        was_compared(CONFIG, URI)
 
 
 @pytest.mark.parametrize(("lifted", "removable", "verdict"), [

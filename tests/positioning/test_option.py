@@ -12,6 +12,7 @@ from typer.testing import CliRunner, Result
 from perchctl.commands import app
 from perchctl.commands.fly import with_positioning
 from perchctl.profile import PositioningConfig, Profile
+from perchctl.profile.positioning import MOST_LATENCY_S
 
 REAL = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x", "--yes")
 
@@ -88,3 +89,9 @@ def test_a_hold_that_each_perfect_frame_would_reach_is_refused(late: dict[str, f
     with pytest.raises(ValidationError, match="a position is stale before the next one comes"):
         PositioningConfig(by="mocap", host="lab", **late)
     PositioningConfig(by="mocap", host="lab", **{**late, "hold_s": 0.4})
+
+
+def test_a_capture_that_is_later_than_can_be_flown_by_is_refused() -> None:
+    PositioningConfig(by="mocap", host="lab", latency_s=MOST_LATENCY_S)
+    with pytest.raises(ValidationError, match=r"less than or equal to 0\.04"):
+        PositioningConfig(by="mocap", host="lab", latency_s=0.07)
