@@ -61,7 +61,7 @@ def load_calibration(file: Path | str, cam: str | None = None) -> CameraModel:
         kind = file_kind(path)
         what = "" if "calibration" in kind else f" (it is {kind})"
         raise InvalidValue(f"{path}: key {error.args[0]} is missing{what}") from None
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InvalidValue(f"{path}: a value is not a number: {error}") from None
 
 
@@ -130,18 +130,18 @@ def _kalibr_values(raw: dict[Any, Any], cam: str) -> _Values:
 
 
 def _opencv_values(path: Path) -> _Values:
+    keys = ("image_width", "image_height", "fisheye_model")
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        K, dist = (storage.getNode(k).mat() for k in ("camera_matrix", "distortion_coefficients"))
+        # The last one is written by OpenCV's calibration program where the lens is its fisheye's.
+        width, height, fisheye = (
+            None if (node := storage.getNode(key)).empty() else node.real() for key in keys
+        )
     except (cv2.error, SystemError):
         raise InvalidValue("not a readable OpenCV FileStorage file") from None
-    K, dist = (storage.getNode(key).mat() for key in ("camera_matrix", "distortion_coefficients"))
     if K is None or dist is None:
         raise InvalidValue("camera_matrix and distortion_coefficients are needed in an OpenCV file")
-    # Written by OpenCV's calibration program where the lens is its fisheye's.
-    width, height, fisheye = (
-        None if (node := storage.getNode(key)).empty() else node.real()
-        for key in ("image_width", "image_height", "fisheye_model")
-    )
     return (width, height), np.array(K), np.array(dist), "fisheye" if fisheye else "plumb_bob"
 
 

@@ -74,7 +74,7 @@ def process_state(profiles: Sequence[Profile], threads: int) -> State:
     }
     for profile in profiles:
         files = filter(None, (profile.camera.calibration, profile.camera.mask))
-        state[" and ".join(map(str, files))] = profile_sha256(profile)[:_SHORT]
+        state[" and ".join(map(str, files)) or profile.name] = profile_sha256(profile)[:_SHORT]
     return state
 
 

@@ -265,7 +265,8 @@ def make_sweep(profile: Profile, sweep: str) -> Sweep:
             f"planner.align.xy_m=0.02,0.04"
         )
     profiles = [changed_profile(profile, [f"{key}={text}"], "sweep") for text in texts]
-    return Sweep(key, (*(other for other in profiles if other != profile), profile))
+    others = [p for k, p in enumerate(profiles) if p not in (profile, *profiles[:k])]
+    return Sweep(key, (*others, profile))
 
 
 def _figures(results: Sequence[FlightResult]) -> dict[str, Any]:

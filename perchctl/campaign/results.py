@@ -117,8 +117,10 @@ def peak_memory_mb() -> float:
     if not status.exists():  # no Linux
         return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1e-6)
     # Of getrusage Linux gives a program the peak of the one that started it.
-    peak = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
-    return int(peak.split()[1]) * 1024e-6
+    for line in status.read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024e-6
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024e-6)
 
 
 def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:

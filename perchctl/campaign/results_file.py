@@ -91,10 +91,10 @@ def campaign_results(
     header = campaign_header(profile, faults)
     earlier: dict[int, R] = {}
     good = 0
-    if resume and out.exists():
-        good = _read(out, header, kind, earlier)
     with ExitStack() as stack:
         try:
+            if resume and out.exists():
+                good = _read(out, header, kind, earlier)
             out.parent.mkdir(parents=True, exist_ok=True)
             file = stack.enter_context(out.open("ab", buffering=0))
             file.truncate(good)

@@ -193,18 +193,6 @@ def _free_place(name: str) -> Path:
     return place
 
 
-def _check_unchanged(name: str, then: Profile) -> None:
-    """Raise InvalidValue if the profile no longer says what the numbers rest on: a gear by one
-    turn of the camera is wrong beside another, and a recording takes minutes; NotFound."""
-    now = load_profile(name, with_weights=False)
-    rests_on = [(p.camera.mount, p.camera.latency_s, p.vehicle) for p in (now, then)]
-    if rests_on[0] != rests_on[1]:
-        raise InvalidValue(
-            f"{find_profile(name)} was changed meanwhile, and nothing is written: these numbers "
-            f"rest on what it said before; measure again, with --from"
-        )
-
-
 # -- recordings of files -----------------------------------------------
 
 
@@ -232,6 +220,18 @@ def _check_seen_by(recordings: Sequence[MountingRecording], now: str) -> None:
                 f"the {recording.part} was seen by {recording.seen_by}; the profile has {now}: "
                 f"record it anew, or name the profile that it was recorded with"
             )
+
+
+def _check_unchanged(name: str, then: Profile) -> None:
+    """Raise InvalidValue if the profile no longer says what the numbers rest on: a gear by one
+    turn of the camera is wrong beside another, and a recording takes minutes; NotFound."""
+    now = load_profile(name)
+    rests_on = [(p.camera.mount, p.camera.latency_s, p.vehicle) for p in (now, then)]
+    if rests_on[0] != rests_on[1]:
+        raise InvalidValue(
+            f"{find_profile(name)} was changed meanwhile, and nothing is written: these numbers "
+            f"rest on what it said before; measure again, with --from"
+        )
 
 
 # -- a live recording --------------------------------------------------

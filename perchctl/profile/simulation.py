@@ -42,7 +42,6 @@ class SimulationConfig(Section):
     camera_fields: Literal["progressive", "top", "bottom"] = key(
         "progressive", "interlaced: which row's field comes first"
     )
-    camera_blended: bool = key(False, "the two fields averaged, as some converters do")
     camera_readout_s: float = key(
         0.0, "rolling shutter: from the first row to the last", ge=0, le=0.05
     )

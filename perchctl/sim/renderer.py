@@ -148,15 +148,12 @@ class Renderer:
         self, shots: Sequence[Shot], frame_index: int = 0, defocus_px: float | None = None
     ) -> Picture:
         """Return the frame of one shot, or of two fields in their order of time; which rows are
-        the first one's, and whether they are blended, is the scenario's. Otherwise as
-        `render`."""
+        the first one's is the scenario's. Otherwise as `render`."""
         exposed = [self._exposed(shot, defocus_px) for shot in shots]
         picture = exposed[0].copy()
         if len(shots) > 1:
             later = 0 if self.scenario.camera_fields == "bottom" else 1  # the second field's rows
             picture[later::2] = exposed[1][later::2]
-            if self.scenario.camera_blended:
-                picture = blended(picture)
         if self._noise is not None:
             width, height = self.camera.size_px
             r, c = self._noise_at[frame_index % len(self._noise_at)]
@@ -311,13 +308,6 @@ def defocused(picture: Picture, sigma_px: float, box: Box) -> None:
     top, left = (a.start - b.start for a, b in zip(near, far, strict=True))
     into = picture[near]
     into[:] = blurred[top : top + into.shape[0], left : left + into.shape[1]]
-
-
-def blended(frame: Picture) -> Picture:
-    """Return what a converter makes of a woven frame that averages its fields: each row with the
-    mean of its neighbours, which are of the other field."""
-    rows = np.pad(frame, ((1, 1), (0, 0)), mode="edge").astype(np.uint16)
-    return np.asarray((rows[:-2] + 2 * rows[1:-1] + rows[2:] + 2) // 4, np.uint8)
 
 
 # --- A camera that does not move --------------------------------------

@@ -50,8 +50,7 @@ class Scenario:
         T_body_cam_true: rows of the camera's true pose, mounting error included.
         camera_*: what the camera and its radio do to the frames.
         camera_fields: "progressive", or interlaced with the field of the "top" or the
-            "bottom" row first, half a period before the other; camera_blended: averaged
-            by a converter.
+            "bottom" row first, half a period before the other.
         camera_readout_s: from a picture's (or field's) first row to its last.
         camera_flicker, camera_pumping: share by which lamps (100 Hz) and an exposure control
             that hunts change the brightness.
@@ -108,7 +107,6 @@ class Scenario:
     camera_exposure_s: float = 0.008
     camera_defocus_px: float = 0.6
     camera_fields: str = "progressive"
-    camera_blended: bool = False
     camera_readout_s: float = 0.0
     camera_flicker: float = 0.0
     camera_pumping: float = 0.0
@@ -159,7 +157,6 @@ _AS_GIVEN = (
     "camera_exposure_s",
     "camera_defocus_px",
     "camera_fields",
-    "camera_blended",
     "camera_readout_s",
     "camera_flicker",
     "camera_pumping",

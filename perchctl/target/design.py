@@ -75,6 +75,11 @@ class TargetDesign:
         if self.start_height_m == 0.0:
             sure_px = least_side_px(self.large_px)
             far_m = focal_px(self.camera) * self.target.large.side_m / sure_px
+        if start_m is not None and start_m < 0.3 and self.start_height_m > 0.0:
+            found.append(
+                f"the ceiling is hardly above the search height ({self.start_height_m:g} m): lower "
+                f"planner.search.max_height_m"
+            )
         if start_m is not None and start_m > far_m:
             found.append(
                 f"gap at the start: from {self.start_height_m:g} m over the floor the target is "
@@ -245,11 +250,9 @@ def suggest_target(
     R, gear = gear_from_camera(profile)
     standoff_m = profile.planner.ascend.standoff_m
     # The largest side whose circle is in the picture with the gear at the stand-off.
-    near_m = next(
-        side_m
-        for side_m in np.arange(1.0, 0.0, -_SMALL_STEP_M).tolist()
-        if view.holds(raised(turned_outline(side_m), standoff_m) @ R.T + gear)
-    )
+    sides_m = np.arange(1.0, 0.0, -_SMALL_STEP_M).tolist()
+    held_m = (s for s in sides_m if view.holds(raised(turned_outline(s), standoff_m) @ R.T + gear))
+    near_m = next(held_m, 0.0)
     most_m = min(magnet_m / math.sqrt(2.0), NEAR_MARGIN * near_m)
 
     def target_of(large_m: float) -> TargetConfig:

@@ -30,6 +30,8 @@ PAGES_MM: dict[str, tuple[float, float]] = {
     "a3": (297.0, 420.0),
 }
 """Named pages, portrait, in the order in which one that fits is proposed."""
+MOST_PAGE = 5000.0
+"""mm, the longest side: a PDF's pages end at 5.08 m."""
 UNPRINTABLE = 5.0
 """mm at the paper's edges that many printers leave white."""
 MIN_QUIET_CELLS = 0.5
@@ -70,6 +72,8 @@ def target_pdf(
     """
     check_target(target, magnet_m)
     size = parse_page(page)
+    # Of Helvetica's letters alone.
+    origin = origin.encode("latin-1", errors="replace").decode("latin-1")
     texts = _caption(target, origin, date)
     place = _layout_on(target, size, texts)
     if place is None:
@@ -103,7 +107,7 @@ def board_pdf(board: Board, page: str) -> bytes:
     texts = (
         f"perchctl {board.notation()}   print at 100 %, not scaled: both rulers must measure "
         f"100 mm",
-        f"Then measure the black area ({width:g} x {height:g} mm) and tell them to perchctl "
+        f"Then measure the black area ({width:g} x {height:g} mm) and give its sides to perchctl "
         f"calibrate, behind the board: {board.notation()}:measured=WIDTHxHEIGHTmm.",
     )
     left = max(UNPRINTABLE, pdf.cx - width / 2)
@@ -141,6 +145,8 @@ def parse_page(text: str) -> tuple[float, float]:
         round(1e3 * parse_length(number + match[3], f"page {text}"), 6)
         for number in match.groups()[:2]
     )
+    if max(width, height) > MOST_PAGE:
+        raise InvalidValue(f"page {text!r} is too large: at most {MOST_PAGE:g} mm a side")
     return width, height
 
 
@@ -183,6 +189,10 @@ def _layout_on(
     None where the target does not fit."""
     side, cell = _side_and_cell(target)
     width, height = page
+    if min(page) / 2 - UNPRINTABLE < _ruler_half(
+        side / 2
+    ):  # perhaps too narrow for a word of the caption
+        return None
     lines, below = _caption_room(texts, width)
     # Where a small target's sheet ends inside of the rulers, the page has room for a cell.
     half = min(width / 2 - _RULER_DEPTH, height / 2 - below) - UNPRINTABLE

@@ -226,7 +226,6 @@ def _directions(values: tuple[float, float], least: float, figures: str, unit: s
 FROM_M = 0.10
 """The last stretch that is judged, from gear to target."""
 _STEP_M = 0.0005
-_OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its axes
 
 
 @dataclass(frozen=True)

@@ -138,6 +138,7 @@ def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
     ("[300.0, 300.0, 320.0, 240.0]", "[380.0, 1.0]", "fu, fv, pu, pv"),
     ("  resolution: [640, 480]\n", "", "key resolution is missing"),
     ("resolution: [640, 480]", "resolution: 640", "not a number"),
+    ("resolution: [640, 480]", "resolution: [.inf, 480]", "not a number"),
     ("intrinsics: [300.0,", "intrinsics: [wide,", "not a number"),
     ("-0.002]", "-0.002, 0.0, 0.0]", "found 6"),
 ])  # fmt: skip

@@ -203,19 +203,16 @@ def test_numbers_that_cannot_be_written_are_still_reported(
     ],
 )
 def test_a_profile_that_was_changed_meanwhile_is_not_written_to(
-    place: Path,
-    logs: dict[str, Path],
-    monkeypatch: pytest.MonkeyPatch,
-    changed: str | None,
+    place: Path, logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, changed: str | None,
     code: int,
-) -> None:
+) -> None:  # fmt: skip
     """A gear by the old turn beside a new one would be a gear in another place. The numbers are
     printed all the same, also where the profile (None) is gone."""
     mine, text = Path("mine.yaml"), f"extends: crazyflie\n{changed}\n"
     mine.write_text("extends: crazyflie\n", encoding="utf-8")
     solved = calibrate_mount.solve_mounting
 
-    def long_work(*given: Any) -> Any:
+    def long_work(*given: Any) -> MountingReport:
         mine.unlink() if changed is None else mine.write_text(text, encoding="utf-8")
         return solved(*given)
 

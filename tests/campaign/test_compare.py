@@ -26,6 +26,7 @@ from perchctl.campaign.compare import (
     Comparison,
     Sweep,
     compare_pairs,
+    mean_interval,
     whole_seeds,
 )
 from perchctl.errors import InvalidValue, UsageError
@@ -64,6 +65,8 @@ def test_a_difference_below_the_spread_of_the_seeds_is_found_by_pairs() -> None:
     assert 0 < miss["interval"][0] < 0.001 < miss["interval"][1]
     assert (miss["better"], better(found)) == ("A", {"A"})
     assert "A is better by 1." in text(found)
+    alone = compare_pairs(spread(60, by_m=0.001), ("miss_m",))["miss_m"]
+    assert np.ptp(alone["interval"]) < np.ptp(miss["interval"]), "of fewer questions"
 
 
 def test_a_profile_and_its_copy_are_identical() -> None:
@@ -71,6 +74,12 @@ def test_a_profile_and_its_copy_are_identical() -> None:
     assert better(found) == set()
     assert text(found).endswith("\nidentical in all 60 flights")
     assert text(found).count("no difference proven") == 4
+
+
+def test_chance_alone_is_seldom_a_difference() -> None:
+    """All questions together, in one comparison of twenty."""
+    alarms = sum(bool(better(compare_pairs(spread(30, start=k)))) for k in range(40))
+    assert alarms <= 5
 
 
 def test_success_is_told_by_the_pairs_that_differ() -> None:
@@ -109,6 +118,15 @@ def test_few_flights_prove_nothing() -> None:
     assert "-" in text(none)
 
 
+def test_the_interval_holds_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(4)
+    held = 0
+    for _ in range(60):
+        low, high = mean_interval(rng.normal(1.0, 2.0, 40))
+        held += low <= 1.0 <= high
+    assert 52 <= held < 60
+
+
 ends = st.sampled_from([PERCHED, LANDED, replace(PERCHED, fell=True), replace(PERCHED, attempts=3)])
 
 
@@ -145,7 +163,7 @@ def sweep(values: str) -> Sweep:
 
 
 def test_each_value_is_a_cell_and_the_profiles_own_is_the_last() -> None:
-    for values in ("0.02,0.04,0.08", "0.02,0.08"):
+    for values in ("0.02,0.04,0.08", "0.02,0.08,0.020"):
         asked = sweep(values)
         assert [profile.planner.align.xy_m for profile in asked.profiles] == [0.02, 0.08, 0.04]
         assert asked.profiles[-1] == SIM

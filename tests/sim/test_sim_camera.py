@@ -168,13 +168,6 @@ def at_once(t_s: float, turn_radps: float = 0.0) -> Picture:
     return Renderer(STILL, CAMERA, TargetConfig()).render([pose(t_s, turn_radps)])
 
 
-def test_blended_fields_are_the_mean_of_each_row_and_its_neighbours() -> None:
-    woven, _ = first_frame(replace(STILL, camera_fields="top"), TURN_RADPS)
-    frame, _ = first_frame(replace(STILL, camera_fields="top", camera_blended=True), TURN_RADPS)
-    mean = (woven[1:-3:2] / 4.0 + woven[2:-2:2] / 2.0 + woven[3:-1:2] / 4.0).astype(np.float32)
-    assert np.abs(frame[2:-2:2] - mean).max() <= 0.5
-
-
 @pytest.mark.parametrize("fields", ["progressive", "top", "bottom"])
 def test_each_row_of_a_rolling_shutter_shows_its_own_moment(fields: str) -> None:
     """Of a frame, and of a field."""

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from perchctl.geometry import GRAVITY_MPS2, rotation_from_quaternion, rotation_from_rpy
 from perchctl.sim import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.firmware import Firmware
-from perchctl.sim.world import DRAG_VERTICAL_NSPM, World
+from perchctl.sim.world import DRAG_VERTICAL_NSPM, SUCTION_LENGTH_M, World
 from tests.helpers.carried import lifted_and_turned
 
 OFF = (0.0, 0.0, 0.0, 0.0)
@@ -55,6 +55,27 @@ def test_free_fall_is_the_closed_form_with_linear_drag() -> None:
     # One Euler step of 2 ms at this speed is 8 mm.
     assert 3.0 - world.z_m == pytest.approx(fallen_m, abs=0.008)
     assert np.linalg.norm(felt_mps2(world)) < 1.2
+
+
+@pytest.mark.parametrize(
+    ("motors", "axis", "sign"),
+    [
+        ((0, 0, 1, 1), 0, 1),  # left motors up: roll to the right
+        ((0, 1, 1, 0), 1, 1),  # back motors up: nose down
+        ((0, 1, 0, 1), 2, 1),  # M2 and M4 turn clockwise: counter-clockwise reaction
+    ],
+)
+def test_motor_pairs_turn_the_right_way(
+    motors: tuple[int, int, int, int], axis: int, sign: int
+) -> None:
+    world = make()
+    world.set_pose((0.0, 0.0, 1.0))
+    a, b, c, d = (56000.0 + 2000.0 * m for m in motors)
+    run(world, 0.05, (a, b, c, d))
+    rates = np.array((world.p_radps, world.q_radps, world.r_radps))
+    assert sign * rates[axis] > 0.01
+    others = [i for i in range(3) if i != axis]
+    assert np.abs(rates[others]).max() < 0.2 * abs(rates[axis])
 
 
 @settings(max_examples=15, deadline=None)
@@ -132,6 +153,24 @@ def test_a_weak_first_contact_breaks_and_the_second_holds() -> None:
         run(world, 0.5)
         assert world.magnet_engaged is holds
         assert (world.z_m > 2.1) is holds
+
+
+# The air ------------------------------------------------------------------------------
+
+
+ROTOR_RADIUS_M = 0.023
+ROTORS_OVER_CENTRE_M = 0.01
+
+
+@pytest.mark.parametrize("height_m", [0.03, 0.035, 0.04, 0.05, 0.07, 0.1, 0.15])
+def test_the_ceilings_pull_is_that_of_momentum_theory(height_m: float) -> None:
+    """A rotor of radius R at D below a ceiling has its wake's power divided by
+    g = (1 + sqrt(1 + (R / D)^2 / 8)) / 2 (Hsiao and Chirarattananon, arXiv 1905.04632, who
+    measured it with rotors of this radius); at the same power the thrust grows by g^(2/3)."""
+    gap_m = height_m - ROTORS_OVER_CENTRE_M
+    g = 0.5 + 0.5 * math.sqrt(1.0 + (ROTOR_RADIUS_M / gap_m) ** 2 / 8.0)
+    gained = Scenario().ceiling_suction * math.exp(-height_m / SUCTION_LENGTH_M)
+    assert gained == pytest.approx(g ** (2.0 / 3.0) - 1.0, abs=0.006)
 
 
 # In a hand ------------------------------------------------------------------------------

@@ -177,7 +177,8 @@ def test_nothing_overlaps_all_is_printable_and_half_a_cell_stays_white(
 
 
 @pytest.mark.parametrize(
-    ("large", "page"), [(150.0, "150x150mm"), (150.0, "196x297mm"), (300.0, "a4")]
+    ("large", "page"),
+    [(150.0, "150x150mm"), (150.0, "196x297mm"), (150.0, "20x300mm"), (300.0, "a4")],
 )
 def test_a_page_too_small_is_refused_with_the_one_that_fits(large: float, page: str) -> None:
     """196 mm leave less than half a cell of white around 150 mm and inside of the rulers."""
@@ -264,6 +265,7 @@ REFUSALS = [
     (["--magnet", "20mm"], 30, "not inside the magnet"),
     (["--page", "150x150mm"], 30, "--page a4 holds it"),
     (["--page", "a9"], 30, "allowed are a4, letter, a3"),
+    (["--page", "9x9m"], 30, "too large: at most 5000 mm a side"),
     (["-o", "target.txt"], 30, "must end in .pdf"),
     (["-o", "/dev/null/target.pdf"], 30, "/dev/null is a file, not a folder"),
     (["-p", "nothing"], 20, "profile 'nothing' not found"),

@@ -176,7 +176,6 @@ def test_a_blind_range_is_named() -> None:
 
 # --- the designer against the renderer and the paper ---------------------------------------------
 
-TARGET = TargetConfig()
 ROOT = Path(__file__).resolve().parents[2]
 PAPER_CAMERA = camera_of(380.0)
 AHEAD = (np.eye(3), np.zeros(3))
@@ -240,6 +239,7 @@ def test_z3_is_the_geometry_s() -> None:
     [
         ({}, ""),
         ({"z1_m": 0.9}, "gap at the start"),
+        ({"start_range_m": 0.2}, "the ceiling is hardly above the search height"),
         ({"z2_m": 0.15}, "gap between the markers"),
         ({"z1_m": None}, "never read"),
         ({"small_nearest_m": 0.2}, "gap before contact"),
@@ -252,15 +252,19 @@ def test_gaps_are_named(paper_design: TargetDesign, changes: dict[str, Any], sai
     assert said in "".join(warnings)
 
 
-def test_a_gap_on_the_ground_is_named_where_the_target_is_the_position(
-    paper_design: TargetDesign,
-) -> None:
+def test_a_gap_on_the_ground_is_named_where_the_target_is_the_position() -> None:
     """From the search height it would be near enough."""
     ground = short_profile({"positioning": "target"}, base="sim")
     sure_m = 380.0 * 0.150 / SURE_PX
     for ceiling_m, gap in ((0.9 * sure_m, False), (1.1 * sure_m, True)):
         design = make_design(TARGET, PAPER_CAMERA, 0.6, ground, ceiling_m)
         assert any("gap at the start" in text for text in design.warnings) is gap
+
+
+def test_a_camera_far_from_the_gear_gets_a_target_and_a_warning() -> None:
+    aside = short_profile({"camera.mount.position_m": (0.3, 0.0, 0.0)}, base="sim")
+    found, _ = suggest_target(PAPER_CAMERA, 0.6, aside, 0.05)
+    assert any("gap before contact" in text for text in found.warnings)
 
 
 @pytest.mark.long

@@ -21,7 +21,7 @@ from perchctl.geometry import (
     rotation_from_rpy,
     wrap_rad,
 )
-from perchctl.profile import PoseConfig, TargetConfig
+from perchctl.profile import KalmanConfig, PoseConfig, TargetConfig
 from perchctl.sim.renderer import spoil
 from perchctl.vision import (
     Attitude,
@@ -35,7 +35,10 @@ from perchctl.vision import (
     square_corners,
     step,
 )
+from perchctl.vision.filter import PRINT, make_filter
+from perchctl.vision.merge import disagree
 from perchctl.vision.pose import normal_cam
+from perchctl.vision.target_selection import measurement
 from perchctl.vision.types import Detection
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -323,6 +326,31 @@ def test_a_wrong_size_is_within_its_claim(scale: float, most: float) -> None:
         off = np.append(pose.e_m - true.e_m, wrap_rad(pose.e_yaw_rad - true.e_yaw_rad))
         squares.append(float(off @ np.linalg.solve(pose.cov, off)))
     assert np.mean(squares) < most + 4.0
+
+
+def test_a_wrong_print_excuses_no_gap_between_the_markers() -> None:
+    """Both are as wrong, and in the same direction."""
+    place = (0.0, 0.0, 0.8, 0.0, 0.05, -0.04)
+    setup = setup_of(size_sigma=0.1, curl_per_m=0.0)
+    large = solved(["large"], setup, place)
+    smaller = solved(["small"], setup, (0.0, 0.0, 1.0, 0.0, 0.05, -0.04))
+    assert np.abs(large.e_m - smaller.e_m).max() < 4.0 * large.sigma_m.max()
+    assert disagree(large, smaller, 0.03)
+
+
+def test_the_print_s_errors_are_no_noise_of_a_measurement() -> None:
+    """They do not change from frame to frame: no filter trusts a pose less for them, and no
+    number of frames takes them away."""
+    true, doubtful = setup_of(size_sigma=0.0, curl_per_m=0.0), setup_of(size_sigma=0.02)
+    constants = make_filter(KalmanConfig())
+    known, told = (
+        measurement(solved(["large", "small"], setup), None, False, constants, setup)
+        for setup in (true, doubtful)
+    )
+    assert known.R is not None
+    assert told.R is not None
+    assert np.allclose(known.R, told.R, rtol=1e-6, atol=1e-15)
+    assert np.linalg.norm(told.bias[1:, PRINT]) > 0.02 * 0.3
 
 
 # --- The spread that a picture's pose claims is what it errs by --------------------------------

@@ -59,10 +59,6 @@ class Fit:
         """The spread of one coordinate of the residuals, from their median distance."""
         return _spread_px(np.concatenate(self.residuals))
 
-    def view_rms_px(self) -> Array:
-        """Return the RMS distance of each view, (v,) px."""
-        return np.array([np.sqrt((r**2).sum(axis=1).mean()) for r in self.residuals])
-
 
 def parameters_of(camera: CameraModel) -> Array:
     """Return fx, fy, cx, cy and the distortion of a camera, (p,); four coefficients of plumb_bob

@@ -125,7 +125,7 @@ class MountingRecording:
                     parts[-1].poses.append(_pose(record))
                 else:
                     parts[-1].attitudes.append(_attitude(record))
-            except (KeyError, TypeError, ValueError, IndexError, RecursionError) as error:
+            except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
                 why = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
                 raise InvalidValue(
                     f"{path}, line {number} is no line of a recording of calibrate mount: {why}"

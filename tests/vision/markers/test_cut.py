@@ -22,7 +22,7 @@ from perchctl.vision import (
     square_corners,
     step,
 )
-from perchctl.vision.lens import undistort_px
+from perchctl.vision.lens import distort, undistort, undistort_px
 from perchctl.vision.markers.corners import within
 from perchctl.vision.markers.cut import (
     MOST_AGE_S,
@@ -225,6 +225,17 @@ def _pose(name: str) -> RigidPose:
     rvec, tvec = POSES[name]
     R = np.asarray(cv2.Rodrigues(rvec)[0], dtype=float)
     return RigidPose(R @ np.diag([1.0, -1.0, -1.0]), tvec / 0.075)
+
+
+def test_corners_that_the_lens_cannot_image_are_not_given() -> None:
+    """Of the large marker alone in view, and its far corners where the lens model has no
+    inverse."""
+    image, outline = picture("corner"), outline_of(SETUP.patterns["large"].drawing)
+    x = undistort(distort(np.array([[2.3, 0.6]]), CAMERA), CAMERA)
+    assert np.abs(x - (2.3, 0.6)).max() > 1e-2
+    found = fitted(image, _pose("corner"), outline, 0.0 * outline.cell, CAMERA)
+    assert found.small == 0
+    assert cut_markers(image, both(POSES["corner"]), SETUP.patterns, CAMERA) == {}
 
 
 def test_a_prediction_may_be_off_in_range() -> None:

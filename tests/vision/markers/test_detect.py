@@ -15,7 +15,7 @@ from perchctl.vision.markers.detect import (
     detect_markers,
     follow,
 )
-from perchctl.vision.markers.detector import make_aruco_detector
+from perchctl.vision.markers.detector import MIRROR_INDEX, make_aruco_detector
 from perchctl.vision.markers.search import misfit
 from perchctl.vision.types import Detection, Detections
 from tests.helpers.markers import POSE, SETUP, both, box, corners, followed, frame, paste
@@ -91,6 +91,18 @@ def grown(grey: np.ndarray, clipped: bool) -> np.ndarray:
     """White that has grown over black: by a tone curve, or by all that is lost above white."""
     tone = grey * 1.7 if clipped else 240.0 * (grey / 205.0) ** 0.5
     return np.clip(tone, 0, 255).astype(np.uint8)
+
+
+def test_a_marker_like_its_own_mirror_image_gives_no_hint() -> None:
+    target = TargetConfig(small=MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=0, side_m=0.025))
+    usual = make_aruco_detector(DetectorConfig(), TargetConfig())
+    assert [len(d.bytesList) for d in usual.dictionaries] == [1 + MIRROR_INDEX, 1 + MIRROR_INDEX]
+    setup = make_aruco_detector(DetectorConfig(), target)
+    bits = aruco_dictionary("DICT_ARUCO_ORIGINAL")
+    grid = cv2.aruco.Dictionary.getBitsFromByteList(np.ascontiguousarray(bits.bytesList[0:1]), 5)
+    symmetric = any(np.array_equal(np.rot90(grid, k), grid[:, ::-1]) for k in range(4))
+    assert symmetric
+    assert [len(d.bytesList) for d in setup.dictionaries] == [1 + MIRROR_INDEX, 1]
 
 
 def test_correction_bits_are_the_profiles() -> None:

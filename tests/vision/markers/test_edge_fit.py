@@ -25,7 +25,6 @@ from perchctl.vision.markers.pattern import (
 from tests.helpers.markers import POSE, SETUP, corners
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
-HALF_PX, NEAR_PX, DEPTH_PX = 7.0, 7.0, 12.0
 # --- Corners by lines --------------------------------------------------------------------------
 
 
@@ -173,9 +172,6 @@ def test_none_leaves_the_corners_alone() -> None:
     assert np.array_equal(result.corners_px, raw[0])
     assert not result.refined
     assert refine(render(rvec, tvec), np.empty((0, 4, 2)), [], CAMERA, "line") == []
-
-
-# --- A marker's square -------------------------------------------------------------------------
 
 
 # --- Cells -------------------------------------------------------------------------------------

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, Profile, TargetConfig, load_profile
-from perchctl.vision import make_pipeline
+from perchctl.vision import Frame, make_pipeline
+from perchctl.vision.fields import field_picture
 from perchctl.vision.markers.corners import from_unit, mapped
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import (
+    hidden_in,
     hides,
     make_aruco_detector,
     make_mask,
@@ -263,6 +265,20 @@ def test_what_a_leg_covers_counts_for_nothing(name: str) -> None:
         found.append(large.corners_px)
     assert np.array_equal(found[0], found[1])
     assert np.array_equal(found[0], found[2])
+
+
+def test_a_field_shows_the_gear_in_the_rows_beside_it_too() -> None:
+    covered = LEGS["corner"]
+    mask = make_mask(covered)
+    image = np.where(covered, 0, 200).astype(np.uint8)
+    for first_row, name in ((0, "top"), (1, "bottom")):
+        field = field_picture(image, first_row)
+        hidden = hidden_in(Frame(0, 0.0, field, fields=name), mask)
+        assert hidden is not None
+        assert (field[~hidden] == 200).all()
+    whole = hidden_in(Frame(0, 0.0, image, fields="whole"), mask)
+    assert whole is not None
+    assert np.array_equal(whole, covered)
 
 
 # --- the file ----------------------------------------------------------------------------------
