@@ -41,7 +41,7 @@ PARTS: dict[str, tuple[str, ...]] = {
         "perchctl.link.mock:MockLink.send",
         "perchctl.link.mock:MockLink.telemetry",
     ),
-    "planner": ("perchctl.flight.loop:step_mission", "perchctl.flight.loop:events_of"),
+    "planner": ("perchctl.flight.loop:step_mission", "perchctl.mission.records:Event.of_tick"),
     "history, turns, log": (
         "perchctl.flight.inputs:add_samples",
         "perchctl.perception.perception:update_calibration",

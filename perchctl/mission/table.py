@@ -106,8 +106,7 @@ def is_astray(c: Context) -> bool:
     setpoint, phase = c.state.setpoint, c.state.phase
     if c.profile.positioning.by == "deck" or not c.placed:
         return False
-    walked = phase in (P.ESTIMATE, P.ALIGN, P.ASCEND) and c.profile.positioning.by == "mocap"
-    if c.held(C.OTHERWISE) >= OTHERWISE_S or (walked and c.climb_mps < -SWINGS_MPS):
+    if c.held(C.OTHERWISE) >= OTHERWISE_S or _swings(c):
         return True
     if setpoint is None:
         return False
@@ -126,12 +125,22 @@ def is_astray(c: Context) -> bool:
     return _away_m(c) > (ASTRAY_LOW_M if stays else ASTRAY_M)
 
 
+def _swings(c: Context) -> bool:
+    walked = c.state.phase in (P.ESTIMATE, P.ALIGN, P.ASCEND)
+    return walked and c.profile.positioning.by == "mocap" and c.climb_mps < -SWINGS_MPS
+
+
 def _away_m(c: Context) -> float:
     (x_m, y_m, _), setpoint = c.telemetry.position_m, c.state.setpoint
     return 0.0 if setpoint is None else math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
 
 
 def why_astray(c: Context) -> str:
+    if _swings(c):
+        return (
+            f"it swings up and down, now at {-c.climb_mps:.1f} m/s: are the positions of the "
+            f"motion capture late?"
+        )
     cause = (
         "swapped axes in the motion capture, positions that are late, or a body that is turned in "
         "it; perchctl check --lift tells"
@@ -189,7 +198,9 @@ def mounted_wrong(c: Context) -> bool:
 def why_mounted_wrong(c: Context) -> str:
     turn_rad = c.mismatch.turn_rad
     if turn_rad or c.state.mount.wrong:
-        return describe_turn(turn_rad or c.state.mount.turn_rad)
+        text = describe_turn(turn_rad or c.state.mount.turn_rad)
+        capture = not turn_rad and c.profile.positioning.by == "mocap"
+        return f"{text}; or swapped axes in the motion capture" if capture else text
     return (
         f"the target seems to lie {-c.error_z_m:.1f} m below the vehicle: camera.mount does not "
         f"look up"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -13,12 +14,16 @@ from perchctl.mission import ImuMotion
 from perchctl.mission.imu import (
     FROZEN_S,
     GAP_S,
+    MOST_CLIMB_MPS,
+    PUSHED_G,
+    REACH_M,
     UNCORRECTED_S,
     Reckoning,
+    add_sight,
     advance_reckoning,
 )
 from perchctl.vehicle import Telemetry
-from tests.helpers.mission import telemetry
+from tests.helpers.mission import HOVER_THRUST, telemetry
 
 
 def flown(samples: list[Telemetry], motion: ImuMotion | None = None) -> ImuMotion:
@@ -82,6 +87,110 @@ def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     assert advance_reckoning(old, heard, after, believed=False, astray=True).velocity_mps == (
         old.velocity_mps
     )
+
+
+@given(
+    step_rad=st.tuples(st.floats(-0.15, 0.15), st.floats(-0.15, 0.15)),
+    step_mps=st.floats(0.2, 2.0),
+    rate_radps=st.floats(-3.0, 3.0),
+)
+def test_a_correction_by_a_wrong_position_does_not_turn_what_is_felt(
+    step_rad: tuple[float, float], step_mps: float, rate_radps: float
+) -> None:
+    """The estimate's speed steps, and the attitude with it, while the vehicle itself turns on."""
+
+    def flight(jumps: bool) -> list[Telemetry]:
+        samples = []
+        for i in range(60):
+            after = jumps and i >= 30
+            roll, pitch = step_rad if after else (0.0, 0.0)
+            turned_rad = 0.1 * rate_radps * max(0.0, min(0.1, 0.01 * i - 0.25))
+            samples.append(
+                telemetry(
+                    0.01 * i, roll_rad=turned_rad + roll, pitch_rad=pitch,
+                    velocity_mps=(step_mps if after else 0.0, 0.0, 0.0),
+                    acc_x_g=0.0001 * i, acc_z_g=1.0,
+                )
+            )  # fmt: skip
+        return samples
+
+    misled, true = flown(flight(True)), flown(flight(False))
+    assert true.misled_rad == (0.0, 0.0)
+    assert misled.misled_rad == pytest.approx(step_rad, rel=0.06, abs=0.001)
+    assert misled.velocity_mps[:2] == pytest.approx(true.velocity_mps[:2], abs=0.04)
+
+
+@given(below_m=st.floats(0.05, 2.0), silent_s=st.floats(GAP_S + 0.01, 2.0))
+def test_in_a_silence_it_may_climb_into_the_magnet_s_reach(below_m: float, silent_s: float) -> None:
+    """However it was last heard to sink. A sight from after it tells again where it is."""
+    before = telemetry(1.0, velocity_mps=(0.0, 0.0, -0.3))
+    after = telemetry(1.0 + silent_s, velocity_mps=(0.0, 0.0, -0.3))
+    imu = flown([before])
+    old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
+    new = advance_reckoning(old, imu.with_sample(before, after), after, believed=False)
+    assert (new.unsure_s == after.t_s) == (below_m - MOST_CLIMB_MPS * silent_s < REACH_M)
+    assert new.below_m == below_m
+    seen = add_sight(new, after.t_s + 0.1, (0.0, 0.0), below_m, 0.001)
+    assert seen.nearest_m == below_m
+
+
+@given(below_m=st.floats(0.05, 2.0), silent_s=st.floats(GAP_S + 0.01, 3.0))
+def test_what_had_no_thrust_in_a_silence_did_not_climb(below_m: float, silent_s: float) -> None:
+    """With motors that were off, or started anew: it lies, or hangs where it hung."""
+    for thrust, start in ((0.0, 0), (HOVER_THRUST, 1)):
+        before = telemetry(1.0, thrust=thrust)
+        after = telemetry(1.0 + silent_s, thrust=0.0, start=start)
+        imu = flown([before])
+        old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
+        new = advance_reckoning(old, imu.with_sample(before, after), after, believed=False)
+        assert new.unsure_s == -math.inf
+        assert new.below_m == math.inf
+        near = replace(old, below_m=0.02, nearest_m=0.02)
+        new = advance_reckoning(near, imu.with_sample(before, after), after, believed=False)
+        assert (new.unsure_s, new.below_m) == (after.t_s, 0.02)
+
+
+def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring() -> None:
+    """It fell by 5 cm, and the setpoint that catches it is a metre above."""
+    falls = [telemetry(1.0 + 0.01 * i, acc_z_g=0.3) for i in range(13)]
+    reckoning = add_sight(Reckoning(flown(falls[:1])), 0.9, (0.0, 0.0), 0.0, 0.001)
+    motion = flown(falls[:1])
+    for last, new in pairwise(falls):
+        motion = motion.with_sample(last, new)
+        reckoning = advance_reckoning(reckoning, motion, new, believed=False)
+    assert motion.fell_s > 1.0
+    assert 0.02 < reckoning.nearest_m < 0.1
+    late = telemetry(falls[-1].t_s + 1.5)
+    reckoning = advance_reckoning(
+        reckoning, motion.with_sample(falls[-1], late), late, believed=False
+    )
+    assert reckoning.unsure_s == late.t_s
+
+
+def beside_mps(turn: int, pushed_g: float = 0.0, samples: int = 4, offset_g: float = 0.0) -> float:
+    """After 0.4 s of a tilt that speeds it up by 1 m/s2, with an estimate that follows as it is, or
+    mirrored (`turn` -1), or corrected by positions after a push that it did not feel and that so
+    many samples show. `offset_g`: what the accelerometer reads too much."""
+    lean_rad = 1.0 / 9.81
+    reckoning, motion, last = Reckoning(), ImuMotion(offset_g=(offset_g, 0.0, 0.0)), None
+    for i in range(41):
+        t_s = 1.0 + 0.01 * i
+        new = telemetry(
+            t_s, velocity_mps=(turn * 0.01 * i, 0.0, 0.0), pitch_rad=lean_rad + 1e-6 * (i % 7),
+            acc_x_g=offset_g + (pushed_g if 3 <= i < 3 + samples else 1e-6 * (i % 7)),
+        )  # fmt: skip
+        motion = motion.with_sample(last, new)
+        reckoning = advance_reckoning(reckoning, motion, new, believed=True)
+        last = new
+    return abs(reckoning.beside_mps[0])
+
+
+def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_was_pushed() -> None:
+    assert beside_mps(1) < 0.05
+    assert beside_mps(-1) > 0.3
+    assert beside_mps(-1, pushed_g=2.0 * PUSHED_G) == 0.0
+    assert beside_mps(-1, pushed_g=0.09, samples=20) == 0.0  # a gust of 1 m/s in a second
+    assert beside_mps(-1, offset_g=1.2 * PUSHED_G) > 0.3
 
 
 # --- Whether the estimate is corrected -----------------------------------------------------------

@@ -22,6 +22,7 @@ from perchctl.mission import (
     Operator,
     Phase,
     PlannerState,
+    VisualInertialMotion,
     lander,
     planner,
 )
@@ -237,6 +238,7 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     obs = observation(NOW_S + TICK_S)
     state, command = planner.step_mission(begin, obs, PROFILES[positioning])
     assert (state.phase, state.row, state.astray) == (Phase.LANDING, "mounting", astray)
+    assert ("swapped axes in the motion capture" in state.reason) is astray
     assert isinstance(command, RawThrust if astray else PositionSetpoint)
 
 
@@ -267,7 +269,74 @@ def test_a_way_down_that_is_spent_ends_without_a_lock(
     assert isinstance(command, StopMotors if spent else Idle)
 
 
+@pytest.mark.parametrize(("acc_z_g", "stands"), [(0.93, True), (0.8, True), (0.55, False)])
+def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
+    acc_z_g: float, stands: bool
+) -> None:
+    """On half of the hover thrust: in the air the accelerometer reads half a g."""
+    half = 0.5 * HOVER_THRUST
+    aside = Reckoning(imu=ImuMotion(t_s=NOW_S - 0.01), velocity_mps=(0.8, 0.0, 0.0))
+    c = context(
+        Evidence.IMU, z_m=0.02, tel={"acc_z_g": acc_z_g, "thrust": half},
+        touch_s=NOW_S - 0.5, level_thrust=half, reckoning=aside,
+    )  # fmt: skip
+    state, command = lander.act(c)
+    assert (state.touch_s is not None) is stands
+    assert isinstance(command, RawThrust)
+    assert (command.pitch_rad == 0.0) is stands  # tilted on the floor, it would slide
+
+
+@pytest.mark.parametrize(("vz_mps", "stops"), [(-0.35, False), (-0.05, True)])
+def test_below_5_cm_it_stops_only_at_rest(vz_mps: float, stops: bool) -> None:
+    """The height may be wrong by as much: what sinks still is not on the floor."""
+    sinks = {"velocity_mps": (0.0, 0.0, vz_mps)}
+    c = context(Evidence.SIGHT, z_m=0.0, tel=sinks, level_thrust=0.9 * HOVER_THRUST)
+    assert isinstance(lander.act(c)[1], StopMotors if stops else RawThrust)
+
+
 # --- What pictures and accelerometer agree on ---------------------------------------------------
+
+
+def test_level_is_what_pictures_show_to_be_level() -> None:
+    """An attitude that is 0.02 rad wrong makes 0.2 m/s of speed a second: pitched forward as it
+    seems to hover, it would slide forward."""
+    leans = Reckoning(imu=ImuMotion(t_s=NOW_S - 0.01), bias_mps2=(-0.2, 0.0, 0.0))
+    c, tilts = context(Evidence.IMU, reckoning=leans), []
+    for age_s in (0.05, 2.0, 7.0):
+        felt = VisualInertialMotion(NOW_S - age_s, (0.0, 0.0), (-0.2, 0.0), 0.0)
+        command = lander.act(Context(c.state, replace(c.obs, felt=felt), c.profile))[1]
+        assert isinstance(command, RawThrust)
+        assert command.roll_rad == 0.0
+        tilts.append(command.pitch_rad)
+    assert tilts[0] == pytest.approx(-0.2 / 9.81, rel=0.05)  # nose up, against it
+    assert tilts[0] < tilts[1] < tilts[2] == 0.0
+
+
+def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
+    c = context(Evidence.IMU, reckoning=Reckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
+    motion = VisualInertialMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0), 0.0)
+    obs = replace(c.obs, felt=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
+    state = lander.observe(Context(c.state, obs, c.profile)).state
+    assert state.reckoning.velocity_mps[:2] == (0.3, 0.0)
+    later = replace(obs, imu=replace(obs.imu, t_s=NOW_S + 0.01))  # the same motion again
+    moved = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.1, 0.0, 0.0)))
+    assert lander.observe(Context(moved, later, c.profile)).state.reckoning.velocity_mps[0] < 0.2
+
+
+@pytest.mark.parametrize("later_s", [0.0, 0.5])
+def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
+    """Its vertical speed is what they tell with the right delay, and the floor may be near."""
+    reckoning = Reckoning(imu=ImuMotion(t_s=NOW_S - 0.03), velocity_mps=(0.0, 0.0, -0.7))
+    c = context(Evidence.IMU, blind_height_m=2.0, reckoning=reckoning)
+    motion = VisualInertialMotion(NOW_S - 0.01, (0.0, 0.0), (0.0, 0.0), -0.4)
+    obs = replace(c.obs, felt=motion, mismatch=Mismatch(later_s) if later_s else None)
+    obs = replace(obs, imu=replace(obs.imu, t_s=NOW_S))
+    state = lander.observe(Context(c.state, obs, c.profile)).state
+    assert state.reckoning.velocity_mps[2] == pytest.approx(-0.4 if later_s else -0.7, abs=0.05)
+    state = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.0, 0.0, -0.4)))
+    _, command = lander.act(Context(state, obs, c.profile))
+    assert isinstance(command, RawThrust)
+    assert (command.thrust > 0.97 * HOVER_THRUST) is (later_s > 0.0)
 
 
 @pytest.mark.parametrize("hung", [0.9, 1.1])

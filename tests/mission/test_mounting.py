@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
-from perchctl.mission.mounting import MountWatch, Sight, update_watch
+from perchctl.mission.mounting import MountWatch, Sight, sight_of, update_watch
 from perchctl.vehicle import Command, PositionSetpoint
-from tests.helpers.mission import CEILING_M, state_in, target_at
+from tests.helpers.mission import CEILING_M, state_in, target_at, telemetry
 from tests.mission.rig import BEGIN_S, Motors, at, fly
 
 FRAME_S = 1.0 / 30.0
@@ -58,7 +58,34 @@ def test_a_mounting_that_leads_to_the_target_is_left_alone(deg: float) -> None:
     assert not flown(turned(deg))[0].wrong
 
 
-HEIGHT_M = 1.5
+def _tilting(deg: float) -> MountWatch:
+    """A vehicle on its place, 1.5 m below, that leans by 5 deg to all sides for four seconds."""
+    watch, reach_m = MountWatch(), 1.5 * math.tan(math.radians(5.0))
+    for i in range(120):
+        t_s = i * FRAME_S
+        lean = reach_m * complex(math.sin(4.0 * t_s), 0.8 * math.sin(5.0 * t_s + 1.0))
+        watch = update_watch(watch, Sight(t_s, 0j, turned(deg)(t_s, lean), lean))
+    return watch
+
+
+@pytest.mark.parametrize("deg", [90, 180, -90])
+def test_a_turned_mounting_shows_in_the_vehicles_own_tilts(deg: int) -> None:
+    """Before it has gone anywhere. Taken for a target that jumps, it would be looked at afresh
+    with each tilt, while the vehicle flies on."""
+    watch = _tilting(deg)
+    assert watch.wrong
+    assert abs(math.remainder(math.degrees(watch.turn_rad) - deg, 360.0)) < 5.0
+
+
+def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
+    """Nose down by 10 deg, heading left: the axis leans to the left."""
+    tel = telemetry(
+        1.0, position_m=(0.3, 0.1, 1.0), pitch_rad=math.radians(10.0), yaw_rad=math.pi / 2
+    )
+    sight = sight_of(1.0, tel, np.array([0.5, 0.2, 2.2]))
+    assert sight.vehicle == pytest.approx(0.3 + 0.1j)
+    assert sight.target == pytest.approx(0.5 + 0.2j)
+    assert sight.lean == pytest.approx(1.2j * math.sin(math.radians(10.0)), rel=0.02)
 
 
 def test_a_landing_for_the_mounting_stops_at_once() -> None:

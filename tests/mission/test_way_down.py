@@ -15,10 +15,14 @@ from perchctl.mission import ContactError, Observation, Outcome, Phase, PlannerS
 from perchctl.mission.guidance import UNREAD_S
 from perchctl.mission.lander import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, own_landing
 from perchctl.mission.planner import step_mission
+from perchctl.mission.state import Condition
+from perchctl.mission.table import TABLE
 from perchctl.vehicle import (
     CRASHED,
+    HL_ACTIVE,
     LOCKED,
     TUMBLED,
+    Command,
     EmergencyStop,
     Idle,
     Land,
@@ -282,9 +286,67 @@ def test_only_what_hangs_at_the_target_is_caught(
     assert fly(begin, InAHand(below_m, aside_m, sigma_m), 2.18, feels=True).state.phase is to
 
 
+class BacksOff(Motors):
+    """Pressed out of sight of the target, and backed off from; what it touched holds it. The
+    estimate goes on sliding, by 2 cm/s."""
+
+    def __init__(self, aside_m: float, sigma_m: float) -> None:
+        super().__init__(1.2 * HOVER_THRUST)
+        self.aside_m, self.sigma_m = aside_m, sigma_m
+
+    def look(self, t_s: float, state: PlannerState) -> Observation:
+        body_m = (self.aside_m + 0.02 * max(0.0, t_s - 10.5), 0.0, HANG_Z_M)
+        target = target_at(
+            t_s, body_m=body_m, sigma_m=np.full(3, self.sigma_m), measured=False, tracked=False,
+            measured_s=10.0,
+        )  # fmt: skip
+        return at(obs={"target": target}, position_m=body_m, thrust=self.thrust)(t_s)
+
+    def obey(self, state: PlannerState, command: Command) -> None:
+        if not (isinstance(command, PositionSetpoint) and state.phase is Phase.PERCH):
+            super().obey(state, command)
+
+
+@pytest.mark.parametrize(
+    ("aside_m", "sigma_m", "row", "ends", "outcome"),
+    [
+        (0.012, 0.022, "caught", Phase.PERCHED, Outcome.PERCHED),
+        (0.012, 0.075, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
+        (0.04, 0.01, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
+        (0.012, math.inf, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
+        (0.06, 0.01, "held", Phase.ABORTED, Outcome.SAFETY),
+    ],
+)
+def test_what_hangs_where_it_touched_the_target_is_told_by_its_place_there(
+    aside_m: float, sigma_m: float, row: str, ends: Phase, outcome: Outcome
+) -> None:
+    """Not by where the estimate slides to meanwhile, 4 cm farther aside."""
+    begin = landing(HANG_Z_M, Phase.PERCH)
+    flight = fly(begin, BacksOff(aside_m, sigma_m), 16.0, feels=True)
+    assert {"beside-the-magnet", row} <= flight.rows
+    assert (flight.state.phase, flight.state.outcome) == (ends, outcome)
+    if ends is Phase.PERCHED:
+        assert flight.state.contact is not None
+        assert flight.state.contact.aside_m == pytest.approx(aside_m)
+
+
 # --- Where it touched, as it is remembered -------------------------------------------------------
 
-TOUCHED: dict[str, Any] = {"contact": ContactError(0.01, 0.02)}
+
+@pytest.mark.parametrize(("since_s", "touched"), [(10.0, False), (9.0, True)])
+def test_one_sample_that_looks_like_a_contact_is_no_touch(since_s: float, touched: bool) -> None:
+    tel = telemetry(10.02, HANG_Z_M, thrust=1.2 * HOVER_THRUST)
+    pressing = landing(phase=Phase.PERCH, since={Condition.CONTACT: since_s})
+    row = next(row for row in TABLE if row.name == "no-contact")
+    backs_off = (replace(row, when=lambda c: True),)
+    after, _ = step_mission(pressing, observation(10.02, telemetry=tel), PROFILE, backs_off)
+    assert after.phase is Phase.RECOVER
+    assert (after.contact is not None) is touched
+
+
+def test_what_has_left_its_contact_forgets_where_that_was() -> None:
+    state = fly(hanging(Phase.RECOVER, contact=ContactError(0.01, 0.02)), at(HANG_Z_M - 0.1)).state
+    assert (state.contact_z_m, state.contact) == (None, None)
 
 
 def test_a_vehicle_still_at_the_ceiling_has_not_recovered() -> None:
@@ -363,6 +425,13 @@ def slipped(**changes: Any) -> PlannerState:
 FALLS: dict[str, Any] = {"velocity_mps": SINKS, "thrust": 1000.0, "acc_z_g": 0.2}
 
 
+def test_nothing_is_caught_on_an_old_speed() -> None:
+    """Two seconds of full thrust on a speed of long ago would end far above."""
+    late = at(HANG_Z_M - 0.1, age_s=0.2, **FALLS)
+    _, command = step_mission(slipped(), late(10.08), PROFILE)
+    assert is_setpoint(command, below_m=HANG_Z_M + 0.1)
+
+
 # --- A step of the estimate -------------------------------------------------------------
 
 
@@ -376,6 +445,32 @@ def test_a_step_of_the_estimates_height_moves_what_is_remembered(step_m: float) 
     assert before.ground_m is not None
     assert state.ground_m is not None
     assert state.ground_m[2] == pytest.approx(before.ground_m[2] + step_m, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "moves"), [(0.02, True), (0.1, True), (0.3, False), (5.0, False)]
+)
+def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves: bool) -> None:
+    """It was at rest before the silence and is at rest after it: on the floor."""
+    state = landing(1.0, last=telemetry(10.0, 1.0))
+    new, _ = step_mission(state, at(0.02, obs={"jumped": True})(10.0 + gap_s), PROFILE)
+    assert state.ground_m is not None
+    assert new.ground_m is not None
+    assert new.ground_m[2] - state.ground_m[2] == pytest.approx(-0.98 if moves else 0.0)
+
+
+def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None:
+    """By the line in the world that was it would dive by the step."""
+    lands = AIRBORNE | HL_ACTIVE
+    state = landing(0.4, orders=3, ordered_s=9.0, last=telemetry(9.98, 0.4, supervisor=lands))
+    up = at(0.9, obs={"jumped": True}, velocity_mps=(0.0, 0.0, -0.3), supervisor=lands)
+    state, command = step_mission(state, up(10.0), PROFILE)
+    assert is_setpoint(command, above_m=1.2)
+    slow = at(0.87, velocity_mps=(0.0, 0.0, -0.05), supervisor=lands)
+    state, command = step_mission(state, slow(10.14), PROFILE)
+    assert isinstance(command, Land)
+    assert state.ground_m is not None
+    assert command.height_m < state.ground_m[2]
 
 
 # --- Its own landing -----------------------------------------------------------------
