@@ -71,7 +71,7 @@ def _default_and_allowed(key: Key) -> str:
     default = f"{_shown(key.default)} {key.unit if key.default not in (None, ()) else ''}".strip()
     allowed = key.allowed
     if key.default is not None:  # which shows how many
-        allowed = re.sub("^[0-9] numbers(, )?", "", allowed)
+        allowed = re.sub("^([0-9] numbers|lowest, highest)(, )?", "", allowed)
     if allowed in ("", "text", "text, or none", "true, false"):
         return default
     return f"{default}; {allowed}"
@@ -98,14 +98,21 @@ def worlds() -> str:
         values = [getattr(simulation, key.path) for simulation in world.values()]
         if any(value != values[0] for value in values):
             shown = " | ".join(_shown(value) for value in values)
-            rows.append(f"| `{key.path}` | {shown} | {key.meaning} |")
-    head = f"| key | {' | '.join(f'`{name}`' for name in world)} | meaning |"
-    return "\n".join([head, "|---" * (len(world) + 2) + "|", *rows])
+            rows.append(f"| `{key.path}` | {shown} |")
+    head = f"| key | {' | '.join(f'`{name}`' for name in world)} |"
+    return "\n".join([head, "|---" * (len(world) + 1) + "|", *rows])
 
 
 def log_fields() -> str:
-    rows = [f"| `{name}` | {text} |" for name, text in FIELDS.items()]
-    return "\n".join(["| field | meaning |", "|---|---|", *rows])
+    """A row for fields in a row that have the same meaning, or that of one before them."""
+    rows: list[tuple[str, list[str]]] = []
+    for name, text in FIELDS.items():
+        if rows and (text == rows[-1][0] or re.search(r"\bas \w+$", text)):
+            rows[-1][1].append(name)
+        else:
+            rows.append((text, [name]))
+    lines = [f"| {', '.join(f'`{name}`' for name in names)} | {text} |" for text, names in rows]
+    return "\n".join(["| field | meaning |", "|---|---|", *lines])
 
 
 WAY_OF_A_FRAME: tuple[tuple[str, Callable[..., Any]], ...] = (
@@ -214,18 +221,26 @@ _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
     (BEFORE_CONTACT, "before contact"),
     (table.BY_CAMERA, "by camera"),
     (table.IN_THE_OPEN, "in the open"),
+    (table.BY_CAMERA | {Phase.PERCH}, "by camera, PERCH"),
+    (table.IN_THE_OPEN | {Phase.LANDING}, "in the open, LANDING"),
 )
 
 
+FEW_PHASES = 2
+"""A row of the mission's table that leaves from more phases is not in the diagram."""
+
+
 def mission_diagram() -> str:
-    """The undisturbed mission and its ways back, as a mermaid state diagram; the safety
-    rows, which leave from every phase, are in `mission_rows`."""
+    """The undisturbed mission and its ways back, as a mermaid state diagram; rows that leave from
+    many phases are in `mission_rows`."""
     lines = ["stateDiagram-v2", "    [*] --> APPROACH"]
+    ways: dict[tuple[Phase, Phase], list[str]] = {}
     for row in table.TABLE:
-        if _group(row) is not None:
-            continue
-        for phase in sorted(row.phases, key=_order):
-            lines.append(f"    {phase.value} --> {row.to.value}: {row.name}")
+        if _group(row) is None and len(row.phases) <= FEW_PHASES:
+            for phase in sorted(row.phases, key=_order):
+                ways.setdefault((phase, row.to), []).append(row.name)
+    for (phase, to), names in ways.items():
+        lines.append(f"    {phase.value} --> {to.value}: {', '.join(names)}")
     lines += [
         f"    {phase.value} --> [*]" for phase in (Phase.PERCHED, Phase.LANDED, Phase.ABORTED)
     ]
