@@ -219,13 +219,19 @@ def mission_diagram() -> str:
 
 
 def mission_rows() -> str:
-    """Every row in its order, as a Markdown table."""
-    lines = ["| row | from | to | severity |", "|---|---|---|---|"]
+    """Every row in its order, as a Markdown table; those that follow each other with the same ways
+    and severity share a line."""
+    lines: list[tuple[list[str], str]] = []
     for row in table.TABLE:
         origin = _group(row) or ", ".join(p.value for p in sorted(row.phases, key=_order))
         severity = row.severity.name.lower().replace("_", " ")
-        lines.append(f"| {row.name} | {origin} | {row.to.value} | {severity} |")
-    return "\n".join(lines)
+        rest = f"{origin} | {row.to.value} | {severity} |"
+        if lines and lines[-1][1] == rest:
+            lines[-1][0].append(row.name)
+        else:
+            lines.append(([row.name], rest))
+    head = ["| row | from | to | severity |", "|---|---|---|---|"]
+    return "\n".join([*head, *(f"| {', '.join(names)} | {rest}" for names, rest in lines)])
 
 
 def _group(row: table.Transition) -> str | None:
