@@ -46,10 +46,8 @@ SEE = {  # of a key: where a page says more
 
 
 def _section(path: str) -> str:
-    """Return the heading of a key: its first word, and the planner's phase."""
-    words = path.split(".")
-    deep = words[0] == "planner" and len(words) > 2
-    return ".".join(words[: 2 if deep else 1]) if len(words) > 1 else ""
+    """Return the heading of a key: its first word."""
+    return path.split(".")[0] if "." in path else ""
 
 
 def profile_keys() -> str:
@@ -71,7 +69,7 @@ def _default_and_allowed(key: Key) -> str:
     default = f"{_shown(key.default)} {key.unit if key.default not in (None, ()) else ''}".strip()
     allowed = key.allowed
     if key.default is not None:  # which shows how many
-        allowed = re.sub("^[0-9] numbers(, )?", "", allowed)
+        allowed = re.sub("^([0-9] numbers|lowest, highest)(, )?", "", allowed)
     if allowed in ("", "text", "text, or none", "true, false"):
         return default
     return f"{default}; {allowed}"
@@ -98,14 +96,21 @@ def worlds() -> str:
         values = [getattr(simulation, key.path) for simulation in world.values()]
         if any(value != values[0] for value in values):
             shown = " | ".join(_shown(value) for value in values)
-            rows.append(f"| `{key.path}` | {shown} | {key.meaning} |")
-    head = f"| key | {' | '.join(f'`{name}`' for name in world)} | meaning |"
-    return "\n".join([head, "|---" * (len(world) + 2) + "|", *rows])
+            rows.append(f"| `{key.path}` | {shown} |")
+    head = f"| key | {' | '.join(f'`{name}`' for name in world)} |"
+    return "\n".join([head, "|---" * (len(world) + 1) + "|", *rows])
 
 
 def log_fields() -> str:
-    rows = [f"| `{name}` | {text} |" for name, text in FIELDS.items()]
-    return "\n".join(["| field | meaning |", "|---|---|", *rows])
+    """A row for fields in a row that have the same meaning, or that of one before them."""
+    rows: list[tuple[str, list[str]]] = []
+    for name, text in FIELDS.items():
+        if rows and (text == rows[-1][0] or re.search(r"\bas \w+$", text)):
+            rows[-1][1].append(name)
+        else:
+            rows.append((text, [name]))
+    lines = [f"| {', '.join(f'`{name}`' for name in names)} | {text} |" for text, names in rows]
+    return "\n".join(["| field | meaning |", "|---|---|", *lines])
 
 
 WAY_OF_A_FRAME: tuple[tuple[str, Callable[..., Any]], ...] = (
@@ -132,33 +137,6 @@ def frame_diagram() -> str:
 def _mermaid_type(annotation: str) -> str:
     """The value that goes on: not None, and of a pair with a memory the second."""
     return annotation.removesuffix(" | None").rpartition(", ")[2].removesuffix("]")
-
-
-def package_diagram() -> str:
-    """Which package imports which, without what a longer path implies already."""
-    from tests.test_architecture import IMPORTS, LAYERS, room_of
-
-    packages = [
-        room for rooms in LAYERS for room in rooms if (ROOT / room.replace(".", "/")).is_dir()
-    ]
-    needs: dict[str, set[str]] = {package: set() for package in packages}
-    for found in IMPORTS:
-        importer, imported = room_of(found.importer), room_of(found.imported)
-        if importer in needs and imported in needs and importer != imported:
-            needs[importer].add(imported)
-    lines = ["flowchart BT"]
-    for package in packages:
-        implied = {far for near in needs[package] for far in _reached(needs, near)}
-        for other in sorted(needs[package] - implied):
-            lines.append(f"    {package.split('.')[1]} --> {other.split('.')[1]}")
-    return "\n".join(lines)
-
-
-def _reached(needs: dict[str, set[str]], package: str) -> set[str]:
-    reached = set(needs[package])
-    for near in needs[package]:
-        reached |= _reached(needs, near)
-    return reached
 
 
 def packages() -> str:
@@ -214,18 +192,26 @@ _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
     (BEFORE_CONTACT, "before contact"),
     (table.BY_CAMERA, "by camera"),
     (table.IN_THE_OPEN, "in the open"),
+    (table.BY_CAMERA | {Phase.PERCH}, "by camera, PERCH"),
+    (table.IN_THE_OPEN | {Phase.LANDING}, "in the open, LANDING"),
 )
 
 
+FEW_PHASES = 2
+"""A row of the mission's table that leaves from more phases is not in the diagram."""
+
+
 def mission_diagram() -> str:
-    """The undisturbed mission and its ways back, as a mermaid state diagram; the safety
-    rows, which leave from every phase, are in `mission_rows`."""
+    """The undisturbed mission and its ways back, as a mermaid state diagram; rows that leave from
+    many phases are in `mission_rows`."""
     lines = ["stateDiagram-v2", "    [*] --> APPROACH"]
+    ways: dict[tuple[Phase, Phase], list[str]] = {}
     for row in table.TABLE:
-        if _group(row) is not None:
-            continue
-        for phase in sorted(row.phases, key=_order):
-            lines.append(f"    {phase.value} --> {row.to.value}: {row.name}")
+        if _group(row) is None and len(row.phases) <= FEW_PHASES:
+            for phase in sorted(row.phases, key=_order):
+                ways.setdefault((phase, row.to), []).append(row.name)
+    for (phase, to), names in ways.items():
+        lines.append(f"    {phase.value} --> {to.value}: {', '.join(names)}")
     lines += [
         f"    {phase.value} --> [*]" for phase in (Phase.PERCHED, Phase.LANDED, Phase.ABORTED)
     ]
@@ -233,13 +219,19 @@ def mission_diagram() -> str:
 
 
 def mission_rows() -> str:
-    """Every row in its order, as a Markdown table."""
-    lines = ["| row | from | to | severity |", "|---|---|---|---|"]
+    """Every row in its order, as a Markdown table; those that follow each other with the same ways
+    and severity share a line."""
+    lines: list[tuple[list[str], str]] = []
     for row in table.TABLE:
         origin = _group(row) or ", ".join(p.value for p in sorted(row.phases, key=_order))
         severity = row.severity.name.lower().replace("_", " ")
-        lines.append(f"| {row.name} | {origin} | {row.to.value} | {severity} |")
-    return "\n".join(lines)
+        rest = f"{origin} | {row.to.value} | {severity} |"
+        if lines and lines[-1][1] == rest:
+            lines[-1][0].append(row.name)
+        else:
+            lines.append(([row.name], rest))
+    head = ["| row | from | to | severity |", "|---|---|---|---|"]
+    return "\n".join([*head, *(f"| {', '.join(names)} | {rest}" for names, rest in lines)])
 
 
 def _group(row: table.Transition) -> str | None:
@@ -252,7 +244,6 @@ def _order(phase: Phase) -> int:
 
 PARTS: dict[str, Callable[[], str]] = {
     "frame-diagram": lambda: f"```mermaid\n{frame_diagram()}\n```",
-    "package-diagram": lambda: f"```mermaid\n{package_diagram()}\n```",
     "packages": packages,
     "import-order": import_order,
     "diagram": lambda: f"```mermaid\n{mission_diagram()}\n```",
