@@ -207,7 +207,8 @@ def _estimator(vehicle: Vehicle, profile: Profile) -> Finding:
     problem = GroundCriteria(t, profile).unsettled
     if problem is not None:
         return failed(problem.found, "is there a positioning system? wait a little")
-    kind = profile.link.parameters.get(ESTIMATOR, vehicle.parameters.get(ESTIMATOR))
+    set_by_fly = profile.link.parameters | ProbeLink.estimator_parameters(profile.positioning)
+    kind = set_by_fly.get(ESTIMATOR, vehicle.parameters.get(ESTIMATOR))
     if t.position_variance_m2 is None:
         return skipped("its variance is not logged")
     found = f"variance {t.position_variance_m2:.2g} m^2"
@@ -243,8 +244,10 @@ def _level(vehicle: Vehicle, profile: Profile) -> Finding:
 
 def _parameters(vehicle: Vehicle, profile: Profile) -> Finding:
     """Judge the firmware's parameters: `fly` sets those that differ, and refuses those that the
-    firmware lacks."""
-    wanted, present = profile.link.parameters, vehicle.parameters
+    firmware lacks. What positions from outside need it sets over the user's own."""
+    laid_over = ProbeLink.estimator_parameters(profile.positioning)
+    wanted = {n: v for n, v in profile.link.parameters.items() if n not in laid_over}
+    present = vehicle.parameters
     unknown = [name for name in wanted if name not in present]
     if unknown:
         found = f"the firmware has no {', '.join(unknown)}"

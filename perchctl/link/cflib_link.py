@@ -123,7 +123,7 @@ class CflibLink:
             self.connection.cf,
             self._uri,
             self._positioning,
-            feed or Standing(self.external, ground_z_m, self._clock),
+            feed or Standing(self.external, ground_z_m, self._positioning.rate_hz, self._clock),
             lambda: self._blocks.newest,
             self._clock,
         ).run()

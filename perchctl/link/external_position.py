@@ -149,18 +149,23 @@ class Settling:
 
 class Standing:
     """Feed of a vehicle that stands at the world's origin, level, with its front along x: so the
-    world is defined. `wait` sends that place all the time."""
+    world is defined. `wait` sends that place, `rate_hz` times a second."""
 
-    def __init__(self, send: SendPosition, ground_z_m: float, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, send: SendPosition, ground_z_m: float, rate_hz: float, clock: Callable[[], float]
+    ) -> None:
         self._send, self._place = send, ExternalPosition((0.0, 0.0, ground_z_m))
+        self._period_s, self._due_s = 1.0 / rate_hz, -math.inf
         self._clock, self._count = clock, 0
 
     def wait(self, duration_s: float) -> None:
         """Let the time pass."""
         end_s = self._clock() + duration_s
-        while self._clock() < end_s:
-            self._count += self._send(self._place) is not False
-            time.sleep(POLL_S)
+        while (now_s := self._clock()) < end_s:
+            if now_s >= self._due_s:
+                self._count += self._send(self._place) is not False
+                self._due_s = now_s + self._period_s
+            time.sleep(min(self._due_s, end_s) - now_s)
 
     def status(self, now_s: float) -> FeedStatus:
         return FeedStatus(0.0, None, self._count, self._place)

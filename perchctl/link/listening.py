@@ -28,6 +28,7 @@ from perchctl.link.connection import (
     send_packets,
 )
 from perchctl.link.crtp import Packet, Port
+from perchctl.link.external_position import estimator_parameters
 from perchctl.link.firmware import (
     NEEDED_PROTOCOL,
     check_firmware,
@@ -153,6 +154,7 @@ class ProbeLink(ListeningLink):
     """
 
     NEEDED_PROTOCOL = NEEDED_PROTOCOL
+    estimator_parameters = staticmethod(estimator_parameters)
 
     def __init__(self, uri: str, config: LinkConfig, clock: Callable[[], float]) -> None:
         super().__init__(uri, config, clock)

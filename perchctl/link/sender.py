@@ -147,9 +147,9 @@ class Sender:
     # --- the first thread ------------------------------------------------------------------
 
     def _start_worker(self) -> None:
-        self._called_s = None
-        self._worker = threading.Thread(target=self._work, name="perchctl-sender", daemon=True)
-        self._worker.start()
+        worker = threading.Thread(target=self._work, name="perchctl-sender", daemon=True)
+        worker.start()  # an error leaves the old one, and the next look tries again
+        self._called_s, self._worker = None, worker
 
     def _work(self) -> None:
         pause_s = 0.0

@@ -220,6 +220,21 @@ def test_a_deck_of_one_s_own_is_believed_where_it_is_named() -> None:
     assert "positioning.decks" in before.advice
 
 
+def test_what_positions_from_outside_need_is_set_by_fly_and_not_warned_of() -> None:
+    """Over the user's own, also where a deck gives the vehicle a position by itself."""
+    own = {"stabilizer.estimator": 1, "locSrv.extPosStdDev": 0.05}
+    vehicle = replace(GOOD, parameters=parameters(locSrv__extPosStdDev=0.01))
+    for by, verdict in (("target", Verdict.PASS), ("deck", Verdict.WARN)):
+        profile = PROFILE.model_copy(
+            update={
+                "link": LinkConfig(parameters=own),
+                "positioning": PROFILE.positioning.model_copy(update={"by": by}),
+            }
+        )
+        rows = rows_of(vehicle, profile)
+        assert (rows["parameters"].verdict, rows["estimator"].verdict) == (verdict, verdict)
+
+
 def test_a_position_that_slides_at_rest_is_seen() -> None:
     slid = [said(t_s=0.01 * k, position_m=(0.001 * k, 0.0, 0.0)) for k in range(200)]
     assert moved_m(slid) == pytest.approx(0.18, abs=0.001)

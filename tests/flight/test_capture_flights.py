@@ -178,7 +178,3 @@ def test_what_a_blow_knocks_off_the_magnet_is_braked(seed: int) -> None:
     result = blown(seed)
     assert result.fault == "kick"
     assert result.astray_m < 0.5
-
-
-# --- A camera 90 deg from what the profile says, measured by a hand -------------------------------
-# Flown as it is, it stops (`test_flights.py`, and the fault `camera-turned` of the campaigns).

@@ -14,7 +14,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import Interrupted, InvalidValue, NotFound, PerchError, SafetyAbort, TimedOut
 from perchctl.flight.preflight import still_waiting_for
-from perchctl.mission import FlightReport, Operator, Outcome, Tick
+from perchctl.mission import FlightReport, Operator, Outcome, Phase, Tick
 from perchctl.perception import perception
 from perchctl.vehicle import CRASHED, DECK_FAULT, FLYING, LOCKED, TUMBLED, Land, PositionSetpoint
 from perchctl.vision.types import Detections
@@ -84,6 +84,11 @@ def test_a_camera_that_reports_a_failure_lands_with_its_words() -> None:
 
     rig.watcher.on_tick = unplug
     landed_for(rig, "the plug was pulled")
+
+
+def test_a_recording_that_ends_in_flight_lands() -> None:
+    rig = Rig(camera=Camera(live=False, frames=100))
+    assert landed_for(rig, "the scripted camera has ended").phase is Phase.LANDED
 
 
 def test_a_lost_link_lands() -> None:

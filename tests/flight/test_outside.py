@@ -174,6 +174,13 @@ def test_positions_that_are_none_keep_it_on_the_ground(
     assert not it.link.said(PositionSetpoint)
 
 
+def test_nothing_that_tells_the_position_is_a_refusal() -> None:
+    Rig(profile=MOCAP).refused(SafetyAbort, "nothing sends positions")
+    it = Rig()
+    it.link.measured_by = lambda: MeasuredBy((), False)  # type: ignore[method-assign]
+    it.refused(SafetyAbort, "no positioning deck.*set positioning: mocap")
+
+
 @pytest.mark.parametrize(("for_s", "lands"), [(0.3, False), (60.0, True)])
 def test_an_occlusion_is_held_and_a_lasting_one_landed(for_s: float, lands: bool) -> None:
     def hidden(t_s: float) -> bool:

@@ -109,10 +109,6 @@ def test_fly_perches_in_real_time_through_cflib(tmp_path: Path) -> None:
     assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
 
 
-LEAST_MISS_M = 0.002
-"""By decks: a lucky one would ask for more than any picture tells."""
-
-
 # --- Interrupted flights -------------------------------------------------------------------
 
 

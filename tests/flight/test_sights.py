@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from perchctl.calibration import profile_camera
 from perchctl.flight import FlightInputs
-from perchctl.flight.inputs import TargetPositioning, is_supported
+from perchctl.flight.inputs import CARRIED_FOR_S, TargetPositioning, is_supported
 from perchctl.geometry import Place
 from perchctl.perception import History, add_samples
 from perchctl.profile import SafetyConfig
@@ -70,6 +70,19 @@ def test_the_first_sample_of_a_fall_ends_it(felt_g: float) -> None:
     samples.append(replace(samples[-1], t_s=samples[-1].t_s + SAMPLE_S, acc_z_g=felt_g))
     sights.begin(history(samples), samples[-1].t_s, touches=True)
     assert not sent
+
+
+def test_a_slow_slip_ends_it_within_a_tenth_of_a_second() -> None:
+    """On nine tenths of its weight no single sample tells."""
+    samples = at_rest()
+    for _ in range(round(CARRIED_FOR_S / SAMPLE_S) - 1):
+        samples.append(replace(samples[-1], t_s=samples[-1].t_s + SAMPLE_S, acc_z_g=0.9))
+    assert not is_supported(history(samples), samples[-1].t_s)
+
+
+def test_sinking_at_a_steady_speed_is_no_hanging() -> None:
+    samples = at_rest(velocity_mps=(0.0, 0.0, -0.2))
+    assert not is_supported(history(samples), samples[-1].t_s)
 
 
 @pytest.mark.parametrize("frozen", [False, True])

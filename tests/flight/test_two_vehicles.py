@@ -16,7 +16,6 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.flight import fly_lockstep
 from perchctl.geometry import invert_T, make_T, rot_z, yaw_of
-from perchctl.link import Port
 from perchctl.mission import Phase
 from perchctl.profile import Profile
 from perchctl.record import read_log
@@ -25,14 +24,6 @@ from tests.helpers.flights import SEED, fly_short, short_profile
 
 APART_M = 0.8
 MISS_M = 0.02
-SAME_M = 2e-4
-"""Of a setpoint in the log and on its way: the log rounds, a packet holds 32 bits."""
-WATCHDOG_M = 0.1
-FLIGHT_LIMIT_S = 120.0
-LATEST_S = 0.25
-"""The latest turn of a flight that the computer was fast enough for."""
-COMMANDS = (Port.COMMANDER, Port.COMMANDER_GENERIC, Port.HIGH_LEVEL, Port.SUPERVISOR)
-_POSITION = 7  # type of a setpoint
 
 
 def pair(profile: Profile, seed: int, apart_m: float) -> tuple[Scenario, Scenario]:
@@ -81,16 +72,3 @@ def test_where_only_the_other_s_is_in_view_it_lands_and_says_why() -> None:
     assert flown.way == ["APPROACH", "SEARCH", "LANDING", "LANDED"]
     assert "0.40 m from target.expected_xy_m is not followed" in flown.report.reason
     assert flown.farthest_m < 0.15
-
-
-# --- in real time ------------------------------------------------------------------------
-
-
-CALIBRATION = """%YAML 1.0
----
-image_width: 320
-image_height: 240
-distortion_model: plumb_bob
-camera_matrix: {rows: 3, cols: 3, data: [190, 0, 160.5, 0, 190.3, 118.9, 0, 0, 1]}
-distortion_coefficients: {rows: 1, cols: 5, data: [-0.17, 0.04, 0.0004, -0.0007, -0.003]}
-"""

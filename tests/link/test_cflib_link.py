@@ -6,6 +6,7 @@ Waiting is always for the vehicle's own simulated time or state, and bounded.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -160,6 +161,34 @@ def test_wrong_parameters_are_refused(
     with pytest.raises(error, match=words), linked(sim, config):
         pass
     assert motors_off(sim)
+
+
+def test_telemetry_is_si_right_handed_and_in_the_loop_s_time(sim: SimProcess) -> None:
+    """Firmware facts, "Signs and units": the Crazyflie's pitch is nose up, ours nose down."""
+    with linked(sim) as link:
+        assert newest(link).has(CAN_FLY)
+        let_pass(sim, 0.5)
+        times = [sample.t_s for sample in link.telemetry()]
+        assert len(times) > 20
+        assert times == sorted(times)
+        assert max(times) <= time.monotonic()
+        sim.set_pose((0.1, -0.2, 0.5), (0.15, 0.25, 0.6), hold=True)
+        true = until(lambda: sim.truth())
+
+        def arrived() -> bool:
+            sample = newest(link)
+            return (
+                math.dist(sample.position_m, true["position_m"]) < 0.02
+                # The estimate of a vehicle turned by hand follows slowly, but the right way.
+                and 0.03 < sample.roll_rad < 0.18
+                and 0.06 < sample.pitch_rad < 0.28
+                and 0.12 < sample.yaw_rad < 0.65
+            )
+
+        until(arrived)
+        sample = newest(link)
+        assert sample.battery_v == pytest.approx(true["battery_v"], abs=0.02)
+        assert sample.acc_z_g == pytest.approx(true["specific_force_mps2"][2] / 9.81, abs=0.1)
 
 
 def test_a_vehicle_that_has_started_anew_is_known_by_its_samples(sim: SimProcess) -> None:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import queue
 import socket
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import dataclass
@@ -17,6 +19,7 @@ from typing import Any
 
 import cflib.crtp
 import pytest
+from cflib.crtp import radiodriver
 
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.link import CflibLink, Packet, Port
@@ -47,12 +50,24 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+class Thread:
+    """The thread of a driver, as cflib's radio has it."""
+
+    def __init__(self) -> None:
+        self.alive = True
+        self._retry_before_disconnect: int | None = 100_000
+
+    def is_alive(self) -> bool:
+        return self.alive
+
+
 class Driver:
     """A link of cflib's that can hang, fail, or have no room."""
 
     needs_resending = False
 
     def __init__(self) -> None:
+        self._thread: Any = Thread()
         self.sent: list[bytes] = []
         self.out_queue: queue.Queue[Any] = queue.Queue(1)
         self.entered, self.free = threading.Event(), threading.Event()
@@ -79,6 +94,15 @@ class Bench:
     driver: Driver
     link: CflibLink
     now_s: float = 100.0
+
+    def is_dead_within(self, for_s: float, lost_packets: int = 0) -> bool:
+        """Asked all the time, while the driver counts so many lost packets each time."""
+        dead = False
+        for _ in range(round(for_s / STEP_S)):
+            self.now_s += STEP_S
+            self.driver._thread._retry_before_disconnect -= lost_packets
+            dead = dead or self.connection.is_dead()
+        return dead
 
     def place(self, x_m: float) -> bool:
         """Hand over a position from outside."""
@@ -107,6 +131,31 @@ def reopened(bench: Bench, monkeypatch: pytest.MonkeyPatch, driver: Any) -> None
     until(lambda: bench.connection.lost is None, LIMIT_S)
 
 
+# --- A driver that takes nothing ---------------------------------------------------------------
+
+
+def test_a_radio_that_counts_what_it_loses_is_alive_and_one_that_counts_nothing_is_dead(
+    bench: Bench,
+) -> None:
+    assert not bench.is_dead_within(100.0, lost_packets=25)
+    bench.now_s += 1.0
+    assert not bench.is_dead_within(DEAD_S)
+    assert bench.is_dead_within(2 * STEP_S)
+
+
+def test_one_whose_thread_has_ended_is_dead(bench: Bench) -> None:
+    bench.driver._thread.alive = False
+    assert bench.connection.is_dead()
+
+
+@pytest.mark.parametrize("thread", [None, SimpleNamespace(is_alive=lambda: True)])
+def test_of_a_driver_that_tells_nothing_nothing_is_said(bench: Bench, thread: Any) -> None:
+    bench.driver._thread = thread
+    for _ in range(round(2 * DEAD_S / STEP_S)):
+        bench.now_s += STEP_S
+        assert not bench.connection.is_dead()
+
+
 def test_a_lock_that_is_never_free_is_a_dead_link_and_a_reopened_one_has_its_own(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -121,6 +170,22 @@ def test_a_lock_that_is_never_free_is_a_dead_link_and_a_reopened_one_has_its_own
     assert connection.send(PACKET)
     assert (len(bench.driver.sent), len(after.sent)) == (0, 1)
     assert not connection.is_dead()
+
+
+def test_a_dead_thread_of_a_dongles_is_not_opened_again(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """cflib would hand it out for ever, and wait for its answers."""
+    radios: list[Any] = [SimpleNamespace(is_alive=lambda: False)]
+    monkeypatch.setattr(radiodriver.RadioManager, "_radios", radios)
+    found: list[Any] = []
+
+    def driver(*_: Any) -> Driver:
+        found.append(radios[0])
+        return Driver()
+
+    reopened(bench, monkeypatch, driver)
+    assert found == [None]
 
 
 # --- Positions from outside, through cflib's lock ----------------------------------------------
@@ -216,3 +281,17 @@ def test_a_radio_that_another_program_has_open_is_named_as_that() -> None:
     assert "another program has it open" in said
     assert "radio://1" in said
     assert "udev" not in said
+
+
+def test_a_real_flight_loads_nothing_of_the_simulator() -> None:
+    """Neither does its link: the mock takes a simulated vehicle as an argument."""
+    program = (
+        "import sys, time\n"
+        "import perchctl.flight.session\n"
+        "from perchctl.link import CflibLink, MockLink, Packet, ProbeLink\n"
+        "from perchctl.profile import LinkConfig\n"
+        "CflibLink('radio://0/80/2M', LinkConfig(), time.monotonic)\n"
+        "print(*[name for name in sys.modules if name.startswith('perchctl.sim')])\n"
+    )
+    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (shown.returncode, shown.stdout.split()) == (0, []), shown.stderr

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,13 @@ import pytest
 from perchctl.errors import ConnectionFailed, PerchError, TimedOut
 from perchctl.geometry import rot_z
 from perchctl.link import external_position
-from perchctl.link.external_position import AGREE_WITHIN_S, RESET_PARAMETER, RESETS, Settling
+from perchctl.link.external_position import (
+    AGREE_WITHIN_S,
+    RESET_PARAMETER,
+    RESETS,
+    Settling,
+    Standing,
+)
 from perchctl.positioning import FeedStatus, Placed
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import FLYING, Telemetry
@@ -43,6 +50,10 @@ class Bench:
     at_reset: Callable[[], None] = lambda: None
     values: dict[str, float] = field(default_factory=dict)
     orders: list[tuple[str, float]] = field(default_factory=list)
+    feed: Standing | None = None
+
+    def clock(self) -> float:
+        return self.now_s
 
     def set_parameters(
         self, cf: Any, uri: str, parameters: Mapping[str, float], *_: str, read_back: bool = True
@@ -72,12 +83,10 @@ class Bench:
         return Placed(self.now_s, np.array(self.place_m), rot_z(2.0))
 
     def settle(self) -> None:
-        feed: Any = self
+        feed: Any = self.feed or self
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(external_position, "set_parameters", self.set_parameters)
-            Settling(
-                None, "udp://x", CONFIG, feed, self.newest, lambda: self.now_s, self.wait
-            ).run()
+            Settling(None, "udp://x", CONFIG, feed, self.newest, self.clock, self.wait).run()
 
     def refused(self, kind: type[PerchError]) -> str:
         """The one sentence by which it is refused, within the bound."""
@@ -140,3 +149,15 @@ def test_agreement_counts_over_fresh_telemetry_only() -> None:
 
     bench.at_reset = fall_silent
     bench.refused(PerchError)
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 30.0])
+def test_what_stands_is_sent_as_often_as_the_profile_has_it(
+    monkeypatch: pytest.MonkeyPatch, rate_hz: float
+) -> None:
+    bench, sent_s = Bench(place_m=(0.0, 0.0, 0.03)), list[float]()
+    monkeypatch.setattr(external_position, "time", SimpleNamespace(sleep=bench.wait))
+    bench.feed = Standing(lambda place: sent_s.append(bench.now_s), 0.03, rate_hz, bench.clock)
+    bench.settle()
+    assert np.diff(sent_s) == pytest.approx(1.0 / rate_hz)
+    assert len(sent_s) > 0.5 * rate_hz
