@@ -84,13 +84,13 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # Packages with a face: the others take its names, and nothing from behind it. The number is how
 # many names it has at most.
 MOST_NAMES = {
-    "analysis": 12,
+    "analysis": 10,
     "calibration": 17,
     "camera": 17,
-    "campaign": 24,
-    "check": 15,
-    "commands": 15,
-    "display": 8,
+    "campaign": 22,
+    "check": 8,
+    "commands": 2,
+    "display": 7,
     "faults": 6,
     "flight": 15,
     "link": 11,

@@ -16,28 +16,28 @@ SOURCES = {path: path.read_text(encoding="utf-8") for path in sorted(ROOT.rglob(
 # Package -> lines at most; "." are the modules beside the packages. What needs more raises the
 # bound in its own change, and says why there.
 MOST_LINES = {
-    ".": 1200,
-    "analysis": 3500,
-    "calibration": 4200,
-    "camera": 2350,
-    "campaign": 1800,
-    "check": 2100,
-    "commands": 5250,
-    "display": 950,
-    "faults": 3150,
-    "flight": 2500,
-    "link": 2650,
-    "record": 3200,
-    "mission": 4900,
-    "perception": 900,
-    "positioning": 1250,
-    "profile": 2100,
-    "sim": 6650,
-    "target": 2300,
-    "vision": 7600,
-    "weights": 1500,
+    ".": 1150,
+    "analysis": 2700,
+    "calibration": 3250,
+    "camera": 1750,
+    "campaign": 1250,
+    "check": 2000,
+    "commands": 4300,
+    "display": 850,
+    "faults": 3050,
+    "flight": 2400,
+    "link": 2400,
+    "record": 2550,
+    "mission": 4800,
+    "perception": 850,
+    "positioning": 1050,
+    "profile": 2050,
+    "sim": 5300,
+    "target": 1850,
+    "vision": 7450,
+    "weights": 1450,
 }
-MOST_FILES = 240
+MOST_FILES = 220
 # Of the code before it was made shorter: what is shorter because its lines are fuller is not.
 CHARACTERS_A_LINE, DOCSTRING_SHARE, WITHIN = 37.8, 0.106, 0.05
 MOST_MEDIAN_LINES = 15  # of a function
