@@ -105,7 +105,7 @@ def log_fields() -> str:
     """A row for fields in a row that have the same meaning, or that of one before them."""
     rows: list[tuple[str, list[str]]] = []
     for name, text in FIELDS.items():
-        if rows and (text == rows[-1][0] or re.search(r"\bas \w+$", text)):
+        if rows and (text == rows[-1][0] or re.search(r"\bas \w+_(m|rad)$", text)):
             rows[-1][1].append(name)
         else:
             rows.append((text, [name]))

@@ -108,7 +108,7 @@ class Comparison:
             meta, difference = f.metadata, self.differences[f.name]
             label = meta["label"] + (f" [{meta['unit']}]" if meta["unit"] else "")
             less = "" if difference is None else f"{difference * meta['scale']:+.{meta['digits']}f}"
-            yield _row(label, a.text(f.name), b.text(f.name), less)
+            yield _row(label, a.value_text(f.name), b.value_text(f.name), less)
 
 
 def _flight_record(flight: FlightAnalysis) -> dict[str, Any]:

@@ -75,7 +75,7 @@ class Measures:
     late_p99_s: float | None = _number("turn late, 99 %", "ms", 1e3, 1)
     telemetry_age_p99_s: float | None = _number("telemetry's age, 99 %", "ms", 1e3, 0)
 
-    def text(self, name: str) -> str:
+    def value_text(self, name: str) -> str:
         """Return a number as people read it, without its unit; ``-`` where it is not known."""
         (of,) = [f for f in fields(self) if f.name == name]
         value = getattr(self, name)
@@ -87,7 +87,7 @@ class Measures:
     def rows(self) -> list[tuple[str, str]]:
         """Each number that is known: its label and its text with the unit."""
         return [
-            (f.metadata["label"], f"{self.text(f.name)} {f.metadata['unit']}".rstrip())
+            (f.metadata["label"], f"{self.value_text(f.name)} {f.metadata['unit']}".rstrip())
             for f in fields(self)
             if getattr(self, f.name) is not None
         ]

@@ -106,11 +106,11 @@ class _Given:
     def _picture_of(self, seen: FrameSeen) -> NDArray[np.uint8]:
         if self._taken.problem is not None:  # nobody looked at it
             return np.zeros((1, 1), np.uint8)
-        image = self._again(seen) if seen.repeated else self._recorded(seen)
+        image = self._repeated_picture(seen) if seen.repeated else self._recorded(seen)
         self._shown = (seen.checksum, image)
         return image
 
-    def _again(self, seen: FrameSeen) -> NDArray[np.uint8]:
+    def _repeated_picture(self, seen: FrameSeen) -> NDArray[np.uint8]:
         """Return a picture that the source repeated, which is not recorded: nothing is measured in
         it, but whether its bytes are the same shows a frozen camera."""
         if self._shown is None:

@@ -106,7 +106,7 @@ def utc_text(started_utc: Any) -> str:
 
 
 def _measure_lines(flight: FlightAnalysis) -> Iterator[str]:
-    m, of = flight.measures, flight.measures.text
+    m, of = flight.measures, flight.measures.value_text
     if m.settled_xy_rms_m is not None:
         yield from _named(
             "settled",

@@ -200,7 +200,7 @@ def _mirrored(rehearsal: Rehearsal, profile: Profile) -> Finding:
     return passed("no")
 
 
-def _target(rehearsal: Rehearsal, profile: Profile) -> Finding:
+def _target_in_view(rehearsal: Rehearsal, profile: Profile) -> Finding:
     if not rehearsal.found:
         return skipped("not in view", "put the vehicle under it to check the rest")
     found = _share_found(rehearsal)
@@ -236,7 +236,7 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
     "pictures": _pictures,
     "focus": _focus,
     "mirrored": _mirrored,
-    "target": _target,
+    "target": _target_in_view,
     "print": _print,
 }
 

@@ -1,6 +1,6 @@
 """The motion capture that gives a vehicle its position: answers, body, rate, noise, axes.
 
-`listen` hears vehicle and capture for a while; `capture_rows` judges that at rest, and
+`listen` hears vehicle and capture for a while; `mocap_rows_at_rest` judges that at rest, and
 `hand_finding` what a hand that lifts, turns and tilts the vehicle shows. Pure, and nothing is sent.
 
 The vehicle's own attitude knows how it is turned, and which way is up; the capture says the same
@@ -117,7 +117,7 @@ def refused_rows(why: str, config: PositioningConfig) -> list[Row]:
     return [Row("capture", *failed(why, advice)), *skip_all(names, f"no {config.label}")]
 
 
-def capture_rows(heard: Listened, profile: Profile) -> list[Row]:
+def mocap_rows_at_rest(heard: Listened, profile: Profile) -> list[Row]:
     """Judge what came of a capture while the vehicle stood still."""
     config = profile.positioning
     if not heard.frames:
@@ -215,7 +215,7 @@ STRANGER = 0.4
 
 
 @dataclass(frozen=True, eq=False)
-class Moved:
+class PairedMotion:
     """Pairs of one moment each: n attitudes as the vehicle and as the capture have them, the
     capture's places (n, 3), and the accelerometer's largest difference from 1 g."""
 
@@ -244,7 +244,7 @@ class Turns:
         return np.asarray(self.world.as_matrix()[:, 2])
 
 
-def paired(telemetry: Sequence[Telemetry], places: Sequence[Placed]) -> Moved | None:
+def paired(telemetry: Sequence[Telemetry], places: Sequence[Placed]) -> PairedMotion | None:
     """Pair each place with the vehicle's attitude of its moment, every `EVERY_S`; None of fewer
     than three pairs."""
     if len(telemetry) < 2:
@@ -265,7 +265,7 @@ def paired(telemetry: Sequence[Telemetry], places: Sequence[Placed]) -> Moved | 
     if len(own) < 3:
         return None
     moved_g = max(abs(t.acc_z_g - 1.0) for t in telemetry)
-    return Moved(
+    return PairedMotion(
         Rotation.from_matrix(np.array(own)),
         Rotation.from_matrix(np.array(seen)),
         np.array(place_m),
@@ -273,7 +273,7 @@ def paired(telemetry: Sequence[Telemetry], places: Sequence[Placed]) -> Moved | 
     )
 
 
-def turns_of(moved: Moved) -> Turns | None:
+def turns_of(moved: PairedMotion) -> Turns | None:
     """Solve A and B by all pairs of moments between which it was turned; None where it was turned
     about fewer than two axes."""
     i, j = np.triu_indices(len(moved.own), 1)
@@ -299,7 +299,7 @@ def _has_many_axes(turns: Array) -> bool:
     return bool(np.quantile(aside_rad, MANY_SHARE) > LEAST_STEP_RAD)
 
 
-def is_enough(moved: Moved | None) -> bool:
+def is_enough(moved: PairedMotion | None) -> bool:
     """Return whether it was lifted, turned, tilted and put back: more would tell no more."""
     if moved is None or turns_of(moved) is None:
         return False
@@ -313,7 +313,7 @@ def _turned_rad(attitudes: Rotation) -> Array:
     return np.asarray((attitudes[0].inv() * attitudes).magnitude())
 
 
-def hand_finding(moved: Moved | None, config: PositioningConfig) -> Finding:
+def hand_finding(moved: PairedMotion | None, config: PositioningConfig) -> Finding:
     """Compare vehicle and capture, and return the gravest finding."""
     if moved is None:
         return skipped("no moments at which both vehicle and capture said something", HOW_TO_TURN)
@@ -343,7 +343,7 @@ def hand_finding(moved: Moved | None, config: PositioningConfig) -> Finding:
     return _world_finding(turns, moved) or _body_finding(turns, moved, config)
 
 
-def _risen_m(turns: Turns, moved: Moved) -> Array:
+def _risen_m(turns: Turns, moved: PairedMotion) -> Array:
     """Return the way (3,) from the first place to the one farthest along the capture's vertical,
     or, where that is too near for a lift, to the farthest of all."""
     ways_m = moved.ways_m
@@ -353,7 +353,7 @@ def _risen_m(turns: Turns, moved: Moved) -> Array:
     return np.asarray(risen_m)
 
 
-def _world_finding(turns: Turns, moved: Moved) -> Finding | None:
+def _world_finding(turns: Turns, moved: PairedMotion) -> Finding | None:
     """Return what is wrong with the capture's world: tilted, its axes swapped, or mirrored. Its
     places may be in other axes than its attitudes."""
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.up[2])))))
@@ -386,7 +386,7 @@ def _sideways(risen_m: Array) -> Finding | None:
     )
 
 
-def _body_finding(turns: Turns, moved: Moved, config: PositioningConfig) -> Finding:
+def _body_finding(turns: Turns, moved: PairedMotion, config: PositioningConfig) -> Finding:
     """Judge what is left of the body's turn beyond the profile's, and whether it was lifted."""
     off_deg = math.degrees(float(turns.body.magnitude()))
     if off_deg > BODY_WARN_DEG:

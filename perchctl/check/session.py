@@ -166,7 +166,7 @@ class VehicleSession:
         seconds = self.scope.capture_s
         self.scope.tell(f"listening to {config.label} for {seconds:g} s")
         seen = capture.listen(take, self.room, time.monotonic, time.sleep, seconds)
-        return capture.capture_rows(seen, self.profile)
+        return capture.mocap_rows_at_rest(seen, self.profile)
 
     def _compared_rows(self) -> list[Row]:
         simulated = self.uri.startswith("sim://")
@@ -201,7 +201,7 @@ class VehicleSession:
             return skipped(f"no {config.label}")
         self.scope.tell(f"now, within {within_s:g} s: {capture.HOW_TO_TURN}")
 
-        def moved(so_far: capture.Listened) -> capture.Moved | None:
+        def moved(so_far: capture.Listened) -> capture.PairedMotion | None:
             return capture.paired(so_far.telemetry, so_far.places(config))
 
         seen = capture.listen(

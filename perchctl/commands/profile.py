@@ -324,8 +324,8 @@ def summary(answers: Answers) -> str:
 
 
 def new_profile(answers: Answers, name: str) -> tuple[Profile, set[str]]:
-    """Return the profile that these answers make, few or all, and the keys that it is written with.
-    Raises NotFound, InvalidValue, UsageError, each with the key."""
+    """Return the profile that these answers make, and the keys to write to its file. What is not
+    answered yet has its default. Raises NotFound, InvalidValue, UsageError, each with the key."""
     texts = {key: text for key, text in answers.items() if key not in EDGES_AND_CEILING}
     if "target.large.side_m" in texts and "target.small.side_m" not in texts:
         texts["target.small.side_m"] = default_answer("target.small.side_m", answers)

@@ -1,6 +1,6 @@
 """The faults that can be laid into a simulated flight.
 
-A fault is one entry of `FAULTS`: its name, what happens, the README's promise that holds for it,
+A fault is one entry of `FAULTS`: its name, what happens, the promise that holds for it,
 what it does with which drawn values, the phases in which it begins, and the outcomes that are
 expected of it. `draw_case` is one seed's fault: which, in which phase, when in it, with what
 values. A seed gives the same flight for ever: draws stay in their order.
@@ -43,14 +43,14 @@ LONGEST_S, EVER_SHARE = 30.0, 0.25
 # --- Draws ------------------------------------------------------------
 
 
-class Source(NamedTuple):
+class DrawInputs(NamedTuple):
     """What a case is drawn from."""
 
     rng: np.random.Generator
     scenario: Scenario
 
 
-Draw = Callable[[Source], Any]
+Draw = Callable[[DrawInputs], Any]
 """Draws one value."""
 
 
@@ -65,7 +65,7 @@ def log_between(low: float, high: float) -> Draw:
     return lambda source: round(float(math.exp(source.rng.uniform(*logs))), 4)
 
 
-def chance(source: Source, share: float) -> bool:
+def chance(source: DrawInputs, share: float) -> bool:
     """Return True in that share of all draws."""
     return bool(source.rng.uniform() < share)
 
@@ -73,7 +73,7 @@ def chance(source: Source, share: float) -> bool:
 def lasting(low: float = 0.1) -> Draw:
     """Draw a duration log-uniformly from `low` to `LONGEST_S`; one in four lasts for ever."""
 
-    def draw(source: Source) -> float:
+    def draw(source: DrawInputs) -> float:
         for_s: float = log_between(low, LONGEST_S)(source)
         return e.FOR_EVER if chance(source, EVER_SHARE) else for_s
 
@@ -95,7 +95,7 @@ def one_of(*choices: Any) -> Draw:
     return lambda source: choices[int(source.rng.integers(len(choices)))]
 
 
-def direction(source: Source) -> tuple[float, float]:
+def direction(source: DrawInputs) -> tuple[float, float]:
     """Draw a horizontal unit vector of random direction."""
     angle = float(source.rng.uniform(-math.pi, math.pi))
     return math.cos(angle), math.sin(angle)
@@ -104,14 +104,14 @@ def direction(source: Source) -> tuple[float, float]:
 def presses(period: Any, duration: Draw) -> Draw:
     """Draw the times of a key that is pressed again and again."""
 
-    def draw(source: Source) -> tuple[float, ...]:
+    def draw(source: DrawInputs) -> tuple[float, ...]:
         period_s, for_s = _value(period, source), duration(source)
         return tuple(round(float(t), 3) for t in np.arange(0.0, for_s, period_s))
 
     return draw
 
 
-def _value(value: Any, source: Source) -> Any:
+def _value(value: Any, source: DrawInputs) -> Any:
     """Return a value that is given, or drawn; of a tuple each of its parts."""
     if isinstance(value, tuple):
         return tuple(_value(part, source) for part in value)
@@ -123,19 +123,19 @@ def drawn(act: Callable[..., object], **values: Any) -> Draw:
     return lambda source: partial(act, **{name: _value(v, source) for name, v in values.items()})
 
 
-def _jump_xy(source: Source) -> e.Axes:
+def _jump_xy(source: DrawInputs) -> e.Axes:
     x, y = direction(source)
     step_m = log_between(0.1, 2.0)(source)
     return x * step_m, y * step_m, 0.0
 
 
-def _drift(source: Source) -> e.Axes:
+def _drift(source: DrawInputs) -> e.Axes:
     x, y = direction(source)
     speed_mps = log_between(0.03, 0.3)(source)
     return x * speed_mps, y * speed_mps, between(-0.2, 0.2)(source) * speed_mps
 
 
-def _blow(source: Source) -> e.Axes:
+def _blow(source: DrawInputs) -> e.Axes:
     """Draw the force of a blow of 40 ms that changes the speed by up to 1 m/s, mostly sideways."""
     x, y = direction(source)
     z = between(-0.5, 0.5)(source)
@@ -143,7 +143,7 @@ def _blow(source: Source) -> e.Axes:
     return x * force_n, y * force_n, z * force_n
 
 
-def _gust(source: Source) -> e.Axes:
+def _gust(source: DrawInputs) -> e.Axes:
     """Draw a force of up to a fifth of the weight, mostly sideways."""
     x, y = direction(source)
     z = between(-0.3, 0.3)(source)
@@ -151,18 +151,18 @@ def _gust(source: Source) -> e.Axes:
     return x * force_n, y * force_n, z * force_n
 
 
-def _a_step_aside(source: Source) -> tuple[float, float]:
+def _a_step_aside(source: DrawInputs) -> tuple[float, float]:
     x, y = direction(source)
     return 0.3 * x, 0.3 * y
 
 
-def _beside(source: Source) -> tuple[Neighbour, ...]:
+def _beside(source: DrawInputs) -> tuple[Neighbour, ...]:
     x, y = direction(source)
     away_m = between(0.35, 1.2)(source)
     return (Neighbour((x * away_m, y * away_m)),)
 
 
-def _turned_camera(source: Source) -> tuple[tuple[float, ...], ...]:
+def _turned_camera(source: DrawInputs) -> tuple[tuple[float, ...], ...]:
     turn = rot_z(math.radians(one_of(90.0, 180.0, -90.0)(source)))
     rows = [list(row) for row in source.scenario.T_body_cam_true]
     for row in rows[:3]:
@@ -170,22 +170,22 @@ def _turned_camera(source: Source) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, rows))
 
 
-def _one_weak_motor(source: Source) -> tuple[float, ...]:
+def _one_weak_motor(source: DrawInputs) -> tuple[float, ...]:
     weak = one_of(1, 2, 3, 4)(source)
     return tuple(0.85 if motor == weak else 1.0 for motor in (1, 2, 3, 4))
 
 
-def _another_thrust(source: Source) -> tuple[float, ...]:
+def _another_thrust(source: DrawInputs) -> tuple[float, ...]:
     return (round(1.0 / between(0.92, 1.08)(source), 4),) * 4
 
 
-def _packet_twice(source: Source) -> tuple[e.Effect, ...]:
+def _packet_twice(source: DrawInputs) -> tuple[e.Effect, ...]:
     order = one_of("setpoint", "land", "notify", "stop")(source)
     twice = partial(e.packet_twice, order=order)
     return (twice, ONCE(source)) if order in ("land", "notify") else (twice,)
 
 
-def _hung_and_packet_lost(source: Source) -> tuple[e.Effect, ...]:
+def _hung_and_packet_lost(source: DrawInputs) -> tuple[e.Effect, ...]:
     """Draw a stuck loop, with the loss of the first packets that the watchdog sends."""
     order = one_of("raw", "stop", "land")(source)
     return HUNG(source), lost(order)(source)
@@ -651,7 +651,7 @@ def draw_case(seed: int, scenario: Scenario, faults: Sequence[Fault] = FAULTS) -
 
 def case_of(fault: Fault, phase: Phase, rng: np.random.Generator, scenario: Scenario) -> Case:
     """Return a case of the given fault and phase with everything else drawn."""
-    source = Source(rng, scenario)
+    source = DrawInputs(rng, scenario)
     moment_s = between(0.0, USUAL_S[phase])(source)
     effects = _value(fault.draw, source)
     landed_from, after_s, first_hold = None, 0.0, None

@@ -232,13 +232,13 @@ def room(scenario: Scenario, **fields: Any) -> Scenario:
     return replace(scenario, **fields)
 
 
-FROM_THE_START = (magnet_holds, room)
+OF_THE_SCENARIO = (magnet_holds, room)
 
 
 def changed_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
     """Return the scenario with what holds from the start."""
     for effect in effects:
-        if effect.func in FROM_THE_START:
+        if effect.func in OF_THE_SCENARIO:
             scenario = effect(scenario)
         elif effect.func in (external_positions, deck_silent):
             extra = {**scenario.extra, "external_position": 1.0}
@@ -281,7 +281,7 @@ class Injector:
         self, edges: Edges, effects: tuple[Effect, ...], phase: Phase, moment_s: float
     ) -> None:
         self._edges, self._phase, self._moment_s = edges, phase, moment_s
-        self._effects = [effect for effect in effects if effect.func not in FROM_THE_START]
+        self._effects = [effect for effect in effects if effect.func not in OF_THE_SCENARIO]
         self._due_s: float | None = None
         self.begin_s: float | None = None
         self.flown: Phase | None = None

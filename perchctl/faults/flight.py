@@ -123,7 +123,7 @@ class FaultyFlight:
         """Fly to the end, wait until the vehicle is at rest, and return the judgement."""
         self._vehicle.each = self._each
         self._link.connect()
-        if self._case.fault.phases is FROM_THE_START:
+        if self._case.fault.phases == FROM_THE_START:
             self._injector.begin(self._vehicle.t_s)
         try:
             end, reason, report = self._mission()

@@ -1,6 +1,6 @@
-"""What the README promises for when something goes wrong, and whether a flight keeps it.
+"""What docs/faults.md promises for when something goes wrong, and whether a flight keeps it.
 
-The README's table is drawn from `PROMISES`; each fault of the catalogue names the key of one.
+Its table, "In short", is drawn from `PROMISES`; each fault of the catalogue names the key of one.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ CUT: frozenset[End] = frozenset({"perched", "landed", "aborted"})
 
 @dataclass(frozen=True)
 class Promise:
-    """One row of the README's table. `ends`: the ends that a flight with such a fault may have.
+    """One row of that table. `ends`: the ends that a flight with such a fault may have.
     `unseen`: it may also end with an unconfirmed landing, or held away from the target by an
     estimate that moved. `names`: a word that its last sentence contains unless it perched."""
 
@@ -58,8 +58,8 @@ PROMISES: dict[str, Promise] = {
     ),
     "telemetry": Promise(
         "telemetry old or standing still, or a part of it; loop late or hanging",
-        "held after 0.3 s (a late loop after 0.25 s), landed after 1 s; nothing old proves a "
-        "contact or a landing",
+        "held by the planner from 0.25 s late, by the watchdog after 0.3 s of silence; landed "
+        "after 1 s; nothing old proves a contact or a landing",
         unseen=True,
     ),
     "link": Promise(

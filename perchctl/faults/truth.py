@@ -322,10 +322,12 @@ def targets_of(scenario: Scenario) -> list[Place]:
 
 
 class UnfeltDrift:
-    """The distance by which a fault may move the vehicle sideways unnoticed by everything on
-    board: a drift of the estimate while it does not steer by a visible target, and, with the
-    target as positioning system and out of view, a force while it acts. A step of the estimate
-    is not counted, since it can be noticed."""
+    """How far (m) a fault may push the vehicle sideways with no sensor noticing.
+
+    A drift of the estimate counts while the vehicle does not steer by a visible target. A force
+    counts while it acts, if the target is the positioning system and is out of view. A step of
+    the estimate does not count, since it can be noticed.
+    """
 
     def __init__(
         self, effects: tuple[e.Effect, ...], scenario: Scenario, *, by_target: bool

@@ -52,7 +52,8 @@ class GivesTelemetry(Protocol):
 
 @dataclass(eq=False)
 class FlightInputs:
-    """Takes in telemetry and at most one frame a tick, and observes what follows from them."""
+    """Takes telemetry and at most one frame a tick, and makes the planner's observation of them:
+    the target, the ages of both, and what contradicts them."""
 
     SENSED: ClassVar = (
         "telemetry",

@@ -36,7 +36,7 @@ FIRST_FRAME_S = 1.0
 
 
 class LockstepClock:
-    """The vehicle's own time; waiting lets the vehicle live."""
+    """The simulated vehicle's time; waiting advances the simulation."""
 
     def __init__(self, link: MockLink) -> None:
         self._link = link
@@ -218,8 +218,9 @@ _shared_pipelines: dict[Hashable, Pipeline] = {}
 
 
 def _pipeline_of(profile: Profile, camera: CameraModel) -> Pipeline:
-    """Return the pipeline that a campaign's flights share: to make one takes as long as 10
-    pictures. Two profiles may be compared; one with a mask shares none: its file may change."""
+    """Return a vision pipeline; flights of one profile and camera share it, since making one takes
+    as long as 10 pictures. Two are kept, for `simulate compare`. A profile with a mask gets a new
+    one each time: the mask's file may have changed."""
     if profile.camera.mask is not None:
         return make_pipeline(profile, camera)
     key = profile.model_dump_json(), camera.contents

@@ -5,8 +5,8 @@ not reach. From `REPEAT_AFTER_S` of silence on the last position is held: never 
 so that it neither climbs nor presses. While it sinks, a setpoint above stays: it brakes. From
 `safety.loop_late_land_s` on, or on the operator's order, or where the loop was already on its way
 down or had put the weight on the magnet, the lander of `perchctl.mission` goes on in its place.
-With decks or motion capture it orders the vehicle's own landing at once, three times, since a late
-loop can steer nothing; by the target alone it comes down level.
+With decks or motion capture it orders the vehicle's own landing at once, three to six times, since
+a late loop can steer nothing; by the target alone it comes down level.
 """
 
 from __future__ import annotations

@@ -414,7 +414,7 @@ def expected_corners(
     R_then, R_now = _R_world_cam(then, setup), _R_world_cam(attitude, setup)
     by_place, by_speed = sight.off_rad2
     share = by_place / (by_place + by_speed) if by_place + by_speed > 0.0 else 0.5
-    stepped_m, flown_m = _moves(then, attitude, setup)
+    stepped_m, flown_m = _camera_motions_m(then, attitude, setup)
     moved_m = stepped_m + share * (flown_m - stepped_m)
     R = R_now.T.dot(R_then)
     tvec = R.dot(pose.tvec_m) - R_now.T.dot(moved_m)
@@ -440,7 +440,10 @@ def update_sight(
     R = _R_world_cam(attitude, setup)
     seen_m = _R_world_cam(then, setup).dot(before.pose.tvec_m) - R.dot(pose.tvec_m)
     # Across the view: along it a far target's own distance is vague.
-    off = [R.T.dot(way_m - seen_m)[:2] / pose.tvec_m[2] for way_m in _moves(then, attitude, setup)]
+    off = [
+        R.T.dot(way_m - seen_m)[:2] / pose.tvec_m[2]
+        for way_m in _camera_motions_m(then, attitude, setup)
+    ]
     by_place, by_speed = (
         old + _FORGOTTEN * (float(new.dot(new)) - old)
         for old, new in zip(before.off_rad2, off, strict=True)
@@ -459,7 +462,7 @@ def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
     return bool((at_px > 0.0).all() and (at_px < np.subtract(setup.camera.size_px, 1)).all())
 
 
-def _moves(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
+def _camera_motions_m(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
     """Return the camera's way in the world (3,) m, by the state estimate's places and by its
     speeds."""
     turned_m = _ahead_m(now, setup) - _ahead_m(then, setup)

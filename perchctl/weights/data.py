@@ -186,7 +186,8 @@ def _read_table(path: Path, reader: Any) -> tuple[tuple[str, ...], NDArray[np.in
 def _check_cells(
     path: Path, lines: NDArray[np.int64], heads: Array, poses: dict[str, Array]
 ) -> None:
-    """Raises InvalidValue for a number that is none, an empty cell, or half a pose."""
+    """Raises InvalidValue for infinite numbers, missing cells, and poses of which a part is
+    missing."""
 
     def refuse(bad: Any, text: str) -> None:
         if bad.any():

@@ -43,7 +43,7 @@ def test_settled_is_the_last_second_before_the_last_contact() -> None:
     found = FlightAnalysis(log_of(records)).measures
     assert found.settled_xy_rms_m == pytest.approx(0.003 * math.sqrt(2))
     assert found.settled_yaw_rms_rad == pytest.approx(0.006)
-    assert (found.text("settled_xy_rms_m"), found.text("miss_m")) == ("4.2", "-")
+    assert (found.value_text("settled_xy_rms_m"), found.value_text("miss_m")) == ("4.2", "-")
     assert FlightAnalysis(log_of(records[:3])).measures.settled_xy_rms_m is None
 
 

@@ -64,7 +64,7 @@ def rows_of(it: Scripted, sample: Telemetry | None = None) -> dict[str, Row]:
         return [replace(rest, t_s=it.now_s)]
 
     seen = capture.listen(heard, it, it.clock, it.wait)
-    found = capture.capture_rows(seen, PROFILE)
+    found = capture.mocap_rows_at_rest(seen, PROFILE)
     assert [row.name for row in found] == ["capture", "body", *capture.CAPTURE]
     return {row.name: row for row in found}
 
@@ -130,7 +130,7 @@ def test_a_tilted_vehicle_is_not_judged() -> None:
 def test_without_a_vehicle_no_place_is_compared() -> None:
     it = Scripted()
     seen = capture.listen(list, it, it.clock, it.wait)
-    *_, place = capture.capture_rows(seen, PROFILE)
+    *_, place = capture.mocap_rows_at_rest(seen, PROFILE)
     assert (place.verdict, "no telemetry" in place.found) == (Verdict.SKIPPED, True)
 
 

@@ -89,7 +89,7 @@ def test_nothing_goes_wrong(name: str, phase: Phase, by: str) -> None:
     assert not_known or promise_of(name).is_kept(result), result
 
 
-def test_each_fault_stands_under_one_line_of_the_readme() -> None:
+def test_each_fault_stands_under_one_line_of_the_table() -> None:
     """The last line is of what no fault brings about by itself."""
     assert {fault.promise for fault in FAULTS} == {*PROMISES} - {"ended"}
 

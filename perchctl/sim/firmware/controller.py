@@ -123,7 +123,8 @@ _THRUST_SCALE = 1000.0
 
 
 class Pid:
-    """One PID loop; the derivative acts on the measurement. A `limit` of 0 means none."""
+    """One PID loop; the derivative acts on the measurement. `i_limit` bounds the
+    integral, `limit` the output; a `limit` of 0 means no bound."""
 
     def __init__(
         self, kp: float, ki: float, kd: float, period_s: float, i_limit: float, limit: float = 0.0

@@ -107,7 +107,7 @@ def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -
     return found if camera is None else distort(found, camera)
 
 
-def completed(
+def with_missing_marker(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
     """Return both markers, the other where the one that is expected puts it; `ratio` is the small

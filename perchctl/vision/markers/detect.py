@@ -26,12 +26,12 @@ from perchctl.vision.markers.blurred import aligned, expected_in_blur, hidden_in
 from perchctl.vision.markers.corners import (
     NESTED_SIGMA_PX,
     RefinedCorners,
-    completed,
     known_from,
     mean_side_px,
     nested,
     shortest_side_px,
     side_lengths_px,
+    with_missing_marker,
     within,
 )
 from perchctl.vision.markers.cut import (
@@ -87,7 +87,7 @@ def detect_markers(
     is looked at, and the result is the mean: where the markers were at the frame's own time.
     """
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
-    both = completed(expected, setup.ratio, camera)
+    both = with_missing_marker(expected, setup.ratio, camera)
     look = _look(empty_frames, bool(expected), setup)
     turn = None
     if empty_frames is not None and look in ("near", "fits"):

@@ -624,11 +624,11 @@ _HIGH_LOW: Floats = np.where(np.arange(PROFILES) % 2, _FAR, -_FAR).astype(np.flo
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What lies beside the edges.
+    """The neighbouring edges that blur into the one that is measured.
 
-    depth_px: width of a cell, (rows,). inside, outside: 1 where a falling edge of the same
-    height lies one cell further in or out, (rows, n). possible: False where there is no
-    edge to be found, (rows, n).
+    depth_px: size of a marker's cell across the edge, (rows,). inside, outside: 1 where another
+    edge of the same contrast lies one cell further in or out, (rows, n). possible: False where no
+    edge can be found, (rows, n).
     """
 
     depth_px: Array
