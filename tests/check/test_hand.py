@@ -218,12 +218,12 @@ def test_a_hand_may_drift_aside() -> None:
     assert recorded(7, way_m=(0.05, -0.12, 0.3)).verdict is Verdict.PASS
 
 
-def truly_moved(way: Stops, from_s: float, to_s: float) -> capture.Moved:
+def truly_moved(way: Stops, from_s: float, to_s: float) -> capture.PairedMotion:
     """Vehicle and capture agree on that way."""
     times_s = np.arange(from_s, to_s, capture.EVERY_S)
     places, turns = zip(*(way(HOME, I3, float(t_s)) for t_s in times_s), strict=True)
     R = Rotation.from_matrix(turns)
-    return capture.Moved(R, R, np.array(places), 0.2)
+    return capture.PairedMotion(R, R, np.array(places), 0.2)
 
 
 @given(tilt_deg=st.floats(20.0, 40.0), before_s=st.floats(0.2, 5.0), after_s=st.floats(0.2, 20.0))
