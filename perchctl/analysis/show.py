@@ -1,5 +1,5 @@
-"""A flight as `perchctl log show` prints it: lines of at most `COLUMNS` columns, or one record; and
-the logs of a folder, a line each."""
+"""A flight as `perchctl log show` prints it: lines of at most `COLUMNS` columns, or one
+record."""
 
 from __future__ import annotations
 

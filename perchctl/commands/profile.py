@@ -107,7 +107,8 @@ WORDS: dict[str, str] = {
     "camera.source": "The camera: camera:N (a receiver at /dev/videoN), http://..., rtsp://..., "
     "aideck://HOST",
     "camera.calibration": "Its calibration file, of perchctl calibrate",
-    "camera.latency_s": "How late the picture is, from exposure to arrival (often 60 to 100 ms)",
+    "camera.latency_s": "How late the picture is, from exposure to arrival (often 60 to 100 ms),\n"
+    "or measured: by each flight",
     "front": "Hold a hand over the front of the vehicle. At which edge of the picture does it\n"
     "come in: top, right, bottom or left?",
     "left": "And a hand over its left side (a camera that mirrors has it at the other edge)?",
@@ -294,12 +295,14 @@ def _read(name: str, typed: str) -> str:
         return typed
     unit, size = MEASURES[name]
     words = re.sub(rf"(?<=[\d.])\s*{unit}(?![a-zA-Z])", " ", typed).replace(",", " ").split()
+    if (name, typed) == ("camera.latency_s", "measured"):
+        return typed
     try:
         numbers = [float(word) for word in words]
     except ValueError:
         raise InvalidValue(f"found {typed!r}; numbers in {unit} are needed") from None
-    if unit == "mm" and any(numbers) and all(abs(number) < 1.0 for number in numbers):
-        raise InvalidValue(f"found {typed!r}: these look like metres; the question is in mm")
+    if size < 1.0 and any(numbers) and all(abs(number) < 1.0 for number in numbers):
+        raise InvalidValue(f"found {typed!r}: too small for {unit}, in which the question is")
     values = [f"{number * size:.12g}" for number in numbers]
     return values[0] if len(values) == 1 else f"[{', '.join(values)}]"
 
@@ -309,7 +312,10 @@ def _shown(name: str, value: str) -> str:
     if name not in MEASURES:
         return value
     unit, size = MEASURES[name]
-    numbers = (float(part) / size for part in value.strip("[]").split(","))
+    try:
+        numbers = [float(part) / size for part in value.strip("[]").split(",")]
+    except ValueError:  # a word, or a number with its unit, as --set may give it
+        return value
     return f"{' '.join(f'{number:.4g}' for number in numbers)} {unit}"
 
 

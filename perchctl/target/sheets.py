@@ -189,9 +189,8 @@ def _layout_on(
     None where the target does not fit."""
     side, cell = _side_and_cell(target)
     width, height = page
-    if min(page) / 2 - UNPRINTABLE < _ruler_half(
-        side / 2
-    ):  # perhaps too narrow for a word of the caption
+    # Narrower than its rulers, a page may have no room for a word of the caption.
+    if min(page) / 2 - UNPRINTABLE < _ruler_half(side / 2):
         return None
     lines, below = _caption_room(texts, width)
     # Where a small target's sheet ends inside of the rulers, the page has room for a cell.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tempfile
 from pathlib import Path
 
@@ -138,8 +139,8 @@ WRONG: dict[str, tuple[str, str]] = {
 
 
 MISTYPED = WRONG | {
-    "camera.latency_s": ("2000", "allowed are 0 to 1"),
-    "camera.mount.position_m": ("0.03 0 0.01", "look like metres"),
+    "camera.latency_s": ("0.08", "too small for ms"),
+    "camera.mount.position_m": ("0.03 0 0.01", "too small for mm"),
     "vehicle.gear_body_m": ("0 0 400", "0.4"),
     "target.large.side_m": ("15 cm", "numbers in mm"),
     "target.small.side_m": ("80", "less than half"),
@@ -167,6 +168,18 @@ def test_a_ruler_s_millimetres_are_written_as_metres_and_one_may_go_back(tmp_pat
     assert (mine.target.large.side_m, mine.target.small.side_m) == (0.18, 0.03)
     assert mine.safety.fence_radius_m == 1.2
     assert "picture                  mirrored, turned by" in done.stderr
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_a_latency_that_flights_measure_may_be_answered(tmp_path: Path, given: bool) -> None:
+    output, settings = tmp_path / "mine.yaml", ["--set", "ceiling=2.4m"]
+    settings += ["--set", "camera.latency_s=measured"] if given else []
+    typed = "\n" * 3 + ("" if given else "measured\n") + "\n" * 8
+    done = new(output, *settings, typed=typed)
+    assert done.exit_code == 0, done.stderr
+    assert load_profile(str(output)).camera.latency_s == "measured"
+    assert re.search(r"camera.latency_s +measured\n", done.stderr)
+    assert re.search(r"ceiling +2.4m\n", done.stderr)
 
 
 def test_a_calibration_that_lies_there_is_offered(
