@@ -209,10 +209,8 @@ class GroundCriteria:
         target, (x, y, _) = self.profile.target, place.position_m
         if target.expected_xy_m is None:
             return None
-        away_m, fence_m = (
-            math.dist((x, y), target.expected_xy_m),
-            self.profile.safety.fence_radius_m,
-        )
+        away_m = math.dist((x, y), target.expected_xy_m)
+        fence_m = self.profile.safety.fence_radius_m
         if not away_m > fence_m + target.expected_within_m:
             return None
         return Problem(
