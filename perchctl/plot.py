@@ -46,5 +46,10 @@ def figure_bytes(figure: Figure, suffix: str = ".png") -> bytes:
     """Return the figure in one of `FORMATS`, the same bytes for the same figure."""
     content = BytesIO()
     with rc_context({"svg.hashsalt": "perchctl"}):
+        # The layout's solver differs in its last bits from one call to the next.
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+        for ax in figure.axes:
+            ax.set_position([round(v, 6) for v in ax.get_position(original=True).bounds])
         figure.savefig(content, format=suffix.removeprefix("."), metadata=_METADATA[suffix])
     return content.getvalue()

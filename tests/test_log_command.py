@@ -70,10 +70,13 @@ def test_a_plot_s_name_is_its_form(logs: Path, monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["x.png", "x.pdf", "x.svg"])
 def test_the_same_flight_is_drawn_to_the_same_bytes(logs: Path, name: str) -> None:
-    assert run("log", "plot", OLD, "-o", name).code == 0
-    once = Path(name).read_bytes()
-    assert run("log", "plot", OLD, "-o", name, "--force").code == 0
-    assert Path(name).read_bytes() == once
+    """Also where objects lie at other addresses, by which a solver may order its sums."""
+    drawn, kept = set[bytes](), list[list[object]]()
+    for n in range(4):
+        kept.append([object() for _ in range(10_007 * n)])
+        assert run("log", "plot", OLD, "-o", name, "--force").code == 0
+        drawn.add(Path(name).read_bytes())
+    assert len(drawn) == 1
 
 
 def test_two_flights_are_compared(logs: Path) -> None:
