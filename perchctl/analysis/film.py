@@ -135,7 +135,7 @@ class _Stage:
 
     def drawn(self, index: int, image: Array | None, corners: dict[str, Array]) -> Rgb:
         """Return the picture of a tick, (height, width, 3)."""
-        self._move(index, image, corners)
+        self._draw_frame(index, image, corners)
         self._canvas.restore_region(self._still)
         for artist in self._moving:
             (artist.axes or self._figure).draw_artist(artist)
@@ -203,7 +203,7 @@ class _Stage:
         thrust_ax.set_ylim(0.0, 105.0)
         self._cursor = self._add(thrust_ax.axvline(0.0, color=BLACK, linewidth=1.0))
 
-    def _move(self, index: int, image: Array | None, corners: dict[str, Array]) -> None:
+    def _draw_frame(self, index: int, image: Array | None, corners: dict[str, Array]) -> None:
         flight, ways = self._flight, self._ways
         record, t_s = flight.log.records[index], float(flight.log.t_s[index])
         if image is not None:

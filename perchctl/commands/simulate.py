@@ -171,7 +171,7 @@ def run(
         say_where_logs_are(results, log_dir)
 
     with (
-        signals_to(stop_once()),
+        signals_to(stop_handler()),
         campaigns.campaign_results(
             flown,
             seeds,
@@ -290,7 +290,7 @@ def _fly_by_each(
     cluster: str | None,
     report: Callable[[list[campaigns.VariantResult], PerchError | None], None],
 ) -> int:
-    with signals_to(stop_once()):
+    with signals_to(stop_handler()):
         return fly_each(
             lambda executor, note: campaigns.fly_variants(profiles, seeds, executor, note),
             report,
@@ -396,7 +396,7 @@ def fly_each(
     return problem.exit_code
 
 
-def stop_once(
+def stop_handler(
     clock: Callable[[], float] = time.monotonic, leave: Callable[[int], object] = os._exit
 ) -> Callable[[int, FrameType | None], None]:
     """Return a handler: the first signal raises KeyboardInterrupt, a further one ends the program

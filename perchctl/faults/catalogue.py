@@ -200,7 +200,7 @@ def camera(kind: str) -> Draw:
     return drawn(e.camera_fault, kind=kind, for_s=lasting())
 
 
-def external(how: Any) -> Draw:
+def wrong_positions(how: Any) -> Draw:
     return drawn(e.external_positions, how=how, for_s=lasting())
 
 
@@ -390,7 +390,7 @@ FAULTS: tuple[Fault, ...] = (
         "external-position",
         "positions freeze or end",
         "positions",
-        external(either(0.5, "frozen", "silent")),
+        wrong_positions(either(0.5, "frozen", "silent")),
     ),
     Fault(
         "external-occluded",
@@ -398,8 +398,12 @@ FAULTS: tuple[Fault, ...] = (
         "positions",
         drawn(e.external_positions, how="occluded", for_s=either(0.5, 0.3, lasting(0.5))),
     ),
-    Fault("external-swapped", "another body takes its name", "positions", external("swapped")),
-    Fault("external-scaled", "positions in millimetres", "positions", external("millimetres")),
+    Fault(
+        "external-swapped", "another body takes its name", "positions", wrong_positions("swapped")
+    ),
+    Fault(
+        "external-scaled", "positions in millimetres", "positions", wrong_positions("millimetres")
+    ),
     Fault(
         "external-late",
         "positions come 50 to 150 ms later than they say",
@@ -553,7 +557,7 @@ FAULTS: tuple[Fault, ...] = (
         "pushed",
         drawn(e.thrust_changed, to=_another_thrust),
     ),
-    Fault("external-mirrored", "positions come mirrored", "positions", external("mirrored")),
+    Fault("external-mirrored", "positions come mirrored", "positions", wrong_positions("mirrored")),
     Fault("exception", "an exception ends the loop", "exception", drawn(e.raises)),
     Fault(
         "operator-hammers",

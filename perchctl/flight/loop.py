@@ -48,7 +48,7 @@ HUNG_S = 0.25
 """A turn that takes longer hung somewhere: what it knew of the vehicle is old."""
 
 
-class Positions(Protocol):
+class GivesPositions(Protocol):
     """What the loop needs of a `perchctl.positioning.PositionFeed`."""
 
     def status(self, now_s: float) -> FeedStatus: ...
@@ -72,7 +72,7 @@ class FlightParts:
     watchers: tuple[Watcher, ...] = ()
     operator: Callable[[], Operator] = lambda: Operator.NONE
     simulated: Callable[[Event], str] = lambda event: ""
-    positions: Positions | None = None
+    positions: GivesPositions | None = None
     remarks: Callable[[], Sequence[str]] = tuple
 
     def position_age_s(self, now_s: float) -> float:

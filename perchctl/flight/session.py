@@ -61,7 +61,7 @@ class FlyOptions:
         return self.uri.startswith("sim://")
 
     def require_comparison(self) -> None:
-        """Raises SafetyAbort for a capture that no hand has compared with this vehicle."""
+        """As the function of this name, for this flight."""
         require_comparison(self.profile.positioning, self.uri, simulated=self.simulated)
 
 
@@ -205,8 +205,9 @@ def _check_positioning(profile: Profile, *, simulated: bool) -> None:
 
 
 def require_comparison(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
-    """Raises SafetyAbort for a capture that no hand has compared recently with this vehicle:
-    swapped axes do not show at rest. The simulator's own room is right as it is built."""
+    """Raises SafetyAbort unless somebody has lately moved this vehicle by hand and compared it with
+    the motion capture (`perchctl check --lift`): swapped axes do not show at rest. The simulator's
+    own room is right as it is built."""
     if config.by != "mocap" or simulated:
         return
     objected = load_comparison(config, vehicle_uri(uri)).objection(datetime.now().astimezone())

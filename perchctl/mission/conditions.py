@@ -152,7 +152,7 @@ def hovers(c: Context) -> bool:
 
 def _magnet_holds(c: Context) -> bool:
     """True if the vehicle stays up on a thrust that could not carry it."""
-    return _is_carried(c) and not _slipping(c) and (c.placed or _still(c))
+    return _is_carried(c) and not _magnet_slips(c) and (c.placed or _still(c))
 
 
 def _is_carried(c: Context) -> bool:
@@ -161,7 +161,7 @@ def _is_carried(c: Context) -> bool:
     return c.thrust_is_known and c.state.hover_thrust > 0 and c.telemetry.thrust <= most
 
 
-def _slipping(c: Context) -> bool:
+def _magnet_slips(c: Context) -> bool:
     """True if it falls away from the proven contact, by position or by acceleration."""
     complete, tel = c.planner.complete, c.telemetry
     if c.state.contact_z_m is None or not c.sinks(complete.slip_mps):
@@ -182,7 +182,7 @@ def _weight_hangs(c: Context) -> bool:
         c.state.released_s is not None
         and (c.telemetry.thrust <= STILL_MOTORS_THRUST or not c.thrust_is_known)
         and _still(c)
-        and not _slipping(c)
+        and not _magnet_slips(c)
     )
 
 
@@ -289,7 +289,7 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.SETTLED: _settled,
     Condition.CONTACT: _contact,
     Condition.MAGNET_HOLDS: _magnet_holds,
-    Condition.SLIPPING: _slipping,
+    Condition.SLIPPING: _magnet_slips,
     Condition.HANGING: _hanging,
     Condition.STEADY: lambda c: c.speed_mps <= c.planner.recover.steady_mps,
     Condition.TILTED: lambda c: (  # by a fresh attitude, however old the position is

@@ -235,9 +235,9 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 def add_moment(
     old: ConsistencySums, t_s: float, rows: Array, variance: Array, range_m: float
 ) -> ConsistencySums:
-    """Return the sums with the frame of `t_s`, which tells what `consistency_moment` returns. After
-    a gap, or where the target or the estimate's world has jumped, the level begins anew, and what
-    was learned is kept."""
+    """Return the sums with one frame more; `rows`, `variance` and `range_m` are what
+    `consistency_moment` returns of it. After a gap, or a jump of the target or of the estimate, the
+    level that changes are counted from begins anew; what was learned of delay and turn is kept."""
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)
     gap_s = t_s - old.t_s

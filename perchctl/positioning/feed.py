@@ -341,11 +341,11 @@ class Judge:
         )
 
     def _followed(self, placed: Placed, now_s: float) -> Placed | None:
-        """Refused where no vehicle can be so soon.
+        """Return the pose, or None and a `problem` if no vehicle gets there so soon.
 
-        A jump that stays is not taken for true by and by, though a vehicle could have got
-        there in the meantime: what goes on from a refused pose is refused, until the body is
-        seen again where it was left. On the way there the age grows, and the flight ends by it.
+        Time does not make a jump true: poses near a refused one are refused too, until the body is
+        seen again where it was last believed. Meanwhile the age of the position grows, and ends
+        the flight.
         """
         last, stranger = self._believed, self._stranger
         if last is not None:

@@ -237,7 +237,7 @@ _EMPTY = struct.pack("<i", 0)
 _UNSEEN = BodyPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
-class CaptureServer:
+class MotionCaptureServer:
     """Answers in a thread of its own; `publish` sends a frame to the newest client at once."""
 
     def __init__(self, names: Sequence[str]) -> None:

@@ -23,7 +23,7 @@ from perchctl.children import Channel, connect_back
 from perchctl.errors import PerchError
 from perchctl.geometry import rotation_from_quaternion, rpy_from_rotation
 from perchctl.link import Packet
-from perchctl.sim.capture import CaptureFault, CaptureServer, SimCapture
+from perchctl.sim.capture import CaptureFault, MotionCaptureServer, SimCapture
 from perchctl.sim.crtp import CrtpServer
 from perchctl.sim.optics import Picture
 from perchctl.sim.process import LOOP_PATIENCE_S, START_TIMEOUT_S, HostSetup, SharedTime
@@ -54,7 +54,7 @@ class VehicleHost:
         self.vehicle = self._new_vehicle(setup.scenario)
         self.server = CrtpServer(self.vehicle.firmware, setup.link)
         self.stream: MjpegServer | None = None
-        self.positions: CaptureServer | None = None
+        self.positions: MotionCaptureServer | None = None
         with contextlib.ExitStack() as opened:
             use = opened.enter_context
             self.socket = use(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
@@ -65,7 +65,7 @@ class VehicleHost:
             if setup.camera is not None:
                 self.stream = use(contextlib.closing(MjpegServer()))
             if setup.capture is not None:
-                self.positions = use(contextlib.closing(CaptureServer(setup.capture.names)))
+                self.positions = use(contextlib.closing(MotionCaptureServer(setup.capture.names)))
 
             def lines(file: Path | None) -> TextIO | None:
                 return None if file is None else use(file.open("w", encoding="utf-8"))

@@ -57,7 +57,7 @@ class SharedTime(ctypes.Structure):
 
     @classmethod
     def free(cls) -> SharedTime:
-        """Return a time of one process, without a limit."""
+        """Return a time for one process alone, which waits for nobody."""
         return cls(0.0, math.inf)
 
     @classmethod

@@ -349,11 +349,12 @@ def gauss_newton(points: Points, start: PoseCandidate) -> Scored | None:
 
 
 def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
-    """Return the covariance (6, 6) of (rvec, tvec), the squared error per degree of freedom, and by
-    how much one standard deviation of the sheet's curl moves them, (6,).
+    """Return the pose's covariance, its fit and its change by a curl of the sheet.
 
-    The covariance is that of the corners' noise, grown as far as the residuals show that they
-    spread more than they claim, and what common shifts do to the pose, and a twist; not the curl.
+    These are the covariance (6, 6) of (rvec, tvec), the squared error per degree of freedom, and
+    the change (6,) by one standard deviation of the curl. In the covariance are the corners'
+    noise (more, if the residuals show more), shifts that all corners share, and a twist of the
+    sheet; its curl is not.
     """
     W = points.whitening
     A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())

@@ -106,8 +106,8 @@ def to_world(
 def to_level(
     position_m: Array, yaw_rad: float, attitude: Attitude, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Return place (3,) and heading relative to the gear in the level frame; the inverse of
-    `to_world`."""
+    """Return a place (3,) and a heading of the world as the gear has them, in the level frame; the
+    inverse of `to_world`."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     way = (position_m - np.asarray(attitude.position_m)).dot(attitude.R_world_level)
     return way - gear_level, wrap_rad(yaw_rad - attitude.yaw_rad)

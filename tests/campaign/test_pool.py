@@ -28,7 +28,7 @@ from perchctl.commands.simulate import (
     executor_of,
     fly_each,
     say_where_logs_are,
-    stop_once,
+    stop_handler,
     with_problem,
 )
 from perchctl.errors import Interrupted, InvalidValue, PerchError
@@ -140,14 +140,14 @@ def test_with_nothing_flown_there_is_nothing_to_report() -> None:
     def flown(_executor: object, _note: object) -> None:
         signal.raise_signal(signal.SIGINT)
 
-    with signals_to(stop_once()), pytest.raises(Interrupted, match="0 of 10 flights were flown"):
+    with signals_to(stop_handler()), pytest.raises(Interrupted, match="0 of 10 flights were flown"):
         fly_each(flown, Reported(), 10, executor_of(None, None, []))
 
 
 def test_a_second_press_ends_the_program_at_once() -> None:
     now_s = [0.0]
     left: list[int] = []
-    press = stop_once(lambda: now_s[0], left.append)
+    press = stop_handler(lambda: now_s[0], left.append)
     with pytest.raises(KeyboardInterrupt):
         press(signal.SIGINT, None)
     now_s[0] = 0.5 * AGAIN_S

@@ -24,7 +24,7 @@ def campaign(
     # Not at the top: each process that flies loads this module.
     from perchctl.campaign import fly_all
     from perchctl.commands.interrupt import signals_to
-    from perchctl.commands.simulate import executor_of, fly_each, stop_once
+    from perchctl.commands.simulate import executor_of, fly_each, stop_handler
 
     def flown(executor: Executor, note: Callable[[Ended], None]) -> None:
         def noted(result: Ended) -> None:
@@ -33,7 +33,7 @@ def campaign(
 
         fly_all(fly, range(flights), executor, noted)
 
-    with signals_to(stop_once()):
+    with signals_to(stop_handler()):
         return fly_each(flown, report, flights, executor_of(jobs, cluster, []))
 
 

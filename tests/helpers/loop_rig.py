@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from perchctl.flight import FlightParts, fly
-from perchctl.flight.loop import Positions
+from perchctl.flight.loop import GivesPositions
 from perchctl.flight.watchdog import rescue
 from perchctl.mission import (
     Event,
@@ -253,7 +253,7 @@ class Rig:
     profile: Profile = PROFILE
     setup: Pipeline = SETUP
     operator: Callable[[], Operator] = lambda: Operator.NONE
-    positions: Positions | None = None
+    positions: GivesPositions | None = None
 
     def parts(self) -> FlightParts:
         return FlightParts(

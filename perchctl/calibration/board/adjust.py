@@ -265,6 +265,6 @@ def jackknife_covariance(
 
 
 def student_factor(freedom: int) -> float:
-    """Return half the width of a 95 % interval whose spread was estimated from so many values, over
-    the normal distribution's; below 3 degrees of freedom that of 3."""
+    """Return Student's 95 % half-width over the normal distribution's, for that many degrees of
+    freedom, taken as at least 3."""
     return float(stdtrit(max(freedom, 3), 0.975)) / SIGMAS_95

@@ -67,8 +67,8 @@ _TO_THE_LEFT = np.array(-1j)
 
 
 def places(lengths_px: Array) -> Array:
-    """Return how far along its side (rows,) of that length each profile is: (rows, n) in 0..1; the
-    ends keep clear of the neighbouring sides' blur."""
+    """Return where along sides of these lengths (rows,) the brightness is sampled across them, as
+    shares of the side (rows, n), 0..1; not near the corners, where the next side's blur begins."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 

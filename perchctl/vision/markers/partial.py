@@ -136,7 +136,7 @@ def wholly_seen(
 
 
 def _prior_px(seen: SeenEdges) -> float:
-    """Return how far edges are shifted before that is measured."""
+    """Return the spread, px, of the shift that all edges share, before it is measured."""
     return _CLIPPED_PRIOR_PX if seen.white > _CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 

@@ -156,7 +156,7 @@ def resemblances(image: NDArray[np.uint8], squares: Array, pattern: Pattern) -> 
     """Return the `resemblance` of many at a time: homographies (m, 3, 3) of the unit square to (m,
     4)."""
     like = np.zeros((len(squares), 4))
-    inside, grey = _read_many(image, squares, pattern)
+    inside, grey = _read_squares(image, squares, pattern)
     like[inside] = _likeness(grey, pattern)
     return like
 
@@ -191,7 +191,7 @@ def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Arra
     return image[nearest[:, 1], nearest[:, 0]].astype(np.float64)
 
 
-def _read_many(
+def _read_squares(
     image: NDArray[np.uint8], H: Array, pattern: Pattern
 ) -> tuple[NDArray[np.bool_], Array]:
     """Return which of m squares (m, 3, 3) have all spots in the picture, and the grey values (n, k)
