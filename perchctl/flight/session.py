@@ -205,9 +205,9 @@ def _check_positioning(profile: Profile, *, simulated: bool) -> None:
 
 
 def require_comparison(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
-    """Raises SafetyAbort unless somebody has lately moved this vehicle by hand and compared it with
-    the motion capture (`perchctl check --lift`): swapped axes do not show at rest. The simulator's
-    own room is right as it is built."""
+    """Raises SafetyAbort unless somebody has lately compared this vehicle with the motion capture
+    by hand (`perchctl check --lift`): swapped axes do not show at rest. The simulator's room is
+    right."""
     if config.by != "mocap" or simulated:
         return
     objected = load_comparison(config, vehicle_uri(uri)).objection(datetime.now().astimezone())

@@ -236,8 +236,8 @@ def add_moment(
     old: ConsistencySums, t_s: float, rows: Array, variance: Array, range_m: float
 ) -> ConsistencySums:
     """Return the sums with one frame more; `rows`, `variance` and `range_m` are what
-    `consistency_moment` returns of it. After a gap, or a jump of the target or of the estimate, the
-    level that changes are counted from begins anew; what was learned of delay and turn is kept."""
+    `consistency_moment` returns of it. After a gap, or a jump of the target or of the estimate,
+    changes are counted anew; what was learned of delay and turn is kept."""
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)
     gap_s = t_s - old.t_s
