@@ -23,7 +23,7 @@ autodoc_typehints = "description"
 html_theme = "furo"
 html_title = f"perchctl {release}"
 
-PAGE = re.compile(r"^\| \[[^\]]*\]\(([\w-]+)\.md\) \|", re.MULTILINE)
+PAGE = re.compile(r"^- \[[^\]]*\]\(([\w-]+)\.md\): ", re.MULTILINE)
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]*)\]\(\.\./[^)]*\)")
 
 

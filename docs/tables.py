@@ -30,7 +30,7 @@ from perchctl.mission import Phase, step_mission, table  # noqa: E402
 from perchctl.mission.lander import DESCENTS  # noqa: E402
 from perchctl.mission.state import BEFORE_CONTACT, FLYING_PHASES  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
-from perchctl.profile import Profile, load_profile  # noqa: E402
+from perchctl.profile import Profile  # noqa: E402
 from perchctl.profile.keys import Key, keys  # noqa: E402
 from perchctl.record.fields import FIELDS  # noqa: E402
 from perchctl.vision import step  # noqa: E402
@@ -51,17 +51,16 @@ def _section(path: str) -> str:
 
 
 def profile_keys() -> str:
-    """A table for each section."""
+    """A list for each section."""
     sections: dict[str, list[str]] = {}
     for key in keys(Profile()):
         name = key.path.removeprefix(f"{_section(key.path)}.")
         meaning = key.meaning + (f" ({SEE[key.path]})" if key.path in SEE else "")
-        row = f"| `{name}` | {_default_and_allowed(key)} | {meaning} |"
+        row = f"- `{name}` ({_default_and_allowed(key)}): {meaning}"
         sections.setdefault(_section(key.path), []).append(row)
-    head = ["", "| key | default; allowed | meaning |", "|---|---|---|"]
     lines: list[str] = []
     for section, rows in sections.items():
-        lines += ["", f"### `{section}`" if section else "### At the top", *head, *rows]
+        lines += ["", f"### `{section}`" if section else "### At the top", "", *rows]
     return "\n".join(lines[1:])
 
 
@@ -88,29 +87,17 @@ def _shown(value: Any) -> str:
     return f"`{value}`"
 
 
-def worlds() -> str:
-    """The keys of the simulation in which the harder worlds differ from `sim`."""
-    world = {name: load_profile(name).simulation for name in ("sim", "rough", "extreme")}
-    rows = []
-    for key in keys(world["sim"]):
-        values = [getattr(simulation, key.path) for simulation in world.values()]
-        if any(value != values[0] for value in values):
-            shown = " | ".join(_shown(value) for value in values)
-            rows.append(f"| `{key.path}` | {shown} |")
-    head = f"| key | {' | '.join(f'`{name}`' for name in world)} |"
-    return "\n".join([head, "|---" * (len(world) + 1) + "|", *rows])
-
-
 def log_fields() -> str:
-    """A row for fields in a row that have the same meaning, or that of one before them."""
+    """A line for fields in a row that have the same meaning, or that of one before them."""
     rows: list[tuple[str, list[str]]] = []
     for name, text in FIELDS.items():
         if rows and (text == rows[-1][0] or re.search(r"\bas \w+_(m|rad)$", text)):
             rows[-1][1].append(name)
         else:
             rows.append((text, [name]))
-    lines = [f"| {', '.join(f'`{name}`' for name in names)} | {text} |" for text, names in rows]
-    return "\n".join(["| field | meaning |", "|---|---|", *lines])
+    return "\n".join(
+        f"- {', '.join(f'`{name}`' for name in names)}: {text}" for text, names in rows
+    )
 
 
 WAY_OF_A_FRAME: tuple[tuple[str, Callable[..., Any]], ...] = (
@@ -175,8 +162,8 @@ def packages() -> str:
             continue
         text = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
         first = " ".join(text.split("\n\n")[0].split())
-        rows.append(f"| `perchctl/{path.name}` | {first} |")
-    return "\n".join(["| package | what it holds |", "|---|---|", *rows])
+        rows.append(f"- `perchctl/{path.name}`: {first}")
+    return "\n".join(rows)
 
 
 def import_order() -> str:
@@ -187,8 +174,7 @@ def import_order() -> str:
 
 
 def exit_codes() -> str:
-    rows = [f"| {code} | {meaning} |" for code, meaning in sorted(EXIT_CODES.items())]
-    return "\n".join(["| code | meaning |", "|---|---|", *rows])
+    return "\n".join(f"- {code}: {meaning}" for code, meaning in sorted(EXIT_CODES.items()))
 
 
 def expected_outcomes() -> str:
@@ -202,8 +188,7 @@ def expected_outcomes() -> str:
 
 
 def promises() -> str:
-    rows = [f"| {promise.what} | {promise.happens} |" for promise in PROMISES.values()]
-    return "\n".join(["| what | what happens |", "|---|---|", *rows])
+    return "\n".join(f"- **{p.what}**: {p.happens}" for p in PROMISES.values())
 
 
 def manoeuvres() -> str:
@@ -278,7 +263,6 @@ PARTS: dict[str, Callable[[], str]] = {
     "rows": mission_rows,
     "manoeuvres": manoeuvres,
     "profile-keys": profile_keys,
-    "worlds": worlds,
     "log-fields": log_fields,
     "exit-codes": exit_codes,
     "expected-outcomes": expected_outcomes,

@@ -270,7 +270,7 @@ def test_every_public_name_is_explained() -> None:
 
     page = TEXT[DOCS / "python.md"]
     for name in getattr(perchctl, "__all__", ()):
-        assert name.startswith("__") or f"| `{name}" in page, name
+        assert name.startswith("__") or f"- `{name}" in page, name
 
 
 # --- tables ---------------------------------------------------------------------------
@@ -291,6 +291,13 @@ def test_every_table_is_on_a_page_and_every_key_has_its_meaning() -> None:
     everything = "".join(TEXT.values())
     assert [n for n in tables()["PARTS"] if f"<!-- begin {n} -->" not in everything] == []
     assert [key.path for key in keys(Profile()) if not key.meaning] == []
+
+
+@pytest.mark.parametrize(
+    "script", re.findall(r"^- \*\*`(\w+\.py)`\*\*", TEXT[DOCS / "benchmarks.md"], re.MULTILINE)
+)
+def test_every_benchmark_on_its_page_runs(script: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_python(["python", f"benchmarks/{script}", "--help"], monkeypatch)
 
 
 def test_every_shipped_profile_is_described() -> None:
@@ -315,7 +322,7 @@ def test_every_room_is_described() -> None:
         holds = [f for f in path.rglob("*.py") if f.name != "__init__.py"]
         if (holds or path.suffix == ".py") and path.name != "__main__.py":
             names = (path.name, path.stem)
-            assert any(f"| `perchctl/{name}` |" in page for name in names), path.name
+            assert any(f"- `perchctl/{name}`: " in page for name in names), path.name
 
 
 # --- what the pages name --------------------------------------------------------------
@@ -387,7 +394,7 @@ def test_named_keys_are_the_schema_s(path: Path) -> None:
 
 
 def test_faults_have_their_numbers() -> None:
-    rows = re.findall(r"^\| (\d+) \|.* \|$", FAULTS, re.MULTILINE)
+    rows = re.findall(r"^(\d+)\. .*: ", FAULTS, re.MULTILINE)
     assert [int(number) for number in rows] == list(range(1, 47))
 
 
