@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -72,7 +73,8 @@ from perchctl.vehicle import Idle, Telemetry  # noqa: E402
 from perchctl.vision import Frame, PipelineState, TargetEstimate, make_pipeline, step  # noqa: E402
 from perchctl.vision.types import Stage  # noqa: E402
 
-PAGE_PX, REPORT_PX = (1100, 560), (1200, 1250)
+PAGE_PX, REPORT_PX = (1280, 760), (1200, 1250)
+PAGE_S = 8.0  # of the flight, on the page before it is photographed
 FILM = ("--rate", "6", "--width", "640")
 """Small enough for the README: at most 3 MB."""
 
@@ -215,24 +217,27 @@ def calibration(_: Flight, file: Path) -> None:
 
 def page(flown: Flight, file: Path) -> None:
     """The live page of the flight, in a browser without a window."""
-    index = _shown(flown)
-    tick, picture = flown.tick(index), flown.sketch(flown.frame(index))
+    last = _shown(flown)
+    first = flown.index_at(float(flown.log.records[last]["t_s"]) - flown.log.start_s - PAGE_S)
+    picture, shown = flown.sketch(flown.frame(last)), [first]
+    profile = flown.profile
+    drawn = {"large_m": profile.target.large.side_m, "gear_m": profile.vehicle.gear_body_m[2]}
     live = LivePage(flown.camera, "perchctl fly sim://", on_stop=lambda: None)
     closing = threading.Event()
 
     def feed() -> None:
         """As a flight does: 30 pictures a second, so that the page shows a rate."""
-        number = 0
+        start_s = time.monotonic()
         while not closing.wait(1.0 / 30.0):
-            number += 1
-            live.show(number, picture)
+            passed = min(1.0, (time.monotonic() - start_s) / PAGE_S)
+            shown.append(first + round(passed * (last - first)))
+            live.show(len(shown), picture)
 
-    live.set_state(lambda: flight_state(tick), live=False)
+    live.set_state(lambda: flight_state(flown.tick(shown[-1]), drawn), live=False)
     feeder = threading.Thread(target=feed, daemon=True)
     feeder.start()
     try:
-        # The rate that it shows is that of the last seconds.
-        _photograph(file, live.url, PAGE_PX, "performance.now() > 4000")
+        _photograph(file, live.url, PAGE_PX, f"performance.now() > {1e3 * PAGE_S + 1000:g}", 0.8)
     finally:
         closing.set()
         live.close()

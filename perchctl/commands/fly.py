@@ -291,7 +291,11 @@ def flight_page(
         return
     profile, title = options.profile, f"perchctl fly {options.uri}"
     with live_page(profile_camera(profile.camera), title, view, say, switch.land) as page:
-        yield None if page is None else FlightPage(page, profile.target.large.side_m)
+        yield (
+            None
+            if page is None
+            else FlightPage(page, profile.target.large.side_m, profile.vehicle.gear_body_m[2])
+        )
 
 
 # --- What `perchctl fly --dry-run` shows: the flight as it is resolved, before anything is opened

@@ -11,11 +11,13 @@ from typing import Any
 from perchctl.camera import FrameSource, WrappedSource
 from perchctl.display.live import LivePage, Sketch, sketch_of
 from perchctl.display.panel import status_rows
-from perchctl.mission import Event, Tick
+from perchctl.mission import Event, Phase, Tick
 from perchctl.record import FlightSummary
 from perchctl.vision import Frame
 
 GOOD = "perched"
+STEPS = [phase.value for phase in Phase if phase.is_flying and phase is not Phase.RECOVER]
+"""The paper's seven phases, in the order in which a flight has them."""
 
 
 class FlightPage:
@@ -27,9 +29,10 @@ class FlightPage:
 
     problem: str | None = None
 
-    def __init__(self, page: LivePage, large_side_m: float) -> None:
+    def __init__(self, page: LivePage, large_side_m: float, gear_up_m: float) -> None:
         self.page = page
         self._side_m = large_side_m
+        self._drawn = {"large_m": large_side_m, "gear_m": gear_up_m}  # to scale
         self._frame: Frame | None = None
         self._flying = False
         self._rescue = ""
@@ -47,7 +50,8 @@ class FlightPage:
             if frame is not None:
                 self._frame = None
                 self.page.show(frame.index, sketch_of(frame, tick.output, self._side_m))
-            self.page.set_state(partial(flight_state, tick), live=not tick.state.phase.is_over)
+            describe = partial(flight_state, tick, self._drawn)
+            self.page.set_state(describe, live=not tick.state.phase.is_over)
         except Exception as error:
             self.page.remember(error)
 
@@ -81,16 +85,26 @@ class FlightPage:
             self.page.show(frame.index, Sketch(frame.image))
 
 
-def flight_state(tick: Tick) -> dict[str, Any]:
-    """Return what the page shows of a tick: phase, battery, the rows of the terminal's panel, and
-    whether the flight is over."""
-    state, volts = tick.state, tick.telemetry.battery_v
+def flight_state(tick: Tick, drawn: dict[str, float]) -> dict[str, Any]:
+    """Return what the page shows of a tick: phase, battery, the rows of the terminal's panel,
+    whether the flight is over, and for its drawings height, error (m; None: no target) and `drawn`,
+    the sizes of marker and gear."""
+    state, volts, target = tick.state, tick.telemetry.battery_v, tick.target
+    off_m, below_m = (
+        (None, None) if target is None else (math.hypot(*target.e_m[:2]), target.e_m[2])
+    )
+    ground_m = state.ground_m[2] if state.ground_m else 0.0
     mirrored = tick.output is not None and tick.output.detections.mirrored
     seen = "the picture is mirrored (camera.mirrored in the profile)" if mirrored else ""
     return {
         "phase": state.phase.value,
         "battery": f"{volts:.2f} V" if math.isfinite(volts) else "battery unknown",
-        "rows": [list(row) for row in status_rows(tick)],
+        "rows": [list(row) for row in status_rows(tick) if row[0] != "phase"],
         "note": f"held: {state.hold}" if state.hold else seen,
         "over": state.phase.is_over,
+        "steps": STEPS,
+        "height_m": tick.telemetry.position_m[2] - ground_m,
+        "off_m": off_m,
+        "below_m": below_m,
+        **drawn,
     }

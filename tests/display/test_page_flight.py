@@ -79,7 +79,7 @@ def one_frame(frame: Frame) -> Any:
 
 
 def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> None:
-    flight = FlightPage(page, 0.15)
+    flight = FlightPage(page, 0.15, 0.03)
     frame = Frame(7, 1.0, np.full((480, 640), 90, np.uint8))
     source = flight.watched(one_frame(frame))
     assert state_of(page)["phase"] == "WAITING"
@@ -91,7 +91,11 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
     state = state_of(page)
     assert state["phase"] == "ALIGN"
     assert state["battery"] == "3.71 V"
-    assert ["phase", "ALIGN  1.5 s"] in state["rows"]
+    assert state["steps"][3] == state["phase"]  # of seven
+    assert [row[0] for row in state["rows"]][:2] == ["error", "markers"]
+    assert state["off_m"] == pytest.approx(np.hypot(-0.123, 0.045), abs=1e-3)
+    assert (state["below_m"], state["height_m"]) == pytest.approx((1.234, 0.82), abs=1e-3)
+    assert (state["large_m"], state["gear_m"]) == (0.15, 0.03)
     newest = page.jpeg_after(1)
     assert newest is not None
     decoded = cv2.imdecode(np.frombuffer(newest[1], np.uint8), cv2.IMREAD_COLOR)
@@ -101,7 +105,7 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
 
 
 def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
-    flight = FlightPage(page, 0.15)
+    flight = FlightPage(page, 0.15, 0.03)
     flight.watched(one_frame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
     flight.tick(None)  # type: ignore[arg-type]
     flight.event(note(0.0, "something"))
@@ -115,7 +119,7 @@ def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
 
 
 def test_the_numbers_tell_their_age(page: LivePage, clock: list[float]) -> None:
-    flight = FlightPage(page, 0.15)
+    flight = FlightPage(page, 0.15, 0.03)
     clock[0] += 60.0
     assert state_of(page)["age_s"] is None  # connecting may take its time
     flight.tick(tick(START_S))
@@ -130,7 +134,7 @@ def test_the_numbers_tell_their_age(page: LivePage, clock: list[float]) -> None:
 def test_after_the_flight_nothing_is_due_and_nothing_to_stop(
     page: LivePage, clock: list[float], phase: Phase
 ) -> None:
-    flight = FlightPage(page, 0.15)
+    flight = FlightPage(page, 0.15, 0.03)
     assert stop(page.url, page.token) == 200
     flight.tick(tick(START_S))
     assert state_of(page)["stop"] == "requested"
@@ -176,7 +180,7 @@ def test_the_card_tells_outcome_reason_miss_and_where_to_look(
     page: LivePage, tmp_path: Path
 ) -> None:
     log = tmp_path / "my flights" / "flight.jsonl"
-    FlightPage(page, 0.15).end(SUMMARY, log)
+    FlightPage(page, 0.15, 0.03).end(SUMMARY, log)
     card = state_of(page)["card"]
     assert (card["outcome"], card["good"]) == ("PERCHED", True)
     assert card["reason"] == SUMMARY.reason
@@ -189,7 +193,7 @@ def test_the_card_tells_outcome_reason_miss_and_where_to_look(
 def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     page: LivePage, tmp_path: Path
 ) -> None:
-    flight = FlightPage(page, 0.15)
+    flight = FlightPage(page, 0.15, 0.03)
     flight.fail(Interrupted("interrupted before take-off"), None)
     card = state_of(page)["card"]
     assert (card["outcome"], card["good"], card["rows"]) == ("FAILED", False, [])
