@@ -178,13 +178,11 @@ def exit_codes() -> str:
 
 
 def expected_outcomes() -> str:
-    rows = [
-        f"| {outcome.name} | {', '.join(sorted(outcome.flags)).replace('_', ' ')} | "
-        f"{outcome.within_s:g} s | {outcome.reason} |"
+    return "\n".join(
+        f"- **{outcome.name}** ({', '.join(sorted(outcome.flags)).replace('_', ' ')}, "
+        f"{outcome.within_s:g} s): {outcome.reason}"
         for outcome in EXPECTED_OUTCOMES
-    ]
-    head = ["| outcome | what is not counted | within | why |", "|---|---|---|---|"]
-    return "\n".join([*head, *rows])
+    )
 
 
 def promises() -> str:
