@@ -50,6 +50,7 @@ def figure_bytes(figure: Figure, suffix: str = ".png") -> bytes:
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
         for ax in figure.axes:
-            ax.set_position([round(v, 6) for v in ax.get_position(original=True).bounds])
+            left, bottom, width, height = ax.get_position(original=True).bounds
+            ax.set_position((round(left, 6), round(bottom, 6), round(width, 6), round(height, 6)))
         figure.savefig(content, format=suffix.removeprefix("."), metadata=_METADATA[suffix])
     return content.getvalue()
