@@ -173,11 +173,16 @@ def _draw_power(ax: Axes, flight: FlightAnalysis) -> None:
     rest_v = flight.log.column("battery_rest_v")
     ax.plot(flight.log.t_s, rest_v, color=GREEN, linestyle="--", label="at rest, est.")
     ax.set_ylabel("battery [V]")
-    thrust_ax = ax.twinx()
+    _add_legend(ax, draw_thrust(ax, flight))
+
+
+def draw_thrust(ax: Axes, flight: FlightAnalysis) -> Axes:
+    """Draw the commanded thrust in percent on an axis at the panel's right, which is returned."""
+    thrust_ax: Axes = ax.twinx()
     thrust = flight.log.column("thrust") * FULL_THRUST_PERCENT
     thrust_ax.plot(flight.log.t_s, thrust, color=ORANGE, linewidth=1.0, label="thrust [%], right")
     thrust_ax.set_ylim(0.0, 105.0)
-    _add_legend(ax, thrust_ax)
+    return thrust_ax
 
 
 def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
