@@ -20,7 +20,7 @@ import perchctl
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
-from perchctl.analysis.story import Advice, Sentence, advice_of, count, length, story_of
+from perchctl.analysis.story import Sentence, count, length, story_of
 from perchctl.errors import PerchError
 from perchctl.files import write_files
 from perchctl.mission import Phase
@@ -68,7 +68,7 @@ class Report:
                 "outcome": told.outcome,
                 "miss_m": told.flight.summary.miss_m,
                 "used_mah": told.flight.measures.battery_used_mah,
-                "advice": [f"{a.about}: {a.text} ({a.evidence})" for a in told.advice],
+                "advice": list(told.advice),
             }
             for told in self.flights
         ]
@@ -88,10 +88,11 @@ class ReportedFlight:
         """What happened."""
         return story_of(self.flight)
 
-    @cached_property
-    def advice(self) -> tuple[Advice, ...]:
-        """What to change for the next flight."""
-        return advice_of(self.flight)
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What the flight found of latency and mounting that the profile should have."""
+        findings = self.flight.summary.findings
+        return () if findings is None else findings.advice
 
     @property
     def outcome(self) -> str:

@@ -6,7 +6,6 @@ import base64
 import contextlib
 import csv
 import gzip
-import math
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping
@@ -199,24 +198,11 @@ class FlightLog:
 
     # --- the setup that was flown
 
-    def setting(self, key: str) -> Any:
-        """Return the flown profile's value of a dotted key, as JSON has it; None without one."""
-        value = self.header.get("profile")
-        for name in key.split("."):
-            value = value.get(name) if isinstance(value, Mapping) else None
-        return value
-
-    def number(self, key: str) -> float | None:
-        """Return the flown profile's value of a dotted key; None if it is no finite number."""
-        value = self.setting(key)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            return None
-        return float(value) if math.isfinite(value) else None
-
     @property
     def profile_name(self) -> str | None:
         """The flown profile's name; None where the header holds none."""
-        name = self.setting("name")
+        profile = self.header.get("profile")
+        name = profile.get("name") if isinstance(profile, dict) else None
         return None if name is None else str(name)
 
     @property
