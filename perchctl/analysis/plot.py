@@ -241,6 +241,6 @@ def _name_spans(ax: Axes, spans: Sequence[Span], shown_s: tuple[float, float]) -
         start_s, end_s = max(start_s, shown_s[0]), min(end_s, shown_s[1])
         at_s = (start_s + end_s) / 2
         if start_s <= end_s and at_s >= named_s + gap_s:
-            place = {"xy": (at_s, 1.03), "xycoords": ("data", "axes fraction")}
-            ax.annotate(name, **place, rotation=45, fontsize=8, annotation_clip=False)
+            above = ax.get_xaxis_transform()
+            ax.text(at_s, 1.03, name, transform=above, rotation=45, fontsize=8)
             named_s = at_s

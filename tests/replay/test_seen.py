@@ -84,8 +84,7 @@ def test_the_pictures_show_what_they_showed() -> None:
     assert (found.seen.frames, found.seen.ended) == (PICTURES, "")
     assert not beyond(found), f"{beyond(found)[:1]}; {ANEW}"
     if not found.log.computer_differences:
-        first = found.seen.first
-        assert first is None, f"{first.text}; {ANEW}"
+        assert not found.seen.differences, f"{found.seen.differences[0].text}; {ANEW}"
 
 
 def test_they_show_all_that_matters() -> None:
