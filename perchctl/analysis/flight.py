@@ -69,8 +69,6 @@ class Measures:
     frame_age_s: float | None = _number("frames, median age", "ms", 1e3, 0)
     frame_gaps: int | None = _number("gaps without a frame")
     frame_gaps_s: float | None = _number("time in such gaps", "s", digits=2)
-    frame_gap_longest_s: float | None = _number("longest such gap", "s", digits=2)
-    corner_rms_px: float | None = _number("corners' misfit, median", "px", digits=2)
     turns: int | None = _number("turns of the loop")
     late_p99_s: float | None = _number("turn late, 99 %", "ms", 1e3, 1)
     telemetry_age_p99_s: float | None = _number("telemetry's age, 99 %", "ms", 1e3, 0)
@@ -184,8 +182,6 @@ class FlightAnalysis:
             frame_age_s=_known(frames.age_s),
             frame_gaps=len(gaps_s),
             frame_gaps_s=float(np.sum(gaps_s)),
-            frame_gap_longest_s=float(np.max(gaps_s)) if gaps_s.size else None,
-            corner_rms_px=_known(frames.misfit_px),
             turns=len(log.records),
             late_p99_s=_known(percentile(log.column("late_s"), 99)),
             telemetry_age_p99_s=_known(percentile(log.column("tel_age_s"), 99)),
