@@ -102,9 +102,8 @@ def flight_figure(flight: FlightAnalysis) -> Figure:
 
 def title_of(flight: FlightAnalysis) -> str:
     """Return profile, seed, outcome, and the miss where it is known, as one line."""
-    end, seed = flight.summary, flight.log.header.get("seed")
-    name = f"profile {flight.log.profile_name or '?'}"
-    parts = [name + ("" if seed is None else f", seed {seed}"), end.outcome]
+    end = flight.summary
+    parts = [flight.log.setup_text, end.outcome]
     if end.outcome != "perched" and end.reason:
         parts[-1] += f" ({end.reason})"
     if end.miss_m is not None:

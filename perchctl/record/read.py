@@ -206,6 +206,12 @@ class FlightLog:
         return None if name is None else str(name)
 
     @property
+    def setup_text(self) -> str:
+        """The flown profile's name, and the seed of a simulated flight, as people read them."""
+        seed = self.header.get("seed")
+        return f"profile {self.profile_name or '?'}" + ("" if seed is None else f", seed {seed}")
+
+    @property
     def flown_profile(self) -> Profile:
         """The profile that was flown, but for passwords. A `Note` names each key that was flown
         with another value than the constant that it is now. Errors: InvalidValue."""
