@@ -142,19 +142,6 @@ FIELDS: dict[str, str] = {
     "true_miss_m": "true horizontal distance of the gear from the target's centre, simulation only",
 }
 
-Kind = Literal["number", "integer", "flag", "text", "corners"]
-_KINDS: dict[Kind, tuple[str, ...]] = {
-    "text": ("phase", "stage", "reason", "hold", "pos_note", "lock_note", "cmd"),
-    "flag": ("measured", "tracked"),
-    "integer": ("attempts", "battery_state", "supervisor", "pos_sent", "frame", "unseen"),
-    "corners": ("large_px", "small_px"),
-}
-
-
-def field_kind(key: str) -> Kind:
-    """Return what a field of `FIELDS` holds; `corners` are eight numbers."""
-    return next((kind for kind, keys in _KINDS.items() if key in keys), "number")
-
 
 def event_record(event: Event) -> dict[str, Any]:
     """Return an event as a flat record. Severities are continue, hold, back off, land and stop."""

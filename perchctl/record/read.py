@@ -31,7 +31,6 @@ from perchctl.record.fields import (
     FORMAT,
     READABLE_VERSIONS,
     SCHEMA_VERSION,
-    field_kind,
     sent_values,
 )
 from perchctl.record.header import computer_record
@@ -157,11 +156,12 @@ class FlightLog:
         if not self.records:
             raise InvalidValue(f"{self.path}: the log holds no ticks, there is nothing to export")
         text = StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(name for key in FIELDS for name in _columns_of(key))
+        table = csv.DictWriter(text, FIELDS, extrasaction="ignore", lineterminator="\n")
+        table.writeheader()
         for record in self.records:
-            times = {key: self.since(record[key]) for key in TIMES if record[key] is not None}
-            writer.writerow(cell for key in FIELDS for cell in _cells(key, {**record, **times}))
+            times_s = {key: record[key] for key in TIMES if record[key] is not None}
+            since_s = {key: round(self.since(t_s), 6) for key, t_s in times_s.items()}
+            table.writerow(record | since_s)
         return text.getvalue()
 
     # --- times
@@ -268,29 +268,6 @@ class FlightLog:
 
 TIMES = ("t_s", "frame_t_s")
 """On the loop's clock in the log, from the flight's first turn in a table."""
-
-
-def _columns_of(key: str) -> list[str]:
-    """Return the names of the columns of a field in a table."""
-    if field_kind(key) != "corners":
-        return [key]
-    corners = ("tl", "tr", "br", "bl")
-    return [f"{key.removesuffix('_px')}_{corner}_{axis}_px" for corner in corners for axis in "xy"]
-
-
-def _cells(key: str, record: Mapping[str, Any]) -> list[Any]:
-    """Return the values of those columns in a record."""
-    value, kind = record[key], field_kind(key)
-    if kind == "corners":
-        cells = [None] * 8 if value is None else list(value)
-        if len(cells) != 8:
-            raise ValueError(f"{key} needs 8 numbers")
-        return cells
-    if kind == "flag" and value is not None:
-        return [int(value)]
-    if kind == "number" and value is not None:
-        return [round(value + 0.0, 6)]
-    return [value]
 
 
 # --- the file ---------------------------------------------------------

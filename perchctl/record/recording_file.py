@@ -40,7 +40,7 @@ from perchctl.geometry import quaternion_from_rotation, quaternion_from_rpy
 from perchctl.profile import Profile
 from perchctl.record.disk import DiskFile
 from perchctl.record.exact import encode
-from perchctl.record.fields import FIELDS, field_kind
+from perchctl.record.fields import FIELDS
 from perchctl.vision import Frame
 
 WORLD, BODY, GEAR, CAMERA = "world", "body", "gear", "camera"
@@ -199,18 +199,22 @@ def encoded(frame: Frame) -> tuple[bytes, str]:
     return data.tobytes(), "png"
 
 
-_JSON_TYPES: dict[str, dict[str, Any]] = {
-    "number": {"type": "number"},
-    "integer": {"type": "number"},
-    "flag": {"type": "boolean"},
-    "text": {"type": "string"},
-    "corners": {"type": "array", "items": {"type": "number"}},
+_TEXTS = ("phase", "stage", "reason", "hold", "pos_note", "lock_note", "cmd")
+_TYPES = {
+    **dict.fromkeys(_TEXTS, "string"),
+    **dict.fromkeys(("measured", "tracked"), "boolean"),
+    **dict.fromkeys(("large_px", "small_px"), "array"),
 }
 TICK_SCHEMA = {
     "type": "object",
     "title": "One turn of the flight loop, as the flight log has it",
     "properties": {
-        key: {**_JSON_TYPES[field_kind(key)], "description": text} for key, text in FIELDS.items()
+        key: {
+            "type": _TYPES.get(key, "number"),
+            "items": {"type": "number"},  # of an array
+            "description": text,
+        }
+        for key, text in FIELDS.items()
     },
 }
 """JSON schema of the ticks, for which Foxglove has none."""
