@@ -113,7 +113,7 @@ def _taken_over(flight: FlightAnalysis) -> Iterator[Sentence]:
     for go in flight.takeovers:
         if go.by in TOOK_OVER:
             text = f"{TOOK_OVER[go.by]} for {go.end_s - go.start_s:.1f} s: {go.text}"
-            steered = go.commands.keys() <= {"position", "thrust"}
+            steered = go.commands.keys() <= {"position setpoint", "raw thrust"}
             yield Sentence(max(0.0, go.start_s), text, "warn" if steered else "bad")
 
 

@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from perchctl.mission import Event, ExternalPositions, SentCommand, Tick
+from perchctl.mission import Event, ExternalPositions, Tick
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -295,10 +295,4 @@ def command_values(command: Command) -> Mapping[str, Any]:
             return {"cmd": "stop"}
         case Land(height_m, duration_s):
             return {"cmd": "land", "cmd_z_m": height_m, "cmd_duration_s": duration_s}
-        case EmergencyStop():
-            return {"cmd": "emergency"}
-
-
-def sent_values(sent: SentCommand) -> dict[str, Any]:
-    """Return what was sent in the loop's place by the names of a tick's fields, and ``by``."""
-    return {"t_s": sent.t_s, "by": sent.by, **command_values(sent.command)}
+    return {"cmd": {Idle: "idle", StopMotors: "stop", EmergencyStop: "emergency"}[type(command)]}

@@ -31,7 +31,6 @@ from perchctl.record.fields import (
     FORMAT,
     READABLE_VERSIONS,
     SCHEMA_VERSION,
-    sent_values,
 )
 from perchctl.record.header import computer_record
 from perchctl.vision import CameraModel
@@ -99,12 +98,6 @@ class FlightLog:
     def sent(self) -> list[SentCommand]:
         """What was sent in the loop's place; empty before version 4. Errors: InvalidValue."""
         return [sent_of(record) for record in self.sent_records]
-
-    @property
-    def sent_values(self) -> list[dict[str, Any]]:
-        """What was sent in the loop's place by the names of a tick's fields, and ``by``. Errors:
-        InvalidValue."""
-        return [sent_values(each) for each in self.sent]
 
     def column(self, key: str) -> Array:
         """Return a field over the ticks, shape (n,); NaN where it is missing.

@@ -53,19 +53,20 @@ def test_what_one_sends_in_one_go_is_told_together(log: Path) -> None:
     assert [go.by for go in goes] == ["watchdog", "watchdog", "rescue", "farewell"]
     assert [go.start_s + start_s for go in goes] == pytest.approx([4.0, 6.8, 9.0, 9.5])
     assert [go.end_s + start_s for go in goes] == pytest.approx([4.7, 6.8, 9.0, 9.5])
-    assert goes[0].text == "position setpoints (2), landing ordered (1)"
+    assert goes[0].text == "position setpoint (2), land (1)"
 
 
 def test_show_and_story_tell_who_took_over(log: Path) -> None:
     read = read_log(log)
     text = show_text(FlightAnalysis(read))
-    assert "watchdog  position setpoints (2), landing ordered (1)" in text
-    assert show_record(FlightAnalysis(read))["sent"][0]["commands"] == {"position": 2, "land": 1}
+    assert "watchdog  position setpoint (2), land (1)" in text
+    (first, *_) = show_record(FlightAnalysis(read))["sent"]
+    assert first["commands"] == {"position setpoint": 2, "land": 1}
     told = [s for s in story_of(FlightAnalysis(read)) if "took over" in s.text]
     assert [s.t_s for s in told] == pytest.approx(
         [4.0 - read.start_s, 6.8 - read.start_s, 9.0 - read.start_s]
     )
-    assert told[0].text.endswith("for 0.7 s: position setpoints (2), landing ordered (1)")
+    assert told[0].text.endswith("for 0.7 s: position setpoint (2), land (1)")
     assert told[2].grade == "bad"
 
 
