@@ -73,9 +73,9 @@ def _why(stay: PhaseSpan) -> str:
 
 
 def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
-    """Yield the lines that `fly` ends with, but for the phases, which come as a table."""
+    """Yield the lines that `fly` ends with, but for the battery, which has a longer one."""
     log = flight.log
-    end = replace(flight.summary, phases=(), battery_min_v=None)
+    end = replace(flight.summary, battery_min_v=None)
     first, *others = end.text().splitlines()
     yield from wrap(plain(first), COLUMNS, subsequent_indent="  ")
     for line in others:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.mission import ContactError, Findings, Touchdown
-from perchctl.record.read import FlightLog, PhaseSpan
+from perchctl.record.read import FlightLog
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 
@@ -69,7 +69,6 @@ class FlightSummary:
     battery_min_v: float | None = None
     locked: bool = False
     fell: bool = False
-    phases: tuple[PhaseSpan, ...] = ()
     findings: Findings | None = None
     contact: ContactError | None = None
     touchdown: Touchdown | None = None
@@ -80,7 +79,6 @@ class FlightSummary:
     @classmethod
     def of(cls, log: FlightLog) -> FlightSummary:
         """Return the summary by the log's record; by its ticks where that is missing."""
-        phases = log.phases
         battery_v = log.column("battery_v")
         known_v = battery_v[battery_v >= NO_BATTERY_READING_V]
         end: Mapping[str, Any] = log.summary or {
@@ -93,13 +91,12 @@ class FlightSummary:
             outcome=str(end.get("outcome", "unknown")),
             reason=str(end.get("reason", "")),
             cause=str(end.get("cause") or ""),
-            duration_s=float(end.get("duration_s") or sum(p.duration_s for p in phases)),
+            duration_s=float(end.get("duration_s") or sum(p.duration_s for p in log.phases)),
             attempts=int(end.get("attempts", last.get("attempts")) or 0),
             miss_m=end.get("miss_m"),
             battery_min_v=end.get("battery_min_v") or battery_min_v,
             locked=bool(end.get("locked", False)),
             fell=bool(end.get("fell", False)),
-            phases=phases,
             findings=_part_in(end, Findings, _FINDINGS),
             contact=_part_in(end, ContactError, _CONTACT),
             touchdown=_part_in(end, Touchdown, _TOUCHDOWN),
@@ -108,8 +105,7 @@ class FlightSummary:
         )
 
     def as_record(self) -> dict[str, Any]:
-        """Return the record for `FlightLogWriter.close`. The phases are in the ticks already,
-        and the writer adds what the log lacks."""
+        """Return the record for `FlightLogWriter.end`, which adds what the log lacks."""
         return {
             "outcome": self.outcome,
             "cause": self.cause or None,
@@ -137,8 +133,6 @@ class FlightSummary:
             lines.append(f"contact:   {self.contact.text}")
         attempts = f"{self.attempts} attempt{'' if self.attempts == 1 else 's'}"
         lines.append(f"flight:    {self.duration_s:.1f} s, {attempts}")
-        if self.phases:
-            lines.append(f"phases:    {phases_text(self.phases)}")
         if self.battery_min_v is not None:
             lines.append(f"battery:   {self.battery_min_v:.2f} V at its lowest")
         if self.findings is not None:  # with 95 % intervals
@@ -191,9 +185,3 @@ def _last_known(log: FlightLog) -> str:
         return f"the log ends in {log.phases[-1].phase}"
     phases = [r["phase"] for r in log.turn_records if r.get("role") == "flown" and r.get("phase")]
     return f"the log ends in {phases[-1]}" if phases else "the log holds no flight"
-
-
-def phases_text(phases: Sequence[PhaseSpan]) -> str:
-    """Return ``APPROACH 3.1 s > SEARCH 0.4 s > ...``; ends, which take no time, by name alone."""
-    parts = [f"{p.phase} {p.duration_s:.1f} s" if p.duration_s > 0 else p.phase for p in phases]
-    return " > ".join(parts)

@@ -14,7 +14,6 @@ from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
 from perchctl.profile import Profile
 from perchctl.record.fields import event_record, tick_record
 from perchctl.record.header import make_header
-from perchctl.record.read import PhaseSpan
 from perchctl.record.summary import FlightSummary, RecordingEnd
 from perchctl.record.write import FlightLogWriter, log_path, recording_path
 from perchctl.vehicle import NO_BATTERY_READING_V
@@ -150,7 +149,6 @@ class LogWatcher:
             battery_min_v=self._battery_min_v,
             locked=report.locked,
             fell=fell,
-            phases=spans_of(report),
             findings=report.findings,
             contact=report.contact,
             touchdown=report.touchdown,
@@ -173,19 +171,4 @@ class LogWatcher:
                 recording.path.unlink(missing_ok=True)
 
     def _ended_recording(self) -> RecordingEnd | None:
-        return None if self._recorder is None else self._recorder.close()
-
-    @property
-    def problem(self) -> str | None:
-        return self.writer.problem
-
-
-def spans_of(report: FlightReport) -> tuple[PhaseSpan, ...]:
-    """Return the report's history as stays in phases."""
-    starts = report.history
-    times_s = [event.t_s - starts[0].t_s for event in starts]
-    ends_s = [*times_s[1:], *times_s[-1:]]
-    return tuple(
-        PhaseSpan(event.phase.value if event.phase else "", start_s, end_s, event.reason)
-        for event, start_s, end_s in zip(starts, times_s, ends_s, strict=True)
-    )
+        return None if self.recorder is None else self.recorder.close()
