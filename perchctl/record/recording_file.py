@@ -51,7 +51,6 @@ TF = "/tf"
 LOG, TICK = "/log", "/tick"
 
 NS = 1_000_000_000
-HEADER_NAME = "header.json"
 CHUNK_BYTES = 4_000_000
 PNG_LEVEL = 1
 """Fast; the next levels cost twice the time for a twentieth of the size."""
@@ -75,23 +74,18 @@ class RecordingFile:
         size_bytes: of all messages so far, before they are compressed.
     """
 
-    def __init__(
-        self, stream: DiskFile, header: Mapping[str, Any], profile: Profile | None = None
-    ) -> None:
-        """Begin the file with the log's header. Without a profile it has no mounting."""
+    def __init__(self, stream: DiskFile, header: Mapping[str, Any], profile: Profile) -> None:
+        """Begin the file at the times of the log's header."""
         self.pictures = self.size_bytes = 0
         self.newest_s = self._t0_s = float(header["t0_s"])
         started = header.get("started_utc")
         self._started_ns = NS * round(datetime.fromisoformat(started).timestamp()) if started else 0
-        self._mounts = () if profile is None else mounts_of(profile)
+        self._mounts = mounts_of(profile)
         self._first_s: float | None = None
         self._stream = stream
         self._writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)  # type: ignore[arg-type]
         self._channels: dict[str, int] = {}
         self._writer.start(library=f"perchctl {perchctl.__version__}")
-        text = json.dumps(header).encode()
-        start_ns = self._ns(self._t0_s)
-        self._writer.add_attachment(start_ns, start_ns, HEADER_NAME, "application/json", text)
 
     def frame(self, about: Mapping[str, Any], picture: tuple[bytes, str] | None) -> None:
         """Write a frame as its source gave it (`frame_record`), and its picture with its format

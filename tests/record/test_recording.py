@@ -107,9 +107,6 @@ def test_readers_find_it_whole_by_its_index_and_foxgloves_own_schemas(
     assert schemas == own | theirs
     assert len(found["/camera/image"]) == len(found["/camera/frame"]) == len(FLIGHT.frames)
     assert len(found["/tick"]) == len(found["/tf"]) == len(FLIGHT.ticks)
-    with recording.open("rb") as stream:
-        (attached,) = make_reader(stream).iter_attachments()
-    assert json.loads(attached.data)["profile"]["name"] == "sim"  # the log's header
 
 
 KINDS = {"number": (int, float), "string": (str,), "boolean": (bool,), "array": (list,)}
