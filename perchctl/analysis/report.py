@@ -234,7 +234,7 @@ def reported_flight(log_path: Path) -> ReportedFlight:
     try:
         with log_values(log_path):
             decisions = decisions_of(flight)
-        for picture in recorded_pictures(log_path, exact=False, numbers=decisions):
+        for picture in recorded_pictures(log_path, decisions):
             caption, record = decisions[picture.number]
             shown.append(Shown(caption, _jpeg(record, picture.image)))
     except PerchError as error:

@@ -295,6 +295,6 @@ def film(
         flight = FlightAnalysis(log)
     from perchctl.analysis import write_film
 
-    pictures = recorded_pictures(path, exact=False) if is_recorded else None
+    pictures = recorded_pictures(path) if is_recorded else None
     write_film(flight, pictures, place, rate_hz, width_px)
     print(f"film:      {place}")
