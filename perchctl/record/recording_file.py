@@ -187,9 +187,7 @@ def encoded(frame: Frame) -> tuple[bytes, str]:
     """Return the picture's bytes and their format: as they came, or without loss."""
     if frame.encoded is not None:
         return frame.encoded, "jpeg"
-    ok, data = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
-    if not ok:
-        raise ValueError(f"a picture of shape {frame.image.shape} cannot be encoded")
+    _, data = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
     return data.tobytes(), "png"
 
 
@@ -267,12 +265,12 @@ def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
 
 def mounts_of(profile: Profile) -> list[FrameTransform]:
     """Return the transforms of what does not move against the body: camera and gear."""
-    T_body_cam = profile.camera.mount.T_body_cam
+    T_body_cam, gear_m = profile.camera.mount.T_body_cam, profile.vehicle.gear_body_m
     q = quaternion_from_rotation(T_body_cam[:3, :3])
-    gear_m = profile.vehicle.gear_body_m
+    level = (1.0, 0.0, 0.0, 0.0)
     return [
         _transform(0, BODY, CAMERA, T_body_cam[:3, 3], q),
-        _transform(0, BODY, GEAR, gear_m, (1.0, 0.0, 0.0, 0.0)),
+        _transform(0, BODY, GEAR, gear_m, level),
     ]
 
 
