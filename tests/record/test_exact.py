@@ -160,14 +160,12 @@ def test_a_command_of_each_kind_comes_back(command: Any) -> None:
 
 @pytest.mark.parametrize(
     ("changes", "why"),
-    [({"phase": "HOVER"}, "phase: 'HOVER' is not a valid Phase"),
-     ({"speed": 1}, "Turn has no field speed"),
-     ({"t_s": "soon"}, "t_s: float is needed, found 'soon'"),
-     ({"t_s": True}, "t_s: float is needed"),
-     ({"command": ["Jump", {}]}, "command: one of Idle, "),
+    [({"phase": "HOVER"}, "phase: 'HOVER' is not a valid Phase"), ({"speed": 1}, "speed: "),
+     ({"t_s": "soon"}, "t_s: 'soon'"), ({"t_s": True}, "t_s: float is needed"),
+     ({"command": ["Jump", {}]}, "command: 'Jump'"), ({"command": 3}, "command: "),
      ({"poses": {"joint": {"t_s": 0.0, "e_m": [0.0, "x"], "e_yaw_rad": 0.0}}}, "poses: e_m: "),
-     ({"observation": {}}, "observation: "),
-     ({"role": "flying"}, "role: 'flying' is none of waiting, redone, flown, failed")],
+     ({"observation": {}}, "observation: "), ({"role": "flying"}, "role: "),
+     ({"taken": {"samples": 3}}, "taken: samples: "), ({"taken": "none"}, "taken: ")],
 )  # fmt: skip
 def test_what_is_no_turn_is_one_sentence(changes: dict[str, Any], why: str) -> None:
     record = decode_line(turn_line(whole_turn())) | changes
@@ -198,13 +196,13 @@ def test_what_has_no_exact_form_is_refused(value: Any) -> None:
 def test_plain_values() -> None:
     values = {
         "np": np.float32(0.5), "int": np.int64(3), "bool": np.bool_(True), "none": None,
-        "nan": [math.nan, math.inf, -math.inf], "array": np.array([[1.23456789, -0.0]]),
+        "nan": [math.nan, math.inf, -math.inf], "vector": np.array([1.23456789, -0.0]).tolist(),
         "enum": Phase.ALIGN, "path": Path("a/b"), "text": "°€\ud800",
     }  # fmt: skip
     line = encode(values)
     assert "-0.0" not in line.decode()
     assert decode_line(line) == {
-        "np": 0.5, "int": 3, "bool": True, "nan": [None] * 3, "array": [[1.234568, 0.0]],
+        "np": 0.5, "int": 3, "bool": True, "nan": [None] * 3, "vector": [1.234568, 0.0],
         "enum": "ALIGN", "path": "a/b", "text": "°€\ud800",
     }  # fmt: skip
 
