@@ -37,7 +37,6 @@ from perchctl.vision import CameraModel
 
 Times = TypeVar("Times", float, Array)
 Exact = TypeVar("Exact", Turn, SentCommand)
-SUFFIX = ".jsonl"
 KINDS = ("tick", "turn", "sent", "event", "summary", "recording")
 """Of a log's records behind its header."""
 SAME_S = 1e-3
@@ -140,12 +139,8 @@ class FlightLog:
         return tuple(spans)
 
     def csv(self) -> str:
-        """Return the ticks as CSV: a line of names, then a line each tick with times from 0 and the
-        markers' corners as columns of their own; a missing value is empty, a flag 0 or 1.
-
-        Errors: InvalidValue for a log without ticks; what `log_values` takes for a value that no
-        flight writes.
-        """
+        """Return the ticks as CSV: a line of names, then a line each tick, with times from 0; a
+        missing value is empty. Errors: InvalidValue for a log without ticks."""
         if not self.records:
             raise InvalidValue(f"{self.path}: the log holds no ticks, there is nothing to export")
         text = StringIO()
@@ -232,18 +227,14 @@ class FlightLog:
             raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
 
     def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
-        """Return the flown mask, (height, width), True where the gear covers; None without one.
-        Errors: InvalidValue."""
+        """Return the flown mask, (height, width), True where the gear covers; None without one."""
         text = self.header.get("mask")
         if text is None:
             return None
         width, height = camera.size_px
-        try:
-            packed = zlib.decompress(base64.b64decode(text))
-            bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8))
-            return bits[: width * height].reshape(height, width).astype(bool)
-        except (ValueError, TypeError, zlib.error) as error:
-            raise InvalidValue(f"the log's header holds no mask: mask: {error}") from None
+        packed = zlib.decompress(base64.b64decode(text))
+        bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8))
+        return bits[: width * height].reshape(height, width).astype(bool)
 
     @property
     def computer_differences(self) -> str:
@@ -345,22 +336,16 @@ def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
     except (IndexError, ValueError):
         header = {}
     if header.get("kind") != "header" or header.get("format") != FORMAT:
-        kind = file_kind(path)
-        is_cut = kind in ("a file of JSON lines", "a file packed by gzip", "another kind of file")
-        found = (
-            "not a flight log of perchctl, or cut off in its header" if is_cut else f"it is {kind}"
-        )
         raise InvalidValue(
-            f"{path}: line 1: {found}; logs are the {SUFFIX} files in the profile's log.directory"
+            f"{path}: line 1: not a flight log of perchctl, or cut off in its header (it is "
+            f"{file_kind(path)}); logs are the .jsonl files in the profile's log.directory"
         )
     version = header.get("version")
     if version not in READABLE_VERSIONS:
-        newer = isinstance(version, int) and version > SCHEMA_VERSION
         raise InvalidValue(
             f"{path}: line 1: schema version {version!r}, this perchctl reads 1 to "
-            f"{READABLE_VERSIONS[-1]}; the log was written by perchctl "
-            f"{header.get('perchctl', 'of unknown version')}, this is {__version__}"
-            + (": update perchctl" if newer else "")
+            f"{SCHEMA_VERSION}; the log was written by perchctl "
+            f"{header.get('perchctl', 'of unknown version')}, this is {__version__}: update it"
         )
     return header
 

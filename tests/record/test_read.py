@@ -87,7 +87,7 @@ def with_line(at: int, line: bytes) -> Callable[[bytes], bytes]:
 NO_LOG = "line 1: not a flight log"
 DAMAGED: dict[str, tuple[Callable[[bytes], bytes] | bytes, tuple[str, ...]]] = {
     "empty": (b"", (NO_LOG, "logs are the .jsonl files")),
-    "picture": (b"\x89PNG\r\n\x1a\n" + bytes(50), ("line 1: it is a picture",)),
+    "picture": (b"\x89PNG\r\n\x1a\n" + bytes(50), (NO_LOG, "it is a picture")),
     "table": (b"t_s,phase\n0.0,SEARCH\n", (NO_LOG,)),
     "other lines": (b'{"part":"carry"}\n', (NO_LOG,)),
     "no header": (b'{"kind":"tick","t_s":0.0}\n', (NO_LOG,)),
@@ -97,7 +97,7 @@ DAMAGED: dict[str, tuple[Callable[[bytes], bytes] | bytes, tuple[str, ...]]] = {
     "cut header": (lambda good: good[:700], (NO_LOG, "cut off in its header")),
     "newer": (
         lambda good: good.replace(b'"version":4', b'"version":9').replace(b"0.2.0", b"9.1", 1),
-        ("schema version 9, this perchctl reads 1 to 4", "perchctl 9.1", "update perchctl"),
+        ("schema version 9, this perchctl reads 1 to 4", "perchctl 9.1", "update it"),
     ),
     "garbage": (with_line(4, b"garbage"), ("line 4: not a record", "take the original")),
     "no time": (with_line(4, b'{"kind":"tick"}'), ("line 4", "t_s must be")),
