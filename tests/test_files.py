@@ -145,7 +145,6 @@ def test_one_file_by_two_names(tmp_path: Path) -> None:
         (b"%PDF-1.7", "a PDF"),
         (b"image_width: 640\ncamera_matrix: {}\n", "a camera calibration"),
         (b"# mine\nextends: sim\n", "a profile"),
-        (b'{"kind": "header", "format": "perchctl-campaign"}\n', "a campaign's results"),
         (b"", "another kind of file"),
     ],
 )
