@@ -8,9 +8,11 @@ from __future__ import annotations
 from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 from perchctl.files import check_output, write_files
 
@@ -50,6 +52,7 @@ def figure_bytes(figure: Figure, suffix: str = ".png") -> bytes:
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
         for ax in figure.axes:
-            ax.set_position([round(v, 6) for v in ax.get_position(original=True).bounds])
+            place = np.round(ax.get_position(original=True).get_points(), 6)
+            ax.set_position(Bbox(place))
         figure.savefig(content, format=suffix.removeprefix("."), metadata=_METADATA[suffix])
     return content.getvalue()
