@@ -114,7 +114,7 @@ def flown(frames: list[Frame], for_s: float, folder: Path) -> tuple[Times, Recor
         due_s += PERIOD_S
         time.sleep(max(0.0, due_s - time.monotonic()))
     logs[False].close()
-    recorder = logs[True]._recorder
+    recorder = logs[True].recorder
     assert recorder is not None
     ended = recorder.close()
     logs[True].close()

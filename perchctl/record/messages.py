@@ -1,45 +1,31 @@
-"""A flight's recording as an MCAP file: what is written into it, and how.
+"""What the messages of a flight's recording are made of: the log's own records.
 
-The messages are made of the log's own records. They are Foxglove's protobuf ones, with the
-definitions of Foxglove's own package: a picture stays the bytes that it came as, which the JSON
-variant of the same schemas would make a third longer. What is perchctl's own is JSON. Frames:
-`world` (of the state estimate), `body`, `gear`, `camera` (OpenCV's axes, which are Foxglove's),
-`target` and `setpoint`.
+They are Foxglove's protobuf ones, with the definitions of Foxglove's own package: a picture stays
+the bytes that it came as, which the JSON variant of the same schemas would make a third longer.
+What is perchctl's own is JSON. Frames: `world` (of the state estimate), `body`, `gear`, `camera`
+(OpenCV's axes, which are Foxglove's), `target` and `setpoint`.
 """
 
 from __future__ import annotations
 
-import json
 import math
-import zlib
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from datetime import datetime
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import cv2
-import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Point2_pb2 import Point2
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
-from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import CompressionType, Writer
-from mcap_protobuf.schema import register_schema
 
-import perchctl
 from perchctl.geometry import quaternion_from_rotation, quaternion_from_rpy
 from perchctl.profile import Profile
-from perchctl.record.disk import DiskFile
-from perchctl.record.exact import encode
 from perchctl.record.fields import FIELDS
 from perchctl.vision import Frame
 
@@ -51,7 +37,6 @@ TF = "/tf"
 LOG, TICK = "/log", "/tick"
 
 NS = 1_000_000_000
-CHUNK_BYTES = 4_000_000
 PNG_LEVEL = 1
 """Fast; the next levels cost twice the time for a twentieth of the size."""
 BODY_KEYS = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
@@ -59,136 +44,14 @@ TARGET_KEYS = ("tx_m", "ty_m", "tz_m", "tyaw_rad")
 SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
 
 
-# --- the file ---------------------------------------------------------
-
-
-class RecordingFile:
-    """A recording that grows, in the order in which a flight gives it; one thread's. Every method
-    but `close` may raise OSError.
-
-    Its times are nanoseconds since 1970. A flight in lockstep has no wall clock: its recording
-    begins in 1970, at 0.
-
-    Attributes:
-        pictures: how many were written; `newest_s`: the loop's time of what was written last.
-        size_bytes: of all messages so far, before they are compressed.
-    """
-
-    def __init__(self, stream: DiskFile, header: Mapping[str, Any], profile: Profile) -> None:
-        """Begin the file at the times of the log's header."""
-        self.pictures = self.size_bytes = 0
-        self.newest_s = self._t0_s = float(header["t0_s"])
-        started = header.get("started_utc")
-        self._started_ns = NS * round(datetime.fromisoformat(started).timestamp()) if started else 0
-        self._mounts = mounts_of(profile)
-        self._first_s: float | None = None
-        self._stream = stream
-        self._writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)  # type: ignore[arg-type]
-        self._channels: dict[str, int] = {}
-        self._writer.start(library=f"perchctl {perchctl.__version__}")
-
-    def frame(self, about: Mapping[str, Any], picture: tuple[bytes, str] | None) -> None:
-        """Write a frame as its source gave it (`frame_record`), and its picture with its format
-        (`encoded`) where it is to be kept."""
-        ns = self._ns(about["t_arrival_s"])
-        self.newest_s = about["t_arrival_s"]
-        number = about["number"] & 0xFFFFFFFF
-        if picture is not None:
-            data, form = picture
-            taken = stamp(self._ns(about["t_s"]))
-            image = CompressedImage(timestamp=taken, frame_id=CAMERA, data=data, format=form)
-            self._add(IMAGE, ns, image, number)
-            self.pictures += 1
-        # With all digits: a replay needs the very times.
-        self._add(FRAME, ns, json.dumps(about).encode(), number)
-
-    def tick(self, record: Mapping[str, Any]) -> None:
-        """Write a tick's record (`perchctl.record.fields.FIELDS`) with its times since the first
-        flown turn, and what it shows in space."""
-        t_s, exposed_s = float(record["t_s"]), record.get("frame_t_s")
-        self.newest_s, ns = t_s, self._ns(t_s)
-        first_s = self._first_s = t_s if self._first_s is None else self._first_s
-        for mount in self._mounts:
-            mount.timestamp.CopyFrom(stamp(ns))
-        sampled_ns = self._ns(t_s - (record.get("tel_age_s") or 0.0))
-        moving = [
-            _transform_to(BODY, sampled_ns, record, BODY_KEYS),
-            _transform_to(TARGET, ns, record, TARGET_KEYS),
-            _transform_to(SETPOINT, ns, record, SETPOINT_KEYS),
-        ]
-        transforms = [*self._mounts, *(each for each in moving if each is not None)]
-        self._add(TF, ns, FrameTransforms(transforms=transforms))
-        shown = {**record, "t_s": t_s - first_s}
-        if exposed_s is not None:
-            self._add(CORNERS, ns, corners_message(self._ns(exposed_s), record))
-            shown["frame_t_s"] = exposed_s - first_s
-        self._add(TICK, ns, encode(shown)[:-1])
-
-    def event(self, record: Mapping[str, Any]) -> None:
-        """Write an event's record (`perchctl.record.fields.event_record`)."""
-        ns = self._ns(float(record["t_s"]))
-        self._add(LOG, ns, log_message(ns, record))
-
-    def flush(self) -> None:
-        """Bring to the disk what was added so far."""
-        self._writer.flush()
-
-    def free_bytes(self) -> int:
-        """Return the bytes that are left on its disk."""
-        return self._stream.free_bytes()
-
-    def finish(self) -> None:
-        """End the file with its index; nothing can be added any more."""
-        self._writer.finish()
-        self._stream.flush()
-        self._stream.close()
-
-    def close(self) -> None:
-        """Close the file without an index, where its last whole record ends. Never raises."""
-        with suppress(OSError):
-            self._stream.close()
-
-    def _ns(self, t_s: float) -> int:
-        """Return a time on the loop's clock as nanoseconds since 1970; what was before that is at
-        0, which MCAP begins at."""
-        return max(0, self._started_ns + round((t_s - self._t0_s) * NS))
-
-    def _add(self, topic: str, ns: int, message: Message | bytes, sequence: int = 0) -> None:
-        """Add a message of Foxglove's, or JSON."""
-        channel = self._channels.get(topic)
-        if channel is None:
-            channel = self._channels[topic] = self._new_channel(topic, message)
-        data = message if isinstance(message, bytes) else message.SerializeToString()
-        self._writer.add_message(channel, ns, data, ns, sequence)
-        self.size_bytes += len(data)
-
-    def _new_channel(self, topic: str, message: Message | bytes) -> int:
-        if isinstance(message, bytes):
-            schema = json.dumps(TICK_SCHEMA if topic == TICK else {"type": "object"}).encode()
-            name = f"perchctl.{topic.rpartition('/')[2].capitalize()}"
-            number = self._writer.register_schema(name, SchemaEncoding.JSONSchema, schema)
-            return self._writer.register_channel(topic, MessageEncoding.JSON, number)
-        number = register_schema(self._writer, type(message))
-        return self._writer.register_channel(topic, MessageEncoding.Protobuf, number)
-
-
-def frame_record(frame: Frame) -> dict[str, Any]:
-    """Return the frame without its picture, but with the checksum that identifies it."""
-    return {
-        "number": frame.index,
-        "t_s": frame.t_s,
-        "t_arrival_s": frame.t_arrival_s,
-        "repeated": frame.repeated,
-        "crc32": zlib.crc32(np.ascontiguousarray(frame.image).data),
-    }
-
-
-def encoded(frame: Frame) -> tuple[bytes, str]:
-    """Return the picture's bytes and their format: as they came, or without loss."""
-    if frame.encoded is not None:
-        return frame.encoded, "jpeg"
-    _, data = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
-    return data.tobytes(), "png"
+def image_message(ns: int, frame: Frame) -> CompressedImage:
+    """Return the message of a picture: its bytes as they came, or without loss."""
+    data = frame.encoded
+    if data is None:
+        png = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1]
+        data = png.tobytes()
+    form = "png" if data.startswith(b"\x89PNG") else "jpeg"
+    return CompressedImage(timestamp=stamp(ns), frame_id=CAMERA, data=data, format=form)
 
 
 _TEXTS = ("phase", "stage", "reason", "hold", "pos_note", "lock_note", "cmd")
@@ -274,17 +137,20 @@ def mounts_of(profile: Profile) -> list[FrameTransform]:
     ]
 
 
-def _transform_to(
-    child: str, ns: int, record: Mapping[str, Any], keys: Sequence[str]
-) -> FrameTransform | None:
-    """Return the transform from the world, by three keys of a position and one of a heading or
-    three of an attitude; None where one of them is missing or not finite."""
-    values: list[Any] = [record.get(key) for key in keys]
-    if any(value is None or not math.isfinite(value) for value in values):
-        return None
-    x, y, z, *angles = values
-    roll, pitch, yaw = angles if len(angles) == 3 else (0.0, 0.0, *angles)
-    return _transform(ns, WORLD, child, (x, y, z), quaternion_from_rpy(roll, pitch, yaw))
+def moving(ns: int, sampled_ns: int, record: Mapping[str, Any]) -> Iterator[FrameTransform]:
+    """Yield the transforms from the world of what a tick's record places: the body, at the time of
+    its sample, the target and the setpoint. One that is missing or not finite is left out."""
+    for child, at_ns, keys in (
+        (BODY, sampled_ns, BODY_KEYS),
+        (TARGET, ns, TARGET_KEYS),
+        (SETPOINT, ns, SETPOINT_KEYS),
+    ):
+        values: list[Any] = [record.get(key) for key in keys]
+        if all(value is not None and math.isfinite(value) for value in values):
+            x, y, z, *angles = values
+            roll, pitch, yaw = angles if len(angles) == 3 else (0.0, 0.0, *angles)
+            q = quaternion_from_rpy(roll, pitch, yaw)
+            yield _transform(at_ns, WORLD, child, (x, y, z), q)
 
 
 def _transform(

@@ -19,7 +19,7 @@ from zstandard import ZstdError
 
 from perchctl.camera import decode_picture
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.record.recording_file import FRAME, IMAGE
+from perchctl.record.messages import FRAME, IMAGE
 from perchctl.record.write import recording_path
 
 MOST_RECORD_BYTES = 64_000_000
@@ -56,7 +56,7 @@ def recorded_pictures(path: Path | str, numbers: Container[int] | None = None) -
 
 
 def recorded_frames(path: Path) -> Iterator[tuple[dict[str, Any], CompressedImage | None]]:
-    """Yield each frame of a recording as `frame_record` has it, with its picture where it was kept.
+    """Yield what is said of each frame of a recording, with its picture where it was kept.
 
     Errors: NotFound where there is no file, InvalidValue where it is no MCAP file.
     """

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from perchctl.camera import FrameSource, WrappedSource
-from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
+from perchctl.mission import Event, FlightReport, Tick
 from perchctl.profile import Profile
 from perchctl.record.fields import event_record, tick_record
 from perchctl.record.header import make_header
@@ -25,21 +25,19 @@ Truth = tuple[tuple[float, float, float], float]
 """The body's true position (world, m) and the gear's true miss (m)."""
 
 
-class LogWatcher:
-    """Writes every tick and event; its problem is the log's.
+class LogWatcher(FlightLogWriter):
+    """Writes every tick and event of a loop that it watches; its problem is the log's.
 
     `truth`, where a simulation sets it, gives what is true at the time of the tick. A recording
     goes with it where one is wanted: its pictures come through `watched`, and what is wrong with
     it is in `remarks`, never in `problem`.
     """
 
-    def __init__(self, writer: FlightLogWriter, recorder: Recorder | None = None) -> None:
-        self.writer = writer
-        self._recorder = recorder
-        self.truth: Callable[[], Truth] | None = None
-        self._battery_min_v: float | None = None
-        self._ticks = 0
-        self._has_remarked = False
+    truth: Callable[[], Truth] | None = None
+    recorder: Recorder | None = None
+    _battery_min_v: float | None = None
+    _ticks = 0
+    _has_remarked = False
 
     @classmethod
     def lockstep(cls, path: Path, profile: Profile, seed: int, record: bool = False) -> LogWatcher:
@@ -68,33 +66,29 @@ class LogWatcher:
     def _opened(
         cls, path: Path, header: Mapping[str, Any], profile: Profile, record: bool, live: bool
     ) -> LogWatcher:
-        writer = FlightLogWriter.open(path, header, live)
-        if not record:
-            return cls(writer)
-        from perchctl.record.recorder import Recorder
+        log = cls.open(path, header, live)
+        if record:
+            from perchctl.record.recorder import Recorder
 
-        try:
-            return cls(writer, Recorder.open(recording_path(writer.path), header, profile, live))
-        except BaseException:
-            writer.close()
-            writer.path.unlink(missing_ok=True)
-            raise
+            try:
+                log.recorder = Recorder.open(recording_path(log.path), header, profile, live)
+            except BaseException:
+                log.end()
+                log.path.unlink(missing_ok=True)
+                raise
+        return log
 
     def watched(self, source: FrameSource) -> FrameSource:
         """Return the same source; the frames that it gives are recorded, where that is wanted."""
-        return source if self._recorder is None else WrappedSource(source, self._recorder.frame)
+        return source if self.recorder is None else WrappedSource(source, self.recorder.frame)
 
     def remarks(self) -> list[str]:
         """Return what is new about the recording, a sentence, once a flight."""
-        problem = None if self._recorder is None else self._recorder.problem
+        problem = None if self.recorder is None else self.recorder.problem
         if problem is None or self._has_remarked:
             return []
         self._has_remarked = True
         return [problem]
-
-    @property
-    def path(self) -> Path:
-        return self.writer.path
 
     @property
     def begun(self) -> bool:
@@ -109,24 +103,17 @@ class LogWatcher:
             self._battery_min_v = min(battery_v, self._battery_min_v or battery_v)
         position_m, miss_m = (None, None) if self.truth is None else self.truth()
         record = tick_record(tick, position_m, miss_m)
-        self.writer.write(record)
+        self.write(record)
         if tick.turn is not None:
-            self.writer.turn(tick.turn)
-        if self._recorder is not None:
-            self._recorder.tick(record)
-
-    def turn(self, turn: Turn) -> None:
-        """Write a turn that has no tick."""
-        self.writer.turn(turn)
-
-    def sent(self, sent: SentCommand) -> None:
-        """Write what was sent in the loop's place; from any thread, and without waiting."""
-        self.writer.sent(sent)
+            self.turn(tick.turn)
+        if self.recorder is not None:
+            self.recorder.tick(record)
 
     def event(self, event: Event) -> None:
-        self.writer.event(event)
-        if self._recorder is not None:
-            self._recorder.event(event_record(event))
+        """Write an event, into the recording too. Never raises."""
+        super().event(event)
+        if self.recorder is not None:
+            self.recorder.event(event_record(event))
 
     def close(
         self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False
@@ -136,7 +123,7 @@ class LogWatcher:
 
         The log comes first: a recording's disk that hangs holds up its own end only."""
         if report is None:
-            self.writer.close()
+            self.end()
             self._ended_recording()
             return None
         summary = FlightSummary(
@@ -153,17 +140,17 @@ class LogWatcher:
             contact=report.contact,
             touchdown=report.touchdown,
         )
-        self.writer.close(summary.as_record())
+        self.end(summary.as_record())
         return replace(
             summary,
-            lost_records=self.writer.lost_records,
-            log_problem=self.writer.lacks,
+            lost_records=self.lost_records,
+            log_problem=self.lacks,
             recording=self._ended_recording(),
         )
 
     def abandon(self, reason: str) -> None:
         """Close the log of a flight that failed. One that never began leaves no file."""
-        self.writer.close({"outcome": "failed", "reason": reason})
+        self.end({"outcome": "failed", "reason": reason})
         recording = self._ended_recording()
         if not self.begun:
             self.path.unlink(missing_ok=True)

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from perchctl.errors import InvalidValue
 from perchctl.mission import Event, SentCommand, Turn
-from perchctl.record.disk import BackgroundWriter, DiskFile
+from perchctl.record.disk import BackgroundWriter, DiskFile, begin_file
 from perchctl.record.exact import encode, json_line, to_exact
 from perchctl.record.fields import event_record
 
@@ -43,7 +43,9 @@ class FlightLogWriter:
             alone is lost: the disk is well, and nothing lands for it.
     """
 
-    def __init__(self, path: Path, file: DiskFile, live: bool) -> None:
+    def __init__(self, path: Path, header_line: bytes, live: bool, file: DiskFile) -> None:
+        """Write the header into a new file. Raises OSError."""
+        file.write(header_line)
         self.path = path
         self.problem: str | None = None
         self.formless: str | None = None
@@ -66,7 +68,7 @@ class FlightLogWriter:
         return self.problem or self.formless
 
     @classmethod
-    def open(cls, path: Path, header: Mapping[str, Any], live: bool = False) -> FlightLogWriter:
+    def open(cls, path: Path, header: Mapping[str, Any], live: bool = False) -> Self:
         """Create the file and its folder and write the header.
 
         `live` (for flights in real time): a thread of its own writes, and brings the records
@@ -78,14 +80,10 @@ class FlightLogWriter:
         line = json_line(to_exact({k: v for k, v in header.items() if v is not None}))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            file, path = _new_file(path, live)
-            try:
-                file.write(line)
-                return cls(path, file, live)
-            except BaseException:
-                file.close()
-                path.unlink(missing_ok=True)
-                raise
+            for free in _free_names(path):
+                with suppress(FileExistsError):
+                    return begin_file(free, live, partial(cls, free, line, live))
+            raise AssertionError("unreachable")
         except OSError as error:
             raise InvalidValue(
                 f"{path}: the flight log cannot be created ({error.strerror or error}): free the "
@@ -108,7 +106,7 @@ class FlightLogWriter:
         """Append an event (`perchctl.record.fields.event_record`). Never raises."""
         self._put(partial(encode, {"kind": "event", **event_record(event)}), event.t_s)
 
-    def close(self, summary: Mapping[str, Any] | None = None) -> None:
+    def end(self, summary: Mapping[str, Any] | None = None) -> None:
         """Append the summary, if there is one, and close. Never raises; a second call does
         nothing.
 
@@ -116,8 +114,8 @@ class FlightLogWriter:
         if self._closed:
             return
         self._closed = True
-        end = partial(self._end, summary)
-        self._unfinished = self._writer.finish(end, CLOSE_TIMEOUT_S)
+        last = partial(self._end, summary)
+        self._unfinished = self._writer.finish(last, CLOSE_TIMEOUT_S)
         if self._unfinished:
             self._remember(NO_ANSWER)
 
@@ -147,10 +145,8 @@ class FlightLogWriter:
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
-            # What has been waited for in vain is in the file by now.
-            problem = None if self.problem == NO_ANSWER else self.problem
             lost_records = self._writer.refused + self._failed
-            lost = {"lost_records": lost_records, "problem": problem or self.formless}
+            lost = {"lost_records": lost_records, "problem": self.lacks}
             self._store(partial(encode, {"kind": "summary", **summary, **lost}))
         self._sync_to_disk()
         with suppress(OSError):
@@ -207,12 +203,9 @@ def log_path(directory: Path, profile_name: str, started: datetime) -> Path:
     return directory / f"flight_{started.astimezone(UTC):%Y%m%d_%H%M%S}_{safe[:60]}.jsonl"
 
 
-def _new_file(path: Path, sync: bool) -> tuple[DiskFile, Path]:
-    """Create a file by `path`'s name or the next free one, beside which there is no recording,
-    either. Raises OSError."""
+def _free_names(path: Path) -> Iterator[Path]:
+    """Yield the path, then with ``_2``, ``_3``...; none beside which there is a recording."""
     for number in count(1):
-        free = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
-        if not recording_path(free).exists():
-            with suppress(FileExistsError):
-                return DiskFile(free, sync), free
-    raise AssertionError("unreachable")
+        name = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
+        if not recording_path(name).exists():
+            yield name

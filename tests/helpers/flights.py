@@ -52,7 +52,7 @@ class Flown:
 class NoLog(LogWatcher):
     """Takes a log's place, and writes none."""
 
-    problem: str | None = None  # type: ignore[assignment]
+    problem: str | None = None
 
     def __init__(self) -> None:
         self.truth: Callable[[], Truth] | None = None

@@ -189,7 +189,7 @@ def write(
         writer.write(record)
     for event in events:
         writer.event(event)
-    writer.close(summary)
+    writer.end(summary)
     return writer.path
 
 
@@ -211,7 +211,7 @@ def small_log(path: Path, ticks: int = 5) -> Path:
     for i in range(ticks):
         writer.write({"t_s": 0.02 * i, "phase": "SEARCH", "z_m": 0.1 * i})
         writer.event(note(0.02 * i, f"event {i}"))
-    writer.close(SUMMARY)
+    writer.end(SUMMARY)
     assert writer.problem is None
     return writer.path
 

@@ -36,7 +36,7 @@ def written(
         writer.write(record)
     for event in events:
         writer.event(event)
-    writer.close(summary)
+    writer.end(summary)
     assert writer.problem is None
     return writer.path
 

@@ -57,7 +57,7 @@ def test_a_full_disk_that_gets_room_again(tmp_path: Path) -> None:
     assert lost > 5
     assert writer.problem == "the flight log cannot be written: File too large"
     writer.write({"t_s": 2.0, "phase": "ALIGN"})
-    writer.close(synthetic.SUMMARY)
+    writer.end(synthetic.SUMMARY)
     log = read_log(writer.path)
     assert (log.records[-1]["phase"], len(log.records)) == ("ALIGN", 11 - lost)
     assert log.ignored_bytes == 0  # no piece of a record was left behind
@@ -78,9 +78,9 @@ def test_a_record_without_a_form_costs_itself_alone(
         return exact.encode(record)
 
     monkeypatch.setattr(write, "encode", encode)
-    log = LogWatcher(opened(tmp_path, live))
+    log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(), live)
     for i in range(4):
-        log.writer.write({"t_s": 0.02 * i, "odd": i == 1})
+        log.write({"t_s": 0.02 * i, "odd": i == 1})
     summary = log.close(FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False))
     assert log.problem is None
     assert [r["t_s"] for r in read_log(log.path).records] == [0.0, 0.04, 0.06]
@@ -106,7 +106,7 @@ def test_fsync_about_once_a_second_where_it_is_live(
     writer = opened(tmp_path, live)
     for i in range(251):
         writer.write({"t_s": 100.0 + 0.02 * i})
-    writer.close()
+    writer.end()
     assert 2 <= len(calls) <= 6 if live else not calls  # at most five in flight, one at the end
     assert (writer.problem is not None) is live
     assert writer.lost_records == 0
@@ -164,7 +164,7 @@ def test_a_disk_that_hangs_holds_up_nobody(hung: tuple[FlightLogWriter, Disk]) -
     assert "does not keep up" in (writer.problem or "")
     assert writer.lost_records == 30
     disk.gate.set()
-    writer.close(synthetic.SUMMARY)
+    writer.end(synthetic.SUMMARY)
     log = read_log(writer.path)
     assert len(log.records) == 50
     assert log.summary is not None
@@ -176,7 +176,7 @@ def test_closing_does_not_wait_for_ever(hung: tuple[FlightLogWriter, Disk]) -> N
     for i in range(10):
         writer.write({"t_s": 0.02 * i})
     began_s = time.monotonic()
-    writer.close(synthetic.SUMMARY)
+    writer.end(synthetic.SUMMARY)
     assert time.monotonic() - began_s < 2.0
     assert "does not answer" in (writer.problem or "")
     assert writer.lost_records == 11  # the summary too
@@ -211,7 +211,7 @@ def test_a_full_disk_is_in_the_exit_code_of_a_good_flight(
 
     def session(options: FlyOptions, log: LogWatcher, *rest: Any) -> Any:
         for record in list(synthetic.ticks())[:5]:
-            log.writer.write(record)
+            log.write(record)
         return FlightReport(Phase.PERCHED, outcome, "hanging still", 1, 9.0, False), None
 
     quiet = changed_profile(load_profile("sim"), ["log.plot=false"])

@@ -42,7 +42,7 @@ def test_a_flight_comes_back(tmp_path: Path, live: bool) -> None:
     for record in written:
         writer.write(record)
     writer.event(held(1.5, "no picture"))
-    writer.close(synthetic.SUMMARY)
+    writer.end(synthetic.SUMMARY)
     log = read_log(writer.path)
     assert log.header["profile"]["name"] == "sim"
     assert log.header["seed"] == 7
@@ -69,7 +69,7 @@ def test_the_same_flight_gives_the_same_bytes(tmp_path: Path) -> None:
         writer = FlightLogWriter.open(tmp_path / name / "f.jsonl", synthetic.header())
         for record in synthetic.ticks(seed=3):
             writer.write(record)
-        writer.close(synthetic.SUMMARY)
+        writer.end(synthetic.SUMMARY)
         files.append(writer.path.read_bytes())
     assert files[0] == files[1]
     assert b"started_utc" not in files[0]
@@ -81,7 +81,7 @@ def test_names_and_no_overwriting(tmp_path: Path) -> None:
     paths = []
     for _ in range(3):
         writer = FlightLogWriter.open(path, synthetic.header(started=STARTED))
-        writer.close()
+        writer.end()
         paths.append(writer.path.name)
     assert paths == [
         "flight_20240301_140509_my-profile.jsonl",

@@ -15,10 +15,9 @@ from mcap.reader import make_reader
 
 from perchctl.errors import InvalidValue
 from perchctl.mission import FlightReport, Outcome, Phase
-from perchctl.record import LogWatcher, read_log, recorded_pictures, recording_file
+from perchctl.record import LogWatcher, read_log, recorded_pictures
 from perchctl.record import recorder as recording_module
 from perchctl.record.recorder import Recorder
-from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers import recorded
 from tests.helpers.disk import full_disk
@@ -113,7 +112,7 @@ def test_a_disk_that_hangs_holds_up_nobody(
 ) -> None:
     """What may wait is used up; it goes on with the next turn that there is room for."""
     monkeypatch.setattr(recording_module, "MOST_WAITING_BYTES", 300_000)
-    monkeypatch.setattr(recording_file, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(recording_module, "CHUNK_BYTES", 1)
     recorder, flight = onto(hung, live=True), recorded.flown(120)
     hung.gate.clear()
     began_s = time.monotonic()
@@ -204,12 +203,12 @@ def test_what_is_left_by_a_killed_flight_gives_what_is_whole(tmp_path: Path) -> 
 def test_what_is_wrong_with_it_is_no_problem_of_the_log_s(tmp_path: Path) -> None:
     """For which the vehicle would land."""
     disk = MemoryDisk()
-    log = LogWatcher(FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header()), onto(disk))
+    log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header())
+    log.recorder = onto(disk)
     disk.room = 0
     log.event(recorded.EVENT)
     for tick in recorded.flown(1).ticks:
-        assert log._recorder is not None
-        log._recorder.tick(tick)
+        log.recorder.tick(tick)
     assert log.problem is None
     (said,) = log.remarks()
     assert "No space left" in said
@@ -224,11 +223,11 @@ def test_the_log_is_whole_before_the_recording_s_end_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hung: MemoryDisk
 ) -> None:
     monkeypatch.setattr(recording_module, "CLOSE_TIMEOUT_S", 0.1)
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
-    log = LogWatcher(writer, onto(hung, live=True))
+    log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
+    log.recorder = onto(hung, live=True)
     log.event(recorded.EVENT)
     hung.gate.clear()
-    recorder: Any = log._recorder
+    recorder: Any = log.recorder
     close = recorder.close
 
     def closed() -> Any:

@@ -20,7 +20,7 @@ from perchctl.geometry import (
 )
 from perchctl.record import recorded_pictures
 from perchctl.record.fields import FIELDS
-from perchctl.record.recording_file import TICK_SCHEMA
+from perchctl.record.messages import TICK_SCHEMA
 from tests.helpers import recorded
 from tests.helpers.flights import ROOT
 

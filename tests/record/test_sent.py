@@ -43,7 +43,7 @@ def log(tmp_path: Path) -> Path:
         while left and left[0].t_s < tick["t_s"]:
             writer.sent(left.pop(0))
         writer.write(tick)
-    writer.close(synthetic.SUMMARY)
+    writer.end(synthetic.SUMMARY)
     return writer.path
 
 
@@ -127,8 +127,7 @@ def test_the_sender_tells_of_its_guard_and_not_of_the_loop() -> None:
 
 
 def test_the_guard_waits_for_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
-    watcher = LogWatcher(writer)
+    watcher = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
     watcher.sent(TOLD[0])
     gate, real = threading.Event(), os.write
     monkeypatch.setattr(os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))

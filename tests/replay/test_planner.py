@@ -193,7 +193,7 @@ def test_the_header_s_profile_is_the_flown_one_to_the_bit(tmp_path: Path) -> Non
          "camera": {"source": "rtsp://me:secret@10.0.0.2/a", "latency_s": 1 / 14}}
     )  # fmt: skip
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", make_header(profile, uri="", source=""))
-    writer.close()
+    writer.end()
     log = read_log(writer.path)
     assert changed_keys(profile, log.flown_profile) == ("camera.source",)
     assert log.flown_profile.safety.jump_m == 0.1 + 0.2

@@ -20,7 +20,6 @@ from perchctl.perception import perception
 from perchctl.profile import changed_profile
 from perchctl.record import FlightLog, LogWatcher, read_log
 from perchctl.record.header import make_header
-from perchctl.record.write import FlightLogWriter
 from perchctl.vision import Frame, Pipeline, PipelineState
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner
 from tests.helpers.loop_rig import PROFILE, Camera, Rig, SleepyClock, Vehicle
@@ -54,12 +53,11 @@ def flown(folder: Path, rig: Rig) -> tuple[FlightLog, list[Picture]]:
 
     rig.watcher.on_tick = press
     header = make_header(PROFILE, uri="sim://", source="sim:", lockstep=True)
-    writer = FlightLogWriter.open(folder / "f.jsonl", header)
-    log = LogWatcher(writer)
+    log = LogWatcher.open(folder / "f.jsonl", header)
     parts = rig.parts()
     report = fly(replace(parts, watchers=(*parts.watchers, log)))
     log.close(report)
-    return read_log(writer.path), kept.pictures
+    return read_log(log.path), kept.pictures
 
 
 def seen_again(log: FlightLog, pictures: list[Picture]) -> Replay:
