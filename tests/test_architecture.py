@@ -29,7 +29,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "motioncapture": ("perchctl.positioning",),
     "mcap": ("perchctl.record.recorder", "perchctl.record.recorded"),
     "mcap_protobuf": ("perchctl.record.recorder",),
-    "foxglove_schemas_protobuf": ("perchctl.record.*",),
+    "foxglove_schemas_protobuf": ("perchctl.record",),
     "google": ("perchctl.record.messages", "perchctl.record.recorder"),
     "distributed": ("perchctl.campaign",),
     "av": ("perchctl.camera.network", "perchctl.analysis.film"),

@@ -17,7 +17,6 @@ from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
-from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Point2_pb2 import Point2
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
@@ -34,7 +33,7 @@ TARGET, SETPOINT = "target", "setpoint"
 
 IMAGE, FRAME, CORNERS = "/camera/image", "/camera/frame", "/camera/corners"
 TF = "/tf"
-LOG, TICK = "/log", "/tick"
+TICK = "/tick"
 
 NS = 1_000_000_000
 PNG_LEVEL = 1
@@ -77,34 +76,12 @@ TICK_SCHEMA = {
 
 # --- Foxglove's messages ----------------------------------------------
 
-_LEVELS = {"hold": Log.WARNING, "back off": Log.WARNING, "land": Log.ERROR, "stop": Log.FATAL}
 _OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)
 
 
 def stamp(ns: int) -> Timestamp:
     """Return nanoseconds since 1970 as protobuf's time stamp."""
     return Timestamp(seconds=ns // NS, nanos=ns % NS)
-
-
-def log_message(ns: int, record: Mapping[str, Any]) -> Log:
-    """Return the message of an event's record. What goes on is an info, a landing an error, a stop
-    fatal."""
-    level = _LEVELS.get(str(record.get("severity")), Log.INFO)
-    what, phase = record.get("event"), record.get("phase")
-    text = str(record.get("reason") or "")
-    if what == "phase":
-        text = f"{phase}: {text}".rstrip(": ")
-    elif what == "hold":
-        text = f"held: {text}"
-    if record.get("simulated"):
-        text = f"{text} (simulated: {record['simulated']})"
-    return Log(
-        timestamp=stamp(ns),
-        level=level,
-        message=text,
-        name="perchctl",
-        file=record.get("row") or "",
-    )
 
 
 def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:

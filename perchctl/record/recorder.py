@@ -1,4 +1,4 @@
-"""Records a flight while it flies: pictures, transforms, ticks and events.
+"""Records a flight while it flies: pictures, transforms and ticks.
 
 The flight hands over what it has and goes on: a thread of its own encodes and writes. The
 recording is not the log: what it loses is counted and said, and nothing lands for it.
@@ -30,14 +30,12 @@ from perchctl.record.messages import (
     CORNERS,
     FRAME,
     IMAGE,
-    LOG,
     NS,
     TF,
     TICK,
     TICK_SCHEMA,
     corners_message,
     image_message,
-    log_message,
     mounts_of,
     moving,
     stamp,
@@ -57,8 +55,8 @@ RESERVE_BYTES = 200_000_000
 
 
 class Recorder:
-    """Writes one flight's recording. Only `open` raises. `frame`, `tick` and `event` are called
-    by the loop, and cost it no more than a place in a queue.
+    """Writes one flight's recording. Only `open` raises. `frame` and `tick` are called by the
+    loop, and cost it no more than a place in a queue.
 
     Live, a turn is handed over at its end, with its frame: the thread works while the loop
     sleeps. Otherwise (lockstep) everything is written at once, and nothing is ever dropped.
@@ -115,10 +113,6 @@ class Recorder:
         self._turn.append(partial(self._write_frame, frame))
         # A frame that repeats holds its picture too.
         self._turn_bytes += frame.image.nbytes + len(frame.encoded or b"")
-
-    def event(self, record: Mapping[str, Any]) -> None:
-        """Record an event (`perchctl.record.fields.event_record`). Never raises."""
-        self._turn.append(partial(self._write_event, record))
 
     def tick(self, record: Mapping[str, Any]) -> None:
         """Record a tick (`perchctl.record.fields.tick_record`), which ends a turn. Never raises."""
@@ -194,10 +188,6 @@ class Recorder:
             self._add(CORNERS, ns, corners_message(self._ns(exposed_s), record))
             shown["frame_t_s"] = exposed_s - first_s
         self._add(TICK, ns, encode(shown)[:-1])
-
-    def _write_event(self, record: Mapping[str, Any]) -> None:
-        ns = self._ns(float(record["t_s"]))
-        self._add(LOG, ns, log_message(ns, record))
 
     def _flush(self) -> None:
         """Bring to the disk, once a second, what was written; end a recording that is too large."""

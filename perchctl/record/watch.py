@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from perchctl.camera import FrameSource, WrappedSource
-from perchctl.mission import Event, FlightReport, Tick
+from perchctl.mission import FlightReport, Tick
 from perchctl.profile import Profile
-from perchctl.record.fields import event_record, tick_record
+from perchctl.record.fields import tick_record
 from perchctl.record.header import make_header
 from perchctl.record.summary import FlightSummary, RecordingEnd
 from perchctl.record.write import FlightLogWriter, log_path, recording_path
@@ -108,12 +108,6 @@ class LogWatcher(FlightLogWriter):
             self.turn(tick.turn)
         if self.recorder is not None:
             self.recorder.tick(record)
-
-    def event(self, event: Event) -> None:
-        """Write an event, into the recording too. Never raises."""
-        super().event(event)
-        if self.recorder is not None:
-            self.recorder.event(event_record(event))
 
     def close(
         self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from perchctl.errors import InvalidValue
 from perchctl.mission import FlightReport, Outcome, Phase
-from perchctl.record import LogWatcher, read_log, recorded_pictures
+from perchctl.record import FlightSummary, LogWatcher, read_log, recorded_pictures
 from perchctl.record import recorder as recording_module
 from perchctl.record.recorder import Recorder
 from tests.helpers import log as synthetic
@@ -23,6 +23,7 @@ from tests.helpers import recorded
 from tests.helpers.disk import full_disk
 from tests.helpers.mission import changed
 from tests.helpers.recorded import MemoryDisk
+from tests.helpers.waiting import until
 
 WAIT_S = 20.0
 
@@ -36,13 +37,6 @@ def pictures_on(disk: MemoryDisk, tmp_path: Path) -> list[int]:
     path = tmp_path / "f.mcap"
     path.write_bytes(disk.data)
     return [picture.number for picture in recorded_pictures(path)]
-
-
-def until(met: Callable[[], object]) -> None:
-    end_s = time.monotonic() + WAIT_S
-    while not met():
-        assert time.monotonic() < end_s, "did not come"
-        time.sleep(0.005)
 
 
 # -- what ends a recording ------------------------------------------------------------------
@@ -131,20 +125,6 @@ def test_a_disk_that_hangs_holds_up_nobody(
     assert kept[-1] == 200
 
 
-def test_closing_does_not_wait_for_ever(hung: MemoryDisk, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording_module, "CLOSE_TIMEOUT_S", 0.1)
-    recorder = onto(hung, live=True)
-    hung.gate.clear()
-    recorded.fly(recorder, recorded.flown(10))
-    began_s = time.monotonic()
-    end = recorder.close()
-    assert time.monotonic() - began_s < 5.0
-    assert "does not answer" in (end.problem or "")
-    assert end.missing == 10 - end.pictures > 0
-    hung.gate.set()
-    until(lambda: hung.closed)  # should the disk ever answer, it is ended
-
-
 # -- live and in lockstep -----------------------------------------------------------------------
 
 
@@ -200,23 +180,25 @@ def test_what_is_left_by_a_killed_flight_gives_what_is_whole(tmp_path: Path) -> 
 # -- beside the log -----------------------------------------------------------------------------
 
 
+def closed(log: LogWatcher) -> FlightSummary:
+    summary = log.close(FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False))
+    assert summary is not None
+    assert (summary.lost_records, summary.log_problem) == (0, None)
+    return summary
+
+
 def test_what_is_wrong_with_it_is_no_problem_of_the_log_s(tmp_path: Path) -> None:
     """For which the vehicle would land."""
-    disk = MemoryDisk()
-    log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header())
+    log, disk = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header()), MemoryDisk()
     log.recorder = onto(disk)
     disk.room = 0
-    log.event(recorded.EVENT)
     for tick in recorded.flown(1).ticks:
         log.recorder.tick(tick)
     assert log.problem is None
     (said,) = log.remarks()
     assert "No space left" in said
     assert log.remarks() == []
-    summary = log.close(FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False))
-    assert summary is not None
-    assert summary.log_problem is None
-    assert f"0 pictures in f.mcap ({said})" in summary.text()
+    assert f"0 pictures in f.mcap ({said})" in closed(log).text()
 
 
 def test_the_log_is_whole_before_the_recording_s_end_is_waited_for(
@@ -225,22 +207,17 @@ def test_the_log_is_whole_before_the_recording_s_end_is_waited_for(
     monkeypatch.setattr(recording_module, "CLOSE_TIMEOUT_S", 0.1)
     log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
     log.recorder = onto(hung, live=True)
-    log.event(recorded.EVENT)
+    recorded.fly(log.recorder, recorded.flown(10))
     hung.gate.clear()
-    recorder: Any = log.recorder
-    close = recorder.close
-
-    def closed() -> Any:
-        assert read_log(log.path).summary is not None
-        return close()
-
-    recorder.close = closed
-    report = FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging still", 1, 9.0, False)
-    summary = log.close(report)
-    assert summary is not None
-    assert summary.recording is not None
-    assert "does not answer" in (summary.recording.problem or "")
-    assert (summary.lost_records, summary.log_problem) == (0, None)
+    began_s = time.monotonic()
+    end = closed(log).recording
+    assert time.monotonic() - began_s < 5.0
+    assert end is not None
+    assert "does not answer" in (end.problem or "")
+    assert end.missing == 10 - end.pictures
+    assert read_log(log.path).summary is not None
+    hung.gate.set()
+    until(lambda: hung.closed)  # should the disk ever answer, it is ended
 
 
 def test_a_flight_that_never_began_leaves_no_file(tmp_path: Path) -> None:
