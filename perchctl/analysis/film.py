@@ -118,8 +118,7 @@ class _Stage:
         self._arms.set_data([x_m - ARM_M, x_m + ARM_M], [z_m, z_m])
         self._gear.set_data([x_m, x_m], [z_m, z_m + self._gear_m])
         self._cursor.set_xdata([t_s, t_s])
-        held = " (held)" if record.get("hold") else ""
-        self._title.set_text(f"{t_s:.1f} s   {record.get('phase') or ''}{held}")
+        self._title.set_text(f"{t_s:.1f} s   {record.get('phase') or ''}")
         self._canvas.restore_region(self._still)
         for artist in self._moving:
             (artist.axes or self._figure).draw_artist(artist)
