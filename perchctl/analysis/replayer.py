@@ -23,10 +23,6 @@ CAUTION = (
     "after the first difference the world would have answered differently: from there on this is "
     "what the planner would have said to another flight's telemetry and pictures"
 )
-NOTHING_SHOWN = (
-    "what acts on the link, the telemetry or external positions, or is asked before take-off, "
-    "changes nothing in a replay, nor does what acts on pictures where none are recorded"
-)
 
 
 @dataclass(frozen=True)
@@ -130,8 +126,8 @@ class Replay:
             found.append("the log ends in the flight, without its summary: replayed is its rest")
         ended = "" if self.seen is None else self.seen.ended
         found += [note for note in (self.gap, ended) if note]
-        if self.changed:
-            found.append(NOTHING_SHOWN if self.same else CAUTION)
+        if self.changed and not self.same:
+            found.append(CAUTION)
         for each in self.decided:
             if each.error is not None:
                 found.append(f"the planner breaks down on turn {each.turn.number}: {each.error}")
