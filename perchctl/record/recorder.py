@@ -128,7 +128,7 @@ class Recorder:
             if self._writer.finish(partial(self._attempt, self._finish), CLOSE_TIMEOUT_S):
                 self._remember("the disk does not answer: the recording lacks its end")
         kept = self._flushed_pictures
-        return RecordingEnd(self.path, kept, self._pictures - kept, self.problem)
+        return RecordingEnd(self.path.name, kept, self._pictures - kept, self.problem)
 
     def _hand_over(self) -> None:
         turn, size = self._turn, self._turn_bytes

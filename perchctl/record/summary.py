@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,35 +14,21 @@ from perchctl.record.read import FlightLog
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 
-@dataclass(frozen=True)
-class RecordingEnd:
-    """What became of a recording.
+class RecordingEnd(NamedTuple):
+    """What became of a recording, by its keys for programs: the file's name, how many pictures are
+    in it, how many are not, and the first reason why."""
 
-    Attributes:
-        pictures: how many are in it; `missing`: how many are not, and `problem`: the first
-            reason why.
-    """
-
-    path: Path
+    recording: str
     pictures: int
-    missing: int = 0
-    problem: str | None = None
+    pictures_missing: int
+    recording_problem: str | None
 
     @property
     def text(self) -> str:
-        told = f"{self.pictures} pictures in {self.path}"
-        if self.missing:
-            told += f", {self.missing} missing"
-        return f"{told} ({self.problem})" if self.problem else told
-
-    def as_record(self) -> dict[str, Any]:
-        """Return the record for programs."""
-        return {
-            "recording": self.path.name,
-            "pictures": self.pictures,
-            "pictures_missing": self.missing,
-            "recording_problem": self.problem,
-        }
+        """The same in words."""
+        missing = f", {self.pictures_missing} missing" if self.pictures_missing else ""
+        why = f" ({self.recording_problem})" if self.recording_problem else ""
+        return f"{self.pictures} pictures in {self.recording}{missing}{why}"
 
 
 @dataclass(frozen=True)
@@ -119,7 +105,7 @@ class FlightSummary:
             "locked": self.locked,
             "fell": self.fell,
             **_keys_of(self.findings, _FINDINGS),
-            **({} if self.recording is None else self.recording.as_record()),
+            **({} if self.recording is None else self.recording._asdict()),
         }
 
     def text(self, log_path: Path | None = None) -> str:

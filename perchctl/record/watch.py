@@ -145,11 +145,11 @@ class LogWatcher(FlightLogWriter):
     def abandon(self, reason: str) -> None:
         """Close the log of a flight that failed. One that never began leaves no file."""
         self.end({"outcome": "failed", "reason": reason})
-        recording = self._ended_recording()
+        self._ended_recording()
         if not self.begun:
             self.path.unlink(missing_ok=True)
-            if recording is not None:
-                recording.path.unlink(missing_ok=True)
+            if self.recorder is not None:
+                self.recorder.path.unlink(missing_ok=True)
 
     def _ended_recording(self) -> RecordingEnd | None:
         return None if self.recorder is None else self.recorder.close()
