@@ -96,7 +96,7 @@ class FlightLog:
     @cached_property
     def sent(self) -> list[SentCommand]:
         """What was sent in the loop's place; empty before version 4. Errors: InvalidValue."""
-        return [sent_of(record) for record in self.sent_records]
+        return [exact_of(SentCommand, record) for record in self.sent_records]
 
     def column(self, key: str) -> Array:
         """Return a field over the ticks, shape (n,); NaN where it is missing.
@@ -376,21 +376,16 @@ def turn_of(record: dict[str, Any]) -> Turn:
         samples = taken.get("late") or taken.get("samples")
         if isinstance(samples, list) and samples:
             record = record | {"observation": obs | {"telemetry": samples[-1]}}
-    return _exact(Turn, record, f"the log's turn {record.get('number', '?')}")
+    return exact_of(Turn, record)
 
 
-def sent_of(record: Mapping[str, Any]) -> SentCommand:
-    """Return the command of a record, to the same bits. Errors: InvalidValue."""
-    return _exact(
-        SentCommand, record, f"the log's record of what was sent at {record.get('t_s', '?')} s"
-    )
-
-
-def _exact(kind: type[Exact], record: Mapping[str, Any], name: str) -> Exact:
+def exact_of(kind: type[Exact], record: Mapping[str, Any]) -> Exact:
+    """Return the turn, or the command that was sent in the loop's place, of a record, to the same
+    bits. Errors: InvalidValue."""
     try:
         return from_exact(kind, _without_kind(record))
     except ValueError as error:
         raise InvalidValue(
-            f"{name} cannot be read ({error}): the log is damaged, or another version of "
-            f"perchctl wrote it"
+            f"the log's {record.get('kind')} at {record.get('t_s')} s cannot be read ({error}): "
+            f"the log is damaged, or another version of perchctl wrote it"
         ) from None
