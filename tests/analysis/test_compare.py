@@ -37,9 +37,3 @@ def test_what_differs_is_in_the_table(pair: Comparison) -> None:
     assert max(map(len, text.splitlines())) <= 79
     assert "UNKNOWN: the log ends in ASCEND" in text
     assert "camera.latency_s                0.07  0.1" in text
-
-
-def test_a_flight_beside_itself(pair: Comparison) -> None:
-    found = Comparison((pair.flights[0], pair.flights[0]))
-    assert "their profiles are the same" in found.text()
-    assert {d for d in found.record()["differences"].values() if d is not None} == {0}

@@ -210,8 +210,7 @@ def test_a_full_disk_is_in_the_exit_code_of_a_good_flight(
         return real(fd, data)
 
     def session(options: FlyOptions, log: LogWatcher, *rest: Any) -> Any:
-        for record in list(synthetic.ticks())[:5]:
-            log.write(record)
+        log.write({"t_s": 0.0, "phase": "PERCHED"})
         return FlightReport(Phase.PERCHED, outcome, "hanging still", 1, 9.0, False), None
 
     quiet = changed_profile(load_profile("sim"), ["log.plot=false"])
@@ -222,7 +221,5 @@ def test_a_full_disk_is_in_the_exit_code_of_a_good_flight(
     assert fly.fly_and_report(options, as_json=True, view=False) == code
     said = capsys.readouterr()
     told = json.loads(said.out)
-    assert told["exit_code"] == code
-    assert (told["log_problem"] is not None) is full
-    assert (told["lost_records"] > 0) is full
+    assert (told["exit_code"], told["lost_records"]) == (code, int(full))
     assert ("No space left on device" in said.err) is full

@@ -30,7 +30,7 @@ from perchctl.mission import (
 from perchctl.mission.state import Condition
 from perchctl.record import from_exact, to_exact
 from perchctl.record.exact import decode_line, encode, to_plain
-from perchctl.record.read import sent_of, turn_of
+from perchctl.record.read import exact_of, turn_of
 from perchctl.record.write import sent_line, turn_line
 from perchctl.vehicle import (
     EmergencyStop,
@@ -153,9 +153,9 @@ def test_a_command_of_each_kind_comes_back(command: Any) -> None:
     """In a turn, and sent in the loop's place. Three kinds have no field at all."""
     assert comes_back(Turn, Turn(0, "flown", 0.0, 0.0, TurnInputs(), command=command))
     line = sent_line(sent := SentCommand(0.1 + 0.2, "watchdog", command))
-    assert bits(sent_of(decode_line(line))) == bits(sent)
+    assert bits(exact_of(SentCommand, decode_line(line))) == bits(sent)
     with pytest.raises(InvalidValue, match="sent at soon s cannot be read"):
-        sent_of(decode_line(line) | {"t_s": "soon"})
+        exact_of(SentCommand, decode_line(line) | {"t_s": "soon"})
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_a_command_of_each_kind_comes_back(command: Any) -> None:
 )  # fmt: skip
 def test_what_is_no_turn_is_one_sentence(changes: dict[str, Any], why: str) -> None:
     record = decode_line(turn_line(whole_turn())) | changes
-    with pytest.raises(InvalidValue, match="turn 7 cannot be read") as caught:
+    with pytest.raises(InvalidValue, match=r"turn at .* s cannot be read") as caught:
         turn_of(record)
     assert why in str(caught.value)
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import gzip
-import json
 import signal
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.errors import InvalidValue
 from perchctl.record import read_log
 from tests.helpers.log import run_python, small_log
 
@@ -58,15 +56,6 @@ def test_a_killed_writer_leaves_a_readable_log(tmp_path: Path) -> None:
     assert log.truncated
 
 
-def test_columns(tmp_path: Path) -> None:
-    log = read_log(small_log(tmp_path / "f.jsonl"))
-    np.testing.assert_allclose(log.column("z_m"), [0.0, 0.1, 0.2, 0.3, 0.4])
-    assert np.isnan(log.column("ex_m")).all()
-    with pytest.raises(InvalidValue, match="phase is not a number"):
-        log.column("phase")
-    assert json.dumps(log.header)  # plain values only
-
-
 def test_a_packed_log_is_read_like_another(tmp_path: Path) -> None:
     good = small_log(tmp_path / "good.jsonl")
     path = tmp_path / "x.jsonl.gz"
@@ -102,8 +91,6 @@ DAMAGED: dict[str, tuple[Callable[[bytes], bytes] | bytes, tuple[str, ...]]] = {
     "garbage": (with_line(4, b"garbage"), ("line 4: not a record", "take the original")),
     "no time": (with_line(4, b'{"kind":"tick"}'), ("line 4", "t_s must be")),
     "kind": (with_line(3, b'{"kind":"?","t_s":1}'), ("line 3", "allowed are")),
-    "nan": (with_line(3, b'{"kind":"tick","t_s":NaN}'), ("line 3", "NaN")),
-    "deep": (with_line(3, b"[" * 100_000), ("line 3",)),
 }
 
 
@@ -126,10 +113,3 @@ def test_what_is_no_text_is_not_read_whole() -> None:
     """It would never end."""
     with pytest.raises(InvalidValue, match="not a flight log"):
         read_log("/dev/zero")
-
-
-def test_a_folder_and_nothing(tmp_path: Path) -> None:
-    with pytest.raises(NotFound, match="is a folder"):
-        read_log(tmp_path)
-    with pytest.raises(NotFound, match="does not exist"):
-        read_log(tmp_path / "none.jsonl")

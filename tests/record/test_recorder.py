@@ -64,9 +64,9 @@ def test_what_ends_the_recording_is_one_sentence_and_the_flight_goes_on(
         recorder.tick(change["tick"])
     recorded.fly(recorder, recorded.Flown(flight.frames[60:], flight.ticks[120:]))
     end = recorder.close()
-    assert said in (end.problem or "")
-    assert "the flight and its log go on" in (end.problem or "")
-    assert end.pictures + end.missing == len(flight.frames)
+    assert said in (end.recording_problem or "")
+    assert "the flight and its log go on" in (end.recording_problem or "")
+    assert end.pictures + end.pictures_missing == len(flight.frames)
     assert 0 < end.pictures < 120
     assert disk.closed
     assert pictures_on(disk, tmp_path) == list(range(end.pictures))
@@ -120,7 +120,7 @@ def test_a_disk_that_hangs_holds_up_nobody(
     end = recorder.close()
     kept = pictures_on(hung, tmp_path)
     assert end.pictures == len(kept)
-    assert end.pictures + end.missing == 121
+    assert end.pictures + end.pictures_missing == 121
     assert 10 <= len(kept) <= 15
     assert kept[-1] == 200
 
@@ -136,7 +136,7 @@ def test_live_and_in_lockstep_it_holds_the_same(tmp_path: Path) -> None:
         assert threading.active_count() == before + live
         recorded.fly(recorder, flight)
         end = recorder.close()
-        assert (end.pictures, end.missing, end.problem) == (60, 0, None)
+        assert (end.pictures, end.pictures_missing, end.recording_problem) == (60, 0, None)
     live_one, one, other = (tmp_path / f"{name}.mcap" for name in ("live", "a", "b"))
     assert str(recorded.messages(live_one)) == str(recorded.messages(one))
     assert one.read_bytes() == other.read_bytes()
@@ -213,8 +213,8 @@ def test_the_log_is_whole_before_the_recording_s_end_is_waited_for(
     end = closed(log).recording
     assert time.monotonic() - began_s < 5.0
     assert end is not None
-    assert "does not answer" in (end.problem or "")
-    assert end.missing == 10 - end.pictures
+    assert "does not answer" in (end.recording_problem or "")
+    assert end.pictures_missing == 10 - end.pictures
     assert read_log(log.path).summary is not None
     hung.gate.set()
     until(lambda: hung.closed)  # should the disk ever answer, it is ended

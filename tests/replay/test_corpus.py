@@ -7,7 +7,6 @@ planner".
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -67,12 +66,6 @@ def test_flights_of_two_formats_are_in_it() -> None:
         told = [turn.reason is not None for turn in corpus(name).turns if turn.command]
         assert all(told) if version == SCHEMA_VERSION else not any(told)
     assert {each.by for each in corpus("hung").sent} == {"watchdog"}
-
-
-def test_each_flight_of_the_corpus_can_be_made_anew() -> None:
-    text = Path(FOLDER / "make.py").read_text(encoding="utf-8")
-    assert NAMES
-    assert all(f'"{name}": ' in text for name in NAMES)
 
 
 def _beyond_last_bits(found: Replay) -> list[Any]:

@@ -8,16 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 import perchctl
 from perchctl.analysis import replay
 from perchctl.analysis.decide import first_differing
-from perchctl.analysis.replayer import CAUTION, NOTHING_SHOWN, Replay, changed_keys
+from perchctl.analysis.replayer import CAUTION, Replay, changed_keys
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
 from perchctl.mission import Turn, guidance, step_mission
 from perchctl.profile import Profile, changed_profile
-from perchctl.record import FlightLog, json_line, read_log, to_exact
+from perchctl.record import FlightLog, json_line, read_log
 from perchctl.record.header import make_header
 from perchctl.record.write import FlightLogWriter
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
@@ -86,27 +88,6 @@ def test_a_changed_word_of_the_planner_is_named_by_tick_and_field(
     assert "hanging" in said.replayed
     assert old.header["version"] == 3
     assert replay(old).same
-
-
-def test_a_planner_that_broke_down_has_to_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    step = step_mission
-    *turns, last = corpus("hung").turns
-    failed = replace(
-        last, role="failed", command=None, phase=None, outcome=None, reason=None, error="KeyError"
-    )
-    log = with_turns(corpus("hung"), [*turns, failed])
-    (mended,) = replay(log).differences
-    assert (mended.field, mended.recorded, mended.replayed) == ("error", "KeyError", None)
-
-    def fails(state: Any, obs: Any, profile: Any) -> Any:
-        if obs.t_s == last.t_s:
-            raise KeyError("by the test")
-        return step(state, obs, profile)
-
-    plan_by(monkeypatch, fails)
-    again = replay(log)
-    assert again.same
-    assert any("breaks down on turn" in note for note in again.notes)
 
 
 @pytest.mark.parametrize(
@@ -186,39 +167,28 @@ def test_a_log_without_whole_turns_cannot_be_replayed(tmp_path: Path, version: i
         replay(log)
 
 
-def test_the_header_s_profile_is_the_flown_one_to_the_bit(tmp_path: Path) -> None:
-    """A rounded threshold would be another flight's."""
+def test_the_header_s_profile_and_mask_are_the_flown_ones_to_the_bit(tmp_path: Path) -> None:
+    """A rounded threshold would be another flight's; the mask's file may be gone."""
+    covered = np.zeros((480, 640), np.uint8)
+    covered[400:, 5:123] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), covered)
     profile = Profile.model_validate(
         {"name": "x", "kalman": {"n_max": 7}, "safety": {"jump_m": 0.1 + 0.2},
-         "camera": {"source": "rtsp://me:secret@10.0.0.2/a", "latency_s": 1 / 14}}
+         "camera": {"source": "rtsp://me:secret@10.0.0.2/a", "latency_s": 1 / 14,
+                    "mask": str(tmp_path / "mask.png")}}
     )  # fmt: skip
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", make_header(profile, uri="", source=""))
     writer.end()
+    (tmp_path / "mask.png").unlink()
     log = read_log(writer.path)
     assert changed_keys(profile, log.flown_profile) == ("camera.source",)
     assert log.flown_profile.safety.jump_m == 0.1 + 0.2
     assert b"secret" not in writer.path.read_bytes()
     camera = log.flown_camera
     assert camera is not None
-    assert log.flown_mask(camera) is None
-
-
-def test_a_mask_goes_with_the_log(tmp_path: Path) -> None:
-    import cv2
-    import numpy as np
-
-    picture = np.zeros((480, 640), np.uint8)
-    picture[400:, 5:123] = 255
-    cv2.imwrite(str(tmp_path / "mask.png"), picture)
-    profile = Profile.model_validate({"camera": {"mask": str(tmp_path / "mask.png")}})
-    header = json.loads(json.dumps(to_exact(make_header(profile, uri="", source=""))))
-    (tmp_path / "mask.png").unlink()
-    log = FlightLog(tmp_path / "f.jsonl", header, [], [], None, True)
-    camera = log.flown_camera
-    assert camera is not None
     mask = log.flown_mask(camera)
     assert mask is not None
-    assert np.array_equal(mask, picture > 0)
+    assert np.array_equal(mask, covered > 0)
 
 
 # --- what if -------------------------------------------------------------------------------
@@ -242,29 +212,17 @@ def test_what_if_names_the_first_tick_that_would_differ() -> None:
     json.dumps(record, allow_nan=False)
 
 
-def test_what_if_nothing_that_a_replay_without_pictures_can_tell_would_differ() -> None:
-    found = what_if(corpus("perched"), "kalman.n_max=3")
-    assert found.same
-    assert NOTHING_SHOWN in found.notes
-
-
 @pytest.mark.parametrize(
-    ("setting", "error", "why"),
+    ("setting", "error"),
     [
-        ("planner.align.xy_m", UsageError, "must be KEY=VALUE"),
-        ("planner.align.xy=3", InvalidValue, "planner.align.xy: this key is unknown"),
-        ("planner.align.xy_m=-1", InvalidValue, "planner.align.xy_m: "),
-        ("planner.align.xy_m=[", InvalidValue, "not YAML"),
+        ("planner.align.xy_m", UsageError),
+        ("planner.align.xy=3", InvalidValue),
+        ("planner.align.xy_m=[", InvalidValue),
     ],
 )
-def test_a_setting_that_is_none(setting: str, error: type[Exception], why: str) -> None:
-    with pytest.raises(error) as caught:
+def test_a_setting_that_is_none(setting: str, error: type[Exception]) -> None:
+    with pytest.raises(error, match="--set"):
         changed_profile(Profile(), [setting])
-    assert why in str(caught.value)
-    assert "--set" in str(caught.value)
-    xy_m = "planner.align.xy_m"
-    profile = changed_profile(Profile(), [f"{xy_m}=0.02", f"{xy_m}=0.03", "link.parameters={a: 1}"])
-    assert (profile.planner.align.xy_m, profile.link.parameters) == (0.03, {"a": 1})
 
 
 # --- the command ---------------------------------------------------------------------------
