@@ -104,24 +104,40 @@ def utc_text(started_utc: Any) -> str:
     return str(started_utc).replace("T", " ").replace("+00:00", " UTC")
 
 
-_MEASURES = {
-    "settled": "{settled_xy_rms_m} mm aside and {settled_yaw_rms_rad} deg RMS in the last second "
-    "before the contact",
-    "frames": "{frames}, {frames_unseen} without the target; {frame_rate_hz} Hz, {frame_age_s} ms "
-    "old; gaps: {frame_gaps}, {frame_gaps_s} s together",
-    "battery": "{battery_min_v} V at its lowest; {battery_start_v} V at the start, "
-    "{battery_end_v} V at the end",
-    "loop": "{turns} turns, late by {late_p99_s} ms, telemetry {telemetry_age_p99_s} ms old (99 % "
-    "at most)",
-}
+_MEASURES = (
+    (
+        "settled",
+        "settled_xy_rms_m",
+        "{settled_xy_rms_m} mm aside and {settled_yaw_rms_rad} deg RMS in the last second before "
+        "the contact",
+    ),
+    (
+        "frames",
+        "frames",
+        "{frames}, {frames_unseen} without the target; {frame_rate_hz} Hz, {frame_age_s} ms old; "
+        "gaps: {frame_gaps}, {frame_gaps_s} s together",
+    ),
+    (
+        "battery",
+        "battery_min_v",
+        "{battery_min_v} V at its lowest; {battery_start_v} V at the start, {battery_end_v} V at "
+        "the end",
+    ),
+    (
+        "loop",
+        "turns",
+        "{turns} turns, late by {late_p99_s} ms, telemetry {telemetry_age_p99_s} ms old (99 % at "
+        "most)",
+    ),
+)
+"""Of a line: its name, the figure without which it is left out, and the line."""
 
 
 def _measure_lines(flight: FlightAnalysis) -> Iterator[str]:
-    """Yield a line a topic of `_MEASURES`, but for one whose first figure is not known or 0."""
-    texts = {f.name: flight.measures.value_text(f.name) for f in fields(flight.measures)}
-    for name, line in _MEASURES.items():
-        first = line[1 : line.index("}")]
-        if getattr(flight.measures, first):
+    measures = flight.measures
+    texts = {f.name: measures.value_text(f.name) for f in fields(measures)}
+    for name, needed, line in _MEASURES:
+        if getattr(measures, needed):
             yield from _named(name, line.format_map(texts))
 
 

@@ -79,7 +79,8 @@ class Recorder:
         self._closed = False
         # Of the thread that writes.
         self._stream = stream
-        self._mcap = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)  # type: ignore[arg-type]
+        sink: Any = stream  # of IO[bytes] the writer needs no more
+        self._mcap = Writer(sink, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
         self._mcap.start(library=f"perchctl {perchctl.__version__}")
         self._channels: dict[str, int] = {}
         self._mounts = mounts_of(profile)
