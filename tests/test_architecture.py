@@ -94,7 +94,7 @@ MOST_NAMES = {
     "faults": 6,
     "flight": 15,
     "link": 11,
-    "record": 13,
+    "record": 12,
     "mission": 27,
     "perception": 6,
     "positioning": 10,

@@ -1,7 +1,6 @@
 from .exact import from_exact as from_exact
 from .exact import json_line as json_line
 from .exact import to_exact as to_exact
-from .header import arithmetic_fingerprint as arithmetic_fingerprint
 from .header import camera_record as camera_record
 from .read import FlightLog as FlightLog
 from .read import PhaseSpan as PhaseSpan
