@@ -120,9 +120,7 @@ def test_a_changed_constant_of_the_pipeline_is_noticed(
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the switches are that processor's")
 def test_on_another_processor_it_is_near() -> None:
     """Its arithmetic is another, which is noticed."""
-    asked = (
-        "from perchctl.record.header import arithmetic_fingerprint; print(arithmetic_fingerprint())"
-    )
+    asked = "from perchctl.record import header; print(header.arithmetic_fingerprint())"
     assert _elsewhere({}, asked) != _elsewhere(ELSEWHERE, asked)
     _elsewhere(
         ELSEWHERE,
