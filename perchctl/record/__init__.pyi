@@ -8,5 +8,5 @@ from .read import log_values as log_values
 from .read import read_log as read_log
 from .recorded import recorded_pictures as recorded_pictures
 from .summary import FlightSummary as FlightSummary
-from .watch import LogWatcher as LogWatcher
+from .write import LogWatcher as LogWatcher
 from .write import path_beside as path_beside

@@ -6,9 +6,6 @@ and NaN as ``"inf"``, ``"-inf"``, ``"nan"``; a row of float64 as a list, any oth
 type and shape; an enum by its value; where a field takes one of several dataclasses, such as a
 command, the class's name stands before it. None is left out where it is the field's default.
 A field of type Any holds JSON's own types and comes back as them.
-
-`to_plain` rounds, for people and plots; `encode` makes one line of a record, the same bytes for
-the same values.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ class FlightSummary:
         )
 
     def as_record(self) -> dict[str, Any]:
-        """Return the record for `FlightLogWriter.end`, which adds what the log lacks."""
+        """Return the record for `LogWatcher.end`, which adds what the log lacks."""
         return {
             "outcome": self.outcome,
             "cause": self.cause or None,

@@ -20,7 +20,6 @@ from perchctl.flight import FlyOptions
 from perchctl.mission import FlightReport, Outcome, Phase
 from perchctl.profile import changed_profile, load_profile
 from perchctl.record import LogWatcher, exact, read_log, write
-from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers.disk import full_disk
 
@@ -43,8 +42,8 @@ class Disk:
         return self._real(fd, part)
 
 
-def opened(folder: Path, live: bool = False, **header: Any) -> FlightLogWriter:
-    return FlightLogWriter.open(folder / "f.jsonl", synthetic.header() | header, live)
+def opened(folder: Path, live: bool = False, **header: Any) -> LogWatcher:
+    return LogWatcher.open(folder / "f.jsonl", synthetic.header() | header, live)
 
 
 def test_a_full_disk_that_gets_room_again(tmp_path: Path) -> None:
@@ -143,7 +142,7 @@ def test_a_log_that_cannot_begin_leaves_nothing(
 
 
 @pytest.fixture
-def hung(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[FlightLogWriter, Disk]]:
+def hung(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[LogWatcher, Disk]]:
     """A log in real time with room for 50 records, and its disk, which hangs."""
     monkeypatch.setattr(write, "CLOSE_TIMEOUT_S", 0.2)
     monkeypatch.setattr(write, "MOST_WAITING", 50)
@@ -155,7 +154,7 @@ def hung(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Flig
     disk.gate.set()
 
 
-def test_a_disk_that_hangs_holds_up_nobody(hung: tuple[FlightLogWriter, Disk]) -> None:
+def test_a_disk_that_hangs_holds_up_nobody(hung: tuple[LogWatcher, Disk]) -> None:
     writer, disk = hung
     began_s = time.monotonic()
     for i in range(80):
@@ -171,7 +170,7 @@ def test_a_disk_that_hangs_holds_up_nobody(hung: tuple[FlightLogWriter, Disk]) -
     assert (log.summary["lost_records"], log.summary["problem"]) == (30, writer.problem)
 
 
-def test_closing_does_not_wait_for_ever(hung: tuple[FlightLogWriter, Disk]) -> None:
+def test_closing_does_not_wait_for_ever(hung: tuple[LogWatcher, Disk]) -> None:
     writer, disk = hung
     for i in range(10):
         writer.write({"t_s": 0.02 * i})

@@ -12,10 +12,10 @@ import pytest
 
 from perchctl.mission import ExternalPositions, Phase, PlannerState
 from perchctl.mission.state import BatteryOutlook
-from perchctl.record import path_beside, read_log
+from perchctl.record import LogWatcher, path_beside, read_log
 from perchctl.record.exact import to_plain
 from perchctl.record.fields import FIELDS, tick_record
-from perchctl.record.write import FlightLogWriter, log_path
+from perchctl.record.write import log_path
 from perchctl.vehicle import (
     EmergencyStop,
     ExternalPosition,
@@ -36,7 +36,7 @@ STARTED = datetime(2024, 3, 1, 14, 5, 9, tzinfo=UTC)
 def test_a_flight_comes_back(tmp_path: Path, live: bool) -> None:
     """In lockstep without a thread."""
     threads = threading.active_count()
-    writer = FlightLogWriter.open(tmp_path / "new" / "f.jsonl", synthetic.header(), live=live)
+    writer = LogWatcher.open(tmp_path / "new" / "f.jsonl", synthetic.header(), live=live)
     assert threading.active_count() == threads + live
     written = list(synthetic.ticks())
     for record in written:
@@ -68,7 +68,7 @@ def test_names_and_no_overwriting(tmp_path: Path) -> None:
     assert path.name == "flight_20240301_140509_my-profile.jsonl"
     paths = []
     for _ in range(3):
-        writer = FlightLogWriter.open(path, synthetic.header(started=STARTED))
+        writer = LogWatcher.open(path, synthetic.header(started=STARTED))
         writer.end()
         paths.append(writer.path.name)
     assert paths == [

@@ -42,9 +42,9 @@ def test_a_killed_writer_leaves_a_readable_log(tmp_path: Path) -> None:
     code = (
         "import os, sys\n"
         "from pathlib import Path\n"
-        "from perchctl.record.write import FlightLogWriter\n"
+        "from perchctl.record import LogWatcher\n"
         "from tests.helpers import log as synthetic\n"
-        "w = FlightLogWriter.open(Path(sys.argv[1]), synthetic.header(), live=True)\n"
+        "w = LogWatcher.open(Path(sys.argv[1]), synthetic.header(), live=True)\n"
         "for n, record in enumerate(synthetic.ticks()):\n"
         "    w.write(record)\n"
         "    while n == 150 and Path(sys.argv[1]).read_bytes().count(b'\\n') < 152: pass\n"

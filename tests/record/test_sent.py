@@ -17,7 +17,6 @@ from perchctl.link.sender import Sender
 from perchctl.mission import Operator, SentCommand
 from perchctl.perception import History
 from perchctl.record import LogWatcher, read_log
-from perchctl.record.write import FlightLogWriter
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers import log as synthetic
 from tests.helpers.loop_rig import HANG_AT_S, PROFILE, Clock, hung_rig
@@ -38,7 +37,7 @@ TOLD = (
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
+    writer = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header())
     left = list(TOLD)
     for tick in synthetic.ticks():
         while left and left[0].t_s < tick["t_s"]:

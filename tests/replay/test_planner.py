@@ -19,9 +19,8 @@ from perchctl.analysis.replayer import CAUTION, Replay, changed_keys
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
 from perchctl.mission import Turn, guidance, step_mission
 from perchctl.profile import Profile, changed_profile
-from perchctl.record import FlightLog, json_line, read_log
+from perchctl.record import FlightLog, LogWatcher, json_line, read_log
 from perchctl.record.header import make_header
-from perchctl.record.write import FlightLogWriter
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.commands import run
 from tests.helpers.hangs import plan_by
@@ -177,7 +176,7 @@ def test_the_header_s_profile_and_mask_are_the_flown_ones_to_the_bit(tmp_path: P
          "camera": {"source": "rtsp://me:secret@10.0.0.2/a", "latency_s": 1 / 14,
                     "mask": str(tmp_path / "mask.png")}}
     )  # fmt: skip
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", make_header(profile, uri="", source=""))
+    writer = LogWatcher.open(tmp_path / "f.jsonl", make_header(profile, uri="", source=""))
     writer.end()
     (tmp_path / "mask.png").unlink()
     log = read_log(writer.path)
