@@ -67,10 +67,9 @@ class FlightSummary:
         """Return the summary by the log's record; by its ticks where that is missing."""
         battery_v = log.column("battery_v")
         known_v = battery_v[battery_v >= NO_BATTERY_READING_V]
-        end: Mapping[str, Any] = log.summary or {
-            "outcome": "unknown",
-            "reason": _last_known(log),
-        }
+        ends = f"ends in {log.phases[-1].phase}" if log.phases else "holds no flight"
+        unknown = {"outcome": "unknown", "reason": f"the log {ends}"}
+        end: Mapping[str, Any] = log.summary or unknown
         last = log.records[-1] if log.records else {}
         battery_min_v = float(np.min(known_v)) if known_v.size else None
         return cls(
@@ -164,10 +163,3 @@ def _part_in(end: Mapping[str, Any], kind: Any, keys: Mapping[str, str]) -> Any:
     if next(iter(keys.values())) not in known:
         return None
     return kind(**{n: tuple(v) if isinstance(v, list) else v for n, v in known.items()})
-
-
-def _last_known(log: FlightLog) -> str:
-    if log.phases:
-        return f"the log ends in {log.phases[-1].phase}"
-    phases = [r["phase"] for r in log.turn_records if r.get("role") == "flown" and r.get("phase")]
-    return f"the log ends in {phases[-1]}" if phases else "the log holds no flight"
