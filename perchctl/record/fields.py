@@ -67,8 +67,6 @@ FIELDS: dict[str, str] = {
     # positions from outside, as they are sent to the vehicle; None where its decks measure them
     "pos_age_s": "of the newest position from outside that was sent, since its exposure",
     "pos_note": "why none is sent now",
-    "pos_sent": "how many were sent so far",
-    "pos_hz": "how many were sent in the last second",
     **_axes("pos_{}_m", "the newest that was sent, world of the state estimate"),
     # the camera; None in a tick without a new frame
     "frame": "number of the frame that this tick processed",
@@ -168,8 +166,6 @@ def _external_values(external: ExternalPositions | None) -> dict[str, Any]:
     return {
         "pos_age_s": external.age_s if math.isfinite(external.age_s) else None,
         "pos_note": external.problem,
-        "pos_sent": external.sent,
-        "pos_hz": external.rate_hz,
         **_xyz("pos_", external.place and external.place.position_m),
     }
 
