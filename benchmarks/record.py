@@ -114,7 +114,7 @@ def flown(frames: list[Frame], for_s: float, folder: Path) -> tuple[Times, Recor
         due_s += PERIOD_S
         time.sleep(max(0.0, due_s - time.monotonic()))
     logs[False].close()
-    recorder = logs[True]._recorder
+    recorder = logs[True].recorder
     assert recorder is not None
     ended = recorder.close()
     logs[True].close()
@@ -165,9 +165,10 @@ def main() -> int:
     for form, frames in zip(FORMS, ([as_jpeg(f) for f in plain], plain), strict=True):
         with tempfile.TemporaryDirectory() as folder:
             took, ended = flown(frames, for_s, Path(folder))
-            size = ended.path.stat().st_size
+            size = (Path(folder) / ended.recording).stat().st_size
         ends.append(
-            f"{form}: {ended.pictures} pictures, {ended.missing} missing, {size / 1e6:.0f} MB"
+            f"{form}: {ended.pictures} pictures, {ended.pictures_missing} missing, "
+            f"{size / 1e6:.0f} MB"
         )
         for part in PARTS:
             without, recorded = (percentiles(took[part, record]) for record in (False, True))

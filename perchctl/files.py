@@ -25,17 +25,12 @@ FORMAT = "the format that is written"
 _BEGINNINGS = (
     (b"\x89PNG", "a picture"),
     (b"\xff\xd8\xff", "a picture"),
-    (b"GIF8", "a picture"),
     (b"%PDF", "a PDF"),
     (b"\x89MCAP0", "a recording"),
-    (b"\x1f\x8b", "a file packed by gzip"),
-    (b"PK\x03\x04", "a ZIP archive"),
-    (b"<!DOCTYPE html", "a page for a browser"),
 )
 _KEYS = (  # of a YAML file, at the beginning of a line
     (r"image_width|camera_matrix|distortion_model|cam0", "a camera calibration"),
     (r"extends|vehicle|planner|safety|positioning", "a profile"),
-    (r"weights", "a file of merge weights"),
 )
 _READ_BYTES = 4096
 
@@ -54,9 +49,6 @@ def file_kind(path: Path) -> str:
         if head[4:8] == b"ftyp":
             return "a video"
         text = head.decode("utf-8", errors="ignore")
-        if text.startswith("{"):
-            is_campaign = '"perchctl-campaign"' in text.partition("\n")[0]
-            return "a campaign's results" if is_campaign else "a file of JSON lines"
         for keys, kind in _KEYS:
             if re.search(rf"^(?:{keys})\s*:", text, re.MULTILINE):
                 return kind

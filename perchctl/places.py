@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import Literal
 
 import platformdirs
 
@@ -19,7 +20,7 @@ def data_folder(kind: str) -> Path:
 
 def data_file(kind: str, name: str) -> Path | None:
     """Return a shipped or user file by name (with or without .yaml), or None."""
-    for folder in (user_config_folder() / kind, data_folder(kind)):
+    for folder in (user_folder("config") / kind, data_folder(kind)):
         for candidate in (folder / name, folder / f"{name}.yaml"):
             if candidate.is_file():
                 return candidate
@@ -28,7 +29,7 @@ def data_file(kind: str, name: str) -> Path | None:
 
 def file_names(kind: str) -> list[str]:
     """Return the names of the files of that kind that can be named without a path."""
-    folders = (data_folder(kind), user_config_folder() / kind)
+    folders = (data_folder(kind), user_folder("config") / kind)
     return sorted({p.stem for f in folders if f.is_dir() for p in f.glob("*.yaml")})
 
 
@@ -42,24 +43,10 @@ def is_shipped_example(path: Path) -> bool:
         return False
 
 
-def user_config_folder() -> Path:
-    """Return the folder of the user's own profiles and calibrations, by the XDG rules."""
-    return Path(platformdirs.user_config_dir("perchctl", appauthor=False))
-
-
-def user_runtime_folder() -> Path:
-    """Return the folder for what lives no longer than a session. It is not made, and may not
-    exist."""
+def user_folder(kind: Literal["config", "cache", "state", "runtime"]) -> Path:
+    """Return a folder of the user's by the XDG rules: for own profiles and calibrations, for what
+    can be made anew, for results, or for what lives no longer than a session. It is not made."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # where the system names none, another is taken
-        return Path(platformdirs.user_runtime_dir("perchctl", appauthor=False))
-
-
-def user_cache_folder() -> Path:
-    """Return the folder for what can be made anew, by the XDG rules."""
-    return Path(platformdirs.user_cache_dir("perchctl", appauthor=False))
-
-
-def user_state_folder() -> Path:
-    """Return the folder for results that are not made anew by themselves."""
-    return Path(platformdirs.user_state_dir("perchctl", appauthor=False))
+        find = getattr(platformdirs, f"user_{kind}_dir")
+        return Path(find("perchctl", appauthor=False))

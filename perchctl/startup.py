@@ -18,14 +18,8 @@ SENTENCE = "Ctrl-C"
 
 def leave_at_ctrl_c() -> None:
     """Leave at Ctrl-C from now on, unless it is ignored or somebody else's already."""
-    if _is_main() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
-
-
-def _is_main() -> bool:
-    """Return True if this is the thread that may have signals."""
-    threading = sys.modules.get("threading")
-    return threading is None or threading.current_thread() is threading.main_thread()
 
 
 def restore_ctrl_c() -> None:

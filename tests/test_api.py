@@ -17,11 +17,6 @@ def test_a_public_name_is_there_and_says_what_it_is(name: str) -> None:
     assert name in dir(perchctl)
 
 
-def test_an_unknown_name_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="make_pipelines"):
-        perchctl.make_pipelines  # noqa: B018
-
-
 def test_the_package_itself_loads_nothing_heavy() -> None:
     code = "import sys, perchctl; print([m for m in ('numpy', 'cv2', 'cflib') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -34,11 +34,6 @@ def test_the_newest_is_shown_and_named(words: list[str], logs: Path) -> None:
     assert json.loads(run("log", *words, "--json").stdout)["log"] == NEW
 
 
-def test_a_folder_stands_for_its_newest_log(logs: Path) -> None:
-    synthetic.write(Path("other/flight_x.jsonl"), summary=synthetic.SUMMARY, most=3)
-    assert run("log", "other").stdout.startswith("PERCHED")
-
-
 def test_a_table_goes_beside_the_log_or_to_a_file(logs: Path) -> None:
     said = run("log", "export", OLD)
     assert said.stdout.startswith("export:    perchctl-logs/flight_old.csv (60 rows, ")
@@ -81,13 +76,7 @@ def test_the_same_flight_is_drawn_to_the_same_bytes(logs: Path, name: str) -> No
 
 def test_two_flights_are_compared(logs: Path) -> None:
     assert "their profiles are the same" in run("log", "compare", OLD, NEW).stdout
-    told = json.loads(run("log", "compare", OLD, NEW, "--json").stdout)
-    assert told["differences"]["turns"] == -30
-    assert told["profile"] == {}
-
-
-BAD: dict[str, dict[str, object]] = {"exposure": {"frame_t_s": "x"}, "age": {"tel_age_s": "q"}}
-"""Records, by what in them no flight writes."""
+    assert json.loads(run("log", "compare", OLD, NEW, "--json").stdout)["profile"] == {}
 
 
 @pytest.mark.parametrize(
@@ -97,16 +86,13 @@ BAD: dict[str, dict[str, object]] = {"exposure": {"frame_t_s": "x"}, "age": {"te
         (["show", "empty"], 20, "holds no flight log"),
         (["replay", "flight_1.jsonl", "-p", "smi"], 20, "'smi'"),
         (["show", "a.csv"], 30, "not a flight log"),
-        (["plot", "a.csv"], 30, "not a flight log"),
         (["plot", "bare.jsonl"], 30, "nothing to plot"),
         (["plot", "flight_1.jsonl", "-o", "x.gif"], 30, "must end in"),
         (["export", "bare.jsonl"], 30, "nothing to export"),
         (["show", "damaged.jsonl"], 30, "battery_v is not a number"),
         (["show", "odd.jsonl"], 30, "no flight writes"),
-        (["report", "bad_exposure.jsonl"], 30, "no flight writes"),
-        (["report", "bad_age.jsonl"], 30, "tel_age_s is not a number"),
+        (["report", "bad.jsonl"], 30, "tel_age_s is not a number"),
         (["export", "bare.jsonl", "-o", "x.mcap"], 30, "must end in .csv"),
-        (["compare", "a.csv", "bare.jsonl"], 30, "not a flight log"),
         (["report", "bare.jsonl", "-o", "bare.jsonl"], 2, "one of the logs"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -119,10 +105,7 @@ def test_what_goes_wrong_is_one_sentence(words: list[str], code: int, said: str)
     Path("odd.jsonl").write_bytes(good.replace(b'"duration_s":18.6', b'"duration_s":"x"'))
     Path("damaged.jsonl").write_bytes(good.replace(b'"battery_v":3.', b'"battery_v":"a","y":3.'))
     lines = synthetic.write(Path("whole.jsonl"), summary=synthetic.SUMMARY, most=200).read_bytes()
-    *before, tick, end = lines.splitlines(keepends=True)
-    for name, bad in BAD.items():
-        changed = json.dumps(json.loads(tick) | bad).encode() + b"\n"
-        Path(f"bad_{name}.jsonl").write_bytes(b"".join([*before, tick, changed, end]))
+    Path("bad.jsonl").write_bytes(lines.replace(b'"tel_age_s":0.', b'"tel_age_s":"q","y":0.'))
     result = run("log", *words)
     assert (result.code, result.stdout) == (code, "")
     assert said in result.complaint

@@ -22,24 +22,15 @@ class Comparison:
 
     @cached_property
     def phases(self) -> list[dict[str, Any]]:
-        """How long, and how often, each flight was in each phase that one of them flew through."""
+        """How long each flight was in each phase that one of them flew through."""
         names = dict.fromkeys(stay.phase for flight in self.flights for stay in flight.log.phases)
         found = []
         for name in names:
-            a, b = (
-                [stay.duration_s for stay in flight.log.phases if stay.phase == name]
+            a_s, b_s = (
+                sum(stay.duration_s for stay in flight.log.phases if stay.phase == name)
                 for flight in self.flights
             )
-            found.append(
-                {
-                    "phase": name,
-                    "a_s": round(sum(a), 6),
-                    "b_s": round(sum(b), 6),
-                    "difference_s": round(sum(b) - sum(a), 6),
-                    "a_visits": len(a),
-                    "b_visits": len(b),
-                }
-            )
+            found.append({"phase": name, "a_s": round(a_s, 6), "b_s": round(b_s, 6)})
         return found
 
     @cached_property
@@ -74,11 +65,7 @@ class Comparison:
     def _lines(self) -> Iterator[str]:
         for name, flight in zip("AB", self.flights, strict=True):
             log, end = flight.log, flight.summary
-            seed = log.header.get("seed")
-            which = f"profile {log.profile_name or '?'}" + (
-                "" if seed is None else f", seed {seed}"
-            )
-            yield from hung(f"{name}:  ", f"{log.path} ({which})")
+            yield from hung(f"{name}:  ", f"{log.path} ({log.setup_text})")
             yield from hung("    ", f"{end.outcome.upper()}: {end.reason}".rstrip(": "))
         yield ""
         yield _row("", "A", "B", "B - A")
@@ -87,18 +74,12 @@ class Comparison:
             yield ""
             yield "time in each phase [s]"
         for each in self.phases:
-            visits = each["a_visits"], each["b_visits"]
-            often = "" if visits == (1, 1) else f" ({visits[0]}x, {visits[1]}x)"
-            yield _row(
-                f"  {plain(each['phase'])}{often}",
-                f"{each['a_s']:.2f}",
-                f"{each['b_s']:.2f}",
-                f"{each['difference_s']:+.2f}",
-            )
+            a_s, b_s = each["a_s"], each["b_s"]
+            yield _row(f"  {plain(each['phase'])}", f"{a_s:.2f}", f"{b_s:.2f}", f"{b_s - a_s:+.2f}")
         yield ""
         yield "profile keys that differ, A and B" if self.profile else "their profiles are the same"
         for key, (a, b) in self.profile.items():
-            yield from hung(f"  {plain(key):<{_NAME - 2}}  ", f"{_value(a)}  {_value(b)}")
+            yield from hung(f"  {plain(key):<{_NAME - 2}}  ", f"{a}  {b}")
 
     def _measure_rows(self) -> Iterator[str]:
         a, b = (flight.measures for flight in self.flights)
@@ -124,10 +105,6 @@ def _flight_record(flight: FlightAnalysis) -> dict[str, Any]:
 
 def _row(name: str, a: str, b: str, difference: str) -> str:
     return f"{name:<{_NAME}}{a:>{_CELL}}{b:>{_CELL}}{difference:>{_CELL}}".rstrip()
-
-
-def _value(value: Any) -> str:
-    return "none" if value is None else str(value)
 
 
 def profile_differences(one: Any, other: Any) -> dict[str, tuple[Any, Any]]:

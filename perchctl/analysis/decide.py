@@ -10,7 +10,6 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 from perchctl.errors import InvalidValue
@@ -25,36 +24,19 @@ FieldDifference = tuple[str, Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class Decided:
-    """One turn, decided again: `state` and `command` are the replay's, what was flown is in
-    `turn`. `tick` counts the turns that were flown, from 0. `error` names what the planner raised:
-    then the state is the one before, None at the first turn, and there is no command."""
+    """One turn, decided again.
+
+    Attributes:
+        tick: how many turns were flown before it.
+        difference: the first field in which it differs; None without one. A log before version 4
+            does not hold what the planner raised and has no difference there.
+        error: the name of what the planner raised, None where it did not.
+    """
 
     tick: int
     turn: Turn
-    observation: Observation
-    state: PlannerState | None
-    command: Command | None
+    difference: FieldDifference | None
     error: str | None = None
-
-    @cached_property
-    def difference(self) -> FieldDifference | None:
-        """The first field in which the turn differs; None without one. Where the planner raised,
-        that is what it raised; a log before version 4 does not hold that, and has no difference."""
-        turn, state = self.turn, self.state
-        if turn.role == "failed" or self.error is not None:
-            return first_differing("error", turn.error, self.error)
-        if turn.command is None or state is None:
-            return None
-        replayed = {
-            "phase": state.phase,
-            "row": state.row,
-            "held": bool(state.hold),
-            "attempts": state.attempts,
-            "command": self.command,
-        }
-        if turn.reason is not None:
-            replayed |= {"outcome": state.outcome, "reason": state.reason}
-        return first_differing_of((n, getattr(turn, n), value) for n, value in replayed.items())
 
 
 def whole_turns(log: FlightLog) -> tuple[list[Turn], str]:
@@ -92,11 +74,29 @@ def decide(
         try:
             new, command = step_mission(state, obs, profile)
         except Exception as error:
-            yield Decided(tick, turn, obs, state, None, type(error).__name__)
+            name = type(error).__name__
+            yield Decided(tick, turn, first_differing("error", turn.error, name), name)
             return  # what came after it cannot be decided
-        yield Decided(tick, turn, obs, new, command)
+        yield Decided(tick, turn, _difference(turn, new, command))
         if turn.role == "flown":
             state, tick = new, tick + 1
+
+
+def _difference(turn: Turn, state: PlannerState, command: Command) -> FieldDifference | None:
+    if turn.role == "failed":
+        return first_differing("error", turn.error, None)
+    if turn.command is None:
+        return None
+    replayed = {
+        "phase": state.phase,
+        "row": state.row,
+        "held": bool(state.hold),
+        "attempts": state.attempts,
+        "command": command,
+    }
+    if turn.reason is not None:  # not in a log before version 4
+        replayed |= {"outcome": state.outcome, "reason": state.reason}
+    return first_differing_of((n, getattr(turn, n), value) for n, value in replayed.items())
 
 
 # --- In which field two values first differ, to the bit: 0.0 is not -0.0, and NaN is NaN ---

@@ -15,23 +15,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from perchctl.analysis.flight import FlightAnalysis
+from perchctl.analysis.plot import draw_thrust
 from perchctl.errors import InvalidValue
 from perchctl.files import cannot_be_written, whole_file
-from perchctl.geometry import Array, rot_z, rotation_from_rpy
-from perchctl.plot import (
-    BLACK,
-    BLUE,
-    GREY,
-    GRID,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    new_figure,
-)
-from perchctl.record import FlightLog
+from perchctl.geometry import Array
+from perchctl.plot import BLACK, BLUE, GREY, GRID, ORANGE, PURPLE, SKY, VERMILLION, new_figure
 
-FULL_THRUST_PERCENT = 1 / 655.35
 ARM_M = 0.046
 """From the vehicle's centre to a motor."""
 BESIDE_M, ABOVE_M = 0.25, 0.12
@@ -41,8 +30,8 @@ LEAST_ASIDE_M = 0.05
 LAST_S = 2.0
 """The last picture stays for so long."""
 WIDTH_IN, HEIGHT_IN = 9.6, 5.4
-GIF_GREYS, GIF_TINTS = 64, 4
-"""The colours of a GIF: greys, and so many mixtures of each line's colour with white."""
+SIZE_STEP_PX = 32
+"""Of the width, so that width and height are even, as H.264 needs them."""
 Rgb = NDArray[np.uint8]
 Recorded = Iterator[tuple[int, float, NDArray[np.uint8]]]
 """Recorded pictures: number, time of exposure, grey (height, width)."""
@@ -55,12 +44,11 @@ def write_film(
     rate_hz: float = 15.0,
     width_px: int = 960,
 ) -> int:
-    """Write the flight as a film (.mp4 or .gif), and return its number of pictures.
+    """Write the flight as a film (.mp4 or .gif) at its own pace, and return its number of pictures.
 
     Args:
         pictures: the recorded pictures, oldest first; None without a recording.
-        rate_hz: pictures a second of flight, of a GIF the next that is whole hundredths of a
-            second; the film runs at the flight's own pace.
+        rate_hz: pictures a second of flight; their period is whole hundredths of a second.
         width_px: width of the film; its height is 9/16 of it.
 
     Errors: InvalidValue for a log without ticks, a recording that cannot be read, or a file that
@@ -68,58 +56,41 @@ def write_film(
     """
     if not flight.log.records:
         raise InvalidValue(f"{flight.log.path}: the log holds no ticks, there is nothing to film")
-    period = 1 / Fraction(rate_hz).limit_denominator(1001)
-    if path.suffix.lower() == ".gif":
-        period = Fraction(max(2, round(100 * period)), 100)
+    period = Fraction(max(2, round(100 / rate_hz)), 100)
     times_s = np.arange(0.0, flight.log.end_s + LAST_S, float(period))
+    drawn = _film_pictures(flight, pictures or iter(()), times_s, width_px)
+    write = _write_gif if path.suffix.lower() == ".gif" else _write_video
     try:
         with whole_file(path) as part:
-            _write_video(_film_pictures(flight, pictures, times_s, width_px), part, 1 / period)
+            write(drawn, part, period)
     except OSError as error:
         raise cannot_be_written(path, error) from None
     return len(times_s)
 
 
 def _film_pictures(
-    flight: FlightAnalysis, recorded: Recorded | None, times_s: Array, width_px: int
+    flight: FlightAnalysis, recorded: Recorded, times_s: Array, width_px: int
 ) -> Iterator[Rgb]:
+    """Draw the newest tick at each time, with the newest recorded picture by then."""
     stage = _Stage(flight, width_px)
-    shown = _Shown(recorded)
+    coming, image, newest = next(recorded, None), None, flight.log.records[0]
     for t_s in times_s:
         index = flight.log.index_at(float(t_s))
-        yield stage.drawn(index, *shown.at(flight.log.records[index]))
-
-
-class _Shown:
-    """The recorded picture that belongs to a tick, with the corners found in it."""
-
-    def __init__(self, pictures: Recorded | None) -> None:
-        self._coming: Recorded = iter(()) if pictures is None else pictures
-        self._next = next(self._coming, None)
-        self._image = None if self._next is None else np.asarray(self._next[2], dtype=float)
-        self._corners: dict[str, Array] = {}
-
-    def at(self, record: dict[str, Any]) -> tuple[Array | None, dict[str, Array]]:
-        """Return the newest picture of this tick or before, and its markers' corners (4, 2)."""
-        number = record.get("frame")
-        if number is not None:
-            while self._next is not None and self._next[0] <= number:
-                self._image = np.asarray(self._next[2], dtype=float)
-                self._next = next(self._coming, None)
-            self._corners = {
-                key: np.reshape(record[key], (4, 2))
-                for key in ("large_px", "small_px")
-                if record.get(key) is not None
-            }
-        return self._image, self._corners
+        record = flight.log.records[index]
+        if record.get("frame") is not None:
+            newest = record
+            while coming is not None and coming[0] <= record["frame"]:
+                image, coming = coming[2], next(recorded, None)
+        yield stage.drawn(index, image, newest)
 
 
 class _Stage:
     """The figure: what stays is drawn once, what moves is drawn for each picture."""
 
     def __init__(self, flight: FlightAnalysis, width_px: int) -> None:
-        self._flight, self._ways = flight, Ways(flight)
-        self._figure: Figure = new_figure(WIDTH_IN, HEIGHT_IN, width_px / WIDTH_IN)
+        self._flight = flight
+        dpi = width_px // SIZE_STEP_PX * SIZE_STEP_PX / WIDTH_IN
+        self._figure: Figure = new_figure(WIDTH_IN, HEIGHT_IN, dpi)
         grid = self._figure.add_gridspec(2, 2, height_ratios=(2.6, 1.0), width_ratios=(2.0, 1.0))
         self._moving: list[Any] = []
         self._set_picture(self._figure.add_subplot(grid[0, 0]))
@@ -133,9 +104,21 @@ class _Stage:
         self._canvas.draw()
         self._still = self._canvas.copy_from_bbox(self._figure.bbox)
 
-    def drawn(self, index: int, image: Array | None, corners: dict[str, Array]) -> Rgb:
-        """Return the picture of a tick, (height, width, 3)."""
-        self._draw_frame(index, image, corners)
+    def drawn(self, index: int, image: Rgb | None, newest: dict[str, Any]) -> Rgb:
+        """Return the picture of a tick, (height, width, 3); `newest` is the record of the newest
+        frame, with its markers' corners."""
+        record, t_s = self._flight.log.records[index], float(self._flight.log.t_s[index])
+        if image is not None:
+            self._image.set_data(image)
+            for key, line in self._outlines.items():
+                corners = np.reshape(newest.get(key) or [], (-1, 2))
+                line.set_data(*np.vstack([corners, corners[:1]]).T)
+        x_m, z_m = self._place_m[index]
+        self._trail.set_data(*self._place_m[: index + 1].T)
+        self._arms.set_data([x_m - ARM_M, x_m + ARM_M], [z_m, z_m])
+        self._gear.set_data([x_m, x_m], [z_m, z_m + self._gear_m])
+        self._cursor.set_xdata([t_s, t_s])
+        self._title.set_text(f"{t_s:.1f} s   {record.get('phase') or ''}")
         self._canvas.restore_region(self._still)
         for artist in self._moving:
             (artist.axes or self._figure).draw_artist(artist)
@@ -146,8 +129,8 @@ class _Stage:
         self._moving.append(artist)
         return artist
 
-    def _line(self, ax: Axes, style: str = "-", **more: Any) -> Any:
-        return self._add(ax.plot([], [], style, solid_capstyle="butt", **more)[0])
+    def _line(self, ax: Axes, **more: Any) -> Any:
+        return self._add(ax.plot([], [], solid_capstyle="butt", **more)[0])
 
     def _set_picture(self, ax: Axes) -> None:
         ax.set_axis_off()
@@ -164,26 +147,25 @@ class _Stage:
         }
 
     def _set_side_view(self, ax: Axes) -> None:
-        ways = self._ways
+        self._place_m, target_z_m = side_view(self._flight)
+        profile = self._flight.log.flown_profile
+        self._gear_m = profile.vehicle.gear_body_m[2]
+        half_m = 0.5 * profile.target.large.side_m
+        beside_m, height_m = self._place_m.T
         ax.set_aspect("equal", adjustable="box")
-        low_m, high_m = ways.span_m
-        ax.set_xlim(low_m - BESIDE_M, high_m + BESIDE_M)
-        ax.set_ylim(0.0, ways.top_m + ABOVE_M)
+        ax.set_xlim(
+            min(-half_m, np.nanmin(beside_m)) - BESIDE_M,
+            max(half_m, np.nanmax(beside_m)) + BESIDE_M,
+        )
+        ax.set_ylim(0.0, max(np.nanmax(height_m) + self._gear_m, target_z_m or 0.0) + ABOVE_M)
         ax.set_xticks([0.0])
         ax.set_xlabel("beside the target [m]")
         ax.set_ylabel("height [m]")
-        if ways.target_z_m is not None:
-            ax.axhline(ways.target_z_m, color=GREY, linewidth=1.0)
-            half_m = 0.5 * ways.large_side_m
-            ax.plot(
-                [-half_m, half_m],
-                [ways.target_z_m] * 2,
-                color=BLACK,
-                linewidth=4.0,
-                solid_capstyle="butt",
-            )
+        if target_z_m is not None:
+            ax.axhline(target_z_m, color=GREY, linewidth=1.0)
+            sheet = ax.plot([-half_m, half_m], [target_z_m] * 2, color=BLACK, linewidth=4.0)
+            sheet[0].set_solid_capstyle("butt")
         self._trail = self._line(ax, color=SKY, linewidth=1.0)
-        self._setpoint = self._line(ax, "+", color=VERMILLION, markersize=7)
         self._arms = self._line(ax, color=BLUE, linewidth=3.0)
         self._gear = self._line(ax, color=VERMILLION, linewidth=1.8)
 
@@ -196,146 +178,70 @@ class _Stage:
         ax.set_xlim(0.0, max(flight.log.end_s, 0.1))
         ax.set_xlabel("time [s]")
         ax.grid(True, color=GRID, linewidth=0.6)
-        thrust_ax: Axes = ax.twinx()
-        thrust = flight.log.column("thrust") * FULL_THRUST_PERCENT
-        thrust_ax.plot(flight.log.t_s, thrust, color=ORANGE, linewidth=1.0)
+        thrust_ax = draw_thrust(ax, flight)
         thrust_ax.set_ylabel("thrust [%]", color=ORANGE)
-        thrust_ax.set_ylim(0.0, 105.0)
         self._cursor = self._add(thrust_ax.axvline(0.0, color=BLACK, linewidth=1.0))
 
-    def _draw_frame(self, index: int, image: Array | None, corners: dict[str, Array]) -> None:
-        flight, ways = self._flight, self._ways
-        record, t_s = flight.log.records[index], float(flight.log.t_s[index])
-        if image is not None:
-            self._image.set_data(image)
-            for key, line in self._outlines.items():
-                outline = corners.get(key, np.empty((0, 2)))
-                line.set_data(*np.vstack([outline, outline[:1]]).T)
-        place = ways.place_m[index]
-        arms, gear = ways.body_m(index)
-        self._trail.set_data(*ways.place_m[: index + 1].T)
-        self._arms.set_data(*(place + arms).T)
-        self._gear.set_data(*np.array([place, place + gear]).T)
-        self._setpoint.set_data(*ways.setpoint_m[index : index + 1].T)
-        self._cursor.set_xdata([t_s, t_s])
-        text = f"{t_s:.1f} s   {record.get('phase') or ''}"
-        if record.get("hold"):
-            text += " (held)"
-        if image is None:
-            text += "   (no recorded picture)"
-        self._title.set_text(text)
 
-
-class Ways:
-    """Where everything is in the side view: metres beside the target, and above the floor.
-
-    The view's plane is vertical and holds the target and the place of take-off. Everything is shown
-    relative to the target as it was estimated then.
-
-    Attributes:
-        place_m: the vehicle's centre in each tick, (n, 2); `setpoint_m`: its setpoint.
-        target_z_m: the target's height; None where it was never seen.
-        span_m: from where to where the view has to show; `top_m`: and up to where.
-    """
-
-    def __init__(self, flight: FlightAnalysis) -> None:
-        log = flight.log
-        profile = log.flown_profile
-        body_m = _columns(log, "{}_m")
-        if not np.isfinite(body_m.sum(axis=1)).any():
-            raise InvalidValue(f"{log.path}: the log knows no position, there is nothing to film")
-        self.large_side_m = profile.target.large.side_m
-        self._gear_body_m = np.array(profile.vehicle.gear_body_m)
-        self._angles_rad = np.column_stack(
-            [log.column(f"{name}_rad") for name in ("roll", "pitch", "yaw")]
-        )
-        targets_m = _filled(_columns(log, "t{}_m"))
-        is_setpoint = np.array([kind == "position" for kind in log.texts("cmd")])
-        setpoints_m = np.where(is_setpoint[:, None], _columns(log, "cmd_{}_m"), np.nan)
-        ground_m = float(_filled(body_m)[0, 2])
-        known = np.isfinite(targets_m).all()
-        self.target_z_m = float(np.median(targets_m[:, 2])) - ground_m if known else None
-        origin_m = targets_m if known else np.array([*_filled(body_m)[0, :2], ground_m])
-        above_m = self.target_z_m or 0.0
-        start = (body_m - origin_m)[0, :2]
-        length_m = float(np.hypot(*start))
-        self._axis = start / length_m if length_m > LEAST_ASIDE_M else np.array([1.0, 0.0])
-        self.place_m = self._seen(body_m - origin_m, above_m)
-        if known:  # nothing is above the sheet; an estimate of a vehicle that hangs drifts
-            highest_m = above_m - float(self._gear_body_m[2])
-            self.place_m[:, 1] = np.minimum(self.place_m[:, 1], highest_m)
-        self.setpoint_m = self._seen(setpoints_m - origin_m, above_m)
-        half_m = 0.5 * self.large_side_m
-        beside_m, height_m = self.place_m.T
-        self.span_m = min(-half_m, np.nanmin(beside_m)), max(half_m, np.nanmax(beside_m))
-        self.top_m = max(float(np.nanmax(height_m)) + float(self._gear_body_m[2]), above_m)
-
-    def body_m(self, index: int) -> tuple[Array, Array]:
-        """Return both arms' ends (2, 2) and the gear's tip (2,) from the vehicle's centre."""
-        roll, pitch, yaw = np.nan_to_num(self._angles_rad[index])
-        R_world_body = rotation_from_rpy(roll, pitch, yaw)
-        axis = np.append(self._axis, 0.0)
-        arm = R_world_body @ rot_z(yaw).T @ (ARM_M * axis)
-        end = np.array([arm @ axis, arm[2]])
-        gear = R_world_body @ self._gear_body_m
-        return np.array([-end, end]), np.array([gear @ axis, gear[2]])
-
-    def _seen(self, points_m: Array, above_m: float) -> Array:
-        return np.column_stack([points_m[:, :2] @ self._axis, points_m[:, 2] + above_m])
-
-
-def _columns(log: FlightLog, name: str) -> Array:
-    return np.column_stack([log.column(name.format(axis)) for axis in "xyz"])
-
-
-def _filled(points_m: Array) -> Array:
-    """Return the points, (n, 3), with each unknown one as the last known, or the first known."""
-    known = np.isfinite(points_m.sum(axis=1))
-    if not known.any():
-        return points_m
-    last = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
-    filled: Array = points_m[np.where(last < 0, np.argmax(known), last)]
-    return filled
+def side_view(flight: FlightAnalysis) -> tuple[Array, float | None]:
+    """Return the vehicle's centre in each tick, (n, 2), and the target's height, None where it was
+    never seen: metres beside the target and above the ground, in the vertical plane that holds
+    the target and the place of take-off. Errors: InvalidValue for a log without a position."""
+    log = flight.log
+    body_m, targets_m = (
+        np.column_stack([log.column(f"{prefix}{axis}_m") for axis in "xyz"]) for prefix in ("", "t")
+    )
+    known_m = body_m[np.isfinite(body_m).all(axis=1)]
+    seen_m = targets_m[np.isfinite(targets_m).all(axis=1)]
+    if not known_m.size:
+        raise InvalidValue(f"{log.path}: the log knows no position, there is nothing to film")
+    start_m = known_m[0]
+    target_m = seen_m[-1] if seen_m.size else start_m
+    aside_m = start_m[:2] - target_m[:2]
+    length_m = float(np.hypot(*aside_m))
+    axis = aside_m / length_m if length_m > LEAST_ASIDE_M else np.array([1.0, 0.0])
+    place_m = np.column_stack([(body_m - target_m)[:, :2] @ axis, body_m[:, 2] - start_m[2]])
+    if not seen_m.size:
+        return place_m, None
+    target_z_m = float(target_m[2] - start_m[2])
+    # Nothing is above the sheet; an estimate of a vehicle that hangs drifts.
+    highest_m = target_z_m - log.flown_profile.vehicle.gear_body_m[2]
+    place_m[:, 1] = np.minimum(place_m[:, 1], highest_m)
+    return place_m, target_z_m
 
 
 # --- The file ---------------------------------------------------------
 
 
-def _write_video(pictures: Iterator[Rgb], path: Path, rate: Fraction) -> None:
-    """Write the pictures one by one: H.264, which browsers play, or an animated GIF."""
+def _write_video(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
+    """Write the pictures one by one as H.264, which browsers play."""
     import av
 
-    is_gif = path.suffix.lower() == ".gif"
-    first = next(pictures)
-    height, width = (size // 2 * 2 for size in first.shape[:2])  # H.264 needs even ones
-    with av.open(str(path), "w", options={} if is_gif else {"movflags": "faststart"}) as video:
-        if is_gif:
-            stream = video.add_stream("gif", rate)
-        else:
-            stream = video.add_stream("libx264", rate, options={"preset": "veryfast", "crf": "23"})
-        stream.pix_fmt = "pal8" if is_gif else "yuv420p"
-        stream.height, stream.width = height, width
+    with av.open(str(path), "w", options={"movflags": "faststart"}) as video:
+        options = {"preset": "veryfast", "crf": "23"}
+        stream = video.add_stream("libx264", 1 / period, options=options)
+        stream.pix_fmt = "yuv420p"
+        first = next(pictures)
+        stream.height, stream.width = first.shape[:2]
         for picture in chain([first], pictures):
-            even = picture[:height, :width]
-            frame = _gif_frame(even) if is_gif else av.VideoFrame.from_ndarray(even, "rgb24")
-            video.mux(stream.encode(frame))
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
         video.mux(stream.encode(None))
 
 
-def _gif_frame(picture: Rgb) -> Any:
-    """Return a picture in the one palette of a GIF, so that what stands still costs nothing."""
-    import av
+def _write_gif(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
+    """Write an animated GIF in one palette of greys and the lines' colours with white, so that
+    what stands still costs nothing."""
     from PIL import Image
 
-    greys = np.repeat(np.linspace(0.0, 255.0, GIF_GREYS)[:, None], 3, axis=1)
-    shares = np.linspace(1.0, 0.25, GIF_TINTS)[:, None]
-    lines = [255.0 * np.array(to_rgb(c)) for c in (SKY, BLUE, ORANGE, PURPLE, VERMILLION)]
-    tints = [shares * line + 255.0 * (1.0 - shares) for line in lines]
-    rgb = np.rint(np.vstack([greys, *tints])).astype(np.uint8)
+    greys = np.repeat(np.linspace(0.0, 255.0, 64)[:, None], 3, axis=1)
+    lines = 255.0 * np.array([to_rgb(c) for c in (SKY, BLUE, ORANGE, PURPLE, VERMILLION)])
+    tints = [255.0 - share * (255.0 - lines) for share in (1.0, 0.75, 0.5, 0.25)]
     palette = Image.new("P", (1, 1))
-    palette.putpalette(rgb.tobytes())
-    indices = Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
-    argb = np.zeros((256, 4), np.uint8)
-    argb[:, 0] = 255
-    argb[: len(rgb), 1:] = rgb
-    return av.VideoFrame.from_ndarray((np.array(indices), argb), format="pal8")  # type: ignore[arg-type]
+    palette.putpalette(np.rint(np.vstack([greys, *tints])).astype(np.uint8).tobytes())
+    images = (
+        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
+        for picture in pictures
+    )
+    first = next(images)
+    duration_ms = int(1000 * period)
+    first.save(path, save_all=True, append_images=images, duration=duration_ms, loop=0)

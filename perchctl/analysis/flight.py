@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -15,6 +15,7 @@ import numpy as np
 
 from perchctl.analysis.sight import Frames, Loss, frames_of, losses_of, percentile
 from perchctl.geometry import Array
+from perchctl.mission import SentCommand
 from perchctl.record import FlightLog, FlightSummary, PhaseSpan
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -69,8 +70,6 @@ class Measures:
     frame_age_s: float | None = _number("frames, median age", "ms", 1e3, 0)
     frame_gaps: int | None = _number("gaps without a frame")
     frame_gaps_s: float | None = _number("time in such gaps", "s", digits=2)
-    frame_gap_longest_s: float | None = _number("longest such gap", "s", digits=2)
-    corner_rms_px: float | None = _number("corners' misfit, median", "px", digits=2)
     turns: int | None = _number("turns of the loop")
     late_p99_s: float | None = _number("turn late, 99 %", "ms", 1e3, 1)
     telemetry_age_p99_s: float | None = _number("telemetry's age, 99 %", "ms", 1e3, 0)
@@ -184,8 +183,6 @@ class FlightAnalysis:
             frame_age_s=_known(frames.age_s),
             frame_gaps=len(gaps_s),
             frame_gaps_s=float(np.sum(gaps_s)),
-            frame_gap_longest_s=float(np.max(gaps_s)) if gaps_s.size else None,
-            corner_rms_px=_known(frames.misfit_px),
             turns=len(log.records),
             late_p99_s=_known(percentile(log.column("late_s"), 99)),
             telemetry_age_p99_s=_known(percentile(log.column("tel_age_s"), 99)),
@@ -235,19 +232,14 @@ def _known(value: float) -> float | None:
 
 APART_S = 2.0
 """Commands of one sender that are farther apart are two goes."""
-_TELLS = {
-    "position": "position setpoints",
-    "thrust": "raw thrust",
-    "land": "landing ordered",
-    "stop": "motors stopped",
-    "emergency": "motors cut",
-}
+_BETWEEN = re.compile(r"(?<=[a-z])(?=[A-Z])")
+"""Two words of a class's name."""
 
 
 @dataclass(frozen=True)
 class Takeover:
     """What one sender sent in one go. Times are since the flight's first turn; `commands` counts
-    the commands by their name in a tick's `cmd`, in the order of their first."""
+    the commands by their kind, such as ``position setpoint``, in the order of their first."""
 
     by: str
     start_s: float
@@ -256,24 +248,24 @@ class Takeover:
 
     @property
     def text(self) -> str:
-        """``position setpoints (14), landing ordered (2)``"""
-        return ", ".join(f"{_TELLS[name]} ({count})" for name, count in self.commands.items())
+        """``position setpoint (14), land (2)``"""
+        return ", ".join(f"{name} ({count})" for name, count in self.commands.items())
 
 
 def takeovers_of(log: FlightLog) -> tuple[Takeover, ...]:
     """Group what was sent in the loop's place by sender and time, oldest first."""
-    goes: list[list[Mapping[str, Any]]] = []
-    for each in sorted(log.sent_values, key=lambda one: float(one["t_s"])):
+    goes: list[list[SentCommand]] = []
+    for each in sorted(log.sent, key=lambda one: one.t_s):
         last = goes[-1][-1] if goes else None
-        if last is None or last["by"] != each["by"] or each["t_s"] - last["t_s"] > APART_S:
+        if last is None or last.by != each.by or each.t_s - last.t_s > APART_S:
             goes.append([])
         goes[-1].append(each)
     return tuple(
         Takeover(
-            go[0]["by"],
-            log.since(go[0]["t_s"]),
-            log.since(go[-1]["t_s"]),
-            dict(Counter(each["cmd"] for each in go)),
+            go[0].by,
+            log.since(go[0].t_s),
+            log.since(go[-1].t_s),
+            dict(Counter(_BETWEEN.sub(" ", type(each.command).__name__).lower() for each in go)),
         )
         for go in goes
     )

@@ -10,10 +10,8 @@ from textwrap import fill
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from perchctl.analysis.flight import FlightAnalysis
-from perchctl.analysis.sight import Frames
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.plot import (
@@ -79,8 +77,8 @@ def flight_figure(flight: FlightAnalysis) -> Figure:
     *axes, last_ax = figure.subplots(7, 1, height_ratios=(1, 1, 1, 1, 1.1, 1.1, 2.0))
     for ax, (key, scale, label) in zip(axes[:4], TRACKS, strict=True):
         _draw_raw_and_filtered(ax, flight, key, scale, label)
-        _mark_lost(ax, flight.frames)
-    axes[0].legend(handles=_track_legend(), loc="best", ncols=6, fontsize=8)
+        _mark_lost(ax, flight)
+    _add_legend(axes[0])
     _draw_height(axes[4], flight)
     _draw_power(axes[5], flight)
     shown_s = _draw_last_seconds(last_ax, flight)
@@ -104,9 +102,8 @@ def flight_figure(flight: FlightAnalysis) -> Figure:
 
 def title_of(flight: FlightAnalysis) -> str:
     """Return profile, seed, outcome, and the miss where it is known, as one line."""
-    end, seed = flight.summary, flight.log.header.get("seed")
-    name = f"profile {flight.log.profile_name or '?'}"
-    parts = [name + ("" if seed is None else f", seed {seed}"), end.outcome]
+    end = flight.summary
+    parts = [flight.log.setup_text, end.outcome]
     if end.outcome != "perched" and end.reason:
         parts[-1] += f" ({end.reason})"
     if end.miss_m is not None:
@@ -123,29 +120,18 @@ def _draw_raw_and_filtered(
     # A frame is some 100 ms old when it is measured; the estimate is carried to the present.
     log = flight.log
     frame_s = log.since(log.column("frame_t_s"))
-    for source, marker, colour, _ in RAW:
+    for source, marker, colour, text in RAW:
         raw = scale * log.column(f"{source}{key}")
-        ax.plot(frame_s, raw, linestyle="none", marker=marker, markersize=3, color=colour)
+        ax.plot(frame_s, raw, marker, markersize=3, color=colour, label=text)
     filtered = flight.tracked(f"e{key}")
     if key == "yaw_rad":  # a gap, not a line across the panel, where it wraps
         filtered[np.flatnonzero(np.abs(np.diff(filtered)) > math.pi)] = np.nan
     filtered = scale * filtered
-    ax.plot(flight.log.t_s, filtered, color=BLACK, linewidth=1.1)
+    ax.plot(log.t_s, filtered, color=BLACK, linewidth=1.1, label="filtered")
     coasting = np.array([record.get("measured") is False for record in log.records])
     unseen = np.where(coasting, filtered, np.nan)
-    ax.plot(flight.log.t_s, unseen, color=VERMILLION, linewidth=2.4)
+    ax.plot(log.t_s, unseen, color=VERMILLION, linewidth=2.4, label="unseen, or no frame")
     ax.set_ylabel(label)
-
-
-def _track_legend() -> list[Line2D]:
-    return [
-        *(
-            Line2D([], [], linestyle="none", marker=marker, markersize=4, color=colour, label=text)
-            for _, marker, colour, text in RAW
-        ),
-        Line2D([], [], color=BLACK, linewidth=1.4, label="filtered"),
-        Line2D([], [], color=VERMILLION, linewidth=2.4, label="unseen, or no frame"),
-    ]
 
 
 def _draw_height(ax: Axes, flight: FlightAnalysis) -> None:
@@ -166,23 +152,26 @@ def _draw_height(ax: Axes, flight: FlightAnalysis) -> None:
 
 
 def _draw_power(ax: Axes, flight: FlightAnalysis) -> None:
-    """The battery's voltage as it was read and at rest; thrust on an axis of its own."""
+    """The battery's voltage as it was read; thrust on an axis of its own."""
     volts = flight.log.column("battery_v")
     volts = np.where(volts > 0, volts, np.nan)
-    ax.plot(flight.log.t_s, volts, color=BLACK, linewidth=1.2, label="read")
-    rest_v = flight.log.column("battery_rest_v")
-    ax.plot(flight.log.t_s, rest_v, color=GREEN, linestyle="--", label="at rest, est.")
+    ax.plot(flight.log.t_s, volts, color=BLACK, linewidth=1.2, label="battery")
     ax.set_ylabel("battery [V]")
-    thrust_ax = ax.twinx()
+    _add_legend(ax, draw_thrust(ax, flight))
+
+
+def draw_thrust(ax: Axes, flight: FlightAnalysis) -> Axes:
+    """Draw the commanded thrust in percent on an axis at the panel's right, which is returned."""
+    thrust_ax: Axes = ax.twinx()
     thrust = flight.log.column("thrust") * FULL_THRUST_PERCENT
     thrust_ax.plot(flight.log.t_s, thrust, color=ORANGE, linewidth=1.0, label="thrust [%], right")
     thrust_ax.set_ylim(0.0, 105.0)
-    _add_legend(ax, thrust_ax)
+    return thrust_ax
 
 
 def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
     """The contact's approach in millimetres: single frames and the estimate, up to the last frame
-    with the target, and the height on an axis of its own. Returns from when to when."""
+    with the target. Returns from when to when."""
     log, frames = flight.log, flight.frames
     end_s = float(frames.seen_s[-1]) if frames.seen_s.size else flight.log.end_s
     low_s, high_s = max(0.0, end_s - LAST_S), min(end_s + AFTER_S, max(flight.log.end_s, 0.1))
@@ -193,15 +182,7 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
     for axis, colour in (("x", BLUE), ("y", ORANGE)):
         for source, marker, _, _ in RAW:
             raw_mm = 1e3 * log.column(f"{source}{axis}_m")[near]
-            ax.plot(
-                frame_s[near],
-                raw_mm,
-                marker,
-                markersize=2.4,
-                color=colour,
-                fillstyle="none",
-                markeredgewidth=0.6,
-            )
+            ax.plot(frame_s[near], raw_mm, marker, markersize=2.4, color=colour, fillstyle="none")
         e_mm = 1e3 * flight.tracked(f"e{axis}_m")[inside]
         ax.plot(t_s, e_mm, color=colour, linewidth=1.4, label=f"e{axis}")
         span_mm.append(_most(np.abs(e_mm)))
@@ -209,30 +190,20 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
     if np.isfinite(miss_mm).any():
         ax.plot(t_s, miss_mm, color=PURPLE, linewidth=1.4, linestyle=":", label="true miss")
         span_mm.append(_most(miss_mm))
-    up_ax, up_mm = ax.twinx(), 1e3 * flight.tracked("ez_m")[inside]
-    up_ax.plot(t_s, up_mm, color=BLACK, linewidth=1.0, linestyle="--", label="to go, right")
-    up_ax.set_ylim(min(0.0, -_most(-up_mm)), 1.1 * max(_most(up_mm), LEAST_SPAN_MM))
     ax.axhline(0.0, color=GREY, linewidth=0.8)
     ax.set_ylim(-1.15 * max(span_mm), 1.15 * max(span_mm))
     ax.set_ylabel("last 5 s with\nthe target [mm]")
-    _add_legend(ax, up_ax)
-    _mark_lost(ax, frames)
+    _add_legend(ax)
+    _mark_lost(ax, flight)
     ax.set_xlim(low_s, high_s)
     return low_s, high_s
 
 
-def _mark_lost(ax: Axes, frames: Frames) -> None:
+def _mark_lost(ax: Axes, flight: FlightAnalysis) -> None:
     """Mark frames without the target, and times without any frame, at the panel's bottom."""
-    if frames.unseen_s.size:
-        ax.vlines(
-            frames.unseen_s,
-            0.0,
-            LOST_SHARE,
-            transform=ax.get_xaxis_transform(),
-            color=BLACK,
-            linewidth=0.7,
-        )
-    for start_s, end_s in frames.gaps_s:
+    unseen_s, bottom = flight.frames.unseen_s, ax.get_xaxis_transform()
+    ax.vlines(unseen_s, 0.0, LOST_SHARE, transform=bottom, color=BLACK, linewidth=0.7)
+    for start_s, end_s in flight.frames.gaps_s:
         ax.axvspan(start_s, end_s, 0.0, LOST_SHARE, color=VERMILLION, linewidth=0.0)
 
 
@@ -255,12 +226,8 @@ def _most(values: Array) -> float:
 
 def _shade_spans(ax: Axes, spans: Sequence[Span]) -> None:
     """Alternate shades, and a line where a phase begins."""
-    first_s, last_s = ax.get_xlim()
     for i, (_, start_s, end_s) in enumerate(spans):
-        if end_s < first_s or start_s > last_s:
-            continue
-        if end_s > start_s:
-            ax.axvspan(start_s, end_s, facecolor=SHADES[i % 2], edgecolor="none", zorder=-2)
+        ax.axvspan(start_s, end_s, facecolor=SHADES[i % 2], edgecolor="none", zorder=-2)
         if i:
             ax.axvline(start_s, color=GREY, linewidth=0.6, zorder=-1)
 
@@ -269,19 +236,10 @@ def _name_spans(ax: Axes, spans: Sequence[Span], shown_s: tuple[float, float]) -
     """Names above a panel, slanted; where phases crowd, some go unnamed."""
     gap_s = NAME_GAP * (shown_s[1] - shown_s[0])
     named_s = -math.inf
-    for i, (name, start_s, end_s) in enumerate(spans):
+    for name, start_s, end_s in spans:
         start_s, end_s = max(start_s, shown_s[0]), min(end_s, shown_s[1])
-        if end_s < start_s:
-            continue
-        at_s = max((start_s + end_s) / 2, named_s + gap_s)
-        if at_s > end_s + 2 * gap_s and i < len(spans) - 1:
-            continue
-        ax.annotate(
-            name,
-            xy=(at_s, 1.03),
-            xycoords=("data", "axes fraction"),
-            rotation=45,
-            fontsize=8,
-            annotation_clip=False,
-        )
-        named_s = at_s
+        at_s = (start_s + end_s) / 2
+        if start_s <= end_s and at_s >= named_s + gap_s:
+            above = ax.get_xaxis_transform()
+            ax.text(at_s, 1.03, name, transform=above, rotation=45, fontsize=8)
+            named_s = at_s

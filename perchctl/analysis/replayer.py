@@ -10,7 +10,7 @@ from typing import Any
 import perchctl
 from perchctl.analysis.compare import profile_differences
 from perchctl.analysis.decide import Decided, decide, first_differing_of, whole_turns
-from perchctl.analysis.sense import Picture, PictureMissing, Sensed, one_thread, sense
+from perchctl.analysis.sense import Picture, PictureMissing, Sensed, sense
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
 from perchctl.flight import FlightInputs
@@ -23,11 +23,6 @@ CAUTION = (
     "after the first difference the world would have answered differently: from there on this is "
     "what the planner would have said to another flight's telemetry and pictures"
 )
-NOTHING_SHOWN = (
-    "what acts on the link, the telemetry or external positions, or is asked before take-off, "
-    "changes nothing in a replay, nor does what acts on pictures where none are recorded"
-)
-SHOWN_DIGITS = 6
 
 
 @dataclass(frozen=True)
@@ -47,9 +42,7 @@ class Difference:
     @property
     def text(self) -> str:
         """``tick 512 at 10.24 s: command.z_m was 1.25, the replay has 1.26``"""
-        was, now = (json.dumps(_rounded(v)) for v in (self.recorded, self.replayed))
-        if was == now:  # they differ in the last bits
-            was, now = json.dumps(self.recorded), json.dumps(self.replayed)
+        was, now = json.dumps(self.recorded), json.dumps(self.replayed)
         return f"tick {self.tick} at {self.t_s:.2f} s: {self.field} was {was}, the replay has {now}"
 
 
@@ -59,17 +52,20 @@ class Seen:
 
     Attributes:
         turns: each, seen again, up to where a picture is missing.
-        differences: turns of which a pose, or what the planner sees, differs; `first` of them.
-        frames: pictures that were looked at, of `frames_flown`.
+        differences: of the turns in which a pose, or what the planner sees, differs.
+        frames_flown: how many frames the flight looked at.
         missing: what ended it before the flight; None where nothing did.
     """
 
     turns: Sequence[Sensed]
-    differences: int
-    first: Difference | None
-    frames: int
+    differences: Sequence[Difference]
     frames_flown: int
     missing: PictureMissing | None
+
+    @property
+    def frames(self) -> int:
+        """How many pictures were looked at again."""
+        return _frames_of(each.turn for each in self.turns)
 
     @property
     def ended(self) -> str:
@@ -77,16 +73,10 @@ class Seen:
         return f"{self.missing}: what came after it cannot be seen again" if self.missing else ""
 
     @property
-    def is_another(self) -> bool:
-        """True if it ends at a picture that is not the flown one."""
-        return self.missing is not None and self.missing.kind == "another"
-
-    @property
     def same(self) -> bool:
-        """True if nothing differs. A recording that cannot be read tells of no difference; of one
-        whose first picture is missing nothing is known."""
-        is_unknown = self.missing is not None and self.missing.kind == "missing" and not self.frames
-        return not (self.differences or self.is_another or is_unknown)
+        """True if nothing differs. What is not recorded, or cannot be read, tells of no
+        difference."""
+        return not (self.differences or (self.missing is not None and self.missing.is_another))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +84,8 @@ class Replay:
     """A log decided again, and seen again where there are pictures.
 
     Attributes:
-        decided: each turn of the planner, decided again.
-        ticks: how many were flown; `differences`, how many of them were decided otherwise; `first`
-            may be of one that was not sent.
+        decided: each turn of the planner, decided again; `differences` are of those that were
+            decided otherwise, sent or not.
         seen: what the pictures show; None without any.
         changed: the keys in which the profile is another than the flown one's.
         gap: which turn is the first that the log has lost, or empty.
@@ -104,17 +93,20 @@ class Replay:
 
     log: FlightLog
     decided: Sequence[Decided]
-    ticks: int
-    differences: int
-    first: Difference | None
+    differences: Sequence[Difference]
     seen: Seen | None = None
     changed: tuple[str, ...] = ()
     gap: str = ""
 
     @property
+    def ticks(self) -> int:
+        """How many of the turns were flown."""
+        return sum(each.turn.role == "flown" for each in self.decided)
+
+    @property
     def same(self) -> bool:
         """True if no decision and nothing that was seen differs."""
-        return self.first is None and (self.seen is None or self.seen.same)
+        return not self.differences and (self.seen is None or self.seen.same)
 
     @property
     def notes(self) -> list[str]:
@@ -134,8 +126,8 @@ class Replay:
             found.append("the log ends in the flight, without its summary: replayed is its rest")
         ended = "" if self.seen is None else self.seen.ended
         found += [note for note in (self.gap, ended) if note]
-        if self.changed:
-            found.append(NOTHING_SHOWN if self.same else CAUTION)
+        if self.changed and not self.same:
+            found.append(CAUTION)
         for each in self.decided:
             if each.error is not None:
                 found.append(f"the planner breaks down on turn {each.turn.number}: {each.error}")
@@ -148,20 +140,18 @@ class Replay:
         any, `changed` empty where the profile is the flown one.
         """
         seen = self.seen
+        pictures = seen and {
+            "frames": seen.frames,
+            "frames_flown": seen.frames_flown,
+            "ended": seen.ended or None,
+            **_counted(seen.differences),
+        }
         return {
             "log": str(self.log.path),
             "same": self.same,
             "ticks": self.ticks,
-            **_differences(self),
-            "gap": self.gap or None,
-            "pictures": None
-            if seen is None
-            else {
-                "frames": seen.frames,
-                "frames_flown": seen.frames_flown,
-                "ended": seen.ended or None,
-                **_differences(seen),
-            },
+            **_counted(self.differences),
+            "pictures": pictures,
             "changed": list(self.changed),
             "notes": self.notes,
         }
@@ -170,40 +160,26 @@ class Replay:
         """Return the replay's lines for people, without `notes`."""
         lines = [f"changed:   {', '.join(self.changed)}"] if self.changed else []
         text = "all with the same commands"
-        if self.first is not None:
-            text = f"{self.differences or 'what was not sent'} decided otherwise"
-        elif self.gap:
-            text += ", up to where the log has lost a turn"
+        if self.differences:
+            text = f"{len(self.differences)} decided otherwise"
         lines.append(f"planner:   {self.ticks} turns, {text}")
-        if self.first is not None:
-            lines.append(f"first:     {self.first.text}")
-        seen = self.seen
-        if seen is None:
+        lines += [f"first:     {each.text}" for each in self.differences[:1]]
+        if (seen := self.seen) is None:
             return lines
         text = f"{seen.frames} frames"
         if seen.ended:
             text = f"seen up to frame {seen.frames} of {seen.frames_flown}"
-        if seen.first is not None:
-            lines.append(f"pictures:  {text}, {seen.differences} turns see something else")
-            return [*lines, f"first:     {seen.first.text}"]
-        poses = ", all with the same poses, to the bit" if seen.frames else ""
-        return [*lines, f"pictures:  {text}{poses}"]
+        if seen.differences:
+            text += f", {len(seen.differences)} turns see something else"
+        elif seen.frames:
+            text += ", all with the same poses, to the bit"
+        lines.append(f"pictures:  {text}")
+        return lines + [f"first:     {each.text}" for each in seen.differences[:1]]
 
 
-def _differences(found: Replay | Seen) -> dict[str, Any]:
-    first = None if found.first is None else asdict(found.first)
-    return {"differences": found.differences, "first_difference": first}
-
-
-def _rounded(value: Any) -> Any:
-    """JSON's own types with every number to `SHOWN_DIGITS`."""
-    if isinstance(value, float):
-        return float(f"{value:.{SHOWN_DIGITS}g}")
-    if isinstance(value, list):
-        return [_rounded(each) for each in value]
-    if isinstance(value, dict):
-        return {key: _rounded(each) for key, each in value.items()}
-    return value
+def _counted(differences: Sequence[Difference]) -> dict[str, Any]:
+    first = asdict(differences[0]) if differences else None
+    return {"differences": len(differences), "first_difference": first}
 
 
 def replay(
@@ -228,28 +204,18 @@ def replay(
         pipeline = pipeline or pipeline_of(log, used, changed)
         seen = _seen(log, turns, flown, used, pictures, pipeline)
     observations: dict[int, Observation | None] = {}
-    if seen is not None and changed and (seen.frames > 0 or seen.is_another):
+    if seen is not None and changed and seen.frames:
         observations = {each.turn.number: each.observation for each in seen.turns}
         turns = turns[: len(seen.turns)]
     decided = list(
         decide(turns, used, lambda turn: observations.get(turn.number, turn.observation))
     )
-    flown_turns = [each for each in decided if each.turn.role == "flown"]
-    firsts = (
+    differences = [
         Difference(each.tick, log.since(each.turn.t_s), *each.difference)
         for each in decided
         if each.difference is not None
-    )
-    return Replay(
-        log=log,
-        decided=decided,
-        ticks=len(flown_turns),
-        differences=sum(each.difference is not None for each in flown_turns),
-        first=next(firsts, None),
-        seen=seen,
-        changed=changed,
-        gap=gap,
-    )
+    ]
+    return Replay(log, decided, differences, seen, changed, gap)
 
 
 def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:
@@ -288,21 +254,12 @@ def _seen(
     later_s = flown.camera.start_latency_s - profile.camera.start_latency_s
     found: list[Sensed] = []
     missing: PictureMissing | None = None
-    with one_thread():
-        try:
-            for each in sense(turns, profile, pipeline, pictures, later_s):
-                found.append(each)
-        except PictureMissing as error:
-            missing = error
-    differences = list(_differing(log, turns, found))
-    return Seen(
-        found,
-        len(differences),
-        next(iter(differences), None),
-        frames=_frames_of(each.turn for each in found),
-        frames_flown=_frames_of(turns),
-        missing=missing,
-    )
+    try:
+        for each in sense(turns, profile, pipeline, pictures, later_s):
+            found.append(each)
+    except PictureMissing as error:
+        missing = error
+    return Seen(found, list(_differing(log, turns, found)), _frames_of(turns), missing)
 
 
 def _differing(

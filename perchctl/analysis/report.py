@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -18,12 +17,11 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 import perchctl
-from perchctl.analysis.film import write_film
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
-from perchctl.analysis.story import Advice, Sentence, advice_of, count, length, story_of
-from perchctl.errors import InvalidValue, PerchError
+from perchctl.analysis.story import Sentence, count, length, story_of
+from perchctl.errors import PerchError
 from perchctl.files import write_files
 from perchctl.mission import Phase
 from perchctl.record import log_values, path_beside, read_log, recorded_pictures
@@ -39,14 +37,13 @@ TITLES = {
 GRADES = {"perched": "good", "landed": "warn"}
 
 
-def write_report(log_paths: Sequence[Path], output: Path, with_film: bool = False) -> Report:
-    """Write the page, whole or not at all; return what is on it. `with_film` embeds a film of each
-    flight.
+def write_report(log_paths: Sequence[Path], output: Path) -> Report:
+    """Write the page, whole or not at all; return what is on it.
 
     Raises NotFound and InvalidValue, as `read_log` and `write_files`.
     """
     report = Report(tuple(reported_flight(path) for path in log_paths))
-    write_files({output: page_of(report.flights, with_film).encode("utf-8")})
+    write_files({output: page_of(report.flights).encode("utf-8")})
     return report
 
 
@@ -71,7 +68,7 @@ class Report:
                 "outcome": told.outcome,
                 "miss_m": told.flight.summary.miss_m,
                 "used_mah": told.flight.measures.battery_used_mah,
-                "advice": [f"{a.about}: {a.text} ({a.evidence})" for a in told.advice],
+                "advice": list(told.advice),
             }
             for told in self.flights
         ]
@@ -91,10 +88,11 @@ class ReportedFlight:
         """What happened."""
         return story_of(self.flight)
 
-    @cached_property
-    def advice(self) -> tuple[Advice, ...]:
-        """What to change for the next flight."""
-        return advice_of(self.flight)
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What the flight found of latency and mounting that the profile should have."""
+        findings = self.flight.summary.findings
+        return () if findings is None else findings.advice
 
     @property
     def outcome(self) -> str:
@@ -143,11 +141,11 @@ class ReportedFlight:
 
 # --- the page ---------------------------------------------------------
 
-POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """No script, nothing from elsewhere: the browser holds the page to it."""
 
 
-def page_of(flights: Sequence[ReportedFlight], with_film: bool = False) -> str:
+def page_of(flights: Sequence[ReportedFlight]) -> str:
     """Return the page of at least one flight as HTML that needs no other file. Raises InvalidValue
     for a value that no flight writes."""
     articles = []
@@ -160,7 +158,6 @@ def page_of(flights: Sequence[ReportedFlight], with_film: bool = False) -> str:
                     flight=told.flight,
                     number=number,
                     is_session=len(flights) > 1,
-                    with_film=with_film,
                 )
             )
     return _render(
@@ -190,28 +187,8 @@ def _templates() -> jinja2.Environment:
     templates.globals.update(
         seven_phases=[phase.value for phase in tuple(Phase)[:7]],
         plot_of=lambda flight: _address("image/png", flight_png(flight)),
-        film_of=film_address,
     )
     return templates
-
-
-def film_address(flight: FlightAnalysis) -> tuple[str, str]:
-    """Return the flight's film as a `data:` address, and why it, or its camera pictures, are
-    missing; each may be empty. The log has at least one tick."""
-    path = flight.log.path
-    is_recorded = path_beside(path, ".mcap").is_file()
-    recorded = [recorded_pictures(path, exact=False)] if is_recorded else []
-    problem = ""
-    with tempfile.TemporaryDirectory() as folder:
-        film = Path(folder) / "film.mp4"
-        for pictures in (*recorded, None):
-            try:
-                write_film(flight, pictures, film)
-            except InvalidValue as error:
-                problem = _without_folder(error, path)
-                continue
-            return _address("video/mp4", film.read_bytes()), problem
-    return "", problem
 
 
 def _without_folder(error: PerchError, log_path: Path) -> str:
@@ -257,7 +234,7 @@ def reported_flight(log_path: Path) -> ReportedFlight:
     try:
         with log_values(log_path):
             decisions = decisions_of(flight)
-        for picture in recorded_pictures(log_path, exact=False, numbers=decisions):
+        for picture in recorded_pictures(log_path, decisions):
             caption, record = decisions[picture.number]
             shown.append(Shown(caption, _jpeg(record, picture.image)))
     except PerchError as error:

@@ -9,7 +9,6 @@ import contextlib
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -27,15 +26,14 @@ Picture = tuple[int, float, NDArray[np.uint8]]
 
 
 class PictureMissing(Exception):
-    """The replay of pictures ends here; the message says why.
+    """The replay of pictures ends here; the message says why. `is_another`: at a picture that is
+    not the flown one."""
 
-    `kind`: the picture is ``missing``; it is ``another`` than the flown one; or the recording is
-    ``unreadable``.
-    """
+    is_another = False
 
-    def __init__(self, message: str, kind: Literal["missing", "another", "unreadable"] = "missing"):
-        super().__init__(message)
-        self.kind = kind
+
+class _PictureIsAnother(PictureMissing):
+    is_another = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +65,8 @@ class _Given:
         self._taken, self._samples = taken, [taken.samples, taken.late]
         told = None if obs is None else obs.camera_problem
         if taken.ended and told is not None and told.endswith(FlightInputs.ENDED_TEXT):
-            self._name = told.removesuffix(
-                FlightInputs.ENDED_TEXT
-            )  # no other record has the flown source's
+            # No other record has the flown source's name.
+            self._name = told.removesuffix(FlightInputs.ENDED_TEXT)
 
     # As a link.
 
@@ -125,9 +122,7 @@ class _Given:
         for index, t_s, image in self._pictures:
             if (index, t_s) == (seen.index, seen.t_s):
                 if seen.checksum not in (None, zlib.crc32(image.tobytes())):
-                    raise PictureMissing(
-                        f"the picture of frame {seen.index} is another one", "another"
-                    )
+                    raise _PictureIsAnother(f"the picture of frame {seen.index} is another one")
                 return image
             if index > seen.index:
                 break
@@ -150,7 +145,7 @@ def sense(
     """
     given = _Given(pictures, pipeline.camera.size_px, later_s)
     inputs = FlightInputs(given, given, pipeline, profile, recorded=True)
-    with one_thread():
+    with _one_thread():
         for turn in turns:
             given.turn(turn)
             inputs.take_in(turn.began_s, look=turn.taken.look)
@@ -164,7 +159,7 @@ def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
     try:
         yield from pictures
     except (InvalidValue, NotFound) as error:
-        raise PictureMissing(str(error), "unreadable") from error
+        raise PictureMissing(str(error)) from error
 
 
 def _observed(turn: Turn, inputs: FlightInputs) -> Observation | None:
@@ -175,7 +170,7 @@ def _observed(turn: Turn, inputs: FlightInputs) -> Observation | None:
 
 
 @contextlib.contextmanager
-def one_thread() -> Iterator[None]:
+def _one_thread() -> Iterator[None]:
     """Keep OpenCV to one thread, so that its sums have one order."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)

@@ -4,7 +4,7 @@ record."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -73,9 +73,9 @@ def _why(stay: PhaseSpan) -> str:
 
 
 def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
-    """Yield the lines that `fly` ends with, but for the phases, which come as a table."""
+    """Yield the lines that `fly` ends with, but for the battery, which has a longer one."""
     log = flight.log
-    end = replace(flight.summary, phases=(), battery_min_v=None)
+    end = replace(flight.summary, battery_min_v=None)
     first, *others = end.text().splitlines()
     yield from wrap(plain(first), COLUMNS, subsequent_indent="  ")
     for line in others:
@@ -89,10 +89,9 @@ def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
 
 def _origin(log: FlightLog) -> str:
     header = log.header
-    started, seed = header.get("started_utc"), header.get("seed")
+    started = header.get("started_utc")
     parts = [
-        f"profile {log.profile_name or '?'}",
-        "" if seed is None else f"seed {seed}",
+        log.setup_text,
         f"{header.get('uri', '?')} with {header.get('source', '?')}",
         "" if not started else f"begun {utc_text(started)}",
         f"perchctl {header.get('perchctl', '?')}, version {header.get('version')}",
@@ -105,33 +104,41 @@ def utc_text(started_utc: Any) -> str:
     return str(started_utc).replace("T", " ").replace("+00:00", " UTC")
 
 
+_MEASURES = (
+    (
+        "settled",
+        "settled_xy_rms_m",
+        "{settled_xy_rms_m} mm aside and {settled_yaw_rms_rad} deg RMS in the last second before "
+        "the contact",
+    ),
+    (
+        "frames",
+        "frames",
+        "{frames}, {frames_unseen} without the target; {frame_rate_hz} Hz, {frame_age_s} ms old; "
+        "gaps: {frame_gaps}, {frame_gaps_s} s together",
+    ),
+    (
+        "battery",
+        "battery_min_v",
+        "{battery_min_v} V at its lowest; {battery_start_v} V at the start, {battery_end_v} V at "
+        "the end",
+    ),
+    (
+        "loop",
+        "turns",
+        "{turns} turns, late by {late_p99_s} ms, telemetry {telemetry_age_p99_s} ms old (99 % at "
+        "most)",
+    ),
+)
+"""Of a line: its name, the figure without which it is left out, and the line."""
+
+
 def _measure_lines(flight: FlightAnalysis) -> Iterator[str]:
-    m, of = flight.measures, flight.measures.value_text
-    if m.settled_xy_rms_m is not None:
-        yield from _named(
-            "settled",
-            f"{of('settled_xy_rms_m')} mm aside and {of('settled_yaw_rms_rad')} deg RMS in the "
-            f"last second before the contact",
-        )
-    if m.frames:
-        yield from _named(
-            "frames",
-            f"{of('frames')}, {of('frames_unseen')} without the target; {of('frame_rate_hz')} Hz, "
-            f"{of('frame_age_s')} ms old; gaps: {of('frame_gaps')}, {of('frame_gaps_s')} s "
-            f"together; corners' misfit {of('corner_rms_px')} px",
-        )
-    if m.battery_min_v is not None:
-        yield from _named(
-            "battery",
-            f"{of('battery_min_v')} V at its lowest; {of('battery_start_v')} V at the start, "
-            f"{of('battery_end_v')} V at the end",
-        )
-    if m.turns:
-        yield from _named(
-            "loop",
-            f"{of('turns')} turns, late by {of('late_p99_s')} ms, telemetry "
-            f"{of('telemetry_age_p99_s')} ms old (99 % at most)",
-        )
+    measures = flight.measures
+    texts = {f.name: measures.value_text(f.name) for f in fields(measures)}
+    for name, needed, line in _MEASURES:
+        if getattr(measures, needed):
+            yield from _named(name, line.format_map(texts))
 
 
 def plain(text: str) -> str:

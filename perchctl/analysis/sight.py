@@ -33,23 +33,18 @@ class Frames:
     """The camera frames that the pipeline was given, in order.
 
     Attributes:
-        ticks: (n,) the index of the tick that processed each frame.
         t_s: (n,) times of exposure since the flight's first turn.
         seen: (n,) bool, True for the frames that showed the target.
         gaps_s: (k, 2) from when to when no usable frame came.
         rate_hz: 1 over the median time between two frames; NaN where it is unknown.
         age_s: median age of a picture when it was used; NaN where it is unknown.
-        misfit_px: median misfit of the corners and the pose; NaN where it is unknown. Four corners
-            alone fit nearly any pose: where both markers were ever seen, only such frames count.
     """
 
-    ticks: NDArray[np.int_]
     t_s: Array
     seen: NDArray[np.bool_]
     gaps_s: Array
     rate_hz: float
     age_s: float
-    misfit_px: float
 
     @property
     def seen_s(self) -> Array:
@@ -64,23 +59,20 @@ class Frames:
 
 def frames_of(log: FlightLog) -> Frames:
     """Read the frames of a flight; the median period decides what is a gap."""
-    taken = [i for i, record in enumerate(log.records) if record.get("frame_t_s") is not None]
-    records = [log.records[i] for i in taken]
+    records = [record for record in log.records if record.get("frame_t_s") is not None]
     times_s = log.since(np.array([r["frame_t_s"] for r in records], dtype=np.float64))
     ages_s = np.array([r["t_s"] - r["frame_t_s"] for r in records], dtype=np.float64)
     age_s, gaps_s = percentile(ages_s, 50), np.empty((0, 2))
-    if taken:
+    if records:
         # The flight's end, as old as frames are when they are measured, may end a gap, too.
         gaps_s = _gaps(log, np.append(times_s, max(log.end_s - age_s, times_s[-1])))
     between_s = np.diff(np.sort(times_s))
     return Frames(
-        ticks=np.array(taken, dtype=int),
         t_s=times_s,
         seen=np.array([shows_target(record) for record in records], dtype=bool),
         gaps_s=gaps_s,
         rate_hz=1.0 / percentile(between_s[between_s > 0], 50),
         age_s=age_s,
-        misfit_px=_misfit_px(records),
     )
 
 
@@ -100,14 +92,6 @@ def _gaps(log: FlightLog, times_s: Array) -> Array:
     return gaps_s
 
 
-def _misfit_px(records: Sequence[Mapping[str, Any]]) -> float:
-    for keys in (("j_rms_px",), ("l_rms_px", "s_rms_px")):
-        misfits = [r[key] for r in records for key in keys if r.get(key) is not None]
-        if misfits:
-            return percentile(np.array(misfits, dtype=np.float64), 50)
-    return math.nan
-
-
 # --- losses -----------------------------------------------------------
 
 LEAST_LOSS_S = 0.3
@@ -123,14 +107,12 @@ class Loss:
 
     Attributes:
         frames: how many came without the target; 0: no picture came at all.
-        phase: the one in which it went out of sight.
     """
 
     start_s: float
     end_s: float
     regained: bool
     frames: int
-    phase: str
 
     @property
     def duration_s(self) -> float:
@@ -147,15 +129,8 @@ def losses_of(log: FlightLog, frames: Frames) -> tuple[Loss, ...]:
         end_s = _end_of_loss(start_s, next_s, stays)
         if end_s is not None:
             unseen = (frames.unseen_s > start_s) & (frames.unseen_s < end_s)
-            found.append(
-                Loss(
-                    start_s,
-                    end_s,
-                    start_s != starts_s[-1],
-                    int(np.count_nonzero(unseen)),
-                    _phase_at(stays, start_s + LEAST_LOSS_S / 2),
-                )
-            )
+            regained = start_s != starts_s[-1]
+            found.append(Loss(start_s, end_s, regained, int(np.count_nonzero(unseen))))
     return tuple(found)
 
 
@@ -163,7 +138,8 @@ def _end_of_loss(start_s: float, end_s: float, stays: Sequence[PhaseSpan]) -> fl
     """When it ended; None where nothing was lost."""
     if end_s - start_s < LEAST_LOSS_S:
         return None
-    phase = _phase_at(stays, start_s + LEAST_LOSS_S / 2)  # the last sight may be just before it
+    at_s = start_s + LEAST_LOSS_S / 2  # the last sight may be just before the phase
+    phase = next((s.phase for s in reversed(stays) if s.start_s <= at_s), "")
     left = next(
         (s for s in stays if s.start_s > start_s and s.phase not in NEEDED_IN | {"SEARCH"}), None
     )
@@ -174,7 +150,3 @@ def _end_of_loss(start_s: float, end_s: float, stays: Sequence[PhaseSpan]) -> fl
     if phase not in NEEDED_IN or (left is not None and left.start_s - start_s < LEAST_LOSS_S):
         return None
     return end_s
-
-
-def _phase_at(stays: Sequence[PhaseSpan], t_s: float) -> str:
-    return next((s.phase for s in reversed(stays) if s.start_s <= t_s), "")

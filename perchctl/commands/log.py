@@ -227,7 +227,7 @@ def replay(
     app,
     "perchctl log report",
     "perchctl log report perchctl-logs/*.jsonl -o session.html",
-    "perchctl log report flight.jsonl --film --force",
+    "perchctl log report flight.jsonl --force",
 )
 def report(
     files: Annotated[
@@ -235,7 +235,6 @@ def report(
         typer.Argument(help="Flight logs; by default the newest of perchctl-logs."),
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="The page: .html.")] = None,
-    with_film: Annotated[bool, typer.Option("--film", help="Embed a film of each flight.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -251,7 +250,7 @@ def report(
     if any(same_file(output, path) for path in logs):
         raise UsageError(f"{output} is one of the logs; write the page to another file")
     check_output(output, PAGE_SUFFIXES, force, "a page for a browser")
-    page = write_report(logs, output, with_film)
+    page = write_report(logs, output)
     if as_json:
         size = output.stat().st_size
         print_result({"report": str(output), "bytes": size, "flights": page.record()})
@@ -296,6 +295,6 @@ def film(
         flight = FlightAnalysis(log)
     from perchctl.analysis import write_film
 
-    pictures = recorded_pictures(path, exact=False) if is_recorded else None
+    pictures = recorded_pictures(path) if is_recorded else None
     write_film(flight, pictures, place, rate_hz, width_px)
     print(f"film:      {place}")

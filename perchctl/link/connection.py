@@ -18,7 +18,7 @@ from perchctl.errors import ConnectionFailed
 from perchctl.files import cannot_be_written
 from perchctl.link.crtp import Packet
 from perchctl.link.protocol import UDEV_HELP, vehicle_uri
-from perchctl.places import user_cache_folder, user_runtime_folder
+from perchctl.places import user_folder
 
 CONNECT_TRIES = 2
 CLOSE_TIMEOUT_S = 3.0
@@ -47,7 +47,7 @@ class Connection:
     def __init__(self) -> None:
         from cflib.crazyflie import Crazyflie
 
-        cache = user_cache_folder() / "toc"
+        cache = user_folder("cache") / "toc"
         try:
             cache.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -371,7 +371,7 @@ def claim_vehicle(uri: str) -> contextlib.ExitStack:
     Nothing is locked where no lock can be kept (no folder to write to, Windows), which is no reason
     not to fly. Raises ConnectionFailed if another program has it.
     """
-    path = user_runtime_folder() / (re.sub(r"[^A-Za-z0-9.]+", "_", vehicle_uri(uri)) + ".lock")
+    path = user_folder("runtime") / (re.sub(r"[^A-Za-z0-9.]+", "_", vehicle_uri(uri)) + ".lock")
     with contextlib.ExitStack() as claim:
         with contextlib.suppress(ImportError, OSError):
             import fcntl

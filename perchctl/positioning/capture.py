@@ -20,16 +20,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from perchctl.children import (
-    Channel,
-    accept,
-    connect_back,
-    end,
-    listen,
-    new_token,
-    send_address,
-    spawn,
-)
+from perchctl.children import Channel, connect_back, end, spawn
 from perchctl.errors import ConnectionFailed, broken_motion_capture
 from perchctl.positioning.feed import BodyPose, CaptureFrame, PositionFeed
 from perchctl.profile import PositioningConfig
@@ -106,8 +97,7 @@ class MotionCapture:
         self._ended: str | None = None
         self._failed: Failed | None = None
         self._last_line = ""
-        self._child = spawn(_CHILD, subprocess.PIPE)
-        self._channel: Channel | None = None
+        self._child, self._channel = spawn(_CHILD, subprocess.PIPE)
         self._threads = [threading.Thread(target=self._read_output, daemon=True)]
         self._threads[0].start()
         try:
@@ -145,21 +135,17 @@ class MotionCapture:
         end(self._child, _END_TIMEOUT_S)
         for thread in self._threads:
             thread.join(_END_TIMEOUT_S)
-        if self._channel is not None:
-            self._channel.close()
-        for pipe in (self._child.stdin, self._child.stdout):
-            if pipe is not None and not self._threads[0].is_alive():
-                pipe.close()
+        self._channel.close()
+        if self._child.stdout is not None and not self._threads[0].is_alive():
+            self._child.stdout.close()
 
     def _begin(self) -> None:
-        token = new_token()
-        with listen() as listener:
-            send_address(self._child, listener, token)
-            self._channel = accept(
-                listener, token, UP_TIMEOUT_S, lambda: self._child.poll() is None
-            )
-        if self._channel is None:
-            raise ConnectionFailed(f"no {self._who}: its reader did not start{self._words()}")
+        try:
+            self._channel.receive(UP_TIMEOUT_S)
+        except (EOFError, OSError):
+            raise ConnectionFailed(
+                f"no {self._who}: its reader did not start{self._words()}"
+            ) from None
         self._channel.send(self._setup)
         reading = threading.Thread(
             target=self._read_frames, args=(self._channel,), name="perchctl-capture", daemon=True
@@ -300,7 +286,6 @@ def _pass_on(client: Any, channel: Channel, partial: bool) -> None:
 
 def _end_with(channel: Channel) -> None:
     """End the process with the parent, which never speaks again; the library may be anywhere."""
-    channel.socket.settimeout(None)  # its setup was waited for with a limit; a flight has none
-    with contextlib.suppress(OSError):
-        channel.socket.recv(1)
+    with contextlib.suppress(EOFError, OSError):
+        channel.recv()
     os._exit(0)

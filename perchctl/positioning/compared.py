@@ -19,7 +19,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, ValidationError
 
 from perchctl.errors import InvalidValue
 from perchctl.files import write_files
-from perchctl.places import user_state_folder
+from perchctl.places import user_folder
 from perchctl.profile import PositioningConfig
 
 VALID_S = 24 * 3600.0
@@ -71,7 +71,7 @@ def path_of(config: PositioningConfig, vehicle: str) -> Path:
     """Return the file of a vehicle's comparison. `vehicle`: as `perchctl.link.vehicle_uri` has
     it."""
     of = repr(_set_up(config, vehicle)).encode()
-    return user_state_folder() / "compared" / f"{hashlib.sha256(of).hexdigest()[:16]}.json"
+    return user_folder("state") / "compared" / f"{hashlib.sha256(of).hexdigest()[:16]}.json"
 
 
 def load_comparison(config: PositioningConfig, vehicle: str) -> Comparison:

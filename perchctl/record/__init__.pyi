@@ -1,7 +1,6 @@
 from .exact import from_exact as from_exact
 from .exact import json_line as json_line
 from .exact import to_exact as to_exact
-from .header import arithmetic_fingerprint as arithmetic_fingerprint
 from .header import camera_record as camera_record
 from .read import FlightLog as FlightLog
 from .read import PhaseSpan as PhaseSpan
@@ -9,5 +8,5 @@ from .read import log_values as log_values
 from .read import read_log as read_log
 from .recorded import recorded_pictures as recorded_pictures
 from .summary import FlightSummary as FlightSummary
-from .watch import LogWatcher as LogWatcher
+from .write import LogWatcher as LogWatcher
 from .write import path_beside as path_beside

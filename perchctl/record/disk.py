@@ -9,8 +9,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from queue import SimpleQueue
+from typing import TypeVar
 
 Job = Callable[[], object]
+T = TypeVar("T")
 
 
 class DiskFile:
@@ -56,6 +58,18 @@ class DiskFile:
         fd, self._fd = self._fd, -1  # the number may be another file's by the second time
         if fd >= 0:
             os.close(fd)
+
+
+def begin_file(path: Path, sync: bool, begun: Callable[[DiskFile], T]) -> T:
+    """Create a file and return what `begun` makes of it; an error of that leaves no file. Raises
+    OSError as `DiskFile` does."""
+    file = DiskFile(path, sync)
+    try:
+        return begun(file)
+    except BaseException:
+        file.close()
+        path.unlink(missing_ok=True)
+        raise
 
 
 class BackgroundWriter:

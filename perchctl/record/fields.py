@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
-from perchctl.mission import Event, ExternalPositions, SentCommand, Tick
+from perchctl.mission import Event, ExternalPositions, Tick
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -23,7 +23,7 @@ from perchctl.vehicle import (
     StopMotors,
     Telemetry,
 )
-from perchctl.vision import MARKERS, Consistency, PipelineOutput, TargetEstimate
+from perchctl.vision import MARKERS, PipelineOutput, TargetEstimate
 
 FORMAT = "perchctl-flight-log"
 SCHEMA_VERSION = 4
@@ -32,6 +32,12 @@ READABLE_VERSIONS = (1, 2, 3, SCHEMA_VERSION)
 turns; 3 neither why a turn was decided so, nor what was sent in the loop's place."""
 
 _POSE_SOURCES = {"l": "large", "s": "small", "j": "joint"}
+
+
+def _axes(name: str, meaning: str) -> dict[str, str]:
+    """Return a field each for x, y and z, whose letter stands in the name's place for one."""
+    return {name.format(axis): meaning for axis in "xyz"}
+
 
 FIELDS: dict[str, str] = {
     "t_s": "time on the loop's clock",
@@ -42,12 +48,8 @@ FIELDS: dict[str, str] = {
     "hold": "why the vehicle is held in place, empty when it is not",
     "attempts": "failed perching attempts so far",
     # the vehicle's own estimate, world axes
-    "x_m": "body in the world of the state estimate",
-    "y_m": "body in the world of the state estimate",
-    "z_m": "body in the world of the state estimate, up",
-    "vx_mps": "velocity, world axes",
-    "vy_mps": "velocity, world axes",
-    "vz_mps": "velocity, world axes",
+    **_axes("{}_m", "body in the world of the state estimate, z up"),
+    **_axes("v{}_mps", "velocity, world axes"),
     "roll_rad": "right-handed about body x",
     "pitch_rad": "right-handed about body y: positive is nose down",
     "yaw_rad": "right-handed about world z",
@@ -65,70 +67,42 @@ FIELDS: dict[str, str] = {
     # positions from outside, as they are sent to the vehicle; None where its decks measure them
     "pos_age_s": "of the newest position from outside that was sent, since its exposure",
     "pos_note": "why none is sent now",
-    "pos_sent": "how many were sent so far",
-    "pos_hz": "how many were sent in the last second",
-    "pos_x_m": "the newest that was sent, world of the state estimate",
-    "pos_y_m": "the newest that was sent",
-    "pos_z_m": "the newest that was sent",
-    "pos_qw": "its attitude, where that is sent, too: w of the quaternion from body to world",
-    "pos_qx": "as pos_qw: x",
-    "pos_qy": "as pos_qw: y",
-    "pos_qz": "as pos_qw: z",
+    **_axes("pos_{}_m", "the newest that was sent, world of the state estimate"),
     # the camera; None in a tick without a new frame
     "frame": "number of the frame that this tick processed",
     "frame_t_s": "its time of exposure on the loop's clock",
     "large_px": "corners of the large marker, x y of TL TR BR BL",
     "small_px": "corners of the small marker, x y of TL TR BR BL",
     **{
-        key: text
+        key: f"{name}: {text}"
         for short, name in _POSE_SOURCES.items()
         for key, text in (
-            (f"{short}x_m", f"{name}: unfiltered pose of the target, relative to the gear, level"),
-            (f"{short}y_m", f"{name}: as {short}x_m"),
-            (f"{short}z_m", f"{name}: as {short}x_m"),
-            (f"{short}yaw_rad", f"{name}: unfiltered heading of the target in the level frame"),
-            (f"{short}_rms_px", f"{name}: RMS reprojection error"),
+            (f"{short}x_m", "unfiltered pose of the target, relative to the gear, level"),
+            (f"{short}y_m", f"as {short}x_m"),
+            (f"{short}z_m", f"as {short}x_m"),
+            (f"{short}yaw_rad", "unfiltered heading of the target in the level frame"),
+            (f"{short}_rms_px", "RMS reprojection error"),
         )
     },
     "lock_note": "why the frame's pose was not taken for the target's, or where it was taken anew",
     "cam_age_s": "since the last good frame",
-    # what the flight shows of latency and mounting, once a second
     "delay_s": "by how much the pictures are later than the profile's camera.latency_s",
-    "delay_sigma_s": "standard deviation of delay_s",
-    **{
-        key: text
-        for axis in "xyz"
-        for key, text in (
-            (f"turn_{axis}_rad", f"the camera's turn from the profile's, about body {axis}"),
-            (f"turn_{axis}_sigma_rad", f"standard deviation of turn_{axis}_rad"),
-        )
-    },
     "delay_used_s": "taken off the frames' times beyond camera.latency_s, where it is `measured`",
     # the target's estimate at t_s, which the planner steers by: the paper's error vector
-    "ex_m": "target relative to the gear, level frame",
-    "ey_m": "target relative to the gear, level frame",
-    "ez_m": "target relative to the gear, level frame",
+    **_axes("e{}_m", "target relative to the gear, level frame"),
     "eyaw_rad": "heading of the target in the level frame",
-    "evx_mps": "the filter's velocity of the target, level axes",
-    "evy_mps": "the filter's velocity of the target, level axes",
-    "evz_mps": "the filter's velocity of the target, level axes",
-    "esx_m": "standard deviation of ex_m",
-    "esy_m": "standard deviation of ey_m",
-    "esz_m": "standard deviation of ez_m",
+    **_axes("ev{}_mps", "the filter's velocity of the target, level axes"),
+    **_axes("es{}_m", "standard deviation of the target's place"),
     "esyaw_rad": "standard deviation of eyaw_rad",
     "measured": "true when the newest frame held the target, false while the filter coasts",
     "tracked": "true while the filter lives, false for a place that is only remembered",
     "target_age_s": "since the exposure of the last frame in which the target was measured",
     "unseen": "frames since the target was last detected",
-    "tx_m": "target in the world of the state estimate",
-    "ty_m": "target in the world of the state estimate",
-    "tz_m": "target in the world of the state estimate",
+    **_axes("t{}_m", "target in the world of the state estimate"),
     "tyaw_rad": "heading of the target in the world of the state estimate",
     # what was sent
     "cmd": "idle, position, thrust, stop, land or emergency",
-    "cmd_x_m": "position setpoint, world of the state estimate",
-    "cmd_y_m": "position setpoint, world of the state estimate",
-    "cmd_z_m": "position setpoint, or the height of a landing",
+    **_axes("cmd_{}_m", "position setpoint; z also the height of a landing"),
     "cmd_yaw_rad": "setpoint's heading",
     "cmd_thrust": "raw thrust 0..65535",
     "cmd_roll_rad": "roll to the right that goes with it",
@@ -136,24 +110,9 @@ FIELDS: dict[str, str] = {
     "cmd_duration_s": "duration of a landing",
     "late_s": "how late this tick began",
     # simulation only
-    "true_x_m": "true position of the body, simulation only",
-    "true_y_m": "true position of the body, simulation only",
-    "true_z_m": "true position of the body, simulation only",
+    **_axes("true_{}_m", "true position of the body, simulation only"),
     "true_miss_m": "true horizontal distance of the gear from the target's centre, simulation only",
 }
-
-Kind = Literal["number", "integer", "flag", "text", "corners"]
-_KINDS: dict[Kind, tuple[str, ...]] = {
-    "text": ("phase", "stage", "reason", "hold", "pos_note", "lock_note", "cmd"),
-    "flag": ("measured", "tracked"),
-    "integer": ("attempts", "battery_state", "supervisor", "pos_sent", "frame", "unseen"),
-    "corners": ("large_px", "small_px"),
-}
-
-
-def field_kind(key: str) -> Kind:
-    """Return what a field of `FIELDS` holds; `corners` are eight numbers."""
-    return next((kind for kind, keys in _KINDS.items() if key in keys), "number")
 
 
 def event_record(event: Event) -> dict[str, Any]:
@@ -187,9 +146,9 @@ def tick_record(
         "tel_age_s": tick.telemetry_age_s,
         "cam_age_s": tick.camera_age_s,
         "late_s": tick.loop_late_s,
+        "delay_s": None if tick.consistency is None else tick.consistency.delay_s,
         "delay_used_s": tick.delay_used_s or None,
         "true_miss_m": true_miss_m,
-        **_consistency_values(tick.consistency),
         **_xyz("true_", true_position_m),
         **_external_values(tick.outside),
         **({} if battery is None else {f"battery_{k}": v for k, v in vars(battery).items()}),
@@ -201,32 +160,14 @@ def tick_record(
     return {key: values.get(key) for key in FIELDS}
 
 
-def _consistency_values(seen: Consistency | None) -> dict[str, Any]:
-    if seen is None:
-        return {}
-    return {
-        "delay_s": seen.delay_s,
-        "delay_sigma_s": seen.delay_sigma_s,
-        **{f"turn_{axis}_rad": v for axis, v in zip("xyz", seen.turn_rad, strict=True)},
-        **{f"turn_{axis}_sigma_rad": v for axis, v in zip("xyz", seen.turn_sigma_rad, strict=True)},
-    }
-
-
 def _external_values(external: ExternalPositions | None) -> dict[str, Any]:
     if external is None:
         return {}
-    values: dict[str, Any] = {
+    return {
         "pos_age_s": external.age_s if math.isfinite(external.age_s) else None,
         "pos_note": external.problem,
-        "pos_sent": external.sent,
-        "pos_hz": external.rate_hz,
+        **_xyz("pos_", external.place and external.place.position_m),
     }
-    place = external.place
-    if place is not None:
-        values |= _xyz("pos_", place.position_m)
-        if place.quaternion is not None:
-            values |= {f"pos_q{c}": q for c, q in zip("wxyz", place.quaternion, strict=True)}
-    return values
 
 
 def _xyz(prefix: str, vector: Any, unit: str = "m") -> dict[str, Any]:
@@ -236,20 +177,11 @@ def _xyz(prefix: str, vector: Any, unit: str = "m") -> dict[str, Any]:
 
 
 def _telemetry_values(tel: Telemetry) -> dict[str, Any]:
-    same = (
-        "roll_rad",
-        "pitch_rad",
-        "yaw_rad",
-        "acc_z_g",
-        "thrust",
-        "battery_v",
-        "battery_state",
-        "supervisor",
-    )
+    same = "roll_rad pitch_rad yaw_rad acc_z_g thrust battery_v battery_state supervisor"
     return {
         **_xyz("", tel.position_m),
         **_xyz("v", tel.velocity_mps, "mps"),
-        **{name: getattr(tel, name) for name in same},
+        **{name: getattr(tel, name) for name in same.split()},
         "var_m2": tel.position_variance_m2,
     }
 
@@ -297,21 +229,11 @@ def _target_values(target: TargetEstimate | None) -> dict[str, Any]:
 def command_values(command: Command) -> Mapping[str, Any]:
     """Return the values of a command by the names of a tick's fields: ``cmd`` and its numbers."""
     match command:
-        case Idle():
-            return {"cmd": "idle"}
         case PositionSetpoint(x_m, y_m, z_m, yaw_rad):
             return {"cmd": "position", **_xyz("cmd_", (x_m, y_m, z_m)), "cmd_yaw_rad": yaw_rad}
         case RawThrust(thrust, roll_rad, pitch_rad):
             tilt = {"cmd_roll_rad": roll_rad, "cmd_pitch_rad": pitch_rad}
             return {"cmd": "thrust", "cmd_thrust": thrust, **tilt}
-        case StopMotors():
-            return {"cmd": "stop"}
         case Land(height_m, duration_s):
             return {"cmd": "land", "cmd_z_m": height_m, "cmd_duration_s": duration_s}
-        case EmergencyStop():
-            return {"cmd": "emergency"}
-
-
-def sent_values(sent: SentCommand) -> dict[str, Any]:
-    """Return what was sent in the loop's place by the names of a tick's fields, and ``by``."""
-    return {"t_s": sent.t_s, "by": sent.by, **command_values(sent.command)}
+    return {"cmd": {Idle: "idle", StopMotors: "stop", EmergencyStop: "emergency"}[type(command)]}

@@ -6,7 +6,6 @@ import base64
 import contextlib
 import csv
 import gzip
-import math
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping
@@ -32,15 +31,12 @@ from perchctl.record.fields import (
     FORMAT,
     READABLE_VERSIONS,
     SCHEMA_VERSION,
-    field_kind,
-    sent_values,
 )
 from perchctl.record.header import computer_record
 from perchctl.vision import CameraModel
 
 Times = TypeVar("Times", float, Array)
 Exact = TypeVar("Exact", Turn, SentCommand)
-SUFFIX = ".jsonl"
 KINDS = ("tick", "turn", "sent", "event", "summary", "recording")
 """Of a log's records behind its header."""
 SAME_S = 1e-3
@@ -100,13 +96,7 @@ class FlightLog:
     @cached_property
     def sent(self) -> list[SentCommand]:
         """What was sent in the loop's place; empty before version 4. Errors: InvalidValue."""
-        return [sent_of(record) for record in self.sent_records]
-
-    @property
-    def sent_values(self) -> list[dict[str, Any]]:
-        """What was sent in the loop's place by the names of a tick's fields, and ``by``. Errors:
-        InvalidValue."""
-        return [sent_values(each) for each in self.sent]
+        return [exact_of(SentCommand, record) for record in self.sent_records]
 
     def column(self, key: str) -> Array:
         """Return a field over the ticks, shape (n,); NaN where it is missing.
@@ -149,20 +139,17 @@ class FlightLog:
         return tuple(spans)
 
     def csv(self) -> str:
-        """Return the ticks as CSV: a line of names, then a line each tick with times from 0 and the
-        markers' corners as columns of their own; a missing value is empty, a flag 0 or 1.
-
-        Errors: InvalidValue for a log without ticks; what `log_values` takes for a value that no
-        flight writes.
-        """
+        """Return the ticks as CSV: a line of names, then a line each tick, with times from 0; a
+        missing value is empty. Errors: InvalidValue for a log without ticks."""
         if not self.records:
             raise InvalidValue(f"{self.path}: the log holds no ticks, there is nothing to export")
         text = StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(name for key in FIELDS for name in _columns_of(key))
+        table = csv.DictWriter(text, FIELDS, extrasaction="ignore", lineterminator="\n")
+        table.writeheader()
         for record in self.records:
-            times = {key: self.since(record[key]) for key in TIMES if record[key] is not None}
-            writer.writerow(cell for key in FIELDS for cell in _cells(key, {**record, **times}))
+            times_s = {key: record[key] for key in TIMES if record[key] is not None}
+            since_s = {key: round(self.since(t_s), 6) for key, t_s in times_s.items()}
+            table.writerow(record | since_s)
         return text.getvalue()
 
     # --- times
@@ -199,25 +186,18 @@ class FlightLog:
 
     # --- the setup that was flown
 
-    def setting(self, key: str) -> Any:
-        """Return the flown profile's value of a dotted key, as JSON has it; None without one."""
-        value = self.header.get("profile")
-        for name in key.split("."):
-            value = value.get(name) if isinstance(value, Mapping) else None
-        return value
-
-    def number(self, key: str) -> float | None:
-        """Return the flown profile's value of a dotted key; None if it is no finite number."""
-        value = self.setting(key)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            return None
-        return float(value) if math.isfinite(value) else None
-
     @property
     def profile_name(self) -> str | None:
         """The flown profile's name; None where the header holds none."""
-        name = self.setting("name")
+        profile = self.header.get("profile")
+        name = profile.get("name") if isinstance(profile, dict) else None
         return None if name is None else str(name)
+
+    @property
+    def setup_text(self) -> str:
+        """The flown profile's name, and the seed of a simulated flight, as people read them."""
+        seed = self.header.get("seed")
+        return f"profile {self.profile_name or '?'}" + ("" if seed is None else f", seed {seed}")
 
     @property
     def flown_profile(self) -> Profile:
@@ -247,18 +227,14 @@ class FlightLog:
             raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
 
     def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
-        """Return the flown mask, (height, width), True where the gear covers; None without one.
-        Errors: InvalidValue."""
+        """Return the flown mask, (height, width), True where the gear covers; None without one."""
         text = self.header.get("mask")
         if text is None:
             return None
         width, height = camera.size_px
-        try:
-            packed = zlib.decompress(base64.b64decode(text))
-            bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8))
-            return bits[: width * height].reshape(height, width).astype(bool)
-        except (ValueError, TypeError, zlib.error) as error:
-            raise InvalidValue(f"the log's header holds no mask: mask: {error}") from None
+        packed = zlib.decompress(base64.b64decode(text))
+        bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8))
+        return bits[: width * height].reshape(height, width).astype(bool)
 
     @property
     def computer_differences(self) -> str:
@@ -276,29 +252,6 @@ class FlightLog:
 
 TIMES = ("t_s", "frame_t_s")
 """On the loop's clock in the log, from the flight's first turn in a table."""
-
-
-def _columns_of(key: str) -> list[str]:
-    """Return the names of the columns of a field in a table."""
-    if field_kind(key) != "corners":
-        return [key]
-    corners = ("tl", "tr", "br", "bl")
-    return [f"{key.removesuffix('_px')}_{corner}_{axis}_px" for corner in corners for axis in "xy"]
-
-
-def _cells(key: str, record: Mapping[str, Any]) -> list[Any]:
-    """Return the values of those columns in a record."""
-    value, kind = record[key], field_kind(key)
-    if kind == "corners":
-        cells = [None] * 8 if value is None else list(value)
-        if len(cells) != 8:
-            raise ValueError(f"{key} needs 8 numbers")
-        return cells
-    if kind == "flag" and value is not None:
-        return [int(value)]
-    if kind == "number" and value is not None:
-        return [round(value + 0.0, 6)]
-    return [value]
 
 
 # --- the file ---------------------------------------------------------
@@ -383,22 +336,16 @@ def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
     except (IndexError, ValueError):
         header = {}
     if header.get("kind") != "header" or header.get("format") != FORMAT:
-        kind = file_kind(path)
-        is_cut = kind in ("a file of JSON lines", "a file packed by gzip", "another kind of file")
-        found = (
-            "not a flight log of perchctl, or cut off in its header" if is_cut else f"it is {kind}"
-        )
         raise InvalidValue(
-            f"{path}: line 1: {found}; logs are the {SUFFIX} files in the profile's log.directory"
+            f"{path}: line 1: not a flight log of perchctl, or cut off in its header (it is "
+            f"{file_kind(path)}); logs are the .jsonl files in the profile's log.directory"
         )
     version = header.get("version")
     if version not in READABLE_VERSIONS:
-        newer = isinstance(version, int) and version > SCHEMA_VERSION
         raise InvalidValue(
             f"{path}: line 1: schema version {version!r}, this perchctl reads 1 to "
-            f"{READABLE_VERSIONS[-1]}; the log was written by perchctl "
-            f"{header.get('perchctl', 'of unknown version')}, this is {__version__}"
-            + (": update perchctl" if newer else "")
+            f"{SCHEMA_VERSION}; the log was written by perchctl "
+            f"{header.get('perchctl', 'of unknown version')}, this is {__version__}: update it"
         )
     return header
 
@@ -429,21 +376,16 @@ def turn_of(record: dict[str, Any]) -> Turn:
         samples = taken.get("late") or taken.get("samples")
         if isinstance(samples, list) and samples:
             record = record | {"observation": obs | {"telemetry": samples[-1]}}
-    return _exact(Turn, record, f"the log's turn {record.get('number', '?')}")
+    return exact_of(Turn, record)
 
 
-def sent_of(record: Mapping[str, Any]) -> SentCommand:
-    """Return the command of a record, to the same bits. Errors: InvalidValue."""
-    return _exact(
-        SentCommand, record, f"the log's record of what was sent at {record.get('t_s', '?')} s"
-    )
-
-
-def _exact(kind: type[Exact], record: Mapping[str, Any], name: str) -> Exact:
+def exact_of(kind: type[Exact], record: Mapping[str, Any]) -> Exact:
+    """Return the turn, or the command that was sent in the loop's place, of a record, to the same
+    bits. Errors: InvalidValue."""
     try:
         return from_exact(kind, _without_kind(record))
     except ValueError as error:
         raise InvalidValue(
-            f"{name} cannot be read ({error}): the log is damaged, or another version of "
-            f"perchctl wrote it"
+            f"the log's {record.get('kind')} at {record.get('t_s')} s cannot be read ({error}): "
+            f"the log is damaged, or another version of perchctl wrote it"
         ) from None

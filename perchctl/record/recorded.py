@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import struct
-import zlib
 from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ from zstandard import ZstdError
 
 from perchctl.camera import decode_picture
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.record.recording_file import FRAME, IMAGE
+from perchctl.record.messages import FRAME, IMAGE
 from perchctl.record.write import recording_path
 
 MOST_RECORD_BYTES = 64_000_000
@@ -38,18 +37,12 @@ class Picture(NamedTuple):
     image: NDArray[np.uint8]
 
 
-def recorded_pictures(
-    path: Path | str, *, exact: bool = True, numbers: Container[int] | None = None
-) -> Iterator[Picture]:
+def recorded_pictures(path: Path | str, numbers: Container[int] | None = None) -> Iterator[Picture]:
     """Yield the pictures `(number, t_s, image)`, oldest first, of a recording or of the log that it
     lies beside; of one that was cut off, those that are whole.
 
-    Args:
-        exact: every picture must be the flight's to the bit.
-        numbers: only the frames of these, the others are not decoded; None is all.
-
-    Errors, with the first picture: NotFound without a recording; InvalidValue where it is none,
-    and where this computer's decoder makes other pixels of a JPEG than the flight's did.
+    Only the frames of `numbers`, where it is given, are decoded. Errors, with the first picture:
+    NotFound without a recording; InvalidValue where it is none.
     """
     path = recording_path(path)
     for frame, message in recorded_frames(path):
@@ -59,16 +52,11 @@ def recorded_pictures(
             grey = decode_picture(message.data)
         except ValueError as error:
             raise InvalidValue(f"{path}: picture {frame['number']} {error}") from None
-        if exact and zlib.crc32(grey.data) != frame["crc32"]:
-            raise InvalidValue(
-                f"{path}: picture {frame['number']} decodes to other pixels here than in the "
-                f"flight: another version of OpenCV decoded it there"
-            )
         yield Picture(frame["number"], frame["t_s"], grey)
 
 
 def recorded_frames(path: Path) -> Iterator[tuple[dict[str, Any], CompressedImage | None]]:
-    """Yield each frame of a recording as `frame_record` has it, with its picture where it was kept.
+    """Yield what is said of each frame of a recording, with its picture where it was kept.
 
     Errors: NotFound where there is no file, InvalidValue where it is no MCAP file.
     """

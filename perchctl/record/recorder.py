@@ -1,4 +1,4 @@
-"""Records a flight while it flies: pictures, transforms, ticks and events.
+"""Records a flight while it flies: pictures, transforms and ticks.
 
 The flight hands over what it has and goes on: a thread of its own encodes and writes. The
 recording is not the log: what it loses is counted and said, and nothing lands for it.
@@ -6,19 +6,44 @@ recording is not the log: what it loses is counted and said, and nothing lands f
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
+from contextlib import suppress
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from google.protobuf.message import Message
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
+
+import perchctl
 from perchctl.errors import InvalidValue
 from perchctl.profile import Profile
-from perchctl.record.disk import BackgroundWriter, DiskFile, Job
-from perchctl.record.recording_file import RecordingFile, encoded, frame_record
+from perchctl.record.disk import BackgroundWriter, DiskFile, Job, begin_file
+from perchctl.record.exact import encode
+from perchctl.record.messages import (
+    CORNERS,
+    FRAME,
+    IMAGE,
+    NS,
+    TF,
+    TICK,
+    TICK_SCHEMA,
+    corners_message,
+    image_message,
+    mounts_of,
+    moving,
+    stamp,
+)
 from perchctl.record.summary import RecordingEnd
 from perchctl.vision import Frame
 
+CHUNK_BYTES = 4_000_000
 CLOSE_TIMEOUT_S = 5.0
 MOST_WAITING_BYTES = 64_000_000
 """What may wait for the disk holds so much memory."""
@@ -30,8 +55,8 @@ RESERVE_BYTES = 200_000_000
 
 
 class Recorder:
-    """Writes one flight's recording. Only `open` raises. `frame`, `tick` and `event` are called
-    by the loop, and cost it no more than a place in a queue.
+    """Writes one flight's recording. Only `open` raises. `frame` and `tick` are called by the
+    loop, and cost it no more than a place in a queue.
 
     Live, a turn is handed over at its end, with its frame: the thread works while the loop
     sleeps. Otherwise (lockstep) everything is written at once, and nothing is ever dropped.
@@ -43,7 +68,7 @@ class Recorder:
     def __init__(
         self, path: Path, stream: DiskFile, header: Mapping[str, Any], profile: Profile, live: bool
     ) -> None:
-        """Begin the file. Raises OSError."""
+        """Begin the file at the times of the log's header. Raises OSError."""
         self.path = path
         self.problem: str | None = None
         # Of the loop's thread.
@@ -53,8 +78,18 @@ class Recorder:
         self._pictures = 0
         self._closed = False
         # Of the thread that writes.
-        self._file = RecordingFile(stream, header, profile)
+        self._stream = stream
+        sink: Any = stream  # of IO[bytes] the writer needs no more
+        self._mcap = Writer(sink, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+        self._mcap.start(library=f"perchctl {perchctl.__version__}")
+        self._channels: dict[str, int] = {}
+        self._mounts = mounts_of(profile)
+        self._newest_s = self._t0_s = float(header["t0_s"])
+        started = header.get("started_utc")
+        self._started_ns = NS * round(datetime.fromisoformat(started).timestamp()) if started else 0
+        self._first_s: float | None = None
         self._most_bytes = profile.log.max_mb * 1_000_000
+        self._written_bytes = self._written_pictures = 0
         self._over = False
         self._flushed_s = -math.inf
         self._flushed_pictures = 0
@@ -65,13 +100,7 @@ class Recorder:
     ) -> Recorder:
         """Begin a new file beside the log. Errors: InvalidValue, before the flight."""
         try:
-            stream = DiskFile(path, sync=live)
-            try:
-                return cls(path, stream, header, profile, live)
-            except BaseException:
-                stream.close()
-                path.unlink(missing_ok=True)
-                raise
+            return begin_file(path, live, lambda stream: cls(path, stream, header, profile, live))
         except OSError as error:
             raise InvalidValue(
                 f"{path}: the recording cannot be begun ({error.strerror or error}): free the "
@@ -82,17 +111,13 @@ class Recorder:
         """Record a frame that the source gave. Never raises."""
         self._hand_over()  # before take-off no tick does
         self._pictures += not frame.repeated
-        self._turn.append(partial(self._store, frame))
+        self._turn.append(partial(self._write_frame, frame))
         # A frame that repeats holds its picture too.
         self._turn_bytes += frame.image.nbytes + len(frame.encoded or b"")
 
-    def event(self, record: Mapping[str, Any]) -> None:
-        """Record an event (`perchctl.record.fields.event_record`). Never raises."""
-        self._turn.append(partial(self._file.event, record))
-
     def tick(self, record: Mapping[str, Any]) -> None:
         """Record a tick (`perchctl.record.fields.tick_record`), which ends a turn. Never raises."""
-        self._turn.append(partial(self._file.tick, record))
+        self._turn.append(partial(self._write_tick, record))
         self._hand_over()
 
     def close(self) -> RecordingEnd:
@@ -104,7 +129,7 @@ class Recorder:
             if self._writer.finish(partial(self._attempt, self._finish), CLOSE_TIMEOUT_S):
                 self._remember("the disk does not answer: the recording lacks its end")
         kept = self._flushed_pictures
-        return RecordingEnd(self.path, kept, self._pictures - kept, self.problem)
+        return RecordingEnd(self.path.name, kept, self._pictures - kept, self.problem)
 
     def _hand_over(self) -> None:
         turn, size = self._turn, self._turn_bytes
@@ -129,32 +154,88 @@ class Recorder:
             if isinstance(error, OSError):
                 why = error.strerror or str(error)
             self._end(why)
-            self._file.close()
+            with suppress(OSError):
+                self._stream.close()  # without an index, where its last whole record ends
 
-    def _store(self, frame: Frame) -> None:
-        self._file.frame(frame_record(frame), None if frame.repeated else encoded(frame))
+    def _write_frame(self, frame: Frame) -> None:
+        """Write a frame as its source gave it, and its picture unless that repeats."""
+        number = frame.index & 0xFFFFFFFF
+        about = {
+            "number": frame.index,
+            "t_s": frame.t_s,
+            "t_arrival_s": frame.t_arrival_s,
+            "repeated": frame.repeated,
+        }
+        self._newest_s, ns = frame.t_arrival_s, self._ns(frame.t_arrival_s)
+        if not frame.repeated:
+            self._add(IMAGE, ns, image_message(self._ns(frame.t_s), frame), number)
+            self._written_pictures += 1
+        # With all digits: a replay needs the very times.
+        self._add(FRAME, ns, json.dumps(about).encode(), number)
+
+    def _write_tick(self, record: Mapping[str, Any]) -> None:
+        """Write a tick's record with its times since the first flown turn, and what it shows in
+        space."""
+        t_s, exposed_s = float(record["t_s"]), record.get("frame_t_s")
+        self._newest_s, ns = t_s, self._ns(t_s)
+        first_s = self._first_s = t_s if self._first_s is None else self._first_s
+        for mount in self._mounts:
+            mount.timestamp.CopyFrom(stamp(ns))
+        sampled_ns = self._ns(t_s - (record.get("tel_age_s") or 0.0))
+        transforms = [*self._mounts, *moving(ns, sampled_ns, record)]
+        self._add(TF, ns, FrameTransforms(transforms=transforms))
+        shown = {**record, "t_s": t_s - first_s}
+        if exposed_s is not None:
+            self._add(CORNERS, ns, corners_message(self._ns(exposed_s), record))
+            shown["frame_t_s"] = exposed_s - first_s
+        self._add(TICK, ns, encode(shown)[:-1])
 
     def _flush(self) -> None:
         """Bring to the disk, once a second, what was written; end a recording that is too large."""
-        file = self._file
-        if file.newest_s - self._flushed_s < FLUSH_PERIOD_S:
+        if self._newest_s - self._flushed_s < FLUSH_PERIOD_S:
             return
-        self._flushed_s = file.newest_s
-        file.flush()
-        self._flushed_pictures = file.pictures
-        free_bytes = file.free_bytes()
-        if file.size_bytes > self._most_bytes:
+        self._flushed_s = self._newest_s
+        self._mcap.flush()
+        self._flushed_pictures = self._written_pictures
+        free_bytes = self._stream.free_bytes()
+        if self._written_bytes > self._most_bytes:
             self._end(f"it is full: log.max_mb in the profile is {self._most_bytes / 1e6:g}")
         elif free_bytes < RESERVE_BYTES:
             self._end(f"its disk's last {free_bytes / 1e6:.0f} MB are left to the log")
         if self._over:
-            file.finish()
+            self._finish()
 
     def _finish(self) -> None:
-        self._file.finish()
-        self._flushed_pictures = self._file.pictures
+        """End the file with its index."""
         self._over = True
+        self._mcap.finish()
+        self._stream.flush()
+        self._stream.close()
+        self._flushed_pictures = self._written_pictures
 
     def _end(self, why: str) -> None:
         self._over = True
         self._remember(f"the recording has ended ({why}): the flight and its log go on")
+
+    def _ns(self, t_s: float) -> int:
+        """Return a time on the loop's clock as nanoseconds since 1970, where a flight in lockstep
+        begins; what was before that is at 0, which MCAP begins at."""
+        return max(0, self._started_ns + round((t_s - self._t0_s) * NS))
+
+    def _add(self, topic: str, ns: int, message: Message | bytes, sequence: int = 0) -> None:
+        """Add a message of Foxglove's, or JSON."""
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._channels[topic] = self._new_channel(topic, message)
+        data = message if isinstance(message, bytes) else message.SerializeToString()
+        self._mcap.add_message(channel, ns, data, ns, sequence)
+        self._written_bytes += len(data)
+
+    def _new_channel(self, topic: str, message: Message | bytes) -> int:
+        if isinstance(message, bytes):
+            schema = json.dumps(TICK_SCHEMA if topic == TICK else {"type": "object"}).encode()
+            name = f"perchctl.{topic.rpartition('/')[2].capitalize()}"
+            number = self._mcap.register_schema(name, SchemaEncoding.JSONSchema, schema)
+            return self._mcap.register_channel(topic, MessageEncoding.JSON, number)
+        number = register_schema(self._mcap, type(message))
+        return self._mcap.register_channel(topic, MessageEncoding.Protobuf, number)

@@ -2,47 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from perchctl.mission import ContactError, Findings, Touchdown
-from perchctl.record.read import FlightLog, PhaseSpan
+from perchctl.record.read import FlightLog
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 
-@dataclass(frozen=True)
-class RecordingEnd:
-    """What became of a recording.
+class RecordingEnd(NamedTuple):
+    """What became of a recording, by its keys for programs: the file's name, how many pictures are
+    in it, how many are not, and the first reason why."""
 
-    Attributes:
-        pictures: how many are in it; `missing`: how many are not, and `problem`: the first
-            reason why.
-    """
-
-    path: Path
+    recording: str
     pictures: int
-    missing: int = 0
-    problem: str | None = None
+    pictures_missing: int
+    recording_problem: str | None
 
     @property
     def text(self) -> str:
-        told = f"{self.pictures} pictures in {self.path}"
-        if self.missing:
-            told += f", {self.missing} missing"
-        return f"{told} ({self.problem})" if self.problem else told
-
-    def as_record(self) -> dict[str, Any]:
-        """Return the record for programs."""
-        return {
-            "recording": self.path.name,
-            "pictures": self.pictures,
-            "pictures_missing": self.missing,
-            "recording_problem": self.problem,
-        }
+        """The same in words."""
+        missing = f", {self.pictures_missing} missing" if self.pictures_missing else ""
+        why = f" ({self.recording_problem})" if self.recording_problem else ""
+        return f"{self.pictures} pictures in {self.recording}{missing}{why}"
 
 
 @dataclass(frozen=True)
@@ -69,7 +55,6 @@ class FlightSummary:
     battery_min_v: float | None = None
     locked: bool = False
     fell: bool = False
-    phases: tuple[PhaseSpan, ...] = ()
     findings: Findings | None = None
     contact: ContactError | None = None
     touchdown: Touchdown | None = None
@@ -80,26 +65,23 @@ class FlightSummary:
     @classmethod
     def of(cls, log: FlightLog) -> FlightSummary:
         """Return the summary by the log's record; by its ticks where that is missing."""
-        phases = log.phases
         battery_v = log.column("battery_v")
         known_v = battery_v[battery_v >= NO_BATTERY_READING_V]
-        end: Mapping[str, Any] = log.summary or {
-            "outcome": "unknown",
-            "reason": _last_known(log),
-        }
+        ends = f"ends in {log.phases[-1].phase}" if log.phases else "holds no flight"
+        unknown = {"outcome": "unknown", "reason": f"the log {ends}"}
+        end: Mapping[str, Any] = log.summary or unknown
         last = log.records[-1] if log.records else {}
         battery_min_v = float(np.min(known_v)) if known_v.size else None
         return cls(
             outcome=str(end.get("outcome", "unknown")),
             reason=str(end.get("reason", "")),
             cause=str(end.get("cause") or ""),
-            duration_s=float(end.get("duration_s") or sum(p.duration_s for p in phases)),
+            duration_s=float(end.get("duration_s") or sum(p.duration_s for p in log.phases)),
             attempts=int(end.get("attempts", last.get("attempts")) or 0),
             miss_m=end.get("miss_m"),
             battery_min_v=end.get("battery_min_v") or battery_min_v,
             locked=bool(end.get("locked", False)),
             fell=bool(end.get("fell", False)),
-            phases=phases,
             findings=_part_in(end, Findings, _FINDINGS),
             contact=_part_in(end, ContactError, _CONTACT),
             touchdown=_part_in(end, Touchdown, _TOUCHDOWN),
@@ -108,8 +90,7 @@ class FlightSummary:
         )
 
     def as_record(self) -> dict[str, Any]:
-        """Return the record for `FlightLogWriter.close`. The phases are in the ticks already,
-        and the writer adds what the log lacks."""
+        """Return the record for `LogWatcher.end`, which adds what the log lacks."""
         return {
             "outcome": self.outcome,
             "cause": self.cause or None,
@@ -123,7 +104,7 @@ class FlightSummary:
             "locked": self.locked,
             "fell": self.fell,
             **_keys_of(self.findings, _FINDINGS),
-            **({} if self.recording is None else self.recording.as_record()),
+            **({} if self.recording is None else self.recording._asdict()),
         }
 
     def text(self, log_path: Path | None = None) -> str:
@@ -137,8 +118,6 @@ class FlightSummary:
             lines.append(f"contact:   {self.contact.text}")
         attempts = f"{self.attempts} attempt{'' if self.attempts == 1 else 's'}"
         lines.append(f"flight:    {self.duration_s:.1f} s, {attempts}")
-        if self.phases:
-            lines.append(f"phases:    {phases_text(self.phases)}")
         if self.battery_min_v is not None:
             lines.append(f"battery:   {self.battery_min_v:.2f} V at its lowest")
         if self.findings is not None:  # with 95 % intervals
@@ -184,16 +163,3 @@ def _part_in(end: Mapping[str, Any], kind: Any, keys: Mapping[str, str]) -> Any:
     if next(iter(keys.values())) not in known:
         return None
     return kind(**{n: tuple(v) if isinstance(v, list) else v for n, v in known.items()})
-
-
-def _last_known(log: FlightLog) -> str:
-    if log.phases:
-        return f"the log ends in {log.phases[-1].phase}"
-    phases = [r["phase"] for r in log.turn_records if r.get("role") == "flown" and r.get("phase")]
-    return f"the log ends in {phases[-1]}" if phases else "the log holds no flight"
-
-
-def phases_text(phases: Sequence[PhaseSpan]) -> str:
-    """Return ``APPROACH 3.1 s > SEARCH 0.4 s > ...``; ends, which take no time, by name alone."""
-    parts = [f"{p.phase} {p.duration_s:.1f} s" if p.duration_s > 0 else p.phase for p in phases]
-    return " > ".join(parts)

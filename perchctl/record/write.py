@@ -1,29 +1,37 @@
 """The flight log: append-only JSON lines, readable after any crash.
 
 Line 1 is the header; then a `tick` and a `turn` record for each turn of the loop (the one
-rounded, for people and plots, the other exact and whole), `event` records between them, and one
-`summary` at the end. `sent` records hold what went to the vehicle in the loop's place. A flight is
-never troubled by its log: in real time a thread of its own writes it, and a write that fails is
-remembered in `FlightLogWriter.problem`.
+rounded, for people and plots, the other exact and whole), `event` and `sent` records between them,
+and one `summary` at the end. A flight is never troubled by its log.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from perchctl.camera import FrameSource, WrappedSource
 from perchctl.errors import InvalidValue
-from perchctl.mission import Event, SentCommand, Turn
-from perchctl.record.disk import BackgroundWriter, DiskFile
+from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
+from perchctl.profile import Profile
+from perchctl.record.disk import BackgroundWriter, DiskFile, begin_file
 from perchctl.record.exact import encode, json_line, to_exact
-from perchctl.record.fields import event_record
+from perchctl.record.fields import event_record, tick_record
+from perchctl.record.header import make_header
+from perchctl.record.summary import FlightSummary, RecordingEnd
+from perchctl.vehicle import NO_BATTERY_READING_V
+
+if TYPE_CHECKING:
+    from perchctl.record.recorder import Recorder
 
 FSYNC_PERIOD_S = 1.0
 CLOSE_TIMEOUT_S = 3.0
@@ -33,20 +41,34 @@ NO_ANSWER = "the disk does not answer: the flight log lacks its end"
 NO_ROOM = "the disk does not keep up with the flight log: records are dropped"
 
 
-class FlightLogWriter:
-    """Writes one flight. Only `open` raises; afterwards look at `problem`.
+Truth = tuple[tuple[float, float, float], float]
+"""The body's true position (world, m) and the gear's true miss (m)."""
+
+
+class LogWatcher:
+    """Writes every turn and event of one flight, and its recording where one is wanted. Only
+    opening it raises; afterwards look at `problem`, or for the recording at `remarks`.
 
     Attributes:
         path: the file; `open` adds ``_2``, ``_3``... rather than overwrite one.
         problem: None, or one sentence about the first failure of the disk.
         formless: None, or one sentence about the first record that no line could be made of. It
             alone is lost: the disk is well, and nothing lands for it.
+        truth: gives what is true at the time of a tick, where a simulation sets it.
+        recorder: of the pictures that come through `watched`; None without a recording.
     """
 
-    def __init__(self, path: Path, file: DiskFile, live: bool) -> None:
+    def __init__(self, path: Path, header_line: bytes, live: bool, file: DiskFile) -> None:
+        """Write the header into a new file. Raises OSError."""
+        file.write(header_line)
         self.path = path
         self.problem: str | None = None
         self.formless: str | None = None
+        self.truth: Callable[[], Truth] | None = None
+        self.recorder: Recorder | None = None
+        self._battery_min_v: float | None = None
+        self._ticks = 0
+        self._has_remarked = False
         self._file = file
         self._writer = BackgroundWriter(MOST_WAITING, "perchctl-log", live)
         self._closed = False
@@ -66,31 +88,95 @@ class FlightLogWriter:
         return self.problem or self.formless
 
     @classmethod
-    def open(cls, path: Path, header: Mapping[str, Any], live: bool = False) -> FlightLogWriter:
+    def open(cls, path: Path, header: Mapping[str, Any], live: bool = False) -> LogWatcher:
         """Create the file and its folder and write the header.
 
-        `live` (for flights in real time): a thread of its own writes, and brings the records
-        to the disk about once a second of the loop's time; otherwise each record is in the
-        file at once. Raises InvalidValue when the file cannot be created: that is before the
-        flight, where refusing costs nothing.
+        `live`: a thread of its own writes, and brings the records to the disk about once a second;
+        otherwise each record is in the file at once. Raises InvalidValue, before the flight.
         """
         # A replay flies by the profile in the header, so no number of it is rounded.
         line = json_line(to_exact({k: v for k, v in header.items() if v is not None}))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            file, path = _new_file(path, live)
-            try:
-                file.write(line)
-                return cls(path, file, live)
-            except BaseException:
-                file.close()
-                path.unlink(missing_ok=True)
-                raise
+            for free in _free_names(path):
+                with suppress(FileExistsError):
+                    return begin_file(free, live, partial(cls, free, line, live))
+            raise AssertionError("unreachable")
         except OSError as error:
             raise InvalidValue(
                 f"{path}: the flight log cannot be created ({error.strerror or error}): free the "
                 f"place, or name another folder with --log-dir, or in the profile (log.directory)"
             ) from None
+
+    @classmethod
+    def lockstep(cls, path: Path, profile: Profile, seed: int, record: bool = False) -> LogWatcher:
+        """Open the log of a simulated flight: the same seed gives the same bytes. Errors:
+        InvalidValue."""
+        header = make_header(profile, uri="sim://", source="sim:", seed=seed, lockstep=True)
+        return cls._opened(path, header, profile, record, live=False)
+
+    @classmethod
+    def real_time(
+        cls,
+        directory: Path,
+        profile: Profile,
+        uri: str,
+        source: str,
+        seed: int | None = None,
+        record: bool = False,
+    ) -> LogWatcher:
+        """Open a new log in `directory`, which a thread of its own writes. Errors: InvalidValue."""
+        started, t0_s = datetime.now(UTC), time.monotonic()
+        header = make_header(profile, uri=uri, source=source, seed=seed, started=started, t0_s=t0_s)
+        path = log_path(directory, profile.name, started)
+        return cls._opened(path, header, profile, record, live=True)
+
+    @classmethod
+    def _opened(
+        cls, path: Path, header: Mapping[str, Any], profile: Profile, record: bool, live: bool
+    ) -> LogWatcher:
+        log = cls.open(path, header, live)
+        if record:
+            from perchctl.record.recorder import Recorder
+
+            try:
+                log.recorder = Recorder.open(recording_path(log.path), header, profile, live)
+            except BaseException:
+                log.end()
+                log.path.unlink(missing_ok=True)
+                raise
+        return log
+
+    def watched(self, source: FrameSource) -> FrameSource:
+        """Return the same source; the frames that it gives are recorded, where that is wanted."""
+        return source if self.recorder is None else WrappedSource(source, self.recorder.frame)
+
+    def remarks(self) -> list[str]:
+        """Return what is new about the recording, a sentence, once a flight."""
+        problem = None if self.recorder is None else self.recorder.problem
+        if problem is None or self._has_remarked:
+            return []
+        self._has_remarked = True
+        return [problem]
+
+    @property
+    def begun(self) -> bool:
+        """True if the flight has begun; `abandon` leaves no file of one that has not."""
+        return self._ticks > 0
+
+    def tick(self, tick: Tick) -> None:
+        """Write a tick, with its turn and the simulation's truth. Never raises."""
+        self._ticks += 1
+        battery_v = tick.telemetry.battery_v
+        if battery_v >= NO_BATTERY_READING_V:
+            self._battery_min_v = min(battery_v, self._battery_min_v or battery_v)
+        position_m, miss_m = (None, None) if self.truth is None else self.truth()
+        record = tick_record(tick, position_m, miss_m)
+        self.write(record)
+        if tick.turn is not None:
+            self.turn(tick.turn)
+        if self.recorder is not None:
+            self.recorder.tick(record)
 
     def write(self, record: Mapping[str, Any]) -> None:
         """Append one tick record (`perchctl.record.fields.tick_record`). Never raises."""
@@ -108,7 +194,52 @@ class FlightLogWriter:
         """Append an event (`perchctl.record.fields.event_record`). Never raises."""
         self._put(partial(encode, {"kind": "event", **event_record(event)}), event.t_s)
 
-    def close(self, summary: Mapping[str, Any] | None = None) -> None:
+    def close(
+        self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False
+    ) -> FlightSummary | None:
+        """Write the summary and close; without a report (the flight raised) only close. Return the
+        summary.
+
+        The log comes first: a recording's disk that hangs holds up its own end only."""
+        if report is None:
+            self.end()
+            self._ended_recording()
+            return None
+        summary = FlightSummary(
+            outcome=report.phase.value.lower(),
+            reason=report.reason,
+            cause=report.outcome.value,
+            duration_s=report.duration_s,
+            attempts=report.attempts,
+            miss_m=miss_m,
+            battery_min_v=self._battery_min_v,
+            locked=report.locked,
+            fell=fell,
+            findings=report.findings,
+            contact=report.contact,
+            touchdown=report.touchdown,
+        )
+        self.end(summary.as_record())
+        return replace(
+            summary,
+            lost_records=self.lost_records,
+            log_problem=self.lacks,
+            recording=self._ended_recording(),
+        )
+
+    def abandon(self, reason: str) -> None:
+        """Close the log of a flight that failed. One that never began leaves no file."""
+        self.end({"outcome": "failed", "reason": reason})
+        self._ended_recording()
+        if not self.begun:
+            self.path.unlink(missing_ok=True)
+            if self.recorder is not None:
+                self.recorder.path.unlink(missing_ok=True)
+
+    def _ended_recording(self) -> RecordingEnd | None:
+        return None if self.recorder is None else self.recorder.close()
+
+    def end(self, summary: Mapping[str, Any] | None = None) -> None:
         """Append the summary, if there is one, and close. Never raises; a second call does
         nothing.
 
@@ -116,8 +247,8 @@ class FlightLogWriter:
         if self._closed:
             return
         self._closed = True
-        end = partial(self._end, summary)
-        self._unfinished = self._writer.finish(end, CLOSE_TIMEOUT_S)
+        last = partial(self._end, summary)
+        self._unfinished = self._writer.finish(last, CLOSE_TIMEOUT_S)
         if self._unfinished:
             self._remember(NO_ANSWER)
 
@@ -147,10 +278,8 @@ class FlightLogWriter:
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
-            # What has been waited for in vain is in the file by now.
-            problem = None if self.problem == NO_ANSWER else self.problem
             lost_records = self._writer.refused + self._failed
-            lost = {"lost_records": lost_records, "problem": problem or self.formless}
+            lost = {"lost_records": lost_records, "problem": self.lacks}
             self._store(partial(encode, {"kind": "summary", **summary, **lost}))
         self._sync_to_disk()
         with suppress(OSError):
@@ -207,12 +336,9 @@ def log_path(directory: Path, profile_name: str, started: datetime) -> Path:
     return directory / f"flight_{started.astimezone(UTC):%Y%m%d_%H%M%S}_{safe[:60]}.jsonl"
 
 
-def _new_file(path: Path, sync: bool) -> tuple[DiskFile, Path]:
-    """Create a file by `path`'s name or the next free one, beside which there is no recording,
-    either. Raises OSError."""
+def _free_names(path: Path) -> Iterator[Path]:
+    """Yield the path, then with ``_2``, ``_3``...; none beside which there is a recording."""
     for number in count(1):
-        free = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
-        if not recording_path(free).exists():
-            with suppress(FileExistsError):
-                return DiskFile(free, sync), free
-    raise AssertionError("unreachable")
+        name = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
+        if not recording_path(name).exists():
+            yield name

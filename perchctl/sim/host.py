@@ -299,13 +299,13 @@ class Runner:
         return now_s - self._waiting_since_s < LOOP_PATIENCE_S
 
     def _wait(self, timeout_s: float) -> None:
-        sockets = [self._host.socket]
+        sockets: list[Any] = [self._host.socket]
         if self._channel is not None:
-            sockets.append(self._channel.socket)
+            sockets.append(self._channel)
         ready, _, _ = select.select(sockets, [], [], timeout_s)
         if self._host.socket in ready:
             self._host.serve()
-        if self._channel is not None and self._channel.socket in ready:
+        if self._channel is not None and self._channel in ready:
             self._answer(self._channel)
 
     def _answer(self, channel: Channel) -> None:

@@ -11,6 +11,7 @@ import contextlib
 import ctypes
 import math
 import mmap
+import signal
 import tempfile
 import threading
 from collections.abc import Callable
@@ -19,16 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any, ClassVar, Literal
 
-from perchctl.children import (
-    Channel,
-    accept,
-    end,
-    last_line,
-    listen,
-    new_token,
-    send_address,
-    spawn,
-)
+from perchctl.children import end, last_line, spawn
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
 from perchctl.profile import TargetConfig
 from perchctl.sim.capture import CaptureSettings
@@ -139,26 +131,18 @@ class SimProcess:
         self._stopped = False
         self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed by stop)
         # Both processes have mapped the file once the child has answered.
-        with (
-            listen() as listener,
-            tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
-        ):
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             file = Path(folder, "time")
             file.write_bytes(bytes(SharedTime.free()))
             self.shared_time = SharedTime.mapped(file)
-            self._child = spawn(_CHILD, self._stderr)
-            token = new_token()
-            send_address(self._child, listener, token)
-            channel = accept(listener, token, timeout_s, lambda: self._child.poll() is None)
-            if channel is None:
-                raise self._gave_up(f"did not come up within {timeout_s:.0f} s")
-            self._channel: Channel = channel
+            self._child, self._channel = spawn(_CHILD, self._stderr)
             try:
-                channel.send(replace(setup, time_file=file))
-                answer = channel.receive(timeout_s)
+                self._channel.receive(timeout_s)
+                self._channel.send(replace(setup, time_file=file))
+                answer = self._channel.receive(timeout_s)
             except (EOFError, OSError):
-                channel.close()
-                raise self._gave_up("gave no answer") from None
+                self._channel.close()
+                raise self._gave_up(f"did not come up within {timeout_s:.0f} s") from None
         self.pid = self._child.pid
         if isinstance(answer, str):
             self.stop()
@@ -228,9 +212,9 @@ class SimProcess:
         return result
 
     def _gave_up(self, why: str) -> ConnectionFailed:
-        code = self._child.poll()
-        end(self._child, 0.0)
-        what = f"ended with code {code}" if code is not None else why
+        end(self._child, _STOP_TIMEOUT_S)
+        code = self._child.returncode
+        what = why if code == -signal.SIGKILL else f"ended with code {code}"
         error = ConnectionFailed(f"the simulated vehicle {what}{last_line(self._stderr)}")
         self._stderr.close()
         return error

@@ -32,15 +32,8 @@ def test_what_differs_is_in_the_table(pair: Comparison) -> None:
     assert record["differences"]["turns"] == 500 - record["a"]["turns"]
     assert record["differences"]["miss_m"] is None  # the second flight's is not known
     (ascend,) = [p for p in record["phases"] if p["phase"] == "ASCEND"]
-    assert (ascend["a_s"], ascend["a_visits"], ascend["b_visits"]) == (6.0, 1, 1)
-    assert ascend["difference_s"] == pytest.approx(ascend["b_s"] - 6.0)
+    assert ascend["a_s"] == 6.0 > ascend["b_s"]
     text = found.text()
     assert max(map(len, text.splitlines())) <= 79
     assert "UNKNOWN: the log ends in ASCEND" in text
     assert "camera.latency_s                0.07  0.1" in text
-
-
-def test_a_flight_beside_itself(pair: Comparison) -> None:
-    found = Comparison((pair.flights[0], pair.flights[0]))
-    assert "their profiles are the same" in found.text()
-    assert {d for d in found.record()["differences"].values() if d is not None} == {0}

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.analysis import FlightAnalysis, plot_flight
-from perchctl.analysis.plot import title_of
+from perchctl.analysis import plot_flight
 from perchctl.errors import InvalidValue
 from perchctl.record import FlightLog
 from tests.helpers.told import made
@@ -49,12 +48,6 @@ def test_many_attempts_and_names_that_matplotlib_would_typeset(tmp_path: Path) -
     log = made(change, {"outcome": "landed", "reason": "a $ in {a} reason $ with \\frac"})
     assert len(log.phases) > 50
     assert picture(log, tmp_path / "f.png").std() > 1.0
-
-
-def test_title(log: FlightLog) -> None:
-    assert title_of(FlightAnalysis(log)) == "profile sim, seed 7   |   perched   |   miss 3.1 mm"
-    cut = replace(log, header={}, summary=None)
-    assert "unknown (the log ends in PERCHED)" in title_of(FlightAnalysis(cut))
 
 
 def test_nothing_to_plot(log: FlightLog, tmp_path: Path) -> None:

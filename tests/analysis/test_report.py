@@ -83,6 +83,19 @@ KINDS: dict[str, tuple[dict[str, Any], str]] = {
     "first version": ({"version": 1}, "What happened"),
     "without a profile": ({"profile": None}, "What happened"),
     "odd profile": ({"profile": {"name": "x", "camera": 3, "planner": []}}, "What happened"),
+    "found": (
+        {
+            "summary": synthetic.SUMMARY
+            | {
+                "latency_s": 0.099,
+                "latency_sigma_s": 0.003,
+                "mount_turn_deg": [0.1, -1.0, -0.4],
+                "mount_turn_sigma_deg": [0.3, 0.3, 0.8],
+                "advice": ["set camera.latency_s to 0.099"],
+            }
+        },
+        "Set camera.latency_s to 0.099.",
+    ),
     "full disk": (
         {"summary": {"outcome": "landed", "lost_records": 7, "problem": "the disk is full"}},
         "The log lacks 7 records: the disk is full.",

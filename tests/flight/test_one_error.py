@@ -17,7 +17,7 @@ from perchctl.mission import Phase, Tick, planner
 from perchctl.mission.context import Context
 from perchctl.perception import perception
 from perchctl.record.fields import tick_record
-from perchctl.record.watch import Truth
+from perchctl.record.write import Truth
 from perchctl.sim import draw_scenario
 from perchctl.vision import merge
 from tests.helpers.flights import SEED, NoLog, short_profile

@@ -15,7 +15,7 @@ from perchctl.flight.lockstep import LockstepFlight
 from perchctl.mission import Event, FlightReport, Operator, Phase
 from perchctl.profile import Profile, load_profile
 from perchctl.record import LogWatcher
-from perchctl.record.watch import Truth
+from perchctl.record.write import Truth
 from perchctl.sim import draw_capture, draw_scenario
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class Flown:
 class NoLog(LogWatcher):
     """Takes a log's place, and writes none."""
 
-    problem: str | None = None  # type: ignore[assignment]
+    problem: str | None = None
 
     def __init__(self) -> None:
         self.truth: Callable[[], Truth] | None = None

@@ -15,9 +15,9 @@ import numpy as np
 
 from perchctl.mission import Event, Phase, PlannerState, Tick
 from perchctl.profile import Profile
+from perchctl.record import LogWatcher
 from perchctl.record.fields import tick_record
 from perchctl.record.header import make_header
-from perchctl.record.write import FlightLogWriter
 from perchctl.vehicle import (
     Command,
     Idle,
@@ -184,12 +184,12 @@ def write(
 ) -> Path:
     """The flight as a file: its first `most` ticks, the header's `changes`, and `events` at the
     end; without a summary it was killed."""
-    writer = FlightLogWriter.open(path, header() | dict(changes or {}))
+    writer = LogWatcher.open(path, header() | dict(changes or {}))
     for record in islice(ticks(), most):
         writer.write(record)
     for event in events:
         writer.event(event)
-    writer.close(summary)
+    writer.end(summary)
     return writer.path
 
 
@@ -207,11 +207,11 @@ SUMMARY = {
 
 
 def small_log(path: Path, ticks: int = 5) -> Path:
-    writer = FlightLogWriter.open(path, header())
+    writer = LogWatcher.open(path, header())
     for i in range(ticks):
         writer.write({"t_s": 0.02 * i, "phase": "SEARCH", "z_m": 0.1 * i})
         writer.event(note(0.02 * i, f"event {i}"))
-    writer.close(SUMMARY)
+    writer.end(SUMMARY)
     assert writer.problem is None
     return writer.path
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from perchctl.geometry import Array, make_T, rotation_from_quaternion
-from perchctl.mission import Event, EventKind, Phase
-from perchctl.mission.state import Severity
 from perchctl.profile import Profile
-from perchctl.record.fields import event_record
 from perchctl.record.recorder import Recorder
 from perchctl.vision import Frame
 from tests.helpers import log as synthetic
@@ -25,9 +21,6 @@ from tests.helpers import log as synthetic
 SIZE_PX = (64, 48)
 LATENCY_S = 0.075
 PROFILE = Profile(name="sim")
-EVENT = Event(
-    2.0, EventKind.PHASE, "target not found", Phase.LANDING, "searched-out", Severity.LAND
-)
 
 
 def picture(number: int) -> np.ndarray[Any, Any]:
@@ -56,7 +49,6 @@ class Flown:
 
     frames: list[Frame]
     ticks: list[dict[str, Any]]
-    event: Mapping[str, Any] = field(default_factory=lambda: event_record(EVENT))
 
 
 def flown(count: int = 20) -> Flown:
@@ -68,8 +60,6 @@ def fly(recorder: Recorder, flight: Flown) -> None:
     for n, tick in enumerate(flight.ticks):
         if n % 2 == 0 and n // 2 < len(flight.frames):
             recorder.frame(flight.frames[n // 2])
-        if n == 3:
-            recorder.event(flight.event)
         recorder.tick(tick)
 
 

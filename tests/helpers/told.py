@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.mission import Event, EventKind, Phase
-from perchctl.record import FlightLog
+from perchctl.record import FlightLog, LogWatcher
 from perchctl.record.exact import to_plain
 from perchctl.record.fields import event_record
-from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
 
 Change = Callable[[dict[str, Any]], None]
@@ -30,13 +29,13 @@ def written(
     **header: Any,
 ) -> Path:
     """The flight of `tests.helpers.log.PLAN` as a file; `change` is given each tick's record."""
-    writer = FlightLogWriter.open(path, synthetic.header() | header)
+    writer = LogWatcher.open(path, synthetic.header() | header)
     for record in synthetic.ticks():
         change(record)
         writer.write(record)
     for event in events:
         writer.event(event)
-    writer.close(summary)
+    writer.end(summary)
     assert writer.problem is None
     return writer.path
 

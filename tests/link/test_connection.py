@@ -267,7 +267,7 @@ def test_a_cache_folder_that_is_a_file_is_told_by_what_chooses_it(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (folder / "file").write_text("")
-    monkeypatch.setattr(room, "user_cache_folder", lambda: folder / "file" / "perchctl")
+    monkeypatch.setattr(room, "user_folder", lambda kind: folder / "file" / "perchctl")
     with pytest.raises(InvalidValue, match=r"cannot be written: .*: set XDG_CACHE_HOME to"):
         Connection()
 

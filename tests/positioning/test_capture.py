@@ -174,7 +174,7 @@ def test_it_ends_with_a_parent_that_was_killed(
         "from perchctl.positioning import capture\n"
         "spawn = capture.spawn\n"
         "def told(code, output):\n"
-        "    child = spawn(code, output); print(child.pid, flush=True); return child\n"
+        "    pair = spawn(code, output); print(pair[0].pid, flush=True); return pair\n"
         "capture.spawn = told\n"
         "from perchctl.profile.positioning import PositioningConfig\n"
         f"one = capture.open_capture(PositioningConfig(by='mocap', host={fault!r}, body='cf'))\n"
@@ -252,13 +252,10 @@ def test_the_real_library_through_its_process() -> None:
 
 
 def test_a_reader_outlives_the_time_in_which_it_was_set_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        own = socket.create_connection(listener.getsockname())
-        parent, _ = listener.accept()
+    channel, parent = (Channel(end.detach()) for end in socket.socketpair())
     ended = threading.Event()
     monkeypatch.setattr(capture.os, "_exit", lambda code: ended.set())
-    channel = Channel(own)
-    parent.sendall(b"\x02\x00\x00\x00N.")  # a setup: None, pickled
+    parent.send(None)
     assert channel.receive(0.05) is None
     thread = threading.Thread(target=capture._end_with, args=(channel,))
     thread.start()
@@ -266,7 +263,7 @@ def test_a_reader_outlives_the_time_in_which_it_was_set_up(monkeypatch: pytest.M
     parent.close()
     assert ended.wait(5.0)
     thread.join()
-    own.close()
+    channel.close()
 
 
 def test_a_host_that_cannot_be_resolved_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,7 +36,7 @@ OTHERS: list[dict[str, Any]] = [
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    monkeypatch.setattr(compared, "user_state_folder", lambda: tmp_path / "state")
+    monkeypatch.setattr(compared, "user_folder", lambda kind: tmp_path / "state")
     return tmp_path / "state"
 
 

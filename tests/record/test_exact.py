@@ -30,7 +30,7 @@ from perchctl.mission import (
 from perchctl.mission.state import Condition
 from perchctl.record import from_exact, to_exact
 from perchctl.record.exact import decode_line, encode, to_plain
-from perchctl.record.read import sent_of, turn_of
+from perchctl.record.read import exact_of, turn_of
 from perchctl.record.write import sent_line, turn_line
 from perchctl.vehicle import (
     EmergencyStop,
@@ -153,25 +153,23 @@ def test_a_command_of_each_kind_comes_back(command: Any) -> None:
     """In a turn, and sent in the loop's place. Three kinds have no field at all."""
     assert comes_back(Turn, Turn(0, "flown", 0.0, 0.0, TurnInputs(), command=command))
     line = sent_line(sent := SentCommand(0.1 + 0.2, "watchdog", command))
-    assert bits(sent_of(decode_line(line))) == bits(sent)
+    assert bits(exact_of(SentCommand, decode_line(line))) == bits(sent)
     with pytest.raises(InvalidValue, match="sent at soon s cannot be read"):
-        sent_of(decode_line(line) | {"t_s": "soon"})
+        exact_of(SentCommand, decode_line(line) | {"t_s": "soon"})
 
 
 @pytest.mark.parametrize(
     ("changes", "why"),
-    [({"phase": "HOVER"}, "phase: 'HOVER' is not a valid Phase"),
-     ({"speed": 1}, "Turn has no field speed"),
-     ({"t_s": "soon"}, "t_s: float is needed, found 'soon'"),
-     ({"t_s": True}, "t_s: float is needed"),
-     ({"command": ["Jump", {}]}, "command: one of Idle, "),
+    [({"phase": "HOVER"}, "phase: 'HOVER' is not a valid Phase"), ({"speed": 1}, "speed: "),
+     ({"t_s": "soon"}, "t_s: 'soon'"), ({"t_s": True}, "t_s: float is needed"),
+     ({"command": ["Jump", {}]}, "command: 'Jump'"), ({"command": 3}, "command: "),
      ({"poses": {"joint": {"t_s": 0.0, "e_m": [0.0, "x"], "e_yaw_rad": 0.0}}}, "poses: e_m: "),
-     ({"observation": {}}, "observation: "),
-     ({"role": "flying"}, "role: 'flying' is none of waiting, redone, flown, failed")],
+     ({"observation": {}}, "observation: "), ({"role": "flying"}, "role: "),
+     ({"taken": {"samples": 3}}, "taken: samples: "), ({"taken": "none"}, "taken: ")],
 )  # fmt: skip
 def test_what_is_no_turn_is_one_sentence(changes: dict[str, Any], why: str) -> None:
     record = decode_line(turn_line(whole_turn())) | changes
-    with pytest.raises(InvalidValue, match="turn 7 cannot be read") as caught:
+    with pytest.raises(InvalidValue, match=r"turn at .* s cannot be read") as caught:
         turn_of(record)
     assert why in str(caught.value)
 
@@ -198,13 +196,13 @@ def test_what_has_no_exact_form_is_refused(value: Any) -> None:
 def test_plain_values() -> None:
     values = {
         "np": np.float32(0.5), "int": np.int64(3), "bool": np.bool_(True), "none": None,
-        "nan": [math.nan, math.inf, -math.inf], "array": np.array([[1.23456789, -0.0]]),
+        "nan": [math.nan, math.inf, -math.inf], "vector": np.array([1.23456789, -0.0]).tolist(),
         "enum": Phase.ALIGN, "path": Path("a/b"), "text": "°€\ud800",
     }  # fmt: skip
     line = encode(values)
     assert "-0.0" not in line.decode()
     assert decode_line(line) == {
-        "np": 0.5, "int": 3, "bool": True, "nan": [None] * 3, "array": [[1.234568, 0.0]],
+        "np": 0.5, "int": 3, "bool": True, "nan": [None] * 3, "vector": [1.234568, 0.0],
         "enum": "ALIGN", "path": "a/b", "text": "°€\ud800",
     }  # fmt: skip
 

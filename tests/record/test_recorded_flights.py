@@ -3,10 +3,7 @@ in flight changes nothing of the flight."""
 
 from __future__ import annotations
 
-import errno
-import os
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +15,7 @@ from perchctl.calibration import profile_camera
 from perchctl.campaign.flights import fly_seed
 from perchctl.geometry import R_MARKER_TARGET, invert_T, make_T
 from perchctl.profile import load_profile
-from perchctl.record import read_log, recorded_pictures
+from perchctl.record import read_log
 from perchctl.vision import project, square_corners
 from tests.helpers import recorded
 from tests.helpers.commands import run
@@ -58,31 +55,6 @@ def test_the_target_of_the_transforms_lies_on_that_of_the_pictures(
         errors.append(float(np.abs(drawn - found).max() / side_px))
     assert len(errors) > 10
     assert np.median(errors) < 0.05  # the picture is 60 ms older than the tick
-
-
-@pytest.mark.long
-def test_a_disk_that_fills_up_ends_the_recording_and_not_the_flight(
-    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The same flight, tick by tick, with one note more."""
-    real, room = os.write, 6_000_000
-
-    def write(fd: int, data: Any) -> int:
-        if os.fstat(fd).st_size + len(data) > room:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return real(fd, data)
-
-    monkeypatch.setattr(os, "write", write)
-    path = tmp_path / "flight.jsonl"
-    result = fly_seed(load_profile(SHORT), SEED, path, record=True)
-    assert (result.outcome, result.log_problem) == ("perched", None)
-    whole, here = read_log(flown), read_log(path)
-    assert here.records == whole.records
-    notes = [event["reason"] for event in here.events if event not in whole.events]
-    (note,) = notes
-    assert "the recording has ended (No space left on device)" in note
-    kept = len(list(recorded_pictures(path)))
-    assert 0 < kept < len(list(recorded_pictures(flown)))
 
 
 @pytest.mark.parametrize(

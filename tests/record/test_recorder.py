@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,15 @@ from mcap.reader import make_reader
 
 from perchctl.errors import InvalidValue
 from perchctl.mission import FlightReport, Outcome, Phase
-from perchctl.record import LogWatcher, read_log, recorded_pictures, recording_file
+from perchctl.record import FlightSummary, LogWatcher, read_log, recorded_pictures
 from perchctl.record import recorder as recording_module
 from perchctl.record.recorder import Recorder
-from perchctl.record.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers import recorded
 from tests.helpers.disk import full_disk
 from tests.helpers.mission import changed
 from tests.helpers.recorded import MemoryDisk
+from tests.helpers.waiting import until
 
 WAIT_S = 20.0
 
@@ -37,13 +37,6 @@ def pictures_on(disk: MemoryDisk, tmp_path: Path) -> list[int]:
     path = tmp_path / "f.mcap"
     path.write_bytes(disk.data)
     return [picture.number for picture in recorded_pictures(path)]
-
-
-def until(met: Callable[[], object]) -> None:
-    end_s = time.monotonic() + WAIT_S
-    while not met():
-        assert time.monotonic() < end_s, "did not come"
-        time.sleep(0.005)
 
 
 # -- what ends a recording ------------------------------------------------------------------
@@ -71,9 +64,9 @@ def test_what_ends_the_recording_is_one_sentence_and_the_flight_goes_on(
         recorder.tick(change["tick"])
     recorded.fly(recorder, recorded.Flown(flight.frames[60:], flight.ticks[120:]))
     end = recorder.close()
-    assert said in (end.problem or "")
-    assert "the flight and its log go on" in (end.problem or "")
-    assert end.pictures + end.missing == len(flight.frames)
+    assert said in (end.recording_problem or "")
+    assert "the flight and its log go on" in (end.recording_problem or "")
+    assert end.pictures + end.pictures_missing == len(flight.frames)
     assert 0 < end.pictures < 120
     assert disk.closed
     assert pictures_on(disk, tmp_path) == list(range(end.pictures))
@@ -113,7 +106,7 @@ def test_a_disk_that_hangs_holds_up_nobody(
 ) -> None:
     """What may wait is used up; it goes on with the next turn that there is room for."""
     monkeypatch.setattr(recording_module, "MOST_WAITING_BYTES", 300_000)
-    monkeypatch.setattr(recording_file, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(recording_module, "CHUNK_BYTES", 1)
     recorder, flight = onto(hung, live=True), recorded.flown(120)
     hung.gate.clear()
     began_s = time.monotonic()
@@ -127,23 +120,9 @@ def test_a_disk_that_hangs_holds_up_nobody(
     end = recorder.close()
     kept = pictures_on(hung, tmp_path)
     assert end.pictures == len(kept)
-    assert end.pictures + end.missing == 121
+    assert end.pictures + end.pictures_missing == 121
     assert 10 <= len(kept) <= 15
     assert kept[-1] == 200
-
-
-def test_closing_does_not_wait_for_ever(hung: MemoryDisk, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording_module, "CLOSE_TIMEOUT_S", 0.1)
-    recorder = onto(hung, live=True)
-    hung.gate.clear()
-    recorded.fly(recorder, recorded.flown(10))
-    began_s = time.monotonic()
-    end = recorder.close()
-    assert time.monotonic() - began_s < 5.0
-    assert "does not answer" in (end.problem or "")
-    assert end.missing == 10 - end.pictures > 0
-    hung.gate.set()
-    until(lambda: hung.closed)  # should the disk ever answer, it is ended
 
 
 # -- live and in lockstep -----------------------------------------------------------------------
@@ -157,7 +136,7 @@ def test_live_and_in_lockstep_it_holds_the_same(tmp_path: Path) -> None:
         assert threading.active_count() == before + live
         recorded.fly(recorder, flight)
         end = recorder.close()
-        assert (end.pictures, end.missing, end.problem) == (60, 0, None)
+        assert (end.pictures, end.pictures_missing, end.recording_problem) == (60, 0, None)
     live_one, one, other = (tmp_path / f"{name}.mcap" for name in ("live", "a", "b"))
     assert str(recorded.messages(live_one)) == str(recorded.messages(one))
     assert one.read_bytes() == other.read_bytes()
@@ -201,47 +180,44 @@ def test_what_is_left_by_a_killed_flight_gives_what_is_whole(tmp_path: Path) -> 
 # -- beside the log -----------------------------------------------------------------------------
 
 
+def closed(log: LogWatcher) -> FlightSummary:
+    summary = log.close(FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False))
+    assert summary is not None
+    assert (summary.lost_records, summary.log_problem) == (0, None)
+    return summary
+
+
 def test_what_is_wrong_with_it_is_no_problem_of_the_log_s(tmp_path: Path) -> None:
     """For which the vehicle would land."""
-    disk = MemoryDisk()
-    log = LogWatcher(FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header()), onto(disk))
+    log, disk = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header()), MemoryDisk()
+    log.recorder = onto(disk)
     disk.room = 0
-    log.event(recorded.EVENT)
     for tick in recorded.flown(1).ticks:
-        assert log._recorder is not None
-        log._recorder.tick(tick)
+        log.recorder.tick(tick)
     assert log.problem is None
     (said,) = log.remarks()
     assert "No space left" in said
     assert log.remarks() == []
-    summary = log.close(FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False))
-    assert summary is not None
-    assert summary.log_problem is None
-    assert f"0 pictures in f.mcap ({said})" in summary.text()
+    assert f"0 pictures in f.mcap ({said})" in closed(log).text()
 
 
 def test_the_log_is_whole_before_the_recording_s_end_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hung: MemoryDisk
 ) -> None:
     monkeypatch.setattr(recording_module, "CLOSE_TIMEOUT_S", 0.1)
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
-    log = LogWatcher(writer, onto(hung, live=True))
-    log.event(recorded.EVENT)
+    log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
+    log.recorder = onto(hung, live=True)
+    recorded.fly(log.recorder, recorded.flown(10))
     hung.gate.clear()
-    recorder: Any = log._recorder
-    close = recorder.close
-
-    def closed() -> Any:
-        assert read_log(log.path).summary is not None
-        return close()
-
-    recorder.close = closed
-    report = FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging still", 1, 9.0, False)
-    summary = log.close(report)
-    assert summary is not None
-    assert summary.recording is not None
-    assert "does not answer" in (summary.recording.problem or "")
-    assert (summary.lost_records, summary.log_problem) == (0, None)
+    began_s = time.monotonic()
+    end = closed(log).recording
+    assert time.monotonic() - began_s < 5.0
+    assert end is not None
+    assert "does not answer" in (end.recording_problem or "")
+    assert end.pictures_missing == 10 - end.pictures
+    assert read_log(log.path).summary is not None
+    hung.gate.set()
+    until(lambda: hung.closed)  # should the disk ever answer, it is ended
 
 
 def test_a_flight_that_never_began_leaves_no_file(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from foxglove_schemas_protobuf import Log_pb2
 from mcap.reader import make_reader
 
 from perchctl.errors import InvalidValue, NotFound
@@ -19,10 +18,7 @@ from perchctl.geometry import (
     rotation_from_rpy,
 )
 from perchctl.record import recorded_pictures
-from perchctl.record.fields import FIELDS
-from perchctl.record.recording_file import TICK_SCHEMA
 from tests.helpers import recorded
-from tests.helpers.flights import ROOT
 
 FLIGHT = recorded.flown(120)
 
@@ -36,7 +32,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recorder = recorded.recorder(path, started=STARTED, t0_s=1.0)
     recorded.fly(recorder, FLIGHT)
     end = recorder.close()
-    assert (end.pictures, end.missing, end.problem) == (len(FLIGHT.frames), 0, None)
+    assert end[1:] == (len(FLIGHT.frames), 0, None)
     return path
 
 
@@ -58,18 +54,6 @@ def test_each_picture_is_the_pipeline_s_to_the_bit(recording: Path) -> None:
     assert stored[0].data == FLIGHT.frames[0].encoded  # a JPEG lies there as it came
 
 
-def test_a_picture_that_decodes_otherwise_here_is_said(
-    recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import cv2
-
-    real = cv2.imdecode
-    monkeypatch.setattr(cv2, "imdecode", lambda *args: real(*args) // 2)
-    with pytest.raises(InvalidValue, match="picture 0 decodes to other pixels"):
-        next(recorded_pictures(recording))
-    assert next(recorded_pictures(recording, exact=False)).number == 0
-
-
 def test_no_recording_and_none_of_ours(tmp_path: Path) -> None:
     with pytest.raises(NotFound, match="does not exist"):
         next(recorded_pictures(tmp_path / "flight.jsonl"))
@@ -82,7 +66,6 @@ FOXGLOVE_S = {
     "/camera/image": "CompressedImage",
     "/camera/corners": "ImageAnnotations",
     "/tf": "FrameTransforms",
-    "/log": "Log",
 }
 
 
@@ -107,31 +90,10 @@ def test_readers_find_it_whole_by_its_index_and_foxgloves_own_schemas(
     assert schemas == own | theirs
     assert len(found["/camera/image"]) == len(found["/camera/frame"]) == len(FLIGHT.frames)
     assert len(found["/tick"]) == len(found["/tf"]) == len(FLIGHT.ticks)
-    with recording.open("rb") as stream:
-        (attached,) = make_reader(stream).iter_attachments()
-    assert json.loads(attached.data)["profile"]["name"] == "sim"  # the log's header
 
 
-KINDS = {"number": (int, float), "string": (str,), "boolean": (bool,), "array": (list,)}
-
-
-def test_a_tick_is_as_its_schema_says(found: dict[str, list[Any]]) -> None:
-    """Foxglove draws what the schema names, and by its type."""
-    properties: Any = TICK_SCHEMA["properties"]
-    for data in found["/tick"]:
-        for key, value in json.loads(data).items():
-            assert isinstance(value, KINDS[properties[key]["type"]]), key
-            assert isinstance(value, bool) is (properties[key]["type"] == "boolean"), key
-
-
-def test_messages_have_the_wall_s_time(recording: Path, found: dict[str, list[Any]]) -> None:
-    """What people read off a tick counts from the first flown turn."""
+def test_people_s_times_count_from_the_first_flown_turn(found: dict[str, list[Any]]) -> None:
     assert json.loads(found["/tick"][0])["t_s"] == 0.0
-    with recording.open("rb") as stream:
-        times = [m.log_time for _, c, m in make_reader(stream).iter_messages(topics=["/tick"])]
-    begun_ns = round(STARTED.timestamp()) * 10**9
-    told = [round((tick["t_s"] - 1.0) * 1e9) for tick in FLIGHT.ticks]
-    assert [t_ns - begun_ns for t_ns in times] == pytest.approx(told, abs=1)
 
 
 def test_the_transforms_lead_from_the_world_to_camera_gear_and_target(
@@ -154,13 +116,6 @@ def test_the_transforms_lead_from_the_world_to_camera_gear_and_target(
     np.testing.assert_allclose(T["world setpoint"], make_T(rot_z(tick["cmd_yaw_rad"]), place))
 
 
-def test_the_body_is_where_it_was_when_that_was_measured(found: dict[str, list[Any]]) -> None:
-    (body,) = [each for each in found["/tf"][50].transforms if each.child_frame_id == "body"]
-    told_s = FLIGHT.ticks[50]["t_s"] - FLIGHT.ticks[50]["tel_age_s"] - 1.0
-    since_s = body.timestamp.seconds - STARTED.timestamp() + body.timestamp.nanos * 1e-9
-    assert since_s == pytest.approx(told_s, abs=1e-8)
-
-
 def test_values_that_are_no_numbers_make_no_transform(tmp_path: Path) -> None:
     recorder = recorded.recorder(tmp_path / "f.mcap")
     recorder.tick({**FLIGHT.ticks[0], "x_m": float("nan"), "cmd_z_m": float("inf")})
@@ -169,25 +124,7 @@ def test_values_that_are_no_numbers_make_no_transform(tmp_path: Path) -> None:
     assert set(recorded.transforms(said)) == {"body camera", "body gear"}
 
 
-def test_events_and_corners_are_shown(found: dict[str, list[Any]]) -> None:
-    (said,) = found["/log"]
-    assert (said.message, said.level) == ("LANDING: target not found", Log_pb2.Log.ERROR)
+def test_corners_are_shown(found: dict[str, list[Any]]) -> None:
     tick = next(tick for tick in FLIGHT.ticks if tick["large_px"] is not None)
     outline = next(message for message in found["/camera/corners"] if message.points).points[0]
     assert [v for p in outline.points for v in (p.x, p.y)] == tick["large_px"]
-
-
-def test_the_layout_shows_what_is_there(found: dict[str, list[Any]]) -> None:
-    """Of the layout for Foxglove that docs/after-a-flight.md names."""
-    shown = json.loads((ROOT / "docs" / "foxglove.json").read_bytes())
-    topics = set(found)
-    text = json.dumps(shown)
-    named = {word for word in text.replace(".", '"').split('"') if word.startswith("/")}
-    assert named <= topics
-    assert {"/camera/image", "/camera/corners"} <= named
-    plotted = {
-        path["value"].removeprefix("/tick.")
-        for panel in shown["configById"].values()
-        for path in panel.get("paths", ())
-    }
-    assert plotted <= set(FIELDS)

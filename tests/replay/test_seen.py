@@ -84,8 +84,7 @@ def test_the_pictures_show_what_they_showed() -> None:
     assert (found.seen.frames, found.seen.ended) == (PICTURES, "")
     assert not beyond(found), f"{beyond(found)[:1]}; {ANEW}"
     if not found.log.computer_differences:
-        first = found.seen.first
-        assert first is None, f"{first.text}; {ANEW}"
+        assert not found.seen.differences, f"{found.seen.differences[0].text}; {ANEW}"
 
 
 def test_they_show_all_that_matters() -> None:
@@ -121,7 +120,7 @@ def test_a_changed_constant_of_the_pipeline_is_noticed(
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the switches are that processor's")
 def test_on_another_processor_it_is_near() -> None:
     """Its arithmetic is another, which is noticed."""
-    asked = "from perchctl.record import arithmetic_fingerprint; print(arithmetic_fingerprint())"
+    asked = "from perchctl.record import header; print(header.arithmetic_fingerprint())"
     assert _elsewhere({}, asked) != _elsewhere(ELSEWHERE, asked)
     _elsewhere(
         ELSEWHERE,

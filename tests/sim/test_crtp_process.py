@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -150,24 +149,3 @@ def test_ctrl_c_does_not_reach_the_vehicle(stepped: SimProcess) -> None:
     before_s = stepped.truth()["t_s"]
     assert stepped.advance(0.1) == pytest.approx(before_s + 0.1)
     assert alive(stepped.pid)
-
-
-def test_a_foreign_connection_cannot_take_the_parents_place() -> None:
-    """A connection without the token is closed before anything is unpickled."""
-    from perchctl import children
-
-    with children.listen() as listener:
-        foreign = socket.create_connection(listener.getsockname())
-        foreign.sendall(b"0" * 64)
-        connection = socket.create_connection(listener.getsockname())
-        connection.sendall(b"f" * 64)
-        friend = children.Channel(connection)
-        channel = children.accept(listener, "f" * 64, 5.0, lambda: True)
-        assert channel is not None
-        friend.send({"a": 1})
-        assert channel.receive(5.0) == {"a": 1}
-        friend.close()
-        with pytest.raises(EOFError):
-            channel.receive(5.0)
-        channel.close()
-        foreign.close()

@@ -40,11 +40,12 @@ from perchctl.mission import (  # noqa: E402
     Operator,
     Phase,
 )
+from perchctl.profile import Profile  # noqa: E402
 from perchctl.record import LogWatcher  # noqa: E402
-from perchctl.record.disk import DiskFile  # noqa: E402
 from perchctl.record.recorded import recorded_frames  # noqa: E402
-from perchctl.record.recording_file import RecordingFile  # noqa: E402
+from perchctl.record.recorder import Recorder  # noqa: E402
 from perchctl.record.write import recording_path  # noqa: E402
+from perchctl.vision import Frame  # noqa: E402
 from tests.helpers.flights import short_profile  # noqa: E402
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner  # noqa: E402
 
@@ -147,10 +148,12 @@ def _packed(data: bytes) -> bytes:
 def _keep_pictures(recording: Path, path: Path) -> None:
     """Of a recording, what a replay takes from it."""
     path.unlink(missing_ok=True)
-    kept = RecordingFile(DiskFile(path), {"t0_s": 0.0})
-    for frame, picture in islice(recorded_frames(recording), PICTURES):
-        kept.frame(frame, None if picture is None else (_packed(picture.data), "png"))
-    kept.finish()
+    kept, image = Recorder.open(path, {"t0_s": 0.0}, Profile()), np.zeros((1, 1), np.uint8)
+    for about, picture in islice(recorded_frames(recording), PICTURES):
+        data = None if picture is None else _packed(picture.data)
+        number, t_s, arrival_s = about["number"], about["t_s"], about["t_arrival_s"]
+        kept.frame(Frame(number, t_s, image, arrival_s, repeated=data is None, encoded=data))
+    kept.close()
 
 
 def main() -> None:
