@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import os
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -17,11 +18,12 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 import perchctl
+from perchctl.analysis.film import write_film
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
 from perchctl.analysis.story import Sentence, count, length, story_of
-from perchctl.errors import PerchError
+from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import write_files
 from perchctl.mission import Phase
 from perchctl.record import log_values, path_beside, read_log, recorded_pictures
@@ -37,13 +39,14 @@ TITLES = {
 GRADES = {"perched": "good", "landed": "warn"}
 
 
-def write_report(log_paths: Sequence[Path], output: Path) -> Report:
-    """Write the page, whole or not at all; return what is on it.
+def write_report(log_paths: Sequence[Path], output: Path, with_film: bool = False) -> Report:
+    """Write the page, whole or not at all; return what is on it. `with_film` embeds a film of each
+    flight.
 
     Raises NotFound and InvalidValue, as `read_log` and `write_files`.
     """
     report = Report(tuple(reported_flight(path) for path in log_paths))
-    write_files({output: page_of(report.flights).encode("utf-8")})
+    write_files({output: page_of(report.flights, with_film).encode("utf-8")})
     return report
 
 
@@ -141,11 +144,11 @@ class ReportedFlight:
 
 # --- the page ---------------------------------------------------------
 
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
 """No script, nothing from elsewhere: the browser holds the page to it."""
 
 
-def page_of(flights: Sequence[ReportedFlight]) -> str:
+def page_of(flights: Sequence[ReportedFlight], with_film: bool = False) -> str:
     """Return the page of at least one flight as HTML that needs no other file. Raises InvalidValue
     for a value that no flight writes."""
     articles = []
@@ -158,6 +161,7 @@ def page_of(flights: Sequence[ReportedFlight]) -> str:
                     flight=told.flight,
                     number=number,
                     is_session=len(flights) > 1,
+                    with_film=with_film,
                 )
             )
     return _render(
@@ -187,8 +191,28 @@ def _templates() -> jinja2.Environment:
     templates.globals.update(
         seven_phases=[phase.value for phase in tuple(Phase)[:7]],
         plot_of=lambda flight: _address("image/png", flight_png(flight)),
+        film_of=film_address,
     )
     return templates
+
+
+def film_address(flight: FlightAnalysis) -> tuple[str, str]:
+    """Return the flight's film as a `data:` address, and why it, or its camera pictures, are
+    missing; each may be empty. The log has at least one tick."""
+    path = flight.log.path
+    is_recorded = path_beside(path, ".mcap").is_file()
+    recorded = [recorded_pictures(path, exact=False)] if is_recorded else []
+    problem = ""
+    with tempfile.TemporaryDirectory() as folder:
+        film = Path(folder) / "film.mp4"
+        for pictures in (*recorded, None):
+            try:
+                write_film(flight, pictures, film)
+            except InvalidValue as error:
+                problem = _without_folder(error, path)
+                continue
+            return _address("video/mp4", film.read_bytes()), problem
+    return "", problem
 
 
 def _without_folder(error: PerchError, log_path: Path) -> str:

@@ -227,7 +227,7 @@ def replay(
     app,
     "perchctl log report",
     "perchctl log report perchctl-logs/*.jsonl -o session.html",
-    "perchctl log report flight.jsonl --force",
+    "perchctl log report flight.jsonl --film --force",
 )
 def report(
     files: Annotated[
@@ -235,6 +235,7 @@ def report(
         typer.Argument(help="Flight logs; by default the newest of perchctl-logs."),
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="The page: .html.")] = None,
+    with_film: Annotated[bool, typer.Option("--film", help="Embed a film of each flight.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -250,7 +251,7 @@ def report(
     if any(same_file(output, path) for path in logs):
         raise UsageError(f"{output} is one of the logs; write the page to another file")
     check_output(output, PAGE_SUFFIXES, force, "a page for a browser")
-    page = write_report(logs, output)
+    page = write_report(logs, output, with_film)
     if as_json:
         size = output.stat().st_size
         print_result({"report": str(output), "bytes": size, "flights": page.record()})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import re
 from pathlib import Path
 
 import av
@@ -83,3 +85,18 @@ def test_the_command_makes_a_gif_at_the_flight_s_pace(flown: Path, tmp_path: Pat
     assert lasts_ms == pytest.approx(1000.0 * (flown_s + LAST_S), abs=200.0)
     assert run(*words, str(tmp_path / "flight.avi")).code == InvalidValue.exit_code
     assert run(*words, str(out)).code == InvalidValue.exit_code  # it exists
+
+
+def test_a_bad_recording_costs_the_report_s_film_its_pictures_only(
+    flown: Path, tmp_path: Path
+) -> None:
+    log, page = tmp_path / "flight.jsonl", tmp_path / "page.html"
+    log.write_bytes(flown.read_bytes())
+    (tmp_path / "flight.mcap").write_bytes(b"no recording")
+    assert run("log", "report", str(log), "-o", str(page), "--film").code == 0
+    (video,) = re.findall(r'<video controls src="data:video/mp4;base64,([^"]+)"', page.read_text())
+    (tmp_path / "film.mp4").write_bytes(base64.b64decode(video))
+    assert len(pictures_of(tmp_path / "film.mp4")) > 100
+    film = page.read_text().partition("<h3>Film</h3>")[2].partition("</section>")[0]
+    assert "flight.mcap" in film.partition("</figure>")[2]
+    assert str(tmp_path) not in film
