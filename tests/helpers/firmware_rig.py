@@ -8,7 +8,7 @@ from typing import Any
 from perchctl.sim import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.firmware.controller import Setpoint
-from perchctl.sim.firmware.planner import HlTakeoff
+from perchctl.sim.firmware.planner import Planner
 from perchctl.sim.world import World
 
 STREAM_PERIOD_S = 0.02
@@ -48,7 +48,7 @@ class Rig:
         return max(self.firmware.motors) == 0.0
 
     def take_off(self, height_m: float = 0.8, settle_s: float = 2.5) -> None:
-        self.firmware.high_level(HlTakeoff(height_m, 2.5))
+        self.firmware.high_level(Planner.take_off, height_m, 2.5, None)
         self.run(2.5 + settle_s)
 
     def hold(self, seconds: float = 2.0, z_m: float = 0.8) -> None:

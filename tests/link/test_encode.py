@@ -27,7 +27,7 @@ from perchctl.link.firmware import EXTERNAL_POSITION_TICK
 from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.sim.crtp import execute
 from perchctl.sim.firmware.controller import Setpoint
-from perchctl.sim.firmware.planner import HlLand
+from perchctl.sim.firmware.planner import Planner
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -173,7 +173,7 @@ def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None
     (RawThrust(40000), [("low_level", (Setpoint.raw(0.0, 0.0, 0.0, 40000),))]),
     (RawThrust(40000, math.pi / 8.0, -math.pi / 4.0),
      [("low_level", (Setpoint.raw(22.5, -45.0, 0.0, 40000),))]),
-    (Land(-0.25, 3.0), [*[("high_level", (HlLand(-0.25, 3.0, None),))] * LAND_TIMES,
+    (Land(-0.25, 3.0), [*[("high_level", (Planner.land, -0.25, 3.0, None))] * LAND_TIMES,
                         ("notify_setpoint_stop", ())]),
     (EmergencyStop(), [("emergency_stop", ())]),
 ])  # fmt: skip

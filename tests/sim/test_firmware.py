@@ -9,7 +9,7 @@ import pytest
 
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.firmware.controller import Setpoint
-from perchctl.sim.firmware.planner import HlLand, HlStop, HlTakeoff
+from perchctl.sim.firmware.planner import Planner
 from perchctl.vehicle import CRASHED
 from tests.helpers.firmware_rig import PERFECT, Rig, make_rig
 
@@ -29,9 +29,9 @@ def flying(**conditions: float) -> Rig:
 def test_a_landing_of_a_landing_and_a_take_off_in_flight_are_refused() -> None:
     rig = make_rig()
     rig.take_off()
-    order, t_s = rig.firmware.planner.command, rig.firmware.t_s
-    orders = HlTakeoff(1.0, 1.0), HlLand(0.0, 3.0), HlLand(0.0, 1.0)
-    assert [order(each, t_s) for each in orders] == [False, True, False]
+    planner, t_s = rig.firmware.planner, rig.firmware.t_s
+    assert not planner.take_off(1.0, 1.0, None, t_s)
+    assert [planner.land(0.0, duration_s, None, t_s) for duration_s in (3.0, 1.0)] == [True, False]
 
 
 def test_stop_parameter_is_an_emergency_stop_and_high_level_stop_cuts_the_motors() -> None:
@@ -41,7 +41,7 @@ def test_stop_parameter_is_an_emergency_stop_and_high_level_stop_cuts_the_motors
     assert rig.info == LOCK
     rig = make_rig()
     rig.take_off()
-    rig.firmware.high_level(HlStop())
+    rig.firmware.high_level(Planner.stop)
     rig.run(0.02)
     assert rig.motors_off
 

@@ -36,10 +36,9 @@ MODE_RAW: Mode = (DISABLED, DISABLED, DISABLED, ABSOLUTE, ABSOLUTE, VELOCITY)
 class Setpoint:
     """One setpoint in the firmware's own units: m, m/s, degrees, pitch nose up.
 
-    Yaw rates are counter-clockwise positive, `thrust` is 0..65535; `body_velocity` means that
-    the velocity is along the body's axes instead of the world's. The class methods take what
-    cflib's calls of the same kind take. Without arguments it is the one of
-    `send_stop_setpoint`: no thrust.
+    Yaw rates are counter-clockwise positive, `thrust` is 0..65535; the velocity is along the
+    world's axes, with `MODE_HOVER` along the body's. The class methods take what cflib's calls of
+    the same kind take. Without arguments it is the one of `send_stop_setpoint`: no thrust.
     """
 
     mode: Mode = MODE_OFF
@@ -54,7 +53,6 @@ class Setpoint:
     yaw_deg: float = 0.0
     yaw_rate_dps: float = 0.0
     thrust: float = 0.0
-    body_velocity: bool = False
 
     @classmethod
     def raw(cls, roll_deg: float, pitch_deg: float, yaw_rate_dps: float, thrust: float) -> Setpoint:
@@ -71,37 +69,6 @@ class Setpoint:
     def position(cls, x_m: float, y_m: float, z_m: float, yaw_deg: float) -> Setpoint:
         """Return that of `send_position_setpoint`: m and degrees, counter-clockwise positive."""
         return cls(MODE_POSITION, x_m, y_m, z_m, yaw_deg=yaw_deg)
-
-    @classmethod
-    def velocity(cls, vx_mps: float, vy_mps: float, vz_mps: float, yaw_rate_dps: float) -> Setpoint:
-        """Return that of `send_velocity_world_setpoint`: yaw rate counter-clockwise positive."""
-        return cls(MODE_VELOCITY, 0.0, 0.0, 0.0, vx_mps, vy_mps, vz_mps, yaw_rate_dps=yaw_rate_dps)
-
-    @classmethod
-    def hover(cls, vx_mps: float, vy_mps: float, yaw_rate_dps: float, z_m: float) -> Setpoint:
-        """Return that of `send_hover_setpoint`: velocity in body axes, yaw rate, absolute
-        height."""
-        return cls(
-            MODE_HOVER,
-            z_m=z_m,
-            vx_mps=vx_mps,
-            vy_mps=vy_mps,
-            yaw_rate_dps=yaw_rate_dps,
-            body_velocity=True,
-        )
-
-    @classmethod
-    def z_distance(
-        cls, roll_deg: float, pitch_deg: float, yaw_rate_dps: float, z_m: float
-    ) -> Setpoint:
-        """Return that of `send_zdistance_setpoint`: attitude, yaw rate, absolute height."""
-        return cls(
-            MODE_Z_DISTANCE,
-            z_m=z_m,
-            roll_deg=roll_deg,
-            pitch_deg=pitch_deg,
-            yaw_rate_dps=yaw_rate_dps,
-        )
 
     def levelled(self) -> Setpoint:
         """Return what the supervisor flies while setpoints are missing: level, no turn, same z."""
@@ -246,7 +213,7 @@ class Controller:
         yaw_rad = math.radians(now.yaw_deg)
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         want_x, want_y = setpoint.vx_mps, setpoint.vy_mps
-        if not setpoint.body_velocity:
+        if mode != MODE_HOVER:
             want_x, want_y = want_x * c + want_y * s, want_y * c - want_x * s
         if mode[0] == ABSOLUTE:
             want_x = self.x.update(setpoint.x_m * c + setpoint.y_m * s, now.x_m * c + now.y_m * s)

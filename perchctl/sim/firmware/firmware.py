@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from perchctl.sim.firmware.controller import (
     MODE_RAW,
@@ -16,7 +16,7 @@ from perchctl.sim.firmware.controller import (
 )
 from perchctl.sim.firmware.estimator import Estimator
 from perchctl.sim.firmware.outside import SETTINGS, Quaternion, Vector
-from perchctl.sim.firmware.planner import HighLevelCommand, Planner
+from perchctl.sim.firmware.planner import Planner
 from perchctl.sim.firmware.supervisor import EVERY as SUPERVISOR_EVERY
 from perchctl.sim.firmware.supervisor import State, Supervisor
 from perchctl.sim.firmware.variables import (
@@ -149,9 +149,10 @@ class Firmware:
         self._inform_planner()
         self._low_level = False
 
-    def high_level(self, command: HighLevelCommand) -> None:
-        """Plan a command; it is flown only when no low-level stream has priority."""
-        self.planner.command(command, self.t_s)
+    def high_level(self, order: Callable[..., object], *values: Any) -> None:
+        """Give the planner an order, a method of `Planner` and its values but for the time. It is
+        flown only when no low-level stream has priority."""
+        order(self.planner, *values, self.t_s)
 
     def emergency_stop(self) -> None:
         """Stop the motors and lock, within one supervisor update."""
