@@ -37,7 +37,7 @@ os.environ.setdefault("MUJOCO_GL", "disable")
 
 import mujoco
 
-from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_quaternion, rotation_from_rpy
+from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_rpy
 from perchctl.sim.powertrain import CellKind, Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
@@ -47,14 +47,10 @@ DRAG_LEVEL_NSPM = 0.009
 DRAG_VERTICAL_NSPM = 0.009
 SUCTION_LENGTH_M = 0.02
 _SQRT_HALF = math.sqrt(0.5)
-_HAND_STEP_S = 1e-4
 _WIND_EVERY = 10  # the wind is evaluated every 20 ms
 
 
 Vector = tuple[float, float, float]
-Way = Callable[[Vector, Array, float], tuple[Array, Array]]
-"""Place (3,) and R_world_body (3, 3) of a vehicle in a hand, given those at which it was taken
-and the time since."""
 
 
 class World:
@@ -78,13 +74,12 @@ class World:
         self.powertrain = Powertrain(scenario.battery_rest_v, CellKind.of(scenario))
         self._wind_mps = (0.0, 0.0, 0.0)
         self._wind = Wind(scenario)
-        self._held = False
-        self._carried: tuple[float, tuple[Vector, Array], Way] | None = None
+        self._hand: Callable[[World], None] | None = None
         self.magnet = Magnet(scenario)
         self.external_force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
         mujoco.mj_forward(self._model, self._data)
         self._read()
-        self._set_specific_force(0.0, 0.0, 0.0)
+        self.feel(0.0, 0.0, 0.0)
 
     @property
     def t_s(self) -> float:
@@ -117,8 +112,8 @@ class World:
         """Advance by `CONTROL_PERIOD_S` under four duty cycles 0..65535."""
         self._steps += 1
         f1, f2, f3, f4 = self.powertrain.step(pwm)
-        if self._held:
-            self._follow_hand()
+        if self._hand is not None:
+            self._hand(self)
             return
         if self._steps % _WIND_EVERY == 1:
             self._wind_mps = self._wind.at(self.t_s)
@@ -132,8 +127,7 @@ class World:
         torque_x = arm * (f3 + f4 - f1 - f2)
         torque_y = arm * (f2 + f3 - f1 - f4)
         torque_z = YAW_TORQUE_M * (f2 + f4 - f1 - f3)
-        r02, r12, r22 = self._up
-        r20, r21 = self._down_row
+        (_, _, r02), (_, _, r12), (r20, r21, r22) = self._R
         wind = self._wind_mps
         push = self.external_force_n
         force_x = thrust_n * r02 - DRAG_LEVEL_NSPM * (self.vx_mps - wind[0]) + push[0]
@@ -154,21 +148,14 @@ class World:
         mujoco.mj_step(self._model, self._data)
         self._read()
         rate = 1.0 / CONTROL_PERIOD_S
-        self._set_specific_force(
-            (self.vx_mps - vx) * rate, (self.vy_mps - vy) * rate, (self.vz_mps - vz) * rate
-        )
+        self.feel((self.vx_mps - vx) * rate, (self.vy_mps - vy) * rate, (self.vz_mps - vz) * rate)
 
     def gear_tip_m(self) -> tuple[float, float, float]:
         """Return the gear's tip in world axes."""
-        w, x, y, z = self.quaternion
         gx, gy, gz = self._scenario.gear_body_m
-        r02, r12, r22 = self._up
-        r20, r21 = self._down_row
-        return (
-            self.x_m + (1 - 2 * (y * y + z * z)) * gx + 2 * (x * y - w * z) * gy + r02 * gz,
-            self.y_m + 2 * (x * y + w * z) * gx + (1 - 2 * (x * x + z * z)) * gy + r12 * gz,
-            self.z_m + r20 * gx + r21 * gy + r22 * gz,
-        )
+        rows = zip((self.x_m, self.y_m, self.z_m), self._R, strict=True)
+        x, y, z = (place + a * gx + b * gy + c * gz for place, (a, b, c) in rows)
+        return x, y, z
 
     def gear_miss_m(self) -> float:
         """Return the horizontal distance of the gear's tip from the target's centre."""
@@ -186,42 +173,31 @@ class World:
     ) -> None:
         """Put the vehicle somewhere, not turning; `hold` pins it there until `let_go`.
 
-        No gyroscope measures it (see `perchctl.sim.firmware.estimator`), unlike `move_by_hand`.
+        No gyroscope measures it (see `perchctl.sim.firmware.estimator`).
         """
-        self._held, self._carried = hold, None
-        self._place(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
+        self._hand = World._stay if hold else None
+        self.place(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
 
-    def move_by_hand(self, way: Way) -> None:
-        """Let a hand take the vehicle from where it is along a way, until `let_go`. Its sensors
-        feel all of it."""
-        start = (self.x_m, self.y_m, self.z_m), rotation_from_quaternion(self.quaternion)
-        self._carried = (self.t_s, start, way)
-        self._held = True
+    def carry(self, hand: Callable[[World], None]) -> None:
+        """Let a hand move the vehicle, which is called each control period, until `let_go`; by
+        `place` and `feel`."""
+        self._hand = hand
 
     def let_go(self) -> None:
-        """End what `set_pose(..., hold=True)` or `move_by_hand` began."""
-        self._held, self._carried = False, None
+        """End what `set_pose(..., hold=True)` or `carry` began."""
+        self._hand = None
 
-    def _follow_hand(self) -> None:
-        if self._carried is None:
-            self._set_specific_force(0.0, 0.0, 0.0)
-            return
-        began_s, start, way = self._carried
-        t_s, dt_s = self.t_s - began_s, _HAND_STEP_S
-        before, here, after = (way(*start, t_s + k * dt_s) for k in (-1, 0, 1))
-        turn = before[1].T @ after[1]  # so small a turn is its own vector
-        rates = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / (2.0 * dt_s)
-        self._place(here[0], here[1], (after[0] - before[0]) / (2.0 * dt_s), rates)
-        acceleration_mps2 = (after[0] - 2.0 * here[0] + before[0]) / dt_s**2
-        self._set_specific_force(*acceleration_mps2.tolist())
+    def _stay(self) -> None:
+        self.feel(0.0, 0.0, 0.0)
 
-    def _place(
+    def place(
         self,
         position_m: Sequence[float] | Array,
         R: Array,
         velocity_mps: Sequence[float] | Array,
         rates_radps: Sequence[float] | Array,
     ) -> None:
+        """Set the state: position, R_world_body (3, 3), velocity and turning rates."""
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, R.ravel())
         self._data.qpos[:3] = position_m
@@ -237,17 +213,18 @@ class World:
             self._qvel.tolist()
         )
         self.quaternion = (w, x, y, z)
-        self._up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-        self._down_row = (2 * (x * z - w * y), 2 * (y * z + w * x))
+        self._R = (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        )
 
-    def _set_specific_force(self, ax: float, ay: float, az: float) -> None:
-        w, x, y, z = self.quaternion
+    def feel(self, ax: float, ay: float, az: float) -> None:
+        """Let the accelerometer read what belongs to an acceleration in world axes, m/s^2."""
         az += GRAVITY_MPS2
-        r20, r21 = self._down_row
-        r02, r12, r22 = self._up
-        self.fx_mps2 = (1 - 2 * (y * y + z * z)) * ax + 2 * (x * y + w * z) * ay + r20 * az
-        self.fy_mps2 = 2 * (x * y - w * z) * ax + (1 - 2 * (x * x + z * z)) * ay + r21 * az
-        self.fz_mps2 = r02 * ax + r12 * ay + r22 * az
+        self.fx_mps2, self.fy_mps2, self.fz_mps2 = (
+            a * ax + b * ay + c * az for a, b, c in zip(*self._R, strict=True)
+        )
 
     def on_floor(self) -> bool:
         """True if the vehicle touches the floor."""

@@ -14,7 +14,7 @@ from perchctl.geometry import GRAVITY_MPS2, rotation_from_quaternion, rotation_f
 from perchctl.sim import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.world import DRAG_VERTICAL_NSPM, SUCTION_LENGTH_M, World
-from tests.helpers.carried import lifted_and_turned
+from tests.helpers.carried import Hand, lifted_and_turned
 
 OFF = (0.0, 0.0, 0.0, 0.0)
 GEAR_Z_M = 0.03
@@ -184,7 +184,7 @@ def test_the_attitude_estimate_follows_a_hand_all_the_way() -> None:
     scenario = Scenario()
     world = World(scenario)
     firmware = Firmware(world, scenario)
-    world.move_by_hand(lifted_and_turned(HOME))
+    world.carry(Hand(lifted_and_turned(HOME)))
     turned, felt = [], []
     for _ in range(round(8.0 / CONTROL_PERIOD_S)):
         firmware.step()
