@@ -14,7 +14,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any, TextIO
 
 import cv2
@@ -23,7 +22,7 @@ from perchctl.children import Channel, connect_back
 from perchctl.errors import PerchError
 from perchctl.geometry import rotation_from_quaternion, rpy_from_rotation
 from perchctl.link import Packet
-from perchctl.sim.capture import CaptureFault, MotionCaptureServer, SimCapture
+from perchctl.sim.capture import MotionCaptureServer, SimCapture
 from perchctl.sim.crtp import CrtpServer
 from perchctl.sim.optics import Picture
 from perchctl.sim.process import LOOP_PATIENCE_S, START_TIMEOUT_S, HostSetup, SharedTime
@@ -67,10 +66,9 @@ class VehicleHost:
             if setup.capture is not None:
                 self.positions = use(contextlib.closing(MotionCaptureServer(setup.capture.names)))
 
-            def lines(file: Path | None) -> TextIO | None:
-                return None if file is None else use(file.open("w", encoding="utf-8"))
-
-            self._truth, self._heard = lines(setup.truth_file), lines(setup.heard_file)
+            self._truth: TextIO | None = None
+            if setup.truth_file is not None:
+                self._truth = use(setup.truth_file.open("w", encoding="utf-8"))
             self._opened = opened.pop_all()
 
     @property
@@ -93,8 +91,6 @@ class VehicleHost:
             packet = Packet.decode(datagram)
             if packet is None or not self._passes():
                 continue
-            if self._heard is not None:
-                _write(self._heard, {"from": address, "packet": datagram.hex()})
             if datagram[0] != _NULL_HEADER:
                 self._peer = address
             self._send(self.server.handle(packet), address)
@@ -114,7 +110,8 @@ class VehicleHost:
         if self._peer is not None:
             self._send(self.server.due(), self._peer)
         if self._truth is not None and self._steps % TRUTH_EVERY == 0:
-            _write(self._truth, self.truth())
+            self._truth.write(json.dumps(self.truth()) + "\n")
+            self._truth.flush()
 
     def advance(self, dt_s: float) -> float:
         """Let `dt_s` pass; the simulated time since the start."""
@@ -123,9 +120,11 @@ class VehicleHost:
         return self.elapsed_s
 
     def answer(self, name: str, *arguments: Any, **named: Any) -> Any:
-        """Return what a method gives: of this host, or `set_pose`, `move_by_hand` and `let_go` of
-        its world."""
-        of: Any = self.vehicle.world if hasattr(self.vehicle.world, name) else self
+        """Return what a method gives: of this host, its server, or its vehicle's world or motion
+        capture. Raises AttributeError without such a method."""
+        vehicle = self.vehicle
+        parts = (self, self.server, vehicle.world, vehicle.capture)
+        of = next((part for part in parts if hasattr(part, name)), self)
         return getattr(of, name)(*arguments, **named)
 
     def set_battery(self, rest_v: float) -> None:
@@ -135,18 +134,6 @@ class VehicleHost:
     def silence(self, duration_s: float) -> None:
         """Let the link receive and send nothing for `duration_s` of simulated time."""
         self._silent_s = (self.elapsed_s, self.elapsed_s + duration_s)
-
-    def capture_fault(self, fault: CaptureFault | None, for_s: float = math.inf) -> None:
-        """Begin a fault of the motion capture for so long; None ends all faults."""
-        assert self.vehicle.capture is not None, "it was started without a motion capture"
-        if fault is None:
-            self.vehicle.capture.heal()
-        else:
-            self.vehicle.capture.lay(fault, for_s)
-
-    def reboot(self) -> None:
-        """Restart the firmware, as the power button does; log blocks are lost."""
-        self.server.reboot()
 
     def truth(self) -> dict[str, Any]:
         """Return the true state, SI and radians, and the firmware's outputs: no Crazyflie reports
@@ -195,11 +182,6 @@ class VehicleHost:
         return self._bursts is None or not self._bursts.lost(self.elapsed_s)
 
 
-def _write(file: TextIO, record: dict[str, Any]) -> None:
-    file.write(json.dumps(record) + "\n")
-    file.flush()
-
-
 # --- The child process: runs the vehicle that the parent describes ----
 
 
@@ -218,8 +200,7 @@ def serve_parent() -> None:
         return
     with contextlib.closing(host):
         channel.send((host.uri, "" if host.stream is None else host.stream.url, host.capture))
-        realtime = setup.pace == "realtime"
-        Runner(host, channel, realtime=realtime, linger_s=setup.linger_s, shared=shared).run()
+        Runner(host, channel, realtime=setup.pace == "realtime", shared=shared).run()
 
 
 # --- How time passes in the simulated vehicle's process, and when it ends ---
@@ -228,10 +209,11 @@ def serve_parent() -> None:
 # - stepped: only the parent's `advance` moves time; between two of them the link is
 #   answered, so that cflib connects without simulated time passing.
 #
-# When the parent is gone, however it went, the vehicle flies on in real time for
-# `HostSetup.linger_s` and then ends, so that the firmware's reaction can be observed.
+# When the parent is gone, however it went, the vehicle flies on in real time for `LINGER_S` and
+# then ends, so that the firmware's reaction can be observed.
 
 
+LINGER_S = 5.0
 MAX_LAG_S = 1.0
 """A longer hiccup (a suspended computer) is cut off instead of being caught up with."""
 _IDLE_S = 0.25
@@ -247,14 +229,12 @@ class Runner:
         channel: Channel | None,
         *,
         realtime: bool,
-        linger_s: float,
         clock: Callable[[], float] = time.monotonic,
         shared: SharedTime | None = None,
     ) -> None:
         self._host = host
         self._channel = channel
         self._realtime = realtime
-        self._linger_s = linger_s
         self._clock = clock
         self._shared = shared or SharedTime.free()
         self._waiting_since_s: float | None = None
@@ -332,7 +312,7 @@ class Runner:
             self._channel.close()
             self._channel = None
         self._realtime, self._shared = True, SharedTime.free()
-        self._end_s = self._clock() + self._linger_s
+        self._end_s = self._clock() + LINGER_S
         self._origin_s = self._clock() - self._host.elapsed_s
 
 

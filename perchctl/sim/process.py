@@ -80,8 +80,6 @@ class HostSetup:
         capture: None: no motion capture.
         truth_file: JSON lines of the true state, 50 a simulated second, also after the parent has
             ended.
-        heard_file: JSON lines of every packet that arrived, and who had sent it.
-        linger_s: time on the wall's clock for which the vehicle then runs on.
         time_file: a `SharedTime` of the parent's; None: time runs freely.
     """
 
@@ -92,36 +90,21 @@ class HostSetup:
     capture: CaptureSettings | None = None
     link: LinkOptions = field(default_factory=LinkOptions)
     truth_file: Path | None = None
-    heard_file: Path | None = None
-    linger_s: float = 12.0
     time_file: Path | None = None
 
 
-ANSWER_TIMEOUT_S = 15.0
-SLOWEST_PACE = 20.0
-"""Wall-clock seconds allowed for one simulated second of `advance`."""
+ANSWER_TIMEOUT_S = 60.0
+"""Also of `advance`, which takes a second for half a minute."""
 _STOP_TIMEOUT_S = 5.0
 _CHILD = "from perchctl.sim.host import serve_parent; serve_parent()"
-REQUESTS = (
-    "truth",
-    "set_pose",
-    "move_by_hand",
-    "let_go",
-    "set_battery",
-    "silence",
-    "capture_fault",
-    "reboot",
-    "replace_vehicle",
-)
-"""Methods of the child's `VehicleHost` and its `World` that a `SimProcess` has, too."""
 
 
 class SimProcess:
-    """Handle of a running simulated vehicle; a context manager. It has the methods `REQUESTS` of
-    `perchctl.sim.host.VehicleHost` and its `World`.
+    """Handle of a running simulated vehicle; a context manager. It has the methods of the child's
+    `perchctl.sim.host.VehicleHost`, and of its server, its world and its motion capture.
 
-    All methods may be called from any thread; they raise `ConnectionFailed` when the child is gone
-    and `TimedOut` when it does not answer.
+    All methods may be called from any thread; they raise `ConnectionFailed` when the child is
+    gone, `TimedOut` when it does not answer, and `InvalidValue` when it refuses.
 
     Attributes:
         uri: for cflib.
@@ -181,13 +164,8 @@ class SimProcess:
         """
         return cls(HostSetup(scenario or Scenario(), pace, **settings), timeout_s)
 
-    def advance(self, dt_s: float) -> float:
-        """Let `dt_s` pass (stepped pace only); the simulated time since the start."""
-        allowed_s = ANSWER_TIMEOUT_S + SLOWEST_PACE * dt_s
-        return float(self._ask("advance", dt_s, timeout_s=allowed_s))
-
     def __getattr__(self, name: str) -> Callable[..., Any]:
-        if name not in REQUESTS:
+        if name.startswith("_"):
             raise AttributeError(name)
         return partial(self._ask, name)
 
@@ -197,7 +175,7 @@ class SimProcess:
             return
         self._stopped = True
         with contextlib.suppress(PerchError):
-            self._ask("stop", timeout_s=_STOP_TIMEOUT_S)
+            self._ask("stop")
         self._channel.close()
         end(self._child, _STOP_TIMEOUT_S)
         self._stderr.close()
@@ -208,9 +186,8 @@ class SimProcess:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _ask(
-        self, name: str, *arguments: Any, timeout_s: float = ANSWER_TIMEOUT_S, **named: Any
-    ) -> Any:
+    def _ask(self, name: str, *arguments: Any, **named: Any) -> Any:
+        timeout_s = _STOP_TIMEOUT_S if name == "stop" else ANSWER_TIMEOUT_S
         with self._lock:
             try:
                 self._channel.send((name, arguments, named))

@@ -51,7 +51,7 @@ def test_stepped_time_passes_only_by_advance(stepped: SimProcess) -> None:
     assert stepped.truth()["t_s"] == start_s
     assert stepped.advance(0.5) == pytest.approx(start_s + 0.5)
     assert stepped.truth()["t_s"] == pytest.approx(start_s + 0.5)
-    with pytest.raises(AttributeError):
+    with pytest.raises(InvalidValue, match="no_such_request"):
         stepped.no_such_request()
 
 
@@ -113,7 +113,7 @@ from pathlib import Path
 from perchctl.sim import SimProcess
 started = []
 for pace in ("realtime", "stepped"):
-    sim = SimProcess.start(pace=pace, truth_file=Path({folder!r}, pace), linger_s=3.0)
+    sim = SimProcess.start(pace=pace, truth_file=Path({folder!r}, pace))
     print(pace, sim.pid, sim.uri, flush=True)
     started.append(sim)
 sys.stdin.readline()
