@@ -262,8 +262,8 @@ class CrtpServer:
         self._version = options.protocol_version
         self._blocks: dict[int, _Block] = {}
         log_codes = {
-            name: BY_CTYPE[ctype].log_code
-            for name, ctype in firmware.LOG_VARIABLES.items()
+            name: BY_CTYPE[variable.ctype].log_code
+            for name, variable in firmware.LOG_VARIABLES.items()
             if name not in options.missing_log_variables
         }
         self._log_toc = Toc(Port.LOG, log_codes, bytes((MAX_BLOCKS, MAX_VARIABLES)))

@@ -78,7 +78,7 @@ def thrust_n(volts: float) -> float:
 
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age ---
 # - Resting voltage by charge: the levels in tenths by which the firmware tells a battery's
-#   state (`perchctl.sim.firmware.firmware`) are a discharge curve of the Crazyflie's own cell.
+#   state (source: power management) are a discharge curve of the Crazyflie's own cell.
 #   It is flat in the middle and falls ever faster below a tenth, where 24 s of hovering take
 #   0.7 V; what lies between 0 and 10 per cent is shaped as lithium polymer cells fall off.
 # - The voltage falls under load by the cell's resistance at once, and in an old or cold cell

@@ -69,7 +69,6 @@ class Scenario:
         cell_slow_ohm: more of it, that an old or cold cell shows within seconds.
         cell_charge: what an old cell still holds, as a share of a new one's.
         cell_knee: the share of its charge below which its voltage falls steeply.
-        rssi_dbm: of the radio, at the vehicle.
         parameters: the firmware's, where they differ from its release at boot.
         gyro_bias_radps, acc_bias_mps2: what the gyroscope, after the firmware has taken out what it
             found on the ground, and the accelerometer, before the firmware scales it to 1 g, read
@@ -123,7 +122,6 @@ class Scenario:
     cell_slow_ohm: float = 0.0
     cell_charge: float = 1.0
     cell_knee: float = 0.1
-    rssi_dbm: float = -40.0
     parameters: dict[str, float] = field(default_factory=dict)
     no_target: bool = False
     camera_freeze_at_s: float | None = None

@@ -100,7 +100,7 @@ def clean(client: Client) -> Iterator[Client]:
 def test_log_data_have_period_and_stamp(sim: SimProcess, clean: Client) -> None:
     """Row "Log data: block id, 3-byte ms timestamp, data", with conversion on the way; 13 variables
     take a second packet."""
-    names = [f"stateEstimateZ.{n}" for n in ("x", "y", "z", "vx", "vy", "vz")]
+    names = [f"debugCtr.c{i}" for i in range(6)]
     names += ["pm.vbatMV", *(f"motor.m{i}" for i in (1, 2, 3, 4)), "supervisor.info"]
     block = log_block("p", dict.fromkeys(names, "uint16_t") | {"pm.vbat": "FP16"}, 50)
     got: list[tuple[int, dict[str, float]]] = []
@@ -124,8 +124,8 @@ def test_log_limits_are_known_to_cflib(clean: Client) -> None:
     """Rows "Unknown log variable: KeyError. Too large a log block: AttributeError"."""
     with pytest.raises(KeyError):
         clean.cf.log.add_config(log_block("u", {"no.such": "float"}))
-    too_large = {f"kalman.q{i}": "float" for i in range(4)} | {
-        f"stateEstimate.{n}": "float" for n in "xyz"
+    too_large = {
+        f"{group}.{n}": "float" for group in ("acc", "gyro", "stateEstimate") for n in "xyz"
     }
     with pytest.raises(AttributeError):
         clean.cf.log.add_config(log_block("l", too_large))

@@ -79,7 +79,6 @@ def test_it_flies_by_ideal_positions_as_measured() -> None:
     assert place(rig) == pytest.approx((0.0, 0.0, 0.8), abs=0.12)  # the integral settles slowly
     log = rig.firmware.log_value
     assert max(log(f"kalman.varP{axis}") for axis in "XYZ") == pytest.approx(2.5e-4, rel=0.1)
-    assert log("range.zrange") == 0.0
 
 
 def test_a_wrong_initial_heading_cannot_be_flown() -> None:

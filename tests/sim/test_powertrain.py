@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.firmware.controller import MOTORS_OFF, THRUST_MIN, MotorDriver
-from perchctl.sim.firmware.firmware import _LEVELS_V
 from perchctl.sim.powertrain import (
     MOTOR_FORCE_N,
     STANDSTILL_V,
@@ -21,6 +20,8 @@ from perchctl.sim.powertrain import (
 )
 
 HOVER_A = 3.8
+LEVELS_V = (3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10)
+"""At which the firmware's battery level leaves 10, 20, ... 90 per cent (source)."""
 
 
 def settled(battery_v: float) -> MotorDriver:
@@ -52,7 +53,7 @@ def after(cell: Cell, seconds: float, current_a: float = HOVER_A) -> float:
 def test_each_tenth_of_the_charge_ends_at_the_firmwares_level() -> None:
     cell = Cell(4.2, CellKind())
     tenth_s = 90.0 / HOVER_A
-    for level_v in reversed(_LEVELS_V[1:]):
+    for level_v in reversed(LEVELS_V):
         assert after(cell, tenth_s) == pytest.approx(level_v, abs=0.002)
     assert after(cell, tenth_s) == pytest.approx(3.0, abs=0.02)
 

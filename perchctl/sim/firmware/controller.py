@@ -260,10 +260,9 @@ _N_PER_COMMAND = MOTOR_FORCE_N / FULL_COMMAND
 
 
 class MotorDriver:
-    """`requested`: the duty cycles before the cap (`motor.m1req`)."""
+    """Turns thrust requests into duty cycles, by the battery's voltage that it has filtered."""
 
     def __init__(self) -> None:
-        self.requested: Motors = MOTORS_OFF
         # Low-passed with 0.1 s: the compensation meets a sagging battery late.
         self._supply_v = SUPPLY_AT_BOOT_V
 
@@ -271,14 +270,13 @@ class MotorDriver:
         """Return duty cycles 0..65535 for thrust requests; `MOTORS_OFF` itself when all are 0."""
         self._supply_v = supply_v = battery_v + _KEEP * (self._supply_v - battery_v)
         if requests is MOTORS_OFF or supply_v < SUPPLY_LEAST_V:
-            self.requested = MOTORS_OFF
             return MOTORS_OFF
         scale = FULL_COMMAND / supply_v
         p1, p2, p3, p4 = (
             scale * motor_v(_N_PER_COMMAND * request) if request >= THRUST_MIN else 0.0
             for request in requests
         )
-        self.requested = pwm = (p1, p2, p3, p4)
+        pwm = (p1, p2, p3, p4)
         if max(pwm) == 0.0:
             return MOTORS_OFF
         excess = max(pwm) - FULL_COMMAND

@@ -19,12 +19,7 @@ from perchctl.sim.firmware.outside import SETTINGS, Quaternion, Vector
 from perchctl.sim.firmware.planner import Planner
 from perchctl.sim.firmware.supervisor import EVERY as SUPERVISOR_EVERY
 from perchctl.sim.firmware.supervisor import State, Supervisor
-from perchctl.sim.firmware.variables import (
-    LIVE,
-    LOG_VARIABLES,
-    PARAMETERS,
-    Parameter,
-)
+from perchctl.sim.firmware.variables import LOG_VARIABLES, PARAMETERS, LogVariable, Parameter
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 if TYPE_CHECKING:
@@ -45,7 +40,7 @@ class Firmware:
     `CONTROL_PERIOD_S`. Commands take effect in the next step.
     """
 
-    LOG_VARIABLES: ClassVar[dict[str, str]] = LOG_VARIABLES
+    LOG_VARIABLES: ClassVar[dict[str, LogVariable]] = LOG_VARIABLES
     PARAMETERS: ClassVar[dict[str, Parameter]] = PARAMETERS
 
     def __init__(self, world: World, scenario: Scenario) -> None:
@@ -206,11 +201,7 @@ class Firmware:
         """
         if name in self.log_overrides:
             return self.log_overrides[name]
-        if name in LIVE:
-            return LIVE[name](self)
-        if name not in LOG_VARIABLES:
-            raise KeyError(name)
-        return 0.0
+        return LOG_VARIABLES[name].read(self)
 
     def log_values(self, names: Iterable[str]) -> dict[str, float]:
         """Return the values of a whole block, by name. Errors as for one."""
@@ -258,14 +249,12 @@ class Firmware:
         )
 
 
-# --- The battery as the power management reports it: voltage, level, low-power state ---
+# --- The battery as the power management reports it: voltage and low-power state ---
 
 
 ON_BATTERY, LOW_POWER = 0, 3
 LOW_DELAY_S = 5.0
 _BATTERY_FILTER = 0.2  # at 25 Hz
-# Voltages at which the level leaves 0, 10, ... 90 per cent.
-_LEVELS_V = (3.00, 3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10)
 
 
 class PowerMonitor:
@@ -275,10 +264,6 @@ class PowerMonitor:
         self.battery_v = battery_v
         self.state = ON_BATTERY
         self._fine_s = 0.0
-
-    @property
-    def level_percent(self) -> int:
-        return 10 * max(0, sum(self.battery_v >= v for v in _LEVELS_V) - 1)
 
     def update(self, t_s: float, battery_v: float, parameters: Mapping[str, float]) -> None:
         self.battery_v += _BATTERY_FILTER * (battery_v - self.battery_v)
