@@ -7,7 +7,6 @@ from .process import SharedTime as SharedTime
 from .process import SimProcess as SimProcess
 from .renderer import Renderer as Renderer
 from .scenario import CONTROL_PERIOD_S as CONTROL_PERIOD_S
-from .scenario import EventExplainer as EventExplainer
 from .scenario import Neighbour as Neighbour
 from .scenario import Scenario as Scenario
 from .scenario import draw_scenario as draw_scenario

@@ -1,5 +1,5 @@
 """One simulated flight's conditions: what they are, how a profile's ranges and a seed give them,
-when the radio is silent, and how they explain an event of the flight."""
+and when the radio is silent."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2, Array, make_T, rotation_from_rpy
-from perchctl.mission import Event, EventKind
 from perchctl.profile import Profile, SimulationConfig
 
 CONTROL_PERIOD_S = 0.002
@@ -330,38 +329,3 @@ class Bursts:
             mean_s = self._bad_s if self._bad else self._good_s
             self._until_s += float(self._rng.exponential(mean_s))
         return self._bad
-
-
-# --- What the scenario did, said with the event that it led to --------
-# A newcomer who sees the target lost should not look for the fault in the program.
-
-
-LOSSES = ("estimate-lost", "align-lost", "ascend-lost", "camera-gone")
-"""Rows of the mission's table that lost pictures lead to."""
-FELT_FOR_S = 1.2
-"""After the last lost frame: a second of no track, and the latency of the next picture."""
-
-
-class EventExplainer:
-    """Explains the events of one flight that lost frames or a weak first contact led to; call it
-    with each of them, in order."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
-        self._slips = 0
-
-    def __call__(self, event: Event, t_s: float) -> str:
-        """Return what the scenario did, in a few words, or the empty string. `t_s` is the event's
-        time in the simulation."""
-        scenario, force_n = self._scenario, self._scenario.first_contact_force_n
-        held = event.reason if event.kind is EventKind.HOLD else ""
-        if event.row in LOSSES or held.startswith("no picture"):
-            start_s, frames = scenario.camera_burst or (math.inf, 0)
-            if 0.0 <= t_s - start_s <= frames / scenario.camera_rate_hz + FELT_FOR_S:
-                return f"{frames} frames lost"
-        if event.row == "slipped" and force_n is not None:
-            self._slips += 1
-            if self._slips == 1:
-                part = force_n / (scenario.mass_kg * GRAVITY_MPS2)
-                return f"the first contact holds {100 * part:.0f} % of the weight"
-        return ""
