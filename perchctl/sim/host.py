@@ -14,18 +14,17 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from multiprocessing.connection import Connection
 from typing import Any, TextIO
 
 import cv2
 
-from perchctl.children import Channel, connect_back
-from perchctl.errors import PerchError
 from perchctl.geometry import rotation_from_quaternion, rpy_from_rotation
 from perchctl.link import Packet
 from perchctl.sim.capture import MotionCaptureServer, SimCapture
 from perchctl.sim.crtp import CrtpServer
 from perchctl.sim.optics import Picture
-from perchctl.sim.process import LOOP_PATIENCE_S, START_TIMEOUT_S, HostSetup, SharedTime
+from perchctl.sim.process import LOOP_PATIENCE_S, HostSetup, SharedTime
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.vehicle import SimulatedVehicle
 
@@ -185,22 +184,19 @@ class VehicleHost:
 # --- The child process: runs the vehicle that the parent describes ----
 
 
-def serve_parent() -> None:
-    """Run the vehicle that the parent describes, until it sends stop or is gone."""
-    cv2.setNumThreads(1)  # the picture must not take the physics' core
+def serve_parent(channel: Connection, setup: HostSetup, shared: SharedTime) -> None:
+    """Run the vehicle until the parent closes the channel or is gone. The channel's first message
+    is where its link, stream and motion capture are; a text is why it has ended."""
+    os.setsid()  # away from the terminal
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    channel = connect_back()
-    setup: HostSetup = channel.receive(START_TIMEOUT_S)
+    cv2.setNumThreads(1)  # the picture must not take the physics' core
     try:
-        file = setup.time_file
-        shared = SharedTime.free() if file is None else SharedTime.mapped(file)
-        host = VehicleHost(setup)
-    except (PerchError, OSError, ValueError) as error:
-        channel.send(f"{type(error).__name__}: {error}")
-        return
-    with contextlib.closing(host):
-        channel.send((host.uri, "" if host.stream is None else host.stream.url, host.capture))
-        Runner(host, channel, realtime=setup.pace == "realtime", shared=shared).run()
+        with contextlib.closing(VehicleHost(setup)) as host:
+            channel.send((host.uri, "" if host.stream is None else host.stream.url, host.capture))
+            Runner(host, channel, realtime=setup.pace == "realtime", shared=shared).run()
+    except Exception as error:
+        with contextlib.suppress(OSError):
+            channel.send(f"{type(error).__name__}: {error}")
 
 
 # --- How time passes in the simulated vehicle's process, and when it ends ---
@@ -208,12 +204,8 @@ def serve_parent() -> None:
 #   sets `SharedTime.limit_s`, it waits for the flight's loop instead;
 # - stepped: only the parent's `advance` moves time; between two of them the link is
 #   answered, so that cflib connects without simulated time passing.
-#
-# When the parent is gone, however it went, the vehicle flies on in real time for `LINGER_S` and
-# then ends, so that the firmware's reaction can be observed.
 
 
-LINGER_S = 5.0
 MAX_LAG_S = 1.0
 """A longer hiccup (a suspended computer) is cut off instead of being caught up with."""
 _IDLE_S = 0.25
@@ -221,33 +213,35 @@ _BATCH = 50  # steps between two polls of the control connection while catching 
 
 
 class Runner:
-    """Runs one host until it is stopped or its parent has been gone for a while."""
+    """Runs one host until its parent is gone."""
 
     def __init__(
         self,
         host: VehicleHost,
-        channel: Channel | None,
+        channel: Connection,
         *,
         realtime: bool,
+        shared: SharedTime,
         clock: Callable[[], float] = time.monotonic,
-        shared: SharedTime | None = None,
     ) -> None:
         self._host = host
         self._channel = channel
         self._realtime = realtime
         self._clock = clock
-        self._shared = shared or SharedTime.free()
+        self._shared = shared
         self._waiting_since_s: float | None = None
         self._limit_s = math.inf
-        self._parent = os.getppid()
-        self._end_s = math.inf
         self._origin_s = clock() - host.elapsed_s
 
     def run(self) -> None:
-        while self._clock() < self._end_s:
-            self._wait(self.catch_up() if self._realtime else _IDLE_S)
-            if self._channel is not None and os.getppid() != self._parent:
-                self._lose_parent()
+        with contextlib.suppress(EOFError, ConnectionError):
+            while True:
+                wait_s = self.catch_up() if self._realtime else _IDLE_S
+                ready, _, _ = select.select([self._host.socket, self._channel], [], [], wait_s)
+                if self._host.socket in ready:
+                    self._host.serve()
+                if self._channel in ready:
+                    self._channel.send(self._answer(*self._channel.recv()))
 
     def catch_up(self) -> float:
         """Step up to now, some steps at most at once; how long to wait for the next step."""
@@ -278,42 +272,14 @@ class Runner:
             self._waiting_since_s = now_s  # the loop has given a sign of life
         return now_s - self._waiting_since_s < LOOP_PATIENCE_S
 
-    def _wait(self, timeout_s: float) -> None:
-        sockets = [self._host.socket]
-        if self._channel is not None:
-            sockets.append(self._channel.socket)
-        ready, _, _ = select.select(sockets, [], [], timeout_s)
-        if self._host.socket in ready:
-            self._host.serve()
-        if self._channel is not None and self._channel.socket in ready:
-            self._answer(self._channel)
-
-    def _answer(self, channel: Channel) -> None:
-        """Answer one request of the parent, (name, arguments, named ones), by (True, result) or
-        (False, text)."""
+    def _answer(self, name: str, arguments: Any, named: Any) -> tuple[bool, Any]:
+        """Return the answer to a request of the parent: (True, result) or (False, text)."""
+        if name == "advance" and self._realtime:
+            return False, "only a stepped vehicle can be advanced"
         try:
-            name, arguments, named = channel.receive()
-            answer: tuple[bool, Any] = True, None
-            try:
-                if name == "stop":
-                    self._end_s = -math.inf
-                elif name == "advance" and self._realtime:
-                    answer = False, "only a stepped vehicle can be advanced"
-                else:
-                    answer = True, self._host.answer(name, *arguments, **named)
-            except Exception as error:
-                answer = False, f"{type(error).__name__}: {error}"
-            channel.send(answer)
-        except (EOFError, OSError):
-            self._lose_parent()
-
-    def _lose_parent(self) -> None:
-        if self._channel is not None:
-            self._channel.close()
-            self._channel = None
-        self._realtime, self._shared = True, SharedTime.free()
-        self._end_s = self._clock() + LINGER_S
-        self._origin_s = self._clock() - self._host.elapsed_s
+            return True, self._host.answer(name, *arguments, **named)
+        except Exception as error:
+            return False, f"{type(error).__name__}: {error}"
 
 
 # --- The simulated camera's picture over HTTP, as a network camera would send it ---

@@ -1,8 +1,7 @@
 """The simulated vehicle as a process of its own: a Crazyflie on UDP, its camera on HTTP.
 
 `SimProcess` is the handle in the process that flies, `perchctl.sim.host` runs in the other one.
-The child does not share its terminal's Ctrl-C and outlives a killed parent by a few seconds, as a
-real vehicle would.
+The child does not share its terminal's Ctrl-C, and ends with its parent.
 """
 
 from __future__ import annotations
@@ -10,26 +9,16 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import math
-import mmap
-import tempfile
+import multiprocessing
+import signal
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
-from perchctl.children import (
-    Channel,
-    accept,
-    end,
-    last_line,
-    listen,
-    new_token,
-    send_address,
-    spawn,
-)
-from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
+from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
 from perchctl.profile import TargetConfig
 from perchctl.sim.capture import CaptureSettings
 from perchctl.sim.crtp import LinkOptions
@@ -60,15 +49,6 @@ class SharedTime(ctypes.Structure):
         """Return a time for one process alone, which waits for nobody."""
         return cls(0.0, math.inf)
 
-    @classmethod
-    def mapped(cls, file: Path) -> SharedTime:
-        """Return the time that the file holds, for each process that maps it."""
-        with file.open("r+b") as opened:
-            return cls.from_buffer(mmap.mmap(opened.fileno(), ctypes.sizeof(cls)))
-
-
-START_TIMEOUT_S = 30.0
-
 
 @dataclass(frozen=True)
 class HostSetup:
@@ -78,9 +58,7 @@ class HostSetup:
         pace: "realtime", or "stepped": time passes by `SimProcess.advance` only.
         camera: None: no camera and no stream.
         capture: None: no motion capture.
-        truth_file: JSON lines of the true state, 50 a simulated second, also after the parent has
-            ended.
-        time_file: a `SharedTime` of the parent's; None: time runs freely.
+        truth_file: JSON lines of the true state, 50 a simulated second.
     """
 
     scenario: Scenario = field(default_factory=Scenario)
@@ -90,13 +68,19 @@ class HostSetup:
     capture: CaptureSettings | None = None
     link: LinkOptions = field(default_factory=LinkOptions)
     truth_file: Path | None = None
-    time_file: Path | None = None
 
 
+START_TIMEOUT_S = 30.0
 ANSWER_TIMEOUT_S = 60.0
 """Also of `advance`, which takes a second for half a minute."""
 _STOP_TIMEOUT_S = 5.0
-_CHILD = "from perchctl.sim.host import serve_parent; serve_parent()"
+_CONTEXT = multiprocessing.get_context("spawn")
+
+
+def _serve(*arguments: Any) -> None:
+    from perchctl.sim.host import serve_parent
+
+    serve_parent(*arguments)
 
 
 class SimProcess:
@@ -119,34 +103,25 @@ class SimProcess:
 
     def __init__(self, setup: HostSetup, timeout_s: float) -> None:
         self._lock = threading.Lock()
-        self._stopped = False
-        self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed by stop)
-        # Both processes have mapped the file once the child has answered.
-        with (
-            listen() as listener,
-            tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
-        ):
-            file = Path(folder, "time")
-            file.write_bytes(bytes(SharedTime.free()))
-            self.shared_time = SharedTime.mapped(file)
-            self._child = spawn(_CHILD, self._stderr)
-            token = new_token()
-            send_address(self._child, listener, token)
-            channel = accept(listener, token, timeout_s, lambda: self._child.poll() is None)
-            if channel is None:
-                raise self._gave_up(f"did not come up within {timeout_s:.0f} s")
-            self._channel: Channel = channel
-            try:
-                channel.send(replace(setup, time_file=file))
-                answer = channel.receive(timeout_s)
-            except (EOFError, OSError):
-                channel.close()
-                raise self._gave_up("gave no answer") from None
+        self.shared_time = _CONTEXT.RawValue(SharedTime, 0.0, math.inf)
+        self._channel, childs = _CONTEXT.Pipe()
+        arguments = (childs, setup, self.shared_time)
+        self._child = _CONTEXT.Process(target=_serve, args=arguments, daemon=True)
+        # The child takes over that Ctrl-C is blocked, until it has left the terminal.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._child.start()
+        except OSError as error:
+            raise ConnectionFailed(f"the simulated vehicle could not start: {error}") from error
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            childs.close()
         self.pid = self._child.pid
-        if isinstance(answer, str):
+        try:
+            self.uri, self.stream_url, self.capture = self._receive(timeout_s)
+        except TimedOut:
             self.stop()
-            raise ConnectionFailed(f"the simulated vehicle could not start: {answer}")
-        self.uri, self.stream_url, self.capture = answer
+            raise
 
     @classmethod
     def start(
@@ -157,10 +132,10 @@ class SimProcess:
         timeout_s: float = START_TIMEOUT_S,
         **settings: Any,
     ) -> SimProcess:
-        """Start the vehicle and wait, for at most `timeout_s`, until it answers.
+        """Start the vehicle and wait until it answers.
 
         `settings` are further fields of `HostSetup`. Raises `ConnectionFailed` when the child
-        ends or does not come up.
+        ends, `TimedOut` when it does not answer within `timeout_s`.
         """
         return cls(HostSetup(scenario or Scenario(), pace, **settings), timeout_s)
 
@@ -171,14 +146,9 @@ class SimProcess:
 
     def stop(self) -> None:
         """End the vehicle's process. May be called twice."""
-        if self._stopped:
-            return
-        self._stopped = True
-        with contextlib.suppress(PerchError):
-            self._ask("stop")
         self._channel.close()
-        end(self._child, _STOP_TIMEOUT_S)
-        self._stderr.close()
+        self._child.join(_STOP_TIMEOUT_S)
+        self._child.kill()
 
     def __enter__(self) -> SimProcess:
         return self
@@ -187,27 +157,22 @@ class SimProcess:
         self.stop()
 
     def _ask(self, name: str, *arguments: Any, **named: Any) -> Any:
-        timeout_s = _STOP_TIMEOUT_S if name == "stop" else ANSWER_TIMEOUT_S
         with self._lock:
-            try:
+            with contextlib.suppress(OSError):  # then there is no answer either
                 self._channel.send((name, arguments, named))
-                good, result = self._channel.receive(timeout_s)
-            except TimeoutError:
-                raise TimedOut(
-                    f"the simulated vehicle did not answer {name!r} within {timeout_s:.0f} s"
-                ) from None
-            except (EOFError, OSError):
-                raise ConnectionFailed(
-                    f"the simulated vehicle has ended{last_line(self._stderr)}"
-                ) from None
+            good, result = self._receive(ANSWER_TIMEOUT_S)
         if not good:
             raise InvalidValue(f"the simulated vehicle refused {name!r}: {result}")
         return result
 
-    def _gave_up(self, why: str) -> ConnectionFailed:
-        code = self._child.poll()
-        end(self._child, 0.0)
-        what = f"ended with code {code}" if code is not None else why
-        error = ConnectionFailed(f"the simulated vehicle {what}{last_line(self._stderr)}")
-        self._stderr.close()
-        return error
+    def _receive(self, timeout_s: float) -> Any:
+        try:
+            answer = self._channel.recv() if self._channel.poll(timeout_s) else None
+        except (EOFError, OSError):
+            answer = "its process is gone"
+        if answer is None:
+            raise TimedOut(f"the simulated vehicle did not answer within {timeout_s:.0f} s")
+        if isinstance(answer, str):
+            self.stop()
+            raise ConnectionFailed(f"the simulated vehicle has ended: {answer}")
+        return answer

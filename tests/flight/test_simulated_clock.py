@@ -38,7 +38,7 @@ class Rig:
         self.wall_s = 100.0
         self.host, self.shared, self.runs = Host(), SharedTime.free(), True
         self.runner = Runner(
-            self.host, None, realtime=True, clock=lambda: self.wall_s,
+            self.host, self.host, realtime=True, clock=lambda: self.wall_s,
             shared=self.shared,
         )  # type: ignore[arg-type] # fmt: skip
         self.clock = SimulatedClock(self.shared, CLOCK_MARGIN_S, lambda: self.wall_s, self.let_pass)

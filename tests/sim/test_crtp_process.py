@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -20,7 +18,7 @@ from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.places import data_file
 from perchctl.sim import Scenario, SimProcess
-from tests.helpers.crtp_rig import ROOT, Client, pictures_of
+from tests.helpers.crtp_rig import pictures_of
 from tests.helpers.waiting import until
 
 
@@ -56,7 +54,7 @@ def test_stepped_time_passes_only_by_advance(stepped: SimProcess) -> None:
 
 
 def test_a_child_that_ends_or_does_not_come_up_is_a_clear_error(
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sim = SimProcess.start(pace="stepped")
     sim.stop()
@@ -68,9 +66,10 @@ def test_a_child_that_ends_or_does_not_come_up_is_a_clear_error(
     os.kill(sim.pid, signal.SIGKILL)
     with pytest.raises(ConnectionFailed, match="has ended"):
         sim.advance(0.1)
-    sim.stop()
-    monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(ConnectionFailed, match="ended with code"):
+    with pytest.raises(ConnectionFailed, match="No such file"):
+        SimProcess.start(truth_file=tmp_path / "none" / "truth")
+    monkeypatch.setattr("multiprocessing.spawn._python_exe", b"/bin/false")
+    with pytest.raises(ConnectionFailed):
         SimProcess.start(pace="stepped")
 
 
@@ -103,44 +102,29 @@ def test_the_vehicles_picture_is_streamed_and_real_time_never_runs_ahead() -> No
         assert np.array_equal(first, again)
 
 
-# --- Without a parent ----------------------------------------------------------------
+# --- Parent and terminal -----------------------------------------------------------
 
 
 _PARENT = """
 import sys
-sys.path.insert(0, {root!r})
-from pathlib import Path
 from perchctl.sim import SimProcess
-started = []
-for pace in ("realtime", "stepped"):
-    sim = SimProcess.start(pace=pace, truth_file=Path({folder!r}, pace))
-    print(pace, sim.pid, sim.uri, flush=True)
-    started.append(sim)
-sys.stdin.readline()
+if __name__ == "__main__":
+    started = [SimProcess.start(pace=pace) for pace in ("realtime", "stepped")]
+    print(*(sim.pid for sim in started), flush=True)
+    sys.stdin.readline()
 """
 
 
 @pytest.mark.long
-def test_flies_on_when_the_parent_is_killed(tmp_path: Path, toc_cache: str) -> None:
-    """The vehicle outlives a kill -9 of its parent, answers meanwhile, and then ends."""
-    code = _PARENT.format(root=ROOT, folder=str(tmp_path))
+def test_it_ends_when_its_parent_is_killed() -> None:
     with subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", _PARENT], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as parent:
         assert parent.stdout is not None
-        started = [parent.stdout.readline().split() for _ in range(2)]
+        pids = list(map(int, parent.stdout.readline().split()))
+        assert all(map(alive, pids))
         parent.kill()
-        parent.wait()
-        for _, pid, uri in started:
-            client = Client(uri, toc_cache)
-            assert client.connect()
-            assert alive(int(pid))
-            client.close()
-    for pace, pid, _ in started:
-        until(lambda pid=pid: not alive(int(pid)))
-        lines = [json.loads(line) for line in (tmp_path / pace).read_text().splitlines()]
-        assert lines[-1]["t_s"] > 1.0
-        assert lines[-1]["supervisor_info"] == 0x020E
+    until(lambda: not any(map(alive, pids)))
 
 
 def test_ctrl_c_does_not_reach_the_vehicle(stepped: SimProcess) -> None:
@@ -150,24 +134,3 @@ def test_ctrl_c_does_not_reach_the_vehicle(stepped: SimProcess) -> None:
     before_s = stepped.truth()["t_s"]
     assert stepped.advance(0.1) == pytest.approx(before_s + 0.1)
     assert alive(stepped.pid)
-
-
-def test_a_foreign_connection_cannot_take_the_parents_place() -> None:
-    """A connection without the token is closed before anything is unpickled."""
-    from perchctl import children
-
-    with children.listen() as listener:
-        foreign = socket.create_connection(listener.getsockname())
-        foreign.sendall(b"0" * 64)
-        connection = socket.create_connection(listener.getsockname())
-        connection.sendall(b"f" * 64)
-        friend = children.Channel(connection)
-        channel = children.accept(listener, "f" * 64, 5.0, lambda: True)
-        assert channel is not None
-        friend.send({"a": 1})
-        assert channel.receive(5.0) == {"a": 1}
-        friend.close()
-        with pytest.raises(EOFError):
-            channel.receive(5.0)
-        channel.close()
-        foreign.close()
