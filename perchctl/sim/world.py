@@ -38,7 +38,7 @@ os.environ.setdefault("MUJOCO_GL", "disable")
 import mujoco
 
 from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_rpy
-from perchctl.sim.powertrain import CellKind, Powertrain
+from perchctl.sim.powertrain import Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 ARM_M = 0.046  # hub to motor axis, X configuration
@@ -71,7 +71,7 @@ class World:
         self._reach_m = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + MAGNET_RANGE_M
         self._suction = scenario.ceiling_suction
         self._steps = 0
-        self.powertrain = Powertrain(scenario.battery_rest_v, CellKind.of(scenario))
+        self.powertrain = Powertrain(scenario)
         self._wind_mps = (0.0, 0.0, 0.0)
         self._wind = Wind(scenario)
         self._hand: Callable[[World], None] | None = None
@@ -98,7 +98,7 @@ class World:
     @property
     def battery_v(self) -> float:
         """The battery's voltage under the load of now."""
-        return self.powertrain.battery_v
+        return self.powertrain.cell.battery_v
 
     @property
     def battery_rest_v(self) -> float:
@@ -106,7 +106,7 @@ class World:
 
     @battery_rest_v.setter
     def battery_rest_v(self, rest_v: float) -> None:
-        self.powertrain.cell.rest_v = rest_v
+        self.powertrain.cell.set_rest_v(rest_v)
 
     def step(self, pwm: tuple[float, float, float, float]) -> None:
         """Advance by `CONTROL_PERIOD_S` under four duty cycles 0..65535."""
@@ -245,9 +245,7 @@ class World:
 # --- The rigid bodies as a MuJoCo model: floor, ceiling, and the vehicle with its gear ---
 
 
-FRAME_HALF_M = (0.035, 0.035, 0.012)
-REST_HEIGHT_M = FRAME_HALF_M[2]
-GEAR_RADIUS_M = 0.006
+REST_HEIGHT_M = 0.012
 # Crazyflie 2.1 at 27 g; scaled by mass.
 INERTIA_REFERENCE_KG = 0.027
 INERTIA_REFERENCE_KGM2 = (1.66e-5, 1.67e-5, 2.93e-5)
@@ -263,8 +261,8 @@ _MODEL = """
     <body name="vehicle" pos="0 0 {rest}">
       <freejoint/>
       <inertial pos="0 0 0" mass="{mass}" diaginertia="{inertia}"/>
-      <geom name="frame" type="box" size="{frame}"/>
-      <geom name="gear" type="cylinder" size="{radius} 0.002" pos="{gear}"/>
+      <geom name="frame" type="box" size="0.035 0.035 {rest}"/>
+      <geom name="gear" type="cylinder" size="0.006 0.002" pos="{gear}"/>
     </body>
   </worldbody>
 </mujoco>
@@ -287,8 +285,6 @@ def build_model(scenario: Scenario) -> Any:
             rest=REST_HEIGHT_M,
             mass=mass,
             inertia=" ".join(repr(i * scale) for i in INERTIA_REFERENCE_KGM2),
-            frame=" ".join(map(repr, FRAME_HALF_M)),
-            radius=GEAR_RADIUS_M,
             gear=f"{gear[0]!r} {gear[1]!r} {gear[2] - 0.002!r}",
         )
     )

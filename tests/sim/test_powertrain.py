@@ -14,7 +14,6 @@ from perchctl.sim.powertrain import (
     MOTOR_FORCE_N,
     STANDSTILL_V,
     Cell,
-    CellKind,
     motor_v,
     thrust_n,
 )
@@ -51,7 +50,7 @@ def after(cell: Cell, seconds: float, current_a: float = HOVER_A) -> float:
 
 
 def test_each_tenth_of_the_charge_ends_at_the_firmwares_level() -> None:
-    cell = Cell(4.2, CellKind())
+    cell = Cell(4.2)
     tenth_s = 90.0 / HOVER_A
     for level_v in reversed(LEVELS_V):
         assert after(cell, tenth_s) == pytest.approx(level_v, abs=0.002)
@@ -59,7 +58,7 @@ def test_each_tenth_of_the_charge_ends_at_the_firmwares_level() -> None:
 
 
 def test_an_old_cell_empties_faster_and_sags_more() -> None:
-    new, old = Cell(4.1, CellKind()), Cell(4.1, CellKind(resistance_ohm=0.2, charge=0.5))
+    new, old = Cell(4.1), Cell(4.1, ohm=0.2, charge=0.5)
     after(new, 40.0)
     after(old, 20.0)
     assert old.rest_v == pytest.approx(new.rest_v, abs=1e-6)
@@ -68,7 +67,7 @@ def test_an_old_cell_empties_faster_and_sags_more() -> None:
 
 
 def test_a_slow_resistance_shows_within_seconds_and_recovers() -> None:
-    cell = Cell(4.1, CellKind(slow_ohm=0.05))
+    cell = Cell(4.1, slow_ohm=0.05)
     after(cell, 0.1)
     assert cell.rest_v - cell.battery_v == pytest.approx(0.143 * HOVER_A, abs=0.005)
     after(cell, 60.0)
@@ -78,8 +77,8 @@ def test_a_slow_resistance_shows_within_seconds_and_recovers() -> None:
 
 
 def test_a_voltage_that_is_set_leaves_the_charge_as_it_is() -> None:
-    fine, fallen = Cell(4.1, CellKind()), Cell(4.1, CellKind())
-    fallen.rest_v -= 0.4
+    fine, fallen = Cell(4.1), Cell(4.1)
+    fallen.set_rest_v(fallen.rest_v - 0.4)
     assert fallen.rest_v == pytest.approx(3.7)
     assert after(fine, 20.0) - after(fallen, 20.0) == pytest.approx(0.4)
 
@@ -87,6 +86,6 @@ def test_a_voltage_that_is_set_leaves_the_charge_as_it_is() -> None:
 @pytest.mark.parametrize("rest_v", [3.3, 3.6, 3.85, 4.0, 4.2])
 @pytest.mark.parametrize("knee", [0.07, 0.1, 0.15])
 def test_it_starts_at_the_resting_voltage_that_is_asked_for(rest_v: float, knee: float) -> None:
-    cell = Cell(rest_v, CellKind(knee=knee))
+    cell = Cell(rest_v, knee=knee)
     assert cell.rest_v == cell.battery_v == rest_v
     assert after(cell, CONTROL_PERIOD_S) == pytest.approx(rest_v, abs=1e-3)
