@@ -15,18 +15,21 @@ import time
 from collections.abc import Callable, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing.connection import Connection
-from typing import Any, TextIO
+from pathlib import Path
+from typing import Any
 
 import cv2
 
 from perchctl.geometry import rotation_from_quaternion, rpy_from_rotation
 from perchctl.link import Packet
-from perchctl.sim.capture import MotionCaptureServer, SimCapture
-from perchctl.sim.crtp import CrtpServer
+from perchctl.profile import TargetConfig
+from perchctl.sim.capture import CaptureSettings, MotionCaptureServer, SimCapture
+from perchctl.sim.crtp import CrtpServer, LinkOptions
 from perchctl.sim.optics import Picture
-from perchctl.sim.process import LOOP_PATIENCE_S, HostSetup, SharedTime
+from perchctl.sim.process import LOOP_PATIENCE_S, SharedTime
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.vision import CameraModel
 
 Address = tuple[str, int]
 TRUTH_EVERY = 10  # control periods between two lines of the truth file
@@ -41,39 +44,46 @@ class VehicleHost:
     The endpoint is a socket on loopback: one CRTP packet a UDP datagram, as cflib's `udp://`
     driver sends them. Answers go to the address that asked. What the vehicle sends by itself goes
     to the last address that sent anything but a scan's probe.
+
+    Args:
+        camera: None: no camera and no stream.
+        capture: None: no motion capture.
+        truth_file: JSON lines of the true state, 50 a simulated second.
     """
 
-    def __init__(self, setup: HostSetup) -> None:
-        self._setup = setup
+    def __init__(
+        self,
+        scenario: Scenario,
+        camera: CameraModel | None = None,
+        target: TargetConfig | None = None,
+        capture: CaptureSettings | None = None,
+        link: LinkOptions | None = None,
+        truth_file: Path | None = None,
+    ) -> None:
+        self._parts = camera, target, capture
         self._steps = 0
         self._peer: Address | None = None
         self._silent_s = (math.inf, math.inf)
-        self._bursts = setup.scenario.radio_bursts()
-        self.vehicle = self._new_vehicle(setup.scenario)
-        self.server = CrtpServer(self.vehicle.firmware, setup.link)
-        self.stream: MjpegServer | None = None
-        self.positions: MotionCaptureServer | None = None
-        with contextlib.ExitStack() as opened:
-            use = opened.enter_context
-            self.socket = use(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-            self.socket.setblocking(False)
-            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
-            self.socket.bind(("127.0.0.1", 0))
-            self.uri = f"udp://127.0.0.1:{self.socket.getsockname()[1]}"
-            if setup.camera is not None:
-                self.stream = use(contextlib.closing(MjpegServer()))
-            if setup.capture is not None:
-                self.positions = use(contextlib.closing(MotionCaptureServer(setup.capture.names)))
-
-            self._truth: TextIO | None = None
-            if setup.truth_file is not None:
-                self._truth = use(setup.truth_file.open("w", encoding="utf-8"))
-            self._opened = opened.pop_all()
+        self._bursts = scenario.radio_bursts()
+        self.vehicle = SimulatedVehicle(scenario, *self._parts)
+        self.server = CrtpServer(self.vehicle.firmware, link)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
+        self.socket.bind(("127.0.0.1", 0))
+        self.uri = f"udp://127.0.0.1:{self.socket.getsockname()[1]}"
+        self.stream = None if camera is None else MjpegServer()
+        self.positions = None if capture is None else MotionCaptureServer(capture.names)
+        self._truth = None if truth_file is None else truth_file.open("w", encoding="utf-8")
 
     @property
-    def capture(self) -> tuple[str, str] | None:
-        """The motion capture's kind, as `motioncapture` calls it, and its address."""
-        return None if self.positions is None else (SimCapture.SYSTEM, self.positions.host)
+    def addresses(self) -> tuple[str, str, tuple[str, str] | None]:
+        """The URI of the link, the URL of the stream ("" without one), and of the motion capture
+        the kind, as `motioncapture` calls it, and the address; None without one."""
+        stream_url = "" if self.stream is None else self.stream.url
+        positions = self.positions
+        capture = None if positions is None else (SimCapture.SYSTEM, positions.host)
+        return self.uri, stream_url, capture
 
     @property
     def elapsed_s(self) -> float:
@@ -119,16 +129,12 @@ class VehicleHost:
         return self.elapsed_s
 
     def answer(self, name: str, *arguments: Any, **named: Any) -> Any:
-        """Return what a method gives: of this host, its server, or its vehicle's world or motion
-        capture. Raises AttributeError without such a method."""
-        vehicle = self.vehicle
-        parts = (self, self.server, vehicle.world, vehicle.capture)
+        """Return what a method gives: of this host, its server, or its vehicle's world, battery or
+        motion capture. Raises AttributeError without such a method."""
+        world = self.vehicle.world
+        parts = (self, self.server, world, world.powertrain.cell, self.vehicle.capture)
         of = next((part for part in parts if hasattr(part, name)), self)
         return getattr(of, name)(*arguments, **named)
-
-    def set_battery(self, rest_v: float) -> None:
-        """Change the battery's resting voltage."""
-        self.vehicle.world.battery_rest_v = rest_v
 
     def silence(self, duration_s: float) -> None:
         """Let the link receive and send nothing for `duration_s` of simulated time."""
@@ -156,16 +162,14 @@ class VehicleHost:
 
     def replace_vehicle(self, scenario: Scenario) -> None:
         """Put a new vehicle under the same link: connection and log blocks stay."""
-        self.vehicle = self._new_vehicle(scenario)
+        self.vehicle = SimulatedVehicle(scenario, *self._parts)
         self.server.replace_firmware(self.vehicle.firmware)
 
     def close(self) -> None:
         """Free the ports and close the files."""
-        self._opened.close()
-
-    def _new_vehicle(self, scenario: Scenario) -> SimulatedVehicle:
-        setup = self._setup
-        return SimulatedVehicle(scenario, setup.camera, setup.target, setup.capture)
+        for part in (self.socket, self.stream, self.positions, self._truth):
+            if part is not None:
+                part.close()
 
     def _send(self, packets: Iterable[Packet], address: Address) -> None:
         for packet in packets:
@@ -184,16 +188,18 @@ class VehicleHost:
 # --- The child process: runs the vehicle that the parent describes ----
 
 
-def serve_parent(channel: Connection, setup: HostSetup, shared: SharedTime) -> None:
+def serve_parent(
+    channel: Connection, shared: SharedTime, pace: str, scenario: Scenario, settings: dict[str, Any]
+) -> None:
     """Run the vehicle until the parent closes the channel or is gone. The channel's first message
-    is where its link, stream and motion capture are; a text is why it has ended."""
+    is the host's `addresses`; a text is why the vehicle has ended."""
     os.setsid()  # away from the terminal
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)  # the picture must not take the physics' core
     try:
-        with contextlib.closing(VehicleHost(setup)) as host:
-            channel.send((host.uri, "" if host.stream is None else host.stream.url, host.capture))
-            Runner(host, channel, realtime=setup.pace == "realtime", shared=shared).run()
+        with contextlib.closing(VehicleHost(scenario, **settings)) as host:
+            channel.send(host.addresses)
+            Runner(host, channel, realtime=pace == "realtime", shared=shared).run()
     except Exception as error:
         with contextlib.suppress(OSError):
             channel.send(f"{type(error).__name__}: {error}")

@@ -13,17 +13,11 @@ import multiprocessing
 import signal
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
-from perchctl.profile import TargetConfig
-from perchctl.sim.capture import CaptureSettings
-from perchctl.sim.crtp import LinkOptions
 from perchctl.sim.scenario import Scenario
-from perchctl.vision import CameraModel
 
 LOOP_PATIENCE_S = 2.0
 """The simulator waits so long, on the wall's clock, for a loop that gives no sign of life."""
@@ -48,26 +42,6 @@ class SharedTime(ctypes.Structure):
     def free(cls) -> SharedTime:
         """Return a time for one process alone, which waits for nobody."""
         return cls(0.0, math.inf)
-
-
-@dataclass(frozen=True)
-class HostSetup:
-    """How the simulated vehicle's process is set up.
-
-    Attributes:
-        pace: "realtime", or "stepped": time passes by `SimProcess.advance` only.
-        camera: None: no camera and no stream.
-        capture: None: no motion capture.
-        truth_file: JSON lines of the true state, 50 a simulated second.
-    """
-
-    scenario: Scenario = field(default_factory=Scenario)
-    pace: Literal["realtime", "stepped"] = "realtime"
-    camera: CameraModel | None = None
-    target: TargetConfig | None = None
-    capture: CaptureSettings | None = None
-    link: LinkOptions = field(default_factory=LinkOptions)
-    truth_file: Path | None = None
 
 
 START_TIMEOUT_S = 30.0
@@ -101,11 +75,13 @@ class SimProcess:
     uri = stream_url = ""
     capture: tuple[str, str] | None = None
 
-    def __init__(self, setup: HostSetup, timeout_s: float) -> None:
+    def __init__(
+        self, pace: str, scenario: Scenario, settings: dict[str, Any], timeout_s: float
+    ) -> None:
         self._lock = threading.Lock()
         self.shared_time = _CONTEXT.RawValue(SharedTime, 0.0, math.inf)
         self._channel, childs = _CONTEXT.Pipe()
-        arguments = (childs, setup, self.shared_time)
+        arguments = (childs, self.shared_time, pace, scenario, settings)
         self._child = _CONTEXT.Process(target=_serve, args=arguments, daemon=True)
         # The child takes over that Ctrl-C is blocked, until it has left the terminal.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -132,12 +108,13 @@ class SimProcess:
         timeout_s: float = START_TIMEOUT_S,
         **settings: Any,
     ) -> SimProcess:
-        """Start the vehicle and wait until it answers.
+        """Start the vehicle and wait until it answers. With `pace` "stepped" time passes by
+        `advance` only.
 
-        `settings` are further fields of `HostSetup`. Raises `ConnectionFailed` when the child
+        `settings` are further arguments of `VehicleHost`. Raises `ConnectionFailed` when the child
         ends, `TimedOut` when it does not answer within `timeout_s`.
         """
-        return cls(HostSetup(scenario or Scenario(), pace, **settings), timeout_s)
+        return cls(pace, scenario or Scenario(), settings, timeout_s)
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("_"):

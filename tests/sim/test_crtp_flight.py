@@ -86,7 +86,7 @@ def test_raw_thrust_limits(pilot: Pilot) -> None:
 
 def test_hover_command_at_42_g(pilot: Pilot) -> None:
     """Row "hover at 42 g is a command of about 56,200 of 65,535" (fresh battery)."""
-    pilot.sim.set_battery(4.2)
+    pilot.sim.set_rest_v(4.2)
     pilot.take_off(0.8, settle_s=2.0)
     values = [v for _, v in pilot.log("stabilizer.thrust", pilot.t_s - 1.0)]
     assert sum(values) / len(values) == pytest.approx(56_200, rel=0.01)
@@ -95,7 +95,7 @@ def test_hover_command_at_42_g(pilot: Pilot) -> None:
 def test_raw_burst_gains_little(pilot: Pilot) -> None:
     """Row "The largest raw thrust: a 0.5 s burst gained 5.8 cm and 0.25 m/s"."""
     pilot.take_off(0.8)
-    pilot.sim.set_battery(4.2)
+    pilot.sim.set_rest_v(4.2)
     pilot.stream(4.0, lambda: pilot.hold(0.8))  # the compensation has met the change
     before_m = height(pilot)
     pilot.stream(0.5, lambda: raw(pilot, 60000))
@@ -249,7 +249,7 @@ def test_go_to_yaw_in_radians_and_relative_in_world_axes(pilot: Pilot) -> None:
 @pytest.mark.parametrize(("rest_v", "low"), [(3.30, False), (3.15, True), (2.95, True)])
 def test_low_battery(pilot: Pilot, rest_v: float, low: bool) -> None:
     """Row "Battery: low 3.2 V, critical 3.0 V, 5 s delay; pm.state 3 = low power"."""
-    pilot.sim.set_battery(rest_v)
+    pilot.sim.set_rest_v(rest_v)
     since_s = pilot.t_s
     pilot.advance(7.0)
     assert pilot.now("pm.vbat") == pytest.approx(rest_v, abs=0.05)

@@ -19,7 +19,6 @@ from perchctl.link import Packet
 from perchctl.sim import Scenario, SimProcess
 from perchctl.sim.crtp import CrtpServer, LinkOptions
 from perchctl.sim.host import VehicleHost
-from perchctl.sim.process import HostSetup
 from tests.helpers.crtp_rig import (
     LOCKED_BIT,
     READY,
@@ -182,7 +181,7 @@ def test_a_scans_probe_is_answered_and_takes_nobodys_place() -> None:
     packet is passed over."""
     probe, create, start = b"\xff\x01\x01\x01", b"\x5d\x06\x01\x07\x00\x00", b"\x5d\x03\x01\x01"
     with (
-        contextlib.closing(VehicleHost(HostSetup())) as host,
+        contextlib.closing(VehicleHost(Scenario())) as host,
         wired(host.uri) as scan,
         wired(host.uri) as client,
     ):
