@@ -103,7 +103,7 @@ class Truth(Watcher):
     def tick(self, tick: Tick) -> None:
         world = self._vehicle.world
         on_purpose = tick.state.phase in MAY_TOUCH_THE_FLOOR
-        is_down = world.on_floor()
+        _, is_down = world.contacts()
         if is_down and (not on_purpose or self._sink_mps > HARD_LANDING_MPS):
             self.fell = True
         if is_down and not self._was_down:

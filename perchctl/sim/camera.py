@@ -49,10 +49,7 @@ class SimCamera:
       exposures from start on; these are not rendered;
     - late: `camera_latency_s` plus normal jitter (sigma `camera_jitter_s`, cut at
       2.5 sigma), never before the exposure's end, never overtaking;
-    - frozen: exposures from `camera_freeze_at_s` on show the last picture before;
-    - mirrored: with `camera_mirrored` flipped left to right;
-    - blank: with `camera_blank_rate` a blue screen in the place of the picture;
-    - given out again: at `camera_receiver_hz`, where the receiver has a rate of its own.
+    - frozen: exposures from `camera_freeze_at_s` on show the last picture before.
     """
 
     def __init__(self, scenario: Scenario, renderer: Renderer) -> None:
@@ -73,11 +70,6 @@ class SimCamera:
         self._first_output_s = float(rng.random()) / (scenario.camera_receiver_hz or 1.0)
         self._outputs = 0
         self._newest: DeliveredFrame | None = None  # that the receiver gives out again
-
-    @property
-    def exposed_s(self) -> float:
-        """Time from the first light on a frame to the last, s."""
-        return 2.0 * self._half_s
 
     def advance(self, t_s: float, pose_at: PoseAt) -> None:
         """Take all exposures that end at or before `t_s`.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from errno import E2BIG, EEXIST, ENOENT, ENOEXEC, ENOMEM
 from typing import TYPE_CHECKING, Any
@@ -73,24 +73,24 @@ def execute(firmware: Firmware, packet: Packet) -> bytes | None:
         case Port.HIGH_LEVEL, 0, _:
             return data[:3].ljust(3, b"\0") + bytes((_plan(firmware, data),))
         case Port.LOCALIZATION, 0, _:
-            firmware.external_position(struct.unpack_from("<fff", data))
+            firmware.external(struct.unpack_from("<fff", data))
         case Port.LOCALIZATION, 1, 8:
             x, y, z, qx, qy, qz, qw = struct.unpack_from("<fffffff", data, 1)
-            firmware.external_pose((x, y, z), (qx, qy, qz, qw))
+            firmware.external((x, y, z), (qw, qx, qy, qz))
         case ((Port.LOCALIZATION | Port.SUPERVISOR), 1, 3):
             firmware.emergency_stop()
         case ((Port.LOCALIZATION | Port.SUPERVISOR), 1, 4):
-            firmware.emergency_stop_watchdog()
+            firmware.supervisor.notify_watchdog(firmware.t_s)
         case Port.SUPERVISOR, 0, 0x0C:
             return struct.pack("<BH", 0x8C, firmware.supervisor_info)
         case Port.SUPERVISOR, 1, 1 if len(data) > 1:
-            return bytes((0x81, *firmware.arm(bool(data[1]))))
+            return bytes((0x81, *firmware.supervisor.request_arming(bool(data[1]))))
         case Port.SUPERVISOR, 1, 2:
-            return bytes((0x82, *firmware.recover_from_crash()))
+            return bytes((0x82, *firmware.supervisor.request_recovery()))
         case Port.PLATFORM, 0, 1 if len(data) > 1:
-            return bytes((1, *firmware.arm(bool(data[1]))))
+            return bytes((1, *firmware.supervisor.request_arming(bool(data[1]))))
         case Port.PLATFORM, 0, 2:
-            return bytes((2, *firmware.recover_from_crash()))
+            return bytes((2, *firmware.supervisor.request_recovery()))
     return None
 
 
@@ -165,8 +165,6 @@ BY_CTYPE = {
     "uint16_t": Number("H", 0x02, 0x09),
     "uint32_t": Number("I", 0x03, 0x0A),
     "int8_t": Number("b", 0x04, 0x00),
-    "int16_t": Number("h", 0x05, 0x01),
-    "int32_t": Number("i", 0x06, 0x02),
     "float": Number("f", 0x07, 0x06),
     "FP16": Number("e", 0x08, 0x05),
 }
@@ -229,19 +227,6 @@ _LINK_SOURCE = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")
 _RESTARTS = (b"\xfe\xf0\x01", b"\xfe\x03")  # the radio chip's: reset to the firmware, system on
 
 
-@dataclass(frozen=True)
-class LinkOptions:
-    """How the link of a simulated vehicle differs from a good one.
-
-    Attributes:
-        protocol_version: below 12 the supervisor port is missing (an old firmware).
-        missing_log_variables: left out of the log table.
-    """
-
-    protocol_version: int = PROTOCOL_VERSION
-    missing_log_variables: tuple[str, ...] = ()
-
-
 @dataclass
 class _Block:
     variables: list[tuple[str, Number]] = field(default_factory=list)
@@ -254,17 +239,22 @@ class _Block:
 
 
 class CrtpServer:
-    """Serves one firmware to one peer at a time."""
+    """Serves one firmware to one peer at a time. Below protocol version 12 the supervisor port is
+    missing (an old firmware)."""
 
-    def __init__(self, firmware: Firmware, options: LinkOptions | None = None) -> None:
-        options = options or LinkOptions()
+    def __init__(
+        self,
+        firmware: Firmware,
+        protocol_version: int = PROTOCOL_VERSION,
+        missing_log_variables: Sequence[str] = (),
+    ) -> None:
         self._firmware = firmware
-        self._version = options.protocol_version
+        self._version = protocol_version
         self._blocks: dict[int, _Block] = {}
         log_codes = {
             name: BY_CTYPE[variable.ctype].log_code
             for name, variable in firmware.LOG_VARIABLES.items()
-            if name not in options.missing_log_variables
+            if name not in missing_log_variables
         }
         self._log_toc = Toc(Port.LOG, log_codes, bytes((MAX_BLOCKS, MAX_VARIABLES)))
         parameters = firmware.PARAMETERS.items()

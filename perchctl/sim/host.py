@@ -4,6 +4,7 @@ process of its own."""
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import math
 import os
@@ -16,17 +17,17 @@ from collections.abc import Callable, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
+import numpy as np
 
 from perchctl.geometry import rotation_from_quaternion, rpy_from_rotation
 from perchctl.link import Packet
 from perchctl.profile import TargetConfig
 from perchctl.sim.capture import CaptureSettings, MotionCaptureServer, SimCapture
-from perchctl.sim.crtp import CrtpServer, LinkOptions
+from perchctl.sim.crtp import CrtpServer
 from perchctl.sim.optics import Picture
-from perchctl.sim.process import LOOP_PATIENCE_S, SharedTime
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.vision import CameraModel
@@ -49,6 +50,7 @@ class VehicleHost:
         camera: None: no camera and no stream.
         capture: None: no motion capture.
         truth_file: JSON lines of the true state, 50 a simulated second.
+        link: further arguments of `CrtpServer`.
     """
 
     def __init__(
@@ -57,8 +59,8 @@ class VehicleHost:
         camera: CameraModel | None = None,
         target: TargetConfig | None = None,
         capture: CaptureSettings | None = None,
-        link: LinkOptions | None = None,
         truth_file: Path | None = None,
+        **link: Any,
     ) -> None:
         self._parts = camera, target, capture
         self._steps = 0
@@ -66,7 +68,7 @@ class VehicleHost:
         self._silent_s = (math.inf, math.inf)
         self._bursts = scenario.radio_bursts()
         self.vehicle = SimulatedVehicle(scenario, *self._parts)
-        self.server = CrtpServer(self.vehicle.firmware, link)
+        self.server = CrtpServer(self.vehicle.firmware, **link)
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
@@ -167,7 +169,7 @@ class VehicleHost:
 
     def close(self) -> None:
         """Free the ports and close the files."""
-        for part in (self.socket, self.stream, self.positions, self._truth):
+        for part in (self.socket, self.stream, self._truth):
             if part is not None:
                 part.close()
 
@@ -186,6 +188,26 @@ class VehicleHost:
 
 
 # --- The child process: runs the vehicle that the parent describes ----
+
+
+LOOP_PATIENCE_S = 2.0
+"""The simulator waits so long, on the wall's clock, for a loop that gives no sign of life."""
+
+
+class SharedTime(ctypes.Structure):
+    """How far simulated time has come and may go, where both processes see it.
+
+    Attributes:
+        reached_s: written by the simulator.
+        limit_s: written by the flight; infinity lets time run freely.
+    """
+
+    MARGIN_S: ClassVar = 0.02
+    """Simulated time may run so far past the moment that the flight loop waits for."""
+
+    reached_s: float
+    limit_s: float
+    _fields_ = (("reached_s", ctypes.c_double), ("limit_s", ctypes.c_double))
 
 
 def serve_parent(
@@ -243,7 +265,8 @@ class Runner:
         with contextlib.suppress(EOFError, ConnectionError):
             while True:
                 wait_s = self.catch_up() if self._realtime else _IDLE_S
-                ready, _, _ = select.select([self._host.socket, self._channel], [], [], wait_s)
+                awaited: list[Any] = [self._host.socket, self._channel]
+                ready, _, _ = select.select(awaited, [], [], wait_s)
                 if self._host.socket in ready:
                     self._host.serve()
                 if self._channel in ready:
@@ -280,8 +303,6 @@ class Runner:
 
     def _answer(self, name: str, arguments: Any, named: Any) -> tuple[bool, Any]:
         """Return the answer to a request of the parent: (True, result) or (False, text)."""
-        if name == "advance" and self._realtime:
-            return False, "only a stepped vehicle can be advanced"
         try:
             return True, self._host.answer(name, *arguments, **named)
         except Exception as error:
@@ -294,7 +315,6 @@ class Runner:
 
 JPEG_QUALITY = 92
 _BOUNDARY = "perchctlframe"
-_WAIT_S = 0.5
 _CLIENT_TIMEOUT_S = 5.0
 
 
@@ -307,31 +327,24 @@ class MjpegServer(ThreadingHTTPServer):
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
         self._changed = threading.Condition()
-        self._image: Picture | None = None
-        self._number = 0
-        self.closed = False
+        self._newest: tuple[int, Picture] = 0, np.zeros((1, 1), np.uint8)
         self.url = f"http://127.0.0.1:{self.server_address[1]}/stream.mjpg"
         threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True).start()
 
     def publish(self, image: Picture) -> None:
         """Publish a picture, grey uint8 (h, w). It costs nothing while nobody watches."""
         with self._changed:
-            self._image = image
-            self._number += 1
+            self._newest = self._newest[0] + 1, image
             self._changed.notify_all()
 
-    def after(self, number: int) -> tuple[int, Picture] | None:
-        """Return the newest picture and its number if that is above `number`; None when none came
-        for a while."""
+    def after(self, number: int) -> tuple[int, Picture]:
+        """Return the newest picture and its number as soon as that is above `number`."""
         with self._changed:
-            self._changed.wait_for(lambda: self.closed or self._number > number, _WAIT_S)
-            if self._image is None or self._number <= number:
-                return None
-            return self._number, self._image
+            self._changed.wait_for(lambda: self._newest[0] > number)
+            return self._newest
 
     def close(self) -> None:
-        """End all streams and free the port."""
-        self.closed = True
+        """Free the port."""
         self.shutdown()
         self.server_close()
 
@@ -346,10 +359,8 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_response(200)
             self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
             self.end_headers()
-            while not self.server.closed:
-                if (newer := self.server.after(number)) is None:
-                    continue
-                number, image = newer
+            while True:
+                number, image = self.server.after(number)
                 _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
                 head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}"
                 self.wfile.write(f"{head}\r\n\r\n".encode() + jpeg.tobytes() + b"\r\n")

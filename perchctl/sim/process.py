@@ -7,54 +7,23 @@ The child does not share its terminal's Ctrl-C, and ends with its parent.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import math
 import multiprocessing
 import signal
 import threading
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
+from perchctl.sim.host import SharedTime, serve_parent
 from perchctl.sim.scenario import Scenario
-
-LOOP_PATIENCE_S = 2.0
-"""The simulator waits so long, on the wall's clock, for a loop that gives no sign of life."""
-
-
-class SharedTime(ctypes.Structure):
-    """How far simulated time has come and may go, where both processes see it.
-
-    Attributes:
-        reached_s: written by the simulator.
-        limit_s: written by the flight; infinity lets time run freely.
-    """
-
-    MARGIN_S: ClassVar = 0.02
-    """Simulated time may run so far past the moment that the flight loop waits for."""
-
-    reached_s: float
-    limit_s: float
-    _fields_ = (("reached_s", ctypes.c_double), ("limit_s", ctypes.c_double))
-
-    @classmethod
-    def free(cls) -> SharedTime:
-        """Return a time for one process alone, which waits for nobody."""
-        return cls(0.0, math.inf)
-
 
 START_TIMEOUT_S = 30.0
 ANSWER_TIMEOUT_S = 60.0
 """Also of `advance`, which takes a second for half a minute."""
 _STOP_TIMEOUT_S = 5.0
 _CONTEXT = multiprocessing.get_context("spawn")
-
-
-def _serve(*arguments: Any) -> None:
-    from perchctl.sim.host import serve_parent
-
-    serve_parent(*arguments)
 
 
 class SimProcess:
@@ -82,7 +51,7 @@ class SimProcess:
         self.shared_time = _CONTEXT.RawValue(SharedTime, 0.0, math.inf)
         self._channel, childs = _CONTEXT.Pipe()
         arguments = (childs, self.shared_time, pace, scenario, settings)
-        self._child = _CONTEXT.Process(target=_serve, args=arguments, daemon=True)
+        self._child = _CONTEXT.Process(target=serve_parent, args=arguments, daemon=True)
         # The child takes over that Ctrl-C is blocked, until it has left the terminal.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:

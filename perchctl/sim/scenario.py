@@ -146,7 +146,8 @@ class Scenario:
 
 
 _STREAM, _GROUPS_STREAM, _IMU_STREAM = 1, 21, 22  # the scenario's own random streams
-_AIR, _CELL, _TILT, _RADIO, _CAPTURE = 0, 1, 2, 6, 7
+_DRAWN = ("ceiling_z_m", "mass_kg", "battery_rest_v", "camera_latency_s", "camera_noise_sigma")
+"""Keys that each seed draws from their range, in this order."""
 _AS_GIVEN = (
     "camera_rate_hz",
     "camera_jitter_s",
@@ -179,13 +180,9 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     def between(key: str) -> float:
         return float(rng.uniform(*getattr(sim, key)))
 
-    offset = rng.uniform(-sim.start_offset_m, sim.start_offset_m, size=2)
+    x_m, y_m = rng.uniform(-sim.start_offset_m, sim.start_offset_m, size=2).tolist()
     yaw_rad = math.radians(between("target_yaw_deg"))
-    ceiling_z_m = between("ceiling_z_m")
-    mass_kg = between("mass_kg")
-    battery_v = between("battery_rest_v")
-    latency_s = between("camera_latency_s")
-    noise_sigma = between("camera_noise_sigma")
+    drawn: dict[str, Any] = {key: between(key) for key in _DRAWN}
     burst_s, frames = between("camera_burst_start_s"), sim.camera_burst_frames or (0, 0)
     if frames[0] == frames[1]:
         rng.integers(2)  # numpy draws none of one number, and what comes later must stay
@@ -204,24 +201,20 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         extra["external_position"] = 1.0  # and no deck
     return Scenario(
         seed=seed,
-        mass_kg=mass_kg,
-        battery_rest_v=battery_v,
-        ceiling_z_m=ceiling_z_m,
-        target_xy_m=(float(offset[0]), float(offset[1])),
+        target_xy_m=(x_m, y_m),
         target_yaw_rad=yaw_rad,
         large_side_m=profile.target.large.side_m,
         small_side_m=profile.target.small.side_m,
         gear_body_m=profile.vehicle.gear_body_m,
         T_body_cam_true=tuple(tuple(float(v) for v in row) for row in T_body_cam),
-        camera_latency_s=latency_s,
         camera_burst=None if sim.camera_burst_frames is None else burst,
-        camera_noise_sigma=noise_sigma,
         camera_mirrored=profile.camera.mirrored,
         estimate_tilt_bias_rad=(bias_x, bias_y),
         drift_mps=(drift_x, drift_y, drift_z),
         draught_mps=(wind_mps * math.cos(wind_angle), wind_mps * math.sin(wind_angle), 0.0),
-        first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
+        first_contact_force_n=weak_part * drawn["mass_kg"] * 9.81 if fails else None,
         **_imu_errors(sim, seed),
+        **drawn,
         **{name: getattr(sim, name) for name in _AS_GIVEN},
         extra=extra,
         neighbours=tuple(
@@ -255,8 +248,7 @@ def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
 def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
     """Return what harder worlds draw; where the ranges are those of `sim`, its defaults."""
     air, cell, tilt, radio, capture = (
-        np.random.default_rng([seed, _GROUPS_STREAM, group])
-        for group in (_AIR, _CELL, _TILT, _RADIO, _CAPTURE)
+        np.random.default_rng([seed, _GROUPS_STREAM, group]) for group in (0, 1, 2, 6, 7)
     )
     ohm = sim.cell_resistance_ohm
     return {

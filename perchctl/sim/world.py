@@ -67,8 +67,6 @@ class World:
         self._data = mujoco.MjData(self._model)
         self._qpos, self._qvel = self._data.qpos, self._data.qvel
         self._floor, self._ceiling = (self._model.geom(n).id for n in ("floor", "ceiling"))
-        # Farther than this below the ceiling the gear cannot touch it.
-        self._reach_m = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + MAGNET_RANGE_M
         self._suction = scenario.ceiling_suction
         self._steps = 0
         self.powertrain = Powertrain(scenario)
@@ -133,10 +131,7 @@ class World:
         force_x = thrust_n * r02 - DRAG_LEVEL_NSPM * (self.vx_mps - wind[0]) + push[0]
         force_y = thrust_n * r12 - DRAG_LEVEL_NSPM * (self.vy_mps - wind[1]) + push[1]
         force_z = thrust_n * r22 - DRAG_VERTICAL_NSPM * (self.vz_mps - wind[2]) + push[2]
-        if height_m < self._reach_m:
-            pull_n = self.magnet.pull_n(self.gear_tip_m(), upright=r22 > 0.0)
-        else:
-            pull_n = self.magnet.out_of_reach()
+        pull_n = self.magnet.pull_n(self.gear_tip_m(), upright=r22 > 0.0)
         if pull_n > 0.0:
             force_z += pull_n
             gx, gy, gz = self._scenario.gear_body_m
@@ -226,10 +221,6 @@ class World:
             a * ax + b * ay + c * az for a, b, c in zip(*self._R, strict=True)
         )
 
-    def on_floor(self) -> bool:
-        """True if the vehicle touches the floor."""
-        return self.contacts()[1]
-
     def contacts(self) -> tuple[float, bool]:
         """Return the push between vehicle and ceiling, N, and whether the floor is touched."""
         ceiling_n, floor = 0.0, False
@@ -257,12 +248,13 @@ _MODEL = """
     condim="4"/></default>
   <worldbody>
     <geom name="floor" type="plane" size="30 30 1"/>
-    <geom name="ceiling" type="plane" size="30 30 1" pos="0 0 {ceiling}" quat="0 1 0 0"/>
+    <geom name="ceiling" type="plane" size="30 30 1" pos="0 0 {room.ceiling_z_m}" quat="0 1 0 0"/>
     <body name="vehicle" pos="0 0 {rest}">
       <freejoint/>
-      <inertial pos="0 0 0" mass="{mass}" diaginertia="{inertia}"/>
+      <inertial pos="0 0 0" mass="{room.mass_kg}" diaginertia="{inertia}"/>
       <geom name="frame" type="box" size="0.035 0.035 {rest}"/>
-      <geom name="gear" type="cylinder" size="0.006 0.002" pos="{gear}"/>
+      <geom name="gear" type="cylinder" size="0.006 0.002"
+        pos="{room.gear_body_m[0]} {room.gear_body_m[1]} {gear_z}"/>
     </body>
   </worldbody>
 </mujoco>
@@ -274,18 +266,15 @@ def build_model(scenario: Scenario) -> Any:
 
     The inertia is the Crazyflie 2.1's, scaled by mass; the gear's cylinder ends at its tip.
     """
-    mass = scenario.mass_kg
-    scale = mass / INERTIA_REFERENCE_KG
-    gear = scenario.gear_body_m
+    scale = scenario.mass_kg / INERTIA_REFERENCE_KG
     return mujoco.MjModel.from_xml_string(
         _MODEL.format(
+            room=scenario,
             dt=CONTROL_PERIOD_S,
             g=GRAVITY_MPS2,
-            ceiling=scenario.ceiling_z_m,
             rest=REST_HEIGHT_M,
-            mass=mass,
             inertia=" ".join(repr(i * scale) for i in INERTIA_REFERENCE_KGM2),
-            gear=f"{gear[0]!r} {gear[1]!r} {gear[2] - 0.002!r}",
+            gear_z=scenario.gear_body_m[2] - 0.002,
         )
     )
 
@@ -319,7 +308,8 @@ class Magnet:
         target_x, target_y = self.target_xy_m
         miss_m = math.hypot(tip_m[0] - target_x, tip_m[1] - target_y)
         if scenario.no_target or not upright or gap_m >= MAGNET_RANGE_M or miss_m > MAGNET_RADIUS_M:
-            return self.out_of_reach()
+            self._note(MAGNET_RANGE_M)
+            return 0.0
         self._note(gap_m)
         return 0.0 if self.let_go else self.hold_n * (1.0 - gap_m / MAGNET_RANGE_M) ** 2
 
@@ -330,11 +320,6 @@ class Magnet:
         if scenario.first_contact_force_n is not None and not self._came_off:
             return scenario.first_contact_force_n
         return scenario.magnet_force_n
-
-    def out_of_reach(self) -> float:
-        """Note that the tip is out of reach; return no pull."""
-        self._note(MAGNET_RANGE_M)
-        return 0.0
 
     def _note(self, gap_m: float) -> None:
         if gap_m < MAGNET_TOUCH_M:

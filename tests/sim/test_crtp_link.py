@@ -17,7 +17,7 @@ from cflib.utils.power_switch import PowerSwitch
 
 from perchctl.link import Packet
 from perchctl.sim import Scenario, SimProcess
-from perchctl.sim.crtp import CrtpServer, LinkOptions
+from perchctl.sim.crtp import CrtpServer
 from perchctl.sim.host import VehicleHost
 from tests.helpers.crtp_rig import (
     LOCKED_BIT,
@@ -55,7 +55,7 @@ def test_connect_sequence(sim: SimProcess, toc_cache: str) -> None:
         assert (eeprom.type, eeprom.size) == (MemoryElement.TYPE_I2C, 8192)
         toc = client.cf.param.toc
         assert toc.get_element_by_complete_name("posCtlPid.zKp").is_persistent()
-        assert not toc.get_element_by_complete_name("stabilizer.stop").is_persistent()
+        assert not toc.get_element_by_complete_name("stabilizer.estimator").is_persistent()
         got = threading.Event()
         client.cf.link_statistics.latency_updated.add_callback(lambda _: got.set())
         assert got.wait(WAIT_S)  # a ping every 0.1 s
@@ -253,8 +253,10 @@ def test_an_exception_in_a_with_block_drops_the_vehicle(
 
 def test_old_firmware_has_no_supervisor_port(toc_cache: str) -> None:
     """Row "Protocol < 12": supervisor port missing, old channels work, bit field reads 0."""
-    link = LinkOptions(protocol_version=11, missing_log_variables=("supervisor.info",))
-    with SimProcess.start(pace="stepped", link=link) as process:
+    missing = ("supervisor.info",)
+    with SimProcess.start(
+        pace="stepped", protocol_version=11, missing_log_variables=missing
+    ) as process:
         process.advance(1.0)
         with contextlib.closing(Client(process.uri, toc_cache)) as client:
             assert client.connect()

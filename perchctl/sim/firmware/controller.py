@@ -91,13 +91,19 @@ _THRUST_SCALE = 1000.0
 
 class Pid:
     """One PID loop; the derivative acts on the measurement. `i_limit` bounds the
-    integral, `limit` the output; a `limit` of 0 means no bound."""
+    integral, `limit` the output."""
 
     def __init__(
-        self, kp: float, ki: float, kd: float, period_s: float, i_limit: float, limit: float = 0.0
+        self,
+        kp: float,
+        ki: float,
+        kd: float,
+        period_s: float,
+        i_limit: float,
+        limit: float = math.inf,
     ) -> None:
-        self.kp, self.ki, self.kd = kp, ki, kd
-        self.limit = limit
+        self._kp, self._ki, self._kd = kp, ki, kd
+        self._limit = limit
         self._period = period_s
         self._i_limit = i_limit
         self._integral = self._measured = 0.0
@@ -115,20 +121,15 @@ class Pid:
         integral = max(-bound, min(bound, self._integral + error * self._period))
         self._integral = integral
         self._measured = measured
-        output = self.kp * error + self.ki * integral
-        if self.kd != 0.0:
-            output -= self.kd * change / self._period
-        limit = self.limit
-        return max(-limit, min(limit, output)) if limit > 0.0 else output
+        output = self._kp * error + self._ki * integral
+        if self._kd != 0.0:
+            output -= self._kd * change / self._period
+        return max(-self._limit, min(self._limit, output))
 
 
 def cap_deg(angle: float) -> float:
     """Return the same angle within +-180 degrees."""
-    while angle > 180.0:
-        angle -= 360.0
-    while angle < -180.0:
-        angle += 360.0
-    return angle
+    return math.remainder(angle, 360.0)
 
 
 def _saturated(value: float) -> float:
@@ -276,11 +277,10 @@ class MotorDriver:
             scale * motor_v(_N_PER_COMMAND * request) if request >= THRUST_MIN else 0.0
             for request in requests
         )
-        pwm = (p1, p2, p3, p4)
-        if max(pwm) == 0.0:
+        most = max(p1, p2, p3, p4)
+        if most == 0.0:
             return MOTORS_OFF
-        excess = max(pwm) - FULL_COMMAND
-        if excess > 0.0:
-            # Attitude comes before thrust: all four give way together.
-            p1, p2, p3, p4 = (max(0.0, duty - excess) for duty in pwm)
-        return (p1, p2, p3, p4)
+        # Attitude comes before thrust: all four give way together.
+        excess = max(0.0, most - FULL_COMMAND)
+        p1, p2, p3, p4 = (max(0.0, duty - excess) for duty in (p1, p2, p3, p4))
+        return p1, p2, p3, p4

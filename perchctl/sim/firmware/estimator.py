@@ -25,7 +25,6 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.firmware.controller import Estimate, cap_deg
 from perchctl.sim.firmware.outside import (
     POSITION,
-    SETTINGS,
     Imu,
     OutsideFilter,
     Quaternion,
@@ -86,20 +85,12 @@ class Estimator:
         if self.outside is not None:
             self.outside.reset()
 
-    def external_position(self, position_m: Vector) -> None:
+    def external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
         """Take one measurement from outside; only a vehicle without a deck uses it."""
         if self.outside is not None and self.hears_outside:
             self.outside.position(position_m)
-
-    def external_pose(self, position_m: Vector, quaternion: Quaternion) -> None:
-        """Take a measurement with an attitude: w, x, y, z, body to world."""
-        if self.outside is not None and self.hears_outside:
-            self.outside.pose(position_m, quaternion)
-
-    def set_outside(self, name: str, value: float) -> None:
-        """Set a parameter of `SETTINGS`."""
-        if self.outside is not None:
-            setattr(self.outside, SETTINGS[name], value)
+            if quaternion is not None:
+                self.outside.attitude(quaternion)
 
     def shift_accelerometer(self, z_mps2: float) -> None:
         """Let the accelerometer read so much more along z from now on. A deck, which is simulated

@@ -46,11 +46,12 @@ class Firmware:
     def __init__(self, world: World, scenario: Scenario) -> None:
         self.world = world
         self.scenario = scenario
-        self._parameters = {name: p.default for name, p in PARAMETERS.items()}
         self.log_overrides: dict[str, float] = {}  # what a fault makes of log variables
-        self._boot()
+        self.reboot()
 
-    def _boot(self) -> None:
+    def reboot(self) -> None:
+        """Start, with nothing but the world as it was; no parameter has been stored."""
+        self._parameters = {name: p.default for name, p in PARAMETERS.items()}
         self._steps = 0
         self._flown = False
         self.motors = MOTORS_OFF
@@ -153,37 +154,10 @@ class Firmware:
         """Stop the motors and lock, within one supervisor update."""
         self.supervisor.emergency = True
 
-    def emergency_stop_watchdog(self) -> None:
-        """Start the watchdog, or feed it: a gap over 1 s then cuts the motors and locks."""
-        self.supervisor.notify_watchdog(self.t_s)
-
-    def arm(self, do_arm: bool) -> tuple[bool, bool]:
-        """Arm or disarm; return (success, armed)."""
-        success = self.supervisor.request_arming(do_arm)
-        return success, self.supervisor.armed
-
-    def recover_from_crash(self) -> tuple[bool, bool]:
-        """Recover; return (success, recovered). It is refused while still tumbled."""
-        success = self.supervisor.request_recovery()
-        return success, not self.supervisor.crashed
-
-    def external_position(self, position_m: Vector) -> None:
-        """Take a position from outside, m; see `Estimator`."""
+    def external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
+        """Take a position from outside, m, or a pose: w, x, y, z, body to world."""
         self.external_tick_ms = int(1e3 * self.t_s) % 65536
-        self.estimator.external_position(position_m)
-
-    def external_pose(self, position_m: Vector, quaternion_xyzw: Quaternion) -> None:
-        """Take a pose from outside: m, and body to world."""
-        self.external_tick_ms = int(1e3 * self.t_s) % 65536
-        x, y, z, w = quaternion_xyzw
-        self.estimator.external_pose(position_m, (w, x, y, z))
-
-    def reboot(self) -> None:
-        """Restart everything but the world, the battery and persistent parameters."""
-        for name, parameter in PARAMETERS.items():
-            if not parameter.persistent:
-                self._parameters[name] = parameter.default
-        self._boot()
+        self.estimator.external(position_m, quaternion)
 
     # What can be read ---------------------------------------------------------------
 
@@ -212,9 +186,7 @@ class Firmware:
         return self._parameters[name]
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Raises KeyError for an unknown name, PermissionError for a read-only one."""
-        if PARAMETERS[name].readonly:
-            raise PermissionError(f"parameter {name} is read-only")
+        """Set a parameter of `PARAMETERS`."""
         self._parameters[name] = float(value)
         self._apply(name)
 
@@ -226,10 +198,8 @@ class Firmware:
             self.estimator.reset(self.t_s)
         elif name == "stabilizer.estimator":
             self.estimator.hears_outside = value == ESTIMATOR_KALMAN
-        elif name in SETTINGS:
-            self.estimator.set_outside(name, value)
-        elif name == "stabilizer.stop":
-            self.supervisor.emergency = self.supervisor.emergency or value != 0.0
+        elif name in SETTINGS and self.estimator.outside is not None:
+            setattr(self.estimator.outside, SETTINGS[name], value)
 
     def _consult_planner(self, t_s: float) -> None:
         planner = self.planner

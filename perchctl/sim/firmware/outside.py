@@ -110,6 +110,7 @@ POSITION, VELOCITY, ATTITUDE = 0, 3, 6
 _FIRST_M, _FIRST_HEIGHT_M, _FIRST_MPS, _FIRST_RAD = 100.0, 1.0, 0.01, 0.01
 """Standard deviations after a reset (source: `stdDevInitial*`)."""
 _MOST, _LEAST = 100.0, 1e-6
+_FARTHEST_M, _FASTEST_MPS = 100.0, 10.0  # `kalman.maxPos`, `kalman.maxVel`
 _NOISE_PER_S = (0.0, 0.0, 0.0, 2.5e-4, 2.5e-4, 1e-3, 1e-5, 1e-5, 1e-5)
 """(m/s)^2 and rad^2 a second: `kalman.pNAcc_xy` 0.5 m/s^2, `pNAcc_z` 1 m/s^2 and `mNGyro_*`
 0.1 rad/s, each added as one of 1000 steps a second (source)."""
@@ -125,8 +126,6 @@ SETTINGS = {
     "kalman.initialY": "initial_y_m",
     "kalman.initialZ": "initial_z_m",
     "kalman.initialYaw": "initial_yaw_rad",
-    "kalman.maxPos": "most_m",
-    "kalman.maxVel": "most_mps",
 }
 """The firmware's parameters that reach in here."""
 
@@ -143,7 +142,6 @@ class OutsideFilter:
     def __init__(self) -> None:
         self.position_sigma_m, self.attitude_sigma_rad = 0.01, 0.0045
         self.initial_x_m = self.initial_y_m = self.initial_z_m = self.initial_yaw_rad = 0.0
-        self.most_m, self.most_mps = 100.0, 10.0
         self.reset()
 
     def reset(self) -> None:
@@ -181,7 +179,7 @@ class OutsideFilter:
         self.quaternion = (w, x, y, z)
         self._grow(force)
         far_m, fast_mps = max(map(abs, self.position_m)), max(map(abs, self.velocity_mps))
-        if 0.0 < self.most_m < far_m or 0.0 < self.most_mps < fast_mps:
+        if far_m > _FARTHEST_M or fast_mps > _FASTEST_MPS:
             self.reset()
 
     def position(self, measured_m: Vector) -> None:
@@ -190,9 +188,8 @@ class OutsideFilter:
             (mx, my, mz), (x, y, z) = measured_m, self.position_m
             self._correct(POSITION, (mx - x, my - y, mz - z), self.position_sigma_m)
 
-    def pose(self, measured_m: Vector, measured: Quaternion) -> None:
-        """Take a pose from outside: a position and an attitude, body to world."""
-        self.position(measured_m)
+    def attitude(self, measured: Quaternion) -> None:
+        """Take an attitude from outside, body to world."""
         norm = math.sqrt(sum(v * v for v in measured))
         if not math.isfinite(norm) or norm < 0.5:
             return

@@ -29,10 +29,8 @@ class Parameter:
 
 # group -> "ctype: name=default ..."; "*" persistent, "!" read-only.
 _PARAMETER_GROUPS: dict[str, str] = {
-    "stabilizer": "uint8_t: estimator=2 stop=0",
-    "supervisor": "uint8_t: infdmp=0",
-    "kalman": "uint8_t: resetEstimation=0; float: initialX=0 initialY=0 initialZ=0 initialYaw=0"
-    " maxPos=100 maxVel=10",
+    "stabilizer": "uint8_t: estimator=2",
+    "kalman": "uint8_t: resetEstimation=0; float: initialX=0 initialY=0 initialZ=0 initialYaw=0",
     "posCtlPid": "float: zKp=2.0* zVelMax=1*; uint16_t: thrustBase=36000*",
     "pm": "float: lowVoltage=3.2*",
     "deck": "uint8_t: bcFlow2=1! bcFlow=0! bcLighthouse4=0! bcLoco=0! bcDWM1000=0! bcAI=0!",
