@@ -19,6 +19,7 @@ from perchctl.link import Packet, Port
 from perchctl.sim.firmware.controller import (
     MODE_HOVER,
     MODE_POSITION,
+    MODE_RAW,
     MODE_VELOCITY,
     MODE_Z_DISTANCE,
     Setpoint,
@@ -95,9 +96,12 @@ def execute(firmware: Firmware, packet: Packet) -> bytes | None:
 
 
 def _raw(data: bytes) -> Setpoint:
-    """Return the setpoint of a packet on port 3; cflib negates the pitch on its way out."""
+    """Return the setpoint of a packet on port 3: nose up is positive, as cflib negates the pitch;
+    the yaw rate is clockwise."""
     roll, pitch, yaw_rate, thrust = struct.unpack_from("<fffH", data)
-    return Setpoint.raw(roll, -pitch, yaw_rate, thrust)
+    return Setpoint(
+        MODE_RAW, roll_deg=roll, pitch_deg=pitch, yaw_rate_dps=-yaw_rate, thrust=float(thrust)
+    )
 
 
 def _fly(firmware: Firmware, setpoint: Setpoint) -> None:

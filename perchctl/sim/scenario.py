@@ -40,42 +40,24 @@ class Scenario:
     estimate starts there with heading zero *in the estimate's frame*, so
     `start_yaw_rad` turns the target instead: target_* are given in that frame.
 
+    A field with the name of a key of the profile (`perchctl.profile.SimulationConfig`) is what is
+    said there, one number of the key's range.
+
     Attributes:
-        mass_kg: all-up mass.
-        battery_rest_v: resting voltage at the start.
-        ceiling_z_m: height of the ceiling's underside over the floor.
         target_xy_m, target_yaw_rad: centre and heading of the target.
         gear_body_m: tip of the magnet gear in body axes (its truth).
         T_body_cam_true: rows of the camera's true pose, mounting error included.
-        camera_*: what the camera and its radio do to the frames.
-        camera_fields: "progressive", or interlaced with the field of the "top" or the
-            "bottom" row first, half a period before the other.
-        camera_readout_s: from a picture's (or field's) first row to its last.
-        camera_flicker, camera_pumping: share by which lamps (100 Hz) and an exposure control
-            that hunts change the brightness.
-        camera_receiver_hz: of the receiver's output, where it gives out its newest picture
-            again and again; None: it does not.
-        camera_blank_rate: share of pictures that are a blue screen.
         camera_mirrored: it gives its pictures flipped left to right.
         drift_mps: drift of the state estimate, world axes.
         draught_mps: the wind with its smooth gusts (`perchctl.sim.world.Wind`).
-        ceiling_suction: share of thrust gained with the rotors' plane at the ceiling.
-        magnet_force_n: pull the magnet can hold.
         first_contact_force_n: pull at the first contact; None means the same.
-        no_target: the ceiling is bare.
         camera_freeze_at_s: from then on it gives its last picture; None means never.
-        cell_resistance_ohm: of the battery; None means a good one.
-        cell_slow_ohm: more of it, that an old or cold cell shows within seconds.
-        cell_charge: what an old cell still holds, as a share of a new one's.
-        cell_knee: the share of its charge below which its voltage falls steeply.
         parameters: the firmware's, where they differ from its release at boot.
         gyro_bias_radps, acc_bias_mps2: what the gyroscope, after the firmware has taken out what it
             found on the ground, and the accelerometer, before the firmware scales it to 1 g, read
             too much; body axes, of a vehicle without a deck (`perchctl.sim.firmware.outside`).
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
         target_tilt_rad: the target's turns about the world's x and y, after its heading.
-        radio_loss, radio_burst_s: share of the time in which no packet passes, and how long
-            such a time lasts on average (`perchctl.sim.scenario`).
         capture_holes_s: begin and length of the times in which a motion capture does not see
             the vehicle.
         neighbours: other vehicles' targets. What these vehicles do to the air is in the draught.

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from perchctl.sim.firmware import Firmware
-from perchctl.sim.firmware.controller import Setpoint
 from perchctl.vehicle import CRASHED
-from tests.helpers.firmware_rig import PERFECT, Rig, make_rig
+from tests.helpers.firmware_rig import PERFECT, Rig, at_height, make_rig, raw_thrust
 
-HERE = Setpoint.position(0.0, 0.0, 0.8, 0.0)
-FULL_RAW = Setpoint.raw(0.0, 0.0, 0.0, 60000)
+HERE = at_height(0.8)
+FULL_RAW = raw_thrust(60000)
 
 
 def flying(**conditions: float) -> Rig:
@@ -65,7 +64,7 @@ def test_a_reboot_keeps_no_parameter_and_no_unlock() -> None:
     rig = make_rig()
     firmware = rig.firmware
     firmware.set_parameter("posCtlPid.thrustBase", 52000)
-    firmware.low_level(Setpoint.raw(0.0, 0.0, 0.0, 0))  # unlocks the thrust
+    firmware.low_level(raw_thrust(0))  # unlocks the thrust
     firmware.reboot()
     assert firmware.t_s == 0.0
     assert firmware.get_parameter("posCtlPid.thrustBase") == 36000

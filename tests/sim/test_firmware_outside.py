@@ -10,11 +10,11 @@ import pytest
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.firmware.controller import Setpoint
-from tests.helpers.firmware_rig import Rig, make_rig
+from tests.helpers.firmware_rig import Rig, at_height, make_rig
 
 Place = tuple[float, float, float]
 Sender = Callable[[Rig], None]
-HERE = Setpoint.position(0.0, 0.0, 0.8, 0.0)
+HERE = at_height(0.8)
 PERIOD_S = 0.01
 
 
@@ -66,7 +66,7 @@ def hovering(rig: Rig, send: Sender = send_truth) -> Rig:
     reset(rig)
     fed(rig, 1.0)
     for tenth in range(10):
-        fed(rig, 0.25, send, Setpoint.position(0.0, 0.0, 0.08 * (tenth + 1), 0.0))
+        fed(rig, 0.25, send, at_height(0.08 * (tenth + 1)))
     fed(rig, 3.0, send, HERE)
     return rig
 

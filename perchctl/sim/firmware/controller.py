@@ -37,8 +37,8 @@ class Setpoint:
     """One setpoint in the firmware's own units: m, m/s, degrees, pitch nose up.
 
     Yaw rates are counter-clockwise positive, `thrust` is 0..65535; the velocity is along the
-    world's axes, with `MODE_HOVER` along the body's. The class methods take what cflib's calls of
-    the same kind take. Without arguments it is the one of `send_stop_setpoint`: no thrust.
+    world's axes, with `MODE_HOVER` along the body's. Without arguments it is the one of
+    `send_stop_setpoint`: no thrust.
     """
 
     mode: Mode = MODE_OFF
@@ -53,22 +53,6 @@ class Setpoint:
     yaw_deg: float = 0.0
     yaw_rate_dps: float = 0.0
     thrust: float = 0.0
-
-    @classmethod
-    def raw(cls, roll_deg: float, pitch_deg: float, yaw_rate_dps: float, thrust: float) -> Setpoint:
-        """Return that of `commander.send_setpoint`: pitch +10 is nose down, yaw rate clockwise."""
-        return cls(
-            MODE_RAW,
-            roll_deg=roll_deg,
-            pitch_deg=-pitch_deg,
-            yaw_rate_dps=-yaw_rate_dps,
-            thrust=float(thrust),
-        )
-
-    @classmethod
-    def position(cls, x_m: float, y_m: float, z_m: float, yaw_deg: float) -> Setpoint:
-        """Return that of `send_position_setpoint`: m and degrees, counter-clockwise positive."""
-        return cls(MODE_POSITION, x_m, y_m, z_m, yaw_deg=yaw_deg)
 
     def levelled(self) -> Setpoint:
         """Return what the supervisor flies while setpoints are missing: level, no turn, same z."""

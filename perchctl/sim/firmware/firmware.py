@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -176,10 +176,6 @@ class Firmware:
         if name in self.log_overrides:
             return self.log_overrides[name]
         return LOG_VARIABLES[name].read(self)
-
-    def log_values(self, names: Iterable[str]) -> dict[str, float]:
-        """Return the values of a whole block, by name. Errors as for one."""
-        return {name: self.log_value(name) for name in names}
 
     def get_parameter(self, name: str) -> float:
         """Raises KeyError for an unknown name."""
