@@ -19,7 +19,6 @@ from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
 from perchctl.sim.host import SharedTime, serve_parent
 from perchctl.sim.scenario import Scenario
 
-START_TIMEOUT_S = 30.0
 ANSWER_TIMEOUT_S = 60.0
 """Also of `advance`, which takes a second for half a minute."""
 _STOP_TIMEOUT_S = 5.0
@@ -44,9 +43,7 @@ class SimProcess:
     uri = stream_url = ""
     capture: tuple[str, str] | None = None
 
-    def __init__(
-        self, pace: str, scenario: Scenario, settings: dict[str, Any], timeout_s: float
-    ) -> None:
+    def __init__(self, pace: str, scenario: Scenario, settings: dict[str, Any]) -> None:
         self._lock = threading.Lock()
         self.shared_time = _CONTEXT.RawValue(SharedTime, 0.0, math.inf)
         self._channel, childs = _CONTEXT.Pipe()
@@ -62,28 +59,22 @@ class SimProcess:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             childs.close()
         self.pid = self._child.pid
-        try:
-            self.uri, self.stream_url, self.capture = self._receive(timeout_s)
-        except TimedOut:
-            self.stop()
-            raise
+        self.uri, self.stream_url, self.capture = self._receive()
 
     @classmethod
     def start(
         cls,
         scenario: Scenario | None = None,
         pace: Literal["realtime", "stepped"] = "realtime",
-        *,
-        timeout_s: float = START_TIMEOUT_S,
         **settings: Any,
     ) -> SimProcess:
         """Start the vehicle and wait until it answers. With `pace` "stepped" time passes by
         `advance` only.
 
         `settings` are further arguments of `VehicleHost`. Raises `ConnectionFailed` when the child
-        ends, `TimedOut` when it does not answer within `timeout_s`.
+        ends, `TimedOut` when it does not answer.
         """
-        return cls(pace, scenario or Scenario(), settings, timeout_s)
+        return cls(pace, scenario or Scenario(), settings)
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("_"):
@@ -106,18 +97,19 @@ class SimProcess:
         with self._lock:
             with contextlib.suppress(OSError):  # then there is no answer either
                 self._channel.send((name, arguments, named))
-            good, result = self._receive(ANSWER_TIMEOUT_S)
+            good, result = self._receive()
         if not good:
             raise InvalidValue(f"the simulated vehicle refused {name!r}: {result}")
         return result
 
-    def _receive(self, timeout_s: float) -> Any:
+    def _receive(self) -> Any:
         try:
-            answer = self._channel.recv() if self._channel.poll(timeout_s) else None
+            answer = self._channel.recv() if self._channel.poll(ANSWER_TIMEOUT_S) else None
         except (EOFError, OSError):
             answer = "its process is gone"
         if answer is None:
-            raise TimedOut(f"the simulated vehicle did not answer within {timeout_s:.0f} s")
+            self.stop()
+            raise TimedOut(f"the simulated vehicle did not answer within {ANSWER_TIMEOUT_S:.0f} s")
         if isinstance(answer, str):
             self.stop()
             raise ConnectionFailed(f"the simulated vehicle has ended: {answer}")

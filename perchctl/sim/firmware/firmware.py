@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -21,6 +21,7 @@ from perchctl.sim.firmware.supervisor import EVERY as SUPERVISOR_EVERY
 from perchctl.sim.firmware.supervisor import State, Supervisor
 from perchctl.sim.firmware.variables import LOG_VARIABLES, PARAMETERS, LogVariable, Parameter
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.vehicle import LOW_POWER
 
 if TYPE_CHECKING:
     from perchctl.sim.world import World
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 PLANNER_EVERY = 5  # 100 Hz
 ESTIMATOR_KALMAN = 2
 RAW_THRUST_MIN, RAW_THRUST_MAX = 1000.0, 60000.0
+LOW_DELAY_S = 5.0
+_BATTERY_FILTER = 0.2  # at 25 Hz
 
 _NULL = Setpoint()
 
@@ -65,7 +68,7 @@ class Firmware:
         self.supervisor = Supervisor()
         self.controller = Controller()
         self.driver = MotorDriver()
-        self.power = PowerMonitor(self.world.battery_v)
+        self.supply_v, self.power_state, self._fine_s = self.world.battery_v, 0, 0.0
         self._pressed = False
         if self.scenario.extra.get("external_position"):
             self._parameters["deck.bcFlow2"] = 0.0  # outside positions instead of a deck
@@ -107,7 +110,7 @@ class Firmware:
                 # re-arming only a new packet, or the planner, spins the motors.
                 self._low_level = False
             self.planner.block(not supervisor.motors_allowed)
-            self.power.update(t_s, self.world.battery_v, self._parameters)
+            self._watch_battery(t_s)
         setpoint = self._setpoint if supervisor.motors_allowed else _NULL
         if supervisor.state is State.LEVEL_OUT:
             setpoint = setpoint.levelled()
@@ -214,25 +217,9 @@ class Firmware:
             math.radians(now.yaw_deg),
         )
 
-
-# --- The battery as the power management reports it: voltage and low-power state ---
-
-
-ON_BATTERY, LOW_POWER = 0, 3
-LOW_DELAY_S = 5.0
-_BATTERY_FILTER = 0.2  # at 25 Hz
-
-
-class PowerMonitor:
-    """`update` at 25 Hz. Low below `pm.lowVoltage` for 5 s (docs/firmware.md, "Link")."""
-
-    def __init__(self, battery_v: float) -> None:
-        self.battery_v = battery_v
-        self.state = ON_BATTERY
-        self._fine_s = 0.0
-
-    def update(self, t_s: float, battery_v: float, parameters: Mapping[str, float]) -> None:
-        self.battery_v += _BATTERY_FILTER * (battery_v - self.battery_v)
-        if self.battery_v >= parameters["pm.lowVoltage"]:
+    def _watch_battery(self, t_s: float) -> None:
+        """Report low power below `pm.lowVoltage` for 5 s (docs/firmware.md, "Link")."""
+        self.supply_v += _BATTERY_FILTER * (self.world.battery_v - self.supply_v)
+        if self.supply_v >= self._parameters["pm.lowVoltage"]:
             self._fine_s = t_s
-        self.state = LOW_POWER if t_s - self._fine_s > LOW_DELAY_S else ON_BATTERY
+        self.power_state = LOW_POWER if t_s - self._fine_s > LOW_DELAY_S else 0

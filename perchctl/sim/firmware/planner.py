@@ -88,22 +88,24 @@ class Planner:
         self._now = [*(AxisState(p, v) for p, v in axes), AxisState(yaw_rad)]
 
     def take_off(
-        self, height_m: float, duration_s: float, yaw_rad: float | None, t_s: float
+        self,
+        height_m: float,
+        duration_s: float,
+        yaw_rad: float | None,
+        t_s: float,
+        to: int = FLYING,
     ) -> bool:
         """Plan the way to a height, or refuse. `yaw_rad` None keeps the heading."""
-        if self.blocked or self.state != IDLE:
+        if self.blocked or self.state not in ((IDLE, FLYING) if to == LANDING else (IDLE,)):
             return False
-        self._vertical(height_m, duration_s, yaw_rad, t_s)
-        self.state = FLYING
+        x, y, z, yaw = (AxisState(axis.value) for axis in self._now)
+        self._plan((x, y, z, yaw), (x.value, y.value, height_m), yaw_rad, duration_s, t_s)
+        self.state = to
         return True
 
     def land(self, height_m: float, duration_s: float, yaw_rad: float | None, t_s: float) -> bool:
         """Plan as for a take-off; the motors stop when the plan ends."""
-        if self.blocked or self.state == LANDING:
-            return False
-        self._vertical(height_m, duration_s, yaw_rad, t_s)
-        self.state = LANDING
-        return True
+        return self.take_off(height_m, duration_s, yaw_rad, t_s, LANDING)
 
     def go_to(
         self,
@@ -147,12 +149,6 @@ class Planner:
             yaw_deg=math.degrees(yaw.value),
             yaw_rate_dps=math.degrees(yaw.rate),
         )
-
-    def _vertical(
-        self, height_m: float, duration_s: float, yaw_rad: float | None, t_s: float
-    ) -> None:
-        x, y, z, yaw = (AxisState(axis.value) for axis in self._now)
-        self._plan((x, y, z, yaw), (x.value, y.value, height_m), yaw_rad, duration_s, t_s)
 
     def _plan(
         self,

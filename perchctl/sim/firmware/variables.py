@@ -80,9 +80,9 @@ def _variance(state: int) -> LogVariable:
 
 
 LOG_VARIABLES: dict[str, LogVariable] = {
-    "pm.vbat": _field("power.battery_v"),
-    "pm.vbatMV": _field("power.battery_v", 1000.0, "uint16_t"),
-    "pm.state": _field("power.state", ctype="int8_t"),
+    "pm.vbat": _field("supply_v"),
+    "pm.vbatMV": _field("supply_v", 1000.0, "uint16_t"),
+    "pm.state": _field("power_state", ctype="int8_t"),
     "supervisor.info": _field("supervisor_info", ctype="uint16_t"),
     "stabilizer.thrust": _field("controller.thrust"),
     "locSrvZ.tick": _field("external_tick_ms", ctype="uint16_t"),
