@@ -46,8 +46,7 @@ _SETPOINTS = {
     9: (MODE_Z_DISTANCE, ("roll_deg", "pitch_deg", "yaw_rate_dps", "z_m")),
     10: (MODE_HOVER, ("vx_mps", "vy_mps", "yaw_rate_dps", "z_m")),
 }
-"""Port 7: setpoints by their type, as cflib sends them since protocol 11: their mode and their
-four numbers."""
+"""Port 7: the mode and the numbers of each type, as cflib sends them since protocol 11."""
 
 
 def execute(firmware: Firmware, packet: Packet) -> bytes | None:
@@ -96,8 +95,7 @@ def execute(firmware: Firmware, packet: Packet) -> bytes | None:
 
 
 def _raw(data: bytes) -> Setpoint:
-    """Return the setpoint of a packet on port 3: nose up is positive, as cflib negates the pitch;
-    the yaw rate is clockwise."""
+    """Return the setpoint of a packet on port 3, whose yaw rate is clockwise."""
     roll, pitch, yaw_rate, thrust = struct.unpack_from("<fffH", data)
     return Setpoint(
         MODE_RAW, roll_deg=roll, pitch_deg=pitch, yaw_rate_dps=-yaw_rate, thrust=float(thrust)
@@ -243,8 +241,7 @@ class _Block:
 
 
 class CrtpServer:
-    """Serves one firmware to one peer at a time. Below protocol version 12 the supervisor port is
-    missing (an old firmware)."""
+    """Serves one firmware to one peer; before protocol 12 it has no supervisor port."""
 
     def __init__(
         self,

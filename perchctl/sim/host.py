@@ -80,8 +80,7 @@ class VehicleHost:
 
     @property
     def addresses(self) -> tuple[str, str, tuple[str, str] | None]:
-        """The URI of the link, the URL of the stream ("" without one), and of the motion capture
-        the kind, as `motioncapture` calls it, and the address; None without one."""
+        """As the attributes `uri`, `stream_url` and `capture` of a `SimProcess`."""
         stream_url = "" if self.stream is None else self.stream.url
         positions = self.positions
         capture = None if positions is None else (SimCapture.SYSTEM, positions.host)
@@ -131,8 +130,7 @@ class VehicleHost:
         return self.elapsed_s
 
     def answer(self, name: str, *arguments: Any, **named: Any) -> Any:
-        """Return what a method gives: of this host, its server, or its vehicle's world, battery or
-        motion capture. Raises AttributeError without such a method."""
+        """Call a method of this host, its server, world, battery or motion capture."""
         world = self.vehicle.world
         parts = (self, self.server, world, world.powertrain.cell, self.vehicle.capture)
         of = next((part for part in parts if hasattr(part, name)), self)
@@ -213,8 +211,8 @@ class SharedTime(ctypes.Structure):
 def serve_parent(
     channel: Connection, shared: SharedTime, pace: str, scenario: Scenario, settings: dict[str, Any]
 ) -> None:
-    """Run the vehicle until the parent closes the channel or is gone. The channel's first message
-    is the host's `addresses`; a text is why the vehicle has ended."""
+    """Run the vehicle until the parent closes the channel or is gone. It is sent `addresses`
+    first; a text is why the vehicle has ended."""
     os.setsid()  # away from the terminal
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)  # the picture must not take the physics' core

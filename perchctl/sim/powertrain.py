@@ -10,9 +10,7 @@
   slips of that page cost what was measured there, whether the motors turned, turned slowly or
   stood. With 0.05 s for all, a vehicle with slow motors falls up to two fifths less.
 - Nothing brakes a brushed motor, so it runs down more slowly than it runs up.
-  `MOTOR_COAST_S` is the value with which the fall after a lone notify, the landing, the
-  take-offs and the attitude steps of that page come out nearest to what was measured,
-  all at once.
+  `MOTOR_COAST_S` fits best what that page measured of falls, landings and take-offs.
 - The cell (`Cell`) gives 4.4 A at full thrust. Current and sag are proportional
   to thrust: the voltages beside the duty cycles of that page lie on one line within 0.06 V,
   0.63 V from no thrust to full.
@@ -138,8 +136,7 @@ class Cell:
         self.rest_v = self.battery_v = rest_v
 
     def set_rest_v(self, rest_v: float) -> None:
-        """Set another voltage, and leave the charge as it was: it goes on to fall as it would
-        have."""
+        """Set another voltage; the charge stays as it is."""
         self._offset_v += rest_v - self.rest_v
         self.rest_v = rest_v
 

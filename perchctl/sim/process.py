@@ -29,8 +29,8 @@ class SimProcess:
     """Handle of a running simulated vehicle; a context manager. It has the methods of the child's
     `perchctl.sim.host.VehicleHost`, and of its server, its world and its motion capture.
 
-    All methods may be called from any thread; they raise `ConnectionFailed` when the child is
-    gone, `TimedOut` when it does not answer, and `InvalidValue` when it refuses.
+    From any thread; errors: `ConnectionFailed` when the child is gone, `TimedOut` when it
+    does not answer, `InvalidValue` when it refuses.
 
     Attributes:
         uri: for cflib.

@@ -7,17 +7,14 @@ Assumptions of the model, each with its source:
 
 - Motors, their battery, and the curve between a motor's voltage and its thrust:
   `perchctl.sim.powertrain`.
-- Drag is linear in the airspeed. Of a Crazyflie's four rotors 9.2e-7 N/(m/s) level and
-  10.3e-7 vertically a rad/s of their summed speed have been identified (Foerster, ETH
-  Zurich, 2015); lifting 42 g they turn at 7600 rad/s together (2.9e-8 N/(rad/s)^2
-  each), which makes 0.007 and 0.008. The camera, its board and the gear are some
-  10 cm^2 of bluff body (c_d 1.2): 0.0015 more at 1 m/s. The rounded sums are `DRAG_*`.
+- Drag is linear in the airspeed: of four rotors that lift 42 g 0.007 N/(m/s) level and
+  0.008 vertically (identified by Foerster, ETH Zurich, 2015), of camera, board and gear,
+  10 cm^2 of bluff body, 0.0015 more.
 - A draught is a wind whose speed steady part and smooth gusts reach together, at two
   standard deviations of the gusts (`Wind`).
 - Near the ceiling the rotors pull themselves towards it, `Scenario.ceiling_suction` of their
-  thrust at the ceiling itself. With 0.1 it is within 0.6 per cent of the thrust what momentum
-  theory with a ceiling gives, and benches with rotors of this size (23 mm) measured (Hsiao and
-  Chirarattananon, arXiv 1905.04632), for gears of 3 cm and more: 2 per cent in contact.
+  thrust at the ceiling itself; with 0.1 as measured by benches with rotors of this size
+  (Hsiao and Chirarattananon, arXiv 1905.04632).
 - The magnet: `Magnet`. The gear's tip is a flat disc, so a held vehicle
   hangs level and friction keeps the tip in its place.
 """
@@ -174,8 +171,7 @@ class World:
         self.place(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
 
     def carry(self, hand: Callable[[World], None]) -> None:
-        """Let a hand move the vehicle, which is called each control period, until `let_go`; by
-        `place` and `feel`."""
+        """Let a hand `place` the vehicle, and let it `feel`, each period until `let_go`."""
         self._hand = hand
 
     def let_go(self) -> None:

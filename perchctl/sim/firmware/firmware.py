@@ -53,7 +53,7 @@ class Firmware:
         self.reboot()
 
     def reboot(self) -> None:
-        """Start, with nothing but the world as it was; no parameter has been stored."""
+        """Start anew, in the world as it is; no parameter has been stored."""
         self._parameters = {name: p.default for name, p in PARAMETERS.items()}
         self._steps = 0
         self._flown = False
@@ -149,8 +149,7 @@ class Firmware:
         self._low_level = False
 
     def high_level(self, order: Callable[..., object], *values: Any) -> None:
-        """Give the planner an order, a method of `Planner` and its values but for the time. It is
-        flown only when no low-level stream has priority."""
+        """Give an order, a method of `Planner`; a low-level stream has priority over it."""
         order(self.planner, *values, self.t_s)
 
     def emergency_stop(self) -> None:

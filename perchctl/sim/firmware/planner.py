@@ -117,8 +117,7 @@ class Planner:
         relative: bool,
         t_s: float,
     ) -> None:
-        """Plan the way to a place, unless motors are forbidden; `relative` offsets are in world
-        axes (firmware fact)."""
+        """Plan the way to a place; `relative` offsets are in world axes (firmware fact)."""
         if self.blocked:
             return
         if self.active:

@@ -1,7 +1,7 @@
 """The log variables and parameters that a Crazyflie announces, and what they read and set.
 
-Groups and names follow the real firmware's, as far as something here reads them. Each table is
-filled up to the measured size (docs/firmware.md, "Link": 385 log variables, 257 parameters).
+Names that something reads are the real firmware's. Each table is filled up to the measured
+size (docs/firmware.md, "Link": 385 log variables, 257 parameters).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _PARAMETER_GROUPS: dict[str, str] = {
     "kalman": "uint8_t: resetEstimation=0; float: initialX=0 initialY=0 initialZ=0 initialYaw=0",
     "posCtlPid": "float: zKp=2.0* zVelMax=1*; uint16_t: thrustBase=36000*",
     "pm": "float: lowVoltage=3.2*",
-    "deck": "uint8_t: bcFlow2=1! bcFlow=0! bcLighthouse4=0! bcLoco=0! bcDWM1000=0! bcAI=0!",
+    "deck": "uint8_t: bcFlow2=1! bcLighthouse4=0!",
     "locSrv": "float: extPosStdDev=0.01 extQuatStdDev=0.0045",
     "ctrlMel": "float: mass=0.029",
 }
