@@ -91,7 +91,6 @@ class Scenario:
     camera_flicker: float = 0.0
     camera_pumping: float = 0.0
     camera_receiver_hz: float | None = None
-    camera_blank_rate: float = 0.0
     camera_mirrored: bool = False
     estimate_noise_m: float = 0.002
     estimate_tilt_bias_rad: tuple[float, float] = (0.0, 0.0)
@@ -141,7 +140,6 @@ _AS_GIVEN = (
     "camera_flicker",
     "camera_pumping",
     "camera_receiver_hz",
-    "camera_blank_rate",
     "estimate_noise_m",
     "magnet_force_n",
     "no_target",

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, rotation_from_quaternion, rotation_from_rpy
 from perchctl.sim import CONTROL_PERIOD_S, Scenario
@@ -55,41 +53,6 @@ def test_free_fall_is_the_closed_form_with_linear_drag() -> None:
     # One Euler step of 2 ms at this speed is 8 mm.
     assert 3.0 - world.z_m == pytest.approx(fallen_m, abs=0.008)
     assert np.linalg.norm(felt_mps2(world)) < 1.2
-
-
-@pytest.mark.parametrize(
-    ("motors", "axis", "sign"),
-    [
-        ((0, 0, 1, 1), 0, 1),  # left motors up: roll to the right
-        ((0, 1, 1, 0), 1, 1),  # back motors up: nose down
-        ((0, 1, 0, 1), 2, 1),  # M2 and M4 turn clockwise: counter-clockwise reaction
-    ],
-)
-def test_motor_pairs_turn_the_right_way(
-    motors: tuple[int, int, int, int], axis: int, sign: int
-) -> None:
-    world = make()
-    world.set_pose((0.0, 0.0, 1.0))
-    a, b, c, d = (56000.0 + 2000.0 * m for m in motors)
-    run(world, 0.05, (a, b, c, d))
-    rates = np.array((world.p_radps, world.q_radps, world.r_radps))
-    assert sign * rates[axis] > 0.01
-    others = [i for i in range(3) if i != axis]
-    assert np.abs(rates[others]).max() < 0.2 * abs(rates[axis])
-
-
-@settings(max_examples=15, deadline=None)
-@given(roll=st.floats(-3.0, 3.0), pitch=st.floats(-1.4, 1.4), yaw=st.floats(-3.0, 3.0))
-def test_a_held_pose_is_kept_and_reads_gravity_in_body_axes(
-    roll: float, pitch: float, yaw: float
-) -> None:
-    world = make()
-    R = rotation_from_rpy(roll, pitch, yaw)
-    world.set_pose((0.1, -0.2, 1.0), (roll, pitch, yaw), hold=True)
-    run(world, 0.01, (50000.0,) * 4)
-    assert rotation_from_quaternion(world.quaternion) == pytest.approx(R, abs=1e-9)
-    assert place(world) == pytest.approx([0.1, -0.2, 1.0])
-    assert felt_mps2(world) == pytest.approx(R.T @ [0, 0, GRAVITY_MPS2], abs=1e-9)
 
 
 def test_draught_pushes_to_its_own_side_and_gusts_repeat_with_the_seed() -> None:
