@@ -4,8 +4,6 @@ Every image pixel is a ray, traced to the ceiling's plane and looked up in
 textures; lens distortion lies in the rays, which are precomputed. The sheets' map
 is exact at each pixel. The ceiling's is evaluated at every eighth and interpolated,
 which errs by less than 0.01 px for lenses up to 90 degrees.
-
-Pixel (0, 0) is the centre of the top-left pixel, as in OpenCV.
 """
 
 from __future__ import annotations
@@ -52,8 +50,7 @@ CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
 
 FLOOR_GREY = 60
 _NOISE_ROOM_PX = 64
-"""The bank of noise is larger than a picture by this. Each frame has another part of it, 4225
-of them until the first comes again; and so small a bank stays near to the processor."""
+"""The bank of noise is larger than a picture by this: each frame has another part of it."""
 _PLAIN_PX = 1.5
 """Blur of the lens that the bare ceiling, drawn at half the size or less, does not show."""
 _COVERING_SIGMA = 4.0

@@ -122,8 +122,6 @@ class Scenario:
 
 
 # --- From a profile's ranges and a seed to a scenario -----------------
-# What harder worlds draw beyond that of `sim` comes in groups, each from a random stream of its
-# own, so that no other value of a seed moves.
 
 
 _STREAM, _GROUPS_STREAM, _IMU_STREAM = 1, 21, 22  # the scenario's own random streams

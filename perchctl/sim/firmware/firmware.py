@@ -15,7 +15,7 @@ from perchctl.sim.firmware.controller import (
     Setpoint,
 )
 from perchctl.sim.firmware.estimator import Estimator
-from perchctl.sim.firmware.outside import SETTINGS, Quaternion, Vector
+from perchctl.sim.firmware.outside import Quaternion, Vector
 from perchctl.sim.firmware.planner import Planner
 from perchctl.sim.firmware.supervisor import EVERY as SUPERVISOR_EVERY
 from perchctl.sim.firmware.supervisor import State, Supervisor
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from perchctl.sim.world import World
 
 PLANNER_EVERY = 5  # 100 Hz
-ESTIMATOR_KALMAN = 2
 RAW_THRUST_MIN, RAW_THRUST_MAX = 1000.0, 60000.0
 LOW_DELAY_S = 5.0
 _BATTERY_FILTER = 0.2  # at 25 Hz
@@ -62,7 +61,7 @@ class Firmware:
         self._setpoint_s = 0.0
         self._low_level = False
         self._thrust_locked = True
-        self.estimator = Estimator(self.scenario)
+        self.estimator = Estimator(self.scenario, self._parameters)
         self.external_tick_ms = 0
         self.planner = Planner()
         self.supervisor = Supervisor()
@@ -73,8 +72,6 @@ class Firmware:
         if self.scenario.extra.get("external_position"):
             self._parameters["deck.bcFlow2"] = 0.0  # outside positions instead of a deck
         self._parameters |= self.scenario.parameters
-        for name in PARAMETERS:
-            self._apply(name)
         self.estimator.reset(0.0)
 
     @property
@@ -186,18 +183,10 @@ class Firmware:
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter of `PARAMETERS`."""
         self._parameters[name] = float(value)
-        self._apply(name)
-
-    # Inside -------------------------------------------------------------------------
-
-    def _apply(self, name: str) -> None:
-        value = self._parameters[name]
         if name == "kalman.resetEstimation" and value == 1.0:
             self.estimator.reset(self.t_s)
-        elif name == "stabilizer.estimator":
-            self.estimator.hears_outside = value == ESTIMATOR_KALMAN
-        elif name in SETTINGS and self.estimator.outside is not None:
-            setattr(self.estimator.outside, SETTINGS[name], value)
+
+    # Inside -------------------------------------------------------------------------
 
     def _consult_planner(self, t_s: float) -> None:
         planner = self.planner
