@@ -99,7 +99,7 @@ MOST_NAMES = {
     "perception": 6,
     "positioning": 10,
     "profile": 35,
-    "sim": 14,
+    "sim": 13,
     "target": 15,
     "vision": 26,
     "weights": 9,

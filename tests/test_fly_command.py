@@ -25,7 +25,6 @@ from perchctl.link.connection import open_connection
 from perchctl.mission import FlightReport, Outcome, Phase
 from perchctl.record import LogWatcher
 from perchctl.sim import SimProcess
-from perchctl.sim.crtp import LinkOptions
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT, SHORT
 
@@ -210,16 +209,16 @@ def test_the_library_s_prints_stay_off_stdout(capfd: pytest.CaptureFixture[str])
     ("link", "code", "words"),
     [
         (
-            LinkOptions(missing_log_variables=("stateEstimate.vz",)),
+            {"missing_log_variables": ("stateEstimate.vz",)},
             20,
             ["stateEstimate.vz", "update the firmware"],
         ),
-        (LinkOptions(protocol_version=11), 10, ["protocol 11", "12", "update the firmware"]),
+        ({"protocol_version": 11}, 10, ["protocol 11", "12", "update the firmware"]),
     ],
     ids=["a log variable is missing", "old protocol"],
 )
-def test_an_unfit_firmware(link: LinkOptions, code: int, words: list[str], eyes: str) -> None:
-    with SimProcess.start(link=link) as sim:
+def test_an_unfit_firmware(link: dict[str, Any], code: int, words: list[str], eyes: str) -> None:
+    with SimProcess.start(**link) as sim:
         said = run("fly", "-p", SHORT, "--uri", sim.uri, "--source", eyes, "--yes")
         assert max(sim.truth()["motors"]) == 0
     assert said.code == code

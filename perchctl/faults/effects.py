@@ -328,4 +328,4 @@ def _measure(edges: Edges, noise: random.Random, _now_s: float) -> None:
     world, firmware = edges.vehicle.world, edges.vehicle.firmware
     sigma_m = firmware.scenario.estimate_noise_m
     x_m, y_m, z_m = (p + noise.gauss(0.0, sigma_m) for p in (world.x_m, world.y_m, world.z_m))
-    firmware.estimator.external_position((x_m, y_m, z_m))
+    firmware.estimator.external((x_m, y_m, z_m))

@@ -19,7 +19,6 @@ from perchctl.profile import Profile
 from perchctl.record import FlightSummary, LogWatcher
 from perchctl.sim import (
     CaptureSettings,
-    EventExplainer,
     Scenario,
     SimulatedVehicle,
     draw_capture,
@@ -104,7 +103,7 @@ class Truth(Watcher):
     def tick(self, tick: Tick) -> None:
         world = self._vehicle.world
         on_purpose = tick.state.phase in MAY_TOUCH_THE_FLOOR
-        is_down = world.on_floor()
+        _, is_down = world.contacts()
         if is_down and (not on_purpose or self._sink_mps > HARD_LANDING_MPS):
             self.fell = True
         if is_down and not self._was_down:
@@ -192,7 +191,6 @@ def fly_lockstep(
         watchers = (*watchers, log)
         source = log.watched(source)
     operator = _OperatorAt(operator_at or {})
-    explain = EventExplainer(scenario)
     pipeline = _pipeline_of(profile, camera)
     parts = FlightParts(
         link,
@@ -202,7 +200,6 @@ def fly_lockstep(
         pipeline,
         (*watchers, operator),
         operator.read,
-        lambda event: explain(event, event.t_s),  # the clock is the simulation's
         positions,
         tuple if log is None else log.remarks,
     )

@@ -60,8 +60,7 @@ class GivesPositions(Protocol):
 class FlightParts:
     """The edges of the loop.
 
-    `simulated` gives what the scenario of a simulated flight did that explains an event;
-    `positions` the external ones, None where decks measure them; `remarks` what is new about
+    `positions` gives the external ones, None where decks measure them; `remarks` what is new about
     things that do not matter to safety, as a recording."""
 
     link: Link
@@ -71,7 +70,6 @@ class FlightParts:
     pipeline: Pipeline
     watchers: tuple[Watcher, ...] = ()
     operator: Callable[[], Operator] = lambda: Operator.NONE
-    simulated: Callable[[Event], str] = lambda event: ""
     positions: GivesPositions | None = None
     remarks: Callable[[], Sequence[str]] = tuple
 
@@ -230,7 +228,6 @@ def _mission(
         for text in parts.remarks():
             events.append(Event(now_s, EventKind.NOTE, text, state.phase))
         for event in events:
-            event = replace(event, simulated=parts.simulated(event))
             if event.kind is EventKind.PHASE:
                 passed.append(event)
             for watcher in parts.watchers:

@@ -27,7 +27,7 @@ from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.preflight import refuse_strange
 from perchctl.link import CflibLink, check_uri, vehicle_uri
-from perchctl.mission import Event, FlightReport, Watcher
+from perchctl.mission import FlightReport, Watcher
 from perchctl.positioning import (
     CaptureSource,
     PositionFeed,
@@ -108,10 +108,10 @@ def fly_session(
     with contextlib.ExitStack() as stack:
         uri, spec, simulated = options.uri, options.source, None
         clock: WallClock | SimulatedClock = WallClock()
-        explain: Callable[[Event], str] = _unexplained
         if options.simulated:
             simulated = stack.enter_context(simulated_vehicle(options, camera))
-            clock, explain = _simulated_clock(options, simulated)
+            shared = simulated.shared_time
+            clock = SimulatedClock(shared, shared.MARGIN_S)
             uri = simulated.uri
             spec = simulated.stream_url if spec.startswith("sim:") else spec
         source = open_camera(spec, clock.now, profile.camera, size_px=camera.size_px)
@@ -137,7 +137,6 @@ def fly_session(
                 pipeline,
                 watchers,
                 switch.read,
-                explain,
                 positions,
                 remarks,
             )
@@ -173,22 +172,6 @@ def simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
         target=options.profile.target,
         capture=draw_capture(options.profile, options.seed),
     )
-
-
-def _unexplained(event: Event) -> str:
-    """Explain no event: a real flight has no scenario."""
-    return ""
-
-
-def _simulated_clock(
-    options: FlyOptions, simulated: SimProcess
-) -> tuple[SimulatedClock, Callable[[Event], str]]:
-    """Return the simulated vehicle's time, and what its scenario did at the time of an event."""
-    from perchctl.sim import EventExplainer, draw_scenario
-
-    clock = SimulatedClock(simulated.shared_time, simulated.shared_time.MARGIN_S)
-    explain = EventExplainer(draw_scenario(options.profile, options.seed))
-    return clock, lambda event: explain(event, event.t_s - clock.zero_s)
 
 
 # --- External positions for one flight in real time: capture, feed, and the thread between ---

@@ -197,7 +197,7 @@ class MockLink:
         self._stamp_s = firmware.t_s
         delay_s = self.radio.downlink_delay_s(block, self.now_s)
         if delay_s is not None:
-            values = firmware.log_values(BLOCKS[block])
+            values = {name: firmware.log_value(name) for name in BLOCKS[block]}
             arrives_s, number = self.now_s + delay_s, next(self._count)
             packet = (arrives_s, number, block, self.now_s, values, self._start)
             heapq.heappush(self._under_way, packet)

@@ -118,6 +118,7 @@ GONE = frozenset(
         "camera.controls",
         "simulation.bare_floor_aside_m",
         "simulation.bare_floor_m",
+        "simulation.camera_blank_rate",
         "simulation.camera_blended",
         "simulation.camera_receiver_noise",
         "simulation.draught_towards_deg",

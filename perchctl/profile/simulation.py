@@ -61,9 +61,6 @@ class SimulationConfig(Section):
         gt=0,
         le=200,
     )
-    camera_blank_rate: float = key(
-        0.0, "share of pictures in whose place the screen is blue", ge=0, lt=1
-    )
     mount_error_deg: float = key(1.0, "what the profile's mount is wrong by, at most", ge=0, le=20)
     mount_error_m: float = key(
         0.001, "what the profile's mount is wrong by, at most", ge=0, le=0.05

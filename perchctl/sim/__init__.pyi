@@ -1,13 +1,12 @@
 from .capture import CaptureFault as CaptureFault
 from .capture import CaptureSettings as CaptureSettings
 from .capture import draw_capture as draw_capture
+from .host import SharedTime as SharedTime
 from .powertrain import MOTOR_FORCE_N as MOTOR_FORCE_N
 from .powertrain import most_thrust_n as most_thrust_n
-from .process import SharedTime as SharedTime
 from .process import SimProcess as SimProcess
 from .renderer import Renderer as Renderer
 from .scenario import CONTROL_PERIOD_S as CONTROL_PERIOD_S
-from .scenario import EventExplainer as EventExplainer
 from .scenario import Neighbour as Neighbour
 from .scenario import Scenario as Scenario
 from .scenario import draw_scenario as draw_scenario

@@ -15,12 +15,9 @@ from perchctl.sim.renderer import Renderer, Shot
 from perchctl.sim.scenario import Scenario
 
 SCHEDULE_STREAM, STREAM = 411, 412
-"""Numbers of random streams: the schedule's; that of the light, the receiver and blue screens."""
-_BLANKS = 1
+"""Numbers of random streams: the schedule's; that of the light and the receiver."""
 
 JITTER_LIMIT_SIGMAS = 2.5
-BLUE_GREY, BLUE_NOISE = 41.0, 0.6
-"""A blue screen, in grey, as it comes out of a converter."""
 
 
 PoseAt = Callable[[float], Array]
@@ -49,10 +46,7 @@ class SimCamera:
       exposures from start on; these are not rendered;
     - late: `camera_latency_s` plus normal jitter (sigma `camera_jitter_s`, cut at
       2.5 sigma), never before the exposure's end, never overtaking;
-    - frozen: exposures from `camera_freeze_at_s` on show the last picture before;
-    - mirrored: with `camera_mirrored` flipped left to right;
-    - blank: with `camera_blank_rate` a blue screen in the place of the picture;
-    - given out again: at `camera_receiver_hz`, where the receiver has a rate of its own.
+    - frozen: exposures from `camera_freeze_at_s` on show the last picture before.
     """
 
     def __init__(self, scenario: Scenario, renderer: Renderer) -> None:
@@ -73,11 +67,6 @@ class SimCamera:
         self._first_output_s = float(rng.random()) / (scenario.camera_receiver_hz or 1.0)
         self._outputs = 0
         self._newest: DeliveredFrame | None = None  # that the receiver gives out again
-
-    @property
-    def exposed_s(self) -> float:
-        """Time from the first light on a frame to the last, s."""
-        return 2.0 * self._half_s
 
     def advance(self, t_s: float, pose_at: PoseAt) -> None:
         """Take all exposures that end at or before `t_s`.
@@ -144,18 +133,7 @@ class SimCamera:
             self._last = self.renderer.expose(shots, frame_index=self._index)
             if s.camera_mirrored:
                 self._last = np.ascontiguousarray(self._last[:, ::-1])
-        image = self._blanked(self._last)
-        self._under_way.append(DeliveredFrame(arrival_s, middle_s, image, self._index))
-
-    def _blanked(self, picture: Picture) -> Picture:
-        """Return the picture, or the blue screen in its place."""
-        if not self.scenario.camera_blank_rate:
-            return picture
-        rng = np.random.default_rng([self.scenario.seed, STREAM, _BLANKS, self._index])
-        if float(rng.random()) >= self.scenario.camera_blank_rate:
-            return picture
-        noise = rng.standard_normal(picture.shape, dtype=np.float32)
-        return np.asarray(np.rint(BLUE_GREY + BLUE_NOISE * noise), np.uint8)
+        self._under_way.append(DeliveredFrame(arrival_s, middle_s, self._last, self._index))
 
 
 # --- When each row of a frame is exposed and in what light ------------

@@ -228,7 +228,6 @@ class SimCapture:
 
 CONNECT, SERVER_INFO, ASK_MODELS, MODELS, FRAME = 0, 1, 4, 5, 7
 _HOST = "127.0.0.1"
-_POLL_S = 0.2
 _VERSION = bytes((3, 1, 0, 0))
 _NAME_BYTES = 256
 _TICKS_HZ = 1_000_000
@@ -243,14 +242,11 @@ class MotionCaptureServer:
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.settimeout(_POLL_S)
         self._socket.bind((_HOST, 0))
         self.host = f"{_HOST}:{self._socket.getsockname()[1]}"
         self._client: tuple[str, int] | None = None
         self._count = 0
-        self._closed = False
-        self._thread = threading.Thread(target=self._answer, name="capture-server", daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._answer, name="capture-server", daemon=True).start()
 
     def publish(self, seen: CaptureFrame) -> None:
         """Send a frame; nothing is sent while nobody is connected. A client that has gone, and a
@@ -260,15 +256,9 @@ class MotionCaptureServer:
             with contextlib.suppress(OSError):
                 self._socket.sendto(frame_message(self._count, self._names, seen), self._client)
 
-    def close(self) -> None:
-        self._closed = True
-        self._thread.join()
-        self._socket.close()
-
     def _answer(self) -> None:
-        while not self._closed:
-            # There may be nothing for a while, or a client that has gone.
-            with contextlib.suppress(OSError):
+        while True:
+            with contextlib.suppress(OSError):  # of a client that has gone
                 request, address = self._socket.recvfrom(2048)
                 kind = int.from_bytes(request[:2], "little") if len(request) >= 4 else None
                 if kind == CONNECT:

@@ -10,14 +10,21 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import IntEnum
-from typing import TYPE_CHECKING
+from errno import E2BIG, EEXIST, ENOENT, ENOEXEC, ENOMEM
+from typing import TYPE_CHECKING, Any
 
 from perchctl.link import Packet, Port
-from perchctl.sim.firmware.controller import Setpoint
-from perchctl.sim.firmware.planner import HighLevelCommand, HlGoTo, HlLand, HlStop, HlTakeoff
+from perchctl.sim.firmware.controller import (
+    MODE_HOVER,
+    MODE_POSITION,
+    MODE_RAW,
+    MODE_VELOCITY,
+    MODE_Z_DISTANCE,
+    Setpoint,
+)
+from perchctl.sim.firmware.planner import Planner
 
 if TYPE_CHECKING:
     from perchctl.sim.firmware import Firmware
@@ -26,29 +33,20 @@ MAX_DATA = 30
 PROTOCOL_VERSION = 12
 FIRMWARE_VERSION = "2026.08"
 DEVICE_TYPE = "C21B"
-
-
-class Status(IntEnum):
-    """What the firmware answers: the numbers of C's errno."""
-
-    OK = 0
-    ENOENT = 2
-    E2BIG = 7
-    ENOEXEC = 8
-    ENOMEM = 12
-    EEXIST = 17
+OK = 0
+"""The other answers are the numbers of C's errno."""
 
 
 # --- Packets that command the vehicle, turned into the firmware model's calls ---
 
 
-_SETPOINTS: dict[int, Callable[..., Setpoint]] = {
-    7: Setpoint.position,
-    8: Setpoint.velocity,
-    9: Setpoint.z_distance,
-    10: Setpoint.hover,
+_SETPOINTS = {
+    7: (MODE_POSITION, ("x_m", "y_m", "z_m", "yaw_deg")),
+    8: (MODE_VELOCITY, ("vx_mps", "vy_mps", "vz_mps", "yaw_rate_dps")),
+    9: (MODE_Z_DISTANCE, ("roll_deg", "pitch_deg", "yaw_rate_dps", "z_m")),
+    10: (MODE_HOVER, ("vx_mps", "vy_mps", "yaw_rate_dps", "z_m")),
 }
-"""Port 7: setpoints of four numbers by their type, as cflib sends them since protocol 11."""
+"""Port 7: the mode and the numbers of each type, as cflib sends them since protocol 11."""
 
 
 def execute(firmware: Firmware, packet: Packet) -> bytes | None:
@@ -67,37 +65,41 @@ def execute(firmware: Firmware, packet: Packet) -> bytes | None:
         case Port.COMMANDER_GENERIC, 0, 11:  # manual, by angles
             _fly(firmware, _raw(data[1:]))
         case Port.COMMANDER_GENERIC, 0, kind if kind in _SETPOINTS:
-            _fly(firmware, _SETPOINTS[kind](*struct.unpack_from("<ffff", data, 1)))
+            mode, names = _SETPOINTS[kind]
+            numbers = struct.unpack_from("<ffff", data, 1)
+            _fly(firmware, Setpoint(mode, **dict(zip(names, numbers, strict=True))))
         case Port.COMMANDER_GENERIC, 1, 0:
             firmware.notify_setpoint_stop()
         case Port.HIGH_LEVEL, 0, _:
             return data[:3].ljust(3, b"\0") + bytes((_plan(firmware, data),))
         case Port.LOCALIZATION, 0, _:
-            firmware.external_position(struct.unpack_from("<fff", data))
+            firmware.external(struct.unpack_from("<fff", data))
         case Port.LOCALIZATION, 1, 8:
             x, y, z, qx, qy, qz, qw = struct.unpack_from("<fffffff", data, 1)
-            firmware.external_pose((x, y, z), (qx, qy, qz, qw))
+            firmware.external((x, y, z), (qw, qx, qy, qz))
         case ((Port.LOCALIZATION | Port.SUPERVISOR), 1, 3):
             firmware.emergency_stop()
         case ((Port.LOCALIZATION | Port.SUPERVISOR), 1, 4):
-            firmware.emergency_stop_watchdog()
+            firmware.supervisor.notify_watchdog(firmware.t_s)
         case Port.SUPERVISOR, 0, 0x0C:
             return struct.pack("<BH", 0x8C, firmware.supervisor_info)
         case Port.SUPERVISOR, 1, 1 if len(data) > 1:
-            return bytes((0x81, *firmware.arm(bool(data[1]))))
+            return bytes((0x81, *firmware.supervisor.request_arming(bool(data[1]))))
         case Port.SUPERVISOR, 1, 2:
-            return bytes((0x82, *firmware.recover_from_crash()))
+            return bytes((0x82, *firmware.supervisor.request_recovery()))
         case Port.PLATFORM, 0, 1 if len(data) > 1:
-            return bytes((1, *firmware.arm(bool(data[1]))))
+            return bytes((1, *firmware.supervisor.request_arming(bool(data[1]))))
         case Port.PLATFORM, 0, 2:
-            return bytes((2, *firmware.recover_from_crash()))
+            return bytes((2, *firmware.supervisor.request_recovery()))
     return None
 
 
 def _raw(data: bytes) -> Setpoint:
-    """Return the setpoint of a packet on port 3; cflib negates the pitch on its way out."""
+    """Return the setpoint of a packet on port 3, whose yaw rate is clockwise."""
     roll, pitch, yaw_rate, thrust = struct.unpack_from("<fffH", data)
-    return Setpoint.raw(roll, -pitch, yaw_rate, thrust)
+    return Setpoint(
+        MODE_RAW, roll_deg=roll, pitch_deg=pitch, yaw_rate_dps=-yaw_rate, thrust=float(thrust)
+    )
 
 
 def _fly(firmware: Firmware, setpoint: Setpoint) -> None:
@@ -107,24 +109,26 @@ def _fly(firmware: Firmware, setpoint: Setpoint) -> None:
         firmware.low_level(setpoint)
 
 
-def _plan(firmware: Firmware, data: bytes) -> Status:
+def _plan(firmware: Firmware, data: bytes) -> int:
     """Pass on a command of port 8. Trajectories and spirals are not simulated."""
+    order: Callable[..., object]
+    values: tuple[Any, ...]
     match data[0]:
         case 3:
-            order: HighLevelCommand = HlStop()
+            order, values = Planner.stop, ()
         case 7 | 8 as kind:
             height, yaw, keep_yaw, duration = struct.unpack_from("<ff?f", data, 2)
-            vertical = HlTakeoff if kind == 7 else HlLand
-            order = vertical(height, duration, None if keep_yaw else yaw)
+            order = Planner.take_off if kind == 7 else Planner.land
+            values = (height, duration, None if keep_yaw else yaw)
         case 12:  # data[3] is a flag for straight lines
-            x, y, z, yaw, duration = struct.unpack_from("<fffff", data, 4)
-            order = HlGoTo(x, y, z, yaw, duration, bool(data[2]))
+            values = *struct.unpack_from("<fffff", data, 4), bool(data[2])
+            order = Planner.go_to
         case _:
-            return Status.ENOEXEC
-    is_finite = all(math.isfinite(value) for value in vars(order).values() if value is not None)
+            return ENOEXEC
+    is_finite = all(math.isfinite(value) for value in values if value is not None)
     if is_finite and data[1:2] == b"\0":  # for all groups; this vehicle is in none
-        firmware.high_level(order)
-    return Status.OK
+        firmware.high_level(order, *values)
+    return OK
 
 
 # --- C numbers --------------------------------------------------------
@@ -163,8 +167,6 @@ BY_CTYPE = {
     "uint16_t": Number("H", 0x02, 0x09),
     "uint32_t": Number("I", 0x03, 0x0A),
     "int8_t": Number("b", 0x04, 0x00),
-    "int16_t": Number("h", 0x05, 0x01),
-    "int32_t": Number("i", 0x06, 0x02),
     "float": Number("f", 0x07, 0x06),
     "FP16": Number("e", 0x08, 0x05),
 }
@@ -227,19 +229,6 @@ _LINK_SOURCE = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")
 _RESTARTS = (b"\xfe\xf0\x01", b"\xfe\x03")  # the radio chip's: reset to the firmware, system on
 
 
-@dataclass(frozen=True)
-class LinkOptions:
-    """How the link of a simulated vehicle differs from a good one.
-
-    Attributes:
-        protocol_version: below 12 the supervisor port is missing (an old firmware).
-        missing_log_variables: left out of the log table.
-    """
-
-    protocol_version: int = PROTOCOL_VERSION
-    missing_log_variables: tuple[str, ...] = ()
-
-
 @dataclass
 class _Block:
     variables: list[tuple[str, Number]] = field(default_factory=list)
@@ -252,17 +241,21 @@ class _Block:
 
 
 class CrtpServer:
-    """Serves one firmware to one peer at a time."""
+    """Serves one firmware to one peer; before protocol 12 it has no supervisor port."""
 
-    def __init__(self, firmware: Firmware, options: LinkOptions | None = None) -> None:
-        options = options or LinkOptions()
+    def __init__(
+        self,
+        firmware: Firmware,
+        protocol_version: int = PROTOCOL_VERSION,
+        missing_log_variables: Sequence[str] = (),
+    ) -> None:
         self._firmware = firmware
-        self._version = options.protocol_version
+        self._version = protocol_version
         self._blocks: dict[int, _Block] = {}
         log_codes = {
-            name: BY_CTYPE[ctype].log_code
-            for name, ctype in firmware.LOG_VARIABLES.items()
-            if name not in options.missing_log_variables
+            name: BY_CTYPE[variable.ctype].log_code
+            for name, variable in firmware.LOG_VARIABLES.items()
+            if name not in missing_log_variables
         }
         self._log_toc = Toc(Port.LOG, log_codes, bytes((MAX_BLOCKS, MAX_VARIABLES)))
         parameters = firmware.PARAMETERS.items()
@@ -334,7 +327,7 @@ class CrtpServer:
             case Port.PARAM, 3 if data[0] == _EXTENDED_TYPE_V2:
                 name = self._param_toc.name(data[1:3])
                 persistent = name is not None and self._firmware.PARAMETERS[name].persistent
-                status = (Status.OK, _IS_PERSISTENT) if persistent else (Status.ENOENT,)
+                status = (OK, _IS_PERSISTENT) if persistent else (ENOENT,)
                 return data[:3] + bytes(status)
             case Port.MEM, 0:  # one EEPROM, whose contents no client of this vehicle reads
                 if data[0] == 2:
@@ -351,22 +344,22 @@ class CrtpServer:
 
     # Log blocks ---------------------------------------------------------------------
 
-    def _set_block(self, request: int, ident: int, rest: bytes) -> Status:
+    def _set_block(self, request: int, ident: int, rest: bytes) -> int:
         block = self._blocks.get(ident)
         if request == _CLEAR:
             self._blocks.clear()
-            return Status.OK
+            return OK
         if request == _CREATE_V2:
             if block is not None:
-                return Status.EEXIST
+                return EEXIST
             if len(self._blocks) >= MAX_BLOCKS:
-                return Status.ENOMEM
+                return ENOMEM
             self._blocks[ident] = _Block()
             return self._append(self._blocks[ident], rest)
         if request not in (_APPEND_V2, _DELETE, _START, _STOP):
-            return Status.ENOEXEC
+            return ENOEXEC
         if block is None:
-            return Status.ENOENT
+            return ENOENT
         if request == _APPEND_V2:
             return self._append(block, rest)
         block.due_s = None
@@ -375,9 +368,9 @@ class CrtpServer:
             block.due_s = self._firmware.t_s + block.period_s
         elif request == _DELETE:
             del self._blocks[ident]
-        return Status.OK
+        return OK
 
-    def _append(self, block: _Block, rest: bytes) -> Status:
+    def _append(self, block: _Block, rest: bytes) -> int:
         """Add variables until one does not fit; an incomplete last entry is ignored.
 
         cflib leaves one stray byte at the end of a full packet.
@@ -386,13 +379,13 @@ class CrtpServer:
             number = BY_LOG_CODE.get(rest[at] & 0x0F)
             name = self._log_toc.name(rest[at + 1 : at + _ENTRY_BYTES])
             if name is None or number is None:
-                return Status.ENOENT
+                return ENOENT
             if block.size + number.size > MAX_BLOCK_BYTES:
-                return Status.E2BIG
+                return E2BIG
             if sum(len(b.variables) for b in self._blocks.values()) >= MAX_VARIABLES:
-                return Status.ENOMEM
+                return ENOMEM
             block.variables.append((name, number))
-        return Status.OK
+        return OK
 
     def _data(self, ident: int, block: _Block) -> Packet:
         stamp_ms = round(self._firmware.t_s * 1000.0) & 0xFFFFFF
@@ -408,14 +401,14 @@ class CrtpServer:
     def _read(self, data: bytes) -> bytes:
         name = self._param_toc.name(data[:2])
         if name is None:
-            return data[:2] + bytes((Status.ENOENT,))
-        return data[:2] + bytes((Status.OK,)) + self._value(name)
+            return data[:2] + bytes((ENOENT,))
+        return data[:2] + bytes((OK,)) + self._value(name)
 
     def _write(self, data: bytes) -> bytes | None:
         """Answers with the value that is kept; a read-only one is passed over in silence."""
         name = self._param_toc.name(data[:2])
         if name is None:
-            return data[:2] + bytes((Status.ENOENT,))
+            return data[:2] + bytes((ENOENT,))
         if self._firmware.PARAMETERS[name].readonly:
             return None
         self._firmware.set_parameter(name, self._numbers[name].unpack(data[2:]))

@@ -4,6 +4,7 @@ process of its own."""
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import math
 import os
@@ -14,21 +15,22 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, ClassVar
 
 import cv2
+import numpy as np
 
-from perchctl.children import Channel, connect_back
-from perchctl.errors import PerchError
 from perchctl.geometry import rotation_from_quaternion, rpy_from_rotation
 from perchctl.link import Packet
-from perchctl.sim.capture import CaptureFault, MotionCaptureServer, SimCapture
+from perchctl.profile import TargetConfig
+from perchctl.sim.capture import CaptureSettings, MotionCaptureServer, SimCapture
 from perchctl.sim.crtp import CrtpServer
 from perchctl.sim.optics import Picture
-from perchctl.sim.process import LOOP_PATIENCE_S, START_TIMEOUT_S, HostSetup, SharedTime
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.vision import CameraModel
 
 Address = tuple[str, int]
 TRUTH_EVERY = 10  # control periods between two lines of the truth file
@@ -43,40 +45,46 @@ class VehicleHost:
     The endpoint is a socket on loopback: one CRTP packet a UDP datagram, as cflib's `udp://`
     driver sends them. Answers go to the address that asked. What the vehicle sends by itself goes
     to the last address that sent anything but a scan's probe.
+
+    Args:
+        camera: None: no camera and no stream.
+        capture: None: no motion capture.
+        truth_file: JSON lines of the true state, 50 a simulated second.
+        link: further arguments of `CrtpServer`.
     """
 
-    def __init__(self, setup: HostSetup) -> None:
-        self._setup = setup
+    def __init__(
+        self,
+        scenario: Scenario,
+        camera: CameraModel | None = None,
+        target: TargetConfig | None = None,
+        capture: CaptureSettings | None = None,
+        truth_file: Path | None = None,
+        **link: Any,
+    ) -> None:
+        self._parts = camera, target, capture
         self._steps = 0
         self._peer: Address | None = None
         self._silent_s = (math.inf, math.inf)
-        self._bursts = setup.scenario.radio_bursts()
-        self.vehicle = self._new_vehicle(setup.scenario)
-        self.server = CrtpServer(self.vehicle.firmware, setup.link)
-        self.stream: MjpegServer | None = None
-        self.positions: MotionCaptureServer | None = None
-        with contextlib.ExitStack() as opened:
-            use = opened.enter_context
-            self.socket = use(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-            self.socket.setblocking(False)
-            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
-            self.socket.bind(("127.0.0.1", 0))
-            self.uri = f"udp://127.0.0.1:{self.socket.getsockname()[1]}"
-            if setup.camera is not None:
-                self.stream = use(contextlib.closing(MjpegServer()))
-            if setup.capture is not None:
-                self.positions = use(contextlib.closing(MotionCaptureServer(setup.capture.names)))
-
-            def lines(file: Path | None) -> TextIO | None:
-                return None if file is None else use(file.open("w", encoding="utf-8"))
-
-            self._truth, self._heard = lines(setup.truth_file), lines(setup.heard_file)
-            self._opened = opened.pop_all()
+        self._bursts = scenario.radio_bursts()
+        self.vehicle = SimulatedVehicle(scenario, *self._parts)
+        self.server = CrtpServer(self.vehicle.firmware, **link)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
+        self.socket.bind(("127.0.0.1", 0))
+        self.uri = f"udp://127.0.0.1:{self.socket.getsockname()[1]}"
+        self.stream = None if camera is None else MjpegServer()
+        self.positions = None if capture is None else MotionCaptureServer(capture.names)
+        self._truth = None if truth_file is None else truth_file.open("w", encoding="utf-8")
 
     @property
-    def capture(self) -> tuple[str, str] | None:
-        """The motion capture's kind, as `motioncapture` calls it, and its address."""
-        return None if self.positions is None else (SimCapture.SYSTEM, self.positions.host)
+    def addresses(self) -> tuple[str, str, tuple[str, str] | None]:
+        """As the attributes `uri`, `stream_url` and `capture` of a `SimProcess`."""
+        stream_url = "" if self.stream is None else self.stream.url
+        positions = self.positions
+        capture = None if positions is None else (SimCapture.SYSTEM, positions.host)
+        return self.uri, stream_url, capture
 
     @property
     def elapsed_s(self) -> float:
@@ -93,8 +101,6 @@ class VehicleHost:
             packet = Packet.decode(datagram)
             if packet is None or not self._passes():
                 continue
-            if self._heard is not None:
-                _write(self._heard, {"from": address, "packet": datagram.hex()})
             if datagram[0] != _NULL_HEADER:
                 self._peer = address
             self._send(self.server.handle(packet), address)
@@ -114,7 +120,8 @@ class VehicleHost:
         if self._peer is not None:
             self._send(self.server.due(), self._peer)
         if self._truth is not None and self._steps % TRUTH_EVERY == 0:
-            _write(self._truth, self.truth())
+            self._truth.write(json.dumps(self.truth()) + "\n")
+            self._truth.flush()
 
     def advance(self, dt_s: float) -> float:
         """Let `dt_s` pass; the simulated time since the start."""
@@ -123,30 +130,15 @@ class VehicleHost:
         return self.elapsed_s
 
     def answer(self, name: str, *arguments: Any, **named: Any) -> Any:
-        """Return what a method gives: of this host, or `set_pose`, `move_by_hand` and `let_go` of
-        its world."""
-        of: Any = self.vehicle.world if hasattr(self.vehicle.world, name) else self
+        """Call a method of this host, its server, world, battery or motion capture."""
+        world = self.vehicle.world
+        parts = (self, self.server, world, world.powertrain.cell, self.vehicle.capture)
+        of = next((part for part in parts if hasattr(part, name)), self)
         return getattr(of, name)(*arguments, **named)
-
-    def set_battery(self, rest_v: float) -> None:
-        """Change the battery's resting voltage."""
-        self.vehicle.world.battery_rest_v = rest_v
 
     def silence(self, duration_s: float) -> None:
         """Let the link receive and send nothing for `duration_s` of simulated time."""
         self._silent_s = (self.elapsed_s, self.elapsed_s + duration_s)
-
-    def capture_fault(self, fault: CaptureFault | None, for_s: float = math.inf) -> None:
-        """Begin a fault of the motion capture for so long; None ends all faults."""
-        assert self.vehicle.capture is not None, "it was started without a motion capture"
-        if fault is None:
-            self.vehicle.capture.heal()
-        else:
-            self.vehicle.capture.lay(fault, for_s)
-
-    def reboot(self) -> None:
-        """Restart the firmware, as the power button does; log blocks are lost."""
-        self.server.reboot()
 
     def truth(self) -> dict[str, Any]:
         """Return the true state, SI and radians, and the firmware's outputs: no Crazyflie reports
@@ -170,16 +162,14 @@ class VehicleHost:
 
     def replace_vehicle(self, scenario: Scenario) -> None:
         """Put a new vehicle under the same link: connection and log blocks stay."""
-        self.vehicle = self._new_vehicle(scenario)
+        self.vehicle = SimulatedVehicle(scenario, *self._parts)
         self.server.replace_firmware(self.vehicle.firmware)
 
     def close(self) -> None:
         """Free the ports and close the files."""
-        self._opened.close()
-
-    def _new_vehicle(self, scenario: Scenario) -> SimulatedVehicle:
-        setup = self._setup
-        return SimulatedVehicle(scenario, setup.camera, setup.target, setup.capture)
+        for part in (self.socket, self.stream, self._truth):
+            if part is not None:
+                part.close()
 
     def _send(self, packets: Iterable[Packet], address: Address) -> None:
         for packet in packets:
@@ -195,31 +185,44 @@ class VehicleHost:
         return self._bursts is None or not self._bursts.lost(self.elapsed_s)
 
 
-def _write(file: TextIO, record: dict[str, Any]) -> None:
-    file.write(json.dumps(record) + "\n")
-    file.flush()
-
-
 # --- The child process: runs the vehicle that the parent describes ----
 
 
-def serve_parent() -> None:
-    """Run the vehicle that the parent describes, until it sends stop or is gone."""
-    cv2.setNumThreads(1)  # the picture must not take the physics' core
+LOOP_PATIENCE_S = 2.0
+"""The simulator waits so long, on the wall's clock, for a loop that gives no sign of life."""
+
+
+class SharedTime(ctypes.Structure):
+    """How far simulated time has come and may go, where both processes see it.
+
+    Attributes:
+        reached_s: written by the simulator.
+        limit_s: written by the flight; infinity lets time run freely.
+    """
+
+    MARGIN_S: ClassVar = 0.02
+    """Simulated time may run so far past the moment that the flight loop waits for."""
+
+    reached_s: float
+    limit_s: float
+    _fields_ = (("reached_s", ctypes.c_double), ("limit_s", ctypes.c_double))
+
+
+def serve_parent(
+    channel: Connection, shared: SharedTime, pace: str, scenario: Scenario, settings: dict[str, Any]
+) -> None:
+    """Run the vehicle until the parent closes the channel or is gone. It is sent `addresses`
+    first; a text is why the vehicle has ended."""
+    os.setsid()  # away from the terminal
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    channel = connect_back()
-    setup: HostSetup = channel.receive(START_TIMEOUT_S)
+    cv2.setNumThreads(1)  # the picture must not take the physics' core
     try:
-        file = setup.time_file
-        shared = SharedTime.free() if file is None else SharedTime.mapped(file)
-        host = VehicleHost(setup)
-    except (PerchError, OSError, ValueError) as error:
-        channel.send(f"{type(error).__name__}: {error}")
-        return
-    with contextlib.closing(host):
-        channel.send((host.uri, "" if host.stream is None else host.stream.url, host.capture))
-        realtime = setup.pace == "realtime"
-        Runner(host, channel, realtime=realtime, linger_s=setup.linger_s, shared=shared).run()
+        with contextlib.closing(VehicleHost(scenario, **settings)) as host:
+            channel.send(host.addresses)
+            Runner(host, channel, realtime=pace == "realtime", shared=shared).run()
+    except Exception as error:
+        with contextlib.suppress(OSError):
+            channel.send(f"{type(error).__name__}: {error}")
 
 
 # --- How time passes in the simulated vehicle's process, and when it ends ---
@@ -227,9 +230,6 @@ def serve_parent() -> None:
 #   sets `SharedTime.limit_s`, it waits for the flight's loop instead;
 # - stepped: only the parent's `advance` moves time; between two of them the link is
 #   answered, so that cflib connects without simulated time passing.
-#
-# When the parent is gone, however it went, the vehicle flies on in real time for
-# `HostSetup.linger_s` and then ends, so that the firmware's reaction can be observed.
 
 
 MAX_LAG_S = 1.0
@@ -239,35 +239,36 @@ _BATCH = 50  # steps between two polls of the control connection while catching 
 
 
 class Runner:
-    """Runs one host until it is stopped or its parent has been gone for a while."""
+    """Runs one host until its parent is gone."""
 
     def __init__(
         self,
         host: VehicleHost,
-        channel: Channel | None,
+        channel: Connection,
         *,
         realtime: bool,
-        linger_s: float,
+        shared: SharedTime,
         clock: Callable[[], float] = time.monotonic,
-        shared: SharedTime | None = None,
     ) -> None:
         self._host = host
         self._channel = channel
         self._realtime = realtime
-        self._linger_s = linger_s
         self._clock = clock
-        self._shared = shared or SharedTime.free()
+        self._shared = shared
         self._waiting_since_s: float | None = None
         self._limit_s = math.inf
-        self._parent = os.getppid()
-        self._end_s = math.inf
         self._origin_s = clock() - host.elapsed_s
 
     def run(self) -> None:
-        while self._clock() < self._end_s:
-            self._wait(self.catch_up() if self._realtime else _IDLE_S)
-            if self._channel is not None and os.getppid() != self._parent:
-                self._lose_parent()
+        with contextlib.suppress(EOFError, ConnectionError):
+            while True:
+                wait_s = self.catch_up() if self._realtime else _IDLE_S
+                awaited: list[Any] = [self._host.socket, self._channel]
+                ready, _, _ = select.select(awaited, [], [], wait_s)
+                if self._host.socket in ready:
+                    self._host.serve()
+                if self._channel in ready:
+                    self._channel.send(self._answer(*self._channel.recv()))
 
     def catch_up(self) -> float:
         """Step up to now, some steps at most at once; how long to wait for the next step."""
@@ -298,42 +299,12 @@ class Runner:
             self._waiting_since_s = now_s  # the loop has given a sign of life
         return now_s - self._waiting_since_s < LOOP_PATIENCE_S
 
-    def _wait(self, timeout_s: float) -> None:
-        sockets: list[Any] = [self._host.socket]
-        if self._channel is not None:
-            sockets.append(self._channel)
-        ready, _, _ = select.select(sockets, [], [], timeout_s)
-        if self._host.socket in ready:
-            self._host.serve()
-        if self._channel is not None and self._channel in ready:
-            self._answer(self._channel)
-
-    def _answer(self, channel: Channel) -> None:
-        """Answer one request of the parent, (name, arguments, named ones), by (True, result) or
-        (False, text)."""
+    def _answer(self, name: str, arguments: Any, named: Any) -> tuple[bool, Any]:
+        """Return the answer to a request of the parent: (True, result) or (False, text)."""
         try:
-            name, arguments, named = channel.receive()
-            answer: tuple[bool, Any] = True, None
-            try:
-                if name == "stop":
-                    self._end_s = -math.inf
-                elif name == "advance" and self._realtime:
-                    answer = False, "only a stepped vehicle can be advanced"
-                else:
-                    answer = True, self._host.answer(name, *arguments, **named)
-            except Exception as error:
-                answer = False, f"{type(error).__name__}: {error}"
-            channel.send(answer)
-        except (EOFError, OSError):
-            self._lose_parent()
-
-    def _lose_parent(self) -> None:
-        if self._channel is not None:
-            self._channel.close()
-            self._channel = None
-        self._realtime, self._shared = True, SharedTime.free()
-        self._end_s = self._clock() + self._linger_s
-        self._origin_s = self._clock() - self._host.elapsed_s
+            return True, self._host.answer(name, *arguments, **named)
+        except Exception as error:
+            return False, f"{type(error).__name__}: {error}"
 
 
 # --- The simulated camera's picture over HTTP, as a network camera would send it ---
@@ -342,7 +313,6 @@ class Runner:
 
 JPEG_QUALITY = 92
 _BOUNDARY = "perchctlframe"
-_WAIT_S = 0.5
 _CLIENT_TIMEOUT_S = 5.0
 
 
@@ -355,31 +325,24 @@ class MjpegServer(ThreadingHTTPServer):
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
         self._changed = threading.Condition()
-        self._image: Picture | None = None
-        self._number = 0
-        self.closed = False
+        self._newest: tuple[int, Picture] = 0, np.zeros((1, 1), np.uint8)
         self.url = f"http://127.0.0.1:{self.server_address[1]}/stream.mjpg"
         threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True).start()
 
     def publish(self, image: Picture) -> None:
         """Publish a picture, grey uint8 (h, w). It costs nothing while nobody watches."""
         with self._changed:
-            self._image = image
-            self._number += 1
+            self._newest = self._newest[0] + 1, image
             self._changed.notify_all()
 
-    def after(self, number: int) -> tuple[int, Picture] | None:
-        """Return the newest picture and its number if that is above `number`; None when none came
-        for a while."""
+    def after(self, number: int) -> tuple[int, Picture]:
+        """Return the newest picture and its number as soon as that is above `number`."""
         with self._changed:
-            self._changed.wait_for(lambda: self.closed or self._number > number, _WAIT_S)
-            if self._image is None or self._number <= number:
-                return None
-            return self._number, self._image
+            self._changed.wait_for(lambda: self._newest[0] > number)
+            return self._newest
 
     def close(self) -> None:
-        """End all streams and free the port."""
-        self.closed = True
+        """Free the port."""
         self.shutdown()
         self.server_close()
 
@@ -394,10 +357,8 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_response(200)
             self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
             self.end_headers()
-            while not self.server.closed:
-                if (newer := self.server.after(number)) is None:
-                    continue
-                number, image = newer
+            while True:
+                number, image = self.server.after(number)
                 _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
                 head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}"
                 self.wfile.write(f"{head}\r\n\r\n".encode() + jpeg.tobytes() + b"\r\n")

@@ -42,11 +42,6 @@ class RayGrid:
     down: NDArray[np.float32]  # (rows,), 0 in the picture's first row, 1 in its last
     outline: NDArray[np.float32]  # (n, 2), rays around all of them
 
-    def window(self, rows: slice, cols: slice) -> RayGrid:
-        """Return a part of the grid, whose outline stays that of the whole."""
-        xy = np.ascontiguousarray(self.xy[rows, cols])
-        return RayGrid(xy, self.down[rows], self.outline)
-
 
 def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
     """Return rays over the image, its size rounded up to whole coarse blocks."""

@@ -10,9 +10,7 @@
   slips of that page cost what was measured there, whether the motors turned, turned slowly or
   stood. With 0.05 s for all, a vehicle with slow motors falls up to two fifths less.
 - Nothing brakes a brushed motor, so it runs down more slowly than it runs up.
-  `MOTOR_COAST_S` is the value with which the fall after a lone notify, the landing, the
-  take-offs and the attitude steps of that page come out nearest to what was measured,
-  all at once.
+  `MOTOR_COAST_S` fits best what that page measured of falls, landings and take-offs.
 - The cell (`Cell`) gives 4.4 A at full thrust. Current and sag are proportional
   to thrust: the voltages beside the duty cycles of that page lie on one line within 0.06 V,
   0.63 V from no thrust to full.
@@ -22,7 +20,6 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
 from math import cbrt, sqrt
 
 from perchctl.geometry import GRAVITY_MPS2
@@ -78,7 +75,7 @@ def thrust_n(volts: float) -> float:
 
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age ---
 # - Resting voltage by charge: the levels in tenths by which the firmware tells a battery's
-#   state (`perchctl.sim.firmware.firmware`) are a discharge curve of the Crazyflie's own cell.
+#   state (source: power management) are a discharge curve of the Crazyflie's own cell.
 #   It is flat in the middle and falls ever faster below a tenth, where 24 s of hovering take
 #   0.7 V; what lies between 0 and 10 per cent is shaped as lithium polymer cells fall off.
 # - The voltage falls under load by the cell's resistance at once, and in an old or cold cell
@@ -91,7 +88,6 @@ CHARGE_C = 900.0
 """250 mAh."""
 RESISTANCE_OHM = 0.143
 SLOW_S = 15.0
-KNEE = 0.1
 _CELL_CURVE: tuple[tuple[float, float], ...] = (
     (-0.02, 2.5),
     (0.0, 3.0),
@@ -114,58 +110,42 @@ _CELL_ENDS = tuple(x for x, _ in _CELL_CURVE[1:])  # of its straight parts
 _EMPTY_V, _FULL_V = _CELL_CURVE[0][1], _CELL_CURVE[-1][1]
 
 
-@dataclass(frozen=True)
-class CellKind:
-    """Beside its resting voltage: the resistance that acts at once and the one that acts
-    slowly, the charge that an old cell still holds as a share, and where the steep end begins."""
-
-    resistance_ohm: float = RESISTANCE_OHM
-    slow_ohm: float = 0.0
-    charge: float = 1.0
-    knee: float = KNEE
-
-    @classmethod
-    def of(cls, scenario: Scenario) -> CellKind:
-        """Return the cell of the scenario's vehicle."""
-        ohm = scenario.cell_resistance_ohm
-        return cls(
-            RESISTANCE_OHM if ohm is None else ohm,
-            scenario.cell_slow_ohm,
-            scenario.cell_charge,
-            scenario.cell_knee,
-        )
-
-
 class Cell:
-    """`rest_v` its resting voltage, `battery_v` under load."""
+    """`rest_v` its resting voltage, `battery_v` under load.
 
-    def __init__(self, rest_v: float, kind: CellKind) -> None:
-        self._kind = kind
-        self._left = _charge_at(rest_v, kind.knee)
-        self._offset_v = rest_v - _resting_v(self._left, kind.knee)
+    Args:
+        ohm: the resistance that acts at once; `slow_ohm` the one that acts slowly.
+        charge: what an old cell still holds, as a share.
+        knee: where the steep end begins.
+    """
+
+    def __init__(
+        self,
+        rest_v: float,
+        ohm: float = RESISTANCE_OHM,
+        slow_ohm: float = 0.0,
+        charge: float = 1.0,
+        knee: float = 0.1,
+    ) -> None:
+        self._ohm, self._slow_ohm, self._knee = ohm, slow_ohm, knee
+        self._left = _charge_at(rest_v, knee)
+        self._offset_v = rest_v - _resting_v(self._left, knee)
         self._slow_v = 0.0
-        self._per_step = CONTROL_PERIOD_S / (CHARGE_C * kind.charge)
+        self._per_step = CONTROL_PERIOD_S / (CHARGE_C * charge)
         self._slowly = 1.0 - math.exp(-CONTROL_PERIOD_S / SLOW_S)
-        self._rest_v = self.battery_v = rest_v
+        self.rest_v = self.battery_v = rest_v
 
-    @property
-    def rest_v(self) -> float:
-        return self._rest_v
+    def set_rest_v(self, rest_v: float) -> None:
+        """Set another voltage; the charge stays as it is."""
+        self._offset_v += rest_v - self.rest_v
+        self.rest_v = rest_v
 
-    @rest_v.setter
-    def rest_v(self, rest_v: float) -> None:
-        """Another voltage, and the charge as it was: it goes on to fall as it would have."""
-        self._offset_v += rest_v - self._rest_v
-        self._rest_v = rest_v
-
-    def step(self, current_a: float) -> float:
-        """Return the voltage under load after one control period of a current."""
-        kind = self._kind
+    def step(self, current_a: float) -> None:
+        """Let a current flow for one control period."""
         self._left -= current_a * self._per_step
-        self._slow_v += self._slowly * (kind.slow_ohm * current_a - self._slow_v)
-        self._rest_v = rest_v = _resting_v(self._left, kind.knee) + self._offset_v
-        self.battery_v = rest_v - kind.resistance_ohm * current_a - self._slow_v
-        return self.battery_v
+        self._slow_v += self._slowly * (self._slow_ohm * current_a - self._slow_v)
+        self.rest_v = _resting_v(self._left, self._knee) + self._offset_v
+        self.battery_v = self.rest_v - self._ohm * current_a - self._slow_v
 
 
 def _resting_v(left: float, knee: float) -> float:
@@ -204,11 +184,17 @@ Forces = tuple[float, float, float, float]
 
 
 class Powertrain:
-    """`forces_n` M1..M4; `battery_v` the cell's voltage under their load."""
+    """`forces_n` M1..M4, which load the scenario's `cell`."""
 
-    def __init__(self, rest_v: float, kind: CellKind | None = None) -> None:
-        self.cell = Cell(rest_v, kind or CellKind())
-        self.battery_v = rest_v
+    def __init__(self, scenario: Scenario) -> None:
+        ohm = scenario.cell_resistance_ohm
+        self.cell = Cell(
+            scenario.battery_rest_v,
+            RESISTANCE_OHM if ohm is None else ohm,
+            scenario.cell_slow_ohm,
+            scenario.cell_charge,
+            scenario.cell_knee,
+        )
         self.forces_n = (0.0, 0.0, 0.0, 0.0)
         self.strength: Forces = (1.0, 1.0, 1.0, 1.0)  # what is left of each motor's thrust
         self._speeds_v = [0.0] * 4  # each as the voltage that would keep it
@@ -216,7 +202,7 @@ class Powertrain:
 
     def step(self, pwm: Forces) -> Forces:
         """Return the forces after one control period under four duty cycles 0..65535."""
-        scale = self.battery_v / FULL_COMMAND
+        scale = self.cell.battery_v / FULL_COMMAND
         for motor, duty in enumerate(pwm):
             speed_v = self._speeds_v[motor]
             missing_v = scale * duty - speed_v
@@ -225,7 +211,7 @@ class Powertrain:
         s1, s2, s3, s4 = self.strength
         f1, f2, f3, f4 = map(thrust_n, self._speeds_v)
         self.forces_n = f1, f2, f3, f4 = s1 * f1, s2 * f2, s3 * f3, s4 * f4
-        self.battery_v = self.cell.step(_AMPERES_PER_N * (f1 + f2 + f3 + f4))
+        self.cell.step(_AMPERES_PER_N * (f1 + f2 + f3 + f4))
         return self.forces_n
 
 

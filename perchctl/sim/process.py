@@ -1,119 +1,36 @@
 """The simulated vehicle as a process of its own: a Crazyflie on UDP, its camera on HTTP.
 
 `SimProcess` is the handle in the process that flies, `perchctl.sim.host` runs in the other one.
-The child does not share its terminal's Ctrl-C and outlives a killed parent by a few seconds, as a
-real vehicle would.
+The child does not share its terminal's Ctrl-C, and ends with its parent.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import math
-import mmap
+import multiprocessing
 import signal
-import tempfile
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
-from typing import IO, Any, ClassVar, Literal
+from typing import Any, Literal
 
-from perchctl.children import end, last_line, spawn
-from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
-from perchctl.profile import TargetConfig
-from perchctl.sim.capture import CaptureSettings
-from perchctl.sim.crtp import LinkOptions
+from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
+from perchctl.sim.host import SharedTime, serve_parent
 from perchctl.sim.scenario import Scenario
-from perchctl.vision import CameraModel
 
-LOOP_PATIENCE_S = 2.0
-"""The simulator waits so long, on the wall's clock, for a loop that gives no sign of life."""
-
-
-class SharedTime(ctypes.Structure):
-    """How far simulated time has come and may go, where both processes see it.
-
-    Attributes:
-        reached_s: written by the simulator.
-        limit_s: written by the flight; infinity lets time run freely.
-    """
-
-    MARGIN_S: ClassVar = 0.02
-    """Simulated time may run so far past the moment that the flight loop waits for."""
-
-    reached_s: float
-    limit_s: float
-    _fields_ = (("reached_s", ctypes.c_double), ("limit_s", ctypes.c_double))
-
-    @classmethod
-    def free(cls) -> SharedTime:
-        """Return a time for one process alone, which waits for nobody."""
-        return cls(0.0, math.inf)
-
-    @classmethod
-    def mapped(cls, file: Path) -> SharedTime:
-        """Return the time that the file holds, for each process that maps it."""
-        with file.open("r+b") as opened:
-            return cls.from_buffer(mmap.mmap(opened.fileno(), ctypes.sizeof(cls)))
-
-
-START_TIMEOUT_S = 30.0
-
-
-@dataclass(frozen=True)
-class HostSetup:
-    """How the simulated vehicle's process is set up.
-
-    Attributes:
-        pace: "realtime", or "stepped": time passes by `SimProcess.advance` only.
-        camera: None: no camera and no stream.
-        capture: None: no motion capture.
-        truth_file: JSON lines of the true state, 50 a simulated second, also after the parent has
-            ended.
-        heard_file: JSON lines of every packet that arrived, and who had sent it.
-        linger_s: time on the wall's clock for which the vehicle then runs on.
-        time_file: a `SharedTime` of the parent's; None: time runs freely.
-    """
-
-    scenario: Scenario = field(default_factory=Scenario)
-    pace: Literal["realtime", "stepped"] = "realtime"
-    camera: CameraModel | None = None
-    target: TargetConfig | None = None
-    capture: CaptureSettings | None = None
-    link: LinkOptions = field(default_factory=LinkOptions)
-    truth_file: Path | None = None
-    heard_file: Path | None = None
-    linger_s: float = 12.0
-    time_file: Path | None = None
-
-
-ANSWER_TIMEOUT_S = 15.0
-SLOWEST_PACE = 20.0
-"""Wall-clock seconds allowed for one simulated second of `advance`."""
+ANSWER_TIMEOUT_S = 60.0
+"""Also of `advance`, which takes a second for half a minute."""
 _STOP_TIMEOUT_S = 5.0
-_CHILD = "from perchctl.sim.host import serve_parent; serve_parent()"
-REQUESTS = (
-    "truth",
-    "set_pose",
-    "move_by_hand",
-    "let_go",
-    "set_battery",
-    "silence",
-    "capture_fault",
-    "reboot",
-    "replace_vehicle",
-)
-"""Methods of the child's `VehicleHost` and its `World` that a `SimProcess` has, too."""
+_CONTEXT = multiprocessing.get_context("spawn")
 
 
 class SimProcess:
-    """Handle of a running simulated vehicle; a context manager. It has the methods `REQUESTS` of
-    `perchctl.sim.host.VehicleHost` and its `World`.
+    """Handle of a running simulated vehicle; a context manager. It has the methods of the child's
+    `perchctl.sim.host.VehicleHost`, and of its server, its world and its motion capture.
 
-    All methods may be called from any thread; they raise `ConnectionFailed` when the child is gone
-    and `TimedOut` when it does not answer.
+    From any thread; errors: `ConnectionFailed` when the child is gone, `TimedOut` when it
+    does not answer, `InvalidValue` when it refuses.
 
     Attributes:
         uri: for cflib.
@@ -126,65 +43,49 @@ class SimProcess:
     uri = stream_url = ""
     capture: tuple[str, str] | None = None
 
-    def __init__(self, setup: HostSetup, timeout_s: float) -> None:
+    def __init__(self, pace: str, scenario: Scenario, settings: dict[str, Any]) -> None:
         self._lock = threading.Lock()
-        self._stopped = False
-        self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed by stop)
-        # Both processes have mapped the file once the child has answered.
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            file = Path(folder, "time")
-            file.write_bytes(bytes(SharedTime.free()))
-            self.shared_time = SharedTime.mapped(file)
-            self._child, self._channel = spawn(_CHILD, self._stderr)
-            try:
-                self._channel.receive(timeout_s)
-                self._channel.send(replace(setup, time_file=file))
-                answer = self._channel.receive(timeout_s)
-            except (EOFError, OSError):
-                self._channel.close()
-                raise self._gave_up(f"did not come up within {timeout_s:.0f} s") from None
+        self.shared_time = _CONTEXT.RawValue(SharedTime, 0.0, math.inf)
+        self._channel, childs = _CONTEXT.Pipe()
+        arguments = (childs, self.shared_time, pace, scenario, settings)
+        self._child = _CONTEXT.Process(target=serve_parent, args=arguments, daemon=True)
+        # The child takes over that Ctrl-C is blocked, until it has left the terminal.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._child.start()
+        except OSError as error:
+            raise ConnectionFailed(f"the simulated vehicle could not start: {error}") from error
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            childs.close()
         self.pid = self._child.pid
-        if isinstance(answer, str):
-            self.stop()
-            raise ConnectionFailed(f"the simulated vehicle could not start: {answer}")
-        self.uri, self.stream_url, self.capture = answer
+        self.uri, self.stream_url, self.capture = self._receive()
 
     @classmethod
     def start(
         cls,
         scenario: Scenario | None = None,
         pace: Literal["realtime", "stepped"] = "realtime",
-        *,
-        timeout_s: float = START_TIMEOUT_S,
         **settings: Any,
     ) -> SimProcess:
-        """Start the vehicle and wait, for at most `timeout_s`, until it answers.
+        """Start the vehicle and wait until it answers. With `pace` "stepped" time passes by
+        `advance` only.
 
-        `settings` are further fields of `HostSetup`. Raises `ConnectionFailed` when the child
-        ends or does not come up.
+        `settings` are further arguments of `VehicleHost`. Raises `ConnectionFailed` when the child
+        ends, `TimedOut` when it does not answer.
         """
-        return cls(HostSetup(scenario or Scenario(), pace, **settings), timeout_s)
-
-    def advance(self, dt_s: float) -> float:
-        """Let `dt_s` pass (stepped pace only); the simulated time since the start."""
-        allowed_s = ANSWER_TIMEOUT_S + SLOWEST_PACE * dt_s
-        return float(self._ask("advance", dt_s, timeout_s=allowed_s))
+        return cls(pace, scenario or Scenario(), settings)
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
-        if name not in REQUESTS:
+        if name.startswith("_"):
             raise AttributeError(name)
         return partial(self._ask, name)
 
     def stop(self) -> None:
         """End the vehicle's process. May be called twice."""
-        if self._stopped:
-            return
-        self._stopped = True
-        with contextlib.suppress(PerchError):
-            self._ask("stop", timeout_s=_STOP_TIMEOUT_S)
         self._channel.close()
-        end(self._child, _STOP_TIMEOUT_S)
-        self._stderr.close()
+        self._child.join(_STOP_TIMEOUT_S)
+        self._child.kill()
 
     def __enter__(self) -> SimProcess:
         return self
@@ -192,29 +93,24 @@ class SimProcess:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _ask(
-        self, name: str, *arguments: Any, timeout_s: float = ANSWER_TIMEOUT_S, **named: Any
-    ) -> Any:
+    def _ask(self, name: str, *arguments: Any, **named: Any) -> Any:
         with self._lock:
-            try:
+            with contextlib.suppress(OSError):  # then there is no answer either
                 self._channel.send((name, arguments, named))
-                good, result = self._channel.receive(timeout_s)
-            except TimeoutError:
-                raise TimedOut(
-                    f"the simulated vehicle did not answer {name!r} within {timeout_s:.0f} s"
-                ) from None
-            except (EOFError, OSError):
-                raise ConnectionFailed(
-                    f"the simulated vehicle has ended{last_line(self._stderr)}"
-                ) from None
+            good, result = self._receive()
         if not good:
             raise InvalidValue(f"the simulated vehicle refused {name!r}: {result}")
         return result
 
-    def _gave_up(self, why: str) -> ConnectionFailed:
-        end(self._child, _STOP_TIMEOUT_S)
-        code = self._child.returncode
-        what = why if code == -signal.SIGKILL else f"ended with code {code}"
-        error = ConnectionFailed(f"the simulated vehicle {what}{last_line(self._stderr)}")
-        self._stderr.close()
-        return error
+    def _receive(self) -> Any:
+        try:
+            answer = self._channel.recv() if self._channel.poll(ANSWER_TIMEOUT_S) else None
+        except (EOFError, OSError):
+            answer = "its process is gone"
+        if answer is None:
+            self.stop()
+            raise TimedOut(f"the simulated vehicle did not answer within {ANSWER_TIMEOUT_S:.0f} s")
+        if isinstance(answer, str):
+            self.stop()
+            raise ConnectionFailed(f"the simulated vehicle has ended: {answer}")
+        return answer

@@ -4,8 +4,6 @@ Every image pixel is a ray, traced to the ceiling's plane and looked up in
 textures; lens distortion lies in the rays, which are precomputed. The sheets' map
 is exact at each pixel. The ceiling's is evaluated at every eighth and interpolated,
 which errs by less than 0.01 px for lenses up to 90 degrees.
-
-Pixel (0, 0) is the centre of the top-left pixel, as in OpenCV.
 """
 
 from __future__ import annotations
@@ -25,6 +23,7 @@ from perchctl.sim.optics import (
     COARSE_PX,
     LEAST_RISE,
     Picture,
+    RayGrid,
     lens_of,
     local_px_per_m,
     plane_map,
@@ -51,8 +50,7 @@ CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
 
 FLOOR_GREY = 60
 _NOISE_ROOM_PX = 64
-"""The bank of noise is larger than a picture by this. Each frame has another part of it, 4225
-of them until the first comes again; and so small a bank stays near to the processor."""
+"""The bank of noise is larger than a picture by this: each frame has another part of it."""
 _PLAIN_PX = 1.5
 """Blur of the lens that the bare ceiling, drawn at half the size or less, does not show."""
 _COVERING_SIGMA = 4.0
@@ -103,7 +101,6 @@ class Renderer:
             small=target.small.model_copy(update={"side_m": scenario.small_side_m}),
         )
         own = () if scenario.no_target else (Placed(printed_sheet(printed.model_dump_json())),)
-        self._still: tuple[tuple[bytes, float], Picture] | None = None
         self._sheets = (*own, *(beside(n, printed) for n in scenario.neighbours))
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
@@ -118,7 +115,6 @@ class Renderer:
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
         """Put the target's centre there from now on."""
-        self._still = None
         scenario = self.scenario
         z_m = scenario.ceiling_z_m + scenario.target_above_ceiling_m
         turn = rotation_from_rpy(*scenario.target_tilt_rad, 0.0) @ rot_z(scenario.target_yaw_rad)
@@ -150,7 +146,7 @@ class Renderer:
         """Return the frame of one shot, or of two fields in their order of time; which rows are
         the first one's is the scenario's. Otherwise as `render`."""
         exposed = [self._exposed(shot, defocus_px) for shot in shots]
-        picture = exposed[0].copy()
+        picture = exposed[0]
         if len(shots) > 1:
             later = 0 if self.scenario.camera_fields == "bottom" else 1  # the second field's rows
             picture[later::2] = exposed[1][later::2]
@@ -165,29 +161,20 @@ class Renderer:
         return picture
 
     def _exposed(self, shot: Shot, defocus_px: float | None) -> Picture:
-        """Return what falls onto the sensor in one shot, before noise. Not to be written into."""
+        """Return what falls onto the sensor in one shot, before noise."""
         rows = [self._T_target_world @ np.array(poses) for poses in shot.rows]
         motion_px = self._motion_px(rows[len(rows) // 2])
         length_px = path_length_px(motion_px)
         sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
         if length_px < STILL_PX and len(rows) == 1:
-            picture = self._at_rest(rounded(rows[0][len(rows[0]) // 2]), sigma)
-        else:
-            picture = self._projected(rows, motion_px, length_px, sigma)
+            rows = [rounded(rows[0][len(rows[0]) // 2])[None]]
+            motion_px, length_px = np.zeros((5, 1, 2)), 0.0
+        picture = self._projected(rows, motion_px, length_px, sigma)
         if shot.light is None:
             return picture
         factor = np.broadcast_to(shot.light.astype(np.float32)[:, None], picture.shape)
         lit = cv2.multiply(picture, np.ascontiguousarray(factor), dtype=cv2.CV_8U)
         return np.asarray(lit, np.uint8)
-
-    def _at_rest(self, pose: Array, sigma_px: float) -> Picture:
-        """Return the picture of a camera that does not move. The last one is kept: under the magnet
-        it would cost 4 ms each time."""
-        key = (pose.tobytes(), sigma_px)
-        if self._still is None or self._still[0] != key:
-            picture = self._projected([pose[None]], np.zeros((5, 1, 2)), 0.0, sigma_px)
-            self._still = key, picture
-        return self._still[1]
 
     # -- through the lens ---------------------------------------------------
 
@@ -250,7 +237,9 @@ class Renderer:
 
     def _add_sheet(self, picture: Picture, view: View, maps: Array) -> None:
         rows, cols = pixels_of(view.box)
-        rays = self._pixels.window(rows, cols)
+        pixels = self._pixels
+        here = np.ascontiguousarray(pixels.xy[rows, cols])
+        rays = RayGrid(here, pixels.down[rows], pixels.outline)
         texels = [trace(rays, view.to_texels @ each)[0] for each in maps]
         seen = mean_of([sample(view.texture.value, each) for each in texels])
         alpha = mean_of([sample(view.texture.alpha, each) for each in texels])

@@ -1,5 +1,5 @@
 """One simulated flight's conditions: what they are, how a profile's ranges and a seed give them,
-when the radio is silent, and how they explain an event of the flight."""
+and when the radio is silent."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2, Array, make_T, rotation_from_rpy
-from perchctl.mission import Event, EventKind
 from perchctl.profile import Profile, SimulationConfig
 
 CONTROL_PERIOD_S = 0.002
@@ -41,43 +40,24 @@ class Scenario:
     estimate starts there with heading zero *in the estimate's frame*, so
     `start_yaw_rad` turns the target instead: target_* are given in that frame.
 
+    A field with the name of a key of the profile (`perchctl.profile.SimulationConfig`) is what is
+    said there, one number of the key's range.
+
     Attributes:
-        mass_kg: all-up mass.
-        battery_rest_v: resting voltage at the start.
-        ceiling_z_m: height of the ceiling's underside over the floor.
         target_xy_m, target_yaw_rad: centre and heading of the target.
         gear_body_m: tip of the magnet gear in body axes (its truth).
         T_body_cam_true: rows of the camera's true pose, mounting error included.
-        camera_*: what the camera and its radio do to the frames.
-        camera_fields: "progressive", or interlaced with the field of the "top" or the
-            "bottom" row first, half a period before the other.
-        camera_readout_s: from a picture's (or field's) first row to its last.
-        camera_flicker, camera_pumping: share by which lamps (100 Hz) and an exposure control
-            that hunts change the brightness.
-        camera_receiver_hz: of the receiver's output, where it gives out its newest picture
-            again and again; None: it does not.
-        camera_blank_rate: share of pictures that are a blue screen.
         camera_mirrored: it gives its pictures flipped left to right.
         drift_mps: drift of the state estimate, world axes.
         draught_mps: the wind with its smooth gusts (`perchctl.sim.world.Wind`).
-        ceiling_suction: share of thrust gained with the rotors' plane at the ceiling.
-        magnet_force_n: pull the magnet can hold.
         first_contact_force_n: pull at the first contact; None means the same.
-        no_target: the ceiling is bare.
         camera_freeze_at_s: from then on it gives its last picture; None means never.
-        cell_resistance_ohm: of the battery; None means a good one.
-        cell_slow_ohm: more of it, that an old or cold cell shows within seconds.
-        cell_charge: what an old cell still holds, as a share of a new one's.
-        cell_knee: the share of its charge below which its voltage falls steeply.
-        rssi_dbm: of the radio, at the vehicle.
         parameters: the firmware's, where they differ from its release at boot.
         gyro_bias_radps, acc_bias_mps2: what the gyroscope, after the firmware has taken out what it
             found on the ground, and the accelerometer, before the firmware scales it to 1 g, read
             too much; body axes, of a vehicle without a deck (`perchctl.sim.firmware.outside`).
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
         target_tilt_rad: the target's turns about the world's x and y, after its heading.
-        radio_loss, radio_burst_s: share of the time in which no packet passes, and how long
-            such a time lasts on average (`perchctl.sim.scenario`).
         capture_holes_s: begin and length of the times in which a motion capture does not see
             the vehicle.
         neighbours: other vehicles' targets. What these vehicles do to the air is in the draught.
@@ -111,7 +91,6 @@ class Scenario:
     camera_flicker: float = 0.0
     camera_pumping: float = 0.0
     camera_receiver_hz: float | None = None
-    camera_blank_rate: float = 0.0
     camera_mirrored: bool = False
     estimate_noise_m: float = 0.002
     estimate_tilt_bias_rad: tuple[float, float] = (0.0, 0.0)
@@ -123,7 +102,6 @@ class Scenario:
     cell_slow_ohm: float = 0.0
     cell_charge: float = 1.0
     cell_knee: float = 0.1
-    rssi_dbm: float = -40.0
     parameters: dict[str, float] = field(default_factory=dict)
     no_target: bool = False
     camera_freeze_at_s: float | None = None
@@ -144,12 +122,11 @@ class Scenario:
 
 
 # --- From a profile's ranges and a seed to a scenario -----------------
-# What harder worlds draw beyond that of `sim` comes in groups, each from a random stream of its
-# own, so that no other value of a seed moves.
 
 
 _STREAM, _GROUPS_STREAM, _IMU_STREAM = 1, 21, 22  # the scenario's own random streams
-_AIR, _CELL, _TILT, _RADIO, _CAPTURE = 0, 1, 2, 6, 7
+_DRAWN = ("ceiling_z_m", "mass_kg", "battery_rest_v", "camera_latency_s", "camera_noise_sigma")
+"""Keys that each seed draws from their range, in this order."""
 _AS_GIVEN = (
     "camera_rate_hz",
     "camera_jitter_s",
@@ -161,7 +138,6 @@ _AS_GIVEN = (
     "camera_flicker",
     "camera_pumping",
     "camera_receiver_hz",
-    "camera_blank_rate",
     "estimate_noise_m",
     "magnet_force_n",
     "no_target",
@@ -182,13 +158,9 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     def between(key: str) -> float:
         return float(rng.uniform(*getattr(sim, key)))
 
-    offset = rng.uniform(-sim.start_offset_m, sim.start_offset_m, size=2)
+    x_m, y_m = rng.uniform(-sim.start_offset_m, sim.start_offset_m, size=2).tolist()
     yaw_rad = math.radians(between("target_yaw_deg"))
-    ceiling_z_m = between("ceiling_z_m")
-    mass_kg = between("mass_kg")
-    battery_v = between("battery_rest_v")
-    latency_s = between("camera_latency_s")
-    noise_sigma = between("camera_noise_sigma")
+    drawn: dict[str, Any] = {key: between(key) for key in _DRAWN}
     burst_s, frames = between("camera_burst_start_s"), sim.camera_burst_frames or (0, 0)
     if frames[0] == frames[1]:
         rng.integers(2)  # numpy draws none of one number, and what comes later must stay
@@ -207,24 +179,20 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         extra["external_position"] = 1.0  # and no deck
     return Scenario(
         seed=seed,
-        mass_kg=mass_kg,
-        battery_rest_v=battery_v,
-        ceiling_z_m=ceiling_z_m,
-        target_xy_m=(float(offset[0]), float(offset[1])),
+        target_xy_m=(x_m, y_m),
         target_yaw_rad=yaw_rad,
         large_side_m=profile.target.large.side_m,
         small_side_m=profile.target.small.side_m,
         gear_body_m=profile.vehicle.gear_body_m,
         T_body_cam_true=tuple(tuple(float(v) for v in row) for row in T_body_cam),
-        camera_latency_s=latency_s,
         camera_burst=None if sim.camera_burst_frames is None else burst,
-        camera_noise_sigma=noise_sigma,
         camera_mirrored=profile.camera.mirrored,
         estimate_tilt_bias_rad=(bias_x, bias_y),
         drift_mps=(drift_x, drift_y, drift_z),
         draught_mps=(wind_mps * math.cos(wind_angle), wind_mps * math.sin(wind_angle), 0.0),
-        first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
+        first_contact_force_n=weak_part * drawn["mass_kg"] * 9.81 if fails else None,
         **_imu_errors(sim, seed),
+        **drawn,
         **{name: getattr(sim, name) for name in _AS_GIVEN},
         extra=extra,
         neighbours=tuple(
@@ -258,8 +226,7 @@ def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
 def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
     """Return what harder worlds draw; where the ranges are those of `sim`, its defaults."""
     air, cell, tilt, radio, capture = (
-        np.random.default_rng([seed, _GROUPS_STREAM, group])
-        for group in (_AIR, _CELL, _TILT, _RADIO, _CAPTURE)
+        np.random.default_rng([seed, _GROUPS_STREAM, group]) for group in (0, 1, 2, 6, 7)
     )
     ohm = sim.cell_resistance_ohm
     return {
@@ -332,38 +299,3 @@ class Bursts:
             mean_s = self._bad_s if self._bad else self._good_s
             self._until_s += float(self._rng.exponential(mean_s))
         return self._bad
-
-
-# --- What the scenario did, said with the event that it led to --------
-# A newcomer who sees the target lost should not look for the fault in the program.
-
-
-LOSSES = ("estimate-lost", "align-lost", "ascend-lost", "camera-gone")
-"""Rows of the mission's table that lost pictures lead to."""
-FELT_FOR_S = 1.2
-"""After the last lost frame: a second of no track, and the latency of the next picture."""
-
-
-class EventExplainer:
-    """Explains the events of one flight that lost frames or a weak first contact led to; call it
-    with each of them, in order."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
-        self._slips = 0
-
-    def __call__(self, event: Event, t_s: float) -> str:
-        """Return what the scenario did, in a few words, or the empty string. `t_s` is the event's
-        time in the simulation."""
-        scenario, force_n = self._scenario, self._scenario.first_contact_force_n
-        held = event.reason if event.kind is EventKind.HOLD else ""
-        if event.row in LOSSES or held.startswith("no picture"):
-            start_s, frames = scenario.camera_burst or (math.inf, 0)
-            if 0.0 <= t_s - start_s <= frames / scenario.camera_rate_hz + FELT_FOR_S:
-                return f"{frames} frames lost"
-        if event.row == "slipped" and force_n is not None:
-            self._slips += 1
-            if self._slips == 1:
-                part = force_n / (scenario.mass_kg * GRAVITY_MPS2)
-                return f"the first contact holds {100 * part:.0f} % of the weight"
-        return ""

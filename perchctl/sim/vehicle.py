@@ -17,6 +17,8 @@ from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.world import Vector, World
 from perchctl.vision import CameraModel
 
+_PAST = 128  # control periods: longer than any exposure with its read-out
+
 
 class SimulatedVehicle:
     """One simulated Crazyflie. Without a camera model it has no camera, without a capture's
@@ -33,17 +35,12 @@ class SimulatedVehicle:
         self.world = World(scenario)
         self.firmware = Firmware(self.world, scenario)
         self.camera: SimCamera | None = None
-        exposed_s = 0.0
         if camera is not None:
-            renderer = Renderer(scenario, camera, target or TargetConfig(), scenario.seed)
+            renderer = Renderer(scenario, camera, target or TargetConfig())
             self.camera = SimCamera(scenario, renderer)
-            exposed_s = self.camera.exposed_s
         self.capture = None if capture is None else SimCapture(capture)
         self.watched = True  # somebody takes the camera's pictures; no others are made
-        # The past that an exposure may need.
-        self._past: deque[tuple[Vector, tuple[float, float, float, float]]] = deque(
-            maxlen=int(exposed_s / CONTROL_PERIOD_S) + 8
-        )
+        self._past: deque[tuple[Vector, tuple[float, float, float, float]]] = deque(maxlen=_PAST)
 
     @property
     def t_s(self) -> float:

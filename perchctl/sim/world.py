@@ -7,17 +7,14 @@ Assumptions of the model, each with its source:
 
 - Motors, their battery, and the curve between a motor's voltage and its thrust:
   `perchctl.sim.powertrain`.
-- Drag is linear in the airspeed. Of a Crazyflie's four rotors 9.2e-7 N/(m/s) level and
-  10.3e-7 vertically a rad/s of their summed speed have been identified (Foerster, ETH
-  Zurich, 2015); lifting 42 g they turn at 7600 rad/s together (2.9e-8 N/(rad/s)^2
-  each), which makes 0.007 and 0.008. The camera, its board and the gear are some
-  10 cm^2 of bluff body (c_d 1.2): 0.0015 more at 1 m/s. The rounded sums are `DRAG_*`.
+- Drag is linear in the airspeed: of four rotors that lift 42 g 0.007 N/(m/s) level and
+  0.008 vertically (identified by Foerster, ETH Zurich, 2015), of camera, board and gear,
+  10 cm^2 of bluff body, 0.0015 more.
 - A draught is a wind whose speed steady part and smooth gusts reach together, at two
   standard deviations of the gusts (`Wind`).
 - Near the ceiling the rotors pull themselves towards it, `Scenario.ceiling_suction` of their
-  thrust at the ceiling itself. With 0.1 it is within 0.6 per cent of the thrust what momentum
-  theory with a ceiling gives, and benches with rotors of this size (23 mm) measured (Hsiao and
-  Chirarattananon, arXiv 1905.04632), for gears of 3 cm and more: 2 per cent in contact.
+  thrust at the ceiling itself; with 0.1 as measured by benches with rotors of this size
+  (Hsiao and Chirarattananon, arXiv 1905.04632).
 - The magnet: `Magnet`. The gear's tip is a flat disc, so a held vehicle
   hangs level and friction keeps the tip in its place.
 """
@@ -37,8 +34,8 @@ os.environ.setdefault("MUJOCO_GL", "disable")
 
 import mujoco
 
-from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_quaternion, rotation_from_rpy
-from perchctl.sim.powertrain import CellKind, Powertrain
+from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_rpy
+from perchctl.sim.powertrain import Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 ARM_M = 0.046  # hub to motor axis, X configuration
@@ -47,14 +44,10 @@ DRAG_LEVEL_NSPM = 0.009
 DRAG_VERTICAL_NSPM = 0.009
 SUCTION_LENGTH_M = 0.02
 _SQRT_HALF = math.sqrt(0.5)
-_HAND_STEP_S = 1e-4
 _WIND_EVERY = 10  # the wind is evaluated every 20 ms
 
 
 Vector = tuple[float, float, float]
-Way = Callable[[Vector, Array, float], tuple[Array, Array]]
-"""Place (3,) and R_world_body (3, 3) of a vehicle in a hand, given those at which it was taken
-and the time since."""
 
 
 class World:
@@ -71,20 +64,17 @@ class World:
         self._data = mujoco.MjData(self._model)
         self._qpos, self._qvel = self._data.qpos, self._data.qvel
         self._floor, self._ceiling = (self._model.geom(n).id for n in ("floor", "ceiling"))
-        # Farther than this below the ceiling the gear cannot touch it.
-        self._reach_m = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + MAGNET_RANGE_M
         self._suction = scenario.ceiling_suction
         self._steps = 0
-        self.powertrain = Powertrain(scenario.battery_rest_v, CellKind.of(scenario))
+        self.powertrain = Powertrain(scenario)
         self._wind_mps = (0.0, 0.0, 0.0)
         self._wind = Wind(scenario)
-        self._held = False
-        self._carried: tuple[float, tuple[Vector, Array], Way] | None = None
+        self._hand: Callable[[World], None] | None = None
         self.magnet = Magnet(scenario)
         self.external_force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
         mujoco.mj_forward(self._model, self._data)
         self._read()
-        self._set_specific_force(0.0, 0.0, 0.0)
+        self.feel(0.0, 0.0, 0.0)
 
     @property
     def t_s(self) -> float:
@@ -103,7 +93,7 @@ class World:
     @property
     def battery_v(self) -> float:
         """The battery's voltage under the load of now."""
-        return self.powertrain.battery_v
+        return self.powertrain.cell.battery_v
 
     @property
     def battery_rest_v(self) -> float:
@@ -111,14 +101,14 @@ class World:
 
     @battery_rest_v.setter
     def battery_rest_v(self, rest_v: float) -> None:
-        self.powertrain.cell.rest_v = rest_v
+        self.powertrain.cell.set_rest_v(rest_v)
 
     def step(self, pwm: tuple[float, float, float, float]) -> None:
         """Advance by `CONTROL_PERIOD_S` under four duty cycles 0..65535."""
         self._steps += 1
         f1, f2, f3, f4 = self.powertrain.step(pwm)
-        if self._held:
-            self._follow_hand()
+        if self._hand is not None:
+            self._hand(self)
             return
         if self._steps % _WIND_EVERY == 1:
             self._wind_mps = self._wind.at(self.t_s)
@@ -132,17 +122,13 @@ class World:
         torque_x = arm * (f3 + f4 - f1 - f2)
         torque_y = arm * (f2 + f3 - f1 - f4)
         torque_z = YAW_TORQUE_M * (f2 + f4 - f1 - f3)
-        r02, r12, r22 = self._up
-        r20, r21 = self._down_row
+        (_, _, r02), (_, _, r12), (r20, r21, r22) = self._R
         wind = self._wind_mps
         push = self.external_force_n
         force_x = thrust_n * r02 - DRAG_LEVEL_NSPM * (self.vx_mps - wind[0]) + push[0]
         force_y = thrust_n * r12 - DRAG_LEVEL_NSPM * (self.vy_mps - wind[1]) + push[1]
         force_z = thrust_n * r22 - DRAG_VERTICAL_NSPM * (self.vz_mps - wind[2]) + push[2]
-        if height_m < self._reach_m:
-            pull_n = self.magnet.pull_n(self.gear_tip_m(), upright=r22 > 0.0)
-        else:
-            pull_n = self.magnet.out_of_reach()
+        pull_n = self.magnet.pull_n(self.gear_tip_m(), upright=r22 > 0.0)
         if pull_n > 0.0:
             force_z += pull_n
             gx, gy, gz = self._scenario.gear_body_m
@@ -154,21 +140,14 @@ class World:
         mujoco.mj_step(self._model, self._data)
         self._read()
         rate = 1.0 / CONTROL_PERIOD_S
-        self._set_specific_force(
-            (self.vx_mps - vx) * rate, (self.vy_mps - vy) * rate, (self.vz_mps - vz) * rate
-        )
+        self.feel((self.vx_mps - vx) * rate, (self.vy_mps - vy) * rate, (self.vz_mps - vz) * rate)
 
     def gear_tip_m(self) -> tuple[float, float, float]:
         """Return the gear's tip in world axes."""
-        w, x, y, z = self.quaternion
         gx, gy, gz = self._scenario.gear_body_m
-        r02, r12, r22 = self._up
-        r20, r21 = self._down_row
-        return (
-            self.x_m + (1 - 2 * (y * y + z * z)) * gx + 2 * (x * y - w * z) * gy + r02 * gz,
-            self.y_m + 2 * (x * y + w * z) * gx + (1 - 2 * (x * x + z * z)) * gy + r12 * gz,
-            self.z_m + r20 * gx + r21 * gy + r22 * gz,
-        )
+        rows = zip((self.x_m, self.y_m, self.z_m), self._R, strict=True)
+        x, y, z = (place + a * gx + b * gy + c * gz for place, (a, b, c) in rows)
+        return x, y, z
 
     def gear_miss_m(self) -> float:
         """Return the horizontal distance of the gear's tip from the target's centre."""
@@ -186,42 +165,30 @@ class World:
     ) -> None:
         """Put the vehicle somewhere, not turning; `hold` pins it there until `let_go`.
 
-        No gyroscope measures it (see `perchctl.sim.firmware.estimator`), unlike `move_by_hand`.
+        No gyroscope measures it (see `perchctl.sim.firmware.estimator`).
         """
-        self._held, self._carried = hold, None
-        self._place(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
+        self._hand = World._stay if hold else None
+        self.place(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
 
-    def move_by_hand(self, way: Way) -> None:
-        """Let a hand take the vehicle from where it is along a way, until `let_go`. Its sensors
-        feel all of it."""
-        start = (self.x_m, self.y_m, self.z_m), rotation_from_quaternion(self.quaternion)
-        self._carried = (self.t_s, start, way)
-        self._held = True
+    def carry(self, hand: Callable[[World], None]) -> None:
+        """Let a hand `place` the vehicle, and let it `feel`, each period until `let_go`."""
+        self._hand = hand
 
     def let_go(self) -> None:
-        """End what `set_pose(..., hold=True)` or `move_by_hand` began."""
-        self._held, self._carried = False, None
+        """End what `set_pose(..., hold=True)` or `carry` began."""
+        self._hand = None
 
-    def _follow_hand(self) -> None:
-        if self._carried is None:
-            self._set_specific_force(0.0, 0.0, 0.0)
-            return
-        began_s, start, way = self._carried
-        t_s, dt_s = self.t_s - began_s, _HAND_STEP_S
-        before, here, after = (way(*start, t_s + k * dt_s) for k in (-1, 0, 1))
-        turn = before[1].T @ after[1]  # so small a turn is its own vector
-        rates = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / (2.0 * dt_s)
-        self._place(here[0], here[1], (after[0] - before[0]) / (2.0 * dt_s), rates)
-        acceleration_mps2 = (after[0] - 2.0 * here[0] + before[0]) / dt_s**2
-        self._set_specific_force(*acceleration_mps2.tolist())
+    def _stay(self) -> None:
+        self.feel(0.0, 0.0, 0.0)
 
-    def _place(
+    def place(
         self,
         position_m: Sequence[float] | Array,
         R: Array,
         velocity_mps: Sequence[float] | Array,
         rates_radps: Sequence[float] | Array,
     ) -> None:
+        """Set the state: position, R_world_body (3, 3), velocity and turning rates."""
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, R.ravel())
         self._data.qpos[:3] = position_m
@@ -237,21 +204,18 @@ class World:
             self._qvel.tolist()
         )
         self.quaternion = (w, x, y, z)
-        self._up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-        self._down_row = (2 * (x * z - w * y), 2 * (y * z + w * x))
+        self._R = (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        )
 
-    def _set_specific_force(self, ax: float, ay: float, az: float) -> None:
-        w, x, y, z = self.quaternion
+    def feel(self, ax: float, ay: float, az: float) -> None:
+        """Let the accelerometer read what belongs to an acceleration in world axes, m/s^2."""
         az += GRAVITY_MPS2
-        r20, r21 = self._down_row
-        r02, r12, r22 = self._up
-        self.fx_mps2 = (1 - 2 * (y * y + z * z)) * ax + 2 * (x * y + w * z) * ay + r20 * az
-        self.fy_mps2 = 2 * (x * y - w * z) * ax + (1 - 2 * (x * x + z * z)) * ay + r21 * az
-        self.fz_mps2 = r02 * ax + r12 * ay + r22 * az
-
-    def on_floor(self) -> bool:
-        """True if the vehicle touches the floor."""
-        return self.contacts()[1]
+        self.fx_mps2, self.fy_mps2, self.fz_mps2 = (
+            a * ax + b * ay + c * az for a, b, c in zip(*self._R, strict=True)
+        )
 
     def contacts(self) -> tuple[float, bool]:
         """Return the push between vehicle and ceiling, N, and whether the floor is touched."""
@@ -268,9 +232,7 @@ class World:
 # --- The rigid bodies as a MuJoCo model: floor, ceiling, and the vehicle with its gear ---
 
 
-FRAME_HALF_M = (0.035, 0.035, 0.012)
-REST_HEIGHT_M = FRAME_HALF_M[2]
-GEAR_RADIUS_M = 0.006
+REST_HEIGHT_M = 0.012
 # Crazyflie 2.1 at 27 g; scaled by mass.
 INERTIA_REFERENCE_KG = 0.027
 INERTIA_REFERENCE_KGM2 = (1.66e-5, 1.67e-5, 2.93e-5)
@@ -282,12 +244,13 @@ _MODEL = """
     condim="4"/></default>
   <worldbody>
     <geom name="floor" type="plane" size="30 30 1"/>
-    <geom name="ceiling" type="plane" size="30 30 1" pos="0 0 {ceiling}" quat="0 1 0 0"/>
+    <geom name="ceiling" type="plane" size="30 30 1" pos="0 0 {room.ceiling_z_m}" quat="0 1 0 0"/>
     <body name="vehicle" pos="0 0 {rest}">
       <freejoint/>
-      <inertial pos="0 0 0" mass="{mass}" diaginertia="{inertia}"/>
-      <geom name="frame" type="box" size="{frame}"/>
-      <geom name="gear" type="cylinder" size="{radius} 0.002" pos="{gear}"/>
+      <inertial pos="0 0 0" mass="{room.mass_kg}" diaginertia="{inertia}"/>
+      <geom name="frame" type="box" size="0.035 0.035 {rest}"/>
+      <geom name="gear" type="cylinder" size="0.006 0.002"
+        pos="{room.gear_body_m[0]} {room.gear_body_m[1]} {gear_z}"/>
     </body>
   </worldbody>
 </mujoco>
@@ -299,20 +262,15 @@ def build_model(scenario: Scenario) -> Any:
 
     The inertia is the Crazyflie 2.1's, scaled by mass; the gear's cylinder ends at its tip.
     """
-    mass = scenario.mass_kg
-    scale = mass / INERTIA_REFERENCE_KG
-    gear = scenario.gear_body_m
+    scale = scenario.mass_kg / INERTIA_REFERENCE_KG
     return mujoco.MjModel.from_xml_string(
         _MODEL.format(
+            room=scenario,
             dt=CONTROL_PERIOD_S,
             g=GRAVITY_MPS2,
-            ceiling=scenario.ceiling_z_m,
             rest=REST_HEIGHT_M,
-            mass=mass,
             inertia=" ".join(repr(i * scale) for i in INERTIA_REFERENCE_KGM2),
-            frame=" ".join(map(repr, FRAME_HALF_M)),
-            radius=GEAR_RADIUS_M,
-            gear=f"{gear[0]!r} {gear[1]!r} {gear[2] - 0.002!r}",
+            gear_z=scenario.gear_body_m[2] - 0.002,
         )
     )
 
@@ -346,7 +304,8 @@ class Magnet:
         target_x, target_y = self.target_xy_m
         miss_m = math.hypot(tip_m[0] - target_x, tip_m[1] - target_y)
         if scenario.no_target or not upright or gap_m >= MAGNET_RANGE_M or miss_m > MAGNET_RADIUS_M:
-            return self.out_of_reach()
+            self._note(MAGNET_RANGE_M)
+            return 0.0
         self._note(gap_m)
         return 0.0 if self.let_go else self.hold_n * (1.0 - gap_m / MAGNET_RANGE_M) ** 2
 
@@ -357,11 +316,6 @@ class Magnet:
         if scenario.first_contact_force_n is not None and not self._came_off:
             return scenario.first_contact_force_n
         return scenario.magnet_force_n
-
-    def out_of_reach(self) -> float:
-        """Note that the tip is out of reach; return no pull."""
-        self._note(MAGNET_RANGE_M)
-        return 0.0
 
     def _note(self, gap_m: float) -> None:
         if gap_m < MAGNET_TOUCH_M:

@@ -24,7 +24,7 @@ from perchctl.flight.session import require_comparison
 from perchctl.profile import Profile
 from perchctl.sim import CaptureFault, CaptureSettings, SimProcess, draw_scenario
 from tests.helpers.capture import SWAPPED_XY, Y_UP
-from tests.helpers.carried import Stop, Stops, lifted_and_turned
+from tests.helpers.carried import Hand, Stop, Stops, lifted_and_turned
 from tests.helpers.checks import QUICK, options, wait_for
 from tests.helpers.flights import short_profile
 
@@ -74,7 +74,7 @@ class Lab:
 
         def tell(text: str) -> None:
             if HOW_TO_TURN in text:
-                self.sim.move_by_hand(lifted_and_turned(HOME))
+                self.sim.carry(Hand(lifted_and_turned(HOME)))
 
         self._put_down()
         quick = CheckScope(**QUICK)
@@ -84,7 +84,7 @@ class Lab:
 
     def _put_down(self) -> None:
         """By a hand, too: what is put somewhere else no gyroscope follows."""
-        self.sim.move_by_hand(Stops((Stop(0.5, HOME),)))
+        self.sim.carry(Hand(Stops((Stop(0.5, HOME),))))
         end_s = time.monotonic() + 20.0
         while math.dist(self.sim.truth()["position_m"], HOME) > 1e-3:
             assert time.monotonic() < end_s
@@ -132,11 +132,11 @@ def test_what_is_set_up_wrong_is_named_and_not_flown_by(
 ) -> None:
     it = lab(sim, body=body)
     if fault is not None:
-        sim.capture_fault(fault)
+        sim.lay(fault)
     try:
         rows = it.lift(within_s, Verdict.FAIL)
     finally:
-        sim.capture_fault(None)
+        sim.heal()
     assert rows[LIFTED].verdict is Verdict.FAIL, rows[LIFTED]
     assert re.search(words, rows[LIFTED].found)
     with pytest.raises(SafetyAbort, match="compared by hand on"):

@@ -19,7 +19,6 @@ from perchctl.check.vehicle import VEHICLE, Vehicle, look, moved_m
 from perchctl.link import ProbeLink
 from perchctl.profile import LinkConfig, Profile
 from perchctl.sim import Scenario, SimProcess
-from perchctl.sim.crtp import LinkOptions
 from perchctl.vehicle import (
     CAN_FLY,
     CRASHED,
@@ -47,7 +46,7 @@ BAD = Scenario(
     estimate_tilt_bias_rad=(0.0, 0.35),
     extra={"external_position": 1.0},  # no deck; and nobody sends positions
 )
-OLD = LinkOptions(protocol_version=11, missing_log_variables=("acc.z",))
+OLD = {"protocol_version": 11, "missing_log_variables": ("acc.z",)}
 
 
 def rows_of(vehicle: Vehicle, profile: Profile = PROFILE) -> dict[str, Row]:
@@ -81,7 +80,7 @@ def vehicles(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, dic
             sim.replace_vehicle(BAD)
             sim.set_pose((0.0, 0.0, 0.6), hold=True)
             found["bad"] = looked_at(sim)
-        with SimProcess.start(link=OLD) as sim:
+        with SimProcess.start(**OLD) as sim:
             found["old"] = looked_at(sim)
         yield found
 

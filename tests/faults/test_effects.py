@@ -35,9 +35,9 @@ from perchctl.link.telemetry import BLOCKS_DELETED_AFTER_S
 from perchctl.mission import Phase, PlannerState
 from perchctl.profile import TargetConfig
 from perchctl.sim import CaptureSettings, Scenario
-from perchctl.sim.firmware.controller import Setpoint
 from perchctl.vehicle import EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from perchctl.vision import Frame
+from tests.helpers.firmware_rig import raw_thrust
 
 CAMERA = load_calibration("example_640x480.yaml")
 SCENARIO = Scenario(seed=2, camera_rate_hz=0.01, target_xy_m=(0.1, 0.2))
@@ -378,7 +378,7 @@ def test_a_vehicle_that_starts_again_stops_its_motors_and_time_goes_on() -> None
     firmware = rig.vehicle.firmware
     rig.wait(0.1)
     for thrust in (0, 30000, 30000):
-        firmware.low_level(Setpoint.raw(0.0, 0.0, 0.0, thrust))
+        firmware.low_level(raw_thrust(thrust))
         rig.wait(0.3)
     assert max(firmware.motors) > 0.0
     rig.begin()

@@ -226,7 +226,7 @@ def test_ctrl_c_twice_cuts_the_motors(phase: Phase) -> None:
     assert report.locked  # which is said, though no telemetry has told it yet
 
 
-# --- Receivers that repeat, add noise, and blank --------------------------------------------------
+# --- Receivers that repeat ------------------------------------------------------------------------
 
 
 PAL = {"camera_rate_hz": 25.0}
@@ -237,7 +237,6 @@ PAL = {"camera_rate_hz": 25.0}
     PAL | {"camera_receiver_hz": 60.0},
     PAL | {"camera_receiver_hz": 30.0},
     PAL | {"camera_receiver_hz": 60.0, "camera_fields": "top"},
-    {"camera_blank_rate": 0.2},
 ])  # fmt: skip
 def test_it_perches_and_is_never_held(scenario: dict[str, Any]) -> None:
     flown = fly_short(**scenario)

@@ -25,7 +25,6 @@ from perchctl.mission import Phase
 from perchctl.profile import CameraConfig, Profile
 from perchctl.sim import SimulatedVehicle, draw_scenario
 from perchctl.sim.host import VehicleHost
-from perchctl.sim.process import HostSetup
 from tests.helpers.flights import SEED, fly_short, short_profile
 
 Pictures = list[NDArray[np.uint8]]
@@ -62,12 +61,9 @@ def faulty(profile: Profile) -> Pictures:
 
 def published(profile: Profile) -> Pictures:
     """By the simulated vehicle's process, on its way to the stream."""
-    setup = HostSetup(
-        scenario=draw_scenario(profile, SEED), camera=profile_camera(profile.camera),
-        target=profile.target,
-    )  # fmt: skip
+    scenario, camera = draw_scenario(profile, SEED), profile_camera(profile.camera)
     out: Pictures = []
-    with contextlib.closing(VehicleHost(setup)) as host:
+    with contextlib.closing(VehicleHost(scenario, camera, profile.target)) as host:
         assert host.stream is not None
         host.stream.publish = out.append  # type: ignore[method-assign]
         host.advance(LOOKED_S)

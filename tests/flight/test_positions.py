@@ -114,12 +114,12 @@ def test_the_estimate_is_the_capture_s_and_follows_it(sim: SimProcess) -> None:
         assert newest.yaw_rad == pytest.approx(truth["rpy_rad"][2] + 2.0, abs=math.radians(5.0))
         until(lambda: status(time.monotonic()).rate_hz > 60.0)
 
-        sim.capture_fault(CaptureFault(occluded=True))
+        sim.lay(CaptureFault(occluded=True))
         until(lambda: "does not see the rigid body" in (status(time.monotonic()).problem or ""))
         sent = status(time.monotonic()).sent
         until(lambda: status(time.monotonic()).age_s > 0.3)
         assert status(time.monotonic()).sent == sent
-        sim.capture_fault(None)
+        sim.heal()
         until(lambda: status(time.monotonic()).problem is None)
         assert status(time.monotonic()).sent > sent
 
@@ -141,7 +141,7 @@ def test_what_is_no_position_is_named_on_the_ground(
     words: str,
 ) -> None:
     if fault is not None:
-        sim.capture_fault(fault)
+        sim.lay(fault)
     config = config.model_copy(update={"connect_timeout_s": 3.0})
     with pytest.raises(kind, match=words), fed(sim, config):
         pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,8 +12,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.flight.clock import SIM_PATIENCE_S, SimulatedClock
 from perchctl.sim import CONTROL_PERIOD_S, SharedTime
-from perchctl.sim.host import Runner
-from perchctl.sim.process import LOOP_PATIENCE_S
+from perchctl.sim.host import LOOP_PATIENCE_S, Runner
 
 CLOCK_MARGIN_S = SharedTime.MARGIN_S
 PERIOD_S = 0.02
@@ -36,9 +36,9 @@ class Rig:
 
     def __init__(self) -> None:
         self.wall_s = 100.0
-        self.host, self.shared, self.runs = Host(), SharedTime.free(), True
+        self.host, self.shared, self.runs = Host(), SharedTime(0.0, math.inf), True
         self.runner = Runner(
-            self.host, None, realtime=True, linger_s=0.0, clock=lambda: self.wall_s,
+            self.host, self.host, realtime=True, clock=lambda: self.wall_s,
             shared=self.shared,
         )  # type: ignore[arg-type] # fmt: skip
         self.clock = SimulatedClock(self.shared, CLOCK_MARGIN_S, lambda: self.wall_s, self.let_pass)

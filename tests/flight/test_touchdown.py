@@ -61,7 +61,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, float, Touchdo
         for _ in range(10):
             t_s += 0.002
             link.advance_to(t_s)
-            if dropped_s < t_s < hit_s and vehicle.world.on_floor():
+            if dropped_s < t_s < hit_s and vehicle.world.contacts()[1]:
                 hit_s, speed_mps = t_s, sink_mps
             sink_mps = -vehicle.world.vz_mps
         for sample in link.telemetry():

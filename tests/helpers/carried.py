@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from perchctl.geometry import Array, rotation_from_rpy, rpy_from_rotation
+from perchctl.geometry import (
+    Array,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+    rpy_from_rotation,
+)
 
 Place = tuple[float, float, float]
 
@@ -23,7 +28,8 @@ class Stop(NamedTuple):
 
 @dataclass(frozen=True)
 class Stops:
-    """The way of a hand through all stops (`perchctl.sim.world.Way`); at the last it is held."""
+    """The way of a hand through all stops: its place and R_world_body by those at which it took the
+    vehicle and the time since; at the last it is held."""
 
     stops: tuple[Stop, ...]
 
@@ -38,6 +44,27 @@ class Stops:
                 return a + share * (c - a), rotation_from_rpy(*(b + share * (d - b)).tolist())
             a, b, t_s = c, d, t_s - after_s
         return a, rotation_from_rpy(*b.tolist())
+
+
+class Hand:
+    """Moves the vehicle of a `perchctl.sim.world.World` from where it is along a way; the sensors
+    feel all of it."""
+
+    def __init__(self, way: Stops) -> None:
+        self._way = way
+        self._start: tuple[float, Place, Array] | None = None
+
+    def __call__(self, world: Any) -> None:
+        if self._start is None:
+            place_m = world.x_m, world.y_m, world.z_m
+            self._start = world.t_s, place_m, rotation_from_quaternion(world.quaternion)
+        began_s, *start = self._start
+        t_s, dt_s = world.t_s - began_s, 1e-4
+        before, here, after = (self._way(*start, t_s + k * dt_s) for k in (-1, 0, 1))
+        turn = before[1].T @ after[1]  # so small a turn is its own vector
+        rates = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / (2.0 * dt_s)
+        world.place(*here, (after[0] - before[0]) / (2.0 * dt_s), rates)
+        world.feel(*((after[0] - 2.0 * here[0] + before[0]) / dt_s**2).tolist())
 
 
 def lifted_and_turned(home: Place, yaw_rad: float = 0.0) -> Stops:

@@ -12,7 +12,6 @@ import struct
 import threading
 import urllib.request
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import cflib.crtp
@@ -23,11 +22,8 @@ from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.log import LogConfig
 from cflib.crtp.crtpstack import CRTPPacket
 
-import perchctl
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim import Scenario, SimProcess
-
-ROOT = str(Path(perchctl.__file__).resolve().parents[1])
 
 WAIT_S = 10.0
 CONNECTED_S = 60.0  # all tables, where a busy machine gives it a tenth of a core

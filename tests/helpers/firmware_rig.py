@@ -7,12 +7,22 @@ from typing import Any
 
 from perchctl.sim import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.firmware import Firmware
-from perchctl.sim.firmware.controller import Setpoint
-from perchctl.sim.firmware.planner import HlTakeoff
+from perchctl.sim.firmware.controller import MODE_POSITION, MODE_RAW, Setpoint
+from perchctl.sim.firmware.planner import Planner
 from perchctl.sim.world import World
 
 STREAM_PERIOD_S = 0.02
 PERFECT = {"estimate_noise_m": 0.0}
+
+
+def at_height(z_m: float) -> Setpoint:
+    """That of `send_position_setpoint(0, 0, z_m, 0)`."""
+    return Setpoint(MODE_POSITION, z_m=z_m)
+
+
+def raw_thrust(thrust: float) -> Setpoint:
+    """That of `send_setpoint(0, 0, 0, thrust)`."""
+    return Setpoint(MODE_RAW, thrust=float(thrust))
 
 
 @dataclass
@@ -48,11 +58,11 @@ class Rig:
         return max(self.firmware.motors) == 0.0
 
     def take_off(self, height_m: float = 0.8, settle_s: float = 2.5) -> None:
-        self.firmware.high_level(HlTakeoff(height_m, 2.5))
+        self.firmware.high_level(Planner.take_off, height_m, 2.5, None)
         self.run(2.5 + settle_s)
 
     def hold(self, seconds: float = 2.0, z_m: float = 0.8) -> None:
-        self.run(seconds, Setpoint.position(0.0, 0.0, z_m, 0.0))
+        self.run(seconds, at_height(z_m))
 
 
 def make_rig(*, booted: bool = True, **conditions: Any) -> Rig:

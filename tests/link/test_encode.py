@@ -26,8 +26,8 @@ from perchctl.link.crtp import ARM, LAND_TIMES, MAX_DATA, UNLOCK_THRUST, UNLOCK_
 from perchctl.link.firmware import EXTERNAL_POSITION_TICK
 from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.sim.crtp import execute
-from perchctl.sim.firmware.controller import Setpoint
-from perchctl.sim.firmware.planner import HlLand
+from perchctl.sim.firmware.controller import MODE_POSITION, MODE_RAW, Setpoint
+from perchctl.sim.firmware.planner import Planner
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -168,12 +168,12 @@ def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None
 @pytest.mark.parametrize(("command", "calls"), [
     (Idle(), []),
     (PositionSetpoint(0.25, -0.5, 1.5, math.pi / 2),
-     [("low_level", (Setpoint.position(0.25, -0.5, 1.5, 90.0),))]),
+     [("low_level", (Setpoint(MODE_POSITION, 0.25, -0.5, 1.5, yaw_deg=90.0),))]),
     (PositionSetpoint(math.nan, 0.0, 1.0, 0.0), []),
-    (RawThrust(40000), [("low_level", (Setpoint.raw(0.0, 0.0, 0.0, 40000),))]),
+    (RawThrust(40000), [("low_level", (Setpoint(MODE_RAW, thrust=40000.0),))]),
     (RawThrust(40000, math.pi / 8.0, -math.pi / 4.0),
-     [("low_level", (Setpoint.raw(22.5, -45.0, 0.0, 40000),))]),
-    (Land(-0.25, 3.0), [*[("high_level", (HlLand(-0.25, 3.0, None),))] * LAND_TIMES,
+     [("low_level", (Setpoint(MODE_RAW, roll_deg=22.5, pitch_deg=45.0, thrust=40000.0),))]),
+    (Land(-0.25, 3.0), [*[("high_level", (Planner.land, -0.25, 3.0, None))] * LAND_TIMES,
                         ("notify_setpoint_stop", ())]),
     (EmergencyStop(), [("emergency_stop", ())]),
 ])  # fmt: skip

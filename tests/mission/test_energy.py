@@ -25,7 +25,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.state import EnergyState
 from perchctl.profile import Profile
 from perchctl.sim import CONTROL_PERIOD_S
-from perchctl.sim.powertrain import Cell, CellKind
+from perchctl.sim.powertrain import Cell
 from perchctl.vehicle import FULL_THRUST
 from tests.helpers.mission import (
     FINE_BATTERY,
@@ -51,10 +51,10 @@ class Moment:
 
 
 def hovering(
-    rest_v: float, kind: CellKind, most_s: float = 120.0, hover: float = HOVER
+    rest_v: float, kind: dict[str, float], most_s: float = 120.0, hover: float = HOVER
 ) -> Iterator[Moment]:
     """On the ground for 1 s, then hovering, with a press of a second every 8 s."""
-    cell, energy, reading_v = Cell(rest_v, kind), EnergyState(), rest_v
+    cell, energy, reading_v = Cell(rest_v, **kind), EnergyState(), rest_v
     for i in range(round(most_s / PERIOD_S)):
         t_s = PERIOD_S * i
         load = 0.0 if t_s < 1.0 else 1.0 if t_s % 8.0 > 7.0 else hover
@@ -68,10 +68,10 @@ def hovering(
 
 
 WEAK = {
-    "low": (3.87, CellKind()),
-    "early knee": (3.9, CellKind(knee=0.14)),
-    "high resistance": (4.1, CellKind(resistance_ohm=0.19, slow_ohm=0.02)),
-    "old": (4.0, CellKind(resistance_ohm=0.165, charge=0.5, slow_ohm=0.02)),
+    "low": (3.87, {}),
+    "early knee": (3.9, {"knee": 0.14}),
+    "high resistance": (4.1, {"ohm": 0.19, "slow_ohm": 0.02}),
+    "old": (4.0, {"ohm": 0.165, "charge": 0.5, "slow_ohm": 0.02}),
 }
 
 
@@ -98,7 +98,7 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
 
 @pytest.mark.parametrize("ohm", [0.12, 0.143, 0.2])
 def test_the_sag_is_found_within_seconds(ohm: float) -> None:
-    *_, last = hovering(4.1, CellKind(resistance_ohm=ohm), 5.0)
+    *_, last = hovering(4.1, {"ohm": ohm}, 5.0)
     assert fit_battery(last.energy)[0] == pytest.approx(4.4 * ohm, rel=0.05)
 
 

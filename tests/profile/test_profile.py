@@ -301,8 +301,9 @@ def keys_of(model: type[BaseModel], name: str = "profile") -> Iterator[tuple[str
 @cache
 def attributes_read() -> set[tuple[str, str]]:
     """Every ``name.key`` and ``x.name.key`` in the package's code, and what is drawn by its name:
-    ``between("key")``, or copied by its name (`_AS_GIVEN` of the scenario)."""
-    found: set[tuple[str, str]] = {("simulation", key) for key in scenario._AS_GIVEN}
+    ``between("key")``, or copied by its name (`_AS_GIVEN` and `_DRAWN` of the scenario)."""
+    by_name = (*scenario._AS_GIVEN, *scenario._DRAWN)
+    found: set[tuple[str, str]] = {("simulation", key) for key in by_name}
     for path in Path(perchctl.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "between":

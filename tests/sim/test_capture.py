@@ -8,7 +8,6 @@ import itertools
 import math
 import statistics
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,34 +39,24 @@ class Room:
 
 
 def watched(
-    capture: SimCapture, seconds: float, room: Room, act: Callable[[], None] = lambda: None
+    capture: SimCapture, seconds: float, room: Room, climb_mps: float = 0.0
 ) -> list[CaptureFrame]:
     frames = []
     for _ in range(round(seconds / STEP_S)):
         room.t_s += STEP_S
-        act()
+        room.z_m += climb_mps * STEP_S
         capture.advance(room)
         frames += capture.take()
     return frames
 
 
-def always(**fault: Any) -> tuple[tuple[float, float, CaptureFault]]:
-    return ((0.0, math.inf, CaptureFault(**fault)),)
-
-
-def wrong(since_s: float, to_s: float, **fault: Any) -> list[float]:
-    """When the frames of 1.5 s come in which something is wrong for a time."""
-    faults = ((since_s, to_s, CaptureFault(**fault)),)
-    return [f.t_s for f in watched(SimCapture(replace(EXACT, faults=faults)), 1.5, Room())]
+def during(since_s: float, to_s: float, **fault: Any) -> CaptureSettings:
+    """Settings with something wrong for a time."""
+    return replace(EXACT, faults=((since_s, to_s, CaptureFault(**fault)),))
 
 
 def test_frames_come_at_the_cameras_rate_and_late() -> None:
-    room = Room()
-
-    def climb() -> None:
-        room.z_m = room.t_s  # so that a frame says when it was exposed
-
-    frames = watched(SimCapture(EXACT), 2.0, room, climb)
+    frames = watched(SimCapture(EXACT), 2.0, Room(z_m=0.0), climb_mps=1.0)  # tells when
     assert len(frames) == pytest.approx(240, abs=3)
     gaps = [b.t_s - a.t_s for a, b in itertools.pairwise(frames)]
     assert statistics.fmean(gaps) == pytest.approx(1 / 120, rel=1e-3)
@@ -114,21 +103,21 @@ def test_a_body_s_own_axes_are_undone_by_the_profile_s() -> None:
 def test_a_body_is_where_the_capture_s_world_and_the_fault_put_it(
     settings: dict[str, Any], fault: dict[str, Any], at_m: tuple[float, ...]
 ) -> None:
-    frames = watched(SimCapture(replace(EXACT, **settings, faults=always(**fault))), 0.5, Room())
+    wrong = replace(during(0.0, math.inf, **fault), **settings)
+    frames = watched(SimCapture(wrong), 0.5, Room())
     assert frames[-1].bodies["crazyflie"].position_m == pytest.approx(at_m)
 
 
 def test_an_occluded_body_is_missing_for_its_time_only() -> None:
     """All other frames are as without the fault."""
-    capture, free = (SimCapture(CaptureSettings()) for _ in range(2))
-    room = Room()
-    frames = watched(capture, 0.5, room)
-    capture.lay(CaptureFault(occluded=True), 0.3)
-    frames += watched(capture, 0.5, room)
+    noisy = replace(during(0.5, 0.8, occluded=True), position_noise_m=0.001)
+    frames, free = (
+        watched(SimCapture(each), 1.0, Room()) for each in (noisy, replace(noisy, faults=()))
+    )
     hidden = [frame for frame in frames if "crazyflie" not in frame.bodies]
     assert len(hidden) == pytest.approx(36, abs=1)
     assert all("wand" in frame.bodies for frame in hidden)
-    assert frames[-10:] == watched(free, 1.0, Room())[-10:]
+    assert frames[-10:] == free[-10:]
 
 
 def test_frozen_bodies_stay_to_the_last_digit_until_they_are_healed() -> None:
@@ -143,8 +132,11 @@ def test_frozen_bodies_stay_to_the_last_digit_until_they_are_healed() -> None:
 
 
 def test_frames_that_are_gone_or_late_leave_a_gap_and_never_overtake() -> None:
-    assert not [t_s for t_s in wrong(0.5, 1.0, gone=True) if 0.515 < t_s < 1.0]
-    late = wrong(0.5, 1.0, late_s=0.1)
+    gone, late = (
+        [frame.t_s for frame in watched(SimCapture(during(0.5, 1.0, **fault)), 1.5, Room())]
+        for fault in ({"gone": True}, {"late_s": 0.1})
+    )
+    assert not [t_s for t_s in gone if 0.515 < t_s < 1.0]
     assert late == sorted(late)
     assert not [t_s for t_s in late if 0.52 < t_s < 0.6]
 
@@ -178,7 +170,7 @@ def test_the_library_reads_the_room_of_the_vehicle_s_process() -> None:
             turned = (math.cos(0.5), 0.0, 0.0, math.sin(0.5))
             assert pose.quaternion == pytest.approx(turned, abs=0.02)
             until(lambda: seen_at("wand", (1.2, -0.9, 0.05)))
-            sim.capture_fault(CaptureFault(occluded=True))
+            sim.lay(CaptureFault(occluded=True))
             until(lambda: set(bodies()) == {"wand"})
-            sim.capture_fault(None)
+            sim.heal()
             until(lambda: set(bodies()) == {"crazyflie", "wand"})

@@ -84,34 +84,18 @@ def test_raw_thrust_limits(pilot: Pilot) -> None:
 # --- Thrust budget ----------------------------------------------------------------
 
 
-def test_hover_command_at_42_g(pilot: Pilot) -> None:
-    """Row "hover at 42 g is a command of about 56,200 of 65,535" (fresh battery)."""
-    pilot.sim.set_battery(4.2)
-    pilot.take_off(0.8, settle_s=2.0)
+def test_the_thrust_budget(pilot: Pilot) -> None:
+    """Rows "hover at 42 g is a command of about 56,200 of 65,535" (fresh battery) and "The largest
+    raw thrust: a 0.5 s burst gained 5.8 cm and 0.25 m/s"."""
+    pilot.take_off(0.8)
+    pilot.sim.set_rest_v(4.2)
+    pilot.stream(4.0, lambda: pilot.hold(0.8))  # the compensation has met the change
     values = [v for _, v in pilot.log("stabilizer.thrust", pilot.t_s - 1.0)]
     assert sum(values) / len(values) == pytest.approx(56_200, rel=0.01)
-
-
-def test_raw_burst_gains_little(pilot: Pilot) -> None:
-    """Row "The largest raw thrust: a 0.5 s burst gained 5.8 cm and 0.25 m/s"."""
-    pilot.take_off(0.8)
-    pilot.sim.set_battery(4.2)
-    pilot.stream(4.0, lambda: pilot.hold(0.8))  # the compensation has met the change
     before_m = height(pilot)
     pilot.stream(0.5, lambda: raw(pilot, 60000))
     assert height(pilot) - before_m == pytest.approx(0.058, abs=0.01)
     assert pilot.sim.truth()["velocity_mps"][2] == pytest.approx(0.25, abs=0.02)
-
-
-def test_position_controller_pushes_harder_than_raw(pilot: Pilot) -> None:
-    """Row "The onboard position controller can command 65,535"."""
-    pilot.fresh(no_target=True)
-    pilot.fly_to(1.6, 0.5)
-    pilot.stream(3.0, lambda: pilot.hold(3.0))
-    pressed_n = pilot.sim.truth()["ceiling_force_n"]
-    assert pilot.now("stabilizer.thrust") == pytest.approx(65_535, abs=1)
-    pilot.stream(1.0, lambda: raw(pilot, 60000))
-    assert 0.0 < pilot.sim.truth()["ceiling_force_n"] < pressed_n
 
 
 # --- Setpoint modes ---------------------------------------------------------------
@@ -249,7 +233,7 @@ def test_go_to_yaw_in_radians_and_relative_in_world_axes(pilot: Pilot) -> None:
 @pytest.mark.parametrize(("rest_v", "low"), [(3.30, False), (3.15, True), (2.95, True)])
 def test_low_battery(pilot: Pilot, rest_v: float, low: bool) -> None:
     """Row "Battery: low 3.2 V, critical 3.0 V, 5 s delay; pm.state 3 = low power"."""
-    pilot.sim.set_battery(rest_v)
+    pilot.sim.set_rest_v(rest_v)
     since_s = pilot.t_s
     pilot.advance(7.0)
     assert pilot.now("pm.vbat") == pytest.approx(rest_v, abs=0.05)
@@ -448,7 +432,8 @@ def test_a_take_off_whose_stream_falls_silent_stays_down(pilot: Pilot) -> None:
 
 
 def test_an_ordered_take_off_needs_no_link(pilot: Pilot) -> None:
-    """Row "HL take-off with the link cut 0.25 s after the order": hovers at 0.5 m, for 35 s."""
+    """Rows "HL take-off with the link cut 0.25 s after the order": hovers at 0.5 m, for 35 s, and
+    "HL hover never times out"."""
     pilot.unlock()
     pilot.cf.high_level_commander.takeoff(0.5, 2.0)
     pilot.advance(0.25)

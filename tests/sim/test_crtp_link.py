@@ -17,9 +17,8 @@ from cflib.utils.power_switch import PowerSwitch
 
 from perchctl.link import Packet
 from perchctl.sim import Scenario, SimProcess
-from perchctl.sim.crtp import CrtpServer, LinkOptions
+from perchctl.sim.crtp import CrtpServer
 from perchctl.sim.host import VehicleHost
-from perchctl.sim.process import HostSetup
 from tests.helpers.crtp_rig import (
     LOCKED_BIT,
     READY,
@@ -56,7 +55,7 @@ def test_connect_sequence(sim: SimProcess, toc_cache: str) -> None:
         assert (eeprom.type, eeprom.size) == (MemoryElement.TYPE_I2C, 8192)
         toc = client.cf.param.toc
         assert toc.get_element_by_complete_name("posCtlPid.zKp").is_persistent()
-        assert not toc.get_element_by_complete_name("stabilizer.stop").is_persistent()
+        assert not toc.get_element_by_complete_name("stabilizer.estimator").is_persistent()
         got = threading.Event()
         client.cf.link_statistics.latency_updated.add_callback(lambda _: got.set())
         assert got.wait(WAIT_S)  # a ping every 0.1 s
@@ -100,7 +99,7 @@ def clean(client: Client) -> Iterator[Client]:
 def test_log_data_have_period_and_stamp(sim: SimProcess, clean: Client) -> None:
     """Row "Log data: block id, 3-byte ms timestamp, data", with conversion on the way; 13 variables
     take a second packet."""
-    names = [f"stateEstimateZ.{n}" for n in ("x", "y", "z", "vx", "vy", "vz")]
+    names = [f"debugCtr.c{i}" for i in range(6)]
     names += ["pm.vbatMV", *(f"motor.m{i}" for i in (1, 2, 3, 4)), "supervisor.info"]
     block = log_block("p", dict.fromkeys(names, "uint16_t") | {"pm.vbat": "FP16"}, 50)
     got: list[tuple[int, dict[str, float]]] = []
@@ -124,8 +123,8 @@ def test_log_limits_are_known_to_cflib(clean: Client) -> None:
     """Rows "Unknown log variable: KeyError. Too large a log block: AttributeError"."""
     with pytest.raises(KeyError):
         clean.cf.log.add_config(log_block("u", {"no.such": "float"}))
-    too_large = {f"kalman.q{i}": "float" for i in range(4)} | {
-        f"stateEstimate.{n}": "float" for n in "xyz"
+    too_large = {
+        f"{group}.{n}": "float" for group in ("acc", "gyro", "stateEstimate") for n in "xyz"
     }
     with pytest.raises(AttributeError):
         clean.cf.log.add_config(log_block("l", too_large))
@@ -182,7 +181,7 @@ def test_a_scans_probe_is_answered_and_takes_nobodys_place() -> None:
     packet is passed over."""
     probe, create, start = b"\xff\x01\x01\x01", b"\x5d\x06\x01\x07\x00\x00", b"\x5d\x03\x01\x01"
     with (
-        contextlib.closing(VehicleHost(HostSetup())) as host,
+        contextlib.closing(VehicleHost(Scenario())) as host,
         wired(host.uri) as scan,
         wired(host.uri) as client,
     ):
@@ -254,8 +253,10 @@ def test_an_exception_in_a_with_block_drops_the_vehicle(
 
 def test_old_firmware_has_no_supervisor_port(toc_cache: str) -> None:
     """Row "Protocol < 12": supervisor port missing, old channels work, bit field reads 0."""
-    link = LinkOptions(protocol_version=11, missing_log_variables=("supervisor.info",))
-    with SimProcess.start(pace="stepped", link=link) as process:
+    missing = ("supervisor.info",)
+    with SimProcess.start(
+        pace="stepped", protocol_version=11, missing_log_variables=missing
+    ) as process:
         process.advance(1.0)
         with contextlib.closing(Client(process.uri, toc_cache)) as client:
             assert client.connect()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -11,7 +10,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -19,7 +17,7 @@ from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.places import data_file
 from perchctl.sim import Scenario, SimProcess
-from tests.helpers.crtp_rig import ROOT, Client, pictures_of
+from tests.helpers.crtp_rig import pictures_of
 from tests.helpers.waiting import until
 
 
@@ -50,12 +48,12 @@ def test_stepped_time_passes_only_by_advance(stepped: SimProcess) -> None:
     assert stepped.truth()["t_s"] == start_s
     assert stepped.advance(0.5) == pytest.approx(start_s + 0.5)
     assert stepped.truth()["t_s"] == pytest.approx(start_s + 0.5)
-    with pytest.raises(AttributeError):
+    with pytest.raises(InvalidValue, match="no_such_request"):
         stepped.no_such_request()
 
 
 def test_a_child_that_ends_or_does_not_come_up_is_a_clear_error(
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sim = SimProcess.start(pace="stepped")
     sim.stop()
@@ -67,9 +65,10 @@ def test_a_child_that_ends_or_does_not_come_up_is_a_clear_error(
     os.kill(sim.pid, signal.SIGKILL)
     with pytest.raises(ConnectionFailed, match="has ended"):
         sim.advance(0.1)
-    sim.stop()
-    monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(ConnectionFailed, match="ended with code"):
+    with pytest.raises(ConnectionFailed, match="No such file"):
+        SimProcess.start(truth_file=tmp_path / "none" / "truth")
+    monkeypatch.setattr("multiprocessing.spawn._python_exe", b"/bin/false")
+    with pytest.raises(ConnectionFailed):
         SimProcess.start(pace="stepped")
 
 
@@ -77,7 +76,6 @@ def test_a_child_that_ends_or_does_not_come_up_is_a_clear_error(
 
 
 def test_the_vehicles_picture_is_streamed_and_real_time_never_runs_ahead() -> None:
-    """A stock reader opens it, too, and each client gets the newest."""
     path = data_file("calib", "example_640x480")
     assert path is not None
     camera, before_s = load_calibration(path), time.monotonic()
@@ -86,14 +84,7 @@ def test_the_vehicles_picture_is_streamed_and_real_time_never_runs_ahead() -> No
         assert first.shape[::-1] == camera.size_px
         assert first.std() > 3.0
         assert not np.array_equal(first, later)  # noise, motion
-        capture = cv2.VideoCapture(sim.stream_url, cv2.CAP_FFMPEG)
-        ok, frame = capture.read()
-        capture.release()
-        assert ok
-        assert frame.shape[1::-1] == camera.size_px
         assert sim.truth()["t_s"] <= time.monotonic() - before_s
-        with pytest.raises(InvalidValue, match="only a stepped vehicle"):
-            sim.advance(1.0)
         now_s = sim.truth()["t_s"]
         until(lambda: sim.truth()["t_s"] > now_s + 0.1)
     with SimProcess.start(Scenario(seed=1), "stepped", camera=camera) as sim:
@@ -102,44 +93,29 @@ def test_the_vehicles_picture_is_streamed_and_real_time_never_runs_ahead() -> No
         assert np.array_equal(first, again)
 
 
-# --- Without a parent ----------------------------------------------------------------
+# --- Parent and terminal -----------------------------------------------------------
 
 
 _PARENT = """
 import sys
-sys.path.insert(0, {root!r})
-from pathlib import Path
 from perchctl.sim import SimProcess
-started = []
-for pace in ("realtime", "stepped"):
-    sim = SimProcess.start(pace=pace, truth_file=Path({folder!r}, pace), linger_s=3.0)
-    print(pace, sim.pid, sim.uri, flush=True)
-    started.append(sim)
-sys.stdin.readline()
+if __name__ == "__main__":
+    started = [SimProcess.start(pace=pace) for pace in ("realtime", "stepped")]
+    print(*(sim.pid for sim in started), flush=True)
+    sys.stdin.readline()
 """
 
 
 @pytest.mark.long
-def test_flies_on_when_the_parent_is_killed(tmp_path: Path, toc_cache: str) -> None:
-    """The vehicle outlives a kill -9 of its parent, answers meanwhile, and then ends."""
-    code = _PARENT.format(root=ROOT, folder=str(tmp_path))
+def test_it_ends_when_its_parent_is_killed() -> None:
     with subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", _PARENT], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as parent:
         assert parent.stdout is not None
-        started = [parent.stdout.readline().split() for _ in range(2)]
+        pids = list(map(int, parent.stdout.readline().split()))
+        assert all(map(alive, pids))
         parent.kill()
-        parent.wait()
-        for _, pid, uri in started:
-            client = Client(uri, toc_cache)
-            assert client.connect()
-            assert alive(int(pid))
-            client.close()
-    for pace, pid, _ in started:
-        until(lambda pid=pid: not alive(int(pid)))
-        lines = [json.loads(line) for line in (tmp_path / pace).read_text().splitlines()]
-        assert lines[-1]["t_s"] > 1.0
-        assert lines[-1]["supervisor_info"] == 0x020E
+    until(lambda: not any(map(alive, pids)))
 
 
 def test_ctrl_c_does_not_reach_the_vehicle(stepped: SimProcess) -> None:

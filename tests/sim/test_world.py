@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, rotation_from_quaternion, rotation_from_rpy
 from perchctl.sim import CONTROL_PERIOD_S, Scenario
-from perchctl.sim.firmware import Firmware
 from perchctl.sim.world import DRAG_VERTICAL_NSPM, SUCTION_LENGTH_M, World
-from tests.helpers.carried import lifted_and_turned
+from tests.helpers.carried import Hand, lifted_and_turned
+from tests.helpers.firmware_rig import make_rig
 
 OFF = (0.0, 0.0, 0.0, 0.0)
 GEAR_Z_M = 0.03
@@ -55,41 +53,6 @@ def test_free_fall_is_the_closed_form_with_linear_drag() -> None:
     # One Euler step of 2 ms at this speed is 8 mm.
     assert 3.0 - world.z_m == pytest.approx(fallen_m, abs=0.008)
     assert np.linalg.norm(felt_mps2(world)) < 1.2
-
-
-@pytest.mark.parametrize(
-    ("motors", "axis", "sign"),
-    [
-        ((0, 0, 1, 1), 0, 1),  # left motors up: roll to the right
-        ((0, 1, 1, 0), 1, 1),  # back motors up: nose down
-        ((0, 1, 0, 1), 2, 1),  # M2 and M4 turn clockwise: counter-clockwise reaction
-    ],
-)
-def test_motor_pairs_turn_the_right_way(
-    motors: tuple[int, int, int, int], axis: int, sign: int
-) -> None:
-    world = make()
-    world.set_pose((0.0, 0.0, 1.0))
-    a, b, c, d = (56000.0 + 2000.0 * m for m in motors)
-    run(world, 0.05, (a, b, c, d))
-    rates = np.array((world.p_radps, world.q_radps, world.r_radps))
-    assert sign * rates[axis] > 0.01
-    others = [i for i in range(3) if i != axis]
-    assert np.abs(rates[others]).max() < 0.2 * abs(rates[axis])
-
-
-@settings(max_examples=15, deadline=None)
-@given(roll=st.floats(-3.0, 3.0), pitch=st.floats(-1.4, 1.4), yaw=st.floats(-3.0, 3.0))
-def test_a_held_pose_is_kept_and_reads_gravity_in_body_axes(
-    roll: float, pitch: float, yaw: float
-) -> None:
-    world = make()
-    R = rotation_from_rpy(roll, pitch, yaw)
-    world.set_pose((0.1, -0.2, 1.0), (roll, pitch, yaw), hold=True)
-    run(world, 0.01, (50000.0,) * 4)
-    assert rotation_from_quaternion(world.quaternion) == pytest.approx(R, abs=1e-9)
-    assert place(world) == pytest.approx([0.1, -0.2, 1.0])
-    assert felt_mps2(world) == pytest.approx(R.T @ [0, 0, GRAVITY_MPS2], abs=1e-9)
 
 
 def test_draught_pushes_to_its_own_side_and_gusts_repeat_with_the_seed() -> None:
@@ -158,17 +121,13 @@ def test_a_weak_first_contact_breaks_and_the_second_holds() -> None:
 # The air ------------------------------------------------------------------------------
 
 
-ROTOR_RADIUS_M = 0.023
-ROTORS_OVER_CENTRE_M = 0.01
-
-
 @pytest.mark.parametrize("height_m", [0.03, 0.035, 0.04, 0.05, 0.07, 0.1, 0.15])
 def test_the_ceilings_pull_is_that_of_momentum_theory(height_m: float) -> None:
     """A rotor of radius R at D below a ceiling has its wake's power divided by
     g = (1 + sqrt(1 + (R / D)^2 / 8)) / 2 (Hsiao and Chirarattananon, arXiv 1905.04632, who
     measured it with rotors of this radius); at the same power the thrust grows by g^(2/3)."""
-    gap_m = height_m - ROTORS_OVER_CENTRE_M
-    g = 0.5 + 0.5 * math.sqrt(1.0 + (ROTOR_RADIUS_M / gap_m) ** 2 / 8.0)
+    gap_m = height_m - 0.01
+    g = 0.5 + 0.5 * math.sqrt(1.0 + (0.023 / gap_m) ** 2 / 8.0)
     gained = Scenario().ceiling_suction * math.exp(-height_m / SUCTION_LENGTH_M)
     assert gained == pytest.approx(g ** (2.0 / 3.0) - 1.0, abs=0.006)
 
@@ -181,22 +140,20 @@ HOME = (0.0, 0.0, 0.012)
 
 def test_the_attitude_estimate_follows_a_hand_all_the_way() -> None:
     """By the gyroscope: what is put somewhere at once is followed in seconds only."""
-    scenario = Scenario()
-    world = World(scenario)
-    firmware = Firmware(world, scenario)
-    world.move_by_hand(lifted_and_turned(HOME))
+    rig = make_rig()
+    world, estimator = rig.world, rig.firmware.estimator
+    world.carry(Hand(lifted_and_turned(HOME)))
     turned, felt = [], []
     for _ in range(round(8.0 / CONTROL_PERIOD_S)):
-        firmware.step()
-        now = firmware.estimator.now
+        rig.firmware.step()
+        now = estimator.now
         own = rotation_from_rpy(
             *(math.radians(a) for a in (now.roll_deg, -now.pitch_deg, now.yaw_deg))
         )
         off = own.T @ rotation_from_quaternion(world.quaternion)
         turned.append(math.degrees(math.acos(min(1.0, (float(np.trace(off)) - 1.0) / 2.0))))
-        felt.append(firmware.estimator.acc_g[2])
+        felt.append(estimator.acc_g[2])
     assert max(turned) < 2.0
     assert max(felt) > 1.08, "lifted"
     assert min(felt) < 0.9, "tilted"
     assert place(world) == pytest.approx(HOME, abs=1e-6)
-    assert (world.p_radps, world.q_radps, world.r_radps) == pytest.approx((0, 0, 0), abs=1e-6)

@@ -36,9 +36,8 @@ MODE_RAW: Mode = (DISABLED, DISABLED, DISABLED, ABSOLUTE, ABSOLUTE, VELOCITY)
 class Setpoint:
     """One setpoint in the firmware's own units: m, m/s, degrees, pitch nose up.
 
-    Yaw rates are counter-clockwise positive, `thrust` is 0..65535; `body_velocity` means that
-    the velocity is along the body's axes instead of the world's. The class methods take what
-    cflib's calls of the same kind take. Without arguments it is the one of
+    Yaw rates are counter-clockwise positive, `thrust` is 0..65535; the velocity is along the
+    world's axes, with `MODE_HOVER` along the body's. Without arguments it is the one of
     `send_stop_setpoint`: no thrust.
     """
 
@@ -54,54 +53,6 @@ class Setpoint:
     yaw_deg: float = 0.0
     yaw_rate_dps: float = 0.0
     thrust: float = 0.0
-    body_velocity: bool = False
-
-    @classmethod
-    def raw(cls, roll_deg: float, pitch_deg: float, yaw_rate_dps: float, thrust: float) -> Setpoint:
-        """Return that of `commander.send_setpoint`: pitch +10 is nose down, yaw rate clockwise."""
-        return cls(
-            MODE_RAW,
-            roll_deg=roll_deg,
-            pitch_deg=-pitch_deg,
-            yaw_rate_dps=-yaw_rate_dps,
-            thrust=float(thrust),
-        )
-
-    @classmethod
-    def position(cls, x_m: float, y_m: float, z_m: float, yaw_deg: float) -> Setpoint:
-        """Return that of `send_position_setpoint`: m and degrees, counter-clockwise positive."""
-        return cls(MODE_POSITION, x_m, y_m, z_m, yaw_deg=yaw_deg)
-
-    @classmethod
-    def velocity(cls, vx_mps: float, vy_mps: float, vz_mps: float, yaw_rate_dps: float) -> Setpoint:
-        """Return that of `send_velocity_world_setpoint`: yaw rate counter-clockwise positive."""
-        return cls(MODE_VELOCITY, 0.0, 0.0, 0.0, vx_mps, vy_mps, vz_mps, yaw_rate_dps=yaw_rate_dps)
-
-    @classmethod
-    def hover(cls, vx_mps: float, vy_mps: float, yaw_rate_dps: float, z_m: float) -> Setpoint:
-        """Return that of `send_hover_setpoint`: velocity in body axes, yaw rate, absolute
-        height."""
-        return cls(
-            MODE_HOVER,
-            z_m=z_m,
-            vx_mps=vx_mps,
-            vy_mps=vy_mps,
-            yaw_rate_dps=yaw_rate_dps,
-            body_velocity=True,
-        )
-
-    @classmethod
-    def z_distance(
-        cls, roll_deg: float, pitch_deg: float, yaw_rate_dps: float, z_m: float
-    ) -> Setpoint:
-        """Return that of `send_zdistance_setpoint`: attitude, yaw rate, absolute height."""
-        return cls(
-            MODE_Z_DISTANCE,
-            z_m=z_m,
-            roll_deg=roll_deg,
-            pitch_deg=pitch_deg,
-            yaw_rate_dps=yaw_rate_dps,
-        )
 
     def levelled(self) -> Setpoint:
         """Return what the supervisor flies while setpoints are missing: level, no turn, same z."""
@@ -124,13 +75,19 @@ _THRUST_SCALE = 1000.0
 
 class Pid:
     """One PID loop; the derivative acts on the measurement. `i_limit` bounds the
-    integral, `limit` the output; a `limit` of 0 means no bound."""
+    integral, `limit` the output."""
 
     def __init__(
-        self, kp: float, ki: float, kd: float, period_s: float, i_limit: float, limit: float = 0.0
+        self,
+        kp: float,
+        ki: float,
+        kd: float,
+        period_s: float,
+        i_limit: float,
+        limit: float = math.inf,
     ) -> None:
-        self.kp, self.ki, self.kd = kp, ki, kd
-        self.limit = limit
+        self._kp, self._ki, self._kd = kp, ki, kd
+        self._limit = limit
         self._period = period_s
         self._i_limit = i_limit
         self._integral = self._measured = 0.0
@@ -148,20 +105,15 @@ class Pid:
         integral = max(-bound, min(bound, self._integral + error * self._period))
         self._integral = integral
         self._measured = measured
-        output = self.kp * error + self.ki * integral
-        if self.kd != 0.0:
-            output -= self.kd * change / self._period
-        limit = self.limit
-        return max(-limit, min(limit, output)) if limit > 0.0 else output
+        output = self._kp * error + self._ki * integral
+        if self._kd != 0.0:
+            output -= self._kd * change / self._period
+        return max(-self._limit, min(self._limit, output))
 
 
 def cap_deg(angle: float) -> float:
     """Return the same angle within +-180 degrees."""
-    while angle > 180.0:
-        angle -= 360.0
-    while angle < -180.0:
-        angle += 360.0
-    return angle
+    return math.remainder(angle, 360.0)
 
 
 def _saturated(value: float) -> float:
@@ -246,7 +198,7 @@ class Controller:
         yaw_rad = math.radians(now.yaw_deg)
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         want_x, want_y = setpoint.vx_mps, setpoint.vy_mps
-        if not setpoint.body_velocity:
+        if mode != MODE_HOVER:
             want_x, want_y = want_x * c + want_y * s, want_y * c - want_x * s
         if mode[0] == ABSOLUTE:
             want_x = self.x.update(setpoint.x_m * c + setpoint.y_m * s, now.x_m * c + now.y_m * s)
@@ -293,10 +245,9 @@ _N_PER_COMMAND = MOTOR_FORCE_N / FULL_COMMAND
 
 
 class MotorDriver:
-    """`requested`: the duty cycles before the cap (`motor.m1req`)."""
+    """Turns thrust requests into duty cycles, by the battery's voltage that it has filtered."""
 
     def __init__(self) -> None:
-        self.requested: Motors = MOTORS_OFF
         # Low-passed with 0.1 s: the compensation meets a sagging battery late.
         self._supply_v = SUPPLY_AT_BOOT_V
 
@@ -304,18 +255,16 @@ class MotorDriver:
         """Return duty cycles 0..65535 for thrust requests; `MOTORS_OFF` itself when all are 0."""
         self._supply_v = supply_v = battery_v + _KEEP * (self._supply_v - battery_v)
         if requests is MOTORS_OFF or supply_v < SUPPLY_LEAST_V:
-            self.requested = MOTORS_OFF
             return MOTORS_OFF
         scale = FULL_COMMAND / supply_v
         p1, p2, p3, p4 = (
             scale * motor_v(_N_PER_COMMAND * request) if request >= THRUST_MIN else 0.0
             for request in requests
         )
-        self.requested = pwm = (p1, p2, p3, p4)
-        if max(pwm) == 0.0:
+        most = max(p1, p2, p3, p4)
+        if most == 0.0:
             return MOTORS_OFF
-        excess = max(pwm) - FULL_COMMAND
-        if excess > 0.0:
-            # Attitude comes before thrust: all four give way together.
-            p1, p2, p3, p4 = (max(0.0, duty - excess) for duty in pwm)
-        return (p1, p2, p3, p4)
+        # Attitude comes before thrust: all four give way together.
+        excess = max(0.0, most - FULL_COMMAND)
+        p1, p2, p3, p4 = (max(0.0, duty - excess) for duty in (p1, p2, p3, p4))
+        return p1, p2, p3, p4

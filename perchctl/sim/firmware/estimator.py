@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +25,6 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.firmware.controller import Estimate, cap_deg
 from perchctl.sim.firmware.outside import (
     POSITION,
-    SETTINGS,
     Imu,
     OutsideFilter,
     Quaternion,
@@ -36,6 +35,7 @@ from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 if TYPE_CHECKING:
     from perchctl.sim.world import World
 
+KALMAN = 2
 _STREAM = 2
 _DEG = 180.0 / math.pi
 _BATCH = 2048
@@ -56,8 +56,8 @@ _VARIANCE_START, _VARIANCE_FALL_S, _VARIANCE_FLOOR = 100.0, 0.1, 2e-5
 class Estimator:
     """Writes `now` (an `Estimate`) and `acc_g` once a control period."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
+    def __init__(self, scenario: Scenario, parameters: Mapping[str, float]) -> None:
+        self._scenario, self._parameters = scenario, parameters
         self._rng = np.random.default_rng([scenario.seed, _STREAM])
         self._white: list[float] = []
         self.now = Estimate()
@@ -73,10 +73,9 @@ class Estimator:
         self.outside: OutsideFilter | None = None
         self._imu: Imu | None = None
         if scenario.extra.get("external_position"):
-            self.outside, self._imu = OutsideFilter(), Imu(scenario)
+            self.outside, self._imu = OutsideFilter(parameters), Imu(scenario)
         self._reset_s = 0.0
         self._rng.uniform()  # keeps the flights of all seeds as they were
-        self.hears_outside = True
         self.spoil: Callable[[Estimate], None] | None = None  # a fault's, upon each estimate
 
     def reset(self, t_s: float) -> None:
@@ -86,20 +85,12 @@ class Estimator:
         if self.outside is not None:
             self.outside.reset()
 
-    def external_position(self, position_m: Vector) -> None:
+    def external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
         """Take one measurement from outside; only a vehicle without a deck uses it."""
-        if self.outside is not None and self.hears_outside:
+        if self.outside is not None and self._parameters["stabilizer.estimator"] == KALMAN:
             self.outside.position(position_m)
-
-    def external_pose(self, position_m: Vector, quaternion: Quaternion) -> None:
-        """Take a measurement with an attitude: w, x, y, z, body to world."""
-        if self.outside is not None and self.hears_outside:
-            self.outside.pose(position_m, quaternion)
-
-    def set_outside(self, name: str, value: float) -> None:
-        """Set a parameter of `SETTINGS`."""
-        if self.outside is not None:
-            setattr(self.outside, SETTINGS[name], value)
+            if quaternion is not None:
+                self.outside.attitude(quaternion)
 
     def shift_accelerometer(self, z_mps2: float) -> None:
         """Let the accelerometer read so much more along z from now on. A deck, which is simulated

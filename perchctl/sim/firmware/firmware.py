@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from perchctl.sim.firmware.controller import (
     MODE_RAW,
@@ -15,24 +15,21 @@ from perchctl.sim.firmware.controller import (
     Setpoint,
 )
 from perchctl.sim.firmware.estimator import Estimator
-from perchctl.sim.firmware.outside import SETTINGS, Quaternion, Vector
-from perchctl.sim.firmware.planner import HighLevelCommand, Planner
+from perchctl.sim.firmware.outside import Quaternion, Vector
+from perchctl.sim.firmware.planner import Planner
 from perchctl.sim.firmware.supervisor import EVERY as SUPERVISOR_EVERY
 from perchctl.sim.firmware.supervisor import State, Supervisor
-from perchctl.sim.firmware.variables import (
-    LIVE,
-    LOG_VARIABLES,
-    PARAMETERS,
-    Parameter,
-)
+from perchctl.sim.firmware.variables import LOG_VARIABLES, PARAMETERS, LogVariable, Parameter
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.vehicle import LOW_POWER
 
 if TYPE_CHECKING:
     from perchctl.sim.world import World
 
 PLANNER_EVERY = 5  # 100 Hz
-ESTIMATOR_KALMAN = 2
 RAW_THRUST_MIN, RAW_THRUST_MAX = 1000.0, 60000.0
+LOW_DELAY_S = 5.0
+_BATTERY_FILTER = 0.2  # at 25 Hz
 
 _NULL = Setpoint()
 
@@ -45,17 +42,18 @@ class Firmware:
     `CONTROL_PERIOD_S`. Commands take effect in the next step.
     """
 
-    LOG_VARIABLES: ClassVar[dict[str, str]] = LOG_VARIABLES
+    LOG_VARIABLES: ClassVar[dict[str, LogVariable]] = LOG_VARIABLES
     PARAMETERS: ClassVar[dict[str, Parameter]] = PARAMETERS
 
     def __init__(self, world: World, scenario: Scenario) -> None:
         self.world = world
         self.scenario = scenario
-        self._parameters = {name: p.default for name, p in PARAMETERS.items()}
         self.log_overrides: dict[str, float] = {}  # what a fault makes of log variables
-        self._boot()
+        self.reboot()
 
-    def _boot(self) -> None:
+    def reboot(self) -> None:
+        """Start anew, in the world as it is; no parameter has been stored."""
+        self._parameters = {name: p.default for name, p in PARAMETERS.items()}
         self._steps = 0
         self._flown = False
         self.motors = MOTORS_OFF
@@ -63,19 +61,17 @@ class Firmware:
         self._setpoint_s = 0.0
         self._low_level = False
         self._thrust_locked = True
-        self.estimator = Estimator(self.scenario)
+        self.estimator = Estimator(self.scenario, self._parameters)
         self.external_tick_ms = 0
         self.planner = Planner()
         self.supervisor = Supervisor()
         self.controller = Controller()
         self.driver = MotorDriver()
-        self.power = PowerMonitor(self.world.battery_v)
+        self.supply_v, self.power_state, self._fine_s = self.world.battery_v, 0, 0.0
         self._pressed = False
         if self.scenario.extra.get("external_position"):
             self._parameters["deck.bcFlow2"] = 0.0  # outside positions instead of a deck
         self._parameters |= self.scenario.parameters
-        for name in PARAMETERS:
-            self._apply(name)
         self.estimator.reset(0.0)
 
     @property
@@ -111,7 +107,7 @@ class Firmware:
                 # re-arming only a new packet, or the planner, spins the motors.
                 self._low_level = False
             self.planner.block(not supervisor.motors_allowed)
-            self.power.update(t_s, self.world.battery_v, self._parameters)
+            self._watch_battery(t_s)
         setpoint = self._setpoint if supervisor.motors_allowed else _NULL
         if supervisor.state is State.LEVEL_OUT:
             setpoint = setpoint.levelled()
@@ -149,45 +145,18 @@ class Firmware:
         self._inform_planner()
         self._low_level = False
 
-    def high_level(self, command: HighLevelCommand) -> None:
-        """Plan a command; it is flown only when no low-level stream has priority."""
-        self.planner.command(command, self.t_s)
+    def high_level(self, order: Callable[..., object], *values: Any) -> None:
+        """Give an order, a method of `Planner`; a low-level stream has priority over it."""
+        order(self.planner, *values, self.t_s)
 
     def emergency_stop(self) -> None:
         """Stop the motors and lock, within one supervisor update."""
         self.supervisor.emergency = True
 
-    def emergency_stop_watchdog(self) -> None:
-        """Start the watchdog, or feed it: a gap over 1 s then cuts the motors and locks."""
-        self.supervisor.notify_watchdog(self.t_s)
-
-    def arm(self, do_arm: bool) -> tuple[bool, bool]:
-        """Arm or disarm; return (success, armed)."""
-        success = self.supervisor.request_arming(do_arm)
-        return success, self.supervisor.armed
-
-    def recover_from_crash(self) -> tuple[bool, bool]:
-        """Recover; return (success, recovered). It is refused while still tumbled."""
-        success = self.supervisor.request_recovery()
-        return success, not self.supervisor.crashed
-
-    def external_position(self, position_m: Vector) -> None:
-        """Take a position from outside, m; see `Estimator`."""
+    def external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
+        """Take a position from outside, m, or a pose: w, x, y, z, body to world."""
         self.external_tick_ms = int(1e3 * self.t_s) % 65536
-        self.estimator.external_position(position_m)
-
-    def external_pose(self, position_m: Vector, quaternion_xyzw: Quaternion) -> None:
-        """Take a pose from outside: m, and body to world."""
-        self.external_tick_ms = int(1e3 * self.t_s) % 65536
-        x, y, z, w = quaternion_xyzw
-        self.estimator.external_pose(position_m, (w, x, y, z))
-
-    def reboot(self) -> None:
-        """Restart everything but the world, the battery and persistent parameters."""
-        for name, parameter in PARAMETERS.items():
-            if not parameter.persistent:
-                self._parameters[name] = parameter.default
-        self._boot()
+        self.estimator.external(position_m, quaternion)
 
     # What can be read ---------------------------------------------------------------
 
@@ -205,39 +174,19 @@ class Firmware:
         """
         if name in self.log_overrides:
             return self.log_overrides[name]
-        if name in LIVE:
-            return LIVE[name](self)
-        if name not in LOG_VARIABLES:
-            raise KeyError(name)
-        return 0.0
-
-    def log_values(self, names: Iterable[str]) -> dict[str, float]:
-        """Return the values of a whole block, by name. Errors as for one."""
-        return {name: self.log_value(name) for name in names}
+        return LOG_VARIABLES[name].read(self)
 
     def get_parameter(self, name: str) -> float:
         """Raises KeyError for an unknown name."""
         return self._parameters[name]
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Raises KeyError for an unknown name, PermissionError for a read-only one."""
-        if PARAMETERS[name].readonly:
-            raise PermissionError(f"parameter {name} is read-only")
+        """Set a parameter of `PARAMETERS`."""
         self._parameters[name] = float(value)
-        self._apply(name)
-
-    # Inside -------------------------------------------------------------------------
-
-    def _apply(self, name: str) -> None:
-        value = self._parameters[name]
         if name == "kalman.resetEstimation" and value == 1.0:
             self.estimator.reset(self.t_s)
-        elif name == "stabilizer.estimator":
-            self.estimator.hears_outside = value == ESTIMATOR_KALMAN
-        elif name in SETTINGS:
-            self.estimator.set_outside(name, value)
-        elif name == "stabilizer.stop":
-            self.supervisor.emergency = self.supervisor.emergency or value != 0.0
+
+    # Inside -------------------------------------------------------------------------
 
     def _consult_planner(self, t_s: float) -> None:
         planner = self.planner
@@ -256,31 +205,9 @@ class Firmware:
             math.radians(now.yaw_deg),
         )
 
-
-# --- The battery as the power management reports it: voltage, level, low-power state ---
-
-
-ON_BATTERY, LOW_POWER = 0, 3
-LOW_DELAY_S = 5.0
-_BATTERY_FILTER = 0.2  # at 25 Hz
-# Voltages at which the level leaves 0, 10, ... 90 per cent.
-_LEVELS_V = (3.00, 3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10)
-
-
-class PowerMonitor:
-    """`update` at 25 Hz. Low below `pm.lowVoltage` for 5 s (docs/firmware.md, "Link")."""
-
-    def __init__(self, battery_v: float) -> None:
-        self.battery_v = battery_v
-        self.state = ON_BATTERY
-        self._fine_s = 0.0
-
-    @property
-    def level_percent(self) -> int:
-        return 10 * max(0, sum(self.battery_v >= v for v in _LEVELS_V) - 1)
-
-    def update(self, t_s: float, battery_v: float, parameters: Mapping[str, float]) -> None:
-        self.battery_v += _BATTERY_FILTER * (battery_v - self.battery_v)
-        if self.battery_v >= parameters["pm.lowVoltage"]:
+    def _watch_battery(self, t_s: float) -> None:
+        """Report low power below `pm.lowVoltage` for 5 s (docs/firmware.md, "Link")."""
+        self.supply_v += _BATTERY_FILTER * (self.world.battery_v - self.supply_v)
+        if self.supply_v >= self._parameters["pm.lowVoltage"]:
             self._fine_s = t_s
-        self.state = LOW_POWER if t_s - self._fine_s > LOW_DELAY_S else ON_BATTERY
+        self.power_state = LOW_POWER if t_s - self._fine_s > LOW_DELAY_S else 0

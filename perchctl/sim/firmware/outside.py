@@ -5,16 +5,14 @@ The firmware's Kalman filter (source: `kalman_core`, `estimator_kalman`). 100 ti
 gyroscope turns the attitude and the accelerometer moves the velocity: in flight along the thrust's
 axis alone, so that drag and draught go unfelt; otherwise along all three, and the attitude is
 drawn to the initial one. A position corrects position, velocity and attitude, by what the
-covariance says each has to do with it; so a tilt is learnt from the slide that it makes, and a
-heading from manoeuvres, a little. Nothing here looks at the truth. What leads the estimate astray
-are the sensors' errors (`Imu`) and whatever is sent: late, false or in millimetres, it is believed
-as `locSrv.extPosStdDev` and `locSrv.extQuatStdDev` say. There is no gate (source).
+covariance says each has to do with it. Nothing here looks at the truth. The sensors' errors
+(`Imu`) lead the estimate astray, and whatever is sent: there is no gate (source).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -110,6 +108,7 @@ POSITION, VELOCITY, ATTITUDE = 0, 3, 6
 _FIRST_M, _FIRST_HEIGHT_M, _FIRST_MPS, _FIRST_RAD = 100.0, 1.0, 0.01, 0.01
 """Standard deviations after a reset (source: `stdDevInitial*`)."""
 _MOST, _LEAST = 100.0, 1e-6
+_FARTHEST_M, _FASTEST_MPS = 100.0, 10.0  # `kalman.maxPos`, `kalman.maxVel`
 _NOISE_PER_S = (0.0, 0.0, 0.0, 2.5e-4, 2.5e-4, 1e-3, 1e-5, 1e-5, 1e-5)
 """(m/s)^2 and rad^2 a second: `kalman.pNAcc_xy` 0.5 m/s^2, `pNAcc_z` 1 m/s^2 and `mNGyro_*`
 0.1 rad/s, each added as one of 1000 steps a second (source)."""
@@ -117,18 +116,6 @@ _LEAST_SIGMA = 1e-4
 _REVERSION = 1e-3
 """Share of the way to the initial attitude, each time while not in flight (source:
 `attitudeReversion`)."""
-
-SETTINGS = {
-    "locSrv.extPosStdDev": "position_sigma_m",
-    "locSrv.extQuatStdDev": "attitude_sigma_rad",
-    "kalman.initialX": "initial_x_m",
-    "kalman.initialY": "initial_y_m",
-    "kalman.initialZ": "initial_z_m",
-    "kalman.initialYaw": "initial_yaw_rad",
-    "kalman.maxPos": "most_m",
-    "kalman.maxVel": "most_mps",
-}
-"""The firmware's parameters that reach in here."""
 
 
 class OutsideFilter:
@@ -140,19 +127,19 @@ class OutsideFilter:
     body's there, which is the same for a vehicle that is nearly level.
     """
 
-    def __init__(self) -> None:
-        self.position_sigma_m, self.attitude_sigma_rad = 0.01, 0.0045
-        self.initial_x_m = self.initial_y_m = self.initial_z_m = self.initial_yaw_rad = 0.0
-        self.most_m, self.most_mps = 100.0, 10.0
+    def __init__(self, parameters: Mapping[str, float]) -> None:
+        self._parameters = parameters  # the firmware's, as they are now
         self.reset()
 
     def reset(self) -> None:
         """Begin again at the place and heading of `kalman.initial*`, level and at rest."""
         m2, height_m2 = min(_FIRST_M**2, _MOST), _FIRST_HEIGHT_M**2
         self.covariance = np.diag([m2, m2, height_m2] + [_FIRST_MPS**2] * 3 + [_FIRST_RAD**2] * 3)
-        self.position_m: Vector = (self.initial_x_m, self.initial_y_m, self.initial_z_m)
+        names = ("X", "Y", "Z", "Yaw")
+        x, y, z, yaw = (self._parameters[f"kalman.initial{name}"] for name in names)
+        self.position_m: Vector = (x, y, z)
         self.velocity_mps: Vector = (0.0, 0.0, 0.0)
-        half = 0.5 * self.initial_yaw_rad
+        half = 0.5 * yaw
         self._initial: Quaternion = (math.cos(half), 0.0, 0.0, math.sin(half))
         self.quaternion = self._initial
 
@@ -181,18 +168,18 @@ class OutsideFilter:
         self.quaternion = (w, x, y, z)
         self._grow(force)
         far_m, fast_mps = max(map(abs, self.position_m)), max(map(abs, self.velocity_mps))
-        if 0.0 < self.most_m < far_m or 0.0 < self.most_mps < fast_mps:
+        if far_m > _FARTHEST_M or fast_mps > _FASTEST_MPS:
             self.reset()
 
     def position(self, measured_m: Vector) -> None:
         """Take a position from outside for the one of now."""
         if all(map(math.isfinite, measured_m)):
             (mx, my, mz), (x, y, z) = measured_m, self.position_m
-            self._correct(POSITION, (mx - x, my - y, mz - z), self.position_sigma_m)
+            sigma_m = self._parameters["locSrv.extPosStdDev"]
+            self._correct(POSITION, (mx - x, my - y, mz - z), sigma_m)
 
-    def pose(self, measured_m: Vector, measured: Quaternion) -> None:
-        """Take a pose from outside: a position and an attitude, body to world."""
-        self.position(measured_m)
+    def attitude(self, measured: Quaternion) -> None:
+        """Take an attitude from outside, body to world."""
         norm = math.sqrt(sum(v * v for v in measured))
         if not math.isfinite(norm) or norm < 0.5:
             return
@@ -202,7 +189,7 @@ class OutsideFilter:
             return  # half a turn, which has no direction
         twice = 2.0 / left[0]
         wrong = (twice * left[1], twice * left[2], twice * left[3])
-        self._correct(ATTITUDE, wrong, self.attitude_sigma_rad)
+        self._correct(ATTITUDE, wrong, self._parameters["locSrv.extQuatStdDev"])
 
     def _grow(self, force_mps2: Vector) -> None:
         """Let the errors grow after a prediction. `force_mps2` is the specific force in world

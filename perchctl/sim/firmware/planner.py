@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from perchctl.geometry import wrap_rad
@@ -11,40 +10,6 @@ from perchctl.sim.firmware.controller import MODE_POSITION, Setpoint
 
 IDLE, FLYING, LANDING = 0, 1, 3
 Place = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class HlTakeoff:
-    """Absolute height; `yaw_rad` None keeps the current heading."""
-
-    height_m: float
-    duration_s: float
-    yaw_rad: float | None = None
-
-
-@dataclass(frozen=True)
-class HlLand(HlTakeoff):
-    """As a take-off, and the plan ends with the motors off."""
-
-
-@dataclass(frozen=True)
-class HlGoTo:
-    """`relative` offsets are in world axes (firmware fact)."""
-
-    x_m: float
-    y_m: float
-    z_m: float
-    yaw_rad: float
-    duration_s: float
-    relative: bool
-
-
-@dataclass(frozen=True)
-class HlStop:
-    """The plan ends at once, and the motors stop."""
-
-
-HighLevelCommand = HlTakeoff | HlGoTo | HlStop
 
 
 class AxisState(NamedTuple):
@@ -107,7 +72,8 @@ class Planner:
         modes")."""
         return self.state == IDLE or t_s - self._begin_s >= self._duration_s
 
-    def stop(self) -> None:
+    def stop(self, t_s: float = 0.0) -> None:
+        """End the plan at once."""
         self.state = IDLE
 
     def block(self, blocked: bool) -> None:
@@ -121,24 +87,48 @@ class Planner:
         axes = zip(position_m, velocity_mps, strict=True)
         self._now = [*(AxisState(p, v) for p, v in axes), AxisState(yaw_rad)]
 
-    def command(self, command: HighLevelCommand, t_s: float) -> bool:
-        """Accept or refuse a command."""
-        if isinstance(command, HlStop):
-            self.stop()
-            return True
-        if self.blocked:
-            return False
-        if isinstance(command, HlGoTo):
-            self._go_to(command, t_s)
-            return True
-        landing = isinstance(command, HlLand)
-        if (self.state == LANDING) if landing else (self.state != IDLE):
+    def take_off(
+        self,
+        height_m: float,
+        duration_s: float,
+        yaw_rad: float | None,
+        t_s: float,
+        to: int = FLYING,
+    ) -> bool:
+        """Plan the way to a height, or refuse. `yaw_rad` None keeps the heading."""
+        if self.blocked or self.state not in ((IDLE, FLYING) if to == LANDING else (IDLE,)):
             return False
         x, y, z, yaw = (AxisState(axis.value) for axis in self._now)
-        place = (x.value, y.value, command.height_m)
-        self._plan((x, y, z, yaw), place, command.yaw_rad, command, t_s)
-        self.state = LANDING if landing else FLYING
+        self._plan((x, y, z, yaw), (x.value, y.value, height_m), yaw_rad, duration_s, t_s)
+        self.state = to
         return True
+
+    def land(self, height_m: float, duration_s: float, yaw_rad: float | None, t_s: float) -> bool:
+        """Plan as for a take-off; the motors stop when the plan ends."""
+        return self.take_off(height_m, duration_s, yaw_rad, t_s, LANDING)
+
+    def go_to(
+        self,
+        x_m: float,
+        y_m: float,
+        z_m: float,
+        yaw_rad: float,
+        duration_s: float,
+        relative: bool,
+        t_s: float,
+    ) -> None:
+        """Plan the way to a place; `relative` offsets are in world axes (firmware fact)."""
+        if self.blocked:
+            return
+        if self.active:
+            self._now = [axis.at(t_s - self._begin_s) for axis in self._axes]
+        x, y, z, yaw = self._now
+        if relative:
+            x_m, y_m, z_m = x.value + x_m, y.value + y_m, z.value + z_m
+            yaw_rad += yaw.value
+        start = (x, y, z, AxisState(yaw.value, yaw.rate))
+        self._plan(start, (x_m, y_m, z_m), yaw_rad, duration_s, t_s)
+        self.state = FLYING
 
     def setpoint(self, t_s: float) -> Setpoint:
         """Return the setpoint at t; a null one (motors off) while idle."""
@@ -159,23 +149,12 @@ class Planner:
             yaw_rate_dps=math.degrees(yaw.rate),
         )
 
-    def _go_to(self, command: HlGoTo, t_s: float) -> None:
-        if self.active:
-            self._now = [axis.at(t_s - self._begin_s) for axis in self._axes]
-        x, y, z, yaw = self._now
-        place, heading = (command.x_m, command.y_m, command.z_m), command.yaw_rad
-        if command.relative:
-            place = (x.value + place[0], y.value + place[1], z.value + place[2])
-            heading += yaw.value
-        self._plan((x, y, z, AxisState(yaw.value, yaw.rate)), place, heading, command, t_s)
-        self.state = FLYING
-
     def _plan(
         self,
         start: tuple[AxisState, ...],
         place: Place,
         heading_rad: float | None,
-        command: HlTakeoff | HlGoTo,
+        duration_s: float,
         t_s: float,
     ) -> None:
         """Plan the way to a place; the heading turns the short way round, None keeps it."""
@@ -184,8 +163,7 @@ class Planner:
         turn_rad = 0.0 if heading_rad is None else wrap_rad(heading_rad - now_rad)
         goal = (*place, now_rad + turn_rad)
         states = (*axes, AxisState(now_rad, yaw.rate))
-        self._begin_s, self._duration_s = t_s, command.duration_s
+        self._begin_s, self._duration_s = t_s, duration_s
         self._axes = tuple(
-            Polynomial(state, end, command.duration_s)
-            for state, end in zip(states, goal, strict=True)
+            Polynomial(state, end, duration_s) for state, end in zip(states, goal, strict=True)
         )

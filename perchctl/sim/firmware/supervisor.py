@@ -67,21 +67,17 @@ class Supervisor:
         self._entered_s = 0.0
         self._tumble_s: float | None = None
 
-    def request_arming(self, do_arm: bool) -> bool:
-        if do_arm == self.armed:
-            return True
-        if do_arm and self.state is not State.CHECKS_PASSED:
-            return False
-        self.armed = do_arm
-        return True
+    def request_arming(self, do_arm: bool) -> tuple[bool, bool]:
+        """Arm or disarm; return (success, armed)."""
+        allowed = not do_arm or self.armed or self.state is State.CHECKS_PASSED
+        if allowed:
+            self.armed = do_arm
+        return allowed, self.armed
 
-    def request_recovery(self) -> bool:
-        if not self.crashed:
-            return True
-        if self.tumbled:
-            return False
-        self.crashed = False
-        return True
+    def request_recovery(self) -> tuple[bool, bool]:
+        """Recover from a crash; return (success, recovered). It is refused while tumbled."""
+        self.crashed = self.crashed and self.tumbled
+        return not self.crashed, not self.crashed
 
     def notify_watchdog(self, t_s: float) -> None:
         self._watchdog_s = t_s
