@@ -201,7 +201,7 @@ def film_address(flight: FlightAnalysis) -> tuple[str, str]:
     missing; each may be empty. The log has at least one tick."""
     path = flight.log.path
     is_recorded = path_beside(path, ".mcap").is_file()
-    recorded = [recorded_pictures(path, exact=False)] if is_recorded else []
+    recorded = [recorded_pictures(path)] if is_recorded else []
     problem = ""
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / "film.mp4"
