@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from perchctl.camera.credentials import without_password
 from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_extent
-from perchctl.camera.network import StreamSource
-from perchctl.camera.source import Clock
+from perchctl.camera.source import Clock, LiveSource
 from perchctl.errors import InvalidValue
 
 PORT = 5000
@@ -97,13 +96,13 @@ class _Picture:
         return image if image is not None and image.shape == shape else None
 
 
-class AiDeckSource(StreamSource):
+class AiDeckSource(LiveSource):
     """Bitcraze's image streamer: CPX packets over TCP, raw or JPEG pictures.
 
     A picture's time is that of its first byte less `latency_s`: the deck sends the header as soon
     as the picture is taken, and only the transfer behind it, of 60 ms and more for a raw one,
-    hangs on the air. Its age of arrival is the last byte's. A picture that is not whole is dropped
-    (`damaged`); what is no packet ends the connection, and the next one begins with a whole packet.
+    hangs on the air. Its age of arrival is the last byte's. A picture that is not whole is dropped;
+    what is no packet ends the connection, and the next one begins with a whole packet.
     """
 
     def __init__(self, host: str, port: int, latency_s: float, clock: Clock) -> None:
@@ -142,7 +141,6 @@ class AiDeckSource(StreamSource):
         """Take the data of one of the streamer's packets: a picture's header, or a part of one."""
         header = _header_of(data, came_s)
         if header is not None:
-            self.damaged += self._picture is not None
             self._picture = header
             return
         picture = self._picture
@@ -154,7 +152,6 @@ class AiDeckSource(StreamSource):
         self._picture = None
         image = picture.pixels() if self._clock() - picture.began_s <= STALLED_S else None
         if image is None:
-            self.damaged += 1
             return
         grey = self._grey(image)
         as_came = picture.is_jpeg and grey is image  # no mosaic was taken out of it

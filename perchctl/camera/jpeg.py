@@ -78,12 +78,11 @@ class JpegSplitter:
     It follows the JPEG's own structure instead of the multipart headers. Wrong lengths, odd
     boundaries and missing headers therefore do no harm, and a picture is out with its last byte.
     A damaged picture is dropped, and the search goes on where its structure breaks: up to 64 kB
-    later if the damage is in a segment's length. `damaged` counts the pictures that were dropped.
+    later if the damage is in a segment's length.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self.damaged = 0
 
     def feed(self, data: bytes) -> list[tuple[bytes, Extent]]:
         """Append bytes; return the pictures that are complete now, oldest first."""
@@ -99,7 +98,6 @@ class JpegSplitter:
             except Damaged as damage:
                 # The start of the next picture may be what broke this one's structure.
                 del self._buffer[: damage.at]
-                self.damaged += 1
                 continue
             if extent is None:
                 break
@@ -114,7 +112,6 @@ class JpegSplitter:
         """Give up a picture that never ends."""
         if len(self._buffer) > MAX_PICTURE_BYTES:
             self._buffer.clear()
-            self.damaged += 1
 
 
 def grey_pixels(data: bytes) -> NDArray[np.uint8] | None:

@@ -1,8 +1,8 @@
 """Cameras over a network: ``http://`` (Motion-JPEG) and ``rtsp://``, each read by a thread.
 
-They connect, read, and connect again, with a limit; the newest frame wins. PyAV's mpjpeg reader
-is not used for Motion-JPEG: without a length in front of each picture it gives one out with the
-next one's first bytes, a whole period late (41 ms instead of 0.2 ms at 25 Hz).
+PyAV's mpjpeg reader is not used for Motion-JPEG: without a length in front of each picture it
+gives one out with the next one's first bytes, a whole period late (41 ms instead of 0.2 ms at
+25 Hz).
 """
 
 from __future__ import annotations
@@ -19,69 +19,8 @@ from urllib.request import HTTPRedirectHandler, ProxyHandler, Request, build_ope
 
 from perchctl.camera.credentials import authorization, without_password
 from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, grey_pixels
-from perchctl.camera.source import Clock, LiveSource, one_line
-
-MAX_FAILED_CONNECTIONS = 5
-"""Connections in a row that bring no picture before the source gives up."""
-
-
-class StreamSource(LiveSource):
-    """Reconnects when the stream ends, stalls or breaks; gives up after
-    `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when the server
-    answers that there is no such stream before the first picture came (`not_found`).
-
-    It connects from `begin` until `close`, which waits for the end of a read. A subclass has
-    `_connection`. `damaged` counts the pictures that were dropped.
-    """
-
-    connect_timeout_s = 3.0
-    read_timeout_s = 2.0
-    reconnect_wait_s = 0.3
-
-    def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
-        super().__init__(without_password(url), latency_s, clock)
-        self._url = url
-        self.not_found = False
-        self.connections = 0
-        self.damaged = 0
-
-    def begin(self) -> None:
-        """Connect, and read in a thread."""
-        self._start(self._run)
-
-    def _connection(self) -> str:
-        """Read one connection until it ends; return why it ended. It may raise any Exception."""
-        raise NotImplementedError
-
-    def _run(self) -> None:
-        failed = 0
-        while not self._stop.is_set():
-            before = self._arrived
-            self.connections += 1
-            try:
-                reason = self._connection()
-            except Exception as error:
-                # Whatever damaged bytes do to a library: a new connection may bring whole ones.
-                reason = _reason(error)
-            if self.not_found:
-                self._fail(f"{self._name}: {reason}")
-                return
-            failed = 0 if self._arrived > before else failed + 1
-            if failed >= MAX_FAILED_CONNECTIONS:
-                self._fail(f"{self._name} gave no picture in {failed} attempts: {reason}")
-                return
-            self._stop.wait(self.reconnect_wait_s)
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, URLError) and isinstance(error.reason, Exception):
-        error = error.reason
-    if isinstance(error, TimeoutError):
-        return "no answer in time"
-    if isinstance(error, ConnectionRefusedError):
-        return "connection refused"
-    return one_line(error)
-
+from perchctl.camera.source import Clock, LiveSource
+from perchctl.errors import NotFound
 
 # --- Motion-JPEG over HTTP --------------------------------------------
 
@@ -98,7 +37,7 @@ class _NoRedirects(HTTPRedirectHandler):
         return None
 
 
-class MjpegSource(StreamSource):
+class MjpegSource(LiveSource):
     """A Motion-JPEG stream (multipart/x-mixed-replace, or bare JPEGs one after another).
 
     It gives up at once, too, where the server wants another name and password, or redirects to
@@ -106,22 +45,28 @@ class MjpegSource(StreamSource):
     It goes straight to the camera: a proxy for the internet is not for it.
     """
 
+    def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
+        super().__init__(url, latency_s, clock)
+        self._url = url
+
     def _connection(self) -> str:
         try:
             with closing(self._opened()) as response:
                 self._read(response)
         except HTTPError as refused:
-            self.not_found = self._count == 0 and refused.code in (401, 403, 404, 410, *_REDIRECTS)
             with refused:
-                return _refusal(refused, self._url)
+                reason = _refusal(refused, self._url)
+            if refused.code in (401, 403, 404, 410, *_REDIRECTS):
+                raise NotFound(f"{self._name}: {reason}") from None
+            return reason
         except URLError as error:
             if not isinstance(error.reason, ssl.SSLCertVerificationError):
                 raise
-            self.not_found = self._count == 0
-            return (
-                f"its certificate is not trusted ({error.reason.verify_message}); name a file with "
-                f"that certificate in the environment variable SSL_CERT_FILE, or use http://"
-            )
+            raise NotFound(
+                f"{self._name}: its certificate is not trusted ({error.reason.verify_message}); "
+                f"name a file with that certificate in the environment variable SSL_CERT_FILE, or "
+                f"use http://"
+            ) from None
         return "the stream ended"
 
     def _opened(self) -> HTTPResponse:
@@ -145,7 +90,6 @@ class MjpegSource(StreamSource):
 
     def _read(self, response: HTTPResponse) -> None:
         splitter = JpegSplitter()
-        earlier = self.damaged
         while not self._stop.is_set():
             data = response.read1(READ_BYTES)
             if not data:
@@ -157,8 +101,6 @@ class MjpegSource(StreamSource):
                 if image is not None:
                     self._put(image, encoded=picture)
                     break
-                splitter.damaged += 1
-            self.damaged = earlier + splitter.damaged
 
 
 def _refusal(refused: HTTPError, url: str) -> str:
@@ -228,13 +170,17 @@ class TransferDelay:
         return way_s - self._ways[0][1]
 
 
-class RtspSource(StreamSource):
+class RtspSource(LiveSource):
     """An RTSP stream of any codec that FFmpeg decodes, over TCP where the camera can.
 
     Given up at once, too, where the camera wants another name and password.
     """
 
     connect_timeout_s = 5.0
+
+    def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
+        super().__init__(url, latency_s, clock)
+        self._url = url
 
     def _connection(self) -> str:
         import av  # late: most flights have another camera
@@ -247,9 +193,9 @@ class RtspSource(StreamSource):
         except (av.error.FFmpegError, OSError, ValueError) as error:
             # Without FFmpeg's own texts, which hold the URL with its password.
             name = type(error).__name__
-            self.not_found = self._count == 0 and name in _FINAL
-            reason = (_FINAL | _PASSING).get(name) or getattr(error, "strerror", None)
-            return str(reason or name)
+            if name in _FINAL:
+                raise NotFound(f"{self._name}: {_FINAL[name]}") from None
+            return str(_PASSING.get(name) or getattr(error, "strerror", None) or name)
 
     def _read(self, stream: Any) -> str:
         """Read one connection until it ends, and return why. Raises PyAV's errors."""
@@ -269,7 +215,6 @@ class RtspSource(StreamSource):
                 frames = [(f.to_ndarray(format="gray"), f.time) for f in packet.decode()[-1:]]
             except (av.error.FFmpegError, ValueError):
                 damaged += 1
-                self.damaged += 1
                 if damaged >= MAX_DAMAGED:
                     return "its pictures cannot be decoded"
                 continue

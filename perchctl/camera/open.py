@@ -12,7 +12,7 @@ from perchctl.camera.aideck import FORM, AiDeckSource, aideck_address
 from perchctl.camera.credentials import without_password
 from perchctl.camera.device import DeviceSource, open_capture
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
-from perchctl.camera.network import MjpegSource, RtspSource, StreamSource
+from perchctl.camera.network import MjpegSource, RtspSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource, WrappedSource, unmirror_frame
 from perchctl.errors import InvalidValue, NotFound, TimedOut
 from perchctl.profile import CameraConfig
@@ -132,20 +132,16 @@ def _live(
     clock: Clock,
     config: CameraConfig | None,
 ) -> LiveSource:
-    """Open a camera or stream whose first frame is still to come."""
+    """Return a camera or stream that is not opened yet."""
     if name.scheme == "camera":
         opener = partial(open_capture, name.place, size_px, config)
         return DeviceSource(str(name), latency_s, clock, opener)
-    stream: StreamSource | None = None
     if name.scheme == "aideck":
-        stream = AiDeckSource(*aideck_address(name.spec), latency_s, clock)
-    elif name.scheme in _USUAL_PORT and name.place.strip("/"):
+        return AiDeckSource(*aideck_address(name.spec), latency_s, clock)
+    if name.scheme in _USUAL_PORT and name.place.strip("/"):
         _check_address(name)
         kind = RtspSource if name.scheme == "rtsp" else MjpegSource
-        stream = kind(name.spec, latency_s, clock)
-    if stream is not None:
-        stream.begin()
-        return stream
+        return kind(name.spec, latency_s, clock)
     if name.spec == "sim:":
         raise InvalidValue(
             "camera source sim: is the simulated vehicle's camera and needs a link of sim://; "
@@ -173,17 +169,12 @@ def _check_address(name: SourceName) -> None:
 
 
 def _started(source: LiveSource, timeout_s: float) -> FrameSource:
-    """Wait for the first frame. Raises NotFound or TimedOut without one, with the source closed."""
+    """Wait for the first frame. Raises the source's failure, or TimedOut, with it closed."""
+    source.begin()
     if source.wait_first(timeout_s):
         return source
-    problem = source.problem(float("-inf"))
-    described = source.describe()
     source.close()
-    if isinstance(source, StreamSource) and source.not_found:
-        raise NotFound(f"no first frame: {problem}")
-    if problem is not None:
-        raise TimedOut(f"no first frame: {problem}")
-    raise TimedOut(
-        f"{described}: no first frame within {timeout_s:g} s; is the camera powered, and its "
-        f"receiver on the right channel?"
+    raise source.failure or TimedOut(
+        f"{source.describe()}: no first frame within {timeout_s:g} s; is the camera powered, and "
+        f"its receiver on the right channel?"
     )

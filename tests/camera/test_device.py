@@ -29,7 +29,7 @@ from perchctl.camera.source import LiveSource
 from perchctl.commands import app, check
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
-from tests.helpers.live import WAIT_S, Clock, level, next_frame
+from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
 from tests.helpers.waiting import until
 
 
@@ -170,9 +170,8 @@ def device(
     clock: Clock | None = None,
     reopen_every_s: float = 0.001,
 ) -> DeviceSource:
-    source = DeviceSource("camera:2", 0.05, clock or Clock(), opener, 0.0, reopen_every_s)
-    opened.append(source)
-    return source
+    source = DeviceSource("camera:2", 0.05, clock or Clock(), opener)
+    return begun(source, opened, retry_s=0.0, reconnect_wait_s=reopen_every_s)
 
 
 def test_a_device_delivers_grey_frames_drops_a_damaged_one_and_is_released(
@@ -181,7 +180,7 @@ def test_a_device_delivers_grey_frames_drops_a_damaged_one_and_is_released(
     colour = np.full((48, 64, 3), 160, np.uint8)
     capture = Capture(grey(60), cv2.error("damaged"), colour)
     source = device(opened, Bus(capture).open)
-    until(lambda: source._count == 2)
+    until(lambda: source._slot.count == 2)
     frame = next_frame(source)
     assert (level(frame), frame.image.shape) == (160, (48, 64))
     assert frame.t_s == pytest.approx(99.95)

@@ -113,8 +113,8 @@ def test_a_packet_that_cannot_be_decoded_costs_no_connection(
     stream = Packets(60, error, 160)
     monkeypatch.setattr(av, "open", lambda *_, **__: stream)
     source = begun(RtspSource("rtsp://camera/x", 0.0, Clock()), opened, reconnect_wait_s=WAIT_S)
-    until(lambda: source._count == 2)
-    assert (source.connections, source.damaged) == (1, 1)
+    until(lambda: source._slot.count == 2)
+    assert source.connections == 1
     assert int(stream.context.options["max_pixels"]) == MOST_STREAM_PX
 
 
