@@ -8,16 +8,24 @@ gives one out with the next one's first bytes, a whole period late (41 ms instea
 from __future__ import annotations
 
 import math
-import ssl
+import re
+from base64 import b64encode
 from collections import deque
 from contextlib import closing
 from http.client import HTTPResponse
 from typing import Any
-from urllib.error import HTTPError, URLError
-from urllib.parse import urljoin, urlsplit, urlunsplit
-from urllib.request import HTTPRedirectHandler, ProxyHandler, Request, build_opener
+from urllib.error import HTTPError
+from urllib.parse import unquote, urlsplit, urlunsplit
+from urllib.request import (
+    HTTPDigestAuthHandler,
+    HTTPPasswordMgrWithDefaultRealm,
+    ProxyHandler,
+    Request,
+    build_opener,
+    parse_http_list,
+    parse_keqv_list,
+)
 
-from perchctl.camera.credentials import authorization, without_password
 from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, grey_pixels
 from perchctl.camera.source import Clock, LiveSource
 from perchctl.errors import NotFound
@@ -27,66 +35,65 @@ from perchctl.errors import NotFound
 
 READ_BYTES = 65536
 _HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*"}
-_REDIRECTS = (301, 302, 303, 307, 308)
-
-
-class _NoRedirects(HTTPRedirectHandler):
-    """Takes a redirect for a refusal: another host would get the name and the password."""
-
-    def redirect_request(self, *_: Any) -> None:
-        return None
+_NOT_MENDED = (401, 403, 404, 410)
+"""What the server answers to another attempt, too."""
+_DIGEST = re.compile(r"\bDigest\s+(.*)", re.IGNORECASE)
 
 
 class MjpegSource(LiveSource):
     """A Motion-JPEG stream (multipart/x-mixed-replace, or bare JPEGs one after another).
 
-    It gives up at once, too, where the server wants another name and password, or redirects to
-    another address. Name and password are sent once the server asks for them, digest or basic.
-    It goes straight to the camera: a proxy for the internet is not for it.
+    It gives up at once, too, where the server wants another name and password. They are sent once
+    the camera asks for them, digest (MD5) or basic, and to no address that it redirects to. It goes
+    straight to the camera: a proxy for the internet is not for it.
     """
 
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
         super().__init__(url, latency_s, clock)
-        self._url = url
+        parts = urlsplit(url)
+        self._bare = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
+        self._name_and_password = unquote(parts.username or ""), unquote(parts.password or "")
 
     def _connection(self) -> str:
         try:
             with closing(self._opened()) as response:
                 self._read(response)
         except HTTPError as refused:
-            with refused:
-                reason = _refusal(refused, self._url)
-            if refused.code in (401, 403, 404, 410, *_REDIRECTS):
+            refused.close()
+            reason = f"the server answers {refused.code} {refused.reason}"
+            if refused.code == 401:
+                reason += ", so write its name and password as in http://NAME:PASSWORD@HOST/PATH"
+            if refused.code in _NOT_MENDED:
                 raise NotFound(f"{self._name}: {reason}") from None
             return reason
-        except URLError as error:
-            if not isinstance(error.reason, ssl.SSLCertVerificationError):
-                raise
-            raise NotFound(
-                f"{self._name}: its certificate is not trusted ({error.reason.verify_message}); "
-                f"name a file with that certificate in the environment variable SSL_CERT_FILE, or "
-                f"use http://"
-            ) from None
         return "the stream ended"
 
     def _opened(self) -> HTTPResponse:
-        """Return the stream's response, with name and password once the server has asked for them.
-        Raises HTTPError for any other answer."""
-        parts = urlsplit(self._url)
-        bare = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
-        opener = build_opener(ProxyHandler({}), _NoRedirects)
-        request = Request(bare, headers=_HEADERS)
+        """Return the stream's response, with name and password once the camera has asked for them:
+        once, since cameras lock out who tries again and again."""
+        opener, request = build_opener(ProxyHandler({})), Request(self._bare, headers=_HEADERS)
+        response: HTTPResponse
         try:
-            response: HTTPResponse = opener.open(request, timeout=self.read_timeout_s)
+            response = opener.open(request, timeout=self.read_timeout_s)
         except HTTPError as refused:
-            asked = refused.headers.get_all("WWW-Authenticate") or []
-            given = authorization(asked, request, parts) if refused.code == 401 else None
-            if given is None:
+            if refused.code != 401 or not any(self._name_and_password):
                 raise
             refused.close()
-            request.add_unredirected_header("Authorization", given)
+            asked = ", ".join(refused.headers.get_all("WWW-Authenticate") or [])
+            request.add_unredirected_header("Authorization", self._answer(asked, request))
             response = opener.open(request, timeout=self.read_timeout_s)
         return response
+
+    def _answer(self, asked: str, request: Request) -> str:
+        """Return the Authorization header, by a digest where the camera takes one: basic shows the
+        password."""
+        found = _DIGEST.search(asked)
+        if found is None:
+            return "Basic " + b64encode(":".join(self._name_and_password).encode()).decode()
+        passwords = HTTPPasswordMgrWithDefaultRealm()
+        passwords.add_password(None, request.full_url, *self._name_and_password)
+        challenge = parse_keqv_list(parse_http_list(found[1]))
+        return f"Digest {HTTPDigestAuthHandler(passwords).get_authorization(request, challenge)}"
 
     def _read(self, response: HTTPResponse) -> None:
         splitter = JpegSplitter()
@@ -101,20 +108,6 @@ class MjpegSource(LiveSource):
                 if image is not None:
                     self._put(image, encoded=picture)
                     break
-
-
-def _refusal(refused: HTTPError, url: str) -> str:
-    """Say why an answer holds no stream."""
-    hint = ""
-    if refused.code in _REDIRECTS:
-        to = without_password(urljoin(url, refused.headers.get("Location", "")))
-        hint = f": it redirects to {to}; name that address in camera.source"
-    elif refused.code == 401:
-        hint = (
-            "; write a name and a password that it takes, for basic or digest authentication by "
-            "MD5, as in http://NAME:PASSWORD@HOST/PATH (@ is %40 there, : is %3A)"
-        )
-    return f"the server answers {refused.code} {refused.reason}{hint}"
 
 
 # --- RTSP, decoded by PyAV: its open and read end in time, and say why they failed; OpenCV's

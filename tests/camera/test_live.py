@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import re
 import threading
 from collections.abc import Iterator
-from hashlib import md5
-from pathlib import Path
+from contextlib import closing
 from typing import Any
-from urllib.parse import urlsplit
-from urllib.request import Request
 
 import cv2
 import numpy as np
 import pytest
 
 from perchctl.camera import network, open_camera
-from perchctl.camera.credentials import authorization
 from perchctl.camera.jpeg import grey_pixels
 from perchctl.camera.network import MjpegSource
 from perchctl.camera.source import SILENT_AFTER_S, LiveSource
@@ -162,39 +157,17 @@ def test_no_first_frame_in_time(server: MjpegServer) -> None:
     quiet.set()
 
 
-# -- certificates, redirects, names and passwords --------------------------------------
+# -- redirects, names and passwords ----------------------------------------------------
 
-DIGEST = ['Basic realm="camera"', 'Digest realm="camera", nonce="n1", qop="auth,auth-int"']
-
-
-def test_a_certificate_that_nobody_vouches_for(
-    server: MjpegServer, opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pem = Path(__file__).parents[1] / "helpers" / "loopback.pem"  # for 127.0.0.1 and 100 years
-    server.encrypt(pem)
-    url = server.url.replace("http://", "https://me:secret@")
-    with pytest.raises(NotFound, match=r"is not trusted \(self.signed.*SSL_CERT_FILE") as caught:
-        open_camera(url, Clock(), timeout_s=WAIT_S)
-    assert "secret" not in str(caught.value)
-    monkeypatch.setenv("SSL_CERT_FILE", str(pem))
-    server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = begun(MjpegSource(url, 0.0, Clock()), opened)
-    assert level(next_frame(source)) == 60
-
-
-BASIC = "Basic bWU6cEBzcw=="
-BY_DIGEST = 'Digest username="me", realm="camera"'
-SHA_256 = 'Digest realm="camera", nonce="n1", algorithm=SHA-256'
+DIGEST = 'Digest realm="camera", nonce="n1", qop="auth"'
+BASIC = 'Basic realm="camera"'
 
 
 @pytest.mark.parametrize(("challenges", "answered"), [
-    (['Basic realm="camera"'], BASIC),
-    (DIGEST, BY_DIGEST),
-    ([", ".join(DIGEST)], BY_DIGEST),
-    ([SHA_256, *DIGEST], BY_DIGEST),
-    (['digest realm="camera", nonce="n1", opaque="o"'], BY_DIGEST),
+    ([BASIC], "Basic bWU6cEBzcw=="),
+    ([BASIC, DIGEST], 'Digest username="me", realm="camera"'),
 ])  # fmt: skip
-def test_name_and_password_are_sent_once_they_are_asked_for_digest_first(
+def test_name_and_password_are_sent_once_they_are_asked_for(
     challenges: list[str], answered: str, server: MjpegServer, opened: list[LiveSource]
 ) -> None:
     server.challenges = challenges
@@ -207,45 +180,31 @@ def test_name_and_password_are_sent_once_they_are_asked_for_digest_first(
     assert "p%40ss" not in source.describe()
 
 
-def test_a_digest_is_that_of_rfc_2617() -> None:
-    asked = (
-        'Digest realm="testrealm@host.com", qop="auth,auth-int", '
-        'nonce="dcd98b7102dd2f0e8b11d0f600bfb0c093", opaque="5ccc069c403ebaf9f0171e9517f40e41"'
-    )
-    url = "http://Mufasa:Circle%20Of%20Life@host/dir/index.html"
-    given = authorization([asked], Request("http://host/dir/index.html"), urlsplit(url))
-    values = dict(re.findall(r'(\w+)="?([^",]*)', str(given)))
-
-    def h(*words: str) -> str:
-        return md5(":".join(words).encode()).hexdigest()
-
-    first = h("Mufasa", "testrealm@host.com", "Circle Of Life")
-    middle = (values["nonce"], values["nc"], values["cnonce"], "auth")
-    assert values["response"] == h(first, *middle, h("GET", "/dir/index.html"))
-    assert values["opaque"] == "5ccc069c403ebaf9f0171e9517f40e41"
+def test_a_redirect_to_another_address_gets_no_password(
+    server: MjpegServer, opened: list[LiveSource]
+) -> None:
+    with closing(MjpegServer()) as other:
+        server.challenges, server.redirect = [BASIC], other.url
+        other.challenges = [BASIC]
+        with pytest.raises(NotFound, match="401"):
+            open_camera(server.url.replace("//", "//me:secret@"), Clock(), timeout_s=WAIT_S)
+        assert server.authorization[0] is None
+        assert str(server.authorization[1]).startswith("Basic")
+        assert set(other.authorization) == {None}
 
 
-@pytest.mark.parametrize(("changes", "who", "requests", "words"), [
-    ({"status": 404}, "", 1, "404"),
-    ({"status": 403}, "me:wrong@", 1, "403"),
-    ({"challenges": DIGEST}, "", 1, "write a name and a password .*, as in http://NAME:PASSWORD"),
-    ({"challenges": DIGEST}, "me:wrong@", 2, "write a name and a password"),
-    *(({"challenges": [*of]}, "me:wrong@", 1, "for basic or digest authentication by MD5")
-      for of in (("Negotiate",), (SHA_256, 'Basic realm="camera"'), ("\xff=",))),
-    *(({"redirect": to}, "me:wrong@", 1, "redirects to .*name that address in camera.source")
-      for to in ("/elsewhere.mjpg", "http://me:wrong@127.0.0.1:1/x", "rtsp://127.0.0.1/live")),
+@pytest.mark.parametrize(("changes", "who", "words"), [
+    ({"status": 404}, "", "404"),
+    ({"status": 403}, "me:wrong@", "403"),
+    ({"challenges": [DIGEST]}, "", "401 .*as in http://NAME:PASSWORD"),
+    ({"challenges": [DIGEST]}, "me:wrong@", "401 .*as in http://NAME:PASSWORD"),
 ])  # fmt: skip
 def test_what_trying_again_would_not_mend_is_said_at_once(
-    changes: dict[str, Any], who: str, requests: int, words: str, server: MjpegServer
+    changes: dict[str, Any], who: str, words: str, server: MjpegServer
 ) -> None:
-    """Nothing follows a redirect: nobody can ask for the password in the camera's place. Nor is a
-    password shown where a digest was asked for that is not known."""
     server.nonce = "none of mine"
     for name, value in changes.items():
         setattr(server, name, value)
     with pytest.raises(NotFound, match=words) as caught:
         open_camera(server.url.replace("http://", f"http://{who}"), Clock(), timeout_s=WAIT_S)
-    assert len(server.authorization) == requests
     assert "wrong" not in str(caught.value)
-    if "redirect" in changes:
-        assert changes["redirect"].rpartition("/")[2] in str(caught.value)
