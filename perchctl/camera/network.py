@@ -184,11 +184,12 @@ class RtspSource(LiveSource):
             with av.open(self._url, options=_OPTIONS, timeout=timeouts_s) as stream:
                 return self._read(stream)
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            # Without FFmpeg's own texts, which hold the URL with its password.
+            # Not the error's whole text, which holds the URL with its password.
             name = type(error).__name__
+            reason = str(_REASONS.get(name) or getattr(error, "strerror", None) or name)
             if name in _FINAL:
-                raise NotFound(f"{self._name}: {_FINAL[name]}") from None
-            return str(_PASSING.get(name) or getattr(error, "strerror", None) or name)
+                raise NotFound(f"{self._name}: {reason}") from None
+            return reason
 
     def _read(self, stream: Any) -> str:
         """Read one connection until it ends, and return why. Raises PyAV's errors."""
@@ -217,19 +218,17 @@ class RtspSource(LiveSource):
         return "the stream ended"
 
 
-_FINAL = {
-    "HTTPUnauthorizedError": "it wants another name or password (401), as in "
-    "rtsp://NAME:PASSWORD@HOST/PATH (@ is %40 there, : is %3A)",
-    "HTTPForbiddenError": "this name may not see the stream (403)",
-    "HTTPNotFoundError": "there is no such stream (404); look for the path in its manual",
-    "HTTPBadRequestError": "it does not understand the request (400)",
-    "DecoderNotFoundError": "its pictures are in a form that FFmpeg cannot decode",
-}
+_FINAL = (
+    "HTTPUnauthorizedError",
+    "HTTPForbiddenError",
+    "HTTPNotFoundError",
+    "HTTPBadRequestError",
+    "DecoderNotFoundError",
+)
 """PyAV's errors that another attempt would not mend, by name."""
-_PASSING = {
-    "ConnectionRefusedError": "connection refused",
-    "OSError": "the host cannot be reached, or its name is unknown: correct it",
+_REASONS = {
+    "OSError": "the host cannot be reached, or its name is unknown",
     "ExitError": "no answer in time",
     "InvalidDataError": "no answer in time, or none of RTSP",
-    "TimeoutError": "no answer in time",
 }
+"""In the place of FFmpeg's own, which say less."""
