@@ -12,7 +12,6 @@ is not used.
 
 from __future__ import annotations
 
-import re
 import socket
 import struct
 from dataclasses import dataclass
@@ -23,13 +22,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.camera.credentials import without_password
 from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_extent
 from perchctl.camera.source import Clock, LiveSource
-from perchctl.errors import InvalidValue
 
 PORT = 5000
-FORM = "aideck://HOST[:5000]"
 STALLED_S = 2.0
 """A picture that takes longer from its first byte to its last is dropped: its end would be taken
 for its time of arrival."""
@@ -40,30 +36,11 @@ MOST_SIDE_PX = 1024
 # What waits unread while the reader stalls is then given out one by one, dated when it is read.
 # Linux holds at most twice this, three raw pictures or some forty JPEGs; then the deck has to wait.
 _RECEIVE_BYTES = 131072
-_HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|[0-9A-Fa-f:]+")
 _PACKET = struct.Struct("<HBB")
 _HEADER = struct.Struct("<BHHBBI")
 _MAGIC, _RAW, _JPEG = 0xBC, 0, 1
 _APP = 5
 _FUNCTIONS = (1, 2, 3, 4, _APP, 14, 15)
-
-
-def aideck_address(spec: str) -> tuple[str, int]:
-    """Return host and port of ``aideck://HOST[:PORT]``. Raises InvalidValue."""
-    wrong = InvalidValue(
-        f"camera source {without_password(spec)!r} is no AI-deck's address; write {FORM}, as in "
-        f"aideck://192.168.4.1"
-    )
-    try:
-        parts = urlsplit(spec)
-        port = PORT if parts.port is None else parts.port
-    except ValueError:
-        raise wrong from None
-    host = parts.hostname or ""
-    more = parts.username or parts.path.strip("/") or parts.query or parts.fragment
-    if parts.scheme != "aideck" or not _HOST_NAME.fullmatch(host) or port == 0 or more:
-        raise wrong
-    return host, port
 
 
 @dataclass
@@ -105,9 +82,10 @@ class AiDeckSource(LiveSource):
     what is no packet ends the connection, and the next one begins with a whole packet.
     """
 
-    def __init__(self, host: str, port: int, latency_s: float, clock: Clock) -> None:
-        super().__init__(f"aideck://{host}:{port}", latency_s, clock)
-        self._address = host, port
+    def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
+        super().__init__(url, latency_s, clock)
+        parts = urlsplit(url)
+        self._address = parts.hostname, parts.port or PORT
         self._grey = MosaicFilter()
         self._picture: _Picture | None = None
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from perchctl.camera.aideck import FORM, AiDeckSource, aideck_address
+from perchctl.camera.aideck import AiDeckSource
 from perchctl.camera.credentials import without_password
 from perchctl.camera.device import DeviceSource, open_capture
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
@@ -19,10 +19,15 @@ from perchctl.profile import CameraConfig
 
 REAL = (
     "camera:N, camera:NAME, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, "
-    f"rtsp://HOST/PATH, {FORM}"
+    "rtsp://HOST/PATH, aideck://HOST[:5000]"
 )
-ALLOWED = f"{REAL}, sim:"
-SCHEMES = ("camera", "video", "images", "http", "https", "rtsp", "aideck", "sim")
+STREAMS: dict[str, Callable[[str, float, Clock], LiveSource]] = {
+    "http": MjpegSource,
+    "https": MjpegSource,
+    "rtsp": RtspSource,
+    "aideck": AiDeckSource,
+}
+SCHEMES = ("camera", "video", "images", "sim", *STREAMS)
 FIRST_FRAME_WITHIN_S = 8.0
 
 
@@ -48,32 +53,45 @@ class SourceName:
         return without_password(self.spec)
 
 
-def parse_source(text: str, *, files: bool = False) -> SourceName:
-    """Return the source that a text names: a scheme in small or capital letters, and its place.
+def parse_source(text: str) -> SourceName:
+    """Return the source that a text names: a scheme in small or capital letters, and its place; or
+    a bare path of a video, a picture, a pattern or a folder of pictures. Nothing is opened.
 
-    `files`: a bare path names a video, a picture, a pattern or a folder of pictures. Nothing is
-    opened. Errors: InvalidValue for an unknown scheme or an AI-deck's address that is none;
-    NotFound for a bare path that does not exist.
+    Errors: InvalidValue for an unknown scheme or a stream without a host; NotFound for a bare path
+    that does not exist.
     """
     scheme, colon, place = text.partition(":")
-    scheme = scheme.lower() if colon else ""
-    if scheme == "aideck":
-        aideck_address(f"{scheme}:{place}")
-    if scheme in SCHEMES:
-        return SourceName(scheme, place)  # FFmpeg knows rtsp:// and not RTSP://
-    path = Path(text).expanduser()
-    is_path = "://" not in text and not (scheme and not path.suffix and "/" not in text)
-    if files and (path.is_dir() or any(c in text for c in "*?[")):
+    name = SourceName(scheme.lower() if colon else "", place)
+    if name.scheme in STREAMS:
+        _check_address(name)
+    if name.scheme in SCHEMES:
+        return name  # FFmpeg knows rtsp:// and not RTSP://
+    path, shown = Path(text).expanduser(), without_password(text)
+    if path.is_dir() or any(c in text for c in "*?["):
         return SourceName("images", text)
-    if files and path.is_file():
+    if path.is_file():
         return SourceName("images" if path.suffix.lower() in IMAGE_SUFFIXES else "video", text)
-    shown = without_password(text)
-    if files and is_path:
-        raise NotFound(
-            f"{shown} does not exist; a source is a video, picture or folder of pictures, or one "
-            f"of {REAL}"
+    if name.scheme:
+        raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {REAL}, sim:")
+    raise NotFound(
+        f"{shown} does not exist; a source is a video, picture or folder of pictures, or one of "
+        f"{REAL}"
+    )
+
+
+def _check_address(name: SourceName) -> None:
+    """Raise InvalidValue where a stream's URL has no host, or a port that cannot be."""
+    try:
+        parts = urlsplit(name.spec)
+        is_right = name.place.startswith("//") and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        is_right = False
+    if not is_right:
+        raise InvalidValue(
+            f"camera source {str(name)!r} has no host or no port that can be read, as in "
+            f"{name.scheme}://192.168.1.20:5000/stream; a port is 1 to 65535; in a name or "
+            f"password @ is %40, : is %3A, / is %2F"
         )
-    raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED}")
 
 
 def open_camera(
@@ -113,7 +131,7 @@ def open_camera(
     if not isinstance(source, str):
         opened = ImagesSource(source, latency_s, pictures_hz)
     else:
-        name = parse_source(source, files=True)
+        name = parse_source(source)
         if name.scheme == "video" and name.place:
             opened = VideoSource(Path(name.place).expanduser(), latency_s)
         elif name.scheme == "images" and name.place:
@@ -136,36 +154,12 @@ def _live(
     if name.scheme == "camera":
         opener = partial(open_capture, name.place, size_px, config)
         return DeviceSource(str(name), latency_s, clock, opener)
-    if name.scheme == "aideck":
-        return AiDeckSource(*aideck_address(name.spec), latency_s, clock)
-    if name.scheme in _USUAL_PORT and name.place.strip("/"):
-        _check_address(name)
-        kind = RtspSource if name.scheme == "rtsp" else MjpegSource
-        return kind(name.spec, latency_s, clock)
-    if name.spec == "sim:":
-        raise InvalidValue(
-            "camera source sim: is the simulated vehicle's camera and needs a link of sim://; "
-            f"other sources are {REAL}"
-        )
-    raise InvalidValue(f"camera source {str(name)!r} is unknown; allowed are {ALLOWED}")
-
-
-_USUAL_PORT = {"http": 80, "https": 443, "rtsp": 554}
-
-
-def _check_address(name: SourceName) -> None:
-    """Raise InvalidValue where a stream's URL has no host, or a port that cannot be."""
-    try:
-        parts = urlsplit(name.spec)
-        is_right = name.place.startswith("//") and bool(parts.hostname) and parts.port != 0
-    except ValueError:
-        is_right = False
-    if not is_right:
-        raise InvalidValue(
-            f"camera source {str(name)!r} has no host or no port that can be read, as in "
-            f"{name.scheme}://192.168.1.20:{_USUAL_PORT[name.scheme]}/stream; a port is 1 to "
-            f"65535; in a name or password @ is %40, : is %3A, / is %2F"
-        )
+    if name.scheme in STREAMS:
+        return STREAMS[name.scheme](name.spec, latency_s, clock)
+    raise InvalidValue(
+        f"camera source {str(name)!r} names no camera or file; allowed are {REAL}, and sim: with a "
+        f"link of sim://"
+    )
 
 
 def _started(source: LiveSource, timeout_s: float) -> FrameSource:

@@ -117,7 +117,7 @@ def track(
     along the camera's x, y, z.
     """
     flown = load_profile(profile)
-    source = parse_source(source, files=True).spec
+    source = parse_source(source).spec
     if stills is None:  # files of pictures need not belong together
         stills = source.startswith("images:")
     if calibration is None:

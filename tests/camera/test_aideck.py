@@ -13,18 +13,15 @@ import pytest
 
 from perchctl.calibration import load_calibration
 from perchctl.camera import aideck as aideck_module
-from perchctl.camera import open_camera
 from perchctl.camera.aideck import (
     STALLED_S,
     AiDeckSource,
     MosaicFilter,
     _Picture,
-    aideck_address,
     has_mosaic,
     without_mosaic,
 )
 from perchctl.camera.source import LiveSource
-from perchctl.errors import InvalidValue
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
 from tests.helpers.aideck import (
@@ -60,7 +57,7 @@ def read(deck: AiDeck, opened: list[LiveSource]) -> Callable[..., AiDeckSource]:
     """Opens the deck's source."""
 
     def make(clock: Clock | None = None, **options: float) -> AiDeckSource:
-        source = AiDeckSource(*aideck_address(deck.url), 0.06, clock or Clock())
+        source = AiDeckSource(deck.url, 0.06, clock or Clock())
         return begun(source, opened, reconnect_wait_s=0.0, **options)
 
     return make
@@ -194,25 +191,6 @@ def test_reconnects_are_bounded_and_the_reason_is_given(
     until(lambda: "in 5 attempts: " in (source.problem(100.0) or ""))
     assert words in str(source.problem(100.0))
     assert deck.connections == 5
-
-
-@pytest.mark.parametrize(("spec", "address"), [
-    ("aideck://192.168.4.1", ("192.168.4.1", 5000)),
-    ("aideck://aideck-4E4BDC.local:81/", ("aideck-4e4bdc.local", 81)),
-    ("aideck://[::1]:5001", ("::1", 5001)),
-])  # fmt: skip
-def test_an_address(spec: str, address: tuple[str, int]) -> None:
-    assert aideck_address(spec) == address
-
-
-@pytest.mark.parametrize("spec", [
-    "aideck:", "aideck://", "aideck:192.168.4.1", "aideck://:5000", "aideck://a:b", "aideck://a:0",
-    "aideck://a:70000", "aideck://a/stream", "aideck://u:p@a", "aideck://a?colour=yes",
-    "aideck://a b", "aideck://a#x", "aideck://[::1",
-])  # fmt: skip
-def test_a_wrong_address_is_one_sentence(spec: str) -> None:
-    with pytest.raises(InvalidValue, match=r"write aideck://HOST\[:5000\], as in aideck://192"):
-        open_camera(spec, Clock())
 
 
 # --- A colour camera ----------------------------------------------------------------------
