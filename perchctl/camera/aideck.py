@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_extent
+from perchctl.camera.jpeg import grey_pixels, jpeg_extent
 from perchctl.camera.source import Clock, LiveSource
 
 PORT = 5000
@@ -65,10 +65,7 @@ class _Picture:
             return None
         if not self.is_jpeg:
             return np.frombuffer(data, np.uint8).reshape(shape)
-        try:
-            is_whole = jpeg_extent(data) == (len(data), (self.width, self.height))
-        except Damaged:
-            return None
+        is_whole = jpeg_extent(data) == (len(data), (self.width, self.height))
         image = grey_pixels(data) if is_whole else None
         return image if image is not None and image.shape == shape else None
 

@@ -102,9 +102,8 @@ class MjpegSource(LiveSource):
             if not data:
                 return
             # If the network delivered several at once only the newest is worth decoding.
-            for picture, extent in reversed(splitter.feed(data)):
-                width, height = extent.size_px
-                image = grey_pixels(picture) if 0 < width * height <= MOST_STREAM_PX else None
+            for picture, (width, height) in reversed(splitter.feed(data)):
+                image = grey_pixels(picture) if width * height <= MOST_STREAM_PX else None
                 if image is not None:
                     self._put(image, encoded=picture)
                     break
