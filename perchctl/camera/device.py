@@ -149,24 +149,17 @@ def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> in
     """Return the N of what stands behind ``camera:``: a number, a name or a part of one (quotes
     and capitals do not matter), or a path of the device.
 
-    Errors: InvalidValue, nothing given, or several that fit; NotFound.
+    Errors: InvalidValue, several that fit; NotFound.
     """
     wanted = text.strip().strip("\"'").strip()
     if wanted.isascii() and wanted.isdigit():
         return int(wanted)
-    if not wanted or wanted.lstrip("-").isdigit():
-        raise InvalidValue(
-            f"camera source 'camera:{text}' lacks a camera's number or name, as in camera:0 or "
-            f"camera:USB Video; perchctl check --cameras lists them"
-        )
     known = find_cameras(devices, names)
-    low = wanted.casefold()
     if wanted.startswith("/"):
         fitting = [c for c in known if c.number in _video_numbers([Path(wanted).resolve()])]
     else:
-        fitting = [c for c in known if c.name.casefold() == low] or [
-            c for c in known if low in f"{c.name} {Path(c.stable_path).name}".casefold()
-        ]
+        named = ((c, f"{c.name} {Path(c.stable_path).name}".casefold()) for c in known)
+        fitting = [camera for camera, name in named if wanted.casefold() in name]
     if len(fitting) == 1:
         return fitting[0].number
     if fitting:
