@@ -212,15 +212,15 @@ class FlightInputs:
         if (width, height) != (size_px := self.pipeline.camera.size_px):
             return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
         live = self.source.live
-        verdict = self.perception.health.assess(frame, live)
+        kind = self.perception.health.assess(frame, live)
         if self.recorded and self.taken.frame is not None:
             seen = replace(self.taken.frame, checksum=zlib.crc32(frame.image.tobytes()))
             self.taken = replace(self.taken, frame=seen)
         # A dark target may still be seen, and a bare ceiling looks like an empty screen: such
         # pictures are searched all the same, with a note.
-        self._note = verdict.text if verdict.kind in ("dark", "uniform") else None
-        if not verdict.usable and self._note is None:
-            return verdict.text
+        self._note = VERDICT_TEXTS[kind] if kind in ("dark", "uniform") else None
+        if kind != "ok" and self._note is None:
+            return VERDICT_TEXTS[kind]
         return lateness_text(now_s - frame.t_s, self.profile.safety) if live else None
 
 
