@@ -10,6 +10,7 @@ lifts and turns the vehicle (`perchctl check --lift`), or in its first centimetr
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,9 +32,9 @@ from perchctl.vehicle import (
     FLYING,
     LOCKED,
     NO_BATTERY_READING_V,
+    POSITION_DECKS,
     TUMBLED,
     ExternalPosition,
-    MeasuredBy,
     Telemetry,
 )
 from perchctl.vision import TargetEstimate
@@ -160,23 +161,18 @@ class GroundCriteria:
         return Problem(f"its accelerometer reads {acc_z_g:.2f} g", "let it stand still")
 
     @staticmethod
-    def unmeasured(by: MeasuredBy, profile: Profile) -> Problem | None:
+    def unmeasured(decks: Sequence[str], profile: Profile) -> Problem | None:
         """A vehicle without any position source, which would fly by a sum of accelerations."""
         config = profile.positioning
-        if config.by != "deck" or by.placed_by(config.decks) or by.external:
+        if config.by != "deck" or {*decks} & {*POSITION_DECKS, *config.decks}:
             return None
-        outside = "whether positions come from outside is not told"
-        if by.external is not None:
-            outside = "no position comes from outside"
         advice = (
             "mount a positioning deck (flow, lighthouse, loco), or set positioning: mocap or "
             "positioning: target"
         )
-        if by.decks:
-            advice += (
-                f"; if {' or '.join(by.decks)} measures it, name that one in positioning.decks"
-            )
-        return Problem(f"no positioning deck, and {outside}", advice)
+        if decks:
+            advice += f"; if {' or '.join(decks)} measures it, name that one in positioning.decks"
+        return Problem("no positioning deck", advice)
 
     @staticmethod
     def too_near(target: TargetEstimate | None) -> Problem | None:

@@ -41,7 +41,7 @@ def refuse_unmeasured(link: Link, profile: Profile, *, positions: bool) -> None:
     """Raises SafetyAbort without any position source. `positions`: those of the profile's motion
     capture are being sent."""
     if profile.positioning.by == "deck":
-        _refuse(GroundCriteria.unmeasured(link.measured_by(), profile))
+        _refuse(GroundCriteria.unmeasured(link.decks(), profile))
     elif profile.positioning.by == "mocap" and not positions:
         raise SafetyAbort("the profile says positioning: mocap, and nothing sends positions")
 

@@ -30,7 +30,7 @@ from perchctl.link.external_position import (
     Standing,
     estimator_parameters,
 )
-from perchctl.link.firmware import check_firmware, measured_by, set_parameters
+from perchctl.link.firmware import check_firmware, decks_found, read_parameters, set_parameters
 from perchctl.link.protocol import Guard, SentCallback, check_uri, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
 from perchctl.link.telemetry import LogBlocks
@@ -43,7 +43,6 @@ from perchctl.vehicle import (
     Command,
     ExternalPosition,
     Idle,
-    MeasuredBy,
     RawThrust,
     Telemetry,
     is_known,
@@ -97,8 +96,8 @@ class CflibLink:
             self._leave(farewell=self._may_say_farewell())
             raise
 
-    def measured_by(self) -> MeasuredBy:
-        return MeasuredBy() if self.connection is None else measured_by(self.connection.cf)
+    def decks(self) -> tuple[str, ...]:
+        return () if self.connection is None else decks_found(read_parameters(self.connection.cf))
 
     def telemetry(self) -> list[Telemetry]:
         return self._blocks.take()

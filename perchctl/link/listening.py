@@ -35,7 +35,6 @@ from perchctl.link.firmware import (
     is_logged,
     missing_variables,
     read_parameters,
-    read_variable,
 )
 from perchctl.link.protocol import FORMS, USUAL_ADDRESS
 from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S, Timebase, start_block
@@ -193,10 +192,6 @@ class ProbeLink(ListeningLink):
     def has_variable(self, name: str) -> bool:
         """True if the firmware logs this variable."""
         return is_logged(self._cf, name)
-
-    def variable(self, name: str) -> float | None:
-        """Return a log variable's value; None for one that is missing or does not come."""
-        return read_variable(self._cf, name)
 
     def echoes(self, duration_s: float) -> list[float]:
         """Send packets to come back for so long, and wait `ANSWER_S` for the last. Returns the time

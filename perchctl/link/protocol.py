@@ -8,7 +8,7 @@ from typing import Protocol
 
 from perchctl.errors import InvalidValue
 from perchctl.mission import SentCommand
-from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
+from perchctl.vehicle import Command, ExternalPosition, Telemetry
 
 SentCallback = Callable[[SentCommand], None]
 """Called with what a link sends in the loop's place; neither waits nor raises."""
@@ -42,9 +42,8 @@ class Link(Protocol):
     def connect(self) -> None:
         """Connect, check the firmware, set parameters, unlock the thrust. Bounded."""
 
-    def measured_by(self) -> MeasuredBy:
-        """Return what tells the connected vehicle, on the ground, where it is. Bounded, but it may
-        take a second."""
+    def decks(self) -> tuple[str, ...]:
+        """Return the decks that the connected vehicle found at boot, by the firmware's names."""
 
     def telemetry(self) -> list[Telemetry]:
         """Return the samples that arrived since the last call, oldest first."""

@@ -23,7 +23,6 @@ from perchctl.errors import InvalidValue
 from perchctl.link import MockLink, Packet, Radio
 from perchctl.link.connection import send_packets
 from perchctl.link.crtp import ARM, LAND_TIMES, MAX_DATA, UNLOCK_THRUST, UNLOCK_TIMES, encode
-from perchctl.link.firmware import EXTERNAL_POSITION_TICK
 from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.sim.crtp import execute
 from perchctl.sim.firmware.controller import Setpoint
@@ -31,7 +30,6 @@ from perchctl.sim.firmware.planner import HlLand
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
-    ExternalPosition,
     Idle,
     Land,
     PositionSetpoint,
@@ -204,15 +202,3 @@ def test_a_lost_packet_does_not_leave_the_thrust_locked(lost: int) -> None:
         link.send(RawThrust(15000))
         link.advance_to(link.now_s + 0.02)
     assert link.telemetry()[-1].thrust == pytest.approx(15000, abs=1500)
-
-
-def test_positions_count_while_they_come_by_the_firmware_s_name() -> None:
-    # crtp_localization_service.c: the group locSrv has no tick.
-    assert EXTERNAL_POSITION_TICK == "locSrvZ.tick"
-    link = MockLink(SimulatedVehicle(Scenario(extra={"external_position": 1.0})))
-    assert link.measured_by().external is False
-    link.external(ExternalPosition((0.0, 0.0, 0.0)))
-    link.advance_to(link.now_s + 0.1)
-    assert link.measured_by().external is False  # those that have ended are none
-    link.each(0.01, lambda now_s: link.external(ExternalPosition((0.0, 0.0, 0.0))))
-    assert link.measured_by().external is True
