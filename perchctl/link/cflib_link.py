@@ -22,7 +22,6 @@ from perchctl.link.crtp import (
     UNLOCK_TIMES,
     Packet,
     encode,
-    encode_external,
 )
 from perchctl.link.external_position import (
     NEEDED_BY,
@@ -108,7 +107,7 @@ class CflibLink:
 
     def external(self, place: ExternalPosition) -> bool:
         try:
-            return self.connection is not None and self.connection.send(encode_external(place))
+            return self.connection is not None and self.connection.send(*encode(place))
         except Exception:  # the library's; commands report their own
             return False
 

@@ -14,7 +14,6 @@ from perchctl.link.crtp import (
     UNLOCK_TIMES,
     Packet,
     encode,
-    encode_external,
 )
 from perchctl.link.external_position import (
     RESET_PARAMETER,
@@ -159,7 +158,7 @@ class MockLink:
         self._hand_over(encode(command))
 
     def external(self, place: ExternalPosition) -> bool:
-        self._hand_over((encode_external(place),))
+        self._hand_over(encode(place))
         return True
 
     def settle(self, config: PositioningConfig, start: Placed) -> None:

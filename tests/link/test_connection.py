@@ -32,7 +32,7 @@ from perchctl.link.connection import (
     plain_cause,
     send_packets,
 )
-from perchctl.link.crtp import encode_external
+from perchctl.link.crtp import encode
 from perchctl.profile import LinkConfig
 from perchctl.vehicle import ExternalPosition
 from tests.helpers.waiting import until
@@ -192,7 +192,7 @@ def test_a_dead_thread_of_a_dongles_is_not_opened_again(
 
 
 def test_a_position_does_not_wait_behind_a_command_that_hangs(bench: Bench) -> None:
-    driver, packets = bench.driver, [encode_external(at(0))]
+    driver, packets = bench.driver, encode(at(0))
     driver.free.clear()
     hanging = threading.Thread(target=send_packets, args=(bench.connection.cf, packets))
     hanging.start()
@@ -201,7 +201,7 @@ def test_a_position_does_not_wait_behind_a_command_that_hangs(bench: Bench) -> N
     driver.free.set()
     hanging.join(LIMIT_S)
     assert bench.place(3.0) is True
-    assert driver.sent == [encode_external(at(x)).data for x in (0.0, 3.0)]
+    assert driver.sent == [encode(at(x))[0].data for x in (0.0, 3.0)]
 
 
 def test_a_position_goes_out_at_once_or_not_at_all(bench: Bench) -> None:
@@ -212,7 +212,7 @@ def test_a_position_goes_out_at_once_or_not_at_all(bench: Bench) -> None:
     assert bench.place(1.0) is False
     bench.driver.error = None
     assert bench.place(2.0) is True  # the lock is free
-    assert bench.driver.sent == [encode_external(at(2.0)).data]
+    assert bench.driver.sent == [encode(at(2.0))[0].data]
     assert bench.place(1e300) is False
     bench.connection.lost = "gone"
     assert bench.place(1.0) is False
