@@ -15,7 +15,6 @@ from functools import partial
 from typing import Any
 
 from perchctl.errors import ConnectionFailed
-from perchctl.files import cannot_be_written
 from perchctl.link.crtp import Packet
 from perchctl.link.protocol import UDEV_HELP, vehicle_uri
 from perchctl.places import user_cache_folder, user_runtime_folder
@@ -48,12 +47,9 @@ class Connection:
         from cflib.crazyflie import Crazyflie
 
         cache = user_cache_folder() / "toc"
-        try:
+        with contextlib.suppress(OSError):  # then the tables are read from the vehicle each time
             cache.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            more = ": set XDG_CACHE_HOME to a folder that can be written to"
-            raise cannot_be_written(cache, error, more) from None
-        self.cf: Any = Crazyflie(rw_cache=str(cache))
+        self.cf: Any = Crazyflie(rw_cache=str(cache) if cache.is_dir() else None)
         self.lost: str | None = None
         self.claim = contextlib.ExitStack()
         self._settled = threading.Event()  # connected, or failed
@@ -251,7 +247,7 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
 
     `timeout_s` is shared by `CONNECT_TRIES` tries, since one lost packet can hang cflib's
     connect for good (docs/firmware.md, "Link"). Raises `ConnectionFailed`, also where another
-    program has the vehicle; InvalidValue without a folder for cflib's tables.
+    program has the vehicle.
     """
     share_s = timeout_s / CONNECT_TRIES
     with claim_vehicle(uri) as claim:
