@@ -16,7 +16,7 @@ from typing import Any
 
 from perchctl.errors import ConnectionFailed
 from perchctl.link.crtp import Packet
-from perchctl.link.protocol import UDEV_HELP, vehicle_uri
+from perchctl.link.protocol import vehicle_uri
 from perchctl.places import user_cache_folder, user_runtime_folder
 
 CONNECT_TRIES = 2
@@ -308,26 +308,29 @@ def _as_cflib(packet: Packet) -> Any:
     return outgoing
 
 
+_PERMISSION = (
+    "there is no permission to use it.\nFor the permission see https://www.bitcraze.io/documentation/"
+    "repository/crazyflie-lib-python/master/installation/usb_permissions"
+)
+_CAUSES = {
+    "Resource busy": "another program has it open: a Crazyradio, or a USB cable, serves one "
+    "program at a time; end that one, or plug in another Crazyradio and name it as radio://1/...",
+    "Connection refused": "nothing listens there (connection refused)",
+    "Could not open usb": "no Crazyflie is plugged in by USB and switched on, or " + _PERMISSION,
+    "Cannot find": "no Crazyradio is plugged in, or " + _PERMISSION,
+    "Access denied": _PERMISSION,
+}
+"""What to say of a message of cflib's, by words in it: the first that fits."""
+
+
 def plain_cause(message: str) -> str:
-    """Return cflib's message without its traceback, and with the remedy where there is one."""
+    """Return cflib's message without its traceback, or the cause and its remedy where they are
+    known."""
+    for words, cause in _CAUSES.items():
+        if words in message:
+            return cause
     line = message.strip().splitlines()[0] if message.strip() else "unknown cause"
-    line = line.removeprefix("Couldn't load link driver: ")
-    if "Resource busy" in message or "[Errno 16]" in message:
-        return (
-            f"another program has it open ({line}): a Crazyradio, or a USB cable, serves one "
-            f"program at a time; end that one, or plug in another Crazyradio and name it as "
-            f"radio://1/..."
-        )
-    if "Connection refused" in message:
-        return "nothing listens there (connection refused)"
-    missing = ""
-    if "Could not open usb" in message:
-        missing = "no Crazyflie is plugged in by USB and switched on, or "
-    elif "Cannot find" in message:
-        missing = "no Crazyradio is plugged in, or "
-    elif "Crazyradio" not in message and "Access denied" not in message:
-        return line
-    return f"{missing}there is no permission to use it ({line}).\n{UDEV_HELP}"
+    return line.removeprefix("Couldn't load link driver: ")
 
 
 def _run_bounded(calls: Iterable[Callable[[], None]]) -> None:

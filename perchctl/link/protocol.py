@@ -69,7 +69,7 @@ class Link(Protocol):
         """Leave the vehicle safe: closes only when it is not flying (bounded wait)."""
 
 
-# --- The forms of a vehicle's URI, and what to do without rights to the radio ---
+# --- The forms of a vehicle's URI ---
 
 
 USUAL_ADDRESS = "E7E7E7E7E7"
@@ -82,26 +82,11 @@ FORMS = {
     "usb": r"\d+",
     "udp": _HOST_AND_PORT,
     "tcp": _HOST_AND_PORT,
-    "serial": ".+",
 }
 EXAMPLES = (
     "sim://, radio://0/80/2M/E7E7E7E7E7 (channel 0 to 125; 250K, 1M or 2M; an address of at "
     "most ten hex digits), usb://0, udp://127.0.0.1:19850 (port 1 to 65535)"
 )
-
-UDEV_HELP = """\
-Write these lines to /etc/udev/rules.d/99-bitcraze.rules:
-  # Crazyradio (PA and 2.0)
-  SUBSYSTEM=="usb", ATTRS{idVendor}=="1915", ATTRS{idProduct}=="7777", MODE="0664", GROUP="plugdev"
-  # Crazyradio bootloader
-  SUBSYSTEM=="usb", ATTRS{idVendor}=="1915", ATTRS{idProduct}=="0101", MODE="0664", GROUP="plugdev"
-  # Crazyflie over USB
-  SUBSYSTEM=="usb", ATTRS{idVendor}=="0483", ATTRS{idProduct}=="5740", MODE="0664", GROUP="plugdev"
-then run:
-  sudo groupadd -f plugdev
-  sudo usermod -a -G plugdev $USER
-  sudo udevadm control --reload-rules && sudo udevadm trigger
-log in again, and plug the radio or the vehicle in again."""
 
 
 def check_uri(uri: str) -> str:
@@ -121,6 +106,4 @@ def vehicle_uri(uri: str) -> str:
         given = [part for part in rest.split("/")[1:4] if part]
         channel, rate, address = (*given, *_USUAL[len(given) :])
         return f"radio/{int(channel)}/{rate.upper()}/{address.upper().zfill(len(USUAL_ADDRESS))}"
-    if scheme != "serial":  # whose place is a file, and its case tells
-        rest = rest.lower().replace("localhost:", "127.0.0.1:")
-    return f"{scheme}/{rest}"
+    return f"{scheme}/{rest.lower().replace('localhost:', '127.0.0.1:')}"

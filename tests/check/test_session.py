@@ -163,4 +163,4 @@ def test_a_scan_names_what_answers() -> None:
     if radio_problem:  # where there is none, it is said
         assert radio.verdict is Verdict.SKIPPED
         assert "Crazyradio" in radio.found
-        assert "udev" in radio.advice
+        assert "usb_permissions" in radio.advice

@@ -275,7 +275,7 @@ def test_a_radio_that_another_program_has_open_is_named_as_that() -> None:
     )
     assert "another program has it open" in said
     assert "radio://1" in said
-    assert "udev" not in said
+    assert "permission" not in said
 
 
 def test_a_real_flight_loads_nothing_of_the_simulator() -> None:
