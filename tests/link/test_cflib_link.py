@@ -19,9 +19,8 @@ from tests.helpers.waiting import until
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
-from perchctl.link import CflibLink, MockLink
+from perchctl.link import CflibLink, MockLink, ProbeLink
 from perchctl.link.cflib_link import LANDING_WAIT_S
-from perchctl.link.listening import ListeningLink
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
 from perchctl.sim import Scenario, SimProcess, SimulatedVehicle
@@ -288,7 +287,7 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
         second = CflibLink(sim.uri, CONFIG, time.monotonic)
         with pytest.raises(ConnectionFailed, match="flying already: land it"):
             second.connect()
-        listener = ListeningLink(sim.uri, CONFIG, time.monotonic)
+        listener = ProbeLink(sim.uri, CONFIG, time.monotonic)
         listener.connect()
         sent = commands_sent(listener, sim)
         assert newest(listener).has(FLYING)

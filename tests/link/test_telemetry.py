@@ -210,7 +210,6 @@ def test_nothing_begins_before_the_block_came_and_its_silence_is_a_problem(
     """What is unknown is not still."""
     monkeypatch.setattr(listening, "start_block", lambda *_: None)
     monkeypatch.setattr(listening, "check_firmware", lambda *_: None)
-    monkeypatch.setattr(listening, "is_logged", lambda *_: True)
     monkeypatch.setattr(listening, "FIRST_SAMPLE_TIMEOUT_S", 0.0)
     connection: Any = SimpleNamespace(cf=SimpleNamespace(log=None))
     link = Listened()
