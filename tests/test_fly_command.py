@@ -3,7 +3,6 @@ follows the flight."""
 
 from __future__ import annotations
 
-import gc
 import json
 import os
 import socket
@@ -20,8 +19,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration import load_calibration
 from perchctl.commands import app
 from perchctl.commands.fly import fly_and_report, resolve
-from perchctl.errors import EXIT_CODES, ConnectionFailed, Interrupted
-from perchctl.link.connection import open_connection
+from perchctl.errors import EXIT_CODES, Interrupted
 from perchctl.mission import FlightReport, Outcome, Phase
 from perchctl.record import LogWatcher
 from perchctl.sim import SimProcess
@@ -192,17 +190,6 @@ def test_the_library_s_tracebacks_stay_away(profile: str, eyes: str) -> None:
     assert said.code == 10
     assert "nothing listens there" in said.stderr
     assert "link error callback" not in said.stderr
-
-
-@pytest.mark.filterwarnings(
-    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
-)
-def test_the_library_s_prints_stay_off_stdout(capfd: pytest.CaptureFixture[str]) -> None:
-    """cflib tells of its sockets on stdout, where the one object belongs. (It leaves one open.)"""
-    with pytest.raises(ConnectionFailed, match="nothing listens there"):
-        open_connection("tcp://127.0.0.1:9", 5.0)
-    assert capfd.readouterr().out == ""
-    gc.collect()
 
 
 @pytest.mark.long

@@ -7,7 +7,6 @@ import contextlib
 import logging
 import os
 import re
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -273,21 +272,13 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
 
 def ready_cflib() -> None:
     """Register cflib's drivers, keep its radio from giving up after the first lost packets, and
-    silence it: its log has tracebacks of what is reported by callback as well, and what some of its
-    modules print on stdout, which is for the result, is logged instead."""
+    silence it: its log has tracebacks of what is reported by callback as well."""
     import cflib.crtp
     from cflib.crtp import radiodriver
 
     logger = logging.getLogger("cflib")
     logger.addHandler(logging.NullHandler())
     logger.propagate = bool(os.environ.get("PERCHCTL_DEBUG"))
-
-    def log(*words: object, **_how: object) -> None:
-        logger.info(" ".join(map(str, words)))
-
-    for name, module in list(sys.modules.items()):
-        if name.startswith(("cflib.crtp", "cflib.cpx")):
-            vars(module).setdefault("print", log)
     radiodriver.set_retries_before_disconnect(RADIO_RETRIES)
     if not cflib.crtp.CLASSES:  # init_drivers() extends this list at each call
         cflib.crtp.init_drivers()

@@ -75,13 +75,11 @@ class Link(Protocol):
 USUAL_ADDRESS = "E7E7E7E7E7"
 _USUAL = ("2", "2M", USUAL_ADDRESS)  # channel, rate and address of a radio's URI that names none
 _CHANNEL, _RATE, _ADDRESS = "(12[0-5]|1[01][0-9]|0?[0-9]{1,2})", "(250K|1M|2M)", "[0-9A-Fa-f]{1,10}"
-_HOST_AND_PORT = r"[^/:\s]+:0*[1-9]\d{0,4}"
 FORMS = {
     "sim": "",
     "radio": rf"([0-9]+|[0-9A-Fa-f]{{10}})(/{_CHANNEL}(/{_RATE}(/{_ADDRESS})?)?)?(\?.+)?",
     "usb": r"\d+",
-    "udp": _HOST_AND_PORT,
-    "tcp": _HOST_AND_PORT,
+    "udp": r"[^/:\s]+:0*[1-9]\d{0,4}",
 }
 EXAMPLES = (
     "sim://, radio://0/80/2M/E7E7E7E7E7 (channel 0 to 125; 250K, 1M or 2M; an address of at "
@@ -93,7 +91,7 @@ def check_uri(uri: str) -> str:
     """Return the URI's scheme. Raises InvalidValue, which names what is allowed."""
     scheme, _, rest = uri.partition("://")
     fits = "://" in uri and scheme in FORMS and re.fullmatch(FORMS[scheme], rest)
-    if not fits or (scheme in ("udp", "tcp") and int(rest.rpartition(":")[2]) > 65535):
+    if not fits or (scheme == "udp" and int(rest.rpartition(":")[2]) > 65535):
         raise InvalidValue(f"URI {uri!r} is not one of a vehicle; examples: {EXAMPLES}")
     return scheme
 
