@@ -96,7 +96,6 @@ class Settling:
                     f"{status.problem or 'none was sent'}"
                 )
             self.wait(POLL_S)
-        found = ""
         for _ in range(RESETS):
             if may_fly(self.newest(), self.clock()):
                 raise ConnectionFailed(
@@ -106,14 +105,13 @@ class Settling:
             start = self.feed.place()
             assert start is not None  # one was sent
             self._reset(start)
-            found = self._disagreement(start)
-            if not found:
+            if self._agrees(start):
                 return
         by_target = self.config.by == "target"
         where = "the origin, where it stands" if by_target else f"where {self.config.label} sees it"
         raise TimedOut(
-            f"the estimate of {self.uri} does not come to {where}: {found}; do positions arrive, "
-            f"and of this vehicle?"
+            f"the estimate of {self.uri} does not come to {where}: does it stand still, and do "
+            f"positions arrive, and of this vehicle?"
         )
 
     def _reset(self, start: Placed) -> None:
@@ -124,27 +122,27 @@ class Settling:
             set_parameters(self.cf, self.uri, order, NEEDED_BY, read_back=False)
             self.wait(RESET_PULSE_S * value)
 
-    def _disagreement(self, start: Placed) -> str:
-        """Return an empty string once feed and estimate have agreed over fresh samples of both for
-        `AGREE_FOR_S`; otherwise what has been in the way."""
-        found = "no fresh telemetry has come"
+    def _agrees(self, start: Placed) -> bool:
+        """Return True once feed and estimate have agreed over fresh samples of both for
+        `AGREE_FOR_S`, and the vehicle has stood at `start`."""
         end_s = self.clock() + AGREE_WITHIN_S
         since_s: float | None = None
         while (now_s := self.clock()) < end_s:
             status, placed, sample = self.feed.status(now_s), self.feed.place(), self.newest()
-            if status.problem is not None or placed is None:
-                found, since_s = str(status.problem), None
-            elif sample is None or not knows_its_position(sample, now_s):
-                since_s = None
-            else:
-                found = _difference(placed, sample)
-                if math.dist(placed.position_m, start.position_m) > STILL_M:
-                    found = "it is being moved"
-                since_s = None if found else (now_s if since_s is None else since_s)
+            agree = (
+                status.problem is None
+                and placed is not None
+                and sample is not None
+                and knows_its_position(sample, now_s)
+                and math.dist(placed.position_m, start.position_m) <= STILL_M
+                and math.dist(placed.position_m, sample.position_m) <= AGREE_M
+                and abs(wrap_rad(sample.yaw_rad - yaw_of(placed.R))) <= AGREE_RAD
+            )
+            since_s = (now_s if since_s is None else since_s) if agree else None
             if since_s is not None and now_s - since_s >= AGREE_FOR_S:
-                return ""
+                return True
             self.wait(POLL_S)
-        return found or "it has not stayed there"
+        return False
 
 
 class Standing:
@@ -172,12 +170,3 @@ class Standing:
 
     def place(self) -> Placed:
         return Placed(self._clock(), np.array(self._place.position_m), np.eye(3))
-
-
-def _difference(placed: Placed, newest: Telemetry) -> str:
-    """Return in words how far apart they are; empty if they agree."""
-    way_m = math.dist(placed.position_m, newest.position_m)
-    turn_rad = wrap_rad(newest.yaw_rad - yaw_of(placed.R))
-    if way_m <= AGREE_M and abs(turn_rad) <= AGREE_RAD:
-        return ""
-    return f"they are {way_m:.2f} m and {abs(math.degrees(turn_rad)):.0f} deg of heading apart"

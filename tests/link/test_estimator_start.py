@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -110,12 +109,9 @@ def test_the_filter_starts_where_the_capture_sees_the_vehicle(deaf: int) -> None
     assert bench.now_s < 51.0 or deaf
 
 
-@pytest.mark.parametrize(("bench", "words"), [
-    (Bench(deaf=99), "motion capture at vicon:lab.*115 deg of heading apart"),
-    (Bench(carried_mps=0.3), "it is being moved"),
-])  # fmt: skip
-def test_what_does_not_agree_is_not_flown_by(bench: Bench, words: str) -> None:
-    assert re.search(words, bench.refused(TimedOut))
+@pytest.mark.parametrize("bench", [Bench(deaf=99), Bench(carried_mps=0.3)])
+def test_what_does_not_agree_or_is_carried_is_not_flown_by(bench: Bench) -> None:
+    assert "where motion capture at vicon:lab sees it" in bench.refused(TimedOut)
 
 
 @pytest.mark.parametrize(("bench", "kind", "words"), [
