@@ -17,8 +17,9 @@ from perchctl.flight.clock import Clock
 from perchctl.flight.criteria import AtRest
 from perchctl.flight.inputs import FlightInputs, Turns
 from perchctl.flight.preflight import (
+    out_of_view,
     refuse,
-    refuse_out_of_view,
+    refuse_forbidden,
     refuse_strange,
     refuse_unmeasured,
     still_waiting_for,
@@ -156,7 +157,7 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) ->
             raise Interrupted("interrupted before take-off: nothing was started")
         inputs.take_in(now_s)
         newest = inputs.history.newest
-        refuse(newest, parts.profile)
+        refuse_forbidden(newest, parts.profile)
         outside = _outside(parts, inputs, now_s)
         refuse_strange(outside, newest, parts.profile, now_s, at_rest)
         turns.waiting(inputs, now_s, outside)
@@ -169,7 +170,6 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) ->
             inputs.target(now_s),
             0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
             outside,
-            parts.pipeline.camera,
         )
         if parts.source.finished:
             raise NotFound(
@@ -177,9 +177,11 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) ->
                 f"go on, from a camera or a longer recording"
             )
         if not waiting:
-            if newest is not None and inputs.target_positioning is not None:
-                target = inputs.target_positioning.feed.target
-                refuse_out_of_view(target, newest, parts.profile, parts.pipeline.camera)
+            positioning = inputs.target_positioning
+            if newest is not None and positioning is not None and positioning.feed.target:
+                camera, yaw_rad = parts.pipeline.camera, newest.yaw_rad
+                place, start_m = positioning.feed.target, newest.position_m
+                refuse(out_of_view(place, start_m, yaw_rad, parts.profile, camera))
             return
         parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
 

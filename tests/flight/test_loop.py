@@ -179,7 +179,7 @@ NO_PICTURE = Camera(lambda frame: None)
         ({"position_variance_m2": math.nan}, "settle"),
         ({"position_variance_m2": 0.5, "position_m": HANGS}, "settle"),  # it is no height
         ({"supervisor": 0x06}, "0x0006"),
-        ({"roll_rad": 0.3}, "stand level .it is tilted by 17 deg, at most 10"),
+        ({"roll_rad": 0.3}, "stand level .tilted by 17 deg, at most 10"),
         ({"roll_rad": math.radians(10.2)}, r"by 10\.2 deg, at most 10\.0"),
         ({"pitch_rad": -0.2}, "tilted by 11 deg"),
         ({"acc_z_g": 0.7}, r"stand still .*0\.70 g"),
