@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +26,7 @@ from perchctl.sim import (
 )
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
-from perchctl.vision import CameraModel, Frame, Pipeline, make_pipeline
+from perchctl.vision import Frame, make_pipeline
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
 _QUEUED = 2  # pictures that wait; a newer one replaces the oldest
@@ -193,13 +192,12 @@ def fly_lockstep(
         source = log.watched(source)
     operator = _OperatorAt(operator_at or {})
     explain = EventExplainer(scenario)
-    pipeline = _pipeline_of(profile, camera)
     parts = FlightParts(
         link,
         source,
         LockstepClock(link),
         profile,
-        pipeline,
+        make_pipeline(profile, camera),
         (*watchers, operator),
         operator.read,
         lambda event: explain(event, event.t_s),  # the clock is the simulation's
@@ -212,23 +210,6 @@ def fly_lockstep(
     link.close()
     link.advance_to(link.now_s + 1.0)
     return _flown(report, vehicle, truth)
-
-
-_shared_pipelines: dict[Hashable, Pipeline] = {}
-
-
-def _pipeline_of(profile: Profile, camera: CameraModel) -> Pipeline:
-    """Return a vision pipeline; flights of one profile and camera share it, since making one takes
-    as long as 10 pictures. Two are kept, for `simulate compare`. A profile with a mask gets a new
-    one each time: the mask's file may have changed."""
-    if profile.camera.mask is not None:
-        return make_pipeline(profile, camera)
-    key = profile.model_dump_json(), camera.contents
-    if key not in _shared_pipelines:
-        if len(_shared_pipelines) >= 2:
-            _shared_pipelines.clear()
-        _shared_pipelines[key] = make_pipeline(profile, camera)
-    return _shared_pipelines[key]
 
 
 def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> LockstepFlight:

@@ -12,12 +12,11 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration import profile_camera
 from perchctl.campaign import FlightResult, campaign_summary, fly_all
 from perchctl.campaign.flights import fly_seed
 from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.flight import FlyOptions, fly_lockstep
-from perchctl.flight.lockstep import LockstepFlight, _pipeline_of
+from perchctl.flight.lockstep import LockstepFlight
 from perchctl.mission import Event, EventKind, Operator, Outcome, Phase, Tick
 from perchctl.mission.state import SEVEN_PHASES
 from perchctl.profile import load_profile
@@ -272,21 +271,3 @@ def test_the_planner_is_shown_the_same(tmp_path: Path) -> None:
             other_spread += not same
             assert same or field.name in SPREAD, field.name
     assert other_spread > 100
-
-
-# --- Flights of one profile share their pipeline; no other one does -------------------------------
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"kalman.n_max": 7}, {"camera.mount.rpy_deg": (0.0, 1.0, 0.0)}, {"target.large.side_m": 0.12}],
-    ids=lambda change: next(iter(change)),
-)
-def test_a_profile_or_a_camera_that_differs_has_its_own(change: dict[str, object]) -> None:
-    profile = short_profile()
-    camera, again = profile_camera(profile.camera), profile_camera(profile.camera)
-    shared = _pipeline_of(profile, camera)
-    assert _pipeline_of(short_profile(), again) is shared
-    assert _pipeline_of(short_profile(change), camera) is not shared
-    other = dataclasses.replace(camera, dist=camera.dist + 1e-9)
-    assert _pipeline_of(profile, other).camera is other
