@@ -17,6 +17,7 @@ from perchctl.mission import (
     Observation,
     PlannerState,
     PoseSeen,
+    SentCommand,
     Turn,
     TurnInputs,
     TurnTiming,
@@ -30,7 +31,7 @@ from perchctl.perception import (
     battery_age_s,
 )
 from perchctl.positioning import FeedStatus, SightFeed
-from perchctl.profile import Profile, SafetyConfig
+from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import Command, SendPosition, Telemetry
 from perchctl.vision import (
@@ -221,12 +222,9 @@ class FlightInputs:
         self._note = VERDICT_TEXTS[kind] if kind in ("dark", "uniform") else None
         if kind != "ok" and self._note is None:
             return VERDICT_TEXTS[kind]
-        return lateness_text(now_s - frame.t_s, self.profile.safety) if live else None
-
-
-def lateness_text(age_s: float, safety: SafetyConfig) -> str | None:
-    """Return why a live picture of this age is no measurement; None if it is one."""
-    return f"the picture is {age_s:.1f} s late" if age_s > safety.max_frame_age_s else None
+        age_s = now_s - frame.t_s
+        is_late = live and age_s > self.profile.safety.max_frame_age_s
+        return f"the picture is {age_s:.1f} s late" if is_late else None
 
 
 def _seen(frame: Frame | None) -> FrameSeen | None:
@@ -303,10 +301,14 @@ def is_supported(history: History, now_s: float) -> bool:
 
 
 @runtime_checkable
-class TurnWatcher(Watcher, Protocol):
-    """A watcher of the turns without a tick, too: before take-off, and those decided anew."""
+class LogKeeper(Watcher, Protocol):
+    """A watcher of all that a flight log holds: of the turns without a tick, too, which are those
+    before take-off and those decided anew, and of what is sent in the loop's place."""
 
     def turn(self, turn: Turn) -> None: ...
+
+    def sent(self, sent: SentCommand) -> None:
+        """Called in the sender's own thread: must neither wait nor raise."""
 
 
 Decision = tuple[PlannerState, Command, FeedStatus | None]
@@ -323,7 +325,7 @@ class Turns:
         wall: Callable[[], float] = time.perf_counter,
     ) -> None:
         self._wall = wall if isinstance(clock, (WallClock, SimulatedClock)) else None
-        self._watchers = [w for w in watchers if isinstance(w, TurnWatcher)]
+        self._watchers = [w for w in watchers if isinstance(w, LogKeeper)]
         self._count = 0
         self._began_s = 0.0
         self._laps_s = [0.0]

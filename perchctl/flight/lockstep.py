@@ -166,18 +166,9 @@ def fly_lockstep(
     Errors: NotFound, InvalidValue (calibration, log file).
     """
     scenario = draw_scenario(profile, seed) if scenario is None else scenario
+    opened: LogWatcher | None = None
     if isinstance(log, (Path, str)):
-        watcher = LogWatcher.lockstep(Path(log), profile, scenario.seed)
-        flight = fly_lockstep(
-            profile,
-            log=watcher,
-            scenario=scenario,
-            capture=capture,
-            operator_at=operator_at,
-            watchers=watchers,
-        )
-        flight.conclude(watcher)
-        return flight
+        log = opened = LogWatcher.lockstep(Path(log), profile, scenario.seed)
     camera = profile_camera(profile.camera)
     capture = capture or draw_capture(profile, scenario.seed)
     vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
@@ -209,7 +200,10 @@ def fly_lockstep(
     vehicle.watched = False
     link.close()
     link.advance_to(link.now_s + 1.0)
-    return _flown(report, vehicle, truth)
+    flight = _flown(report, vehicle, truth)
+    if opened is not None:
+        flight.conclude(opened)
+    return flight
 
 
 def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> LockstepFlight:

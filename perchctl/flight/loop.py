@@ -9,13 +9,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 from perchctl.camera import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
 from perchctl.flight.criteria import AtRest
-from perchctl.flight.inputs import FlightInputs, Turns
+from perchctl.flight.inputs import FlightInputs, LogKeeper, Turns
 from perchctl.flight.preflight import (
     out_of_view,
     refuse,
@@ -122,17 +122,9 @@ def fly(parts: FlightParts) -> FlightReport:
         raise
 
 
-@runtime_checkable
-class SentWatcher(Watcher, Protocol):
-    """A watcher of what was sent in the loop's place, too."""
-
-    def sent(self, sent: SentCommand) -> None:
-        """Called in the sender's own thread: must neither wait nor raise."""
-
-
 def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
     """Return a callback that passes on what is sent in the loop's place to those who watch it."""
-    told = [watcher for watcher in parts.watchers if isinstance(watcher, SentWatcher)]
+    told = [watcher for watcher in parts.watchers if isinstance(watcher, LogKeeper)]
 
     def tell(sent: SentCommand) -> None:
         for watcher in told:
@@ -225,12 +217,11 @@ def _mission(
             parts.positions.stop()
             inputs.perception.drop_sights()
         events = Event.of_tick(before, state, obs, parts.profile)
+        notes = [*parts.remarks()]
         if obs.log_problem is not None and not log_noted:
             log_noted = True
-            text = f"the log of this flight is incomplete: {obs.log_problem}"
-            events.append(Event(now_s, EventKind.NOTE, text, state.phase))
-        for text in parts.remarks():
-            events.append(Event(now_s, EventKind.NOTE, text, state.phase))
+            notes.insert(0, f"the log of this flight is incomplete: {obs.log_problem}")
+        events += [Event(now_s, EventKind.NOTE, text, state.phase) for text in notes]
         for event in events:
             event = replace(event, simulated=parts.simulated(event))
             if event.kind is EventKind.PHASE:

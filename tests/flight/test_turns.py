@@ -9,8 +9,16 @@ import pytest
 
 from perchctl.analysis.decide import decide
 from perchctl.flight import FlightInputs, fly
-from perchctl.flight.inputs import TurnWatcher
-from perchctl.mission import Observation, Operator, PlannerState, Tick, Turn, step_mission
+from perchctl.flight.inputs import LogKeeper
+from perchctl.mission import (
+    Observation,
+    Operator,
+    PlannerState,
+    SentCommand,
+    Tick,
+    Turn,
+    step_mission,
+)
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, Land
 from tests.helpers.hangs import hang_in_the_planner, plan_by
@@ -26,6 +34,9 @@ class Told(LooksOn):
 
     def turn(self, turn: Turn) -> None:
         self.turns.append(turn)
+
+    def sent(self, sent: SentCommand) -> None:
+        return None
 
     @property
     def of_ticks(self) -> list[Turn]:
@@ -142,8 +153,8 @@ def test_an_interrupted_planner_did_not_fail_and_no_turn_is_told_twice(
 
 
 def test_all_that_is_taken_in_is_in_the_turns_and_a_watcher_of_ticks_gets_no_others() -> None:
-    assert isinstance(Told(), TurnWatcher)
-    assert not isinstance(LooksOn(), TurnWatcher)
+    assert isinstance(Told(), LogKeeper)
+    assert not isinstance(LooksOn(), LogKeeper)
     assert set(FlightInputs.SENSED) < {f.name for f in fields(Observation)}
     rig, given = Rig(), list[Any]()
     inside = rig.link.telemetry
