@@ -22,10 +22,8 @@ from perchctl.errors import (
     no_simulator,
 )
 from perchctl.flight.clock import Clock, SimulatedClock, WallClock
-from perchctl.flight.criteria import AtRest
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
-from perchctl.flight.preflight import refuse_strange
 from perchctl.link import CflibLink, check_uri, vehicle_uri
 from perchctl.mission import Event, FlightReport, Watcher
 from perchctl.positioning import (
@@ -39,8 +37,6 @@ from perchctl.vision import CameraModel, make_pipeline
 
 if TYPE_CHECKING:
     from perchctl.sim import SimProcess
-
-STRANGE_S = 0.5  # external positions are examined for so long before they are used
 
 
 @dataclass(frozen=True)
@@ -127,7 +123,9 @@ def fly_session(
             link.connect()
             if before_arming is not None:
                 before_arming()
-            positions = started_feed(stack, capture, link, positioning, clock, profile)
+            positions = started_feed(
+                stack, capture, link, positioning, clock, profile.safety.ground_z_m
+            )
             switch.listening = True
             parts = FlightParts(
                 link,
@@ -233,31 +231,20 @@ def started_feed(
     link: CflibLink,
     config: PositioningConfig,
     clock: Clock,
-    profile: Profile,
+    ground_z_m: float = 0.0,
 ) -> PositionFeed | None:
     """Settle the vehicle's estimate on the capture's positions, and feed them until `stack` ends:
     the link is closed before that, since a landing vehicle still needs them. None with decks, and
     where the target is the positioning system.
 
-    Errors: those of `CflibLink.settle`, and SafetyAbort for positions of another world."""
+    Errors: those of `CflibLink.settle`."""
     if config.by == "target":
-        link.settle(None, profile.safety.ground_z_m)
+        link.settle(None, ground_z_m)
         return None  # what follows is seen, and sent, by the loop
     if capture is None:
         return None
     feed = PositionFeed(capture, link.external, config)
     stack.callback(feed.close)
     feed.start(clock.now)
-    _refuse_strange(feed, link, clock, profile)
     link.settle(feed)
     return feed
-
-
-def _refuse_strange(feed: PositionFeed, link: CflibLink, clock: Clock, profile: Profile) -> None:
-    """Raises SafetyAbort for positions of another world, before an estimate is set to them. Late
-    ones are left to those who wait for them."""
-    end_s, newest, at_rest = clock.now() + STRANGE_S, None, AtRest()
-    while (now_s := clock.now()) < end_s:
-        newest = next(reversed(link.telemetry()), newest)
-        refuse_strange(feed.status(now_s), newest, profile, now_s, at_rest)
-        clock.wait_until(now_s + 0.02)
