@@ -43,7 +43,6 @@ KNOWN_SUPERVISOR_BITS = 0x0FFF
 REST_ACC_G = 0.15  # at rest the accelerometer reads 1 g, give or take so much
 WITHIN_REACH_M = 0.35  # of the gear: a take-off needs more height, so no target is so near
 ROOM_M = 50.0  # no capture is larger: what is farther off is in another unit
-HIGH_M = 4.0  # of a vehicle at its take-off place: what is higher is in another unit
 UPRIGHT_DEG = 20.0  # between attitude and capture: a rigid body's attitude is defined by eye
 WANDERED_M = 0.1  # far beyond a capture's noise
 AGREE_M, AGREE_DEG = 0.1, 15.0  # estimate and capture, once positions and heading are fused
@@ -125,14 +124,19 @@ class GroundCriteria:
     @property
     def height(self) -> Problem | None:
         """A vehicle off the ground by its settled estimate: it hangs, or is held."""
-        safety, z_m = self.profile.safety, self.telemetry.position_m[2]
+        return self._off_the_ground(
+            self.telemetry.position_m[2],
+            "the state estimate places the vehicle at",
+            "if it hangs, take it down and restart it; if the positioning system's zero is "
+            "elsewhere, set safety.ground_z_m",
+        )
+
+    def _off_the_ground(self, z_m: float, found: str, advice: str) -> Problem | None:
+        safety = self.profile.safety
         if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
             return None
         return Problem(
-            f"the state estimate places the vehicle at {z_m:.2f} m, and the ground is at "
-            f"{safety.ground_z_m:.2f} m",
-            "if it hangs, take it down and restart it; if the positioning system's zero is "
-            "elsewhere, set safety.ground_z_m",
+            f"{found} {z_m:.2f} m, and the ground is at {safety.ground_z_m:.2f} m", advice
         )
 
     @property
@@ -191,14 +195,22 @@ class GroundCriteria:
     def world_problem(self, place: ExternalPosition) -> Problem | None:
         """An external position in another unit, with another axis up, or elsewhere, which waiting
         will not mend. By the target the world is the vehicle's own, so only the fence counts."""
+        x, y, z = place.position_m
         if self.profile.positioning.by == "target":
             return self._unreachable(place)
-        return (
-            self._in_millimetres(place)
-            or with_another_up(place, self.telemetry)
-            or self._off_the_ground(place)
-            or self._unreachable(place)
+        if max(abs(x), abs(y), abs(z)) >= ROOM_M:
+            return Problem(
+                f"the motion capture has the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m: these "
+                f"look like millimetres",
+                "set the unit of its stream to metres",
+            )
+        standing = self._off_the_ground(
+            z,
+            "the motion capture has the vehicle at",
+            "swapped axes, another rigid body or zero, or millimetres: perchctl check --lift "
+            "tells; safety.ground_z_m is the height that it has where it stands",
         )
+        return with_another_up(place, self.telemetry) or standing or self._unreachable(place)
 
     def _unreachable(self, place: ExternalPosition) -> Problem | None:
         """A place from which no flight reaches the expected target: perhaps another vehicle's."""
@@ -213,29 +225,6 @@ class GroundCriteria:
             f"the target is expected {away_m:.1f} m from where the vehicle stands (x {x:.2f}, y "
             f"{y:.2f} m), and the fence is {fence_m:g} m",
             "correct target.expected_xy_m, or positioning.body if it names another vehicle's body",
-        )
-
-    def _in_millimetres(self, place: ExternalPosition) -> Problem | None:
-        safety, (x, y, z) = self.profile.safety, place.position_m
-        far_m = max(abs(v) for v in place.position_m)
-        on_ground = abs(z / 1000.0 - safety.ground_z_m) <= safety.ground_tolerance_m
-        if not far_m >= ROOM_M and not (z >= HIGH_M and on_ground):
-            return None
-        return Problem(
-            f"the motion capture has the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m: these look "
-            f"like millimetres",
-            "set the unit of its stream to metres",
-        )
-
-    def _off_the_ground(self, place: ExternalPosition) -> Problem | None:
-        safety, z_m = self.profile.safety, place.position_m[2]
-        if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
-            return None
-        return Problem(
-            f"the motion capture has the vehicle at {z_m:.2f} m, and the ground is at "
-            f"{safety.ground_z_m:.2f} m",
-            "swapped axes, another rigid body or zero: perchctl check --lift tells; "
-            "safety.ground_z_m is the height that it has where it stands",
         )
 
 

@@ -51,7 +51,7 @@ REACH = changed({"target.expected_xy_m": (0.3, 0.0), "target.expected_within_m":
     (at(0.0, 0.0, 12.0), MOCAP, "millimetres"),
     (at(-1200.0, 0.0, 0.04), MOCAP, "millimetres"),
     (at(0.3, 0.02, 0.4), MOCAP, "at 0.40 m, and the ground .* 0.00 m: swapped axes"),
-    (at(0.3, 0.4, 2.1), MOCAP, "swapped axes, another rigid body or zero"),
+    (at(0.3, 0.4, 2.1), MOCAP, "swapped axes, another rigid body or zero, or millimetres"),
     (at(0.0, 0.0, 0.012, rotation_from_rpy(-1.5708, 0, 0)), MOCAP, "swapped axes: up is -?y"),
     # Two vehicles in one room: the other one stands level, on the ground, two metres aside.
     (at(0.2, -0.5, 0.012), REACH, None),
