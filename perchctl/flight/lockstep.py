@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -126,7 +127,6 @@ class LockstepFlight:
     hanging: bool
     fell: bool
     locked: bool
-    simulated_s: float
     touchdown_mps: float
     scenario: Scenario
 
@@ -152,7 +152,7 @@ def fly_lockstep(
     *,
     scenario: Scenario | None = None,
     capture: CaptureSettings | None = None,
-    operator_at: dict[Phase, Operator] | None = None,
+    operator: Callable[[], Operator] = lambda: Operator.NONE,
     watchers: tuple[Watcher, ...] = (),
 ) -> LockstepFlight:
     """Fly one seed of the profile's scenario to its end, faster than real time.
@@ -160,7 +160,7 @@ def fly_lockstep(
     Args:
         log: a file to log to, or a watcher that is left open.
         scenario, capture: flown instead of the seed's own.
-        operator_at: the operator's command, given as soon as a phase is reached.
+        operator: the operator's command.
         watchers: others that look on.
 
     Errors: NotFound, InvalidValue (calibration, log file).
@@ -181,7 +181,6 @@ def fly_lockstep(
         log.truth = truth.for_log
         watchers = (*watchers, log)
         source = log.watched(source)
-    operator = _OperatorAt(operator_at or {})
     explain = EventExplainer(scenario)
     parts = FlightParts(
         link,
@@ -189,8 +188,8 @@ def fly_lockstep(
         LockstepClock(link),
         profile,
         make_pipeline(profile, camera),
-        (*watchers, operator),
-        operator.read,
+        watchers,
+        operator,
         lambda event: explain(event, event.t_s),  # the clock is the simulation's
         positions,
         tuple if log is None else log.remarks,
@@ -216,24 +215,9 @@ def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> Loc
         hanging=hanging,
         fell=fell,
         locked=bool(vehicle.firmware.supervisor_info & LOCKED),
-        simulated_s=vehicle.t_s,
         touchdown_mps=truth.touchdown_mps,
         scenario=vehicle.scenario,
     )
-
-
-class _OperatorAt(Watcher):
-    """Gives the operator's command once a phase has been reached."""
-
-    def __init__(self, at: dict[Phase, Operator]) -> None:
-        self._at = at
-        self._command = Operator.NONE
-
-    def read(self) -> Operator:
-        return self._command
-
-    def tick(self, tick: Tick) -> None:
-        self._command = max(self._command, self._at.get(tick.state.phase, Operator.NONE))
 
 
 # --- External positions in lockstep: the simulated motion capture, by the same feed ---
