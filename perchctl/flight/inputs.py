@@ -254,10 +254,6 @@ class TargetPositioning:
         self.feed = SightFeed(send, profile, pipeline.pose)
         self._touches = False
 
-    def status(self, now_s: float) -> FeedStatus:
-        """Return the status as that of a motion capture's feed."""
-        return self.feed.status(now_s)
-
     def begin(self, history: History, now_s: float, *, touches: bool) -> None:
         """Begin a tick, before its picture. `touches`: contact was proven and has not ended."""
         newest = history.newest

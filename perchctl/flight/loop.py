@@ -262,7 +262,7 @@ def _mission(
 def _outside(parts: FlightParts, inputs: FlightInputs, now_s: float) -> FeedStatus | None:
     """Return the status of the external positions, or of those by the target; None with decks."""
     if inputs.target_positioning is not None:
-        return inputs.target_positioning.status(now_s)
+        return inputs.target_positioning.feed.status(now_s)
     return None if parts.positions is None else parts.positions.status(now_s)
 
 

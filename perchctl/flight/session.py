@@ -26,12 +26,7 @@ from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.link import CflibLink, check_uri, vehicle_uri
 from perchctl.mission import Event, FlightReport, Watcher
-from perchctl.positioning import (
-    CaptureSource,
-    PositionFeed,
-    load_comparison,
-    open_capture,
-)
+from perchctl.positioning import PositionFeed, load_comparison, open_capture
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vision import CameraModel, make_pipeline
 
@@ -117,15 +112,12 @@ def fly_session(
         if simulated is not None and simulated.capture is not None:
             system, host = simulated.capture
             positioning = positioning.model_copy(update={"system": system, "host": host})
-        capture = opened_capture(stack, positioning, clock)
         link = CflibLink(uri, profile.link, clock.now, positioning=positioning)
         try:
             link.connect()
             if before_arming is not None:
                 before_arming()
-            positions = started_feed(
-                stack, capture, link, positioning, clock, profile.safety.ground_z_m
-            )
+            positions = started_feed(stack, link, positioning, clock, profile.safety.ground_z_m)
             switch.listening = True
             parts = FlightParts(
                 link,
@@ -213,21 +205,8 @@ def require_comparison(config: PositioningConfig, uri: str, *, simulated: bool) 
         raise SafetyAbort(": ".join(objected))
 
 
-def opened_capture(
-    stack: contextlib.ExitStack, config: PositioningConfig, clock: Clock
-) -> CaptureSource | None:
-    """Return the open capture; None with decks. Raises InvalidValue, UsageError,
-    ConnectionFailed."""
-    if config.by != "mocap":
-        return None
-    capture = open_capture(config, clock.now)
-    stack.callback(capture.close)
-    return capture
-
-
 def started_feed(
     stack: contextlib.ExitStack,
-    capture: CaptureSource | None,
     link: CflibLink,
     config: PositioningConfig,
     clock: Clock,
@@ -235,14 +214,15 @@ def started_feed(
 ) -> PositionFeed | None:
     """Settle the vehicle's estimate on the capture's positions, and feed them until `stack` ends:
     the link is closed before that, since a landing vehicle still needs them. None with decks, and
-    where the target is the positioning system.
+    where the target is the positioning system, as which the loop sends what it sees.
 
-    Errors: those of `CflibLink.settle`."""
+    Errors: those of `CflibLink.settle`, and InvalidValue, UsageError, ConnectionFailed."""
     if config.by == "target":
         link.settle(None, ground_z_m)
-        return None  # what follows is seen, and sent, by the loop
-    if capture is None:
+    if config.by != "mocap":
         return None
+    capture = open_capture(config, clock.now)
+    stack.callback(capture.close)
     feed = PositionFeed(capture, link.external, config)
     stack.callback(feed.close)
     feed.start(clock.now)

@@ -23,7 +23,7 @@ from perchctl.errors import (
     UsageError,
 )
 from perchctl.flight import FlyOptions, WallClock, check_options, session
-from perchctl.flight.session import opened_capture, started_feed
+from perchctl.flight.session import started_feed
 from perchctl.link import CflibLink
 from perchctl.positioning import FeedStatus
 from perchctl.profile import LinkConfig, PositioningConfig, find_profile, load_profile
@@ -54,11 +54,10 @@ def fed(
         assert sim.capture is not None
         system, host = sim.capture
         config = config.model_copy(update={"system": system, "host": host})
-        capture = opened_capture(stack, config, clock)
         link = CflibLink(sim.uri, LinkConfig(), clock.now, positioning=config)
         try:
             link.connect()
-            feed = started_feed(stack, capture, link, config, clock)
+            feed = started_feed(stack, link, config, clock)
             assert feed is not None
             yield link, feed.status
         finally:

@@ -52,7 +52,7 @@ def test_what_hangs_is_told_where() -> None:
     samples = at_rest()
     sights.begin(history(samples), samples[-1].t_s, touches=True)
     assert [place.position_m for place in sent] == [sights.feed.touching(0.0)]
-    assert sights.status(samples[-1].t_s).age_s == 0.0
+    assert sights.feed.status(samples[-1].t_s).age_s == 0.0
 
 
 def test_what_flies_is_told_nothing_without_a_sight() -> None:
