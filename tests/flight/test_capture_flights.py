@@ -4,8 +4,6 @@ with a mounting that a hand has measured."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -18,10 +16,11 @@ from perchctl.faults.catalogue import draw_case
 from perchctl.faults.flight import FaultyFlight
 from perchctl.faults.results import FaultResult
 from perchctl.flight import fly_lockstep
-from perchctl.mission import Event, Outcome, Phase, Tick
+from perchctl.mission import Outcome, Phase, Tick
 from perchctl.sim import CaptureFault, draw_scenario
 from tests.helpers.capture import SWAPPED_XY, Y_UP, Rows
 from tests.helpers.flights import Flown, fly_short
+from tests.helpers.loop_rig import Watcher
 from tests.helpers.sights import TARGET_ONLY
 
 MOCAP = {"positioning.by": "mocap"}
@@ -123,20 +122,6 @@ ON_IT = tuple(
 )  # fmt: skip
 
 
-@dataclass
-class Looker:
-    """Calls `see` with each tick."""
-
-    see: Callable[[Tick], None]
-    problem: str | None = None
-
-    def tick(self, tick: Tick) -> None:
-        self.see(tick)
-
-    def event(self, event: Event) -> None:
-        return None
-
-
 @pytest.mark.long
 def test_it_perches_by_the_sight_of_the_target_alone() -> None:
     ages_s: dict[Phase, float] = {}
@@ -146,7 +131,7 @@ def test_it_perches_by_the_sight_of_the_target_alone() -> None:
         phase = tick.state.phase
         ages_s[phase] = max(ages_s.get(phase, 0.0), tick.outside.age_s)
 
-    it = fly_lockstep(TARGET_ONLY, 3, watchers=(Looker(see),))
+    it = fly_lockstep(TARGET_ONLY, 3, watchers=(Watcher(see),))
     assert it.report.phase is Phase.PERCHED
     assert it.perched_miss_m is not None
     assert it.perched_miss_m < MISS_M

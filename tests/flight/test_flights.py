@@ -17,7 +17,7 @@ from perchctl.campaign.flights import fly_seed
 from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.flight import FlyOptions, fly_lockstep
 from perchctl.flight.lockstep import LockstepFlight
-from perchctl.mission import Event, EventKind, Operator, Outcome, Phase, Tick
+from perchctl.mission import EventKind, Operator, Outcome, Phase, Tick
 from perchctl.mission.state import SEVEN_PHASES
 from perchctl.profile import load_profile
 from perchctl.record import FlightLog, read_log
@@ -48,21 +48,6 @@ def assert_landed(flown: Flown, outcome: Outcome, exit_code: int, words: str = "
     assert words in report.reason
     assert flown.z_m < ON_THE_FLOOR_M
     assert not any((flight.hanging, flight.locked, report.locked, flight.fell))
-
-
-class Looker:
-    """A watcher of the ticks."""
-
-    problem: str | None = None
-
-    def __init__(self) -> None:
-        self.ticks: list[Tick] = []
-
-    def tick(self, tick: Tick) -> None:
-        self.ticks.append(tick)
-
-    def event(self, event: Event) -> None:
-        return None
 
 
 # --- A flight under good conditions ---------------------------------------------------
@@ -254,7 +239,7 @@ SPREAD = {"sigma_m", "sigma_yaw_rad"}
 @pytest.mark.long
 def test_the_planner_is_shown_the_same(tmp_path: Path) -> None:
     def flown(log: Path | None) -> tuple[LockstepFlight, list[Tick]]:
-        looker = Looker()
+        looker = Watcher()
         return fly_lockstep(short_profile({}), SEED, log, watchers=(looker,)), looker.ticks
 
     (bare, unlogged), (whole, logged) = flown(None), flown(tmp_path / "flight.jsonl")

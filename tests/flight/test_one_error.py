@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
@@ -15,81 +13,34 @@ from perchctl.display.panel import status_rows
 from perchctl.flight import fly_lockstep
 from perchctl.mission import Phase, Tick, planner
 from perchctl.mission.context import Context
-from perchctl.perception import perception
 from perchctl.record.fields import tick_record
-from perchctl.record.watch import Truth
-from perchctl.sim import draw_scenario
-from perchctl.vision import merge
-from tests.helpers.flights import SEED, NoLog, short_profile
+from tests.helpers.flights import SEED, short_profile
+from tests.helpers.loop_rig import Watcher
 
 pytestmark = pytest.mark.long
 
-PROFILE = short_profile()
-SCENARIO = draw_scenario(PROFILE, SEED)
-
-
-class Looker(NoLog):
-    """The ticks, and where the vehicle truly was."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.ticks: list[tuple[Tick, Truth]] = []
-
-    def tick(self, tick: Tick) -> None:
-        assert self.truth is not None
-        self.ticks.append((tick, self.truth()))
-
-
-@dataclass
-class Watched:
-    """A flight's ticks with the truth, calls of the pose solver, and the planner's contexts."""
-
-    ticks: list[tuple[Tick, Truth]]
-    in_step: int = 0
-    elsewhere: int = 0
-    stepping: bool = False
-    contexts: list[Context] = field(default_factory=list)
+Watched = tuple[list[Tick], list[Context]]
 
 
 @pytest.fixture(scope="module")
-def flight() -> Iterator[Watched]:
-    """One quiet flight, watched from everywhere."""
-    looker = Looker()
-    watched = Watched(looker.ticks)
-    solve, step, act = merge.estimate_pose, perception.step, planner.act
-
-    def solved(*arguments: Any) -> Any:
-        watched.in_step += watched.stepping
-        watched.elsewhere += not watched.stepping
-        return solve(*arguments)
-
-    def stepped(*arguments: Any) -> Any:
-        watched.stepping = True
-        try:
-            return step(*arguments)
-        finally:
-            watched.stepping = False
+def flight() -> Watched:
+    """The ticks of one quiet flight, and the planner's contexts."""
+    watcher, contexts, act = Watcher(), list[Context](), planner.act
 
     def acted(context: Context) -> Any:
-        watched.contexts.append(context)
+        contexts.append(context)
         return act(context)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(merge, "estimate_pose", solved)
-        patch.setattr(perception, "step", stepped)
         patch.setattr(planner, "act", acted)
-        flown = fly_lockstep(PROFILE, log=looker, scenario=SCENARIO)
-        assert flown.report.phase is Phase.PERCHED
-        for tick, _ in looker.ticks:  # whatever looks at a tick solves nothing
-            tick_record(tick)
-            status_rows(tick)
-        yield watched
+        flown = fly_lockstep(short_profile(), SEED, watchers=(watcher,))
+    assert flown.report.phase is Phase.PERCHED
+    return watcher.ticks, contexts
 
 
 def test_the_log_and_the_panel_hold_the_planner_s_error(flight: Watched) -> None:
-    assert len(flight.ticks) == len(flight.contexts)
-    seen = 0
-    for (tick, _), context in zip(flight.ticks, flight.contexts, strict=True):
+    ticks, seen = flight[0], 0
+    for tick, context in zip(*flight, strict=True):
         record, shown = tick_record(tick), dict(status_rows(tick))["error"]
         target = context.obs.target
         if target is None:
@@ -103,4 +54,4 @@ def test_the_log_and_the_panel_hold_the_planner_s_error(flight: Watched) -> None
         assert math.hypot(record["ex_m"], record["ey_m"]) == context.error_xy_m
         assert record["ez_m"] == context.error_z_m
         assert target.t_s == tick.t_s  # at the present, not at the frame's time
-    assert seen > 0.5 * len(flight.ticks)
+    assert seen > 0.5 * len(ticks)
