@@ -56,26 +56,6 @@ def test_it_perches(own: dict[str, Any], capture: dict[str, Any], miss_m: float)
     assert Phase.LANDING.value not in it.way
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("what", "words"),
-    [
-        ({"occluded": True}, "does not see the rigid body 'crazyflie'; it sees wand"),
-        ({"frozen": True}, "is frozen"),
-        ({"gone": True}, "no frame has come"),
-        ({"swapped": True}, "another body is taken for it"),
-        ({"scale": 1000.0}, "jumped by"),
-    ],
-)
-def test_what_lasts_is_landed_and_named(what: dict[str, Any], words: str) -> None:
-    it = flown(**wrong(IN_ALIGN_S, **what))
-    assert it.report.phase is Phase.LANDED, it.report.reason
-    assert it.report.outcome is Outcome.SAFETY
-    assert words in it.report.reason
-    assert not it.flight.fell
-    assert it.farthest_m < 0.5
-
-
 OTHERS = {"others": (("wand", (2.5, -0.9, 0.05)),)}
 
 

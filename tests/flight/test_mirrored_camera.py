@@ -15,10 +15,6 @@ from numpy.typing import NDArray
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import FrameSource, mirrored_note, open_camera
-from perchctl.faults.catalogue import BY_NAME, draw_case
-from perchctl.faults.edges import CameraFault
-from perchctl.faults.effects import FOR_EVER
-from perchctl.faults.flight import FaultyFlight
 from perchctl.flight import lockstep_source
 from perchctl.link import MockLink
 from perchctl.mission import Phase
@@ -50,16 +46,6 @@ def lockstep(by: Profile, camera: Profile) -> Pictures:
     return polled(lockstep_source(vehicle, by), MockLink(vehicle))
 
 
-def faulty(profile: Profile) -> Pictures:
-    """A flight whose camera mirrors against what the profile says."""
-    scenario = draw_scenario(profile, SEED)
-    case = draw_case(SEED, scenario, [BY_NAME["camera-mirrored"]])
-    flight = FaultyFlight(profile, case, scenario)
-    source = flight._parts.source
-    source.begin(CameraFault("mirrored", FOR_EVER), 0.0)  # type: ignore[attr-defined]
-    return polled(source, flight._link)
-
-
 def published(profile: Profile) -> Pictures:
     """By the simulated vehicle's process, on its way to the stream."""
     setup = HostSetup(
@@ -81,8 +67,6 @@ def test_each_simulated_camera_mirrors_and_the_flight_sees_it_turned_right() -> 
     assert np.array_equal(lockstep(MIRRORED, MIRRORED), plain)
     assert np.array_equal(lockstep(PLAIN, MIRRORED), flipped), "the camera itself does mirror"
     assert np.array_equal(lockstep(MIRRORED, PLAIN), flipped)
-    assert np.array_equal(faulty(PLAIN), flipped)
-    assert np.array_equal(faulty(MIRRORED), flipped)
     plain = [image[:, ::-1] for image in published(PLAIN)]
     assert np.array_equal(plain, published(MIRRORED))
 

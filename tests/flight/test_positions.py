@@ -18,7 +18,6 @@ pytest.importorskip("motioncapture", reason="motion capture needs the extra [moc
 from perchctl.errors import (
     ConnectionFailed,
     InvalidValue,
-    NotFound,
     TimedOut,
     UsageError,
 )
@@ -127,15 +126,3 @@ def test_what_cannot_be_flown_is_refused_before_anything_is_opened(
     monkeypatch.setattr(session, "find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"pip install 'perchctl\[mocap\]'"):
         check_options(options({}, uri="sim://"))
-
-
-@pytest.mark.long
-def test_a_firmware_without_the_parameters_is_one_sentence(
-    sim: SimProcess, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from perchctl.link import cflib_link
-
-    monkeypatch.setattr(cflib_link, "estimator_parameters", lambda config: {"locSrv.nothing": 1.0})
-    link = CflibLink(sim.uri, LinkConfig(), time.monotonic, positioning=CONFIG)
-    with pytest.raises(NotFound, match=r"no parameter locSrv\.nothing, which positioning from"):
-        link.connect()

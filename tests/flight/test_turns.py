@@ -105,18 +105,6 @@ def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     assert again.difference == ("error", "ZeroDivisionError", None)
 
 
-def test_a_planner_that_fails_on_the_first_turn_fails_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def fails(c: object) -> None:
-        raise ValueError("by the test")
-
-    monkeypatch.setattr("perchctl.mission.planner._remember", fails)
-    rig = Rig()
-    (again,) = decide(broken(rig, ValueError).turns, rig.profile)
-    assert (again.turn.role, again.error, again.difference) == ("failed", "ValueError", None)
-
-
 def test_what_fails_behind_the_planner_is_not_the_planner_s() -> None:
     """The command may have been sent: the turn is told with it, and replays."""
     rig = Rig()

@@ -94,32 +94,29 @@ def test_an_approach_out_of_sight_is_refused_with_the_reason() -> None:
 # --- Waiting for it -------------------------------------------------------------------------
 
 
-def waits(waited_s: float = 0.0, problem: str | None = None, **seen: Any) -> str:
+def waits(waited_s: float = 0.0, **seen: Any) -> str:
     """What is waited for by a vehicle at rest that has pictures."""
-    given = {"has_frame": True, "target": None, "outside": FeedStatus(problem=UNSEEN)} | seen
-    sample = given.pop("telemetry", REST)
-    return still_waiting_for(
-        sample, camera_problem=problem, waited_s=waited_s, profile=TARGET, **given
-    )
+    given = {"telemetry": REST, "has_frame": True, "outside": FeedStatus(problem=UNSEEN)} | seen
+    return still_waiting_for(camera_problem=None, waited_s=waited_s, profile=TARGET, **given)
 
 
 BESIDE = FeedStatus(problem="by the target the vehicle is 0.40 m beside its estimate")
 
 
-@pytest.mark.parametrize(("problem", "seen", "words"), [
-    (None, {}, f"sight of the target.*{UNSEEN}"),
+@pytest.mark.parametrize(("seen", "words"), [
+    ({}, f"sight of the target.*{UNSEEN}"),
     # Who carries it, or has no camera, has no use for where the target is.
-    (None, {"telemetry": replace(REST, roll_rad=0.4)}, "stand level"),
-    (None, {"telemetry": replace(REST, acc_z_g=1.3)}, "stand still"),
-    (None, {"has_frame": False}, "a good picture"),
-    (None, {"outside": BESIDE}, r"sight of the target.*0\.40 m beside its estimate"),
+    ({"telemetry": replace(REST, roll_rad=0.4)}, "stand level"),
+    ({"telemetry": replace(REST, acc_z_g=1.3)}, "stand still"),
+    ({"has_frame": False}, "a good picture"),
+    ({"outside": BESIDE}, r"sight of the target.*0\.40 m beside its estimate"),
 ])  # fmt: skip
 def test_what_keeps_a_target_from_being_measured_is_named_first_things_first(
-    problem: str | None, seen: dict[str, Any], words: str
+    seen: dict[str, Any], words: str
 ) -> None:
-    assert waits(1.0, problem, **seen)
+    assert waits(1.0, **seen)
     with pytest.raises(TimedOut, match=words) as refused:
-        waits(LATE_S, problem, **seen)
+        waits(LATE_S, **seen)
     assert "motion capture" not in str(refused.value)
 
 
