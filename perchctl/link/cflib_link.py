@@ -23,12 +23,7 @@ from perchctl.link.crtp import (
     Packet,
     encode,
 )
-from perchctl.link.external_position import (
-    NEEDED_BY,
-    Settling,
-    Standing,
-    estimator_parameters,
-)
+from perchctl.link.external_position import Settling, Standing, estimator_parameters
 from perchctl.link.firmware import check_firmware, decks_found, read_parameters, set_parameters
 from perchctl.link.protocol import Guard, SentCallback, check_uri, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
@@ -168,12 +163,7 @@ class CflibLink:
         if newest is not None and not newest.has(ARMED):  # a Crazyflie 2.1 arms itself
             send_packets(connection.cf, ARM)
         self._unlock_thrust(connection)  # from here on it is known to be on the ground
-        set_parameters(
-            connection.cf,
-            self._uri,
-            estimator_parameters(self._positioning),
-            needed_by=NEEDED_BY,
-        )
+        set_parameters(connection.cf, self._uri, estimator_parameters(self._positioning))
         self._sender = Sender(
             self._hand_over,
             self._ask_guard,

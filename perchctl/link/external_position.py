@@ -42,7 +42,6 @@ AGREE_M, AGREE_RAD = 0.05, math.radians(5.0)
 STILL_M = 0.05
 """From the reset until they agree: a vehicle that moves farther is being carried."""
 POLL_S = 0.02
-NEEDED_BY = "positioning from outside"
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
@@ -115,11 +114,10 @@ class Settling:
         )
 
     def _reset(self, start: Placed) -> None:
-        set_parameters(self.cf, self.uri, start_parameters(start), NEEDED_BY)
+        set_parameters(self.cf, self.uri, start_parameters(start))
         # Whether it was heard shows in the estimate: the firmware may clear it by itself.
         for value in (1, 0):
-            order = {RESET_PARAMETER: value}
-            set_parameters(self.cf, self.uri, order, NEEDED_BY, read_back=False)
+            set_parameters(self.cf, self.uri, {RESET_PARAMETER: value}, read_back=False)
             self.wait(RESET_PULSE_S * value)
 
     def _agrees(self, start: Placed) -> bool:

@@ -17,17 +17,14 @@ PARAMETER_TIMEOUT_S = 2.0
 
 def check_firmware(cf: Any, uri: str) -> None:
     """Raises ConnectionFailed for an old protocol, NotFound for a missing log variable."""
-    version = cf.platform.get_protocol_version()
+    version, remedy = cf.platform.get_protocol_version(), "update the firmware to 2026.08 or later"
     if version < NEEDED_PROTOCOL:
         raise ConnectionFailed(
-            f"the firmware at {uri} has protocol {version}, perchctl needs "
-            f"{NEEDED_PROTOCOL} or later (release 2026.08): update the firmware"
+            f"the firmware at {uri} has protocol {version}, perchctl needs {NEEDED_PROTOCOL} or "
+            f"later: {remedy}"
         )
     for name in missing_variables(cf):
-        raise NotFound(
-            f"the firmware at {uri} has no log variable {name}, which perchctl "
-            f"needs: update the firmware to release 2026.08 or later"
-        )
+        raise NotFound(f"the firmware at {uri} has no log variable {name}: {remedy}")
 
 
 def is_logged(cf: Any, name: str) -> bool:
@@ -41,25 +38,19 @@ def missing_variables(cf: Any) -> list[str]:
 
 
 def set_parameters(
-    cf: Any,
-    uri: str,
-    parameters: Mapping[str, float],
-    needed_by: str | None = None,
-    *,
-    read_back: bool = True,
+    cf: Any, uri: str, parameters: Mapping[str, float], *, read_back: bool = True
 ) -> None:
     """Set each parameter, read it back from the vehicle where `read_back` is set, and compare.
 
-    `needed_by`: what they are for, where they are not the user's own. Raises NotFound for an
-    unknown name, InvalidValue for a value that the vehicle does not keep, TimedOut without an
-    answer.
+    Raises NotFound for an unknown name, InvalidValue for a value that the vehicle does not keep,
+    TimedOut without an answer.
     """
     for name, wanted in parameters.items():
         if cf.param.toc.get_element_by_complete_name(name) is None:
-            remedy = ": correct link.parameters in the profile"
-            if needed_by is not None:
-                remedy = f", which {needed_by} needs: update the firmware to 2026.08 or later"
-            raise NotFound(f"the firmware at {uri} has no parameter {name}{remedy}")
+            raise NotFound(
+                f"the firmware at {uri} has no parameter {name}: correct link.parameters in the "
+                f"profile, or update the firmware to 2026.08 or later"
+            )
         kept: str | None = str(wanted)
         try:
             cf.param.set_value(name, kept)

@@ -55,7 +55,7 @@ class Bench:
         return self.now_s
 
     def set_parameters(
-        self, cf: Any, uri: str, parameters: Mapping[str, float], *_: str, read_back: bool = True
+        self, cf: Any, uri: str, parameters: Mapping[str, float], read_back: bool = True
     ) -> None:
         self.orders += parameters.items()
         self.values.update(parameters)
