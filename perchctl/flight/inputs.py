@@ -116,9 +116,13 @@ class FlightInputs:
         self.output, self.blind, self.repeated = None, not look, False
         frame = self.source.poll(now_s)
         problem = self.source.problem(now_s)
+        seen: FrameSeen | None = None
+        if frame is not None:
+            times_s = frame.t_s, frame.t_arrival_s
+            seen = FrameSeen(frame.index, *times_s, frame.fields, frame.repeated)
         self.taken = TurnInputs(
             tuple(samples),
-            frame=_seen(frame),
+            frame=seen,
             problem=problem,
             ended=self.source.finished,
             live=self.source.live,
@@ -225,12 +229,6 @@ class FlightInputs:
         age_s = now_s - frame.t_s
         is_late = live and age_s > self.profile.safety.max_frame_age_s
         return f"the picture is {age_s:.1f} s late" if is_late else None
-
-
-def _seen(frame: Frame | None) -> FrameSeen | None:
-    if frame is None:
-        return None
-    return FrameSeen(frame.index, frame.t_s, frame.t_arrival_s, frame.fields, frame.repeated)
 
 
 # --- The target as positioning system, tick by tick -------------------

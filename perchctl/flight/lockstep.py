@@ -199,25 +199,20 @@ def fly_lockstep(
     vehicle.watched = False
     link.close()
     link.advance_to(link.now_s + 1.0)
-    flight = _flown(report, vehicle, truth)
+    hanging = vehicle.world.magnet_engaged
+    flight = LockstepFlight(
+        report=report,
+        seed=scenario.seed,
+        miss_m=vehicle.world.gear_miss_m(),
+        hanging=hanging,
+        fell=truth.fell or (report.phase is Phase.PERCHED and not hanging),
+        locked=bool(vehicle.firmware.supervisor_info & LOCKED),
+        touchdown_mps=truth.touchdown_mps,
+        scenario=scenario,
+    )
     if opened is not None:
         flight.conclude(opened)
     return flight
-
-
-def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> LockstepFlight:
-    hanging = vehicle.world.magnet_engaged
-    fell = truth.fell or (report.phase is Phase.PERCHED and not hanging)
-    return LockstepFlight(
-        report=report,
-        seed=vehicle.scenario.seed,
-        miss_m=vehicle.world.gear_miss_m(),
-        hanging=hanging,
-        fell=fell,
-        locked=bool(vehicle.firmware.supervisor_info & LOCKED),
-        touchdown_mps=truth.touchdown_mps,
-        scenario=vehicle.scenario,
-    )
 
 
 # --- External positions in lockstep: the simulated motion capture, by the same feed ---

@@ -118,7 +118,9 @@ def fly(parts: FlightParts) -> FlightReport:
         )
         with contextlib.suppress(Exception):  # the log may be what failed
             turns.failed(inputs, error)
-        _tell_rescue(parts, error, rest)
+        for watcher in parts.watchers:
+            with contextlib.suppress(Exception):  # it may be the one that failed
+                watcher.event(Event.of_rescue(parts.clock.now(), error, rest))
         raise
 
 
@@ -132,12 +134,6 @@ def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
                 watcher.sent(sent)
 
     return tell
-
-
-def _tell_rescue(parts: FlightParts, error: BaseException, rest: str) -> None:
-    for watcher in parts.watchers:
-        with contextlib.suppress(Exception):  # it may be the one that failed
-            watcher.event(Event.of_rescue(parts.clock.now(), error, rest))
 
 
 def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) -> None:
@@ -189,10 +185,13 @@ def _mission(
     redone = log_noted = False
     logged = inputs.perception.calibration.newest
     while True:
-        now_s = clock.now()
-        turns.begin(now_s)
-        inputs.take_in(now_s, look=not _is_blind(state))
-        now_s = _present(parts, inputs, now_s)
+        began_s = now_s = clock.now()
+        turns.begin(began_s)
+        # Against the ceiling the picture shows no target and steers nothing.
+        inputs.take_in(began_s, look=state is None or state.phase is not Phase.COMPLETE)
+        if clock.now() - began_s > HUNG_S:  # a setpoint for the time before the hang is stale
+            now_s = clock.now()
+            inputs.present(began_s, now_s)
         late_s = max(0.0, now_s - due_s)
         outside = _outside(parts, inputs, now_s)
         obs = _observe(parts, inputs, now_s, late_s, outside)
@@ -264,21 +263,6 @@ def _outside(parts: FlightParts, inputs: FlightInputs, now_s: float) -> FeedStat
     if inputs.target_positioning is not None:
         return inputs.target_positioning.feed.status(now_s)
     return None if parts.positions is None else parts.positions.status(now_s)
-
-
-def _present(parts: FlightParts, inputs: FlightInputs, began_s: float) -> float:
-    """Return the turn's time: after a hang of camera or vision the present, with what has arrived
-    meanwhile, since a setpoint for the time before the hang would be stale."""
-    now_s = parts.clock.now()
-    if now_s - began_s <= HUNG_S:
-        return began_s
-    inputs.present(began_s, now_s)
-    return now_s
-
-
-def _is_blind(state: PlannerState | None) -> bool:
-    """True against the ceiling, where the picture shows no target and steers nothing."""
-    return state is not None and state.phase is Phase.COMPLETE
 
 
 def _observe(

@@ -59,7 +59,10 @@ class FlyOptions:
 def check_options(options: FlyOptions) -> None:
     """Refuse what can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
-    _check_positioning(options.profile, simulated=options.simulated)
+    if options.profile.positioning.by == "mocap" and not options.simulated:
+        PositionFeed.check_reachable(options.profile.positioning)
+    elif options.profile.positioning.by == "mocap" and find_spec("motioncapture") is None:
+        raise no_motion_capture()  # the simulated room has a capture of its own
     source = parse_source(options.source)
     if source.scheme == "sim" and not options.simulated:
         raise UsageError(
@@ -182,16 +185,6 @@ def _simulated_clock(
 
 
 # --- External positions for one flight in real time: capture, feed, and the thread between ---
-
-
-def _check_positioning(profile: Profile, *, simulated: bool) -> None:
-    config = profile.positioning
-    if config.by != "mocap":
-        return
-    if not simulated:
-        PositionFeed.check_reachable(config)
-    elif find_spec("motioncapture") is None:  # the simulated room has a capture of its own
-        raise no_motion_capture()
 
 
 def require_comparison(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
