@@ -122,7 +122,6 @@ class LockstepFlight:
     """A finished flight and what only the simulator can measure."""
 
     report: FlightReport
-    seed: int
     miss_m: float
     hanging: bool
     fell: bool
@@ -202,7 +201,6 @@ def fly_lockstep(
     hanging = vehicle.world.magnet_engaged
     flight = LockstepFlight(
         report=report,
-        seed=scenario.seed,
         miss_m=vehicle.world.gear_miss_m(),
         hanging=hanging,
         fell=truth.fell or (report.phase is Phase.PERCHED and not hanging),

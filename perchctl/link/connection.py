@@ -23,11 +23,8 @@ CLOSE_TIMEOUT_S = 3.0
 RADIO_RETRIES = 100_000
 """Lost packets in a row after which cflib gives a radio up: about 200 s, cflib's own 100 are 0.2 s.
 
-More than any flight outlives without its radio, because waiting is the better way back. A driver
-that goes on repeating is heard with the first packet that the vehicle answers. One that has given
-up has to be opened again: the dongle is reset, and safelink agreed upon anew. Nothing hangs by
-the waiting: what finds no room is not handed over (`Connection.send`), and the age of the
-telemetry ends the flight long before."""
+Waiting is the better way back: a driver that goes on repeating is heard with the first packet that
+the vehicle answers; one that has given up resets its dongle, and agrees upon safelink anew."""
 REOPEN_PAUSE_S = 0.05
 SAFELINK_S = 0.15
 """The driver's ten attempts at a safelink take 20 to 50 ms."""
@@ -350,9 +347,8 @@ def _forget_dead_dongle(uri: str) -> None:
 
 
 # --- One program at a time for each vehicle: a lock that this user's programs on this computer
-# share. A second connection would do harm without a word: cflib's connect resets the log blocks of
-# a vehicle that flies for another program, and two streams of setpoints would pull it two ways. The
-# operating system holds the lock and lets it go with the process, however that ends.
+# share. cflib's connect would reset the log blocks of a vehicle that flies for another program, and
+# two streams of setpoints would pull it two ways.
 
 
 def claim_vehicle(uri: str) -> contextlib.ExitStack:
